@@ -1,0 +1,197 @@
+"""One tick of one joint: sample in, command out.
+
+    position -> phase and reference -> velocity -> safety -> law -> finite check, torque limit, rate limit
+
+The phases themselves are in `sequence`, the limits in `safety`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from firmware_py.computed_torque import step_law
+from firmware_py.kernel import kernel
+from firmware_py.records import AxisConstants, AxisState, Command, Sample
+from firmware_py.safety import drive_fault, limited_torque_Nm, motion_fault, reference_fault
+from firmware_py.sequence import (
+    enter,
+    powered,
+    react,
+    request_stop,
+    step_enabling,
+    step_stopping,
+    step_waiting,
+    trip,
+    write_command,
+)
+from firmware_py.states import AxisPhase, Fault, Reaction
+from firmware_py.trajectory import approach_at, brake_step, reference_at
+from firmware_py.velocity import step_velocity
+
+
+@kernel
+def _take_position(constants: AxisConstants, state: AxisState, sample: Sample, elapsed_cycles: int) -> int:
+    """Position of this cycle; periods since the last sample, 0 if there is no new one.
+
+    Between samples the joint is assumed to move on evenly.
+    """
+    if sample.count == state.sample_count:
+        state.sample_age_cycles += elapsed_cycles
+        state.good_samples = 0
+        state.measured_position_rad += state.velocity.velocity_radps * elapsed_cycles * constants.velocity.period_s
+        return 0
+    gap_cycles = state.sample_age_cycles + elapsed_cycles
+    if state.velocity.primed != 0:
+        moved_rad = abs(sample.position_rad - state.velocity.last_position_rad)
+        if not moved_rad <= constants.limits.position_jump_max_rad * gap_cycles:
+            trip(state, Fault.POSITION_JUMP, moved_rad, 0)
+    state.sample_count = sample.count
+    state.sample_age_cycles = 0
+    state.good_samples += 1
+    state.measured_position_rad = sample.position_rad
+    state.measured_torque_Nm = sample.torque_Nm
+    return gap_cycles
+
+
+@kernel
+def _check_surroundings(
+    constants: AxisConstants, state: AxisState, sample: Sample, skipped_cycles: int, supervisor_age_cycles: int
+) -> None:
+    """Faults of the drive, the bus, the schedule and the supervisor; the drive's first, it tells most of the cause."""
+    if state.phase >= AxisPhase.DISABLING:
+        return
+    if state.restarts_at_start < 0:
+        state.restarts_at_start = sample.restarts
+    fault = drive_fault(sample.drive_state, powered(state.phase), sample.restarts - state.restarts_at_start)
+    trip(state, fault, float(sample.status_word), sample.drive_error)
+    if state.phase >= AxisPhase.ENABLING and state.phase <= AxisPhase.RELEASING:
+        if state.sample_age_cycles > constants.limits.sample_age_max_cycles:
+            trip(state, Fault.STALE_SAMPLE, float(state.sample_age_cycles), 0)
+        if sample.bus_errors > constants.limits.sample_age_max_cycles:
+            trip(state, Fault.BUS_ERROR, float(sample.bus_errors), 0)
+    if state.phase <= AxisPhase.RELEASING:
+        if 0 < constants.sequence.supervisor_max_cycles < supervisor_age_cycles:
+            trip(state, Fault.SUPERVISOR_LOST, float(supervisor_age_cycles), 0)
+    if powered(state.phase) and skipped_cycles > constants.limits.skipped_max_cycles:
+        trip(state, Fault.OVERRUN, float(skipped_cycles), 0)
+
+
+@kernel
+def _move_reference(constants: AxisConstants, state: AxisState, table: np.ndarray, elapsed_cycles: int) -> None:
+    """The desired motion of this cycle: approach, trajectory, or braking.  Time goes on through an overrun."""
+    if state.phase == AxisPhase.APPROACH and state.trajectory_s >= 0.0:
+        enter(state, AxisPhase.TRACKING)
+    duration_s = constants.trajectory.duration_s
+    if state.phase == AxisPhase.TRACKING and 0.0 < duration_s <= state.trajectory_s:
+        react(state, Reaction.RAMP)
+    if state.phase == AxisPhase.APPROACH:
+        approach_at(state.approach, state.trajectory_s + constants.sequence.approach_s, state.reference)
+    elif state.phase == AxisPhase.TRACKING:
+        state.table_row = reference_at(
+            constants.trajectory, table, state.table_row, state.trajectory_s, state.reference
+        )
+    else:
+        _brake(constants, state, elapsed_cycles)
+        return
+    state.trajectory_s = state.trajectory_s + elapsed_cycles * constants.law.period_s
+    fault = reference_fault(constants.limits, state.reference.position_rad, state.reference.velocity_radps)
+    trip(state, fault, state.reference.position_rad, 0)
+
+
+@kernel
+def _brake(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> None:
+    """RAMPING: brake the reference, then wait until the joint itself stands."""
+    for _ in range(elapsed_cycles):
+        brake_step(state.reference, constants.sequence.brake_radps2, constants.law.period_s)
+    if state.reference.velocity_radps == 0.0:
+        if abs(state.velocity.velocity_radps) <= constants.limits.standstill_radps:
+            enter(state, AxisPhase.RELEASING)
+    if state.phase_cycle > constants.sequence.stop_max_cycles:
+        trip(state, Fault.STOP_TIMEOUT, state.velocity.velocity_radps, 0)
+
+
+@kernel
+def _check_motion(constants: AxisConstants, state: AxisState) -> None:
+    """Measured position, velocity and following error against their limits."""
+    error_rad = state.measured_position_rad - state.reference.position_rad
+    fault = motion_fault(constants.limits, state.measured_position_rad, state.velocity.velocity_radps, error_rad)
+    value = state.measured_position_rad
+    if fault == Fault.VELOCITY_LIMIT:
+        value = state.velocity.velocity_radps
+    elif fault == Fault.FOLLOWING_ERROR:
+        value = error_rad
+    trip(state, fault, value, 0)
+
+
+@kernel
+def _released_torque_Nm(constants: AxisConstants, state: AxisState) -> float:
+    """RELEASING: the last torque along a straight line to zero."""
+    left_cycles = constants.sequence.release_s / constants.law.period_s - state.phase_cycle
+    if left_cycles <= 0.0:
+        enter(state, AxisPhase.DISABLING)
+        return 0.0
+    return state.command_torque_Nm * left_cycles / (left_cycles + 1.0)
+
+
+@kernel
+def _command_torque(constants: AxisConstants, state: AxisState) -> None:
+    """The torque of this cycle; a torque that is not finite is never sent."""
+    if state.phase == AxisPhase.RELEASING:
+        state.unlimited_torque_Nm = _released_torque_Nm(constants, state)
+    elif powered(state.phase):
+        state.unlimited_torque_Nm = step_law(
+            constants.law, state.law, state.measured_position_rad, state.velocity, state.reference
+        )
+    else:
+        state.unlimited_torque_Nm = 0.0
+    limits = constants.limits
+    torque_Nm, finite = limited_torque_Nm(
+        limits, state.unlimited_torque_Nm, state.command_torque_Nm, constants.law.period_s
+    )
+    if not finite:
+        trip(state, Fault.NOT_FINITE, state.unlimited_torque_Nm, 0)
+    if abs(torque_Nm) >= limits.torque_max_Nm:
+        state.saturated_cycles += 1
+        if state.saturated_cycles > limits.saturation_max_cycles:
+            trip(state, Fault.TORQUE_SATURATED, torque_Nm, 0)
+    else:
+        state.saturated_cycles = 0
+    state.command_torque_Nm = torque_Nm if powered(state.phase) else 0.0
+
+
+@kernel
+def step_axis(
+    constants: AxisConstants,
+    state: AxisState,
+    table: np.ndarray,
+    sample: Sample,
+    command: Command,
+    elapsed_cycles: int,
+    stop_request: int,
+    supervisor_age_cycles: int,
+) -> None:
+    """One cycle.
+
+    `table` float64[N, 5], the rows of a table trajectory; `elapsed_cycles` >= 1 periods since the last call (more
+    than 1 after an overrun); `stop_request` a `StopRequest`; `supervisor_age_cycles` periods since the supervisor's
+    last sign of life.
+    """
+    state.cycle += elapsed_cycles
+    state.phase_cycle += elapsed_cycles
+    gap_cycles = _take_position(constants, state, sample, elapsed_cycles)
+    request_stop(state, stop_request)
+    _check_surroundings(constants, state, sample, elapsed_cycles - 1, supervisor_age_cycles)
+    if state.phase == AxisPhase.WAITING:
+        step_waiting(constants, state)
+    elif state.phase == AxisPhase.ENABLING:
+        step_enabling(constants, state, sample, table)
+    if state.phase >= AxisPhase.APPROACH and state.phase <= AxisPhase.RAMPING:
+        _move_reference(constants, state, table, elapsed_cycles)
+    if gap_cycles > 0:
+        error_rad = sample.position_rad - state.reference.position_rad
+        step_velocity(constants.velocity, state.velocity, sample.position_rad, error_rad, gap_cycles)
+    if powered(state.phase):
+        _check_motion(constants, state)
+    _command_torque(constants, state)
+    step_stopping(constants, state, sample)
+    write_command(state, command)

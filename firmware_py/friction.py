@@ -1,0 +1,126 @@
+"""Multi-stage friction model (11): Stribeck near zero speed, a cubic polynomial beyond the knee.
+
+Torque is that at the MOTOR, speed that of the JOINT in rad/s; the joint feels `reduction_ratio` times the torque.
+Each direction is stored mirrored (positive speed, positive friction), so that one expression serves both:
+
+    u = |v| <= knee :  tc + (ts - tc) exp(-u / ws) + tv u
+    u > knee        :  a0 + a1 u + a2 u^2 + a3 u^3
+    u > maximum     :  value and slope at the maximum are held (the data end there, so extrapolation is a guess)
+
+(11) prints the exponent of the negative direction as -v/ws, which diverges; mirrored it is -|v|/ws.
+The two stages need not meet at the knee (Table 3 has steps of 0.0017 and 0.0013 Nm).
+Not modelled: position, temperature and load dependence.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from firmware_py.kernel import kernel
+from firmware_py.records import FrictionBranch, FrictionConstants
+from firmware_py.schema import new
+from firmware_py.states import ZeroSpeedRule
+
+DEGREE = math.pi / 180.0
+
+
+@kernel
+def branch_torque_Nm(branch: FrictionBranch, speed_radps: float) -> float:
+    """Friction of one direction at the motor [Nm] for a speed >= 0; at 0 it is the static friction."""
+    if speed_radps <= branch.knee_radps:
+        decay = math.exp(-speed_radps / branch.stribeck_speed_radps)
+        return branch.coulomb_Nm + (branch.static_Nm - branch.coulomb_Nm) * decay + branch.viscous_Nmspr * speed_radps
+    a = branch.cubic
+    u = min(speed_radps, branch.max_radps)
+    torque = a[0] + u * (a[1] + u * (a[2] + u * a[3]))
+    if speed_radps > branch.max_radps:
+        torque += (speed_radps - u) * (a[1] + u * (2.0 * a[2] + 3.0 * u * a[3]))
+    return torque
+
+
+@kernel
+def friction_motor_torque_Nm(friction: FrictionConstants, velocity_radps: float) -> float:
+    """Friction at the motor [Nm], opposing the motion and counted positive for positive velocity; 0 at v = 0."""
+    if velocity_radps > 0.0:
+        return branch_torque_Nm(friction.positive, velocity_radps)
+    if velocity_radps < 0.0:
+        return -branch_torque_Nm(friction.negative, -velocity_radps)
+    return 0.0
+
+
+@kernel
+def compensation_motor_torque_Nm(
+    friction: FrictionConstants, zero_rule: int, zero_band_radps: float, velocity_radps: float
+) -> float:
+    """Feed-forward friction torque at the motor [Nm] with an explicit rule at v = 0, where friction is set-valued.
+
+    PAPER gives +static friction at exactly zero; LINEAR draws a line through zero inside +-zero_band_radps.
+    """
+    if zero_rule == ZeroSpeedRule.LINEAR and abs(velocity_radps) < zero_band_radps:
+        edge = math.copysign(zero_band_radps, velocity_radps)
+        return friction_motor_torque_Nm(friction, edge) * abs(velocity_radps) / zero_band_radps
+    if zero_rule == ZeroSpeedRule.PAPER and velocity_radps == 0.0:
+        return branch_torque_Nm(friction.positive, 0.0)
+    return friction_motor_torque_Nm(friction, velocity_radps)
+
+
+def branch_constants(
+    tc: float,
+    ts: float,
+    ws: float,
+    tv: float,
+    cubic: Sequence[float],
+    knee: float,
+    maximum: float,
+    *,
+    negative: bool,
+    radps_per_unit: float,
+    torque_scale: float = 1.0,
+) -> Any:
+    """One direction from the numbers as (11) prints them; returns a `FrictionBranch` record.
+
+    `cubic` is (a0, a1, a2, a3) with the signs of (11); `knee` and `maximum` may carry the sign of the direction;
+    speeds are in a unit of `radps_per_unit` rad/s of the joint; `torque_scale` turns the given torque into motor Nm.
+    """
+    branch = new(FrictionBranch)[0]
+    mirror = (-1.0, 1.0, -1.0, 1.0) if negative else (1.0, 1.0, 1.0, 1.0)
+    branch.coulomb_Nm = tc * torque_scale
+    branch.static_Nm = ts * torque_scale
+    branch.stribeck_speed_radps = ws * radps_per_unit
+    branch.viscous_Nmspr = tv * torque_scale / radps_per_unit
+    for power in range(4):
+        branch.cubic[power] = mirror[power] * cubic[power] * torque_scale / radps_per_unit**power
+    branch.knee_radps = abs(knee) * radps_per_unit
+    branch.max_radps = abs(maximum) * radps_per_unit
+    return branch
+
+
+def friction_constants(positive: Any, negative: Any) -> Any:
+    """A `FrictionConstants` record array of one record from two branches."""
+    constants = new(FrictionConstants)
+    constants[0].positive = positive
+    constants[0].negative = negative
+    return constants
+
+
+def paper_friction() -> Any:
+    """Table 3 of the paper: speed in deg/s of the joint, torque at the motor."""
+    positive = branch_constants(
+        0.11985, 0.14537, 1.2301, 0.0026518, (0.17995, 0.0012298, -6.5261e-7, -7.6969e-9), 40.0, 200.0,
+        negative=False, radps_per_unit=DEGREE,
+    )  # fmt: skip
+    negative = branch_constants(
+        0.1063, 0.1575, 2.887, 0.002475, (-0.1272, 0.0022866, 1e-5, 2.1182e-8), -40.0, -200.0,
+        negative=True, radps_per_unit=DEGREE,
+    )  # fmt: skip
+    return friction_constants(positive, negative)
+
+
+def friction_curve_Nm(constants: Any, velocity_radps: np.ndarray) -> np.ndarray:
+    """(11) at many velocities; arrays of shape (N,)."""
+    friction = constants[0]
+    return np.array([friction_motor_torque_Nm(friction, float(v)) for v in velocity_radps])

@@ -1,0 +1,114 @@
+"""The one way to compile a function, and the few things a compiled function needs from the C library.
+
+Everything that runs between enabling and stopping a joint is compiled with `kernel`, so that one place
+decides the options:
+
+* ``nogil``: the loop must not wait for other Python threads;
+* ``error_model="numpy"``: a division by zero gives inf, which the finite check catches; an exception would
+  unwind the loop with torque applied;
+* no ``fastmath``: it lets the compiler assume that NaN does not exist, and then `isfinite` is always true;
+* ``cache``: on disk, in a folder named after a hash of *all* our sources.  Numba looks only at the file of the
+  function itself, so that an edited callee in another file would run stale.
+
+With ``NUMBA_DISABLE_JIT=1`` the same functions run as plain Python (coverage and debugging).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+# In `tools` only sub-packages may hold kernels (a test sees to it), so that editing a verb does not recompile.
+_KERNEL_SOURCES = ("firmware_py/**/*.py", "drivers/**/*.py", "hil/**/*.py", "tools/*/**/*.py")
+_KEPT_CACHES = 4
+
+
+def source_hash(root: Path | None = None) -> str:
+    """Hash (16 hex digits) of every source that can hold a kernel or a constant of one, and of interpreter and CPU."""
+    root = root or Path(__file__).resolve().parent.parent
+    digest = hashlib.sha256(f"{sys.version}{os.uname().machine}".encode())
+    for pattern in _KERNEL_SOURCES:
+        for path in sorted(root.glob(pattern)):
+            digest.update(str(path.relative_to(root)).encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _cache_base() -> Path:
+    configured = os.environ.get("JOINTCTL_CACHE_DIR")
+    if configured:
+        return Path(configured)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jointctl"
+
+
+def _prune(base: Path, keep: Path) -> None:
+    """Remove the caches of older sources, but none used in the last hour: another process may run from it."""
+    folders = sorted((p for p in base.glob("numba-*") if p != keep), key=lambda p: p.stat().st_mtime, reverse=True)
+    for old in folders[_KEPT_CACHES - 1 :]:
+        if time.time() - old.stat().st_mtime > 3600.0:
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def prepare_cache() -> Path | None:
+    """Point numba at the folder for the present sources; None (and no cache) where no folder can be written."""
+    base = _cache_base()
+    folder = base / f"numba-{source_hash()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        os.utime(folder)
+        _prune(base, folder)
+    except OSError:
+        return None
+    os.environ["NUMBA_CACHE_DIR"] = str(folder)
+    return folder
+
+
+cache_folder = prepare_cache()
+
+import numba  # noqa: E402  (NUMBA_CACHE_DIR is read while numba is imported)
+from numba.core import types  # noqa: E402
+
+_numba_config: Any = numba.config
+if cache_folder is not None:
+    _numba_config.CACHE_DIR = str(cache_folder)
+
+JIT_DISABLED = bool(_numba_config.DISABLE_JIT)
+_OPTIONS: dict[str, Any] = {"nogil": True, "cache": cache_folder is not None, "error_model": "numpy"}
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def kernel(function: Function) -> Function:
+    """Compile `function` for the control loop (nopython, nogil, cached, no exceptions from arithmetic)."""
+    return cast(Function, numba.njit(**_OPTIONS)(function))
+
+
+def inlined(function: Function) -> Function:
+    """Compile a very small function whose body is copied into its callers."""
+    return cast(Function, numba.njit(inline="always", **_OPTIONS)(function))
+
+
+def exported(signature: Any) -> Callable[[Function], Any]:
+    """Compile to a C function of a fixed signature, which a kernel may take as an argument and still be cached.
+
+    This is how the loop (which may not import a driver) calls the driver it was given.
+    """
+
+    def wrap(function: Function) -> Any:
+        if JIT_DISABLED:
+            return function
+        compile_c: Any = numba.cfunc
+        return compile_c(signature, nopython=True, cache=cache_folder is not None)(function)
+
+    return wrap
+
+
+def record_array_type(dtype: Any) -> Any:
+    """The numba type of a one-dimensional array of records, for `exported` signatures."""
+    return types.Array(numba.from_dtype(dtype), 1, "C")

@@ -1,0 +1,126 @@
+"""The C library by name, and atomic words, usable in kernels.
+
+Functions named by `ExternalFunction` are found by the linker, so that a kernel calling them can be cached on
+disk (an address taken with ctypes cannot).  Pointers are passed as integer addresses.  With the JIT disabled the
+same names are ctypes functions, so that the callers stay testable in plain Python.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno as errno_codes
+from typing import Any
+
+import numpy as np
+from numba.core import types
+from numba.extending import intrinsic
+
+from firmware_py.kernel import JIT_DISABLED, kernel
+
+_CTYPES = {
+    types.int32: ctypes.c_int32,
+    types.int64: ctypes.c_int64,
+    types.uintp: ctypes.c_size_t,
+    types.intp: ctypes.c_ssize_t,
+}
+
+
+def external(name: str, result: Any, *arguments: Any) -> Any:
+    if not JIT_DISABLED:
+        return types.ExternalFunction(name, result(*arguments))
+    function = getattr(ctypes.CDLL(None, use_errno=False), name)
+    function.restype = _CTYPES[result]
+    function.argtypes = [_CTYPES[argument] for argument in arguments]
+    return function
+
+
+clock_nanosleep = external("clock_nanosleep", types.int32, types.int32, types.int32, types.uintp, types.uintp)
+clock_gettime = external("clock_gettime", types.int32, types.int32, types.uintp)
+send = external("send", types.intp, types.int32, types.uintp, types.uintp, types.int32)
+recv = external("recv", types.intp, types.int32, types.uintp, types.uintp, types.int32)
+ppoll = external("ppoll", types.int32, types.uintp, types.uintp, types.uintp, types.uintp)
+accept4 = external("accept4", types.int32, types.int32, types.uintp, types.uintp, types.int32)
+close = external("close", types.int32, types.int32)
+_errno_location = external("__errno_location", types.uintp)
+
+CLOCK_MONOTONIC = 1
+TIMER_ABSTIME = 1
+MSG_DONTWAIT = 0x40
+MSG_NOSIGNAL = 0x4000
+POLLIN = 0x001
+POLLERR_POLLHUP = 0x018
+SOCK_NONBLOCK_CLOEXEC = 0o4000 | 0o2000000
+EAGAIN = errno_codes.EAGAIN
+EINTR = errno_codes.EINTR
+ENOBUFS = errno_codes.ENOBUFS
+NANOSECONDS = 1_000_000_000
+
+
+if JIT_DISABLED:
+
+    def _load_int32(address: int) -> int:
+        return ctypes.c_int32.from_address(address).value
+
+    def load_acquire(words: Any, index: int) -> int:
+        """Read a shared int64 word."""
+        return int(words[index])
+
+    def store_release(words: Any, index: int, value: int) -> None:
+        """Write a shared int64 word."""
+        words[index] = value
+
+else:
+    from llvmlite import ir
+
+    @intrinsic
+    def _load_int32(typing_context: Any, address: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            pointer = builder.inttoptr(arguments[0], ir.IntType(32).as_pointer())
+            return builder.load(pointer)
+
+        return types.int32(types.uintp), generate
+
+    @intrinsic
+    def load_acquire(typing_context: Any, words: Any, index: Any) -> Any:
+        """Read a shared int64 word so that nothing after it is moved before it (a plain read is hoisted)."""
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            array = context.make_array(signature.args[0])(context, builder, arguments[0])
+            pointer = builder.gep(array.data, [arguments[1]])
+            return builder.load_atomic(pointer, "acquire", 8)
+
+        return types.int64(words, types.int64), generate
+
+    @intrinsic
+    def store_release(typing_context: Any, words: Any, index: Any, value: Any) -> Any:
+        """Write a shared int64 word so that nothing before it is moved after it."""
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            array = context.make_array(signature.args[0])(context, builder, arguments[0])
+            pointer = builder.gep(array.data, [arguments[1]])
+            builder.store_atomic(arguments[2], pointer, "release", 8)
+
+        return types.void(words, types.int64, types.int64), generate
+
+
+@kernel
+def errno() -> int:
+    """The C errno of the calling thread."""
+    return _load_int32(_errno_location())
+
+
+@kernel
+def monotonic_ns(timespec: np.ndarray) -> int:
+    """CLOCK_MONOTONIC [ns]; `timespec` is an int64[2] scratch array owned by the caller (no allocation)."""
+    clock_gettime(np.int32(CLOCK_MONOTONIC), np.uintp(timespec.ctypes.data))
+    return timespec[0] * NANOSECONDS + timespec[1]
+
+
+@kernel
+def sleep_until_ns(deadline_ns: int, timespec: np.ndarray) -> None:
+    """Sleep until the absolute CLOCK_MONOTONIC time; sleeps on after a signal; `timespec` int64[2] is scratch."""
+    timespec[0] = deadline_ns // NANOSECONDS
+    timespec[1] = deadline_ns % NANOSECONDS
+    address = np.uintp(timespec.ctypes.data)
+    while clock_nanosleep(np.int32(CLOCK_MONOTONIC), np.int32(TIMER_ABSTIME), address, np.uintp(0)) == EINTR:
+        pass

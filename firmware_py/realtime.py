@@ -1,0 +1,154 @@
+"""The fixed-rate loop: one compiled function from before enabling until the drive is off.
+
+    sleep until the absolute deadline -> receive -> tick -> send -> log record
+
+No Python object is touched inside, no memory is allocated, the GIL is not held.  An overrun skips slots and keeps
+the phase of the schedule; it never sends a burst.  The loop ends by itself when the axis is FINISHED.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+
+from firmware_py.axis import step_axis
+from firmware_py.kernel import kernel
+from firmware_py.libc import load_acquire, monotonic_ns, sleep_until_ns, store_release
+from firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
+from firmware_py.states import AxisPhase
+
+HISTOGRAM_BINS = 4097  # 1 us each; the last one holds everything later
+
+
+class Word(IntEnum):
+    """Index of a shared int64 word; eight apart, so that no two lie in one cache line."""
+
+    GO = 0  # the supervisor lets the loop begin
+    STOP = 8  # a StopRequest
+    SUPERVISOR_NS = 16  # CLOCK_MONOTONIC of the supervisor's last sign of life
+    HEAD = 24  # log records written since the start
+    LOOP_NS = 32  # CLOCK_MONOTONIC of the last finished cycle
+    READY = 40  # the loop is compiled and warm
+    SKIPPED = 48  # slots skipped so far
+    ENDED = 56  # the loop has returned
+
+
+WORDS = 64
+
+
+class Histogram(IntEnum):
+    """Row of the histogram array int64[3, HISTOGRAM_BINS]."""
+
+    WAKE = 0
+    ROUND_TRIP = 1
+    WORK = 2
+
+
+@kernel
+def count(histogram: np.ndarray, row: int, duration_ns: int) -> None:
+    """Add one duration to a row."""
+    bin_us = duration_ns // 1000
+    histogram[row, min(max(bin_us, 0), HISTOGRAM_BINS - 1)] += 1
+
+
+@kernel
+def write_log(record: LogRecord, state: AxisState, sample: Sample, command: Command) -> None:
+    """Copy one cycle into a log record; the loop adds the times."""
+    record.cycle = state.cycle
+    record.trajectory_s = state.trajectory_s
+    record.position_rad = state.measured_position_rad
+    record.velocity_radps = state.velocity.velocity_radps
+    record.desired_position_rad = state.reference.position_rad
+    record.desired_velocity_radps = state.reference.velocity_radps
+    record.desired_acceleration_radps2 = state.reference.acceleration_radps2
+    record.error_rad = state.measured_position_rad - state.reference.position_rad
+    record.error_rate_radps = state.velocity.velocity_radps - state.reference.velocity_radps
+    record.command_torque_Nm = state.command_torque_Nm
+    record.unlimited_torque_Nm = state.unlimited_torque_Nm
+    record.measured_torque_Nm = state.measured_torque_Nm
+    record.inertia_torque_Nm = state.law.inertia_torque_Nm
+    record.feedback_torque_Nm = state.law.feedback_torque_Nm
+    record.friction_torque_Nm = state.law.friction_torque_Nm
+    record.gravity_torque_Nm = state.law.gravity_torque_Nm
+    record.network_torque_Nm = state.law.network_torque_Nm
+    for i in range(len(record.weights)):
+        record.weights[i] = state.law.network.weights[i]
+    record.sample_age_cycles = state.sample_age_cycles
+    record.phase = state.phase
+    record.fault = state.fault
+    record.request = command.request
+    record.drive_state = sample.drive_state
+    record.status_word = sample.status_word
+    record.drive_error = sample.drive_error
+
+
+@kernel
+def run_loop(
+    receive: Any,
+    send: Any,
+    port: np.ndarray,
+    frames: np.ndarray,
+    scratch: np.ndarray,
+    constants: np.ndarray,
+    state: np.ndarray,
+    table: np.ndarray,
+    sample: np.ndarray,
+    command: np.ndarray,
+    words: np.ndarray,
+    ring: np.ndarray,
+    histograms: np.ndarray,
+    period_ns: int,
+    receive_ns: int,
+    max_cycles: int,
+) -> int:
+    """Run until FINISHED or `max_cycles` slots; returns the number of cycles executed.
+
+    `receive(port, frames, scratch, sample, now_ns, deadline_ns) -> int64` waited [ns] (0: no sample came) and
+    `send(port, frames, sample, command) -> int32` are the driver's, as C function types; `port`, `frames` and
+    `scratch` are its memory and are only passed through.  Arrays of one record: `constants` AxisConstants, `state`
+    AxisState (reset), `sample`, `command`.  `ring` LogRecord[N]; record k is at k % N once HEAD > k.
+    `receive_ns` is how long a cycle may wait for its sample, counted from the deadline.
+    With max_cycles = 0 nothing is sent: that call compiles.
+    """
+    timespec = np.zeros(2, np.int64)
+    axis: AxisConstants = constants[0]
+    now_state: AxisState = state[0]
+    executed = 0
+    deadline_ns = monotonic_ns(timespec) + period_ns
+    last_slot_ns = deadline_ns - period_ns
+    while executed < max_cycles:
+        sleep_until_ns(deadline_ns, timespec)
+        wake_ns = monotonic_ns(timespec)
+        late_ns = wake_ns - deadline_ns
+        if late_ns >= period_ns:
+            deadline_ns += late_ns // period_ns * period_ns
+        elapsed_cycles = (deadline_ns - last_slot_ns) // period_ns
+        last_slot_ns = deadline_ns
+        waited_ns = receive(port, frames, scratch, sample, np.int64(wake_ns), np.int64(deadline_ns + receive_ns))
+        stop_request = load_acquire(words, Word.STOP)
+        supervisor_age = (wake_ns - load_acquire(words, Word.SUPERVISOR_NS)) // period_ns
+        step_axis(axis, now_state, table, sample[0], command[0], elapsed_cycles, stop_request, supervisor_age)
+        send(port, frames, sample, command)
+        end_ns = monotonic_ns(timespec)
+        head = load_acquire(words, Word.HEAD)
+        record = ring[head % len(ring)]
+        write_log(record, now_state, sample[0], command[0])
+        record.time_ns = deadline_ns
+        record.wake_late_ns = min(late_ns, 2147483647)
+        record.round_trip_ns = waited_ns if now_state.sample_age_cycles == 0 else 0
+        record.work_ns = end_ns - wake_ns - waited_ns
+        record.skipped = elapsed_cycles - 1
+        count(histograms, Histogram.WAKE, late_ns)
+        if now_state.sample_age_cycles == 0:
+            count(histograms, Histogram.ROUND_TRIP, waited_ns)
+        count(histograms, Histogram.WORK, end_ns - wake_ns - waited_ns)
+        store_release(words, Word.SKIPPED, load_acquire(words, Word.SKIPPED) + elapsed_cycles - 1)
+        store_release(words, Word.HEAD, head + 1)
+        store_release(words, Word.LOOP_NS, end_ns)
+        executed += 1
+        if now_state.phase == AxisPhase.FINISHED:
+            break
+        deadline_ns += period_ns
+    return executed

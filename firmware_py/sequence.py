@@ -1,0 +1,172 @@
+"""The phases of a run and the latch of its first fault.
+
+    WAITING -> ENABLING -> APPROACH -> TRACKING -> RAMPING -> RELEASING -> DISABLING -> FINISHED
+                                          any fault: RAMPING, QUICK_STOPPING or DISABLING, never back
+
+Nothing here enables a drive again, and nothing resets a fault.  A later fault can only make the reaction stronger.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from firmware_py.computed_torque import reset_law
+from firmware_py.kernel import kernel
+from firmware_py.records import AxisConstants, AxisState, Command, Sample
+from firmware_py.safety import motion_fault, reaction_to
+from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction, StopRequest
+from firmware_py.trajectory import plan_approach, reference_at
+
+# The drive answers a request one cycle later at the earliest; a state older than this is not its answer.
+ANSWER_CYCLES = 2
+
+
+@kernel
+def reset_axis(constants: AxisConstants, state: AxisState) -> None:
+    """Begin a run: power off, nothing heard, nothing learned."""
+    state.phase = AxisPhase.WAITING
+    state.fault = Fault.NONE
+    state.reaction = Reaction.NONE
+    state.fault_drive_error = 0
+    state.fault_value = 0.0
+    state.cycle = 0
+    state.phase_cycle = 0
+    state.good_samples = 0
+    state.sample_count = 0
+    state.sample_age_cycles = 0
+    state.saturated_cycles = 0
+    state.restarts_at_start = -1
+    state.table_row = 0
+    state.trajectory_s = 0.0
+    state.command_torque_Nm = 0.0
+    state.unlimited_torque_Nm = 0.0
+    state.velocity.primed = 0
+    reset_law(constants.law, state.law)
+
+
+@kernel
+def enter(state: AxisState, phase: int) -> None:
+    """Begin a phase."""
+    state.phase = phase
+    state.phase_cycle = 0
+    state.good_samples = 0
+
+
+@kernel
+def powered(phase: int) -> bool:
+    """Whether the loop itself commands torque in this phase."""
+    return phase >= AxisPhase.APPROACH and phase <= AxisPhase.RELEASING
+
+
+@kernel
+def react(state: AxisState, reaction: int) -> None:
+    """Go forward to the phase of the reaction; never weakens the one in force."""
+    if reaction <= state.reaction or state.phase >= AxisPhase.FINISHED:
+        return
+    state.reaction = reaction
+    if reaction == Reaction.OFF:
+        if state.phase < AxisPhase.DISABLING:
+            enter(state, AxisPhase.DISABLING)
+    elif reaction == Reaction.QUICK_STOP:
+        if state.phase < AxisPhase.QUICK_STOPPING:
+            enter(state, AxisPhase.QUICK_STOPPING)
+    elif state.phase < AxisPhase.RAMPING:
+        enter(state, AxisPhase.RAMPING)
+
+
+@kernel
+def trip(state: AxisState, fault: int, value: float, drive_error: int) -> None:
+    """Latch the first fault and the value that showed it, and take the stronger reaction."""
+    if fault == Fault.NONE:
+        return
+    if state.fault == Fault.NONE:
+        state.fault = fault
+        state.fault_value = value
+        state.fault_drive_error = drive_error
+    react(state, reaction_to(fault, state.phase))
+
+
+@kernel
+def request_stop(state: AxisState, stop_request: int) -> None:
+    """A stop asked for by the user is no fault; before torque is applied it just switches off."""
+    if stop_request == StopRequest.NONE:
+        return
+    if state.phase <= AxisPhase.ENABLING or stop_request == StopRequest.OFF:
+        react(state, Reaction.OFF)
+    elif stop_request == StopRequest.QUICK_STOP:
+        react(state, Reaction.QUICK_STOP)
+    else:
+        react(state, Reaction.RAMP)
+
+
+@kernel
+def step_waiting(constants: AxisConstants, state: AxisState) -> None:
+    """WAITING: some good samples at standstill inside the limits, then ask the drive to enable."""
+    limits = constants.limits
+    moving = not abs(state.velocity.velocity_radps) <= limits.standstill_radps
+    if state.good_samples >= constants.sequence.settle_cycles:
+        fault = motion_fault(limits, state.measured_position_rad, 0.0, 0.0)
+        if fault != Fault.NONE:
+            trip(state, fault, state.measured_position_rad, 0)
+            return
+        if not moving:
+            enter(state, AxisPhase.ENABLING)
+            return
+    if state.phase_cycle > constants.sequence.wait_max_cycles:
+        if state.sample_count == 0:
+            trip(state, Fault.NO_SAMPLES, 0.0, 0)
+        elif moving:
+            trip(state, Fault.NOT_AT_STANDSTILL, state.velocity.velocity_radps, 0)
+        else:
+            trip(state, Fault.STALE_SAMPLE, float(state.sample_age_cycles), 0)
+
+
+@kernel
+def step_enabling(constants: AxisConstants, state: AxisState, sample: Sample, table: np.ndarray) -> None:
+    """ENABLING: once the drive is on, plan the way from where the joint stands to the trajectory's start."""
+    if sample.drive_state == DriveState.ENABLED and state.sample_age_cycles == 0:
+        approach_s = constants.sequence.approach_s
+        state.table_row = reference_at(constants.trajectory, table, 0, 0.0, state.reference)
+        plan_approach(state.measured_position_rad, state.reference, approach_s, state.approach)
+        state.trajectory_s = -approach_s
+        if approach_s > 0.0:
+            state.reference.position_rad = state.measured_position_rad
+            enter(state, AxisPhase.APPROACH)
+        else:
+            enter(state, AxisPhase.TRACKING)
+        # the error has no history yet: without this its first difference would be the distance to the trajectory
+        state.velocity.last_error_rad = state.velocity.last_position_rad - state.reference.position_rad
+        state.velocity.error_rate_radps = 0.0
+        reset_law(constants.law, state.law)
+    elif state.phase_cycle > constants.sequence.enable_max_cycles:
+        trip(state, Fault.ENABLE_TIMEOUT, float(sample.status_word), sample.drive_error)
+
+
+@kernel
+def step_stopping(constants: AxisConstants, state: AxisState, sample: Sample) -> None:
+    """QUICK_STOPPING and DISABLING end when the drive says that its power stage is off, or when it never does."""
+    off = sample.drive_state == DriveState.OFF or sample.drive_state == DriveState.FAULT
+    off = off and state.sample_age_cycles == 0 and state.phase_cycle > ANSWER_CYCLES
+    if state.phase == AxisPhase.QUICK_STOPPING:
+        if off:
+            enter(state, AxisPhase.DISABLING)
+        elif state.phase_cycle > constants.sequence.stop_max_cycles:
+            react(state, Reaction.OFF)
+    elif state.phase == AxisPhase.DISABLING:
+        if off:
+            enter(state, AxisPhase.FINISHED)
+        elif state.phase_cycle > constants.sequence.off_max_cycles:
+            trip(state, Fault.OFF_TIMEOUT, float(sample.status_word), sample.drive_error)
+            enter(state, AxisPhase.FINISHED)
+
+
+@kernel
+def write_command(state: AxisState, command: Command) -> None:
+    """What the drive is asked for in this phase."""
+    command.torque_Nm = state.command_torque_Nm
+    if state.phase == AxisPhase.QUICK_STOPPING:
+        command.request = DriveRequest.QUICK_STOP
+    elif state.phase >= AxisPhase.ENABLING and state.phase <= AxisPhase.RELEASING:
+        command.request = DriveRequest.ENABLE
+    else:
+        command.request = DriveRequest.OFF

@@ -1,0 +1,116 @@
+"""The named integers that the loop, the drivers and the log share."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class DriveState(IntEnum):
+    """What a drive of any make is doing (a driver maps its own states onto these)."""
+
+    UNKNOWN = 0  # nothing heard yet, or not ready
+    OFF = 1  # power stage off
+    STARTING = 2  # on the way to ENABLED, no torque yet
+    ENABLED = 3  # follows the command
+    STOPPING = 4  # the drive itself brakes (quick stop)
+    FAULT = 5  # power off because of a fault
+    FAULT_BRAKING = 6  # still carrying out the reaction to a fault
+
+
+class DriveRequest(IntEnum):
+    """What the loop wants of the drive; the driver finds the way there."""
+
+    OFF = 0
+    ENABLE = 1
+    QUICK_STOP = 2
+
+
+class AxisPhase(IntEnum):
+    """Where the joint is in the life of one run; only ever goes forward."""
+
+    WAITING = 0  # power off, waiting for valid samples at standstill
+    ENABLING = 1  # the drive is asked to enable, torque zero
+    APPROACH = 2  # from where the joint stands to the start of the trajectory
+    TRACKING = 3
+    RAMPING = 4  # controlled braking of the reference, the law active
+    RELEASING = 5  # standstill, torque ramped to zero
+    QUICK_STOPPING = 6  # the drive brakes by itself
+    DISABLING = 7  # power off requested, waiting for the drive to say so
+    FINISHED = 8
+
+
+class Fault(IntEnum):
+    """Why a run was ended by the loop; the first one is latched."""
+
+    NONE = 0
+    POSITION_LIMIT = 1
+    VELOCITY_LIMIT = 2
+    REFERENCE_LIMIT = 3  # the desired position or velocity left the limits
+    FOLLOWING_ERROR = 4
+    STALE_SAMPLE = 5
+    NOT_FINITE = 6
+    TORQUE_SATURATED = 7  # at the torque limit for too long
+    DRIVE_FAULT = 8
+    DRIVE_NOT_ENABLED = 9  # left Operation Enabled without being asked
+    DRIVE_RESTARTED = 10
+    ENABLE_TIMEOUT = 11
+    SUPERVISOR_LOST = 12
+    BUS_ERROR = 13
+    STOP_TIMEOUT = 14  # standstill not reached in time
+    OFF_TIMEOUT = 15  # the drive did not confirm power off
+    NO_SAMPLES = 16  # not one valid sample before enabling
+    NOT_AT_STANDSTILL = 17  # the joint moved while waiting to enable
+    OVERRUN = 18  # too many cycles skipped
+    POSITION_JUMP = 19  # the encoder moved faster than the joint can
+
+
+class Reaction(IntEnum):
+    """What the loop does about a fault or a stop request; a greater one replaces a smaller one."""
+
+    NONE = 0
+    RAMP = 1  # brake along a ramp under control, then release and disable
+    QUICK_STOP = 2  # the drive brakes by itself, then disable
+    OFF = 3  # power off at once
+
+
+class FeedForward(IntEnum):
+    """The velocity at which the friction model is evaluated for compensation."""
+
+    NONE = 0
+    MEASURED = 1  # as the paper does
+    DESIRED = 2
+    LUGRE_DESIRED = 3  # LuGre dynamics driven by the desired velocity
+
+
+class ZeroSpeedRule(IntEnum):
+    """What the friction compensation gives at zero velocity, where friction is set-valued."""
+
+    ZERO = 0
+    PAPER = 1  # (11) read literally: +static friction at v = 0
+    LINEAR = 2  # a straight line through zero inside a band
+
+
+class ControllerKind(IntEnum):
+    """Which law computes the torque."""
+
+    COMPUTED_TORQUE = 0
+    COMPUTED_TORQUE_RBF = 1  # the paper's (29)
+
+
+class TrajectoryKind(IntEnum):
+    """The shape of the desired motion."""
+
+    HOLD = 0
+    SINE = 1
+    MIN_JERK = 2
+    TRAPEZOID = 3
+    TABLE = 4
+
+
+class StopRequest(IntEnum):
+    """Value of the stop word that the supervisor writes."""
+
+    NONE = 0
+    RAMP = 1
+    QUICK_STOP = 2
+    OFF = 3
