@@ -1,0 +1,155 @@
+"""The virtual CiA 402 drive for a synchronous user: frames in, frames out, at the times that the caller names."""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from firmware_py.schema import dtype_of, new
+from hil.device_core import accept_frame, advance, power_on
+from hil.device_records import Device, NmtState
+from hil.device_write_rules import check_write
+from hil.frames import FRAME_SIZE, FrameQueue
+from hil.object_dictionary import ObjectDictionary
+from hil.plant_records import PlantConstants, PlantState
+from hil.sdo_server import SdoServer
+
+
+@dataclass(frozen=True)
+class DeviceSettings:
+    """What distinguishes one drive from another; the gains are those of its velocity and position loop.
+
+    The motor's torque constant turns the current limit 6073 into a torque limit; the default makes rated current
+    yield rated torque.
+    """
+
+    node_id: int = 1
+    rated_current_mA: int = 5000
+    rated_torque_mNm: int = 500  # motor side
+    reduction_ratio: float = 121.0
+    motor_torque_constant_NmpA: float | None = None
+    vendor_id: int = 0
+    product_code: int = 1
+    revision: int = 0x00010000
+    serial_number: int = 1
+    velocity_gain_Nmspr: float = 200.0
+    velocity_integral_Nmprad: float = 10_000.0
+    position_gain_ps: float = 30.0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("node_id", 1, 127),
+            ("rated_current_mA", 1, 100_000_000),
+            ("rated_torque_mNm", 1, 100_000_000),
+            ("reduction_ratio", 0.001, 100_000.0),
+            ("vendor_id", 0, 0xFFFFFFFF),
+            ("product_code", 0, 0xFFFFFFFF),
+            ("revision", 0, 0xFFFFFFFF),
+            ("serial_number", 0, 0xFFFFFFFF),
+            ("velocity_gain_Nmspr", 0.0, 1e6),
+            ("velocity_integral_Nmprad", 0.0, 1e8),
+            ("position_gain_ps", 0.0, 1e4),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ValueError(f"{name} (={value}) must be in [{low}..{high}]")
+        constant = self.motor_torque_constant_NmpA
+        if constant is not None and not 0.0 < constant < math.inf:
+            raise ValueError(f"motor_torque_constant_NmpA (={constant}) must be greater than 0")
+
+    @property
+    def torque_constant_NmpA(self) -> float:
+        """The given one, or rated torque per rated current."""
+        return self.motor_torque_constant_NmpA or self.rated_torque_mNm / self.rated_current_mA
+
+
+class Cia402Device:
+    """One drive with its plant.  `device`, `plant_constants`, `plant_state`, `queue` are record arrays for kernels."""
+
+    def __init__(self, eds_path: Path, settings: DeviceSettings, plant_constants: Any, plant_state: Any) -> None:
+        for name, array, record in (
+            ("plant_constants", plant_constants, PlantConstants),
+            ("plant_state", plant_state, PlantState),
+        ):
+            if getattr(array, "dtype", None) != dtype_of(record):
+                raise TypeError(f"{name} (={type(array).__name__}) must be a record array of {record.__name__}")
+        self.settings = settings
+        self.plant_constants = plant_constants
+        self.plant_state = plant_state
+        self.device = new(Device)
+        self.queue = new(FrameQueue)
+        self._frame = np.zeros(FRAME_SIZE, np.uint8)
+        self.objects = ObjectDictionary(eds_path, settings.node_id, self.device)
+        self._configure()
+        self.sdo = SdoServer(self.objects, self._write)
+        power_on(self.device[0])
+        self._resets = int(self.device[0].application_resets)
+
+    def _configure(self) -> None:
+        settings, device, objects = self.settings, self.device[0], self.objects
+        device.node_id = settings.node_id
+        device.reduction_ratio = settings.reduction_ratio
+        device.motor_torque_constant_NmpA = settings.torque_constant_NmpA
+        device.velocity_gain_Nmspr = settings.velocity_gain_Nmspr
+        device.velocity_integral_Nmprad = settings.velocity_integral_Nmprad
+        device.position_gain_ps = settings.position_gain_ps
+        device.counts_per_rad = self.plant_constants[0].counts_prad
+        objects.set_default(0x608F, 1, round(abs(device.counts_per_rad) * 2.0 * math.pi))
+        objects.set_default(0x608F, 2, max(1, round(settings.reduction_ratio)))
+        objects.set_default(0x6075, 0, settings.rated_current_mA)
+        objects.set_default(0x6076, 0, settings.rated_torque_mNm)
+        identity = (settings.vendor_id, settings.product_code, settings.revision, settings.serial_number)
+        for sub, value in enumerate(identity, 1):
+            objects.set_default(0x1018, sub, value)
+
+    def _write(self, index: int, sub: int, data: bytes) -> None:
+        """A complete SDO download."""
+        value = self.objects.check(index, sub, data)
+        check_write(self.objects, index, sub, value, int(self.device[0].state))
+        self.objects.store(index, sub, data)
+
+    def is_sdo_request(self, frame: bytes) -> bool:
+        """True for a frame that `answer_sdo` is for, in a state in which SDO is alive."""
+        identifier = struct.unpack_from("<I", frame)[0]
+        alive = self.device[0].nmt not in (NmtState.BOOT_UP, NmtState.STOPPED)
+        return bool(identifier == 0x600 + self.settings.node_id and alive)
+
+    def answer_sdo(self, frame: bytes) -> list[bytes]:
+        """SDO response frames; the core notices what was written at its next `advance`."""
+        resets = int(self.device[0].application_resets)
+        if resets != self._resets:
+            self._resets = resets
+            self.objects.restore_strings()
+            self.sdo = SdoServer(self.objects, self._write)
+        size = min(frame[4], 8)
+        responses = self.sdo.handle(frame[8 : 8 + size])
+        return [struct.pack("<IB3x8s", 0x580 + self.settings.node_id, 8, data) for data in responses]
+
+    def _take_queue(self) -> list[bytes]:
+        queue = self.queue[0]
+        frames = [bytes(queue.frames[i]) for i in range(int(queue.count))]
+        queue.count = 0
+        return frames
+
+    def advance(self, now_ns: int) -> list[bytes]:
+        """Run drive and plant up to `now_ns`; the frames (16 bytes each) that were sent meanwhile."""
+        advance(self.device[0], self.plant_constants[0], self.plant_state[0], now_ns, self.queue[0])
+        return self._take_queue()
+
+    def handle(self, frame: bytes, now_ns: int) -> list[bytes]:
+        """Take one frame (16 bytes) from the bus at `now_ns`; the frames sent up to then, then the answers to it."""
+        if len(frame) != FRAME_SIZE:
+            raise ValueError(f"frame length (={len(frame)}) must be {FRAME_SIZE}")
+        sent = self.advance(now_ns)
+        if self.is_sdo_request(frame):
+            responses = self.answer_sdo(frame)
+            self.device[0].next_due_ns = 0
+            return sent + self.advance(now_ns) + responses
+        self._frame[:] = np.frombuffer(frame, np.uint8)
+        accept_frame(self.device[0], self.plant_constants[0], self.plant_state[0], self._frame, now_ns, self.queue[0])
+        return sent + self._take_queue()

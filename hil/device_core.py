@@ -1,0 +1,322 @@
+"""The virtual drive without any I/O: frames in, frames out, time given by the caller (`now_ns`).
+
+The real-time process and the lockstep simulation call the same three functions: `power_on`, `accept_frame` for
+every frame but the SDO requests, `advance` up to the present time.  Time must not run backwards; all times [ns] are
+those of the caller's clock and greater than 0.  Plant and drive advance in substeps of the plant.
+Not modelled: node guarding, TIME, LSS, bus-off.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from firmware_py.kernel import kernel
+from hil.cia402_core import (
+    abort_connection,
+    apply_controlword,
+    outside_position_limit,
+    power_off,
+    raise_fault,
+    status_word,
+)
+from hil.cia402_motion import demand_torque_Nm, following_error_tripped
+from hil.device_errors import (
+    FOLLOWING_ERROR,
+    HEARTBEAT_LOST,
+    NMT_LEFT,
+    POSITION_LIMIT,
+    RPDO_TIMEOUT,
+    SYNC_LOST,
+    error_register,
+    push_frame,
+    report_cleared,
+    report_error,
+)
+from hil.device_records import CONSUMERS, PDOS, Device, NmtState, PowerState, int64
+from hil.frames import FrameQueue
+from hil.joint import encoder_counts, step_plant
+from hil.pdo_core import mark_events, receive_rpdo, receive_sync, send_due_tpdos, start_pdos
+from hil.plant_records import PlantConstants, PlantState
+
+_FAR_NS = 1_000_000_000
+_MS = 1_000_000
+_SYNC_ERROR = 0x04
+_RPDO_ERROR = 0x10
+
+
+@kernel
+def _restart(device: Device, application: bool) -> None:
+    """Restore the defaults (communication only, or all of them) and boot again with the power stage off."""
+    device.communication = device.default_communication
+    if application:
+        device.drive = device.default_drive
+        device.fault_code = 0
+        device.last_controlword = 0
+        device.state = PowerState.SWITCH_ON_DISABLED
+        device.application_resets += 1
+    if device.fault_code == 0:
+        power_off(device)
+    device.communication_errors = 0
+    device.communication.error_register = error_register(device)
+    device.following_time_s = 0.0
+    device.demand = 0.0
+    device.heartbeat_period_ms = 0
+    for i in range(CONSUMERS):
+        device.consumer_heard_ns[i] = 0
+    device.nmt = NmtState.BOOT_UP
+    device.boot_pending = 1
+    device.next_due_ns = 0
+
+
+@kernel
+def power_on(device: Device) -> None:
+    """Start the device from its defaults; the first `advance` sends the boot-up message."""
+    device.primed = 0
+    device.inject_fault_code = 0
+    _restart(device, True)
+
+
+@kernel
+def _enter_nmt(device: Device, state: int) -> None:
+    """Change the NMT state; leaving operational while the power stage is on is a lost connection (6007)."""
+    if device.nmt == NmtState.OPERATIONAL and state != NmtState.OPERATIONAL:
+        abort_connection(device, NMT_LEFT)
+    if state == NmtState.OPERATIONAL and device.nmt != NmtState.OPERATIONAL:
+        start_pdos(device)
+    device.nmt = state
+
+
+@kernel
+def _connection_lost(device: Device, code: int, cause: int, whole: bool, queue: FrameQueue) -> None:
+    """Report the error, react as 6007 says, and, when the `whole` connection is gone, change NMT as 1029 says."""
+    device.communication_errors |= cause
+    abort_connection(device, code)
+    report_error(device, code, queue)
+    behaviour = device.communication.error_behaviour
+    if whole and behaviour == 2:
+        _enter_nmt(device, NmtState.STOPPED)
+    elif whole and behaviour == 0 and device.nmt == NmtState.OPERATIONAL:
+        _enter_nmt(device, NmtState.PRE_OPERATIONAL)
+
+
+@kernel
+def _connection_back(device: Device, cause: int, queue: FrameQueue) -> None:
+    if device.communication_errors & cause:
+        device.communication_errors &= ~cause
+        report_cleared(device, queue)
+
+
+@kernel
+def _producer_heartbeat(device: Device, now_ns: int, next_ns: int, queue: FrameQueue) -> int:
+    period_ms = int64(device.communication.producer_heartbeat_ms)
+    if period_ms != device.heartbeat_period_ms:
+        device.heartbeat_period_ms = period_ms
+        device.heartbeat_due_ns = now_ns  # a new period starts with a heartbeat at once
+    if period_ms == 0:
+        return next_ns
+    if now_ns >= device.heartbeat_due_ns:
+        slot = push_frame(queue, 0x700 + device.node_id, 1)
+        if slot >= 0:
+            queue.frames[slot, 8] = device.nmt
+        device.heartbeat_due_ns += period_ms * _MS
+        if device.heartbeat_due_ns <= now_ns:  # far behind: keep no backlog
+            device.heartbeat_due_ns = now_ns + period_ms * _MS
+    return min(next_ns, device.heartbeat_due_ns)
+
+
+@kernel
+def _watch(device: Device, now_ns: int, next_ns: int, queue: FrameQueue) -> int:
+    """Heartbeats, SYNC and RPDOs that must not stay away; each is watched once it was heard."""
+    group = device.communication
+    errors = int64(device.communication_errors)
+    for i in range(CONSUMERS):
+        entry = int64(group.consumer_heartbeat[i])
+        if entry != device.consumer_entry[i]:
+            device.consumer_entry[i] = entry
+            device.consumer_heard_ns[i] = 0
+            _connection_back(device, 1 << i, queue)
+            continue
+        time_ns = (entry & 0xFFFF) * _MS
+        heard_ns = device.consumer_heard_ns[i]
+        if time_ns and entry >> 16 and heard_ns and not errors & (1 << i):
+            if now_ns - heard_ns >= time_ns:
+                _connection_lost(device, HEARTBEAT_LOST, 1 << i, True, queue)
+            else:
+                next_ns = min(next_ns, heard_ns + time_ns)
+    if device.nmt != NmtState.OPERATIONAL:
+        return next_ns
+    time_ns = int64(device.drive.sync_timeout_ms) * _MS
+    if time_ns and device.sync_heard_ns and not errors & _SYNC_ERROR:
+        if now_ns - device.sync_heard_ns >= time_ns:
+            _connection_lost(device, SYNC_LOST, _SYNC_ERROR, True, queue)
+        else:
+            next_ns = min(next_ns, device.sync_heard_ns + time_ns)
+    for pdo in range(PDOS):
+        time_ns = int64(group.rpdo_timer_ms[pdo]) * _MS
+        heard_ns = device.rpdo_heard_ns[pdo]
+        if time_ns and heard_ns and not errors & (_RPDO_ERROR << pdo):
+            if now_ns - heard_ns >= time_ns:
+                _connection_lost(device, RPDO_TIMEOUT, _RPDO_ERROR << pdo, False, queue)
+            else:
+                next_ns = min(next_ns, heard_ns + time_ns)
+    return next_ns
+
+
+@kernel
+def _run_timers(device: Device, now_ns: int, queue: FrameQueue) -> None:
+    next_ns = now_ns + _FAR_NS
+    if device.boot_pending:
+        device.boot_pending = 0
+        push_frame(queue, 0x700 + device.node_id, 1)
+        device.nmt = NmtState.PRE_OPERATIONAL
+    next_ns = _watch(device, now_ns, next_ns, queue)
+    next_ns = _producer_heartbeat(device, now_ns, next_ns, queue)
+    if device.nmt == NmtState.OPERATIONAL:
+        next_ns = send_due_tpdos(device, now_ns, next_ns, queue)
+    device.next_due_ns = next_ns
+
+
+@kernel
+def _int16(value: float) -> int:
+    """Rounded and saturated: a plain cast would wrap; not-a-number gives 0."""
+    if not np.isfinite(value):
+        return 0
+    return int64(np.rint(min(max(value, -32768.0), 32767.0)))
+
+
+@kernel
+def _int32(value: float) -> int:
+    if not np.isfinite(value):
+        return 0
+    return int64(np.rint(min(max(value, -2147483648.0), 2147483647.0)))
+
+
+@kernel
+def sample_objects(device: Device, plant_c: PlantConstants, plant_s: PlantState) -> None:
+    """Measured values of the plant into the objects, in their units; statusword last."""
+    drive = device.drive
+    drive.position = encoder_counts(plant_c, plant_s)
+    drive.velocity = _int32(plant_s.joint_velocity_radps * device.counts_per_rad)
+    motor_torque_mNm = 1e3 * plant_s.actuator_torque_Nm / device.reduction_ratio
+    drive.torque = _int16(1e3 * motor_torque_mNm / int64(drive.rated_torque_mNm))
+    drive.current = _int16(1e6 * plant_s.current_A / int64(drive.rated_current_mA))
+    drive.demand_torque = _int16(device.demand)
+    mode = drive.mode_display
+    if (mode == 1 or mode == 8) and device.state == PowerState.OPERATION_ENABLED and not device.resync:
+        reference = device.reference_position_rad * device.counts_per_rad
+        drive.demand_position = _int32(reference)
+        drive.following_error = _int32(reference - drive.position)
+    else:
+        drive.demand_position = drive.position
+        drive.following_error = 0
+    drive.statusword = status_word(device)
+
+
+@kernel
+def _substep(device: Device, plant_c: PlantConstants, plant_s: PlantState, dt_s: float, queue: FrameQueue) -> None:
+    limits = device.drive.position_limit
+    mode = device.drive.mode_display
+    counts = int64(device.drive.position)
+    if limits[0] != 0 or limits[1] != 0 or mode == 1 or mode == 8 or device.resync:  # the encoder costs time
+        counts = int64(encoder_counts(plant_c, plant_s))
+    if device.fault_code == 0:
+        code = int64(device.inject_fault_code)
+        if code != 0:
+            raise_fault(device, code, queue)
+        elif outside_position_limit(device.drive, counts):
+            raise_fault(device, POSITION_LIMIT, queue)
+        elif following_error_tripped(device, counts, dt_s):
+            raise_fault(device, FOLLOWING_ERROR, queue)
+    torque_Nm = demand_torque_Nm(device, counts, plant_s.joint_velocity_radps, dt_s)
+    step_plant(plant_c, plant_s, torque_Nm)
+
+
+@kernel
+def _notice_status(device: Device) -> None:
+    """A changed status is a TPDO event."""
+    state = int64(device.state) | int64(device.drive.mode_display) << 8 | int64(device.fault_code) << 16
+    state = state << 16 | int64(device.drive.statusword)
+    if state != device.event_status:
+        device.event_status = state
+        mark_events(device)
+        device.next_due_ns = 0
+
+
+@kernel
+def advance(device: Device, plant_c: PlantConstants, plant_s: PlantState, until_ns: int, queue: FrameQueue) -> None:
+    """Integrate drive and plant up to `until_ns` and append the frames that became due meanwhile to `queue`."""
+    step_ns = int64(np.rint(plant_c.step_s * 1e9))
+    if not device.primed:
+        device.primed = 1
+        device.time_ns = until_ns
+    apply_controlword(device, queue)  # SDO may have written 6040 or 6060
+    while device.time_ns + step_ns <= until_ns:
+        _substep(device, plant_c, plant_s, plant_c.step_s, queue)
+        device.time_ns += step_ns
+        before = int64(device.event_status) >> 16
+        if int64(device.state) != before & 0xFF or device.time_ns >= device.next_due_ns:
+            sample_objects(device, plant_c, plant_s)
+            _notice_status(device)
+            _run_timers(device, device.time_ns, queue)
+    sample_objects(device, plant_c, plant_s)
+    _notice_status(device)
+    if until_ns >= device.next_due_ns:
+        _run_timers(device, until_ns, queue)
+
+
+@kernel
+def _command_nmt(device: Device, command: int) -> None:
+    if command == 0x01:
+        _enter_nmt(device, NmtState.OPERATIONAL)
+    elif command == 0x02:
+        _enter_nmt(device, NmtState.STOPPED)
+    elif command == 0x80:
+        _enter_nmt(device, NmtState.PRE_OPERATIONAL)
+    elif command == 0x81:
+        _restart(device, True)
+    elif command == 0x82:
+        _restart(device, False)
+
+
+@kernel
+def accept_frame(
+    device: Device,
+    plant_c: PlantConstants,
+    plant_s: PlantState,
+    frame: np.ndarray,
+    now_ns: int,
+    queue: FrameQueue,
+) -> None:
+    """One frame (uint8[16]) from the bus; SDO requests and everything foreign are ignored; advances to `now_ns`."""
+    advance(device, plant_c, plant_s, now_ns, queue)
+    identifier = int64(frame[0]) | int64(frame[1]) << 8
+    size = int64(frame[4])
+    if frame[3] & 0xE0 or frame[2] or identifier > 0x7FF or device.nmt == NmtState.BOOT_UP or size > 8:
+        return  # extended, remote and error frames are not for this device
+    if identifier == 0:
+        if size == 2 and (frame[9] == 0 or frame[9] == device.node_id):
+            _command_nmt(device, int64(frame[8]))
+            device.next_due_ns = 0
+    elif 0x700 < identifier <= 0x77F:
+        for i in range(CONSUMERS):
+            entry = int64(device.communication.consumer_heartbeat[i])
+            if entry & 0xFFFF and entry >> 16 == identifier - 0x700:
+                device.consumer_entry[i] = entry
+                device.consumer_heard_ns[i] = now_ns
+                _connection_back(device, 1 << i, queue)
+                device.next_due_ns = 0
+    elif device.nmt == NmtState.OPERATIONAL:
+        if identifier == int64(device.communication.sync_cob_id) & 0x7FF:
+            device.sync_heard_ns = now_ns
+            timeout_ns = int64(device.drive.sync_timeout_ms) * _MS
+            if timeout_ns:
+                device.next_due_ns = min(device.next_due_ns, now_ns + timeout_ns)
+            _connection_back(device, _SYNC_ERROR, queue)
+            receive_sync(device, now_ns, queue)
+        else:
+            receive_rpdo(device, identifier, frame, now_ns, queue)
+    drive_status = status_word(device)
+    device.drive.statusword = drive_status
+    _notice_status(device)
+    if now_ns >= device.next_due_ns:
+        _run_timers(device, now_ns, queue)

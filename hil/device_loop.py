@@ -1,0 +1,208 @@
+"""The virtual drive in real time, on a file descriptor that carries 16-byte frames (AF_CAN, or AF_UNIX SEQPACKET).
+
+The core runs in one compiled loop without the interpreter lock.  SDO requests go through a socket pair to a Python
+thread, and its responses come back the same way: the core first acts on what was written, then sends the response, so
+that a master which has its answer finds the controlword carried out.  The loop is the only sender on the bus.
+"""
+
+from __future__ import annotations
+
+import socket
+import threading
+from typing import Any
+
+import numpy as np
+
+from firmware_py.kernel import kernel
+from firmware_py.libc import (
+    EAGAIN,
+    EINTR,
+    MSG_DONTWAIT,
+    MSG_NOSIGNAL,
+    POLLIN,
+    errno,
+    load_acquire,
+    monotonic_ns,
+    ppoll,
+    recv,
+    send,
+    store_release,
+)
+from firmware_py.schema import new
+from hil.device import Cia402Device
+from hil.device_core import accept_frame, advance
+from hil.device_records import Device, NmtState, int64
+from hil.frames import FRAME_SIZE, FrameQueue
+from hil.plant_records import PlantConstants, PlantState
+
+STOP_WORD = 0  # not zero: leave the loop
+SEND_ERRORS_WORD = 1  # frames that could not be sent
+ENDED_WORD = 2  # 1 = stopped, 2 = the bus has gone
+WORDS = 3
+
+_LONGEST_WAIT_NS = 2_000_000  # faults of the plant are seen at least this often
+_FRAMES_AT_ONCE = 64  # received before timers are looked at again
+
+
+@kernel
+def _flush(fd: int, queue: FrameQueue, words: np.ndarray) -> None:
+    """Send the queue; what the bus does not take is lost and counted, as on a real bus."""
+    for i in range(queue.count):
+        sent = send(
+            np.int32(fd),
+            np.uintp(queue.frames[i].ctypes.data),
+            np.uintp(FRAME_SIZE),
+            np.int32(MSG_DONTWAIT | MSG_NOSIGNAL),
+        )
+        if sent != FRAME_SIZE:
+            store_release(words, SEND_ERRORS_WORD, load_acquire(words, SEND_ERRORS_WORD) + 1)
+    queue.count = 0
+
+
+@kernel
+def _receive(fd: int, frame: np.ndarray) -> int:
+    """Bytes received into `frame`; 0 = nothing waits, -1 = the other end has gone."""
+    got = recv(np.int32(fd), np.uintp(frame.ctypes.data), np.uintp(FRAME_SIZE), np.int32(MSG_DONTWAIT))
+    if got == 0:
+        return -1
+    if got < 0:
+        code = errno()
+        return 0 if code in (EAGAIN, EINTR) else -1
+    return got
+
+
+@kernel
+def run_device(
+    fd: int,
+    devices: Any,
+    plant_constants: Any,
+    plant_states: Any,
+    queues: Any,
+    words: np.ndarray,
+    service_fd: int,
+    frame: np.ndarray,
+    polls: np.ndarray,
+    timespec: np.ndarray,
+) -> int:
+    """Serve the bus until the stop word; scratch: `frame` uint8[16], `polls` int32[4], `timespec` int64[2].
+
+    `devices`, `plant_constants`, `plant_states`, `queues` are record arrays of one element, `words` int64[WORDS].
+    Returns the value of ENDED_WORD.
+    """
+    device: Device = devices[0]
+    plant_c: PlantConstants = plant_constants[0]
+    plant_s: PlantState = plant_states[0]
+    queue: FrameQueue = queues[0]
+    ended = 1
+    while load_acquire(words, STOP_WORD) == 0 and ended == 1:
+        now_ns = monotonic_ns(timespec)
+        advance(device, plant_c, plant_s, now_ns, queue)
+        _flush(fd, queue, words)
+        wait_ns = max(0, min(device.next_due_ns - now_ns, _LONGEST_WAIT_NS))
+        polls[0] = fd
+        polls[1] = POLLIN
+        polls[2] = service_fd
+        polls[3] = POLLIN
+        timespec[0] = 0
+        timespec[1] = wait_ns
+        ppoll(np.uintp(polls.ctypes.data), np.uintp(2), np.uintp(timespec.ctypes.data), np.uintp(0))
+        for _ in range(_FRAMES_AT_ONCE):
+            got = _receive(fd, frame)
+            if got <= 0:
+                if got < 0:
+                    ended = 2
+                break
+            if got != FRAME_SIZE:
+                continue
+            now_ns = monotonic_ns(timespec)
+            identifier = int64(frame[0]) | int64(frame[1]) << 8 | int64(frame[3]) << 24
+            if identifier == 0x600 + device.node_id:
+                advance(device, plant_c, plant_s, now_ns, queue)
+                if device.nmt != NmtState.STOPPED and device.nmt != NmtState.BOOT_UP:
+                    address = np.uintp(frame.ctypes.data)
+                    send(np.int32(service_fd), address, np.uintp(FRAME_SIZE), np.int32(MSG_DONTWAIT | MSG_NOSIGNAL))
+            else:
+                accept_frame(device, plant_c, plant_s, frame, now_ns, queue)
+            _flush(fd, queue, words)
+        while _receive(service_fd, frame) == FRAME_SIZE:
+            device.next_due_ns = 0
+            advance(device, plant_c, plant_s, monotonic_ns(timespec), queue)
+            slot = queue.count
+            if slot < len(queue.frames):
+                queue.frames[slot] = frame
+                queue.count = slot + 1
+            _flush(fd, queue, words)
+    store_release(words, ENDED_WORD, ended)
+    return ended
+
+
+class RealtimeDevice:
+    """Runs a device on a connected socket: `start`, `stop`, or a `with` block.  The descriptor stays the caller's."""
+
+    def __init__(self, device: Cia402Device, fd: int) -> None:
+        self._device = device
+        self._fd = fd
+        self.words = np.zeros(WORDS, np.int64)
+        self._threads: list[threading.Thread] = []
+        self._core_end: socket.socket | None = None
+
+    def _run(self, service_fd: int) -> None:
+        device = self._device
+        run_device(
+            self._fd,
+            device.device,
+            device.plant_constants,
+            device.plant_state,
+            new(FrameQueue),
+            self.words,
+            service_fd,
+            np.zeros(FRAME_SIZE, np.uint8),
+            np.zeros(4, np.int32),
+            np.zeros(2, np.int64),
+        )
+
+    def _serve(self, service: socket.socket) -> None:
+        """Answer SDO requests until the other end closes."""
+        with service:
+            while frame := service.recv(FRAME_SIZE):
+                for response in self._device.answer_sdo(frame):
+                    service.send(response)
+
+    def start(self) -> None:
+        """Compile if need be, then boot: the boot-up message is sent."""
+        if self._threads:
+            raise RuntimeError("the device is running already")
+        self.words[:] = 0
+        self.words[STOP_WORD] = 1
+        self._run(-1)  # compiles, does nothing
+        self.words[:] = 0
+        self._core_end, python_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._threads = [
+            threading.Thread(target=self._run, args=(self._core_end.fileno(),), name="device", daemon=True),
+            threading.Thread(target=self._serve, args=(python_end,), name="device-sdo", daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def stop(self) -> None:
+        """End both threads; the plant stays where it is.  Harmless when not running."""
+        if not self._threads or self._core_end is None:
+            return
+        store_release_word(self.words, STOP_WORD, 1)
+        self._threads[0].join()
+        self._core_end.close()
+        self._threads[1].join()
+        self._threads = []
+
+    def __enter__(self) -> RealtimeDevice:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+
+@kernel
+def store_release_word(words: np.ndarray, index: int, value: int) -> None:
+    """`store_release` for callers in Python."""
+    store_release(words, index, value)

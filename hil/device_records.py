@@ -1,0 +1,264 @@
+"""Memory of the virtual drive: its CANopen objects as typed fields, and the state of the compiled core.
+
+`CommunicationObjects` holds what CiA 301 defines (1000..1FFF), `DriveObjects` what CiA 402 and the maker define.
+They are separate because "reset communication" restores only the first one.  Units are those of the objects
+(counts, per mille of the rated value, ms, ...), as in the EDS; the rest of the device is in SI units.
+
+`FIELDS` says which field holds which object; objects without a field are constants of the EDS or strings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import IntEnum
+from typing import Annotated, Any
+
+import numpy as np
+
+from firmware_py.schema import array_of, f8, i1, i2, i4, i8, record, u1, u2, u4
+
+# Widens an object's value before arithmetic (uint8 << 8 would overflow in plain Python); typed for mypy.
+int64: Callable[[Any], int] = np.int64  # type: ignore[assignment]
+
+PDOS = 4
+MAPPED = 8
+HISTORY = 8
+CONSUMERS = 2
+
+
+class NmtState(IntEnum):
+    """CiA 301 states as a heartbeat carries them."""
+
+    BOOT_UP = 0
+    STOPPED = 4
+    OPERATIONAL = 5
+    PRE_OPERATIONAL = 127
+
+
+class PowerState(IntEnum):
+    """CiA 402 states of the power drive system."""
+
+    NOT_READY = 0
+    SWITCH_ON_DISABLED = 1
+    READY_TO_SWITCH_ON = 2
+    SWITCHED_ON = 3
+    OPERATION_ENABLED = 4
+    QUICK_STOP_ACTIVE = 5
+    FAULT_REACTION_ACTIVE = 6
+    FAULT = 7
+
+
+class Mode(IntEnum):
+    """Modes of operation (6060) that this drive has."""
+
+    NONE = 0
+    PROFILE_POSITION = 1
+    PROFILE_VELOCITY = 3
+    TORQUE = 4
+    CYCLIC_POSITION = 8
+    CYCLIC_VELOCITY = 9
+    CYCLIC_TORQUE = 10
+
+
+@record
+class CommunicationObjects:
+    error_register: u1
+    error_count: u1
+    error_history: Annotated[np.ndarray, array_of(u4, HISTORY)]
+    sync_cob_id: u4
+    sync_period_us: u4
+    emcy_cob_id: u4
+    consumer_heartbeat: Annotated[np.ndarray, array_of(u4, CONSUMERS)]  # node << 16 | ms
+    producer_heartbeat_ms: u2
+    error_behaviour: u1
+    identity: Annotated[np.ndarray, array_of(u4, 4)]
+    rpdo_cob_id: Annotated[np.ndarray, array_of(u4, PDOS)]
+    rpdo_type: Annotated[np.ndarray, array_of(u1, PDOS)]
+    rpdo_timer_ms: Annotated[np.ndarray, array_of(u2, PDOS)]
+    rpdo_count: Annotated[np.ndarray, array_of(u1, PDOS)]
+    rpdo_mapping: Annotated[np.ndarray, array_of(u4, PDOS, MAPPED)]
+    tpdo_cob_id: Annotated[np.ndarray, array_of(u4, PDOS)]
+    tpdo_type: Annotated[np.ndarray, array_of(u1, PDOS)]
+    tpdo_inhibit_100us: Annotated[np.ndarray, array_of(u2, PDOS)]
+    tpdo_timer_ms: Annotated[np.ndarray, array_of(u2, PDOS)]
+    tpdo_count: Annotated[np.ndarray, array_of(u1, PDOS)]
+    tpdo_mapping: Annotated[np.ndarray, array_of(u4, PDOS, MAPPED)]
+
+
+@record
+class DriveObjects:
+    sync_timeout_ms: u2
+    abort_option: i2
+    error_code: u2
+    controlword: u2
+    statusword: u2
+    quick_stop_option: i2
+    shutdown_option: i2
+    disable_option: i2
+    fault_reaction_option: i2
+    mode: i1
+    mode_display: i1
+    demand_position: i4
+    position: i4
+    following_window: u4
+    following_timeout_ms: u2
+    position_window: u4
+    velocity: i4
+    velocity_window: u2
+    target_torque: i2
+    max_torque: u2
+    max_current: u2
+    demand_torque: i2
+    rated_current_mA: u4
+    rated_torque_mNm: u4
+    torque: i2
+    current: i2
+    target_position: i4
+    position_limit: Annotated[np.ndarray, array_of(i4, 2)]
+    max_profile_velocity: u4
+    max_motor_speed_rpm: u4
+    profile_velocity: u4
+    profile_acceleration: u4
+    profile_deceleration: u4
+    quick_stop_deceleration: u4
+    torque_slope: u4
+    encoder_resolution: Annotated[np.ndarray, array_of(u4, 2)]
+    torque_offset: i2
+    interpolation_time: u1
+    interpolation_exponent: i1
+    following_error: i4
+    target_velocity: i4
+    supported_modes: u4
+
+
+@record
+class Device:
+    """The whole drive apart from the plant; one element of a record array."""
+
+    communication: CommunicationObjects
+    drive: DriveObjects
+    default_communication: CommunicationObjects
+    default_drive: DriveObjects
+    # settings, fixed after construction
+    node_id: i4
+    reduction_ratio: f8
+    counts_per_rad: f8  # at the joint; negative when the encoder counts against the joint
+    motor_torque_constant_NmpA: f8  # turns the current limit 6073 into a torque limit
+    velocity_gain_Nmspr: f8
+    velocity_integral_Nmprad: f8
+    position_gain_ps: f8  # 1/s
+    # test access: while not zero the cause of this fault (an EMCY code) is present
+    inject_fault_code: u2
+    # NMT and errors
+    nmt: i4  # NmtState
+    boot_pending: i4
+    application_resets: i8  # how often the defaults were restored
+    time_ns: i8  # plant time
+    primed: i4  # 0 until the first call that carries a time
+    next_due_ns: i8  # no timer runs out before; 0 = work it out again
+    heartbeat_due_ns: i8
+    heartbeat_period_ms: i4  # the value that heartbeat_due_ns was made from
+    consumer_entry: Annotated[np.ndarray, array_of(u4, CONSUMERS)]
+    consumer_heard_ns: Annotated[np.ndarray, array_of(i8, CONSUMERS)]  # 0 = not yet heard
+    sync_heard_ns: i8  # 0 = not yet heard
+    rpdo_heard_ns: Annotated[np.ndarray, array_of(i8, PDOS)]
+    rpdo_waiting: Annotated[np.ndarray, array_of(i4, PDOS)]  # received, applied at the next SYNC
+    rpdo_data: Annotated[np.ndarray, array_of(u1, PDOS, 8)]
+    tpdo_sent_ns: Annotated[np.ndarray, array_of(i8, PDOS)]
+    tpdo_event: Annotated[np.ndarray, array_of(i4, PDOS)]
+    tpdo_syncs: Annotated[np.ndarray, array_of(i4, PDOS)]
+    event_status: i8  # status of which the event-driven TPDOs know
+    communication_errors: i4  # bit mask of causes that are present
+    fault_code: i4  # latched drive fault, 0 = none
+    # CiA 402
+    state: i4  # PowerState
+    last_controlword: i4
+    resync: i4  # 1 = the references start from where the joint is
+    braking: i4  # 0 no, 2 a stop ramp is about to start, 1 it runs
+    brake_deceleration_radps2: f8
+    after_brake: i4  # PowerState to enter at standstill
+    brake_time_left_s: f8
+    reference_position_rad: f8  # position loop, encoder side
+    reference_velocity_radps: f8
+    segment_target: i4  # CSP: interpolated towards it [counts]
+    segment_velocity_radps: f8
+    segment_left_s: f8
+    setpoint_active: i4
+    setpoint_acknowledged: i4
+    setpoint_position_rad: f8
+    integral_Nm: f8
+    demand: f8  # torque demand before limits [per mille of rated]
+    saturated: i4
+    following_time_s: f8
+
+
+def _fields() -> dict[tuple[int, int], str]:
+    fields = {
+        (0x1001, 0): "error_register",
+        (0x1003, 0): "error_count",
+        (0x1005, 0): "sync_cob_id",
+        (0x1006, 0): "sync_period_us",
+        (0x1014, 0): "emcy_cob_id",
+        (0x1017, 0): "producer_heartbeat_ms",
+        (0x1029, 1): "error_behaviour",
+        (0x2102, 0): "sync_timeout_ms",
+        (0x6007, 0): "abort_option",
+        (0x603F, 0): "error_code",
+        (0x6040, 0): "controlword",
+        (0x6041, 0): "statusword",
+        (0x605A, 0): "quick_stop_option",
+        (0x605B, 0): "shutdown_option",
+        (0x605C, 0): "disable_option",
+        (0x605E, 0): "fault_reaction_option",
+        (0x6060, 0): "mode",
+        (0x6061, 0): "mode_display",
+        (0x6062, 0): "demand_position",
+        (0x6064, 0): "position",
+        (0x6065, 0): "following_window",
+        (0x6066, 0): "following_timeout_ms",
+        (0x6067, 0): "position_window",
+        (0x606C, 0): "velocity",
+        (0x606D, 0): "velocity_window",
+        (0x6071, 0): "target_torque",
+        (0x6072, 0): "max_torque",
+        (0x6073, 0): "max_current",
+        (0x6074, 0): "demand_torque",
+        (0x6075, 0): "rated_current_mA",
+        (0x6076, 0): "rated_torque_mNm",
+        (0x6077, 0): "torque",
+        (0x6078, 0): "current",
+        (0x607A, 0): "target_position",
+        (0x607D, 1): "position_limit[0]",
+        (0x607D, 2): "position_limit[1]",
+        (0x607F, 0): "max_profile_velocity",
+        (0x6080, 0): "max_motor_speed_rpm",
+        (0x6081, 0): "profile_velocity",
+        (0x6083, 0): "profile_acceleration",
+        (0x6084, 0): "profile_deceleration",
+        (0x6085, 0): "quick_stop_deceleration",
+        (0x6087, 0): "torque_slope",
+        (0x608F, 1): "encoder_resolution[0]",
+        (0x608F, 2): "encoder_resolution[1]",
+        (0x60B2, 0): "torque_offset",
+        (0x60C2, 1): "interpolation_time",
+        (0x60C2, 2): "interpolation_exponent",
+        (0x60F4, 0): "following_error",
+        (0x60FF, 0): "target_velocity",
+        (0x6502, 0): "supported_modes",
+    }
+    fields |= {(0x1003, 1 + i): f"error_history[{i}]" for i in range(HISTORY)}
+    fields |= {(0x1016, 1 + i): f"consumer_heartbeat[{i}]" for i in range(CONSUMERS)}
+    fields |= {(0x1018, 1 + i): f"identity[{i}]" for i in range(4)}
+    for pdo in range(PDOS):
+        for way, base in (("rpdo", 0x1400), ("tpdo", 0x1800)):
+            fields[base + pdo, 1] = f"{way}_cob_id[{pdo}]"
+            fields[base + pdo, 2] = f"{way}_type[{pdo}]"
+            fields[base + pdo, 5] = f"{way}_timer_ms[{pdo}]"
+            fields[base + 0x200 + pdo, 0] = f"{way}_count[{pdo}]"
+            for entry in range(MAPPED):
+                fields[base + 0x200 + pdo, 1 + entry] = f"{way}_mapping[{pdo * MAPPED + entry}]"
+        fields[0x1800 + pdo, 3] = f"tpdo_inhibit_100us[{pdo}]"
+    return fields
+
+
+FIELDS = _fields()  # (index, sub) -> "field" or "field[flat element]" of the group that the index belongs to

@@ -1,0 +1,365 @@
+"""The virtual drive, frame by frame, with injected time: NMT, PDO, timers, CiA 402 states, modes, faults."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import pytest
+
+from hil.device import Cia402Device, DeviceSettings
+from hil.joint import plant
+
+EDS = Path(__file__).resolve().parents[2] / "configs" / "virtual_joint.eds"
+NODE = 5
+MS = 1_000_000
+
+
+class Rig:
+    """A device and a clock; `send` and `run` collect what it sends."""
+
+    def __init__(self, **settings: float) -> None:
+        self.device = Cia402Device(EDS, DeviceSettings(node_id=NODE), *plant(**settings))
+        self.now_ns = 1000 * MS
+        self.sent: list[tuple[int, bytes]] = []
+        self._collect(self.device.advance(self.now_ns))
+
+    def _collect(self, frames: list[bytes]) -> list[tuple[int, bytes]]:
+        got = []
+        for frame in frames:
+            identifier, size, data = struct.unpack("<IB3x8s", frame)
+            got.append((identifier, data[:size]))
+        self.sent += got
+        return got
+
+    def run(self, ms: int, keep_alive: int | None = None) -> list[tuple[int, bytes]]:
+        got = []
+        for _ in range(ms):
+            self.now_ns += MS
+            got += self._collect(self.device.advance(self.now_ns))
+            if keep_alive is not None:
+                got += self.send(0x700 + keep_alive, b"\x05")
+        return got
+
+    def send(self, identifier: int, data: bytes) -> list[tuple[int, bytes]]:
+        frame = struct.pack("<IB3x8s", identifier, len(data), data)
+        return self._collect(self.device.handle(frame, self.now_ns))
+
+    def write(self, index: int, sub: int, value: int, size: int) -> int:
+        """SDO download; the abort code, 0 = accepted."""
+        command = 0x23 | (4 - size) << 2
+        data = (value & (1 << 8 * size) - 1).to_bytes(4, "little")
+        answer = [d for i, d in self.send(0x600 + NODE, struct.pack("<BHB", command, index, sub) + data) if i > 0x580]
+        return struct.unpack("<I", answer[0][4:])[0] if answer[0][0] == 0x80 else 0
+
+    def set(self, index: int, sub: int, value: int, size: int) -> None:
+        assert self.write(index, sub, value, size) == 0
+
+    def get(self, index: int, sub: int = 0) -> int:
+        return self.device.objects.value(index, sub)
+
+    def state(self) -> int:
+        return int(self.device.device[0].state)
+
+    def control(self, *words: int) -> None:
+        for word in words:
+            self.set(0x6040, 0, word, 2)
+        self.run(1)
+
+    def enable(self, mode: int) -> None:
+        self.set(0x6060, 0, mode, 1)
+        self.control(0x06, 0x07, 0x0F)
+        assert self.get(0x6041) & 0x6F == 0x27
+
+    def operational(self) -> None:
+        self.send(0, bytes([1, NODE]))
+
+    def emergencies(self) -> list[int]:
+        return [struct.unpack_from("<H", d)[0] for i, d in self.sent if i == 0x80 + NODE]
+
+    @property
+    def speed_radps(self) -> float:
+        return float(self.device.plant_state[0].joint_velocity_radps)
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+def test_boot_up_then_heartbeat_tells_the_nmt_state(rig: Rig) -> None:
+    assert rig.sent == [(0x705, b"\x00")]
+    rig.set(0x1017, 0, 10, 2)
+    assert [d for i, d in rig.run(30) if i == 0x705] == [b"\x7f"] * 3
+    rig.send(0, b"\x01\x00")
+    assert (0x705, b"\x05") in rig.run(11)
+    rig.send(0, b"\x02\x05")
+    assert (0x705, b"\x04") in rig.run(11)
+    assert rig.send(0x605, bytes.fromhex("4018100100000000")) == []  # no SDO while stopped
+    rig.send(0, b"\x80\x06")  # another node
+    assert rig.device.device[0].nmt == 4
+
+
+def test_reset_restores_the_defaults_and_boots_again(rig: Rig) -> None:
+    rig.set(0x1017, 0, 10, 2)
+    rig.set(0x6072, 0, 55, 2)
+    rig.send(0, bytes([0x82, NODE]))
+    rig.run(1)
+    assert (rig.get(0x1017), rig.get(0x6072)) == (0, 55)
+    rig.enable(10)
+    rig.send(0, bytes([0x81, NODE]))
+    rig.run(1)
+    assert rig.get(0x6072) == 1000
+    assert rig.get(0x6041) & 0x4F == 0x40
+    assert rig.sent.count((0x705, b"\x00")) == 3
+
+
+@pytest.mark.parametrize(
+    ("words", "status"),
+    [
+        ((0x07,), 0x40),
+        ((0x0F,), 0x40),
+        ((0x06,), 0x21),
+        ((0x06, 0x00), 0x40),
+        ((0x06, 0x02), 0x40),
+        ((0x06, 0x07), 0x23),
+        ((0x06, 0x07, 0x06), 0x21),
+        ((0x06, 0x07, 0x00), 0x40),
+        ((0x06, 0x07, 0x0F), 0x27),
+        ((0x06, 0x0F), 0x27),
+        ((0x06, 0x07, 0x0F, 0x07), 0x23),
+        ((0x06, 0x07, 0x0F, 0x06), 0x21),
+        ((0x06, 0x07, 0x0F, 0x00), 0x40),
+        ((0x06, 0x07, 0x8F), 0x23),
+    ],
+)
+def test_transitions(rig: Rig, words: tuple[int, ...], status: int) -> None:
+    rig.control(*words)
+    rig.run(2)
+    mask = 0x4F if status == 0x40 else 0x6F
+    assert rig.get(0x6041) & mask == status
+
+
+@pytest.mark.parametrize(("option", "status"), [(0, 0x40), (1, 0x40), (2, 0x40), (5, 0x07), (6, 0x07)])
+def test_quick_stop_brakes_and_ends_as_605a_says(rig: Rig, option: int, status: int) -> None:
+    rig.set(0x605A, 0, option, 2)
+    rig.enable(10)
+    rig.set(0x6071, 0, 500, 2)
+    rig.run(100)
+    before = rig.speed_radps
+    assert before > 1.0
+    rig.control(0x02)
+    rig.run(1500)
+    assert rig.get(0x6041) & 0x4F == status
+    assert (abs(rig.speed_radps) < 0.02) is (option != 0)
+    if option >= 5:
+        rig.set(0x6071, 0, 0, 2)
+        rig.control(0x0F)
+        assert rig.get(0x6041) & 0x6F == 0x27
+
+
+def test_cyclic_torque_scales_by_rated_torque_and_moves_the_plant(rig: Rig) -> None:
+    rig.enable(10)
+    rig.set(0x6071, 0, 100, 2)
+    rig.set(0x60B2, 0, 20, 2)
+    rig.run(50)
+    joint_Nm = 0.120 * 0.5 * 121.0
+    assert rig.get(0x6077) == 120
+    assert rig.device.plant_state[0].actuator_torque_Nm == pytest.approx(joint_Nm, rel=1e-9)
+    assert rig.speed_radps == pytest.approx(joint_Nm / 2.1 * 0.05, rel=0.05)
+
+
+@pytest.mark.parametrize(("target", "limit", "limited"), [(299, 300, 0), (300, 300, 0), (301, 300, 1), (-301, 300, 1)])
+@pytest.mark.parametrize("index", [0x6072, 0x6073])
+def test_torque_limits_set_bit_11_only_beyond(rig: Rig, index: int, target: int, limit: int, limited: int) -> None:
+    rig.set(index, 0, limit, 2)
+    rig.enable(10)
+    rig.set(0x6071, 0, target, 2)
+    rig.run(2)
+    assert abs(rig.get(0x6074)) == min(abs(target), limit)
+    assert rig.get(0x6041) >> 11 & 1 == limited
+
+
+def test_torque_mode_follows_the_slope(rig: Rig) -> None:
+    rig.enable(4)
+    rig.set(0x6071, 0, 200, 2)
+    rig.run(100)
+    assert rig.get(0x6074) == pytest.approx(100, abs=3)
+    rig.run(150)
+    assert rig.get(0x6074) == 200
+    assert rig.get(0x6041) & 0x400
+
+
+@pytest.mark.parametrize("mode", [3, 9])
+def test_velocity_modes_reach_the_target(rig: Rig, mode: int) -> None:
+    rig.enable(mode)
+    rig.set(0x60FF, 0, -50_000, 4)
+    rig.run(1000)
+    assert rig.get(0x606C) == pytest.approx(-50_000, abs=500)
+
+
+@pytest.mark.parametrize("mode", [1, 8])
+def test_position_modes_reach_the_target(rig: Rig, mode: int) -> None:
+    rig.enable(mode)
+    for target in range(0, 20_001, 50) if mode == 8 else [20_000]:
+        rig.set(0x607A, 0, target, 4)
+        rig.run(1)
+    if mode == 1:
+        rig.control(0x1F)
+        assert rig.get(0x6041) & 0x1000
+        rig.control(0x0F)
+        assert not rig.get(0x6041) & 0x1000
+    rig.run(1500)
+    assert rig.get(0x6064) == pytest.approx(20_000, abs=100)
+    assert mode == 8 or rig.get(0x6041) & 0x400
+
+
+def test_injected_fault_latches_until_the_cause_is_gone_and_bit_7_rises(rig: Rig) -> None:
+    rig.enable(10)
+    rig.device.device[0].inject_fault_code = 0x2340
+    rig.run(10)
+    assert rig.emergencies() == [0x2340]
+    assert (rig.get(0x603F), rig.get(0x1001), rig.get(0x1003, 1)) == (0x2340, 0x03, 0x2340)
+    rig.control(0x00, 0x80)
+    assert rig.get(0x6041) & 0x4F == 0x08
+    rig.device.device[0].inject_fault_code = 0
+    rig.control(0x80)
+    assert rig.get(0x6041) & 0x4F == 0x08  # no edge
+    rig.control(0x00, 0x80)
+    assert rig.get(0x6041) & 0x4F == 0x40
+    assert rig.emergencies() == [0x2340, 0x0000]
+    assert rig.get(0x1001) == 0
+
+
+@pytest.mark.parametrize(("limit", "tripped"), [(999, True), (1000, False), (1001, False)])
+def test_software_position_limit(limit: int, tripped: bool) -> None:
+    rig = Rig(encoder_offset_counts=1000)
+    rig.run(5)
+    assert rig.emergencies() == []  # both limits 0: off
+    rig.set(0x607D, 1, -5000, 4)
+    rig.set(0x607D, 2, limit, 4)
+    rig.run(5)
+    assert rig.emergencies() == ([0x8680] if tripped else [])
+
+
+@pytest.mark.parametrize(("window", "tripped"), [(300, True), (0xFFFFFFFF, False)])
+def test_following_error(rig: Rig, window: int, tripped: bool) -> None:
+    rig.set(0x6065, 0, window, 4)
+    rig.set(0x6066, 0, 5, 2)
+    rig.set(0x6072, 0, 10, 2)  # too weak to follow
+    rig.enable(8)
+    rig.set(0x607A, 0, 3000, 4)
+    rig.run(30)
+    assert (0x8611 in rig.emergencies()) is tripped
+
+
+@pytest.mark.parametrize("option", [0, 1, 2, 3])
+def test_heartbeat_loss_reacts_as_6007_says(rig: Rig, option: int) -> None:
+    rig.set(0x1016, 1, 0x7F << 16 | 50, 4)
+    rig.set(0x6007, 0, option, 2)
+    rig.operational()
+    rig.enable(10)
+    rig.run(100)
+    assert rig.emergencies() == []  # not watched before it was heard
+    rig.send(0x77F, b"\x05")
+    rig.run(49)
+    assert rig.emergencies() == []
+    rig.run(1)
+    assert rig.emergencies() == [0x8130]
+    rig.run(20)
+    assert rig.device.device[0].nmt == 127  # 1029 = 0
+    assert rig.get(0x6041) & 0x4F == {0: 0x07, 1: 0x08, 2: 0x40, 3: 0x40}[option]
+    rig.send(0x77F, b"\x05")
+    assert rig.emergencies() == [0x8130] if option == 1 else [0x8130, 0]
+
+
+def test_heartbeat_that_keeps_coming_changes_nothing(rig: Rig) -> None:
+    rig.set(0x1016, 1, 0x7F << 16 | 50, 4)
+    rig.operational()
+    rig.enable(10)
+    for _ in range(10):
+        rig.send(0x77F, b"\x05")
+        rig.run(49)
+    assert rig.emergencies() == []
+    assert rig.get(0x6041) & 0x6F == 0x27
+
+
+@pytest.mark.parametrize(("silence_ms", "tripped"), [(19, False), (20, True)])
+def test_rpdo_event_timer(rig: Rig, silence_ms: int, tripped: bool) -> None:
+    rig.set(0x1400, 5, 20, 2)
+    rig.operational()
+    rig.run(50)
+    rig.send(0x205, b"\x06\x00")
+    rig.run(silence_ms)
+    assert rig.emergencies() == ([0x8250] if tripped else [])
+
+
+@pytest.mark.parametrize(("silence_ms", "tripped"), [(19, False), (20, True)])
+def test_sync_timeout(rig: Rig, silence_ms: int, tripped: bool) -> None:
+    rig.set(0x2102, 0, 20, 2)
+    rig.operational()
+    rig.run(50)
+    rig.send(0x80, b"")
+    rig.run(silence_ms)
+    assert rig.emergencies() == ([0x8700] if tripped else [])
+
+
+def test_rpdo_needs_operational_and_its_length(rig: Rig) -> None:
+    rig.send(0x205, b"\x06\x00")
+    rig.run(1)
+    assert rig.get(0x6040) == 0
+    rig.operational()
+    rig.send(0x205, b"\x06")
+    assert rig.emergencies() == [0x8210]
+    assert rig.get(0x6040) == 0
+    rig.send(0x205, b"\x06\x00")
+    assert rig.get(0x6041) & 0x6F == 0x21
+
+
+def test_synchronous_pdos(rig: Rig) -> None:
+    """Type 2: every second SYNC; a synchronous RPDO waits for the SYNC, which reports the state before it."""
+    rig.set(0x1801, 1, 0x285, 4)
+    rig.set(0x1801, 2, 2, 1)
+    rig.set(0x1400, 2, 0, 1)
+    rig.operational()
+    rig.send(0x205, b"\x06\x00")
+    assert rig.get(0x6040) == 0
+    assert [i for i, _ in rig.send(0x80, b"") if i == 0x285] == []
+    assert rig.get(0x6040) == 6
+    got = [d for i, d in rig.send(0x80, b"") if i == 0x285]
+    assert len(got) == 1
+    status, position, torque = struct.unpack("<Hih", got[0])
+    assert (status & 0x6F, position, torque) == (0x21, 0, 0)
+
+
+def test_event_driven_tpdo_inhibit_and_event_timer(rig: Rig) -> None:
+    rig.set(0x1800, 1, 0xC0000185, 4)
+    rig.set(0x1800, 3, 100, 2)  # 10 ms
+    rig.set(0x1800, 5, 40, 2)
+    rig.set(0x1800, 1, 0x40000185, 4)
+    rig.operational()
+    assert [i for i, _ in rig.sent].count(0x185) == 1
+    rig.send(0x205, b"\x06\x00")
+    assert [i for i, _ in rig.sent].count(0x185) == 1  # inhibited
+    rig.run(9)
+    assert [i for i, _ in rig.sent].count(0x185) == 1
+    rig.run(1)
+    assert [i for i, _ in rig.sent].count(0x185) == 2
+    assert [i for i, _ in rig.run(80)].count(0x185) == 2
+
+
+def test_the_same_frames_give_the_same_bits() -> None:
+    def history() -> tuple[bytes, list[tuple[int, bytes]]]:
+        rig = Rig(encoder_noise_counts=2.0)
+        rig.operational()
+        rig.enable(9)
+        rig.set(0x60FF, 0, 20_000, 4)
+        rig.run(50)
+        return rig.device.plant_state.tobytes(), rig.sent
+
+    assert history() == history()
+
+
+def test_settings_out_of_range_are_named() -> None:
+    with pytest.raises(ValueError, match=r"node_id \(=128\) must be in \[1\.\.127\]"):
+        DeviceSettings(node_id=128)
