@@ -1,0 +1,67 @@
+"""Open a bus by the names that python-can gives it: interface, channel, bit rate.
+
+Two kinds of end: a cyclic end is a file descriptor that the compiled loop uses ("socketcan" and "jointctl"); any
+interface of python-can serves for commissioning and for the plain Python loop.
+"""
+
+from __future__ import annotations
+
+import errno
+import socket
+from typing import Any
+
+import can
+
+from drivers.can import socketcan, virtual_bus
+from drivers.errors import BusError
+
+CYCLIC_INTERFACES = ("socketcan", "jointctl")
+
+
+def open_cyclic_end(interface: str, channel: str) -> socket.socket:
+    """A non-blocking socket whose `fileno()` the compiled loop reads and writes; the caller closes it."""
+    if interface == "socketcan":
+        return socketcan.open_socket(channel)
+    if interface == "jointctl":
+        return virtual_bus.connect(channel)
+    raise BusError(
+        f"interface (={interface!r}) must be one of {', '.join(CYCLIC_INTERFACES)} for the compiled loop",
+        "other python-can interfaces run in the plain Python loop",
+    )
+
+
+def open_python_can(interface: str, channel: str, bitrate: int | None = None, **settings: Any) -> can.BusABC:
+    """A python-can bus; everything that can go wrong while opening it becomes a BusError.
+
+    `bitrate` [bit/s] is passed on where given; SocketCAN and the virtual bus ignore it.  `settings` go to the
+    interface unchanged.  The interface "jointctl" works even where the package is not installed.
+    """
+    if bitrate is not None:
+        settings["bitrate"] = bitrate
+    place = f"{interface}:{channel}"
+    try:
+        if interface == "jointctl":
+            return virtual_bus.VirtualBus(channel, **settings)
+        if interface == "socketcan":
+            # python-can binds to an interface that is down without a word: ask the kernel first.
+            socketcan.open_socket(channel).close()
+        return can.Bus(channel=channel, interface=interface, ignore_config=True, **settings)
+    except NotImplementedError as error:  # also CanInterfaceNotImplementedError
+        known = ", ".join(sorted(can.VALID_INTERFACES | {"jointctl"}))
+        if interface not in can.VALID_INTERFACES:
+            raise BusError(f"interface (={interface!r}) must be one of {known}") from None
+        raise BusError(f"interface {interface} cannot be used here: {error}", "install its driver") from None
+    except ImportError as error:
+        raise BusError(f"interface {interface} needs a module that is not installed: {error}", "install it") from None
+    except PermissionError:
+        raise BusError(
+            f"no permission to open {place}", "add the user to the device's group and log in again"
+        ) from None
+    except OSError as error:
+        if error.errno in (errno.ENODEV, errno.ENOENT, errno.ENXIO):
+            raise BusError(f"no such device: {place}", "plug in the adapter") from None
+        raise BusError(f"cannot open {place}: {error.strerror or error}") from None
+    except (can.CanError, ValueError, TypeError) as error:
+        if isinstance(error.__cause__, BusError):
+            raise error.__cause__ from None
+        raise BusError(f"cannot open {place}: {error}") from None

@@ -1,0 +1,120 @@
+"""The CiA 402 power state machine, as an IntEnum and pure functions.
+
+States are recognised by mask and value, never by equality of the whole statusword.  The controlword for a request is
+a function of the present state alone, so that a lost frame is simply sent again.  A fault is never reset here and a
+quick stop is never left towards Operation Enabled: enabling again is a new run.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from firmware_py.kernel import kernel
+from firmware_py.states import DriveRequest, DriveState
+
+
+class State(IntEnum):
+    """Power states of CiA 402 part 2."""
+
+    NOT_READY_TO_SWITCH_ON = 0
+    SWITCH_ON_DISABLED = 1
+    READY_TO_SWITCH_ON = 2
+    SWITCHED_ON = 3
+    OPERATION_ENABLED = 4
+    QUICK_STOP_ACTIVE = 5
+    FAULT_REACTION_ACTIVE = 6
+    FAULT = 7
+    UNDEFINED = 8
+
+
+class ControlWord(IntEnum):
+    """Commands of object 6040h."""
+
+    DISABLE_VOLTAGE = 0x00
+    QUICK_STOP = 0x02
+    SHUTDOWN = 0x06
+    SWITCH_ON = 0x07
+    ENABLE_OPERATION = 0x0F
+    FAULT_RESET = 0x80
+
+
+class Mode(IntEnum):
+    """Modes of operation, objects 6060h and 6061h."""
+
+    PROFILE_POSITION = 1
+    PROFILE_VELOCITY = 3
+    TORQUE = 4
+    HOMING = 6
+    CYCLIC_SYNC_POSITION = 8
+    CYCLIC_SYNC_VELOCITY = 9
+    CYCLIC_SYNC_TORQUE = 10
+
+
+# bit of object 6502h (supported drive modes) for each mode
+SUPPORTED_MODE_BIT = {
+    Mode.PROFILE_POSITION: 0,
+    Mode.PROFILE_VELOCITY: 2,
+    Mode.TORQUE: 3,
+    Mode.HOMING: 5,
+    Mode.CYCLIC_SYNC_POSITION: 7,
+    Mode.CYCLIC_SYNC_VELOCITY: 8,
+    Mode.CYCLIC_SYNC_TORQUE: 9,
+}
+
+
+@kernel
+def decode_state(status_word: int) -> State:
+    """State of a statusword (6041h); Fault Reaction Active is looked for before Fault."""
+    low = status_word & 0x4F
+    if low == 0x0F:
+        return State.FAULT_REACTION_ACTIVE
+    if low == 0x08:
+        return State.FAULT
+    if low == 0x40:
+        return State.SWITCH_ON_DISABLED
+    if low == 0x00:
+        return State.NOT_READY_TO_SWITCH_ON
+    bits = status_word & 0x6F
+    if bits == 0x21:
+        return State.READY_TO_SWITCH_ON
+    if bits == 0x23:
+        return State.SWITCHED_ON
+    if bits == 0x27:
+        return State.OPERATION_ENABLED
+    if bits == 0x07:
+        return State.QUICK_STOP_ACTIVE
+    return State.UNDEFINED
+
+
+@kernel
+def drive_state(state: int) -> DriveState:
+    """The loop's view of a CiA 402 state."""
+    if state == State.OPERATION_ENABLED:
+        return DriveState.ENABLED
+    if state == State.SWITCH_ON_DISABLED:
+        return DriveState.OFF
+    if state == State.READY_TO_SWITCH_ON or state == State.SWITCHED_ON:
+        return DriveState.STARTING
+    if state == State.QUICK_STOP_ACTIVE:
+        return DriveState.STOPPING
+    if state == State.FAULT:
+        return DriveState.FAULT
+    if state == State.FAULT_REACTION_ACTIVE:
+        return DriveState.FAULT_BRAKING
+    return DriveState.UNKNOWN
+
+
+@kernel
+def control_word(state: int, request: int) -> ControlWord:
+    """The command that leads from `state` towards what the loop wants."""
+    if request == DriveRequest.ENABLE:
+        if state == State.SWITCH_ON_DISABLED:
+            return ControlWord.SHUTDOWN
+        if state == State.READY_TO_SWITCH_ON:
+            return ControlWord.SWITCH_ON
+        if state == State.SWITCHED_ON or state == State.OPERATION_ENABLED:
+            return ControlWord.ENABLE_OPERATION
+        return ControlWord.DISABLE_VOLTAGE
+    if request == DriveRequest.QUICK_STOP and (state == State.OPERATION_ENABLED or state == State.QUICK_STOP_ACTIVE):
+        return ControlWord.QUICK_STOP
+    return ControlWord.DISABLE_VOLTAGE

@@ -1,0 +1,168 @@
+"""From an unknown node to a drive whose limits are proven, whose watchdog is armed, and which is still disabled.
+
+Every step writes and reads back.  The order matters: zero targets before anything that could enable, the mode before
+the scaling, PDOs last, because they are only valid for the mode and the rate set before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from drivers.canopen.cia402 import SUPPORTED_MODE_BIT, ControlWord, Mode, State, decode_state
+from drivers.canopen.object_access import ObjectAccess
+from drivers.canopen.pdo_map import configure_loop_pdos
+from drivers.canopen.scaling import joint_torque_per_permille_Nm
+from drivers.canopen.settings import CanopenSettings
+from drivers.drive import DriveIdentity
+from drivers.errors import DeviceError
+
+CIA402_PROFILE = 402
+MODES = {"cst": (Mode.CYCLIC_SYNC_TORQUE,), "tq": (Mode.TORQUE,), "auto": (Mode.CYCLIC_SYNC_TORQUE, Mode.TORQUE)}
+ABORT_QUICK_STOP = 3  # object 6007
+MODE_ATTEMPTS = 20
+
+
+@dataclass
+class Findings:
+    """What commissioning learned, filled step by step."""
+
+    identity: DriveIdentity = field(default_factory=lambda: DriveIdentity("", "", "", ""))
+    mode: Mode = Mode.CYCLIC_SYNC_TORQUE
+    torque_per_permille_Nm: float = 0.0
+    max_permille: int = 0
+    start_counts: int = 0
+    settings: dict[str, str] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+
+
+def identify(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
+    """Device type and identity, compared with what the configuration expects."""
+    profile = objects.read(0x1000, what="device type") & 0xFFFF
+    if profile != CIA402_PROFILE:
+        raise DeviceError(f"node {settings.node} has device profile {profile}, a drive has {CIA402_PROFILE} (CiA 402)")
+    vendor, product, revision, serial = (
+        objects.read(0x1018, sub, what=what) if objects.has(0x1018, sub) else 0
+        for sub, what in ((1, "vendor ID"), (2, "product code"), (3, "revision"), (4, "serial number"))
+    )
+    for name, expected, found in (
+        ("drive.vendor_id", settings.vendor_id, vendor),
+        ("drive.product_code", settings.product_code, product),
+    ):
+        if expected is not None and expected != found:
+            raise DeviceError(
+                f"node {settings.node} is another device: {name} is {found:#x}, the configuration says {expected:#x}"
+            )
+    findings.identity = DriveIdentity(
+        f"{vendor:#010x}", f"{product:#010x}", f"{revision:#010x}", str(serial), objects.text(0x1008)
+    )
+
+
+def disable(objects: ObjectAccess, settings: CanopenSettings) -> None:
+    """Zero every target that could move the motor at enable, take the power stage off, refuse a drive in fault."""
+    objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
+    for index, what in ((0x6071, "target torque"), (0x60FF, "target velocity"), (0x60B2, "torque offset")):
+        objects.write_if_present(index, 0, 0, what=what)
+    state = State(decode_state(objects.read(0x6041, what="statusword")))
+    if state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+        code = objects.read(0x603F, what="error code") if objects.has(0x603F) else 0
+        raise DeviceError(
+            f"node {settings.node} is in fault (error code {code:04X}h)",
+            hint="find the cause, then reset the fault; jointctl never resets one by itself",
+        )
+    if state is State.OPERATION_ENABLED:
+        raise DeviceError(f"node {settings.node} stays enabled although controlword 0 was written")
+
+
+def choose_mode(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
+    """Select a torque mode that the drive has, and wait until 6061 confirms it."""
+    wanted = MODES[settings.mode]
+    if objects.has(0x6502):
+        supported = objects.read(0x6502, what="supported drive modes")
+        usable = [mode for mode in wanted if supported >> SUPPORTED_MODE_BIT[mode] & 1]
+    else:
+        findings.remarks.append("the drive does not tell its supported modes (no object 6502)")
+        usable = list(wanted)
+    if not usable:
+        names = " or ".join(mode.name.lower() for mode in wanted)
+        raise DeviceError(
+            f"node {settings.node} does not support {names} (6502 = {supported:08X}h); drive.mode is {settings.mode}"
+        )
+    findings.mode = usable[0]
+    objects.write(0x6060, 0, findings.mode, what="modes of operation")
+    for _ in range(MODE_ATTEMPTS):
+        shown = objects.read(0x6061, what="modes of operation display")
+        if shown == findings.mode:
+            break
+    else:
+        raise DeviceError(f"node {settings.node}: 6061 shows mode {shown}, mode {int(findings.mode)} was selected")
+    if findings.mode is Mode.TORQUE and objects.has(0x6087):
+        # profile torque ramps its target: make the ramp so steep that the loop's own rate limit decides
+        objects.write(0x6087, 0, 1_000_000, what="torque slope")
+        findings.remarks.append("torque mode with profile (TQ) instead of cyclic synchronous torque")
+    findings.settings["mode"] = findings.mode.name.lower()
+
+
+def _compare_rated(name: str, found: float, expected: float | None, tolerance: float, unit: str) -> None:
+    if expected is not None and abs(found - expected) > tolerance * expected:
+        raise DeviceError(f"drive.{name} (={expected:g}) does not agree with the drive's {found:g} {unit}")
+
+
+def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
+    """Scaling from the rated values, then the drive's own torque limit 6072 from the joint's."""
+    rated_mNm = objects.read(0x6076, what="motor rated torque") if objects.has(0x6076) else 0
+    rated_mA = objects.read(0x6075, what="motor rated current") if objects.has(0x6075) else 0
+    _compare_rated("rated_torque_Nm", rated_mNm * 1e-3, settings.rated_torque_Nm, settings.rated_tolerance, "Nm")
+    _compare_rated("rated_current_A", rated_mA * 1e-3, settings.rated_current_A, settings.rated_tolerance, "A")
+    scale = joint_torque_per_permille_Nm(settings, rated_mNm, rated_mA)
+    if scale <= 0.0:
+        index = "6076" if settings.torque_reference == "rated_torque" else "6075"
+        raise DeviceError(f"node {settings.node}: object {index} is 0, so 6071 has no scale (drive.torque_reference)")
+    findings.torque_per_permille_Nm = scale
+    permille = settings.max_torque_permille or -(-settings.torque_max_Nm // scale)
+    findings.max_permille = min(int(permille), 32767)
+    objects.write_verified(0x6072, 0, findings.max_permille, what="max torque")
+    findings.settings["max torque"] = f"{findings.max_permille} permille = {findings.max_permille * scale:.1f} Nm"
+
+
+def synchronise(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
+    """60C2 = SYNC period, as value x 10^exponent s."""
+    period_us = round(1e6 / settings.rate_Hz)
+    exponent = -6
+    value = period_us
+    while value % 10 == 0 and exponent < 0:
+        value //= 10
+        exponent += 1
+    if value > 255:
+        raise DeviceError(f"loop.rate_Hz (={settings.rate_Hz:g}) has no 60C2 value: the period must be 1..255 x 10^n s")
+    objects.write_verified(0x60C2, 1, value, what="interpolation time period")
+    objects.write_verified(0x60C2, 2, exponent, what="interpolation time index")
+    findings.settings["60C2"] = f"{value}e{exponent} s"
+
+
+def arm_watchdog(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
+    """The drive watches our heartbeat and stops by itself when it stays away; it sends its own as well."""
+    milliseconds = round(settings.heartbeat_s * 1000.0)
+    consumer = settings.master_node << 16 | milliseconds
+    objects.write_verified(0x1016, 1, consumer, what="consumer heartbeat time")
+    objects.write_verified(0x1017, 0, milliseconds, what="producer heartbeat time")
+    if not objects.write_if_present(0x6007, 0, ABORT_QUICK_STOP, what="abort connection option"):
+        findings.remarks.append("no object 6007: what the drive does when our heartbeat stops is up to the drive")
+    objects.write_if_present(0x605A, 0, settings.quick_stop_option, what="quick stop option")
+    if objects.has(0x1029, 1):
+        # 2 = stopped: a communication error must not leave the drive in operational
+        objects.write_verified(0x1029, 1, 2, what="error behaviour")
+    findings.settings["watchdog"] = f"{milliseconds} ms on the heartbeat of node {settings.master_node}"
+
+
+def commission(objects: ObjectAccess, settings: CanopenSettings) -> Findings:
+    """All steps on a node in pre-operational; it ends disabled, with its PDOs mapped."""
+    findings = Findings()
+    identify(objects, settings, findings)
+    disable(objects, settings)
+    choose_mode(objects, settings, findings)
+    limit_torque(objects, settings, findings)
+    synchronise(objects, settings, findings)
+    arm_watchdog(objects, settings, findings)
+    configure_loop_pdos(objects, settings.node, settings.rpdo_transmission_type)
+    findings.start_counts = objects.read(0x6064, what="position actual value")
+    return findings

@@ -1,0 +1,147 @@
+"""The cyclic protocol of one CANopen drive without any input or output: frames to send, frames received.
+
+The real loop, the portable loop and the lockstep simulation all use these three functions:
+
+    begin_cycle  ->  SYNC, and the heartbeat when it is due
+    accept_frame <-  TPDO (statusword, position, torque), EMCY, heartbeat and boot-up of the drive
+    end_cycle    ->  RPDO (controlword, target torque)
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from drivers.can.bit_timing import worst_frame_bits
+from drivers.can.frames import ERROR_FLAG, Frame
+from drivers.canopen.cia402 import State, control_word, decode_state, drive_state
+from drivers.canopen.port import SLOT_HEARTBEAT, SLOT_RPDO, SLOT_SYNC, CanopenPort
+from firmware_py.kernel import kernel
+from firmware_py.records import Command, Sample
+from firmware_py.states import DriveRequest
+
+NMT_OPERATIONAL = 5
+WRAP = 1 << 32
+HALF_WRAP = 1 << 31
+_WORST_BITS = np.array([worst_frame_bits(length) for length in range(9)])
+
+
+@kernel
+def get_u16(data: np.ndarray, at: int) -> int:
+    """Little-endian unsigned 16 bit at byte `at`."""
+    low, high = np.int64(data[at]), np.int64(data[at + 1])  # uint8 would overflow in the shift
+    return low | high << 8  # type: ignore[return-value]
+
+
+@kernel
+def get_i16(data: np.ndarray, at: int) -> int:
+    """Little-endian signed 16 bit."""
+    value = get_u16(data, at)
+    return value - 0x10000 if value >= 0x8000 else value
+
+
+@kernel
+def get_i32(data: np.ndarray, at: int) -> int:
+    """Little-endian signed 32 bit."""
+    value = get_u16(data, at) | get_u16(data, at + 2) << 16
+    return value - WRAP if value >= HALF_WRAP else value
+
+
+@kernel
+def put_u16(data: np.ndarray, at: int, value: int) -> None:
+    """Little-endian 16 bit; negative values as two's complement."""
+    data[at] = value & 0xFF
+    data[at + 1] = value >> 8 & 0xFF
+
+
+@kernel
+def begin_cycle(port: CanopenPort, frames: np.ndarray) -> int:
+    """Write SYNC (slot 0) and, when due, the heartbeat (slot 1); returns how many frames to send."""
+    frames[SLOT_SYNC].can_id = port.sync_id
+    frames[SLOT_SYNC].length = 0
+    port.bits_sent += _WORST_BITS[0]
+    due = port.heartbeat_cycles > 0 and port.cycle % port.heartbeat_cycles == 0
+    port.cycle += 1
+    if not due:
+        return 1
+    frames[SLOT_HEARTBEAT].can_id = port.own_heartbeat_id
+    frames[SLOT_HEARTBEAT].length = 1
+    frames[SLOT_HEARTBEAT].payload[0] = NMT_OPERATIONAL
+    port.bits_sent += _WORST_BITS[1]
+    return 2
+
+
+@kernel
+def _take_counts(port: CanopenPort, counts: int) -> None:
+    """Unwrap the 32 bit position: the joint moves less than half the range between two samples."""
+    if port.primed == 0:
+        port.primed = 1
+        port.counts = counts
+    else:
+        step = counts - port.last_counts
+        if step >= HALF_WRAP:
+            step -= WRAP
+        elif step < -HALF_WRAP:
+            step += WRAP
+        port.counts += step
+    port.last_counts = counts
+
+
+@kernel
+def accept_frame(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -> bool:
+    """Take one received frame; True if it was the TPDO with a new sample.  Foreign frames are only counted."""
+    port.bits_sent += _WORST_BITS[min(frame.length, 8)]
+    if frame.can_id & ERROR_FLAG != 0:
+        port.error_frames += 1
+    elif frame.can_id == port.tpdo_id:
+        if frame.length < port.tpdo_length:
+            port.malformed += 1
+            return False
+        sample.status_word = get_u16(frame.payload, port.status_at)
+        port.state = decode_state(sample.status_word)
+        sample.drive_state = drive_state(port.state)
+        _take_counts(port, get_i32(frame.payload, port.position_at))
+        sample.position_rad = (port.counts - port.zero_counts) * port.position_radpcount
+        if port.torque_at >= 0:
+            sample.torque_Nm = get_i16(frame.payload, port.torque_at) * port.torque_Nmppermille
+        sample.time_ns = now_ns
+        sample.count += 1
+        return True
+    elif frame.can_id == port.emergency_id:
+        if frame.length >= 2:
+            code = get_u16(frame.payload, 0)
+            if code != 0:
+                sample.drive_error = code
+    elif frame.can_id == port.heartbeat_id:
+        if frame.length >= 1:
+            port.nmt_state = frame.payload[0] & 0x7F
+            if port.nmt_state == 0:
+                sample.restarts += 1
+    return False
+
+
+@kernel
+def torque_permille(port: CanopenPort, torque_Nm: float) -> int:
+    """Joint torque [Nm] in 1/1000 of the drive's rated value, saturated before the cast; 0 if not finite."""
+    value = torque_Nm / port.torque_Nmppermille
+    if not math.isfinite(value):
+        return 0
+    limit = float(port.max_permille)
+    return round(min(max(value, -limit), limit))
+
+
+@kernel
+def end_cycle(port: CanopenPort, frames: np.ndarray, sample: Sample, command: Command) -> None:
+    """Write the RPDO (slot 2).  The torque is zero unless the drive is asked to be, and is, enabled."""
+    frame = frames[SLOT_RPDO]
+    frame.can_id = port.rpdo_id
+    frame.length = port.rpdo_length
+    for i in range(8):
+        frame.payload[i] = 0
+    put_u16(frame.payload, port.control_at, control_word(port.state, command.request))
+    target = 0
+    if command.request == DriveRequest.ENABLE and port.state == State.OPERATION_ENABLED:
+        target = torque_permille(port, command.torque_Nm)
+    put_u16(frame.payload, port.target_at, target)
+    port.bits_sent += _WORST_BITS[min(frame.length, 8)]

@@ -1,0 +1,109 @@
+"""The cyclic protocol on a file descriptor: what the compiled loop calls each cycle.
+
+`receive` and `send` are exported with a fixed C signature, so that the loop in firmware_py can take them as arguments.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba.core import types
+
+from drivers.can.frame_io import receive_frame, send_frame, wait_readable_ns
+from drivers.can.frames import Frame
+from drivers.canopen.cyclic import accept_frame, begin_cycle, end_cycle
+from drivers.canopen.port import (
+    FRAME_SLOTS,
+    SCRATCH_WORDS,
+    SLOT_RECEIVED,
+    SLOT_RPDO,
+    CanopenPort,
+)
+from firmware_py.kernel import exported, kernel, record_array_type
+from firmware_py.libc import monotonic_ns
+from firmware_py.records import Command, Sample
+from firmware_py.schema import dtype_of, new
+
+_PORT = record_array_type(dtype_of(CanopenPort))
+_FRAMES = record_array_type(dtype_of(Frame))
+_SAMPLE = record_array_type(dtype_of(Sample))
+_COMMAND = record_array_type(dtype_of(Command))
+_SCRATCH = types.Array(types.int64, 1, "C")
+
+
+@kernel
+def _note_sent(port: CanopenPort, sample: Sample, error: int) -> None:
+    """Count failed cycles in a row: one full transmit queue is bad luck, many are a dead bus."""
+    if error == 0:
+        port.consecutive_failures = 0
+    else:
+        port.consecutive_failures += 1
+        port.send_failures += 1
+        port.last_errno = error
+    sample.bus_errors = port.consecutive_failures
+
+
+@kernel
+def _drain(port: CanopenPort, frames: np.ndarray, sample: Sample, now_ns: int, wanted: bool) -> bool:
+    """Take every frame that is waiting; stop at the TPDO if it is wanted."""
+    while receive_frame(port.fd, frames, SLOT_RECEIVED) == 1:
+        if accept_frame(port, frames[SLOT_RECEIVED], sample, now_ns) and wanted:
+            return True
+    return False
+
+
+@exported(types.int64(_PORT, _FRAMES, _SCRATCH, _SAMPLE, types.int64, types.int64))
+def receive(ports: Any, frames: np.ndarray, scratch: np.ndarray, samples: Any, now_ns: int, deadline_ns: int) -> int:
+    """Send SYNC and wait for the answering TPDO until `deadline_ns`; returns the time waited [ns].
+
+    Frames that came since the last cycle are taken first, so that a late TPDO is not mistaken for the answer.
+    """
+    port = ports[0]
+    sample = samples[0]
+    _drain(port, frames, sample, now_ns, False)
+    count = begin_cycle(port, frames)
+    for slot in range(count):
+        _note_sent(port, sample, send_frame(port.fd, frames, slot))
+    started_ns = monotonic_ns(scratch)
+    arrived_ns = started_ns
+    while True:
+        if _drain(port, frames, sample, arrived_ns, True):
+            return monotonic_ns(scratch) - started_ns
+        if arrived_ns >= deadline_ns:
+            return arrived_ns - started_ns
+        wait_readable_ns(port.fd, deadline_ns - arrived_ns, scratch)
+        arrived_ns = monotonic_ns(scratch)
+
+
+@exported(types.int32(_PORT, _FRAMES, _SAMPLE, _COMMAND))
+def send(ports: Any, frames: np.ndarray, samples: Any, commands: Any) -> int:
+    """Send the RPDO; returns 0 or the errno."""
+    port = ports[0]
+    end_cycle(port, frames, samples[0], commands[0])
+    error = send_frame(port.fd, frames, SLOT_RPDO)
+    _note_sent(port, samples[0], error)
+    return np.int32(error)  # type: ignore[return-value]
+
+
+@exported(types.int64(_PORT, _FRAMES))
+def begin(ports: Any, frames: np.ndarray) -> int:
+    """`cyclic.begin_cycle`, for a caller that moves the frames itself (lockstep simulation)."""
+    return begin_cycle(ports[0], frames)
+
+
+@exported(types.boolean(_PORT, _FRAMES, types.int64, _SAMPLE, types.int64))
+def accept(ports: Any, frames: np.ndarray, slot: int, samples: Any, now_ns: int) -> bool:
+    """`cyclic.accept_frame` on one slot of the frame memory."""
+    return accept_frame(ports[0], frames[slot], samples[0], now_ns)
+
+
+@exported(types.void(_PORT, _FRAMES, _SAMPLE, _COMMAND))
+def end(ports: Any, frames: np.ndarray, samples: Any, commands: Any) -> None:
+    """`cyclic.end_cycle`: the RPDO is in slot SLOT_RPDO."""
+    end_cycle(ports[0], frames, samples[0], commands[0])
+
+
+def exchange_memory() -> tuple[Any, np.ndarray]:
+    """(frames, scratch) that go with a port."""
+    return new(Frame, FRAME_SLOTS), np.zeros(SCRATCH_WORDS, np.int64)

@@ -1,0 +1,110 @@
+"""Reading and writing the drive's objects over SDO, with the EDS as the judge of what exists.
+
+Time-outs are retried (drives leave SDOs unanswered now and then); an abort is an answer and is not.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import canopen
+from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
+
+from drivers.errors import DeviceError, NoDeviceError
+
+ATTEMPTS = 3
+ABORT_TEXT = {
+    0x06090030: "value out of range",
+    0x06090031: "value too high",
+    0x06090032: "value too low",
+    0x06020000: "object does not exist",
+    0x06090011: "sub-index does not exist",
+    0x06010002: "object is read only",
+    0x06010001: "object is write only",
+    0x06040041: "object cannot be mapped to a PDO",
+    0x06040042: "mapped objects exceed the PDO length",
+    0x08000022: "not in the present device state",
+}
+
+
+def object_name(index: int, sub: int = 0) -> str:
+    """6040 or 1018:2."""
+    return f"{index:04X}:{sub}" if sub else f"{index:04X}"
+
+
+class ObjectAccess:
+    """Typed access to one node's object dictionary."""
+
+    def __init__(self, node: canopen.RemoteNode, eds_name: str) -> None:
+        self._node = node
+        self._eds_name = eds_name
+
+    def has(self, index: int, sub: int = 0) -> bool:
+        """Whether the EDS lists the object."""
+        return self._variable(index, sub) is not None
+
+    def _variable(self, index: int, sub: int) -> Any:
+        return self._node.object_dictionary.get_variable(index, sub)
+
+    def _required(self, index: int, sub: int, what: str) -> Any:
+        variable = self._variable(index, sub)
+        if variable is None:
+            raise DeviceError(
+                f"EDS {self._eds_name} has no object {object_name(index, sub)} ({what}), which jointctl needs",
+                hint="use the EDS file that belongs to this drive and firmware",
+            )
+        return variable
+
+    def _failure(self, error: Exception, action: str, index: int, sub: int, what: str) -> Exception:
+        place = f"node {self._node.id}: {action} object {object_name(index, sub)} ({what})"
+        if isinstance(error, SdoAbortedError):
+            reason = ABORT_TEXT.get(error.code, "refused")
+            return DeviceError(f"{place} was refused: {reason} (SDO abort {error.code:08X}h)")
+        return NoDeviceError(f"{place} got no answer in {ATTEMPTS} attempts")
+
+    def read(self, index: int, sub: int = 0, *, what: str) -> int:
+        """Integer value of an object; `what` names it in messages."""
+        variable = self._required(index, sub, what)
+        for attempt in range(ATTEMPTS):
+            try:
+                return int(variable.decode_raw(self._node.sdo.upload(index, sub)))
+            except (SdoAbortedError, SdoCommunicationError) as error:
+                if isinstance(error, SdoAbortedError) or attempt == ATTEMPTS - 1:
+                    raise self._failure(error, "reading", index, sub, what) from error
+        raise AssertionError("unreachable")
+
+    def write(self, index: int, sub: int, value: int, *, what: str) -> None:
+        """Write an integer object; the type and so the length come from the EDS."""
+        variable = self._required(index, sub, what)
+        for attempt in range(ATTEMPTS):
+            try:
+                self._node.sdo.download(index, sub, variable.encode_raw(value))
+                return
+            except (SdoAbortedError, SdoCommunicationError) as error:
+                if isinstance(error, SdoAbortedError) or attempt == ATTEMPTS - 1:
+                    raise self._failure(error, f"writing {value} to", index, sub, what) from error
+
+    def write_verified(self, index: int, sub: int, value: int, *, what: str) -> int:
+        """Write, read back and compare."""
+        self.write(index, sub, value, what=what)
+        found = self.read(index, sub, what=what)
+        if found != value:
+            place = f"node {self._node.id}: object {object_name(index, sub)} ({what})"
+            raise DeviceError(f"{place} reads back {found}, {value} was written")
+        return found
+
+    def write_if_present(self, index: int, sub: int, value: int, *, what: str) -> bool:
+        """`write_verified` where the EDS has the object; False where it has not."""
+        if not self.has(index, sub):
+            return False
+        self.write_verified(index, sub, value, what=what)
+        return True
+
+    def text(self, index: int) -> str:
+        """A visible string such as 1008 (device name); empty if there is none."""
+        if not self.has(index):
+            return ""
+        try:
+            return bytes(self._node.sdo.upload(index, 0)).rstrip(b"\0").decode("latin-1").strip()
+        except (SdoAbortedError, SdoCommunicationError):
+            return ""

@@ -1,0 +1,54 @@
+"""The memory of the cyclic exchange with one CANopen drive."""
+
+from __future__ import annotations
+
+from firmware_py.schema import f8, i4, i8, record, u4
+
+# slots of the frame array that goes with a port
+SLOT_SYNC = 0
+SLOT_HEARTBEAT = 1
+SLOT_RPDO = 2
+SLOT_RECEIVED = 3
+FRAME_SLOTS = 4
+SCRATCH_WORDS = 8
+
+
+@record
+class CanopenPort:
+    """Identifiers, layout and scaling (set by commissioning), and what has been seen on the bus."""
+
+    fd: i4
+    node: i4
+    sync_id: u4
+    tpdo_id: u4
+    rpdo_id: u4
+    emergency_id: u4
+    heartbeat_id: u4  # of the drive
+    own_heartbeat_id: u4
+    heartbeat_cycles: i4  # own heartbeat every so many cycles; 0 = none
+    tpdo_length: i4
+    rpdo_length: i4
+    # byte positions inside the PDOs; -1 = not mapped
+    status_at: i4
+    position_at: i4
+    torque_at: i4
+    control_at: i4
+    target_at: i4
+    # scaling, directions included: all at the joint
+    position_radpcount: f8
+    zero_counts: i8
+    torque_Nmppermille: f8
+    max_permille: i4
+    # state
+    primed: i4
+    last_counts: i8  # as received, 32 bit
+    counts: i8  # unwrapped
+    cycle: i8
+    state: i4  # cia402.State
+    nmt_state: i4
+    malformed: i8  # TPDOs that were too short
+    error_frames: i8
+    send_failures: i8
+    consecutive_failures: i4
+    last_errno: i4
+    bits_sent: i8  # both directions, worst-case stuffing

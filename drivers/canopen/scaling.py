@@ -1,0 +1,56 @@
+"""From the drive's counts and per mille to radians and newton metres of the joint, and back."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from drivers.canopen.port import CanopenPort
+from drivers.canopen.settings import CanopenSettings
+from firmware_py.schema import new
+
+PERMILLE = 1000.0
+
+
+def joint_torque_per_permille_Nm(settings: CanopenSettings, rated_torque_mNm: int, rated_current_mA: int) -> float:
+    """Joint torque [Nm] of 1/1000 of rated in objects 6071 and 6077, without the direction."""
+    if settings.torque_reference == "rated_torque":
+        motor_Nm = rated_torque_mNm * 1e-3
+    else:
+        motor_Nm = rated_current_mA * 1e-3 * settings.torque_constant_NmpA
+    return motor_Nm * settings.reduction_ratio / PERMILLE
+
+
+def joint_angle_per_count_rad(settings: CanopenSettings) -> float:
+    """Joint angle [rad] of one count of 6064, without the direction."""
+    ratio = settings.reduction_ratio if settings.encoder_on_motor else 1.0
+    return 2.0 * math.pi / (settings.counts_per_turn * ratio)
+
+
+def new_port(settings: CanopenSettings, torque_per_permille_Nm: float, max_permille: int) -> Any:
+    """A `CanopenPort` record array of one record for the loop's PDO layout; the file descriptor is still missing."""
+    ports = new(CanopenPort)
+    port = ports[0]
+    port.fd = -1
+    port.node = settings.node
+    port.sync_id = 0x80
+    port.tpdo_id = 0x180 + settings.node
+    port.rpdo_id = 0x200 + settings.node
+    port.emergency_id = 0x80 + settings.node
+    port.heartbeat_id = 0x700 + settings.node
+    port.own_heartbeat_id = 0x700 + settings.master_node
+    # three heartbeats within the drive's time-out, so that one or two lost ones do not stop the joint
+    port.heartbeat_cycles = max(1, int(settings.heartbeat_s * settings.rate_Hz / 3.0))
+    port.tpdo_length = 8
+    port.rpdo_length = 4
+    port.status_at = 0
+    port.position_at = 2
+    port.torque_at = 6
+    port.control_at = 0
+    port.target_at = 2
+    port.position_radpcount = joint_angle_per_count_rad(settings) * settings.encoder_direction
+    port.zero_counts = settings.zero_counts
+    port.torque_Nmppermille = torque_per_permille_Nm * settings.torque_direction
+    port.max_permille = max_permille
+    port.state = 8
+    return ports

@@ -1,0 +1,35 @@
+"""What commissioning has to know about one CANopen joint, in the units of the configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class CanopenSettings:
+    """See the sections [drive], [encoder] and [joint] of the configuration."""
+
+    node: int
+    eds_path: Path
+    mode: str  # "cst", "tq" or "auto"
+    rate_Hz: float
+    heartbeat_s: float
+    master_node: int
+    quick_stop_option: int
+    rpdo_transmission_type: int
+    torque_reference: str  # "rated_torque" or "rated_current"
+    torque_direction: int
+    torque_max_Nm: float  # at the joint
+    torque_constant_NmpA: float  # motor torque per ampere as the drive counts amperes
+    reduction_ratio: float
+    counts_per_turn: int
+    encoder_on_motor: bool
+    encoder_direction: int
+    zero_counts: int
+    vendor_id: int | None = None
+    product_code: int | None = None
+    rated_current_A: float | None = None
+    rated_torque_Nm: float | None = None
+    rated_tolerance: float = 0.01
+    max_torque_permille: int | None = None

@@ -1,0 +1,70 @@
+"""What every drive offers, whatever its make: slow work in Python, and memory for the compiled cyclic exchange."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class DriveIdentity:
+    """Who answered; empty strings where the drive does not tell."""
+
+    vendor: str
+    product: str
+    revision: str
+    serial: str
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class CommissioningReport:
+    """What commissioning found and set, for the user and for the run log."""
+
+    identity: DriveIdentity
+    mode: str
+    start_position_rad: float
+    torque_resolution_Nm: float  # at the joint
+    position_resolution_rad: float
+    settings: dict[str, str] = field(default_factory=dict)  # name -> value read back
+    remarks: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class CyclicExchange:
+    """The driver's half of the loop: two C functions and the memory that they work on."""
+
+    receive: Any
+    send: Any
+    port: Any
+    frames: np.ndarray[Any, Any]
+    scratch: np.ndarray[Any, Any]
+
+
+class Drive(Protocol):
+    """A drive on the way from unknown to commissioned, and back to safe."""
+
+    def commission(self) -> CommissioningReport:
+        """Identify the drive, write and read back limits, arm its watchdog; leaves it disabled.
+
+        Raises `NoDeviceError` if nobody answers, `DeviceError` if it refuses or differs from the configuration.
+        """
+        ...
+
+    def start_cyclic(self) -> None:
+        """Let the drive take part in the cyclic exchange; still disabled."""
+        ...
+
+    def port(self) -> Any:
+        """The record array for the cyclic exchange, without a file descriptor; valid after `commission`."""
+        ...
+
+    def make_safe(self) -> str:
+        """Disable the drive whatever its state and confirm it; returns the state in words.  Never raises."""
+        ...
+
+    def close(self) -> None:
+        """Release the bus."""
+        ...
