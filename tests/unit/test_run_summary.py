@@ -1,0 +1,190 @@
+"""Summary and figure of a run, from records whose answers are known in advance."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from drivers.errors import DataError
+from firmware_py.realtime import HISTOGRAM_BINS, Histogram
+from firmware_py.records import LogRecord
+from firmware_py.schema import new
+from firmware_py.states import AxisPhase, Fault
+from tools.output import Output
+from tools.run_figure import drawn_indices, save_run_figure
+from tools.run_summary import _TIMES, histogram_times, summarise, summary_table
+
+
+def run_records(tracking: int = 1000) -> np.recarray:
+    """100 cycles of approach with a great error, then tracking: e = 2 mrad in the first tenth, then +-0.5 mrad."""
+    records = new(LogRecord, 100 + tracking)
+    records.time_ns = 10**15 + np.arange(len(records)) * 1_000_000
+    records.phase = AxisPhase.TRACKING
+    records.phase[:100] = AxisPhase.APPROACH
+    records.trajectory_s = (np.arange(len(records)) - 100) * 1e-3
+    records.error_rad[:100] = 0.1
+    records.error_rad[100:] = 0.5e-3 * (-1.0) ** np.arange(tracking)
+    records.error_rad[100 : 100 + tracking // 10] = 2e-3
+    records.command_torque_Nm[100:] = np.linspace(-10.0, 20.0, tracking)
+    records.command_torque_Nm[50] = 55.0
+    records.network_torque_Nm[100:] = 1.5
+    records.wake_late_ns = np.arange(len(records)) * 1000
+    records.round_trip_ns[::2] = 300_000
+    return records
+
+
+def test_error_is_that_of_tracking_only() -> None:
+    summary = summarise(run_records())
+    assert summary.error is not None
+    assert summary.late_error is not None
+    assert (summary.error.range_rad.least, summary.error.range_rad.greatest) == (-0.5e-3, 2e-3)
+    assert summary.error.range_rad.peak == 2e-3
+    assert summary.error.rmse_rad == pytest.approx(np.sqrt(0.1 * 4e-6 + 0.9 * 0.25e-6))
+    assert summary.late_error.rmse_rad == pytest.approx(0.5e-3)
+    assert summary.late_error.from_s == pytest.approx(0.5, abs=2e-3)
+    assert summary.cycles == 1100
+    assert summary.duration_s == pytest.approx(1.099)
+    assert summary.fault == "NONE"
+
+
+def test_the_late_part_may_begin_at_a_given_time() -> None:
+    late = summarise(run_records(), late_from_s=0.05).late_error
+    assert late is not None
+    assert late.from_s == pytest.approx(0.05)
+    assert late.range_rad.greatest == 2e-3
+
+
+def test_settling_time_is_when_the_error_stays_within_1_mrad() -> None:
+    records = run_records()
+    assert summarise(records).settling_s == pytest.approx(0.1)
+    records.error_rad[100 + 700] = -1.0001e-3
+    assert summarise(records).settling_s == pytest.approx(0.701)
+    records.error_rad[100 + 700] = -1e-3
+    assert summarise(records).settling_s == pytest.approx(0.1)
+    records.error_rad[-1] = 1.0001e-3
+    assert summarise(records).settling_s is None
+    records.error_rad[-1] = np.nan
+    assert summarise(records).settling_s is None
+
+
+def test_torques_are_those_of_tracking() -> None:
+    summary = summarise(run_records())
+    assert summary.command_torque_Nm is not None
+    assert summary.network_torque_Nm is not None
+    assert (summary.command_torque_Nm.least, summary.command_torque_Nm.greatest) == (-10.0, 20.0)
+    assert (summary.network_torque_Nm.least, summary.network_torque_Nm.greatest) == (1.5, 1.5)
+
+
+def test_deadlines_from_records() -> None:
+    records = run_records()
+    records.skipped[[3, 7]] = (2, 3)
+    records.sample_age_cycles[9] = 4
+    summary = summarise(records)
+    assert summary.wake_late is not None
+    assert summary.round_trip is not None
+    assert (summary.wake_late.count, summary.wake_late.max_us) == (1100, 1099.0)
+    assert summary.wake_late.p50_us == 550.0
+    assert summary.wake_late.p99_us == 1089.0
+    # cycles without a sample do not count as a round trip of zero
+    assert (summary.round_trip.count, summary.round_trip.p50_us) == (550, 300.0)
+    assert summary.skipped_cycles == 5
+    assert summary.oldest_sample_cycles == 4
+
+
+def test_the_rows_of_the_histograms_are_those_of_the_loop() -> None:
+    assert _TIMES == ("wake_late", "round_trip", "work")
+    assert (Histogram.WAKE, Histogram.ROUND_TRIP, Histogram.WORK) == (0, 1, 2)
+
+
+def test_deadlines_from_histograms() -> None:
+    histograms = np.zeros((3, HISTOGRAM_BINS), np.int64)
+    histograms[Histogram.WAKE, 10] = 989
+    histograms[Histogram.WAKE, 20] = 10
+    histograms[Histogram.WAKE, 500] = 1
+    histograms[Histogram.WORK, -1] = 2
+    summary = summarise(run_records(), histograms)
+    wake, work = summary.wake_late, summary.work
+    assert wake is not None
+    assert work is not None
+    assert (wake.count, wake.p50_us, wake.p99_us, wake.p99_9_us, wake.max_us) == (1000, 11.0, 21.0, 21.0, 501.0)
+    assert wake.over_range == 0
+    assert work.over_range == 2
+    assert summary.round_trip is None
+
+
+@pytest.mark.parametrize(("slow", "p99_us"), [(10, 1.0), (11, 101.0)])
+def test_the_99th_percentile_changes_with_the_last_hundredth(slow: int, p99_us: float) -> None:
+    histogram = np.zeros(HISTOGRAM_BINS, np.int64)
+    histogram[0], histogram[100] = 1000 - slow, slow
+    times = histogram_times(histogram)
+    assert times is not None
+    assert times.p99_us == p99_us
+
+
+def test_a_run_that_never_tracked_has_no_errors() -> None:
+    records = run_records()[:50]
+    records.fault[20:] = Fault.ENABLE_TIMEOUT
+    summary = summarise(records)
+    assert summary.error is None
+    assert summary.settling_s is None
+    assert summary.command_torque_Nm is None
+    assert summary.fault == "ENABLE_TIMEOUT"
+    assert summarise(records[:0]).cycles == 0
+
+
+def test_the_summary_is_json_and_a_table() -> None:
+    data = json.loads(json.dumps(summarise(run_records()).to_dict(), allow_nan=False))
+    assert data["error"]["range_rad"]["greatest"] == 2e-3
+    assert data["wake_late"]["max_us"] == 1099.0
+    text = io.StringIO()
+    Console(file=text, width=100).print(summary_table(summarise(run_records())))
+    assert "-0.500 .. 2.000 mrad" in text.getvalue()
+    assert "after 0.10 s" in text.getvalue()
+
+
+def test_the_figure_is_a_png_and_marks_the_fault(tmp_path: Path) -> None:
+    records = run_records()
+    plain = save_run_figure(records, tmp_path / "figures" / "plain.png", "plain").read_bytes()
+    records.fault[600:] = Fault.FOLLOWING_ERROR
+    fault = save_run_figure(records, tmp_path / "fault.png", "plain").read_bytes()
+    assert plain.startswith(b"\x89PNG\r\n")
+    assert plain != fault
+    with pytest.raises(DataError, match="nothing to draw, the run has 0 records"):
+        save_run_figure(records[:0], tmp_path / "none.png")
+
+
+@pytest.mark.parametrize("count", [2, 4000, 4001, 100_003])
+def test_no_peak_is_lost_in_the_figure(count: int) -> None:
+    values = np.sin(np.arange(count))
+    values[count // 3], values[-1] = 5.0, -7.0
+    drawn = drawn_indices(values)
+    assert len(drawn) <= 4004
+    assert {0, count - 1} <= set(drawn)
+    assert (values[drawn].min(), values[drawn].max()) == (-7.0, 5.0)
+    assert np.all(np.diff(drawn) > 0)
+
+
+def test_results_and_messages_go_to_their_own_streams() -> None:
+    out, err = io.StringIO(), io.StringIO()
+    output = Output(stdout=out, stderr=err)
+    output.result("a result that is much longer than eighty columns, " * 3, {"a": 1})
+    output.note("a note [bus]")
+    output.error("first\nsecond", "do this")
+    with output.progress("work", 10.0) as advance:
+        advance(5.0)
+    assert out.getvalue().count("\n") == 1
+    assert err.getvalue() == "a note [bus]\nerror: first\nerror: second\nhint: do this\n"
+
+
+def test_json_is_the_only_thing_on_stdout() -> None:
+    out, err = io.StringIO(), io.StringIO()
+    output = Output(json=True, quiet=True, stdout=out, stderr=err)
+    output.result("text for people", {"peak_rad": np.float64(0.5), "rows": np.arange(2), "bad": float("nan")})
+    output.note("not shown")
+    assert json.loads(out.getvalue()) == {"peak_rad": 0.5, "rows": [0, 1], "bad": None}
+    assert err.getvalue() == ""

@@ -1,0 +1,106 @@
+"""The command line.  Verbs are imported when they are called, so that `--help` is quick."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drivers.errors import JointctlError
+from tools.output import Output
+
+app = typer.Typer(
+    name="jointctl",
+    help="Robot joint controller: CANopen CiA 402 at 1 kHz, with a virtual joint to try it on.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+Interface = Annotated[str | None, typer.Option("-i", "--interface", help="python-can interface [env CAN_INTERFACE]")]
+Channel = Annotated[str | None, typer.Option("-c", "--channel", help="bus channel [env CAN_CHANNEL]")]
+Bitrate = Annotated[int | None, typer.Option("-b", "--bitrate", help="bit/s [env CAN_BITRATE]")]
+Json = Annotated[bool, typer.Option("--json", help="result as one JSON document on stdout")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="no progress on stderr")]
+ConfigPath = Annotated[
+    Path, typer.Argument(metavar="CONFIG", help="configuration file (TOML), or the name of a shipped one")
+]
+Yes = Annotated[bool, typer.Option("-y", "--yes", help="move without asking")]
+
+
+def _config_path(path: Path) -> Path:
+    """The file itself, or a shipped configuration of that name."""
+    from tools.config import shipped_config
+
+    shipped = shipped_config(str(path))
+    return shipped if not path.exists() and shipped.exists() else path
+
+
+@app.command()
+def demo(
+    config: Annotated[Path, typer.Option("--config", help="configuration with a [virtual] section")] = Path("virtual"),
+    duration: Annotated[float | None, typer.Option("--duration", help="seconds of the trajectory", min=0.1)] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Track a trajectory on the virtual joint: no hardware, no set-up."""
+    from tools.demo import demo as run_demo
+
+    raise typer.Exit(run_demo(_config_path(config), Output(json=json, quiet=quiet), duration_s=duration))
+
+
+@app.command()
+def run(
+    config: ConfigPath,
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    yes: Yes = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="commission, show the motion envelope, move nothing")
+    ] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Track the configured trajectory on a real or virtual joint."""
+    from tools.config import load_config, with_bus_overrides
+    from tools.run import run as run_run
+
+    loaded = with_bus_overrides(load_config(_config_path(config)), interface, channel, bitrate)
+    raise typer.Exit(run_run(loaded, Output(json=json, quiet=quiet), assume_yes=yes, dry_run=dry_run))
+
+
+@app.command()
+def hil(
+    config: ConfigPath = Path("virtual"),
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    timing: Annotated[bool, typer.Option("--timing", help="model bit times and arbitration")] = False,
+    ready_fd: Annotated[int | None, typer.Option("--ready-fd", hidden=True)] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Keep the virtual joint up on a virtual bus, for other programs to attach to."""
+    from tools.config import load_config, with_bus_overrides
+    from tools.hil import hil as run_hil
+
+    loaded = with_bus_overrides(load_config(_config_path(config)), interface, channel, bitrate)
+    raise typer.Exit(run_hil(loaded, Output(quiet=quiet), timing=timing, ready_fd=ready_fd))
+
+
+def main() -> None:
+    """Run a verb; every known error is one line and its own exit code."""
+    try:
+        app()
+    except JointctlError as error:
+        Output().error(error.message, error.hint)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        Output().note("interrupted")
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

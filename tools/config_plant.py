@@ -1,0 +1,100 @@
+"""The [virtual] section: the true values of the virtual joint, which the controller does not know.
+
+What is not repeated here (reduction ratio, torque constant, encoder) is taken from the other sections; inertia and
+friction are those of the controller times a scale: the difference is the model error under study.  Keys have the
+names of `hil.plant_records.PlantSettings`, whose checks apply too.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BeforeValidator
+from pydantic_core import PydanticCustomError
+
+from hil.plant_records import EncoderSide, FrictionKind, PlantSettings
+from tools.config_sections import Section, between
+
+if TYPE_CHECKING:
+    from tools.config import Config
+
+_OWN_KEYS = ("friction_kind", "inertia_scale")
+
+
+def _list(value: Any) -> Any:
+    """Lists of TOML as tuples, which a frozen model needs."""
+    good = isinstance(value, (list, tuple)) and len(value) <= 4
+    if not good or any(isinstance(x, bool) or not isinstance(x, (int, float)) for x in value):
+        raise PydanticCustomError("numbers", "must be a list of up to 4 numbers")
+    return tuple(float(x) for x in value)
+
+
+Numbers = Annotated[tuple[float, ...], BeforeValidator(_list)]
+
+
+class Virtual(Section):
+    step_s: Annotated[float, between(1e-6, 1e-3)] = 50e-6
+    initial_position_rad: Annotated[float, between(-1000.0, 1000.0)] = 0.0
+    inertia_scale: Annotated[float, between(0.1, 10.0)] = 1.0  # true inertia over joint.inertia_kgm2
+    current_limit_A: Annotated[float, between(0.001, 10_000.0)] = 100.0
+    current_lag_s: Annotated[float, between(0.0, 1.0)] = 0.0
+    command_delay_s: Annotated[float, between(0.0, 1.0)] = 0.0
+    torque_ripple_Nm: Numbers = ()
+    torque_ripple_per_motor_turn: Numbers = ()
+    torque_ripple_phase_rad: Numbers = ()
+    friction_kind: Literal["none", "sign", "stick_slip", "lugre"]
+    friction_positive_scale: Annotated[float, between(0.0, 10.0)] = 1.0  # true friction over that of [friction]
+    friction_negative_scale: Annotated[float, between(0.0, 10.0)] = 1.0
+    friction_ripple: Annotated[float, between(0.0, 0.9)] = 0.0  # relative amplitude
+    friction_ripple_per_joint_turn: Annotated[float, between(0.0, 1e5)] = 18.0
+    bristle_stiffness_Nmprad: Annotated[float, between(1.0, 1e7)] = 8e4
+    bristle_damping_Nmspr: Annotated[float, between(0.0, 1e5)] = 200.0
+    flexible: bool = False
+    motor_side_inertia_kgm2: Annotated[float, between(1e-3, 1e4)] = 1.2
+    reducer_stiffness_Nmprad: Annotated[float, between(1.0, 1e8)] = 1.3e4
+    reducer_damping_Nmspr: Annotated[float, between(0.0, 1e5)] = 5.0
+    load_torque_Nm: Annotated[float, between(-1e5, 1e5)] = 0.0
+    load_step_Nm: Annotated[float, between(-1e5, 1e5)] = 0.0
+    load_step_at_s: Annotated[float, between(0.0, 1e9)] = 80.0  # of the plant's own time
+    gravity_Nm: Annotated[float, between(0.0, 1e5)] = 0.0  # m g l of m g l sin(q)
+    end_stops: bool = False
+    end_stop_min_rad: Annotated[float, between(-1e4, 1e4)] = -3.0
+    end_stop_max_rad: Annotated[float, between(-1e4, 1e4)] = 3.0
+    end_stop_stiffness_Nmprad: Annotated[float, between(1.0, 1e8)] = 2e5
+    end_stop_damping_Nmspr: Annotated[float, between(0.0, 1e5)] = 200.0
+    thermal: bool = False
+    ambient_degC: Annotated[float, between(-60.0, 100.0)] = 25.0
+    heating_KpA2: Annotated[float, between(0.0, 1e3)] = 0.5
+    thermal_time_s: Annotated[float, between(1.0, 1e6)] = 900.0
+    friction_per_kelvin: Annotated[float, between(-0.05, 0.05)] = -0.005
+    encoder_noise_counts: Annotated[float, between(0.0, 1e6)] = 0.0
+    encoder_seed: Annotated[int, between(1, 2**31 - 1)] = 1
+
+
+def plant_keywords(config: Config, torque_constant_NmpA: float, friction: Any = None) -> dict[str, Any]:
+    """Keyword arguments of `hil.joint.plant`; the torque constant is in the drive's ampere."""
+    assert config.virtual is not None
+    settings = {k: getattr(config.virtual, k) for k in Virtual.model_fields if k not in _OWN_KEYS}
+    return {
+        **settings,
+        "inertia_kgm2": config.joint.inertia_kgm2 * config.virtual.inertia_scale,
+        "reduction_ratio": config.joint.reduction_ratio,
+        "torque_constant_NmpA": torque_constant_NmpA,
+        "friction_kind": FrictionKind[config.virtual.friction_kind.upper()],
+        "friction": friction,
+        "encoder_side": EncoderSide[config.encoder.side.upper()],
+        "encoder_counts_per_turn": config.encoder.counts_per_turn,
+        "encoder_direction": config.encoder.direction,
+        "encoder_offset_counts": config.encoder.zero_counts,
+    }
+
+
+def plant_problems(config: Config) -> list[str]:
+    """What the plant itself refuses about [virtual], such as a step too long for the stiffness."""
+    if config.virtual is None:
+        return []
+    try:
+        PlantSettings(**plant_keywords(config, config.joint.torque_constant_NmpA))
+    except ValueError as error:
+        return [f"virtual.{error}"]
+    return []

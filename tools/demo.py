@@ -1,0 +1,28 @@
+"""`jointctl demo`: the main job on a virtual joint in a process of its own; needs no hardware and no set-up."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from tools.config import Config, load_config, with_bus_overrides
+from tools.output import Output
+from tools.run import run
+from tools.virtual_joint import separate_virtual_joint
+
+
+def demo(config_path: Path, output: Output, *, duration_s: float | None = None) -> int:
+    """Start the virtual joint on a private bus, run the configuration on it, end it."""
+    config = load_config(config_path)
+    channel = f"demo-{os.getpid()}"
+    config = with_bus_overrides(config, interface="jointctl", channel=channel, environ={})
+    if duration_s is not None:
+        config = _with_duration(config, duration_s)
+    output.note("starting the virtual joint (the first start compiles, about a minute)")
+    with separate_virtual_joint(config_path, channel):
+        return run(config, output, assume_yes=True)
+
+
+def _with_duration(config: Config, duration_s: float) -> Config:
+    trajectory = config.trajectory.model_copy(update={"duration_s": duration_s})
+    return config.model_copy(update={"trajectory": trajectory})

@@ -1,0 +1,124 @@
+"""What each fault of the loop means to the person at the bench: what happened, likely cause, next step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from firmware_py.states import Fault
+
+
+@dataclass(frozen=True)
+class FaultText:
+    """`happened` may hold {value}, the number that tripped the limit."""
+
+    happened: str
+    cause: str
+    next_step: str
+
+
+FAULT_TEXTS: dict[Fault, FaultText] = {
+    Fault.POSITION_LIMIT: FaultText(
+        "the joint left its position limits at {value:.4f} rad",
+        "the joint was moved by hand, or limits and encoder zero do not belong together",
+        "compare limits.position_* and encoder.zero_counts with where the joint stands",
+    ),
+    Fault.VELOCITY_LIMIT: FaultText(
+        "the joint moved at {value:.3f} rad/s, faster than limits.velocity_max_radps",
+        "wrong sign of encoder or torque, or gains that the loop delay does not allow",
+        "check encoder.direction and drive.torque_direction before the next run",
+    ),
+    Fault.REFERENCE_LIMIT: FaultText(
+        "the desired motion would leave the limits at {value:.4f} rad",
+        "the trajectory, or its approach from where the joint stands, does not fit the limits",
+        "change the trajectory, the start position or limits.*",
+    ),
+    Fault.FOLLOWING_ERROR: FaultText(
+        "the joint was {value:.4f} rad away from its reference",
+        "blocked or overloaded joint, wrong sign of encoder or torque, or too little torque",
+        "turn the joint by hand with the power off; check the directions and limits.torque_max_Nm",
+    ),
+    Fault.STALE_SAMPLE: FaultText(
+        "no position came for {value:.0f} cycles",
+        "frames lost, cable, bus load, or the drive went silent",
+        "check wiring and termination; watch the bus with candump",
+    ),
+    Fault.NOT_FINITE: FaultText(
+        "the law computed {value}, which is not a number to send",
+        "gains or friction values that overflow",
+        "report the run log: this should not happen with a checked configuration",
+    ),
+    Fault.TORQUE_SATURATED: FaultText(
+        "the torque stayed at its limit ({value:.1f} Nm) for too long",
+        "the joint is blocked, or limits.torque_max_Nm is too low for load and friction",
+        "turn the joint by hand with the power off, then look at the friction values",
+    ),
+    Fault.DRIVE_FAULT: FaultText(
+        "the drive reported a fault (statusword {value:.0f})",
+        "see the drive's error code",
+        "remove the cause, then reset the drive's fault; jointctl never does it by itself",
+    ),
+    Fault.DRIVE_NOT_ENABLED: FaultText(
+        "the drive left Operation Enabled by itself (statusword {value:.0f})",
+        "its enable input or STO was opened, a limit switch, or another master on the bus",
+        "check the enable and STO wiring",
+    ),
+    Fault.DRIVE_RESTARTED: FaultText(
+        "the drive restarted while the loop was running",
+        "its supply dropped, or somebody reset it",
+        "check the supply; the drive has lost its configuration, start again",
+    ),
+    Fault.ENABLE_TIMEOUT: FaultText(
+        "the drive did not reach Operation Enabled in time (statusword {value:.0f})",
+        "no motor supply, STO open, or an interlock of the drive",
+        "check voltage and STO; the statusword's bit 4 is the motor supply",
+    ),
+    Fault.SUPERVISOR_LOST: FaultText(
+        "the supervising process was silent for {value:.0f} cycles",
+        "it was killed, stopped, or the computer was overloaded",
+        "look for what blocked it: disk, memory, a debugger",
+    ),
+    Fault.BUS_ERROR: FaultText(
+        "{value:.0f} frames in a row could not be sent",
+        "interface down, bus off, or nobody acknowledges: cable or bit rate",
+        "ip -details link show, then bring the interface up again",
+    ),
+    Fault.STOP_TIMEOUT: FaultText(
+        "the joint did not come to rest ({value:.3f} rad/s)",
+        "unstable gains or an outside torque",
+        "lower the gains; look at the last seconds of the run log",
+    ),
+    Fault.OFF_TIMEOUT: FaultText(
+        "the drive did not confirm that its power stage is off (statusword {value:.0f})",
+        "the drive is unreachable",
+        "use the emergency stop; then check the bus",
+    ),
+    Fault.NO_SAMPLES: FaultText(
+        "not one sample came from the drive",
+        "the drive does not answer SYNC: PDOs disabled, or not operational",
+        "look for SYNC (080) and the TPDO (180 + node) with candump",
+    ),
+    Fault.NOT_AT_STANDSTILL: FaultText(
+        "the joint moved at {value:.3f} rad/s before it was enabled",
+        "somebody moves it, or the encoder is noisy",
+        "let it rest, or raise limits.standstill_radps",
+    ),
+    Fault.OVERRUN: FaultText(
+        "the loop was held up for {value:.0f} cycles",
+        "the computer was busy: no real-time priority, power saving, a debugger",
+        "run `jointctl doctor`; set loop.priority and loop.cpu",
+    ),
+    Fault.POSITION_JUMP: FaultText(
+        "the position jumped by {value:.4f} rad between two samples",
+        "encoder or its cable, or counts_per_turn too small by a factor",
+        "check the encoder cable and encoder.counts_per_turn",
+    ),
+}
+
+
+def fault_text(fault: Fault, value: float, drive_error: int) -> FaultText:
+    """The text of a fault with its numbers filled in."""
+    text = FAULT_TEXTS[fault]
+    happened = text.happened.format(value=value)
+    if drive_error:
+        happened += f"; the drive's error code is {drive_error:04X}h"
+    return FaultText(happened, text.cause, text.next_step)

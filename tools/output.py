@@ -1,0 +1,89 @@
+"""Where output goes: results on stdout, everything else on stderr; colour and progress only on a terminal.
+
+With `json` the result is one JSON document on stdout and nothing else is printed there; NO_COLOR is honoured by rich.
+"""
+
+from __future__ import annotations
+
+import json as json_format
+import math
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import IO, Any, Protocol
+
+from rich.console import Console, RenderableType
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+
+class Advance(Protocol):
+    """Tells a progress bar how far the work has come, in the unit of its total."""
+
+    def __call__(self, completed: float) -> None: ...
+
+
+@dataclass
+class Output:
+    """The two streams of a command; `stdout` and `stderr` are replaced in tests."""
+
+    json: bool = False
+    quiet: bool = False
+    stdout: IO[str] = field(default_factory=lambda: sys.stdout)
+    stderr: IO[str] = field(default_factory=lambda: sys.stderr)
+
+    def __post_init__(self) -> None:
+        # rich wraps at 80 columns where there is no terminal; a line of a log file or of a pipe is not to be broken
+        self._results = Console(file=self.stdout, highlight=False, soft_wrap=not self.stdout.isatty())
+        self._messages = Console(file=self.stderr, highlight=False, soft_wrap=not self.stderr.isatty())
+
+    def result(self, shown: RenderableType, data: Any = None) -> None:
+        """A result: `shown` for people, `data` (numbers, texts, lists, dicts) with `--json`."""
+        if self.json:
+            if data is not None:
+                print(json_format.dumps(_plain(data), allow_nan=False), file=self.stdout, flush=True)
+        else:
+            self._results.print(shown)
+
+    def note(self, text: str) -> None:
+        """Progress in words; not with `--quiet`."""
+        if not self.quiet:
+            self._messages.print(text, markup=False)
+
+    def warning(self, text: str) -> None:
+        self._messages.print(f"warning: {text}", style="yellow", markup=False)
+
+    def error(self, text: str, hint: str = "") -> None:
+        """One line for each line of `text`, and what to do about it."""
+        for line in text.splitlines():
+            self._messages.print(f"error: {line}", style="red", markup=False)
+        if hint:
+            self._messages.print(f"hint: {hint}", markup=False)
+
+    @contextmanager
+    def progress(self, title: str, total: float) -> Iterator[Advance]:
+        """A bar on stderr, if that is a terminal; else nothing at all."""
+        if self.quiet or not self.stderr.isatty():
+            yield lambda completed: None
+            return
+        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"))
+        with Progress(*columns, TimeRemainingColumn(), console=self._messages, transient=True) as bar:
+            task = bar.add_task(title, total=total)
+
+            def advance(completed: float) -> None:
+                bar.update(task, completed=completed)
+
+            yield advance
+
+
+def _plain(value: Any) -> Any:
+    """JSON knows neither numpy numbers nor nan: the former become Python's, the latter null."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

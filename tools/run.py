@@ -1,0 +1,59 @@
+"""`jointctl run CONFIG`: track the configured trajectory on a real or virtual joint."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+from drivers.drive import CommissioningReport
+from drivers.errors import JointctlError
+from tools.config import Config
+from tools.envelope import motion_envelope
+from tools.output import Output
+from tools.run_report import report_run
+from tools.supervisor import Supervisor
+
+
+class UsageError(JointctlError):
+    """The command line asks for something that cannot be done as it stands."""
+
+    exit_code = 2
+
+
+def log_path(config: Config) -> Path:
+    """A new name in the log folder: configuration and local time."""
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    folder = Path(config.log.folder)
+    path = folder / f"{config.path.stem}-{stamp}.mcap"
+    number = 1
+    while path.exists():
+        number += 1
+        path = folder / f"{config.path.stem}-{stamp}-{number}.mcap"
+    return path
+
+
+def _ask(output: Output) -> bool:
+    if not sys.stdin.isatty():
+        raise UsageError("this moves the joint and there is no terminal to ask on", "give -y to move without asking")
+    output.note("Move the joint? [y/N] ")
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+
+def run(config: Config, output: Output, *, assume_yes: bool, dry_run: bool = False) -> int:
+    """Commission, show the motion envelope, ask, track, report; returns the exit code."""
+
+    def confirm(report: CommissioningReport) -> bool:
+        for line in motion_envelope(config, report):
+            output.note(line)
+        if dry_run:
+            output.note("dry run: nothing moves; the drive was commissioned and is disabled")
+            return False
+        return assume_yes or _ask(output)
+
+    result = Supervisor(config, output, log_path(config), confirm).run()
+    if result is None:
+        if not dry_run:
+            output.note("nothing moved; the drive is disabled")
+        return 0
+    return report_run(result, output, f"{config.path.stem}: {config.trajectory.kind}")

@@ -1,0 +1,199 @@
+"""What happened in a run, in numbers: tracking error, torques, and how well the loop kept its deadlines.
+
+Errors and torques are those of the TRACKING phase (e = q - q_d, at the joint); deadlines are those of the whole run.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from firmware_py.states import AxisPhase, Fault
+
+SETTLED_RAD = 1e-3
+_TIMES = ("wake_late", "round_trip", "work")  # rows of the loop's histograms, and LogRecord fields with _ns
+
+
+@dataclass(frozen=True)
+class Range:
+    """Least and greatest value."""
+
+    least: float
+    greatest: float
+
+    @property
+    def peak(self) -> float:
+        return max(abs(self.least), abs(self.greatest))
+
+
+@dataclass(frozen=True)
+class ErrorSummary:
+    """Tracking error of one stretch of the run."""
+
+    from_s: float  # trajectory time
+    to_s: float
+    range_rad: Range
+    rmse_rad: float
+
+
+@dataclass(frozen=True)
+class TimeSummary:
+    """Durations in microseconds; from a histogram each one is the upper edge of its bin, so never too small."""
+
+    count: int
+    p50_us: float
+    p99_us: float
+    p99_9_us: float
+    max_us: float
+    over_range: int  # how many lie beyond the histogram; then the percentiles may be too small
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """`None` where there is nothing to tell, such as errors of a run that never tracked."""
+
+    cycles: int
+    duration_s: float
+    tracked_s: float
+    fault: str
+    error: ErrorSummary | None
+    late_error: ErrorSummary | None  # after `late_from_s`, by default the second half
+    settling_s: float | None  # from then on |e| stays within 1 mrad; None = never
+    command_torque_Nm: Range | None
+    measured_torque_Nm: Range | None
+    friction_torque_Nm: Range | None
+    network_torque_Nm: Range | None
+    wake_late: TimeSummary | None
+    round_trip: TimeSummary | None
+    work: TimeSummary | None
+    skipped_cycles: int
+    oldest_sample_cycles: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers and texts for JSON; the unit of each is in its key."""
+        return asdict(self)
+
+
+def summarise(records: Any, histograms: Any = None, *, late_from_s: float | None = None) -> RunSummary:
+    """Summary of `records` (array of LogRecord, shape (N,)).
+
+    `histograms` int64[3, bins of 1 us], rows wake-up, round trip, work, the last bin open: where given, the deadline
+    statistics come from it, because the loop counts every cycle there even if the log lost some.
+    `late_from_s` is a trajectory time.
+    """
+    tracking = records[records["phase"] == AxisPhase.TRACKING]
+    time_s = tracking["trajectory_s"]
+    late_from_s = late_from_s if late_from_s is not None else 0.5 * float(time_s[-1]) if len(time_s) else 0.0
+    faults = records["fault"][records["fault"] != 0]
+    duration_ns = int(records["time_ns"][-1]) - int(records["time_ns"][0]) if len(records) else 0
+    return RunSummary(
+        cycles=len(records),
+        duration_s=duration_ns * 1e-9,
+        tracked_s=float(time_s[-1] - time_s[0]) if len(time_s) else 0.0,
+        fault=_fault_name(int(faults[0])) if len(faults) else Fault.NONE.name,
+        error=_error(tracking),
+        late_error=_error(tracking[time_s >= late_from_s]),
+        settling_s=_settling_s(tracking),
+        command_torque_Nm=_range(tracking["command_torque_Nm"]),
+        measured_torque_Nm=_range(tracking["measured_torque_Nm"]),
+        friction_torque_Nm=_range(tracking["friction_torque_Nm"]),
+        network_torque_Nm=_range(tracking["network_torque_Nm"]),
+        **{name: _times(records, histograms, row) for row, name in enumerate(_TIMES)},
+        skipped_cycles=int(records["skipped"].sum()),
+        oldest_sample_cycles=int(records["sample_age_cycles"].max()) if len(records) else 0,
+    )
+
+
+def _fault_name(code: int) -> str:
+    return Fault(code).name if code in list(Fault) else f"FAULT_{code}"
+
+
+def _range(values: Any) -> Range | None:
+    values = values[np.isfinite(values)]
+    return Range(float(values.min()), float(values.max())) if len(values) else None
+
+
+def _error(tracking: Any) -> ErrorSummary | None:
+    error = tracking["error_rad"]
+    found = _range(error)
+    if found is None:
+        return None
+    rmse = float(np.sqrt(np.mean(np.square(error[np.isfinite(error)]))))
+    return ErrorSummary(float(tracking["trajectory_s"][0]), float(tracking["trajectory_s"][-1]), found, rmse)
+
+
+def _settling_s(tracking: Any) -> float | None:
+    outside = np.flatnonzero(~(np.abs(tracking["error_rad"]) <= SETTLED_RAD))
+    if len(tracking) == 0 or (len(outside) and outside[-1] == len(tracking) - 1):
+        return None
+    return float(tracking["trajectory_s"][outside[-1] + 1]) if len(outside) else float(tracking["trajectory_s"][0])
+
+
+def _times(records: Any, histograms: Any, row: int) -> TimeSummary | None:
+    if histograms is not None:
+        return histogram_times(histograms[row])
+    values = records[f"{_TIMES[row]}_ns"] / 1000.0
+    if _TIMES[row] == "round_trip":
+        values = values[values > 0.0]  # 0 = no sample in this cycle
+    if not len(values):
+        return None
+    p50, p99, p99_9 = np.percentile(values, (50.0, 99.0, 99.9), method="higher")
+    return TimeSummary(len(values), float(p50), float(p99), float(p99_9), float(values.max()), 0)
+
+
+def histogram_times(histogram: Any) -> TimeSummary | None:
+    """Percentiles of one row of 1 us bins; bin i holds durations in [i, i + 1) us, the last one all beyond."""
+    total = int(histogram.sum())
+    if total == 0:
+        return None
+    running = np.cumsum(histogram)
+
+    def edge_us(share: float) -> float:
+        # the smallest bin edge that at least this share lies below
+        return float(np.searchsorted(running, np.ceil(share * total - 1e-9)) + 1)
+
+    greatest = float(np.flatnonzero(histogram)[-1] + 1)
+    return TimeSummary(total, edge_us(0.5), edge_us(0.99), edge_us(0.999), greatest, int(histogram[-1]))
+
+
+def summary_table(summary: RunSummary) -> Table:
+    """The summary for a terminal; angles in mrad."""
+    table = Table(title="Run", show_header=False, title_justify="left")
+    table.add_column(style="bold")
+    table.add_column(justify="right")
+    fault = "none" if summary.fault == Fault.NONE.name else summary.fault
+    table.add_row("duration", f"{summary.duration_s:.2f} s, {summary.tracked_s:.2f} s of it tracking")
+    table.add_row("fault", fault, style=None if fault == "none" else "red")
+    for name, error in (("tracking error", summary.error), ("tracking error, late part", summary.late_error)):
+        if error is not None:
+            low, high = error.range_rad.least * 1e3, error.range_rad.greatest * 1e3
+            span = f"{error.from_s:.1f}..{error.to_s:.1f} s"
+            table.add_row(f"{name} ({span})", f"{low:.3f} .. {high:.3f} mrad, RMSE {error.rmse_rad * 1e3:.3f}")
+    settled = "not reached" if summary.settling_s is None else f"after {summary.settling_s:.2f} s"
+    table.add_row("within 1 mrad for good", settled)
+    for name, torque in (
+        ("command torque", summary.command_torque_Nm),
+        ("measured torque", summary.measured_torque_Nm),
+        ("friction feed-forward", summary.friction_torque_Nm),
+        ("network torque", summary.network_torque_Nm),
+    ):
+        if torque is not None:
+            table.add_row(name, f"{torque.least:.2f} .. {torque.greatest:.2f} Nm")
+    for name, times in (
+        ("wake-up late", summary.wake_late),
+        ("round trip", summary.round_trip),
+        ("work", summary.work),
+    ):
+        if times is not None:
+            table.add_row(f"{name}, p50/p99/p99.9/max", _times_text(times))
+    table.add_row("cycles, skipped", f"{summary.cycles}, {summary.skipped_cycles}")
+    table.add_row("oldest sample", f"{summary.oldest_sample_cycles} cycles")
+    return table
+
+
+def _times_text(times: TimeSummary) -> str:
+    values = " / ".join(f"{v:.4g}" for v in (times.p50_us, times.p99_us, times.p99_9_us, times.max_us))
+    return f"{values} us" + (f" ({times.over_range} beyond the range)" if times.over_range else "")
