@@ -7,6 +7,7 @@ import time
 
 from hil.bus import default_socket_path
 from tools.config import Config
+from tools.loop_process import become_realtime
 from tools.output import Output
 from tools.stop_signals import stop_signals
 from tools.virtual_joint import serve_virtual_joint
@@ -16,6 +17,8 @@ _POLL_S = 0.05
 
 def hil(config: Config, output: Output, *, timing: bool = False, ready_fd: int | None = None) -> int:
     """Serve until a stop signal; `ready_fd` gets one byte once the bus can be used."""
+    for line in become_realtime(None, config.loop.priority):
+        output.note(f"virtual joint: {line}")
     with stop_signals() as signals, serve_virtual_joint(config, timing) as joint:
         bus = config.bus
         place = f"{bus.interface}:{bus.channel}"

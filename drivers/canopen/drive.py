@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from collections.abc import Callable
@@ -122,5 +123,6 @@ class CanopenDrive:
         return state.name.lower().replace("_", " ")
 
     def close(self) -> None:
-        """Leave the bus."""
-        self._network.disconnect()
+        """Leave the bus; what went wrong on it has been told before."""
+        with contextlib.suppress(Exception):
+            self._network.disconnect()

@@ -1,0 +1,128 @@
+"""A commissioned virtual joint for the lockstep simulation: set up once, run many times.
+
+Commissioning goes through the real driver and the real SDO server, over a bus without a wire: a frame that is sent
+is handled at once.  Each run starts from a copy of the device as commissioning left it.
+"""
+
+from __future__ import annotations
+
+import queue
+from dataclasses import dataclass
+from typing import Any
+
+import can
+import numpy as np
+
+from drivers.can.virtual_bus import decode, encode
+from drivers.canopen.drive import CanopenDrive
+from drivers.canopen.exchange import accept, begin, end, exchange_memory
+from drivers.drive import CommissioningReport
+from firmware_py.records import AxisState, Command, LogRecord, Sample
+from firmware_py.schema import new
+from firmware_py.sequence import reset_axis
+from firmware_py.states import Fault
+from hil.device import Cia402Device
+from hil.frames import FRAME_SIZE
+from hil.lockstep import run_lockstep
+from tools.config import Config
+from tools.config_drive import canopen_settings
+from tools.config_records import axis_constants, trajectory_table
+from tools.virtual_joint import new_device
+
+_COMMISSIONING_STEP_NS = 1000  # the device's clock goes on a little with every frame
+NO_STOP = -1
+
+
+class DirectBus(can.BusABC):
+    """A python-can bus whose only other participant is a virtual device in the same process."""
+
+    def __init__(self, device: Cia402Device) -> None:
+        super().__init__(channel="direct")
+        self._device = device
+        self._answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self.now_ns = 1
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """The device handles the frame before this returns."""
+        self.now_ns += _COMMISSIONING_STEP_NS
+        for frame in self._device.handle(encode(msg), self.now_ns):
+            self._answers.put(frame)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        try:
+            return decode(self._answers.get(timeout=timeout), self.now_ns * 1e-9, self.channel_info), False
+        except queue.Empty:
+            return None, False
+
+
+@dataclass(frozen=True)
+class LockstepRun:
+    """What one simulated run left."""
+
+    log: Any  # LogRecord recarray, shape (N,)
+    state: Any  # AxisState record
+    plant: Any  # PlantState record
+    device: Any  # Device record
+    fault: Fault
+
+
+class LockstepJoint:
+    """The joint of a configuration, commissioned, disabled and operational."""
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        virtual = new_device(config)
+        bus = DirectBus(virtual)
+        drive = CanopenDrive(bus, canopen_settings(config), sleep=lambda _: None)
+        try:
+            self.report: CommissioningReport = drive.commission()
+            drive.start_cyclic()
+            self._port = drive.port()
+        finally:
+            drive.close()
+        self._start_ns = bus.now_ns + _COMMISSIONING_STEP_NS
+        self._virtual = virtual
+        self.table = trajectory_table(config)
+        self.plant_constants = virtual.plant_constants.copy()
+        self.plant_state = virtual.plant_state.copy()
+
+    def constants(self) -> Any:
+        """Fresh `AxisConstants` for this joint where it stands; may be changed before `run`."""
+        constants = axis_constants(self.config, start_position_rad=self.report.start_position_rad)
+        constants[0].sequence.supervisor_max_cycles = 0  # nobody to watch: simulated time has no wall clock
+        return constants
+
+    def run(
+        self,
+        constants: Any = None,
+        *,
+        plant_constants: Any = None,
+        plant_state: Any = None,
+        log_every: int = 1,
+        stop_cycle: int = NO_STOP,
+        longest_s: float | None = None,
+    ) -> LockstepRun:
+        """One run from power off to FINISHED; the given record arrays are not changed.
+
+        Without `longest_s` a run may take ten seconds more than approach and trajectory together.
+        """
+        constants = self.constants() if constants is None else constants
+        axis = constants[0]
+        period_s = float(axis.law.period_s)
+        if longest_s is None:
+            longest_s = float(axis.sequence.approach_s + axis.trajectory.duration_s) + 10.0
+        cycles = int(longest_s / period_s)
+        log = new(LogRecord, cycles // log_every + 1 if log_every else 1)
+        state, sample, command = new(AxisState), new(Sample), new(Command)
+        reset_axis(axis, state[0])
+        device = self._virtual.device.copy()
+        plant_constants = self.plant_constants if plant_constants is None else plant_constants
+        plant = (self.plant_state if plant_state is None else plant_state).copy()
+        frames, _ = exchange_memory()
+        frame_bytes = frames.view(np.ndarray).view(np.uint8).reshape(len(frames), FRAME_SIZE)
+        written = run_lockstep(
+            begin, accept, end, self._port.copy(), frames, frame_bytes, constants, state, self.table, sample, command,
+            device, plant_constants, plant, self._virtual.queue.copy(), log, log_every, self._start_ns,
+            round(period_s * 1e9), cycles, stop_cycle,
+        )  # fmt: skip
+        return LockstepRun(log[:written], state[0], plant[0], device[0], Fault(int(state[0].fault)))
