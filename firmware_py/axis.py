@@ -25,7 +25,7 @@ from firmware_py.sequence import (
     write_command,
 )
 from firmware_py.states import AxisPhase, Fault, Reaction
-from firmware_py.trajectory import approach_at, brake_step, reference_at
+from firmware_py.trajectory import approach_at, brake_step, reference_at, repetition
 from firmware_py.velocity import step_velocity
 
 
@@ -79,6 +79,9 @@ def _check_surroundings(
 @kernel
 def _move_reference(constants: AxisConstants, state: AxisState, table: np.ndarray, elapsed_cycles: int) -> None:
     """The desired motion of this cycle: approach, trajectory, or braking.  Time goes on through an overrun."""
+    if state.phase <= AxisPhase.TRACKING and state.phase_cycle > 0:  # 0: planned in this very cycle
+        # before the reference is taken: after an overrun it must be that of now, not of the cycle that was missed
+        state.trajectory_s += elapsed_cycles * constants.law.period_s
     if state.phase == AxisPhase.APPROACH and state.trajectory_s >= 0.0:
         enter(state, AxisPhase.TRACKING)
     duration_s = constants.trajectory.duration_s
@@ -93,7 +96,6 @@ def _move_reference(constants: AxisConstants, state: AxisState, table: np.ndarra
     else:
         _brake(constants, state, elapsed_cycles)
         return
-    state.trajectory_s = state.trajectory_s + elapsed_cycles * constants.law.period_s
     fault = reference_fault(constants.limits, state.reference.position_rad, state.reference.velocity_radps)
     trip(state, fault, state.reference.position_rad, 0)
 
@@ -134,13 +136,25 @@ def _released_torque_Nm(constants: AxisConstants, state: AxisState) -> float:
 
 
 @kernel
-def _command_torque(constants: AxisConstants, state: AxisState) -> None:
+def _command_torque(constants: AxisConstants, state: AxisState, table: np.ndarray) -> None:
     """The torque of this cycle; a torque that is not finite is never sent."""
     if state.phase == AxisPhase.RELEASING:
         state.unlimited_torque_Nm = _released_torque_Nm(constants, state)
     elif powered(state.phase):
+        epoch, repeat_s, local_s = 0, 0.0, 0.0
+        if state.phase == AxisPhase.TRACKING:
+            time_s = state.trajectory_s - constants.law.period_s  # of the present reference
+            epoch, repeat_s, local_s = repetition(constants.trajectory, table, time_s)
         state.unlimited_torque_Nm = step_law(
-            constants.law, state.law, state.measured_position_rad, state.velocity, state.reference
+            constants.law,
+            state.law,
+            state.measured_position_rad,
+            state.velocity,
+            state.reference,
+            state.command_torque_Nm,
+            epoch,
+            repeat_s,
+            local_s,
         )
     else:
         state.unlimited_torque_Nm = 0.0
@@ -192,6 +206,6 @@ def step_axis(
         step_velocity(constants.velocity, state.velocity, sample.position_rad, error_rad, gap_cycles)
     if powered(state.phase):
         _check_motion(constants, state)
-    _command_torque(constants, state)
+    _command_torque(constants, state, table)
     step_stopping(constants, state, sample)
     write_command(state, command)

@@ -1,17 +1,24 @@
-"""The control law (29): computed torque, friction feed-forward, and the network that learns the rest.
+"""The control laws: computed torque, friction feed-forward, and one of several ways to deal with the rest.
+
+The paper's law (29) is COMPUTED_TORQUE_RBF:
 
     tau = M0 (q_d'' - kv e' - kp e) + C0 q' + G0(q) + n tau_f0 - fhat,   e = q - q_d
 
-All torques at the joint.  The result is not limited here: the axis checks, limits and rate-limits it.
+COMPUTED_TORQUE leaves fhat away, COMPUTED_TORQUE_OBSERVER replaces it by a disturbance observer, PID by an integral.
+Iterative learning can be added to each.  All torques at the joint; nothing is limited here: the axis checks, limits
+and rate-limits the result.
 """
 
 from __future__ import annotations
 
 import math
 
+from firmware_py.disturbance_observer import add_to_disturbance, reset_observer, step_observer
 from firmware_py.friction import compensation_motor_torque_Nm
+from firmware_py.iterative_learning import learning_torque_Nm, record_correction, reset_learning
 from firmware_py.kernel import kernel
 from firmware_py.lugre import step_lugre
+from firmware_py.pid import integrate_error
 from firmware_py.rbfnn import adapt_network, network_torque_Nm, reset_network
 from firmware_py.records import LawConstants, LawState, Reference, VelocityState
 from firmware_py.states import ControllerKind, FeedForward
@@ -19,9 +26,19 @@ from firmware_py.states import ControllerKind, FeedForward
 
 @kernel
 def reset_law(constants: LawConstants, state: LawState) -> None:
-    """Forget everything learned."""
+    """Forget everything learned; the joint is at rest."""
     reset_network(constants.network, state.network)
+    reset_observer(state.observer, 0.0)
+    reset_learning(state.learning)
     state.lugre_deflection_rad = 0.0
+    state.integral_rads = 0.0
+    state.inertia_torque_Nm = 0.0
+    state.feedback_torque_Nm = 0.0
+    state.friction_torque_Nm = 0.0
+    state.gravity_torque_Nm = 0.0
+    state.network_torque_Nm = 0.0
+    state.observer_torque_Nm = 0.0
+    state.learned_torque_Nm = 0.0
 
 
 @kernel
@@ -49,28 +66,89 @@ def friction_feed_forward_Nm(
 
 
 @kernel
-def step_law(
-    constants: LawConstants, state: LawState, position_rad: float, velocity: VelocityState, reference: Reference
+def _learn(
+    constants: LawConstants, state: LawState, epoch: int, repeat_s: float, local_s: float, correction_Nm: float
 ) -> float:
-    """One cycle: the unlimited torque at the joint [Nm]; adapts the network afterwards."""
+    """Torque from iterative learning [Nm]; what it stops adding at a change is handed to the observer."""
+    before_Nm = state.learned_torque_Nm
+    epoch_before = state.learning.epoch
+    torque = learning_torque_Nm(constants.learning, state.learning, epoch, repeat_s, local_s, constants.period_s)
+    record_correction(constants.learning, state.learning, correction_Nm)
+    if epoch_before != state.learning.epoch or repeat_s == 0.0:
+        add_to_disturbance(constants.observer, state.observer, before_Nm)
+        state.observer_torque_Nm = state.observer.disturbance_Nm
+    return torque
+
+
+@kernel
+def _rest_torque_Nm(
+    constants: LawConstants, state: LawState, error: float, error_rate: float, velocity_radps: float, sent_Nm: float
+) -> float:
+    """What the kind of law adds for all that the model does not know [Nm]."""
+    state.network_torque_Nm = 0.0
+    state.observer_torque_Nm = 0.0
+    if constants.kind == ControllerKind.COMPUTED_TORQUE_RBF:
+        state.network_torque_Nm = network_torque_Nm(constants.network, state.network, error, error_rate)
+        adapt_network(constants.network, state.network, error, error_rate, constants.period_s)
+        return -state.network_torque_Nm
+    if constants.kind == ControllerKind.COMPUTED_TORQUE_OBSERVER:
+        known = state.friction_torque_Nm + state.gravity_torque_Nm + state.learned_torque_Nm
+        momentum = constants.inertia_kgm2 * velocity_radps
+        state.observer_torque_Nm = step_observer(
+            constants.observer, state.observer, sent_Nm, known, momentum, constants.period_s
+        )
+        return state.observer_torque_Nm
+    if constants.kind == ControllerKind.PID:
+        state.integral_rads = integrate_error(
+            state.integral_rads, error, constants.period_s, constants.integral_limit_rads
+        )
+        integral_torque = -constants.inertia_kgm2 * constants.ki * state.integral_rads
+        state.feedback_torque_Nm += integral_torque
+        return integral_torque
+    return 0.0
+
+
+@kernel
+def step_law(
+    constants: LawConstants,
+    state: LawState,
+    position_rad: float,
+    velocity: VelocityState,
+    reference: Reference,
+    sent_torque_Nm: float,
+    epoch: int,
+    repeat_s: float,
+    local_s: float,
+) -> float:
+    """One cycle: the unlimited torque at the joint [Nm]; what adapts, adapts afterwards.
+
+    `sent_torque_Nm` is the limited torque of the cycle before.  `epoch`, `repeat_s` and `local_s` say where in a
+    repeating trajectory this is (`trajectory.repetition`); repeat_s = 0 where nothing repeats.
+    """
     error = position_rad - reference.position_rad
     if constants.matched_filter != 0:
         error_rate = velocity.error_rate_radps
     else:
         error_rate = velocity.velocity_radps - reference.velocity_radps
     state.inertia_torque_Nm = constants.inertia_kgm2 * reference.acceleration_radps2
-    state.feedback_torque_Nm = -constants.inertia_kgm2 * (constants.kv * error_rate + constants.kp * error)
+    proportional_Nm = -constants.inertia_kgm2 * (constants.kv * error_rate + constants.kp * error)
+    state.feedback_torque_Nm = proportional_Nm
     state.gravity_torque_Nm = constants.coriolis_Nmspr * velocity.velocity_radps + constants.gravity_Nm * math.sin(
         position_rad - constants.gravity_zero_rad
     )
     state.friction_torque_Nm = friction_feed_forward_Nm(
         constants, state, velocity.velocity_radps, reference.velocity_radps
     )
-    torque = state.inertia_torque_Nm + state.feedback_torque_Nm + state.gravity_torque_Nm + state.friction_torque_Nm
-    if constants.kind == ControllerKind.COMPUTED_TORQUE_RBF:
-        state.network_torque_Nm = network_torque_Nm(constants.network, state.network, error, error_rate)
-        adapt_network(constants.network, state.network, error, error_rate, constants.period_s)
-        torque -= state.network_torque_Nm
-    else:
-        state.network_torque_Nm = 0.0
-    return torque
+    rest_Nm = _rest_torque_Nm(constants, state, error, error_rate, velocity.velocity_radps, sent_torque_Nm)
+    correction_Nm = proportional_Nm + rest_Nm - constants.inertia_kgm2 * constants.learning.error_gain_ps2 * error
+    state.learned_torque_Nm = _learn(constants, state, epoch, repeat_s, local_s, correction_Nm)
+    if constants.kind == ControllerKind.COMPUTED_TORQUE_OBSERVER:
+        rest_Nm = state.observer_torque_Nm
+    return (
+        state.inertia_torque_Nm
+        + proportional_Nm
+        + state.gravity_torque_Nm
+        + state.friction_torque_Nm
+        + state.learned_torque_Nm
+        + rest_Nm
+    )

@@ -73,6 +73,8 @@ def write_log(record: LogRecord, state: AxisState, sample: Sample, command: Comm
     record.friction_torque_Nm = state.law.friction_torque_Nm
     record.gravity_torque_Nm = state.law.gravity_torque_Nm
     record.network_torque_Nm = state.law.network_torque_Nm
+    record.observer_torque_Nm = state.law.observer_torque_Nm
+    record.learned_torque_Nm = state.law.learned_torque_Nm
     for i in range(len(record.weights)):
         record.weights[i] = state.law.network.weights[i]
     record.sample_age_cycles = state.sample_age_cycles

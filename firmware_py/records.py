@@ -12,6 +12,8 @@ import numpy as np
 from firmware_py.schema import array_of, f8, i4, i8, record, u4
 
 NEURONS = 15
+TORQUE_HISTORY = 16  # cycles that an observer can look back
+LEARNING_BINS = 1 << 14
 
 
 @record
@@ -65,6 +67,46 @@ class NetworkState:
 
 
 @record
+class ObserverConstants:
+    """See `disturbance_observer`."""
+
+    bandwidth_radps: f8  # 0 = off
+    delay_cycles: i8  # from the command to the torque that it becomes
+
+
+@record
+class ObserverState:
+    integral_Nms: f8
+    disturbance_Nm: f8
+    newest: i8
+    sent_torque_Nm: Annotated[np.ndarray, array_of(f8, TORQUE_HISTORY)]
+
+
+@record
+class LearningConstants:
+    """See `iterative_learning`."""
+
+    gain: f8  # 0 = off
+    error_gain_ps2: f8  # J error_gain e is learned on top of what feedback and observer added [1/s^2]
+    lead_cycles: i8
+    half_width: i8  # of the smoothing, in bins
+    blend_s: f8
+
+
+@record
+class LearningState:
+    epoch: i8
+    bins: i8
+    filled: i8  # bins written since the epoch began
+    present_bin: i8
+    last_bin: i8
+    weight: f8
+    torque_Nm: f8  # what is fed forward now
+    learned_Nm: Annotated[np.ndarray, array_of(f8, LEARNING_BINS)]
+    recorded_Nm: Annotated[np.ndarray, array_of(f8, LEARNING_BINS)]
+
+
+@record
 class LawConstants:
     kind: i4  # ControllerKind
     feed_forward: i4  # FeedForward
@@ -77,23 +119,32 @@ class LawConstants:
     gravity_zero_rad: f8
     kp: f8  # [1/s^2]
     kv: f8  # [1/s]
+    ki: f8  # [1/s^3], PID
+    integral_limit_rads: f8  # PID, 0 = none
     reduction_ratio: f8
     zero_band_radps: f8
     friction: FrictionConstants
     lugre: LuGreConstants
     network: NetworkConstants
+    observer: ObserverConstants
+    learning: LearningConstants
 
 
 @record
 class LawState:
     network: NetworkState
+    observer: ObserverState
+    learning: LearningState
     lugre_deflection_rad: f8
+    integral_rads: f8
     # kept for the log: the parts of the torque at the joint
     inertia_torque_Nm: f8
     feedback_torque_Nm: f8
     friction_torque_Nm: f8
     gravity_torque_Nm: f8
     network_torque_Nm: f8  # fhat, which is subtracted
+    observer_torque_Nm: f8
+    learned_torque_Nm: f8
 
 
 @record
@@ -256,6 +307,8 @@ class LogRecord:
     friction_torque_Nm: f8
     gravity_torque_Nm: f8
     network_torque_Nm: f8
+    observer_torque_Nm: f8
+    learned_torque_Nm: f8
     weights: Annotated[np.ndarray, array_of(f8, NEURONS)]
     wake_late_ns: i4  # wake-up after the deadline
     round_trip_ns: i4  # SYNC sent to sample received; 0 = none in this cycle

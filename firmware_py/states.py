@@ -95,6 +95,8 @@ class ControllerKind(IntEnum):
 
     COMPUTED_TORQUE = 0
     COMPUTED_TORQUE_RBF = 1  # the paper's (29)
+    COMPUTED_TORQUE_OBSERVER = 2  # a disturbance observer in the network's place
+    PID = 3  # no friction model unless the feed-forward is switched on
 
 
 class TrajectoryKind(IntEnum):

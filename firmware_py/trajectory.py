@@ -119,6 +119,35 @@ def _point_to_point_at(c: TrajectoryConstants, t_s: float, reference: Reference)
 
 
 @kernel
+def repetition(c: TrajectoryConstants, table: np.ndarray, t_s: float) -> tuple[int, float, float]:
+    """(epoch, period [s], time in the period [s]): where in a repeating motion `t_s` is; period 0 if none repeats.
+
+    The epoch changes where the motion changes: at a SINE's switch.
+    """
+    epoch = 0
+    period_s = 0.0
+    if t_s < 0.0:
+        return epoch, 0.0, 0.0
+    if c.kind == TrajectoryKind.SINE:
+        omega = c.omega_radps
+        if c.switch_s > 0.0 and t_s >= c.switch_s:
+            omega = c.omega2_radps
+            epoch = 1
+        period_s = 2.0 * math.pi / abs(omega) if omega != 0.0 else 0.0
+    elif c.repeats != 0 and (c.kind == TrajectoryKind.MIN_JERK or c.kind == TrajectoryKind.TRAPEZOID):
+        move_s = c.move_s
+        if c.kind == TrajectoryKind.TRAPEZOID:
+            ramp_s, cruise_s = trapezoid_times_s(abs(c.target_rad - c.start_rad), c.speed_radps, c.acceleration_radps2)
+            move_s = 2.0 * ramp_s + cruise_s
+        period_s = 2.0 * (move_s + c.dwell_s)
+    elif c.repeats != 0 and c.kind == TrajectoryKind.TABLE and c.table_rows >= 2:
+        period_s = table[c.table_rows - 1, 0]
+    if not period_s > 0.0:
+        return epoch, 0.0, 0.0
+    return epoch, period_s, t_s % period_s
+
+
+@kernel
 def _find_row(table: np.ndarray, rows: int, hint: int, t_s: float) -> int:
     """The row i in [0, rows - 2] with t0[i] <= t < t0[i + 1]; quick where the hint is near, else by bisection."""
     row = min(max(hint, 0), rows - 2)

@@ -28,6 +28,7 @@ from tools.config_sections import (
     Limits,
     Log,
     Loop,
+    Margin,
     Section,
     Sequence,
     Trajectory,
@@ -63,6 +64,7 @@ class Config(Section):
     trajectory: Trajectory
     friction: Friction | None = None
     virtual: Virtual | None = None
+    margin: Margin = Margin()
     log: Log = Log()
 
     _path: Path = PrivateAttr(default=Path())

@@ -108,6 +108,18 @@ def _control_problems(config: Config) -> list[str]:
     # explicit integration of the error dynamics: beyond this even the ideal sampled loop is unstable
     if control.kv + control.kp / rate >= 2.0 * rate:
         found.append(f"control.kv (={control.kv:g}) and control.kp (={control.kp:g}) are too high for {rate:g} Hz")
+    if (control.kind == "computed_torque_observer") != (control.observer_radps > 0.0):
+        found.append(
+            f"control.observer_radps (={control.observer_radps:g}) must be more than 0 with "
+            f'control.kind "computed_torque_observer" and 0 with any other (={control.kind})'
+        )
+    if control.kind != "pid" and control.ki:
+        found.append(f'control.ki (={control.ki:g}) must be 0 unless control.kind is "pid" (={control.kind})')
+    if control.learning is not None and control.kind != "computed_torque_observer":
+        found.append(
+            f'[control.learning] needs control.kind "computed_torque_observer" (={control.kind}): '
+            "the observer takes over when learning starts anew"
+        )
     if control.zero_rule == "linear" and control.zero_band_radps == 0.0:
         found.append('control.zero_band_radps (=0) must be more than 0 for control.zero_rule = "linear"')
     if control.weight_limit_Nm and abs(control.initial_weight_Nm) > control.weight_limit_Nm:

@@ -121,6 +121,15 @@ def _fill_law(law: Any, config: Config) -> None:
     law.gravity_Nm = joint.gravity_Nm
     law.gravity_zero_rad = joint.gravity_zero_rad
     law.kp, law.kv = control.kp, control.kv
+    law.ki, law.integral_limit_rads = control.ki, control.integral_limit_rads
+    law.observer.bandwidth_radps = control.observer_radps
+    law.observer.delay_cycles = control.observer_delay_cycles
+    if control.learning is not None:
+        law.learning.gain = control.learning.gain
+        law.learning.error_gain_ps2 = control.learning.error_gain_ps2
+        law.learning.lead_cycles = control.learning.lead_cycles
+        law.learning.half_width = control.learning.half_width_cycles
+        law.learning.blend_s = control.learning.blend_s
     law.reduction_ratio = joint.reduction_ratio
     law.zero_band_radps = control.zero_band_radps
     if config.friction is not None:

@@ -166,10 +166,24 @@ class Loop(Section):
     priority: Annotated[int, between(1, 98)] | None = None  # SCHED_FIFO; None = ordinary scheduling
 
 
+class Learning(Section):
+    """Iterative learning on a repeating trajectory, on top of computed_torque_observer."""
+
+    gain: Annotated[float, between(0.0, 1.0, open_low=True)]
+    error_gain_ps2: Annotated[float, between(0.0, 1e6)] = 0.0  # [1/s^2], weight of the error itself
+    lead_cycles: Annotated[int, between(0, 100)]  # delay from command to measured effect
+    half_width_cycles: Annotated[int, between(0, 100)]  # of the smoothing
+    blend_s: Annotated[float, between(0.001, 100.0)] = 0.5
+
+
 class Control(Section):
-    kind: Literal["computed_torque", "computed_torque_rbf"]
+    kind: Literal["computed_torque", "computed_torque_rbf", "computed_torque_observer", "pid"]
     kp: Annotated[float, between(0.0, 1e6, open_low=True)]  # [1/s^2]
     kv: Annotated[float, between(0.0, 1e4, open_low=True)]  # [1/s]
+    ki: Annotated[float, between(0.0, 1e8)] = 0.0  # [1/s^3], pid only
+    integral_limit_rads: Annotated[float, between(0.0, 1e3)] = 0.0  # pid only, 0 = none
+    observer_radps: Annotated[float, between(0.0, 2000.0)] = 0.0  # bandwidth, computed_torque_observer only
+    observer_delay_cycles: Annotated[int, between(0, 15)] = 1  # from a command to its torque
     q: Annotated[tuple[float, ...], _numbers("numbers", 1, 2, low=0.0, high=1e12)]  # Q = q I, or diag(q1, q2)
     learning_rate: Annotated[float, between(0.0, 1e9)]
     initial_weight_Nm: Annotated[float, between(-1000.0, 1000.0)]
@@ -183,6 +197,7 @@ class Control(Section):
     zero_band_radps: Annotated[float, between(0.0, 10.0)] = 0.0
     velocity_cutoff_Hz: Annotated[float, between(0.0, 2000.0)]  # 0 = no filter
     matched_filter: bool
+    learning: Learning | None = None
 
 
 class FrictionDirection(Section):
@@ -277,6 +292,14 @@ class Hold(Section):
 
 
 Trajectory = Annotated[Sine | MinJerk | Trapezoid | Table | Hold, Field(discriminator="kind")]
+
+
+class Margin(Section):
+    """What `check` computes with, and below what `run` refuses to enable."""
+
+    min_phase_margin_deg: Annotated[float, between(0.0, 90.0)] = 20.0
+    loop_delay_s: Annotated[float, between(0.0, 0.1)] | None = None  # command to torque; None = from the RPDO type
+    current_lag_s: Annotated[float, between(0.0, 0.1)] = 0.0005
 
 
 class Log(Section):

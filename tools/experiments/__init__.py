@@ -1,0 +1,1 @@
+"""Controllers compared on many simulated joints, and the paper's experiments."""
