@@ -1,0 +1,280 @@
+"""The verbs identify and validate: what they write, what they leave alone, what they say."""
+
+import io
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomlkit
+
+from drivers.errors import ConfigurationError, DataError
+from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
+from tools.config import load_config, shipped_config
+from tools.config_records import friction_constants
+from tools.identification import identification
+from tools.identification.friction_data import SWEEP_COLUMNS, ForeignFormat, sidecar_contents
+from tools.identification.friction_section import MARK, snippet, with_section
+from tools.identification.identification import Options
+from tools.identification.pso import SwarmSettings
+from tools.identify import identify
+from tools.output import Output
+from tools.validate import validate
+
+QUICK = Options(folds=3, swarm=SwarmSettings(particles=80, iterations=120))
+VALUES = {
+    "velocity_unit": "deg/s", "velocity_side": "joint", "torque_side": "motor",
+    "positive": {"tc_Nm": 0.1, "ts_Nm": 0.2, "ws": 1.5, "tv": 0.003, "a0": 0.1, "a1": 0.002, "a2": 0.0, "a3": 0.0,
+                 "knee": 40.0, "max": 200.0},
+    "negative": {"tc_Nm": 0.1, "ts_Nm": 0.2, "ws": 1.5, "tv": 0.003, "a0": -0.1, "a1": 0.002, "a2": 0.0, "a3": 0.0,
+                 "knee": -40.0, "max": -200.0},
+}  # fmt: skip
+
+
+def write_sweep(path, seed=0, factor=1.0, noise_Nm=0.0046):
+    velocity = np.linspace(-200.0, 200.0, 224) * DEGREE
+    noise = np.random.default_rng(seed).normal(0.0, noise_Nm, len(velocity))
+    torque = factor * (friction_curve_Nm(paper_friction(), velocity) + noise)
+    lines = [",".join(SWEEP_COLUMNS)]
+    for v, t in zip(velocity, torque, strict=True):
+        lines.append(f"{v:.9g},{t / 0.1:.9g},{t:.9g},0.01,0.05,500,1,-0.5,0.5,1.0,,{1 if v > 0 else -1},0")
+    path.write_text("\n".join(lines) + "\n")
+    path.with_suffix(".json").write_text(json.dumps(sidecar_contents(121.0, 0.1)))
+    return path
+
+
+@pytest.fixture
+def sweep(tmp_path):
+    return write_sweep(tmp_path / "sweep.csv")
+
+
+@pytest.fixture
+def config(tmp_path):
+    path = tmp_path / "joint.toml"
+    shutil.copy(shipped_config("virtual"), path)
+    return path
+
+
+def output(**options):
+    return Output(stdout=io.StringIO(), stderr=io.StringIO(), **options)
+
+
+def contents(folder):
+    return {p.name: p.read_bytes() for p in folder.iterdir()}
+
+
+def test_identify_writes_a_section_a_report_and_pictures_beside_the_data(sweep):
+    out = output()
+    assert identify(sweep, out, options=QUICK) == 0
+    names = {p.name for p in sweep.parent.iterdir()} - {"sweep.csv", "sweep.json"}
+    assert names == {
+        "sweep.friction.toml", "sweep.friction.report.json", "sweep.friction.png", "sweep.friction.convergence.png"
+    }  # fmt: skip
+    report = json.loads((sweep.parent / "sweep.friction.report.json").read_text())
+    section = tomlkit.parse((sweep.parent / "sweep.friction.toml").read_text()).unwrap()["friction"]
+    assert section == report["friction"]
+    assert len(report["data_sha256"]) == 64
+    assert report["data_sha256"] in (sweep.parent / "sweep.friction.toml").read_text()
+    for name in ("sweep.friction.png", "sweep.friction.convergence.png"):
+        assert (sweep.parent / name).read_bytes().startswith(b"\x89PNG")
+    shown = out.stdout.getvalue()
+    for word in ("tc", "95 % interval", "weak", "held out", "stribeck", "coulomb-viscous", "RMSE"):
+        assert word in shown
+
+
+def test_the_identified_curve_comes_back_out_of_the_configuration(sweep, config):
+    identify(sweep, output(), into=config, options=QUICK)
+    loaded = load_config(config)
+    constants = friction_constants(loaded.friction, loaded.joint.reduction_ratio)
+    velocity = np.concatenate([np.linspace(-200.0, -3.0, 150), np.linspace(3.0, 200.0, 150)]) * DEGREE
+    truth = friction_curve_Nm(paper_friction(), velocity)
+    assert np.max(np.abs(friction_curve_Nm(constants, velocity) - truth)) < 0.03 * np.max(np.abs(truth))
+
+
+def test_comments_and_other_sections_of_the_configuration_stay(sweep, config):
+    before = config.read_text()
+    identify(sweep, output(), into=config, options=QUICK)
+    identify(sweep, output(), into=config, options=QUICK)
+    after = config.read_text()
+    assert after.count(MARK) == 3  # those of the first time are gone
+    old, new = before.splitlines(), [line for line in after.splitlines() if not line.startswith(MARK)]
+    assert len(old) == len(new)
+    changed = [a for a, b in zip(old, new, strict=True) if a != b]
+    assert changed
+    assert all(line.split("=")[0].strip() in VALUES["positive"] for line in changed)
+    comments = [line.partition("#")[2] for line in old]
+    assert comments == [line.partition("#")[2] for line in new]
+
+
+def test_a_section_is_appended_where_there_is_none_and_lugre_is_kept():
+    text = "# mine\n[joint]\nreduction_ratio = 121.0 # checked"
+    added = with_section(text, VALUES, ["from a test"])
+    assert added.startswith(text + "\n")
+    assert tomlkit.parse(added).unwrap()["friction"] == VALUES
+    kept = with_section(added + "\n[friction.lugre]\nstiffness_Nmprad = 8e4 # bench\n", VALUES, ["again"])
+    assert tomlkit.parse(kept).unwrap()["friction"]["lugre"] == {"stiffness_Nmprad": 8e4}
+    assert "# bench" in kept
+    assert kept.count(MARK) == 1
+
+
+def test_a_section_with_lugre_alone_is_completed():
+    changed = with_section("[friction.lugre]\nstiffness_Nmprad = 8e4 # bench\n", VALUES, ["x"])
+    expected = {**VALUES, "lugre": {"stiffness_Nmprad": 8e4}}
+    assert tomlkit.parse(changed).unwrap()["friction"] == expected
+    assert "# bench" in changed
+
+
+def test_windows_line_ends_stay():
+    text = snippet(VALUES, ["x"]).replace("\n", "\r\n")
+    changed = with_section(text, {**VALUES, "velocity_unit": "rad/s"}, ["y"])
+    assert changed.count("\n") == changed.count("\r\n")
+    assert tomlkit.parse(changed).unwrap()["friction"]["velocity_unit"] == "rad/s"
+
+
+def test_the_snippet_is_what_the_configuration_reads():
+    assert tomlkit.parse(snippet(VALUES, [])).unwrap() == {"friction": VALUES}
+
+
+def test_a_configuration_without_friction_gets_it(sweep, config):
+    text = config.read_text()
+    document = tomlkit.parse(text.replace('"lugre_desired"', '"desired"'))
+    del document["friction"]
+    config.write_text(tomlkit.dumps(document))
+    with pytest.raises(ConfigurationError, match=r"\[friction\] is missing"):
+        load_config(config)
+    out = output()
+    identify(sweep, out, into=config, options=QUICK)
+    assert load_config(config).friction is not None
+    assert "cannot be compared" in out.stderr.getvalue()
+
+
+def test_the_mode_of_the_file_stays_and_a_link_stays_a_link(sweep, config, tmp_path):
+    config.chmod(0o640)
+    link = tmp_path / "link.toml"
+    link.symlink_to(config)
+    identify(sweep, output(), into=link, options=QUICK)
+    assert link.is_symlink()
+    assert config.stat().st_mode & 0o777 == 0o640
+    assert MARK in config.read_text()
+
+
+def edited(path, old, new):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "error"),
+    [
+        (lambda c, s: s.write_bytes(s.read_bytes()[:-40]), DataError),
+        (lambda c, s: edited(s, ",500,1,", ",500,nan,"), DataError),
+        (lambda c, s: write_sweep(s, factor=-1.0), DataError),
+        (lambda c, s: write_sweep(s, factor=3.0), DataError),
+        (lambda c, s: edited(s.with_suffix(".json"), "121.0", "100.0"), DataError),
+        (lambda c, s: edited(c, "[loop]", "[loop"), ConfigurationError),
+        (lambda c, s: edited(c, "[loop]", "[loop]\nspeed = 1"), ConfigurationError),
+    ],
+)
+def test_nothing_is_written_after_an_error(sweep, config, spoil, error):
+    spoil(config, sweep)
+    before = contents(sweep.parent)
+    with pytest.raises(error):
+        identify(sweep, output(), into=config, options=QUICK)
+    assert contents(sweep.parent) == before
+
+
+def test_a_result_that_the_configuration_refuses_leaves_it_alone(sweep, config, monkeypatch):
+    monkeypatch.setattr("tools.identify.section_values", lambda p, n: {**VALUES, "velocity_unit": "furlong"})
+    before = contents(sweep.parent)
+    with pytest.raises(ConfigurationError, match=r"joint.toml: friction.velocity_unit \(=furlong\)") as caught:
+        identify(sweep, output(), into=config, options=QUICK)
+    assert ".joint." not in str(caught.value)  # the temporary file is nobody's business
+    assert contents(sweep.parent) == before
+
+
+def test_an_interruption_writes_nothing(sweep, config, monkeypatch):
+    def interrupted(*args, **keywords):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(identification, "run_swarms", interrupted)
+    before = contents(sweep.parent)
+    with pytest.raises(KeyboardInterrupt):
+        identify(sweep, output(), into=config, options=QUICK)
+    assert contents(sweep.parent) == before
+
+
+@pytest.mark.parametrize("name", ["sweep.csv", "sweep.json", "section"])
+def test_the_section_goes_into_a_toml_file_only(sweep, name):
+    before = contents(sweep.parent)
+    with pytest.raises(DataError, match=r"must end in \.toml"):
+        identify(sweep, output(), out=sweep.parent / name, options=QUICK)
+    assert contents(sweep.parent) == before
+
+
+def test_the_inputs_are_never_overwritten_and_a_missing_folder_is_told(sweep, config):
+    before = contents(sweep.parent)
+    with pytest.raises(DataError, match="is an input of this command"):
+        identify(sweep, output(), out=config, config=config, options=QUICK)
+    with pytest.raises(DataError, match="no folder"):
+        identify(sweep, output(), into=config, out=sweep.parent / "none" / "x.toml", options=QUICK)
+    assert contents(sweep.parent) == before
+
+
+def test_json_output_is_one_document(sweep):
+    out = output(json=True)
+    identify(sweep, out, options=QUICK)
+    result = json.loads(out.stdout.getvalue())
+    assert result["model"] == "multi-stage"
+    assert all(Path(p).exists() for p in result["files"])
+
+
+def test_other_peoples_table_gives_the_same_model_as_our_own(sweep, tmp_path):
+    identify(sweep, output(), out=tmp_path / "ours.toml", options=QUICK)
+    rows = np.genfromtxt(sweep, delimiter=",", names=True)
+    theirs = tmp_path / "theirs.txt"
+    speed_rpm = rows["velocity_radps"] * 121.0 * 60.0 / (2.0 * np.pi)
+    theirs.write_text("rpm;A\n" + "".join(f"{float(v)!r};{float(i)!r}\n" for v, i in
+                                          zip(speed_rpm, rows["current_A"], strict=True)))  # fmt: skip
+    told = ForeignFormat(velocity_column="rpm", current_column="A", velocity_unit="r/min", side="motor", ratio=121.0,
+                         torque_constant_NmpA=0.1)  # fmt: skip
+    identify(theirs, output(), out=tmp_path / "theirs.toml", told=told, options=QUICK)
+    ours, other = (tomlkit.parse((tmp_path / f"{n}.toml").read_text()).unwrap()["friction"] for n in ("ours", "theirs"))
+    assert other["positive"] == pytest.approx(ours["positive"], rel=1e-3, abs=1e-10)
+
+
+def test_validate_reports_the_error_on_other_data(config, tmp_path):
+    other = write_sweep(tmp_path / "other.csv", seed=9)
+    out = output(json=True)
+    assert validate(config, other, out) == 0
+    result = json.loads(out.stdout.getvalue())
+    assert result["rmse_Nm"] == pytest.approx(0.0046, rel=0.12)
+    assert result["points"] == 224
+    assert Path(result["picture"]).read_bytes().startswith(b"\x89PNG")
+
+
+def test_validate_shows_a_joint_whose_friction_has_grown(config, tmp_path):
+    out = output(json=True)
+    validate(config, write_sweep(tmp_path / "other.csv", factor=1.1, noise_Nm=0.0), out)
+    result = json.loads(out.stdout.getvalue())
+    assert result["relative_rmse"] == pytest.approx(0.1 / 1.1, rel=1e-3)
+    assert result["max_error_Nm"] == pytest.approx(0.035398, rel=1e-3)
+
+
+def test_validate_needs_friction_and_believable_data(config, tmp_path):
+    with pytest.raises(DataError, match="does not oppose the motion"):
+        validate(config, write_sweep(tmp_path / "wrong.csv", factor=-1.0), output())
+    assert not (tmp_path / "wrong.validation.png").exists()
+    good = write_sweep(tmp_path / "good.csv")
+    with pytest.raises(DataError, match="is an input"):
+        validate(config, good, output(), figure=good)
+
+
+def test_validate_takes_data_of_one_direction(config, tmp_path):
+    path = write_sweep(tmp_path / "half.csv")
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([lines[0], *lines[113:]]) + "\n")
+    out = output(json=True)
+    assert validate(config, path, out) == 0
+    assert json.loads(out.stdout.getvalue())["points"] == 112

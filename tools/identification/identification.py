@@ -1,0 +1,267 @@
+"""From friction data to an identified model: outliers, knee, swarm, polish, cross-check, selection, intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from drivers.errors import DataError
+from firmware_py.friction import DEGREE
+from tools.identification.friction_data import FrictionData
+from tools.identification.intervals import Uncertainty, uncertainty
+from tools.identification.models import FORMS, MIN_PER_STAGE, Branch
+from tools.identification.plausibility import JointLimits, check_branches, check_data
+from tools.identification.polish import polish
+from tools.identification.pso import SwarmResult, SwarmSettings, run_swarms
+from tools.identification.selection import MAX_OUTLIERS, choose, find_outliers, held_out_rss, with_form
+from tools.identification.variable_projection import Fit, Problem, make_problem, project
+
+DIRECTIONS = (("positive", 1), ("negative", -1))
+_BAD_FIT = 0.15  # RMSE over mean friction
+MODELS = ("multi-stage", "stribeck", "coulomb-viscous", "auto")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to fit and how; speeds in joint rad/s."""
+
+    model: str = "multi-stage"
+    continuous: bool = False
+    search_knee: bool = False
+    knee_radps: float = 40.0 * DEGREE
+    ws_min_radps: float | None = None  # None: a third of the lowest speed
+    ws_max_radps: float = 20.0 * DEGREE
+    static_max_Nm: float | None = None  # None: 1.25 times the greatest friction near zero speed
+    outlier_threshold: float = 5.0
+    folds: int = 10
+    swarm: SwarmSettings = field(default_factory=SwarmSettings)
+
+    def check(self) -> None:
+        """Raise `DataError` for a value out of range."""
+        s = self.swarm
+        for name, value, low, high in (
+            ("--knee [rad/s]", self.knee_radps, 1e-6, 1e3), ("--ws-max [rad/s]", self.ws_max_radps, 1e-9, 1e3),
+            ("--outlier-threshold", self.outlier_threshold, 0.0, 100.0), ("--folds", self.folds, 2, 100),
+            ("--particles", s.particles, 2, 100_000), ("--iterations", s.iterations, 1, 1_000_000),
+            ("--inertia", s.inertia, 0.0, 1.0), ("--cognitive", s.cognitive, 0.0, 4.0),
+            ("--social", s.social, 0.0, 4.0), ("--seed", s.seed, 0, 2**63 - 1), ("--stall", s.stall, 0, 1_000_000),
+        ):  # fmt: skip
+            if not low <= value <= high:
+                raise DataError(f"{name} (={value:g}) must be in [{low:g}..{high:g}]")
+        if self.ws_min_radps is not None and not 0.0 < self.ws_min_radps < self.ws_max_radps:
+            raise DataError(f"--ws-min (={self.ws_min_radps:g} rad/s) must be in (0..{self.ws_max_radps:g})")
+        if self.model not in MODELS:
+            raise DataError(f"--model (={self.model}) must be one of {', '.join(MODELS)}")
+
+
+@dataclass(frozen=True)
+class Direction:
+    """The result of one direction; arrays over the used points are in `fit.problem`, mirrored."""
+
+    fit: Fit
+    swarm: SwarmResult | None
+    projected_rmse_Nm: float
+    source: str  # where the parameters come from: swarm and polish, or variable projection
+    uncertainty: Uncertainty
+    index: np.ndarray  # of the used points in the data
+    outliers: np.ndarray  # indices in the data
+    outlier_scores: np.ndarray
+
+
+@dataclass(frozen=True)
+class Identification:
+    """All that there is to tell; `errors_Nm` is measured minus model over the used points of both directions."""
+
+    data: FrictionData
+    options: Options
+    model: str
+    directions: dict[str, Direction]
+    rmse_by_model_Nm: dict[str, float]
+    held_out_by_model_Nm: dict[str, float]
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def branches(self) -> dict[str, Branch]:
+        return {word: found.fit.branch() for word, found in self.directions.items()}
+
+    @property
+    def errors_Nm(self) -> np.ndarray:
+        parts = []
+        for word, sign in DIRECTIONS:
+            fit = self.directions[word].fit
+            parts.append(sign * (fit.problem.y_Nm - fit.torque_Nm(fit.problem.x)))
+        return np.concatenate(parts)
+
+    @property
+    def measured_Nm(self) -> np.ndarray:
+        return np.concatenate([sign * self.directions[word].fit.problem.y_Nm for word, sign in DIRECTIONS])
+
+    @property
+    def rmse_Nm(self) -> float:
+        return float(np.sqrt(np.mean(self.errors_Nm**2)))
+
+    @property
+    def projected_rmse_Nm(self) -> float:
+        """What variable projection reaches: the least possible."""
+        return _pooled({w: d.projected_rmse_Nm for w, d in self.directions.items()}, self.directions)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as numbers, texts, lists and dicts; parameters mirrored, joint rad/s and motor Nm."""
+        errors, swarm = self.errors_Nm, self.options.swarm
+        return {
+            "data": str(self.data.path), "data_sha256": self.data.sha256, "model": self.model,
+            "reduction_ratio": self.data.reduction_ratio, "points": len(errors),
+            "rmse_Nm": self.rmse_Nm, "max_error_Nm": float(np.max(np.abs(errors))),
+            "relative_rmse": float(np.sqrt(np.mean((errors / self.measured_Nm) ** 2))),
+            "relative_max_error": float(np.max(np.abs(errors / self.measured_Nm))),
+            "held_out_rmse_Nm": self.held_out_by_model_Nm[self.model],
+            "projected_rmse_Nm": self.projected_rmse_Nm,
+            "models": {
+                name: {"rmse_Nm": self.rmse_by_model_Nm[name], "held_out_rmse_Nm": self.held_out_by_model_Nm[name]}
+                for name in self.rmse_by_model_Nm
+            },
+            "swarm": {
+                "seed": swarm.seed, "particles": swarm.particles, "iterations": swarm.iterations,
+                "inertia": swarm.inertia, "cognitive": swarm.cognitive, "social": swarm.social,
+            },
+            "directions": {word: _direction_dict(found, self.data) for word, found in self.directions.items()},
+            "notes": list(self.notes), "warnings": list(self.warnings),
+        }  # fmt: skip
+
+
+def _direction_dict(found: Direction, data: FrictionData) -> dict[str, Any]:
+    model = found.fit.branch()
+    return {
+        "parameters": {
+            name: {"value": i.value, "low": i.low, "high": i.high, "weak": i.weak or None}
+            for name, i in found.uncertainty.intervals.items()
+        },
+        "knee_radps": model.knee_radps, "max_radps": model.max_radps, "rmse_Nm": found.fit.rmse_Nm,
+        "swarm_rmse_Nm": found.swarm.fit.rmse_Nm if found.swarm else None,
+        "projected_rmse_Nm": found.projected_rmse_Nm, "source": found.source,
+        "iterations": found.swarm.iterations if found.swarm else 0,
+        "outlier_lines": [int(n) for n in data.line[found.outliers]],
+    }  # fmt: skip
+
+
+def _pooled(rmse: dict[str, float], directions: dict[str, Any]) -> float:
+    count = {word: len(d.fit.problem.x) for word, d in directions.items()}
+    return float(np.sqrt(sum(rmse[w] ** 2 * count[w] for w in rmse) / sum(count.values())))
+
+
+def _refuse(data: FrictionData, problems: list[str]) -> None:
+    if problems:
+        raise DataError(f"{data.path}: {'; '.join(problems)}")
+
+
+def _stage_check(data: FrictionData, problem: Problem, word: str) -> None:
+    low = int(np.count_nonzero(problem.x <= problem.knee))
+    if problem.form.cubic and min(low, len(problem.x) - low) < MIN_PER_STAGE:
+        raise DataError(
+            f"{data.path}: {low} points up to the knee (={problem.knee * problem.top_radps / DEGREE:.4g} deg/s) and "
+            f"{len(problem.x) - low} beyond at {word} velocity: at least {MIN_PER_STAGE} are needed on both sides",
+            "set --knee, or --search-knee, or --model stribeck",
+        )
+
+
+def identify_friction(
+    data: FrictionData,
+    options: Options,
+    *,
+    limits: JointLimits | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Identification:
+    """The whole computation; raises `DataError` where the data or the result are not believable."""
+    options.check()
+    before = check_data(data, limits)
+    _refuse(data, before.problems)
+    first = FORMS[("multi-stage-continuous" if options.continuous else "multi-stage")]
+    if options.model in ("stribeck", "coulomb-viscous"):
+        first = FORMS[options.model]
+    notes, warnings = list(data.notes), list(before.warnings)
+    problems: dict[str, Problem] = {}
+    index, outliers, scores = {}, {}, {}
+    for word, sign in DIRECTIONS:
+        chosen = data.direction(sign)
+        chosen = chosen[np.argsort(sign * data.velocity_radps[chosen], kind="stable")]
+        problem = make_problem(
+            first, sign * data.velocity_radps[chosen], sign * data.motor_torque_Nm[chosen], options.knee_radps,
+            (options.ws_min_radps, options.ws_max_radps), options.static_max_Nm,
+        )  # fmt: skip
+        if not options.search_knee:
+            _stage_check(data, problem, word)
+        elif first.cubic:
+            problem = replace(problem, knee=project(problem, search_knee=True).knee)
+        out, score = find_outliers(problem, options.outlier_threshold)
+        if np.count_nonzero(out) > MAX_OUTLIERS * len(out):
+            warnings.append(
+                f"{np.count_nonzero(out)} of {len(out)} points at {word} velocity are far from the curve: the model "
+                "does not describe these data; none was left out"
+            )
+            out = np.zeros_like(out)
+        for line, value in zip(data.line[chosen[out]], score[out], strict=True):
+            notes.append(f"line {line}: outlier at {word} velocity, {abs(value):.1f} standard deviations: not used")
+        problem = problem.part(~out)
+        if options.search_knee and first.cubic and out.any():
+            problem = replace(problem, knee=project(problem, search_knee=True).knee)
+        _stage_check(data, problem, word)
+        problems[word], index[word] = problem, chosen[~out]
+        outliers[word], scores[word] = chosen[out], score[out]
+
+    total = sum(len(p.x) for p in problems.values())
+    rmse, held_out = {}, {}
+    names = [n for n in FORMS if FORMS[n].cubic <= first.cubic]
+    for name in names:
+        parts = [with_form(p, FORMS[name]) for p in problems.values()]
+        rmse[name] = float(np.sqrt(sum(project(p).rss for p in parts) / total))
+        squared = sum(held_out_rss(p, options.folds, options.swarm.seed) for p in parts)
+        held_out[name] = float(np.sqrt(squared / total))
+    model = choose(held_out) if options.model == "auto" else first.name
+    best = choose(held_out)
+    if model != best and held_out[best] < held_out[model] / 1.02:
+        warnings.append(
+            f"the model {best} predicts held-out points better: {held_out[best]:.4g} against {held_out[model]:.4g} Nm"
+        )
+    problems = {word: with_form(p, FORMS[model]) for word, p in problems.items()}
+    swarms: list[SwarmResult | None] = [None] * len(problems)
+    if FORMS[model].stribeck:
+        swarms = list(
+            run_swarms(list(problems.values()), options.swarm, search_knee=options.search_knee, progress=progress)
+        )
+    directions = {}
+    for (word, problem), swarm in zip(problems.items(), swarms, strict=True):
+        fit, projected, source = _best_fit(problem, swarm, warnings, word)
+        directions[word] = Direction(
+            fit, swarm, projected, source, uncertainty(fit), index[word], outliers[word], scores[word]
+        )  # fmt: skip
+    for word, found in directions.items():
+        share = found.fit.rmse_Nm / float(np.mean(np.abs(found.fit.problem.y_Nm)))
+        if share > _BAD_FIT:
+            warnings.append(
+                f"the model describes the data at {word} velocity badly: RMSE is {share:.0%} of the friction"
+            )
+    after = check_branches({word: found.fit.branch() for word, found in directions.items()})
+    _refuse(data, after.problems)
+    return Identification(
+        data, options, model, directions, rmse, held_out, tuple(notes), tuple(warnings + after.warnings)
+    )  # fmt: skip
+
+
+def _best_fit(problem: Problem, swarm: SwarmResult | None, warnings: list[str], word: str) -> tuple[Fit, float, str]:
+    """(fit, RMSE of variable projection, source); the exact minimum is taken where swarm and polish stay above it."""
+    projected = project(problem)  # a searched knee is already the problem's
+    if swarm is None:
+        return projected, projected.rmse_Nm, "least squares"
+    polished = polish(swarm.fit)
+    if polished.rss <= projected.rss * (1.0 + 1e-6):
+        return polished, projected.rmse_Nm, "swarm and polish"
+    if polished.rmse_Nm > 1.01 * projected.rmse_Nm:
+        warnings.append(
+            f"the swarm at {word} velocity ended {polished.rmse_Nm / projected.rmse_Nm - 1.0:.1%} above the least "
+            "RMSE: more particles or iterations, or another seed; the variable projection is used"
+        )
+    return projected, projected.rmse_Nm, "variable projection"
