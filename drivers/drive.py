@@ -30,6 +30,7 @@ class CommissioningReport:
     position_resolution_rad: float
     settings: dict[str, str] = field(default_factory=dict)  # name -> value read back
     remarks: tuple[str, ...] = ()
+    loop_delay_s: float | None = None  # measured, position sample to torque command; None = not measured
 
 
 @dataclass(frozen=True)

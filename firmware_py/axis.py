@@ -2,6 +2,8 @@
 
     position -> phase and reference -> velocity -> safety -> law -> finite check, torque limit, rate limit
 
+With CommandKind.VELOCITY the last part is the velocity command -> finite check, velocity limit, acceleration limit.
+
 The phases themselves are in `sequence`, the limits in `safety`.
 """
 
@@ -24,9 +26,12 @@ from firmware_py.sequence import (
     trip,
     write_command,
 )
-from firmware_py.states import AxisPhase, Fault, Reaction
+from firmware_py.states import AxisPhase, CommandKind, Fault, Reaction
 from firmware_py.trajectory import approach_at, brake_step, reference_at, repetition
 from firmware_py.velocity import step_velocity
+from firmware_py.velocity_command import limited_velocity_radps, velocity_command_radps
+
+REACTION_CYCLES = 2  # between seeing that the reference leaves its limits and the first braked cycle
 
 
 @kernel
@@ -96,17 +101,31 @@ def _move_reference(constants: AxisConstants, state: AxisState, table: np.ndarra
     else:
         _brake(constants, state, elapsed_cycles)
         return
-    fault = reference_fault(constants.limits, state.reference.position_rad, state.reference.velocity_radps)
+    reference = state.reference
+    fault = reference_fault(
+        constants.limits,
+        reference.position_rad,
+        reference.velocity_radps,
+        constants.sequence.brake_radps2,
+        REACTION_CYCLES * constants.law.period_s,
+    )
     trip(state, fault, state.reference.position_rad, 0)
 
 
 @kernel
 def _brake(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> None:
-    """RAMPING: brake the reference, then wait until the joint itself stands."""
+    """RAMPING: brake the reference, then wait until the joint itself has stood for a while.
+
+    One slow reading is not enough: an oscillating joint has one at every reversal.
+    """
     for _ in range(elapsed_cycles):
         brake_step(state.reference, constants.sequence.brake_radps2, constants.law.period_s)
-    if state.reference.velocity_radps == 0.0:
-        if abs(state.velocity.velocity_radps) <= constants.limits.standstill_radps:
+    still = abs(state.velocity.velocity_radps) <= constants.limits.standstill_radps
+    if not still or state.reference.velocity_radps != 0.0 or state.sample_age_cycles > 0:
+        state.still_cycles = 0
+    else:
+        state.still_cycles += elapsed_cycles
+        if state.still_cycles >= constants.sequence.settle_cycles:
             enter(state, AxisPhase.RELEASING)
     if state.phase_cycle > constants.sequence.stop_max_cycles:
         trip(state, Fault.STOP_TIMEOUT, state.velocity.velocity_radps, 0)
@@ -126,25 +145,24 @@ def _check_motion(constants: AxisConstants, state: AxisState) -> None:
 
 
 @kernel
-def _released_torque_Nm(constants: AxisConstants, state: AxisState) -> float:
+def _released_torque_Nm(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> float:
     """RELEASING: the last torque along a straight line to zero."""
     left_cycles = constants.sequence.release_s / constants.law.period_s - state.phase_cycle
     if left_cycles <= 0.0:
         enter(state, AxisPhase.DISABLING)
         return 0.0
-    return state.command_torque_Nm * left_cycles / (left_cycles + 1.0)
+    return state.command_torque_Nm * left_cycles / (left_cycles + elapsed_cycles)
 
 
 @kernel
-def _command_torque(constants: AxisConstants, state: AxisState, table: np.ndarray) -> None:
+def _command_torque(constants: AxisConstants, state: AxisState, table: np.ndarray, elapsed_cycles: int) -> None:
     """The torque of this cycle; a torque that is not finite is never sent."""
     if state.phase == AxisPhase.RELEASING:
-        state.unlimited_torque_Nm = _released_torque_Nm(constants, state)
+        state.unlimited_torque_Nm = _released_torque_Nm(constants, state, elapsed_cycles)
     elif powered(state.phase):
         epoch, repeat_s, local_s = 0, 0.0, 0.0
         if state.phase == AxisPhase.TRACKING:
-            time_s = state.trajectory_s - constants.law.period_s  # of the present reference
-            epoch, repeat_s, local_s = repetition(constants.trajectory, table, time_s)
+            epoch, repeat_s, local_s = repetition(constants.trajectory, table, state.trajectory_s)
         state.unlimited_torque_Nm = step_law(
             constants.law,
             state.law,
@@ -165,12 +183,50 @@ def _command_torque(constants: AxisConstants, state: AxisState, table: np.ndarra
     if not finite:
         trip(state, Fault.NOT_FINITE, state.unlimited_torque_Nm, 0)
     if abs(torque_Nm) >= limits.torque_max_Nm:
-        state.saturated_cycles += 1
+        state.saturated_cycles += elapsed_cycles
         if state.saturated_cycles > limits.saturation_max_cycles:
             trip(state, Fault.TORQUE_SATURATED, torque_Nm, 0)
     else:
         state.saturated_cycles = 0
     state.command_torque_Nm = torque_Nm if powered(state.phase) else 0.0
+
+
+@kernel
+def _command_velocity(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> None:
+    """The velocity of this cycle for a drive that closes the velocity loop; zero while the torque is released.
+
+    The torque limit is the drive's; at the limit for too long is a fault here as well, by the measured torque.
+    """
+    limits = constants.limits
+    period_s = constants.law.period_s
+    if state.phase == AxisPhase.RELEASING:
+        if state.phase_cycle * period_s >= constants.sequence.release_s:
+            enter(state, AxisPhase.DISABLING)
+        unlimited_radps = 0.0
+    elif powered(state.phase):
+        unlimited_radps = velocity_command_radps(
+            constants.velocity_command, state.reference, state.measured_position_rad
+        )
+    else:
+        state.command_velocity_radps = 0.0
+        state.saturated_cycles = 0
+        return
+    velocity_radps, finite = limited_velocity_radps(
+        limits,
+        constants.velocity_command.acceleration_max_radps2,
+        unlimited_radps,
+        state.command_velocity_radps,
+        elapsed_cycles * period_s,
+    )
+    if not finite:
+        trip(state, Fault.NOT_FINITE, unlimited_radps, 0)
+    if not abs(state.measured_torque_Nm) < limits.torque_max_Nm:
+        state.saturated_cycles += elapsed_cycles
+        if state.saturated_cycles > limits.saturation_max_cycles:
+            trip(state, Fault.TORQUE_SATURATED, state.measured_torque_Nm, 0)
+    else:
+        state.saturated_cycles = 0
+    state.command_velocity_radps = velocity_radps if powered(state.phase) else 0.0
 
 
 @kernel
@@ -196,7 +252,7 @@ def step_axis(
     request_stop(state, stop_request)
     _check_surroundings(constants, state, sample, elapsed_cycles - 1, supervisor_age_cycles)
     if state.phase == AxisPhase.WAITING:
-        step_waiting(constants, state)
+        step_waiting(constants, state, sample)
     elif state.phase == AxisPhase.ENABLING:
         step_enabling(constants, state, sample, table)
     if state.phase >= AxisPhase.APPROACH and state.phase <= AxisPhase.RAMPING:
@@ -206,6 +262,9 @@ def step_axis(
         step_velocity(constants.velocity, state.velocity, sample.position_rad, error_rad, gap_cycles)
     if powered(state.phase):
         _check_motion(constants, state)
-    _command_torque(constants, state, table)
+    if constants.command_kind == CommandKind.VELOCITY:
+        _command_velocity(constants, state, elapsed_cycles)
+    else:
+        _command_torque(constants, state, table, elapsed_cycles)
     step_stopping(constants, state, sample)
     write_command(state, command)

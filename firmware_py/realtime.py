@@ -68,6 +68,7 @@ def write_log(record: LogRecord, state: AxisState, sample: Sample, command: Comm
     record.command_torque_Nm = state.command_torque_Nm
     record.unlimited_torque_Nm = state.unlimited_torque_Nm
     record.measured_torque_Nm = state.measured_torque_Nm
+    record.command_velocity_radps = state.command_velocity_radps
     record.inertia_torque_Nm = state.law.inertia_torque_Nm
     record.feedback_torque_Nm = state.law.feedback_torque_Nm
     record.friction_torque_Nm = state.law.friction_torque_Nm

@@ -227,6 +227,15 @@ class SequenceConstants:
     stop_max_cycles: i8
     off_max_cycles: i8
     supervisor_max_cycles: i8  # 0 = not supervised
+    may_enable: i4  # 0 holds the run in WAITING until the supervisor has checked the measured delay
+
+
+@record
+class VelocityCommandConstants:
+    """See `velocity_command`."""
+
+    position_gain_ps: f8
+    acceleration_max_radps2: f8
 
 
 @record
@@ -236,6 +245,8 @@ class AxisConstants:
     trajectory: TrajectoryConstants
     limits: LimitConstants
     sequence: SequenceConstants
+    command_kind: i4  # CommandKind
+    velocity_command: VelocityCommandConstants
 
 
 @record
@@ -256,6 +267,7 @@ class Sample:
 @record
 class Command:
     torque_Nm: f8
+    velocity_radps: f8  # CommandKind.VELOCITY only
     request: i4  # DriveRequest
 
 
@@ -271,6 +283,7 @@ class AxisState:
     sample_count: i8
     sample_age_cycles: i8
     saturated_cycles: i8
+    still_cycles: i8
     restarts_at_start: i4
     table_row: i4  # search hint of the trajectory table
     fault_value: f8  # the value that tripped the limit
@@ -279,6 +292,7 @@ class AxisState:
     measured_torque_Nm: f8
     command_torque_Nm: f8
     unlimited_torque_Nm: f8  # the law's output before limits, kept for the log
+    command_velocity_radps: f8  # CommandKind.VELOCITY only
     approach: Annotated[np.ndarray, array_of(f8, 6)]  # quintic coefficients
     reference: Reference
     velocity: VelocityState
@@ -302,6 +316,7 @@ class LogRecord:
     command_torque_Nm: f8
     unlimited_torque_Nm: f8
     measured_torque_Nm: f8
+    command_velocity_radps: f8
     inertia_torque_Nm: f8
     feedback_torque_Nm: f8
     friction_torque_Nm: f8

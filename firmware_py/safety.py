@@ -31,9 +31,14 @@ def motion_fault(limits: LimitConstants, position_rad: float, velocity_radps: fl
 
 
 @kernel
-def reference_fault(limits: LimitConstants, position_rad: float, velocity_radps: float) -> Fault:
-    """Fault of the desired motion."""
+def reference_fault(
+    limits: LimitConstants, position_rad: float, velocity_radps: float, brake_radps2: float, ahead_s: float
+) -> Fault:
+    """Fault of the desired motion: braked `ahead_s` from now, it must come to rest inside the position limits."""
+    stop_rad = position_rad + velocity_radps * (ahead_s + 0.5 * abs(velocity_radps) / brake_radps2)
     if not within(position_rad, limits.position_min_rad, limits.position_max_rad):
+        return Fault.REFERENCE_LIMIT
+    if not within(stop_rad, limits.position_min_rad, limits.position_max_rad):
         return Fault.REFERENCE_LIMIT
     if not within(velocity_radps, -limits.velocity_max_radps, limits.velocity_max_radps):
         return Fault.REFERENCE_LIMIT

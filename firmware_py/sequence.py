@@ -35,11 +35,13 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.sample_count = 0
     state.sample_age_cycles = 0
     state.saturated_cycles = 0
+    state.still_cycles = 0
     state.restarts_at_start = -1
     state.table_row = 0
     state.trajectory_s = 0.0
     state.command_torque_Nm = 0.0
     state.unlimited_torque_Nm = 0.0
+    state.command_velocity_radps = 0.0
     state.velocity.primed = 0
     reset_law(constants.law, state.law)
 
@@ -100,7 +102,7 @@ def request_stop(state: AxisState, stop_request: int) -> None:
 
 
 @kernel
-def step_waiting(constants: AxisConstants, state: AxisState) -> None:
+def step_waiting(constants: AxisConstants, state: AxisState, sample: Sample) -> None:
     """WAITING: some good samples at standstill inside the limits, then ask the drive to enable."""
     limits = constants.limits
     moving = not abs(state.velocity.velocity_radps) <= limits.standstill_radps
@@ -109,12 +111,15 @@ def step_waiting(constants: AxisConstants, state: AxisState) -> None:
         if fault != Fault.NONE:
             trip(state, fault, state.measured_position_rad, 0)
             return
-        if not moving:
+        enabled = sample.drive_state == DriveState.ENABLED  # it should be off: nobody has asked for more
+        if not moving and not enabled and constants.sequence.may_enable != 0:
             enter(state, AxisPhase.ENABLING)
             return
     if state.phase_cycle > constants.sequence.wait_max_cycles:
         if state.sample_count == 0:
             trip(state, Fault.NO_SAMPLES, 0.0, 0)
+        elif sample.drive_state == DriveState.ENABLED:
+            trip(state, Fault.DRIVE_STAYS_ENABLED, float(sample.status_word), sample.drive_error)
         elif moving:
             trip(state, Fault.NOT_AT_STANDSTILL, state.velocity.velocity_radps, 0)
         else:
@@ -164,6 +169,7 @@ def step_stopping(constants: AxisConstants, state: AxisState, sample: Sample) ->
 def write_command(state: AxisState, command: Command) -> None:
     """What the drive is asked for in this phase."""
     command.torque_Nm = state.command_torque_Nm
+    command.velocity_radps = state.command_velocity_radps
     if state.phase == AxisPhase.QUICK_STOPPING:
         command.request = DriveRequest.QUICK_STOP
     elif state.phase >= AxisPhase.ENABLING and state.phase <= AxisPhase.RELEASING:

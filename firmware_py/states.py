@@ -62,6 +62,7 @@ class Fault(IntEnum):
     NOT_AT_STANDSTILL = 17  # the joint moved while waiting to enable
     OVERRUN = 18  # too many cycles skipped
     POSITION_JUMP = 19  # the encoder moved faster than the joint can
+    DRIVE_STAYS_ENABLED = 20  # enabled before the loop asked for it, and it does not switch off
 
 
 class Reaction(IntEnum):
@@ -107,6 +108,13 @@ class TrajectoryKind(IntEnum):
     MIN_JERK = 2
     TRAPEZOID = 3
     TABLE = 4
+
+
+class CommandKind(IntEnum):
+    """What the loop sends to the drive."""
+
+    TORQUE = 0
+    VELOCITY = 1  # the drive closes the velocity loop itself
 
 
 class StopRequest(IntEnum):

@@ -61,6 +61,9 @@ def run(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="commission, show the motion envelope, move nothing")
     ] = False,
+    allow_low_margin: Annotated[
+        bool, typer.Option("--allow-low-margin", help="run a stable loop below margin.min_phase_margin_deg")
+    ] = False,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -69,7 +72,11 @@ def run(
     from tools.run import run as run_run
 
     loaded = with_bus_overrides(load_config(_config_path(config)), interface, channel, bitrate)
-    raise typer.Exit(run_run(loaded, Output(json=json, quiet=quiet), assume_yes=yes, dry_run=dry_run))
+    raise typer.Exit(
+        run_run(
+            loaded, Output(json=json, quiet=quiet), assume_yes=yes, dry_run=dry_run, allow_low_margin=allow_low_margin
+        )
+    )
 
 
 @app.command()
@@ -88,6 +95,40 @@ def hil(
 
     loaded = with_bus_overrides(load_config(_config_path(config)), interface, channel, bitrate)
     raise typer.Exit(run_hil(loaded, Output(quiet=quiet), timing=timing, ready_fd=ready_fd))
+
+
+@app.command()
+def doctor(
+    config: ConfigPath = Path("virtual"),
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    cold: Annotated[bool, typer.Option("--cold", help="measure the cold start as well (about a minute)")] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """What this computer and bus allow: real-time rights, wake-up times, kernel cache, bus budget.  Moves nothing."""
+    from tools.config import load_config, with_bus_overrides
+    from tools.doctor import doctor as run_doctor
+
+    loaded = with_bus_overrides(load_config(_config_path(config)), interface, channel, bitrate)
+    raise typer.Exit(run_doctor(loaded, Output(json=json, quiet=quiet), cold=cold))
+
+
+@app.command()
+def check(
+    config: ConfigPath,
+    delay: Annotated[float | None, typer.Option("--delay", help="measured loop delay [s]", min=0.0)] = None,
+    figure: Annotated[Path | None, typer.Option("--figure", help="PNG to write: Bode, sensitivity, poles")] = None,
+    allow_low_margin: Annotated[bool, typer.Option("--allow-low-margin", help="accept a stable loop below it")] = False,
+    json: Json = False,
+) -> None:
+    """Is the control loop stable enough?  Margins, bounds and what would help."""
+    from tools.check import check as run_check
+    from tools.config import load_config
+
+    loaded = load_config(_config_path(config))
+    raise typer.Exit(run_check(loaded, Output(json=json), delay, figure=figure, allow_low_margin=allow_low_margin))
 
 
 def main() -> None:

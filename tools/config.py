@@ -11,12 +11,13 @@ import os
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated, Any, get_args
 
-from pydantic import BaseModel, PrivateAttr, ValidationError
+from pydantic import BaseModel, Field, PrivateAttr, ValidationError
 
 from drivers.errors import ConfigurationError
 from tools.config_checks import problems_between_sections
+from tools.config_elmo import ElmoSerial, with_serial_bus
 from tools.config_plant import Virtual, plant_problems
 from tools.config_sections import (
     Bus,
@@ -54,7 +55,7 @@ class Config(Section):
     """One joint, its drive and what it shall do; [virtual] only matters on the virtual bus."""
 
     bus: Bus
-    drive: Drive
+    drive: Annotated[Drive | ElmoSerial, Field(discriminator="kind")]
     encoder: Encoder
     joint: Joint
     limits: Limits
@@ -81,9 +82,16 @@ class Config(Section):
         return self._text
 
     @property
+    def canopen(self) -> Drive:
+        """[drive] of a CANopen drive; `ConfigurationError` for any other."""
+        if not isinstance(self.drive, Drive):
+            raise ConfigurationError(f'{self._path}: drive.kind (={self.drive.kind}) must be "canopen" here')
+        return self.drive
+
+    @property
     def eds_path(self) -> Path:
         """The EDS file: beside the configuration, else a shipped one."""
-        return _beside(self._path, self.drive.eds)
+        return _beside(self._path, self.canopen.eds)
 
     @property
     def table_path(self) -> Path | None:
@@ -127,7 +135,8 @@ def load_config(path: str | Path) -> Config:
     config = _validated(data, str(path))
     config._path, config._text = path, text
     _raise_if([f"{path}: {line}" for line in problems_between_sections(config) + plant_problems(config)])
-    for key, file in (("drive.eds", config.eds_path), ("trajectory.file", config.table_path)):
+    eds_path = config.eds_path if isinstance(config.drive, Drive) else None
+    for key, file in (("drive.eds", eds_path), ("trajectory.file", config.table_path)):
         if file is not None and not file.is_file():
             _raise_if([f"{path}: {key} (={file.name}) must name a file beside the configuration or a shipped one"])
     return config
@@ -141,6 +150,11 @@ def with_bus_overrides(
     environ: Mapping[str, str] | None = None,
 ) -> Config:
     """The configuration on another bus: flag beats environment (CAN_INTERFACE, _CHANNEL, _BITRATE) beats file."""
+    if isinstance(config.drive, ElmoSerial):
+        given = interface or channel or bitrate
+        if given is not None:
+            raise ConfigurationError(f"command line: {given} names a CAN bus, the drive is on a serial port: use -p")
+        return config  # the environment speaks of CAN only
     environ = os.environ if environ is None else environ
     bus: dict[str, Any] = config.bus.model_dump()
     origin = "command line"
@@ -163,7 +177,9 @@ def with_bus_overrides(
 
 def _validated(data: Mapping[str, Any], name: str) -> Config:
     try:
-        return Config.model_validate(data)
+        return Config.model_validate(with_serial_bus(data))
+    except ConfigurationError as error:
+        raise ConfigurationProblems([f"{name}: {error.message}"]) from None
     except ValidationError as error:
         lines = [_line(e, data, ()) for e in error.errors(include_url=False)]
         _raise_if([f"{name}: {line}" for line in dict.fromkeys(lines)])
@@ -177,6 +193,12 @@ def _raise_if(lines: list[str]) -> None:
 
 # --- from pydantic's error list to our one line ---
 
+# sections whose key `kind` decides what else is in them
+_UNIONS = {
+    "drive": "'canopen', 'elmo_serial'",
+    "trajectory": "'sine', 'min_jerk', 'trapezoid', 'table', 'hold'",
+}
+
 
 def _model_at(location: tuple[str, ...], data: Mapping[str, Any]) -> type[BaseModel] | None:
     """The section class that holds the last element of `location`."""
@@ -187,8 +209,8 @@ def _model_at(location: tuple[str, ...], data: Mapping[str, Any]) -> type[BaseMo
             return None
         options = [t for t in (field.annotation, *get_args(field.annotation)) if isinstance(t, type)]
         models = [t for t in options if issubclass(t, BaseModel)]
-        if part == "trajectory":
-            kind = data.get("trajectory", {}).get("kind")
+        if part in _UNIONS:
+            kind = data.get(part, {}).get("kind")
             models = [t for t in models if get_args(t.model_fields["kind"].annotation) == (kind,)]
         if not models:
             return None
@@ -214,7 +236,7 @@ def suggestion(unknown: str, known: list[str]) -> str:
 
 def _line(error: Any, data: Mapping[str, Any], prefix: tuple[str, ...]) -> str:
     parts = [str(part) for part in error["loc"]]
-    if len(parts) > 1 and parts[0] == "trajectory":
+    if len(parts) > 1 and parts[0] in _UNIONS:
         del parts[1]  # the tag of the union, which the user did not write
     location = (*prefix, *parts)
     name = ".".join(location)
@@ -232,7 +254,7 @@ def _line(error: Any, data: Mapping[str, Any], prefix: tuple[str, ...]) -> str:
     if kind in ("model_type", "model_attributes_type", "dict_type"):
         return f"{name} (={_shown(value)}) must be a section: [{name}]"
     if kind in ("union_tag_invalid", "union_tag_not_found"):
-        tags = error["ctx"].get("expected_tags", "one of 'sine', 'min_jerk', 'trapezoid', 'table', 'hold'")
+        tags = error["ctx"].get("expected_tags", _UNIONS[location[0]])
         given = f" (={_shown(value.get('kind'))})" if kind == "union_tag_invalid" else ""
         return f"{name}.kind{given} must be one of {tags.removeprefix('one of ')}"
     return f"{name} (={_shown(value)}) {_RULES.get(kind) or _rule(error)}"

@@ -5,9 +5,14 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+from tools.config_elmo import ElmoSerial, serial_problems
+
 if TYPE_CHECKING:
     from tools.config import Config
-    from tools.config_sections import FrictionDirection
+    from tools.config_sections import Friction, FrictionDirection
+
+
+LEAST_CAN_RATE_HZ = 100.0
 
 
 def trajectory_extremes(trajectory: Any) -> tuple[float, float, float] | None:
@@ -139,23 +144,46 @@ def _friction_problems(config: Config) -> list[str]:
     if friction is None:
         if config.control.feed_forward != "none":
             found.append(f"[friction] is missing: control.feed_forward (={config.control.feed_forward}) needs it")
-        if config.virtual is not None and config.virtual.friction_kind != "none":
+        if config.virtual is not None and config.virtual.friction_kind != "none" and config.virtual.friction is None:
             found.append(f"[friction] is missing: virtual.friction_kind (={config.virtual.friction_kind}) needs it")
-        return found
-    if config.control.feed_forward == "lugre_desired" and friction.lugre is None:
+    elif config.control.feed_forward == "lugre_desired" and friction.lugre is None:
         found.append("[friction.lugre] is missing: control.feed_forward (=lugre_desired) needs it")
+    if friction is not None:
+        found += _shape_problems("friction", friction)
+    if config.virtual is not None and config.virtual.friction is not None:
+        found += _shape_problems("virtual.friction", config.virtual.friction)
+    return found
+
+
+def _shape_problems(section: str, friction: Friction) -> list[str]:
+    found = []
     for name, direction, sign in (("positive", friction.positive, 1.0), ("negative", friction.negative, -1.0)):
         knee, maximum = sign * direction.knee, sign * direction.max
         if not 0.0 <= knee <= maximum or maximum == 0.0:
             order = "0 <= knee <= max" if sign > 0.0 else "max <= knee <= 0"
-            found.append(f"friction.{name}.knee (={direction.knee:g}) and max (={direction.max:g}) must be {order}")
+            found.append(f"{section}.{name}.knee (={direction.knee:g}) and max (={direction.max:g}) must be {order}")
         elif sign * _cubic(direction, direction.knee) < 0.0 or sign * _cubic(direction, direction.max) < 0.0:
-            found.append(f"friction.{name}: a0..a3 must give friction that opposes the motion from knee to max")
+            found.append(f"{section}.{name}: a0..a3 must give friction that opposes the motion from knee to max")
     return found
 
 
 def _drive_problems(config: Config) -> list[str]:
-    drive, limits, found = config.drive, config.limits, []
+    if abs(config.joint.gravity_Nm) >= config.limits.torque_max_Nm:
+        weak = [
+            f"joint.gravity_Nm (={config.joint.gravity_Nm:g}) must be less than limits.torque_max_Nm "
+            f"(={config.limits.torque_max_Nm:g}): the joint could not be held"
+        ]
+    else:
+        weak = []
+    if isinstance(config.drive, ElmoSerial):
+        return weak + serial_problems(config)
+    return weak + _canopen_problems(config)
+
+
+def _canopen_problems(config: Config) -> list[str]:
+    drive, limits, found = config.canopen, config.limits, []
+    if config.loop.rate_Hz < LEAST_CAN_RATE_HZ:
+        found.append(f"loop.rate_Hz (={config.loop.rate_Hz:g}) must be in [{LEAST_CAN_RATE_HZ:g}..4000]")
     if drive.node == drive.master_node:
         found.append(f"drive.master_node (={drive.master_node}) must differ from drive.node")
     if 240 < drive.rpdo_transmission_type < 254:
@@ -169,11 +197,6 @@ def _drive_problems(config: Config) -> list[str]:
                     f"limits.torque_max_Nm (={limits.torque_max_Nm:g}) must be in (0..{reach:g}], "
                     "what drive.max_torque_permille allows"
                 )
-    if abs(config.joint.gravity_Nm) >= limits.torque_max_Nm:
-        found.append(
-            f"joint.gravity_Nm (={config.joint.gravity_Nm:g}) must be less than limits.torque_max_Nm "
-            f"(={limits.torque_max_Nm:g}): the joint could not be held"
-        )
     if config.virtual is not None and drive.rated_current_A is None:
         found.append("drive.rated_current_A is missing: the virtual drive needs it")
     if config.virtual is not None and drive.rated_torque_Nm is None:

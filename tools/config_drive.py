@@ -17,7 +17,7 @@ DEFAULT_RATED_TORQUE_NM = 0.5
 
 def canopen_settings(config: Config) -> CanopenSettings:
     """Sections [drive], [encoder], [joint], [limits] and [loop] for commissioning."""
-    drive = config.drive
+    drive = config.canopen
     return CanopenSettings(
         node=drive.node,
         eds_path=config.eds_path,
@@ -42,12 +42,14 @@ def canopen_settings(config: Config) -> CanopenSettings:
         rated_torque_Nm=drive.rated_torque_Nm,
         rated_tolerance=drive.rated_tolerance,
         max_torque_permille=drive.max_torque_permille,
+        velocity_unit=drive.velocity_unit,
+        velocity_max_radps=config.limits.velocity_max_radps,
     )
 
 
 def device_settings(config: Config) -> DeviceSettings:
     """The virtual drive that the configuration describes."""
-    drive = config.drive
+    drive = config.canopen
     return DeviceSettings(
         node_id=drive.node,
         rated_current_mA=round((drive.rated_current_A or DEFAULT_RATED_CURRENT_A) * 1000.0),

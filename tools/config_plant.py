@@ -1,7 +1,8 @@
 """The [virtual] section: the true values of the virtual joint, which the controller does not know.
 
 What is not repeated here (reduction ratio, torque constant, encoder) is taken from the other sections; inertia and
-friction are those of the controller times a scale: the difference is the model error under study.  Keys have the
+friction are those of the controller times a scale: the difference is the model error under study.  With a table of
+its own, [virtual.friction], the joint has friction of which the controller knows nothing.  Keys have the
 names of `hil.plant_records.PlantSettings`, whose checks apply too.
 """
 
@@ -13,12 +14,12 @@ from pydantic import BeforeValidator
 from pydantic_core import PydanticCustomError
 
 from hil.plant_records import EncoderSide, FrictionKind, PlantSettings
-from tools.config_sections import Section, between
+from tools.config_sections import Friction, Section, between
 
 if TYPE_CHECKING:
     from tools.config import Config
 
-_OWN_KEYS = ("friction_kind", "inertia_scale")
+_OWN_KEYS = ("friction_kind", "inertia_scale", "friction")
 
 
 def _list(value: Any) -> Any:
@@ -69,6 +70,7 @@ class Virtual(Section):
     friction_per_kelvin: Annotated[float, between(-0.05, 0.05)] = -0.005
     encoder_noise_counts: Annotated[float, between(0.0, 1e6)] = 0.0
     encoder_seed: Annotated[int, between(1, 2**31 - 1)] = 1
+    friction: Friction | None = None  # the true curve; None = that of [friction]
 
 
 def plant_keywords(config: Config, torque_constant_NmpA: float, friction: Any = None) -> dict[str, Any]:

@@ -84,8 +84,9 @@ def plant_settings(config: Config) -> dict[str, Any]:
     if config.virtual is None:
         raise ConfigurationError(f"{config.path}: [virtual] is missing: the virtual joint needs its true values")
     friction = None
-    if config.friction is not None:
-        friction = friction_constants(config.friction, config.joint.reduction_ratio)[0]
+    table = config.virtual.friction or config.friction
+    if table is not None:
+        friction = friction_constants(table, config.joint.reduction_ratio)[0]
     return plant_keywords(config, torque_constant_NmpA(config), friction)
 
 
@@ -207,6 +208,7 @@ def _fill_sequence(record: Any, config: Config, start_position_rad: float | None
     record.enable_max_cycles = _cycles(config, sequence.enable_timeout_s)
     record.stop_max_cycles = _cycles(config, sequence.stop_timeout_s)
     record.off_max_cycles = _cycles(config, sequence.off_timeout_s)
+    record.may_enable = 1
     record.supervisor_max_cycles = _cycles(config, sequence.supervisor_timeout_s)
 
 

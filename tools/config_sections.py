@@ -111,6 +111,7 @@ class Drive(Section):
     ampere: Ampere = "sine_amplitude"  # of the drive's amperes
     max_torque_permille: Annotated[int, between(1, 10_000)] | None = None  # 6072; None = derived from torque_max_Nm
     torque_direction: Direction = 1  # -1: positive motor torque drives the joint to negative angles
+    velocity_unit: Literal["counts/s", "r/min", "0.1 r/min"] = "counts/s"  # of 60FF; counts of 6064, r/min of the motor
     heartbeat_s: Annotated[float, between(0.01, 2.0)]  # the drive stops itself when our heartbeat is older
     master_node: Node = 126  # whose heartbeat the drive watches
     quick_stop_option: Annotated[int, between(0, 8)] = 2  # 605A
@@ -161,7 +162,7 @@ class Sequence(Section):
 
 
 class Loop(Section):
-    rate_Hz: Annotated[float, between(100.0, 4000.0)]
+    rate_Hz: Annotated[float, between(10.0, 4000.0)]  # over CAN 100 at least, see config_checks
     cpu: Annotated[int, between(0, 1023)] | None = None
     priority: Annotated[int, between(1, 98)] | None = None  # SCHED_FIFO; None = ordinary scheduling
 
@@ -298,7 +299,9 @@ class Margin(Section):
     """What `check` computes with, and below what `run` refuses to enable."""
 
     min_phase_margin_deg: Annotated[float, between(0.0, 90.0)] = 20.0
-    loop_delay_s: Annotated[float, between(0.0, 0.1)] | None = None  # command to torque; None = from the RPDO type
+    loop_delay_s: Annotated[float, between(0.0, 0.1)] | None = (
+        None  # from the position sample to the torque; None = from the RPDO type
+    )
     current_lag_s: Annotated[float, between(0.0, 0.1)] = 0.0005
 
 

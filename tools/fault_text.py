@@ -107,6 +107,11 @@ FAULT_TEXTS: dict[Fault, FaultText] = {
         "the computer was busy: no real-time priority, power saving, a debugger",
         "run `jointctl doctor`; set loop.priority and loop.cpu",
     ),
+    Fault.DRIVE_STAYS_ENABLED: FaultText(
+        "the drive is enabled although nobody asked for it, and does not switch off (statusword {value:.0f})",
+        "another master on the bus, or a drive that ignores the controlword",
+        "use the emergency stop; check who else writes object 6040",
+    ),
     Fault.POSITION_JUMP: FaultText(
         "the position jumped by {value:.4f} rad between two samples",
         "encoder or its cable, or counts_per_turn too small by a factor",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import select
 import time
 
 from hil.bus import default_socket_path
@@ -16,7 +18,7 @@ _POLL_S = 0.05
 
 
 def hil(config: Config, output: Output, *, timing: bool = False, ready_fd: int | None = None) -> int:
-    """Serve until a stop signal; `ready_fd` gets one byte once the bus can be used."""
+    """Serve until a stop signal; `ready_fd` gets one byte once the bus can be used, and its reader's end ends us."""
     for line in become_realtime(None, config.loop.priority):
         output.note(f"virtual joint: {line}")
     with stop_signals() as signals, serve_virtual_joint(config, timing) as joint:
@@ -24,12 +26,22 @@ def hil(config: Config, output: Output, *, timing: bool = False, ready_fd: int |
         place = f"{bus.interface}:{bus.channel}"
         if bus.interface == "jointctl":
             place += f" ({default_socket_path(bus.channel)})"
-        output.note(f"virtual joint: node {config.drive.node} on {place}; Ctrl-C ends it")
+        output.note(f"virtual joint: node {config.canopen.node} on {place}; Ctrl-C ends it")
         if bus.interface == "jointctl":
             output.note(f'attach with python-can: can.Bus(interface="jointctl", channel="{bus.channel}")')
         if ready_fd is not None:
-            os.write(ready_fd, b"+")
-            os.close(ready_fd)
-        while not signals.count and not joint.words[2]:
+            os.set_blocking(ready_fd, False)
+            with contextlib.suppress(BrokenPipeError):
+                os.write(ready_fd, b"+")
+        while not signals.count and not joint.words[2] and not reader_gone(ready_fd):
             time.sleep(_POLL_S)
     return 0
+
+
+def reader_gone(ready_fd: int | None) -> bool:
+    """Whether whoever started us and waited on `ready_fd` has gone."""
+    if ready_fd is None:
+        return False
+    poll = select.poll()
+    poll.register(ready_fd, 0)
+    return bool(poll.poll(0))

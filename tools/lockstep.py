@@ -7,6 +7,7 @@ is handled at once.  Each run starts from a copy of the device as commissioning 
 from __future__ import annotations
 
 import queue
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,19 +18,21 @@ from drivers.can.virtual_bus import decode, encode
 from drivers.canopen.drive import CanopenDrive
 from drivers.canopen.exchange import accept, begin, end, exchange_memory
 from drivers.drive import CommissioningReport
+from drivers.errors import ConfigurationError
 from firmware_py.records import AxisState, Command, LogRecord, Sample
 from firmware_py.schema import new
 from firmware_py.sequence import reset_axis
-from firmware_py.states import Fault
+from firmware_py.states import AxisPhase, Fault
 from hil.device import Cia402Device
 from hil.frames import FRAME_SIZE
-from hil.lockstep import run_lockstep
+from hil.lockstep import TRUTHS, TRUE_POSITION_rad, run_lockstep
 from tools.config import Config
 from tools.config_drive import canopen_settings
 from tools.config_records import axis_constants, trajectory_table
 from tools.virtual_joint import new_device
 
 _COMMISSIONING_STEP_NS = 1000  # the device's clock goes on a little with every frame
+_LISTENER_S = 0.0005
 NO_STOP = -1
 
 
@@ -48,6 +51,13 @@ class DirectBus(can.BusABC):
         for frame in self._device.handle(encode(msg), self.now_ns):
             self._answers.put(frame)
 
+    def sleep(self, seconds: float) -> None:
+        """The device's time goes on; the thread that listens to the bus gets a chance to take what it sent."""
+        self.now_ns += round(seconds * 1e9)
+        for frame in self._device.advance(self.now_ns):
+            self._answers.put(frame)
+        time.sleep(_LISTENER_S)
+
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         try:
             return decode(self._answers.get(timeout=timeout), self.now_ns * 1e-9, self.channel_info), False
@@ -64,6 +74,17 @@ class LockstepRun:
     plant: Any  # PlantState record
     device: Any  # Device record
     fault: Fault
+    truth: np.ndarray  # float64 (N, TRUTHS): what the joint truly did, columns `hil.lockstep.TRUE_*`
+
+    @property
+    def tracking(self) -> np.ndarray:
+        """bool (N,): the records of the trajectory itself, without approach and stop."""
+        return np.asarray(self.log.phase == AxisPhase.TRACKING)
+
+    @property
+    def true_error_rad(self) -> np.ndarray:
+        """Joint position minus desired position, (N,); the log's error is that of the encoder."""
+        return np.asarray(self.truth[:, TRUE_POSITION_rad] - self.log.desired_position_rad)
 
 
 class LockstepJoint:
@@ -73,7 +94,7 @@ class LockstepJoint:
         self.config = config
         virtual = new_device(config)
         bus = DirectBus(virtual)
-        drive = CanopenDrive(bus, canopen_settings(config), sleep=lambda _: None)
+        drive = CanopenDrive(bus, canopen_settings(config), sleep=bus.sleep)
         try:
             self.report: CommissioningReport = drive.commission()
             drive.start_cyclic()
@@ -101,18 +122,23 @@ class LockstepJoint:
         log_every: int = 1,
         stop_cycle: int = NO_STOP,
         longest_s: float | None = None,
+        ideal_velocity: bool = False,
     ) -> LockstepRun:
         """One run from power off to FINISHED; the given record arrays are not changed.
 
         Without `longest_s` a run may take ten seconds more than approach and trajectory together.
+        `ideal_velocity` gives the controller the true position and velocity, for textbook experiments.
         """
         constants = self.constants() if constants is None else constants
         axis = constants[0]
+        if ideal_velocity and axis.law.matched_filter != 0:
+            raise ConfigurationError("control.matched_filter (=true) must be false with an ideal velocity")
         period_s = float(axis.law.period_s)
         if longest_s is None:
             longest_s = float(axis.sequence.approach_s + axis.trajectory.duration_s) + 10.0
         cycles = int(longest_s / period_s)
         log = new(LogRecord, cycles // log_every + 1 if log_every else 1)
+        truth = np.zeros((len(log), TRUTHS))
         state, sample, command = new(AxisState), new(Sample), new(Command)
         reset_axis(axis, state[0])
         device = self._virtual.device.copy()
@@ -124,5 +150,6 @@ class LockstepJoint:
             begin, accept, end, self._port.copy(), frames, frame_bytes, constants, state, self.table, sample, command,
             device, plant_constants, plant, self._virtual.queue.copy(), log, log_every, self._start_ns,
             round(period_s * 1e9), cycles, stop_cycle,
+            truth, ideal_velocity,
         )  # fmt: skip
-        return LockstepRun(log[:written], state[0], plant[0], device[0], Fault(int(state[0].fault)))
+        return LockstepRun(log[:written], state[0], plant[0], device[0], Fault(int(state[0].fault)), truth[:written])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -14,28 +15,36 @@ from firmware_py.sequence import reset_axis
 from firmware_py.states import AxisPhase, StopRequest
 from tools.config import Config
 from tools.loop_process import LoopOrder
-from tools.shared_block import SharedBlock
+from tools.shared_block import SERIAL, SharedBlock
 
 READY_TIMEOUT_S = 180.0  # the first start compiles everything
+SILENT_S = 2.0  # without a cycle for so long, the loop hangs
 RECEIVE_SHARE = 0.6  # of a period: how long a cycle waits for its sample
+
+# what happens to the joint when the loop has gone
+_ON_CAN = "its heartbeat on the bus has ended with it, so the drive stops the joint by itself"
+_ON_SERIAL = "a serial drive does not notice that: it has been told to switch off"
 
 
 class LoopHandle:
     """Owns the process and the shared memory; a context manager that never leaves the process behind."""
 
     def __init__(self, config: Config, table: Any) -> None:
-        self.block = SharedBlock.create(len(table))
+        self.block = SharedBlock.create(len(table), config.bus.interface)
         self.block.table[:] = table
         self._tail = 0
         self.lost_records = 0
+        self._after_end = _ON_SERIAL if config.bus.interface == SERIAL else _ON_CAN
         period_ns = round(NANOSECONDS / config.loop.rate_Hz)
         order = LoopOrder(
+            supervisor_pid=os.getpid(),
             block_fd=self.block.fd,
             table_rows=len(table),
             interface=config.bus.interface,
             channel=config.bus.channel,
             period_ns=period_ns,
             receive_ns=int(RECEIVE_SHARE * period_ns),
+            bitrate_bitps=config.bus.bitrate_bitps,
             cpu=config.loop.cpu,
             priority=config.loop.priority,
         )
@@ -43,6 +52,7 @@ class LoopHandle:
             [sys.executable, "-P", "-m", "tools.loop_process", order.argument()],
             pass_fds=(self.block.fd,),
             stdin=subprocess.DEVNULL,
+            start_new_session=True,  # keys that a terminal turns into signals are not for the loop
         )
 
     def __enter__(self) -> LoopHandle:
@@ -90,7 +100,17 @@ class LoopHandle:
         self.block.port[:] = port
         reset_axis(self.block.constants[0], self.block.state[0])
         self.beat()
+        self.block.words[Word.LOOP_NS] = time.monotonic_ns()
         self.block.words[Word.GO] = 1
+
+    @property
+    def cycles(self) -> int:
+        """Cycles that the loop has executed."""
+        return int(self.block.words[Word.HEAD])
+
+    def allow_enable(self) -> None:
+        """Let the axis leave WAITING (see `SequenceConstants.may_enable`)."""
+        self.block.constants[0].sequence.may_enable = 1
 
     def beat(self) -> None:
         """The supervisor's sign of life."""
@@ -111,17 +131,25 @@ class LoopHandle:
     def running(self) -> bool:
         """True while the loop runs, False after its regular end.
 
-        Raises `MotionFault` if the process is gone without having ended regularly.
+        Raises `MotionFault` if the process is gone, or hangs, without having ended regularly.
         """
         code = self._process.poll()
         if self.block.words[Word.ENDED]:
             return False
         if code is None:
-            return True
+            silent_s = (time.monotonic_ns() - int(self.block.words[Word.LOOP_NS])) * 1e-9
+            if silent_s <= SILENT_S:
+                return True
+            self._process.kill()  # whatever it would do next, it must not wake up beside a new run
+            self._process.wait()
+            raise MotionFault(
+                f"the loop process did nothing for {silent_s:.1f} s and was ended",
+                self._after_end,
+            )
         if self.block.words[Word.ENDED]:
             return False
         how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
         raise MotionFault(
             f"the loop process {how}",
-            "its heartbeat on the bus has ended with it, so the drive stops the joint by itself",
+            self._after_end,
         )

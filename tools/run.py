@@ -11,7 +11,7 @@ from drivers.errors import JointctlError
 from tools.config import Config
 from tools.envelope import motion_envelope
 from tools.output import Output
-from tools.run_report import report_run
+from tools.run_report import INTERRUPTED, report_run
 from tools.supervisor import Supervisor
 
 
@@ -34,14 +34,16 @@ def log_path(config: Config) -> Path:
 
 
 def _ask(output: Output) -> bool:
-    if not sys.stdin.isatty():
-        raise UsageError("this moves the joint and there is no terminal to ask on", "give -y to move without asking")
     output.note("Move the joint? [y/N] ")
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
-def run(config: Config, output: Output, *, assume_yes: bool, dry_run: bool = False) -> int:
+def run(
+    config: Config, output: Output, *, assume_yes: bool, dry_run: bool = False, allow_low_margin: bool = False
+) -> int:
     """Commission, show the motion envelope, ask, track, report; returns the exit code."""
+    if not (assume_yes or dry_run or sys.stdin.isatty()):
+        raise UsageError("this moves the joint and there is no terminal to ask on", "give -y to move without asking")
 
     def confirm(report: CommissioningReport) -> bool:
         for line in motion_envelope(config, report):
@@ -51,7 +53,11 @@ def run(config: Config, output: Output, *, assume_yes: bool, dry_run: bool = Fal
             return False
         return assume_yes or _ask(output)
 
-    result = Supervisor(config, output, log_path(config), confirm).run()
+    try:
+        result = Supervisor(config, output, log_path(config), confirm, allow_low_margin=allow_low_margin).run()
+    except KeyboardInterrupt:
+        output.note("interrupted; nothing moved")
+        return INTERRUPTED
     if result is None:
         if not dry_run:
             output.note("nothing moved; the drive is disabled")

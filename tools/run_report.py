@@ -16,7 +16,11 @@ INTERRUPTED = 130
 
 def report_run(result: RunResult, output: Output, title: str) -> int:
     """Print and save everything; returns the exit code (0, or 130 after an interruption); raises `MotionFault`."""
-    picture = save_run_figure(result.records, result.log_path.with_suffix(".png"), title)
+    picture = result.log_path.with_suffix(".png")
+    try:
+        save_run_figure(result.records, picture, title)
+    except OSError as error:
+        output.warning(f"{picture}: cannot be written: {error.strerror or error}")
     table = summary_table(result.summary)
     table.add_row("bus load", f"{result.bus_load:.1%} at worst-case stuffing")
     table.add_row("drive afterwards", result.drive_state)

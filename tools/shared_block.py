@@ -13,19 +13,21 @@ from typing import Any
 import numpy as np
 
 from drivers.canopen.port import CanopenPort
+from drivers.elmo.port import ElmoPort
 from firmware_py.realtime import HISTOGRAM_BINS, WORDS, Histogram
 from firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
 from firmware_py.schema import dtype_of
 
 RING_RECORDS = 1 << 14  # 16 s at 1 kHz
+SERIAL = "serial"  # the interface of a serial drive
 _LINE = 64  # bytes; nothing of one array shares a cache line with another
 
 
 class SharedBlock:
     """Arrays over the shared memory; `words`, `histograms`, `table` plain, the others record arrays."""
 
-    def __init__(self, fd: int, table_rows: int) -> None:
-        """Map an existing block; every process gives the same `table_rows`."""
+    def __init__(self, fd: int, table_rows: int, interface: str = "") -> None:
+        """Map an existing block; every process gives the same `table_rows` and `interface`, which decides the port."""
         self.fd = fd
         self.table_rows = table_rows
         self._offset = 0
@@ -38,22 +40,22 @@ class SharedBlock:
         self.state = self._records(AxisState, 1)
         self.sample = self._records(Sample, 1)
         self.command = self._records(Command, 1)
-        self.port = self._records(CanopenPort, 1)
+        self.port = self._records(ElmoPort if interface == SERIAL else CanopenPort, 1)
         self.ring = self._records(LogRecord, RING_RECORDS)
 
     @classmethod
-    def create(cls, table_rows: int) -> SharedBlock:
+    def create(cls, table_rows: int, interface: str = "") -> SharedBlock:
         """A new zeroed block."""
         if hasattr(os, "memfd_create"):
             fd = os.memfd_create("jointctl-loop")
         else:
             with tempfile.TemporaryFile() as file:
                 fd = os.dup(file.fileno())
-        return cls(fd, table_rows)
+        return cls(fd, table_rows, interface)
 
     @staticmethod
     def _size(table_rows: int) -> int:
-        records = (AxisConstants, AxisState, Sample, Command, CanopenPort)
+        records = (AxisConstants, AxisState, Sample, Command, CanopenPort, ElmoPort)
         words = WORDS + len(Histogram) * HISTOGRAM_BINS + table_rows * 5
         ring = RING_RECORDS * dtype_of(LogRecord).itemsize
         return 8 * words + sum(dtype_of(r).itemsize for r in records) + ring + 16 * _LINE

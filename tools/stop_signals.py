@@ -19,6 +19,7 @@ class StopSignals:
     def __init__(self) -> None:
         self.count = 0
         self.name = ""
+        self.raising = False  # a signal also raises KeyboardInterrupt, as a question to the user needs it
 
     @property
     def request(self) -> StopRequest:
@@ -31,6 +32,8 @@ class StopSignals:
         """Signal handler."""
         self.count += 1
         self.name = signal.Signals(number).name
+        if self.raising:
+            raise KeyboardInterrupt
 
 
 @contextmanager

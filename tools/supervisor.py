@@ -6,6 +6,7 @@ time happens in the loop process.
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,22 +15,22 @@ from typing import Any
 
 import numpy as np
 
-from drivers.can.open import open_python_can
-from drivers.canopen.drive import CanopenDrive
-from drivers.drive import CommissioningReport
-from drivers.errors import JointctlError, MotionFault
+from drivers.drive import CommissioningReport, Drive
+from drivers.errors import DataError, JointctlError, MotionFault
 from firmware_py.states import AxisPhase, Fault, StopRequest
+from tools.check import require_margin
 from tools.config import Config
-from tools.config_drive import canopen_settings, cyclic_bus_load
 from tools.config_records import axis_constants, trajectory_table
-from tools.fault_text import FaultText, fault_text
+from tools.fault_text import FaultText
 from tools.loop_handle import LoopHandle
+from tools.open_drive import check_cyclic_rate, drive_fault_text, loop_delay_s, open_drive
 from tools.output import Output
 from tools.run_log import RunLogWriter
 from tools.run_summary import RunSummary, summarise
 from tools.stop_signals import StopSignals, stop_signals
 
 POLL_S = 0.02
+DELAY_CYCLES = 300  # how many cycles with the drive off the loop delay is measured over
 INFORMATION, WARNING, ERROR = 20, 30, 40
 
 
@@ -53,29 +54,44 @@ class Supervisor:
     """Carries out one run.  `confirm(report)` is asked before anything can move; False ends the run."""
 
     def __init__(
-        self, config: Config, output: Output, log_path: Path, confirm: Callable[[CommissioningReport], bool]
+        self,
+        config: Config,
+        output: Output,
+        log_path: Path,
+        confirm: Callable[[CommissioningReport], bool],
+        *,
+        allow_low_margin: bool = False,
     ) -> None:
         self._config = config
         self._output = output
         self._log_path = log_path
         self._confirm = confirm
+        self._allow_low_margin = allow_low_margin
         self._phase = AxisPhase.WAITING
+        self._delay_s: float | None = None
 
     def run(self) -> RunResult | None:
         """The whole run; None if the user declined.  The drive is disabled when this returns or raises."""
         config = self._config
-        cyclic_bus_load(config)
+        check_cyclic_rate(config)
         table = trajectory_table(config)
         with stop_signals() as signals, LoopHandle(config, table) as loop:
-            bus = open_python_can(config.bus.interface, config.bus.channel, config.bus.bitrate_bitps)
-            drive = CanopenDrive(bus, canopen_settings(config))
+            drive = open_drive(config)
             try:
                 report = drive.commission()
-                if signals.count or not self._confirm(report):
+                self._leave_if_asked(signals)
+                signals.raising = True
+                confirmed = self._confirm(report)
+                signals.raising = False
+                if not confirmed:
                     return None
                 loop.wait_ready(lambda: self._leave_if_asked(signals))
+                self._leave_if_asked(signals)
                 return self._supervise(drive, loop, report, signals)
+            except OSError as error:
+                raise DataError(f"{self._log_path}: cannot be written: {error.strerror or error}") from None
             finally:
+                signals.raising = False
                 drive.make_safe()
                 drive.close()
 
@@ -85,7 +101,7 @@ class Supervisor:
             raise KeyboardInterrupt
 
     def _supervise(
-        self, drive: CanopenDrive, loop: LoopHandle, report: CommissioningReport, signals: StopSignals
+        self, drive: Drive, loop: LoopHandle, report: CommissioningReport, signals: StopSignals
     ) -> RunResult:
         config = self._config
         metadata = {
@@ -95,6 +111,7 @@ class Supervisor:
         chunks: list[Any] = []
         with RunLogWriter(self._log_path, metadata) as log:
             constants = axis_constants(config, start_position_rad=report.start_position_rad)
+            constants[0].sequence.may_enable = 0
             drive.start_cyclic()
             started_ns = time.monotonic_ns()
             loop.go(constants, drive.port())
@@ -103,15 +120,40 @@ class Supervisor:
                     self._watch(loop, log, chunks, signals)
                     time.sleep(POLL_S)
             except MotionFault as error:
-                log.write_event(ERROR, "supervisor", str(error))
                 state = drive.make_safe()
-                raise MotionFault(error.message, f"{error.hint}; drive state now: {state}") from None
-            finally:
-                elapsed_s = (time.monotonic_ns() - started_ns) * 1e-9
                 self._take_records(loop, log, chunks)
+                log.write_event(ERROR, "supervisor", str(error))
+                raise MotionFault(error.message, f"{error.hint}; drive state now: {state}") from None
+            except BaseException:
+                self._brake(loop)
+                raise
+            elapsed_s = (time.monotonic_ns() - started_ns) * 1e-9
             state = drive.make_safe()
+            self._take_records(loop, log, chunks)
             log.write_event(INFORMATION, "drive", f"after the run: {state}")
             return self._result(loop, chunks, signals, state, elapsed_s)
+
+    def _check_delay(self, loop: LoopHandle) -> None:
+        """Once enough cycles have run with the drive off: refuse the gains, or let the loop enable."""
+        if self._delay_s is not None or loop.cycles < min(DELAY_CYCLES, self._config.loop.rate_Hz):
+            return
+        config = self._config
+        self._delay_s = loop_delay_s(config, loop.block.histograms)
+        found = require_margin(config, self._delay_s, allow_low_margin=self._allow_low_margin)
+        self._output.note(
+            f"  loop delay {self._delay_s * 1e3:.2f} ms measured, phase margin {found.phase_margin_deg:.0f} deg"
+        )
+        loop.allow_enable()
+
+    def _brake(self, loop: LoopHandle) -> None:
+        """The supervisor cannot go on (disk full, say), but the joint moves: brake it under control, unlogged."""
+        sequence = self._config.sequence
+        loop.request_stop(StopRequest.RAMP)
+        give_up_s = time.monotonic() + sequence.stop_timeout_s + sequence.release_s + sequence.off_timeout_s
+        with contextlib.suppress(MotionFault):
+            while loop.running() and time.monotonic() < give_up_s:
+                loop.beat()
+                time.sleep(POLL_S)
 
     def _take_records(self, loop: LoopHandle, log: RunLogWriter, chunks: list[Any]) -> None:
         records = loop.new_records()
@@ -124,12 +166,14 @@ class Supervisor:
         if signals.request is not StopRequest.NONE:
             loop.request_stop(signals.request)
         self._take_records(loop, log, chunks)
+        self._check_delay(loop)
         phase = loop.phase
         if phase is not self._phase:
             self._phase = phase
             text = phase.name.lower().replace("_", " ")
             log.write_event(INFORMATION, "loop", text)
-            self._output.note(f"  {text}")
+            with contextlib.suppress(OSError):  # the terminal may have been closed: no reason to stop watching
+                self._output.note(f"  {text}")
 
     def _result(
         self, loop: LoopHandle, chunks: list[Any], signals: StopSignals, drive_state: str, elapsed_s: float
@@ -141,7 +185,8 @@ class Supervisor:
         fault = Fault(int(state.fault))
         text = None
         if fault is not Fault.NONE:
-            text = fault_text(fault, float(state.fault_value), int(state.fault_drive_error))
+            drive_error = int(state.fault_drive_error)
+            text = drive_fault_text(self._config, fault, float(state.fault_value), drive_error)
         bits = float(loop.block.port[0].bits_sent)
         return RunResult(
             summary=summarise(records, loop.block.histograms),

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from drivers.can.open import open_cyclic_end
-from drivers.errors import BusError
+from drivers.can.open import CYCLIC_INTERFACES, open_cyclic_end, open_python_can
+from drivers.errors import BusError, ConfigurationError
 from hil.bus import VirtualBusError, VirtualBusHub, default_socket_path
 from hil.device import Cia402Device
 from hil.device_loop import RealtimeDevice
@@ -20,6 +20,7 @@ from hil.joint import plant
 from tools.config import Config
 from tools.config_drive import device_settings
 from tools.config_records import plant_settings
+from tools.device_pump import PumpedDevice
 
 READY_TIMEOUT_S = 120.0  # the first start compiles everything
 
@@ -27,12 +28,15 @@ READY_TIMEOUT_S = 120.0  # the first start compiles everything
 def new_device(config: Config) -> Cia402Device:
     """The drive with its plant, as the configuration says that the joint truly is."""
     constants, state = plant(**plant_settings(config))
-    return Cia402Device(config.eds_path, device_settings(config), constants, state)
+    try:
+        return Cia402Device(config.eds_path, device_settings(config), constants, state)
+    except ValueError as error:  # what the EDS file must hold for a virtual drive
+        raise ConfigurationError(f"drive.eds (={config.canopen.eds}) does not make a virtual drive: {error}") from None
 
 
 @contextmanager
-def serve_virtual_joint(config: Config, timing: bool = False) -> Iterator[RealtimeDevice]:
-    """Bus (unless the interface is SocketCAN, where the bus exists already) and drive, running in threads."""
+def serve_virtual_joint(config: Config, timing: bool = False) -> Iterator[RealtimeDevice | PumpedDevice]:
+    """Drive in threads of this process; the bus as well if it is the virtual one, all others exist already."""
     device = new_device(config)
     with ExitStack() as stack:
         if config.bus.interface == "jointctl":
@@ -41,6 +45,11 @@ def serve_virtual_joint(config: Config, timing: bool = False) -> Iterator[Realti
                 stack.enter_context(VirtualBusHub(path, config.bus.bitrate_bitps, timing))
             except VirtualBusError as error:
                 raise BusError(str(error)) from None
+        if config.bus.interface not in CYCLIC_INTERFACES:
+            bus = open_python_can(config.bus.interface, config.bus.channel, config.bus.bitrate_bitps)
+            stack.callback(bus.shutdown)
+            yield stack.enter_context(PumpedDevice(device, bus))
+            return
         end = stack.enter_context(open_cyclic_end(config.bus.interface, config.bus.channel))
         yield stack.enter_context(RealtimeDevice(device, end.fileno()))
 

@@ -6,20 +6,37 @@ the scaling, PDOs last, because they are only valid for the mode and the rate se
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from drivers.canopen.cia402 import SUPPORTED_MODE_BIT, ControlWord, Mode, State, decode_state
 from drivers.canopen.object_access import ObjectAccess
-from drivers.canopen.pdo_map import configure_loop_pdos
-from drivers.canopen.scaling import joint_torque_per_permille_Nm
+from drivers.canopen.pdo_map import TARGET_TORQUE, TARGET_VELOCITY, configure_loop_pdos
+from drivers.canopen.scaling import joint_torque_per_permille_Nm, joint_velocity_per_unit_radps
 from drivers.canopen.settings import CanopenSettings
 from drivers.drive import DriveIdentity
 from drivers.errors import DeviceError
 
 CIA402_PROFILE = 402
-MODES = {"cst": (Mode.CYCLIC_SYNC_TORQUE,), "tq": (Mode.TORQUE,), "auto": (Mode.CYCLIC_SYNC_TORQUE, Mode.TORQUE)}
+MODES = {
+    "cst": (Mode.CYCLIC_SYNC_TORQUE,),
+    "tq": (Mode.TORQUE,),
+    "auto": (Mode.CYCLIC_SYNC_TORQUE, Mode.TORQUE),
+    "csv": (Mode.CYCLIC_SYNC_VELOCITY,),
+    "pv": (Mode.PROFILE_VELOCITY,),
+    "velocity or torque": (
+        Mode.CYCLIC_SYNC_VELOCITY, Mode.PROFILE_VELOCITY, Mode.CYCLIC_SYNC_TORQUE, Mode.TORQUE,
+    ),
+}  # fmt: skip
+VELOCITY_MODES = (Mode.CYCLIC_SYNC_VELOCITY, Mode.PROFILE_VELOCITY)
+LARGEST_UNSIGNED = 0xFFFFFFFF
+STEEP_RADPS2 = 1000.0  # profile acceleration at the joint, above any that the loop asks for
+LARGEST_PERMILLE = 32767  # 6071 is a signed 16 bit number
 ABORT_QUICK_STOP = 3  # object 6007
-MODE_ATTEMPTS = 20
+ATTEMPTS = 20
+PAUSE_S = 0.01  # between two looks at a drive that has been told to change its state or mode
+Pause = Callable[[float], None]
 
 
 @dataclass
@@ -57,12 +74,17 @@ def identify(objects: ObjectAccess, settings: CanopenSettings, findings: Finding
     )
 
 
-def disable(objects: ObjectAccess, settings: CanopenSettings) -> None:
+def disable(objects: ObjectAccess, settings: CanopenSettings, pause: Pause) -> None:
     """Zero every target that could move the motor at enable, take the power stage off, refuse a drive in fault."""
     objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
-    for index, what in ((0x6071, "target torque"), (0x60FF, "target velocity"), (0x60B2, "torque offset")):
+    objects.write_verified(0x6071, 0, 0, what="target torque")
+    for index, what in ((0x60FF, "target velocity"), (0x60B2, "torque offset")):
         objects.write_if_present(index, 0, 0, what=what)
-    state = State(decode_state(objects.read(0x6041, what="statusword")))
+    for _ in range(ATTEMPTS):
+        state = State(decode_state(objects.read(0x6041, what="statusword")))
+        if state is not State.OPERATION_ENABLED and state is not State.QUICK_STOP_ACTIVE:
+            break
+        pause(PAUSE_S)
     if state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
         code = objects.read(0x603F, what="error code") if objects.has(0x603F) else 0
         raise DeviceError(
@@ -73,8 +95,8 @@ def disable(objects: ObjectAccess, settings: CanopenSettings) -> None:
         raise DeviceError(f"node {settings.node} stays enabled although controlword 0 was written")
 
 
-def choose_mode(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
-    """Select a torque mode that the drive has, and wait until 6061 confirms it."""
+def choose_mode(objects: ObjectAccess, settings: CanopenSettings, findings: Findings, pause: Pause) -> None:
+    """Select the first wanted mode that the drive has, and wait until 6061 confirms it."""
     wanted = MODES[settings.mode]
     if objects.has(0x6502):
         supported = objects.read(0x6502, what="supported drive modes")
@@ -89,20 +111,38 @@ def choose_mode(objects: ObjectAccess, settings: CanopenSettings, findings: Find
         )
     findings.mode = usable[0]
     objects.write(0x6060, 0, findings.mode, what="modes of operation")
-    for _ in range(MODE_ATTEMPTS):
+    for _ in range(ATTEMPTS):
         shown = objects.read(0x6061, what="modes of operation display")
         if shown == findings.mode:
             break
+        pause(PAUSE_S)
     else:
         raise DeviceError(f"node {settings.node}: 6061 shows mode {shown}, mode {int(findings.mode)} was selected")
     if findings.mode is Mode.TORQUE and objects.has(0x6087):
         # profile torque ramps its target: make the ramp so steep that the loop's own rate limit decides
-        objects.write(0x6087, 0, 1_000_000, what="torque slope")
+        objects.write_verified(0x6087, 0, 1_000_000, what="torque slope")
         findings.remarks.append("torque mode with profile (TQ) instead of cyclic synchronous torque")
     findings.settings["mode"] = findings.mode.name.lower()
 
 
+def limit_velocity(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
+    """In the velocity modes: no stale target, the drive's own limit 607F, ramps that leave the loop's own in charge."""
+    objects.write_verified(0x60FF, 0, 0, what="target velocity")
+    unit_radps = joint_velocity_per_unit_radps(settings)
+    if settings.velocity_max_radps is not None and objects.has(0x607F):
+        highest = min(math.ceil(settings.velocity_max_radps / unit_radps), LARGEST_UNSIGNED)
+        objects.write_verified(0x607F, 0, highest, what="max profile velocity")
+        findings.settings["max velocity"] = f"{highest} {settings.velocity_unit} = {highest * unit_radps:.2f} rad/s"
+    if findings.mode is Mode.PROFILE_VELOCITY:
+        steep = min(round(STEEP_RADPS2 / unit_radps), LARGEST_UNSIGNED)
+        objects.write_verified(0x6083, 0, steep, what="profile acceleration")
+        objects.write_verified(0x6084, 0, steep, what="profile deceleration")
+        findings.remarks.append("profile velocity mode (PV) instead of cyclic synchronous velocity")
+
+
 def _compare_rated(name: str, found: float, expected: float | None, tolerance: float, unit: str) -> None:
+    if expected is not None and found == 0.0:
+        raise DeviceError(f"drive.{name} (={expected:g}) cannot be compared: the drive does not tell its rated value")
     if expected is not None and abs(found - expected) > tolerance * expected:
         raise DeviceError(f"drive.{name} (={expected:g}) does not agree with the drive's {found:g} {unit}")
 
@@ -118,8 +158,12 @@ def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
         index = "6076" if settings.torque_reference == "rated_torque" else "6075"
         raise DeviceError(f"node {settings.node}: object {index} is 0, so 6071 has no scale (drive.torque_reference)")
     findings.torque_per_permille_Nm = scale
-    permille = settings.max_torque_permille or -(-settings.torque_max_Nm // scale)
-    findings.max_permille = min(int(permille), 32767)
+    permille = settings.max_torque_permille
+    if permille is None:
+        permille = int(-(-settings.torque_max_Nm // scale))
+    findings.max_permille = min(permille, LARGEST_PERMILLE)
+    if findings.max_permille < permille:
+        findings.remarks.append(f"6072 holds at most {LARGEST_PERMILLE} permille: torque is limited to that")
     objects.write_verified(0x6072, 0, findings.max_permille, what="max torque")
     findings.settings["max torque"] = f"{findings.max_permille} permille = {findings.max_permille * scale:.1f} Nm"
 
@@ -154,15 +198,25 @@ def arm_watchdog(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
     findings.settings["watchdog"] = f"{milliseconds} ms on the heartbeat of node {settings.master_node}"
 
 
-def commission(objects: ObjectAccess, settings: CanopenSettings) -> Findings:
-    """All steps on a node in pre-operational; it ends disabled, with its PDOs mapped."""
+def commission(
+    objects: ObjectAccess, settings: CanopenSettings, pause: Pause, prove: Callable[[], str] | None = None
+) -> Findings:
+    """All steps on a node in pre-operational; it ends disabled, with its PDOs mapped.
+
+    `pause` sleeps; `prove` shows that the armed watchdog works and returns what the drive said (None: not proven).
+    """
     findings = Findings()
     identify(objects, settings, findings)
-    disable(objects, settings)
-    choose_mode(objects, settings, findings)
+    disable(objects, settings, pause)
+    choose_mode(objects, settings, findings, pause)
     limit_torque(objects, settings, findings)
+    if findings.mode in VELOCITY_MODES:
+        limit_velocity(objects, settings, findings)
     synchronise(objects, settings, findings)
     arm_watchdog(objects, settings, findings)
-    configure_loop_pdos(objects, settings.node, settings.rpdo_transmission_type)
+    if prove is not None:
+        findings.settings["watchdog proven"] = prove()
+    target = TARGET_VELOCITY if findings.mode in VELOCITY_MODES else TARGET_TORQUE
+    configure_loop_pdos(objects, settings.node, settings.rpdo_transmission_type, target)
     findings.start_counts = objects.read(0x6064, what="position actual value")
     return findings

@@ -4,7 +4,7 @@ The real loop, the portable loop and the lockstep simulation all use these three
 
     begin_cycle  ->  SYNC, and the heartbeat when it is due
     accept_frame <-  TPDO (statusword, position, torque), EMCY, heartbeat and boot-up of the drive
-    end_cycle    ->  RPDO (controlword, target torque)
+    end_cycle    ->  RPDO (controlword, target torque or target velocity)
 """
 
 from __future__ import annotations
@@ -132,16 +132,28 @@ def torque_permille(port: CanopenPort, torque_Nm: float) -> int:
 
 
 @kernel
+def velocity_units(port: CanopenPort, velocity_radps: float) -> int:
+    """Joint velocity [rad/s] in units of 60FF, saturated before the cast; 0 if not finite."""
+    value = velocity_radps / port.velocity_radpspunit
+    if not math.isfinite(value):
+        return 0
+    return round(min(max(value, -2147483647.0), 2147483647.0))
+
+
+@kernel
 def end_cycle(port: CanopenPort, frames: np.ndarray, sample: Sample, command: Command) -> None:
-    """Write the RPDO (slot 2).  The torque is zero unless the drive is asked to be, and is, enabled."""
+    """Write the RPDO (slot 2).  The target is zero unless the drive is asked to be, and is, enabled."""
     frame = frames[SLOT_RPDO]
     frame.can_id = port.rpdo_id
     frame.length = port.rpdo_length
     for i in range(8):
         frame.payload[i] = 0
     put_u16(frame.payload, port.control_at, control_word(port.state, command.request))
-    target = 0
-    if command.request == DriveRequest.ENABLE and port.state == State.OPERATION_ENABLED:
-        target = torque_permille(port, command.torque_Nm)
-    put_u16(frame.payload, port.target_at, target)
+    enabled = command.request == DriveRequest.ENABLE and port.state == State.OPERATION_ENABLED
+    if port.target_is_velocity != 0:
+        units = velocity_units(port, command.velocity_radps) if enabled else 0
+        put_u16(frame.payload, port.target_at, units)
+        put_u16(frame.payload, port.target_at + 2, units >> 16)
+    else:
+        put_u16(frame.payload, port.target_at, torque_permille(port, command.torque_Nm) if enabled else 0)
     port.bits_sent += _WORST_BITS[min(frame.length, 8)]

@@ -12,19 +12,39 @@ import can
 import canopen
 
 from drivers.canopen.cia402 import ControlWord, State, decode_state
-from drivers.canopen.commissioning import Findings, commission
+from drivers.canopen.commissioning import VELOCITY_MODES, Findings, commission
 from drivers.canopen.object_access import ObjectAccess
 from drivers.canopen.scaling import joint_angle_per_count_rad, new_port
 from drivers.canopen.settings import CanopenSettings
+from drivers.canopen.watchdog_proof import prove_watchdog
 from drivers.drive import CommissioningReport
-from drivers.errors import ConfigurationError, DeviceError, JointctlError, NoDeviceError
+from drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
 
 SDO_TIMEOUT_S = 0.3
 SEARCH_S = 0.3
+LISTEN_S = 0.05  # five SYNC periods of the slowest loop
+SYNC_ID = 0x80
 NMT_PRE_OPERATIONAL = 128
 NMT_OPERATIONAL = 1
 NMT_STOPPED = 2
 SAFE_ATTEMPTS = 5
+QUICK_STOP_S = 1.0  # how long a moving joint may brake before its power is taken
+SAFE_POLL_S = 0.02
+FAILURE_PAUSE_S = 0.05
+
+
+class _BusFailure(can.Listener):
+    """Keeps a bus that fails from ending the receiving thread with a traceback; whoever sends next is told."""
+
+    def __init__(self, sleep: Callable[[float], None]) -> None:
+        self._sleep = sleep
+
+    def on_message_received(self, msg: can.Message) -> None:
+        """Messages are for the other listeners."""
+
+    def on_error(self, exc: Exception) -> None:
+        """The thread receives again at once: a dead bus must not make it spin."""
+        self._sleep(FAILURE_PAUSE_S)
 
 
 class CanopenDrive:
@@ -34,10 +54,13 @@ class CanopenDrive:
         self._settings = settings
         self._sleep = sleep
         self._findings: Findings | None = None
+        self._taken = False  # whether the drive has heard anything from us
         # the library warns about every heartbeat state and unknown frame; what matters is told by this driver
         logging.getLogger("canopen").setLevel(logging.ERROR)
         self._network = canopen.Network(bus)
         self._network.NOTIFIER_CYCLE = 0.05
+        on_failure: Any = _BusFailure(sleep)  # the library knows only its own kind of listener
+        self._network.listeners.append(on_failure)
         self._network.connect()
         try:
             dictionary = canopen.import_od(str(settings.eds_path), settings.node)
@@ -59,19 +82,46 @@ class CanopenDrive:
             others = sorted(set(self._network.scanner.nodes) - {self._settings.node})
             if others:
                 message = f"node {self._settings.node} does not answer; these do: {', '.join(map(str, others))}"
-                raise NoDeviceError(
-                    message, hint="drive.node in the configuration, or -t on the command line"
-                ) from error
+                raise NoDeviceError(message, hint="set drive.node in the configuration") from error
             raise NoDeviceError(
                 f"node {self._settings.node} does not answer, and neither does any other",
                 hint="power, wiring, termination, and the bit rate of the drive",
             ) from error
 
+    def _refuse_second_controller(self) -> None:
+        """Who sends SYNC controls a joint on this bus: two of them would fight over the same drive."""
+        seen: list[float] = []
+
+        def on_sync(_: int, data: bytearray, timestamp_s: float) -> None:
+            seen.append(timestamp_s)
+
+        self._network.subscribe(SYNC_ID, on_sync)
+        self._sleep(LISTEN_S)
+        self._network.unsubscribe(SYNC_ID, on_sync)
+        if seen:
+            raise BusError(
+                f"another controller is active on this bus: {len(seen)} SYNC frames (080h) in {LISTEN_S:g} s",
+                hint="end it first; only one controller may use the bus",
+            )
+
+    def _prove_watchdog(self) -> str:
+        """See `prove_watchdog`; afterwards the node is brought back to pre-operational."""
+        settings = self._settings
+        seen = prove_watchdog(self._network, settings.node, settings.master_node, settings.heartbeat_s, self._sleep)
+        self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
+        return seen
+
     def commission(self) -> CommissioningReport:
         """See `Drive.commission`; the node is left in pre-operational."""
-        self._find()
-        self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
-        findings = commission(self._objects, self._settings)
+        try:
+            self._refuse_second_controller()
+            self._taken = True
+            # first: a node that its watchdog or an earlier run left in "stopped" does not answer SDO
+            self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
+            self._find()
+            findings = commission(self._objects, self._settings, self._sleep, self._prove_watchdog)
+        except can.CanError as error:
+            raise BusError(f"the bus failed during commissioning: {error}") from None
         self._findings = findings
         angle_rad = joint_angle_per_count_rad(self._settings)
         counts = findings.start_counts - self._settings.zero_counts
@@ -93,23 +143,30 @@ class CanopenDrive:
         """See `Drive.port`."""
         if self._findings is None:
             raise DeviceError("the drive has not been commissioned")
-        return new_port(self._settings, self._findings.torque_per_permille_Nm, self._findings.max_permille)
+        found = self._findings
+        velocity = found.mode in VELOCITY_MODES
+        return new_port(self._settings, found.torque_per_permille_Nm, found.max_permille, velocity=velocity)
 
     def make_safe(self) -> str:
-        """Controlword 0 until the statusword says disabled, then pre-operational; NMT stop if SDO does not answer.
+        """Pre-operational, quick stop if it is enabled, then controlword 0 until the statusword says disabled.
 
-        The controlword is also in an RPDO, so leave operational first: two writers would fight over it.
+        NMT stop if SDO does not answer.  The controlword is also in an RPDO, so leave operational first: two writers
+        would fight over it.  A drive that `commission` has not taken over is left alone: it may be another's.
         """
+        if not self._taken:
+            return "untouched"
         state = State.UNDEFINED
         try:
             self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
+            self._brake()
             for _ in range(SAFE_ATTEMPTS):
                 self._objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
                 state = State(decode_state(self._objects.read(0x6041, what="statusword")))
                 if state in (State.SWITCH_ON_DISABLED, State.FAULT):
                     break
-                self._sleep(0.02)
+                self._sleep(SAFE_POLL_S)
             self._objects.write_if_present(0x6071, 0, 0, what="target torque")
+            self._objects.write_if_present(0x60FF, 0, 0, what="target velocity")
             # our heartbeat has ended with the loop; disabled, the drive need not watch it any more
             self._objects.write_if_present(0x1016, 1, 0, what="consumer heartbeat time")
         except JointctlError as error:
@@ -121,6 +178,16 @@ class CanopenDrive:
         except can.CanError as error:
             return f"unknown: the bus does not take frames any more ({error})"
         return state.name.lower().replace("_", " ")
+
+    def _brake(self) -> None:
+        """If the drive is enabled, its quick stop, until it is off or QUICK_STOP_S is over."""
+        for attempt in range(round(QUICK_STOP_S / SAFE_POLL_S)):
+            state = decode_state(self._objects.read(0x6041, what="statusword"))
+            if state not in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE):
+                return
+            if attempt == 0 and state == State.OPERATION_ENABLED:
+                self._objects.write(0x6040, 0, ControlWord.QUICK_STOP, what="controlword")
+            self._sleep(SAFE_POLL_S)
 
     def close(self) -> None:
         """Leave the bus; what went wrong on it has been told before."""

@@ -43,6 +43,10 @@ class ObjectAccess:
         """Whether the EDS lists the object."""
         return self._variable(index, sub) is not None
 
+    def require(self, index: int, sub: int = 0, *, what: str) -> None:
+        """`DeviceError` unless the EDS lists the object."""
+        self._required(index, sub, what)
+
     def _variable(self, index: int, sub: int) -> Any:
         return self._node.object_dictionary.get_variable(index, sub)
 

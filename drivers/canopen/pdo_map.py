@@ -35,12 +35,15 @@ POSITION = MappedObject(0x6064, 0, 32, "position actual value")
 TORQUE = MappedObject(0x6077, 0, 16, "torque actual value")
 CONTROL = MappedObject(0x6040, 0, 16, "controlword")
 TARGET_TORQUE = MappedObject(0x6071, 0, 16, "target torque")
+TARGET_VELOCITY = MappedObject(0x60FF, 0, 32, "target velocity")
 
 
 def configure_pdo(
     objects: ObjectAccess, base: int, cob_id: int, transmission_type: int, mapped: tuple[MappedObject, ...]
 ) -> None:
     """Map `mapped` into the PDO whose communication record is at `base`; the node is pre-operational."""
+    for item in mapped:
+        objects.require(item.index, item.sub, what=item.name)
     mapping = base + MAPPING_OFFSET
     what = f"PDO {base:04X}"
     objects.write(base, 1, cob_id | DISABLED, what=f"{what} COB-ID")
@@ -61,10 +64,12 @@ def disable_pdo(objects: ObjectAccess, base: int) -> None:
         objects.write(base, 1, cob_id | DISABLED, what=f"PDO {base:04X} COB-ID")
 
 
-def configure_loop_pdos(objects: ObjectAccess, node: int, rpdo_transmission_type: int) -> None:
-    """TPDO1 = statusword, position, torque at every SYNC; RPDO1 = controlword, target torque; the others off."""
+def configure_loop_pdos(
+    objects: ObjectAccess, node: int, rpdo_transmission_type: int, target: MappedObject = TARGET_TORQUE
+) -> None:
+    """TPDO1 = statusword, position, torque at every SYNC; RPDO1 = controlword, `target`; the others off."""
     for number in range(1, PDOS):
         disable_pdo(objects, COMMUNICATION_TPDO + number)
         disable_pdo(objects, COMMUNICATION_RPDO + number)
     configure_pdo(objects, COMMUNICATION_TPDO, 0x180 + node, 1, (STATUS, POSITION, TORQUE))
-    configure_pdo(objects, COMMUNICATION_RPDO, 0x200 + node, rpdo_transmission_type, (CONTROL, TARGET_TORQUE))
+    configure_pdo(objects, COMMUNICATION_RPDO, 0x200 + node, rpdo_transmission_type, (CONTROL, target))

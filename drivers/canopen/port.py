@@ -39,6 +39,8 @@ class CanopenPort:
     zero_counts: i8
     torque_Nmppermille: f8
     max_permille: i4
+    target_is_velocity: i4  # the target is 60FF (32 bit) instead of 6071 (16 bit)
+    velocity_radpspunit: f8  # of 60FF
     # state
     primed: i4
     last_counts: i8  # as received, 32 bit

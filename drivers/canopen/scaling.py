@@ -10,6 +10,8 @@ from drivers.canopen.settings import CanopenSettings
 from firmware_py.schema import new
 
 PERMILLE = 1000.0
+# units of 60FF besides the encoder's counts per second: motor speed [rad/s] of one unit
+VELOCITY_UNITS = {"counts/s": None, "r/min": math.tau / 60.0, "0.1 r/min": math.tau / 600.0}
 
 
 def joint_torque_per_permille_Nm(settings: CanopenSettings, rated_torque_mNm: int, rated_current_mA: int) -> float:
@@ -27,8 +29,21 @@ def joint_angle_per_count_rad(settings: CanopenSettings) -> float:
     return 2.0 * math.pi / (settings.counts_per_turn * ratio)
 
 
-def new_port(settings: CanopenSettings, torque_per_permille_Nm: float, max_permille: int) -> Any:
-    """A `CanopenPort` record array of one record for the loop's PDO layout; the file descriptor is still missing."""
+def joint_velocity_per_unit_radps(settings: CanopenSettings) -> float:
+    """Joint velocity [rad/s] of one unit of 60FF, 606C and 607F, without the direction."""
+    motor_radps = VELOCITY_UNITS[settings.velocity_unit]
+    if motor_radps is None:
+        return joint_angle_per_count_rad(settings)
+    return motor_radps / settings.reduction_ratio
+
+
+def new_port(
+    settings: CanopenSettings, torque_per_permille_Nm: float, max_permille: int, *, velocity: bool = False
+) -> Any:
+    """A `CanopenPort` record array of one record for the loop's PDO layout; the file descriptor is still missing.
+
+    `velocity`: the drive is in a velocity mode and the RPDO carries 60FF.
+    """
     ports = new(CanopenPort)
     port = ports[0]
     port.fd = -1
@@ -42,7 +57,10 @@ def new_port(settings: CanopenSettings, torque_per_permille_Nm: float, max_permi
     # three heartbeats within the drive's time-out, so that one or two lost ones do not stop the joint
     port.heartbeat_cycles = max(1, int(settings.heartbeat_s * settings.rate_Hz / 3.0))
     port.tpdo_length = 8
-    port.rpdo_length = 4
+    port.rpdo_length = 6 if velocity else 4
+    port.target_is_velocity = int(velocity)
+    # the drive counts speed in the direction of its encoder
+    port.velocity_radpspunit = joint_velocity_per_unit_radps(settings) * settings.encoder_direction
     port.status_at = 0
     port.position_at = 2
     port.torque_at = 6

@@ -12,7 +12,7 @@ class CanopenSettings:
 
     node: int
     eds_path: Path
-    mode: str  # "cst", "tq" or "auto"
+    mode: str  # a key of `commissioning.MODES`
     rate_Hz: float
     heartbeat_s: float
     master_node: int
@@ -33,3 +33,5 @@ class CanopenSettings:
     rated_torque_Nm: float | None = None
     rated_tolerance: float = 0.01
     max_torque_permille: int | None = None
+    velocity_unit: str = "counts/s"  # of 60FF: a key of `scaling.VELOCITY_UNITS`
+    velocity_max_radps: float | None = None  # at the joint, for the drive's own limit in the velocity modes

@@ -131,7 +131,14 @@ def test_trapezoid_within_its_limits_continuous_and_exact_at_the_end(start, targ
 @pytest.mark.parametrize("kind", [TrajectoryKind.MIN_JERK, TrajectoryKind.TRAPEZOID])
 def test_repeated_moves_go_back_and_forth_with_a_rest_at_each_end(kind):
     c = constants(
-        kind, repeats=1, start_rad=1.0, target_rad=2.0, move_s=2.0, speed_radps=1.0, acceleration_radps2=1.0, dwell_s=0.5
+        kind,
+        repeats=1,
+        start_rad=1.0,
+        target_rad=2.0,
+        move_s=2.0,
+        speed_radps=1.0,
+        acceleration_radps2=1.0,
+        dwell_s=0.5,
     )  # both kinds take 2 s a move
     for turn in (0.0, 5.0, 50.0):
         assert at(c, turn + 1.0)[:2] == pytest.approx((1.5, 0.9375 if kind == TrajectoryKind.MIN_JERK else 1.0))

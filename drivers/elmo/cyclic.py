@@ -1,0 +1,351 @@
+"""The cyclic exchange as pure functions on memory: which bytes to send, what the received bytes mean.
+
+    begin_cycle  ->  PX                                  position, at the start of the cycle
+    take_byte    <-  replies, one byte at a time
+    end_cycle    ->  TC=.. (or MO=1; TC=0, ST, MO=0), then SR, IQ or MF in turn
+
+The torque command follows the position as fast as the line allows; status and current use the rest of the cycle.
+
+A reply is only taken if its echo is the whole command (echo on), else by its order (echo off).  After three cycles
+without a reply that is due, the driver says nothing until the line is silent for a cycle, and starts again.
+
+A quick stop is no braking here: in torque mode (UM=1) the drive knows no other torque than the commanded one, and UM
+cannot change with the motor on.  So TC=0, ST and MO=0 follow each other, and friction (or a brake) stops the joint.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from drivers.elmo.port import EXPECTED_MAX, LINE_MAX, OUT_MAX, PORT_GONE, TEXT_MAX, ElmoPort, Question
+from firmware_py.kernel import kernel
+from firmware_py.records import Command, Sample
+from firmware_py.states import DriveRequest, DriveState
+
+NOTHING = -1
+SILENT_CYCLES = 3
+FAULT_CAUSE_CYCLES = 4  # status replies to wait for MF before a fault is told without its cause
+BITS_PER_CHARACTER = 10  # 8N1
+WRAP = 1 << 32
+HALF_WRAP = 1 << 31
+_DIGITS_MAX = 17
+_LETTERS = np.array([[ord(c) for c in q.name] for q in Question], np.uint8)
+_CR, _SEMICOLON, _QUESTION_MARK = 0x0D, 0x3B, 0x3F
+_PLUS, _MINUS, _POINT, _ZERO, _NINE, _EQUALS = 0x2B, 0x2D, 0x2E, 0x30, 0x39, 0x3D
+_AMPLIFIER, _SERVO_ON, _FAULT = 0xF, 1 << 4, 1 << 6
+_TORQUE_MODE = 1
+
+
+# --- commands ---
+
+
+@kernel
+def _put(port: ElmoPort, slot: int, byte: int) -> None:
+    """Append one character to the next write and to the text that its echo must have."""
+    if port.out_length < OUT_MAX and port.expected_length[slot] < TEXT_MAX:
+        port.out[port.out_length] = byte
+        port.out_length += 1
+        port.expected[slot, port.expected_length[slot]] = byte
+        port.expected_length[slot] += 1
+
+
+@kernel
+def put_command(port: ElmoPort, question: int, value_milli: int, decimals: int) -> bool:
+    """Append a command to the next write; False where too many wait for a reply.
+
+    `decimals` < 0: no value; 0: value_milli / 1000 as a whole number; 3: with three digits after the point.
+    """
+    if port.expected_count >= EXPECTED_MAX or port.out_length + TEXT_MAX > OUT_MAX:
+        return False
+    slot = (port.expected_first + port.expected_count) % EXPECTED_MAX
+    port.expected_length[slot] = 0
+    port.expected_question[slot] = question
+    port.expected_count += 1
+    _put(port, slot, _LETTERS[question, 0])
+    _put(port, slot, _LETTERS[question, 1])
+    if decimals >= 0:
+        _put(port, slot, _EQUALS)
+        if value_milli < 0:
+            _put(port, slot, _MINUS)
+        size = abs(value_milli)
+        whole = size // 1000
+        divisor = 1
+        while whole // divisor >= 10:
+            divisor *= 10
+        while divisor > 0:
+            _put(port, slot, _ZERO + whole // divisor % 10)
+            divisor //= 10
+        if decimals > 0:
+            _put(port, slot, _POINT)
+            _put(port, slot, _ZERO + size // 100 % 10)
+            _put(port, slot, _ZERO + size // 10 % 10)
+            _put(port, slot, _ZERO + size % 10)
+    _put(port, slot, _CR)
+    return True
+
+
+@kernel
+def current_mA(port: ElmoPort, torque_Nm: float) -> int:
+    """Joint torque [Nm] as the value of TC [mA], saturated before the cast; 0 if not finite."""
+    value = 1000.0 * torque_Nm / port.torque_NmpA
+    if not math.isfinite(value):
+        return 0
+    limit = float(port.max_current_mA)
+    return round(min(max(value, -limit), limit))
+
+
+@kernel
+def _forget_expected(port: ElmoPort) -> None:
+    port.expected_count = 0
+    port.line_length = 0
+    port.line_overflow = 0
+
+
+@kernel
+def begin_cycle(port: ElmoPort, sample: Sample) -> None:
+    """The question for the position; says nothing while the line must become silent."""
+    port.cycle += 1
+    port.out_length = 0
+    port.no_sample_cycles += 1
+    if port.quiet != 0:
+        _forget_expected(port)
+        if port.heard_bytes == 0:
+            port.quiet = 0
+    elif port.expected_count > 0:
+        port.silent_cycles += 1
+        if port.silent_cycles > SILENT_CYCLES:
+            port.silent_cycles = 0
+            port.resyncs += 1
+            port.lost += port.expected_count
+            port.quiet = 1
+            _forget_expected(port)
+    else:
+        port.silent_cycles = 0
+    port.heard_bytes = 0
+    if port.quiet == 0:
+        put_command(port, Question.PX, 0, -1)
+    sample.bus_errors = PORT_GONE if port.gone != 0 else port.consecutive_failures
+
+
+@kernel
+def _put_stop(port: ElmoPort) -> None:
+    """Torque zero, stop, motor off: said whatever else waits for a reply, and in every cycle until it is off."""
+    if port.expected_count > EXPECTED_MAX - 4 or port.quiet != 0:
+        _forget_expected(port)
+    if port.status & _SERVO_ON != 0:
+        put_command(port, Question.TC, 0, 3)
+        put_command(port, Question.ST, 0, -1)
+    put_command(port, Question.MO, 0, 0)
+
+
+@kernel
+def end_cycle(port: ElmoPort, sample: Sample, command: Command) -> None:
+    """What the drive is told in this cycle, and one of the slower questions."""
+    port.out_length = 0
+    if command.request == DriveRequest.ENABLE:
+        if port.quiet != 0:
+            return
+        if port.status & _SERVO_ON != 0:
+            milli = 0
+            if sample.drive_state == DriveState.ENABLED and port.no_sample_cycles <= port.dead_man_cycles:
+                milli = current_mA(port, command.torque_Nm)
+            put_command(port, Question.TC, milli, 3)
+        elif port.has_been_on != 0 or port.fault_seen > 0:
+            pass  # the drive switched itself off: never on again without the user
+        elif port.enable_wait_cycles == 0:
+            port.enable_wait_cycles = port.enable_retry_cycles
+            put_command(port, Question.MO, 1000, 0)
+        else:
+            port.enable_wait_cycles -= 1
+    elif command.request == DriveRequest.QUICK_STOP or sample.drive_state != DriveState.OFF:
+        _put_stop(port)
+    if port.fault_seen > 0 and port.motor_fault == 0:
+        put_command(port, Question.MF, 0, -1)
+    if port.cycle % 2 == 0 or port.fault_seen > 0:
+        put_command(port, Question.SR, 0, -1)
+    else:
+        put_command(port, Question.IQ, 0, -1)
+
+
+# --- replies ---
+
+
+@kernel
+def _echo_matches(port: ElmoPort, slot: int) -> bool:
+    length = port.expected_length[slot]
+    if port.line_length < length:
+        return False
+    differences = 0
+    for i in range(length):
+        differences += port.line[i] != port.expected[slot, i]
+    return differences == 0
+
+
+@kernel
+def _match(port: ElmoPort) -> int:
+    """Which of the waiting commands the received line answers, as its place in the queue; NOTHING if none."""
+    if port.echo == 0:
+        for i in range(port.line_length):
+            # a CR may only be an error byte (code 13); elsewhere it is an echo that must not be there
+            if port.line[i] == _CR and port.line_length != 2:
+                return NOTHING
+        return 0 if port.expected_count > 0 else NOTHING
+    for place in range(port.expected_count):
+        if _echo_matches(port, (port.expected_first + place) % EXPECTED_MAX):
+            return place
+    return NOTHING
+
+
+@kernel
+def parse_number(line: np.ndarray, start: int, end: int) -> tuple[bool, float, bool]:
+    """(is a number, its value, has no point) of the characters from `start` to `end`; plain decimal notation only."""
+    at = start
+    negative = False
+    if at < end and (line[at] == _MINUS or line[at] == _PLUS):
+        negative = line[at] == _MINUS
+        at += 1
+    digits, scale, value, whole = 0, 1.0, 0.0, True
+    while at < end:
+        byte = line[at]
+        if byte == _POINT and whole:
+            whole = False
+        elif byte >= _ZERO and byte <= _NINE and digits < _DIGITS_MAX:
+            digits += 1
+            value = value * 10.0 + (byte - _ZERO)
+            if not whole:
+                scale *= 10.0
+        else:
+            return False, 0.0, False
+        at += 1
+    value /= scale
+    return digits > 0, -value if negative else value, whole
+
+
+@kernel
+def _take_counts(port: ElmoPort, counts: int) -> None:
+    """Unwrap the 32 bit position: the joint moves less than half the range between two samples."""
+    if port.primed == 0:
+        port.primed = 1
+        port.counts = counts
+    else:
+        step = counts - port.last_counts
+        if step >= HALF_WRAP:
+            step -= WRAP
+        elif step < -HALF_WRAP:
+            step += WRAP
+        port.counts += step
+    port.last_counts = counts
+
+
+@kernel
+def _take_status(port: ElmoPort, sample: Sample, status: int) -> None:
+    """SR: servo, fault, and the unit mode, which is another one after a restart of the drive."""
+    port.status = status
+    sample.status_word = status & 0x7FFFFFFF
+    mode = status >> 7 & 7
+    if port.unit_mode == _TORQUE_MODE and mode != _TORQUE_MODE:
+        sample.restarts += 1
+    port.unit_mode = mode
+    if status & (_FAULT | _AMPLIFIER) != 0:
+        # the cause (MF) is asked for before the fault is told; the power stage is off already
+        port.fault_seen += 1
+        if port.motor_fault != 0 or port.fault_seen > FAULT_CAUSE_CYCLES:
+            sample.drive_state = DriveState.FAULT
+            sample.drive_error = port.motor_fault & 0x7FFFFFFF
+        return
+    port.fault_seen = 0
+    port.motor_fault = 0
+    if status & _SERVO_ON != 0:
+        port.has_been_on = 1
+    sample.drive_state = DriveState.ENABLED if status & _SERVO_ON != 0 else DriveState.OFF
+
+
+@kernel
+def _take_value(port: ElmoPort, sample: Sample, question: int, start: int, now_ns: int) -> bool:
+    """Take the value of one reply; True if it was a position."""
+    if question >= Question.MO or question == Question.TC:
+        return False
+    good, value, whole = parse_number(port.line, start, port.line_length)
+    if not good or (not whole and question != Question.IQ):
+        port.garbled += 1
+        return False
+    if question == Question.PX:
+        if abs(value) >= WRAP:
+            port.garbled += 1
+            return False
+        _take_counts(port, int(value))
+        sample.position_rad = (port.counts - port.zero_counts) * port.position_radpcount
+        sample.time_ns = now_ns
+        sample.count += 1
+        port.no_sample_cycles = 0
+        return True
+    if question == Question.IQ:
+        sample.torque_Nm = value * port.torque_NmpA
+    elif abs(value) < WRAP:
+        if question == Question.SR:
+            _take_status(port, sample, int(value))
+        else:
+            port.motor_fault = int(value)
+    return False
+
+
+@kernel
+def _take_line(port: ElmoPort, sample: Sample, now_ns: int) -> bool:
+    """The line up to `;` is complete."""
+    if port.line_overflow != 0:
+        port.garbled += 1
+        return False
+    place = _match(port)
+    if place == NOTHING:
+        if port.expected_count > 0:
+            port.garbled += 1
+        else:
+            port.unexpected += 1
+        return False
+    slot = (port.expected_first + place) % EXPECTED_MAX
+    question = port.expected_question[slot]
+    start = port.expected_length[slot] if port.echo != 0 else 0
+    port.lost += place
+    port.expected_first = (port.expected_first + place + 1) % EXPECTED_MAX
+    port.expected_count -= place + 1
+    port.silent_cycles = 0
+    length = port.line_length - start
+    if length >= 1 and length <= 2 and port.line[port.line_length - 1] == _QUESTION_MARK:
+        port.refused += 1
+        port.last_error = port.line[start] if length == 2 else 0
+        return False
+    return _take_value(port, sample, question, start, now_ns)
+
+
+@kernel
+def take_byte(port: ElmoPort, byte: int, sample: Sample, now_ns: int) -> bool:
+    """Take one received character; True if it completed a new position."""
+    port.heard_bytes += 1
+    port.bits_sent += BITS_PER_CHARACTER
+    if byte == _SEMICOLON:
+        got = False
+        if port.quiet == 0:
+            got = _take_line(port, sample, now_ns)
+        port.line_length = 0
+        port.line_overflow = 0
+        return got
+    if port.line_length < LINE_MAX:
+        port.line[port.line_length] = byte
+        port.line_length += 1
+    else:
+        port.line_overflow = 1
+    return False
+
+
+@kernel
+def note_written(port: ElmoPort, sample: Sample, error: int) -> None:
+    """Count failed writes in a row."""
+    if error == 0:
+        port.consecutive_failures = 0
+    else:
+        port.consecutive_failures += 1
+        port.send_failures += 1
+        port.last_errno = error
+    sample.bus_errors = PORT_GONE if port.gone != 0 else port.consecutive_failures

@@ -1,0 +1,125 @@
+"""The cyclic exchange on the descriptor of a serial port: what the compiled loop calls each cycle.
+
+Same signatures as `drivers.canopen.exchange`, with bytes in place of frames.
+"""
+
+from __future__ import annotations
+
+import errno as errno_codes
+from typing import Any
+
+import numpy as np
+from numba.core import types
+
+from drivers.elmo.cyclic import begin_cycle, end_cycle, note_written, take_byte
+from drivers.elmo.port import READ_MAX, SCRATCH_WORDS, ElmoPort
+from firmware_py.kernel import exported, kernel, record_array_type
+from firmware_py.libc import EAGAIN, EINTR, NANOSECONDS, POLLIN, errno, external, monotonic_ns, ppoll
+from firmware_py.records import Command, Sample
+from firmware_py.schema import dtype_of
+
+_read = external("read", types.intp, types.int32, types.uintp, types.uintp)
+_write = external("write", types.intp, types.int32, types.uintp, types.uintp)
+
+_PORT = record_array_type(dtype_of(ElmoPort))
+_SAMPLE = record_array_type(dtype_of(Sample))
+_COMMAND = record_array_type(dtype_of(Command))
+_SCRATCH = types.Array(types.int64, 1, "C")
+_BYTES = types.Array(types.uint8, 1, "C")
+
+_GONE_EVENTS = 0x008 | 0x010 | 0x020  # POLLERR, POLLHUP, POLLNVAL
+_EIO = errno_codes.EIO
+
+
+@kernel
+def _lose_port(port: ElmoPort, code: int) -> None:
+    port.gone = 1
+    port.last_errno = code
+
+
+@kernel
+def _wait_ns(port: ElmoPort, timeout_ns: int, scratch: np.ndarray) -> None:
+    """Sleep until bytes came, the port has gone, or the time is over; `scratch` int64[3]: pollfd, timespec."""
+    limited_ns = max(timeout_ns, 0)
+    scratch[0] = (POLLIN << 32) | port.fd
+    scratch[1] = limited_ns // NANOSECONDS
+    scratch[2] = limited_ns % NANOSECONDS
+    address = scratch.ctypes.data
+    if ppoll(np.uintp(address), np.uintp(1), np.uintp(address + 8), np.uintp(0)) > 0:
+        if (scratch[0] >> 48) & _GONE_EVENTS != 0:
+            _lose_port(port, _EIO)
+
+
+@kernel
+def _drain(port: ElmoPort, data: np.ndarray, sample: Sample, now_ns: int) -> bool:
+    """Take every byte that has come; True if there was a position among them.
+
+    At most two buffers full: a line that talks without end must not keep a cycle from its end.
+    """
+    found = False
+    for _ in range(2):
+        got = _read(np.int32(port.fd), np.uintp(data.ctypes.data), np.uintp(READ_MAX))
+        if got < 0:
+            code = errno()
+            if code != EAGAIN and code != EINTR:
+                _lose_port(port, code)
+            return found
+        for i in range(got):
+            if take_byte(port, data[i], sample, now_ns):
+                found = True
+        if got < READ_MAX:  # 0 = nothing there, as a port with VMIN = 0 says it
+            return found
+    return found
+
+
+@kernel
+def _flush(port: ElmoPort, sample: Sample) -> int:
+    """Write what the cycle has to say; 0 or the errno.  A part of a command is as bad as none."""
+    if port.out_length == 0:
+        return 0
+    code = 0
+    sent = _write(np.int32(port.fd), np.uintp(port.out.ctypes.data), np.uintp(port.out_length))
+    if sent < 0:
+        code = int(errno())
+        if code != EAGAIN and code != EINTR:
+            _lose_port(port, code)
+    elif sent != port.out_length:
+        code = EAGAIN
+    port.out_length = 0
+    note_written(port, sample, code)
+    return code
+
+
+@exported(types.int64(_PORT, _BYTES, _SCRATCH, _SAMPLE, types.int64, types.int64))
+def receive(ports: Any, data: np.ndarray, scratch: np.ndarray, samples: Any, now_ns: int, deadline_ns: int) -> int:
+    """Ask for the position and wait for it until `deadline_ns`; returns the time waited [ns].
+
+    The late replies of the last cycle are taken first.
+    """
+    port = ports[0]
+    sample = samples[0]
+    _drain(port, data, sample, now_ns)
+    begin_cycle(port, sample)
+    _flush(port, sample)
+    started_ns = monotonic_ns(scratch)
+    arrived_ns = started_ns
+    while True:
+        if _drain(port, data, sample, arrived_ns):
+            return monotonic_ns(scratch) - started_ns
+        if arrived_ns >= deadline_ns or port.gone != 0:
+            return arrived_ns - started_ns
+        _wait_ns(port, deadline_ns - arrived_ns, scratch)
+        arrived_ns = monotonic_ns(scratch)
+
+
+@exported(types.int32(_PORT, _BYTES, _SAMPLE, _COMMAND))
+def send(ports: Any, data: np.ndarray, samples: Any, commands: Any) -> int:
+    """Send the torque command and the slower questions; returns 0 or the errno."""
+    port = ports[0]
+    end_cycle(port, samples[0], commands[0])
+    return np.int32(_flush(port, samples[0]))  # type: ignore[return-value]
+
+
+def exchange_memory() -> tuple[np.ndarray, np.ndarray]:
+    """(bytes, scratch) that go with a port."""
+    return np.zeros(READ_MAX, np.uint8), np.zeros(SCRATCH_WORDS, np.int64)

@@ -1,0 +1,57 @@
+"""How many characters a cycle has on a serial line, and what rate a line carries.
+
+8N1: ten bits a character.  The characters of both directions are added up although a line is full duplex: a drive
+answers after it has heard, and the second command of a cycle waits for the answer to the first.  That is cautious by
+about a third; what the drive itself needs to answer is unknown before it is measured.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+BITS_PER_CHARACTER = 10
+_COMMANDS = (3, 11, 3)  # PX, TC=-dd.ddd, SR; each with its CR
+_REPLIES = (12, 1, 10)  # -dddddddddd; and ; and up to nine digits of SR
+LARGEST_SHARE = 0.9  # of a period that the measured exchange may take
+
+
+def cycle_characters(echo: bool) -> int:
+    """Characters of one cycle at worst, both directions; echo counts every character of a command twice."""
+    return sum(_COMMANDS) * (2 if echo else 1) + sum(_REPLIES)
+
+
+def highest_rate_Hz(baud_rate_bitps: int, echo: bool) -> float:
+    """The rate at which the characters of a cycle take all of its time."""
+    return baud_rate_bitps / BITS_PER_CHARACTER / cycle_characters(echo)
+
+
+def command_time_s(baud_rate_bitps: int) -> float:
+    """Time of a torque command on the line."""
+    return _COMMANDS[1] * BITS_PER_CHARACTER / baud_rate_bitps
+
+
+@dataclass(frozen=True)
+class MeasuredExchange:
+    """What `measure` found with the motor off."""
+
+    cycle_s: float  # median of a whole exchange
+    worst_cycle_s: float
+    loop_delay_s: float  # position asked for to torque command taken; ninth decile
+
+    @property
+    def highest_rate_Hz(self) -> float:
+        """What this line carries with the reserve of `LARGEST_SHARE`."""
+        return LARGEST_SHARE / self.cycle_s
+
+
+def measured_exchange(
+    position_s: list[float], rest_s: list[float], baud_rate_bitps: int, echo: bool
+) -> MeasuredExchange:
+    """From the times of the exchanges PX and (TC, SR) without values, one of each a cycle.
+
+    TC was asked without a value, because a drive that is off refuses one: the missing characters are added.
+    """
+    value_s = (_COMMANDS[1] - _COMMANDS[0]) * BITS_PER_CHARACTER / baud_rate_bitps * (2 if echo else 1)
+    cycles = sorted(p + r + value_s for p, r in zip(position_s, rest_s, strict=True))
+    late = sorted(position_s)[min(len(position_s) - 1, (9 * len(position_s)) // 10)]
+    return MeasuredExchange(cycles[len(cycles) // 2], cycles[-1], late + command_time_s(baud_rate_bitps))

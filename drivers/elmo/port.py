@@ -1,0 +1,85 @@
+"""The memory of the cyclic exchange with one serial drive."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Annotated
+
+import numpy as np
+
+from firmware_py.schema import array_of, f8, i4, i8, record, u1
+
+TEXT_MAX = 16  # longest cyclic command: TC=-999.999 and CR
+EXPECTED_MAX = 8  # commands that wait for their reply
+LINE_MAX = 64  # longest cyclic reply, echo included
+OUT_MAX = 64  # bytes of one write
+READ_MAX = 256
+SCRATCH_WORDS = 8
+
+PORT_GONE = 1_000_000  # `Sample.bus_errors` when the port has vanished: no point in counting up to a limit
+
+
+class Question(IntEnum):
+    """The commands of the cyclic exchange; index into the table of their letters."""
+
+    PX = 0
+    TC = 1
+    SR = 2
+    IQ = 3
+    MF = 4
+    MO = 5
+    ST = 6
+
+
+@record
+class ElmoPort:
+    """Scaling and limits (set by commissioning), and what has been said on the line."""
+
+    fd: i4
+    echo: i4  # 1: every reply carries its command, which proves what it belongs to
+    # scaling, directions included: all at the joint
+    position_radpcount: f8
+    zero_counts: i8
+    torque_NmpA: f8
+    max_current_mA: i8
+    enable_retry_cycles: i8
+    dead_man_cycles: i8  # without a sample for so long the torque command is zero
+    # commands that wait for their reply, oldest first in a ring
+    expected: Annotated[np.ndarray, array_of(u1, EXPECTED_MAX, TEXT_MAX)]
+    expected_length: Annotated[np.ndarray, array_of(i4, EXPECTED_MAX)]
+    expected_question: Annotated[np.ndarray, array_of(i4, EXPECTED_MAX)]
+    expected_first: i4
+    expected_count: i4
+    # the line being received, and the bytes of the next write
+    line: Annotated[np.ndarray, array_of(u1, LINE_MAX)]
+    line_length: i4
+    line_overflow: i4
+    out: Annotated[np.ndarray, array_of(u1, OUT_MAX)]
+    out_length: i4
+    # state
+    primed: i4
+    last_counts: i8
+    counts: i8
+    cycle: i8
+    status: i8  # SR
+    motor_fault: i8  # MF
+    fault_seen: i4  # status replies that showed a fault
+    unit_mode: i4  # of the last status; 0 = none yet
+    has_been_on: i4  # 1: MO=1 has done its work; it is never said again
+    enable_wait_cycles: i8
+    no_sample_cycles: i8
+    silent_cycles: i8  # cycles since a reply came although one was due
+    quiet: i4  # 1: says nothing until the line is silent, so that old replies are not taken for new ones
+    heard_bytes: i8  # in this cycle
+    gone: i4  # the port has vanished
+    # counters
+    garbled: i8
+    lost: i8
+    unexpected: i8
+    refused: i8
+    last_error: i4  # error byte of the last refusal
+    resyncs: i8
+    send_failures: i8
+    consecutive_failures: i4
+    last_errno: i4
+    bits_sent: i8  # from the drive to the PC, the busier direction

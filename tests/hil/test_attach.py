@@ -1,0 +1,64 @@
+"""Other tools on the same bus: a python-can client and a CANopen client beside a run, and a CiA 402 master after it."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import can
+from canopen.profiles.p402 import BaseNode402
+
+EDS = Path(__file__).resolve().parents[2] / "configs" / "virtual_joint.eds"
+SYNC_ID, TPDO_ID, RPDO_ID, HEARTBEAT_ID = 0x80, 0x181, 0x201, 0x701
+
+
+def test_clients_see_the_run_and_read_objects_meanwhile(bench: Any) -> None:
+    config = bench.config(trajectory__duration_s=3.0)
+    bench.joint(config)
+    with can.Bus(interface="jointctl", channel=bench.channel) as onlooker:
+        network = bench.network()
+        node = network.add_node(1, str(EDS))
+        run = bench.start("run", config, "-y").saw("  tracking")
+        seen: dict[int, int] = {}
+        give_up = time.monotonic() + 1.0
+        while time.monotonic() < give_up:
+            if (message := onlooker.recv(0.1)) is not None:
+                seen[message.arbitration_id] = seen.get(message.arbitration_id, 0) + 1
+        assert node.sdo["Statusword"].raw & 0x6F == 0x27
+        assert node.sdo["Modes of operation display"].raw == 10
+        assert abs(node.sdo[0x6064].raw) < 524288
+        network.disconnect()
+        done = run.finished(30.0)
+    assert done.code == 0, done.err
+    for identifier in (SYNC_ID, TPDO_ID, RPDO_ID):
+        assert seen[identifier] > 100, seen
+    assert seen[HEARTBEAT_ID] >= 2, seen
+    assert bench.disabled()
+
+
+def test_a_cia402_master_of_another_library_enables_and_moves_the_joint(bench: Any) -> None:
+    config = bench.config()
+    bench.joint(config)
+    network = bench.network()
+    node = BaseNode402(1, str(EDS))
+    network.add_node(node)
+    node.nmt.state = "PRE-OPERATIONAL"
+    node.setup_402_state_machine()
+    node.nmt.state = "OPERATIONAL"
+    network.sync.start(0.01)
+    try:
+        before = node.sdo[0x6064].raw
+        node.op_mode = "PROFILED VELOCITY"
+        node.sdo[0x60FF].raw = 20_000  # counts/s, 0.24 rad/s
+        node.state = "OPERATION ENABLED"
+        assert node.state == "OPERATION ENABLED"
+        time.sleep(0.5)
+        moved = node.sdo[0x6064].raw - before
+        node.sdo[0x60FF].raw = 0
+        node.state = "SWITCH ON DISABLED"
+    finally:
+        network.sync.stop()
+        network.disconnect()
+    assert 2_000 < moved < 20_000
+    assert bench.disabled()

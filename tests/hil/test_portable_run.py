@@ -1,0 +1,270 @@
+"""The plain Python loop with the virtual joint: "virtual" of python-can in threads, udp_multicast in processes.
+
+The multicast group has the scope of this computer's own interface (ff11::), so that nothing goes out on the network.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import select
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+import tomlkit
+
+from drivers.can.open import open_python_can
+from drivers.canopen.drive import CanopenDrive
+from firmware_py.realtime import Word
+from firmware_py.sequence import reset_axis
+from firmware_py.states import AxisPhase, Fault
+from tools.config import Config, load_config, shipped_config
+from tools.config_drive import canopen_settings
+from tools.config_records import axis_constants
+from tools.device_pump import PumpedDevice
+from tools.portable_loop import run_portable_loop, warm_up
+from tools.shared_block import SharedBlock
+from tools.virtual_joint import new_device, serve_virtual_joint
+
+RATE_HZ = 100.0
+PERIOD_NS = round(1e9 / RATE_HZ)
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def written_config(folder: Path, interface: str, channel: str) -> Path:
+    """The shipped virtual joint at 100 Hz: gains for that rate, and limits for a busy computer."""
+    data: Any = tomlkit.parse(shipped_config("virtual").read_text())
+    data["bus"].update(interface=interface, channel=channel)
+    data["drive"]["heartbeat_s"] = 2.0
+    data["loop"].update(rate_Hz=RATE_HZ)
+    del data["loop"]["priority"]
+    data["limits"].update(
+        sample_age_max_s=1.0, skipped_max_s=1.0, following_error_max_rad=0.6, position_jump_max_rad=0.1
+    )
+    data["sequence"].update(supervisor_timeout_s=5.0)
+    data["control"].update(kp=36.0, kv=12.0, q=100.0, learning_rate=1.0, velocity_cutoff_Hz=25.0)
+    data["trajectory"].update(duration_s=1.0, amplitude_rad=0.1)
+    data["virtual"].update(initial_position_rad=0.02)
+    data["log"]["folder"] = str(folder / "runs")
+    path = folder / "joint.toml"
+    path.write_text(tomlkit.dumps(data))
+    return path
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Config:
+    return load_config(written_config(tmp_path, "virtual", f"portable-{os.getpid()}-{time.monotonic_ns()}"))
+
+
+def open_bus(config: Config) -> can.BusABC:
+    return open_python_can(config.bus.interface, config.bus.channel, config.bus.bitrate_bitps)
+
+
+def read_device_type(bus: can.BusABC, node: int) -> int | None:
+    bus.send(can.Message(arbitration_id=0x600 + node, is_extended_id=False, data=bytes([0x40, 0, 0x10, 0, 0, 0, 0, 0])))
+    give_up = time.monotonic() + 5.0
+    while time.monotonic() < give_up:
+        message = bus.recv(0.1)
+        if message is not None and message.arbitration_id == 0x580 + node:
+            return int(struct.unpack_from("<I", message.data, 4)[0])
+    return None
+
+
+class TestPump:
+    def test_boots_answers_and_stops(self, config: Config) -> None:
+        with contextlib.closing(_Closing(open_bus(config))) as client:
+            with serve_virtual_joint(config) as joint:
+                assert isinstance(joint, PumpedDevice)
+                assert read_device_type(client.bus, config.drive.node) == 0x00020192
+                with pytest.raises(RuntimeError, match="running already"):
+                    joint.start()
+            assert joint.words[2] == 1
+            client.drain()
+            client.bus.send(can.Message(arbitration_id=0x601, is_extended_id=False, data=b"\x40\x00\x10\0\0\0\0\0"))
+            assert client.bus.recv(0.1) is None
+
+    def test_frames_that_are_no_classic_can_are_ignored(self, config: Config) -> None:
+        with contextlib.closing(_Closing(open_bus(config))) as client, serve_virtual_joint(config) as joint:
+            client.bus.send(can.Message(arbitration_id=0x601, is_fd=True, is_extended_id=False, data=bytes(12)))
+            assert read_device_type(client.bus, config.drive.node) == 0x00020192
+            assert joint.words[2] == 0
+
+    @pytest.mark.parametrize("errors", [3, 10_000])
+    def test_only_a_bus_that_stays_dead_ends_it(self, config: Config, errors: int) -> None:
+        bus = _FailingBus(errors)
+        with PumpedDevice(new_device(config), bus) as joint:
+            give_up = time.monotonic() + 10.0
+            while bus.received < errors + 5 and joint.words[2] == 0 and time.monotonic() < give_up:
+                time.sleep(0.01)
+            assert joint.words[2] == (2 if errors > 100 else 0)
+        assert joint.words[1] >= 1  # the boot-up message was lost
+
+
+class _Closing:
+    """A bus of the test."""
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self.bus = bus
+
+    def drain(self) -> None:
+        while self.bus.recv(0.0) is not None:
+            pass
+
+    def close(self) -> None:
+        self.bus.shutdown()
+
+
+class _FailingBus:
+    """Takes nothing, and fails to receive for a while."""
+
+    def __init__(self, errors: int) -> None:
+        self._errors = errors
+        self.received = 0
+
+    def send(self, message: can.Message, timeout: float | None = None) -> None:
+        raise can.CanOperationError("full")
+
+    def recv(self, timeout: float | None = None) -> None:
+        self.received += 1
+        if self.received <= self._errors:
+            raise can.CanOperationError("down")
+        time.sleep(0.001)
+
+
+def test_a_run_in_threads_on_the_bus_of_one_process(config: Config) -> None:
+    warm_up()
+    block = SharedBlock.create(1)
+    with contextlib.closing(_Closing(open_bus(config))) as loop_end, serve_virtual_joint(config):
+        drive = CanopenDrive(open_bus(config), canopen_settings(config))
+        try:
+            report = drive.commission()
+            block.constants[:] = axis_constants(config, start_position_rad=report.start_position_rad)
+            reset_axis(block.constants[0], block.state[0])
+            block.port[:] = drive.port()
+            block.words[Word.SUPERVISOR_NS] = time.monotonic_ns()
+            drive.start_cyclic()
+            arguments = (loop_end.bus, block, PERIOD_NS, 6_000_000, 2000)
+            thread = threading.Thread(target=run_portable_loop, args=arguments)
+            thread.start()
+            while thread.is_alive():
+                block.words[Word.SUPERVISOR_NS] = time.monotonic_ns()
+                thread.join(0.02)
+            assert (block.state[0].phase, block.state[0].fault) == (AxisPhase.FINISHED, Fault.NONE)
+            assert drive.make_safe() == "switch on disabled"
+        finally:
+            drive.close()
+    records = block.ring[: int(block.words[Word.HEAD])]
+    tracking = records[records.phase == AxisPhase.TRACKING]
+    assert len(tracking) > 10
+    assert abs(tracking.error_rad).max() < 0.3
+    assert abs(records.measured_torque_Nm).max() > 1.0
+    os.close(block.fd)
+
+
+# --- two processes on udp_multicast ---
+
+
+@pytest.fixture
+def multicast_config(tmp_path: Path) -> Iterator[Path]:
+    """One session of tests at a time: every multicast group of one port shares the frames."""
+    with open(Path(tempfile.gettempdir()) / f"jointctl-multicast-{os.getuid()}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield written_config(tmp_path, "udp_multicast", "ff11::7079:7468")
+
+
+def environment() -> dict[str, str]:
+    environ = {key: value for key, value in os.environ.items() if not key.startswith("CAN_")}
+    environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), environ.get("PYTHONPATH"))))
+    return environ
+
+
+@contextlib.contextmanager
+def joint_process(path: Path) -> Iterator[subprocess.Popen[bytes]]:
+    read_end, write_end = os.pipe()
+    command = [sys.executable, "-P", "-m", "tools.cli", "hil", str(path), "--ready-fd", str(write_end), "--quiet"]
+    process = subprocess.Popen(command, pass_fds=(write_end,), env=environment())
+    os.close(write_end)
+    try:
+        assert select.select([read_end], [], [], 180.0)[0]
+        assert os.read(read_end, 1) == b"+"
+        yield process
+    finally:
+        os.close(read_end)
+        process.send_signal(signal.SIGTERM)
+        process.wait(10.0)
+
+
+def start_run(path: Path) -> subprocess.Popen[str]:
+    command = [sys.executable, "-P", "-m", "tools.cli", "run", str(path), "-y", "--json"]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment())
+
+
+def test_the_whole_run_over_udp_multicast(multicast_config: Path) -> None:
+    with joint_process(multicast_config) as joint:
+        process = start_run(multicast_config)
+        stdout, stderr = process.communicate(timeout=180.0)
+        assert process.returncode == 0, stderr
+        assert joint.poll() is None
+    assert "plain Python loop over udp_multicast" in stderr
+    result = json.loads(stdout)
+    assert result["fault"] is None
+    assert result["drive_state"] == "switch on disabled"
+    assert result["tracked_s"] == pytest.approx(1.0, abs=2.0 / RATE_HZ)
+    assert result["error"]["range_rad"]["greatest"] < 0.3
+    assert 0.0 < result["bus_load"] < 0.05  # 285 bits at 100 Hz on 1 Mbit/s; own echoes would double it
+    assert joint.returncode == 0
+
+
+def loop_pid(parent: int) -> int | None:
+    """The child that runs the loop."""
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            text = path.read_text()
+            if int(text.rpartition(")")[2].split()[1]) == parent:
+                if b"tools.loop_process" in (path.parent / "cmdline").read_bytes():
+                    return int(path.parent.name)
+    return None
+
+
+def test_a_killed_loop_ends_disabled_by_the_drives_own_watchdog(multicast_config: Path) -> None:
+    with joint_process(multicast_config):
+        process = start_run(multicast_config)
+        assert process.stderr is not None
+        seen = []
+        for line in process.stderr:
+            seen.append(line)
+            if "approach" in line and "to" not in line:
+                break
+        pid = loop_pid(process.pid)
+        assert pid is not None, seen
+        os.kill(pid, signal.SIGKILL)
+        _, rest = process.communicate(timeout=60.0)
+    assert process.returncode == 7, rest
+    assert "killed by signal 9" in rest
+    assert "switch on disabled" in rest or "fault" in rest
+
+
+def test_an_interrupt_ramps_down(multicast_config: Path) -> None:
+    with joint_process(multicast_config):
+        process = start_run(multicast_config)
+        assert process.stderr is not None
+        for line in process.stderr:
+            if line.strip() == "tracking":
+                break
+        process.send_signal(signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=60.0)
+    assert process.returncode == 130, stderr
+    assert json.loads(stdout)["drive_state"] == "switch on disabled"
+    assert "ramping" in stderr

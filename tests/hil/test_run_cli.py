@@ -1,0 +1,201 @@
+"""`jointctl run` against `jointctl hil` in another process: runs, stops, and what a user is asked."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import resource
+import signal
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from firmware_py.states import AxisPhase, DriveRequest, DriveState
+
+LARGEST_STEP_radps = 0.02  # of the desired velocity in one cycle; braking at 2 rad/s2 is a tenth of it
+
+
+def largest_velocity_step(records: Any) -> float:
+    """Of the desired velocity [rad/s] between neighbouring cycles without a skipped slot."""
+    steps = np.abs(np.diff(records.desired_velocity_radps))
+    return float(np.max(steps[records.skipped[1:] == 0]))
+
+
+def entered(records: Any) -> list[AxisPhase]:
+    return [AxisPhase(p) for i, p in enumerate(records.phase) if i == 0 or p != records.phase[i - 1]]
+
+
+def test_two_runs_on_one_joint_and_it_is_disabled_after_each(bench: Any) -> None:
+    config = bench.config()
+    bench.joint(config)
+    for number in (1, 2):
+        done = bench.run("run", config, "-y", "--json")
+        assert done.code == 0, done.err
+        assert json.loads(done.out)["fault"] is None
+        assert bench.disabled()
+        assert len(list(bench.folder.glob("runs/*.mcap"))) == number
+        assert "now at" in done.err
+        assert "trajectory sine" in done.err
+        assert "limits" in done.err
+
+
+@pytest.mark.parametrize(("number", "name"), [(signal.SIGINT, "SIGINT"), (signal.SIGTERM, "SIGTERM")])
+def test_one_stop_signal_while_tracking_ramps_down(bench: Any, number: int, name: str) -> None:
+    config = bench.config(trajectory__duration_s=30.0)
+    bench.joint(config)
+    started = bench.start("run", config, "-y").saw("  tracking")
+    time.sleep(0.3)
+    started.signal(number, group=True)
+    done = started.finished(20.0)
+    assert done.code == 130, done.err
+    assert "Traceback" not in done.err
+    assert f"stopped by {name}" in done.err
+    assert bench.disabled()
+    records = bench.log().records
+    assert entered(records)[-4:] == [
+        AxisPhase.RAMPING, AxisPhase.RELEASING, AxisPhase.DISABLING, AxisPhase.FINISHED,
+    ]  # fmt: skip
+    assert DriveRequest.QUICK_STOP not in records.request
+    assert largest_velocity_step(records) < LARGEST_STEP_radps
+    ramping = records[records.phase == AxisPhase.RAMPING]
+    assert abs(records[records.phase == AxisPhase.TRACKING].desired_velocity_radps[-1]) > 0.1  # it was moving
+    assert abs(ramping.desired_velocity_radps[-1]) < LARGEST_STEP_radps
+    assert np.all(records[records.phase >= AxisPhase.RELEASING].desired_velocity_radps == 0.0)
+
+
+def test_a_second_ctrl_c_is_a_quick_stop(bench: Any) -> None:
+    # braking so gently that the second signal surely comes while the joint moves
+    config = bench.config(
+        trajectory__duration_s=30.0, sequence__approach_s=1.5,
+        sequence__brake_radps2=0.05, sequence__stop_timeout_s=30.0,
+        limits__position_min_rad=-1.5, limits__position_max_rad=1.5,
+    )  # fmt: skip
+    bench.joint(config)
+    started = bench.start("run", config, "-y").saw("  tracking")
+    started.signal(signal.SIGINT, group=True)
+    started.saw("  ramping").signal(signal.SIGINT, group=True)
+    done = started.finished(20.0)
+    assert done.code == 130, done.err
+    assert bench.disabled()
+    records = bench.log().records
+    assert entered(records)[-3:] == [AxisPhase.QUICK_STOPPING, AxisPhase.DISABLING, AxisPhase.FINISHED]
+    assert np.all(records.command_torque_Nm[records.phase >= AxisPhase.QUICK_STOPPING] == 0.0)
+
+
+@pytest.mark.parametrize("delay_s", [0.1, 0.7, 1.5])
+def test_ctrl_c_before_motion_moves_nothing(bench: Any, delay_s: float) -> None:
+    config = bench.config(trajectory__duration_s=30.0, sequence__settle_s=5.0, sequence__wait_timeout_s=60.0)
+    bench.joint(config)
+    started = bench.start("run", config, "-y")
+    time.sleep(delay_s)
+    started.signal(signal.SIGINT, group=True)
+    done = started.finished(20.0)
+    assert done.code in (130, -signal.SIGINT), done.err  # the latter while Python itself starts
+    assert "tracking" not in done.err
+    if delay_s >= 0.7:
+        assert "Traceback" not in done.err
+    assert bench.disabled()
+    if logs := list(bench.folder.glob("runs/*.mcap")):
+        assert logs
+        assert DriveState.ENABLED not in bench.log().records.drive_state
+
+
+class Terminal:
+    """`jointctl` with a terminal as its standard input and error."""
+
+    def __init__(self, bench: Any, *arguments: str) -> None:
+        self.master, slave = pty.openpty()
+        self.started = bench.start(*arguments, stdin=slave, stderr=slave)
+        os.close(slave)
+        os.set_blocking(self.master, False)
+        self.text = ""
+
+    def saw(self, text: str, timeout_s: float = 180.0) -> Terminal:
+        give_up = time.monotonic() + timeout_s
+        while text not in self.text:
+            assert time.monotonic() < give_up, self.text
+            try:
+                self.text += os.read(self.master, 4096).decode()
+            except BlockingIOError:
+                time.sleep(0.01)
+        return self
+
+
+def test_answering_no_moves_nothing(bench: Any) -> None:
+    config = bench.config()
+    bench.joint(config)
+    terminal = Terminal(bench, "run", config).saw("[y/N]")
+    os.write(terminal.master, b"\n")
+    terminal.saw("nothing moved")
+    assert terminal.started.finished(20.0).code == 0
+    assert bench.disabled()
+    assert not (bench.folder / "runs").exists()
+
+
+def test_ctrl_c_at_the_question_ends_it(bench: Any) -> None:
+    config = bench.config()
+    bench.joint(config)
+    terminal = Terminal(bench, "run", config).saw("[y/N]")
+    terminal.started.signal(signal.SIGINT, group=True)
+    terminal.saw("interrupted; nothing moved", 10.0)
+    assert terminal.started.finished(20.0).code == 130
+    assert bench.disabled()
+
+
+def test_a_terminal_that_is_closed_while_tracking_ramps_down(bench: Any) -> None:
+    config = bench.config(trajectory__duration_s=30.0)
+    bench.joint(config)
+    terminal = Terminal(bench, "run", config, "-y").saw("  tracking")
+    os.close(terminal.master)  # from now on writing to it is an error
+    terminal.started.signal(signal.SIGHUP)
+    terminal.started.finished(20.0)
+    assert bench.disabled()
+    records = bench.log().records
+    assert AxisPhase.RELEASING in entered(records)
+    assert DriveRequest.QUICK_STOP not in records.request
+    assert largest_velocity_step(records) < LARGEST_STEP_radps
+
+
+def test_dry_run_commissions_and_moves_nothing(bench: Any) -> None:
+    config = bench.config(virtual__initial_position_rad=0.1)
+    bench.joint(config)
+    done = bench.run("run", config, "--dry-run")
+    assert done.code == 0, done.err
+    assert "now at     +0.1000 rad" in done.err
+    assert "dry run" in done.err
+    assert bench.disabled()
+    assert not (bench.folder / "runs").exists()
+
+
+def test_a_disk_that_fills_while_tracking_ramps_down(bench: Any) -> None:
+    config = bench.config(trajectory__duration_s=30.0)
+    bench.joint(config)
+    started = bench.start("run", config, "-y").saw("  tracking")
+    resource.prlimit(started.process.pid, resource.RLIMIT_FSIZE, (1024, 1024))
+    started.finished(20.0).refused(8, "runs/", "cannot be written")
+    assert bench.disabled()
+
+
+def test_a_disk_that_is_full_before_motion_moves_nothing(bench: Any) -> None:
+    config = bench.config()
+    bench.joint(config)
+    terminal = Terminal(bench, "run", config).saw("[y/N]")
+    resource.prlimit(terminal.started.process.pid, resource.RLIMIT_FSIZE, (16, 16))
+    os.write(terminal.master, b"y\n")
+    terminal.saw("cannot be written")
+    assert terminal.started.finished(20.0).code == 8
+    assert "Traceback" not in terminal.text
+    assert bench.disabled()
+
+
+def test_a_second_run_on_a_moving_joint_is_refused_and_the_first_goes_on(bench: Any) -> None:
+    config = bench.config(trajectory__duration_s=5.0)
+    bench.joint(config)
+    first = bench.start("run", config, "-y").saw("  tracking")
+    bench.run("run", config, "-y").refused(4, "another controller", "SYNC")
+    done = first.finished(30.0)
+    assert done.code == 0, done.err
+    assert bench.disabled()

@@ -1,0 +1,216 @@
+"""`check`: table, JSON, verdict, remedies and picture; where each assumption comes from."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.errors import ConfigurationError, MarginError
+from firmware_py.states import ControllerKind
+from tools.analysis import loop_settings as mapping
+from tools.analysis.linear_loop import CONTROLLERS
+from tools.analysis.loop_settings import MarginSettings, loop_settings, margin_settings, not_modelled
+from tools.analysis.margins import phase_margin_deg
+from tools.check import check, require_margin
+from tools.config import Config, load_config, shipped_config
+from tools.output import Output
+
+
+@pytest.fixture(autouse=True)
+def wide_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that no cell is folded."""
+    monkeypatch.setenv("COLUMNS", "250")
+
+
+def changed(section: str, config: Config | None = None, **values: Any) -> Config:
+    """The paper's configuration with these values in one section."""
+    config = load_config(shipped_config("paper")) if config is None else config
+    return config.model_copy(update={section: getattr(config, section).model_copy(update=values)})
+
+
+PAPER_SIMULATION = {"q": (2500.0,)}
+
+
+def run_check(config: Config, delay_s: float | None = None, **options: Any) -> tuple[str, str, int]:
+    """(stdout, stderr, exit code); a refusal keeps what was printed before it."""
+    output = Output(json=options.pop("json", False), stdout=io.StringIO(), stderr=io.StringIO())
+    try:
+        code = check(config, output, delay_s, **options)
+    except MarginError as error:
+        output.error(error.message, error.hint)
+        code = error.exit_code
+    return output.stdout.getvalue(), output.stderr.getvalue(), code
+
+
+def test_the_paper_on_its_platform_passes_and_everything_is_printed() -> None:
+    shown, messages, code = run_check(load_config(shipped_config("paper")))
+    assert code == 0
+    for text in ("12680.357", "16.092", "6.709", "0.008536", "24.2 deg", "5.11 ms", "16.5 s", "2.40", "verdict", "ok"):
+        assert text in shown
+    assert "drive.rpdo_transmission_type = 1, synchronous" in shown
+    assert 'control.feed_forward = "measured"' in messages
+
+
+@pytest.mark.parametrize("name", ["virtual", "paper"])
+def test_every_shipped_virtual_configuration_has_its_margin(name: str) -> None:
+    found = require_margin(load_config(shipped_config(name)))
+    assert found.phase_margin_deg >= 20.0
+
+
+def test_too_small_a_margin_is_refused_with_numbers() -> None:
+    shown, messages, code = run_check(changed("control", **PAPER_SIMULATION))
+    assert code == 9
+    assert "too small" in shown
+    assert "16.8 deg" in shown
+    assert "phase margin (=16.8 deg) must be at least 20 deg: at 1000 Hz with 1 ms loop delay" in messages
+    for remedy in ("control.q = 2170 (now 2500", "control.velocity_cutoff_Hz = ", "control.learning_rate = 69.5"):
+        assert remedy in messages
+
+
+def test_an_unstable_loop_is_called_so() -> None:
+    shown, messages, code = run_check(load_config(shipped_config("paper")), 8e-3)
+    assert code == 9
+    assert "NO" in shown
+    assert "the control loop is unstable" in messages
+
+
+def test_the_limit_is_met_exactly_at_the_boundary(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = load_config(shipped_config("paper"))
+    margin_deg = require_margin(config).phase_margin_deg
+    for above_deg, refused in ((-1e-9, False), (0.0, False), (1e-9, True), (0.1, True)):
+        wanted = MarginSettings(min_phase_margin_deg=margin_deg + above_deg)
+        monkeypatch.setattr("tools.check.margin_settings", lambda _, wanted=wanted: wanted)
+        if refused:
+            with pytest.raises(MarginError):
+                require_margin(config)
+        else:
+            require_margin(config)
+
+
+def test_the_override_accepts_a_small_margin_but_never_an_unstable_loop() -> None:
+    config = changed("control", **PAPER_SIMULATION)
+    with pytest.raises(MarginError):
+        require_margin(config)
+    assert require_margin(config, allow_low_margin=True).stable
+    shown, _, code = run_check(config, allow_low_margin=True)
+    assert code == 0
+    assert "below the minimum, accepted" in shown
+    with pytest.raises(MarginError, match="unstable"):
+        require_margin(config, 8e-3, allow_low_margin=True)
+
+
+def test_the_measured_delay_decides() -> None:
+    config = changed("control", **PAPER_SIMULATION)
+    assert require_margin(config, 0.3e-3).phase_margin_deg > 20.0
+    with pytest.raises(MarginError, match=r"1\.5 ms loop delay"):
+        require_margin(config, 1.5e-3)
+
+
+def test_json_holds_the_same_numbers() -> None:
+    shown, _, code = run_check(changed("control", **PAPER_SIMULATION), json=True)
+    data = json.loads(shown)
+    assert code == 9
+    assert data["verdict"] == "too small"
+    assert data["margins"]["phase_margin_deg"] == pytest.approx(16.81, abs=0.01)
+    assert data["margins"]["delay_margin_s"] == pytest.approx(3.21e-3, abs=1e-5)
+    assert data["theory"]["p"] == pytest.approx([17611.607, 1.594388, 22.3499], rel=1e-6)
+    assert data["theory"]["tight_bound_per_Nm"] == pytest.approx(0.0085, abs=5e-5)
+    delay = next(a for a in data["assumptions"] if a["name"] == "loop delay")
+    assert delay == {"name": "loop delay", "value": 1e-3, "unit": "s", "origin": delay["origin"]}
+    assert all(remedy["phase_margin_deg"] >= 20.0 for remedy in data["remedies"])
+    assert data["remedies"]
+
+
+def test_json_of_an_unstable_loop_is_valid() -> None:
+    shown, _, _ = run_check(load_config(shipped_config("paper")), 8e-3, json=True)
+    data = json.loads(shown)
+    assert data["margins"]["stable"] is False
+    assert data["margins"]["sensitivity_peak"] is None  # infinite
+
+
+@pytest.mark.parametrize("delay_s", [None, 8e-3])
+def test_a_picture_is_written_for_stable_and_unstable_loops(tmp_path: Path, delay_s: float | None) -> None:
+    path = tmp_path / "folder" / "loop.png"
+    shown, _, _ = run_check(load_config(shipped_config("paper")), delay_s, figure=path)
+    assert path.read_bytes().startswith(b"\x89PNG")
+    assert "loop.png" in shown
+
+
+@pytest.mark.parametrize(
+    ("transmission_type", "periods"), [(0, 1.0), (1, 1.0), (2, 2.0), (240, 240.0), (254, 1.0), (255, 1.0)]
+)
+def test_the_assumed_delay_follows_the_rpdo(transmission_type: int, periods: float) -> None:
+    config = changed("drive", rpdo_transmission_type=transmission_type)
+    settings, assumptions = loop_settings(config)
+    assert settings.delay_s == pytest.approx(periods * 1e-3)
+    origin = assumptions[1].origin
+    assert origin.startswith("assumed: ")
+    assert ("asynchronous" in origin) is (transmission_type > 240)
+
+
+def test_measured_beats_configured_beats_assumed() -> None:
+    config = load_config(shipped_config("paper"))
+    configured = MarginSettings(loop_delay_s=1.7e-3, current_lag_s=0.9e-3)
+    settings, assumptions = loop_settings(config, None, configured)
+    assert (settings.delay_s, settings.lag_s) == (1.7e-3, 0.9e-3)
+    assert assumptions[1].origin == "margin.loop_delay_s"
+    settings, assumptions = loop_settings(config, 2.5e-3, configured)
+    assert settings.delay_s == 2.5e-3
+    assert assumptions[1].origin == "measured"
+
+
+def test_the_section_of_the_configuration_is_used() -> None:
+    assert asdict(margin_settings(load_config(shipped_config("paper")))) == asdict(MarginSettings())
+    config = changed("margin", min_phase_margin_deg=25.0, loop_delay_s=0.0, current_lag_s=0.001)
+    settings, _ = loop_settings(config)
+    assert (settings.delay_s, settings.lag_s) == (0.0, 0.001)  # a delay of 0 is a value, not "unknown"
+    assert margin_settings(config).min_phase_margin_deg == 25.0
+
+
+def test_a_negative_measured_delay_is_named() -> None:
+    with pytest.raises(ConfigurationError, match=r"delay_s \(=-0\.001\) must be >= 0"):
+        require_margin(load_config(shipped_config("paper")), -1e-3)
+
+
+def test_every_kind_of_the_configuration_can_be_checked() -> None:
+    assert set(CONTROLLERS) == set(ControllerKind)
+    for kind, extra in (
+        ("computed_torque", {}),
+        ("computed_torque_observer", {"observer_radps": 60.0}),
+        ("pid", {"kp": 6075.0, "kv": 135.0, "ki": 91125.0}),
+    ):
+        shown, _, code = run_check(changed("control", kind=kind, **extra))
+        assert code == 0
+        assert "eigenvalues of P" not in shown
+
+
+def test_remedies_of_the_other_kinds_name_their_own_settings() -> None:
+    pid = changed("control", kind="pid", kp=6075.0, kv=135.0, ki=91125.0)
+    assert ", ki = " in run_check(pid, 5e-3)[1]
+    observer = changed("control", kind="computed_torque_observer", observer_radps=200.0)
+    assert "control.observer_radps = " in run_check(observer, 3e-3)[1]
+
+
+def test_widths_and_q_pairs_arrive() -> None:
+    widths = tuple(0.01 * (i + 1) for i in range(15))
+    settings, _ = loop_settings(changed("control", widths=widths, q=(1000.0, 20.0)))
+    assert settings.widths == widths
+    assert settings.q == (1000.0, 20.0)
+    assert len(settings.centres) == 15
+    assert phase_margin_deg(settings) > 0.0
+
+
+def test_what_the_model_leaves_out_is_said() -> None:
+    config = changed("joint", gravity_Nm=5.0, coriolis_Nmspr=0.1)
+    config = changed("control", config, dead_zone_rad=1e-4)
+    texts = not_modelled(config)
+    assert [text.split(" ")[0] for text in texts] == [
+        "control.feed_forward", "joint.gravity_Nm", "joint.coriolis_Nmspr", "control.dead_zone_rad",
+    ]  # fmt: skip
+    assert not_modelled(changed("control", feed_forward="desired")) == []
+    assert mapping.LAST_SYNCHRONOUS_TYPE == 240

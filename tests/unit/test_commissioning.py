@@ -1,0 +1,269 @@
+"""Commissioning by the real driver against the virtual drive, and every reason to refuse."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.canopen.drive import CanopenDrive
+from drivers.canopen.settings import CanopenSettings
+from drivers.errors import ConfigurationError, DeviceError, JointctlError, NoDeviceError
+
+pytestmark = pytest.mark.usefixtures("short_timeout")
+
+
+@pytest.fixture
+def short_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers.canopen.drive.SDO_TIMEOUT_S", 0.15)
+
+
+@contextmanager
+def opened(bus: Any, settings: CanopenSettings) -> Iterator[CanopenDrive]:
+    drive = bus.drive(settings)
+    try:
+        yield drive
+    finally:
+        drive.close()
+
+
+def value(bus: Any, index: int, sub: int = 0) -> int:
+    return int(bus.device.objects.value(index, sub))
+
+
+def refusal(bus: Any, settings: CanopenSettings, kind: type[JointctlError]) -> str:
+    """The message of a commissioning that must fail with exactly this class, in one line, drive left disabled."""
+    with opened(bus, settings) as drive, pytest.raises(JointctlError) as caught:
+        drive.commission()
+    assert type(caught.value) is kind
+    assert "\n" not in str(caught.value)
+    if bus.device is not None:
+        assert value(bus, 0x6041) & 0x6F != 0x27
+    return str(caught.value)
+
+
+# --- the way that works ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def commissioned(device_on_bus: Any, settings_of_virtual_joint: CanopenSettings) -> Iterator[Any]:
+    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+        yield device_on_bus, drive, drive.commission()
+
+
+def test_the_report(commissioned: Any) -> None:
+    _, _, report = commissioned
+    assert report.mode == "cyclic_sync_torque"
+    assert report.start_position_rad == pytest.approx(0.1, abs=2.0 * math.pi / 2**19)
+    assert report.torque_resolution_Nm == pytest.approx(0.0605)
+    assert report.position_resolution_rad == pytest.approx(2.0 * math.pi / 2**19)
+    assert report.identity.name == "jointctl virtual joint"
+    assert report.settings["max torque"] == "1000 permille = 60.5 Nm"
+    assert report.settings["60C2"] == "1e-3 s"
+    assert report.settings["watchdog"].startswith("200 ms")
+
+
+def test_what_is_in_the_drive_afterwards(commissioned: Any) -> None:
+    bus, drive, _ = commissioned
+    assert value(bus, 0x6060) == value(bus, 0x6061) == 10
+    assert value(bus, 0x6072) == 1000
+    assert value(bus, 0x6071) == 0
+    assert (value(bus, 0x60C2, 1), value(bus, 0x60C2, 2)) in ((1, -3), (1, 253))
+    assert value(bus, 0x1016, 1) == 126 << 16 | 200
+    assert value(bus, 0x1017) == 200
+    assert (value(bus, 0x6007), value(bus, 0x605A), value(bus, 0x1029, 1)) == (3, 2, 2)
+    assert [value(bus, 0x1A00, k) for k in range(4)] == [3, 0x60410010, 0x60640020, 0x60770010]
+    assert [value(bus, 0x1600, k) for k in range(3)] == [2, 0x60400010, 0x60710010]
+    assert (value(bus, 0x1800, 1), value(bus, 0x1800, 2)) == (0x181, 1)
+    assert (value(bus, 0x1400, 1), value(bus, 0x1400, 2)) == (0x201, 1)
+    for base in (0x1400, 0x1800):
+        assert all(value(bus, base + k, 1) & 0x80000000 for k in (1, 2, 3))
+    assert bus.device.device[0].nmt == 127
+    port = drive.port()[0]
+    assert (port.max_permille, port.node, port.heartbeat_cycles) == (1000, 1, 66)
+
+
+def test_targets_are_zeroed_before_anything_else_is_written(commissioned: Any) -> None:
+    bus, _, _ = commissioned
+    written = [
+        struct.unpack_from("<H", data, 1)[0] for cob, data in bus.requests if cob == 0x601 and data[0] & 0xE0 == 0x20
+    ]
+    first = {index: written.index(index) for index in written}
+    assert written[0] == 0x6040
+    assert first[0x6071] < first[0x6060] < first[0x6072] < first[0x60C2] < first[0x1016] < first[0x1800]
+    words = [data[4] for cob, data in bus.requests if cob == 0x601 and data[:3] == b"\x2b\x40\x60"]
+    assert set(words) == {0}  # nothing but "disable voltage" is ever written while commissioning
+
+
+def test_a_pdo_is_remapped_in_the_order_of_the_standard(commissioned: Any) -> None:
+    bus, _, _ = commissioned
+    steps = []
+    for cob, data in bus.requests:
+        index, sub = struct.unpack_from("<HB", data, 1) if len(data) == 8 else (0, 0)
+        if cob == 0x601 and data[0] & 0xE0 == 0x20 and index in (0x1800, 0x1A00):
+            steps.append((index, sub, struct.unpack_from("<I", data, 4)[0]))
+    assert [step[:2] for step in steps] == [
+        (0x1800, 1), (0x1800, 2), (0x1A00, 0), (0x1A00, 1), (0x1A00, 2), (0x1A00, 3), (0x1A00, 0), (0x1800, 1),
+    ]  # fmt: skip
+    assert steps[0][2] & 0x80000000
+    assert (steps[2][2], steps[6][2]) == (0, 3)
+    assert steps[7][2] == 0x181
+
+
+def test_cyclic_start_and_make_safe(commissioned: Any) -> None:
+    bus, drive, _ = commissioned
+    drive.start_cyclic()
+    assert drive.make_safe() == "switch on disabled"
+    assert bus.device.device[0].nmt == 127
+    assert value(bus, 0x1016, 1) == 0
+    assert (0x000, b"\x01\x01") in bus.requests
+
+
+def test_torque_mode_where_the_drive_has_no_cyclic_one(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings
+) -> None:
+    device_on_bus.answers[(0x6502, 0)] = 1 << 3
+    with opened(device_on_bus, dataclasses.replace(settings_of_virtual_joint, mode="auto")) as drive:
+        report = drive.commission()
+    assert report.mode == "torque"
+    assert value(device_on_bus, 0x6060) == 4
+    assert value(device_on_bus, 0x6087) == 1_000_000
+    assert any("TQ" in remark for remark in report.remarks)
+
+
+def test_an_unanswered_request_is_repeated(device_on_bus: Any, settings_of_virtual_joint: CanopenSettings) -> None:
+    device_on_bus.mute += [(0x6072, 0), (0x6072, 0), (0x6064, 0)]
+    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+        drive.commission()
+    assert device_on_bus.mute == []
+
+
+# --- refusals --------------------------------------------------------------------------------------------------
+
+
+def test_wrong_node_names_those_that_answer(device_on_bus: Any, settings_of_virtual_joint: CanopenSettings) -> None:
+    settings = dataclasses.replace(settings_of_virtual_joint, node=7)
+    message = refusal(device_on_bus, settings, NoDeviceError)
+    assert "node 7 does not answer; these do: 1" in message
+    assert "drive.node" in message
+
+
+def test_nobody_answers(empty_bus: Any, settings_of_virtual_joint: CanopenSettings) -> None:
+    message = refusal(empty_bus, settings_of_virtual_joint, NoDeviceError)
+    assert "node 1 does not answer, and neither does any other" in message
+
+
+def test_a_drive_that_falls_silent(device_on_bus: Any, settings_of_virtual_joint: CanopenSettings) -> None:
+    device_on_bus.mute += [(0x6076, 0)] * 3
+    message = refusal(device_on_bus, settings_of_virtual_joint, NoDeviceError)
+    assert "reading object 6076 (motor rated torque) got no answer in 3 attempts" in message
+
+
+@pytest.mark.parametrize(
+    ("change", "pattern"),
+    [
+        ({"vendor_id": 0x9A}, r"drive\.vendor_id is 0x0, the configuration says 0x9a"),
+        ({"product_code": 0x30924}, r"drive\.product_code is 0x1, the configuration says 0x30924"),
+        ({"rated_torque_Nm": 0.506}, r"drive\.rated_torque_Nm \(=0\.506\) does not agree with the drive's 0\.5 Nm"),
+        ({"rated_current_A": 4.9}, r"drive\.rated_current_A \(=4\.9\) does not agree with the drive's 5 A"),
+        ({"rate_Hz": 3000.0}, r"loop\.rate_Hz \(=3000\)"),
+    ],
+)
+def test_what_differs_from_the_configuration(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, change: dict[str, Any], pattern: str
+) -> None:
+    settings = dataclasses.replace(settings_of_virtual_joint, **change)
+    assert re.search(pattern, refusal(device_on_bus, settings, DeviceError))
+
+
+@pytest.mark.parametrize("change", [{"vendor_id": 0}, {"product_code": 1}, {"rated_torque_Nm": 0.5049}])
+def test_the_twins_that_agree(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, change: dict[str, Any]
+) -> None:
+    with opened(device_on_bus, dataclasses.replace(settings_of_virtual_joint, **change)) as drive:
+        drive.commission()
+
+
+@pytest.mark.parametrize(
+    ("place", "answer", "pattern"),
+    [
+        ((0x1000, 0), 401, r"node 1 has device profile 401, a drive has 402"),
+        ((0x6502, 0), 0x05, r"node 1 does not support cyclic_sync_torque \(6502 = 00000005h\); drive\.mode is cst"),
+        ((0x6061, 0), 8, r"6061 shows mode 8, mode 10 was selected"),
+        ((0x6072, 0), 3000, r"object 6072 \(max torque\) reads back 3000, 1000 was written"),
+        ((0x60C2, 1), 4, r"object 60C2:1 \(interpolation time period\) reads back 4, 1 was written"),
+        ((0x1016, 1), 0, r"object 1016:1 \(consumer heartbeat time\) reads back 0, 8257736 was written"),
+        ((0x1A00, 2), 0x606C0020, r"object 1A00:2 \(PDO 1800 mapping of position actual value\) reads back"),
+        ((0x6041, 0), 0x0218, r"node 1 is in fault \(error code 0000h\) .*never resets one by itself"),
+        ((0x6041, 0), 0x021F, r"node 1 is in fault"),
+        ((0x6041, 0), 0x1637, r"node 1 stays enabled although controlword 0 was written"),
+        ((0x6071, 0), 5, r"object 6071 \(target torque\) reads back 5, 0 was written"),
+    ],
+)
+def test_a_drive_that_does_not_do_what_it_must(
+    device_on_bus: Any,
+    settings_of_virtual_joint: CanopenSettings,
+    place: tuple[int, int],
+    answer: int,
+    pattern: str,
+) -> None:
+    device_on_bus.answers[place] = answer
+    assert re.search(pattern, refusal(device_on_bus, settings_of_virtual_joint, DeviceError))
+
+
+@pytest.mark.parametrize(("reference", "index"), [("rated_torque", 0x6076), ("rated_current", 0x6075)])
+def test_no_scale_without_a_rated_value(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, reference: str, index: int
+) -> None:
+    device_on_bus.answers[(index, 0)] = 0
+    settings = dataclasses.replace(
+        settings_of_virtual_joint, torque_reference=reference, rated_torque_Nm=None, rated_current_A=None
+    )
+    assert f"object {index:04X} is 0" in refusal(device_on_bus, settings, DeviceError)
+
+
+def test_an_aborted_write_says_why(device_on_bus: Any, settings_of_virtual_joint: CanopenSettings) -> None:
+    settings = dataclasses.replace(settings_of_virtual_joint, quick_stop_option=4)
+    message = refusal(device_on_bus, settings, DeviceError)
+    assert re.search(r"writing 4 to object 605A \(quick stop option\) was refused: .* \(SDO abort 06090030h\)", message)
+
+
+@pytest.mark.parametrize(
+    "index", [0x1000, 0x6040, 0x6041, 0x6060, 0x6061, 0x6064, 0x6071, 0x6072, 0x60C2, 0x1016, 0x1017]
+)
+def test_an_object_that_the_eds_does_not_have(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, tmp_path: Path, index: int
+) -> None:
+    eds = tmp_path / "edited.eds"
+    text = settings_of_virtual_joint.eds_path.read_text()
+    eds.write_text(re.sub(rf"(?ims)^\[{index:04X}(sub[0-9A-F]+)?\].*?(?=^\[)", "", text))
+    settings = dataclasses.replace(settings_of_virtual_joint, eds_path=eds)
+    message = refusal(device_on_bus, settings, DeviceError)
+    assert re.search(rf"EDS edited\.eds has no object {index:04X}.*which jointctl needs", message)
+
+
+@pytest.mark.parametrize("content", [None, "this is no EDS file"])
+def test_an_eds_file_that_cannot_be_read(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, tmp_path: Path, content: str | None
+) -> None:
+    eds = tmp_path / "broken.eds"
+    if content is not None:
+        eds.write_text(content)
+    with pytest.raises(ConfigurationError, match=r"drive\.eds \(=.*broken\.eds\) is not a readable EDS file") as caught:
+        device_on_bus.drive(dataclasses.replace(settings_of_virtual_joint, eds_path=eds))
+    assert "\n" not in str(caught.value)
+
+
+def test_no_port_before_commissioning(device_on_bus: Any, settings_of_virtual_joint: CanopenSettings) -> None:
+    with (
+        opened(device_on_bus, settings_of_virtual_joint) as drive,
+        pytest.raises(DeviceError, match="not been commissioned"),
+    ):
+        drive.port()

@@ -1,0 +1,309 @@
+"""The cyclic exchange, byte by byte, as CiA 301 and CiA 402 lay it out; every expected frame is written by hand."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Frame
+from drivers.canopen import exchange
+from drivers.canopen.cia402 import State
+from drivers.canopen.cyclic import (
+    accept_frame,
+    begin_cycle,
+    end_cycle,
+    get_i16,
+    get_i32,
+    get_u16,
+    put_u16,
+    torque_permille,
+)
+from drivers.canopen.port import FRAME_SLOTS, SCRATCH_WORDS, CanopenPort
+from firmware_py.records import Command, Sample
+from firmware_py.schema import new
+from firmware_py.states import DriveRequest, DriveState
+
+RAD_PER_COUNT = 2.0 * math.pi / 2**19
+STATUSWORDS = {
+    State.NOT_READY_TO_SWITCH_ON: 0x0000, State.SWITCH_ON_DISABLED: 0x0250, State.READY_TO_SWITCH_ON: 0x0231,
+    State.SWITCHED_ON: 0x0233, State.OPERATION_ENABLED: 0x1637, State.QUICK_STOP_ACTIVE: 0x0217,
+    State.FAULT_REACTION_ACTIVE: 0x021F, State.FAULT: 0x0218,
+}  # fmt: skip
+
+
+class Wire:
+    """A port of node 5 with its frame memory and records."""
+
+    def __init__(self) -> None:
+        self.ports = new(CanopenPort)
+        self.port = port = self.ports[0]
+        port.node, port.sync_id, port.tpdo_id, port.rpdo_id = 5, 0x80, 0x185, 0x205
+        port.emergency_id, port.heartbeat_id, port.own_heartbeat_id = 0x85, 0x705, 0x77F
+        port.tpdo_length, port.rpdo_length = 8, 4
+        port.status_at, port.position_at, port.torque_at, port.control_at, port.target_at = 0, 2, 6, 0, 2
+        port.position_radpcount, port.torque_Nmppermille, port.max_permille = RAD_PER_COUNT, 0.0605, 1000
+        port.state, port.heartbeat_cycles = State.UNDEFINED, 3
+        self.frames = new(Frame, FRAME_SLOTS)
+        self.sample, self.command = new(Sample)[0], new(Command)[0]
+
+    def receive(self, identifier: int, data: bytes, now_ns: int = 1) -> bool:
+        frame = self.frames[3]
+        frame.can_id, frame.length = identifier, len(data)
+        frame.payload[:] = 0xEE  # what an earlier frame may have left behind
+        frame.payload[: len(data)] = np.frombuffer(data, np.uint8)
+        return bool(accept_frame(self.port, frame, self.sample, now_ns))
+
+    def tpdo(self, status: int = 0x0250, counts: int = 0, torque: int = 0) -> bool:
+        return self.receive(0x185, struct.pack("<Hih", status, counts, torque))
+
+    def rpdo(self, torque_Nm: float, request: DriveRequest = DriveRequest.ENABLE) -> bytes:
+        self.command.torque_Nm, self.command.request = torque_Nm, request
+        end_cycle(self.port, self.frames, self.sample, self.command)
+        return self.frames[2].tobytes()
+
+
+@pytest.fixture
+def wire() -> Wire:
+    return Wire()
+
+
+@pytest.fixture
+def enabled(wire: Wire) -> Wire:
+    wire.tpdo(STATUSWORDS[State.OPERATION_ENABLED])
+    return wire
+
+
+# --- what is sent ----------------------------------------------------------------------------------------------
+
+
+def test_sync_has_no_data(wire: Wire) -> None:
+    wire.port.cycle = 1
+    assert begin_cycle(wire.port, wire.frames) == 1
+    assert wire.frames[0].tobytes() == bytes.fromhex("80000000 00000000 0000000000000000")
+
+
+def test_heartbeat_says_operational(wire: Wire) -> None:
+    assert begin_cycle(wire.port, wire.frames) == 2
+    assert wire.frames[1].tobytes() == bytes.fromhex("7f070000 01000000 0500000000000000")
+
+
+@pytest.mark.parametrize(
+    ("every", "expected"), [(3, [2, 1, 1, 2, 1, 1, 2]), (1, [2] * 7), (0, [1] * 7), (66, [2] + [1] * 6)]
+)
+def test_heartbeat_schedule(wire: Wire, every: int, expected: list[int]) -> None:
+    wire.port.heartbeat_cycles = every
+    assert [begin_cycle(wire.port, wire.frames) for _ in range(7)] == expected
+
+
+def test_rpdo_of_an_enabled_drive(enabled: Wire) -> None:
+    # 12.1 Nm = 200 permille = 0x00C8; controlword 0x000F; node 5 listens at 0x205
+    assert enabled.rpdo(12.1) == bytes.fromhex("05020000 04000000 0f00c80000000000")
+
+
+def test_rpdo_of_a_negative_torque_is_twos_complement(enabled: Wire) -> None:
+    assert enabled.rpdo(-12.1) == bytes.fromhex("05020000 04000000 0f0038ff00000000")
+    assert enabled.rpdo(-0.0605) == bytes.fromhex("05020000 04000000 0f00ffff00000000")
+
+
+def test_a_motor_mounted_the_other_way_round(enabled: Wire) -> None:
+    enabled.port.torque_Nmppermille = -0.0605
+    assert enabled.rpdo(12.1)[8:12] == bytes.fromhex("0f0038ff")
+    enabled.tpdo(torque=-200)
+    assert enabled.sample.torque_Nm == pytest.approx(12.1)
+
+
+@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("request_", DriveRequest)
+def test_torque_is_zero_unless_asked_and_operation_enabled(wire: Wire, state: State, request_: DriveRequest) -> None:
+    wire.tpdo(STATUSWORDS.get(state, 0x0001))
+    assert wire.port.state == state
+    frame = wire.rpdo(12.1, request_)
+    may = state is State.OPERATION_ENABLED and request_ is DriveRequest.ENABLE
+    assert frame[10:12] == (b"\xc8\x00" if may else b"\x00\x00")
+    assert frame[12:] == b"\0\0\0\0"
+    assert not frame[8] & 0x80
+
+
+@pytest.mark.parametrize("limit", [1000, 32767])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_torque_saturates_and_never_wraps(enabled: Wire, limit: int, sign: int) -> None:
+    enabled.port.max_permille = limit
+    for k in range(-20, 21):
+        value = sign * (limit + k)
+        expected = sign * min(limit + k, limit)
+        sent = struct.unpack("<h", enabled.rpdo(value * 0.0605)[10:12])[0]
+        assert sent == expected
+    for far in (40_000.0, 65_536.0, 1e9, 1e30, 1e300):
+        assert struct.unpack("<h", enabled.rpdo(sign * far * 0.0605)[10:12])[0] == sign * limit
+
+
+@pytest.mark.parametrize("torque_Nm", [math.nan, math.inf, -math.inf])
+def test_a_torque_that_is_not_finite_is_zero(enabled: Wire, torque_Nm: float) -> None:
+    assert enabled.rpdo(torque_Nm)[8:12] == bytes.fromhex("0f000000")
+
+
+@pytest.mark.filterwarnings("ignore:.*encountered in scalar:RuntimeWarning")  # plain Python tells of inf - inf
+@settings(deadline=None)  # the first call compiles
+@given(torque_Nm=st.floats(allow_nan=True, allow_infinity=True), limit=st.integers(0, 32767))
+def test_whatever_the_torque_the_object_stays_in_its_limit(torque_Nm: float, limit: int) -> None:
+    wire = Wire()
+    wire.port.max_permille = limit
+    permille = torque_permille(wire.port, torque_Nm)
+    assert abs(permille) <= limit
+    if math.isfinite(torque_Nm) and abs(torque_Nm) < 0.0605 * limit:
+        assert abs(permille * 0.0605 - torque_Nm) <= 0.5001 * 0.0605
+
+
+def test_no_byte_of_an_earlier_frame_stays(enabled: Wire) -> None:
+    enabled.frames[2].payload[:] = 0xFF
+    assert enabled.rpdo(0.0) == bytes.fromhex("05020000 04000000 0f00000000000000")
+
+
+# --- what is received ------------------------------------------------------------------------------------------
+
+
+def test_tpdo_by_hand(wire: Wire) -> None:
+    # statusword 0x1637, position 0x00012345 = 74565 counts, torque 0xFF38 = -200 permille
+    assert wire.receive(0x185, bytes.fromhex("3716 45230100 38ff"), now_ns=77)
+    sample = wire.sample
+    assert (sample.status_word, sample.drive_state, sample.count) == (0x1637, DriveState.ENABLED, 1)
+    assert sample.position_rad == pytest.approx(74565 * RAD_PER_COUNT)
+    assert sample.torque_Nm == pytest.approx(-12.1)
+    assert sample.time_ns == 77
+
+
+@pytest.mark.parametrize(
+    ("data", "counts"),
+    [("ffffffff", -1), ("00000080", -(2**31)), ("ffffff7f", 2**31 - 1), ("0000ffff", -65536), ("01000000", 1)],
+)
+def test_position_is_signed(wire: Wire, data: str, counts: int) -> None:
+    wire.receive(0x185, bytes.fromhex("5002" + data + "0000"))
+    assert wire.sample.position_rad == pytest.approx(counts * RAD_PER_COUNT)
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("step", [1, 100_000, 2**31 - 1])
+def test_position_wraps_both_ways_without_a_jump(wire: Wire, direction: int, step: int) -> None:
+    """Several turns of the 32 bit counter in one direction, and all the way back."""
+    start = direction * (2**31 - 1 - 2 * min(step, 1000))
+    true = start
+    wire.tpdo(counts=start)
+    for k in range(12):
+        true += direction * step * (1 if k < 6 else -1)
+        wire.tpdo(counts=(true + 2**31) % 2**32 - 2**31)
+        assert wire.port.counts == true
+        assert wire.sample.position_rad == pytest.approx(true * RAD_PER_COUNT)
+    assert wire.port.counts == start
+
+
+def test_zero_and_direction_of_the_encoder(wire: Wire) -> None:
+    wire.port.zero_counts, wire.port.position_radpcount = 1000, -RAD_PER_COUNT
+    wire.tpdo(counts=1500)
+    assert wire.sample.position_rad == pytest.approx(-500 * RAD_PER_COUNT)
+
+
+@pytest.mark.parametrize("length", range(8))
+def test_a_short_tpdo_is_counted_and_ignored(wire: Wire, length: int) -> None:
+    wire.tpdo(0x0250, 1000, 5)
+    before = wire.sample.tobytes()
+    assert not wire.receive(0x185, struct.pack("<Hih", 0x1637, 9999, 99)[:length])
+    assert wire.port.malformed == 1
+    assert wire.sample.tobytes() == before
+    assert wire.port.state == State.SWITCH_ON_DISABLED
+    assert wire.tpdo(0x0250, 1001)  # the twin of full length
+
+
+@pytest.mark.parametrize(
+    "identifier",
+    [0x184, 0x186, 0x285, 0x205, 0x80, 0x85 | EXTENDED_FLAG, 0x185 | EXTENDED_FLAG, 0x185 | REMOTE_FLAG, 0x585, 0x701],
+)
+def test_foreign_identifiers_are_ignored(wire: Wire, identifier: int) -> None:
+    wire.tpdo(0x0250, 1000, 5)
+    before = wire.sample.tobytes()
+    assert not wire.receive(identifier, struct.pack("<Hih", 0x1637, 9999, 99))
+    assert wire.sample.tobytes() == before
+    assert (wire.port.malformed, wire.port.error_frames) == (0, 0)
+
+
+def test_error_frames_of_the_bus_are_counted(wire: Wire) -> None:
+    assert not wire.receive(0x185 | ERROR_FLAG, bytes(8))
+    assert (wire.port.error_frames, wire.sample.count) == (1, 0)
+
+
+def test_an_emergency_is_latched(wire: Wire) -> None:
+    wire.receive(0x85, bytes.fromhex("1033 01 0000000000"))
+    assert wire.sample.drive_error == 0x3310
+    wire.receive(0x85, bytes(8))  # error reset: the cause of the stop must not be forgotten
+    assert wire.sample.drive_error == 0x3310
+    wire.receive(0x85, b"\x30")
+    assert wire.sample.drive_error == 0x3310
+    assert wire.sample.count == 0
+
+
+def test_a_boot_up_is_a_restart_and_a_heartbeat_is_not(wire: Wire) -> None:
+    for data, restarts in (
+        (b"\x05", 0),
+        (b"\x85", 0),
+        (b"\x7f", 0),
+        (b"", 0),
+        (b"\x00", 1),
+        (b"\x05", 1),
+        (b"\x80", 2),
+    ):
+        wire.receive(0x705, data)
+        assert wire.sample.restarts == restarts
+    wire.receive(0x706, b"\x00")
+    assert wire.sample.restarts == 2
+
+
+def test_bus_load_counts_both_directions_at_worst_stuffing(wire: Wire) -> None:
+    """SYNC 55, TPDO 135 and RPDO 95 bits are the 285 of the bus budget."""
+    wire.port.cycle = 1
+    begin_cycle(wire.port, wire.frames)
+    wire.tpdo()
+    wire.rpdo(0.0)
+    assert wire.port.bits_sent == 285
+    wire.port.cycle = 0
+    begin_cycle(wire.port, wire.frames)  # SYNC 55 and heartbeat 65
+    assert wire.port.bits_sent == 285 + 55 + 65
+
+
+@settings(deadline=None)  # the first call compiles
+@given(data=st.binary(min_size=8, max_size=8))
+def test_integers_are_little_endian(data: bytes) -> None:
+    array = np.frombuffer(data, np.uint8)
+    assert get_u16(array, 1) == struct.unpack_from("<H", data, 1)[0]
+    assert get_i16(array, 3) == struct.unpack_from("<h", data, 3)[0]
+    assert get_i32(array, 4) == struct.unpack_from("<i", data, 4)[0]
+
+
+@settings(deadline=None)  # the first call compiles
+@given(value=st.integers(-32768, 65535))
+def test_put_is_the_inverse_of_get(value: int) -> None:
+    array = np.zeros(4, np.uint8)
+    put_u16(array, 1, value)
+    assert get_u16(array, 1) == value % 65536
+    assert (array[0], array[3]) == (0, 0)
+
+
+# --- the exported half of the lockstep simulation --------------------------------------------------------------
+
+
+def test_exchange_memory_has_room_for_every_slot() -> None:
+    frames, scratch = exchange.exchange_memory()
+    assert (len(frames), frames.dtype.itemsize, len(scratch)) == (FRAME_SLOTS, 16, SCRATCH_WORDS)
+    assert scratch.dtype == np.int64
+
+
+def test_one_whole_enable_by_statuswords(wire: Wire) -> None:
+    words = []
+    for status in (0x0250, 0x0231, 0x0233, 0x1637):
+        wire.tpdo(status)
+        frame = wire.rpdo(12.1)
+        words.append(frame[8:12].hex())
+    assert words == ["06000000", "07000000", "0f000000", "0f00c800"]

@@ -1,0 +1,297 @@
+"""`jointctl doctor`: what it finds, what it says about it, and that it only ever reads."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import struct
+import subprocess
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+from drivers.errors import BusError
+from tools import doctor as doctor_module
+from tools import start_time
+from tools.analysis.wake_up import fifo, wake_up_lateness_ns
+from tools.config import Config, load_config, shipped_config
+from tools.doctor import (
+    NOTE,
+    OK,
+    PROBLEM,
+    SDO_READS,
+    Finding,
+    adapters,
+    bus_budget,
+    doctor,
+    drive_finding,
+    findings,
+    kernel_cache,
+    kernel_findings,
+    sdo_round_trips_us,
+    wake_up,
+)
+from tools.output import Output
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config(shipped_config("virtual"))
+
+
+def changed(config: Config, **values: Any) -> Config:
+    """The configuration with another bus or rate."""
+    bus = {key: values[key] for key in ("interface", "channel", "bitrate_bitps") if key in values}
+    loop = {key: values[key] for key in ("rate_Hz", "priority") if key in values}
+    return config.model_copy(
+        update={"bus": config.bus.model_copy(update=bus), "loop": config.loop.model_copy(update=loop)}
+    )
+
+
+def write(root: Path, name: str, text: str) -> None:
+    path = root / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+class SdoBus:
+    """A node that answers reads of 1000h, all or some; everything sent is kept."""
+
+    def __init__(self, node: int, answers: int = SDO_READS) -> None:
+        self.node = node
+        self.answers = answers
+        self.sent: list[can.Message] = []
+        self.waiting: deque[can.Message] = deque()
+        self.closed = False
+
+    def send(self, message: can.Message, timeout: float | None = None) -> None:
+        self.sent.append(message)
+        for identifier, data in (
+            (0x181, bytes(8)),
+            (0x580 + self.node, struct.pack("<BHBI", 0x43, 0x1018, 1, 7)),
+            (0x580 + self.node, struct.pack("<BHBI", 0x43, 0x1000, 0, 0x00020192)),
+        )[: 3 if len(self.sent) <= self.answers else 2]:
+            self.waiting.append(can.Message(arbitration_id=identifier, is_extended_id=False, data=data))
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        return self.waiting.popleft() if self.waiting else None
+
+    def shutdown(self) -> None:
+        self.closed = True
+
+
+@pytest.fixture
+def short_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor_module, "_SDO_TIMEOUT_S", 0.01)
+
+
+class TestComputer:
+    @pytest.mark.parametrize(("text", "status"), [("1\n", OK), ("0\n", NOTE), (None, NOTE)])
+    def test_preempt_rt(self, tmp_path: Path, text: str | None, status: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(doctor_module.platform, "version", lambda: "#1 SMP PREEMPT_DYNAMIC")
+        if text is not None:
+            write(tmp_path, "sys/kernel/realtime", text)
+        kernel = next(kernel_findings(tmp_path))
+        assert kernel.status == status
+        assert ("not PREEMPT_RT" in kernel.text) == (status == NOTE)
+        assert bool(kernel.cure) == (status == NOTE)
+
+    @pytest.mark.parametrize(("clock", "status"), [("tsc", OK), ("hpet", NOTE), ("acpi_pm", NOTE)])
+    def test_clock_source(self, tmp_path: Path, clock: str, status: str) -> None:
+        write(tmp_path, "sys/devices/system/clocksource/clocksource0/current_clocksource", clock + "\n")
+        found = {f.topic: f for f in kernel_findings(tmp_path)}["clock source"]
+        assert (found.status, found.text, bool(found.cure)) == (status, clock, status == NOTE)
+
+    @pytest.mark.parametrize(
+        ("governors", "status"), [([], OK), (["performance"] * 2, OK), (["performance", "powersave"], NOTE)]
+    )
+    def test_governor(self, tmp_path: Path, governors: list[str], status: str) -> None:
+        for core, governor in enumerate(governors):
+            write(tmp_path, f"sys/devices/system/cpu/cpu{core}/cpufreq/scaling_governor", governor)
+        found = {f.topic: f for f in kernel_findings(tmp_path)}["CPU governor"]
+        assert found.status == status
+        assert ("cpupower" in found.cure) == (status == NOTE)
+
+    def test_fifo_is_left_again(self) -> None:
+        before = os.sched_getscheduler(0)
+        with fifo(1) as refused:
+            assert refused or os.sched_getscheduler(0) == os.SCHED_FIFO
+        assert os.sched_getscheduler(0) == before
+
+    def test_a_refused_priority_is_told_and_not_raised(self) -> None:
+        with fifo(1000) as refused:
+            assert refused
+
+
+class TestWakeUp:
+    def test_one_value_a_cycle_and_none_early(self) -> None:
+        late_ns = wake_up_lateness_ns(1000.0, 20)
+        assert late_ns.shape == (20,)
+        assert (late_ns >= 0).all()
+
+    @pytest.mark.parametrize(("rate_Hz", "cycles"), [(0.0, 1), (-1.0, 1), (float("nan"), 1), (1000.0, 0)])
+    def test_bad_input(self, rate_Hz: float, cycles: int) -> None:
+        with pytest.raises(ValueError, match=r"\(=.*\) must be"):
+            wake_up_lateness_ns(rate_Hz, cycles)
+
+    @pytest.mark.parametrize(("worst_us", "status"), [(499, OK), (500, OK), (501, NOTE), (3000, NOTE)])
+    def test_the_worst_decides(
+        self, config: Config, worst_us: int, status: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        late = np.array([10_000] * 99 + [worst_us * 1000])
+        monkeypatch.setattr(doctor_module, "wake_up_lateness_ns", lambda rate, cycles: late)
+        found = next(wake_up(config, 100))
+        assert found.status == status
+        assert (found.numbers["p50_us"], found.numbers["max_us"]) == (10.0, worst_us)
+        assert bool(found.cure) == (status == NOTE)
+
+
+class TestCache:
+    def test_no_folder(self) -> None:
+        (found,) = kernel_cache(None, False)
+        assert found.status == PROBLEM
+        assert "JOINTCTL_CACHE_DIR" in found.cure
+
+    def test_cold_is_not_started_unless_asked(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        started: list[Path | None] = []
+        monkeypatch.setattr(doctor_module, "start_time_s", lambda cache: float(not started.append(cache)))
+        (found,) = kernel_cache(tmp_path, False)
+        assert (found.status, found.numbers["warm"], started) == (NOTE, False, [])
+        write(tmp_path, "firmware_py_1/realtime.run_loop-86.py311.1.nbc", "12345678")
+        found, warm = kernel_cache(tmp_path, False)
+        assert (found.status, found.numbers) == (OK, {"files": 1, "bytes": 8, "warm": True})
+        assert (warm.topic, warm.numbers, started) == ("warm start", {"start_s": 1.0}, [None])
+        assert [f.topic for f in kernel_cache(tmp_path, True)] == ["kernel cache", "warm start", "cold start"]
+        assert isinstance(started[-1], Path)
+        assert started[-1] != tmp_path
+        found = list(kernel_cache(tmp_path / "firmware_py_2", True))
+        assert [f.topic for f in found] == ["kernel cache", "cold start", "warm start"]
+        assert started[-1] == started[-2]  # warm, because the cold start has just filled it
+
+    def test_a_start_that_fails_is_a_problem(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def failing(cache: Path | None) -> float:
+            raise subprocess.CalledProcessError(1, "python", stderr=b"Traceback\nImportError: no numba\n")
+
+        monkeypatch.setattr(doctor_module, "start_time_s", failing)
+        write(tmp_path, "x/realtime.run_loop-86.py311.1.nbc", "1")
+        assert list(kernel_cache(tmp_path, False))[1].text == "the loop cannot be started: ImportError: no numba"
+
+    def test_the_probe_gets_the_other_cache(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        calls: list[dict[str, Any]] = []
+        monkeypatch.setattr(start_time.subprocess, "run", lambda command, **rest: calls.append(rest))
+        monkeypatch.setenv("JOINTCTL_CACHE_DIR", "unchanged")
+        assert start_time.start_time_s() >= 0.0
+        assert start_time.start_time_s(tmp_path) >= 0.0
+        assert [call["env"]["JOINTCTL_CACHE_DIR"] for call in calls] == ["unchanged", str(tmp_path)]
+        assert calls[0]["check"]
+
+
+class TestBus:
+    def test_interfaces_are_found_by_their_type(self, config: Config, tmp_path: Path) -> None:
+        for name, kind, state in (("can0", "280", "up"), ("eth0", "1", "up"), ("vcan1", "280", "unknown")):
+            write(tmp_path, f"sys/class/net/{name}/type", kind + "\n")
+            write(tmp_path, f"sys/class/net/{name}/operstate", state + "\n")
+        found = {f.topic: f for f in adapters(config, tmp_path)}["CAN interfaces"]
+        assert (found.status, found.text) == (OK, "can0 (up), vcan1 (unknown)")
+
+    @pytest.mark.parametrize(("interface", "status"), [("socketcan", PROBLEM), ("jointctl", NOTE), ("slcan", NOTE)])
+    def test_no_interface_is_a_problem_only_where_needed(
+        self, config: Config, tmp_path: Path, interface: str, status: str
+    ) -> None:
+        found = {f.topic: f for f in adapters(changed(config, interface=interface), tmp_path)}["CAN interfaces"]
+        assert (found.status, found.text) == (status, "none")
+
+    @pytest.mark.parametrize(
+        ("rate_Hz", "bitrate", "status"),
+        [(1000.0, 1_000_000, OK), (2807.0, 1_000_000, OK), (2808.0, 1_000_000, PROBLEM), (1000.0, 500_000, OK),
+         (1000.0, 357_000, OK), (1000.0, 356_000, PROBLEM)],
+    )  # fmt: skip
+    def test_budget(self, config: Config, rate_Hz: float, bitrate: int, status: str) -> None:
+        found = bus_budget(changed(config, rate_Hz=rate_Hz, bitrate_bitps=bitrate))
+        assert found.status == status
+        assert found.numbers["load"] == pytest.approx(285.0 * rate_Hz / bitrate)
+
+    @pytest.mark.parametrize(("rate_Hz", "status"), [(499.0, OK), (500.0, OK), (501.0, PROBLEM), (1000.0, PROBLEM)])
+    def test_budget_of_the_plain_python_loop(self, config: Config, rate_Hz: float, status: str) -> None:
+        found = bus_budget(changed(config, interface="slcan", rate_Hz=rate_Hz))
+        assert found.status == status
+        assert "plain Python loop" in found.text
+
+    def test_only_reads_of_1000_are_sent(self) -> None:
+        bus = SdoBus(5)
+        times = sdo_round_trips_us(bus, 5)
+        assert len(times) == SDO_READS
+        assert all(time_us > 0.0 for time_us in times)
+        assert {(m.arbitration_id, bytes(m.data)) for m in bus.sent} == {(0x605, b"\x40\x00\x10\x00\0\0\0\0")}
+
+    @pytest.mark.usefixtures("short_timeout")
+    @pytest.mark.parametrize(
+        ("answers", "status", "asked"), [(0, PROBLEM, 1), (SDO_READS - 1, NOTE, SDO_READS), (SDO_READS, OK, SDO_READS)]
+    )
+    def test_the_drive(
+        self, config: Config, answers: int, status: str, asked: int, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        bus = SdoBus(config.drive.node, answers)
+        monkeypatch.setattr(doctor_module, "open_python_can", lambda *_: bus)
+        found = drive_finding(config)
+        assert (found.status, len(bus.sent), bus.closed) == (status, asked, True)
+
+    def test_a_bus_that_fails_is_a_problem(self, config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+        bus = SdoBus(1)
+
+        def fail(*_: Any) -> None:
+            raise can.CanOperationError("bus off")
+
+        monkeypatch.setattr(bus, "send", fail)
+        monkeypatch.setattr(doctor_module, "open_python_can", lambda *_: bus)
+        found = drive_finding(config)
+        assert (found.status, bus.closed) == (PROBLEM, True)
+        assert "bus off" in found.text
+
+    def test_no_bus_is_a_note_with_the_cure(self, config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+        def fail(*_: Any) -> None:
+            raise BusError("no virtual bus", "start one")
+
+        monkeypatch.setattr(doctor_module, "open_python_can", fail)
+        assert drive_finding(config) == Finding("drive", NOTE, "not asked: no virtual bus", "start one")
+
+
+class TestReport:
+    def report(self, config: Config, found: list[Finding], monkeypatch: pytest.MonkeyPatch, **how: bool) -> Any:
+        monkeypatch.setattr(doctor_module, "findings", lambda *_, **__: iter(found))
+        stdout, stderr = io.StringIO(), io.StringIO()
+        code = doctor(config, Output(stdout=stdout, stderr=stderr, **how))
+        return code, stdout.getvalue(), stderr.getvalue()
+
+    @pytest.mark.parametrize(("status", "code"), [(OK, 0), (NOTE, 0), (PROBLEM, 1)])
+    def test_exit_code_and_table(self, config: Config, status: str, code: int, monkeypatch: pytest.MonkeyPatch) -> None:
+        found = [Finding("Python", OK, "3.11"), Finding("x", status, "a [b]", "do [c]")]
+        result, stdout, stderr = self.report(config, found, monkeypatch)
+        assert result == code
+        assert "a [b]" in stdout
+        assert "do [c]" in stdout
+        assert "Python" in stderr
+
+    def test_json(self, config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+        found = [Finding("x", PROBLEM, "bad", "cure", {"p50_us": np.float64(1.5)})]
+        code, stdout, stderr = self.report(config, found, monkeypatch, json=True, quiet=True)
+        data = json.loads(stdout)
+        assert (code, stderr, data["healthy"]) == (1, "", False)
+        assert data["findings"] == [
+            {"topic": "x", "status": "problem", "text": "bad", "cure": "cure", "numbers": {"p50_us": 1.5}}
+        ]
+
+    def test_on_this_computer(self, config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(doctor_module, "start_time_s", lambda cache: 1.0)
+        elsewhere = changed(config, channel="nobody-listens-here")
+        found = list(findings(elsewhere, wake_cycles=10))
+        topics = [f.topic for f in found]
+        assert len(set(topics)) == len(topics) >= 15
+        assert {"Python", "SCHED_FIFO", "memory lock", "timer slack", "bus budget", "drive"} <= set(topics)
+        assert all(f.text for f in found)
+        assert all(f.cure for f in found if f.status == PROBLEM)

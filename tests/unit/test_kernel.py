@@ -1,0 +1,155 @@
+"""The one decorator: options that matter for safety, the key of the cache, and the same results without the JIT."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from firmware_py import kernel as kernel_module
+from firmware_py.kernel import kernel, source_hash
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("firmware_py", "drivers", "hil", "tools")
+
+
+@kernel
+def divide(a: float, b: float) -> float:
+    return a / b
+
+
+@kernel
+def is_finite(a: float) -> bool:
+    return math.isfinite(a)
+
+
+@pytest.mark.parametrize(("value", "finite"), [(1e308, True), (math.nan, False), (math.inf, False), (-math.inf, False)])
+def test_the_finite_check_is_not_optimised_away(value: float, finite: bool) -> None:
+    assert is_finite(value) is finite
+
+
+def test_a_division_by_zero_does_not_unwind_the_loop() -> None:
+    assert divide(1.0, 0.0) == math.inf
+    assert math.isnan(divide(0.0, 0.0))
+
+
+def test_options() -> None:
+    assert kernel_module._OPTIONS["nogil"] is True
+    assert kernel_module._OPTIONS["error_model"] == "numpy"
+    assert "fastmath" not in kernel_module._OPTIONS
+
+
+# --- the cache must never run stale ----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def copy_of_sources(tmp_path: Path) -> Path:
+    for package in PACKAGES:
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    return tmp_path
+
+
+def test_the_hash_depends_on_the_sources_and_not_on_their_place(copy_of_sources: Path) -> None:
+    before = source_hash(copy_of_sources)
+    assert len(before) == 16
+    assert source_hash(copy_of_sources) == before
+    (copy_of_sources / "firmware_py" / "safety.py").touch()
+    assert source_hash(copy_of_sources) == before
+
+
+@pytest.mark.parametrize(
+    "edited", ["firmware_py/friction.py", "drivers/can/frame_io.py", "drivers/canopen/cyclic.py", "hil/joint.py"]
+)
+def test_an_edited_callee_changes_the_hash(copy_of_sources: Path, edited: str) -> None:
+    before = source_hash(copy_of_sources)
+    path = copy_of_sources / edited
+    path.write_text(path.read_text() + "\n# edited\n")
+    changed = source_hash(copy_of_sources)
+    assert changed != before
+    path.rename(path.with_name("renamed.py"))
+    assert source_hash(copy_of_sources) not in (before, changed)
+
+
+def test_an_edited_verb_does_not(copy_of_sources: Path) -> None:
+    before = source_hash(copy_of_sources)
+    path = copy_of_sources / "tools" / "cli.py"
+    path.write_text(path.read_text() + "\n# edited\n")
+    assert source_hash(copy_of_sources) == before
+
+
+def test_only_sub_packages_of_tools_hold_kernels() -> None:
+    for path in (ROOT / "tools").glob("*.py"):
+        assert "import kernel" not in path.read_text(), path.name
+
+
+def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120.0,
+    )
+
+
+def test_the_cache_is_where_the_variable_says(tmp_path: Path) -> None:
+    code = "from firmware_py.kernel import cache_folder, kernel; print(cache_folder)"
+    result = run_python(code, JOINTCTL_CACHE_DIR=str(tmp_path))
+    assert result.stdout.strip() == str(tmp_path / f"numba-{source_hash()}")
+    assert Path(result.stdout.strip()).is_dir()
+
+
+def test_without_a_folder_it_still_works(tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    code = "from firmware_py.lyapunov import eigenvalues; from firmware_py.kernel import cache_folder, kernel\n"
+    code += "from firmware_py.safety import within\nprint(cache_folder, within(1.0, 0.0, 2.0))"
+    assert run_python(code, JOINTCTL_CACHE_DIR=str(blocked)).stdout.split() == ["None", "True"]
+
+
+def test_old_caches_are_removed_but_not_those_in_use(tmp_path: Path) -> None:
+    now = time.time()
+    for k in range(8):
+        folder = tmp_path / f"numba-{k}"
+        folder.mkdir()
+        age_s = 60.0 if k == 7 else 4000.0 + k
+        os.utime(folder, (now - age_s, now - age_s))
+    kernel_module._prune(tmp_path, tmp_path / "numba-0")
+    left = {p.name for p in tmp_path.iterdir()}
+    assert "numba-0" in left  # the present one
+    assert "numba-7" in left  # used a minute ago
+    assert left == {"numba-0", "numba-7", "numba-1", "numba-2"}
+
+
+# --- without the JIT -------------------------------------------------------------------------------------------
+
+PLAIN = ("test_safety", "test_sequence", "test_friction", "test_lugre", "test_rbfnn", "test_velocity", "test_cia402")
+FULLY_COVERED = ("firmware_py/safety.py", "firmware_py/sequence.py")
+
+
+def test_the_same_tests_pass_in_plain_python_and_cover_the_safety_code(tmp_path: Path) -> None:
+    report = tmp_path / "coverage.json"
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *(f"tests/unit/{name}.py" for name in PLAIN)]
+    command += ["--cov=firmware_py", "--cov-branch", f"--cov-report=json:{report}"]
+    environment = {
+        **os.environ,
+        "NUMBA_DISABLE_JIT": "1",
+        "PYTHONPATH": str(ROOT),
+        "COVERAGE_FILE": str(tmp_path / ".coverage"),
+    }
+    result = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=300.0
+    )
+    assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
+    files = json.loads(report.read_text())["files"]
+    for name in FULLY_COVERED:
+        assert files[name]["missing_lines"] == [], name
+        assert files[name]["missing_branches"] == [], name

@@ -1,0 +1,73 @@
+"""The shape of the project: who owns the top-level names, which layer imports which, where kernels may be."""
+
+from __future__ import annotations
+
+import ast
+import importlib.metadata
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+TOP_LEVEL = ("firmware_py", "drivers", "hil", "tools", "configs")
+LONGEST_MODULE = 300
+MODULES = sorted(path for package in TOP_LEVEL for path in (ROOT / package).rglob("*.py"))
+
+
+def imported(path: Path) -> set[str]:
+    """Every name that a module imports, as `package.module` and `package.module.name`; wherever it does so."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+@pytest.mark.parametrize("name", TOP_LEVEL)
+def test_nobody_else_owns_our_top_level_names(name: str) -> None:
+    owners = set(importlib.metadata.packages_distributions().get(name, ()))
+    assert owners <= {"jointctl"}, f"{name} also comes from {owners - {'jointctl'}}"
+    assert (ROOT / name / "__init__.py").is_file()
+
+
+def test_layers_are_kept() -> None:
+    """The contract of pyproject.toml, by import-linter."""
+    command = [sys.executable, "-c", "from importlinter.cli import lint_imports_command as run; run()", "--no-cache"]
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)}
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "1 kept, 0 broken" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("package", "forbidden"),
+    [
+        ("firmware_py", ("drivers", "hil", "tools", "configs")),
+        ("drivers", ("hil", "tools", "configs")),
+        ("hil", ("drivers", "tools", "configs")),
+    ],
+)
+def test_layers_hold_for_imports_inside_functions_too(package: str, forbidden: tuple[str, ...]) -> None:
+    for path in (ROOT / package).rglob("*.py"):
+        wrong = {name for name in imported(path) if name.split(".")[0] in forbidden}
+        assert not wrong, f"{path.relative_to(ROOT)} imports {wrong}"
+
+
+def test_kernels_are_only_where_the_cache_key_looks() -> None:
+    """`firmware_py.kernel.source_hash` leaves out the verbs, so that editing one does not recompile everything."""
+    for path in (ROOT / "tools").glob("*.py"):
+        decorators = {"firmware_py.kernel.kernel", "firmware_py.kernel.exported", "numba"}
+        wrong = {name for name in imported(path) if name in decorators or name.split(".")[0] == "numba"}
+        assert not wrong, f"{path.relative_to(ROOT)} imports {wrong}: put the kernel into a sub-package"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_modules_are_short(path: Path) -> None:
+    lines = len(path.read_text().splitlines())
+    assert lines <= LONGEST_MODULE, f"{path.relative_to(ROOT)} has {lines} lines: split it"

@@ -1,0 +1,150 @@
+"""Controller, codec, drive and joint in lockstep: commissioned by the real driver, then 1 ms at a time."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.canopen.exchange import accept, begin, end, exchange_memory
+from drivers.canopen.settings import CanopenSettings
+from firmware_py.records import AxisState, Command, LogRecord, Sample
+from firmware_py.schema import new
+from firmware_py.sequence import reset_axis
+from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault
+from hil.frames import FrameQueue
+from hil.lockstep import RECEIVED_SLOT, RPDO_SLOT, run_lockstep
+from tools.config_records import axis_constants
+
+PERIOD_ns = 1_000_000
+
+
+class Lockstep:
+    """The virtual joint after commissioning, and everything that `run_lockstep` works on."""
+
+    def __init__(self, bus: Any, settings: CanopenSettings, config: Any) -> None:
+        drive = bus.drive(settings)
+        try:
+            report = drive.commission()
+            drive.start_cyclic()
+            drive._objects.read(0x1000, what="device type")  # answered after the NMT command was taken
+            self.port = drive.port()
+        finally:
+            drive.close()
+        bus.stop()
+        self.device = bus.device
+        self.start_ns = (bus.now_ns // PERIOD_ns + 1) * PERIOD_ns
+        self.constants = axis_constants(config, start_position_rad=report.start_position_rad)
+        self.state, self.sample, self.command = new(AxisState), new(Sample), new(Command)
+        reset_axis(self.constants[0], self.state[0])
+        self.frames, _ = exchange_memory()
+        self.log = new(LogRecord, 20_000)
+
+    def run(self, cycles: int, stop_cycle: int = -1, log_every: int = 1) -> Any:
+        """The log records of up to `cycles` cycles."""
+        device = self.device
+        written = run_lockstep(
+            begin, accept, end, self.port, self.frames, self.frames.view(np.uint8).reshape(-1, 16), self.constants,
+            self.state, np.zeros((1, 5)), self.sample, self.command, device.device, device.plant_constants,
+            device.plant_state, new(FrameQueue), self.log, log_every, self.start_ns, PERIOD_ns, cycles, stop_cycle,
+        )  # fmt: skip
+        return self.log[:written]
+
+
+@pytest.fixture
+def lockstep(device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, virtual_config: Any) -> Lockstep:
+    return Lockstep(device_on_bus, settings_of_virtual_joint, virtual_config)
+
+
+def test_slots_agree_with_the_driver() -> None:
+    from drivers.canopen import port
+
+    assert (RPDO_SLOT, RECEIVED_SLOT) == (port.SLOT_RPDO, port.SLOT_RECEIVED)
+
+
+def test_a_whole_run_through_the_real_codec(lockstep: Lockstep) -> None:
+    log = lockstep.run(20_000)
+    assert Fault(int(lockstep.state[0].fault)) is Fault.NONE
+    assert lockstep.state[0].phase == AxisPhase.FINISHED
+    assert lockstep.sample[0].drive_state == DriveState.OFF
+    phases = [AxisPhase(int(p)) for p in log.phase]
+    assert phases == sorted(phases)
+    assert set(phases) == set(AxisPhase) - {AxisPhase.QUICK_STOPPING}
+    tracking = log[log.phase == AxisPhase.TRACKING]
+    assert len(tracking) == pytest.approx(10_000, abs=2)
+    assert np.max(np.abs(tracking.error_rad)) < 0.02
+    assert np.sqrt(np.mean(tracking.error_rad[-2000:] ** 2)) < 0.003
+    assert np.max(np.abs(np.diff(log.command_torque_Nm))) <= 20.0 + 1e-9
+    assert log.sample_age_cycles[1:].max() == 0
+    assert np.all(log.command_torque_Nm[log.request != DriveRequest.ENABLE] == 0.0)
+    # the joint starts from where it stands: 0.1 rad, and no jump when it is enabled
+    first = int(np.argmax(log.phase == AxisPhase.APPROACH))
+    assert log.position_rad[first] == pytest.approx(0.1, abs=1e-4)
+    assert abs(log.command_torque_Nm[first]) < 1.0
+
+
+def test_the_logged_time_is_that_of_the_logged_reference(lockstep: Lockstep) -> None:
+    log = lockstep.run(6000)
+    tracking = log[log.phase == AxisPhase.TRACKING]
+    expected = 0.35 * np.sin(0.2 * np.pi * tracking.trajectory_s)
+    np.testing.assert_allclose(tracking.desired_position_rad, expected, atol=1e-12)
+
+
+def test_a_controlled_stop(lockstep: Lockstep) -> None:
+    log = lockstep.run(20_000, stop_cycle=3000)
+    assert (log.phase[2999], log.phase[3000]) == (AxisPhase.APPROACH, AxisPhase.RAMPING) or (
+        log.phase[2999],
+        log.phase[3000],
+    ) == (AxisPhase.TRACKING, AxisPhase.RAMPING)
+    assert lockstep.state[0].phase == AxisPhase.FINISHED
+    assert lockstep.state[0].fault == Fault.NONE
+    assert len(log) < 6000
+
+
+def test_log_every_and_room(lockstep: Lockstep) -> None:
+    log = lockstep.run(1000, log_every=10)
+    assert len(log) == 100
+    assert np.all(np.diff(log.time_ns) == 10 * PERIOD_ns)
+    lockstep.log = new(LogRecord, 3)
+    lockstep.start_ns += 1000 * PERIOD_ns
+    assert len(lockstep.run(100)) == 3
+    lockstep.start_ns += 100 * PERIOD_ns
+    assert len(lockstep.run(100, log_every=0)) == 0
+
+
+def test_bit_identical_on_repeat(
+    lockstep: Lockstep, device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, virtual_config: Any
+) -> None:
+    """The same state of everything, run twice."""
+    device = lockstep.device
+    memory = (
+        device.device, device.plant_constants, device.plant_state, lockstep.port, lockstep.frames, lockstep.state,
+        lockstep.sample, lockstep.command,
+    )  # fmt: skip
+    saved = [array.copy() for array in memory]
+    first = lockstep.run(4000).tobytes()
+    for array, old in zip(memory, saved, strict=True):
+        array[:] = old
+    lockstep.log[:] = np.zeros(1, lockstep.log.dtype)
+    assert lockstep.run(4000).tobytes() == first
+
+
+def test_a_drive_that_is_not_operational_ends_the_run_without_power(lockstep: Lockstep) -> None:
+    lockstep.device.device[0].nmt = 127
+    lockstep.run(20_000)
+    assert lockstep.state[0].phase == AxisPhase.FINISHED
+    assert lockstep.state[0].fault == Fault.NO_SAMPLES
+    assert np.all(lockstep.log.request == DriveRequest.OFF)
+
+
+def test_a_wrong_direction_of_the_torque_is_caught(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, virtual_config: Any
+) -> None:
+    settings = dataclasses.replace(settings_of_virtual_joint, torque_direction=-1)
+    run = Lockstep(device_on_bus, settings, virtual_config)
+    log = run.run(20_000)
+    assert run.state[0].phase == AxisPhase.FINISHED
+    assert run.state[0].fault in (Fault.FOLLOWING_ERROR, Fault.VELOCITY_LIMIT, Fault.TORQUE_SATURATED)
+    assert np.max(np.abs(log.position_rad - 0.1)) < 0.5

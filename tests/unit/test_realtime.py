@@ -1,0 +1,282 @@
+"""The fixed-rate loop with a stub drive: schedule, stop word, supervisor, log ring, and no allocation per cycle."""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numba.core import types
+
+from firmware_py.kernel import exported, record_array_type
+from firmware_py.libc import monotonic_ns, store_release
+from firmware_py.realtime import HISTOGRAM_BINS, WORDS, Histogram, Word, count, run_loop
+from firmware_py.records import AxisState, Command, LogRecord, Sample
+from firmware_py.schema import dtype_of, new
+from firmware_py.sequence import reset_axis
+from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, FeedForward
+
+ROOT = Path(__file__).resolve().parents[2]
+PERIOD_ns = 1_000_000
+# words of the stub drive's own memory
+CYCLE, BUSY_CYCLE, BUSY_ns, STOP_CYCLE, STOP, REQUEST, SENT, HEARD_AT_ns, LATEST_ns = range(9)
+STUB_WORDS = 9
+
+_I64 = types.Array(types.int64, 1, "C")
+_SAMPLES = record_array_type(dtype_of(Sample))
+_COMMANDS = record_array_type(dtype_of(Command))
+
+
+@exported(types.int64(_I64, _I64, _I64, _SAMPLES, types.int64, types.int64))
+def stub_receive(stub: Any, words: Any, scratch: Any, samples: Any, now_ns: int, deadline_ns: int) -> int:
+    """A drive that obeys at once; busy for a while in one cycle, writes the stop word in another."""
+    cycle = stub[CYCLE]
+    stub[CYCLE] += 1
+    stub[HEARD_AT_ns] = now_ns
+    stub[LATEST_ns] = deadline_ns
+    if cycle == stub[BUSY_CYCLE]:
+        end_ns = monotonic_ns(scratch) + stub[BUSY_ns]
+        while monotonic_ns(scratch) < end_ns:
+            pass
+    if cycle == stub[STOP_CYCLE]:
+        store_release(words, Word.STOP, stub[STOP])
+    sample = samples[0]
+    sample.count += 1
+    sample.drive_state = DriveState.ENABLED if stub[REQUEST] == DriveRequest.ENABLE else DriveState.OFF
+    return np.int64(1500)  # type: ignore[return-value]
+
+
+@exported(types.int32(_I64, _I64, _SAMPLES, _COMMANDS))
+def stub_send(stub: Any, words: Any, samples: Any, commands: Any) -> int:
+    stub[REQUEST] = commands[0].request
+    stub[SENT] += 1
+    return np.int32(0)  # type: ignore[return-value]
+
+
+class Loop:
+    """Everything that `run_loop` works on; limits so wide that a noisy computer trips none of them."""
+
+    def __init__(self, constants: Any, ring: int = 1024, period_ns: int = PERIOD_ns) -> None:
+        self.constants = constants
+        axis = constants[0]
+        axis.limits.skipped_max_cycles = axis.limits.saturation_max_cycles = 1 << 40
+        axis.limits.position_min_rad, axis.limits.position_max_rad = -1e9, 1e9
+        axis.limits.velocity_max_radps = axis.limits.following_error_max_rad = 1e9
+        axis.sequence.supervisor_max_cycles = 0
+        axis.sequence.approach_s = 0.02
+        axis.law.feed_forward = FeedForward.LUGRE_DESIRED
+        axis.law.network.weight_limit = 10.0
+        axis.law.network.leakage = 0.01
+        self.state, self.sample, self.command = new(AxisState), new(Sample), new(Command)
+        reset_axis(constants[0], self.state[0])
+        self.words, self.ring = np.zeros(WORDS, np.int64), new(LogRecord, ring)
+        self.histograms = np.zeros((3, HISTOGRAM_BINS), np.int64)
+        self.stub = np.zeros(STUB_WORDS, np.int64)
+        self.stub[BUSY_CYCLE] = self.stub[STOP_CYCLE] = -1
+        self.period_ns = period_ns
+        self.words[Word.SUPERVISOR_NS] = time.monotonic_ns()
+
+    def run(self, cycles: int, receive_ns: int = 0) -> int:
+        return int(
+            run_loop(
+                stub_receive, stub_send, self.stub, self.words, np.zeros(2, np.int64), self.constants, self.state,
+                np.zeros((1, 5)), self.sample, self.command, self.words, self.ring, self.histograms, self.period_ns,
+                receive_ns, cycles,
+            )
+        )  # fmt: skip
+
+
+@pytest.fixture
+def loop(axis_constants: Any) -> Callable[..., Loop]:
+    """Builds a compiled loop."""
+
+    def build(**settings: int) -> Loop:
+        built = Loop(axis_constants, **settings)
+        assert built.run(0) == 0
+        return built
+
+    return build
+
+
+def test_with_no_cycles_nothing_happens(loop: Callable[..., Loop]) -> None:
+    built = loop()
+    assert (built.stub[CYCLE], built.stub[SENT], built.words[Word.HEAD]) == (0, 0, 0)
+    assert not built.histograms.any()
+
+
+def test_every_deadline_is_a_whole_number_of_periods_after_the_last(loop: Callable[..., Loop]) -> None:
+    built = loop()
+    assert built.run(200) == 200
+    log = built.ring[:200]
+    np.testing.assert_array_equal(np.diff(log.time_ns), PERIOD_ns * (1 + log.skipped[1:].astype(np.int64)))
+    assert log.time_ns[-1] - log.time_ns[0] == PERIOD_ns * (log.cycle[-1] - log.cycle[0])
+    assert np.all(log.wake_late_ns >= 0)  # never before its deadline
+    assert built.words[Word.SKIPPED] == log.skipped.sum()
+    assert (built.stub[CYCLE], built.stub[SENT]) == (200, 200)
+
+
+def test_the_sample_may_come_until_a_time_counted_from_the_deadline(loop: Callable[..., Loop]) -> None:
+    built = loop()
+    built.run(5, receive_ns=600_000)
+    assert built.stub[LATEST_ns] == built.ring[4].time_ns + 600_000
+    assert built.stub[HEARD_AT_ns] >= built.ring[4].time_ns
+
+
+def test_an_overrun_skips_slots_and_keeps_the_phase(loop: Callable[..., Loop]) -> None:
+    built = loop()
+    built.stub[BUSY_CYCLE], built.stub[BUSY_ns] = 20, 5_000_000
+    built.run(60)
+    log = built.ring[:60]
+    assert log.skipped[21] >= 4
+    assert log.work_ns[20] >= 4_900_000
+    assert np.all((log.time_ns - log.time_ns[0]) % PERIOD_ns == 0)
+    # no burst: one cycle for each slot at most, and the axis was told how much time has gone
+    assert np.all(np.diff(log.time_ns) >= PERIOD_ns)
+    assert log.cycle[21] - log.cycle[20] == 1 + log.skipped[21]
+    assert built.words[Word.SKIPPED] == log.skipped.sum()
+
+
+@pytest.mark.parametrize(("stop", "phase"), [(1, AxisPhase.RAMPING), (2, AxisPhase.QUICK_STOPPING), (3, None)])
+def test_the_stop_word_is_seen_in_the_same_cycle(loop: Callable[..., Loop], stop: int, phase: AxisPhase | None) -> None:
+    built = loop()
+    built.constants[0].trajectory.amplitude_rad = 0.0
+    built.stub[STOP_CYCLE], built.stub[STOP] = 60, stop
+    executed = built.run(2000)
+    log = built.ring[:executed]
+    assert executed < 200
+    assert log.phase[59] == AxisPhase.TRACKING
+    assert log.phase[60] == (AxisPhase.DISABLING if phase is None else phase)
+    assert log.phase[-1] == AxisPhase.FINISHED
+    assert built.state[0].fault == Fault.NONE
+    assert built.command[0].request == DriveRequest.OFF
+
+
+@pytest.mark.parametrize("beating", [True, False])
+def test_the_age_of_the_supervisor(loop: Callable[..., Loop], beating: bool) -> None:
+    built = loop()
+    built.constants[0].sequence.supervisor_max_cycles = 20_000
+    built.words[Word.SUPERVISOR_NS] = time.monotonic_ns() - (0 if beating else 30_000 * PERIOD_ns)
+    built.run(50)
+    assert built.state[0].fault == (Fault.NONE if beating else Fault.SUPERVISOR_LOST)
+
+
+def test_the_ring_wraps_and_record_k_is_at_k_modulo_its_length(loop: Callable[..., Loop]) -> None:
+    built = loop(ring=16)
+    built.run(40)
+    assert built.words[Word.HEAD] == 40
+    order = [k % 16 for k in range(24, 40)]
+    cycles = built.ring.cycle[order]
+    assert np.all(np.diff(cycles) >= 1)
+    assert cycles[-1] == built.state[0].cycle
+    assert built.words[Word.LOOP_NS] >= built.ring[39 % 16].time_ns
+
+
+def test_the_loop_goes_on_where_it_was_left(loop: Callable[..., Loop]) -> None:
+    built = loop()
+    built.run(10)
+    built.run(10)
+    assert built.words[Word.HEAD] == 20
+    assert built.state[0].cycle == built.ring[19].cycle >= 20
+
+
+def test_histograms_count_every_cycle_once(loop: Callable[..., Loop]) -> None:
+    built = loop()
+    built.run(150)
+    assert list(built.histograms.sum(axis=1)) == [150, 150, 150]
+    assert built.histograms[Histogram.ROUND_TRIP, 1] == 150  # the stub says 1.5 us
+
+
+@pytest.mark.parametrize(
+    ("duration_ns", "bin_us"),
+    [(-5, 0), (0, 0), (999, 0), (1000, 1), (4_095_999, 4095), (4_096_000, 4096), (10**15, 4096)],
+)
+def test_bins(duration_ns: int, bin_us: int) -> None:
+    histograms = np.zeros((3, HISTOGRAM_BINS), np.int64)
+    count(histograms, Histogram.WORK, duration_ns)
+    assert histograms[Histogram.WORK, bin_us] == 1
+    assert histograms.sum() == 1
+
+
+def test_the_log_tells_what_the_axis_did(loop: Callable[..., Loop]) -> None:
+    built = loop()
+    built.run(100)
+    log, state = built.ring[99], built.state[0]
+    assert log.phase == state.phase == AxisPhase.TRACKING
+    assert log.command_torque_Nm == state.command_torque_Nm == built.command[0].torque_Nm
+    assert log.error_rad == log.position_rad - log.desired_position_rad
+    parts = log.inertia_torque_Nm + log.feedback_torque_Nm + log.friction_torque_Nm + log.gravity_torque_Nm
+    assert log.unlimited_torque_Nm == pytest.approx(parts - log.network_torque_Nm)
+    assert list(log.weights) == list(state.law.network.weights)
+    angle = 0.2 * math.pi * log.trajectory_s
+    assert log.desired_position_rad == pytest.approx(0.35 * math.sin(angle), abs=1e-12)
+
+
+# --- no allocation per cycle -----------------------------------------------------------------------------------
+
+_COUNT_ALLOCATIONS = """
+import socket, sys
+import numpy as np
+from numba.core.runtime import rtsys
+from tests.conftest import small_axis_constants
+from tests.unit import test_realtime as stub
+
+loop = stub.Loop(small_axis_constants(), period_ns=10_000)
+
+def stub_run(cycles):
+    return loop.run(cycles)
+
+ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+ours.setblocking(False)
+
+def driver_run(cycles):
+    from drivers.canopen.exchange import exchange_memory, receive, send
+    from drivers.canopen.port import CanopenPort
+    from firmware_py.schema import new
+    from firmware_py.realtime import run_loop
+    global port, frames, scratch
+    if "port" not in globals():
+        port = new(CanopenPort)
+        port[0].fd, port[0].heartbeat_cycles, port[0].tpdo_length = ours.fileno(), 3, 8
+        port[0].torque_Nmppermille = 0.06
+        frames, scratch = exchange_memory()
+        loop.constants[0].sequence.wait_max_cycles = 1 << 40
+    return run_loop(receive, send, port, frames, scratch, loop.constants, loop.state, np.zeros((1, 5)), loop.sample,
+                    loop.command, loop.words, loop.ring, loop.histograms, 10_000, 0, cycles)
+
+run = {"stub": stub_run, "driver": driver_run}[sys.argv[1]]
+
+def allocations(cycles):
+    before = rtsys.get_allocation_stats()
+    assert run(cycles) == cycles
+    after = rtsys.get_allocation_stats()
+    return after.alloc - before.alloc, after.free - before.free
+
+run(0)
+allocations(100)
+print(loop.state[0].phase, *allocations(1), *allocations(100_000))
+"""
+
+
+@pytest.mark.parametrize("exchange", ["stub", "driver"])
+def test_no_memory_is_allocated_per_cycle(exchange: str) -> None:
+    """The loop allocates its scratch when it begins and nothing afterwards, tracking with every part of the law."""
+    result = subprocess.run(
+        [sys.executable, "-c", _COUNT_ALLOCATIONS, exchange],
+        env={**os.environ, "NUMBA_NRT_STATS": "1", "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=240.0,
+    )
+    assert result.returncode == 0, result.stderr[-3000:]
+    phase, *counts = map(int, result.stdout.split())
+    assert phase == (AxisPhase.TRACKING if exchange == "stub" else AxisPhase.WAITING)
+    assert counts[0] > 0  # the statistics are alive
+    assert counts[:2] == counts[2:]

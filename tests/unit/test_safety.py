@@ -1,0 +1,192 @@
+"""The limits of the loop: dense at every boundary, and properties that hold for any number whatever."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from firmware_py.records import LimitConstants
+from firmware_py.safety import drive_fault, limited_torque_Nm, motion_fault, reaction_to, reference_fault, within
+from firmware_py.schema import new
+from firmware_py.states import AxisPhase, DriveState, Fault, Reaction
+
+NOT_FINITE = (math.nan, math.inf, -math.inf)
+
+
+def limit_constants() -> Any:
+    limits = new(LimitConstants)[0]
+    limits.position_min_rad, limits.position_max_rad, limits.velocity_max_radps = -0.5, 0.7, 1.5
+    limits.torque_max_Nm, limits.torque_rate_max_Nmps, limits.following_error_max_rad = 60.0, 20000.0, 0.05
+    return limits
+
+
+LIMITS = limit_constants()
+# fault, lower and upper limit, and the function of one value that reports it
+Check = Callable[[float], int]
+LIMITED: list[tuple[str, Fault, float, float, Check]] = [
+    ("position", Fault.POSITION_LIMIT, -0.5, 0.7, lambda v: motion_fault(LIMITS, v, 0.0, 0.0)),
+    ("velocity", Fault.VELOCITY_LIMIT, -1.5, 1.5, lambda v: motion_fault(LIMITS, 0.0, v, 0.0)),
+    ("error", Fault.FOLLOWING_ERROR, -0.05, 0.05, lambda v: motion_fault(LIMITS, 0.0, 0.0, v)),
+    ("reference position", Fault.REFERENCE_LIMIT, -0.5, 0.7, lambda v: reference_fault(LIMITS, v, 0.0, 2.0, 0.1)),
+    ("reference velocity", Fault.REFERENCE_LIMIT, -1.5, 1.5, lambda v: reference_fault(LIMITS, 0.0, v, 1e9, 0.0)),
+]
+
+
+@pytest.mark.parametrize(("name", "fault", "low", "high", "check"), LIMITED, ids=[c[0] for c in LIMITED])
+def test_each_limit_is_dense_at_its_boundary(name: str, fault: Fault, low: float, high: float, check: Check) -> None:
+    for limit, outward in ((low, -math.inf), (high, math.inf)):
+        outside = inside = limit
+        assert check(limit) == Fault.NONE, f"{name} exactly at {limit}"
+        for _ in range(20):
+            outside, inside = math.nextafter(outside, outward), math.nextafter(inside, 0.0)
+            assert check(outside) == fault
+            assert check(inside) == Fault.NONE
+        for k in range(1, 200):
+            assert check(limit + math.copysign(k * 1e-4, outward)) == fault
+            assert check(limit - math.copysign(k * 1e-4, outward)) == Fault.NONE
+    for k in range(101):
+        assert check(low + (high - low) * k / 100.0) == Fault.NONE
+
+
+@pytest.mark.parametrize(("name", "fault", "low", "high", "check"), LIMITED, ids=[c[0] for c in LIMITED])
+@pytest.mark.parametrize("value", NOT_FINITE)
+def test_what_is_not_finite_is_outside_every_limit(
+    name: str, fault: Fault, low: float, high: float, check: Check, value: float
+) -> None:
+    assert check(value) == fault
+
+
+def test_position_is_reported_before_velocity_before_error() -> None:
+    assert motion_fault(LIMITS, 9.0, 9.0, 9.0) == Fault.POSITION_LIMIT
+    assert motion_fault(LIMITS, 0.0, 9.0, 9.0) == Fault.VELOCITY_LIMIT
+    assert motion_fault(LIMITS, 0.0, 0.0, 9.0) == Fault.FOLLOWING_ERROR
+
+
+def test_a_limit_that_is_not_a_number_allows_nothing() -> None:
+    assert not within(0.0, math.nan, 1.0)
+    assert not within(0.0, -1.0, math.nan)
+
+
+@pytest.mark.parametrize("state", DriveState)
+@pytest.mark.parametrize("expected", [True, False])
+def test_drive_state(state: DriveState, expected: bool) -> None:
+    if state in (DriveState.FAULT, DriveState.FAULT_BRAKING):
+        fault = Fault.DRIVE_FAULT
+    elif expected and state is not DriveState.ENABLED:
+        fault = Fault.DRIVE_NOT_ENABLED
+    else:
+        fault = Fault.NONE
+    assert drive_fault(int(state), expected, 0) == fault
+    for restarts in (1, 2, -1):
+        assert drive_fault(int(state), expected, restarts) == Fault.DRIVE_RESTARTED
+
+
+POWERED = (AxisPhase.APPROACH, AxisPhase.TRACKING, AxisPhase.RAMPING, AxisPhase.RELEASING)
+BY_RAMP = (Fault.REFERENCE_LIMIT, Fault.SUPERVISOR_LOST, Fault.OVERRUN)
+BY_POWER_OFF = (Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED, Fault.DRIVE_RESTARTED)
+
+
+@pytest.mark.parametrize("phase", AxisPhase)
+@pytest.mark.parametrize("fault", Fault)
+def test_reaction_for_every_fault_in_every_phase(fault: Fault, phase: AxisPhase) -> None:
+    if fault is Fault.NONE:
+        expected = Reaction.NONE
+    elif phase not in POWERED or fault in BY_POWER_OFF:
+        expected = Reaction.OFF
+    elif fault in BY_RAMP:
+        expected = Reaction.RAMP
+    else:
+        expected = Reaction.QUICK_STOP
+    assert reaction_to(int(fault), int(phase)) == expected
+
+
+STEP_Nm = 20.0  # 20000 Nm/s in 1 ms
+
+
+@pytest.mark.parametrize(("limit", "last", "sign"), [(60.0, 50.0, 1.0), (60.0, -50.0, -1.0)])
+def test_torque_limit_is_dense_at_its_boundary(limit: float, last: float, sign: float) -> None:
+    for k in range(-100, 101):
+        asked = sign * (limit + k * 0.01)
+        sent, finite = limited_torque_Nm(LIMITS, asked, last, 1e-3)
+        assert finite
+        assert sent == (asked if k <= 0 else sign * limit)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("last", [0.0, 13.0, -13.0])
+def test_rate_limit_is_dense_at_its_boundary(sign: float, last: float) -> None:
+    for k in range(-100, 101):
+        asked = last + sign * (STEP_Nm + k * 0.01)
+        sent, _ = limited_torque_Nm(LIMITS, asked, last, 1e-3)
+        assert sent == (asked if k <= 0 else last + sign * STEP_Nm)
+
+
+def test_the_limit_comes_before_the_rate() -> None:
+    """The order shows where the last torque is above a limit that was lowered: the rate is kept on the way down."""
+    assert limited_torque_Nm(LIMITS, 1000.0, 55.0, 1e-3) == (60.0, True)
+    assert limited_torque_Nm(LIMITS, 1000.0, -60.0, 1e-3) == (-40.0, True)
+    assert limited_torque_Nm(LIMITS, 0.0, 100.0, 1e-3) == (80.0, True)
+    assert limited_torque_Nm(LIMITS, 1000.0, 100.0, 1e-3) == (80.0, True)
+
+
+@pytest.mark.parametrize("value", NOT_FINITE)
+@pytest.mark.parametrize("last", [0.0, 60.0, -60.0])
+def test_not_finite_is_zero_at_once_and_said(value: float, last: float) -> None:
+    assert limited_torque_Nm(LIMITS, value, last, 1e-3) == (0.0, False)
+    # the twin: the greatest finite number is only limited
+    greatest = math.copysign(1.7976931348623157e308, value)
+    sent, finite = limited_torque_Nm(LIMITS, greatest, last, 1e-3)
+    assert finite
+    assert abs(sent - last) <= STEP_Nm
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    asked=st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=1, max_size=40),
+    limit=st.floats(0.1, 1e4),
+    rate=st.floats(0.0, 1e6),
+)
+def test_whatever_is_asked_torque_and_step_stay_within(asked: list[float], limit: float, rate: float) -> None:
+    limits = new(LimitConstants)[0]
+    limits.torque_max_Nm, limits.torque_rate_max_Nmps = limit, rate
+    last = 0.0
+    for value in asked:
+        sent, finite = limited_torque_Nm(limits, value, last, 1e-3)
+        assert finite is math.isfinite(value)
+        assert abs(sent) <= limit
+        if finite:
+            assert abs(sent - last) <= rate * 1e-3 * (1.0 + 1e-12) + 1e-12
+        else:
+            assert sent == 0.0
+        last = sent
+
+
+@settings(max_examples=300, deadline=None)
+@given(value=st.floats(-59.0, 59.0), last=st.floats(-60.0, 60.0))
+def test_what_is_within_all_limits_is_passed_unchanged(value: float, last: float) -> None:
+    sent, finite = limited_torque_Nm(LIMITS, value, last, 1e-3)
+    assert finite
+    if abs(value - last) < STEP_Nm:
+        assert sent == value
+
+
+@settings(max_examples=200, deadline=None)
+@given(value=st.floats(allow_nan=True, allow_infinity=True), low=st.floats(-5.0, 0.0), high=st.floats(0.0, 5.0))
+def test_within_is_the_closed_interval(value: float, low: float, high: float) -> None:
+    assert within(value, low, high) is (low <= value <= high)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("past_rad", "fault"), [(-1e-9, Fault.NONE), (1e-9, Fault.REFERENCE_LIMIT)])
+def test_a_reference_must_be_able_to_brake_inside_the_limits(sign: float, past_rad: float, fault: Fault) -> None:
+    velocity, brake, ahead = 1.2, 4.0, 0.002
+    edge = LIMITS.position_max_rad if sign > 0.0 else LIMITS.position_min_rad
+    position = edge - sign * (velocity * ahead + velocity**2 / (2.0 * brake) - past_rad)
+    assert reference_fault(LIMITS, position, sign * velocity, brake, ahead) == fault
+    # moving away from that limit, the same place is no danger
+    assert reference_fault(LIMITS, position, -sign * 0.1, brake, ahead) == Fault.NONE

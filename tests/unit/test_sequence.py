@@ -1,0 +1,282 @@
+"""The phases of a run as pure functions: forward only, and the stronger reaction wins."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from firmware_py.records import AxisState, Command, Sample
+from firmware_py.schema import new
+from firmware_py.sequence import (
+    ANSWER_CYCLES,
+    enter,
+    powered,
+    react,
+    request_stop,
+    reset_axis,
+    step_enabling,
+    step_stopping,
+    step_waiting,
+    trip,
+    write_command,
+)
+from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction, StopRequest
+
+GOAL = {
+    Reaction.RAMP: AxisPhase.RAMPING,
+    Reaction.QUICK_STOP: AxisPhase.QUICK_STOPPING,
+    Reaction.OFF: AxisPhase.DISABLING,
+}
+
+
+@pytest.fixture
+def axis(axis_constants: Any) -> Any:
+    return axis_constants[0]
+
+
+@pytest.fixture
+def state(axis: Any) -> Any:
+    state = new(AxisState)[0]
+    reset_axis(axis, state)
+    return state
+
+
+def sample_of(drive_state: DriveState) -> Any:
+    sample = new(Sample)[0]
+    sample.drive_state, sample.status_word, sample.drive_error = drive_state, 0x1237, 0x3310
+    return sample
+
+
+def test_reset_forgets_the_run_before(axis: Any, state: Any) -> None:
+    state.phase, state.fault, state.reaction, state.cycle = AxisPhase.FINISHED, Fault.OVERRUN, Reaction.OFF, 99
+    state.command_torque_Nm, state.restarts_at_start, state.saturated_cycles = 7.0, 3, 8
+    state.velocity.primed, state.law.lugre_deflection_rad = 1, 0.1
+    state.law.network.weights[:] = 5.0
+    reset_axis(axis, state)
+    assert (state.phase, state.fault, state.reaction, state.cycle) == (AxisPhase.WAITING, 0, 0, 0)
+    assert (state.command_torque_Nm, state.restarts_at_start, state.saturated_cycles) == (0.0, -1, 0)
+    assert (state.velocity.primed, state.law.lugre_deflection_rad) == (0, 0.0)
+    assert list(state.law.network.weights) == [0.01] * 15
+
+
+@pytest.mark.parametrize("phase", AxisPhase)
+def test_torque_is_only_commanded_between_enabled_and_released(phase: AxisPhase) -> None:
+    assert powered(int(phase)) is (phase.name in ("APPROACH", "TRACKING", "RAMPING", "RELEASING"))
+
+
+@pytest.mark.parametrize("phase", AxisPhase)
+@pytest.mark.parametrize("in_force", Reaction)
+@pytest.mark.parametrize("reaction", Reaction)
+def test_react_goes_forward_or_stays(state: Any, phase: AxisPhase, in_force: Reaction, reaction: Reaction) -> None:
+    state.phase, state.reaction, state.phase_cycle = phase, in_force, 7
+    react(state, int(reaction))
+    if reaction <= in_force or phase is AxisPhase.FINISHED:
+        assert (state.phase, state.reaction, state.phase_cycle) == (phase, in_force, 7)
+    else:
+        assert state.reaction == reaction
+        assert state.phase == max(phase, GOAL[reaction])
+        assert state.phase_cycle == (7 if state.phase == phase else 0)
+
+
+@pytest.mark.parametrize("phase", [AxisPhase.ENABLING, AxisPhase.TRACKING, AxisPhase.RELEASING])
+def test_the_first_fault_is_latched_and_the_reaction_never_weakens(axis: Any, state: Any, phase: AxisPhase) -> None:
+    for first, second in itertools.product(Fault, Fault):
+        reset_axis(axis, state)
+        state.phase = phase
+        trip(state, int(first), 1.0, 11)
+        reaction, after_first = int(state.reaction), int(state.phase)
+        trip(state, int(second), 2.0, 22)
+        latched = first if first is not Fault.NONE else second
+        expected = (0.0, 0) if latched is Fault.NONE else (1.0, 11) if first is not Fault.NONE else (2.0, 22)
+        assert (state.fault, state.fault_value, state.fault_drive_error) == (latched, *expected)
+        assert state.reaction >= reaction
+        assert state.phase >= after_first
+
+
+@pytest.mark.parametrize("phase", AxisPhase)
+@pytest.mark.parametrize("stop", StopRequest)
+def test_stop_request_in_every_phase(state: Any, phase: AxisPhase, stop: StopRequest) -> None:
+    state.phase = phase
+    request_stop(state, int(stop))
+    assert state.fault == Fault.NONE
+    if stop is StopRequest.NONE:
+        goal = phase
+    elif phase <= AxisPhase.ENABLING or stop is StopRequest.OFF:
+        goal = AxisPhase.DISABLING
+    else:
+        goal = GOAL[Reaction(int(stop))]
+    assert state.phase == max(phase, goal)
+
+
+def idle_sample(drive_state: DriveState = DriveState.OFF) -> Any:
+    sample = new(Sample)[0]
+    sample.drive_state = drive_state
+    return sample
+
+
+def settled(state: Any, position_rad: float = 0.0, velocity_radps: float = 0.0, good_samples: int = 4) -> None:
+    state.measured_position_rad, state.good_samples, state.sample_count = position_rad, good_samples, good_samples
+    state.velocity.velocity_radps = velocity_radps
+
+
+@pytest.mark.parametrize(
+    ("position_rad", "velocity_radps", "good_samples", "phase", "fault"),
+    [
+        (0.0, 0.0, 3, AxisPhase.WAITING, Fault.NONE),
+        (0.0, 0.0, 4, AxisPhase.ENABLING, Fault.NONE),
+        (1.0, 0.02, 4, AxisPhase.ENABLING, Fault.NONE),
+        (-1.0, -0.02, 4, AxisPhase.ENABLING, Fault.NONE),
+        (1.0 + 1e-12, 0.0, 4, AxisPhase.DISABLING, Fault.POSITION_LIMIT),
+        (-1.0 - 1e-12, 0.0, 4, AxisPhase.DISABLING, Fault.POSITION_LIMIT),
+        (float("nan"), 0.0, 4, AxisPhase.DISABLING, Fault.POSITION_LIMIT),
+        (0.0, 0.02 + 1e-12, 4, AxisPhase.WAITING, Fault.NONE),
+        (0.0, float("nan"), 4, AxisPhase.WAITING, Fault.NONE),
+    ],
+)
+def test_enabling_is_only_asked_at_standstill_inside_the_limits(
+    axis: Any, state: Any, position_rad: float, velocity_radps: float, good_samples: int, phase: int, fault: int
+) -> None:
+    settled(state, position_rad, velocity_radps, good_samples)
+    step_waiting(axis, state, idle_sample())
+    assert (state.phase, state.fault) == (phase, fault)
+
+
+@pytest.mark.parametrize("drive_state", [DriveState.OFF, DriveState.STARTING, DriveState.ENABLED])
+def test_a_drive_that_is_enabled_already_is_not_taken_over(axis: Any, state: Any, drive_state: DriveState) -> None:
+    settled(state)
+    step_waiting(axis, state, idle_sample(drive_state))
+    enabled = drive_state is DriveState.ENABLED
+    assert state.phase == (AxisPhase.WAITING if enabled else AxisPhase.ENABLING)
+    state.phase_cycle = axis.sequence.wait_max_cycles + 1
+    if enabled:
+        step_waiting(axis, state, idle_sample(drive_state))
+        assert (state.phase, state.fault) == (AxisPhase.DISABLING, Fault.DRIVE_STAYS_ENABLED)
+
+
+def test_the_run_waits_until_it_may_enable(axis: Any, state: Any) -> None:
+    axis.sequence.may_enable = 0
+    settled(state)
+    step_waiting(axis, state, idle_sample())
+    assert (state.phase, state.fault) == (AxisPhase.WAITING, Fault.NONE)
+    axis.sequence.may_enable = 1
+    step_waiting(axis, state, idle_sample())
+    assert state.phase == AxisPhase.ENABLING
+
+
+@pytest.mark.parametrize(
+    ("samples", "velocity_radps", "fault"),
+    [(0, 0.0, Fault.NO_SAMPLES), (3, 0.0, Fault.STALE_SAMPLE), (4, 0.5, Fault.NOT_AT_STANDSTILL)],
+)
+def test_waiting_ends(axis: Any, state: Any, samples: int, velocity_radps: float, fault: Fault) -> None:
+    settled(state, 0.0, velocity_radps, samples)
+    state.phase_cycle = 40
+    step_waiting(axis, state, idle_sample())
+    assert (state.phase, state.fault) == (AxisPhase.WAITING, Fault.NONE)
+    state.phase_cycle = 41
+    step_waiting(axis, state, idle_sample())
+    assert (state.phase, state.fault) == (AxisPhase.DISABLING, fault)
+
+
+@pytest.mark.parametrize("drive_state", DriveState)
+@pytest.mark.parametrize("age_cycles", [0, 1])
+def test_torque_begins_only_with_a_fresh_sample_of_an_enabled_drive(
+    axis: Any, state: Any, drive_state: DriveState, age_cycles: int
+) -> None:
+    state.phase, state.sample_age_cycles, state.measured_position_rad = AxisPhase.ENABLING, age_cycles, 0.3
+    state.law.network.weights[:] = 5.0
+    step_enabling(axis, state, sample_of(drive_state), axis_table())
+    if drive_state is DriveState.ENABLED and age_cycles == 0:
+        assert state.phase == AxisPhase.APPROACH
+        assert state.reference.position_rad == 0.3
+        assert state.trajectory_s == pytest.approx(-0.2, abs=1.1e-3)
+        assert list(state.law.network.weights) == [0.01] * 15
+    else:
+        assert state.phase == AxisPhase.ENABLING
+
+
+def axis_table() -> Any:
+    return np.zeros((1, 5))
+
+
+def test_without_an_approach_the_trajectory_begins_at_once(axis: Any, state: Any) -> None:
+    axis.sequence.approach_s = 0.0
+    state.phase = AxisPhase.ENABLING
+    step_enabling(axis, state, sample_of(DriveState.ENABLED), axis_table())
+    assert state.phase == AxisPhase.TRACKING
+    assert state.reference.velocity_radps == pytest.approx(0.35 * 0.2 * 3.14159265, rel=1e-6)
+
+
+@pytest.mark.parametrize(("phase_cycle", "fault"), [(30, Fault.NONE), (31, Fault.ENABLE_TIMEOUT)])
+def test_enable_timeout(axis: Any, state: Any, phase_cycle: int, fault: Fault) -> None:
+    state.phase, state.phase_cycle = AxisPhase.ENABLING, phase_cycle
+    step_enabling(axis, state, sample_of(DriveState.STARTING), axis_table())
+    assert state.fault == fault
+    assert state.phase == (AxisPhase.DISABLING if fault else AxisPhase.ENABLING)
+    assert (state.fault_value, state.fault_drive_error) == ((0x1237, 0x3310) if fault else (0.0, 0))
+
+
+@pytest.mark.parametrize("drive_state", DriveState)
+@pytest.mark.parametrize("age_cycles", [0, 1])
+@pytest.mark.parametrize("phase_cycle", [ANSWER_CYCLES, ANSWER_CYCLES + 1])
+@pytest.mark.parametrize(
+    ("phase", "following"),
+    [(AxisPhase.QUICK_STOPPING, AxisPhase.DISABLING), (AxisPhase.DISABLING, AxisPhase.FINISHED)],
+)
+def test_only_a_fresh_answer_of_the_drive_ends_the_stop(
+    axis: Any, state: Any, drive_state: DriveState, age_cycles: int, phase_cycle: int, phase: int, following: int
+) -> None:
+    state.phase, state.phase_cycle, state.sample_age_cycles = phase, phase_cycle, age_cycles
+    step_stopping(axis, state, sample_of(drive_state))
+    confirmed = drive_state in (DriveState.OFF, DriveState.FAULT) and age_cycles == 0 and phase_cycle > ANSWER_CYCLES
+    assert state.phase == (following if confirmed else phase)
+    assert state.fault == Fault.NONE
+
+
+@pytest.mark.parametrize("phase", [p for p in AxisPhase if p not in (AxisPhase.QUICK_STOPPING, AxisPhase.DISABLING)])
+def test_the_stop_concerns_no_other_phase(axis: Any, state: Any, phase: AxisPhase) -> None:
+    state.phase, state.phase_cycle = phase, 1000
+    step_stopping(axis, state, sample_of(DriveState.OFF))
+    assert state.phase == phase
+
+
+@pytest.mark.parametrize(("phase_cycle", "phase"), [(100, AxisPhase.QUICK_STOPPING), (101, AxisPhase.DISABLING)])
+def test_a_quick_stop_that_does_not_end_is_cut_off(axis: Any, state: Any, phase_cycle: int, phase: AxisPhase) -> None:
+    state.phase, state.phase_cycle, state.reaction = AxisPhase.QUICK_STOPPING, phase_cycle, Reaction.QUICK_STOP
+    step_stopping(axis, state, sample_of(DriveState.STOPPING))
+    assert state.phase == phase
+
+
+@pytest.mark.parametrize(
+    ("phase_cycle", "phase", "fault"),
+    [(20, AxisPhase.DISABLING, Fault.NONE), (21, AxisPhase.FINISHED, Fault.OFF_TIMEOUT)],
+)
+def test_off_timeout(axis: Any, state: Any, phase_cycle: int, phase: AxisPhase, fault: Fault) -> None:
+    state.phase, state.phase_cycle = AxisPhase.DISABLING, phase_cycle
+    step_stopping(axis, state, sample_of(DriveState.ENABLED))
+    assert (state.phase, state.fault) == (phase, fault)
+
+
+@pytest.mark.parametrize("phase", AxisPhase)
+def test_request_of_every_phase(state: Any, phase: AxisPhase) -> None:
+    enter(state, int(phase))
+    command = new(Command)[0]
+    write_command(state, command)
+    if phase is AxisPhase.QUICK_STOPPING:
+        assert command.request == DriveRequest.QUICK_STOP
+    elif AxisPhase.ENABLING <= phase <= AxisPhase.RELEASING:
+        assert command.request == DriveRequest.ENABLE
+    else:
+        assert command.request == DriveRequest.OFF
+
+
+def test_phases_follow_each_other_in_a_whole_run(rig: Callable[..., Any]) -> None:
+    run = rig(0.1)
+    run.until(AxisPhase.TRACKING).run(20)
+    run.stop = StopRequest.RAMP
+    run.until(AxisPhase.FINISHED)
+    order = [phase for phase, _ in itertools.groupby(run.phases)]
+    assert order == [p for p in AxisPhase if p is not AxisPhase.QUICK_STOPPING]

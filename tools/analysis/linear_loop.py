@@ -1,0 +1,218 @@
+"""The position loop linearised around x = 0, as an exact discrete-time model at the controller's rate.
+
+    controller (period T) -> delay d -> zero-order hold -> current lag 1/(lag s + 1) -> joint 1/(J s^2) -> sampler
+
+The plant is discretised exactly for any delay d >= 0, see `tools.analysis.sampled_joint`.
+The controller is what the kernels compute: the difference quotient and low-pass of `firmware_py.velocity`, law (29),
+and the network evaluated with the old weights before its Euler step (24).  For a constant reference the filtered q' and
+the matched e' are the same signal, so that both velocity paths have this loop.
+
+Sign: u = -C(z) q [Nm at the joint], q = P(z) u, and L = P C is the loop that is broken at the torque: a factor on L is
+a wrong torque constant, or the inverse of a wrong inertia.
+
+The network around x = 0, weights w_i: fhat = sum h_i0 dw_i + (sum w_i h_i0 c_i / b_i^2) x, and every weight moves along
+h_i0, so that one state is exact: s = sum h_i0 dw_i, s <- (1 - leakage T) s + beta T sum h_i0^2 (x^T P B).
+
+Neglected, because it is of second order in x or not linear: the change of h during adaptation, dead zone, projection,
+limits of torque, rate and integral, encoder quantisation, lost samples.  Iterative learning acts from one repetition to
+the next, outside this loop.  Not modelled: flexibility, and friction, gravity and Coriolis
+torque together with their compensation (friction damps the joint; feed-forward on the measured velocity takes damping
+back).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from firmware_py.lyapunov import solve_lyapunov_p
+from firmware_py.states import ControllerKind
+from firmware_py.velocity import low_pass_gain
+from tools.analysis.sampled_joint import Array, ComplexArray, SampledJoint, StateSpace, sampled_joint
+
+_POSITIVE = ("period_s", "inertia_kgm2", "kp", "kv")
+_NOT_NEGATIVE = (
+    "delay_s", "lag_s", "cutoff_Hz", "learning_rate", "leakage_1ps", "ki", "observer_radps", "observer_delay_cycles",
+)  # fmt: skip
+MAX_DELAY_PERIODS = 500  # one state each
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopSettings:
+    """Everything that decides the linear loop; `tools.analysis.loop_settings` makes it from a configuration."""
+
+    kind: ControllerKind
+    period_s: float
+    delay_s: float  # from the sample to the torque command taking effect, ahead of the lag
+    lag_s: float  # of the current loop, first order
+    inertia_kgm2: float  # J at the joint, true and modelled
+    kp: float  # [1/s^2]
+    kv: float  # [1/s]
+    cutoff_Hz: float  # of the velocity's low-pass, 0 = none
+    ki: float = 0.0  # [1/s^3], PID only
+    observer_radps: float = 0.0  # disturbance observer only
+    observer_delay_cycles: int = 0
+    # the network; without effect for other kinds
+    q: tuple[float, float] = (1.0, 1.0)  # Q = diag(q1, q2)
+    learning_rate: float = 0.0  # beta
+    leakage_1ps: float = 0.0
+    centres: tuple[tuple[float, float], ...] = ()  # [rad, rad/s]
+    widths: tuple[float, ...] = ()  # b, one for each centre
+    weight_Nm: float = 0.0  # of every neuron at the point of linearisation
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, (int, float)) and not math.isfinite(value):
+                raise ValueError(f"{field.name} (={value}) must be finite")
+        for name in _POSITIVE:
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} (={getattr(self, name):g}) must be > 0")
+        for name in _NOT_NEGATIVE:
+            if not getattr(self, name) >= 0.0:
+                raise ValueError(f"{name} (={getattr(self, name):g}) must be >= 0")
+        if self.delay_s > MAX_DELAY_PERIODS * self.period_s:
+            longest_s = MAX_DELAY_PERIODS * self.period_s
+            raise ValueError(f"delay_s (={self.delay_s:g}) must be in [0..{longest_s:g}], {MAX_DELAY_PERIODS} periods")
+        if self.kind not in CONTROLLERS:
+            known = ", ".join(kind.name for kind in CONTROLLERS)
+            raise ValueError(f"kind (={self.kind!r}) must be one of {known}")
+        if len(self.widths) != len(self.centres) or not all(width > 0.0 for width in self.widths):
+            raise ValueError(f"widths (={self.widths}) must be > 0 and as many as centres ({len(self.centres)})")
+
+
+# --- the controllers: one function for each kind, from the measured q to the torque u (reference zero) ---
+
+
+def network_gains(settings: LoopSettings) -> tuple[float, float, float, float]:
+    """(a1, a2, g1, g2): s' = a1 e + a2 e' [Nm/s], and g1 e + g2 e' [Nm] of the weights present at x = 0."""
+    _, p12, p22 = solve_lyapunov_p(settings.kp, settings.kv, *settings.q)
+    centres = np.array(settings.centres, dtype=np.float64).reshape(-1, 2)
+    widths = np.array(settings.widths, dtype=np.float64)
+    hidden = np.exp(-np.sum(centres**2, axis=1) / (2.0 * widths**2))
+    adaptation = settings.learning_rate * float(hidden @ hidden) / settings.inertia_kgm2
+    gradient = settings.weight_Nm * (hidden / widths**2) @ centres
+    return adaptation * p12, adaptation * p22, float(gradient[0]), float(gradient[1])
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Linear forms of (states, input), each an array of that size; the first two states are last error and rate."""
+
+    size: int
+
+    def state(self, index: int) -> Array:
+        return np.eye(self.size + 1)[index]
+
+    @property
+    def error(self) -> Array:
+        """e = q - q_d, the input [rad]."""
+        return np.eye(self.size + 1)[self.size]
+
+    def rate(self, settings: LoopSettings) -> Array:
+        """e' of this period: low-pass of the difference quotient [rad/s]."""
+        gain = low_pass_gain(settings.cutoff_Hz, settings.period_s)
+        return (1.0 - gain) * self.state(1) + gain / settings.period_s * (self.error - self.state(0))
+
+    def feedback(self, settings: LoopSettings) -> Array:
+        """-J (kv e' + kp e) [Nm]."""
+        return -settings.inertia_kgm2 * (settings.kv * self.rate(settings) + settings.kp * self.error)
+
+    def state_space(self, settings: LoopSettings, following: list[Array], output: Array) -> StateSpace:
+        """`following`: next values of the states from the third on."""
+        rows = np.array([self.error, self.rate(settings), *following])
+        n = self.size
+        return StateSpace(rows[:, :n], rows[:, n], output[:n], float(output[n]))
+
+
+def computed_torque(settings: LoopSettings) -> StateSpace:
+    """The law without anything that learns."""
+    rows = _Rows(2)
+    return rows.state_space(settings, [], rows.feedback(settings))
+
+
+def computed_torque_rbf(settings: LoopSettings) -> StateSpace:
+    """The law with its adaptive network, which around x = 0 is one (leaky) integrator s [Nm]."""
+    a1, a2, g1, g2 = network_gains(settings)
+    adapts = (a1, a2) != (0.0, 0.0)  # an integrator that nothing drives is no part of the loop
+    rows = _Rows(3 if adapts else 2)
+    rate = rows.rate(settings)
+    output = rows.feedback(settings) - g1 * rows.error - g2 * rate
+    if not adapts:
+        return rows.state_space(settings, [], output)
+    s, period_s = rows.state(2), settings.period_s
+    following = (1.0 - settings.leakage_1ps * period_s) * s + period_s * (a1 * rows.error + a2 * rate)
+    return rows.state_space(settings, [following], output - s)
+
+
+def computed_torque_observer(settings: LoopSettings) -> StateSpace:
+    """The law with the disturbance observer: states z [Nms], r [Nm] and the commands that are not yet applied [Nm]."""
+    waiting = settings.observer_delay_cycles + 1  # the newest command known is that of the cycle before
+    rows = _Rows(4 + waiting)
+    momentum = settings.inertia_kgm2 * rows.rate(settings)
+    integral = rows.state(2) + settings.period_s * (rows.state(3 + waiting) - rows.state(3))
+    disturbance = settings.observer_radps * (integral - momentum)
+    output = rows.feedback(settings) + disturbance
+    sent = [output, *(rows.state(4 + i) for i in range(waiting - 1))]
+    return rows.state_space(settings, [integral, disturbance, *sent], output)
+
+
+def pid(settings: LoopSettings) -> StateSpace:
+    """PID on the inertia: state int(e) dt [rad s], updated before its use."""
+    adapts = settings.ki != 0.0
+    rows = _Rows(3 if adapts else 2)
+    output = rows.feedback(settings)
+    if not adapts:
+        return rows.state_space(settings, [], output)
+    integral = rows.state(2) + settings.period_s * rows.error
+    return rows.state_space(settings, [integral], output - settings.inertia_kgm2 * settings.ki * integral)
+
+
+CONTROLLERS: dict[ControllerKind, Callable[[LoopSettings], StateSpace]] = {
+    ControllerKind.COMPUTED_TORQUE: computed_torque,
+    ControllerKind.COMPUTED_TORQUE_RBF: computed_torque_rbf,
+    ControllerKind.COMPUTED_TORQUE_OBSERVER: computed_torque_observer,
+    ControllerKind.PID: pid,
+}
+
+
+# --- the loop ---
+
+
+@dataclass(frozen=True)
+class LinearLoop:
+    """Plant and controller of one setting."""
+
+    settings: LoopSettings
+    joint: SampledJoint
+    controller: StateSpace
+
+    def open_loop(self, omega_radps: Array) -> ComplexArray:
+        """L at these frequencies, shape (N,), each in (0..pi/T]."""
+        z = np.exp(1j * np.asarray(omega_radps, dtype=np.float64) * self.settings.period_s)
+        response: ComplexArray = -self.joint.response(z) * self.controller.response(z)
+        return response
+
+    def closed_loop_poles(self, gain: float = 1.0) -> ComplexArray:
+        """Eigenvalues z of the closed loop with L times `gain`; stable where all |z| < 1."""
+        plant, law = self.joint.state_space(), self.controller
+        b = gain * plant.b
+        matrix = np.block(
+            [
+                [plant.a + np.outer(b, law.d * plant.c), np.outer(b, law.c)],
+                [np.outer(law.b, plant.c), law.a],
+            ]
+        )
+        return np.asarray(np.linalg.eigvals(matrix), dtype=np.complex128)
+
+    def is_stable(self, gain: float = 1.0) -> bool:
+        return bool(np.max(np.abs(self.closed_loop_poles(gain))) < 1.0)
+
+
+def linear_loop(settings: LoopSettings) -> LinearLoop:
+    """The loop of these settings."""
+    joint = sampled_joint(settings.period_s, settings.delay_s, settings.lag_s, settings.inertia_kgm2)
+    return LinearLoop(settings, joint, CONTROLLERS[settings.kind](settings))

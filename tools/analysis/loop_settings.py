@@ -1,0 +1,123 @@
+"""From a configuration to the linear loop, with the origin of every assumption.
+
+The delay counts from the instant at which the drive takes the position sample (SYNC) to the one at which the torque
+command enters its current loop.  A synchronous RPDO takes effect with the next SYNC, one period after the sample that
+it was computed from; an asynchronous one takes effect within the period, for which one period is an upper bound.  What
+the drive adds inside is not visible on the bus: `margin.loop_delay_s` or a measured delay must contain it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from drivers.errors import ConfigurationError
+from firmware_py.records import NEURONS
+from firmware_py.states import ControllerKind
+from tools.analysis.linear_loop import LoopSettings
+from tools.config_elmo import ElmoSerial
+from tools.config_records import PAPER_CENTRES
+
+if TYPE_CHECKING:
+    from tools.config import Config
+
+LAST_SYNCHRONOUS_TYPE = 240
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarginSettings:
+    """The section [margin]; these are its defaults."""
+
+    min_phase_margin_deg: float = 20.0
+    loop_delay_s: float | None = None  # None = from drive.rpdo_transmission_type
+    current_lag_s: float = 0.0005
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """A value of the analysis and where it comes from."""
+
+    name: str
+    value: float
+    unit: str
+    origin: str
+
+
+def margin_settings(config: Config) -> MarginSettings:
+    """The section [margin]."""
+    section = config.margin
+    return MarginSettings(
+        min_phase_margin_deg=section.min_phase_margin_deg,
+        loop_delay_s=section.loop_delay_s,
+        current_lag_s=section.current_lag_s,
+    )
+
+
+def _delay(config: Config, margin: MarginSettings, measured_s: float | None) -> tuple[float, str]:
+    if measured_s is not None:
+        return measured_s, "measured"
+    if margin.loop_delay_s is not None:
+        return margin.loop_delay_s, "margin.loop_delay_s"
+    if isinstance(config.drive, ElmoSerial):
+        return 1.0 / config.loop.rate_Hz, "assumed: at most one period (serial line)"
+    period_s, kind = 1.0 / config.loop.rate_Hz, config.canopen.rpdo_transmission_type
+    if kind > LAST_SYNCHRONOUS_TYPE:
+        return period_s, f"assumed: at most one period (drive.rpdo_transmission_type = {kind}, asynchronous)"
+    periods = max(kind, 1)
+    count = "one period" if periods == 1 else f"at most {periods} periods"
+    return periods * period_s, f"assumed: {count} (drive.rpdo_transmission_type = {kind}, synchronous)"
+
+
+def loop_settings(
+    config: Config, delay_s: float | None = None, margin: MarginSettings | None = None
+) -> tuple[LoopSettings, tuple[Assumption, ...]]:
+    """The loop of this configuration; `delay_s` is a measured loop delay, which beats the configured one."""
+    margin = margin_settings(config) if margin is None else margin
+    control = config.control
+    delay_s, delay_origin = _delay(config, margin, delay_s)
+    centres = control.centres or tuple((c, c) for c in PAPER_CENTRES)
+    widths = control.widths if len(control.widths) > 1 else control.widths * NEURONS
+    try:
+        settings = LoopSettings(
+            kind=ControllerKind[control.kind.upper()],
+            period_s=1.0 / config.loop.rate_Hz,
+            delay_s=delay_s,
+            lag_s=margin.current_lag_s,
+            inertia_kgm2=config.joint.inertia_kgm2,
+            kp=control.kp,
+            kv=control.kv,
+            cutoff_Hz=control.velocity_cutoff_Hz,
+            ki=control.ki,
+            observer_radps=control.observer_radps,
+            observer_delay_cycles=control.observer_delay_cycles,
+            q=(control.q[0], control.q[-1]),
+            learning_rate=control.learning_rate,
+            leakage_1ps=control.leakage_1ps,
+            centres=centres,
+            widths=widths,
+            weight_Nm=control.initial_weight_Nm,
+        )
+    except ValueError as error:
+        raise ConfigurationError(f"{config.path}: {error}") from None
+    assumptions = (
+        Assumption("loop rate", config.loop.rate_Hz, "Hz", "loop.rate_Hz"),
+        Assumption("loop delay", delay_s, "s", delay_origin),
+        Assumption("current lag", margin.current_lag_s, "s", "margin.current_lag_s"),
+        Assumption("velocity filter", control.velocity_cutoff_Hz, "Hz", "control.velocity_cutoff_Hz (0 = none)"),
+        Assumption("joint inertia", config.joint.inertia_kgm2, "kg m^2", "joint.inertia_kgm2"),
+    )
+    return settings, assumptions
+
+
+def not_modelled(config: Config) -> list[str]:
+    """Configured things that the linear loop does not know, in words."""
+    control, joint, found = config.control, config.joint, []
+    if control.feed_forward == "measured":
+        found.append('control.feed_forward = "measured": takes back the damping that friction gives')
+    if joint.gravity_Nm:
+        found.append(f"joint.gravity_Nm (={joint.gravity_Nm:g}): taken as compensated exactly")
+    if joint.coriolis_Nmspr:
+        found.append(f"joint.coriolis_Nmspr (={joint.coriolis_Nmspr:g}): taken as compensated exactly")
+    if control.kind == "computed_torque_rbf" and control.dead_zone_rad:
+        found.append(f"control.dead_zone_rad (={control.dead_zone_rad:g}): taken as if the error were outside")
+    return found

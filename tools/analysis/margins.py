@@ -1,0 +1,230 @@
+"""Margins of the linear loop, and the continuous-time figures of the theory beside them.
+
+Phase and gain margins and the sensitivity are read off L(e^{j omega T}), which is exact for the sampled loop.  The
+delay margin is exact too: the additional delay at which a closed-loop eigenvalue reaches the unit circle; the quotient
+phase margin / crossover frequency only tells where to search, because a delay inside a period is not a pure phase.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import brentq, minimize_scalar
+
+from firmware_py.lyapunov import eigenvalues, solve_lyapunov_p, ultimate_bounds
+from firmware_py.states import ControllerKind
+from tools.analysis.linear_loop import (
+    MAX_DELAY_PERIODS,
+    LinearLoop,
+    LoopSettings,
+    linear_loop,
+    network_gains,
+)
+from tools.analysis.sampled_joint import Array
+
+_POINTS = 3000
+_DECADES = 6.5  # below pi / T
+_SCAN = 12  # delays tried below the expected limit, in case that stability ends earlier
+
+
+@dataclass(frozen=True)
+class Margins:
+    """What the loop bears.  An unstable loop has no margins: 0 deg, 0 s, factors 1, an infinite sensitivity."""
+
+    stable: bool
+    phase_margin_deg: float  # least, in either direction
+    crossover_Hz: float  # |L| = 1 there; nan if |L| never is 1
+    gain_margin_up: float  # factor on L, >= 1; inf = none needed
+    gain_margin_down: float  # factor on L, <= 1; 0 = any
+    delay_margin_s: float  # in addition to the assumed delay
+    sensitivity_peak: float  # Ms = max |1 / (1 + L)|
+    sensitivity_peak_Hz: float
+    slowest_time_constant_s: float  # of the closed loop's slowest mode; inf if unstable
+    oscillation_Hz: float  # of the least damped complex pair; nan without one
+    oscillation_damping: float  # its damping ratio, negative if it grows
+    poles: tuple[complex, ...]  # eigenvalues z, largest first
+
+
+@dataclass(frozen=True)
+class Theory:
+    """Continuous time, no delay, no lag, no filter: the figures of the stability proof."""
+
+    p: tuple[float, float, float] | None  # P11, P12, P22 of (21); None without network
+    p_eigenvalues: tuple[float, float] | None
+    bound_per_Nm: float | None  # |x| <= this times |eps|, as (30) prints it
+    tight_bound_per_Nm: float | None  # with |P B|
+    polynomial: tuple[float, ...]  # characteristic polynomial, highest power first
+    natural_frequency_radps: float  # of the least damped pair; nan without one
+    damping: float
+    slowest_time_constant_s: float
+
+
+def frequencies_radps(period_s: float, points: int = _POINTS) -> Array:
+    """Logarithmic grid up to the Nyquist frequency pi / T, twice as dense in its last two decades."""
+    top = math.log10(math.pi / period_s)
+    both = (np.linspace(top - _DECADES, top, points // 2), np.linspace(top - 2.0, top, points // 2))
+    grid = np.unique(np.concatenate(both))
+    result: Array = np.power(10.0, grid)
+    result[-1] = math.pi / period_s
+    return result
+
+
+def _at(loop: LinearLoop, log_omega: float) -> complex:
+    return complex(loop.open_loop(np.array([math.exp(log_omega)]))[0])
+
+
+def _gain_crossings(loop: LinearLoop, omega: Array, magnitude: Array) -> list[tuple[float, complex]]:
+    """(omega [rad/s], L) wherever |L| = 1."""
+    found = []
+    for i in np.flatnonzero((magnitude[:-1] > 1.0) != (magnitude[1:] > 1.0)):
+        x = brentq(lambda x: abs(_at(loop, x)) - 1.0, math.log(omega[i]), math.log(omega[i + 1]), xtol=1e-12)
+        found.append((math.exp(x), _at(loop, x)))
+    return found
+
+
+def _gain_factors(loop: LinearLoop, omega: Array, response: np.ndarray) -> list[float]:
+    """Factors on L that bring it to -1: 1 / |L| wherever L is real and negative."""
+    imaginary, real = response.imag[:-1], response.real
+    factors = []
+    for i in np.flatnonzero((imaginary[:-1] > 0.0) != (imaginary[1:] > 0.0)):
+        if real[i] < 0.0 and real[i + 1] < 0.0:
+            x = brentq(lambda x: _at(loop, x).imag, math.log(omega[i]), math.log(omega[i + 1]), xtol=1e-12)
+            factors.append(1.0 / abs(_at(loop, x)))
+    if real[-1] < 0.0:  # at pi / T it is always real
+        factors.append(1.0 / abs(real[-1]))
+    return factors
+
+
+def _with_more_delay_stable(settings: LoopSettings, more_s: float) -> bool:
+    return linear_loop(replace(settings, delay_s=settings.delay_s + more_s)).is_stable()
+
+
+def delay_margin_s(settings: LoopSettings, crossings: list[tuple[float, complex]] | None = None) -> float:
+    """Additional delay that a stable loop bears; inf without a gain crossing.
+
+    Beyond `MAX_DELAY_PERIODS` it is the estimate phase margin / frequency, which is good there: a period is short.
+    """
+    if crossings is None:
+        loop = linear_loop(settings)
+        omega = frequencies_radps(settings.period_s)
+        crossings = _gain_crossings(loop, omega, np.abs(loop.open_loop(omega)))
+    estimates = [(math.atan2(value.imag, value.real) + math.pi) % math.tau / at for at, value in crossings]
+    if not estimates:
+        return math.inf
+    estimate = min(estimates)
+    room_s = MAX_DELAY_PERIODS * settings.period_s - settings.delay_s
+    if estimate > 0.4 * room_s:
+        return estimate
+    step = max(estimate / _SCAN, 0.1 * settings.period_s)
+    low, high = 0.0, step
+    while _with_more_delay_stable(settings, high):
+        low, high = high, high + step
+        if high > room_s:
+            return estimate
+    while high - low > 1e-7 * settings.period_s + 1e-7 * high:
+        middle = 0.5 * (low + high)
+        if _with_more_delay_stable(settings, middle):
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def _sensitivity_peak(loop: LinearLoop, omega: Array, response: np.ndarray) -> tuple[float, float]:
+    """(Ms, omega [rad/s])."""
+    distance = np.abs(1.0 + response)
+    i = int(np.argmin(distance))
+    low, high = math.log(omega[max(i - 1, 0)]), math.log(omega[min(i + 1, len(omega) - 1)])
+    best = minimize_scalar(lambda x: abs(1.0 + _at(loop, x)), bounds=(low, high), method="bounded")
+    if best.fun < distance[i]:
+        return 1.0 / float(best.fun), math.exp(float(best.x))
+    return 1.0 / float(distance[i]), float(omega[i])
+
+
+def _oscillation(poles_radps: list[complex]) -> tuple[float, float]:
+    """(|s| [rad/s], damping ratio) of the complex pair with the slowest decay."""
+    pairs = [s for s in poles_radps if s.imag > 1e-9 * abs(s)]
+    if not pairs:
+        return math.nan, math.nan
+    slowest = max(pairs, key=lambda s: s.real)
+    return abs(slowest), -slowest.real / abs(slowest)
+
+
+def _in_s_plane(poles: list[complex], period_s: float) -> list[complex]:
+    """s = ln z / T; a pole at the origin is a delay and negative real ones have no counterpart."""
+    kept = [z for z in poles if abs(z) > 1e-6 and not (z.real < 0.0 and abs(z.imag) < 1e-9)]
+    return [complex(math.log(abs(z)), math.atan2(z.imag, z.real)) / period_s for z in kept]
+
+
+def margins(settings: LoopSettings) -> Margins:
+    """All margins of the loop with these settings."""
+    loop = linear_loop(settings)
+    poles = sorted((complex(z) for z in loop.closed_loop_poles()), key=abs, reverse=True)
+    radius = abs(poles[0])
+    frequency, damping = _oscillation(_in_s_plane(poles, settings.period_s))
+    oscillation_Hz = frequency / math.tau
+    if radius >= 1.0:
+        return Margins(
+            False, 0.0, math.nan, 1.0, 1.0, 0.0, math.inf, math.nan, math.inf, oscillation_Hz, damping, tuple(poles)
+        )
+    omega = frequencies_radps(settings.period_s)
+    response = loop.open_loop(omega)
+    crossings = _gain_crossings(loop, omega, np.abs(response))
+    phases = [(abs(math.atan2(-value.imag, -value.real)), at) for at, value in crossings]  # distance from -180 deg
+    phase, crossover = min(phases, default=(math.pi, math.nan))
+    factors = _gain_factors(loop, omega, response)
+    peak, peak_radps = _sensitivity_peak(loop, omega, response)
+    return Margins(
+        stable=True,
+        phase_margin_deg=math.degrees(phase),
+        crossover_Hz=crossover / math.tau,
+        gain_margin_up=min((f for f in factors if f > 1.0), default=math.inf),
+        gain_margin_down=max((f for f in factors if f < 1.0), default=0.0),
+        delay_margin_s=delay_margin_s(settings, crossings),
+        sensitivity_peak=peak,
+        sensitivity_peak_Hz=peak_radps / math.tau,
+        slowest_time_constant_s=-settings.period_s / math.log(radius) if radius > 0.0 else 0.0,
+        oscillation_Hz=oscillation_Hz,
+        oscillation_damping=damping,
+        poles=tuple(poles),
+    )
+
+
+def phase_margin_deg(settings: LoopSettings) -> float:
+    """Only the phase margin, for searches; 0 if unstable."""
+    loop = linear_loop(settings)
+    if not loop.is_stable():
+        return 0.0
+    omega = frequencies_radps(settings.period_s, 600)
+    crossings = _gain_crossings(loop, omega, np.abs(loop.open_loop(omega)))
+    return math.degrees(min((abs(math.atan2(-v.imag, -v.real)) for _, v in crossings), default=math.pi))
+
+
+def theory(settings: LoopSettings) -> Theory:
+    """P, both bounds (30) and the continuous-time modes, for the network of e'' + kv e' + kp e = -fhat / J."""
+    kp, kv, inertia = settings.kp, settings.kv, settings.inertia_kgm2
+    polynomial: tuple[float, ...] = (1.0, kv, kp)
+    if settings.kind == ControllerKind.PID and settings.ki != 0.0:
+        polynomial = (1.0, kv, kp, settings.ki)
+    if settings.kind == ControllerKind.COMPUTED_TORQUE_OBSERVER and settings.observer_radps != 0.0:
+        # with the exact inertia the observer's pole is not moved by the loop
+        bandwidth = settings.observer_radps
+        polynomial = (1.0, kv + bandwidth, kp + bandwidth * kv, bandwidth * kp)
+    p = p_eigenvalues = loose = tight = None
+    if settings.kind == ControllerKind.COMPUTED_TORQUE_RBF:
+        p = solve_lyapunov_p(kp, kv, *settings.q)
+        p_eigenvalues = eigenvalues(*p)
+        loose, tight = ultimate_bounds(*p, *settings.q, inertia, 1.0)
+        a1, a2, g1, g2 = (gain / inertia for gain in network_gains(settings))
+        leak = settings.leakage_1ps
+        polynomial = (1.0, kv + g2, kp + g1)
+        if (a1, a2) != (0.0, 0.0):
+            polynomial = (1.0, kv + g2 + leak, kp + g1 + leak * (kv + g2) + a2, leak * (kp + g1) + a1)
+    roots = [complex(s) for s in np.roots(polynomial)]
+    frequency, damping = _oscillation(roots)
+    slowest = max(s.real for s in roots)
+    return Theory(
+        p, p_eigenvalues, loose, tight, polynomial, frequency, damping, -1.0 / slowest if slowest < 0.0 else math.inf
+    )

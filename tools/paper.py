@@ -1,0 +1,79 @@
+"""`jointctl paper`: every experiment of the paper on the virtual joint, the paper's figures beside ours."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+from rich.table import Table
+
+from drivers.errors import DataError
+from tools.experiments.error_figures import error_figures
+from tools.experiments.paper_identification import (
+    PaperIdentification,
+    identification_picture,
+    identify_paper_friction,
+)
+from tools.experiments.paper_rows import PaperRow, PaperRun, paper_rows
+from tools.experiments.paper_runs import AFTER_s, experiments
+from tools.output import Output
+
+PAPER = (
+    "Shen, Zhou, Yu, Wang: Design of Adaptive RBFNN and Computed-torque Control for Manipulator Joint "
+    "Considering Friction Modeling"
+)
+
+
+def paper(output: Output, *, folder: Path | None = None, identification: bool = True) -> int:
+    """Run all experiments (some seconds), print one table, draw the figures into `folder` (None: no figures)."""
+    listed = experiments()
+    runs: dict[str, PaperRun] = {}
+    identified: PaperIdentification | None = None
+    with output.progress("the paper's experiments", len(listed) + 1) as advance:
+        for number, experiment in enumerate(listed, 1):
+            runs[experiment.key] = PaperRun(experiment, experiment.run())
+            advance(number)
+        if identification:
+            identified = identify_paper_friction()
+        advance(len(listed) + 1)
+    pictures = _pictures(runs, identified, folder) if folder is not None else []
+    rows = paper_rows(runs, identified)
+    data = {
+        "paper": PAPER,
+        "rows": [asdict(row) for row in rows],
+        "runs": {key: asdict(error_figures(made.run, AFTER_s)) for key, made in runs.items()},
+        "pictures": [str(path) for path in pictures],
+    }
+    output.result(_table(rows), data)
+    for path in pictures:
+        output.note(f"written: {path}")
+    return 0
+
+
+def _pictures(runs: dict[str, PaperRun], identified: PaperIdentification | None, folder: Path) -> list[Path]:
+    from tools.experiments.paper_figures import draw_all
+
+    pictures = draw_all(runs, folder)
+    if identified is not None:
+        path = folder / "fig07_identification.png"
+        try:
+            path.write_bytes(identification_picture(identified))
+        except OSError as error:
+            raise DataError(f"{path}: cannot be written: {error.strerror or error}") from None
+        pictures.insert(0, path)
+    return pictures
+
+
+def _table(rows: list[PaperRow]) -> Table:
+    table = Table(
+        title=f"Errors in mrad after {AFTER_s:g} s: (least, greatest) RMSE",
+        caption=f"paper: {PAPER}. reference: an independent simulation of the same equations. "
+        "R1: realistic joint, friction 10 % above the model. precise: configs/precise.toml on R1.",
+        title_justify="left",
+        caption_justify="left",
+    )
+    for heading in ("experiment", "paper", "reference", "ours", "precise", "note"):
+        table.add_column(heading, overflow="fold")
+    for row in rows:
+        table.add_row(row.experiment, row.paper, row.reference, row.ours, row.precise, row.note)
+    return table
