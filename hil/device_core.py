@@ -12,7 +12,6 @@ import numpy as np
 
 from firmware_py.kernel import kernel
 from hil.cia402_core import (
-    abort_connection,
     apply_controlword,
     outside_position_limit,
     power_off,
@@ -22,26 +21,18 @@ from hil.cia402_core import (
 from hil.cia402_motion import demand_torque_Nm, following_error_tripped
 from hil.device_errors import (
     FOLLOWING_ERROR,
-    HEARTBEAT_LOST,
-    NMT_LEFT,
     POSITION_LIMIT,
-    RPDO_TIMEOUT,
-    SYNC_LOST,
     error_register,
-    push_frame,
-    report_cleared,
-    report_error,
 )
-from hil.device_records import CONSUMERS, PDOS, Device, NmtState, PowerState, int64
+from hil.device_records import CONSUMERS, Device, NmtState, PowerState, int64
+from hil.device_timers import SYNC_ERROR, connection_back, enter_nmt, run_timers
 from hil.frames import FrameQueue
 from hil.joint import encoder_counts, step_plant
-from hil.pdo_core import mark_events, receive_rpdo, receive_sync, send_due_tpdos, start_pdos
+from hil.pdo_core import mark_events, receive_rpdo, receive_sync
 from hil.plant_records import PlantConstants, PlantState
 
 _FAR_NS = 1_000_000_000
 _MS = 1_000_000
-_SYNC_ERROR = 0x04
-_RPDO_ERROR = 0x10
 
 
 @kernel
@@ -74,106 +65,6 @@ def power_on(device: Device) -> None:
     device.primed = 0
     device.inject_fault_code = 0
     _restart(device, True)
-
-
-@kernel
-def _enter_nmt(device: Device, state: int) -> None:
-    """Change the NMT state; leaving operational while the power stage is on is a lost connection (6007)."""
-    if device.nmt == NmtState.OPERATIONAL and state != NmtState.OPERATIONAL:
-        abort_connection(device, NMT_LEFT)
-    if state == NmtState.OPERATIONAL and device.nmt != NmtState.OPERATIONAL:
-        start_pdos(device)
-    device.nmt = state
-
-
-@kernel
-def _connection_lost(device: Device, code: int, cause: int, whole: bool, queue: FrameQueue) -> None:
-    """Report the error, react as 6007 says, and, when the `whole` connection is gone, change NMT as 1029 says."""
-    device.communication_errors |= cause
-    abort_connection(device, code)
-    report_error(device, code, queue)
-    behaviour = device.communication.error_behaviour
-    if whole and behaviour == 2:
-        _enter_nmt(device, NmtState.STOPPED)
-    elif whole and behaviour == 0 and device.nmt == NmtState.OPERATIONAL:
-        _enter_nmt(device, NmtState.PRE_OPERATIONAL)
-
-
-@kernel
-def _connection_back(device: Device, cause: int, queue: FrameQueue) -> None:
-    if device.communication_errors & cause:
-        device.communication_errors &= ~cause
-        report_cleared(device, queue)
-
-
-@kernel
-def _producer_heartbeat(device: Device, now_ns: int, next_ns: int, queue: FrameQueue) -> int:
-    period_ms = int64(device.communication.producer_heartbeat_ms)
-    if period_ms != device.heartbeat_period_ms:
-        device.heartbeat_period_ms = period_ms
-        device.heartbeat_due_ns = now_ns  # a new period starts with a heartbeat at once
-    if period_ms == 0:
-        return next_ns
-    if now_ns >= device.heartbeat_due_ns:
-        slot = push_frame(queue, 0x700 + device.node_id, 1)
-        if slot >= 0:
-            queue.frames[slot, 8] = device.nmt
-        device.heartbeat_due_ns += period_ms * _MS
-        if device.heartbeat_due_ns <= now_ns:  # far behind: keep no backlog
-            device.heartbeat_due_ns = now_ns + period_ms * _MS
-    return min(next_ns, device.heartbeat_due_ns)
-
-
-@kernel
-def _watch(device: Device, now_ns: int, next_ns: int, queue: FrameQueue) -> int:
-    """Heartbeats, SYNC and RPDOs that must not stay away; each is watched once it was heard."""
-    group = device.communication
-    errors = int64(device.communication_errors)
-    for i in range(CONSUMERS):
-        entry = int64(group.consumer_heartbeat[i])
-        if entry != device.consumer_entry[i]:
-            device.consumer_entry[i] = entry
-            device.consumer_heard_ns[i] = 0
-            _connection_back(device, 1 << i, queue)
-            continue
-        time_ns = (entry & 0xFFFF) * _MS
-        heard_ns = device.consumer_heard_ns[i]
-        if time_ns and entry >> 16 and heard_ns and not errors & (1 << i):
-            if now_ns - heard_ns >= time_ns:
-                _connection_lost(device, HEARTBEAT_LOST, 1 << i, True, queue)
-            else:
-                next_ns = min(next_ns, heard_ns + time_ns)
-    if device.nmt != NmtState.OPERATIONAL:
-        return next_ns
-    time_ns = int64(device.drive.sync_timeout_ms) * _MS
-    if time_ns and device.sync_heard_ns and not errors & _SYNC_ERROR:
-        if now_ns - device.sync_heard_ns >= time_ns:
-            _connection_lost(device, SYNC_LOST, _SYNC_ERROR, True, queue)
-        else:
-            next_ns = min(next_ns, device.sync_heard_ns + time_ns)
-    for pdo in range(PDOS):
-        time_ns = int64(group.rpdo_timer_ms[pdo]) * _MS
-        heard_ns = device.rpdo_heard_ns[pdo]
-        if time_ns and heard_ns and not errors & (_RPDO_ERROR << pdo):
-            if now_ns - heard_ns >= time_ns:
-                _connection_lost(device, RPDO_TIMEOUT, _RPDO_ERROR << pdo, False, queue)
-            else:
-                next_ns = min(next_ns, heard_ns + time_ns)
-    return next_ns
-
-
-@kernel
-def _run_timers(device: Device, now_ns: int, queue: FrameQueue) -> None:
-    next_ns = now_ns + _FAR_NS
-    if device.boot_pending:
-        device.boot_pending = 0
-        push_frame(queue, 0x700 + device.node_id, 1)
-        device.nmt = NmtState.PRE_OPERATIONAL
-    next_ns = _watch(device, now_ns, next_ns, queue)
-    next_ns = _producer_heartbeat(device, now_ns, next_ns, queue)
-    if device.nmt == NmtState.OPERATIONAL:
-        next_ns = send_due_tpdos(device, now_ns, next_ns, queue)
-    device.next_due_ns = next_ns
 
 
 @kernel
@@ -257,21 +148,21 @@ def advance(device: Device, plant_c: PlantConstants, plant_s: PlantState, until_
         if int64(device.state) != before & 0xFF or device.time_ns >= device.next_due_ns:
             sample_objects(device, plant_c, plant_s)
             _notice_status(device)
-            _run_timers(device, device.time_ns, queue)
+            run_timers(device, device.time_ns, queue)
     sample_objects(device, plant_c, plant_s)
     _notice_status(device)
     if until_ns >= device.next_due_ns:
-        _run_timers(device, until_ns, queue)
+        run_timers(device, until_ns, queue)
 
 
 @kernel
 def _command_nmt(device: Device, command: int) -> None:
     if command == 0x01:
-        _enter_nmt(device, NmtState.OPERATIONAL)
+        enter_nmt(device, NmtState.OPERATIONAL)
     elif command == 0x02:
-        _enter_nmt(device, NmtState.STOPPED)
+        enter_nmt(device, NmtState.STOPPED)
     elif command == 0x80:
-        _enter_nmt(device, NmtState.PRE_OPERATIONAL)
+        enter_nmt(device, NmtState.PRE_OPERATIONAL)
     elif command == 0x81:
         _restart(device, True)
     elif command == 0x82:
@@ -303,7 +194,7 @@ def accept_frame(
             if entry & 0xFFFF and entry >> 16 == identifier - 0x700:
                 device.consumer_entry[i] = entry
                 device.consumer_heard_ns[i] = now_ns
-                _connection_back(device, 1 << i, queue)
+                connection_back(device, 1 << i, queue)
                 device.next_due_ns = 0
     elif device.nmt == NmtState.OPERATIONAL:
         if identifier == int64(device.communication.sync_cob_id) & 0x7FF:
@@ -311,7 +202,7 @@ def accept_frame(
             timeout_ns = int64(device.drive.sync_timeout_ms) * _MS
             if timeout_ns:
                 device.next_due_ns = min(device.next_due_ns, now_ns + timeout_ns)
-            _connection_back(device, _SYNC_ERROR, queue)
+            connection_back(device, SYNC_ERROR, queue)
             receive_sync(device, now_ns, queue)
         else:
             receive_rpdo(device, identifier, frame, now_ns, queue)
@@ -319,4 +210,4 @@ def accept_frame(
     device.drive.statusword = drive_status
     _notice_status(device)
     if now_ns >= device.next_due_ns:
-        _run_timers(device, now_ns, queue)
+        run_timers(device, now_ns, queue)

@@ -186,8 +186,9 @@ DEVICE_TIME_FACTOR = 4.0
 
 
 class DeviceOnBus:
-    """The virtual drive on python-can's in-process bus, in a thread; its time moves on 1 ms with every frame and faster than
-    real time while nothing comes.
+    """The virtual drive on python-can's in-process bus, in a thread.
+
+    Its time moves on 1 ms with every frame, and faster than real time while nothing comes.
 
     `answers` replaces the value in expedited SDO upload responses, (index, sub) -> value; `mute` lists objects whose
     next requests stay unanswered; `requests` are the frames that came in.

@@ -32,8 +32,8 @@ from tools.config_sections import (
     Margin,
     Section,
     Sequence,
-    Trajectory,
 )
+from tools.config_trajectory import Trajectory
 
 SHIPPED_FOLDER = Path(__file__).resolve().parent.parent / "configs"
 _UNITS = frozenset(

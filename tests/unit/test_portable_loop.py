@@ -303,7 +303,8 @@ def test_rates_that_are_refused(rate_Hz: float) -> None:
 
 def order(interface: str, period_ns: int, block: SharedBlock) -> str:
     channel = "no-such-bus"
-    return loop_process.LoopOrder(os.getpid(), os.dup(block.fd), 1, interface, channel, period_ns, 600_000, None, None).argument()
+    fd = os.dup(block.fd)
+    return loop_process.LoopOrder(os.getpid(), fd, 1, interface, channel, period_ns, 600_000, None, None).argument()
 
 
 @pytest.mark.parametrize(
