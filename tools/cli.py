@@ -9,6 +9,8 @@ from typing import Annotated
 import typer
 
 from drivers.errors import JointctlError
+from tools import cli_friction
+from tools.cli_options import Bitrate, Channel, ConfigPath, Interface, Json, Quiet, Yes, config_path
 from tools.output import Output
 
 app = typer.Typer(
@@ -19,23 +21,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-Interface = Annotated[str | None, typer.Option("-i", "--interface", help="python-can interface [env CAN_INTERFACE]")]
-Channel = Annotated[str | None, typer.Option("-c", "--channel", help="bus channel [env CAN_CHANNEL]")]
-Bitrate = Annotated[int | None, typer.Option("-b", "--bitrate", help="bit/s [env CAN_BITRATE]")]
-Json = Annotated[bool, typer.Option("--json", help="result as one JSON document on stdout")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="no progress on stderr")]
-ConfigPath = Annotated[
-    Path, typer.Argument(metavar="CONFIG", help="configuration file (TOML), or the name of a shipped one")
-]
-Yes = Annotated[bool, typer.Option("-y", "--yes", help="move without asking")]
-
-
-def _config_path(path: Path) -> Path:
-    """The file itself, or a shipped configuration of that name."""
-    from tools.config import shipped_config
-
-    shipped = shipped_config(str(path))
-    return shipped if not path.exists() and shipped.exists() else path
+cli_friction.register(app)
 
 
 @app.command()
@@ -48,7 +34,7 @@ def demo(
     """Track a trajectory on the virtual joint: no hardware, no set-up."""
     from tools.demo import demo as run_demo
 
-    raise typer.Exit(run_demo(_config_path(config), Output(json=json, quiet=quiet), duration_s=duration))
+    raise typer.Exit(run_demo(config_path(config), Output(json=json, quiet=quiet), duration_s=duration))
 
 
 @app.command()
@@ -71,7 +57,7 @@ def run(
     from tools.config import load_config, with_bus_overrides
     from tools.run import run as run_run
 
-    loaded = with_bus_overrides(load_config(_config_path(config)), interface, channel, bitrate)
+    loaded = with_bus_overrides(load_config(config_path(config)), interface, channel, bitrate)
     raise typer.Exit(
         run_run(
             loaded, Output(json=json, quiet=quiet), assume_yes=yes, dry_run=dry_run, allow_low_margin=allow_low_margin
@@ -93,7 +79,7 @@ def hil(
     from tools.config import load_config, with_bus_overrides
     from tools.hil import hil as run_hil
 
-    loaded = with_bus_overrides(load_config(_config_path(config)), interface, channel, bitrate)
+    loaded = with_bus_overrides(load_config(config_path(config)), interface, channel, bitrate)
     raise typer.Exit(run_hil(loaded, Output(quiet=quiet), timing=timing, ready_fd=ready_fd))
 
 
@@ -111,7 +97,7 @@ def doctor(
     from tools.config import load_config, with_bus_overrides
     from tools.doctor import doctor as run_doctor
 
-    loaded = with_bus_overrides(load_config(_config_path(config)), interface, channel, bitrate)
+    loaded = with_bus_overrides(load_config(config_path(config)), interface, channel, bitrate)
     raise typer.Exit(run_doctor(loaded, Output(json=json, quiet=quiet), cold=cold))
 
 
@@ -127,7 +113,7 @@ def check(
     from tools.check import check as run_check
     from tools.config import load_config
 
-    loaded = load_config(_config_path(config))
+    loaded = load_config(config_path(config))
     raise typer.Exit(run_check(loaded, Output(json=json), delay, figure=figure, allow_low_margin=allow_low_margin))
 
 
