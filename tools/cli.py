@@ -84,6 +84,38 @@ def hil(
 
 
 @app.command()
+def stop(
+    config: ConfigPath,
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    json: Json = False,
+) -> None:
+    """Stop and disable the drive now, also while another program controls it."""
+    from tools.config import load_config, with_bus_overrides
+    from tools.stop import stop as run_stop
+
+    loaded = with_bus_overrides(load_config(config_path(config)), interface, channel, bitrate)
+    raise typer.Exit(run_stop(loaded, Output(json=json)))
+
+
+@app.command("clear-fault")
+def clear_fault(
+    config: ConfigPath,
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    json: Json = False,
+) -> None:
+    """Reset the drive's fault; it stays disabled."""
+    from tools.config import load_config, with_bus_overrides
+    from tools.stop import clear_fault as run_clear_fault
+
+    loaded = with_bus_overrides(load_config(config_path(config)), interface, channel, bitrate)
+    raise typer.Exit(run_clear_fault(loaded, Output(json=json)))
+
+
+@app.command()
 def doctor(
     config: ConfigPath = Path("virtual"),
     interface: Interface = None,

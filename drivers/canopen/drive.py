@@ -13,6 +13,7 @@ import canopen
 
 from drivers.canopen.cia402 import ControlWord, State, decode_state
 from drivers.canopen.commissioning import VELOCITY_MODES, Findings, commission
+from drivers.canopen.fault_reset import reset_fault
 from drivers.canopen.object_access import ObjectAccess
 from drivers.canopen.scaling import joint_angle_per_count_rad, new_port
 from drivers.canopen.settings import CanopenSettings
@@ -188,6 +189,21 @@ class CanopenDrive:
             if attempt == 0 and state == State.OPERATION_ENABLED:
                 self._objects.write(0x6040, 0, ControlWord.QUICK_STOP, what="controlword")
             self._sleep(SAFE_POLL_S)
+
+    def stop_now(self) -> str:
+        """Stop and disable the drive whoever controls it: leaving operational takes it from another controller."""
+        self._taken = True
+        return self.make_safe()
+
+    def clear_fault(self) -> str:
+        """Reset the drive's fault on the user's word; refuses while another controller is active."""
+        self._refuse_second_controller()
+        self._taken = True
+        self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
+        self._find()
+        # nobody sends a heartbeat now: a watchdog that is still armed would keep its fault alive
+        self._objects.write_if_present(0x1016, 1, 0, what="consumer heartbeat time")
+        return reset_fault(self._objects, self._sleep)
 
     def close(self) -> None:
         """Leave the bus; what went wrong on it has been told before."""

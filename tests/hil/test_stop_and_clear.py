@@ -1,0 +1,68 @@
+"""`jointctl stop` and `clear-fault` from a second terminal."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+FAULT = 0x08
+
+
+def _inject_heartbeat_loss(bench: Any, node: int = 1) -> None:
+    """Arm the watchdog with a fault as its reaction, enable, and stay silent: the drive ends in fault."""
+    network = bench.network()
+    try:
+        drive = network.add_node(node)
+        network.send_message(0, [128, node])
+        drive.sdo.download(0x6007, 0, (1).to_bytes(2, "little"))
+        drive.sdo.download(0x1016, 1, (0x7E0064).to_bytes(4, "little"))
+        drive.sdo.download(0x6060, 0, b"\x0a")
+        for word in (0x06, 0x07, 0x0F):
+            drive.sdo.download(0x6040, 0, word.to_bytes(2, "little"))
+        network.send_message(0x700 + 126, [5])
+        give_up_s = time.monotonic() + 5.0
+        while int.from_bytes(drive.sdo.upload(0x6041, 0), "little") & 0x4F != FAULT:
+            assert time.monotonic() < give_up_s
+            time.sleep(0.02)
+    finally:
+        network.disconnect()
+
+
+def test_stop_ends_a_run_of_another_terminal(bench: Any) -> None:
+    config = bench.config(trajectory__duration_s=30.0)
+    bench.joint(config)
+    run = bench.start("run", config, "-y").saw("tracking")
+    stopped = bench.run("stop", config)
+    assert (stopped.code, "switch on disabled" in stopped.out) == (0, True), stopped
+    ended = run.finished(20.0)
+    ended.refused(7)
+    assert bench.disabled()
+
+
+def test_stop_of_a_resting_joint_is_harmless(bench: Any) -> None:
+    config = bench.config()
+    bench.joint(config)
+    assert bench.run("stop", config).code == 0
+    assert bench.run("run", config, "-y").code == 0  # the twin: it can be run as before
+
+
+def test_clear_fault_resets_and_leaves_the_drive_off(bench: Any) -> None:
+    config = bench.config()
+    bench.joint(config)
+    _inject_heartbeat_loss(bench)
+    bench.run("run", config, "-y").refused(6, "fault")
+    cleared = bench.run("clear-fault", config)
+    assert cleared.code == 0, cleared
+    assert "was reset" in cleared.out
+    assert bench.status_word() & 0x6F == 0x40
+    again = bench.run("clear-fault", config)
+    assert (again.code, "no fault" in again.out) == (0, True)
+
+
+def test_clear_fault_is_refused_while_a_run_is_active(bench: Any) -> None:
+    config = bench.config(trajectory__duration_s=30.0)
+    bench.joint(config)
+    run = bench.start("run", config, "-y").saw("tracking")
+    bench.run("clear-fault", config).refused(4, "another controller")
+    run.signal(2)
+    assert run.finished(20.0).code == 130

@@ -1,0 +1,34 @@
+"""`jointctl stop` and `jointctl clear-fault`: from a second terminal, whatever the first one is doing."""
+
+from __future__ import annotations
+
+from drivers.errors import DeviceError
+from tools.config import Config
+from tools.open_drive import open_drive
+from tools.output import Output
+
+SAFE_STATES = ("switch on disabled", "fault", "motor off")
+
+
+def stop(config: Config, output: Output) -> int:
+    """Stop and disable the drive, even while another program controls it; `DeviceError` if it does not confirm."""
+    drive = open_drive(config)
+    try:
+        state = drive.stop_now()
+    finally:
+        drive.close()
+    output.result(f"the drive is {state}", {"drive_state": state})
+    if not state.startswith(SAFE_STATES):
+        raise DeviceError(f"the drive did not confirm that it is off (={state})", "use the emergency stop")
+    return 0
+
+
+def clear_fault(config: Config, output: Output) -> int:
+    """Reset the drive's fault; it stays disabled."""
+    drive = open_drive(config)
+    try:
+        done = drive.clear_fault()
+    finally:
+        drive.close()
+    output.result(done, {"result": done})
+    return 0
