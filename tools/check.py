@@ -10,6 +10,7 @@ from rich.table import Table
 
 from drivers.errors import MarginError
 from tools.analysis.advice import Remedy, longest_delay_s, remedies
+from tools.analysis.learning_loop import Convergence, LearningSettings, learning_convergence
 from tools.analysis.linear_loop import LoopSettings
 from tools.analysis.loop_settings import Assumption, loop_settings, margin_settings, not_modelled
 from tools.analysis.margins import Margins, Theory, margins, theory
@@ -38,6 +39,10 @@ def check(
     accepted = enough or (found.stable and allow_low_margin)
     verdict = "ok" if enough else "below the minimum, accepted" if accepted else "too small"
     table = _table(settings, found, ideal, assumptions, minimum_deg, verdict)
+    learning = _learning(config, settings)
+    if learning is not None:
+        value = f"factor {learning.worst_factor:.2f} at {learning.worst_Hz:.1f} Hz"
+        table.add_row("learning", value, "what is left to learn after one repetition, below 1 it converges")
     if figure is not None:
         from tools.analysis.loop_figure import save_loop_figure
 
@@ -48,6 +53,7 @@ def check(
         output.note(f"not in this analysis: {text}")
     if not accepted:
         raise _refusal(settings, found, minimum_deg, changes)
+    _refuse_diverging_learning(learning)
     return 0
 
 
@@ -59,9 +65,28 @@ def require_margin(config: Config, delay_s: float | None = None, *, allow_low_ma
     minimum_deg = margin_settings(config).min_phase_margin_deg
     settings, _ = loop_settings(config, delay_s)
     found = margins(settings)
+    _refuse_diverging_learning(_learning(config, settings))
     if not _meets(found, minimum_deg) and not (found.stable and allow_low_margin):
         raise _refusal(settings, found, minimum_deg, remedies(settings, minimum_deg))
     return found
+
+
+def _learning(config: Config, settings: LoopSettings) -> Convergence | None:
+    """How iterative learning converges; None where there is none."""
+    learning = config.control.learning
+    if learning is None:
+        return None
+    numbers = LearningSettings(learning.gain, learning.error_gain_ps2, learning.lead_cycles, learning.half_width_cycles)
+    return learning_convergence(settings, numbers)
+
+
+def _refuse_diverging_learning(found: Convergence | None) -> None:
+    if found is not None and not found.worst_factor < 1.0:
+        raise MarginError(
+            f"iterative learning would diverge: factor {found.worst_factor:.2f} from one repetition to the next "
+            f"at {found.worst_Hz:.1f} Hz, below 1 is needed",
+            "lower control.learning.gain or error_gain_ps2, or raise half_width_cycles",
+        )
 
 
 def _meets(found: Margins, minimum_deg: float) -> bool:

@@ -9,8 +9,20 @@ from typing import Annotated
 import typer
 
 from drivers.errors import JointctlError
-from tools import cli_friction
-from tools.cli_options import Bitrate, Channel, ConfigPath, Interface, Json, Quiet, Yes, config_path
+from tools import cli_experiments, cli_friction
+from tools.cli_options import (
+    Bitrate,
+    Channel,
+    ConfigPath,
+    Interface,
+    Json,
+    Port,
+    Quiet,
+    Target,
+    Yes,
+    config_path,
+    loaded,
+)
 from tools.output import Output
 
 app = typer.Typer(
@@ -22,6 +34,7 @@ app = typer.Typer(
 )
 
 cli_friction.register(app)
+cli_experiments.register(app)
 
 
 @app.command()
@@ -43,6 +56,8 @@ def run(
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = None,
+    port: Port = None,
+    target: Target = None,
     yes: Yes = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="commission, show the motion envelope, move nothing")
@@ -54,13 +69,12 @@ def run(
     quiet: Quiet = False,
 ) -> None:
     """Track the configured trajectory on a real or virtual joint."""
-    from tools.config import load_config, with_bus_overrides
     from tools.run import run as run_run
 
-    loaded = with_bus_overrides(load_config(config_path(config)), interface, channel, bitrate)
+    joint = loaded(config, interface, channel, bitrate, port, target)
     raise typer.Exit(
         run_run(
-            loaded, Output(json=json, quiet=quiet), assume_yes=yes, dry_run=dry_run, allow_low_margin=allow_low_margin
+            joint, Output(json=json, quiet=quiet), assume_yes=yes, dry_run=dry_run, allow_low_margin=allow_low_margin
         )
     )
 
@@ -71,16 +85,25 @@ def hil(
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = None,
+    port: Port = None,
+    target: Target = None,
+    serial: Annotated[bool, typer.Option("--serial", help="the virtual serial drive instead of the CAN bus")] = False,
+    link: Annotated[str | None, typer.Option("--link", help="serial drive: path of a link to its port")] = None,
     timing: Annotated[bool, typer.Option("--timing", help="model bit times and arbitration")] = False,
     ready_fd: Annotated[int | None, typer.Option("--ready-fd", hidden=True)] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Keep the virtual joint up on a virtual bus, for other programs to attach to."""
-    from tools.config import load_config, with_bus_overrides
+    """Keep the virtual joint up, on a virtual bus or a pseudo-terminal, for other programs to attach to."""
     from tools.hil import hil as run_hil
 
-    loaded = with_bus_overrides(load_config(config_path(config)), interface, channel, bitrate)
-    raise typer.Exit(run_hil(loaded, Output(quiet=quiet), timing=timing, ready_fd=ready_fd))
+    if serial and config == Path("virtual"):
+        config = Path("elmo_serial")
+    joint = loaded(config, interface, channel, bitrate, port, target)
+    if joint.drive.kind == "elmo_serial":
+        from tools.hil_serial import hil_serial
+
+        raise typer.Exit(hil_serial(joint, Output(quiet=quiet), link=link, ready_fd=ready_fd))
+    raise typer.Exit(run_hil(joint, Output(quiet=quiet), timing=timing, ready_fd=ready_fd))
 
 
 @app.command()
@@ -89,14 +112,15 @@ def stop(
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = None,
+    port: Port = None,
+    target: Target = None,
     json: Json = False,
 ) -> None:
     """Stop and disable the drive now, also while another program controls it."""
-    from tools.config import load_config, with_bus_overrides
     from tools.stop import stop as run_stop
 
-    loaded = with_bus_overrides(load_config(config_path(config)), interface, channel, bitrate)
-    raise typer.Exit(run_stop(loaded, Output(json=json)))
+    joint = loaded(config, interface, channel, bitrate, port, target)
+    raise typer.Exit(run_stop(joint, Output(json=json)))
 
 
 @app.command("clear-fault")
@@ -105,14 +129,15 @@ def clear_fault(
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = None,
+    port: Port = None,
+    target: Target = None,
     json: Json = False,
 ) -> None:
     """Reset the drive's fault; it stays disabled."""
-    from tools.config import load_config, with_bus_overrides
     from tools.stop import clear_fault as run_clear_fault
 
-    loaded = with_bus_overrides(load_config(config_path(config)), interface, channel, bitrate)
-    raise typer.Exit(run_clear_fault(loaded, Output(json=json)))
+    joint = loaded(config, interface, channel, bitrate, port, target)
+    raise typer.Exit(run_clear_fault(joint, Output(json=json)))
 
 
 @app.command()
@@ -121,16 +146,17 @@ def doctor(
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = None,
+    port: Port = None,
+    target: Target = None,
     cold: Annotated[bool, typer.Option("--cold", help="measure the cold start as well (about a minute)")] = False,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """What this computer and bus allow: real-time rights, wake-up times, kernel cache, bus budget.  Moves nothing."""
-    from tools.config import load_config, with_bus_overrides
     from tools.doctor import doctor as run_doctor
 
-    loaded = with_bus_overrides(load_config(config_path(config)), interface, channel, bitrate)
-    raise typer.Exit(run_doctor(loaded, Output(json=json, quiet=quiet), cold=cold))
+    joint = loaded(config, interface, channel, bitrate, port, target)
+    raise typer.Exit(run_doctor(joint, Output(json=json, quiet=quiet), cold=cold))
 
 
 @app.command()
@@ -143,10 +169,9 @@ def check(
 ) -> None:
     """Is the control loop stable enough?  Margins, bounds and what would help."""
     from tools.check import check as run_check
-    from tools.config import load_config
 
-    loaded = load_config(config_path(config))
-    raise typer.Exit(run_check(loaded, Output(json=json), delay, figure=figure, allow_low_margin=allow_low_margin))
+    joint = loaded(config)
+    raise typer.Exit(run_check(joint, Output(json=json), delay, figure=figure, allow_low_margin=allow_low_margin))
 
 
 def main() -> None:

@@ -23,6 +23,9 @@ class Advance(Protocol):
     def __call__(self, completed: float) -> None: ...
 
 
+PIPE_COLUMNS = 140  # of a table that goes to a file or a pipe: nothing may be cut off there
+
+
 @dataclass
 class Output:
     """The two streams of a command; `stdout` and `stderr` are replaced in tests."""
@@ -34,7 +37,8 @@ class Output:
 
     def __post_init__(self) -> None:
         # rich wraps at 80 columns where there is no terminal; a line of a log file or of a pipe is not to be broken
-        self._results = Console(file=self.stdout, highlight=False, soft_wrap=not self.stdout.isatty())
+        width = None if self.stdout.isatty() else PIPE_COLUMNS
+        self._results = Console(file=self.stdout, highlight=False, soft_wrap=not self.stdout.isatty(), width=width)
         self._messages = Console(file=self.stderr, highlight=False, soft_wrap=not self.stderr.isatty())
 
     def result(self, shown: RenderableType, data: Any = None) -> None:

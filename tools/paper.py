@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from pathlib import Path
 
+from rich.markup import escape
 from rich.table import Table
 
 from drivers.errors import DataError
@@ -75,5 +76,6 @@ def _table(rows: list[PaperRow]) -> Table:
     for heading in ("experiment", "paper", "reference", "ours", "precise", "note"):
         table.add_column(heading, overflow="fold")
     for row in rows:
-        table.add_row(row.experiment, row.paper, row.reference, row.ours, row.precise, row.note)
+        cells = (row.experiment, row.paper, row.reference, row.ours, row.precise, row.note)
+        table.add_row(*(escape(cell) for cell in cells))
     return table

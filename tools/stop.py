@@ -7,7 +7,7 @@ from tools.config import Config
 from tools.open_drive import open_drive
 from tools.output import Output
 
-SAFE_STATES = ("switch on disabled", "fault", "motor off")
+SAFE_STATES = ("switch on disabled", "fault", "off")
 
 
 def stop(config: Config, output: Output) -> int:

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
-from tools.identification import pso
+from tools.identification import pso, swarm_kernels
 from tools.identification.models import FORMS, basis, legendre, legendre_to_powers
 from tools.identification.polish import beta_from_vector, polish, vector_limits
-from tools.identification.pso import SwarmSettings, run_swarm, run_swarms, squared_error, stage_table, suffix_sums
+from tools.identification.pso import SwarmSettings, run_swarm, run_swarms
+from tools.identification.swarm_kernels import squared_error, stage_table, suffix_sums
 from tools.identification.variable_projection import knee_candidates, make_problem, project, solve_linear
 
 NOISE_Nm = 0.0046
@@ -181,9 +182,9 @@ def test_the_same_seed_gives_the_same_bits_whatever_the_threads():
 
 
 def test_the_random_stream_is_xorshift64():
-    random, numbers = np.array([pso.stream_seed(7, 0)]), np.empty(50)
+    random, numbers = np.array([swarm_kernels.stream_seed(7, 0)]), np.empty(50)
     state = int(random[0])
-    pso.fill_uniform(random, numbers)
+    swarm_kernels.fill_uniform(random, numbers)
     for number in numbers:
         for shift in (13, -7, 17):
             state ^= (state << shift if shift > 0 else state >> -shift) & (2**64 - 1)
@@ -194,7 +195,7 @@ def test_the_random_stream_is_xorshift64():
 def test_random_numbers_are_uniform_and_streams_differ():
     numbers = np.empty((2, 20000))
     for stream in range(2):
-        pso.fill_uniform(np.array([pso.stream_seed(1, stream)]), numbers[stream])
+        swarm_kernels.fill_uniform(np.array([swarm_kernels.stream_seed(1, stream)]), numbers[stream])
     assert numbers.min() >= 0.0
     assert numbers.max() < 1.0
     counts = np.histogram(numbers[0], bins=20, range=(0.0, 1.0))[0]

@@ -5,30 +5,56 @@ Each plant is drawn from its own seed, so that plant k of a study is the same wh
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import AfterValidator, BeforeValidator
+from pydantic_core import PydanticCustomError
 
 from tools.config import Config
+from tools.config_sections import Section, between
 
 RPDO_AT_ONCE = 255  # the plant's own delay is then the whole delay from command to torque
 
 
-@dataclass(frozen=True)
-class EnsembleSettings:
+def _interval(low: float, high: float) -> Any:
+    """Two numbers in ascending order, each in [low..high]."""
+
+    def check(value: tuple[float, float]) -> tuple[float, float]:
+        if not low <= value[0] <= value[1] <= high:
+            raise PydanticCustomError(
+                "interval",
+                "must be two numbers in ascending order in {range}",
+                {"range": f"[{low:g}..{high:g}]"},
+            )
+        return value
+
+    return AfterValidator(check)
+
+
+def _as_tuple(value: Any) -> Any:
+    """A list of TOML as the tuple that a frozen model holds."""
+    return tuple(value) if isinstance(value, list) else value
+
+
+_FromList = BeforeValidator(_as_tuple)
+Interval = tuple[float, float]
+
+
+class EnsembleSettings(Section):
     """Ranges of the plants; (low, high) are uniform unless the comment says otherwise."""
 
-    friction_scale: tuple[float, float] = (0.9, 1.1)  # per direction
-    stick_slip_share: float = 0.25  # the others have LuGre friction
-    bristle_stiffness_Nmprad: tuple[float, float] = (3e4, 2.5e5)  # log-uniform
-    bristle_damping_Nmspr: float = 200.0
-    encoder_bits: tuple[int, int] = (17, 20)
-    current_lag_s: tuple[float, float] = (0.3e-3, 1.0e-3)
-    command_delay_s: tuple[float, float] = (0.5e-3, 2.0e-3)
-    torque_ripple_Nm: tuple[float, float] = (0.0, 1.5)  # 2 per motor turn; a third of it 10 per motor turn
-    friction_ripple: tuple[float, float] = (0.0, 0.05)  # 18 per joint turn
-    inertia_scale: tuple[float, float] = (0.95, 1.05)
+    friction_scale: Annotated[Interval, _FromList, _interval(0.0, 10.0)] = (0.9, 1.1)  # per direction
+    stick_slip_share: Annotated[float, between(0.0, 1.0)] = 0.25  # the others have LuGre friction
+    bristle_stiffness_Nmprad: Annotated[Interval, _FromList, _interval(1.0, 1e7)] = (3e4, 2.5e5)  # log-uniform
+    bristle_damping_Nmspr: Annotated[float, between(0.0, 1e5)] = 200.0
+    encoder_bits: Annotated[tuple[int, int], _FromList, _interval(8, 26)] = (17, 20)
+    current_lag_s: Annotated[Interval, _FromList, _interval(0.0, 0.1)] = (0.3e-3, 1.0e-3)
+    command_delay_s: Annotated[Interval, _FromList, _interval(0.0, 0.01)] = (0.5e-3, 2.0e-3)
+    # 2 per motor turn; a third of it 10 per motor turn
+    torque_ripple_Nm: Annotated[Interval, _FromList, _interval(0.0, 1e4)] = (0.0, 1.5)
+    friction_ripple: Annotated[Interval, _FromList, _interval(0.0, 0.9)] = (0.0, 0.05)  # 18 per joint turn
+    inertia_scale: Annotated[Interval, _FromList, _interval(0.1, 10.0)] = (0.95, 1.05)
 
 
 def random_plant(base: Config, settings: EnsembleSettings, seed: int, index: int) -> Config:

@@ -10,18 +10,11 @@ for all, updated once per iteration (Kennedy and Eberhart 1995; default weights:
 
     vel = w vel + c r1 (own best - pos) + s r2 (swarm best - pos),  pos = pos + vel, stopped at the box
 
-The squared error needs no loop over the points.  The cubic is linear, so its part is a quadratic form of sums made
-beforehand for every split of the sorted points.  The Stribeck stage is linear but for ws: its part is a quadratic form,
-too, with four sums that depend on ws alone and are tabulated over log ws (cubic Hermite, error of E below 1e-11 of the
-summed squares).  Only with a searched knee the points below it are gone through one by one.
-
-The random numbers are an xorshift64 stream per particle and direction, seeded by splitmix64: the same seed gives the
-same bits on every machine with the same floating point, however many threads run.
+The same seed gives the same bits, however many threads run; the compiled part is in `swarm_kernels`.
 """
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -29,15 +22,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from firmware_py.kernel import inlined, kernel
-from tools.identification.models import legendre
 from tools.identification.polish import beta_from_vector, vector_limits
+from tools.identification.swarm_kernels import (
+    advance_swarm,
+    fill_uniform,
+    splitmix64,
+    stage_table,
+    stream_seed,
+    suffix_sums,
+)
 from tools.identification.variable_projection import Fit, Problem, knee_candidates
 
 CHUNK = 50  # iterations between two looks at the stop flag: some milliseconds
-TABLE_NODES = 2048
-_MASK = (1 << 64) - 1
-_PER_2_31 = 1.0 / 2147483648.0
 
 
 @dataclass(frozen=True)
@@ -60,234 +56,6 @@ class SwarmResult:
     fit: Fit
     curve_Nm: np.ndarray
     iterations: int
-
-
-def splitmix64(value: int) -> int:
-    """One step of Steele's generator: spreads a small seed over 64 bits."""
-    z = (value + 0x9E3779B97F4A7C15) & _MASK
-    z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
-    z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) & _MASK
-    return z ^ (z >> 31)
-
-
-def stream_seed(seed: int, stream: int) -> np.uint64:
-    """Start of an independent random stream; never zero, where xorshift would stay."""
-    return np.uint64(splitmix64(splitmix64(seed & _MASK) ^ (stream + 1)) or 1)
-
-
-@kernel
-def next_random(state: np.uint64) -> np.uint64:
-    """Marsaglia's xorshift64 (13, 7, 17): shifts only, so that plain Python wraps as the compiled code does."""
-    state = state ^ (state << np.uint64(13))
-    state = state ^ (state >> np.uint64(7))
-    return state ^ (state << np.uint64(17))
-
-
-@kernel
-def uniform(state: np.uint64) -> float:
-    """A number in [0..1) from the upper 53 bits."""
-    return float(state >> np.uint64(11)) * (1.0 / 9007199254740992.0)
-
-
-@kernel
-def fill_uniform(random: np.ndarray, numbers: np.ndarray) -> None:
-    """Draw numbers (N,) in [0..1) from the stream in random (1,), which moves on."""
-    state = random[0]
-    for k in range(len(numbers)):
-        state = next_random(state)
-        numbers[k] = uniform(state)
-    random[0] = state
-
-
-@inlined
-def squared_error(
-    p: np.ndarray,
-    x: np.ndarray,
-    y: np.ndarray,
-    sums: np.ndarray,
-    table: np.ndarray,
-    knee: float,
-    fixed_split: int,
-    has_cubic: bool,
-    continuous: bool,
-    search_knee: bool,
-) -> float:
-    """E of one particle; x (N,) sorted, y (N,) [Nm], sums (N + 1, 15) from `suffix_sums`, table from `stage_table`."""
-    tc = p[0] * p[1]
-    d = p[0] - tc
-    tv = p[3]
-    split = fixed_split
-    at_knee = knee
-    error = 0.0
-    if search_knee:
-        at_knee = p[7] if continuous else p[8]
-        split = np.searchsorted(x, at_knee, side="right")
-        inverse_ws = math.exp(-p[2])
-        for i in range(split):
-            r = tc + d * math.exp(-x[i] * inverse_ws) + tv * x[i] - y[i]
-            error += r * r
-    else:
-        # row 0 holds n, x, x^2, y, x y, y^2 summed over the stage; first log ws and 1 / step
-        place = (p[2] - table[0, 6]) * table[0, 7]
-        node = min(max(int(place), 0), len(table) - 3)
-        t = place - node
-        left, right = node + 1, node + 2
-        from_left, from_right = (1.0 + 2.0 * t) * (1.0 - t) * (1.0 - t), t * t * (3.0 - 2.0 * t)
-        slope_left, slope_right = t * (1.0 - t) * (1.0 - t), t * t * (t - 1.0)
-        e = (
-            from_left * table[left, 0]
-            + from_right * table[right, 0]
-            + slope_left * table[left, 4]
-            + slope_right * table[right, 4]
-        )
-        e_e = (
-            from_left * table[left, 1]
-            + from_right * table[right, 1]
-            + slope_left * table[left, 5]
-            + slope_right * table[right, 5]
-        )
-        e_x = (
-            from_left * table[left, 2]
-            + from_right * table[right, 2]
-            + slope_left * table[left, 6]
-            + slope_right * table[right, 6]
-        )
-        e_y = (
-            from_left * table[left, 3]
-            + from_right * table[right, 3]
-            + slope_left * table[left, 7]
-            + slope_right * table[right, 7]
-        )
-        # |tc + d e + tv x - y|^2 multiplied out
-        error = table[0, 5] + tc * (tc * table[0, 0] + 2.0 * (d * e + tv * table[0, 1] - table[0, 3]))
-        error += d * (d * e_e + 2.0 * (tv * e_x - e_y)) + tv * (tv * table[0, 2] - 2.0 * table[0, 4])
-    if has_cubic:
-        if continuous:
-            inverse_ws = math.exp(-p[2])
-            c1, c2, c3 = p[4], p[5], p[6]
-            z = (2.0 * at_knee - knee - 1.0) / (1.0 - knee)
-            c0 = tc + d * math.exp(-at_knee * inverse_ws) + tv * at_knee
-            c0 -= c1 * z + c2 * (1.5 * z * z - 0.5) + c3 * (2.5 * z * z * z - 1.5 * z)
-        else:
-            c0, c1, c2, c3 = p[4], p[5], p[6], p[7]
-        # |y - P c|^2 = y'y - 2 (P'y)'c + c'(P'P)c over the points beyond the knee
-        error += (
-            sums[split, 0]
-            - 2.0 * (sums[split, 1] * c0 + sums[split, 2] * c1 + sums[split, 3] * c2 + sums[split, 4] * c3)
-            + c0 * (sums[split, 5] * c0 + 2.0 * (sums[split, 6] * c1 + sums[split, 7] * c2 + sums[split, 8] * c3))
-            + c1 * (sums[split, 9] * c1 + 2.0 * (sums[split, 10] * c2 + sums[split, 11] * c3))
-            + c2 * (sums[split, 12] * c2 + 2.0 * sums[split, 13] * c3)
-            + c3 * sums[split, 14] * c3
-        )
-    # rounding of the quadratic form may end below zero where the data are fitted exactly
-    return max(error, 0.0)
-
-
-def suffix_sums(x: np.ndarray, y: np.ndarray, knee: float) -> np.ndarray:
-    """Row k: y'y, P'y (4) and the upper triangle of P'P (10) over the points k.. of the sorted data; (N + 1, 15)."""
-    polynomials = legendre(x, knee) if knee < 1.0 else np.zeros((len(x), 4))
-    upper = [polynomials[:, i] * polynomials[:, j] for i in range(4) for j in range(i, 4)]
-    terms = np.column_stack([y * y, *(polynomials[:, i] * y for i in range(4)), *upper])
-    return np.vstack([np.cumsum(terms[::-1], axis=0)[::-1], np.zeros(15)])
-
-
-def stage_table(x: np.ndarray, y: np.ndarray, log_ws_low: float, log_ws_high: float) -> np.ndarray:
-    """Sums over the Stribeck stage for every ws; (TABLE_NODES + 1, 8).
-
-    Row 0: sums of 1, x, x^2, y, x y, y^2, then the first log ws and the nodes per unit of log ws.  Row k + 1: at node k
-    the sums of e, e^2, e x, e y with e = exp(-x / ws), and their derivatives by the node number.
-    """
-    nodes = np.linspace(log_ws_low, log_ws_high, TABLE_NODES)
-    step = nodes[1] - nodes[0]
-    scaled = x / np.exp(nodes)[:, None]
-    e = np.exp(-scaled)
-    rate = scaled * e * step  # d e / d node
-    head = [float(len(x)), np.sum(x), np.sum(x * x), np.sum(y), np.sum(x * y), np.sum(y * y), log_ws_low, 1.0 / step]
-    columns = [e.sum(1), (e * e).sum(1), e @ x, e @ y, rate.sum(1), 2.0 * (e * rate).sum(1), rate @ x, rate @ y]
-    return np.vstack([head, np.column_stack(columns)])
-
-
-@kernel
-def move_along(
-    position: np.ndarray,
-    velocity: np.ndarray,
-    best: np.ndarray,
-    random: np.ndarray,
-    low: float,
-    high: float,
-    lead: float,
-    inertia: float,
-    cognitive: float,
-    social: float,
-) -> None:
-    """Velocity and position of all particles in one dimension; arrays (particles,), a loop the compiler vectorises."""
-    for i in range(len(position)):
-        # two numbers of 31 bits from one draw: plenty for weights, and quickly converted
-        state = next_random(random[i])
-        random[i] = state
-        own = np.int32(state >> np.uint64(33)) * _PER_2_31
-        shared = np.int32(state & np.uint64(0x7FFFFFFF)) * _PER_2_31
-        here = position[i]
-        v = inertia * velocity[i] + cognitive * own * (best[i] - here) + social * shared * (lead - here)
-        there = here + v
-        inside = low if there < low else high if there > high else there
-        position[i] = inside
-        velocity[i] = v if inside == there else 0.0
-
-
-@kernel
-def advance_swarm(
-    position: np.ndarray,
-    velocity: np.ndarray,
-    best: np.ndarray,
-    best_error: np.ndarray,
-    leader: np.ndarray,
-    particle: np.ndarray,
-    random: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    weights: tuple[float, float, float],
-    x: np.ndarray,
-    y: np.ndarray,
-    sums: np.ndarray,
-    table: np.ndarray,
-    knee: float,
-    fixed_split: int,
-    has_cubic: bool,
-    continuous: bool,
-    search_knee: bool,
-    curve: np.ndarray,
-) -> None:
-    """len(curve) iterations; arrays (D, particles) and the random streams (particles,) are changed in place.
-
-    `leader` (D,) is the best position of all; `curve` receives its squared error after each iteration; `particle` (D,)
-    is scratch.  Particles are the last axis, so that the compiler moves several of them at once.
-    """
-    dimensions, particles = position.shape
-    inertia, cognitive, social = weights
-    least = np.min(best_error)
-    for step in range(len(curve)):
-        first = -1
-        for d in range(dimensions):
-            move_along(
-                position[d], velocity[d], best[d], random, lower[d], upper[d], leader[d], inertia, cognitive, social
-            )  # fmt: skip
-        for i in range(particles):
-            for d in range(dimensions):
-                particle[d] = position[d, i]
-            error = squared_error(
-                particle, x, y, sums, table, knee, fixed_split, has_cubic, continuous, search_knee
-            )  # fmt: skip
-            if error < best_error[i]:
-                best_error[i] = error
-                for d in range(dimensions):
-                    best[d, i] = particle[d]
-                if error < least:
-                    least, first = error, i
-        if first >= 0:
-            for d in range(dimensions):
-                leader[d] = best[d, first]
-        curve[step] = least
 
 
 def run_swarm(

@@ -1,0 +1,207 @@
+"""Studies: the same seed gives the same plants and figures, whatever the number of processes."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.errors import ConfigurationError
+from tools.config import Config, load_config, shipped_config
+from tools.experiments.controllers import TABLE, controller_config, named
+from tools.experiments.ensemble import EnsembleSettings, random_plant
+from tools.experiments.error_figures import FAILED, ErrorFigures
+from tools.experiments.study_figure import save_study_figure
+from tools.experiments.study_runs import PlantResult, StudyResult, quantile, run_study, write_csv
+from tools.experiments.study_settings import StudySettings, checked, load_study, study_controllers
+from tools.output import Output
+from tools.study import INTERRUPTED, study
+
+
+@pytest.fixture
+def base() -> Config:
+    """configs/precise.toml with a short trajectory."""
+    config = load_config(shipped_config("precise"))
+    return config.model_copy(update={"trajectory": config.trajectory.model_copy(update={"duration_s": 3.0})})
+
+
+def short_study(base: Config, seed: int, workers: int) -> StudyResult:
+    controllers = named(("paper", "precise"))
+    return run_study(base, controllers, plants=3, seed=seed, after_s=1.0, workers=workers)
+
+
+# --- the plants ---
+
+
+def test_a_plant_depends_on_seed_and_index_only(base: Config) -> None:
+    settings = EnsembleSettings()
+    assert random_plant(base, settings, 4, 7) == random_plant(base, settings, 4, 7)
+    assert random_plant(base, settings, 4, 7) != random_plant(base, settings, 5, 7)
+    assert random_plant(base, settings, 4, 7) != random_plant(base, settings, 4, 8)
+
+
+def test_plants_fill_their_ranges_and_stay_inside(base: Config) -> None:
+    settings = EnsembleSettings()
+    plants = [random_plant(base, settings, 1, index) for index in range(400)]
+    values = [plant.virtual for plant in plants]
+    for name, (low, high) in (
+        ("friction_positive_scale", settings.friction_scale),
+        ("bristle_stiffness_Nmprad", settings.bristle_stiffness_Nmprad),
+        ("current_lag_s", settings.current_lag_s),
+        ("command_delay_s", settings.command_delay_s),
+        ("friction_ripple", settings.friction_ripple),
+        ("inertia_scale", settings.inertia_scale),
+    ):
+        drawn = np.array([getattr(value, name) for value in values])
+        assert low <= drawn.min() < low + 0.05 * (high - low)
+        assert high - 0.05 * (high - low) < drawn.max() <= high
+    slipping = sum(value is not None and value.friction_kind == "stick_slip" for value in values)
+    assert slipping / 400 == pytest.approx(0.25, abs=0.06)
+    assert {round(math.log2(plant.encoder.counts_per_turn)) for plant in plants} == {17, 18, 19, 20}
+
+
+# --- running ---
+
+
+def test_same_seed_same_result_with_one_process_and_with_two(base: Config) -> None:
+    alone = short_study(base, 1, 1)
+    assert short_study(base, 1, 2) == alone
+    assert [plant.index for plant in alone.plants] == [0, 1, 2]
+    assert short_study(base, 2, 1).plants[0].figures != alone.plants[0].figures
+
+
+def test_an_interruption_keeps_what_is_done(base: Config) -> None:
+    def interrupt(done: float) -> None:
+        if done == 2.0:
+            raise KeyboardInterrupt
+
+    result = run_study(base, named(("paper",)), plants=3, seed=1, after_s=1.0, workers=1, progress=interrupt)
+    assert result.interrupted
+    assert len(result.plants) == 2
+
+
+def test_an_interruption_ends_the_other_processes_too(base: Config) -> None:
+    def interrupt(_: float) -> None:
+        raise KeyboardInterrupt
+
+    result = run_study(base, named(("paper",)), plants=40, seed=1, after_s=1.0, workers=2, progress=interrupt)
+    assert result.interrupted
+    assert 1 <= len(result.plants) < 40
+
+
+def test_a_time_after_the_end_is_refused(base: Config) -> None:
+    with pytest.raises(ConfigurationError, match=r"after_s \(=3\) must be in \[0\.\.3\)"):
+        run_study(base, named(("paper",)), plants=1, seed=1, after_s=3.0, workers=1)
+
+
+# --- quantiles, files ---
+
+
+def test_a_run_that_failed_counts_as_infinitely_bad() -> None:
+    good, failed = ErrorFigures("", 1.0, 0.5, -1.0, 1.0, 1.0, 0.5, 0.0, 20.0), ErrorFigures("following_error", *FAILED)
+    plants = tuple(PlantResult(i, "lugre", 19, (failed if i == 0 else good,)) for i in range(10))
+    result = StudyResult(("law",), plants, False)
+    assert result.faults("law") == 1
+    values = result.values("law", "peak_mrad")
+    assert quantile(values, 0.5) == 1.0
+    assert quantile(values, 0.95) == math.inf
+
+
+def test_quantiles_are_linear_where_everything_is_finite() -> None:
+    assert quantile(np.array([0.0, 1.0]), 0.25) == pytest.approx(0.25)
+    assert quantile(np.full(5, math.inf), 0.5) == math.inf
+
+
+def test_csv_has_a_line_for_each_run_and_the_figure_is_drawn(base: Config, tmp_path: Path) -> None:
+    result = short_study(base, 1, 1)
+    write_csv(result, tmp_path / "deep" / "runs.csv")
+    lines = list(csv.DictReader((tmp_path / "deep" / "runs.csv").read_text().splitlines()))
+    assert len(lines) == 6
+    assert {line["controller"] for line in lines} == {"paper", "precise"}
+    assert float(lines[0]["peak_mrad"]) == result.plants[0].figures[0].peak_mrad
+    picture = save_study_figure(result, tmp_path / "box.png", "three plants")
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+# --- the verb ---
+
+
+def test_the_verb_prints_json_and_says_when_it_was_interrupted(
+    base: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tools.study.load_config", lambda _: base)
+    settings = checked({"plants": 2, "after_s": 1.0, "controllers": ["precise"]}, "test")
+    out, err = io.StringIO(), io.StringIO()
+    assert study(settings, Output(json=True, stdout=out, stderr=err), workers=1, csv=tmp_path / "a.csv") == 0
+    data = json.loads(out.getvalue())
+    assert data["plants_done"] == 2
+    assert 0.0 < data["controllers"]["precise"]["rmse_mrad"]["median"] < 1.0
+    assert data["settings"]["plant"]["encoder_bits"] == [17, 20]
+    assert "a.csv" in err.getvalue()
+
+    partial = StudyResult(("precise",), short_study(base, 1, 1).plants[:1], True)
+    partial = StudyResult(("precise",), tuple(PlantResult(0, "lugre", 19, p.figures[:1]) for p in partial.plants), True)
+    monkeypatch.setattr("tools.study.run_study", lambda *_, **__: partial)
+    out, err = io.StringIO(), io.StringIO()
+    assert study(settings, Output(stdout=out, stderr=err)) == INTERRUPTED
+    assert "interrupted: only 1 of 2 plants" in err.getvalue()
+    assert "INTERRUPTED: 1 of 2 plants" in out.getvalue()
+    assert "[mrad]" in out.getvalue()
+    assert "[s]" in out.getvalue()
+
+
+# --- settings and controllers ---
+
+
+def test_every_named_controller_is_a_valid_configuration(base: Config) -> None:
+    for controller in named():
+        assert controller_config(base, controller).control == controller.control
+    assert [c.name for c in named()] == [*TABLE, "precise"]
+
+
+def test_a_study_file(tmp_path: Path) -> None:
+    path = tmp_path / "study.toml"
+    path.write_text(
+        'plants = 5\nseed = 9\ncontrollers = ["paper"]\n[plant]\nencoder_bits = [14, 16]\n'
+        '[variants.damped]\nof = "precise"\nkv = 180.0\n'
+    )
+    settings = load_study(path)
+    assert (settings.plants, settings.seed, settings.plant.encoder_bits) == (5, 9, (14, 16))
+    assert settings.plant.friction_scale == EnsembleSettings().friction_scale
+    first, second = study_controllers(settings)
+    assert (first.name, second.name, second.control.kv) == ("paper", "damped", 180.0)
+    assert second.control.learning is not None
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        ({"plants": 0}, r"plants \(=0\): must be in \[1\.\.100000\]"),
+        ({"plant": {"encoder_bit": [1, 2]}}, "plant.encoder_bit is not a known key: did you mean encoder_bits"),
+        ({"plant": {"friction_scale": [1.1, 0.9]}}, "friction_scale .* two numbers in ascending order"),
+        ({"scenario": "storm"}, r"scenario \(=storm\)"),
+        ({"seeds": 1}, "seeds is not a known key: did you mean seed"),
+    ],
+)
+def test_a_bad_study_is_one_clear_line(data: dict[str, object], words: str) -> None:
+    with pytest.raises(ConfigurationError, match=words) as caught:
+        checked(data, "study.toml")
+    assert caught.value.message.startswith("study.toml: ")
+
+
+def test_bad_controllers_are_named() -> None:
+    with pytest.raises(ConfigurationError, match=r"controller \(=no_such\) must be a configuration file or one of"):
+        named(("no_such",))
+    with pytest.raises(ConfigurationError, match=r"controller \(=paper\) must be named once"):
+        named(("paper", "paper"))
+    with pytest.raises(ConfigurationError, match=r"variants.x: kv \(=-1.0\): must be in"):
+        study_controllers(StudySettings(variants={"x": {"of": "paper", "kv": -1.0}}))
+    with pytest.raises(ConfigurationError, match=r"variants\.x\.of is missing"):
+        study_controllers(StudySettings(variants={"x": {"kv": 1.0}}))
+    with pytest.raises(ConfigurationError, match=r"variants\.paper must not have the name of another"):
+        study_controllers(StudySettings(variants={"paper": {"of": "paper"}}))

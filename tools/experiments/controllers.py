@@ -1,0 +1,113 @@
+"""The controllers that are compared: a table of named settings, and what configuration files add to it.
+
+Every entry is a complete [control] section: that of configs/paper.toml with some keys replaced.  What the controller
+believes about the friction is the base configuration's [friction], or that of the file it comes from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from drivers.errors import ConfigurationError
+from tools.config import Config, load_config, shipped_config
+from tools.config_checks import problems_between_sections
+from tools.config_records import axis_constants
+from tools.config_sections import Control, Friction
+
+_MODEL_BASED: dict[str, Any] = {"zero_rule": "zero", "matched_filter": True}
+_STIFF: dict[str, Any] = {**_MODEL_BASED, "kp": 2500.0, "kv": 130.0, "feed_forward": "lugre_desired"}
+_OBSERVER: dict[str, Any] = {**_MODEL_BASED, "kind": "computed_torque_observer", "feed_forward": "lugre_desired"}
+
+# name -> keys of [control] that differ from configs/paper.toml
+TABLE: dict[str, dict[str, Any]] = {
+    "computed_torque": {**_MODEL_BASED, "kind": "computed_torque", "feed_forward": "none"},
+    "pid": {**_MODEL_BASED, "kind": "pid", "feed_forward": "none", "kp": 6075.0, "kv": 135.0, "ki": 91125.0},
+    "paper_without_friction_model": {"feed_forward": "none"},
+    "paper": {},
+    "paper_desired": {"feed_forward": "desired"},
+    "paper_lugre": {"feed_forward": "lugre_desired"},
+    "network_stiff": {**_STIFF, "q": (2.756e6, 4630.0)},
+    "observer": {**_OBSERVER, "observer_radps": 60.0},
+    "observer_stiff": {**_OBSERVER, "observer_radps": 60.0, "kp": 2500.0, "kv": 100.0},
+}
+PRECISE = "precise"  # configs/precise.toml
+DEFAULT = (*TABLE, PRECISE)
+
+
+@dataclass(frozen=True)
+class Controller:
+    """A law under test; `friction` None is the belief of the base configuration."""
+
+    name: str
+    control: Control
+    friction: Friction | None = None
+
+
+def paper_control() -> Control:
+    """[control] of configs/paper.toml."""
+    return load_config(shipped_config("paper")).control
+
+
+def changed(control: Control, changes: Mapping[str, Any], name: str) -> Control:
+    """`control` with some keys replaced, checked like a file; `name` is what the message calls it."""
+    values = control.model_dump()
+    # a section inside is given as a table of keys and replaces the whole section
+    values.update(changes)
+    try:
+        return Control.model_validate(values)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key = ".".join(str(part) for part in first["loc"])
+        message = str(first["msg"])
+        raise ConfigurationError(f"{name}: {key} (={first['input']}): {message[0].lower()}{message[1:]}") from None
+
+
+def named(names: tuple[str, ...] = DEFAULT) -> list[Controller]:
+    """Entries of the table; the name of a shipped or of any other configuration file takes that file's law."""
+    paper = paper_control()
+    found = []
+    for name in names:
+        if name in TABLE:
+            found.append(Controller(name, changed(paper, TABLE[name], name)))
+        else:
+            found.append(from_file(name))
+    doubled = sorted({c.name for c in found if sum(c.name == other.name for other in found) > 1})
+    if doubled:
+        raise ConfigurationError(f"controller (={doubled[0]}) must be named once")
+    return found
+
+
+def from_file(name: str) -> Controller:
+    """The law of a configuration file, with what that file believes about the friction."""
+    path = Path(name)
+    if not path.exists() and shipped_config(name).exists():
+        path = shipped_config(name)
+    if not path.exists():
+        known = ", ".join(TABLE)
+        raise ConfigurationError(f"controller (={name}) must be a configuration file or one of {known}")
+    config = load_config(path)
+    return Controller(path.stem, config.control, config.friction)
+
+
+def controller_config(base: Config, controller: Controller) -> Config:
+    """The base configuration under this law; contradictions between its sections are refused."""
+    update: dict[str, Any] = {"control": controller.control}
+    if controller.friction is not None:
+        update["friction"] = controller.friction
+    config = base.model_copy(update=update)
+    problems = problems_between_sections(config)
+    if problems:
+        raise ConfigurationError(f"controller {controller.name}: {problems[0]}")
+    return config
+
+
+def controller_constants(base: Config, controller: Controller, start_position_rad: float) -> Any:
+    """`AxisConstants` of this law on the base joint, unsupervised: simulated time has no wall clock."""
+    constants = axis_constants(controller_config(base, controller), start_position_rad=start_position_rad)
+    constants[0].sequence.supervisor_max_cycles = 0
+    return constants

@@ -1,0 +1,75 @@
+"""What happens during an experiment: nothing, or one of the paper's three changes.
+
+    sine       0.35 sin(0.2 pi t) throughout
+    frequency  0.35 sin(0.125 pi (t + 1.5)) from 82.5 s on
+    amplitude  0.175 sin(0.2 pi t) + 0.175 from 82.5 s on
+    load       a load torque of 3 Nm at the joint from 80 s on
+
+Both changes of the trajectory come at a crest: position and velocity go on, the acceleration jumps.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal, get_args
+
+from drivers.errors import ConfigurationError
+from tools.lockstep import LockstepJoint, LockstepRun
+
+Scenario = Literal["sine", "frequency", "amplitude", "load"]
+SCENARIOS: tuple[Scenario, ...] = get_args(Scenario)
+CHANGE_s = 82.5
+LOAD_AT_s = 80.0
+LOAD_Nm = 3.0
+# amplitude [rad], angular frequency [rad/s], shift [s], offset [rad] after the change
+_SECOND_SINE = {
+    "frequency": (0.35, 0.125 * math.pi, 1.5, 0.0),
+    "amplitude": (0.175, 0.2 * math.pi, 0.0, 0.175),
+}
+_PROBE_s = 0.5  # of the trajectory, to learn when it begins on the plant's clock
+
+
+def event_s(scenario: Scenario) -> float | None:
+    """When the change comes, in trajectory time."""
+    return {"frequency": CHANGE_s, "amplitude": CHANGE_s, "load": LOAD_AT_s}.get(scenario)
+
+
+def run_scenario(
+    joint: LockstepJoint, constants: Any, scenario: Scenario = "sine", *, ideal_velocity: bool = False
+) -> LockstepRun:
+    """One run of these constants on this joint, up to the end of the trajectory; neither is changed.
+
+    The controlled stop that follows is no part of an experiment.
+    """
+    constants = constants.copy()
+    trajectory = constants[0].trajectory
+    at_s = event_s(scenario)
+    if at_s is not None and 0.0 < trajectory.duration_s <= at_s:
+        raise ConfigurationError(
+            f"trajectory.duration_s (={trajectory.duration_s:g}) must be more than {at_s:g} for the change {scenario}"
+        )
+    if scenario in _SECOND_SINE:
+        trajectory.switch_s = at_s
+        second = _SECOND_SINE[scenario]
+        trajectory.amplitude2_rad, trajectory.omega2_radps, trajectory.shift2_s, trajectory.offset2_rad = second
+    plant_constants = None
+    if scenario == "load":
+        plant_constants = joint.plant_constants.copy()
+        plant = plant_constants[0]
+        starts_s = _trajectory_start_s(joint, constants)
+        plant.load_step_Nm = LOAD_Nm
+        plant.load_step_substep = round((starts_s + LOAD_AT_s) / float(plant.step_s))
+    longest_s = _before_s(constants) + float(trajectory.duration_s)
+    return joint.run(constants, plant_constants=plant_constants, ideal_velocity=ideal_velocity, longest_s=longest_s)
+
+
+def _before_s(constants: Any) -> float:
+    """Time of settling and approach; enabling takes some cycles more."""
+    sequence = constants[0].sequence
+    return float(sequence.approach_s) + float(sequence.settle_cycles) * float(constants[0].law.period_s)
+
+
+def _trajectory_start_s(joint: LockstepJoint, constants: Any) -> float:
+    """The plant's own time at trajectory time 0, from a short run that ends inside the trajectory."""
+    probe = joint.run(constants, longest_s=_before_s(constants) + _PROBE_s)
+    return float(probe.plant.time_s) - float(probe.log.trajectory_s[-1])
