@@ -74,7 +74,7 @@ def _check_surroundings(
             trip(state, Fault.STALE_SAMPLE, float(state.sample_age_cycles), 0)
         if sample.bus_errors > constants.limits.sample_age_max_cycles:
             trip(state, Fault.BUS_ERROR, float(sample.bus_errors), 0)
-    if state.phase <= AxisPhase.RELEASING:
+        # not before: in WAITING the power is off, and without the supervisor's word it stays off
         if 0 < constants.sequence.supervisor_max_cycles < supervisor_age_cycles:
             trip(state, Fault.SUPERVISOR_LOST, float(supervisor_age_cycles), 0)
     if powered(state.phase) and skipped_cycles > constants.limits.skipped_max_cycles:

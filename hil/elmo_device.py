@@ -29,7 +29,7 @@ BITS_PER_CHARACTER = 10
 RECEIVE_MAX = 512
 LONGEST_WAIT_S = 0.005
 _CR, _SEMICOLON = 0x0D, 0x3B
-_GARBLE = 0xA5
+_GARBLED_IN, _GARBLED_OUT = 0xA5, 0xD2  # different, or the echo would come back whole
 _SPEEDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[:1] == "B" and name[1:].isdigit()}
 
 
@@ -81,12 +81,18 @@ class ElmoDevice:
         """Compile if need be, then serve in a thread."""
         if self._thread is not None:
             raise RuntimeError("the device is running already")
-        state = self.interpreter.state.copy()
-        self.interpreter.advance_to(float(state[0].time_s) + 1.5 * float(self.interpreter.constants[0].step_s))
-        self.interpreter.state[:] = state
-        self._origin_s = time.monotonic() - float(state[0].time_s)
+        self._warm_up()
+        self._origin_s = time.monotonic() - float(self.interpreter.state[0].time_s)
         self._thread = threading.Thread(target=self._run, name="elmo", daemon=True)
         self._thread.start()
+
+    def _warm_up(self) -> None:
+        """Compile or load everything on a copy: a first call in the middle of a run would stall the line."""
+        real = self.interpreter
+        copy = ElmoInterpreter(real.settings, real.constants.copy(), real.state.copy())
+        for line in (b"UM=1", b"MO=1", b"TC=0", b"PX", b"ST", b"MO=0"):
+            copy.execute(line)
+        copy.advance_to(float(copy.state[0].time_s) + 1.5 * float(copy.constants[0].step_s))
 
     def stop(self) -> None:
         """End the thread and take the port away; the joint stays where it is."""
@@ -147,7 +153,7 @@ class ElmoDevice:
             data = os.read(self._master, RECEIVE_MAX)
         except OSError:  # nothing there
             return
-        garble = _GARBLE if self._wrong_speed() else 0
+        garble = _GARBLED_IN if self._wrong_speed() else 0
         for byte in data[: RECEIVE_MAX - len(self._incoming)]:
             self._received_until_s = max(now_s, self._received_until_s) + self._character_s
             self._incoming.append((self._received_until_s, byte ^ garble))
@@ -191,7 +197,7 @@ class ElmoDevice:
             due += self._outgoing.popleft()[1]
         if due and self._master >= 0:
             if self._wrong_speed():
-                due = bytes(byte ^ _GARBLE for byte in due)
+                due = bytes(byte ^ _GARBLED_OUT for byte in due)
             with contextlib.suppress(OSError):  # nobody reads: what does not fit is lost
                 os.write(self._master, due)
 

@@ -1,7 +1,8 @@
 """The compiled loop on a serial port: `firmware_py.realtime.run_loop` with the exchange of `drivers.elmo`.
 
 Compiled, and not plain Python as for CAN adapters without a descriptor: a serial port is a descriptor that the C
-library reads and writes.  See docs/adr for the figures.
+library reads and writes.  Wake-up late p50 / p99 / max at 150 Hz on a noisy 2-core virtual machine, SCHED_FIFO: this
+loop 27 / 56 / 178 us, a bare Python sleep 43 / 84 / 221 us, and 123 / 155 / 3168 us without SCHED_FIFO.
 """
 
 from __future__ import annotations

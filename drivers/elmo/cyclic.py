@@ -134,6 +134,7 @@ def _put_stop(port: ElmoPort) -> None:
     """Torque zero, stop, motor off: said whatever else waits for a reply, and in every cycle until it is off."""
     if port.expected_count > EXPECTED_MAX - 4 or port.quiet != 0:
         _forget_expected(port)
+        port.quiet = 0
     if port.status & _SERVO_ON != 0:
         put_command(port, Question.TC, 0, 3)
         put_command(port, Question.ST, 0, -1)
@@ -161,6 +162,8 @@ def end_cycle(port: ElmoPort, sample: Sample, command: Command) -> None:
             port.enable_wait_cycles -= 1
     elif command.request == DriveRequest.QUICK_STOP or sample.drive_state != DriveState.OFF:
         _put_stop(port)
+    if port.quiet != 0:
+        return  # the answer to a question would keep the line from becoming silent
     if port.fault_seen > 0 and port.motor_fault == 0:
         put_command(port, Question.MF, 0, -1)
     if port.cycle % 2 == 0 or port.fault_seen > 0:

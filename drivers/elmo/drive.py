@@ -144,7 +144,7 @@ class ElmoDrive:
         if status & (FAULT_LATCHED | AMPLIFIER_MASK):
             raise DeviceError(
                 f"the drive is in fault: {motor_off_cause(status, fault)} (SR {status:X}h: {status_text(status)})",
-                "remove the cause and switch the drive off and on; jointctl resets nothing by itself",
+                "remove the cause, then `jointctl clear-fault`; nothing is reset by itself",
             )
 
     def _write_limits(self, found: dict[str, str], remarks: list[str]) -> None:
@@ -278,6 +278,38 @@ class ElmoDrive:
             return self._off()
         except JointctlError as error:
             return f"unknown: {error.message}; only the drive's own limits stop it now, use the emergency stop"
+
+    def stop_now(self) -> str:
+        """See `Drive.stop_now`.  The line has one user at a time: a port in use has been refused at its opening."""
+        self._taken = True
+        return self.make_safe()
+
+    def clear_fault(self) -> str:
+        """See `Drive.clear_fault`.  MF and the latch in SR are cleared by MO=1 alone: in torque mode, with TC at zero.
+
+        So the motor is on for the time of one exchange, without torque, and is switched off again.
+        """
+        line = self._line
+        self._identify()
+        self._taken = True
+        self._motor_off()
+        status, fault = line.integer("SR"), line.integer("MF")
+        if not status & (FAULT_LATCHED | AMPLIFIER_MASK):
+            return "no fault"
+        cause = motor_off_cause(status, fault)
+        if status & AMPLIFIER_MASK:
+            raise DeviceError(f"the fault cannot be cleared while its cause remains: {cause}")
+        line.assign_verified("UM", int(UnitMode.TORQUE))
+        try:
+            line.assign("MO", 1, attempts=1)
+        finally:
+            self._byte_port.write(b"\rTC=0\rMO=0\r")
+            line.resynchronise()
+        self._motor_off()
+        status, fault = line.integer("SR"), line.integer("MF")
+        if status & (FAULT_LATCHED | AMPLIFIER_MASK):
+            raise DeviceError(f"the fault came back: {motor_off_cause(status, fault)}")
+        return f"cleared: {cause}"
 
     def _off(self) -> str:
         line = self._line

@@ -1,0 +1,143 @@
+"""The whole chain on a real SocketCAN interface: virtual joint and controller as separate processes on vcan0."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import can
+import pytest
+
+from drivers.can.open import open_cyclic_end
+from drivers.errors import BusError
+from tools.run_log import read_run_log
+
+CONFIG = Path(__file__).resolve().parents[2] / "configs" / "virtual.toml"
+ON_VCAN = ("-i", "socketcan", "-c", "vcan0")
+# a slow guest needs more than one period for a cycle: the margin is then low, but the loop is stable
+SLOW_GUEST = ("-y", "--allow-low-margin")
+
+
+def jointctl(*arguments: str) -> list[str]:
+    return [sys.executable, "-P", "-m", "tools.cli", *arguments]
+
+
+@pytest.fixture
+def interface() -> Iterator[None]:
+    """vcan0 up before and after."""
+    subprocess.run(["ip", "link", "set", "vcan0", "up"], check=True)
+    yield
+    subprocess.run(["ip", "link", "set", "vcan0", "up"], check=True)
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> str:
+    text = CONFIG.read_text().replace("duration_s = 10.0", "duration_s = 4.0")
+    (tmp_path / "joint.toml").write_text(text)
+    return "joint.toml"
+
+
+@pytest.fixture
+def joint(tmp_path: Path, config: str, interface: None) -> Iterator[subprocess.Popen[str]]:
+    """`jointctl hil` on vcan0."""
+    process = subprocess.Popen(jointctl("hil", config, *ON_VCAN), cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    assert "virtual joint" in process.stderr.readline()
+    yield process
+    process.terminate()
+    process.communicate(timeout=20.0)
+
+
+@contextmanager
+def tracking(folder: Path, config: str) -> Iterator[subprocess.Popen[str]]:
+    """A `jointctl run` that has reached its trajectory."""
+    command = jointctl("run", config, *ON_VCAN, *SLOW_GUEST)
+    with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True) as started:
+        assert started.stderr is not None
+        seen = ""
+        while "tracking" not in seen:
+            seen = started.stderr.readline()
+            assert seen, f"ended with {started.wait()}"
+        yield started
+
+
+def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(jointctl(*arguments), cwd=folder, capture_output=True, text=True, timeout=300.0)
+    assert "Traceback" not in done.stderr, done.stderr
+    return done
+
+
+@pytest.mark.usefixtures("joint")
+def test_a_run_at_1_khz(tmp_path: Path, config: str) -> None:
+    done = run(tmp_path, "run", config, *ON_VCAN, *SLOW_GUEST)
+    assert done.returncode == 0, done.stderr
+    log = read_run_log(next((tmp_path / "runs").glob("*.mcap")))
+    tracking = log.records[log.records.phase == 3]
+    assert len(tracking) > 1000
+    assert abs(tracking.error_rad).max() < 5e-3
+
+
+@pytest.mark.usefixtures("joint")
+def test_candump_sees_the_run_and_cansend_can_stop_it(tmp_path: Path, config: str) -> None:
+    assert shutil.which("candump"), "can-utils must be installed"
+    with subprocess.Popen(["candump", "-L", "vcan0"], stdout=subprocess.PIPE, text=True) as dump:
+        with tracking(tmp_path, config) as started:
+            subprocess.run(["cansend", "vcan0", "000#8001"], check=True)  # NMT: pre-operational, from somebody else
+            assert started.wait(60.0) == 7
+        dump.terminate()
+        lines = dump.communicate()[0].splitlines()
+    identifiers = {line.split()[2].split("#")[0] for line in lines}
+    assert {"080", "181", "201", "77E", "601", "581"} <= identifiers
+
+
+@pytest.mark.usefixtures("joint")
+def test_an_interface_that_goes_down_in_the_run_stops_the_joint(tmp_path: Path, config: str) -> None:
+    with tracking(tmp_path, config) as started:
+        subprocess.run(["ip", "link", "set", "vcan0", "down"], check=True)
+        assert started.wait(60.0) == 7
+        assert started.stderr is not None
+        rest = started.stderr.read()
+    assert "Traceback" not in rest
+    assert "error:" in rest
+    # the drive is alone now: its own watchdog has switched it off, as the next commissioning finds
+    subprocess.run(["ip", "link", "set", "vcan0", "up"], check=True)
+    time.sleep(0.5)
+    stopped = run(tmp_path, "stop", config, *ON_VCAN)
+    assert stopped.returncode == 0, stopped.stderr
+
+
+@pytest.mark.usefixtures("interface")
+def test_interface_problems_are_told_with_their_cure(tmp_path: Path, config: str) -> None:
+    missing = run(tmp_path, "run", config, "-i", "socketcan", "-c", "can7", "-y")
+    assert missing.returncode == 4
+    assert "can7" in missing.stderr
+    assert "ip link set can7 up" in missing.stderr
+    subprocess.run(["ip", "link", "set", "vcan0", "down"], check=True)
+    down = run(tmp_path, "run", config, *ON_VCAN, *SLOW_GUEST)
+    assert down.returncode == 4
+    assert "vcan0 is down" in down.stderr
+
+
+@pytest.mark.usefixtures("interface")
+def test_nobody_on_the_bus(tmp_path: Path, config: str) -> None:
+    alone = run(tmp_path, "run", config, *ON_VCAN, *SLOW_GUEST)
+    assert alone.returncode == 5, alone.stderr
+    assert "does not answer" in alone.stderr
+
+
+@pytest.mark.usefixtures("interface")
+def test_the_cyclic_end_is_non_blocking_and_shares_the_bus_with_python_can() -> None:
+    with open_cyclic_end("socketcan", "vcan0") as end, can.Bus(interface="socketcan", channel="vcan0") as bus:
+        assert not os.get_blocking(end.fileno())
+        bus.send(can.Message(arbitration_id=0x123, data=b"\x01\x02", is_extended_id=False))
+        time.sleep(0.05)
+        frame = end.recv(16)
+        assert (int.from_bytes(frame[:4], "little"), frame[4], frame[8:10]) == (0x123, 2, b"\x01\x02")
+    with pytest.raises(BusError, match="can9"):
+        open_cyclic_end("socketcan", "can9")

@@ -1,0 +1,306 @@
+"""The cyclic exchange on memory, against the virtual drive's interpreter: no port and no time."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.elmo.cyclic import begin_cycle, current_mA, end_cycle, note_written, parse_number, put_command, take_byte
+from drivers.elmo.interpreter import ReplyKind, parse_reply
+from drivers.elmo.port import EXPECTED_MAX, LINE_MAX, PORT_GONE, ElmoPort, Question
+from firmware_py.records import Command, Sample
+from firmware_py.schema import new
+from firmware_py.states import DriveRequest, DriveState
+from hil.elmo_interpreter import ElmoDeviceSettings, ElmoInterpreter
+from hil.elmo_motor import switch_off
+from hil.joint import plant
+
+PERIOD_S = 1.0 / 150.0
+
+
+class Talk:
+    """A port in torque mode with the virtual drive at its other end; `spoil` may change what comes back."""
+
+    def __init__(self, echo: bool = True) -> None:
+        constants, state = plant(initial_position_rad=0.1, encoder_counts_per_turn=2**19)
+        self.device = ElmoInterpreter(ElmoDeviceSettings(), constants, state)
+        self.device.execute(b"UM=1")
+        self.port = new(ElmoPort)[0]
+        self.sample, self.command = new(Sample)[0], new(Command)[0]
+        port = self.port
+        port.echo, port.torque_NmpA, port.max_current_mA = int(echo), 12.1, 5000
+        port.position_radpcount, port.zero_counts = math.tau / 2**19, 0
+        port.enable_retry_cycles, port.dead_man_cycles = 75, 6
+        self.said: list[bytes] = []
+        self.mute = False
+        self.spoil: Any = lambda reply: reply
+        self.cycle_number = 0
+
+    def _exchange(self) -> None:
+        out = bytes(self.port.out[: self.port.out_length])
+        self.port.out_length = 0
+        lines = out.split(b"\r")[:-1]
+        self.said += lines
+        for line in lines:
+            reply = (line + b"\r" if self.port.echo else b"") + self.device.execute(line)
+            self.hear(b"" if self.mute else self.spoil(reply))
+
+    def hear(self, data: bytes) -> bool:
+        got = False
+        for byte in data:
+            got = bool(take_byte(self.port, byte, self.sample, 1)) or got
+        return got
+
+    def cycle(self, request: DriveRequest = DriveRequest.ENABLE, torque_Nm: float = 0.0, count: int = 1) -> list[bytes]:
+        """Whole cycles; returns what was said in the last one."""
+        for _ in range(count):
+            self.said = []
+            self.command.request, self.command.torque_Nm = request, torque_Nm
+            begin_cycle(self.port, self.sample)
+            self._exchange()
+            end_cycle(self.port, self.sample, self.command)
+            self._exchange()
+            self.cycle_number += 1
+            self.device.advance_to(self.cycle_number * PERIOD_S)
+        return self.said
+
+    def enabled(self) -> Talk:
+        self.cycle(DriveRequest.OFF, count=4)
+        self.cycle(count=4)
+        assert self.sample.drive_state == DriveState.ENABLED
+        return self
+
+
+@pytest.fixture(params=[True, False], ids=["echo", "no echo"])
+def talk(request: pytest.FixtureRequest) -> Talk:
+    return Talk(request.param)
+
+
+class TestNormal:
+    def test_off_asks_for_position_status_and_current_and_nothing_else(self, talk: Talk) -> None:
+        said = [tuple(talk.cycle(DriveRequest.OFF)) for _ in range(8)]
+        assert set(said[4:]) == {(b"PX", b"SR"), (b"PX", b"IQ")}
+        assert talk.sample.count == 8
+        assert talk.sample.position_rad == pytest.approx(0.1, abs=2e-5)
+        assert talk.sample.drive_state == DriveState.OFF
+        assert (talk.port.garbled, talk.port.lost, talk.port.unexpected) == (0, 0, 0)
+
+    def test_enable_switches_on_once_and_then_commands_torque(self, talk: Talk) -> None:
+        talk.cycle(DriveRequest.OFF, count=4)
+        assert talk.cycle()[1] == b"MO=1"
+        assert talk.cycle()[1] != b"MO=1"  # the retry comes much later
+        talk.cycle(count=2)
+        assert talk.cycle(torque_Nm=-24.2)[1] == b"TC=-2.000"
+        assert talk.device.m.torque_A == -2.0
+        talk.cycle(torque_Nm=-24.2, count=2)
+        assert talk.sample.torque_Nm == pytest.approx(-24.2, rel=1e-3)
+
+    @pytest.mark.parametrize("request_", [DriveRequest.QUICK_STOP, DriveRequest.OFF])
+    def test_a_stop_is_torque_zero_stop_and_motor_off(self, talk: Talk, request_: DriveRequest) -> None:
+        talk.enabled()
+        assert talk.cycle(request_)[1:4] == [b"TC=0.000", b"ST", b"MO=0"]
+        talk.cycle(request_, count=2)
+        assert talk.sample.drive_state == DriveState.OFF
+        assert talk.device.m.motor_on == 0
+
+    def test_the_position_unwraps_32_bits(self) -> None:
+        talk = Talk()
+        for counts in (2**31 - 5, -(2**31) + 5, 2**31 - 5):
+            begin_cycle(talk.port, talk.sample)
+            talk.port.out_length = 0
+            assert talk.hear(b"PX\r%d;" % counts)
+        assert talk.port.counts == 2**31 - 5
+        begin_cycle(talk.port, talk.sample)
+        talk.hear(b"PX\r%d;" % (-(2**31) + 5))
+        assert talk.sample.position_rad == pytest.approx((2**31 + 5) * math.tau / 2**19)
+
+
+class TestNumbers:
+    @pytest.mark.parametrize(
+        ("torque_Nm", "milli"),
+        [(0.0, 0), (12.1, 1000), (60.5, 5000), (60.6, 5000), (-1e9, -5000), (math.nan, 0), (math.inf, 0), (0.00605, 0),
+         (0.0061, 1)],
+    )  # fmt: skip
+    def test_torque_is_saturated_before_the_cast(self, torque_Nm: float, milli: int) -> None:
+        port = new(ElmoPort)[0]
+        port.torque_NmpA, port.max_current_mA = 12.1, 5000
+        assert current_mA(port, torque_Nm) == milli
+
+    @pytest.mark.parametrize("milli", [0, 1, -1, 9, 10, 999, 1000, -1001, 12345, -99999, 123456])
+    def test_the_text_of_a_current_reads_back(self, milli: int) -> None:
+        port = new(ElmoPort)[0]
+        assert put_command(port, Question.TC, milli, 3)
+        text = bytes(port.out[: port.out_length])
+        assert text[-1:] == b"\r"
+        assert float(text[3:-1]) == milli / 1000.0
+
+    @settings(max_examples=150, deadline=None)
+    @given(st.from_regex(rb"[+-]?[0-9]{1,9}(\.[0-9]{0,6})?", fullmatch=True))
+    def test_decimal_numbers(self, text: bytes) -> None:
+        good, value, whole = parse_number(np.frombuffer(text, np.uint8), 0, len(text))
+        assert good
+        assert value == pytest.approx(float(text), rel=1e-12, abs=1e-12)
+        assert whole == (b"." not in text)
+
+    @pytest.mark.parametrize("text", [b"", b"-", b".", b"1-", b"1.2.3", b"nan", b"1e5", b" 1", b"1\xfe", b"9" * 18])
+    def test_anything_else_is_no_number(self, text: bytes) -> None:
+        assert not parse_number(np.frombuffer(text + b"x", np.uint8), 0, len(text))[0]
+
+
+class TestFaultsOfTheLine:
+    def test_nothing_is_lost_by_a_garbled_reply_but_its_value(self) -> None:
+        talk = Talk().enabled()
+        before = int(talk.sample.count)
+        talk.spoil = lambda reply: b"\xfe" + reply[1:]
+        talk.cycle()
+        assert talk.sample.count == before
+        assert talk.port.garbled >= 1
+        talk.spoil = lambda reply: reply
+        talk.cycle(count=3)
+        assert talk.sample.count == before + 3
+        assert talk.port.silent_cycles == 0
+
+    def test_with_echo_a_reply_is_never_taken_for_another(self) -> None:
+        talk = Talk().enabled()
+        position = float(talk.sample.position_rad)
+        talk.spoil = lambda reply: b"" if reply.startswith(b"PX") else reply  # position replies vanish, others come
+        talk.cycle(count=8)
+        assert talk.sample.position_rad == position
+        assert talk.sample.drive_state == DriveState.ENABLED
+
+    def test_half_a_reply_spoils_the_next_one_only(self) -> None:
+        talk = Talk().enabled()
+        begin_cycle(talk.port, talk.sample)
+        talk.port.out_length = 0
+        assert not talk.hear(b"PX\r83")  # the rest never comes
+        end_cycle(talk.port, talk.sample, talk.command)
+        talk.port.out_length = 0
+        begin_cycle(talk.port, talk.sample)
+        talk.port.out_length = 0
+        assert not talk.hear(b"TC=0.000\r;")
+        assert talk.hear(b"PX\r8344;")
+
+    def test_a_silent_drive_is_asked_again_after_a_pause(self, talk: Talk) -> None:
+        talk.enabled()
+        talk.mute = True
+        said = [tuple(talk.cycle()) for _ in range(9)]
+        assert () in said
+        assert talk.port.resyncs >= 1
+        talk.mute = False
+        count = int(talk.sample.count)
+        talk.cycle(count=6)
+        assert talk.sample.count > count
+
+    def test_the_dead_man_commands_zero_torque_and_its_twin_does_not(self) -> None:
+        talk = Talk().enabled()
+        talk.cycle(torque_Nm=12.1)
+        talk.port.no_sample_cycles = talk.port.dead_man_cycles
+        end_cycle(talk.port, talk.sample, talk.command)
+        assert b"TC=1.000\r" in bytes(talk.port.out[: talk.port.out_length])
+        talk.port.no_sample_cycles += 1
+        end_cycle(talk.port, talk.sample, talk.command)
+        assert b"TC=0.000\r" in bytes(talk.port.out[: talk.port.out_length])
+
+    def test_a_stop_is_said_even_while_the_line_is_in_disorder(self, talk: Talk) -> None:
+        talk.enabled()
+        talk.mute = True
+        talk.cycle(count=5)
+        for _ in range(12):
+            assert b"MO=0" in talk.cycle(DriveRequest.QUICK_STOP)
+        assert talk.device.m.motor_on == 0
+
+    def test_memory_is_bounded(self) -> None:
+        talk = Talk()
+        assert not talk.hear(b"x" * (10 * LINE_MAX) + b";")
+        assert talk.port.line_length == 0
+        count = 0
+        while put_command(talk.port, Question.PX, 0, -1):
+            talk.port.out_length = 0
+            count += 1
+        assert count == EXPECTED_MAX
+
+    def test_a_vanished_port_is_a_bus_error_at_once(self) -> None:
+        talk = Talk()
+        note_written(talk.port, talk.sample, 5)
+        assert talk.sample.bus_errors == 1
+        talk.port.gone = 1
+        begin_cycle(talk.port, talk.sample)
+        assert talk.sample.bus_errors == PORT_GONE
+
+    @settings(max_examples=150, deadline=None)
+    @given(st.lists(st.binary(max_size=24), max_size=20), st.booleans())
+    def test_any_bytes_leave_the_exchange_able_to_go_on(self, chunks: list[bytes], echo: bool) -> None:
+        talk = _shared(echo)
+        for chunk in chunks:
+            begin_cycle(talk.port, talk.sample)
+            talk.hear(chunk)
+            end_cycle(talk.port, talk.sample, talk.command)
+        assert 0 <= talk.port.expected_count <= EXPECTED_MAX
+        assert 0 <= talk.port.line_length <= LINE_MAX
+        assert math.isfinite(talk.sample.position_rad)
+        count = int(talk.sample.count)
+        talk.cycle(DriveRequest.OFF, count=8)
+        assert talk.sample.count > count
+
+    @settings(max_examples=150, deadline=None)
+    @given(st.binary(max_size=20), st.booleans())
+    def test_the_kernel_takes_no_position_that_the_slow_parser_would_not(self, body: bytes, echo: bool) -> None:
+        frame = ((b"PX\r" if echo else b"") + body).replace(b";", b"")
+        talk = _shared(echo)
+        talk.port.expected_count = talk.port.line_length = talk.port.line_overflow = talk.port.quiet = 0
+        put_command(talk.port, Question.PX, 0, -1)
+        if talk.hear(frame + b";"):
+            reply = parse_reply(b"PX\r", frame, echo)
+            assert reply.kind is ReplyKind.VALUE
+            assert int(reply.text) == talk.port.last_counts
+        talk.port.primed = 0
+
+
+_TALKS: dict[bool, Talk] = {}
+
+
+def _shared(echo: bool) -> Talk:
+    """One for all examples: a new plant each would take longer than the test."""
+    return _TALKS.setdefault(echo, Talk(echo))
+
+
+class TestFaultsOfTheDrive:
+    def test_a_motor_fault_is_told_with_its_cause_and_nothing_is_enabled_again(self, talk: Talk) -> None:
+        talk.enabled()
+        switch_off(talk.device.m, 0x20000)
+        said = [line for _ in range(8) for line in talk.cycle()]
+        assert (talk.sample.drive_state, talk.sample.drive_error) == (DriveState.FAULT, 0x20000)
+        assert b"MO=1" not in said
+        assert b"MF" in said
+
+    def test_a_fault_without_cause_is_told_as_well(self, talk: Talk) -> None:
+        talk.enabled()
+        talk.device.amplifier = 3
+        talk.cycle(count=14)
+        assert (talk.sample.drive_state, talk.sample.drive_error) == (DriveState.FAULT, 0)
+
+    def test_a_motor_that_is_switched_off_by_others_stays_off(self, talk: Talk) -> None:
+        talk.enabled()
+        talk.device.execute(b"MO=0")
+        said = [line for _ in range(2 * int(talk.port.enable_retry_cycles)) for line in talk.cycle()]
+        assert talk.sample.drive_state == DriveState.OFF
+        assert b"MO=1" not in said
+
+    def test_a_restart_shows_by_the_unit_mode(self) -> None:
+        talk = Talk().enabled()
+        assert talk.sample.restarts == 0
+        talk.device.restart()
+        talk.cycle(count=4)
+        assert talk.sample.restarts == 1
+        assert talk.sample.drive_state == DriveState.OFF
+
+    def test_its_twin_a_drive_that_goes_off_and_stays_in_torque_mode_has_not_restarted(self) -> None:
+        talk = Talk().enabled()
+        talk.device.execute(b"MO=0")
+        talk.cycle(count=4)
+        assert talk.sample.restarts == 0

@@ -1,0 +1,285 @@
+"""The serial drive on a port in memory: commissioning, what it refuses and in which words, and making safe."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from drivers.elmo.drive import ElmoDrive
+from drivers.elmo.line_budget import cycle_characters, highest_rate_Hz, measured_exchange
+from drivers.elmo.serial_port import SerialPort
+from drivers.elmo.settings import ElmoSettings
+from drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
+from hil.elmo_interpreter import ElmoDeviceSettings, ElmoInterpreter
+from hil.elmo_motor import switch_off
+from hil.joint import plant
+
+COUNTS = 2**19
+SETTINGS = ElmoSettings(
+    port="memory", baud_rate_bitps=115_200, echo=True, reply_timeout_s=0.1, rate_Hz=150.0, torque_max_Nm=60.0,
+    torque_constant_NmpA=0.1, torque_direction=1, reduction_ratio=121.0, counts_per_turn=COUNTS,
+    encoder_on_motor=False, encoder_direction=1, zero_counts=0, continuous_current_A=5.0, peak_current_A=6.0,
+    peak_time_s=2.0, velocity_max_radps=1.0, position_min_rad=-0.7, position_max_rad=0.7, limit_margin=0.2,
+    speed_error_radps=1.0, position_error_rad=0.2, dead_man_s=0.04,
+)  # fmt: skip
+
+
+class MemoryPort:
+    """The virtual drive's interpreter behind a port whose clock only moves when somebody waits."""
+
+    def __init__(self, **settings: Any) -> None:
+        constants, state = plant(encoder_counts_per_turn=COUNTS, initial_position_rad=0.1)
+        self.device = ElmoInterpreter(ElmoDeviceSettings(**settings), constants, state)
+        self.now_s = 0.0
+        self.character_s = 10 / 115_200
+        self.answer: Callable[[bytes, bytes], bytes] = lambda line, reply: reply
+        self.commands: list[bytes] = []
+        self.failure: JointctlError | None = None
+        self.closed = False
+        self._line = b""
+        self._waiting = b""
+
+    def write(self, data: bytes) -> None:
+        if self.failure is not None:
+            raise self.failure
+        self._line += data
+        *lines, self._line = self._line.split(b"\r")
+        for line in lines:
+            self.commands.append(line)
+            echo = line + b"\r" if self.device.echo else b""
+            reply = self.answer(line, echo + self.device.execute(line))
+            self.now_s += (len(line) + 1 + len(reply)) * self.character_s
+            self._waiting += reply
+
+    def read(self, timeout_s: float) -> bytes:
+        if self.failure is not None:
+            raise self.failure
+        data, self._waiting = self._waiting, b""
+        if not data:
+            self.now_s += max(timeout_s, 1e-3)
+        return data
+
+    def discard(self) -> None:
+        self._waiting = b""
+
+    def close(self) -> None:
+        self.closed = True
+
+    def drive(self, **changes: Any) -> ElmoDrive:
+        settings = dataclasses.replace(SETTINGS, **changes)
+        return ElmoDrive(settings, open_port=lambda path, baud: self, clock=lambda: self.now_s)
+
+
+@pytest.fixture
+def port() -> MemoryPort:
+    return MemoryPort()
+
+
+class TestCommissioning:
+    def test_the_report_and_what_the_drive_has_afterwards(self, port: MemoryPort) -> None:
+        report = port.drive().commission()
+        assert report.identity.product == "Whistle"
+        assert report.start_position_rad == pytest.approx(0.1, abs=2e-5)
+        assert report.torque_resolution_Nm == pytest.approx(0.0121)
+        assert report.loop_delay_s is not None
+        assert 0.001 < report.loop_delay_s < 0.004
+        m = port.device.m
+        assert (m.unit_mode, m.motor_on, m.continuous_A, m.peak_A, m.peak_s) == (1, 0, 5.0, 6.0, 2.0)
+        assert m.speed_high_cps == -m.speed_low_cps == round(1.2 * COUNTS / math.tau)
+        assert m.position_high_counts == pytest.approx((0.7 + 0.28) * COUNTS / math.tau, abs=1.0)
+
+    @pytest.mark.parametrize("echo", [True, False])
+    def test_the_echo_is_set_as_configured(self, port: MemoryPort, echo: bool) -> None:
+        drive = port.drive(echo=echo)
+        drive.commission()
+        assert port.device.echo == echo
+        assert drive.port()[0].echo == int(echo)
+
+    def test_a_motor_that_was_on_is_switched_off_and_told(self, port: MemoryPort) -> None:
+        port.device.execute(b"MO=1")
+        report = port.drive().commission()
+        assert port.device.m.motor_on == 0
+        assert any("was on" in remark for remark in report.remarks)
+
+    def test_a_real_drive_without_position_limits_is_a_remark(self, port: MemoryPort) -> None:
+        port.answer = lambda line, reply: line + b"\r\x03?;" if line.startswith((b"HL[3]", b"LL[3]")) else reply
+        report = port.drive().commission()
+        assert sum("bad index" in remark for remark in report.remarks) == 2
+
+    def test_one_bad_reply_is_asked_again(self, port: MemoryPort) -> None:
+        spoilt = iter([True])
+        port.answer = lambda line, reply: b"\xff\xff;" if line == b"PL[1]" and next(spoilt, False) else reply
+        port.drive().commission()
+
+    @pytest.mark.parametrize(
+        ("changes", "kind", "words"),
+        [
+            ({"product": "Gold"}, DeviceError, "must contain 'Gold'"),
+            ({"peak_current_A": 25.0}, DeviceError, "drive.peak_current_A (=25) must be at most 20, the drive's MC"),
+            ({"rate_Hz": 203.0}, ConfigurationError, "loop.rate_Hz (=203) must be at most 202"),
+            ({"counts_per_turn": 4096, "counts_parameter": "CA[18]"}, DeviceError, "differs from the drive's CA[18]"),
+        ],
+    )
+    def test_what_does_not_fit_is_refused(
+        self, port: MemoryPort, changes: dict[str, Any], kind: type[JointctlError], words: str
+    ) -> None:
+        drive = port.drive(**changes)
+        with pytest.raises(kind) as caught:
+            drive.commission()
+        assert words in str(caught.value)
+        assert port.device.m.motor_on == 0
+
+    @pytest.mark.parametrize(
+        ("answer", "kind", "words"),
+        [
+            (lambda line, reply: b"", NoDeviceError, "no drive answers on memory at 115200 baud"),
+            (lambda line, reply: b"\xf8\x80\xfe", NoDeviceError, "baud rate"),
+            (lambda line, reply: b"\xf8;\x80;", NoDeviceError, "baud rate"),
+            (lambda line, reply: b"MO\r1;" if line == b"MO" else reply, DeviceError, "cannot be switched off"),
+            (lambda line, reply: b"CL[1]\r4.9;" if line == b"CL[1]" else reply, DeviceError, "does not read back"),
+            (lambda line, reply: b"HL[2]\r1;" if line == b"HL[2]" else reply, DeviceError, "HL[2]"),
+            (lambda line, reply: b"UM=1\r\x02?;" if line == b"UM=1" else reply, DeviceError, "bad command"),
+            (lambda line, reply: b"PX\rtwo;" if line == b"PX" else reply, DeviceError, "is not a number"),
+        ],
+    )
+    def test_drives_that_answer_wrongly(
+        self, port: MemoryPort, answer: Callable[[bytes, bytes], bytes], kind: type[JointctlError], words: str
+    ) -> None:
+        port.answer = answer
+        with pytest.raises(kind) as caught:
+            port.drive().commission()
+        assert words in str(caught.value)
+        assert "\n" not in caught.value.message
+
+    def test_a_drive_in_fault_is_refused_with_its_cause(self, port: MemoryPort) -> None:
+        port.device.execute(b"MO=1")
+        switch_off(port.device.m, 0x200000)
+        with pytest.raises(DeviceError, match="motor stuck") as caught:
+            port.drive().commission()
+        assert "nothing is reset by itself" in caught.value.hint
+
+    @pytest.mark.parametrize(("slower", "refused"), [(1.1, False), (2.5, True)])
+    def test_the_measured_exchange_decides_as_well(self, port: MemoryPort, slower: float, refused: bool) -> None:
+        port.character_s *= slower
+        drive = port.drive(rate_Hz=150.0)
+        if refused:
+            with pytest.raises(DeviceError, match="one exchange takes"):
+                drive.commission()
+        else:
+            drive.commission()
+
+
+class TestBudget:
+    def test_echo_costs_the_characters_of_the_commands_again(self) -> None:
+        assert (cycle_characters(False), cycle_characters(True)) == (40, 57)
+        assert highest_rate_Hz(115_200, True) == pytest.approx(202.1, abs=0.1)
+        assert highest_rate_Hz(19_200, False) == pytest.approx(48.0)
+
+    def test_the_measurement_adds_the_value_that_was_not_sent(self) -> None:
+        measured = measured_exchange([0.001] * 9 + [0.002], [0.002] * 10, 115_200, False)
+        assert measured.cycle_s == pytest.approx(0.003 + 80 / 115_200)
+        assert measured.worst_cycle_s == pytest.approx(0.004 + 80 / 115_200)
+        assert measured.loop_delay_s == pytest.approx(0.002 + 110 / 115_200)
+
+
+class TestSpeedMode:
+    def test_the_joint_jogs_and_stops(self, port: MemoryPort) -> None:
+        drive = port.drive()
+        drive.commission()
+        drive.start_speed_mode(2.0)
+        assert (port.device.m.unit_mode, port.device.m.motor_on) == (2, 1)
+        drive.jog(0.2)
+        port.device.advance_to(1.0)
+        position_rad, velocity_radps, _ = drive.motion()
+        assert velocity_radps == pytest.approx(0.2, abs=0.01)
+        assert position_rad > 0.15
+        assert drive.make_safe() == "off"
+
+
+class TestClearFault:
+    def test_a_latched_fault_is_cleared_and_the_motor_is_off(self, port: MemoryPort) -> None:
+        port.device.execute(b"MO=1")
+        switch_off(port.device.m, 0x200000)
+        drive = port.drive()
+        assert "motor stuck" in drive.clear_fault()
+        assert (port.device.m.motor_fault, port.device.m.motor_on, port.device.m.torque_A) == (0, 0, 0.0)
+        drive.commission()
+
+    def test_without_a_fault_nothing_is_switched_on(self, port: MemoryPort) -> None:
+        assert port.drive().clear_fault() == "no fault"
+        assert b"MO=1" not in port.commands
+
+    def test_a_cause_that_remains_is_told_and_nothing_is_switched_on(self, port: MemoryPort) -> None:
+        port.device.amplifier = 3
+        with pytest.raises(DeviceError, match="undervoltage"):
+            port.drive().clear_fault()
+        assert b"MO=1" not in port.commands
+
+    def test_a_fault_that_comes_back_is_told(self, port: MemoryPort) -> None:
+        def answer(line: bytes, reply: bytes) -> bytes:
+            if line == b"MO=1":
+                switch_off(port.device.m, 0x20000)
+            return reply
+
+        port.device.m.motor_fault = 0x200000
+        port.answer = answer
+        with pytest.raises(DeviceError, match=r"came back: .*overspeed"):
+            port.drive().clear_fault()
+
+
+class TestMakeSafe:
+    def test_a_drive_that_was_never_found_is_left_alone(self, port: MemoryPort) -> None:
+        drive = port.drive()
+        assert drive.make_safe() == "untouched"
+        assert port.commands == []
+
+    def test_torque_zero_and_motor_off_are_said_first(self, port: MemoryPort) -> None:
+        drive = port.drive()
+        drive.commission()
+        for line in (b"MO=1", b"TC=1"):
+            port.device.execute(line)
+        port.commands.clear()
+        assert drive.make_safe() == "off"
+        assert port.commands[1:4] == [b"TC=0", b"ST", b"MO=0"]
+        assert port.device.m.motor_on == 0
+        drive.close()
+        assert port.closed
+
+    def test_after_a_restart_with_the_echo_back(self, port: MemoryPort) -> None:
+        drive = port.drive(echo=False)
+        drive.commission()
+        port.device.restart()
+        assert drive.make_safe() == "off"
+
+    def test_a_fault_is_told(self, port: MemoryPort) -> None:
+        drive = port.drive()
+        drive.commission()
+        port.device.execute(b"MO=1")
+        switch_off(port.device.m, 0x20000)
+        assert "overspeed" in drive.make_safe()
+
+    @pytest.mark.parametrize("silent", [True, False])
+    def test_it_never_raises_and_says_what_it_does_not_know(self, port: MemoryPort, silent: bool) -> None:
+        drive = port.drive()
+        drive.commission()
+        if silent:
+            port.answer = lambda line, reply: b""
+        else:
+            port.failure = BusError("serial port memory failed: Input/output error")
+        state = drive.make_safe()
+        assert state.startswith("unknown: ")
+        assert "emergency stop" in state
+
+
+class TestSerialPort:
+    def test_what_cannot_be_opened_is_named(self, tmp_path: Any) -> None:
+        with pytest.raises(BusError, match="no such serial port"):
+            SerialPort(str(tmp_path / "none"), 115_200)
+        file = tmp_path / "file"
+        file.write_text("")
+        with pytest.raises(BusError, match="not a serial port"):
+            SerialPort(str(file), 115_200)
