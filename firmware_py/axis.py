@@ -13,7 +13,7 @@ import numpy as np
 
 from firmware_py.computed_torque import step_law
 from firmware_py.kernel import kernel
-from firmware_py.records import AxisConstants, AxisState, Command, Sample
+from firmware_py.records import AxisConstants, AxisState, Command, LimitConstants, Sample
 from firmware_py.safety import drive_fault, limited_torque_Nm, motion_fault, reference_fault
 from firmware_py.sequence import (
     enter,
@@ -33,6 +33,9 @@ from firmware_py.velocity_command import limited_velocity_radps, velocity_comman
 
 REACTION_CYCLES = 2  # between seeing that the reference leaves its limits and the first braked cycle
 
+# at a torque that a sound joint gives way to: it moves by a milliradian in that time
+PUSHED_CYCLES = 20
+
 
 @kernel
 def _take_position(constants: AxisConstants, state: AxisState, sample: Sample, elapsed_cycles: int) -> int:
@@ -50,6 +53,12 @@ def _take_position(constants: AxisConstants, state: AxisState, sample: Sample, e
         moved_rad = abs(sample.position_rad - state.velocity.last_position_rad)
         if not moved_rad <= constants.limits.position_jump_max_rad * gap_cycles:
             trip(state, Fault.POSITION_JUMP, moved_rad, 0)
+    changed = not abs(sample.position_rad - state.frozen_at_rad) <= constants.limits.frozen_tolerance_rad
+    if changed or gap_cycles > 1:
+        state.frozen_at_rad = sample.position_rad
+        state.frozen_samples = 0
+    else:
+        state.frozen_samples += 1
     state.sample_count = sample.count
     state.sample_age_cycles = 0
     state.good_samples += 1
@@ -71,7 +80,7 @@ def _check_surroundings(
     trip(state, fault, float(sample.status_word), sample.drive_error)
     if state.phase >= AxisPhase.ENABLING and state.phase <= AxisPhase.RELEASING:
         if state.sample_age_cycles > constants.limits.sample_age_max_cycles:
-            trip(state, Fault.STALE_SAMPLE, float(state.sample_age_cycles), 0)
+            trip(state, Fault.STALE_SAMPLE, float(state.sample_age_cycles), sample.drive_error)
         if sample.bus_errors > constants.limits.sample_age_max_cycles:
             trip(state, Fault.BUS_ERROR, float(sample.bus_errors), 0)
         # not before: in WAITING the power is off, and without the supervisor's word it stays off
@@ -121,9 +130,9 @@ def _brake(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> N
     for _ in range(elapsed_cycles):
         brake_step(state.reference, constants.sequence.brake_radps2, constants.law.period_s)
     still = abs(state.velocity.velocity_radps) <= constants.limits.standstill_radps
-    if not still or state.reference.velocity_radps != 0.0 or state.sample_age_cycles > 0:
+    if not still or state.reference.velocity_radps != 0.0:
         state.still_cycles = 0
-    else:
+    elif state.sample_age_cycles == 0:  # a lost sample proves nothing either way
         state.still_cycles += elapsed_cycles
         if state.still_cycles >= constants.sequence.settle_cycles:
             enter(state, AxisPhase.RELEASING)
@@ -132,8 +141,31 @@ def _brake(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> N
 
 
 @kernel
+def _check_reading(limits: LimitConstants, state: AxisState) -> None:
+    """A reading that stands still although the reference moves on, or although the joint is pushed hard.
+
+    It must be early: behind a stuck encoder the law pushes ever harder, and the joint moves unseen, long before the
+    following error is too large.
+    """
+    way_rad = state.reference.position_rad - state.frozen_from_rad
+    if state.frozen_samples == 0:
+        state.frozen_from_rad = state.reference.position_rad
+        state.pushed_cycles = 0
+    elif state.sample_age_cycles == 0:
+        if 0.0 < limits.frozen_max_rad < abs(way_rad):
+            trip(state, Fault.POSITION_FROZEN, way_rad, 0)
+        if 0.0 < limits.frozen_torque_Nm < abs(state.command_torque_Nm):
+            state.pushed_cycles += 1
+            if state.pushed_cycles > PUSHED_CYCLES:
+                trip(state, Fault.POSITION_FROZEN, way_rad, 0)
+        else:
+            state.pushed_cycles = 0
+
+
+@kernel
 def _check_motion(constants: AxisConstants, state: AxisState) -> None:
     """Measured position, velocity and following error against their limits."""
+    _check_reading(constants.limits, state)
     error_rad = state.measured_position_rad - state.reference.position_rad
     fault = motion_fault(constants.limits, state.measured_position_rad, state.velocity.velocity_radps, error_rad)
     value = state.measured_position_rad

@@ -87,6 +87,9 @@ class LimitConstants:
     torque_rate_max_Nmps: f8
     following_error_max_rad: f8
     position_jump_max_rad: f8  # between two consecutive samples
+    frozen_max_rad: f8  # way of the reference while the reading stands still; 0 = not watched
+    frozen_torque_Nm: f8  # that a sound joint would not stand still under; 0 = not watched
+    frozen_tolerance_rad: f8  # a reading that changes by no more stands still
     sample_age_max_cycles: i8
     saturation_max_cycles: i8
     skipped_max_cycles: i8  # in one overrun
@@ -164,6 +167,10 @@ class AxisState:
     saturated_cycles: i8
     still_cycles: i8
     restarts_at_start: i4
+    frozen_samples: i8  # in a row, without a gap, that did not change
+    pushed_cycles: i8  # of them with more torque than frozen_torque_Nm
+    frozen_from_rad: f8  # the reference when the reading last changed
+    frozen_at_rad: f8  # that reading
     table_row: i4  # search hint of the trajectory table
     fault_value: f8  # the value that tripped the limit
     trajectory_s: f8

@@ -36,6 +36,8 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.sample_age_cycles = 0
     state.saturated_cycles = 0
     state.still_cycles = 0
+    state.frozen_samples = 0
+    state.pushed_cycles = 0
     state.restarts_at_start = -1
     state.table_row = 0
     state.trajectory_s = 0.0
@@ -143,6 +145,7 @@ def step_enabling(constants: AxisConstants, state: AxisState, sample: Sample, ta
         state.velocity.last_error_rad = state.velocity.last_position_rad - state.reference.position_rad
         state.velocity.error_rate_radps = 0.0
         reset_law(constants.law, state.law)
+        state.frozen_from_rad = state.reference.position_rad
     elif state.phase_cycle > constants.sequence.enable_max_cycles:
         trip(state, Fault.ENABLE_TIMEOUT, float(sample.status_word), sample.drive_error)
 

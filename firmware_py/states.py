@@ -63,6 +63,7 @@ class Fault(IntEnum):
     OVERRUN = 18  # too many cycles skipped
     POSITION_JUMP = 19  # the encoder moved faster than the joint can
     DRIVE_STAYS_ENABLED = 20  # enabled before the loop asked for it, and it does not switch off
+    POSITION_FROZEN = 21  # the reading stands still although the reference moves
 
 
 class Reaction(IntEnum):

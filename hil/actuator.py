@@ -40,6 +40,8 @@ def step_current(c: PlantConstants, s: PlantState, target_joint_torque_Nm: float
     """Motor current [A] at the end of this substep, after delay, limit and lag; a NaN target counts as zero."""
     target = target_joint_torque_Nm * c.current_per_torque_ApNm
     limit = c.current_limit_A
+    if s.current_capped != 0:
+        limit = min(limit, s.current_cap_A)
     if target > limit:
         target = limit
     elif target < -limit:

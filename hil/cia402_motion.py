@@ -126,7 +126,8 @@ def _mode_demand(device: Device, position_rad: float, velocity_radps: float, dt_
     drive = device.drive
     mode = drive.mode_display
     if mode == Mode.CYCLIC_TORQUE:
-        return float(drive.target_torque) + float(drive.torque_offset)
+        torque = float(drive.target_torque) + float(drive.torque_offset)
+        return -torque if device.torque_reversed else torque
     if mode == Mode.TORQUE:
         target = 0.0 if drive.controlword & _HALT else float(drive.target_torque)
         return device.demand + _limit(target - device.demand, int64(drive.torque_slope) * dt_s)

@@ -14,6 +14,7 @@ from firmware_py.schema import dtype_of, new
 from hil.device_core import accept_frame, advance, power_on
 from hil.device_records import Device, NmtState
 from hil.device_write_rules import check_write
+from hil.faults import no_faults
 from hil.frames import FRAME_SIZE, FrameQueue
 from hil.object_dictionary import ObjectDictionary
 from hil.plant_records import PlantConstants, PlantState
@@ -69,9 +70,14 @@ class DeviceSettings:
 
 
 class Cia402Device:
-    """One drive with its plant.  `device`, `plant_constants`, `plant_state`, `queue` are record arrays for kernels."""
+    """One drive with its plant.  `device`, `plant_constants`, `plant_state`, `queue` are record arrays for kernels.
 
-    def __init__(self, eds_path: Path, settings: DeviceSettings, plant_constants: Any, plant_state: Any) -> None:
+    `faults` (FaultConstants[N], see `hil.faults`) are carried out by `RealtimeDevice`, not by `handle` and `advance`.
+    """
+
+    def __init__(
+        self, eds_path: Path, settings: DeviceSettings, plant_constants: Any, plant_state: Any, faults: Any = None
+    ) -> None:
         for name, array, record in (
             ("plant_constants", plant_constants, PlantConstants),
             ("plant_state", plant_state, PlantState),
@@ -81,6 +87,7 @@ class Cia402Device:
         self.settings = settings
         self.plant_constants = plant_constants
         self.plant_state = plant_state
+        self.faults = no_faults() if faults is None else faults
         self.device = new(Device)
         self.queue = new(FrameQueue)
         self._frame = np.zeros(FRAME_SIZE, np.uint8)

@@ -36,7 +36,7 @@ _MS = 1_000_000
 
 
 @kernel
-def _restart(device: Device, application: bool) -> None:
+def restart(device: Device, application: bool) -> None:
     """Restore the defaults (communication only, or all of them) and boot again with the power stage off."""
     device.communication = device.default_communication
     if application:
@@ -64,7 +64,7 @@ def power_on(device: Device) -> None:
     """Start the device from its defaults; the first `advance` sends the boot-up message."""
     device.primed = 0
     device.inject_fault_code = 0
-    _restart(device, True)
+    restart(device, True)
 
 
 @kernel
@@ -164,9 +164,9 @@ def _command_nmt(device: Device, command: int) -> None:
     elif command == 0x80:
         enter_nmt(device, NmtState.PRE_OPERATIONAL)
     elif command == 0x81:
-        _restart(device, True)
+        restart(device, True)
     elif command == 0x82:
-        _restart(device, False)
+        restart(device, False)
 
 
 @kernel

@@ -32,7 +32,10 @@ from firmware_py.schema import new
 from hil.device import Cia402Device
 from hil.device_core import accept_frame, advance
 from hil.device_records import Device, NmtState, int64
+from hil.faults import FaultMemory, fault_memory
+from hil.frame_faults import pass_frame, take_due
 from hil.frames import FRAME_SIZE, FrameQueue
+from hil.plant_faults import step_faults
 from hil.plant_records import PlantConstants, PlantState
 
 STOP_WORD = 0  # not zero: leave the loop
@@ -60,6 +63,21 @@ def _flush(fd: int, queue: FrameQueue, words: np.ndarray) -> None:
 
 
 @kernel
+def _flush_through_faults(
+    fd: int, faults: Any, memory: FaultMemory, node_id: int, now_ns: int, queue: FrameQueue, words: np.ndarray
+) -> None:
+    """As `_flush`, with the wire's faults; late frames go out when they are due."""
+    if len(faults) == 0:
+        _flush(fd, queue, words)
+        return
+    take_due(memory, False, now_ns, False, memory.to_controller)
+    for i in range(queue.count):
+        pass_frame(faults, memory, queue.frames[i], False, node_id, now_ns, memory.to_controller)
+    queue.count = 0
+    _flush(fd, memory.to_controller, words)
+
+
+@kernel
 def _receive(fd: int, frame: np.ndarray) -> int:
     """Bytes received into `frame`; 0 = nothing waits, -1 = the other end has gone."""
     got = recv(np.int32(fd), np.uintp(frame.ctypes.data), np.uintp(FRAME_SIZE), np.int32(MSG_DONTWAIT))
@@ -72,12 +90,35 @@ def _receive(fd: int, frame: np.ndarray) -> int:
 
 
 @kernel
+def _take_frame(
+    device: Device,
+    plant_c: PlantConstants,
+    plant_s: PlantState,
+    frame: np.ndarray,
+    service_fd: int,
+    now_ns: int,
+    queue: FrameQueue,
+) -> None:
+    """One frame at the drive's end: SDO requests go to the Python thread, all others to the core."""
+    identifier = int64(frame[0]) | int64(frame[1]) << 8 | int64(frame[3]) << 24
+    if identifier == 0x600 + device.node_id:
+        advance(device, plant_c, plant_s, now_ns, queue)
+        if device.nmt != NmtState.STOPPED and device.nmt != NmtState.BOOT_UP:
+            address = np.uintp(frame.ctypes.data)
+            send(np.int32(service_fd), address, np.uintp(FRAME_SIZE), np.int32(MSG_DONTWAIT | MSG_NOSIGNAL))
+    else:
+        accept_frame(device, plant_c, plant_s, frame, now_ns, queue)
+
+
+@kernel
 def run_device(
     fd: int,
     devices: Any,
     plant_constants: Any,
     plant_states: Any,
     queues: Any,
+    faults: Any,
+    memories: Any,
     words: np.ndarray,
     service_fd: int,
     frame: np.ndarray,
@@ -87,17 +128,25 @@ def run_device(
     """Serve the bus until the stop word; scratch: `frame` uint8[16], `polls` int32[4], `timespec` int64[2].
 
     `devices`, `plant_constants`, `plant_states`, `queues` are record arrays of one element, `words` int64[WORDS].
-    Returns the value of ENDED_WORD.
+    `faults` FaultConstants[N] and `memories` FaultMemory[1]: see `hil.faults`.  Returns the value of ENDED_WORD.
     """
     device: Device = devices[0]
     plant_c: PlantConstants = plant_constants[0]
     plant_s: PlantState = plant_states[0]
     queue: FrameQueue = queues[0]
+    memory: FaultMemory = memories[0]
+    node_id = int64(device.node_id)
     ended = 1
     while load_acquire(words, STOP_WORD) == 0 and ended == 1:
         now_ns = monotonic_ns(timespec)
+        if len(faults) > 0:
+            step_faults(faults, memory, device, plant_c, plant_s, now_ns)
+            take_due(memory, True, now_ns, False, memory.ready)
+            for i in range(memory.ready.count):
+                _take_frame(device, plant_c, plant_s, memory.ready.frames[i], service_fd, now_ns, queue)
+            memory.ready.count = 0
         advance(device, plant_c, plant_s, now_ns, queue)
-        _flush(fd, queue, words)
+        _flush_through_faults(fd, faults, memory, node_id, now_ns, queue, words)
         wait_ns = max(0, min(device.next_due_ns - now_ns, _LONGEST_WAIT_NS))
         polls[0] = fd
         polls[1] = POLLIN
@@ -115,15 +164,14 @@ def run_device(
             if got != FRAME_SIZE:
                 continue
             now_ns = monotonic_ns(timespec)
-            identifier = int64(frame[0]) | int64(frame[1]) << 8 | int64(frame[3]) << 24
-            if identifier == 0x600 + device.node_id:
-                advance(device, plant_c, plant_s, now_ns, queue)
-                if device.nmt != NmtState.STOPPED and device.nmt != NmtState.BOOT_UP:
-                    address = np.uintp(frame.ctypes.data)
-                    send(np.int32(service_fd), address, np.uintp(FRAME_SIZE), np.int32(MSG_DONTWAIT | MSG_NOSIGNAL))
+            if len(faults) == 0:
+                _take_frame(device, plant_c, plant_s, frame, service_fd, now_ns, queue)
             else:
-                accept_frame(device, plant_c, plant_s, frame, now_ns, queue)
-            _flush(fd, queue, words)
+                pass_frame(faults, memory, frame, True, node_id, now_ns, memory.ready)
+                for i in range(memory.ready.count):
+                    _take_frame(device, plant_c, plant_s, memory.ready.frames[i], service_fd, now_ns, queue)
+                memory.ready.count = 0
+            _flush_through_faults(fd, faults, memory, node_id, now_ns, queue, words)
         while _receive(service_fd, frame) == FRAME_SIZE:
             device.next_due_ns = 0
             advance(device, plant_c, plant_s, monotonic_ns(timespec), queue)
@@ -131,7 +179,7 @@ def run_device(
             if slot < len(queue.frames):
                 queue.frames[slot] = frame
                 queue.count = slot + 1
-            _flush(fd, queue, words)
+            _flush_through_faults(fd, faults, memory, node_id, monotonic_ns(timespec), queue, words)
     store_release(words, ENDED_WORD, ended)
     return ended
 
@@ -143,6 +191,7 @@ class RealtimeDevice:
         self._device = device
         self._fd = fd
         self.words = np.zeros(WORDS, np.int64)
+        self.fault_memory = fault_memory(device.faults)
         self._threads: list[threading.Thread] = []
         self._core_end: socket.socket | None = None
 
@@ -154,6 +203,8 @@ class RealtimeDevice:
             device.plant_constants,
             device.plant_state,
             new(FrameQueue),
+            device.faults,
+            self.fault_memory,
             self.words,
             service_fd,
             np.zeros(FRAME_SIZE, np.uint8),

@@ -149,6 +149,7 @@ class Device:
     position_gain_ps: f8  # 1/s
     # test access: while not zero the cause of this fault (an EMCY code) is present
     inject_fault_code: u2
+    torque_reversed: i4  # test access: the target torque counts the other way
     # NMT and errors
     nmt: i4  # NmtState
     boot_pending: i4

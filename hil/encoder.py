@@ -40,10 +40,20 @@ def _normal(s: PlantState) -> float:
 
 
 @kernel
+def shaft_position_rad(c: PlantConstants, s: PlantState) -> float:
+    """Joint angle as the encoder sees it, its present faults included."""
+    position_rad = s.motor_position_rad if c.encoder_motor_side != 0 else s.joint_position_rad
+    if s.encoder_stuck != 0:
+        return s.encoder_stuck_rad
+    if s.encoder_reversed != 0:
+        position_rad = 2.0 * s.encoder_pivot_rad - position_rad
+    return position_rad + s.encoder_error_rad
+
+
+@kernel
 def encoder_counts(c: PlantConstants, s: PlantState) -> int:
     """Position as the drive reports it [counts].  With noise on, every call draws anew: call it once a sample."""
-    position_rad = s.motor_position_rad if c.encoder_motor_side != 0 else s.joint_position_rad
-    counts = position_rad * c.counts_prad + c.encoder_offset_counts
+    counts = shaft_position_rad(c, s) * c.counts_prad + c.encoder_offset_counts
     if c.encoder_noise_counts > 0.0:
         counts += c.encoder_noise_counts * _normal(s)
     return math.floor(counts + 0.5)

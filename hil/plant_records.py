@@ -114,6 +114,14 @@ class PlantState:
     bristle_deflection_rad: f8
     motor_temperature_degC: f8
     added_load_torque_Nm: f8
+    # faults, written by `hil.plant_faults`; all zero = none
+    encoder_stuck: i4
+    encoder_reversed: i4
+    current_capped: i4
+    encoder_stuck_rad: f8
+    encoder_pivot_rad: f8  # a reversed encoder counts backwards from here
+    encoder_error_rad: f8  # jump and drift
+    current_cap_A: f8
     noise_state: u8  # xorshift64, never 0
     delay_slot: i4
     delayed_current_A: Annotated[np.ndarray, array_of(f8, DELAY_SLOTS)]

@@ -1,4 +1,4 @@
-"""The verbs around friction: identify, validate."""
+"""The verbs around friction: sweep, identify, validate."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import typer
 
 from tools.cli_options import Json, Quiet
 from tools.output import Output
+from tools.sweep_command import sweep_command
 
 if TYPE_CHECKING:
     from tools.identification.friction_data import ForeignFormat
@@ -140,5 +141,6 @@ def validate(
 
 def register(app: typer.Typer) -> None:
     """Add the verbs."""
+    app.command("sweep")(sweep_command)
     app.command()(identify)
     app.command()(validate)

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from tools.config_sections import Friction, FrictionDirection
 
 
-LEAST_CAN_RATE_HZ = 100.0
+CAN_RATE_HZ = (100.0, 4000.0)
 
 
 def trajectory_extremes(trajectory: Any) -> tuple[float, float, float] | None:
@@ -182,8 +182,8 @@ def _drive_problems(config: Config) -> list[str]:
 
 def _canopen_problems(config: Config) -> list[str]:
     drive, limits, found = config.canopen, config.limits, []
-    if config.loop.rate_Hz < LEAST_CAN_RATE_HZ:
-        found.append(f"loop.rate_Hz (={config.loop.rate_Hz:g}) must be in [{LEAST_CAN_RATE_HZ:g}..4000]")
+    if not CAN_RATE_HZ[0] <= config.loop.rate_Hz <= CAN_RATE_HZ[1]:
+        found.append(f"loop.rate_Hz (={config.loop.rate_Hz:g}) must be in [{CAN_RATE_HZ[0]:g}..{CAN_RATE_HZ[1]:g}]")
     if drive.node == drive.master_node:
         found.append(f"drive.master_node (={drive.master_node}) must differ from drive.node")
     if 240 < drive.rpdo_transmission_type < 254:

@@ -10,6 +10,8 @@ from tools.config import Config
 from tools.config_records import torque_constant_NmpA
 
 CYCLE_BYTES = (0, 8, 4)  # SYNC, TPDO, RPDO
+VELOCITY_CYCLE_BYTES = (0, 8, 6)  # 60FF is longer than 6071
+TORQUE_MODES = ("cst", "tq", "auto")  # of `CanopenSettings.mode`; the others may end in a velocity mode
 HIGHEST_LOAD = 0.8  # of the bus by the cyclic frames; the rest is for heartbeats, SDO and EMCY
 DEFAULT_RATED_CURRENT_A = 5.0
 DEFAULT_RATED_TORQUE_NM = 0.5
@@ -64,12 +66,13 @@ def device_settings(config: Config) -> DeviceSettings:
 def cyclic_bus_load(config: Config) -> float:
     """Share of the bus that the cyclic frames take at worst-case stuffing; refuses more than HIGHEST_LOAD."""
     rate_Hz, bitrate = config.loop.rate_Hz, config.bus.bitrate_bitps
-    load = bus_load(CYCLE_BYTES, rate_Hz, bitrate)
+    cycle_bytes = CYCLE_BYTES if config.canopen.mode in TORQUE_MODES else VELOCITY_CYCLE_BYTES
+    load = bus_load(cycle_bytes, rate_Hz, bitrate)
     if load > HIGHEST_LOAD:
-        highest = highest_rate_Hz(CYCLE_BYTES, bitrate, HIGHEST_LOAD)
+        highest = highest_rate_Hz(cycle_bytes, bitrate, HIGHEST_LOAD)
         raise ConfigurationError(
             f"loop.rate_Hz (={rate_Hz:g}) must be at most {highest:.0f} at bus.bitrate_bitps (={bitrate}): "
-            f"SYNC + TPDO(8) + RPDO(4) = {load * bitrate / rate_Hz:.0f} bits a cycle, {load:.0%} of the bus, "
-            f"{HIGHEST_LOAD:.0%} allowed"
+            f"SYNC + TPDO(8) + RPDO({cycle_bytes[-1]}) = {load * bitrate / rate_Hz:.0f} bits a cycle, "
+            f"{load:.0%} of the bus, {HIGHEST_LOAD:.0%} allowed"
         )
     return load

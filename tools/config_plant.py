@@ -13,13 +13,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BeforeValidator
 from pydantic_core import PydanticCustomError
 
+from firmware_py.schema import new
+from hil.faults import LOCKSTEP_ONLY, MAX_FAULTS, FaultConstants, FaultKind, no_faults
 from hil.plant_records import EncoderSide, FrictionKind, PlantSettings
 from tools.config_sections import Friction, Section, between
 
 if TYPE_CHECKING:
     from tools.config import Config
 
-_OWN_KEYS = ("friction_kind", "inertia_scale", "friction")
+_OWN_KEYS = ("friction_kind", "inertia_scale", "friction", "faults")
+FAULT_KINDS = tuple(kind.name.lower() for kind in FaultKind if kind not in (FaultKind.NONE, *LOCKSTEP_ONLY))
 
 
 def _list(value: Any) -> Any:
@@ -31,6 +34,29 @@ def _list(value: Any) -> Any:
 
 
 Numbers = Annotated[tuple[float, ...], BeforeValidator(_list)]
+
+
+def _kind(value: Any) -> Any:
+    if value not in FAULT_KINDS:
+        raise PydanticCustomError("fault_kind", "must be one of {kinds}", {"kinds": ", ".join(FAULT_KINDS)})
+    return value
+
+
+class VirtualFault(Section):
+    """One fault on purpose; what `magnitude` means for each kind is told in `hil.faults`."""
+
+    kind: Annotated[str, BeforeValidator(_kind)]
+    at_s: Annotated[float, between(0.0, 1e6)]  # after the power stage is on for the first time
+    duration_s: Annotated[float, between(0.0, 1e6, open_low=True)] = 1e6
+    magnitude: Annotated[float, between(-1e6, 1e6)] = 1.0
+    seed: Annotated[int, between(1, 2**31 - 1)] = 1
+
+
+def _faults(value: Any) -> Any:
+    """A list of tables as a tuple, which a frozen model needs."""
+    if not isinstance(value, (list, tuple)) or len(value) > MAX_FAULTS:
+        raise PydanticCustomError("faults", "must be a list of at most {most} faults", {"most": MAX_FAULTS})
+    return tuple(value)
 
 
 class Virtual(Section):
@@ -71,6 +97,20 @@ class Virtual(Section):
     encoder_noise_counts: Annotated[float, between(0.0, 1e6)] = 0.0
     encoder_seed: Annotated[int, between(1, 2**31 - 1)] = 1
     friction: Friction | None = None  # the true curve; None = that of [friction]
+    faults: Annotated[tuple[VirtualFault, ...], BeforeValidator(_faults)] = ()  # [[virtual.faults]]
+
+
+def fault_constants(config: Config) -> Any:
+    """[[virtual.faults]] as a record array of `FaultConstants`."""
+    chosen = config.virtual.faults if config.virtual is not None else ()
+    if not chosen:
+        return no_faults()
+    faults = new(FaultConstants, len(chosen))
+    for record, fault in zip(faults, chosen, strict=True):
+        record.kind = FaultKind[fault.kind.upper()]
+        record.start_s, record.duration_s = fault.at_s, fault.duration_s
+        record.magnitude, record.seed = fault.magnitude, fault.seed
+    return faults
 
 
 def plant_keywords(config: Config, torque_constant_NmpA: float, friction: Any = None) -> dict[str, Any]:

@@ -25,6 +25,11 @@ RADPS_PER_UNIT = {"deg/s": math.pi / 180.0, "rad/s": 1.0, "r/min": math.tau / 60
 _PAPER_HALF = (0.05, 0.03, 0.01, 0.008, 0.004, 0.001, 0.0005)
 PAPER_CENTRES = (*_PAPER_HALF, 0.0, *(-c for c in _PAPER_HALF))
 APPROACH_MIN_S = 1.0
+# way of the reference at a standing reading, as a share of the following error that is allowed: without friction
+# feed-forward a sound joint stands that long before it breaks away
+FROZEN_SHARE, FROZEN_SHARE_WITHOUT_MODEL = 0.1, 0.5
+FROZEN_FRICTION = 1.5  # times the static friction: what a sound joint does not stand still under
+FROZEN_COUNTS = 4  # encoder counts by which a standing reading may flicker
 APPROACH_SPEED = 0.25  # share of limits.velocity_max_radps that an automatic approach may use
 
 
@@ -193,6 +198,15 @@ def _fill_limits(record: Any, config: Config) -> None:
         "following_error_max_rad", "position_jump_max_rad", "standstill_radps",
     ):  # fmt: skip
         setattr(record, key, getattr(limits, key))
+    share = FROZEN_SHARE_WITHOUT_MODEL if config.control.feed_forward == "none" else FROZEN_SHARE
+    if config.friction is not None:
+        static_Nm = max(
+            abs(branch.ts_Nm) * (config.joint.reduction_ratio if config.friction.torque_side == "motor" else 1.0)
+            for branch in (config.friction.positive, config.friction.negative)
+        )
+        record.frozen_torque_Nm = FROZEN_FRICTION * static_Nm + abs(config.joint.gravity_Nm)
+    record.frozen_tolerance_rad = FROZEN_COUNTS * abs(joint_rad_per_count(config))
+    record.frozen_max_rad = max(share * limits.following_error_max_rad, 5.0 * record.frozen_tolerance_rad)
     record.sample_age_max_cycles = _cycles(config, limits.sample_age_max_s)
     record.saturation_max_cycles = _cycles(config, limits.saturation_max_s)
     record.skipped_max_cycles = _cycles(config, limits.skipped_max_s)

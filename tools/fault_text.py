@@ -112,6 +112,11 @@ FAULT_TEXTS: dict[Fault, FaultText] = {
         "another master on the bus, or a drive that ignores the controlword",
         "use the emergency stop; check who else writes object 6040",
     ),
+    Fault.POSITION_FROZEN: FaultText(
+        "the position reading stood still although the joint was driven (reference moved by {value:.4f} rad)",
+        "the encoder or its cable is dead, or the joint is blocked",
+        "turn the joint by hand with the power off and watch the position; check the encoder cable",
+    ),
     Fault.POSITION_JUMP: FaultText(
         "the position jumped by {value:.4f} rad between two samples",
         "encoder or its cable, or counts_per_turn too small by a factor",

@@ -25,6 +25,9 @@ from firmware_py.sequence import reset_axis
 from firmware_py.states import AxisPhase, Fault
 from hil.device import Cia402Device
 from hil.frames import FRAME_SIZE
+from hil.fault_lockstep import TRUTHS as FAULT_TRUTHS
+from hil.fault_lockstep import run_with_faults
+from hil.faults import fault_memory
 from hil.lockstep import TRUTHS, TRUE_POSITION_rad, run_lockstep
 from tools.config import Config
 from tools.config_drive import canopen_settings
@@ -101,8 +104,9 @@ class LockstepJoint:
             self._port = drive.port()
         finally:
             drive.close()
-        self._start_ns = bus.now_ns + _COMMISSIONING_STEP_NS
+        self.start_ns = bus.now_ns + _COMMISSIONING_STEP_NS
         self._virtual = virtual
+        self.faults = virtual.faults
         self.table = trajectory_table(config)
         self.plant_constants = virtual.plant_constants.copy()
         self.plant_state = virtual.plant_state.copy()
@@ -131,6 +135,10 @@ class LockstepJoint:
         """
         constants = self.constants() if constants is None else constants
         axis = constants[0]
+        if len(self._virtual.faults):
+            raise ConfigurationError(
+                "[[virtual.faults]] are carried out by run_with_faults(joint.faults), not by run()"
+            )
         if ideal_velocity and axis.law.matched_filter != 0:
             raise ConfigurationError("control.matched_filter (=true) must be false with an ideal velocity")
         period_s = float(axis.law.period_s)
@@ -148,8 +156,47 @@ class LockstepJoint:
         frame_bytes = frames.view(np.ndarray).view(np.uint8).reshape(len(frames), FRAME_SIZE)
         written = run_lockstep(
             begin, accept, end, self._port.copy(), frames, frame_bytes, constants, state, self.table, sample, command,
-            device, plant_constants, plant, self._virtual.queue.copy(), log, log_every, self._start_ns,
+            device, plant_constants, plant, self._virtual.queue.copy(), log, log_every, self.start_ns,
             round(period_s * 1e9), cycles, stop_cycle,
             truth, ideal_velocity,
         )  # fmt: skip
         return LockstepRun(log[:written], state[0], plant[0], device[0], Fault(int(state[0].fault)), truth[:written])
+
+    def run_with_faults(
+        self,
+        faults: Any,
+        constants: Any = None,
+        *,
+        plant_constants: Any = None,
+        plant_state: Any = None,
+        epoch_at_start: bool = False,
+        stop_cycle: int = NO_STOP,
+        longest_s: float | None = None,
+        tail_s: float = 0.0,
+    ) -> LockstepRun:
+        """As `run`, with these `FaultConstants`; `truth` has the columns of `hil.fault_lockstep`, a row each period.
+
+        The faults' times count from the first time that the power stage is on, or from the start of the run.
+        The joint is watched for `tail_s` after the controller has ended and is silent.
+        """
+        constants = self.constants() if constants is None else constants
+        axis = constants[0]
+        period_s = float(axis.law.period_s)
+        if longest_s is None:
+            longest_s = float(axis.sequence.approach_s + axis.trajectory.duration_s) + 10.0
+        cycles, tail_cycles = int(longest_s / period_s), int(tail_s / period_s)
+        log, truth = new(LogRecord, cycles), np.zeros((cycles + tail_cycles, FAULT_TRUTHS))
+        state, sample, command = new(AxisState), new(Sample), new(Command)
+        reset_axis(axis, state[0])
+        device = self._virtual.device.copy()
+        plant_constants = self.plant_constants if plant_constants is None else plant_constants
+        plant = (self.plant_state if plant_state is None else plant_state).copy()
+        frames, _ = exchange_memory()
+        frame_bytes = frames.view(np.ndarray).view(np.uint8).reshape(len(frames), FRAME_SIZE)
+        written, rows = run_with_faults(
+            begin, accept, end, self._port.copy(), frames, frame_bytes, constants, state, self.table, sample, command,
+            device, plant_constants, plant, self._virtual.queue.copy(), log, truth, faults,
+            fault_memory(faults, -1 if epoch_at_start else 0), self.start_ns, round(period_s * 1e9), cycles,
+            stop_cycle, tail_cycles,
+        )  # fmt: skip
+        return LockstepRun(log[:written], state[0], plant[0], device[0], Fault(int(state[0].fault)), truth[:rows])

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 from drivers.errors import JointctlError, MotionFault
@@ -27,9 +28,12 @@ _ON_SERIAL = "a serial drive does not notice that: it has been told to switch of
 
 
 class LoopHandle:
-    """Owns the process and the shared memory; a context manager that never leaves the process behind."""
+    """Owns the process and the shared memory; a context manager that never leaves the process behind.
 
-    def __init__(self, config: Config, table: Any) -> None:
+    `tail_path` is where the loop itself saves the ring if this process has gone when it ends.
+    """
+
+    def __init__(self, config: Config, table: Any, tail_path: Path | None = None) -> None:
         self.block = SharedBlock.create(len(table), config.bus.interface)
         self.block.table[:] = table
         self._tail = 0
@@ -47,6 +51,7 @@ class LoopHandle:
             bitrate_bitps=config.bus.bitrate_bitps,
             cpu=config.loop.cpu,
             priority=config.loop.priority,
+            tail_path=None if tail_path is None else str(tail_path.absolute()),
         )
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "tools.loop_process", order.argument()],

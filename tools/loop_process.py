@@ -45,6 +45,7 @@ class LoopOrder:
     cpu: int | None
     priority: int | None
     bitrate_bitps: int | None = None  # for interfaces that set it when they are opened
+    tail_path: str | None = None  # where the ring is saved if the supervisor has gone
 
     def argument(self) -> str:
         """As one command line argument."""
@@ -146,7 +147,19 @@ def run(order: LoopOrder) -> int:
             time.sleep(_POLL_S)
         go()
         block.words[Word.ENDED] = 1
+    if order.tail_path is not None and os.getppid() != order.supervisor_pid:
+        save_tail(block, Path(order.tail_path))
     return 0
+
+
+def save_tail(block: Any, path: Path) -> None:
+    """Write what the ring holds: the joint is off by now, and nobody else is left to keep the last seconds."""
+    from tools.run_log import ERROR, RunLogWriter
+
+    records, lost = block.new_records(0, int(block.words[Word.HEAD]))
+    with RunLogWriter(path, {"tail": {"why": "the supervising process had gone", "records_before": str(lost)}}) as log:
+        log.write_records(records)
+        log.write_event(ERROR, "loop", "the supervising process had gone; these are the last records of the loop")
 
 
 def _place(error: BaseException) -> str:

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from drivers.drive import CommissioningReport
 from drivers.errors import JointctlError
 from tools.config import Config
 from tools.envelope import motion_envelope
+from tools.live_panel import Display, run_display
 from tools.output import Output
 from tools.run_report import INTERRUPTED, report_run
+from tools.shared_block import SERIAL
 from tools.supervisor import Supervisor
 
 
@@ -39,9 +43,18 @@ def _ask(output: Output) -> bool:
 
 
 def run(
-    config: Config, output: Output, *, assume_yes: bool, dry_run: bool = False, allow_low_margin: bool = False
+    config: Config,
+    output: Output,
+    *,
+    assume_yes: bool,
+    dry_run: bool = False,
+    allow_low_margin: bool = False,
+    scope: tuple[str, int] | None = None,
 ) -> int:
-    """Commission, show the motion envelope, ask, track, report; returns the exit code."""
+    """Commission, show the motion envelope, ask, track, report; returns the exit code.
+
+    `scope`: host and port at which a live page is to be served.
+    """
     if not (assume_yes or dry_run or sys.stdin.isatty()):
         raise UsageError("this moves the joint and there is no terminal to ask on", "give -y to move without asking")
 
@@ -53,13 +66,35 @@ def run(
             return False
         return assume_yes or _ask(output)
 
-    try:
-        result = Supervisor(config, output, log_path(config), confirm, allow_low_margin=allow_low_margin).run()
-    except KeyboardInterrupt:
-        output.note("interrupted; nothing moved")
-        return INTERRUPTED
+    title = f"{config.path.stem}: {config.trajectory.kind}"
+    with _displays(config, output, title, scope) as display:
+        supervisor = Supervisor(
+            config, output, log_path(config), confirm, allow_low_margin=allow_low_margin, display=display
+        )
+        try:
+            result = supervisor.run()
+        except KeyboardInterrupt:
+            output.note("interrupted; nothing moved")
+            return INTERRUPTED
     if result is None:
         if not dry_run:
             output.note("nothing moved; the drive is disabled")
         return 0
-    return report_run(result, output, f"{config.path.stem}: {config.trajectory.kind}")
+    return report_run(result, output, title)
+
+
+@contextmanager
+def _displays(
+    config: Config, output: Output, title: str, scope: tuple[str, int] | None
+) -> Iterator[Callable[[], Display]]:
+    """What shows the run: the terminal, and the page if one is wanted."""
+    terminal = run_display(output, title)
+    if scope is None:
+        yield terminal
+        return
+    from tools.scoping.feed import Displays, scope_order, scope_server
+
+    order = scope_order(title, *scope, cia402=config.bus.interface != SERIAL)
+    output.note(f"scope: {order.url}")
+    with scope_server(order) as feed:
+        yield lambda: Displays([terminal(), feed])

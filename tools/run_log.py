@@ -5,8 +5,9 @@ record IS the CDR body: CDR aligns each number to its size counted from the end 
 fixed arrays without a length.  (Padding at the end of a record, if any, is ignored by readers.)  So writing costs no
 encoding and reading is `np.frombuffer`.
 
-Events are on `/events`; what was run (configuration, versions, identity of the drive) is in metadata records at the
-beginning of the file.  Times are nanoseconds of CLOCK_MONOTONIC; `metadata["clock"]` relates them to the calendar.
+Events are on `/events`, raw CAN frames, if they are recorded, on `/can`; what was run (configuration, versions,
+identity of the drive) is in metadata records at the beginning of the file.  Times are nanoseconds of CLOCK_MONOTONIC;
+`metadata["clock"]` relates them to the calendar.
 A file that was cut off, because the writer was killed or the disk is full, reads up to the last whole chunk.
 """
 
@@ -15,7 +16,7 @@ from __future__ import annotations
 import struct
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
@@ -32,6 +33,7 @@ from mcap.writer import CompressionType, Writer
 from drivers.errors import DataError
 from firmware_py.records import LogRecord
 from firmware_py.schema import dtype_of
+from tools.can_log import CAN_DEFINITION, CAN_FRAME, CAN_SCHEMA, CAN_TOPIC, frame_times_ns
 from tools.cdr import CDR_HEADER, event_body, event_from_body, message_definition
 
 RECORD_TOPIC, RECORD_SCHEMA = "/joint", "jointctl_msgs/msg/LogRecord"
@@ -40,6 +42,7 @@ EVENT_DEFINITION = "int64 time_ns\nint32 level\nstring source\nstring text\n"
 DEBUG, INFO, WARNING, ERROR = 10, 20, 30, 40  # levels, those of Python's logging
 _MAGIC = b"\x89MCAP0\r\n"
 _CHUNK_BYTES = 256 * 1024
+_BEFORE_BODY = 9  # bytes of opcode and length
 _MESSAGE_HEAD = np.dtype(
     [
         ("opcode", "u1"),
@@ -66,6 +69,7 @@ class RunLog:
     events: tuple[Event, ...]
     metadata: dict[str, dict[str, str]]
     complete: bool  # False: the file was cut off, its tail is lost
+    frames: Any = field(default_factory=lambda: np.zeros(0, CAN_FRAME))  # array of CAN_FRAME, shape (N,)
 
 
 class RunLogWriter:
@@ -101,6 +105,7 @@ class RunLogWriter:
         definition = message_definition(dtype_of(LogRecord))
         self._record_channel = self._channel(RECORD_TOPIC, RECORD_SCHEMA, definition)
         self._event_channel = self._channel(EVENT_TOPIC, EVENT_SCHEMA, EVENT_DEFINITION)
+        self._can_channel: int | None = None  # only in logs with frames
         self._file.flush()
 
     def _channel(self, topic: str, name: str, definition: str) -> int:
@@ -119,6 +124,15 @@ class RunLogWriter:
             self._written += 1
         if self._clock() - self._flushed_at_s >= self._flush_s:
             self.flush()
+
+    def write_frames(self, frames: np.ndarray) -> None:
+        """Append raw CAN frames, an array of shape (N,) of CAN_FRAME in order of time."""
+        if self._can_channel is None:
+            self._can_channel = self._channel(CAN_TOPIC, CAN_SCHEMA, CAN_DEFINITION)
+        size, body = frames.dtype.itemsize, frames.tobytes()
+        for i, time_ns in enumerate(frame_times_ns(frames).tolist()):
+            data = CDR_HEADER + body[i * size : (i + 1) * size]
+            self._writer.add_message(self._can_channel, time_ns, data, time_ns)
 
     def write_event(self, level: int, source: str, text: str, time_ns: int | None = None) -> None:
         """Append an event and flush: it may be the last thing that this process does."""
@@ -191,22 +205,27 @@ def _read(file: IO[bytes], path: Path) -> RunLog:
     dtype = dtype_of(LogRecord)
     records = np.concatenate(log.record_parts) if log.record_parts else np.zeros(0, dtype)
     records.flags.writeable = False
-    return RunLog(records.view(np.recarray), tuple(log.events), log.metadata, complete)
+    frames = np.concatenate(log.frame_parts) if log.frame_parts else np.zeros(0, CAN_FRAME)
+    return RunLog(records.view(np.recarray), tuple(log.events), log.metadata, complete, frames)
 
 
 class _Collector:
-    """Takes chunks apart: runs of log records by one `np.frombuffer`, everything else message by message."""
+    """Takes chunks apart: runs of log records or frames by one `np.frombuffer`, else message by message."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.record_parts: list[np.ndarray] = []
+        self.frame_parts: list[np.ndarray] = []
         self.events: list[Event] = []
         self.metadata: dict[str, dict[str, str]] = {}
         self._topics: dict[int, str] = {}
         self._definition = message_definition(dtype_of(LogRecord)).encode()
-        body = [("cdr", "V4"), ("record", dtype_of(LogRecord))]
-        self._message = np.dtype([*_MESSAGE_HEAD.descr, *body])
-        self._length = self._message.itemsize - 9  # without opcode and length
+        bodies = {RECORD_TOPIC: (dtype_of(LogRecord), self.record_parts), CAN_TOPIC: (CAN_FRAME, self.frame_parts)}
+        # topics whose messages all have the same size, so that a run of them is an array
+        self._runs = {
+            topic: (np.dtype([*_MESSAGE_HEAD.descr, ("cdr", "V4"), ("record", body)]), parts)
+            for topic, (body, parts) in bodies.items()
+        }
 
     def take_chunk(self, chunk: Chunk) -> None:
         stream, size = get_chunk_data_stream(chunk, validate_crc=True)
@@ -217,8 +236,9 @@ class _Collector:
             if opcode == Opcode.MESSAGE:
                 (channel,) = struct.unpack_from("<H", data, at + 9)
                 topic = self._topics.get(channel, "")
-                if topic == RECORD_TOPIC and length == self._length:
-                    at += self._take_records(data, at, channel)
+                message, parts = self._runs.get(topic, (None, None))
+                if message is not None and parts is not None and length == message.itemsize - _BEFORE_BODY:
+                    at += _take_run(data, at, channel, message, parts)
                     continue
                 if topic == EVENT_TOPIC:
                     body = data[at + _MESSAGE_HEAD.itemsize + len(CDR_HEADER) : at + 9 + length]
@@ -236,14 +256,15 @@ class _Collector:
         if schema.name == RECORD_SCHEMA and schema.data != self._definition:
             raise DataError(f"{self.path}: was written by another version of jointctl, with other log fields")
 
-    def _take_records(self, data: bytes, at: int, channel: int) -> int:
-        """Take the run of records that begins at `at`; how many bytes it is long."""
-        step = self._message.itemsize
-        rows = np.frombuffer(data, self._message, (len(data) - at) // step, at)
-        same = (rows["opcode"] == Opcode.MESSAGE) & (rows["length"] == self._length) & (rows["channel"] == channel)
-        count = len(rows) if same.all() else int(np.argmin(same))
-        self.record_parts.append(rows["record"][:count].astype(dtype_of(LogRecord)))
-        return count * step
+
+def _take_run(data: bytes, at: int, channel: int, message: np.dtype[Any], parts: list[np.ndarray]) -> int:
+    """Append the run of like messages that begins at `at` to `parts`; how many bytes it is long."""
+    rows = np.frombuffer(data, message, (len(data) - at) // message.itemsize, at)
+    length = message.itemsize - _BEFORE_BODY
+    same = (rows["opcode"] == Opcode.MESSAGE) & (rows["length"] == length) & (rows["channel"] == channel)
+    count = len(rows) if same.all() else int(np.argmin(same))
+    parts.append(rows["record"][:count].astype(message["record"]))
+    return count * message.itemsize
 
 
 def _stream(data: bytes, at: int, length: int) -> ReadDataStream:

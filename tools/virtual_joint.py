@@ -19,6 +19,7 @@ from hil.device_loop import RealtimeDevice
 from hil.joint import plant
 from tools.config import Config
 from tools.config_drive import device_settings
+from tools.config_plant import fault_constants
 from tools.config_records import plant_settings
 from tools.device_pump import PumpedDevice
 
@@ -29,7 +30,7 @@ def new_device(config: Config) -> Cia402Device:
     """The drive with its plant, as the configuration says that the joint truly is."""
     constants, state = plant(**plant_settings(config))
     try:
-        return Cia402Device(config.eds_path, device_settings(config), constants, state)
+        return Cia402Device(config.eds_path, device_settings(config), constants, state, fault_constants(config))
     except ValueError as error:  # what the EDS file must hold for a virtual drive
         raise ConfigurationError(f"drive.eds (={config.canopen.eds}) does not make a virtual drive: {error}") from None
 
@@ -46,6 +47,11 @@ def serve_virtual_joint(config: Config, timing: bool = False) -> Iterator[Realti
             except VirtualBusError as error:
                 raise BusError(str(error)) from None
         if config.bus.interface not in CYCLIC_INTERFACES:
+            if len(device.faults):
+                raise ConfigurationError(
+                    f"bus.interface (={config.bus.interface}) must be one of {', '.join(CYCLIC_INTERFACES)} "
+                    "for [[virtual.faults]]"
+                )
             bus = open_python_can(config.bus.interface, config.bus.channel, config.bus.bitrate_bitps)
             stack.callback(bus.shutdown)
             yield stack.enter_context(PumpedDevice(device, bus))

@@ -22,6 +22,9 @@ from firmware_py.records import Command, Sample
 from firmware_py.states import DriveRequest
 
 NMT_OPERATIONAL = 5
+# A drive that was told to stop and still says that it is enabled, or says nothing, does not hear us (SYNC or RPDO
+# lost).  Its watchdog is what is left: after so many cycles the heartbeat is withheld for the rest of the run.
+UNHEEDED_MAX_CYCLES = 20
 WRAP = 1 << 32
 HALF_WRAP = 1 << 31
 _WORST_BITS = np.array([worst_frame_bits(length) for length in range(9)])
@@ -63,7 +66,7 @@ def begin_cycle(port: CanopenPort, frames: np.ndarray) -> int:
     port.bits_sent += _WORST_BITS[0]
     due = port.heartbeat_cycles > 0 and port.cycle % port.heartbeat_cycles == 0
     port.cycle += 1
-    if not due:
+    if not due or port.unheeded_cycles > UNHEEDED_MAX_CYCLES:
         return 1
     frames[SLOT_HEARTBEAT].can_id = port.own_heartbeat_id
     frames[SLOT_HEARTBEAT].length = 1
@@ -150,6 +153,10 @@ def end_cycle(port: CanopenPort, frames: np.ndarray, sample: Sample, command: Co
         frame.payload[i] = 0
     put_u16(frame.payload, port.control_at, control_word(port.state, command.request))
     enabled = command.request == DriveRequest.ENABLE and port.state == State.OPERATION_ENABLED
+    if command.request != DriveRequest.ENABLE and port.state == State.OPERATION_ENABLED:
+        port.unheeded_cycles += 1
+    elif port.unheeded_cycles <= UNHEEDED_MAX_CYCLES:
+        port.unheeded_cycles = 0
     if port.target_is_velocity != 0:
         units = velocity_units(port, command.velocity_radps) if enabled else 0
         put_u16(frame.payload, port.target_at, units)

@@ -48,6 +48,7 @@ class CanopenPort:
     cycle: i8
     state: i4  # cia402.State
     nmt_state: i4
+    unheeded_cycles: i4  # in a row in which the drive stayed enabled although it was asked to stop
     malformed: i8  # TPDOs that were too short
     error_frames: i8
     send_failures: i8

@@ -1,0 +1,280 @@
+"""Sweeps of the virtual joint: the curve that comes out, in lockstep; stopping and resuming, in real time."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import subprocess
+import sys
+import time
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.errors import DeviceError, MotionFault
+from firmware_py.friction import friction_curve_Nm
+from tools.config import Config, load_config, shipped_config
+from tools.config_records import friction_constants
+from tools.config_sections import Friction
+from tools.identification.friction_data import read_friction_data
+from tools.identification.friction_section import section_values
+from tools.identification.identification import Options, identify_friction
+from tools.identification.pso import SwarmSettings
+from tools.output import Output
+from tools.sweep import sweep
+from tools.sweep_options import SweepOptions
+
+QUANTISATION_Nm = 0.0005  # one per mille of the rated motor torque
+# `jointctl`, also where the verb is not in its list yet
+LAUNCHER = """
+from tools import cli
+from tools.sweep_command import sweep_command
+if "sweep" not in {c.name or c.callback.__name__ for c in cli.app.registered_commands}:
+    cli.app.command("sweep")(sweep_command)
+cli.main()
+"""
+
+
+@pytest.fixture
+def config() -> Config:
+    return load_config(shipped_config("sweep_virtual"))
+
+
+def swept(config: Config, out: Path, **options: Any) -> Any:
+    """The rows of a sweep in lockstep."""
+    output = Output(stdout=StringIO(), stderr=StringIO())
+    assert sweep(config, output, out, SweepOptions(lockstep=True, **options)) == 0
+    return rows(out)
+
+
+def rows(out: Path) -> Any:
+    return np.genfromtxt(out, delimiter=",", names=True)
+
+
+def truth_Nm(config: Config, velocity_radps: np.ndarray) -> np.ndarray:
+    assert config.virtual is not None
+    assert config.virtual.friction is not None
+    return friction_curve_Nm(friction_constants(config.virtual.friction, 121.0), velocity_radps)
+
+
+@pytest.mark.parametrize(("mode", "tolerance_Nm"), [("csv", 0.001), ("pv", 0.001), ("torque", 0.003)])
+def test_the_swept_curve_is_the_sliding_curve_of_the_joint(
+    config: Config, tmp_path: Path, mode: str, tolerance_Nm: float
+) -> None:
+    found = swept(config, tmp_path / "data.csv", points=24, mode=mode)
+    assert len(found) == 24
+    assert np.all(found["settled"] == 1)
+    assert np.sum(found["velocity_radps"] > 0.0) == 12
+    error_Nm = found["motor_torque_Nm"] - truth_Nm(config, found["velocity_radps"])
+    assert np.max(np.abs(error_Nm)) < tolerance_Nm + QUANTISATION_Nm
+    sidecar = json.loads((tmp_path / "data.json").read_text())
+    assert sidecar["reduction_ratio"] == 121.0
+    assert sidecar["drive"]["mode"] == {"csv": "cyclic_sync_velocity", "pv": "profile_velocity"}.get(
+        mode, "cyclic_sync_torque"
+    )
+    # the drive's own limit, written and read back: 3.88 rad/s in counts/s
+    limit = sidecar["drive"].get("max velocity")
+    assert limit == (None if mode == "torque" else "323759 counts/s = 3.88 rad/s")
+
+
+def test_the_joint_never_leaves_its_travel_and_its_speed(config: Config, tmp_path: Path) -> None:
+    found = swept(config, tmp_path / "data.csv", points=6)
+    assert np.all(found["position_min_rad"] > config.limits.position_min_rad)
+    assert np.all(found["position_max_rad"] < config.limits.position_max_rad)
+    assert np.max(np.abs(found["velocity_radps"])) < config.limits.velocity_max_radps
+
+
+def test_an_identified_sweep_is_within_two_percent_of_the_truth(config: Config, tmp_path: Path) -> None:
+    out = tmp_path / "data.csv"
+    found = swept(config, out)
+    assert len(found) == 225
+    small = Options(swarm=SwarmSettings(particles=100, iterations=200))
+    branches = identify_friction(read_friction_data(out), small).branches
+    identified = Friction.model_validate(section_values(branches["positive"], branches["negative"]))
+    speeds = np.linspace(found["velocity_radps"].min() * -1.0, found["velocity_radps"].max(), 500)
+    both = np.concatenate([speeds, -speeds])
+    true_Nm = truth_Nm(config, both)
+    error_Nm = friction_curve_Nm(friction_constants(identified, 121.0), both) - true_Nm
+    assert np.max(np.abs(error_Nm)) < 0.02 * np.max(np.abs(true_Nm))
+
+
+def test_a_wrong_torque_constant_of_the_truth_shows_in_the_data(config: Config, tmp_path: Path) -> None:
+    assert config.virtual is not None
+    weak = config.virtual.model_copy(update={"friction_positive_scale": 0.5, "friction_negative_scale": 0.5})
+    full = swept(config, tmp_path / "full.csv", points=6)
+    half = swept(config.model_copy(update={"virtual": weak}), tmp_path / "half.csv", points=6)
+    assert half["motor_torque_Nm"] / full["motor_torque_Nm"] == pytest.approx(np.full(6, 0.5), rel=0.02)
+
+
+def test_points_that_do_not_settle_are_visited_again_and_marked(config: Config, tmp_path: Path) -> None:
+    # too little damping for the negative slope of Stribeck friction: the joint sticks and slips
+    assert config.virtual is not None
+    weak = config.control.model_copy(update={"kp": 400.0, "kv": 12.0, "observer_radps": 3.0})
+    rough = config.virtual.model_copy(update={"friction_kind": "stick_slip"})
+    joint = config.model_copy(update={"virtual": rough, "control": weak})
+    options = {"points": 4, "min_speed_radps": 0.008, "max_speed_radps": 0.016, "mode": "torque"}
+    found = swept(joint, tmp_path / "data.csv", **options)
+    unsettled = found[found["settled"] == 0]
+    assert len(unsettled) > 0
+    assert len(found) > 4
+    sidecar = json.loads((tmp_path / "data.json").read_text())
+    assert all(sidecar["unsettled"].values())
+
+
+def eds_with_modes(config: Config, folder: Path, supported: int) -> Config:
+    """The configuration of a drive with other supported modes (6502)."""
+    text = config.eds_path.read_text()
+    assert text.count("DefaultValue=0x0000038D") == 1
+    (folder / "drive.eds").write_text(text.replace("DefaultValue=0x0000038D", f"DefaultValue=0x{supported:08X}"))
+    (folder / "joint.toml").write_text(config.text.replace('eds = "virtual_joint.eds"', 'eds = "drive.eds"'))
+    return load_config(folder / "joint.toml")
+
+
+@pytest.mark.parametrize(
+    ("supported", "mode"),
+    [(0x38D, "cyclic_sync_velocity"), (0x28D, "profile_velocity"), (0x281, "cyclic_sync_torque"), (0x8, "torque")],
+)
+def test_auto_takes_the_best_mode_that_the_drive_has(config: Config, tmp_path: Path, supported: int, mode: str) -> None:
+    joint = eds_with_modes(config, tmp_path, supported)
+    swept(joint, tmp_path / "data.csv", points=2, max_speed_radps=1.0, min_speed_radps=0.9, grid="log")
+    assert json.loads((tmp_path / "data.json").read_text())["drive"]["mode"] == mode
+
+
+@pytest.mark.parametrize(("supported", "mode"), [(0x281, "csv"), (0x381, "pv"), (0x181, "torque")])
+def test_a_mode_that_the_drive_lacks_is_a_device_error(
+    config: Config, tmp_path: Path, supported: int, mode: str
+) -> None:
+    joint = eds_with_modes(config, tmp_path, supported)
+    with pytest.raises(DeviceError, match="does not support") as error:
+        swept(joint, tmp_path / "data.csv", points=2, mode=mode)
+    assert error.value.exit_code == 6
+    assert not (tmp_path / "data.csv").exists()
+
+
+def test_a_fault_keeps_what_was_measured_and_resume_completes_it(config: Config, tmp_path: Path) -> None:
+    # the first speeds need less torque than the limit, the fastest more: the drive saturates
+    limits = config.limits.model_copy(update={"torque_max_Nm": 33.0})
+    weak = config.model_copy(update={"limits": limits})
+    out = tmp_path / "data.csv"
+    with pytest.raises(MotionFault, match=r"points are in"):
+        swept(weak, out, points=12)
+    kept = out.read_text()
+    done = len(rows(out))
+    assert 2 < done < 12
+    found = swept(config, out, points=12, resume=True)
+    assert len(found) == 12
+    assert out.read_text().startswith(kept)
+    assert np.all(np.diff(found["time_s"]) > 0.0)
+    error_Nm = found["motor_torque_Nm"] - truth_Nm(config, found["velocity_radps"])
+    assert np.max(np.abs(error_Nm)) < 0.002
+    output = Output(stdout=StringIO(), stderr=StringIO())
+    assert sweep(config, output, out, SweepOptions(lockstep=True, points=12, resume=True)) == 0
+    assert "nothing is left" in output.stderr.getvalue()  # type: ignore[attr-defined]
+
+
+def test_the_same_sweep_twice_gives_the_same_rows(config: Config, tmp_path: Path) -> None:
+    first = swept(config, tmp_path / "a.csv", points=4, shuffle_seed=3)
+    second = swept(config, tmp_path / "b.csv", points=4, shuffle_seed=3)
+    assert np.array_equal(first["motor_torque_Nm"], second["motor_torque_Nm"])
+
+
+def test_a_dry_run_in_lockstep_writes_nothing(config: Config, tmp_path: Path) -> None:
+    output = Output(stdout=StringIO(), stderr=StringIO())
+    options = SweepOptions(lockstep=True, points=4, dry_run=True)
+    assert sweep(config, output, tmp_path / "data.csv", options) == 0
+    text = output.stderr.getvalue()  # type: ignore[attr-defined]
+    for word in ("approach", "sweep      4 points", "motion", "limits", "dry run"):
+        assert word in text
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- in real time, as processes ---
+
+SHORT = ("--max-speed", "1.0", "--min-speed", "0.5", "--points", "6", "--dwell", "0.3", "--warm-up", "0")
+
+
+class SweepProcess:
+    """`jointctl sweep` in the folder of the bench."""
+
+    def __init__(self, bench: Any, *arguments: str) -> None:
+        self._err = bench.folder / f"sweep-{len(list(bench.folder.glob('sweep-*')))}.stderr"
+        with self._err.open("wb") as err:
+            self.process = subprocess.Popen(
+                [sys.executable, "-P", "-c", LAUNCHER, "sweep", *arguments], cwd=bench.folder,
+                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=err, start_new_session=True,
+            )  # fmt: skip
+
+    @property
+    def err(self) -> str:
+        return self._err.read_text()
+
+    def finished(self) -> tuple[int, str]:
+        try:
+            return self.process.wait(120.0), self.err
+        finally:
+            self.process.kill()
+
+
+@pytest.fixture
+def joint(bench: Any) -> Any:
+    """The bench with the joint of sweep_virtual running; limits for a busy computer."""
+    bench.config(base="sweep_virtual", limits__sample_age_max_s=0.5, limits__skipped_max_s=0.5,
+                 drive__heartbeat_s=1.0)  # fmt: skip
+    bench.joint("joint.toml")
+    return bench
+
+
+def test_ctrl_c_keeps_the_rows_and_resume_measures_the_rest(joint: Any) -> None:
+    out = joint.folder / "data.csv"
+    started = SweepProcess(joint, "joint.toml", "-o", "data.csv", "-y", *SHORT)
+    give_up_s = time.monotonic() + 120.0
+    while not (out.exists() and len(out.read_text().splitlines()) >= 3):
+        assert started.process.poll() is None, started.err
+        assert time.monotonic() < give_up_s, started.err
+        time.sleep(0.05)
+    started.process.send_signal(signal.SIGINT)
+    code, err = started.finished()
+    assert code == 130, err
+    assert "Traceback" not in err
+    assert "ramping" in err
+    assert "--resume goes on" in err
+    assert joint.disabled()
+    kept = out.read_text()
+    assert 3 <= len(kept.splitlines()) < 7
+    code, err = SweepProcess(joint, "joint.toml", "-o", "data.csv", "-y", "--resume", *SHORT).finished()
+    assert code == 0, err
+    assert joint.disabled()
+    found = rows(out)
+    assert out.read_text().startswith(kept)
+    once = {(round(v, 1), d) for v, d in zip(found["velocity_radps"], found["direction"], strict=True)}
+    assert len(once) == 6
+    error_Nm = found["motor_torque_Nm"] - truth_Nm(
+        load_config(shipped_config("sweep_virtual")), found["velocity_radps"]
+    )
+    assert np.max(np.abs(error_Nm)) < 0.005
+
+
+def test_a_dry_run_and_a_missing_y_move_nothing(joint: Any) -> None:
+    code, err = SweepProcess(joint, "joint.toml", "-o", "data.csv", "--dry-run", *SHORT).finished()
+    assert code == 0, err
+    assert "nothing moves" in err
+    code, err = SweepProcess(joint, "joint.toml", "-o", "data.csv", *SHORT).finished()
+    assert code == 2, err
+    assert "no terminal to ask on" in err
+    assert joint.disabled()
+    assert not (joint.folder / "data.csv").exists()
+
+
+def test_options_type_matches_the_command(config: Config) -> None:
+    from inspect import signature
+
+    from tools.sweep_command import sweep_command
+
+    parameters = set(signature(sweep_command).parameters) - {
+        "config", "out", "interface", "channel", "bitrate", "json", "quiet",
+    }  # fmt: skip
+    assert len(parameters) == len(dataclasses.fields(SweepOptions))

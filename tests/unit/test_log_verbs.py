@@ -1,0 +1,307 @@
+"""`jointctl log`: what is told, what is exported, and that foreign readers read it back; events and raw frames."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from drivers.errors import ConfigurationError, DataError
+from firmware_py.records import LogRecord
+from firmware_py.schema import new
+from firmware_py.states import AxisPhase, DriveState, Fault
+from tools.can_log import frame_array, frame_times_ns
+from tools.emergency_text import emergency_text
+from tools.frame_recorder import FrameRecorder, recording
+from tools.log import log_export, log_info, log_plot, missing_records
+from tools.log_export import FORMATS
+from tools.output import Output
+from tools.run_events import OVERRUN_CYCLES, EventFinder
+from tools.run_log import RunLogWriter, read_run_log
+
+START_NS = 5_000_000_000
+WORDS = {DriveState.OFF: 0x0250, DriveState.STARTING: 0x0233, DriveState.ENABLED: 0x1237, DriveState.FAULT: 0x0218}
+
+
+def run_records(count: int = 400, first: int = 0) -> Any:
+    """A run of 1 kHz that waits, enables, tracks, and is switched off in its last 50 cycles."""
+    records = new(LogRecord, count)
+    index = np.arange(first, first + count)
+    records.cycle = index + 1
+    records.time_ns = START_NS + index * 1_000_000
+    records.phase = AxisPhase.TRACKING
+    records.drive_state = DriveState.ENABLED
+    records.trajectory_s = index * 1e-3
+    records.position_rad = np.sin(index / 50.0)
+    records.error_rad = 1e-3 / (1 + index)
+    records.weights = np.arange(15) + index[:, None] / 7.0
+    if first == 0:
+        records.phase[:20], records.drive_state[:20] = AxisPhase.WAITING, DriveState.OFF
+        records.phase[20:30], records.drive_state[20:30] = AxisPhase.ENABLING, DriveState.STARTING
+        records.phase[-50:], records.drive_state[-50:] = AxisPhase.FINISHED, DriveState.OFF
+    records.status_word = [WORDS[DriveState(state)] for state in records.drive_state]
+    return records
+
+
+def some_frames() -> np.ndarray:
+    """A SYNC, an extended frame, a remote frame, an error frame, a full one; 1 ms apart."""
+    messages = [
+        can.Message(arbitration_id=0x80, is_extended_id=False),
+        can.Message(arbitration_id=0x80, is_extended_id=True, data=b"\x01"),
+        can.Message(arbitration_id=0x701, is_extended_id=False, is_remote_frame=True, dlc=1),
+        can.Message(arbitration_id=0x84, is_error_frame=True, dlc=8, data=bytes(8)),
+        can.Message(arbitration_id=0x181, is_extended_id=False, data=bytes(range(0xF8, 0x100))),
+    ]
+    return frame_array([(START_NS + i * 1_000_000, message) for i, message in enumerate(messages)])
+
+
+@pytest.fixture
+def log_path(tmp_path: Path) -> Path:
+    path = tmp_path / "run.mcap"
+    with RunLogWriter(path, {"run": {"configuration": "", "path": "joint.toml"}, "drive": {"serial": "7"}}) as log:
+        records = run_records()
+        log.write_frames(some_frames()[:2])
+        log.write_records(records[:300])
+        for event in EventFinder().take(records):
+            log.write_event(event.level, event.source, event.text, event.time_ns)
+        log.write_frames(some_frames()[2:])
+        log.write_records(records[300:])
+    return path
+
+
+def spoken(verb: Any, *arguments: Any, **options: Any) -> Any:
+    """What the verb says with --json."""
+    out = io.StringIO()
+    assert verb(arguments[0], Output(json=True, stdout=out, stderr=io.StringIO()), *arguments[1:], **options) == 0
+    return json.loads(out.getvalue())
+
+
+def test_info_tells_what_the_log_holds(log_path: Path) -> None:
+    data = spoken(log_info, log_path)
+    assert (data["records"], data["missing_records"], data["can_frames"], data["complete"]) == (400, 0, 5, True)
+    assert data["configuration"] == "joint.toml"
+    assert data["drive"]["serial"] == "7"
+    assert data["summary"]["cycles"] == 400
+    assert [e["text"] for e in data["event_list"] if e["source"] == "loop"] == [
+        "waiting", "enabling", "tracking", "finished",
+    ]  # fmt: skip
+    out = io.StringIO()
+    assert log_info(log_path, Output(stdout=out, stderr=io.StringIO())) == 0
+    for text in ("missing records", "operation enabled", "joint.toml", "RMSE"):
+        assert text in out.getvalue()
+
+
+def test_info_of_a_log_that_was_cut_off_says_so(log_path: Path) -> None:
+    log_path.write_bytes(log_path.read_bytes()[:-400])
+    err = io.StringIO()
+    assert log_info(log_path, Output(json=True, stdout=io.StringIO(), stderr=err)) == 0
+    assert "cut off" in err.getvalue()
+
+
+def test_missing_records_are_jumps_of_the_cycle_that_were_not_skipped() -> None:
+    records = run_records()
+    assert missing_records(records) == 0
+    records.cycle[200:] += 3
+    assert missing_records(records) == 3
+    records.skipped[200] = 2
+    assert missing_records(records) == 1
+    records.skipped[200] = 3
+    assert missing_records(records) == 0
+    assert missing_records(records[:1]) == 0
+
+
+def test_csv_has_every_digit_of_every_field(log_path: Path) -> None:
+    target = Path(spoken(log_export, log_path, "csv")["file"])
+    with target.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    records = run_records()
+    assert len(rows) == 400
+    for name in ("position_rad", "error_rad", "trajectory_s"):
+        np.testing.assert_array_equal([float(row[name]) for row in rows], records[name])
+    np.testing.assert_array_equal([int(row["time_ns"]) for row in rows], records.time_ns)
+    np.testing.assert_array_equal([float(row["weights_14"]) for row in rows], records.weights[:, 14])
+
+
+def test_npz_holds_the_records_and_the_events(log_path: Path) -> None:
+    target = Path(spoken(log_export, log_path, "npz")["file"])
+    with np.load(target) as arrays:
+        for name in LogRecord.__annotations__:
+            np.testing.assert_array_equal(arrays[name], run_records()[name], err_msg=name)
+        assert "loop: tracking" in arrays["event_text"].tolist()
+
+
+def test_candump_is_read_by_python_can(log_path: Path) -> None:
+    answer = spoken(log_export, log_path, "candump")
+    assert answer["rows"] == 5
+    with can.CanutilsLogReader(answer["file"]) as reader:
+        read = list(reader)
+    assert [m.arbitration_id for m in read if not m.is_error_frame] == [0x80, 0x80, 0x701, 0x181]
+    assert " 20000084#0000000000000000\n" in Path(answer["file"]).read_text()  # python-can drops the class of an error
+    assert [m.is_extended_id for m in read[:3]] == [False, True, False]
+    assert [m.is_remote_frame for m in read] == [False, False, True, False, False]
+    assert [m.is_error_frame for m in read] == [False, False, False, True, False]
+    assert bytes(read[4].data) == bytes(range(0xF8, 0x100))
+    steps_s = np.diff([m.timestamp for m in read])
+    np.testing.assert_allclose(steps_s, 1e-3, atol=2e-6)
+
+
+def test_a_ros_2_decoder_reads_the_frames(log_path: Path) -> None:
+    with log_path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        messages = [m for _, channel, _, m in reader.iter_decoded_messages() if channel.topic == "/can"]
+    assert [(m.id, m.is_extended, m.is_rtr, m.is_error, m.dlc) for m in messages] == [
+        (0x80, False, False, False, 0), (0x80, True, False, False, 1), (0x701, False, True, False, 1),
+        (0x84, True, False, True, 8), (0x181, False, False, False, 8),
+    ]  # fmt: skip
+    assert bytes(messages[4].data) == bytes(range(0xF8, 0x100))
+    assert (messages[4].header.stamp.sec, messages[4].header.stamp.nanosec) == (5, 4_000_000)
+    np.testing.assert_array_equal(read_run_log(log_path).frames, some_frames())
+
+
+def test_parquet_without_pyarrow_says_what_to_install(log_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(DataError, match="needs the package pyarrow") as caught:
+        log_export(log_path, Output(stdout=io.StringIO()), "parquet")
+    assert "npz" in caught.value.hint
+    assert not log_path.with_suffix(".parquet").exists()
+
+
+@pytest.mark.parametrize("format", ["", "xlsx", "CSV"])
+def test_a_format_that_is_none_is_refused(log_path: Path, format: str) -> None:
+    with pytest.raises(DataError, match=r"format .* must be one of csv, npz, parquet, candump"):
+        log_export(log_path, Output(), format)
+
+
+@pytest.mark.parametrize("format", ["csv", "npz", "candump"])
+def test_the_log_itself_is_never_overwritten(log_path: Path, format: str) -> None:
+    before = log_path.read_bytes()
+    with pytest.raises(DataError, match="log itself"):
+        log_export(log_path, Output(), format, log_path.parent / "." / "run.mcap")
+    with pytest.raises(DataError, match="no folder"):
+        log_export(log_path, Output(), format, log_path.parent / "none" / "x")
+    with pytest.raises(DataError, match="log itself"):
+        log_plot(log_path, Output(), log_path)
+    assert log_path.read_bytes() == before
+    assert format in FORMATS
+
+
+def test_candump_of_a_log_without_frames_tells_how_to_get_them(tmp_path: Path) -> None:
+    with RunLogWriter(tmp_path / "run.mcap", {}) as log:
+        log.write_records(run_records())
+    with pytest.raises(DataError, match="no CAN frames") as caught:
+        log_export(tmp_path / "run.mcap", Output(), "candump")
+    assert "log.frames" in caught.value.hint
+
+
+def test_plot_writes_a_png(log_path: Path) -> None:
+    assert Path(spoken(log_plot, log_path)["picture"]).read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_hundred_thousand_records_with_frames_between_them_all_come_back(tmp_path: Path) -> None:
+    path, size = tmp_path / "long.mcap", 20
+    with RunLogWriter(path, {}) as log:
+        for first in range(0, 100_000, 5000):
+            piece = run_records(5000, first + 1)
+            for at in range(0, 5000, size):
+                log.write_records(piece[at : at + size])
+                log.write_frames(some_frames()[:1] if at % 1000 else some_frames())
+    read = read_run_log(path)
+    assert read.complete
+    assert missing_records(read.records) == 0
+    np.testing.assert_array_equal(read.records.cycle, np.arange(100_000) + 2)
+    assert len(read.frames) == 5000 * 1 + 100 * 4
+
+
+@pytest.mark.parametrize("size", [1, 7, 20, 400])
+def test_events_are_the_same_whatever_the_pieces(size: int) -> None:
+    finder, records = EventFinder(), run_records()
+    found = [event for at in range(0, 400, size) for event in finder.take(records[at : at + size])]
+    assert [(event.time_ns - START_NS, event.source, event.text) for event in found] == [
+        (0, "drive", "switch on disabled (statusword 0250h)"),
+        (0, "loop", "waiting"),
+        (20_000_000, "drive", "switched on (statusword 0233h)"),
+        (20_000_000, "loop", "enabling"),
+        (30_000_000, "drive", "operation enabled (statusword 1237h)"),
+        (30_000_000, "loop", "tracking"),
+        (350_000_000, "drive", "switch on disabled (statusword 0250h)"),
+        (350_000_000, "loop", "finished"),
+    ]
+
+
+def test_a_bit_that_changes_no_state_is_no_event() -> None:
+    records = run_records()
+    records.status_word[100:200] ^= 0x0400  # target reached
+    assert len(EventFinder().take(records)) == 8
+
+
+def test_a_fault_is_told_with_code_cause_and_state() -> None:
+    records = run_records()
+    records.fault[200:] = Fault.DRIVE_FAULT
+    records.drive_error[200:] = 0x8130
+    records.drive_state[200:] = DriveState.FAULT
+    records.status_word[200:] = WORDS[DriveState.FAULT]
+    finder = EventFinder(fault_words=lambda fault, error: f"{fault.name} and {error:x}")
+    texts = [(event.level, event.text) for event in finder.take(records) if event.time_ns == START_NS + 200_000_000]
+    assert texts == [
+        (40, "EMCY 8130h, heartbeat lost"),
+        (30, "fault (statusword 0218h)"),
+        (40, "DRIVE_FAULT (8): DRIVE_FAULT and 8130"),
+    ]
+
+
+@pytest.mark.parametrize(("skipped", "told"), [(0, 0), (OVERRUN_CYCLES - 1, 0), (OVERRUN_CYCLES, 1), (500, 1)])
+def test_a_long_overrun_is_an_event(skipped: int, told: int) -> None:
+    records = run_records()
+    records.skipped[100] = skipped
+    assert sum("skipped" in event.text for event in EventFinder().take(records)) == told
+
+
+@pytest.mark.parametrize(
+    ("code", "name"),
+    [(0x8130, "heartbeat lost"), (0x8199, "communication"), (0x2FFF, "current"), (0xFF77, "maker"), (0x00FF, "not in")],
+)
+def test_an_unknown_emergency_code_is_told_by_its_class(code: int, name: str) -> None:
+    assert name in emergency_text(code)
+    assert f"{code:04X}h" in emergency_text(code)
+
+
+@pytest.mark.parametrize(("queue", "kept"), [(10, 10), (9, 9), (1000, 10)])
+def test_a_recorder_that_nobody_fetches_from_drops_and_counts(queue: int, kept: int) -> None:
+    with can.Bus(interface="virtual", channel=f"recorder {queue}") as sender:
+        recorder = FrameRecorder(can.Bus(interface="virtual", channel=f"recorder {queue}"), queue)
+        try:
+            for number in range(10):
+                sender.send(can.Message(arbitration_id=number, is_extended_id=False))
+            waiter = threading.Event()
+            for _ in range(500):
+                if recorder.dropped + len(recorder._queue) == 10:
+                    break
+                waiter.wait(0.01)
+            found = recorder.new_frames()
+        finally:
+            recorder.close()
+    assert [message.arbitration_id for _, message in found] == list(range(kept))
+    assert recorder.dropped == 10 - kept
+    times = frame_times_ns(frame_array(found))
+    assert np.all(np.diff(times) >= 0)
+    assert recorder.new_frames() == []
+
+
+def test_frames_of_a_serial_line_are_refused(virtual_config: Any) -> None:
+    bus = virtual_config.bus.model_copy(update={"interface": "serial"})
+    log = virtual_config.log.model_copy(update={"frames": True})
+    serial = virtual_config.model_copy(update={"bus": bus, "log": log})
+    with pytest.raises(ConfigurationError, match=r"log.frames \(=true\)"), recording(serial):
+        pass
+    with recording(virtual_config) as recorder:
+        assert recorder is None

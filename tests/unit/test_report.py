@@ -1,0 +1,261 @@
+"""Reports: self-contained, escaped, well-formed; two runs are compared at the same trajectory time."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.errors import DataError
+from firmware_py.records import LogRecord
+from firmware_py.schema import new
+from firmware_py.states import AxisPhase, DriveState, Fault
+from tools.output import Output
+from tools.report import MOST_LOGS, log_names, report, verdict
+from tools.reporting.comparison import aligned, at_times
+from tools.reporting.figure import COLOURS, draw
+from tools.reporting.page import Details, Figure, Paragraph, Section, Table, page, write_page
+from tools.reporting.run_figures import binned, friction_points, run_figures
+from tools.run_log import INFO, RunLogWriter
+from tools.run_summary import summarise
+
+VOID = {"meta", "img", "br", "link", "input", "hr"}
+
+
+class Checker(HTMLParser):
+    """Collects ids, addresses and tags that were not closed in order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.addresses: list[str] = []
+        self.tags: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.ids += [value or "" for name, value in attrs if name == "id"]
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href", "action")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def check(html: str) -> Checker:
+    """The page is well-formed, fetches nothing and runs nothing."""
+    checker = Checker()
+    checker.feed(html)
+    checker.close()
+    assert checker.open == []
+    assert len(checker.ids) == len(set(checker.ids))
+    targets = set(checker.ids)
+    for address in checker.addresses:
+        assert address.startswith("data:image/png;base64,") or address[1:] in targets, address
+    assert "script" not in checker.tags
+    assert not re.search(r"@import|url\(\s*['\"]?(?!#)", html)
+    for mark in re.findall(r"url\(#([^)]*)\)", html):
+        assert mark in targets
+    return checker
+
+
+def run_records(count: int = 3000, rate_Hz: float = 1000.0, from_s: float = 0.0) -> Any:
+    """TRACKING 0.3 sin(2 t) with an error of sin(5 t) mrad and a Coulomb friction of 15 Nm."""
+    records = new(LogRecord, count)
+    time_s = from_s + np.arange(count) / rate_Hz
+    records.cycle = np.arange(count)
+    records.time_ns = 10**12 + np.arange(count) * round(1e9 / rate_Hz)
+    records.trajectory_s = time_s
+    records.phase, records.drive_state, records.status_word = AxisPhase.TRACKING, DriveState.ENABLED, 0x1237
+    records.error_rad = 1e-3 * np.sin(5.0 * time_s)
+    records.desired_position_rad = 0.3 * np.sin(2.0 * time_s)
+    records.position_rad = records.desired_position_rad + records.error_rad
+    records.desired_velocity_radps = 0.6 * np.cos(2.0 * time_s)
+    records.velocity_radps = records.desired_velocity_radps
+    records.inertia_torque_Nm = -2.1 * 1.2 * np.sin(2.0 * time_s)
+    records.friction_torque_Nm = 14.0 * np.sign(records.desired_velocity_radps)
+    records.measured_torque_Nm = records.inertia_torque_Nm + 15.0 * np.sign(records.desired_velocity_radps)
+    records.command_torque_Nm = records.measured_torque_Nm
+    records.wake_late_ns, records.round_trip_ns, records.work_ns = 20_000, 90_000, 15_000
+    return records
+
+
+def write_log(path: Path, records: Any, configuration: str = "[control]\nkind = 'pid'\nkp = 1.0\n") -> Path:
+    with RunLogWriter(path, {"run": {"configuration": configuration, "path": "joint.toml"}}) as log:
+        log.write_records(records)
+        log.write_event(INFO, "loop", "tracking <b>", int(records.time_ns[0]))
+    return path
+
+
+def made(paths: list[Path], out: Path | None = None) -> str:
+    said = io.StringIO()
+    assert report(paths, Output(json=True, stdout=said, stderr=io.StringIO()), out) == 0
+    return Path(json.loads(said.getvalue())["report"]).read_text()
+
+
+def test_a_report_of_one_log_needs_nothing_else(tmp_path: Path) -> None:
+    html = made([write_log(tmp_path / "run.mcap", run_records())])
+    checker = check(html)
+    assert checker.tags.count("svg") == len(run_figures(run_records())) == 5
+    for text in ("error, RMSE [mrad]", "0.7", "wake-up late, p99 [us]", "joint.toml", "pid", "without a fault"):
+        assert text in html
+    assert "tracking &lt;b&gt;" in html
+    assert (tmp_path / "run.html").exists()
+
+
+def test_names_and_configurations_are_text_whatever_they_hold(tmp_path: Path) -> None:
+    evil = "</pre><script>alert(1)</script><img src=x onerror=y>"
+    path = write_log(tmp_path / "<i>&.mcap", run_records(), f'[control]\nkind = "{evil}"\n')
+    html = made([path])
+    check(html)
+    assert "<script" not in html
+    assert "&lt;script&gt;" in html
+
+
+def test_a_fault_is_the_first_thing_said(tmp_path: Path) -> None:
+    records = run_records()
+    records.fault[2000:] = Fault.FOLLOWING_ERROR
+    html = made([write_log(tmp_path / "run.mcap", records)])
+    assert "ended by the fault FOLLOWING_ERROR" in html
+    assert "FOLLOWING_ERROR at 2.000 s" in html
+    assert "ended by the fault" not in verdict("run", summarise(run_records()))
+
+
+def test_only_what_was_used_is_drawn() -> None:
+    def drawn(records: Any) -> str:
+        return " ".join(figure.alt for figure in run_figures(records))
+
+    records = run_records()
+    assert "Network" not in drawn(records)
+    assert "Observer" not in drawn(records)
+    records.network_torque_Nm = 1.0
+    records.observer_torque_Nm = 2.0
+    assert "Network" in drawn(records)
+    assert "Observer" in drawn(records)
+    records.desired_velocity_radps = 0.0
+    assert "over velocity" not in drawn(records)
+
+
+def test_a_run_that_never_tracked_is_reported_too(tmp_path: Path) -> None:
+    records = run_records()
+    records.phase = AxisPhase.WAITING
+    html = made([write_log(tmp_path / "run.mcap", records)])
+    check(html)
+    assert "never tracked" in html
+
+
+def test_colours_follow_the_page(tmp_path: Path) -> None:
+    html = made([write_log(tmp_path / "run.mcap", run_records())])
+    body = html[html.index("<svg") :]
+    assert "var(--blue)" in body
+    assert not [colour for colour in COLOURS.values() if colour in body]
+    for name in COLOURS:
+        assert html.count(f"--{name}: ") == 3  # light, dark, print
+
+
+def test_two_runs_are_compared_at_the_same_trajectory_time(tmp_path: Path) -> None:
+    first, second = run_records(), run_records(900, rate_Hz=500.0, from_s=0.5)
+    second.time_ns += 77_000_000_000  # another day: only trajectory time counts
+    rows, chosen = aligned(first, second)
+    assert rows.trajectory_s[0] == pytest.approx(0.5)
+    assert rows.trajectory_s[-1] == pytest.approx(0.5 + 899 / 500.0)
+    difference = at_times(second, chosen, "error_rad", rows.trajectory_s) - rows.error_rad
+    assert np.max(np.abs(difference)) < 2e-8  # of a straight line between samples: (5 * 0.002)**2 / 8 * 1e-3
+    paths = [write_log(tmp_path / "a.mcap", first), write_log(tmp_path / "b.mcap", second)]
+    html = made(paths)
+    check(html)
+    assert "difference" in html
+    assert "b less a" in html
+    assert "different motions" not in html
+    assert (tmp_path / "a.comparison.html").exists()
+
+
+def test_runs_that_cannot_be_compared_say_so(tmp_path: Path) -> None:
+    later, other = run_records(from_s=100.0), run_records()
+    other.desired_position_rad += 2e-3
+    first = write_log(tmp_path / "a.mcap", run_records())
+    assert "no trajectory time in common" in made([first, write_log(tmp_path / "b.mcap", later)])
+    assert "different motions" in made([first, write_log(tmp_path / "c.mcap", other)])
+
+
+@pytest.mark.parametrize("friction_Nm", [0.0, 15.0, -15.0])
+def test_the_friction_map_shows_what_is_left_of_the_torque(friction_Nm: float) -> None:
+    records = run_records()
+    records.gravity_torque_Nm = 3.0
+    push = friction_Nm * np.sign(records.desired_velocity_radps)
+    records.measured_torque_Nm = records.inertia_torque_Nm + 3.0 + push
+    directions = binned(*friction_points(records))
+    assert len(directions) == 2
+    for sign, rows in zip((-1.0, 1.0), directions, strict=True):
+        assert np.all(sign * rows[:, 0] > 0.0)
+        np.testing.assert_allclose(rows[:, 2], sign * friction_Nm, atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [0, MOST_LOGS + 1])
+def test_the_number_of_logs_is_limited(tmp_path: Path, count: int) -> None:
+    with pytest.raises(DataError, match=rf"number of logs \(={count}\) must be in \[1\.\.{MOST_LOGS}\]"):
+        report([tmp_path / "a.mcap"] * count, Output())
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_log_without_a_run_is_refused(tmp_path: Path, count: int) -> None:
+    path = tmp_path / "run.mcap"
+    with RunLogWriter(path, {}) as log:
+        log.write_records(run_records(2)[:count])
+    with pytest.raises(DataError, match=f"has {count} records"):
+        report([path], Output())
+    assert not (tmp_path / "run.html").exists()
+
+
+def test_a_report_never_overwrites_a_log(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "run.html", run_records())
+    before = path.read_bytes()
+    with pytest.raises(DataError, match="is an input"):
+        report([path], Output())
+    with pytest.raises(DataError, match=r"must end in \.html"):
+        report([path], Output(), tmp_path / "run.txt")
+    with pytest.raises(DataError, match="no folder"):
+        report([path], Output(), tmp_path / "none" / "run.html")
+    assert path.read_bytes() == before
+
+
+def test_logs_of_one_name_are_told_apart() -> None:
+    assert log_names([Path("a/run.mcap"), Path("b/run.mcap"), Path("c.mcap")]) == ["run (1)", "run (2)", "c"]
+
+
+def test_the_page_takes_every_block(tmp_path: Path) -> None:
+    table = Table(["<name>", "value"], [["a", "1.5"], ["b", "-2 %"]], "caption", {1: "error"})
+    picture = Figure("a dot", png=b"\x89PNG")
+    blocks = [Paragraph("5 < 6"), table, picture, Details("more", "<x>"), draw(1.0, lambda f: f.subplots(), "axes")]
+    html = page("T & T", [Section("One", blocks), Section("Two", [draw(1.0, lambda f: f.subplots(), "again")])])
+    check(html)
+    for text in (
+        "T &amp; T",
+        "5 &lt; 6",
+        "&lt;name&gt;",
+        'class="error"',
+        "data:image/png;base64,iVBORw==",
+        "&lt;x&gt;",
+    ):
+        assert text in html
+    assert write_page(tmp_path / "p.html", html).read_text() == html
+
+
+@pytest.mark.parametrize(
+    ("cells", "number"),
+    [(["1", "-2.5"], True), (["1e-3", "-"], True), (["5 %"], True), (["-"], False), (["1", "a"], False), ([], False)],
+)
+def test_columns_of_numbers_stand_right(cells: list[str], number: bool) -> None:
+    assert Table(["x"], [[cell] for cell in cells]).is_number(0) is number

@@ -1,0 +1,1 @@
+"""Paired measurements of speed: ours against C, numpy and other loops."""

@@ -1,0 +1,127 @@
+"""How far and how fast the joint may get, and how long it may take: limits plus a derived stopping distance.
+
+The loop reacts when a measured value passes its limit.  Until the reaction has begun, `t` later, the motor may push
+with all that the drive allows in the worst direction, and friction is not counted on:
+
+    a = (torque limit of the drive + ripple + added load) / J
+    v1 = v_max + a t                     the greatest speed
+    x1 = v_max t + a t^2 / 2             the way until then
+
+From then on the joint is braked by at least its own Coulomb friction F, the weakest of the reactions (power off), less
+the ripple, or, under an added load, by the drive's quick stop with what the load leaves of it:
+
+    d = (F - ripple) / J,   x2 = v1^2 / (2 d)
+
+`t` is `REACTION_s` where the loop measures and is heard: one period each for sample and command, the velocity filter
+(three time constants, 5 ms) and the motor's delay and lag.  Where the drive does not hear the loop it holds the last
+torque until its own watchdog acts: age limit of the samples + UNHEEDED_MAX_CYCLES + drive.heartbeat_s.
+
+A reading that is wrong by w (jump, drift) shifts the true position by w.  Behind a stuck encoder the joint is blind
+until POSITION_FROZEN: it is pushed with at most frozen_torque_Nm for longer than PUSHED_CYCLES, 16 Nm more than the
+Coulomb friction, which the viscous part (18 Nm s/rad below the knee) balances at 0.9 rad/s; the pushed cycles with
+full torque add (60 - 13) Nm / J x 20 ms = 0.5 rad/s.  `BLIND_RADPS` is that and a quarter.
+Not covered: more than one fault at a time, a drive that applies torque by itself, a load greater than the friction
+for good (it needs a brake).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES
+from hil.faults import FaultKind
+from tools.campaign.scenario import Scenario
+from tools.config import Config
+
+REACTION_s = 0.010
+BLIND_RADPS = 1.8
+BLIND_RAD = 1.0
+BRAKE_SPARE_s = 1.0  # a quick stop of the virtual drive may end so much late
+STANDSTILL_RADPS = 0.02
+_UNHEARD = frozenset(
+    {
+        FaultKind.FRAMES_LOST, FaultKind.SYNC_LOST, FaultKind.RPDO_LOST, FaultKind.BUS_OFF, FaultKind.RPDO_LENGTH,
+        FaultKind.RPDO_DELAYED, FaultKind.TPDO_DELAYED, FaultKind.LOOP_HELD_UP,
+    }
+)  # fmt: skip
+_BLIND_FOR_A_WHILE = frozenset({FaultKind.TPDO_LOST, FaultKind.TPDO_LENGTH})
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """What must hold in every period of a scenario."""
+
+    position_min_rad: float
+    position_max_rad: float
+    velocity_max_radps: float
+    command_max_Nm: float
+    command_step_Nm: float
+    stop_s: float  # from the latched fault to power off and standstill, by quick stop or power off
+    ramp_s: float  # the same by a controlled ramp
+
+
+def reaction_s(config: Config, kind: FaultKind) -> float:
+    """Longest time from passing a limit to the beginning of the reaction."""
+    age_s = config.limits.sample_age_max_s
+    if kind in _UNHEARD:
+        unheeded_s = UNHEEDED_MAX_CYCLES / config.loop.rate_Hz
+        return REACTION_s + age_s + unheeded_s + config.canopen.heartbeat_s
+    if kind in _BLIND_FOR_A_WHILE:
+        return REACTION_s + age_s
+    return REACTION_s
+
+
+def _friction_floor_Nm(config: Config, scenario: Scenario) -> float:
+    """The least Coulomb friction at the joint, of the slower direction and with its ripple."""
+    friction, virtual = config.friction, config.virtual
+    assert friction is not None
+    assert virtual is not None
+    curves = (
+        abs(friction.positive.tc_Nm) * scenario.plant["friction_positive_scale"],
+        abs(friction.negative.tc_Nm) * scenario.plant["friction_negative_scale"],
+    )
+    return config.joint.reduction_ratio * min(curves) * (1.0 - virtual.friction_ripple)
+
+
+def envelope(config: Config, scenario: Scenario, constants: Any) -> Envelope:
+    """See the module; `constants` is the AxisConstants record of the scenario."""
+    limits, kind = constants.limits, scenario.kind
+    inertia = scenario.plant["inertia_kgm2"]
+    ripple = sum(scenario.plant["torque_ripple_Nm"])
+    load = abs(scenario.magnitude) if kind is FaultKind.LOAD_JUMP else 0.0
+    drive_Nm = config.canopen.max_torque_permille or 1000
+    drive_Nm *= 1e-3 * (config.canopen.rated_torque_Nm or 0.0) * config.joint.reduction_ratio
+    floor = _friction_floor_Nm(config, scenario) - ripple
+    wait_s = reaction_s(config, kind)
+    push = (drive_Nm + ripple + load) / inertia
+    speed = limits.velocity_max_radps + push * wait_s
+    brake = (min(floor, drive_Nm + floor - load) if load else floor) / inertia
+    way = limits.velocity_max_radps * wait_s + 0.5 * push * wait_s**2 + speed**2 / (2.0 * brake)
+    stop_s = wait_s + speed / brake + BRAKE_SPARE_s
+    if load > floor:  # after power off it moves the joint for the rest of its time
+        pushed = (load - floor) / inertia * scenario.duration_s
+        way += 0.5 * pushed * scenario.duration_s + pushed**2 / (2.0 * brake)
+        speed = max(speed, pushed)
+        stop_s += scenario.duration_s + pushed / brake
+    shift = 0.0
+    if kind is FaultKind.ENCODER_JUMP:
+        shift = abs(scenario.magnitude)
+    elif kind is FaultKind.ENCODER_DRIFT:
+        run_s = constants.sequence.approach_s + constants.trajectory.duration_s + config.sequence.stop_timeout_s
+        shift = abs(scenario.magnitude) * min(scenario.duration_s, run_s + 1.0)
+        speed += abs(scenario.magnitude)
+    elif kind is FaultKind.ENCODER_STUCK:
+        shift, speed = BLIND_RAD, max(speed, BLIND_RADPS)
+        stop_s += speed / brake
+    elif kind is FaultKind.ENCODER_REVERSED:
+        shift = 2.0 * limits.following_error_max_rad + way
+    return Envelope(
+        position_min_rad=limits.position_min_rad - way - shift,
+        position_max_rad=limits.position_max_rad + way + shift,
+        velocity_max_radps=speed,
+        command_max_Nm=limits.torque_max_Nm,
+        command_step_Nm=limits.torque_rate_max_Nmps * constants.law.period_s,
+        stop_s=stop_s,
+        ramp_s=config.sequence.stop_timeout_s + config.sequence.release_s + stop_s,
+    )

@@ -1,0 +1,118 @@
+"""What a campaign showed: a table by kind of fault, JSON with every violation, and a picture."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from tools.campaign.judge import Verdict
+from tools.campaign.scenario import draw_scenario
+
+
+@dataclass(frozen=True)
+class KindRow:
+    """All scenarios of one kind of fault."""
+
+    kind: str
+    scenarios: int
+    harmless: int
+    violations: int
+    causes: dict[str, int]  # told by the loop, without the harmless twins
+    peak_radps: float
+    beyond_rad: float
+    allowed_rad: float
+    longest_off_s: float
+
+
+def rows_by_kind(verdicts: Sequence[Verdict]) -> list[KindRow]:
+    """One row a kind, in order of the first scenario."""
+    rows = []
+    for kind in dict.fromkeys(verdict.kind for verdict in verdicts):
+        mine = [verdict for verdict in verdicts if verdict.kind == kind]
+        off = [verdict.off_s for verdict in mine if not math.isnan(verdict.off_s)]
+        rows.append(
+            KindRow(
+                kind=kind,
+                scenarios=len(mine),
+                harmless=sum(verdict.harmless for verdict in mine),
+                violations=sum(bool(verdict.violations) for verdict in mine),
+                causes=dict(Counter(verdict.fault for verdict in mine if not verdict.harmless).most_common()),
+                peak_radps=max(verdict.peak_radps for verdict in mine),
+                beyond_rad=max(verdict.beyond_rad for verdict in mine),
+                allowed_rad=max(verdict.allowed_rad for verdict in mine),
+                longest_off_s=max(off, default=0.0),
+            )
+        )
+    return rows
+
+
+def table(rows: Sequence[KindRow]) -> Table:
+    """For people."""
+    shown = Table(title="fault campaign")
+    for name, justify in (
+        ("fault", "left"), ("runs", "right"), ("harmless", "right"), ("violations", "right"), ("speed rad/s", "right"),
+        ("beyond limit rad", "right"), ("allowed rad", "right"), ("off after s", "right"), ("told as", "left"),
+    ):  # fmt: skip
+        shown.add_column(name, justify=justify)  # type: ignore[arg-type]
+    for row in rows:
+        causes = ", ".join(f"{name.lower()} {count}" for name, count in row.causes.items())
+        shown.add_row(
+            row.kind, str(row.scenarios), str(row.harmless), str(row.violations), f"{row.peak_radps:.2f}",
+            f"{row.beyond_rad:.3f}", f"{row.allowed_rad:.2f}", f"{row.longest_off_s:.3f}", causes,
+        )  # fmt: skip
+    return shown
+
+
+def violations(verdicts: Sequence[Verdict], seed: int) -> list[dict[str, Any]]:
+    """Everything that is needed to look at each violation again."""
+    return [
+        {**asdict(verdict), "scenario": draw_scenario(seed, verdict.number).describe()}
+        for verdict in verdicts
+        if verdict.violations
+    ]
+
+
+def write_json(path: Path, seed: int, verdicts: Sequence[Verdict], elapsed_s: float) -> None:
+    """Rows and violations."""
+    content = {
+        "seed": seed,
+        "scenarios": len(verdicts),
+        "elapsed_s": round(elapsed_s, 1),
+        "kinds": [asdict(row) for row in rows_by_kind(verdicts)],
+        "violations": violations(verdicts, seed),
+    }
+    text = json.dumps(content, indent=1, allow_nan=True).replace("NaN", "null")
+    path.write_text(text + "\n")
+
+
+def write_figure(path: Path, verdicts: Sequence[Verdict], velocity_max_radps: float) -> None:
+    """Speed reached and time until off, a column of points for each kind; violations in red."""
+    kinds = list(dict.fromkeys(verdict.kind for verdict in verdicts))
+    figure = Figure(figsize=(12.0, 8.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    speed, off = figure.subplots(2, 1, sharex=True)
+    for place, kind in enumerate(kinds):
+        mine = [verdict for verdict in verdicts if verdict.kind == kind]
+        for i, verdict in enumerate(mine):
+            across = place - 0.3 + 0.6 * i / max(len(mine) - 1, 1)
+            colour = "tab:red" if verdict.violations else "tab:green" if verdict.harmless else "tab:blue"
+            speed.plot(across, verdict.peak_radps, ".", color=colour, markersize=2.5)
+            if not math.isnan(verdict.off_s):
+                off.plot(across, max(verdict.off_s, 1e-3), ".", color=colour, markersize=2.5)
+    speed.axhline(velocity_max_radps, color="black", linewidth=0.8, linestyle="--", label="velocity limit")
+    speed.set_ylabel("greatest speed [rad/s]")
+    speed.legend()
+    off.set_ylabel("off and at rest after the fault [s]")
+    off.set_yscale("log")
+    off.set_xticks(range(len(kinds)), kinds, rotation=70, ha="right", fontsize=8)
+    speed.set_title("harmful faults blue, harmless twins green, violations red")
+    figure.savefig(path, dpi=120)
