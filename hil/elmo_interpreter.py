@@ -9,12 +9,30 @@ and the limits that real drives put on the order in which HL, LL, VH and VL may 
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from firmware_py.schema import new
+from hil.elmo_commands import (
+    AMPLIFIER_NOT_READY,
+    BAD_COMMAND,
+    BAD_INDEX,
+    BAD_UNIT_MODE,
+    COMMAND,
+    INDEXED,
+    MOTOR_FIELDS,
+    MOTOR_MUST_BE_OFF,
+    MOTOR_MUST_BE_ON,
+    NOT_ASSIGNABLE,
+    NOT_IN_THIS_MODE,
+    NUMBER,
+    OUT_OF_LIMIT,
+    OUT_OF_RANGE,
+    SYNTAX,
+    WHOLE,
+    ElmoDeviceSettings,
+    RefusedCommandError,
+)
 from hil.elmo_motor import (
     SPEED_BANDWIDTH_RADPS,
     UM_POSITION,
@@ -23,43 +41,11 @@ from hil.elmo_motor import (
     ElmoMotor,
     advance_motor,
     position_counts,
+    status_register,
     switch_off,
 )
 
-BAD_COMMAND, BAD_INDEX, NOT_IN_THIS_MODE, SYNTAX, OUT_OF_RANGE = 2, 3, 12, 19, 21
-NOT_ASSIGNABLE, OUT_OF_LIMIT, MOTOR_MUST_BE_OFF, MOTOR_MUST_BE_ON, BAD_UNIT_MODE = 23, 28, 57, 58, 60
-AMPLIFIER_NOT_READY = 66
 SUBSTEPS_AT_ONCE_S = 2.0  # after a longer sleep of this process, time is lost rather than caught up
-_COMMAND = re.compile(r"([A-Z]{2})(?:\[(\d{1,4})\])?(?:=(.*))?", re.ASCII)
-_NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-_MOTOR_FIELDS = {
-    ("CL", 1): "continuous_A", ("PL", 1): "peak_A", ("PL", 2): "peak_s",
-    ("HL", 2): "speed_high_cps", ("LL", 2): "speed_low_cps",
-    ("HL", 3): "position_high_counts", ("LL", 3): "position_low_counts",
-    ("ER", 2): "speed_error_cps", ("ER", 3): "position_error_counts",
-    ("SP", 0): "profile_cps", ("AC", 0): "acceleration_cps2", ("DC", 0): "deceleration_cps2",
-}  # fmt: skip
-_WHOLE = frozenset(("HL", "LL", "ER", "SP", "AC", "DC"))
-_INDEXED = frozenset(("CL", "PL", "HL", "LL", "ER", "VL", "VH", "CA"))
-
-
-class RefusedCommandError(Exception):
-    """Carries the error code."""
-
-    def __init__(self, code: int) -> None:
-        super().__init__(code)
-        self.code = code
-
-
-@dataclass(frozen=True, kw_only=True)
-class ElmoDeviceSettings:
-    """The virtual drive itself; what the joint is like is in the plant."""
-
-    version: str = "Whistle 1.01.06.22 31Oct2006"
-    maximum_current_A: float = 20.0  # MC
-    counts_per_turn: int = 524288  # CA[18]
-    current_sign: int = 1  # -1: positive current drives the counts down
-    power_on_unit_mode: int = UM_POSITION
 
 
 class ElmoInterpreter:
@@ -119,17 +105,17 @@ class ElmoInterpreter:
     def _reply(self, text: str) -> str:
         if not text:
             return ""
-        match = _COMMAND.fullmatch(text)
+        match = COMMAND.fullmatch(text)
         if match is None:
             raise RefusedCommandError(SYNTAX)
         name, index_text, value_text = match.groups()
-        if (index_text is not None) != (name in _INDEXED):
-            known = name in _INDEXED or name in _HANDLERS or (name, 0) in {**_MOTOR_FIELDS, **self._plain}
+        if (index_text is not None) != (name in INDEXED):
+            known = name in INDEXED or name in _HANDLERS or (name, 0) in {**MOTOR_FIELDS, **self._plain}
             raise RefusedCommandError(BAD_INDEX if known else BAD_COMMAND)
         index = int(index_text or 0)
         value = None
         if value_text is not None:
-            if not _NUMBER.fullmatch(value_text):
+            if not NUMBER.fullmatch(value_text):
                 raise RefusedCommandError(SYNTAX)
             value = float(value_text)
         handler = _HANDLERS.get(name)
@@ -138,16 +124,16 @@ class ElmoInterpreter:
         return self._parameter(name, index, value)
 
     def _parameter(self, name: str, index: int, value: float | None) -> str:
-        field = _MOTOR_FIELDS.get((name, index))
+        field = MOTOR_FIELDS.get((name, index))
         if (name, index) == ("CA", 18):
             return self._constant(value, self.settings.counts_per_turn)
         if (name, index) in (("VL", 2), ("VH", 2)):
             return self._constant(value, round(float(self.m.speed_low_cps if name == "VL" else self.m.speed_high_cps)))
         if field is None and (name, index) not in self._plain:
-            raise RefusedCommandError(BAD_INDEX if name in _INDEXED else BAD_COMMAND)
+            raise RefusedCommandError(BAD_INDEX if name in INDEXED else BAD_COMMAND)
         if value is None:
             number = float(getattr(self.m, field)) if field else self._plain[(name, index)]
-            return str(round(number)) if name in _WHOLE or field is None else f"{number:.4f}"
+            return str(round(number)) if name in WHOLE or field is None else f"{number:.4f}"
         self._check(name, index, value)
         if field:
             setattr(self.m, field, value)
@@ -284,12 +270,7 @@ class ElmoInterpreter:
 
     def status(self) -> int:
         """SR."""
-        m = self.m
-        moving = int(m.moving) if m.motor_on else 0
-        return (
-            self.amplifier | int(m.motor_on) << 4 | int(m.motor_fault != 0) << 6 | int(m.unit_mode) << 7
-            | int(m.limited) << 13 | moving * 2 << 14
-        )  # fmt: skip
+        return status_register(self.m, self.amplifier)
 
     def speed_cps(self) -> float:
         """VX."""

@@ -143,3 +143,10 @@ def advance_motor(m: ElmoMotor, c: PlantConstants, s: PlantState, substeps: int)
 def position_counts(c: PlantConstants, s: PlantState) -> int:
     """PX."""
     return encoder_counts(c, s)
+
+
+def status_register(m: ElmoMotor, amplifier: int) -> int:
+    """SR: amplifier in bits 0-3, servo on, fault latched, unit mode, current limited, motion status."""
+    moving = int(m.moving) if m.motor_on else 0
+    on, fault = int(m.motor_on), int(m.motor_fault != 0)
+    return amplifier | on << 4 | fault << 6 | int(m.unit_mode) << 7 | int(m.limited) << 13 | moving * 2 << 14

@@ -21,7 +21,8 @@ from firmware_py.schema import new
 from hil.actuator import step_current, torque_ripple_Nm
 from hil.encoder import encoder_counts
 from hil.friction import advance
-from hil.plant_records import EncoderSide, FrictionKind, PlantConstants, PlantSettings, PlantState, decay
+from hil.plant_records import EncoderSide, FrictionKind, PlantConstants, PlantState
+from hil.plant_settings import PlantSettings, decay
 
 __all__ = ["R1", "EncoderSide", "FrictionKind", "PlantSettings", "encoder_counts", "plant", "step_plant"]
 

@@ -15,7 +15,7 @@ from pydantic_core import PydanticCustomError
 from drivers.elmo.line_budget import highest_rate_Hz
 from drivers.elmo.settings import ElmoSettings
 from drivers.errors import ConfigurationError
-from hil.elmo_interpreter import ElmoDeviceSettings
+from hil.elmo_commands import ElmoDeviceSettings
 from tools.config_sections import Ampere, Direction, Section, between
 
 if TYPE_CHECKING:

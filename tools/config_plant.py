@@ -15,7 +15,8 @@ from pydantic_core import PydanticCustomError
 
 from firmware_py.schema import new
 from hil.faults import LOCKSTEP_ONLY, MAX_FAULTS, FaultConstants, FaultKind, no_faults
-from hil.plant_records import EncoderSide, FrictionKind, PlantSettings
+from hil.plant_records import EncoderSide, FrictionKind
+from hil.plant_settings import PlantSettings
 from tools.config_sections import Friction, Section, between
 
 if TYPE_CHECKING:

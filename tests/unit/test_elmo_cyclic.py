@@ -16,7 +16,8 @@ from drivers.elmo.port import EXPECTED_MAX, LINE_MAX, PORT_GONE, ElmoPort, Quest
 from firmware_py.records import Command, Sample
 from firmware_py.schema import new
 from firmware_py.states import DriveRequest, DriveState
-from hil.elmo_interpreter import ElmoDeviceSettings, ElmoInterpreter
+from hil.elmo_commands import ElmoDeviceSettings
+from hil.elmo_interpreter import ElmoInterpreter
 from hil.elmo_motor import switch_off
 from hil.joint import plant
 

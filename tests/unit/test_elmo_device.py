@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 import serial
 
+from hil.elmo_commands import ElmoDeviceSettings
 from hil.elmo_device import ElmoDevice
-from hil.elmo_interpreter import ElmoDeviceSettings, ElmoInterpreter
+from hil.elmo_interpreter import ElmoInterpreter
 from hil.elmo_motor import MF_OVERSPEED, MF_POSITION_LIMIT, MF_SPEED_ERROR
 from hil.joint import plant
 
