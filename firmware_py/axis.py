@@ -19,6 +19,7 @@ from firmware_py.sequence import (
     enter,
     powered,
     react,
+    released_torque_Nm,
     request_stop,
     step_enabling,
     step_stopping,
@@ -177,20 +178,10 @@ def _check_motion(constants: AxisConstants, state: AxisState) -> None:
 
 
 @kernel
-def _released_torque_Nm(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> float:
-    """RELEASING: the last torque along a straight line to zero."""
-    left_cycles = constants.sequence.release_s / constants.law.period_s - state.phase_cycle
-    if left_cycles <= 0.0:
-        enter(state, AxisPhase.DISABLING)
-        return 0.0
-    return state.command_torque_Nm * left_cycles / (left_cycles + elapsed_cycles)
-
-
-@kernel
 def _command_torque(constants: AxisConstants, state: AxisState, table: np.ndarray, elapsed_cycles: int) -> None:
     """The torque of this cycle; a torque that is not finite is never sent."""
     if state.phase == AxisPhase.RELEASING:
-        state.unlimited_torque_Nm = _released_torque_Nm(constants, state, elapsed_cycles)
+        state.unlimited_torque_Nm = released_torque_Nm(constants, state, elapsed_cycles)
     elif powered(state.phase):
         epoch, repeat_s, local_s = 0, 0.0, 0.0
         if state.phase == AxisPhase.TRACKING:

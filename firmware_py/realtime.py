@@ -134,18 +134,22 @@ def run_loop(
         supervisor_age = (wake_ns - load_acquire(words, Word.SUPERVISOR_NS)) // period_ns
         step_axis(axis, now_state, table, sample[0], command[0], elapsed_cycles, stop_request, supervisor_age)
         send(port, frames, sample, command)
+        round_trip_ns = waited_ns
+        if 0 < sample[0].time_ns <= wake_ns:
+            # it answers an earlier SYNC and came between the cycles: without this the delay would look shorter
+            round_trip_ns += elapsed_cycles * period_ns
         end_ns = monotonic_ns(timespec)
         head = load_acquire(words, Word.HEAD)
         record = ring[head % len(ring)]
         write_log(record, now_state, sample[0], command[0])
         record.time_ns = deadline_ns
         record.wake_late_ns = min(late_ns, 2147483647)
-        record.round_trip_ns = waited_ns if now_state.sample_age_cycles == 0 else 0
-        record.work_ns = end_ns - wake_ns - waited_ns
-        record.skipped = elapsed_cycles - 1
+        record.round_trip_ns = min(round_trip_ns, 2147483647) if now_state.sample_age_cycles == 0 else 0
+        record.work_ns = min(end_ns - wake_ns - waited_ns, 2147483647)
+        record.skipped = min(elapsed_cycles - 1, 2147483647)
         count(histograms, Histogram.WAKE, late_ns)
         if now_state.sample_age_cycles == 0:
-            count(histograms, Histogram.ROUND_TRIP, waited_ns)
+            count(histograms, Histogram.ROUND_TRIP, round_trip_ns)
         count(histograms, Histogram.WORK, end_ns - wake_ns - waited_ns)
         store_release(words, Word.SKIPPED, load_acquire(words, Word.SKIPPED) + elapsed_cycles - 1)
         store_release(words, Word.HEAD, head + 1)

@@ -151,6 +151,16 @@ def step_enabling(constants: AxisConstants, state: AxisState, sample: Sample, ta
 
 
 @kernel
+def released_torque_Nm(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> float:
+    """RELEASING: the last torque along a straight line to zero."""
+    left_cycles = constants.sequence.release_s / constants.law.period_s - state.phase_cycle
+    if left_cycles <= 0.0:
+        enter(state, AxisPhase.DISABLING)
+        return 0.0
+    return state.command_torque_Nm * left_cycles / (left_cycles + elapsed_cycles)
+
+
+@kernel
 def step_stopping(constants: AxisConstants, state: AxisState, sample: Sample) -> None:
     """QUICK_STOPPING and DISABLING end when the drive says that its power stage is off, or when it never does."""
     off = sample.drive_state == DriveState.OFF or sample.drive_state == DriveState.FAULT

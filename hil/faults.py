@@ -16,8 +16,7 @@ import numpy as np
 
 from firmware_py.kernel import kernel
 from firmware_py.schema import array_of, dtype_of, f8, i4, i8, new, record, u1
-from hil.device_records import int64
-from hil.frames import FRAME_SIZE, QUEUE_LENGTH, FrameQueue
+from hil.frames import FRAME_SIZE, FrameQueue
 from hil.plant_records import u8
 
 MAX_FAULTS = 8
@@ -134,7 +133,8 @@ def is_active(fault: FaultConstants, memory: FaultMemory, now_ns: int) -> bool:
 @kernel
 def kind_active(faults: np.ndarray, memory: FaultMemory, kind: int, now_ns: int) -> bool:
     """Whether any fault of this kind is present."""
-    for i in range(len(faults)):
+    found = False
+    for i in range(len(faults)):  # numba knows no any() over a generator
         if faults[i].kind == kind and is_active(faults[i], memory, now_ns):
-            return True
-    return False
+            found = True
+    return found

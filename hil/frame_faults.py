@@ -38,7 +38,7 @@ def frame_class(frame: np.ndarray, to_drive: bool, node_id: int) -> FrameClass:
             return FrameClass.SYNC
         if identifier == 0x200 + node_id:
             return FrameClass.RPDO
-        if 0x700 < identifier and identifier <= 0x77F:
+        if identifier > 0x700 and identifier <= 0x77F:
             return FrameClass.CONTROLLER_HEARTBEAT
         return FrameClass.OTHER
     if identifier == 0x180 + node_id:
@@ -120,7 +120,7 @@ def _concerned(kind: int, of: int) -> bool:
         return of == FrameClass.RPDO
     if kind == FaultKind.TPDO_LOST:
         return of == FrameClass.TPDO
-    if FaultKind.RPDO_DELAYED <= kind and kind <= FaultKind.TPDO_LENGTH:
+    if kind >= FaultKind.RPDO_DELAYED and kind <= FaultKind.TPDO_LENGTH:
         return of == (FrameClass.RPDO if (kind - FaultKind.RPDO_DELAYED) % 2 == 0 else FrameClass.TPDO)
     return False
 

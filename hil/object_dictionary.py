@@ -67,7 +67,11 @@ class Entry:
 def load_entries(eds_path: Path, node_id: int) -> dict[tuple[int, int], Entry]:
     """Read the EDS; $NODEID is resolved."""
     entries: dict[tuple[int, int], Entry] = {}
-    for item in canopen.import_od(str(eds_path), node_id=node_id).values():
+    try:
+        dictionary = canopen.import_od(str(eds_path), node_id=node_id)
+    except Exception as error:  # the library lets every exception of its parsers through
+        raise ValueError(f"{eds_path.name}: not a readable EDS file: {' '.join(str(error).split())}") from None
+    for item in dictionary.values():
         for variable in [item] if isinstance(item, ODVariable) else item.values():
             key = (variable.index, variable.subindex)
             if variable.data_type not in _TYPES and variable.data_type != _VISIBLE_STRING:
@@ -121,7 +125,12 @@ class ObjectDictionary:
                     f"{eds_path.name}: type of {key[0]:04X}:{key[1]} (={self.entries[key].dtype}) "
                     f"must be {self._live[key].dtype}"
                 )
-            self.set_default(*key, int(self.entries[key].default))
+            default = self.entries[key].default
+            try:
+                self.set_default(*key, int(default))
+            except (ValueError, OverflowError):
+                place, kind = f"{key[0]:04X}:{key[1]}", self._live[key].dtype
+                raise ValueError(f"{eds_path.name}: DefaultValue of {place} (={default}) must be a {kind}") from None
         self.restore_strings()
 
     def __iter__(self) -> Iterator[Entry]:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from drivers.errors import JointctlError
-from tools import cli_experiments, cli_friction
+from tools import cli_experiments, cli_friction, cli_log
 from tools.cli_options import (
     Bitrate,
     Channel,
@@ -35,6 +35,7 @@ app = typer.Typer(
 
 cli_friction.register(app)
 cli_experiments.register(app)
+cli_log.register(app)
 
 
 @app.command()
@@ -65,6 +66,11 @@ def run(
     allow_low_margin: Annotated[
         bool, typer.Option("--allow-low-margin", help="run a stable loop below margin.min_phase_margin_deg")
     ] = False,
+    scope: Annotated[bool, typer.Option("--scope", help="live page in the browser (extra: jointctl[scope])")] = False,
+    scope_host: Annotated[
+        str, typer.Option("--scope-host", help="address of the page; others need a token")
+    ] = "127.0.0.1",
+    scope_port: Annotated[int, typer.Option("--scope-port", min=1, max=65535)] = 8642,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -74,7 +80,12 @@ def run(
     joint = loaded(config, interface, channel, bitrate, port, target)
     raise typer.Exit(
         run_run(
-            joint, Output(json=json, quiet=quiet), assume_yes=yes, dry_run=dry_run, allow_low_margin=allow_low_margin
+            joint,
+            Output(json=json, quiet=quiet),
+            assume_yes=yes,
+            dry_run=dry_run,
+            allow_low_margin=allow_low_margin,
+            scope=(scope_host, scope_port) if scope else None,
         )
     )
 

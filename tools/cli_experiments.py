@@ -1,4 +1,4 @@
-"""The verbs around simulated experiments: paper, study."""
+"""The verbs around simulated experiments: paper, study, fault-campaign, bench."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from tools.cli_options import Json, Quiet
+from tools.cli_options import Json, Quiet, loaded
 from tools.output import Output
 
 
@@ -61,7 +61,27 @@ def study(
     raise typer.Exit(run_study(settings, output, workers=workers, csv=csv, figure=figure))
 
 
+def fault_campaign(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG")] = Path("virtual"),
+    count: Annotated[int, typer.Option("--count", help="how many random scenarios", min=1)] = 10_000,
+    seed: Annotated[int, typer.Option("--seed")] = 1,
+    scenario: Annotated[int | None, typer.Option("--scenario", help="replay this one alone")] = None,
+    folder: Annotated[Path, typer.Option("--folder", help="for report, JSON and picture")] = Path("fault-campaign"),
+    workers: Annotated[int | None, typer.Option("--workers", help="processes; default: one a core")] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Random faults on random joints in lockstep; every safety invariant is checked in every scenario."""
+    from tools.fault_campaign import fault_campaign as run_campaign
+
+    output = Output(json=json, quiet=quiet)
+    raise typer.Exit(
+        run_campaign(loaded(config), output, count=count, seed=seed, scenario=scenario, folder=folder, workers=workers)
+    )
+
+
 def register(app: typer.Typer) -> None:
     """Add the verbs."""
     app.command()(paper)
     app.command()(study)
+    app.command("fault-campaign")(fault_campaign)

@@ -77,6 +77,11 @@ def identify(
         raise DataError(f"{out}: the name of the section's file (-o) must end in .toml")
     limits = _limits(into, config, output)
     data = read_friction_data(data_path, told)
+    if limits is None and data.recorded_limits is None:
+        output.warning(
+            f"{data_path}: no limits of the joint are known: sizes of torque and speed could not be checked, a wrong "
+            "torque constant, ratio, unit or side may go unnoticed; --config CONFIG checks them"
+        )
     total = 2.0 * options.swarm.iterations
     with output.progress("particle swarm", total) as advance:
         found = identify_friction(data, options, limits=limits, progress=advance)

@@ -24,10 +24,10 @@ from firmware_py.schema import new
 from firmware_py.sequence import reset_axis
 from firmware_py.states import AxisPhase, Fault
 from hil.device import Cia402Device
-from hil.frames import FRAME_SIZE
 from hil.fault_lockstep import TRUTHS as FAULT_TRUTHS
 from hil.fault_lockstep import run_with_faults
 from hil.faults import fault_memory
+from hil.frames import FRAME_SIZE
 from hil.lockstep import TRUTHS, TRUE_POSITION_rad, run_lockstep
 from tools.config import Config
 from tools.config_drive import canopen_settings

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from tools.loop_process import LoopOrder
 from tools.shared_block import SERIAL, SharedBlock
 
 READY_TIMEOUT_S = 180.0  # the first start compiles everything
+KILL_S = 1.0  # how long a killed process may take to go
 SILENT_S = 2.0  # without a cycle for so long, the loop hangs
 RECEIVE_SHARE = 0.6  # of a period: how long a cycle waits for its sample
 
@@ -146,7 +148,8 @@ class LoopHandle:
             if silent_s <= SILENT_S:
                 return True
             self._process.kill()  # whatever it would do next, it must not wake up beside a new run
-            self._process.wait()
+            with contextlib.suppress(subprocess.TimeoutExpired):  # stuck in the system: the drive must not wait for it
+                self._process.wait(KILL_S)
             raise MotionFault(
                 f"the loop process did nothing for {silent_s:.1f} s and was ended",
                 self._after_end,

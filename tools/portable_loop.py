@@ -81,6 +81,7 @@ class PortableExchange:
         self._bytes = self._frames.view(np.uint8).reshape(FRAME_SLOTS, -1)
         self._send_timeout_s = 0.25 * period_ns / NANOSECONDS
         self._failed = False
+        self.sync_ns = 0  # when the last SYNC was sent
         port = self._port
         # some interfaces echo a program's own frames; counted again, they would double the bus load
         self._own = frozenset((int(port.sync_id), int(port.rpdo_id), int(port.own_heartbeat_id)))
@@ -135,7 +136,7 @@ class PortableExchange:
             self._accept(message, time.monotonic_ns())
         for slot in range(SLOT_SYNC, begin_cycle(self._port, self._frames)):
             self._send(slot)
-        started_ns = now_ns = time.monotonic_ns()
+        self.sync_ns = started_ns = now_ns = time.monotonic_ns()
         until_ns = max(budget_ns, started_ns + least_wait_ns)
         while now_ns < until_ns:
             message = self._receive((until_ns - now_ns) * 1e-9)
@@ -201,18 +202,21 @@ def _cycles(exchange: PortableExchange, block: SharedBlock, period_ns: int, rece
         exchange.send()
         end_ns = time.monotonic_ns()
         fresh = state.sample_age_cycles == 0
+        round_trip_ns = waited_ns
+        if sample.time_ns < exchange.sync_ns:  # as in `run_loop`: it answers an earlier SYNC
+            round_trip_ns += elapsed_cycles * period_ns
         work_ns = end_ns - wake_ns - waited_ns
         head = int(words[Word.HEAD])
         record = ring[head % len(ring)]
         write_log(record, state, sample, command)
         record.time_ns = deadline_ns
         record.wake_late_ns = min(late_ns, _INT32_MAX)
-        record.round_trip_ns = min(waited_ns, _INT32_MAX) if fresh else 0
+        record.round_trip_ns = min(round_trip_ns, _INT32_MAX) if fresh else 0
         record.work_ns = min(work_ns, _INT32_MAX)
         record.skipped = min(elapsed_cycles - 1, _INT32_MAX)
         count(histograms, Histogram.WAKE, late_ns)
         if fresh:
-            count(histograms, Histogram.ROUND_TRIP, waited_ns)
+            count(histograms, Histogram.ROUND_TRIP, round_trip_ns)
         count(histograms, Histogram.WORK, work_ns)
         words[Word.SKIPPED] += elapsed_cycles - 1
         words[Word.HEAD] = head + 1

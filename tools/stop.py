@@ -10,6 +10,11 @@ from tools.output import Output
 SAFE_STATES = ("switch on disabled", "fault", "off")
 
 
+def is_safe(state: str) -> bool:
+    """Whether the drive's words for its state mean that its power stage is off ("fault reaction active" does not)."""
+    return state.partition(",")[0] in SAFE_STATES
+
+
 def stop(config: Config, output: Output) -> int:
     """Stop and disable the drive, even while another program controls it; `DeviceError` if it does not confirm."""
     drive = open_drive(config)
@@ -18,7 +23,7 @@ def stop(config: Config, output: Output) -> int:
     finally:
         drive.close()
     output.result(f"the drive is {state}", {"drive_state": state})
-    if not state.startswith(SAFE_STATES):
+    if not is_safe(state):
         raise DeviceError(f"the drive did not confirm that it is off (={state})", "use the emergency stop")
     return 0
 

@@ -113,8 +113,11 @@ class Supervisor:
                 raise DataError(f"{self._log_path}: cannot be written: {error.strerror or error}") from None
             finally:
                 signals.raising = False
-                drive.make_safe()
+                state = drive.make_safe()
                 drive.close()
+                if state.startswith("unknown"):
+                    with contextlib.suppress(OSError):  # the terminal may have been closed
+                        self._output.warning(f"the drive did not confirm that it is off: {state}")
 
     def _table(self) -> np.ndarray:
         """Rows of the motion, (N, 5); their number is fixed before the drive is known."""
@@ -153,7 +156,7 @@ class Supervisor:
                 log.write_event(ERROR, "supervisor", str(error))
                 raise MotionFault(error.message, f"{error.hint}; drive state now: {state}") from None
             except BaseException:
-                self._brake(loop)
+                self._brake(loop, signals)
                 raise
             elapsed_s = (time.monotonic_ns() - started_ns) * 1e-9
             state = drive.make_safe()
@@ -184,13 +187,17 @@ class Supervisor:
         self._display.note(text)
         loop.allow_enable()
 
-    def _brake(self, loop: LoopHandle) -> None:
-        """The supervisor cannot go on (disk full, say), but the joint moves: brake it under control, unlogged."""
+    def _brake(self, loop: LoopHandle, signals: StopSignals) -> None:
+        """The supervisor cannot go on (disk full, say), but the joint moves: brake it under control, unlogged.
+
+        The user may still ask for more than a ramp.
+        """
         sequence = self._config.sequence
         loop.request_stop(StopRequest.RAMP)
         give_up_s = time.monotonic() + sequence.stop_timeout_s + sequence.release_s + sequence.off_timeout_s
         with contextlib.suppress(MotionFault):
             while loop.running() and time.monotonic() < give_up_s:
+                loop.request_stop(signals.request)
                 loop.beat()
                 time.sleep(POLL_S)
 

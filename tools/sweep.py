@@ -22,6 +22,7 @@ from tools.fault_text import FaultText, fault_text
 from tools.output import Advance, Output
 from tools.run import log_path
 from tools.run_report import INTERRUPTED
+from tools.sweep_checks import constant_remarks, recorded_limits, refuse_constants, torque_source
 from tools.sweep_file import SweepFile
 from tools.sweep_grid import SweepPoint, SweepUsageError
 from tools.sweep_meter import JointModel, MeasuredPoint, SweepMeter
@@ -61,10 +62,10 @@ def envelope(config: Config, report: CommissioningReport, motion: SweepMotion, p
     total_s = motion.duration_s + approach_s + OVERHEAD_S
     lines = [
         f"drive      {report.identity.name or 'unnamed'}, vendor {report.identity.vendor}, serial "
-        f"{report.identity.serial}, {report.mode}",
+        f"{report.identity.serial or 'unknown'}, {report.mode}",
         f"now at     {start:+.4f} rad",
         f"approach   to {middle:+.4f} rad in {approach_s:.1f} s",
-        f"sweep      {len(points)} points from {speeds[0]:.4g} to {speeds[-1]:.4g} rad/s, each direction",
+        f"sweep      {len(points)} points from {speeds[0]:.4g} to {speeds[-1]:.4g} rad/s, both directions together",
         f"motion     {middle + motion.low_rad:+.3f} .. {middle + motion.high_rad:+.3f} rad, back and forth, "
         f"about {duration_text(total_s)}; points that do not settle are visited once more",
         f"limits     {limits.position_min_rad:+.3f} .. {limits.position_max_rad:+.3f} rad, "
@@ -72,13 +73,14 @@ def envelope(config: Config, report: CommissioningReport, motion: SweepMotion, p
     ]
     if config.joint.gravity_Nm:
         lines.append(f"remark     joint.gravity_Nm (={config.joint.gravity_Nm:g}) is subtracted from what is measured")
-    return lines + [f"remark     {remark}" for remark in report.remarks]
+    return lines + [f"remark     {remark}" for remark in (*constant_remarks(config), *report.remarks)]
 
 
 class Sweep:
     """One `sweep` command: plan, ask, measure, report."""
 
     def __init__(self, config: Config, output: Output, out: Path, options: SweepOptions) -> None:
+        refuse_constants(config)
         self.config = with_mode(config, options.mode)
         self.output = output
         self.out = out
@@ -88,7 +90,6 @@ class Sweep:
         self.drive_state = ""
         self._time_offset_s = 0.0
         self._unsettled: dict[int, SweepPoint] = {}
-        self._measured = 0
         self._confirmed = False
 
     def run(self) -> int:
@@ -101,22 +102,31 @@ class Sweep:
                 self.file = SweepFile.resume(self.out, torque_constant_NmpA(self.config), self.plan.hash)
                 done = self.file.done
                 todo = [p for p in todo if p.index not in done]
+                self._unsettled = {p.index: p for p in self.plan.points if p.index in self.file.unsettled}
                 self.output.note(f"{self.out}: {len(done)} of {len(self.plan.points)} points are there already")
-                if not todo:
+                if not todo and not self._to_revisit():
                     self.output.note("nothing is left to measure")
                     return 0
-            stopped = self._measure(todo, self.options.warm_up_turns, 1.0)
-            for _ in range(REVISITS):
-                if stopped is None or stopped or not self._unsettled:
-                    break
-                again = [p for p in self.plan.points if p.index in self._unsettled]
-                self.output.note(f"{len(again)} points did not settle: once more, with more time")
-                self._unsettled.clear()
-                stopped = self._measure(again, 0.0, REVISIT_DWELL)
+            stopped: str | None = ""
+            if todo:
+                stopped = self._measure(todo, self.options.warm_up_turns, 1.0)
+            if stopped == "":
+                again = self._to_revisit()
+                if again:
+                    points = "1 point" if len(again) == 1 else f"{len(again)} points"
+                    self.output.note(f"{points} did not settle: once more, with more time")
+                    stopped = self._measure(again, 0.0, REVISIT_DWELL)
             return self._report(stopped)
         finally:
             if self.file is not None:
                 self.file.close()
+
+    def _to_revisit(self) -> list[SweepPoint]:
+        """Points that did not settle and were not visited more than REVISITS times yet."""
+        if self.file is None:
+            return []
+        visits = self.file.visits
+        return [p for p in self.plan.points if p.index in self._unsettled and visits[p.index] <= REVISITS]
 
     def _measure(self, points: list[SweepPoint], warm_up_turns: float, dwell_factor: float) -> str | None:
         """Visit the points; the name of the signal that stopped it or "", None if it was declined or a dry run."""
@@ -137,10 +147,20 @@ class Sweep:
             fault, value = ended
             self._raise_fault(fault, fault_text(fault, value, 0) if fault is not Fault.NONE else None)
             return ""
-        with self.output.progress(f"{len(points)} points", motion.duration_s) as advance:
+        with contextlib.ExitStack() as stack:
+            bars: list[Advance] = []
+
+            def confirm_then_show(report: CommissioningReport) -> bool:
+                # not before: a bar that is redrawn would paint over the question
+                agreed = confirm(report)
+                if agreed:
+                    title = "1 point" if len(points) == 1 else f"{len(points)} points"
+                    bars.append(stack.enter_context(self.output.progress(title, motion.duration_s)))
+                return agreed
+
             supervisor = SweepSupervisor(
-                config, self.output, log_path(config), confirm, motion, meter,
-                lambda done_s: self._progress(advance, done_s), allow_low_margin=options.allow_low_margin,
+                config, self.output, log_path(config), confirm_then_show, motion, meter,
+                lambda done_s: self._progress(bars, done_s), allow_low_margin=options.allow_low_margin,
             )  # fmt: skip
             result = supervisor.run()
         if result is None:
@@ -155,8 +175,9 @@ class Sweep:
         return result.stopped_by
 
     @staticmethod
-    def _progress(advance: Advance, done_s: float) -> None:
-        advance(max(0.0, done_s))
+    def _progress(bars: list[Advance], done_s: float) -> None:
+        for advance in bars:
+            advance(max(0.0, done_s))
 
     def _confirm(self, report: CommissioningReport, motion: SweepMotion, points: list[SweepPoint]) -> bool:
         if not self._confirmed:
@@ -183,7 +204,8 @@ class Sweep:
             "started": datetime.now(UTC).isoformat(timespec="seconds"),
             "versions": {"jointctl": version("jointctl"), "python": sys.version.split()[0]},
             "drive": {**vars(report.identity), "mode": report.mode, **report.settings},
-            "torque_source": "object 6077 as the drive measures it; current_A = motor_torque_Nm / torque_constant_NmpA",
+            "limits": recorded_limits(self.config),
+            "torque_source": torque_source(self.config),
             "gravity_subtracted_Nm": self.config.joint.gravity_Nm,
             "points": len(self.plan.points),
             "options": options,
@@ -193,23 +215,25 @@ class Sweep:
     def _on_point(self, measured: MeasuredPoint) -> None:
         assert self.file is not None
         self.file.add(MeasuredPoint(measured.point, measured.result, measured.time_s + self._time_offset_s))
-        self._measured += 1
         result = measured.result
         if result.problem:
             self._unsettled[measured.point.index] = measured.point
+        else:
+            self._unsettled.pop(measured.point.index, None)
         if self.output.stderr.isatty():
             text = "" if result.settled else f"  not settled: {result.problem}"
             with contextlib.suppress(OSError):
                 self.output.note(
-                    f"  {self._measured:4d}/{len(self.plan.points)}  {result.velocity_radps:+9.4f} rad/s  "
+                    f"  {len(self.file.done):4d}/{len(self.plan.points)}  {result.velocity_radps:+9.4f} rad/s  "
                     f"{result.motor_torque_Nm:+.5f} +- {result.half_interval_Nm:.5f} Nm{text}"
                 )
 
     def _raise_fault(self, fault: Fault, text: FaultText | None) -> None:
         if text is None:
             return
+        done = len(self.file.done) if self.file is not None else 0
         raise MotionFault(
-            f"{fault.name} ({int(fault)}): {text.happened}; {self._measured} points are in {self.out}",
+            f"{fault.name} ({int(fault)}): {text.happened}; {done} points are in {self.out}",
             f"likely cause: {text.cause}; next: {text.next_step}; then --resume",
         )
 

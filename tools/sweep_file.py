@@ -11,6 +11,7 @@ import csv
 import io
 import json
 import os
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,16 @@ class SweepFile:
     @property
     def done(self) -> set[int]:
         return set(self._sidecar["measured"])
+
+    @property
+    def visits(self) -> Counter[int]:
+        """How many rows each point has."""
+        return Counter(self._sidecar["measured"])
+
+    @property
+    def unsettled(self) -> set[int]:
+        """Points whose last row did not settle."""
+        return {int(index) for index in self._sidecar["unsettled"]}
 
     @property
     def elapsed_s(self) -> float:

@@ -145,15 +145,21 @@ def velocity_units(port: CanopenPort, velocity_radps: float) -> int:
 
 @kernel
 def end_cycle(port: CanopenPort, frames: np.ndarray, sample: Sample, command: Command) -> None:
-    """Write the RPDO (slot 2).  The target is zero unless the drive is asked to be, and is, enabled."""
+    """Write the RPDO (slot 2).  The target is zero unless the drive is asked to be, and is, enabled.
+
+    Once the heartbeat is withheld the drive's watchdog is dead: from then on enabling is refused.
+    """
+    request = np.int64(command.request)
+    if request == DriveRequest.ENABLE and port.unheeded_cycles > UNHEEDED_MAX_CYCLES:
+        request = np.int64(DriveRequest.OFF)
     frame = frames[SLOT_RPDO]
     frame.can_id = port.rpdo_id
     frame.length = port.rpdo_length
     for i in range(8):
         frame.payload[i] = 0
-    put_u16(frame.payload, port.control_at, control_word(port.state, command.request))
-    enabled = command.request == DriveRequest.ENABLE and port.state == State.OPERATION_ENABLED
-    if command.request != DriveRequest.ENABLE and port.state == State.OPERATION_ENABLED:
+    put_u16(frame.payload, port.control_at, control_word(port.state, request))  # type: ignore[arg-type]
+    enabled = request == DriveRequest.ENABLE and port.state == State.OPERATION_ENABLED
+    if request != DriveRequest.ENABLE and port.state == State.OPERATION_ENABLED:
         port.unheeded_cycles += 1
     elif port.unheeded_cycles <= UNHEEDED_MAX_CYCLES:
         port.unheeded_cycles = 0

@@ -120,6 +120,7 @@ class CanopenDrive:
             # first: a node that its watchdog or an earlier run left in "stopped" does not answer SDO
             self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
             self._find()
+            self._objects.forget_verified()
             findings = commission(self._objects, self._settings, self._sleep, self._prove_watchdog)
         except can.CanError as error:
             raise BusError(f"the bus failed during commissioning: {error}") from None
@@ -137,8 +138,23 @@ class CanopenDrive:
         )
 
     def start_cyclic(self) -> None:
-        """NMT operational: PDOs are valid from here on.  The drive stays disabled until the loop enables it."""
-        self._node.nmt.send_command(NMT_OPERATIONAL)
+        """NMT operational: PDOs are valid from here on.  The drive stays disabled until the loop enables it.
+
+        The user may have taken minutes to confirm.  A drive that was switched off meanwhile, or that another program
+        has made safe, has lost its watchdog or its limits: everything is read back once more.
+        """
+        if self._findings is None:
+            raise DeviceError("the drive has not been commissioned")
+        try:
+            self._objects.verify_again()
+            shown = self._objects.read(0x6061, what="modes of operation display")
+            if shown != self._findings.mode:
+                raise DeviceError(
+                    f"node {self._settings.node}: 6061 shows mode {shown}, it was {self._findings.mode:d}"
+                )
+            self._node.nmt.send_command(NMT_OPERATIONAL)
+        except can.CanError as error:
+            raise BusError(f"the bus failed before the run: {error}") from None
 
     def port(self) -> Any:
         """See `Drive.port`."""
@@ -156,20 +172,15 @@ class CanopenDrive:
         """
         if not self._taken:
             return "untouched"
-        state = State.UNDEFINED
         try:
-            self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
-            self._brake()
-            for _ in range(SAFE_ATTEMPTS):
-                self._objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
-                state = State(decode_state(self._objects.read(0x6041, what="statusword")))
-                if state in (State.SWITCH_ON_DISABLED, State.FAULT):
-                    break
-                self._sleep(SAFE_POLL_S)
-            self._objects.write_if_present(0x6071, 0, 0, what="target torque")
-            self._objects.write_if_present(0x60FF, 0, 0, what="target velocity")
-            # our heartbeat has ended with the loop; disabled, the drive need not watch it any more
-            self._objects.write_if_present(0x1016, 1, 0, what="consumer heartbeat time")
+            return self._off()
+        except JointctlError:
+            pass
+        except can.CanError as error:
+            return f"unknown: the bus does not take frames any more ({error})"
+        # the watchdog may have put the node into "stopped" in this very moment, where it does not answer SDO
+        try:
+            return self._off()
         except JointctlError as error:
             try:
                 self._node.nmt.send_command(NMT_STOPPED)
@@ -178,6 +189,24 @@ class CanopenDrive:
             return f"unknown: {error}; NMT stop was sent"
         except can.CanError as error:
             return f"unknown: the bus does not take frames any more ({error})"
+
+    def _off(self) -> str:
+        """One attempt of `make_safe`; the state in words."""
+        state = State.UNDEFINED
+        self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
+        self._brake()
+        for _ in range(SAFE_ATTEMPTS):
+            self._objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
+            state = State(decode_state(self._objects.read(0x6041, what="statusword")))
+            if state in (State.SWITCH_ON_DISABLED, State.FAULT):
+                break
+            self._sleep(SAFE_POLL_S)
+        self._objects.write_if_present(0x6071, 0, 0, what="target torque")
+        self._objects.write_if_present(0x60FF, 0, 0, what="target velocity")
+        # our heartbeat has ended with the loop; disabled, the drive need not watch it any more.  A drive that did
+        # not obey keeps its watchdog: nothing else is left to stop it.
+        if state in (State.SWITCH_ON_DISABLED, State.FAULT):
+            self._objects.write_if_present(0x1016, 1, 0, what="consumer heartbeat time")
         return state.name.lower().replace("_", " ")
 
     def _brake(self) -> None:

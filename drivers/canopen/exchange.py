@@ -33,10 +33,15 @@ _SCRATCH = types.Array(types.int64, 1, "C")
 
 
 @kernel
-def _note_sent(port: CanopenPort, sample: Sample, error: int) -> None:
-    """Count failed cycles in a row: one full transmit queue is bad luck, many are a dead bus."""
+def _note_sent(port: CanopenPort, sample: Sample, error: int, last: bool) -> None:
+    """Count failed sends in a row: one full transmit queue is bad luck, many are a dead bus.
+
+    Only the `last` frame of a cycle, the RPDO, ends the count: while SYNC gets through and it does not, the drive
+    keeps its last torque.
+    """
     if error == 0:
-        port.consecutive_failures = 0
+        if last:
+            port.consecutive_failures = 0
     else:
         port.consecutive_failures += 1
         port.send_failures += 1
@@ -64,7 +69,7 @@ def receive(ports: Any, frames: np.ndarray, scratch: np.ndarray, samples: Any, n
     _drain(port, frames, sample, now_ns, False)
     count = begin_cycle(port, frames)
     for slot in range(count):
-        _note_sent(port, sample, send_frame(port.fd, frames, slot))
+        _note_sent(port, sample, send_frame(port.fd, frames, slot), False)
     started_ns = monotonic_ns(scratch)
     arrived_ns = started_ns
     while True:
@@ -82,7 +87,7 @@ def send(ports: Any, frames: np.ndarray, samples: Any, commands: Any) -> int:
     port = ports[0]
     end_cycle(port, frames, samples[0], commands[0])
     error = send_frame(port.fd, frames, SLOT_RPDO)
-    _note_sent(port, samples[0], error)
+    _note_sent(port, samples[0], error, True)
     return np.int32(error)  # type: ignore[return-value]
 
 

@@ -38,6 +38,7 @@ class ObjectAccess:
     def __init__(self, node: canopen.RemoteNode, eds_name: str) -> None:
         self._node = node
         self._eds_name = eds_name
+        self._verified: dict[tuple[int, int], tuple[int, str]] = {}  # what `write_verified` has set, and its name
 
     def has(self, index: int, sub: int = 0) -> bool:
         """Whether the EDS lists the object."""
@@ -95,7 +96,23 @@ class ObjectAccess:
         if found != value:
             place = f"node {self._node.id}: object {object_name(index, sub)} ({what})"
             raise DeviceError(f"{place} reads back {found}, {value} was written")
+        self._verified[index, sub] = value, what
         return found
+
+    def forget_verified(self) -> None:
+        """Commissioning begins anew."""
+        self._verified.clear()
+
+    def verify_again(self) -> None:
+        """Read everything that was verified once more; `DeviceError` if the drive has changed in the meantime."""
+        for (index, sub), (value, what) in self._verified.items():
+            found = self.read(index, sub, what=what)
+            if found != value:
+                raise DeviceError(
+                    f"node {self._node.id} has changed since it was commissioned: object {object_name(index, sub)} "
+                    f"({what}) is {found}, {value} was set",
+                    hint="it was restarted, or another program has used it; start the run again",
+                )
 
     def write_if_present(self, index: int, sub: int, value: int, *, what: str) -> bool:
         """`write_verified` where the EDS has the object; False where it has not."""

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numba.core import types
 
-from drivers.elmo.cyclic import begin_cycle, end_cycle, note_written, take_byte
+from drivers.elmo.cyclic import begin_cycle, end_cycle, note_written
 from drivers.elmo.port import READ_MAX, SCRATCH_WORDS, ElmoPort
+from drivers.elmo.replies import take_byte
 from firmware_py.kernel import exported, kernel, record_array_type
 from firmware_py.libc import EAGAIN, EINTR, NANOSECONDS, POLLIN, errno, external, monotonic_ns, ppoll
 from firmware_py.records import Command, Sample

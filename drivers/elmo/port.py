@@ -68,6 +68,7 @@ class ElmoPort:
     has_been_on: i4  # 1: MO=1 has done its work; it is never said again
     enable_wait_cycles: i8
     no_sample_cycles: i8
+    no_status_cycles: i8
     silent_cycles: i8  # cycles since a reply came although one was due
     quiet: i4  # 1: says nothing until the line is silent, so that old replies are not taken for new ones
     heard_bytes: i8  # in this cycle

@@ -278,3 +278,23 @@ def test_options_type_matches_the_command(config: Config) -> None:
         "config", "out", "interface", "channel", "bitrate", "json", "quiet",
     }  # fmt: skip
     assert len(parameters) == len(dataclasses.fields(SweepOptions))
+
+
+def test_resume_revisits_what_did_not_settle_and_only_once(config: Config, tmp_path: Path) -> None:
+    out = tmp_path / "data.csv"
+    swept(config, out, points=4)
+    sidecar = json.loads(out.with_suffix(".json").read_text())
+    sidecar["unsettled"] = {"2": "stopped before its second visit"}
+    out.with_suffix(".json").write_text(json.dumps(sidecar))
+    output = Output(stdout=StringIO(), stderr=StringIO())
+    assert sweep(config, output, out, SweepOptions(lockstep=True, points=4, resume=True)) == 0
+    assert "1 point did not settle: once more" in output.stderr.getvalue()  # type: ignore[attr-defined]
+    sidecar = json.loads(out.with_suffix(".json").read_text())
+    assert sidecar["measured"] == [0, 1, 2, 3, 2]
+    assert sidecar["unsettled"] == {}
+    sidecar["unsettled"] = {"2": "not even the second time"}
+    out.with_suffix(".json").write_text(json.dumps(sidecar))
+    output = Output(stdout=StringIO(), stderr=StringIO())
+    assert sweep(config, output, out, SweepOptions(lockstep=True, points=4, resume=True)) == 0
+    assert "nothing is left" in output.stderr.getvalue()  # type: ignore[attr-defined]
+    assert len(rows(out)) == 5

@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.elmo.cyclic import begin_cycle, current_mA, end_cycle, note_written, parse_number, put_command, take_byte
+from drivers.elmo.cyclic import begin_cycle, current_mA, end_cycle, note_written, put_command
 from drivers.elmo.interpreter import ReplyKind, parse_reply
 from drivers.elmo.port import EXPECTED_MAX, LINE_MAX, PORT_GONE, ElmoPort, Question
+from drivers.elmo.replies import parse_number, take_byte
 from firmware_py.records import Command, Sample
 from firmware_py.schema import new
 from firmware_py.states import DriveRequest, DriveState

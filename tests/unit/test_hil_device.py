@@ -169,6 +169,20 @@ def test_cyclic_torque_scales_by_rated_torque_and_moves_the_plant(rig: Rig) -> N
     assert rig.speed_radps == pytest.approx(joint_Nm / 2.1 * 0.05, rel=0.05)
 
 
+def test_the_reported_torque_is_that_of_the_current_without_the_ripple(rig: Rig) -> None:
+    rig.enable(10)
+    plant = rig.device.plant_constants[0]
+    plant.torque_ripples = 1
+    plant.torque_ripple_Nm[0] = 6.0
+    plant.torque_ripple_phase_turns[0] = 0.25  # its crest, at any angle
+    rig.set(0x6071, 0, 100, 2)
+    rig.run(50)
+    assert rig.get(0x6077) == 100
+    assert rig.get(0x6078) == 100  # rated current yields rated torque
+    joint_Nm = 0.100 * 0.5 * 121.0
+    assert rig.device.plant_state[0].actuator_torque_Nm == pytest.approx(joint_Nm + 6.0, rel=1e-9)
+
+
 @pytest.mark.parametrize(("target", "limit", "limited"), [(299, 300, 0), (300, 300, 0), (301, 300, 1), (-301, 300, 1)])
 @pytest.mark.parametrize("index", [0x6072, 0x6073])
 def test_torque_limits_set_bit_11_only_beyond(rig: Rig, index: int, target: int, limit: int, limited: int) -> None:

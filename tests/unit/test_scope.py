@@ -143,6 +143,15 @@ def test_a_series_keeps_its_peaks_and_leaves_out_what_is_no_number() -> None:
         assert history.series(history.newest(0.1), signal)
 
 
+def test_the_error_is_only_drawn_while_the_law_is_at_work() -> None:
+    history, rows = History(), records(300)
+    rows.phase[:100], rows.phase[200:] = AxisPhase.WAITING, AxisPhase.DISABLING
+    history.take(rows)
+    found = history.newest(1e9)
+    assert len(history.series(found, "error [mrad]")) == 100
+    assert len(history.series(found, "angle [rad]")) == 300
+
+
 def test_the_trigger_is_the_last_crossing_in_its_direction() -> None:
     time_s = np.arange(6) * 1.0
     values = np.array([0.0, 2.0, 0.0, 2.0, 2.0, 0.0])

@@ -90,8 +90,8 @@ def envelope(config: Config, scenario: Scenario, constants: Any) -> Envelope:
     inertia = scenario.plant["inertia_kgm2"]
     ripple = sum(scenario.plant["torque_ripple_Nm"])
     load = abs(scenario.magnitude) if kind is FaultKind.LOAD_JUMP else 0.0
-    drive_Nm = config.canopen.max_torque_permille or 1000
-    drive_Nm *= 1e-3 * (config.canopen.rated_torque_Nm or 0.0) * config.joint.reduction_ratio
+    share = 1e-3 * (config.canopen.max_torque_permille or 1000)
+    drive_Nm = share * (config.canopen.rated_torque_Nm or 0.0) * config.joint.reduction_ratio
     floor = _friction_floor_Nm(config, scenario) - ripple
     wait_s = reaction_s(config, kind)
     push = (drive_Nm + ripple + load) / inertia

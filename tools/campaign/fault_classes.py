@@ -96,7 +96,10 @@ _CLASSES = (
         _STALE | MOTION, True, on_wire=True,
     ),
     FaultClass(FaultKind.FOREIGN_FRAMES, None, Sizes(_ALWAYS, (1.0, 16.0)), on_wire=True),
-    FaultClass(FaultKind.DRIVE_REBOOT, Sizes(_ALWAYS, (1.0, 1.0)), None, frozenset({Fault.DRIVE_RESTARTED}), True),
+    FaultClass(
+        FaultKind.DRIVE_REBOOT, Sizes(_ALWAYS, (1.0, 1.0)), None,
+        frozenset({Fault.DRIVE_RESTARTED, Fault.OFF_TIMEOUT}), True,  # it says nothing more: off is not confirmed
+    ),
     FaultClass(FaultKind.DRIVE_FAULT, Sizes((0.01, LONG_s), (1.0, 1.0)), None, frozenset({Fault.DRIVE_FAULT}), True),
     FaultClass(
         FaultKind.ENCODER_STUCK, Sizes((0.05, LONG_s), (1.0, 1.0)), Sizes((0.001, 0.002), (1.0, 1.0)),
@@ -115,7 +118,9 @@ _CLASSES = (
     FaultClass(
         FaultKind.TORQUE_SATURATED, Sizes((0.05, LONG_s), (0.0, 30.0)), Sizes(_ALWAYS, (58.0, 100.0)), MOTION
     ),
-    FaultClass(FaultKind.CURRENT_LOOP_DEAD, Sizes((0.05, LONG_s), (1.0, 1.0)), Sizes((0.001, 0.002), (1.0, 1.0)), MOTION),
+    FaultClass(
+        FaultKind.CURRENT_LOOP_DEAD, Sizes((0.05, LONG_s), (1.0, 1.0)), Sizes((0.001, 0.002), (1.0, 1.0)), MOTION
+    ),
     FaultClass(
         FaultKind.LOAD_JUMP, Sizes((0.01, 0.2), (15.0, 40.0)), Sizes(_ALWAYS, (0.5, 4.0)),
         MOTION | {Fault.NOT_AT_STANDSTILL},

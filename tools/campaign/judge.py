@@ -12,7 +12,7 @@ from firmware_py.schema import new
 from firmware_py.states import AxisPhase, DriveRequest, Fault, Reaction
 from firmware_py.trajectory import reference_at
 from hil.device_records import PowerState
-from hil.fault_lockstep import TRUE_POSITION_rad, TRUE_POWER_STATE, TRUE_VELOCITY_radps
+from hil.fault_lockstep import TRUE_POWER_STATE, TRUE_POSITION_rad, TRUE_VELOCITY_radps
 from hil.faults import FaultKind
 from tools.campaign.envelope import STANDSTILL_RADPS, Envelope, envelope
 from tools.campaign.fault_classes import FAULT_CLASSES, LATE_CAUSES
@@ -41,7 +41,7 @@ class Verdict:
     peak_radps: float
     beyond_rad: float  # how far the joint got beyond its position limits
     allowed_rad: float  # how far it may
-    off_s: float  # from the latched fault to power off and standstill; nan without a fault
+    off_s: float | None  # from the latched fault to power off and standstill; None without a fault
 
 
 def run_scenario(config: Config, joint: LockstepJoint, scenario: Scenario) -> tuple[LockstepRun, Any]:
@@ -101,14 +101,14 @@ def _off_row(run: LockstepRun) -> int:
     return int(rows[-1]) + 1 if len(rows) else 0
 
 
-def _ending(run: LockstepRun, allowed: Envelope, fault_row: int, period_s: float) -> tuple[list[str], float]:
+def _ending(run: LockstepRun, allowed: Envelope, fault_row: int, period_s: float) -> tuple[list[str], float | None]:
     found = []
     if run.state.phase != AxisPhase.FINISHED:
         found.append(f"the axis did not finish, phase {AxisPhase(int(run.state.phase)).name}")
     off_row = _off_row(run)
     if off_row >= len(run.truth):
         found.append("the joint is not off and at rest in the end")
-    off_s = float("nan")
+    off_s = None
     if fault_row >= 0:
         off_s = max(off_row - fault_row, 0) * period_s
         longest = allowed.ramp_s if (run.log.phase == AxisPhase.RAMPING).any() else allowed.stop_s

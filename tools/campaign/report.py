@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -38,7 +37,7 @@ def rows_by_kind(verdicts: Sequence[Verdict]) -> list[KindRow]:
     rows = []
     for kind in dict.fromkeys(verdict.kind for verdict in verdicts):
         mine = [verdict for verdict in verdicts if verdict.kind == kind]
-        off = [verdict.off_s for verdict in mine if not math.isnan(verdict.off_s)]
+        off = [verdict.off_s for verdict in mine if verdict.off_s is not None]
         rows.append(
             KindRow(
                 kind=kind,
@@ -90,7 +89,7 @@ def write_json(path: Path, seed: int, verdicts: Sequence[Verdict], elapsed_s: fl
         "kinds": [asdict(row) for row in rows_by_kind(verdicts)],
         "violations": violations(verdicts, seed),
     }
-    text = json.dumps(content, indent=1, allow_nan=True).replace("NaN", "null")
+    text = json.dumps(content, indent=1, allow_nan=False)
     path.write_text(text + "\n")
 
 
@@ -106,7 +105,7 @@ def write_figure(path: Path, verdicts: Sequence[Verdict], velocity_max_radps: fl
             across = place - 0.3 + 0.6 * i / max(len(mine) - 1, 1)
             colour = "tab:red" if verdict.violations else "tab:green" if verdict.harmless else "tab:blue"
             speed.plot(across, verdict.peak_radps, ".", color=colour, markersize=2.5)
-            if not math.isnan(verdict.off_s):
+            if verdict.off_s is not None:
                 off.plot(across, max(verdict.off_s, 1e-3), ".", color=colour, markersize=2.5)
     speed.axhline(velocity_max_radps, color="black", linewidth=0.8, linestyle="--", label="velocity limit")
     speed.set_ylabel("greatest speed [rad/s]")

@@ -7,7 +7,8 @@ The sweep file is a CSV with these columns (joint speed, motor torque), one plat
 
 settled is 1 if the mean's confidence interval was met before the time limit, direction is 1 or -1, pass counts repeats
 from 0, temperature_degC may be empty.  Beside it lies a JSON file of the same stem with at least reduction_ratio and
-torque_constant_NmpA; both signs are such that friction opposes motion (torque and velocity have the same sign).
+torque_constant_NmpA, and, if known, limits (torque_max_Nm, velocity_max_radps of the joint); both signs are such that
+friction opposes motion (torque and velocity have the same sign).
 
 What is done with the points: they are sorted by speed, so the order of the file does not matter; repeats of a
 speed are all kept, each a measurement of its own (averaging would hide their spread); a line that is an exact copy
@@ -19,7 +20,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,7 @@ class FrictionData:
     reduction_ratio: float
     torque_constant_NmpA: float | None
     notes: tuple[str, ...] = ()
+    recorded_limits: tuple[float, float] | None = None  # torque [Nm], velocity [rad/s] of the joint, from the sidecar
 
     def direction(self, sign: int) -> np.ndarray:
         """Indices of the usable points of one direction."""
@@ -133,6 +135,20 @@ def _sidecar(path: Path) -> dict[str, Any]:
     return content
 
 
+def _recorded_limits(beside: Path, sidecar: dict[str, Any]) -> tuple[float, float] | None:
+    """Greatest torque and speed of the joint that the sweep was allowed; sidecars of others need not have them."""
+    limits = sidecar.get("limits")
+    if limits is None:
+        return None
+    found = []
+    for key in ("torque_max_Nm", "velocity_max_radps"):
+        value = limits.get(key) if isinstance(limits, dict) else None
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < 1e6:
+            raise DataError(f"{beside}: limits.{key} (={value}) must be a number in (0..1e+06)")
+        found.append(float(value))
+    return found[0], found[1]
+
+
 def _sweep(table: TableFile, told: ForeignFormat) -> FrictionData:
     for flag, value in (("--velocity-unit", told.velocity_unit), ("--side", told.side), ("--torque-side",
                         told.torque_side), ("--torque-constant", told.torque_constant_NmpA)):  # fmt: skip
@@ -141,11 +157,15 @@ def _sweep(table: TableFile, told: ForeignFormat) -> FrictionData:
     if not table.ended:
         # the sweep ends every line, so this one may have lost digits
         raise DataError(f"{table.path}: the last line has no end: the file is cut off", "remove the last line")
-    if told.ratio is None:
+    ratio, constant, limits = told.ratio or math.nan, math.nan, None
+    if told.ratio is None or table.path.with_suffix(".json").exists():
         sidecar = _sidecar(table.path)
         ratio, constant = float(sidecar["reduction_ratio"]), float(sidecar["torque_constant_NmpA"])
-    else:
-        ratio, constant = told.ratio, math.nan
+        limits = _recorded_limits(table.path.with_suffix(".json"), sidecar)
+        if told.ratio is not None and abs(told.ratio / ratio - 1.0) > 1e-6:
+            raise DataError(
+                f"--ratio (={told.ratio:g}) differs from reduction_ratio (={ratio:g}) in the sidecar of {table.path}"
+            )
     velocity = _numbers(table, "velocity_radps")
     torque = _numbers(table, "motor_torque_Nm")
     settled = np.ones(len(velocity), bool)
@@ -165,7 +185,8 @@ def _sweep(table: TableFile, told: ForeignFormat) -> FrictionData:
                     f"{table.path}: motor_torque_Nm is {found:.4g} times current_A, but torque_constant_NmpA "
                     f"(={constant:g}) in the sidecar: one of them is wrong"
                 )
-    return _data(table, velocity, torque, settled, ratio, constant if math.isfinite(constant) else None)
+    data = _data(table, velocity, torque, settled, ratio, constant if math.isfinite(constant) else None)
+    return replace(data, recorded_limits=limits)
 
 
 def _foreign(table: TableFile, told: ForeignFormat) -> FrictionData:
@@ -235,9 +256,9 @@ def _tidy(data: FrictionData) -> FrictionData:
     repeats = int(np.count_nonzero(np.diff(speeds) == 0.0))
     if repeats:
         notes.append(f"{repeats} repeated speeds: each kept as a measurement of its own")
-    return FrictionData(
-        data.path, data.sha256, speeds, data.motor_torque_Nm[index], data.line[index], data.settled[index],
-        data.reduction_ratio, data.torque_constant_NmpA, tuple(notes),
+    return replace(
+        data, velocity_radps=speeds, motor_torque_Nm=data.motor_torque_Nm[index], line=data.line[index],
+        settled=data.settled[index], notes=tuple(notes),
     )  # fmt: skip
 
 

@@ -164,7 +164,7 @@ def _stage_check(data: FrictionData, problem: Problem, word: str) -> None:
         raise DataError(
             f"{data.path}: {low} points up to the knee (={problem.knee * problem.top_radps / DEGREE:.4g} deg/s) and "
             f"{len(problem.x) - low} beyond at {word} velocity: at least {MIN_PER_STAGE} are needed on both sides",
-            "set --knee, or --search-knee, or --model stribeck",
+            "set --knee, or --search-knee, or --model stribeck; or the unit or side of the velocity is wrong",
         )
 
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,6 +17,8 @@ _OPPOSING = 0.9  # least share of points whose torque has the sign of the veloci
 _SPEED_WARN_RADPS, _SPEED_MAX_RADPS = 30.0, 1000.0  # of a joint behind a reducer
 _TORQUE_MAX = 1.2  # of the limit: the sweep itself cannot have driven harder
 _TORQUE_SMALL = 0.01
+# of the speed limit; mixing up two of r/min, deg/s and rad/s is a factor of 6, 9.5 or 57
+_SPEED_OVER, _SPEED_UNDER = 5.0, 0.2
 _ASYMMETRIC, _ASYMMETRIC_MAX = 3.0, 10.0
 _CAUSES = "check torque constant, ratio, units and sides"
 
@@ -36,9 +39,19 @@ class Verdict:
     warnings: list[str] = field(default_factory=list)
 
 
+def recorded_limits(data: FrictionData) -> JointLimits | None:
+    """What the sidecar tells about the joint; ratio and torque constant are then the data's own."""
+    if data.recorded_limits is None:
+        return None
+    torque_Nm, velocity_radps = data.recorded_limits
+    return JointLimits(torque_Nm, velocity_radps, data.reduction_ratio, data.torque_constant_NmpA or math.nan)
+
+
 def check_data(data: FrictionData, limits: JointLimits | None) -> Verdict:
-    """Signs, sizes and constants, before anything is fitted."""
+    """Signs, sizes and constants, before anything is fitted; without `limits` those of the sidecar, if it has some."""
     verdict = Verdict()
+    if limits is None:
+        limits = recorded_limits(data)
     means = {}
     for sign, word in ((1, "positive"), (-1, "negative")):
         chosen = data.direction(sign)
@@ -89,12 +102,12 @@ def _check_limits(data: FrictionData, limits: JointLimits, top_radps: float, ver
         verdict.problems.append(text)
     elif share > 0.8 or share < _TORQUE_SMALL:
         verdict.warnings.append(text)
-    if top_radps > 10.0 * limits.velocity_max_radps:
+    if top_radps > _SPEED_OVER * limits.velocity_max_radps:
         verdict.problems.append(
             f"highest joint speed (={top_radps:.4g} rad/s) is {top_radps / limits.velocity_max_radps:.3g} times "
             f"limits.velocity_max_radps: {_CAUSES}"
         )
-    elif top_radps < 0.02 * limits.velocity_max_radps:
+    elif top_radps < _SPEED_UNDER * limits.velocity_max_radps:
         verdict.warnings.append(
             f"highest joint speed (={top_radps:.4g} rad/s) is {top_radps / limits.velocity_max_radps:.3g} times "
             "limits.velocity_max_radps: beyond it the friction is a guess; or a unit or a side is wrong"

@@ -1,0 +1,192 @@
+"""What the received bytes mean: one byte at a time, whole lines matched with the commands that wait for a reply.
+
+A reply is only taken if its echo is the whole command (echo on), else by its order (echo off).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drivers.elmo.port import EXPECTED_MAX, LINE_MAX, ElmoPort, Question
+from firmware_py.kernel import kernel
+from firmware_py.records import Sample
+from firmware_py.states import DriveState
+
+BITS_PER_CHARACTER = 10  # 8N1
+NOTHING = -1
+FAULT_CAUSE_CYCLES = 4  # status replies to wait for MF before a fault is told without its cause
+WRAP = 1 << 32
+HALF_WRAP = 1 << 31
+_DIGITS_MAX = 17
+_CR, _SEMICOLON, _QUESTION_MARK = 0x0D, 0x3B, 0x3F
+_PLUS, _MINUS, _POINT, _ZERO, _NINE, _EQUALS = 0x2B, 0x2D, 0x2E, 0x30, 0x39, 0x3D
+_AMPLIFIER, _SERVO_ON, _FAULT = 0xF, 1 << 4, 1 << 6
+_TORQUE_MODE = 1
+
+
+@kernel
+def _echo_matches(port: ElmoPort, slot: int) -> bool:
+    length = port.expected_length[slot]
+    if port.line_length < length:
+        return False
+    differences = 0
+    for i in range(length):
+        differences += port.line[i] != port.expected[slot, i]
+    return differences == 0
+
+
+@kernel
+def _match(port: ElmoPort) -> int:
+    """Which of the waiting commands the received line answers, as its place in the queue; NOTHING if none."""
+    if port.echo == 0:
+        for i in range(port.line_length):
+            # a CR may only be an error byte (code 13); elsewhere it is an echo that must not be there
+            if port.line[i] == _CR and port.line_length != 2:
+                return NOTHING
+        return 0 if port.expected_count > 0 else NOTHING
+    for place in range(port.expected_count):
+        if _echo_matches(port, (port.expected_first + place) % EXPECTED_MAX):
+            return place
+    return NOTHING
+
+
+@kernel
+def parse_number(line: np.ndarray, start: int, end: int) -> tuple[bool, float, bool]:
+    """(is a number, its value, has no point) of the characters from `start` to `end`; plain decimal notation only."""
+    at = start
+    negative = False
+    if at < end and (line[at] == _MINUS or line[at] == _PLUS):
+        negative = line[at] == _MINUS
+        at += 1
+    digits, scale, value, whole = 0, 1.0, 0.0, True
+    while at < end:
+        byte = line[at]
+        if byte == _POINT and whole:
+            whole = False
+        elif byte >= _ZERO and byte <= _NINE and digits < _DIGITS_MAX:
+            digits += 1
+            value = value * 10.0 + (byte - _ZERO)
+            if not whole:
+                scale *= 10.0
+        else:
+            return False, 0.0, False
+        at += 1
+    value /= scale
+    return digits > 0, -value if negative else value, whole
+
+
+@kernel
+def _take_counts(port: ElmoPort, counts: int) -> None:
+    """Unwrap the 32 bit position: the joint moves less than half the range between two samples."""
+    if port.primed == 0:
+        port.primed = 1
+        port.counts = counts
+    else:
+        step = counts - port.last_counts
+        if step >= HALF_WRAP:
+            step -= WRAP
+        elif step < -HALF_WRAP:
+            step += WRAP
+        port.counts += step
+    port.last_counts = counts
+
+
+@kernel
+def _take_status(port: ElmoPort, sample: Sample, status: int) -> None:
+    """SR: servo, fault, and the unit mode, which is another one after a restart of the drive."""
+    port.status = status
+    port.no_status_cycles = 0
+    sample.status_word = status & 0x7FFFFFFF
+    mode = status >> 7 & 7
+    if port.unit_mode == _TORQUE_MODE and mode != _TORQUE_MODE:
+        sample.restarts += 1
+    port.unit_mode = mode
+    if status & (_FAULT | _AMPLIFIER) != 0:
+        # the cause (MF) is asked for before the fault is told; the power stage is off already
+        port.fault_seen += 1
+        if port.motor_fault != 0 or port.fault_seen > FAULT_CAUSE_CYCLES:
+            sample.drive_state = DriveState.FAULT
+            sample.drive_error = port.motor_fault & 0x7FFFFFFF
+        return
+    port.fault_seen = 0
+    port.motor_fault = 0
+    if status & _SERVO_ON != 0:
+        port.has_been_on = 1
+    sample.drive_state = DriveState.ENABLED if status & _SERVO_ON != 0 else DriveState.OFF
+
+
+@kernel
+def _take_value(port: ElmoPort, sample: Sample, question: int, start: int, now_ns: int) -> bool:
+    """Take the value of one reply; True if it was a position."""
+    if question >= Question.MO or question == Question.TC:
+        return False
+    good, value, whole = parse_number(port.line, start, port.line_length)
+    if not good or (not whole and question != Question.IQ):
+        port.garbled += 1
+        return False
+    if question == Question.PX:
+        if abs(value) >= WRAP:
+            port.garbled += 1
+            return False
+        _take_counts(port, int(value))
+        sample.position_rad = (port.counts - port.zero_counts) * port.position_radpcount
+        sample.time_ns = now_ns
+        sample.count += 1
+        port.no_sample_cycles = 0
+        return True
+    if question == Question.IQ:
+        sample.torque_Nm = value * port.torque_NmpA
+    elif abs(value) < WRAP:
+        if question == Question.SR:
+            _take_status(port, sample, int(value))
+        else:
+            port.motor_fault = int(value)
+    return False
+
+
+@kernel
+def _take_line(port: ElmoPort, sample: Sample, now_ns: int) -> bool:
+    """The line up to `;` is complete."""
+    if port.line_overflow != 0:
+        port.garbled += 1
+        return False
+    place = _match(port)
+    if place == NOTHING:
+        if port.expected_count > 0:
+            port.garbled += 1
+        else:
+            port.unexpected += 1
+        return False
+    slot = (port.expected_first + place) % EXPECTED_MAX
+    question = port.expected_question[slot]
+    start = port.expected_length[slot] if port.echo != 0 else 0
+    port.lost += place
+    port.expected_first = (port.expected_first + place + 1) % EXPECTED_MAX
+    port.expected_count -= place + 1
+    port.silent_cycles = 0
+    length = port.line_length - start
+    if length >= 1 and length <= 2 and port.line[port.line_length - 1] == _QUESTION_MARK:
+        port.refused += 1
+        port.last_error = port.line[start] if length == 2 else 0
+        return False
+    return _take_value(port, sample, question, start, now_ns)
+
+
+@kernel
+def take_byte(port: ElmoPort, byte: int, sample: Sample, now_ns: int) -> bool:
+    """Take one received character; True if it completed a new position."""
+    port.heard_bytes += 1
+    port.bits_sent += BITS_PER_CHARACTER
+    if byte == _SEMICOLON:
+        got = False
+        if port.quiet == 0:
+            got = _take_line(port, sample, now_ns)
+        port.line_length = 0
+        port.line_overflow = 0
+        return got
+    if port.line_length < LINE_MAX:
+        port.line[port.line_length] = byte
+        port.line_length += 1
+    else:
+        port.line_overflow = 1
+    return False

@@ -1,0 +1,235 @@
+"""The campaign: no violation in some hundred scenarios, and each invariant does notice what it is for."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import time
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from firmware_py.records import LogRecord
+from firmware_py.schema import new
+from firmware_py.states import AxisPhase, DriveRequest, Fault
+from hil.device_records import PowerState
+from hil.faults import FaultKind
+from tools.campaign import judge as judge_module
+from tools.campaign import runner
+from tools.campaign.envelope import Envelope, envelope, reaction_s
+from tools.campaign.fault_classes import FAULT_CLASSES
+from tools.campaign.judge import judge, run_scenario
+from tools.campaign.report import rows_by_kind, write_figure
+from tools.campaign.scenario import draw_scenario
+from tools.config import Config, load_config
+from tools.fault_campaign import fault_campaign
+from tools.lockstep import LockstepJoint, LockstepRun
+from tools.output import Output
+
+CONFIG = Path(__file__).resolve().parents[2] / "configs" / "virtual.toml"
+KINDS = len(FAULT_CLASSES)
+WIDE = Envelope(-9.0, 9.0, 9.0, 60.0, 20.0, 1.0, 2.0)
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config(CONFIG)
+
+
+@pytest.mark.parametrize("seed", [11, 12])
+def test_no_scenario_violates_an_invariant(config: Config, joint: LockstepJoint, seed: int) -> None:
+    found = [judge(config, joint, draw_scenario(seed, number)) for number in range(6 * KINDS)]
+    assert [(v.number, v.kind, v.violations) for v in found if v.violations] == []
+    assert {v.kind for v in found} == {kind.name.lower() for kind in FAULT_CLASSES}
+    assert any(v.harmless for v in found)
+    tripped = [v for v in found if v.fault != "NONE"]
+    assert len(tripped) > len(found) // 4  # the faults are no trifles
+    assert all(v.fault == "NONE" for v in found if v.harmless)
+
+
+def test_every_kind_of_fault_has_its_class() -> None:
+    assert set(FAULT_CLASSES) == set(FaultKind) - {FaultKind.NONE}
+    for item in FAULT_CLASSES.values():
+        assert item.harmful is not None or item.harmless is not None
+        assert (item.harmful is None) == (not item.causes)
+
+
+def test_number_and_seed_decide_everything(config: Config, joint: LockstepJoint) -> None:
+    assert draw_scenario(3, 40) == draw_scenario(3, 40)
+    assert draw_scenario(3, 40) != draw_scenario(4, 40)
+    assert judge(config, joint, draw_scenario(3, 40)) == judge(config, joint, draw_scenario(3, 40))
+
+
+# --- each invariant notices ------------------------------------------------------------------------------------
+
+
+def good_run(cycles: int = 300, tail: int = 100) -> LockstepRun:
+    """A made-up run that satisfies every invariant: off, enabled with a torque that varies, off."""
+    log = new(LogRecord, cycles)
+    truth = np.zeros((cycles + tail, 4))
+    log.time_ns = np.arange(cycles) * 1_000_000
+    log.phase[:50], log.phase[50:250], log.phase[250:] = AxisPhase.WAITING, AxisPhase.TRACKING, AxisPhase.DISABLING
+    log.request[50:250] = DriveRequest.ENABLE
+    log.command_torque_Nm[51:240] = 10.0 * np.sin(np.arange(189) / 20.0)
+    truth[:, 3] = PowerState.SWITCH_ON_DISABLED
+    truth[53:252, 3] = PowerState.OPERATION_ENABLED
+    state = type("State", (), {"phase": AxisPhase.FINISHED, "fault_value": 0.0, "fault_drive_error": 0})()
+    return LockstepRun(log, state, None, None, Fault.NONE, truth)
+
+
+def all_checks(run: LockstepRun, fault_row: int = -1) -> list[str]:
+    scenario = draw_scenario(1, 0)
+    ending, _ = judge_module._ending(run, WIDE, fault_row, 1e-3)
+    again = judge_module._enabled_again(run, scenario, 0, 1_000_000)
+    return judge_module._commands(run, WIDE) + judge_module._motion(run, WIDE) + ending + again
+
+
+def test_a_good_run_violates_nothing() -> None:
+    assert all_checks(good_run()) == []
+
+
+def set_(field: str, rows: Any, value: Any) -> Any:
+    return lambda run: run.log[field].__setitem__(rows, value)
+
+
+def true(column: int, rows: Any, value: Any) -> Any:
+    return lambda run: run.truth.__setitem__((rows, column), value)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (set_("command_torque_Nm", 100, 60.1), "exceeds 60"),
+        (set_("command_torque_Nm", 100, float("nan")), "torque command"),
+        (set_("command_torque_Nm", slice(100, 110), 35.0), "steps by"),
+        (set_("command_torque_Nm", 20, 0.1), "without power"),
+        (true(0, 60, 9.1), "position"),
+        (true(0, 399, -9.1), "position"),
+        (true(1, 60, -9.1), "speed 9.10"),
+        (true(1, 60, float("nan")), "not finite"),
+        (true(3, 399, PowerState.OPERATION_ENABLED), "not off and at rest"),
+        (true(1, 399, 0.03), "not off and at rest"),
+        (true(3, slice(300, 310), PowerState.OPERATION_ENABLED), "enabled again 51 ms after"),
+        (set_("request", slice(260, 270), DriveRequest.ENABLE), "asked to enable again"),
+        (lambda run: setattr(run.state, "phase", AxisPhase.DISABLING), "did not finish"),
+    ],
+)
+def test_each_invariant_notices(spoil: Any, words: str) -> None:
+    run = good_run()
+    spoil(run)
+    assert any(words in line for line in all_checks(run)), all_checks(run)
+
+
+@pytest.mark.parametrize(("off_row", "late"), [(1299, False), (1302, True)])
+def test_the_time_to_stop_is_checked_at_its_boundary(off_row: int, late: bool) -> None:
+    run = good_run(300, 1200)
+    run.truth[253:off_row, 3] = PowerState.QUICK_STOP_ACTIVE
+    lines = judge_module._ending(run, WIDE, 300, 1e-3)[0]
+    assert any("after the fault" in line for line in lines) is late
+
+
+def test_a_wrong_cause_and_a_fault_that_is_not_noticed_are_violations(config: Config, joint: LockstepJoint) -> None:
+    number = list(FAULT_CLASSES).index(FaultKind.DRIVE_REBOOT)
+    scenario = dataclasses.replace(draw_scenario(1, number), at_s=1.5, trajectory=draw_scenario(1, 1).trajectory)
+    run, _ = run_scenario(config, joint, scenario)
+    assert judge_module._cause(run, scenario, 1e-3, joint.start_ns) == []
+    wrong = dataclasses.replace(run, fault=Fault.VELOCITY_LIMIT)
+    assert "the cause is told as VELOCITY_LIMIT" in judge_module._cause(wrong, scenario, 1e-3, joint.start_ns)[0]
+    harmless = dataclasses.replace(scenario, harmless=True)
+    assert "a harmless fault tripped" in judge_module._cause(run, harmless, 1e-3, joint.start_ns)[0]
+    early = dataclasses.replace(scenario, at_s=1e6)
+    quiet, _ = run_scenario(config, joint, early)
+    late = dataclasses.replace(scenario, at_s=1.2)
+    assert judge_module._cause(quiet, late, 1e-3, joint.start_ns) == ["the fault was not noticed"]
+
+
+def test_the_envelope_follows_its_derivation(config: Config, joint: LockstepJoint) -> None:
+    """Recomputed by hand for a plant of 2 kg m2 without ripple: 60.5 Nm for 10 ms, then friction alone."""
+    plain = dataclasses.replace(
+        draw_scenario(1, 0),
+        kind=FaultKind.TORQUE_REVERSED,
+        plant={"inertia_kgm2": 2.0, "torque_ripple_Nm": (0.0, 0.0), "friction_positive_scale": 1.0,
+               "friction_negative_scale": 1.0},
+    )  # fmt: skip
+    allowed = envelope(config, plain, joint.constants()[0])
+    speed = 1.0 + 60.5 / 2.0 * 0.01
+    brake = 121.0 * 0.1063 * 0.95 / 2.0
+    assert allowed.velocity_max_radps == pytest.approx(speed)
+    way = 0.01 + 0.5 * 30.25 * 1e-4 + speed**2 / (2.0 * brake)
+    assert allowed.position_max_rad == pytest.approx(0.7 + way)
+    assert allowed.position_min_rad == pytest.approx(-0.7 - way)
+    assert allowed.stop_s == pytest.approx(0.01 + speed / brake + 1.0)
+    assert reaction_s(config, FaultKind.SYNC_LOST) == pytest.approx(0.01 + 0.05 + 0.02 + 0.2)
+
+
+# --- the verb --------------------------------------------------------------------------------------------------
+
+
+def output() -> tuple[Output, StringIO, StringIO]:
+    out, err = StringIO(), StringIO()
+    return Output(json=True, stdout=out, stderr=err), out, err
+
+
+def test_the_verb_writes_table_json_and_picture(config: Config, tmp_path: Path) -> None:
+    shown, out, _ = output()
+    assert fault_campaign(config, shown, count=KINDS, seed=5, folder=tmp_path / "new", workers=1) == 0
+    data = json.loads(out.getvalue())
+    assert (data["scenarios"], data["violations"], data["interrupted"]) == (KINDS, 0, False)
+    report = json.loads((tmp_path / "new" / "campaign.json").read_text())
+    assert report["violations"] == []
+    assert len(report["kinds"]) == KINDS
+    assert (tmp_path / "new" / "campaign.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_violation_is_told_with_the_command_that_replays_it(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(judge_module, "_motion", lambda run, allowed: ["made up"])
+    shown, _, err = output()
+    assert fault_campaign(config, shown, count=2, seed=5, folder=tmp_path, workers=1) == 10
+    assert "--seed 5 --scenario 0" in err.getvalue()
+    report = json.loads((tmp_path / "campaign.json").read_text())
+    assert report["violations"][1]["violations"] == ["made up"]
+    assert report["violations"][1]["scenario"]["number"] == 1
+
+
+def test_one_scenario_is_replayed(config: Config) -> None:
+    shown, out, _ = output()
+    assert fault_campaign(config, shown, seed=5, scenario=7) == 0
+    data = json.loads(out.getvalue())
+    assert data["scenario"]["number"] == 7
+    assert data["verdict"]["number"] == 7
+
+
+def test_ctrl_c_keeps_what_is_done(config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def three(*_: Any) -> Any:
+        joint = LockstepJoint(config)
+        for number in range(3):
+            yield judge(config, joint, draw_scenario(1, number))
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(5.0)
+
+    monkeypatch.setattr(runner, "_verdicts", three)
+    shown, out, _ = output()
+    assert fault_campaign(config, shown, count=100, folder=tmp_path) == 130
+    data = json.loads(out.getvalue())
+    assert (data["scenarios"], data["interrupted"]) == (3, True)
+    assert json.loads((tmp_path / "campaign.json").read_text())["scenarios"] == 3
+
+
+def test_workers_give_the_same_verdicts_as_one_process(config: Config, joint: LockstepJoint, tmp_path: Path) -> None:
+    done: list[float] = []
+    found, _, interrupted = runner.run_campaign(CONFIG, 9, 40, done.append, workers=2)
+    assert not interrupted
+    assert done[-1] == 40.0
+    alone = [judge(config, joint, draw_scenario(9, number)) for number in range(40)]
+    assert [dataclasses.astuple(v)[:8] for v in found] == [dataclasses.astuple(v)[:8] for v in alone]
+    rows = rows_by_kind(found)
+    assert sum(row.scenarios for row in rows) == 40
+    write_figure(tmp_path / "a.png", found, 1.0)
+    assert (tmp_path / "a.png").stat().st_size > 10_000

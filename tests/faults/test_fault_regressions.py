@@ -1,0 +1,102 @@
+"""What the fault campaign found, each as it was found, with the twin that must not trip."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES
+from firmware_py.states import AxisPhase, Fault
+from hil.device_records import PowerState
+from hil.fault_lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
+from hil.faults import FaultKind
+from tools.lockstep import LockstepJoint, LockstepRun
+
+MakeFault = Callable[..., Any]
+AT_s = 2.0  # after the power stage is on: the joint tracks
+HEARTBEAT_s, SAMPLE_AGE_s = 0.2, 0.05
+
+
+def seconds_until(run: LockstepRun, state: PowerState) -> float:
+    """From the beginning of the fault to the first period in this power state."""
+    enabled = int(np.argmax(run.truth[:, TRUE_POWER_STATE] == PowerState.OPERATION_ENABLED))
+    rows = np.flatnonzero(run.truth[enabled + int(AT_s * 1000) :, TRUE_POWER_STATE] == state)
+    return float(rows[0]) * 1e-3 if len(rows) else float("inf")
+
+
+@pytest.mark.parametrize(("kind", "fault"), [(FaultKind.SYNC_LOST, Fault.STALE_SAMPLE), (FaultKind.RPDO_LOST, None)])
+def test_a_drive_that_does_not_hear_the_loop_is_stopped_by_its_own_watchdog(
+    joint: LockstepJoint, one_fault: MakeFault, kind: FaultKind, fault: Fault | None
+) -> None:
+    """The loop went on sending its heartbeat, so that the drive held the last torque until the loop ended, 5 s on."""
+    run = joint.run_with_faults(one_fault(kind, AT_s), tail_s=1.0)
+    assert run.fault is not Fault.NONE
+    assert fault is None or run.fault is fault
+    tripped = int(np.argmax(run.log.fault != Fault.NONE))
+    enabled = int(np.argmax(run.truth[:, TRUE_POWER_STATE] == PowerState.OPERATION_ENABLED))
+    known_s = (tripped - enabled) * 1e-3 - AT_s
+    longest_s = known_s + UNHEEDED_MAX_CYCLES * 1e-3 + HEARTBEAT_s + 0.01
+    assert seconds_until(run, PowerState.QUICK_STOP_ACTIVE) <= longest_s
+    assert run.truth[-1, TRUE_POWER_STATE] == PowerState.SWITCH_ON_DISABLED
+
+
+def test_its_twin_a_drive_that_hears_again_in_time_is_not_left_alone(
+    joint: LockstepJoint, one_fault: MakeFault
+) -> None:
+    run = joint.run_with_faults(one_fault(FaultKind.SYNC_LOST, AT_s, 0.045))
+    assert run.fault is Fault.NONE
+    assert run.state.phase == AxisPhase.FINISHED
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.5])
+def test_behind_a_stuck_encoder_the_joint_does_not_run_away(
+    joint: LockstepJoint, one_fault: MakeFault, noise: float
+) -> None:
+    """The law pushed ever harder: 4.7 rad/s before the following error was seen."""
+    plant = joint.plant_constants.copy()
+    plant[0].encoder_noise_counts = noise
+    for at_s in np.arange(1.0, 8.0, 0.7):
+        run = joint.run_with_faults(one_fault(FaultKind.ENCODER_STUCK, float(at_s)), plant_constants=plant)
+        assert run.fault is Fault.POSITION_FROZEN
+        assert np.abs(run.truth[:, TRUE_VELOCITY_radps]).max() < 1.0
+
+
+@pytest.mark.parametrize("friction_kind", [2, 3])
+@pytest.mark.parametrize("scale", [0.85, 1.0, 1.15])
+def test_its_twin_a_joint_that_sticks_at_its_reversals_is_not_frozen(
+    joint: LockstepJoint, friction_kind: int, scale: float, one_fault: MakeFault
+) -> None:
+    plant = joint.plant_constants.copy()
+    plant[0].friction_kind = friction_kind
+    plant[0].positive_factor *= scale
+    plant[0].negative_factor *= scale
+    run = joint.run_with_faults(one_fault(FaultKind.NONE), plant_constants=plant)
+    assert run.fault is Fault.NONE
+    assert run.state.phase == AxisPhase.FINISHED
+
+
+def test_missing_samples_are_no_frozen_reading(joint: LockstepJoint, one_fault: MakeFault) -> None:
+    """Samples that stay away were told as a reading that stands still."""
+    run = joint.run_with_faults(one_fault(FaultKind.TPDO_LOST, AT_s))
+    assert run.fault is Fault.STALE_SAMPLE
+    assert joint.run_with_faults(one_fault(FaultKind.TPDO_LOST, AT_s, 0.045)).fault is Fault.NONE
+
+
+@pytest.mark.parametrize("share", [0.3, 1.0])
+def test_samples_with_holes_prove_standstill_too(joint: LockstepJoint, one_fault: MakeFault, share: float) -> None:
+    """One hole within settle_s began the wait for standstill anew: STOP_TIMEOUT at the end of a good run."""
+    run = joint.run_with_faults(one_fault(FaultKind.TPDO_REORDERED, 0.0, magnitude=share))
+    assert run.fault is Fault.NONE
+    assert run.state.phase == AxisPhase.FINISHED
+
+
+def test_a_watchdog_that_trips_is_told_by_its_error_code(joint: LockstepJoint, one_fault: MakeFault) -> None:
+    """A stopped node sends no TPDO: the loop saw stale samples only, and did not tell the drive's 8130h."""
+    run = joint.run_with_faults(one_fault(FaultKind.CONTROLLER_HEARTBEAT_LOST, AT_s))
+    assert (run.fault, int(run.state.fault_drive_error)) == (Fault.STALE_SAMPLE, 0x8130)
+    assert seconds_until(run, PowerState.QUICK_STOP_ACTIVE) <= HEARTBEAT_s
+    twin = joint.run_with_faults(one_fault(FaultKind.CONTROLLER_HEARTBEAT_LOST, AT_s, 0.06))
+    assert twin.fault is Fault.NONE

@@ -1,0 +1,138 @@
+"""The last two seconds before a fault are in a log, whatever crashed; a reader that stalls disturbs nobody."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from firmware_py.records import LogRecord
+from firmware_py.schema import dtype_of
+from firmware_py.states import AxisPhase, Fault, StopRequest
+from tools.config import load_config
+from tools.config_records import axis_constants, trajectory_table
+from tools.loop_handle import LoopHandle
+from tools.open_drive import open_drive
+from tools.run_log import RunLogWriter, read_run_log
+from tools.shared_block import RING_RECORDS, SharedBlock
+
+
+@pytest.fixture
+def moving(bench: Any, processes: Any) -> Any:
+    moving = processes.Moving(bench)
+    time.sleep(2.2)  # two seconds to keep
+    yield moving
+    moving.close()
+
+
+def covered_s(records: Any) -> float:
+    return float(records.time_ns[-1] - records.time_ns[0]) * 1e-9
+
+
+def test_supervisor_killed_the_loop_saves_what_it_has(moving: Any, processes: Any) -> None:
+    killed_ns = time.monotonic_ns()
+    moving.run.signal(signal.SIGKILL)
+    assert processes.gone(moving.loop, 20.0)
+    (path,) = moving.bench.folder.glob("runs/*.tail.mcap")
+    tail = read_run_log(path)
+    assert tail.complete
+    records = tail.records
+    assert records.time_ns[0] < killed_ns - 2_000_000_000
+    assert records.phase[-1] == AxisPhase.FINISHED
+    assert records.fault[-1] == Fault.SUPERVISOR_LOST
+    gaps = np.diff(records.time_ns)
+    assert (gaps == 1_000_000 * (1 + records.skipped[1:])).all()  # without a hole up to the end
+    assert any("supervising process" in event.text for event in tail.events)
+
+
+def test_loop_killed_the_supervisor_saves_the_ring(moving: Any) -> None:
+    os.kill(moving.loop, signal.SIGKILL)
+    killed_ns = time.monotonic_ns()
+    done = moving.run.finished(20.0)
+    assert done.code == 7
+    log = moving.bench.log()
+    assert log.complete
+    assert covered_s(log.records) > 2.0
+    # up to the very last cycles: the ring outlives the process that wrote it
+    assert killed_ns - log.records.time_ns[-1] < 100_000_000
+    assert log.records.phase[-1] == AxisPhase.TRACKING
+
+
+def test_its_twin_a_run_that_ends_by_itself_leaves_no_tail(bench: Any) -> None:
+    config = bench.config()
+    bench.joint(config)
+    assert bench.run("run", config, "-y").code == 0
+    assert list(bench.folder.glob("runs/*.tail.mcap")) == []
+    assert bench.log().records.phase[-1] == AxisPhase.FINISHED
+
+
+def test_a_reader_that_stalls_loses_records_which_are_counted_and_the_loop_goes_on(bench: Any) -> None:
+    """The loop runs for longer than the ring holds while nobody reads."""
+    path = bench.folder / bench.config(trajectory__duration_s=60.0, sequence__supervisor_timeout_s=10.0)
+    bench.joint(path.name)
+    config = load_config(path)
+    table = trajectory_table(config)
+    seconds = RING_RECORDS / config.loop.rate_Hz + 1.5
+    with LoopHandle(config, table) as loop:
+        drive = open_drive(config)
+        try:
+            report = drive.commission()
+            loop.wait_ready()
+            drive.start_cyclic()
+            loop.go(axis_constants(config, start_position_rad=report.start_position_rad), drive.port())
+            give_up = time.monotonic() + 2.0 * seconds
+            while loop.cycles < RING_RECORDS + 1000:
+                assert loop.running()
+                assert time.monotonic() < give_up
+                loop.beat()
+                time.sleep(0.05)
+            records = loop.new_records()
+            assert loop.lost_records >= 1000
+            assert len(records) == RING_RECORDS
+            assert (np.diff(records.cycle) >= 1).all()
+            assert loop.phase is AxisPhase.TRACKING
+            loop.request_stop(StopRequest.RAMP)
+            while loop.running():
+                loop.beat()
+                time.sleep(0.02)
+            assert loop.block.state[0].fault == Fault.NONE
+            last = loop.new_records()
+            assert last.cycle[0] > records.cycle[-1]
+            assert loop.lost_records + len(records) + len(last) == loop.cycles
+        finally:
+            drive.make_safe()
+            drive.close()
+
+
+@pytest.mark.parametrize(
+    ("written", "lost"), [(RING_RECORDS, 0), (RING_RECORDS + 1, 1), (3 * RING_RECORDS, 2 * RING_RECORDS)]
+)
+def test_the_ring_at_its_boundary(written: int, lost: int) -> None:
+    block = SharedBlock.create(1)
+    for number in range(max(0, written - RING_RECORDS), written):
+        block.ring[number % RING_RECORDS].cycle = number
+    records, counted = block.new_records(0, written)
+    assert counted == lost
+    assert records.cycle[0] == lost
+    assert records.cycle[-1] == written - 1
+
+
+def test_a_log_folder_that_is_no_folder_is_refused_before_anything_moves(bench: Any) -> None:
+    (bench.folder / "runs").write_text("")
+    config = bench.config()
+    bench.joint(config)
+    bench.run("run", config, "-y").refused(8, "runs")
+    assert bench.disabled()
+
+
+def test_the_writer_keeps_what_it_wrote_before_it_was_killed(tmp_path: Any) -> None:
+    path = tmp_path / "run.mcap"
+    log = RunLogWriter(path, {})
+    log.write_records(np.zeros(2000, dtype_of(LogRecord)))
+    log.write_event(20, "test", "flushed")
+    assert len(read_run_log(path).records) == 2000  # without close
+    log.close()

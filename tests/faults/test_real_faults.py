@@ -1,0 +1,181 @@
+"""The faults of the campaign in real time: a loop process of its own, the virtual bus, the drive in this process.
+
+Faults count from the moment in which the power stage is on; the joint tracks by then.  Processes that die or hang are
+in tests/hil/test_processes.py.
+"""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Callable
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from firmware_py.states import AxisPhase, DriveRequest, Fault
+from hil.faults import LOCKSTEP_ONLY, FaultKind
+from tools.config import Config, load_config
+from tools.config_plant import FAULT_KINDS, fault_constants
+from tools.output import Output
+from tools.supervisor import RunResult, Supervisor
+from tools.virtual_joint import serve_virtual_joint
+
+SHIPPED = (Path(__file__).resolve().parents[2] / "configs" / "virtual.toml").read_text()
+AT_s = 0.7
+OFF = ("switch on disabled", "fault")
+MOTION = (Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR, Fault.POSITION_JUMP, Fault.POSITION_FROZEN)
+GONE = (Fault.STALE_SAMPLE, Fault.BUS_ERROR)
+
+RunWith = Callable[..., RunResult]
+
+
+@pytest.fixture
+def run_with(tmp_path: Path) -> RunWith:
+    """`run_with(kind, duration_s, magnitude)`: one whole run with this fault in [[virtual.faults]]."""
+
+    def run(kind: FaultKind, duration_s: float, magnitude: float, tracking_s: float = 1.2) -> RunResult:
+        text = SHIPPED.replace('channel = "virtual0"', f'channel = "fault-{os.getpid()}-{uuid.uuid4().hex[:8]}"')
+        text = text.replace('approach_s = "auto"', "approach_s = 0.3")
+        text = text.replace("initial_position_rad = 0.1", "initial_position_rad = 0.0")
+        text = text.replace("duration_s = 10.0", f"duration_s = {tracking_s}")
+        # a busy computer must not be the fault that is seen
+        for key, value in {
+            "sample_age_max_s = 0.05": "sample_age_max_s = 0.25", "skipped_max_s = 0.05": "skipped_max_s = 0.25",
+            "heartbeat_s = 0.2": "heartbeat_s = 0.4", "stop_timeout_s = 3.0": "stop_timeout_s = 1.0",
+            "off_timeout_s = 2.0": "off_timeout_s = 0.7",
+        }.items():  # fmt: skip
+            assert key in text
+            text = text.replace(key, value)
+        text += (
+            f'\n[[virtual.faults]]\nkind = "{kind.name.lower()}"\nat_s = {AT_s}\n'
+            f"duration_s = {duration_s}\nmagnitude = {magnitude}\n"
+        )
+        path = tmp_path / "joint.toml"
+        path.write_text(text)
+        config = load_config(path)
+        with serve_virtual_joint(config):
+            supervisor = Supervisor(
+                config, Output(quiet=True, stderr=StringIO()), tmp_path / "run.mcap", lambda _: True,
+                allow_low_margin=True,
+            )  # fmt: skip
+            result = supervisor.run()
+        assert result is not None
+        return result
+
+    return run
+
+
+LONG = 60.0
+HARMFUL: list[tuple[FaultKind, float, float, tuple[Fault, ...]]] = [
+    (FaultKind.FRAMES_LOST, 1.5, 1.0, GONE),
+    (FaultKind.SYNC_LOST, LONG, 1.0, GONE),
+    (FaultKind.TPDO_LOST, LONG, 1.0, GONE),
+    (FaultKind.CONTROLLER_HEARTBEAT_LOST, LONG, 1.0, (*GONE, Fault.DRIVE_NOT_ENABLED)),
+    (FaultKind.RPDO_LENGTH, LONG, 2.0, (*MOTION, *GONE)),
+    (FaultKind.TPDO_LENGTH, LONG, 7.0, GONE),
+    (FaultKind.TPDO_CORRUPTED, 0.05, 1.0, (*MOTION, Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED)),
+    (FaultKind.DRIVE_REBOOT, 1.0, 1.0, (Fault.DRIVE_RESTARTED,)),
+    (FaultKind.DRIVE_FAULT, 0.1, 0x7121, (Fault.DRIVE_FAULT,)),
+    (FaultKind.ENCODER_STUCK, LONG, 1.0, MOTION),
+    (FaultKind.ENCODER_JUMP, LONG, 0.1, MOTION),
+    (FaultKind.ENCODER_REVERSED, LONG, 1.0, MOTION),
+    (FaultKind.TORQUE_REVERSED, LONG, 1.0, MOTION),
+    (FaultKind.CURRENT_LOOP_DEAD, LONG, 1.0, MOTION),
+    (FaultKind.LOAD_JUMP, LONG, -50.0, MOTION),
+]
+HARMLESS: list[tuple[FaultKind, float, float]] = [
+    (FaultKind.FRAMES_LOST, 0.01, 1.0),
+    (FaultKind.TPDO_LOST, 0.02, 1.0),
+    (FaultKind.RPDO_LOST, 0.005, 1.0),
+    (FaultKind.RPDO_DUPLICATED, LONG, 1.0),
+    (FaultKind.TPDO_DUPLICATED, LONG, 0.5),
+    (FaultKind.FOREIGN_FRAMES, LONG, 3.0),
+    (FaultKind.DRIVE_HEARTBEAT_LOST, LONG, 1.0),
+    (FaultKind.ENCODER_JUMP, LONG, 0.0003),
+    (FaultKind.LOAD_JUMP, LONG, 3.0),
+]
+
+
+def once_enabled(records: Any) -> bool:
+    """The loop asked to enable in one stretch of cycles only."""
+    asked = np.flatnonzero(np.asarray(records.request) == DriveRequest.ENABLE)
+    return len(asked) > 0 and bool((np.diff(asked) == 1).all())
+
+
+@pytest.mark.parametrize(("kind", "duration_s", "magnitude", "causes"), HARMFUL, ids=lambda v: getattr(v, "name", None))
+def test_the_joint_is_stopped_and_disabled_and_the_user_is_told(
+    run_with: RunWith, kind: FaultKind, duration_s: float, magnitude: float, causes: tuple[Fault, ...]
+) -> None:
+    result = run_with(kind, duration_s, magnitude)
+    assert result.fault in causes
+    text = result.fault_text
+    assert text is not None
+    assert text.happened
+    assert text.cause
+    assert text.next_step
+    assert once_enabled(result.records)
+    assert np.abs(result.records.command_torque_Nm).max() <= 60.0
+    assert (np.asarray(result.records.command_torque_Nm)[result.records.request != DriveRequest.ENABLE] == 0.0).all()
+    assert result.drive_state in OFF
+    if kind is FaultKind.DRIVE_FAULT:
+        assert "7121h" in text.happened
+    assert result.records.fault[-1] == result.fault  # and it is in the log
+    assert (result.records.phase == AxisPhase.TRACKING).any()
+
+
+@pytest.mark.parametrize(("kind", "duration_s", "magnitude"), HARMLESS, ids=lambda v: getattr(v, "name", None))
+def test_its_twin_goes_on_to_the_end(run_with: RunWith, kind: FaultKind, duration_s: float, magnitude: float) -> None:
+    result = run_with(kind, duration_s, magnitude)
+    assert result.fault is Fault.NONE, result.fault_text
+    assert result.drive_state == "switch on disabled"
+    tracked = result.records[result.records.phase == AxisPhase.TRACKING]
+    assert tracked.trajectory_s[-1] == pytest.approx(1.2, abs=0.06)
+    assert result.records.phase[-1] == AxisPhase.FINISHED
+
+
+# --- the configuration -----------------------------------------------------------------------------------------
+
+
+def configured(tmp_path: Path, table: str) -> Config:
+    path = tmp_path / "joint.toml"
+    path.write_text(SHIPPED + table)
+    return load_config(path)
+
+
+def test_faults_come_from_the_configuration(tmp_path: Path) -> None:
+    table = '\n[[virtual.faults]]\nkind = "encoder_jump"\nat_s = 2.0\nmagnitude = -0.1\n'
+    table += '\n[[virtual.faults]]\nkind = "tpdo_lost"\nat_s = 1.0\nduration_s = 0.5\nmagnitude = 0.25\nseed = 7\n'
+    first, second = fault_constants(configured(tmp_path, table))
+    assert (first.kind, first.start_s, first.magnitude) == (FaultKind.ENCODER_JUMP, 2.0, -0.1)
+    assert (second.kind, second.start_s, second.duration_s) == (FaultKind.TPDO_LOST, 1.0, 0.5)
+    assert (second.magnitude, second.seed) == (0.25, 7)
+    assert len(fault_constants(load_config(Path(__file__).resolve().parents[2] / "configs" / "virtual.toml"))) == 0
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ('kind = "encoder_jmp"\nat_s = 1.0', "(=encoder_jmp) must be one of"),
+        ('kind = "encoder_jump"', "at_s is missing"),
+        ('kind = "encoder_jump"\nat_s = -1.0', "at_s (=-1) must be in [0..1e+06]"),
+        ('kind = "encoder_jump"\nat_s = 1.0\nduration_s = 0.0', "duration_s (=0) must be in (0..1e+06]"),
+        ('kind = "encoder_jump"\nat = 1.0', "is not a known key"),
+        ('kind = "clock_step"\nat_s = 1.0', "(=clock_step) must be one of"),
+    ],
+)
+def test_a_bad_fault_is_refused_by_one_line(tmp_path: Path, table: str, words: str) -> None:
+    from drivers.errors import ConfigurationError
+
+    with pytest.raises(ConfigurationError) as caught:
+        configured(tmp_path, f"\n[[virtual.faults]]\n{table}\n")
+    assert words in caught.value.message
+    assert "virtual.faults" in caught.value.message
+
+
+def test_all_kinds_but_those_of_the_controllers_own_computer_can_be_configured() -> None:
+    named = {FaultKind[name.upper()] for name in FAULT_KINDS}
+    assert named == set(FaultKind) - {FaultKind.NONE, *LOCKSTEP_ONLY}

@@ -1,0 +1,114 @@
+"""What the scope remembers: the newest records in a ring, the newest events, and what to draw of them."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from firmware_py.records import LogRecord
+from firmware_py.schema import dtype_of, new
+from tools.reporting.run_figures import powered
+from tools.run_figure import drawn_indices
+from tools.run_log import Event
+
+RING_RECORDS = 1 << 16  # 65 s at 1 kHz
+EVENTS = 50
+POINTS = 1000  # of one signal on the page
+
+# name on the page -> (field of LogRecord, factor)
+SIGNALS: dict[str, tuple[str, float]] = {
+    "error [mrad]": ("error_rad", 1e3),
+    "angle [rad]": ("position_rad", 1.0),
+    "desired angle [rad]": ("desired_position_rad", 1.0),
+    "velocity [rad/s]": ("velocity_radps", 1.0),
+    "desired velocity [rad/s]": ("desired_velocity_radps", 1.0),
+    "command torque [Nm]": ("command_torque_Nm", 1.0),
+    "measured torque [Nm]": ("measured_torque_Nm", 1.0),
+    "friction feed-forward [Nm]": ("friction_torque_Nm", 1.0),
+    "network torque [Nm]": ("network_torque_Nm", 1.0),
+    "observer torque [Nm]": ("observer_torque_Nm", 1.0),
+    "learned torque [Nm]": ("learned_torque_Nm", 1.0),
+    "wake-up late [us]": ("wake_late_ns", 1e-3),
+    "round trip [us]": ("round_trip_ns", 1e-3),
+}
+# without meaning while the law rests
+_OF_THE_LAW = ("error_rad", "desired_position_rad", "desired_velocity_radps")
+
+
+class History:
+    """Filled by one thread, read by others; its memory never grows."""
+
+    def __init__(self, ring_records: int = RING_RECORDS) -> None:
+        self._ring = new(LogRecord, ring_records)
+        self._head = 0
+        self._start_ns = 0
+        self._lock = threading.Lock()
+        self.skipped = 0
+        self.events: deque[Event] = deque(maxlen=EVENTS)
+        self.ended = False
+
+    def take(self, records: Any) -> None:
+        """Append records, shape (N,), in order of time."""
+        if not len(records):
+            return
+        with self._lock:
+            if self._head == 0:
+                self._start_ns = int(records["time_ns"][0])
+            index = np.arange(self._head, self._head + len(records)) % len(self._ring)
+            self._ring[index[-len(self._ring) :]] = records[-len(self._ring) :]
+            self._head += len(records)
+            self.skipped += int(records["skipped"].sum())
+
+    def take_bytes(self, body: bytes) -> None:
+        """As `take`, of records as they came through the socket."""
+        self.take(np.frombuffer(body, dtype_of(LogRecord)))
+
+    def newest(self, span_s: float, before_s: float | None = None) -> Any:
+        """A copy of the records of the last `span_s`, up to `before_s` since the start if that is given."""
+        with self._lock:
+            count = min(self._head, len(self._ring))
+            rows = self._ring[np.arange(self._head - count, self._head) % len(self._ring)]
+        if not count:
+            return rows
+        time_s = self.seconds(rows)
+        end_s = float(time_s[-1]) if before_s is None else before_s
+        return rows[(time_s > end_s - span_s) & (time_s <= end_s)]
+
+    def seconds(self, records: Any) -> np.ndarray:
+        """float64[N] since the first record ever taken."""
+        since: np.ndarray = (records["time_ns"] - self._start_ns) * 1e-9
+        return since
+
+    def series(self, records: Any, signal: str) -> list[list[float]]:
+        """[seconds, value] of a signal, at most about POINTS of them, least and greatest of each stretch."""
+        field, factor = SIGNALS[signal]
+        values = np.asarray(records[field], float) * factor
+        if field in _OF_THE_LAW:
+            values = np.where(powered(records), values, np.nan)
+        keep = drawn_indices(values, POINTS)
+        keep = keep[np.isfinite(values[keep])]
+        pairs = np.stack([self.seconds(records)[keep], values[keep]], axis=1)
+        return np.round(pairs, 6).tolist()
+
+
+def crossing_s(time_s: np.ndarray, values: np.ndarray, level: float, *, rising: bool) -> float | None:
+    """When the signal last crossed the level in that direction; None if it did not."""
+    above = values > level if rising else values < level
+    found = np.flatnonzero(above[1:] & ~above[:-1])
+    return float(time_s[found[-1] + 1]) if len(found) else None
+
+
+def percentiles_us(records: Any) -> dict[str, str]:
+    """p50 / p99 / max of wake-up, round trip and work [us] in these records."""
+    found = {}
+    for name, field in (("wake-up late", "wake_late_ns"), ("round trip", "round_trip_ns"), ("work", "work_ns")):
+        values = records[field] / 1000.0
+        if field == "round_trip_ns":
+            values = values[values > 0.0]
+        if len(values):
+            p50, p99 = np.percentile(values, (50.0, 99.0))
+            found[name] = f"{p50:.0f} / {p99:.0f} / {values.max():.0f} us"
+    return found
