@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import can
+
 from drivers.can.open import CYCLIC_INTERFACES, open_python_can
 from drivers.canopen.drive import CanopenDrive
 from drivers.drive import Drive
@@ -29,7 +31,8 @@ def check_cyclic_rate(config: Config) -> None:
         serial_line_share(config)
         return
     cyclic_bus_load(config)
-    if config.bus.interface not in CYCLIC_INTERFACES:
+    # a name that python-can does not know is told when the bus is opened
+    if config.bus.interface not in CYCLIC_INTERFACES and config.bus.interface in can.VALID_INTERFACES:
         check_portable_rate(config.bus.interface, config.loop.rate_Hz)
 
 

@@ -232,9 +232,10 @@ class Sweep:
         if text is None:
             return
         done = len(self.file.done) if self.file is not None else 0
+        kept = f"{done} points are in {self.out}" if done else "nothing was measured"
         raise MotionFault(
-            f"{fault.name} ({int(fault)}): {text.happened}; {done} points are in {self.out}",
-            f"likely cause: {text.cause}; next: {text.next_step}; then --resume",
+            f"{fault.name} ({int(fault)}): {text.happened}; {kept}",
+            f"likely cause: {text.cause}; next: {text.next_step}" + ("; then --resume" if done else ""),
         )
 
     def _report(self, stopped: str | None) -> int:

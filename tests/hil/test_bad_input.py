@@ -47,7 +47,7 @@ class Witness:
         ("kp = 784.0\nkpp = 3.0", ("control.kpp", "not a known key")),
         ("torque_max_mNm = 60.0", ("limits.torque_max_mNm", "torque_max_Nm")),
         ("node = 128", ("drive.node", "128", "[1..127]")),
-        ("rate_Hz = -5.0", ("loop.rate_Hz", "-5", "[100..4000]")),
+        ("rate_Hz = -5.0", ("loop.rate_Hz", "-5", "[10..10000]")),
         ('mode = "csp"', ("drive.mode", "csp", "cst")),
         ("position_max_rad = -0.9", ("limits.position_m",)),
         ("amplitude_rad = 0.9", ("trajectory", "0.9", "[-0.7..0.7]")),

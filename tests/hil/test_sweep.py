@@ -134,6 +134,14 @@ def eds_with_modes(config: Config, folder: Path, supported: int) -> Config:
     return load_config(folder / "joint.toml")
 
 
+def test_a_fault_before_the_first_point_leaves_no_file_and_says_so(config: Config, tmp_path: Path) -> None:
+    weak = config.model_copy(update={"limits": config.limits.model_copy(update={"torque_max_Nm": 33.0})})
+    with pytest.raises(MotionFault, match="nothing was measured") as error:
+        swept(weak, tmp_path / "data.csv", points=12)
+    assert "--resume" not in str(error.value)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("supported", "mode"),
     [(0x38D, "cyclic_sync_velocity"), (0x28D, "profile_velocity"), (0x281, "cyclic_sync_torque"), (0x8, "torque")],
@@ -157,7 +165,8 @@ def test_a_mode_that_the_drive_lacks_is_a_device_error(
 
 def test_a_fault_keeps_what_was_measured_and_resume_completes_it(config: Config, tmp_path: Path) -> None:
     # the first speeds need less torque than the limit, the fastest more: the drive saturates
-    limits = config.limits.model_copy(update={"torque_max_Nm": 33.0})
+    # (the warm-up at half the fastest speed needs 35 Nm, without a ripple that would lift it off the limit)
+    limits = config.limits.model_copy(update={"torque_max_Nm": 36.0})
     weak = config.model_copy(update={"limits": limits})
     out = tmp_path / "data.csv"
     with pytest.raises(MotionFault, match=r"points are in"):

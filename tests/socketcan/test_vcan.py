@@ -58,7 +58,10 @@ def joint(tmp_path: Path, config: str, interface: None) -> Iterator[subprocess.P
     """`jointctl hil` on vcan0."""
     process = subprocess.Popen(jointctl("hil", config, *ON_VCAN), cwd=tmp_path, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None
-    assert "virtual joint" in process.stderr.readline()
+    seen = ""
+    while "Ctrl-C ends it" not in seen:
+        seen = process.stderr.readline()
+        assert seen, f"ended with {process.wait()}"
     yield process
     process.terminate()
     process.communicate(timeout=20.0)
