@@ -7,6 +7,7 @@ that a master which has its answer finds the controlword carried out.  The loop 
 
 from __future__ import annotations
 
+import errno as errno_codes
 import socket
 import threading
 from typing import Any
@@ -38,6 +39,7 @@ from hil.frames import FRAME_SIZE, FrameQueue
 from hil.plant_faults import step_faults
 from hil.plant_records import PlantConstants, PlantState
 
+ENETDOWN = errno_codes.ENETDOWN
 STOP_WORD = 0  # not zero: leave the loop
 SEND_ERRORS_WORD = 1  # frames that could not be sent
 ENDED_WORD = 2  # 1 = stopped, 2 = the bus has gone
@@ -85,7 +87,8 @@ def _receive(fd: int, frame: np.ndarray) -> int:
         return -1
     if got < 0:
         code = errno()
-        return 0 if code in (EAGAIN, EINTR) else -1
+        # an interface that goes down may come up again: a drive outlives its bus
+        return 0 if code in (EAGAIN, EINTR, ENETDOWN) else -1
     return got
 
 

@@ -80,8 +80,22 @@ def fault_campaign(
     )
 
 
+def bench(
+    quick: Annotated[bool, typer.Option("--quick", help="shorter, with more noise")] = False,
+    out: Annotated[Path | None, typer.Option("--out", help="folder for bench.json and bench.png")] = None,
+    only: Annotated[list[str] | None, typer.Option("--only", help="law, loop, lockstep, swarm or start")] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Speed as paired ratios: the law against C and numpy, the loop against C and others, lockstep, swarm, start."""
+    from tools.bench import bench as run_bench
+
+    raise typer.Exit(run_bench(Output(json=json, quiet=quiet), quick=quick, out=out, only=tuple(only or ())))
+
+
 def register(app: typer.Typer) -> None:
     """Add the verbs."""
     app.command()(paper)
     app.command()(study)
     app.command("fault-campaign")(fault_campaign)
+    app.command()(bench)

@@ -1,0 +1,191 @@
+"""The arithmetic and the report of the benchmarks; nothing here measures time.  `bench_*.py` beside it do."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.errors import ConfigurationError
+from firmware_py.states import ControllerKind
+from tools.bench import PartError, bench
+from tools.benchmarks import c_programs
+from tools.benchmarks.c_programs import NoCompilerError, compiler
+from tools.benchmarks.compiled_loops import at_rate, run_cyclictest
+from tools.benchmarks.law_memory import FIRST_WEIGHT, law_doubles, state_doubles
+from tools.benchmarks.law_speed import SAME_NUMBERS, difference, kernel_ticks, law_rows, sine_inputs
+from tools.benchmarks.load import LOADS, load
+from tools.benchmarks.loop_times import times_from_ns
+from tools.benchmarks.numpy_law import NumpyLaw
+from tools.benchmarks.outcome import outcome_data, outcome_table, write_outcome
+from tools.benchmarks.paired import Row, compared, interleaved, measured, skipped
+from tools.benchmarks.start_speed import verbs
+from tools.config import load_config, shipped_config
+from tools.config_records import axis_constants
+from tools.output import Output
+
+
+@pytest.fixture(scope="module")
+def constants():
+    return axis_constants(load_config(shipped_config("virtual")))
+
+
+def test_the_ratio_is_the_median_of_the_pairs_and_not_the_ratio_of_the_medians():
+    row = compared("g", "w", [1.0, 10.0, 300.0], [2.0, 10.0, 100.0], "us", "C")
+    assert row.ratio == 1.0  # of 0.5, 1, 3
+    assert (row.low, row.high) == (0.75, 2.0)
+    assert (row.ours, row.other, row.pairs) == (10.0, 10.0, 3)
+
+
+@pytest.mark.parametrize(("ours", "other"), [([], []), ([1.0], [1.0, 2.0])])
+def test_values_that_are_no_pairs_are_refused(ours, other):
+    with pytest.raises(ValueError, match="equal in number"):
+        compared("g", "w", ours, other, "us", "C")
+
+
+@pytest.mark.parametrize(
+    ("ours", "reached"),
+    [(1.19, True), (1.2, True), (np.nextafter(1.2, 2.0), False), (1.21, False)],
+)
+def test_a_goal_is_met_up_to_and_including_its_value(ours, reached):
+    assert compared("g", "w", [ours], [1.0], "us", "C", goal=1.2).reached is reached
+    assert measured("g", "w", [ours], "s", goal=1.2).reached is reached
+
+
+def test_nothing_measured_reaches_no_goal_and_misses_none():
+    assert skipped("g", "w", "no compiler").reached is None
+    assert Row("g", "w", math.nan, "s", goal=1.0, goal_is_value=True).reached is None
+    assert compared("g", "w", [1.0], [1.0], "us", "C").reached is None
+
+
+def test_pairs_are_measured_in_turn_and_the_order_turns_round():
+    calls: list[str] = []
+
+    def note(name: str) -> float:
+        calls.append(name)
+        return float(len(calls))
+
+    first, second = interleaved(3, lambda: note("a"), lambda: note("b"))
+    assert "".join(calls) == "abbaab"
+    assert first == [1.0, 4.0, 5.0]
+    assert second == [2.0, 3.0, 6.0]
+
+
+def test_the_numpy_law_gives_the_numbers_of_the_kernel(constants):
+    inputs = sine_inputs(constants[0], 3000)
+    assert difference(kernel_ticks(constants), NumpyLaw(constants[0]).ticks, inputs) <= SAME_NUMBERS
+
+
+def test_the_comparison_of_numbers_can_fail(constants):
+    other = constants.copy()
+    other[0].law.network.learning_rate *= 1.0 + 1e-6
+    inputs = sine_inputs(constants[0], 3000)
+    assert difference(kernel_ticks(constants), NumpyLaw(other[0]).ticks, inputs) > SAME_NUMBERS
+
+
+def test_the_flat_memory_holds_the_law_in_the_order_of_the_c_structure(constants):
+    law = constants[0].law
+    values = law_doubles(constants[0])
+    assert len(values) == 17 + 2 + 2 * 10 + 30 + 15
+    assert values[0] == law.period_s
+    assert list(values[17:19]) == list(law.network.p_b)
+    assert values[19] == law.friction.positive.coulomb_Nm
+    assert values[-1] == law.network.inverse_width[14]
+    state = state_doubles(constants[0])
+    assert np.all(state[FIRST_WEIGHT : FIRST_WEIGHT + 15] == law.network.initial_weight)
+    assert np.count_nonzero(state) == 15
+
+
+def test_a_law_that_the_c_source_does_not_know_is_refused(constants):
+    other = constants.copy()
+    other[0].law.kind = ControllerKind.PID
+    with pytest.raises(ConfigurationError, match="computed_torque_rbf"):
+        law_doubles(other[0])
+
+
+@pytest.mark.parametrize("missing", ["compiler", "sources"])
+def test_without_compiler_or_sources_the_comparison_is_skipped_with_a_word(constants, tmp_path, monkeypatch, missing):
+    if missing == "compiler":
+        monkeypatch.setenv("PATH", str(tmp_path))
+    else:
+        monkeypatch.setattr(c_programs, "SOURCES", tmp_path / "none")
+    with pytest.raises(NoCompilerError):
+        compiler()
+    rows = list(law_rows(constants, tmp_path, pairs=1))
+    assert rows[0].note.startswith("skipped: ")
+    assert math.isnan(rows[0].ratio)
+    assert rows[-1].other_name == "numpy"  # the rest goes on
+    assert rows[-1].ratio > 0.0
+
+
+def test_a_cycle_without_a_sample_has_no_round_trip():
+    times = times_from_ns(np.array([[1000, 2000, 3000], [4000, -1, 5000], [6000, 0, 7000]], np.int64))
+    assert list(times.wake_us) == [1.0, 4.0, 6.0]
+    assert list(times.round_trip_us) == [2.0]
+    assert times.quantile("work", 0.5) == 5.0
+    assert math.isnan(times_from_ns(np.zeros((0, 3), np.int64)).quantile("wake", 0.5))
+
+
+def test_the_histogram_of_cyclictest_is_read(tmp_path):
+    program = tmp_path / "cyclictest"
+    program.write_text(
+        "#!/bin/sh\necho '# /dev/cpu_dma_latency set to 0us'\necho '000007 000003'\necho '000009 000001'\n"
+    )
+    program.chmod(0o755)
+    times = run_cyclictest(str(program), load_config(shipped_config("virtual")), 0.004, "idle")
+    assert sorted(times.wake_us) == [7.0, 7.0, 7.0, 9.0]
+
+
+def test_every_load_ends_with_its_block():
+    before = threading.active_count()
+    for name in LOADS:
+        with load(name):
+            pass
+    assert threading.active_count() == before
+    with pytest.raises(ValueError, match="load"), load("nothing"):
+        pass
+
+
+def test_another_rate_changes_nothing_else():
+    config = load_config(shipped_config("virtual"))
+    faster = at_rate(config, 2000.0)
+    assert faster.loop.rate_Hz == 2000.0
+    assert faster.limits == config.limits
+    assert config.loop.rate_Hz == 1000.0
+
+
+def test_every_verb_of_the_command_line_is_timed():
+    assert {"run", "hil", "check", "identify"} <= set(verbs())
+
+
+ROWS = [
+    compared("loop", "wake-up p99", [10.0, 12.0], [10.0, 10.0], "us", "C loop", goal=1.2, note="a [remark]"),
+    measured("start", "run until enabled", [4.0], "s", goal=3.0),
+    skipped("loop", "against cyclictest", "not installed"),
+]
+
+
+def test_the_report_is_a_table_json_and_a_picture(tmp_path: Path):
+    data = outcome_data(ROWS, {"cores": 2})
+    out, err = io.StringIO(), io.StringIO()
+    Output(stdout=out, stderr=err).result(outcome_table(ROWS), data)
+    text = " ".join(out.getvalue().split())
+    assert "yes (<= 1.2)" in text
+    assert "NO (<= 3 s)" in text
+    assert "a [remark]" in text
+    json_path, picture = write_outcome(tmp_path / "new", ROWS, data)
+    read = json.loads(json_path.read_text())
+    assert read["conditions"] == {"cores": 2}
+    assert [row["reached"] for row in read["rows"]] == [True, False, None]
+    assert read["rows"][2]["ratio"] is None
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_part_that_does_not_exist_is_named():
+    with pytest.raises(PartError, match=r"only \(=lop\) must be one of law, loop, lockstep, swarm, start"):
+        bench(Output(quiet=True), only=["lop"])

@@ -1,0 +1,63 @@
+"""The controller's constants as the flat arrays of float64 that tests/bench/c/law_tick.h declares as structures."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from drivers.errors import ConfigurationError
+from firmware_py.records import NEURONS
+from firmware_py.states import ControllerKind, FeedForward
+
+STATE_DOUBLES = 12 + 2 * NEURONS
+FIRST_WEIGHT = 12  # struct law_state: twelve scalars, then weights, then hidden
+
+
+def require_comparable(axis: Any) -> None:
+    """The C source knows one law: computed torque with network, LuGre on the desired velocity, matched filter."""
+    wanted = (ControllerKind.COMPUTED_TORQUE_RBF, FeedForward.LUGRE_DESIRED, 1, 0.0)
+    law = axis.law
+    if (law.kind, law.feed_forward, law.matched_filter, law.learning.gain) != wanted:
+        raise ConfigurationError(
+            "bench needs control.kind = computed_torque_rbf, feed_forward = lugre_desired, matched_filter = true "
+            "and no learning: the C source knows no other law"
+        )
+
+
+def _branch(branch: Any) -> list[float]:
+    return [
+        branch.coulomb_Nm, branch.static_Nm, branch.stribeck_speed_radps, branch.viscous_Nmspr,
+        *branch.cubic, branch.knee_radps, branch.max_radps,
+    ]  # fmt: skip
+
+
+def law_doubles(axis: Any) -> np.ndarray:
+    """`struct law` of an `AxisConstants` record."""
+    require_comparable(axis)
+    law, network, limits = axis.law, axis.law.network, axis.limits
+    values = [
+        law.period_s, law.inertia_kgm2, law.coriolis_Nmspr, law.gravity_Nm, law.gravity_zero_rad, law.kp, law.kv,
+        law.reduction_ratio, law.lugre.stiffness_Nmprad, law.lugre.damping_Nmspr,
+        axis.velocity.period_gain, network.learning_rate, network.leakage, network.weight_limit, network.dead_zone_rad,
+        limits.torque_max_Nm, limits.torque_rate_max_Nmps, *network.p_b,
+        *_branch(law.friction.positive), *_branch(law.friction.negative),
+        *np.ravel(network.centres), *network.inverse_width,
+    ]  # fmt: skip
+    return np.array(values, float)
+
+
+def state_doubles(axis: Any) -> np.ndarray:
+    """`struct law_state` before the first tick."""
+    state = np.zeros(STATE_DOUBLES)
+    state[FIRST_WEIGHT : FIRST_WEIGHT + NEURONS] = axis.law.network.initial_weight
+    return state
+
+
+def setting_doubles(axis: Any, port: Any) -> np.ndarray:
+    """`struct setting` of exchange_loop.c: identifiers and layout of a `CanopenPort` record, then the law."""
+    names = (
+        "sync_id", "tpdo_id", "rpdo_id", "own_heartbeat_id", "heartbeat_cycles", "status_at", "position_at",
+        "control_at", "target_at", "rpdo_length", "position_radpcount", "torque_Nmppermille", "max_permille",
+    )  # fmt: skip
+    return np.concatenate([[float(port[name]) for name in names], law_doubles(axis)])

@@ -1,0 +1,171 @@
+"""The control law: our kernel, the same law in C, and the same law in numpy, tick by tick on the same inputs.
+
+A tick is here: velocity filter, law, finite check, torque limit and rate limit, on one thread and from warm memory.
+`step_axis`, the whole tick with phases and supervision, is timed in the lockstep simulation.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba.core import runtime
+
+from firmware_py.computed_torque import reset_law, step_law
+from firmware_py.kernel import kernel
+from firmware_py.rbfnn import network_torque_Nm
+from firmware_py.records import AxisConstants, AxisState
+from firmware_py.safety import limited_torque_Nm
+from firmware_py.schema import new
+from firmware_py.velocity import step_velocity
+from tools.benchmarks.c_programs import FAST_MATH, OPTIMISED, NoCompilerError, law_library
+from tools.benchmarks.law_memory import STATE_DOUBLES, law_doubles, require_comparable, state_doubles
+from tools.benchmarks.numpy_law import NumpyLaw
+from tools.benchmarks.paired import Row, compared, interleaved, measured, skipped
+
+GROUP = "control law"
+SAME_NUMBERS = 1e-12  # of the largest torque
+GOAL_TO_C = 1.3
+CHUNK_TICKS = 20_000
+NUMPY_TICKS = 500
+
+Ticks = Callable[[np.ndarray, np.ndarray], None]
+
+
+@kernel
+def run_ticks(constants: np.ndarray, state: np.ndarray, inputs: np.ndarray, torque_Nm: np.ndarray) -> None:
+    """`inputs` float64[N, 4]: position, desired position, velocity, acceleration; writes float64[N] torques [Nm]."""
+    axis: AxisConstants = constants[0]
+    now: AxisState = state[0]
+    for i in range(len(torque_Nm)):
+        now.reference.position_rad = inputs[i, 1]
+        now.reference.velocity_radps = inputs[i, 2]
+        now.reference.acceleration_radps2 = inputs[i, 3]
+        position_rad = inputs[i, 0]
+        step_velocity(axis.velocity, now.velocity, position_rad, position_rad - inputs[i, 1], 1)
+        unlimited = step_law(
+            axis.law, now.law, position_rad, now.velocity, now.reference, now.command_torque_Nm, 0, 0.0, 0.0
+        )
+        limited, _ = limited_torque_Nm(axis.limits, unlimited, now.command_torque_Nm, axis.law.period_s)
+        now.command_torque_Nm = limited
+        torque_Nm[i] = limited
+
+
+@kernel
+def run_hidden(constants: np.ndarray, state: np.ndarray, inputs: np.ndarray, torque_Nm: np.ndarray) -> None:
+    """The network's output alone, the same arguments: 15 exponentials a tick."""
+    axis: AxisConstants = constants[0]
+    now: AxisState = state[0]
+    for i in range(len(torque_Nm)):
+        torque_Nm[i] = network_torque_Nm(axis.law.network, now.law.network, inputs[i, 0] - inputs[i, 1], inputs[i, 2])
+
+
+def sine_inputs(axis: Any, ticks: int) -> np.ndarray:
+    """Desired motion 0.35 sin(0.2 pi t) and a position that follows it with a small error, (ticks, 4)."""
+    t = np.arange(ticks) * axis.law.period_s
+    w = 0.2 * math.pi
+    inputs = np.empty((ticks, 4))
+    inputs[:, 1] = 0.35 * np.sin(w * t)
+    inputs[:, 2] = 0.35 * w * np.cos(w * t)
+    inputs[:, 3] = -0.35 * w**2 * np.sin(w * t)
+    inputs[:, 0] = inputs[:, 1] + 1e-3 * np.sin(7.0 * t) * np.cos(0.3 * t)
+    return inputs
+
+
+def kernel_ticks(constants: Any) -> Ticks:
+    """Our kernel, from a fresh state."""
+    state = new(AxisState)
+    reset_law(constants[0].law, state[0].law)
+    return lambda inputs, torque_Nm: run_ticks(constants, state, inputs, torque_Nm)
+
+
+def c_function(library: ctypes.CDLL, name: str, constants: Any) -> Ticks:
+    """One function of the C library, from a fresh state."""
+    law, state = law_doubles(constants[0]), state_doubles(constants[0])
+    if library.law_doubles() != len(law) or library.state_doubles() != STATE_DOUBLES:
+        raise NoCompilerError("law_tick.h and law_memory.py disagree about the structures")
+    function = getattr(library, name)
+
+    def ticks(inputs: np.ndarray, torque_Nm: np.ndarray) -> None:
+        function(law.ctypes.data, state.ctypes.data, inputs.ctypes.data, torque_Nm.ctypes.data, len(torque_Nm))
+
+    return ticks
+
+
+def difference(one: Ticks, other: Ticks, inputs: np.ndarray) -> float:
+    """Largest difference of two laws' torques over the inputs, relative to the largest torque."""
+    torque, other_torque = np.zeros(len(inputs)), np.zeros(len(inputs))
+    one(inputs, torque)
+    other(inputs, other_torque)
+    return float(np.max(np.abs(torque - other_torque)) / np.max(np.abs(torque)))
+
+
+def allocations(constants: Any) -> int:
+    """Memory allocations of 20 000 ticks more than of one: those of the call itself cancel out."""
+    counts = []
+    numba_runtime: Any = runtime  # untyped, and the switch is not exported
+    switch, system = numba_runtime.nrt._nrt, numba_runtime.rtsys
+    was_counting = switch.memsys_stats_enabled()
+    switch.memsys_enable_stats()
+    try:
+        for ticks in (1, CHUNK_TICKS):
+            inputs, torque_Nm = sine_inputs(constants[0], ticks), np.zeros(ticks)
+            run = kernel_ticks(constants)
+            run(inputs, torque_Nm)
+            before = system.get_allocation_stats()
+            run(inputs, torque_Nm)
+            counts.append(system.get_allocation_stats().alloc - before.alloc)
+    finally:
+        if not was_counting:
+            switch.memsys_disable_stats()
+    return int(counts[1] - counts[0])
+
+
+def _timer(ticks: Ticks, inputs: np.ndarray) -> Callable[[], float]:
+    torque_Nm = np.zeros(len(inputs))
+    ticks(inputs, torque_Nm)  # compiles, warms
+
+    def measure() -> float:
+        begin_ns = time.perf_counter_ns()
+        ticks(inputs, torque_Nm)
+        return (time.perf_counter_ns() - begin_ns) / len(inputs)
+
+    return measure
+
+
+def _versus_c(constants: Any, folder: Path, pairs: int) -> Iterator[Row]:
+    inputs = sine_inputs(constants[0], CHUNK_TICKS)
+    ours = _timer(kernel_ticks(constants), inputs)
+    for options, goal in ((OPTIMISED, GOAL_TO_C), (FAST_MATH, None)):
+        name = f"gcc {' '.join(options)}"
+        library = law_library(folder, options)
+        apart = difference(kernel_ticks(constants), c_function(library, "run_ticks", constants), inputs)
+        note = f"torques differ by {apart:.1e}" + ("" if apart <= SAME_NUMBERS else ": MORE THAN ALLOWED")
+        values = interleaved(pairs, ours, _timer(c_function(library, "run_ticks", constants), inputs))
+        yield compared(GROUP, "tick", values[0], values[1], "ns", name, goal=goal, note=note)
+        state = new(AxisState)
+        hidden = _timer(lambda i, t, state=state: run_hidden(constants, state, i, t), inputs)  # type: ignore[misc]
+        values = interleaved(pairs, hidden, _timer(c_function(library, "run_hidden", constants), inputs))
+        yield compared(GROUP, "of it: the network's 15 exponentials", values[0], values[1], "ns", name)
+
+
+def law_rows(constants: Any, folder: Path, *, pairs: int) -> Iterator[Row]:
+    """`constants` AxisConstants array of one; `folder` takes what is compiled."""
+    require_comparable(constants[0])
+    try:
+        yield from _versus_c(constants, folder, pairs)
+    except NoCompilerError as error:
+        yield skipped(GROUP, "tick against C", error.message)
+    count = float(allocations(constants))
+    yield measured(GROUP, f"memory allocations in {CHUNK_TICKS} ticks", [count], "", goal=0.0)
+    inputs = sine_inputs(constants[0], NUMPY_TICKS)
+    apart = difference(kernel_ticks(constants), NumpyLaw(constants[0]).ticks, inputs)
+    values = interleaved(
+        max(3, pairs // 3), _timer(kernel_ticks(constants), inputs), _timer(NumpyLaw(constants[0]).ticks, inputs)
+    )
+    yield compared(GROUP, "tick", values[0], values[1], "ns", "numpy", note=f"torques differ by {apart:.1e}")

@@ -1,0 +1,123 @@
+"""How long a command takes to start: `--help` of every verb, and `run` until the drive is enabled.
+
+Warm: compiled kernels are in the cache.  Cold: the cache is an empty folder, as after an installation or an edit of
+a kernel; the bytecode of the libraries is there in both cases.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from drivers.errors import JointctlError
+from tools.benchmarks.paired import Row, compared, interleaved, measured
+from tools.config import Config
+from tools.virtual_joint import separate_virtual_joint
+
+GROUP = "start"
+HELP_GOAL_S = 0.3
+ENABLED_GOAL_S = 3.0
+LONGEST_S = 240.0  # a cold start compiles everything
+END_S = 10.0
+ENABLED = ("approach", "tracking")  # the first phase with the drive enabled, as `run` names it on stderr
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def _environment(cache: Path | None = None) -> dict[str, str]:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    if cache is not None:
+        environment["JOINTCTL_CACHE_DIR"] = str(cache)
+    return environment
+
+
+def command_s(*arguments: str) -> float:
+    """Seconds that Python takes with these arguments, from start to end."""
+    begin_s = time.perf_counter()
+    subprocess.run(
+        [sys.executable, "-P", *arguments],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env=_environment(),
+        check=True,
+        timeout=LONGEST_S,
+    )
+    return time.perf_counter() - begin_s
+
+
+def verbs() -> list[str]:
+    """Names of all verbs, as the command line registers them."""
+    from tools.cli import app
+
+    names = [command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands]
+    return sorted(name for name in names if name)
+
+
+def until_enabled_s(config_path: Path, channel: str, cache: Path | None = None) -> float:
+    """Seconds from the start of `run` to its first phase with the drive enabled; the run is stopped then."""
+    command = [sys.executable, "-P", "-m", "tools.cli", "run", str(config_path.resolve()), "-y"]
+    # a busy computer may delay a few of the first cycles so that the margin gate refuses: not what is measured here
+    command += ["--allow-low-margin"]
+    command += ["--interface", "jointctl", "--channel", channel]
+    with tempfile.TemporaryDirectory() as folder:
+        begin_s = time.perf_counter()
+        process = subprocess.Popen(
+            command, cwd=folder, env=_environment(cache), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+            stdin=subprocess.DEVNULL,
+        )  # fmt: skip
+        try:
+            elapsed_s = _wait_for(process, ENABLED, begin_s)
+        finally:
+            process.send_signal(signal.SIGINT)
+            try:
+                process.communicate(timeout=END_S)
+            except subprocess.TimeoutExpired:
+                process.terminate()
+                process.communicate()
+    return elapsed_s
+
+
+def _wait_for(process: subprocess.Popen[bytes], words: tuple[str, ...], begin_s: float) -> float:
+    """Seconds since `begin_s` when a line of stderr is one of `words`."""
+    assert process.stderr is not None
+    fd, text = process.stderr.fileno(), ""
+    while (left_s := begin_s + LONGEST_S - time.perf_counter()) > 0.0:
+        ready, _, _ = select.select([fd], [], [], left_s)
+        part = os.read(fd, 4096).decode(errors="replace") if ready else ""
+        if not part:
+            break
+        text += part
+        if any(line.strip() in words for line in text.splitlines()):
+            return time.perf_counter() - begin_s
+    last = (text.strip().splitlines() or ["it said nothing"])[-1]
+    raise JointctlError(f"`run` did not enable the drive: {last}")
+
+
+def start_rows(config: Config, *, runs: int, cold: bool, every_verb: bool) -> Iterator[Row]:
+    """Uses a virtual joint of its own for `run`."""
+    command_s("-m", "tools.cli", "--help")
+    cli, bare = interleaved(runs, lambda: command_s("-m", "tools.cli", "--help"), lambda: command_s("-c", "pass"))
+    yield measured(GROUP, "jointctl --help", cli, "s", goal=HELP_GOAL_S, note=f"best {min(cli):.2f} s")
+    yield compared(GROUP, "jointctl --help", cli, bare, "s", "python -c pass")
+    for verb in verbs() if every_verb else []:
+        taken = [command_s("-m", "tools.cli", verb, "--help") for _ in range(2)]
+        yield measured(GROUP, f"jointctl {verb} --help", [min(taken)], "s")
+    channel = f"benchstart{os.getpid()}"
+    with separate_virtual_joint(config.path, channel):
+        until_enabled_s(config.path, channel)  # fills the cache, if need be
+        warm = [until_enabled_s(config.path, channel) for _ in range(runs)]
+        note = f"best {min(warm):.2f} s; the joint is up already"
+        yield measured(GROUP, "run until enabled, warm", warm, "s", goal=ENABLED_GOAL_S, note=note)
+        if not cold:
+            yield Row(GROUP, "run until enabled, cold", math.nan, "s", note="skipped: takes a minute, not with --quick")
+            return
+        with tempfile.TemporaryDirectory() as cache:
+            taken_s = until_enabled_s(config.path, channel, Path(cache))
+        yield measured(GROUP, "run until enabled, cold", [taken_s], "s", note="everything is compiled")
