@@ -17,6 +17,7 @@ from drivers.can.bit_timing import worst_frame_bits
 from drivers.can.frames import ERROR_FLAG, Frame
 from drivers.canopen.cia402 import State, control_word, decode_state, drive_state
 from drivers.canopen.port import SLOT_HEARTBEAT, SLOT_RPDO, SLOT_SYNC, CanopenPort
+from drivers.position_counts import HALF_WRAP, WRAP, take_counts
 from firmware_py.kernel import kernel
 from firmware_py.records import Command, Sample
 from firmware_py.states import DriveRequest
@@ -25,8 +26,6 @@ NMT_OPERATIONAL = 5
 # A drive that was told to stop and still says that it is enabled, or says nothing, does not hear us (SYNC or RPDO
 # lost).  Its watchdog is what is left: after so many cycles the heartbeat is withheld for the rest of the run.
 UNHEEDED_MAX_CYCLES = 20
-WRAP = 1 << 32
-HALF_WRAP = 1 << 31
 _WORST_BITS = np.array([worst_frame_bits(length) for length in range(9)])
 
 
@@ -76,22 +75,6 @@ def begin_cycle(port: CanopenPort, frames: np.ndarray) -> int:
 
 
 @kernel
-def _take_counts(port: CanopenPort, counts: int) -> None:
-    """Unwrap the 32 bit position: the joint moves less than half the range between two samples."""
-    if port.primed == 0:
-        port.primed = 1
-        port.counts = counts
-    else:
-        step = counts - port.last_counts
-        if step >= HALF_WRAP:
-            step -= WRAP
-        elif step < -HALF_WRAP:
-            step += WRAP
-        port.counts += step
-    port.last_counts = counts
-
-
-@kernel
 def accept_frame(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -> bool:
     """Take one received frame; True if it was the TPDO with a new sample.  Foreign frames are only counted."""
     port.bits_sent += _WORST_BITS[min(frame.length, 8)]
@@ -104,7 +87,7 @@ def accept_frame(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -
         sample.status_word = get_u16(frame.payload, port.status_at)
         port.state = decode_state(sample.status_word)
         sample.drive_state = drive_state(port.state)
-        _take_counts(port, get_i32(frame.payload, port.position_at))
+        take_counts(port, get_i32(frame.payload, port.position_at))
         sample.position_rad = (port.counts - port.zero_counts) * port.position_radpcount
         if port.torque_at >= 0:
             sample.torque_Nm = get_i16(frame.payload, port.torque_at) * port.torque_Nmppermille

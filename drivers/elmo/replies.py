@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from drivers.elmo.port import EXPECTED_MAX, LINE_MAX, ElmoPort, Question
+from drivers.position_counts import WRAP, take_counts
 from firmware_py.kernel import kernel
 from firmware_py.records import Sample
 from firmware_py.states import DriveState
@@ -15,8 +16,6 @@ from firmware_py.states import DriveState
 BITS_PER_CHARACTER = 10  # 8N1
 NOTHING = -1
 FAULT_CAUSE_CYCLES = 4  # status replies to wait for MF before a fault is told without its cause
-WRAP = 1 << 32
-HALF_WRAP = 1 << 31
 _DIGITS_MAX = 17
 _CR, _SEMICOLON, _QUESTION_MARK = 0x0D, 0x3B, 0x3F
 _PLUS, _MINUS, _POINT, _ZERO, _NINE, _EQUALS = 0x2B, 0x2D, 0x2E, 0x30, 0x39, 0x3D
@@ -76,22 +75,6 @@ def parse_number(line: np.ndarray, start: int, end: int) -> tuple[bool, float, b
 
 
 @kernel
-def _take_counts(port: ElmoPort, counts: int) -> None:
-    """Unwrap the 32 bit position: the joint moves less than half the range between two samples."""
-    if port.primed == 0:
-        port.primed = 1
-        port.counts = counts
-    else:
-        step = counts - port.last_counts
-        if step >= HALF_WRAP:
-            step -= WRAP
-        elif step < -HALF_WRAP:
-            step += WRAP
-        port.counts += step
-    port.last_counts = counts
-
-
-@kernel
 def _take_status(port: ElmoPort, sample: Sample, status: int) -> None:
     """SR: servo, fault, and the unit mode, which is another one after a restart of the drive."""
     port.status = status
@@ -128,7 +111,7 @@ def _take_value(port: ElmoPort, sample: Sample, question: int, start: int, now_n
         if abs(value) >= WRAP:
             port.garbled += 1
             return False
-        _take_counts(port, int(value))
+        take_counts(port, int(value))
         sample.position_rad = (port.counts - port.zero_counts) * port.position_radpcount
         sample.time_ns = now_ns
         sample.count += 1
