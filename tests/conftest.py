@@ -25,9 +25,9 @@ from firmware_py.sequence import reset_axis
 from firmware_py.states import AxisPhase, ControllerKind, DriveRequest, DriveState, StopRequest, TrajectoryKind
 from firmware_py.velocity import low_pass_gain
 from hil.device import Cia402Device
-from tools.config import load_config
-from tools.config_drive import canopen_settings
-from tools.virtual_joint import new_device
+from tools.configuration.drive_settings import canopen_settings
+from tools.configuration.load import load_config
+from tools.simulation.virtual_joint import new_device
 
 PERIOD_s = 1e-3
 INERTIA_kgm2 = 2.1

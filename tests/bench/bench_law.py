@@ -27,9 +27,9 @@ from tools.benchmarks.law_speed import (
     sine_inputs,
 )
 from tools.benchmarks.numpy_law import NumpyLaw
-from tools.config import load_config, shipped_config
-from tools.config_records import axis_constants
-from tools.lockstep import LockstepJoint
+from tools.configuration.load import load_config, shipped_config
+from tools.configuration.records import axis_constants
+from tools.simulation.lockstep import LockstepJoint
 
 TICKS = 10_000
 

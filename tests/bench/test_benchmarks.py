@@ -13,7 +13,6 @@ import pytest
 
 from drivers.errors import ConfigurationError
 from firmware_py.states import ControllerKind
-from tools.bench import PartError, bench
 from tools.benchmarks import c_programs
 from tools.benchmarks.c_programs import NoCompilerError, compiler
 from tools.benchmarks.compiled_loops import at_rate, run_cyclictest
@@ -25,9 +24,10 @@ from tools.benchmarks.numpy_law import NumpyLaw
 from tools.benchmarks.outcome import outcome_data, outcome_table, write_outcome
 from tools.benchmarks.paired import Row, compared, interleaved, measured, skipped
 from tools.benchmarks.start_speed import verbs
-from tools.config import load_config, shipped_config
-from tools.config_records import axis_constants
+from tools.configuration.load import load_config, shipped_config
+from tools.configuration.records import axis_constants
 from tools.output import Output
+from tools.verbs.bench import PartError, bench
 
 
 @pytest.fixture(scope="module")

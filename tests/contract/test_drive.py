@@ -14,10 +14,10 @@ from drivers.elmo.drive import ElmoDrive
 from drivers.errors import DeviceError, NoDeviceError
 from hil.device_records import PowerState
 from hil.elmo_device import ElmoDevice
-from tools.config import load_config, shipped_config
-from tools.config_elmo import elmo_settings, with_port_override
-from tools.config_records import torque_constant_NmpA
-from tools.hil_serial import serve_virtual_elmo
+from tools.configuration.conversions import torque_constant_NmpA
+from tools.configuration.elmo_settings import elmo_settings, with_port_override
+from tools.configuration.load import load_config, shipped_config
+from tools.verbs.hil_serial import serve_virtual_elmo
 
 
 class Bench(Protocol):

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from hil.faults import FaultKind, no_faults
-from tools.config import load_config
-from tools.lockstep import LockstepJoint
+from tools.configuration.load import load_config
+from tools.simulation.lockstep import LockstepJoint
 
 TESTS = Path(__file__).resolve().parents[1]
 

@@ -26,10 +26,11 @@ from tools.campaign.fault_classes import FAULT_CLASSES
 from tools.campaign.judge import judge, run_scenario
 from tools.campaign.report import rows_by_kind, write_figure
 from tools.campaign.scenario import draw_scenario
-from tools.config import Config, load_config
-from tools.fault_campaign import fault_campaign
-from tools.lockstep import LockstepJoint, LockstepRun
+from tools.configuration.config import Config
+from tools.configuration.load import load_config
 from tools.output import Output
+from tools.simulation.lockstep import LockstepJoint, LockstepRun
+from tools.verbs.fault_campaign import fault_campaign
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "virtual.toml"
 KINDS = len(FAULT_CLASSES)

@@ -13,7 +13,7 @@ from firmware_py.states import AxisPhase, Fault
 from hil.device_records import PowerState
 from hil.fault_lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
 from hil.faults import FaultKind
-from tools.lockstep import LockstepJoint, LockstepRun
+from tools.simulation.lockstep import LockstepJoint, LockstepRun
 
 MakeFault = Callable[..., Any]
 AT_s = 2.0  # after the power stage is on: the joint tracks

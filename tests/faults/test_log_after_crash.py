@@ -13,12 +13,12 @@ import pytest
 from firmware_py.records import LogRecord
 from firmware_py.schema import dtype_of
 from firmware_py.states import AxisPhase, Fault, StopRequest
-from tools.config import load_config
-from tools.config_records import axis_constants, trajectory_table
-from tools.loop_handle import LoopHandle
-from tools.open_drive import open_drive
-from tools.run_log import RunLogWriter, read_run_log
-from tools.shared_block import RING_RECORDS, SharedBlock
+from tools.configuration.load import load_config
+from tools.configuration.records import axis_constants, trajectory_table
+from tools.recording.run_log import RunLogWriter, read_run_log
+from tools.running.loop_handle import LoopHandle
+from tools.running.open_drive import open_drive
+from tools.running.shared_block import RING_RECORDS, SharedBlock
 
 
 @pytest.fixture

@@ -18,11 +18,13 @@ import pytest
 
 from firmware_py.states import AxisPhase, DriveRequest, Fault
 from hil.faults import LOCKSTEP_ONLY, FaultKind
-from tools.config import Config, load_config
-from tools.config_plant import FAULT_KINDS, fault_constants
+from tools.configuration.config import Config
+from tools.configuration.load import load_config
+from tools.configuration.plant import FAULT_KINDS
+from tools.configuration.plant_settings import fault_constants
 from tools.output import Output
-from tools.supervisor import RunResult, Supervisor
-from tools.virtual_joint import serve_virtual_joint
+from tools.running.supervisor import RunResult, Supervisor
+from tools.simulation.virtual_joint import serve_virtual_joint
 
 SHIPPED = (Path(__file__).resolve().parents[2] / "configs" / "virtual.toml").read_text()
 AT_s = 0.7

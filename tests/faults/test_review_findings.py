@@ -23,8 +23,8 @@ from hil.device_core import power_on
 from hil.device_records import NmtState
 from tests.unit.test_elmo_cyclic import Talk
 from tests.unit.test_realtime import Loop
-from tools.stop import is_safe
-from tools.supervisor import Supervisor
+from tools.running.supervisor import Supervisor
+from tools.verbs.stop import is_safe
 
 ENABLED, DISABLED = 0x0637, 0x0650
 WATCHDOG = 126 << 16 | 200  # 1016:1 as configs/virtual.toml arms it

@@ -16,7 +16,7 @@ import canopen
 import pytest
 import tomlkit
 
-from tools.run_log import read_run_log
+from tools.recording.run_log import read_run_log
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 

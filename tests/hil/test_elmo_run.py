@@ -16,8 +16,8 @@ import pytest
 
 from firmware_py.states import AxisPhase
 from hil.elmo_device import ElmoDevice
-from tools.config import load_config
-from tools.hil_serial import serve_virtual_elmo
+from tools.configuration.load import load_config
+from tools.verbs.hil_serial import serve_virtual_elmo
 
 # a busy computer may stop this process, and with it the virtual drive, for tens of milliseconds
 # and 100 Hz leaves room for what it adds to the measured delay
@@ -61,7 +61,7 @@ class SerialBench:
 def serial_config(folder: Path, name: str, values: dict[str, Any]) -> str:
     import tomlkit
 
-    from tools.config import shipped_config
+    from tools.configuration.load import shipped_config
 
     document: Any = tomlkit.parse(shipped_config("elmo_serial").read_text())
     for path, value in values.items():

@@ -11,17 +11,18 @@ import pytest
 
 from drivers.errors import DataError
 from firmware_py.friction import DEGREE, friction_curve_Nm
-from tools.config import Config, load_config, shipped_config
-from tools.config_records import friction_constants
-from tools.config_sections import Friction
+from tools.configuration.config import Config
+from tools.configuration.conversions import friction_constants
+from tools.configuration.load import load_config, shipped_config
+from tools.configuration.sections import Friction
 from tools.identification.friction_data import read_friction_data
 from tools.identification.friction_section import section_values
 from tools.identification.identification import Options, identify_friction
 from tools.identification.pso import SwarmSettings
-from tools.lockstep import LockstepJoint
 from tools.output import Output
-from tools.sweep import sweep
-from tools.sweep_options import SweepOptions
+from tools.simulation.lockstep import LockstepJoint
+from tools.sweeping.options import SweepOptions
+from tools.verbs.sweep import sweep
 
 POINTS = 60
 SMALL = {"folds": 3, "swarm": SwarmSettings(particles=60, iterations=100)}

@@ -11,11 +11,11 @@ import pytest
 from firmware_py.states import Fault
 from tools.analysis.learning_loop import LearningSettings, learning_convergence
 from tools.analysis.loop_settings import loop_settings
-from tools.config import Config
+from tools.configuration.config import Config
 from tools.experiments.controllers import Controller, changed, controller_config, controller_constants, from_file
 from tools.experiments.paper_runs import ideal, law, r1
 from tools.experiments.scenarios import Scenario, run_scenario
-from tools.lockstep import LockstepJoint, LockstepRun
+from tools.simulation.lockstep import LockstepJoint, LockstepRun
 
 
 def joint(config: Config, duration_s: float, **virtual: Any) -> Config:

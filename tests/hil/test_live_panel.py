@@ -19,9 +19,9 @@ from firmware_py.realtime import HISTOGRAM_BINS
 from firmware_py.records import LogRecord
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, DriveState, Fault
-from tools.live_panel import LivePanel, PhaseLines, Snapshot, panel, run_display, time_left
-from tools.log import missing_records
 from tools.output import Output
+from tools.recording.log_facts import missing_records
+from tools.running.live_panel import LivePanel, PhaseLines, Snapshot, panel, run_display, time_left
 
 ESCAPE = "\x1b["
 TERMINAL = {**os.environ, "TERM": "xterm-256color"}

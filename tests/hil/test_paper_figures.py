@@ -14,7 +14,7 @@ import pytest
 from drivers.errors import ConfigurationError
 from tools.analysis.loop_settings import loop_settings
 from tools.analysis.margins import phase_margin_deg
-from tools.config import load_config, shipped_config
+from tools.configuration.load import load_config, shipped_config
 from tools.experiments.controllers import named
 from tools.experiments.error_figures import ErrorFigures, error_figures, settling_s
 from tools.experiments.paper_identification import identify_paper_friction
@@ -23,9 +23,9 @@ from tools.experiments.paper_runs import AFTER_s, Experiment, experiments, frict
 from tools.experiments.study_runs import StudyResult, quantile, run_study
 from tools.identification.identification import Options
 from tools.identification.pso import SwarmSettings
-from tools.lockstep import LockstepJoint
 from tools.output import Output
-from tools.paper import paper
+from tools.simulation.lockstep import LockstepJoint
+from tools.verbs.paper import paper
 
 _RUN = Experiment.run  # a test replaces it
 _ALL = {experiment.key: experiment for experiment in experiments()}
@@ -127,7 +127,7 @@ def test_the_verb_prints_one_table_and_draws_a_page_for_each_figure(
 ) -> None:
     monkeypatch.setattr(Experiment, "run", lambda self: made(self.key).run)
     few = Options(swarm=SwarmSettings(particles=60, iterations=200))
-    monkeypatch.setattr("tools.paper.identify_paper_friction", lambda: identify_paper_friction(few))
+    monkeypatch.setattr("tools.verbs.paper.identify_paper_friction", lambda: identify_paper_friction(few))
     out, err = io.StringIO(), io.StringIO()
     assert paper(Output(json=True, stdout=out, stderr=err), folder=tmp_path) == 0
     data = json.loads(out.getvalue())

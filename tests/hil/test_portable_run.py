@@ -30,13 +30,14 @@ from drivers.canopen.drive import CanopenDrive
 from firmware_py.realtime import Word
 from firmware_py.sequence import reset_axis
 from firmware_py.states import AxisPhase, Fault
-from tools.config import Config, load_config, shipped_config
-from tools.config_drive import canopen_settings
-from tools.config_records import axis_constants
-from tools.device_pump import PumpedDevice
-from tools.portable_loop import run_portable_loop, warm_up
-from tools.shared_block import SharedBlock
-from tools.virtual_joint import new_device, serve_virtual_joint
+from tools.configuration.config import Config
+from tools.configuration.drive_settings import canopen_settings
+from tools.configuration.load import load_config, shipped_config
+from tools.configuration.records import axis_constants
+from tools.running.portable_loop import run_portable_loop, warm_up
+from tools.running.shared_block import SharedBlock
+from tools.simulation.device_pump import PumpedDevice
+from tools.simulation.virtual_joint import new_device, serve_virtual_joint
 
 RATE_HZ = 100.0
 PERIOD_NS = round(1e9 / RATE_HZ)
@@ -233,7 +234,7 @@ def loop_pid(parent: int) -> int | None:
         with contextlib.suppress(OSError):
             text = path.read_text()
             if int(text.rpartition(")")[2].split()[1]) == parent:
-                if b"tools.loop_process" in (path.parent / "cmdline").read_bytes():
+                if b"tools.running.loop_process" in (path.parent / "cmdline").read_bytes():
                     return int(path.parent.name)
     return None
 

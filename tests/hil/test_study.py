@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from drivers.errors import ConfigurationError
-from tools.config import Config, load_config, shipped_config
+from tools.configuration.config import Config
+from tools.configuration.load import load_config, shipped_config
 from tools.experiments.controllers import TABLE, controller_config, named
 from tools.experiments.ensemble import EnsembleSettings, random_plant
 from tools.experiments.error_figures import FAILED, ErrorFigures
@@ -20,7 +21,7 @@ from tools.experiments.study_figure import save_study_figure
 from tools.experiments.study_runs import PlantResult, StudyResult, quantile, run_study, write_csv
 from tools.experiments.study_settings import StudySettings, checked, load_study, study_controllers
 from tools.output import Output
-from tools.study import INTERRUPTED, study
+from tools.verbs.study import INTERRUPTED, study
 
 
 @pytest.fixture
@@ -134,7 +135,7 @@ def test_csv_has_a_line_for_each_run_and_the_figure_is_drawn(base: Config, tmp_p
 def test_the_verb_prints_json_and_says_when_it_was_interrupted(
     base: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tools.study.load_config", lambda _: base)
+    monkeypatch.setattr("tools.verbs.study.load_config", lambda _: base)
     settings = checked({"plants": 2, "after_s": 1.0, "controllers": ["precise"]}, "test")
     out, err = io.StringIO(), io.StringIO()
     assert study(settings, Output(json=True, stdout=out, stderr=err), workers=1, csv=tmp_path / "a.csv") == 0
@@ -146,7 +147,7 @@ def test_the_verb_prints_json_and_says_when_it_was_interrupted(
 
     partial = StudyResult(("precise",), short_study(base, 1, 1).plants[:1], True)
     partial = StudyResult(("precise",), tuple(PlantResult(0, "lugre", 19, p.figures[:1]) for p in partial.plants), True)
-    monkeypatch.setattr("tools.study.run_study", lambda *_, **__: partial)
+    monkeypatch.setattr("tools.verbs.study.run_study", lambda *_, **__: partial)
     out, err = io.StringIO(), io.StringIO()
     assert study(settings, Output(stdout=out, stderr=err)) == INTERRUPTED
     assert "interrupted: only 1 of 2 plants" in err.getvalue()

@@ -17,22 +17,23 @@ import pytest
 
 from drivers.errors import DeviceError, MotionFault
 from firmware_py.friction import friction_curve_Nm
-from tools.config import Config, load_config, shipped_config
-from tools.config_records import friction_constants
-from tools.config_sections import Friction
+from tools.configuration.config import Config
+from tools.configuration.conversions import friction_constants
+from tools.configuration.load import load_config, shipped_config
+from tools.configuration.sections import Friction
 from tools.identification.friction_data import read_friction_data
 from tools.identification.friction_section import section_values
 from tools.identification.identification import Options, identify_friction
 from tools.identification.pso import SwarmSettings
 from tools.output import Output
-from tools.sweep import sweep
-from tools.sweep_options import SweepOptions
+from tools.sweeping.options import SweepOptions
+from tools.verbs.sweep import sweep
 
 QUANTISATION_Nm = 0.0005  # one per mille of the rated motor torque
 # `jointctl`, also where the verb is not in its list yet
 LAUNCHER = """
 from tools import cli
-from tools.sweep_command import sweep_command
+from tools.cli.sweep_command import sweep_command
 if "sweep" not in {c.name or c.callback.__name__ for c in cli.app.registered_commands}:
     cli.app.command("sweep")(sweep_command)
 cli.main()
@@ -281,7 +282,7 @@ def test_a_dry_run_and_a_missing_y_move_nothing(joint: Any) -> None:
 def test_options_type_matches_the_command(config: Config) -> None:
     from inspect import signature
 
-    from tools.sweep_command import sweep_command
+    from tools.cli.sweep_command import sweep_command
 
     parameters = set(signature(sweep_command).parameters) - {
         "config", "out", "interface", "channel", "bitrate", "json", "quiet",

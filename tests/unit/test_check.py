@@ -15,10 +15,12 @@ from firmware_py.states import ControllerKind
 from tools.analysis import loop_settings as mapping
 from tools.analysis.linear_loop import CONTROLLERS
 from tools.analysis.loop_settings import MarginSettings, loop_settings, margin_settings, not_modelled
+from tools.analysis.margin_gate import require_margin
 from tools.analysis.margins import phase_margin_deg
-from tools.check import check, require_margin
-from tools.config import Config, load_config, shipped_config
+from tools.configuration.config import Config
+from tools.configuration.load import load_config, shipped_config
 from tools.output import Output
+from tools.verbs.check import check
 
 
 @pytest.fixture(autouse=True)
@@ -84,7 +86,7 @@ def test_the_limit_is_met_exactly_at_the_boundary(monkeypatch: pytest.MonkeyPatc
     margin_deg = require_margin(config).phase_margin_deg
     for above_deg, refused in ((-1e-9, False), (0.0, False), (1e-9, True), (0.1, True)):
         wanted = MarginSettings(min_phase_margin_deg=margin_deg + above_deg)
-        monkeypatch.setattr("tools.check.margin_settings", lambda _, wanted=wanted: wanted)
+        monkeypatch.setattr("tools.analysis.margin_gate.margin_settings", lambda _, wanted=wanted: wanted)
         if refused:
             with pytest.raises(MarginError):
                 require_margin(config)

@@ -13,17 +13,12 @@ from drivers.errors import ConfigurationError
 from firmware_py import friction as friction_model
 from firmware_py.states import ControllerKind, FeedForward, TrajectoryKind
 from firmware_py.trajectory_table import approach_peak, approach_start, peak_of
-from tools.config import Config, load_config, shipped_config, with_bus_overrides
-from tools.config_checks import trajectory_extremes
-from tools.config_records import (
-    approach_s,
-    axis_constants,
-    friction_constants,
-    joint_rad_per_count,
-    plant_settings,
-    torque_constant_NmpA,
-    trajectory_table,
-)
+from tools.configuration.checks import trajectory_extremes
+from tools.configuration.config import Config
+from tools.configuration.conversions import friction_constants, joint_rad_per_count, torque_constant_NmpA
+from tools.configuration.load import load_config, shipped_config, with_bus_overrides
+from tools.configuration.plant_settings import plant_settings
+from tools.configuration.records import approach_s, axis_constants, trajectory_table
 
 VIRTUAL = shipped_config("virtual").read_text()
 UNIT = " (the unit is part of the key)"

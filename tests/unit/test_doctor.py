@@ -16,11 +16,13 @@ import numpy as np
 import pytest
 
 from drivers.errors import BusError
-from tools import doctor as doctor_module
-from tools import start_time
 from tools.analysis.wake_up import fifo, wake_up_lateness_ns
-from tools.config import Config, load_config, shipped_config
-from tools.doctor import (
+from tools.configuration.config import Config
+from tools.configuration.load import load_config, shipped_config
+from tools.output import Output
+from tools.running import start_time
+from tools.verbs import doctor as doctor_module
+from tools.verbs.doctor import (
     NOTE,
     OK,
     PROBLEM,
@@ -36,7 +38,6 @@ from tools.doctor import (
     sdo_round_trips_us,
     wake_up,
 )
-from tools.output import Output
 
 
 @pytest.fixture(scope="module")

@@ -16,9 +16,10 @@ from firmware_py.records import LogRecord
 from firmware_py.schema import dtype_of
 from firmware_py.trajectory_table import table_from_csv
 from hil.object_dictionary import ObjectDictionary
-from tools.config import Config, load_config
+from tools.configuration.config import Config
+from tools.configuration.load import load_config
 from tools.identification.friction_data import read_friction_data
-from tools.run_log import RunLogWriter, read_run_log
+from tools.recording.run_log import RunLogWriter, read_run_log
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 TOML = (CONFIGS / "virtual.toml").read_text()
@@ -93,7 +94,7 @@ def test_any_value_for_any_key(tmp_path: Path, number: int, value: str) -> None:
 @slow
 @given(content=st.one_of(damaged(EDS), st.binary(max_size=200)))
 def test_any_eds_text_for_the_virtual_drive(tmp_path: Path, content: bytes) -> None:
-    from tools.virtual_joint import new_device
+    from tools.simulation.virtual_joint import new_device
 
     path = tmp_path / "virtual_joint.eds"
     path.write_bytes(content)

@@ -18,8 +18,8 @@ from drivers.canopen.scaling import new_port
 from firmware_py.records import Command, Sample
 from firmware_py.schema import new
 from firmware_py.states import DriveRequest, DriveState
-from tools.config import load_config
-from tools.virtual_joint import new_device
+from tools.configuration.load import load_config
+from tools.simulation.virtual_joint import new_device
 
 quick = settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 identifiers = st.one_of(

@@ -11,16 +11,16 @@ import tomlkit
 
 from drivers.errors import ConfigurationError, DataError
 from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
-from tools.config import load_config, shipped_config
-from tools.config_records import friction_constants
+from tools.configuration.conversions import friction_constants
+from tools.configuration.load import load_config, shipped_config
 from tools.identification import identification
 from tools.identification.friction_data import SWEEP_COLUMNS, ForeignFormat, sidecar_contents
 from tools.identification.friction_section import MARK, snippet, with_section
 from tools.identification.identification import Options
 from tools.identification.pso import SwarmSettings
-from tools.identify import identify
 from tools.output import Output
-from tools.validate import validate
+from tools.verbs.identify import identify
+from tools.verbs.validate import validate
 
 QUICK = Options(folds=3, swarm=SwarmSettings(particles=80, iterations=120))
 VALUES = {
@@ -186,7 +186,7 @@ def test_nothing_is_written_after_an_error(sweep, config, spoil, error):
 
 
 def test_a_result_that_the_configuration_refuses_leaves_it_alone(sweep, config, monkeypatch):
-    monkeypatch.setattr("tools.identify.section_values", lambda p, n: {**VALUES, "velocity_unit": "furlong"})
+    monkeypatch.setattr("tools.verbs.identify.section_values", lambda p, n: {**VALUES, "velocity_unit": "furlong"})
     before = contents(sweep.parent)
     with pytest.raises(ConfigurationError, match=r"joint.toml: friction.velocity_unit \(=furlong\)") as caught:
         identify(sweep, output(), into=config, options=QUICK)

@@ -16,7 +16,7 @@ from firmware_py.sequence import reset_axis
 from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault
 from hil.frames import FrameQueue
 from hil.lockstep import RECEIVED_SLOT, RPDO_SLOT, run_lockstep
-from tools.config_records import axis_constants
+from tools.configuration.records import axis_constants
 
 PERIOD_ns = 1_000_000
 

@@ -20,13 +20,14 @@ from drivers.errors import ConfigurationError, DataError
 from firmware_py.records import LogRecord
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, DriveState
-from tools.can_log import frame_array, frame_times_ns
-from tools.frame_recorder import FrameRecorder, recording
-from tools.log import log_export, log_info, log_plot, missing_records
-from tools.log_export import FORMATS
 from tools.output import Output
-from tools.run_events import EventFinder
-from tools.run_log import RunLogWriter, read_run_log
+from tools.recording.can_log import frame_array, frame_times_ns
+from tools.recording.log_export import FORMATS
+from tools.recording.log_facts import missing_records
+from tools.recording.run_log import RunLogWriter, read_run_log
+from tools.running.events import EventFinder
+from tools.running.frame_recorder import FrameRecorder, recording
+from tools.verbs.log import log_export, log_info, log_plot
 
 START_NS = 5_000_000_000
 WORDS = {DriveState.OFF: 0x0250, DriveState.STARTING: 0x0233, DriveState.ENABLED: 0x1237, DriveState.FAULT: 0x0218}

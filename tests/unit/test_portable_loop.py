@@ -18,11 +18,11 @@ from drivers.errors import ConfigurationError
 from firmware_py.realtime import Histogram, Word
 from firmware_py.sequence import reset_axis
 from firmware_py.states import AxisPhase, Fault, StopRequest, TrajectoryKind
-from tools import loop_process, portable_loop
-from tools.config import load_config, shipped_config
-from tools.config_records import axis_constants
-from tools.portable_loop import check_portable_rate, run_portable_loop
-from tools.shared_block import SharedBlock
+from tools.configuration.load import load_config, shipped_config
+from tools.configuration.records import axis_constants
+from tools.running import loop_process, portable_loop
+from tools.running.portable_loop import check_portable_rate, run_portable_loop
+from tools.running.shared_block import SharedBlock
 
 PERIOD_NS = 1_000_000
 RECEIVE_NS = 600_000

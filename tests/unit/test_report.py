@@ -17,13 +17,13 @@ from firmware_py.records import LogRecord
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, DriveState, Fault
 from tools.output import Output
-from tools.report import MOST_LOGS, log_names, report, verdict
+from tools.recording.run_log import INFO, RunLogWriter
+from tools.recording.run_summary import summarise
 from tools.reporting.comparison import aligned, at_times
 from tools.reporting.figure import COLOURS, draw
 from tools.reporting.page import Details, Figure, Paragraph, Section, Table, page, write_page
 from tools.reporting.run_figures import binned, friction_points, run_figures
-from tools.run_log import INFO, RunLogWriter
-from tools.run_summary import summarise
+from tools.verbs.report import MOST_LOGS, log_names, report, verdict
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 

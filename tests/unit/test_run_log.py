@@ -15,8 +15,8 @@ from mcap_ros2.decoder import DecoderFactory
 from drivers.errors import DataError
 from firmware_py.records import LogRecord
 from firmware_py.schema import dtype_of, new
-from tools.cdr import event_body, event_from_body, message_definition
-from tools.run_log import ERROR, INFO, RunLogWriter, read_run_log
+from tools.recording.cdr import event_body, event_from_body, message_definition
+from tools.recording.run_log import ERROR, INFO, RunLogWriter, read_run_log
 
 
 def sample_records(count: int, first: int = 0) -> np.recarray:
@@ -117,7 +117,7 @@ def test_a_killed_writer_leaves_what_was_flushed(tmp_path: Path) -> None:
         "import sys, time\n"
         "from firmware_py.records import LogRecord\n"
         "from firmware_py.schema import new\n"
-        "from tools.run_log import RunLogWriter\n"
+        "from tools.recording.run_log import RunLogWriter\n"
         "log = RunLogWriter(sys.argv[1], {'versions': {'a': '1'}}, flush_s=0.0)\n"
         "records = new(LogRecord, 1000)\n"
         "records['cycle'] = range(1000)\n"

@@ -16,8 +16,8 @@ from firmware_py.records import LogRecord
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, Fault
 from tools.output import Output
-from tools.run_figure import drawn_indices, save_run_figure
-from tools.run_summary import _TIMES, histogram_times, summarise, summary_table
+from tools.recording.run_figure import drawn_indices, save_run_figure
+from tools.recording.run_summary import _TIMES, histogram_times, summarise, summary_table
 
 
 def run_records(tracking: int = 1000) -> np.recarray:

@@ -15,9 +15,9 @@ from firmware_py.realtime import HISTOGRAM_BINS
 from firmware_py.records import LogRecord
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, StopRequest
-from tools.live_panel import PhaseLines, Snapshot
 from tools.output import Output
-from tools.run_log import INFO, Event
+from tools.recording.run_log import INFO, Event
+from tools.running.live_panel import PhaseLines, Snapshot
 from tools.scoping import feed as feed_module
 from tools.scoping.access import COOKIE, allowed
 from tools.scoping.feed import EVENT, PIECE, RECORDS, Displays, ScopeFeed, ScopeOrder, scope_order

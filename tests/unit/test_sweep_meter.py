@@ -15,11 +15,11 @@ from firmware_py.records import LogRecord
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase
 from tools.identification.friction_data import SWEEP_COLUMNS, read_friction_data
-from tools.sweep_file import HEADING, SweepFile
-from tools.sweep_grid import SweepPoint
-from tools.sweep_meter import JointModel, MeasuredPoint, SweepMeter
-from tools.sweep_plan import Window
-from tools.sweep_statistics import LEAST_SAMPLES, PlateauResult, Tolerance
+from tools.sweeping.data_file import HEADING, SweepFile
+from tools.sweeping.grid import SweepPoint
+from tools.sweeping.meter import JointModel, MeasuredPoint, SweepMeter
+from tools.sweeping.plan import Window
+from tools.sweeping.statistics import LEAST_SAMPLES, PlateauResult, Tolerance
 
 MODEL = JointModel(100.0, 0.0, 0.0, 1.2e-5, (18.0 / math.tau,))
 FAST, BACK = SweepPoint(0, 0.5, 0), SweepPoint(1, -0.5, 0)

@@ -10,13 +10,14 @@ from typing import Any
 import pytest
 
 from drivers.errors import ConfigurationError, DataError, DeviceError, JointctlError
-from tools.config import Config, load_config, shipped_config
-from tools.config_records import plant_settings
+from tools.configuration.config import Config
+from tools.configuration.load import load_config, shipped_config
+from tools.configuration.plant_settings import plant_settings
 from tools.output import Output
-from tools.sweep import sweep
-from tools.sweep_grid import SweepUsageError
-from tools.sweep_options import QUICK_S, SweepOptions, make_plan
-from tools.sweep_run import middle_rad, with_mode, with_tracking_law
+from tools.sweeping.carry_out import middle_rad, with_mode, with_tracking_law
+from tools.sweeping.grid import SweepUsageError
+from tools.sweeping.options import QUICK_S, SweepOptions, make_plan
+from tools.verbs.sweep import sweep
 
 SWEEP = shipped_config("sweep_virtual")
 

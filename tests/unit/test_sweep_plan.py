@@ -17,7 +17,7 @@ from firmware_py.schema import new
 from firmware_py.states import TrajectoryKind
 from firmware_py.trajectory import reference_at
 from firmware_py.trajectory_table import peak_of
-from tools.sweep_grid import (
+from tools.sweeping.grid import (
     SweepPoint,
     SweepUsageError,
     both_directions,
@@ -26,7 +26,7 @@ from tools.sweep_grid import (
     ordered_points,
     plan_hash,
 )
-from tools.sweep_plan import PlanSettings, SweepMotion, fastest_radps, plan_motion, shifted, stroke_of
+from tools.sweeping.plan import PlanSettings, SweepMotion, fastest_radps, plan_motion, shifted, stroke_of
 
 RATIO = 121.0
 

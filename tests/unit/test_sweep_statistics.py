@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tools.sweep_statistics import (
+from tools.sweeping.statistics import (
     BATCHES,
     LEAST_SAMPLES,
     Samples,

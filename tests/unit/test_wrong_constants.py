@@ -13,15 +13,16 @@ import pytest
 
 from drivers.errors import ConfigurationError, DataError
 from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
-from tools.config import Config, load_config, shipped_config
+from tools.configuration.config import Config
+from tools.configuration.load import load_config, shipped_config
 from tools.identification.friction_data import SWEEP_COLUMNS, ForeignFormat, sidecar_contents
 from tools.identification.identification import Options
 from tools.identification.pso import SwarmSettings
-from tools.identify import identify
 from tools.output import Output
-from tools.sweep import sweep
-from tools.sweep_checks import constant_remarks, recorded_limits, refuse_constants
-from tools.sweep_options import SweepOptions
+from tools.sweeping.checks import constant_remarks, recorded_limits, refuse_constants
+from tools.sweeping.options import SweepOptions
+from tools.verbs.identify import identify
+from tools.verbs.sweep import sweep
 
 QUICK = Options(folds=3, swarm=SwarmSettings(particles=40, iterations=40))
 CONFIG = shipped_config("sweep_virtual")

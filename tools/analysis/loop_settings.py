@@ -15,11 +15,11 @@ from drivers.errors import ConfigurationError
 from firmware_py.records import NEURONS
 from firmware_py.states import ControllerKind
 from tools.analysis.linear_loop import LoopSettings
-from tools.config_elmo import ElmoSerial
-from tools.config_records import PAPER_CENTRES
+from tools.configuration.elmo import ElmoSerial
+from tools.configuration.records import PAPER_CENTRES
 
 if TYPE_CHECKING:
-    from tools.config import Config
+    from tools.configuration.config import Config
 
 LAST_SYNCHRONOUS_TYPE = 240
 

@@ -25,10 +25,10 @@ from tools.analysis.wake_up import fifo, wake_up_lateness_ns
 from tools.benchmarks.law_memory import setting_doubles
 from tools.benchmarks.load import load
 from tools.benchmarks.loop_times import NO_VALUES, LoopTimes, times_from_ns
-from tools.config import Config
-from tools.config_records import axis_constants, trajectory_table
-from tools.loop_handle import RECEIVE_SHARE, LoopHandle
-from tools.open_drive import open_drive
+from tools.configuration.config import Config
+from tools.configuration.records import axis_constants, trajectory_table
+from tools.running.loop_handle import RECEIVE_SHARE, LoopHandle
+from tools.running.open_drive import open_drive
 
 SETTLE_S = 0.5  # from the start of the loop until the drive is enabled, and a little more
 POLL_S = 0.02

@@ -15,8 +15,8 @@ from tools.benchmarks.load import LOADS
 from tools.benchmarks.loop_times import LoopTimes
 from tools.benchmarks.paired import Row, compared, skipped
 from tools.benchmarks.python_loops import run_canopen_sync, run_python_can
-from tools.config import Config
-from tools.virtual_joint import separate_virtual_joint
+from tools.configuration.config import Config
+from tools.simulation.virtual_joint import separate_virtual_joint
 
 GROUP = "loop"
 RATES_Hz = (1000.0, 2000.0)

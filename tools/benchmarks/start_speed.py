@@ -19,8 +19,8 @@ from pathlib import Path
 
 from drivers.errors import JointctlError
 from tools.benchmarks.paired import Row, compared, interleaved, measured
-from tools.config import Config
-from tools.virtual_joint import separate_virtual_joint
+from tools.configuration.config import Config
+from tools.simulation.virtual_joint import separate_virtual_joint
 
 GROUP = "start"
 HELP_GOAL_S = 0.3
@@ -54,7 +54,7 @@ def command_s(*arguments: str) -> float:
 
 def verbs() -> list[str]:
     """Names of all verbs, as the command line registers them."""
-    from tools.cli import app
+    from tools.cli.main import app
 
     names = [command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands]
     return sorted(name for name in names if name)

@@ -32,7 +32,7 @@ from typing import Any
 from drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES
 from hil.faults import FaultKind
 from tools.campaign.scenario import Scenario
-from tools.config import Config
+from tools.configuration.config import Config
 
 REACTION_s = 0.010
 BLIND_RADPS = 1.8

@@ -17,9 +17,9 @@ from hil.faults import FaultKind
 from tools.campaign.envelope import STANDSTILL_RADPS, Envelope, envelope
 from tools.campaign.fault_classes import FAULT_CLASSES, LATE_CAUSES
 from tools.campaign.scenario import Scenario, plant_of
-from tools.config import Config
-from tools.config_records import axis_constants
-from tools.lockstep import LockstepJoint, LockstepRun
+from tools.configuration.config import Config
+from tools.configuration.records import axis_constants
+from tools.simulation.lockstep import LockstepJoint, LockstepRun
 
 SUPERVISOR_CYCLES = 1000
 APPROACH_s = 1.0

@@ -11,8 +11,9 @@ from pathlib import Path
 
 from tools.campaign.judge import Verdict, judge
 from tools.campaign.scenario import draw_scenario
-from tools.config import Config, load_config
-from tools.lockstep import LockstepJoint
+from tools.configuration.config import Config
+from tools.configuration.load import load_config
+from tools.simulation.lockstep import LockstepJoint
 
 AT_ONCE = 16  # scenarios that a worker takes at a time
 _worker: dict[str, object] = {}

@@ -13,9 +13,9 @@ from hil.faults import FaultConstants, FaultKind
 from hil.joint import plant
 from hil.plant_records import FrictionKind
 from tools.campaign.fault_classes import EMERGENCY_CODES, FAULT_CLASSES, SIGNED, Sizes
-from tools.config import Config
-from tools.config_records import plant_settings
-from tools.config_trajectory import Hold, MinJerk, Sine, Trapezoid
+from tools.configuration.config import Config
+from tools.configuration.plant_settings import plant_settings
+from tools.configuration.trajectory import Hold, MinJerk, Sine, Trapezoid
 
 HARMLESS_SHARE = 0.35
 REACH_RAD = 0.4  # of the trajectories; the limits are at 0.7

@@ -11,8 +11,8 @@ from drivers.errors import DataError
 from tools.experiments.paper_rows import Runs
 from tools.experiments.paper_runs import friction_estimate, hidden_outputs
 from tools.experiments.scenarios import event_s
-from tools.lockstep import LockstepRun
-from tools.run_figure import drawn_indices
+from tools.recording.run_figure import drawn_indices
+from tools.simulation.lockstep import LockstepRun
 
 _START_s = 1.0
 _BLUE, _ORANGE, _GREEN, _RED, _GREY = "#1f5fa8", "#d9822b", "#3a8f4d", "#b3282d", "#555555"

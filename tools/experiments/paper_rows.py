@@ -10,7 +10,7 @@ import numpy as np
 from tools.experiments.error_figures import error_figures
 from tools.experiments.paper_identification import PaperIdentification
 from tools.experiments.paper_runs import AFTER_s, Experiment, friction_estimate
-from tools.lockstep import LockstepRun
+from tools.simulation.lockstep import LockstepRun
 
 
 @dataclass(frozen=True)

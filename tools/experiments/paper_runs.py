@@ -15,11 +15,12 @@ import numpy as np
 
 from drivers.errors import MotionFault
 from firmware_py.states import Fault
-from tools.config import Config, load_config, shipped_config
+from tools.configuration.config import Config
+from tools.configuration.load import load_config, shipped_config
 from tools.experiments.controllers import Controller, changed, controller_constants, from_file, paper_control
 from tools.experiments.ensemble import RPDO_AT_ONCE
 from tools.experiments.scenarios import Scenario, run_scenario
-from tools.lockstep import LockstepJoint, LockstepRun
+from tools.simulation.lockstep import LockstepJoint, LockstepRun
 
 AFTER_s = 75.0  # the paper looks at the errors from here on
 Q_SIMULATION, Q_PLATFORM = 2500.0, 1800.0

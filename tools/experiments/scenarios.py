@@ -14,7 +14,7 @@ import math
 from typing import Any, Literal, get_args
 
 from drivers.errors import ConfigurationError
-from tools.lockstep import LockstepJoint, LockstepRun
+from tools.simulation.lockstep import LockstepJoint, LockstepRun
 
 Scenario = Literal["sine", "frequency", "amplitude", "load"]
 SCENARIOS: tuple[Scenario, ...] = get_args(Scenario)

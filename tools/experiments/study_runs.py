@@ -19,12 +19,12 @@ from pathlib import Path
 import numpy as np
 
 from drivers.errors import ConfigurationError, DataError
-from tools.config import Config
+from tools.configuration.config import Config
 from tools.experiments.controllers import Controller, controller_constants
 from tools.experiments.ensemble import EnsembleSettings, random_plant
 from tools.experiments.error_figures import ErrorFigures, error_figures
 from tools.experiments.scenarios import Scenario, run_scenario
-from tools.lockstep import LockstepJoint
+from tools.simulation.lockstep import LockstepJoint
 
 Progress = Callable[[float], None]
 

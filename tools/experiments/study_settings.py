@@ -22,8 +22,8 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field, ValidationError
 
 from drivers.errors import ConfigurationError
-from tools.config import suggestion
-from tools.config_sections import Section, between
+from tools.configuration.problems import suggestion
+from tools.configuration.sections import Section, between
 from tools.experiments.controllers import DEFAULT, Controller, changed, named
 from tools.experiments.ensemble import EnsembleSettings
 from tools.experiments.scenarios import Scenario

@@ -19,7 +19,8 @@ from tomlkit.exceptions import TOMLKitError
 
 from drivers.errors import ConfigurationError, DataError
 from firmware_py.friction import DEGREE
-from tools.config import ConfigurationProblems, load_config
+from tools.configuration.load import load_config
+from tools.configuration.problems import ConfigurationProblems
 from tools.identification.models import Branch
 
 MARK = "# identified by jointctl: "

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from firmware_py.states import AxisPhase, Fault
+from tools.recording.run_figure import drawn_indices
 from tools.reporting.figure import BLUE, COLOURS, GREEN, GREY, INK, ORANGE, RED, SOFT, VIOLET, draw
 from tools.reporting.page import Figure
-from tools.run_figure import drawn_indices
 
 POINTS = 1600  # more than the page is wide; least and greatest of each bucket, so that no peak is lost
 _PARTS = (

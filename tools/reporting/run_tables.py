@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from firmware_py.states import Fault
-from tools.log import began_at, event_rows, missing_records
+from tools.recording.log_facts import began_at, event_rows, missing_records
+from tools.recording.run_log import RunLog
+from tools.recording.run_summary import Range, RunSummary, TimeSummary
 from tools.reporting.page import Table
-from tools.run_log import RunLog
-from tools.run_summary import Range, RunSummary, TimeSummary
 
 Figures = list[tuple[str, float | None, int]]
 _EVENTS_SHOWN = 300

@@ -16,8 +16,8 @@ from typing import Any, Self
 
 from drivers.errors import DataError
 from firmware_py.states import StopRequest
-from tools.live_panel import Display, Snapshot
-from tools.run_log import Event
+from tools.recording.run_log import Event
+from tools.running.live_panel import Display, Snapshot
 
 RECORDS, EVENT = b"R", b"E"  # first byte of a message
 PIECE = 64  # records a message; less than the buffer of the socket

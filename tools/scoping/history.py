@@ -10,9 +10,9 @@ import numpy as np
 
 from firmware_py.records import LogRecord
 from firmware_py.schema import dtype_of, new
+from tools.recording.run_figure import drawn_indices
+from tools.recording.run_log import Event
 from tools.reporting.run_figures import powered
-from tools.run_figure import drawn_indices
-from tools.run_log import Event
 
 RING_RECORDS = 1 << 16  # 65 s at 1 kHz
 EVENTS = 50

@@ -8,7 +8,7 @@ from typing import Any
 from nicegui import ui
 
 from firmware_py.states import Fault
-from tools.run_events import drive_state_name, phase_name
+from tools.running.events import drive_state_name, phase_name
 from tools.scoping.feed import ScopeOrder
 from tools.scoping.history import SIGNALS, History, crossing_s, percentiles_us
 

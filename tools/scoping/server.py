@@ -10,7 +10,7 @@ import threading
 import time
 from pathlib import Path
 
-from tools.run_log import Event, read_run_log
+from tools.recording.run_log import Event, read_run_log
 from tools.scoping.access import AccessControl
 from tools.scoping.feed import EVENT, RECORDS, ScopeOrder
 from tools.scoping.history import EVENTS, RING_RECORDS, History

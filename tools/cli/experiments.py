@@ -1,0 +1,101 @@
+"""The verbs around simulated experiments: paper, study, fault-campaign, bench."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from tools.cli.options import Json, Quiet, loaded
+from tools.output import Output
+
+
+def paper(
+    figures: Annotated[Path | None, typer.Option("--figures", help="folder for the figures; without it none")] = None,
+    no_identification: Annotated[
+        bool, typer.Option("--no-identification", help="leave the identification figures out")
+    ] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Reproduce every experiment of the paper on the virtual joint, in lockstep: its figure beside ours."""
+    from tools.verbs.paper import paper as run_paper
+
+    output = Output(json=json, quiet=quiet)
+    raise typer.Exit(run_paper(output, folder=figures, identification=not no_identification))
+
+
+def study(
+    file: Annotated[Path | None, typer.Option("--file", help="TOML with plants, seed and controllers")] = None,
+    plants: Annotated[int | None, typer.Option("--plants", help="how many random plants")] = None,
+    seed: Annotated[int | None, typer.Option("--seed")] = None,
+    after: Annotated[float | None, typer.Option("--after", help="errors are taken after this time [s]")] = None,
+    scenario: Annotated[str | None, typer.Option("--scenario", help="sine, frequency, amplitude or load")] = None,
+    controller: Annotated[
+        list[str] | None, typer.Option("--controller", help="name or configuration file; may be repeated")
+    ] = None,
+    base: Annotated[str | None, typer.Option("--base", help="configuration of the joint: name or file")] = None,
+    workers: Annotated[int | None, typer.Option("--workers", help="processes; default: one a core")] = None,
+    csv: Annotated[Path | None, typer.Option("--csv", help="file for all single results")] = None,
+    figure: Annotated[Path | None, typer.Option("--figure", help="PNG with a box plot")] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Compare controllers on many random joints: medians and 5-95 % ranges of error, peak and settling time."""
+    from tools.experiments.study_settings import StudySettings, checked, load_study
+    from tools.verbs.study import study as run_study
+
+    given: dict[str, Any] = {
+        "plants": plants,
+        "seed": seed,
+        "after_s": after,
+        "scenario": scenario,
+        "controllers": controller or None,
+        "base": base,
+    }
+    flags = {key: value for key, value in given.items() if value is not None}
+    settings = load_study(file) if file is not None else StudySettings()
+    settings = checked({**settings.model_dump(), **flags}, "command line")
+    output = Output(json=json, quiet=quiet)
+    raise typer.Exit(run_study(settings, output, workers=workers, csv=csv, figure=figure))
+
+
+def fault_campaign(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG")] = Path("virtual"),
+    count: Annotated[int, typer.Option("--count", help="how many random scenarios", min=1)] = 10_000,
+    seed: Annotated[int, typer.Option("--seed")] = 1,
+    scenario: Annotated[int | None, typer.Option("--scenario", help="replay this one alone")] = None,
+    folder: Annotated[Path, typer.Option("--folder", help="for report, JSON and picture")] = Path("fault-campaign"),
+    workers: Annotated[int | None, typer.Option("--workers", help="processes; default: one a core")] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Random faults on random joints in lockstep; every safety invariant is checked in every scenario."""
+    from tools.verbs.fault_campaign import fault_campaign as run_campaign
+
+    output = Output(json=json, quiet=quiet)
+    raise typer.Exit(
+        run_campaign(loaded(config), output, count=count, seed=seed, scenario=scenario, folder=folder, workers=workers)
+    )
+
+
+def bench(
+    quick: Annotated[bool, typer.Option("--quick", help="shorter, with more noise")] = False,
+    out: Annotated[Path | None, typer.Option("--out", help="folder for bench.json and bench.png")] = None,
+    only: Annotated[list[str] | None, typer.Option("--only", help="law, loop, lockstep, swarm or start")] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Speed as paired ratios: the law against C and numpy, the loop against C and others, lockstep, swarm, start."""
+    from tools.verbs.bench import bench as run_bench
+
+    raise typer.Exit(run_bench(Output(json=json, quiet=quiet), quick=quick, out=out, only=tuple(only or ())))
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verbs."""
+    app.command()(paper)
+    app.command()(study)
+    app.command("fault-campaign")(fault_campaign)
+    app.command()(bench)

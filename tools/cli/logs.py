@@ -1,0 +1,80 @@
+"""The verbs that look at run logs: log info, plot, export; report; scope."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tools.cli.options import Json, Quiet
+from tools.output import Output
+
+LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="run log (MCAP)")]
+
+log_app = typer.Typer(help="Look at a run log: what it holds, a picture, other formats.", no_args_is_help=True)
+
+
+@log_app.command("info")
+def info(log: LogPath, json: Json = False) -> None:
+    """What the log holds, the run in numbers, its events."""
+    from tools.verbs.log import log_info
+
+    raise typer.Exit(log_info(log, Output(json=json)))
+
+
+@log_app.command("plot")
+def plot(
+    log: LogPath,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="PNG to write; default: beside the log")] = None,
+    json: Json = False,
+) -> None:
+    """The picture of the run."""
+    from tools.verbs.log import log_plot
+
+    raise typer.Exit(log_plot(log, Output(json=json), out))
+
+
+@log_app.command("export")
+def export(
+    log: LogPath,
+    format: Annotated[str, typer.Option("-f", "--format", help="csv, npz, parquet, or candump for the raw frames")],
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="file to write; default: beside the log")] = None,
+    json: Json = False,
+) -> None:
+    """The log in another format."""
+    from tools.verbs.log import log_export
+
+    raise typer.Exit(log_export(log, Output(json=json), format, out))
+
+
+def report(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="run logs; several are compared")],
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="HTML to write; default: beside the log")] = None,
+    json: Json = False,
+) -> None:
+    """One self-contained page about a run, or about several beside each other."""
+    from tools.verbs.report import report as run_report
+
+    raise typer.Exit(run_report(logs, Output(json=json), out))
+
+
+def scope(
+    log: LogPath,
+    host: Annotated[
+        str, typer.Option("--host", help="address to serve at; beyond this computer with a token")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port")] = 8642,
+    quiet: Quiet = False,
+) -> None:
+    """A run log in a local web page, to zoom into.  For a live one: jointctl run CONFIG --scope."""
+    from tools.verbs.scope import scope as run_scope
+
+    raise typer.Exit(run_scope(log, Output(quiet=quiet), host=host, port=port))
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verbs."""
+    app.add_typer(log_app, name="log")
+    app.command()(report)
+    app.command()(scope)

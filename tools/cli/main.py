@@ -1,0 +1,199 @@
+"""The command line.  Verbs are imported when they are called, so that `--help` is quick."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drivers.errors import JointctlError
+from tools.cli import experiments as cli_experiments
+from tools.cli import friction as cli_friction
+from tools.cli import logs as cli_log
+from tools.cli.options import (
+    Bitrate,
+    Channel,
+    ConfigPath,
+    Interface,
+    Json,
+    Port,
+    Quiet,
+    Target,
+    Yes,
+    config_path,
+    loaded,
+)
+from tools.output import Output
+
+app = typer.Typer(
+    name="jointctl",
+    help="Robot joint controller: CANopen CiA 402 at 1 kHz, with a virtual joint to try it on.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+cli_friction.register(app)
+cli_experiments.register(app)
+cli_log.register(app)
+
+
+@app.command()
+def demo(
+    config: Annotated[Path, typer.Option("--config", help="configuration with a [virtual] section")] = Path("virtual"),
+    duration: Annotated[float | None, typer.Option("--duration", help="seconds of the trajectory", min=0.1)] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Track a trajectory on the virtual joint: no hardware, no set-up."""
+    from tools.verbs.demo import demo as run_demo
+
+    raise typer.Exit(run_demo(config_path(config), Output(json=json, quiet=quiet), duration_s=duration))
+
+
+@app.command()
+def run(
+    config: ConfigPath,
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    port: Port = None,
+    target: Target = None,
+    yes: Yes = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="commission, show the motion envelope, move nothing")
+    ] = False,
+    allow_low_margin: Annotated[
+        bool, typer.Option("--allow-low-margin", help="run a stable loop below margin.min_phase_margin_deg")
+    ] = False,
+    scope: Annotated[bool, typer.Option("--scope", help="live page in the browser (extra: jointctl[scope])")] = False,
+    scope_host: Annotated[
+        str, typer.Option("--scope-host", help="address of the page; others need a token")
+    ] = "127.0.0.1",
+    scope_port: Annotated[int, typer.Option("--scope-port", min=1, max=65535)] = 8642,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Track the configured trajectory on a real or virtual joint."""
+    from tools.verbs.run import run as run_run
+
+    joint = loaded(config, interface, channel, bitrate, port, target)
+    raise typer.Exit(
+        run_run(
+            joint,
+            Output(json=json, quiet=quiet),
+            assume_yes=yes,
+            dry_run=dry_run,
+            allow_low_margin=allow_low_margin,
+            scope=(scope_host, scope_port) if scope else None,
+        )
+    )
+
+
+@app.command()
+def hil(
+    config: ConfigPath = Path("virtual"),
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    port: Port = None,
+    target: Target = None,
+    serial: Annotated[bool, typer.Option("--serial", help="the virtual serial drive instead of the CAN bus")] = False,
+    link: Annotated[str | None, typer.Option("--link", help="serial drive: path of a link to its port")] = None,
+    timing: Annotated[bool, typer.Option("--timing", help="model bit times and arbitration")] = False,
+    ready_fd: Annotated[int | None, typer.Option("--ready-fd", hidden=True)] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Keep the virtual joint up, on a virtual bus or a pseudo-terminal, for other programs to attach to."""
+    from tools.verbs.hil import hil as run_hil
+
+    if serial and config == Path("virtual"):
+        config = Path("elmo_serial")
+    joint = loaded(config, interface, channel, bitrate, port, target)
+    if joint.drive.kind == "elmo_serial":
+        from tools.verbs.hil_serial import hil_serial
+
+        raise typer.Exit(hil_serial(joint, Output(quiet=quiet), link=link, ready_fd=ready_fd))
+    raise typer.Exit(run_hil(joint, Output(quiet=quiet), timing=timing, ready_fd=ready_fd))
+
+
+@app.command()
+def stop(
+    config: ConfigPath,
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    port: Port = None,
+    target: Target = None,
+    json: Json = False,
+) -> None:
+    """Stop and disable the drive now, also while another program controls it."""
+    from tools.verbs.stop import stop as run_stop
+
+    joint = loaded(config, interface, channel, bitrate, port, target)
+    raise typer.Exit(run_stop(joint, Output(json=json)))
+
+
+@app.command("clear-fault")
+def clear_fault(
+    config: ConfigPath,
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    port: Port = None,
+    target: Target = None,
+    json: Json = False,
+) -> None:
+    """Reset the drive's fault; it stays disabled."""
+    from tools.verbs.stop import clear_fault as run_clear_fault
+
+    joint = loaded(config, interface, channel, bitrate, port, target)
+    raise typer.Exit(run_clear_fault(joint, Output(json=json)))
+
+
+@app.command()
+def doctor(
+    config: ConfigPath = Path("virtual"),
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    port: Port = None,
+    target: Target = None,
+    cold: Annotated[bool, typer.Option("--cold", help="measure the cold start as well (about a minute)")] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """What this computer and bus allow: real-time rights, wake-up times, kernel cache, bus budget.  Moves nothing."""
+    from tools.verbs.doctor import doctor as run_doctor
+
+    joint = loaded(config, interface, channel, bitrate, port, target)
+    raise typer.Exit(run_doctor(joint, Output(json=json, quiet=quiet), cold=cold))
+
+
+@app.command()
+def check(
+    config: ConfigPath,
+    delay: Annotated[float | None, typer.Option("--delay", help="measured loop delay [s]", min=0.0)] = None,
+    figure: Annotated[Path | None, typer.Option("--figure", help="PNG to write: Bode, sensitivity, poles")] = None,
+    allow_low_margin: Annotated[bool, typer.Option("--allow-low-margin", help="accept a stable loop below it")] = False,
+    json: Json = False,
+) -> None:
+    """Is the control loop stable enough?  Margins, bounds and what would help."""
+    from tools.verbs.check import check as run_check
+
+    joint = loaded(config)
+    raise typer.Exit(run_check(joint, Output(json=json), delay, figure=figure, allow_low_margin=allow_low_margin))
+
+
+def main() -> None:
+    """Run a verb; every known error is one line and its own exit code."""
+    try:
+        app()
+    except JointctlError as error:
+        Output().error(error.message, error.hint)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        Output().note("interrupted")
+        sys.exit(130)

@@ -1,0 +1,53 @@
+"""Options and arguments that several verbs share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from tools.configuration.config import Config
+
+Interface = Annotated[str | None, typer.Option("-i", "--interface", help="python-can interface [env CAN_INTERFACE]")]
+Channel = Annotated[str | None, typer.Option("-c", "--channel", help="bus channel [env CAN_CHANNEL]")]
+Bitrate = Annotated[int | None, typer.Option("-b", "--bitrate", help="bit/s [env CAN_BITRATE]")]
+Port = Annotated[str | None, typer.Option("-p", "--port", help="serial port of an elmo_serial drive")]
+Target = Annotated[
+    int | None, typer.Option("-t", "--target", help="CANopen node instead of drive.node", min=1, max=127)
+]
+Json = Annotated[bool, typer.Option("--json", help="result as one JSON document on stdout")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="no progress on stderr")]
+ConfigPath = Annotated[
+    Path, typer.Argument(metavar="CONFIG", help="configuration file (TOML), or the name of a shipped one")
+]
+Yes = Annotated[bool, typer.Option("-y", "--yes", help="move without asking")]
+
+
+def config_path(path: Path) -> Path:
+    """The file itself, or a shipped configuration of that name."""
+    from tools.configuration.load import shipped_config
+
+    shipped = shipped_config(str(path))
+    return shipped if not path.exists() and shipped.exists() else path
+
+
+def loaded(
+    path: Path,
+    interface: str | None = None,
+    channel: str | None = None,
+    bitrate: int | None = None,
+    port: str | None = None,
+    target: int | None = None,
+) -> Config:
+    """The configuration with what the command line and the environment say about bus, port and node."""
+    from tools.configuration.elmo_settings import with_port_override
+    from tools.configuration.load import load_config, with_bus_overrides
+
+    config = with_port_override(load_config(config_path(path)), port)
+    if config.drive.kind == "canopen":
+        config = with_bus_overrides(config, interface, channel, bitrate)
+        if target is not None:
+            config = config.model_copy(update={"drive": config.drive.model_copy(update={"node": target})})
+    return config

@@ -1,0 +1,202 @@
+"""Checks between sections of a configuration: the values are each in range, but do they fit together?"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from tools.configuration.config import Config
+from tools.configuration.elmo import ElmoSerial
+from tools.configuration.elmo_settings import serial_problems
+from tools.configuration.sections import Friction, FrictionDirection
+
+CAN_RATE_HZ = (100.0, 4000.0)
+
+
+def trajectory_extremes(trajectory: Any) -> tuple[float, float, float] | None:
+    """(lowest position [rad], highest position [rad], highest speed [rad/s]); None where a file must be read first.
+
+    A sine is taken with its full amplitude even if `duration_s` ends before the peak.
+    """
+    if trajectory.kind == "sine":
+        parts = [trajectory] + ([trajectory.switch] if trajectory.switch else [])
+        low = min(p.offset_rad - abs(p.amplitude_rad) for p in parts)
+        high = max(p.offset_rad + abs(p.amplitude_rad) for p in parts)
+        return low, high, max(abs(p.amplitude_rad) * math.tau * p.frequency_Hz for p in parts)
+    if trajectory.kind == "hold":
+        return trajectory.position_rad, trajectory.position_rad, 0.0
+    if trajectory.kind == "table":
+        return None
+    ends = trajectory.start_rad, trajectory.target_rad
+    distance = abs(ends[1] - ends[0])
+    if trajectory.kind == "min_jerk":
+        # the quintic's peak speed is 15/8 of its mean
+        return min(ends), max(ends), 1.875 * distance / trajectory.move_s
+    peak = min(trajectory.speed_radps, math.sqrt(distance * trajectory.acceleration_radps2))
+    return min(ends), max(ends), peak
+
+
+def extremes_problems(config: Config, low_rad: float, high_rad: float, speed_radps: float) -> list[str]:
+    """A trajectory against the limits; also called once a table has been read."""
+    limits = config.limits
+    allowed = f"[{limits.position_min_rad:g}..{limits.position_max_rad:g}]"
+    found = []
+    for end, value in (("lowest", low_rad), ("highest", high_rad)):
+        if not limits.position_min_rad <= value <= limits.position_max_rad:
+            found.append(f"trajectory: {end} position (={value:g} rad) must be in {allowed}, the limits.position_*_rad")
+    if not speed_radps <= limits.velocity_max_radps:
+        found.append(
+            f"trajectory: peak speed (={speed_radps:g} rad/s) must be in [0..{limits.velocity_max_radps:g}], "
+            "up to limits.velocity_max_radps"
+        )
+    return found
+
+
+def problems_between_sections(config: Config) -> list[str]:
+    """One line for each contradiction, without the file name."""
+    return [
+        *_limit_problems(config),
+        *_control_problems(config),
+        *_friction_problems(config),
+        *_drive_problems(config),
+    ]
+
+
+def _limit_problems(config: Config) -> list[str]:
+    limits, loop = config.limits, config.loop
+    low, high = limits.position_min_rad, limits.position_max_rad
+    found = []
+    if not low < high:
+        return [f"limits.position_min_rad (={low:g}) must be less than limits.position_max_rad (={high:g})"]
+    if limits.following_error_max_rad >= high - low:
+        error = limits.following_error_max_rad
+        found.append(
+            f"limits.following_error_max_rad (={error:g}) must be less than the range of motion, {high - low:g}"
+        )
+    if limits.standstill_radps >= limits.velocity_max_radps:
+        found.append(
+            f"limits.standstill_radps (={limits.standstill_radps:g}) must be less than "
+            f"limits.velocity_max_radps (={limits.velocity_max_radps:g})"
+        )
+    step = limits.velocity_max_radps / loop.rate_Hz
+    if limits.position_jump_max_rad < step:
+        found.append(
+            f"limits.position_jump_max_rad (={limits.position_jump_max_rad:g}) must be at least {step:g}, "
+            "one period at limits.velocity_max_radps"
+        )
+    for key in ("sample_age_max_s", "saturation_max_s", "skipped_max_s"):
+        value = getattr(limits, key)
+        if value * loop.rate_Hz < 1.0:
+            found.append(f"limits.{key} (={value:g}) must be at least one period, {1.0 / loop.rate_Hz:g} s")
+    extremes = trajectory_extremes(config.trajectory)
+    if extremes is not None:
+        found += extremes_problems(config, *extremes)
+    braking = limits.velocity_max_radps / config.sequence.brake_radps2
+    if braking >= config.sequence.stop_timeout_s:
+        found.append(
+            f"sequence.stop_timeout_s (={config.sequence.stop_timeout_s:g}) must be more than {braking:g}, "
+            "the braking time from limits.velocity_max_radps"
+        )
+    return found
+
+
+def _control_problems(config: Config) -> list[str]:
+    control, rate = config.control, config.loop.rate_Hz
+    found = []
+    if control.velocity_cutoff_Hz >= rate / 2.0:
+        found.append(
+            f"control.velocity_cutoff_Hz (={control.velocity_cutoff_Hz:g}) must be in [0..{rate / 2.0:g}), "
+            "below half of loop.rate_Hz"
+        )
+    # explicit integration of the error dynamics: beyond this even the ideal sampled loop is unstable
+    if control.kv + control.kp / rate >= 2.0 * rate:
+        found.append(f"control.kv (={control.kv:g}) and control.kp (={control.kp:g}) are too high for {rate:g} Hz")
+    if (control.kind == "computed_torque_observer") != (control.observer_radps > 0.0):
+        found.append(
+            f"control.observer_radps (={control.observer_radps:g}) must be more than 0 with "
+            f'control.kind "computed_torque_observer" and 0 with any other (={control.kind})'
+        )
+    if control.kind != "pid" and control.ki:
+        found.append(f'control.ki (={control.ki:g}) must be 0 unless control.kind is "pid" (={control.kind})')
+    if control.learning is not None and control.kind != "computed_torque_observer":
+        found.append(
+            f'[control.learning] needs control.kind "computed_torque_observer" (={control.kind}): '
+            "the observer takes over when learning starts anew"
+        )
+    if control.zero_rule == "linear" and control.zero_band_radps == 0.0:
+        found.append('control.zero_band_radps (=0) must be more than 0 for control.zero_rule = "linear"')
+    if control.weight_limit_Nm and abs(control.initial_weight_Nm) > control.weight_limit_Nm:
+        found.append(
+            f"control.initial_weight_Nm (={control.initial_weight_Nm:g}) must be in "
+            f"[{-control.weight_limit_Nm:g}..{control.weight_limit_Nm:g}], the control.weight_limit_Nm"
+        )
+    return found
+
+
+def _cubic(d: FrictionDirection, v: float) -> float:
+    return d.a0 + v * (d.a1 + v * (d.a2 + v * d.a3))
+
+
+def _friction_problems(config: Config) -> list[str]:
+    friction, found = config.friction, []
+    if friction is None:
+        if config.control.feed_forward != "none":
+            found.append(f"[friction] is missing: control.feed_forward (={config.control.feed_forward}) needs it")
+        if config.virtual is not None and config.virtual.friction_kind != "none" and config.virtual.friction is None:
+            found.append(f"[friction] is missing: virtual.friction_kind (={config.virtual.friction_kind}) needs it")
+    elif config.control.feed_forward == "lugre_desired" and friction.lugre is None:
+        found.append("[friction.lugre] is missing: control.feed_forward (=lugre_desired) needs it")
+    if friction is not None:
+        found += _shape_problems("friction", friction)
+    if config.virtual is not None and config.virtual.friction is not None:
+        found += _shape_problems("virtual.friction", config.virtual.friction)
+    return found
+
+
+def _shape_problems(section: str, friction: Friction) -> list[str]:
+    found = []
+    for name, direction, sign in (("positive", friction.positive, 1.0), ("negative", friction.negative, -1.0)):
+        knee, maximum = sign * direction.knee, sign * direction.max
+        if not 0.0 <= knee <= maximum or maximum == 0.0:
+            order = "0 <= knee <= max" if sign > 0.0 else "max <= knee <= 0"
+            found.append(f"{section}.{name}.knee (={direction.knee:g}) and max (={direction.max:g}) must be {order}")
+        elif sign * _cubic(direction, direction.knee) < 0.0 or sign * _cubic(direction, direction.max) < 0.0:
+            found.append(f"{section}.{name}: a0..a3 must give friction that opposes the motion from knee to max")
+    return found
+
+
+def _drive_problems(config: Config) -> list[str]:
+    if abs(config.joint.gravity_Nm) >= config.limits.torque_max_Nm:
+        weak = [
+            f"joint.gravity_Nm (={config.joint.gravity_Nm:g}) must be less than limits.torque_max_Nm "
+            f"(={config.limits.torque_max_Nm:g}): the joint could not be held"
+        ]
+    else:
+        weak = []
+    if isinstance(config.drive, ElmoSerial):
+        return weak + serial_problems(config)
+    return weak + _canopen_problems(config)
+
+
+def _canopen_problems(config: Config) -> list[str]:
+    drive, limits, found = config.canopen, config.limits, []
+    if not CAN_RATE_HZ[0] <= config.loop.rate_Hz <= CAN_RATE_HZ[1]:
+        found.append(f"loop.rate_Hz (={config.loop.rate_Hz:g}) must be in [{CAN_RATE_HZ[0]:g}..{CAN_RATE_HZ[1]:g}]")
+    if drive.node == drive.master_node:
+        found.append(f"drive.master_node (={drive.master_node}) must differ from drive.node")
+    if 240 < drive.rpdo_transmission_type < 254:
+        kind = drive.rpdo_transmission_type
+        found.append(f"drive.rpdo_transmission_type (={kind}) must be in [0..240] or in [254..255]")
+    if drive.rated_torque_Nm is not None and drive.max_torque_permille is not None:
+        if drive.torque_reference == "rated_torque":
+            reach = drive.rated_torque_Nm * config.joint.reduction_ratio * drive.max_torque_permille / 1000.0
+            if limits.torque_max_Nm > reach * (1.0 + 1e-9):
+                found.append(
+                    f"limits.torque_max_Nm (={limits.torque_max_Nm:g}) must be in (0..{reach:g}], "
+                    "what drive.max_torque_permille allows"
+                )
+    if config.virtual is not None and drive.rated_current_A is None:
+        found.append("drive.rated_current_A is missing: the virtual drive needs it")
+    if config.virtual is not None and drive.rated_torque_Nm is None:
+        found.append("drive.rated_torque_Nm is missing: the virtual drive needs it")
+    return found

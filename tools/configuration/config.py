@@ -1,0 +1,90 @@
+"""Read and check a TOML configuration: `load_config(path)` gives a frozen `Config` or one line for each problem.
+
+A line reads `FILE: section.key (=value) must be in [a..b]`; an unknown key names the one that was meant, also when
+only the unit is wrong or missing (`loop.rate_kHz` -> `rate_Hz`).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, PrivateAttr
+
+from drivers.errors import ConfigurationError
+from tools.configuration.elmo import ElmoSerial
+from tools.configuration.plant import Virtual
+from tools.configuration.sections import (
+    Bus,
+    Control,
+    Drive,
+    Encoder,
+    Friction,
+    Joint,
+    Limits,
+    Log,
+    Loop,
+    Margin,
+    Section,
+    Sequence,
+)
+from tools.configuration.trajectory import Trajectory
+
+SHIPPED_FOLDER = Path(__file__).resolve().parents[2] / "configs"
+
+
+class Config(Section):
+    """One joint, its drive and what it shall do; [virtual] only matters on the virtual bus."""
+
+    bus: Bus
+    drive: Annotated[Drive | ElmoSerial, Field(discriminator="kind")]
+    encoder: Encoder
+    joint: Joint
+    limits: Limits
+    sequence: Sequence
+    loop: Loop
+    control: Control
+    trajectory: Trajectory
+    friction: Friction | None = None
+    virtual: Virtual | None = None
+    margin: Margin = Margin()
+    log: Log = Log()
+
+    _path: Path = PrivateAttr(default=Path())
+    _text: str = PrivateAttr(default="")
+
+    @property
+    def path(self) -> Path:
+        """The file that this was read from."""
+        return self._path
+
+    @property
+    def text(self) -> str:
+        """The file as it was read, for the log."""
+        return self._text
+
+    @property
+    def canopen(self) -> Drive:
+        """[drive] of a CANopen drive; `ConfigurationError` for any other."""
+        if not isinstance(self.drive, Drive):
+            raise ConfigurationError(f'{self._path}: drive.kind (={self.drive.kind}) must be "canopen" here')
+        return self.drive
+
+    @property
+    def eds_path(self) -> Path:
+        """The EDS file: beside the configuration, else a shipped one."""
+        return _beside(self._path, self.canopen.eds)
+
+    @property
+    def table_path(self) -> Path | None:
+        """The file of a table trajectory."""
+        return _beside(self._path, self.trajectory.file) if self.trajectory.kind == "table" else None
+
+
+def _beside(config_path: Path, name: str) -> Path:
+    own = config_path.parent / name
+    shipped = SHIPPED_FOLDER / name
+    return shipped if not own.exists() and shipped.exists() else own
+
+
+# --- from pydantic's error list to our one line ---

@@ -1,0 +1,45 @@
+"""Units of the configuration into those of the kernels: joint radians, motor newton metres, the drive's ampere."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from firmware_py import friction as friction_model
+from tools.configuration.config import Config
+from tools.configuration.sections import Friction, FrictionDirection
+
+RADPS_PER_UNIT = {"deg/s": math.pi / 180.0, "rad/s": 1.0, "r/min": math.tau / 60.0}
+
+
+def period_s(config: Config) -> float:
+    return 1.0 / config.loop.rate_Hz
+
+
+def torque_constant_NmpA(config: Config) -> float:
+    """Motor torque per ampere as the drive counts amperes (rms, or amplitude of the sine = sqrt(2) rms)."""
+    factor = {("rms", "sine_amplitude"): math.sqrt(0.5), ("sine_amplitude", "rms"): math.sqrt(2.0)}
+    return config.joint.torque_constant_NmpA * factor.get(
+        (config.joint.torque_constant_ampere, config.drive.ampere), 1.0
+    )
+
+
+def joint_rad_per_count(config: Config) -> float:
+    """Joint angle of one encoder count, direction included."""
+    turns = config.encoder.counts_per_turn * (config.joint.reduction_ratio if config.encoder.side == "motor" else 1.0)
+    return config.encoder.direction * math.tau / turns
+
+
+def friction_constants(friction: Friction, reduction_ratio: float) -> Any:
+    """`FrictionConstants` (joint rad/s, motor Nm) from the table as the user gave it."""
+    speed = RADPS_PER_UNIT[friction.velocity_unit] / (reduction_ratio if friction.velocity_side == "motor" else 1.0)
+    scale = 1.0 / reduction_ratio if friction.torque_side == "joint" else 1.0
+
+    def branch(d: FrictionDirection, negative: bool) -> Any:
+        cubic = (d.a0, d.a1, d.a2, d.a3)
+        return friction_model.branch_constants(
+            d.tc_Nm, d.ts_Nm, d.ws, d.tv, cubic, d.knee, d.max,
+            negative=negative, radps_per_unit=speed, torque_scale=scale,
+        )  # fmt: skip
+
+    return friction_model.friction_constants(branch(friction.positive, False), branch(friction.negative, True))

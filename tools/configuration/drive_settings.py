@@ -1,0 +1,78 @@
+"""From a configuration to what the driver and the virtual drive need to know, and the arithmetic of the bus."""
+
+from __future__ import annotations
+
+from drivers.can.bit_timing import bus_load, highest_rate_Hz
+from drivers.canopen.settings import CanopenSettings
+from drivers.errors import ConfigurationError
+from hil.device import DeviceSettings
+from tools.configuration.config import Config
+from tools.configuration.conversions import torque_constant_NmpA
+
+CYCLE_BYTES = (0, 8, 4)  # SYNC, TPDO, RPDO
+VELOCITY_CYCLE_BYTES = (0, 8, 6)  # 60FF is longer than 6071
+TORQUE_MODES = ("cst", "tq", "auto")  # of `CanopenSettings.mode`; the others may end in a velocity mode
+HIGHEST_LOAD = 0.8  # of the bus by the cyclic frames; the rest is for heartbeats, SDO and EMCY
+DEFAULT_RATED_CURRENT_A = 5.0
+DEFAULT_RATED_TORQUE_NM = 0.5
+
+
+def canopen_settings(config: Config) -> CanopenSettings:
+    """Sections [drive], [encoder], [joint], [limits] and [loop] for commissioning."""
+    drive = config.canopen
+    return CanopenSettings(
+        node=drive.node,
+        eds_path=config.eds_path,
+        mode=drive.mode,
+        rate_Hz=config.loop.rate_Hz,
+        heartbeat_s=drive.heartbeat_s,
+        master_node=drive.master_node,
+        quick_stop_option=drive.quick_stop_option,
+        rpdo_transmission_type=drive.rpdo_transmission_type,
+        torque_reference=drive.torque_reference,
+        torque_direction=drive.torque_direction,
+        torque_max_Nm=config.limits.torque_max_Nm,
+        torque_constant_NmpA=torque_constant_NmpA(config),
+        reduction_ratio=config.joint.reduction_ratio,
+        counts_per_turn=config.encoder.counts_per_turn,
+        encoder_on_motor=config.encoder.side == "motor",
+        encoder_direction=config.encoder.direction,
+        zero_counts=config.encoder.zero_counts,
+        vendor_id=drive.vendor_id,
+        product_code=drive.product_code,
+        rated_current_A=drive.rated_current_A,
+        rated_torque_Nm=drive.rated_torque_Nm,
+        rated_tolerance=drive.rated_tolerance,
+        max_torque_permille=drive.max_torque_permille,
+        velocity_unit=drive.velocity_unit,
+        velocity_max_radps=config.limits.velocity_max_radps,
+    )
+
+
+def device_settings(config: Config) -> DeviceSettings:
+    """The virtual drive that the configuration describes."""
+    drive = config.canopen
+    return DeviceSettings(
+        node_id=drive.node,
+        rated_current_mA=round((drive.rated_current_A or DEFAULT_RATED_CURRENT_A) * 1000.0),
+        rated_torque_mNm=round((drive.rated_torque_Nm or DEFAULT_RATED_TORQUE_NM) * 1000.0),
+        reduction_ratio=config.joint.reduction_ratio,
+        motor_torque_constant_NmpA=torque_constant_NmpA(config),
+        vendor_id=drive.vendor_id or 0,
+        product_code=drive.product_code or 1,
+    )
+
+
+def cyclic_bus_load(config: Config) -> float:
+    """Share of the bus that the cyclic frames take at worst-case stuffing; refuses more than HIGHEST_LOAD."""
+    rate_Hz, bitrate = config.loop.rate_Hz, config.bus.bitrate_bitps
+    cycle_bytes = CYCLE_BYTES if config.canopen.mode in TORQUE_MODES else VELOCITY_CYCLE_BYTES
+    load = bus_load(cycle_bytes, rate_Hz, bitrate)
+    if load > HIGHEST_LOAD:
+        highest = highest_rate_Hz(cycle_bytes, bitrate, HIGHEST_LOAD)
+        raise ConfigurationError(
+            f"loop.rate_Hz (={rate_Hz:g}) must be at most {highest:.0f} at bus.bitrate_bitps (={bitrate}): "
+            f"SYNC + TPDO(8) + RPDO({cycle_bytes[-1]}) = {load * bitrate / rate_Hz:.0f} bits a cycle, "
+            f"{load:.0%} of the bus, {HIGHEST_LOAD:.0%} allowed"
+        )
+    return load

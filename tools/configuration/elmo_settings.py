@@ -1,0 +1,106 @@
+"""From a configuration to what the serial driver and the virtual serial drive need to know."""
+
+from __future__ import annotations
+
+from drivers.elmo.line_budget import highest_rate_Hz
+from drivers.elmo.settings import ElmoSettings
+from drivers.errors import ConfigurationError
+from hil.elmo_commands import ElmoDeviceSettings
+from tools.configuration.config import Config
+from tools.configuration.conversions import torque_constant_NmpA
+from tools.configuration.elmo import KIND, ElmoSerial
+
+
+def elmo_section(config: Config) -> ElmoSerial:
+    """[drive] of a serial drive; `ConfigurationError` for any other."""
+    if not isinstance(config.drive, ElmoSerial):
+        raise ConfigurationError(f'{config.path}: drive.kind (={config.drive.kind}) must be "{KIND}" for a serial port')
+    return config.drive
+
+
+def with_port_override(config: Config, port: str | None) -> Config:
+    """The configuration on another serial port; None leaves it as it is."""
+    if port is None:
+        return config
+    drive = elmo_section(config).model_copy(update={"port": port})
+    return config.model_copy(update={"drive": drive, "bus": config.bus.model_copy(update={"channel": port})})
+
+
+def elmo_settings(config: Config, torque_constant_NmpA: float) -> ElmoSettings:
+    """Sections [drive], [encoder], [joint], [limits] and [loop] for the driver."""
+    drive, limits = elmo_section(config), config.limits
+    return ElmoSettings(
+        port=drive.port,
+        baud_rate_bitps=drive.baud_rate_bitps,
+        echo=drive.echo,
+        reply_timeout_s=drive.reply_timeout_s,
+        rate_Hz=config.loop.rate_Hz,
+        torque_max_Nm=limits.torque_max_Nm,
+        torque_constant_NmpA=torque_constant_NmpA,
+        torque_direction=drive.torque_direction,
+        reduction_ratio=config.joint.reduction_ratio,
+        counts_per_turn=config.encoder.counts_per_turn,
+        encoder_on_motor=config.encoder.side == "motor",
+        encoder_direction=config.encoder.direction,
+        zero_counts=config.encoder.zero_counts,
+        continuous_current_A=drive.continuous_current_A,
+        peak_current_A=drive.peak_current_A,
+        peak_time_s=drive.peak_time_s,
+        velocity_max_radps=limits.velocity_max_radps,
+        position_min_rad=limits.position_min_rad,
+        position_max_rad=limits.position_max_rad,
+        limit_margin=drive.limit_margin,
+        speed_error_radps=drive.speed_error_radps,
+        position_error_rad=drive.position_error_rad,
+        dead_man_s=drive.dead_man_s,
+        product=drive.product,
+        counts_parameter=drive.counts_parameter,
+    )
+
+
+def elmo_device_settings(config: Config) -> ElmoDeviceSettings:
+    """The virtual drive that the configuration describes."""
+    drive = elmo_section(config)
+    return ElmoDeviceSettings(
+        maximum_current_A=max(20.0, drive.peak_current_A),
+        counts_per_turn=config.encoder.counts_per_turn,
+        current_sign=drive.torque_direction * config.encoder.direction,
+    )
+
+
+def serial_line_share(config: Config) -> float:
+    """Share of the period that the characters of a cycle take at worst; refuses more than all of it."""
+    drive, rate_Hz = elmo_section(config), config.loop.rate_Hz
+    highest = highest_rate_Hz(drive.baud_rate_bitps, drive.echo)
+    if rate_Hz > highest:
+        raise ConfigurationError(
+            f"{config.path}: loop.rate_Hz (={rate_Hz:g}) must be at most {highest:.0f} at drive.baud_rate_bitps "
+            f"(={drive.baud_rate_bitps}) with drive.echo (={str(drive.echo).lower()})"
+        )
+    return rate_Hz / highest
+
+
+def serial_problems(config: Config) -> list[str]:
+    """What does not fit together, one line each, without the file name."""
+    drive = elmo_section(config)
+    found = []
+    if drive.continuous_current_A > drive.peak_current_A:
+        found.append(
+            f"drive.continuous_current_A (={drive.continuous_current_A:g}) must be at most drive.peak_current_A "
+            f"(={drive.peak_current_A:g})"
+        )
+
+    reach_Nm = drive.peak_current_A * torque_constant_NmpA(config) * config.joint.reduction_ratio
+    if config.limits.torque_max_Nm > reach_Nm * (1.0 + 1e-9):
+        found.append(
+            f"limits.torque_max_Nm (={config.limits.torque_max_Nm:g}) must be in (0..{reach_Nm:g}], "
+            "what drive.peak_current_A gives at the joint"
+        )
+    if drive.dead_man_s * config.loop.rate_Hz < 1.0:
+        found.append(f"drive.dead_man_s (={drive.dead_man_s:g}) must be at least one period")
+    if drive.dead_man_s > config.limits.sample_age_max_s:
+        found.append(
+            f"drive.dead_man_s (={drive.dead_man_s:g}) must be at most limits.sample_age_max_s "
+            f"(={config.limits.sample_age_max_s:g})"
+        )
+    return found

@@ -1,0 +1,125 @@
+"""From pydantic's list of errors to one line each: `section.key (=value) must be in [a..b]`.
+
+An unknown key names the one that was meant, also when only the unit is wrong or missing (`loop.rate_kHz` -> `rate_Hz`).
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from typing import Any, get_args
+
+from pydantic import BaseModel
+
+from drivers.errors import ConfigurationError
+from tools.configuration.config import Config
+
+
+class ConfigurationProblems(ConfigurationError):
+    """Every problem found in a configuration: `problems` one by one, `message` one line each."""
+
+    def __init__(self, problems: list[str]) -> None:
+        super().__init__(problems[0])
+        self.problems = tuple(problems)
+        self.message = "\n".join(problems)
+
+
+_UNITS = frozenset(
+    "Nm A rad radps radps2 s Hz Nmps Nmpa NmpA kgm2 Nmprad Nmspr bitps permille 1ps degC V "
+    "ms us ns kHz MHz deg degps rpm mNm mA kbitps bps min turn turns mm".lower().split()
+)
+
+
+def raise_if(lines: list[str]) -> None:
+    if lines:
+        raise ConfigurationProblems(lines)
+
+
+# sections whose key `kind` decides what else is in them
+_UNIONS = {
+    "drive": "'canopen', 'elmo_serial'",
+    "trajectory": "'sine', 'min_jerk', 'trapezoid', 'table', 'hold'",
+}
+
+
+def _model_at(location: tuple[str, ...], data: Mapping[str, Any]) -> type[BaseModel] | None:
+    """The section class that holds the last element of `location`."""
+    model: type[BaseModel] = Config
+    for part in location[:-1]:
+        field = model.model_fields.get(part)
+        if field is None:
+            return None
+        options = [t for t in (field.annotation, *get_args(field.annotation)) if isinstance(t, type)]
+        models = [t for t in options if issubclass(t, BaseModel)]
+        if part in _UNIONS:
+            kind = data.get(part, {}).get("kind")
+            models = [t for t in models if get_args(t.model_fields["kind"].annotation) == (kind,)]
+        if not models:
+            return None
+        model = models[0]
+    return model
+
+
+def _stem(key: str) -> str:
+    head, _, tail = key.rpartition("_")
+    return (head if head and tail.lower() in _UNITS else key).lower()
+
+
+def suggestion(unknown: str, known: list[str]) -> str:
+    """What the user probably meant by an unknown key, as the end of a message."""
+    for key in known:
+        if key != unknown and _stem(key) == _stem(unknown):
+            return f": use {key} (the unit is part of the key)"
+    close = difflib.get_close_matches(unknown, known, 1, 0.6) or difflib.get_close_matches(
+        _stem(unknown), known, 1, 0.5
+    )
+    return f": did you mean {close[0]}?" if close else f": known are {', '.join(sorted(known))}"
+
+
+def problem_line(error: Any, data: Mapping[str, Any], prefix: tuple[str, ...]) -> str:
+    parts = [str(part) for part in error["loc"]]
+    if len(parts) > 1 and parts[0] in _UNIONS:
+        del parts[1]  # the tag of the union, which the user did not write
+    location = (*prefix, *parts)
+    name = ".".join(location)
+    kind, value = error["type"], error["input"]
+    model = _model_at(location, data)
+    if kind == "extra_forbidden":
+        known = list(model.model_fields) if model else []
+        what = f"[{name}] is not a known section" if len(location) == 1 else f"{name} is not a known key"
+        return what + suggestion(location[-1], known)
+    if kind == "missing":
+        field = model.model_fields[location[-1]] if model else None
+        section = len(location) == 1 or (field is not None and isinstance(field.annotation, type)
+                                         and issubclass(field.annotation, BaseModel))  # fmt: skip
+        return f"[{name}] is missing" if section else f"{name} is missing"
+    if kind in ("model_type", "model_attributes_type", "dict_type"):
+        return f"{name} (={_shown(value)}) must be a section: [{name}]"
+    if kind in ("union_tag_invalid", "union_tag_not_found"):
+        tags = error["ctx"].get("expected_tags", _UNIONS[location[0]])
+        given = f" (={_shown(value.get('kind'))})" if kind == "union_tag_invalid" else ""
+        return f"{name}.kind{given} must be one of {tags.removeprefix('one of ')}"
+    return f"{name} (={_shown(value)}) {_RULES.get(kind) or _rule(error)}"
+
+
+_RULES = {
+    "float_type": "must be a number",
+    "int_type": "must be a whole number",
+    "string_type": "must be a text in quotes",
+    "bool_type": "must be true or false",
+    "finite_number": "must be finite",
+    "string_too_short": "must not be empty",
+}
+
+
+def _rule(error: Any) -> str:
+    if error["type"] == "literal_error":
+        return f"must be one of {error['ctx']['expected']}"
+    message = str(error["msg"])
+    return message[0].lower() + message[1:]
+
+
+def _shown(value: Any) -> str:
+    text = value if isinstance(value, str) else f"{value:g}" if isinstance(value, float) else str(value)
+    text = " ".join(text.split()) or '""'
+    return text if len(text) <= 60 else text[:57] + "..."

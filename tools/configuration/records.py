@@ -1,0 +1,206 @@
+"""From a checked configuration to the controller's records; every unit is converted here, and only here."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from drivers.errors import ConfigurationError
+from firmware_py.lyapunov import solve_lyapunov_p
+from firmware_py.records import NEURONS, AxisConstants, TrajectoryConstants
+from firmware_py.schema import new
+from firmware_py.states import ControllerKind, FeedForward, TrajectoryKind, ZeroSpeedRule
+from firmware_py.trajectory_table import approach_duration_s, approach_start, ends_meet, peak_of, table_from_csv
+from firmware_py.velocity import low_pass_gain
+from tools.configuration.checks import extremes_problems
+from tools.configuration.config import Config
+from tools.configuration.conversions import friction_constants, joint_rad_per_count, period_s
+from tools.configuration.problems import ConfigurationProblems
+
+# the paper's centres, in rad and in rad/s: -c_p, 0, c_p with c_p = 1e-2 [-5 -3 -1 -0.8 -0.4 -0.1 -0.05]
+_PAPER_HALF = (0.05, 0.03, 0.01, 0.008, 0.004, 0.001, 0.0005)
+PAPER_CENTRES = (*_PAPER_HALF, 0.0, *(-c for c in _PAPER_HALF))
+APPROACH_MIN_S = 1.0
+# way of the reference at a standing reading, as a share of the following error that is allowed: without friction
+# feed-forward a sound joint stands that long before it breaks away
+FROZEN_SHARE, FROZEN_SHARE_WITHOUT_MODEL = 0.1, 0.5
+FROZEN_FRICTION = 1.5  # times the static friction: what a sound joint does not stand still under
+FROZEN_COUNTS = 4  # encoder counts by which a standing reading may flicker
+APPROACH_SPEED = 0.25  # share of limits.velocity_max_radps that an automatic approach may use
+
+
+def axis_constants(config: Config, *, start_position_rad: float | None = None) -> Any:
+    """A record array of one `AxisConstants`.
+
+    `start_position_rad` is where the joint stands; it only matters for `approach_s = "auto"`, which takes the whole
+    range of motion as the distance when it is not known.
+    """
+    constants = new(AxisConstants)
+    axis = constants[0]
+    _fill_law(axis.law, config)
+    axis.velocity.period_s = period_s(config)
+    axis.velocity.cutoff_Hz = config.control.velocity_cutoff_Hz
+    axis.velocity.period_gain = low_pass_gain(config.control.velocity_cutoff_Hz, period_s(config))
+    _fill_trajectory(axis.trajectory, config)
+    _fill_limits(axis.limits, config)
+    _fill_sequence(axis.sequence, config, start_position_rad)
+    return constants
+
+
+def trajectory_table(config: Config) -> np.ndarray:
+    """Rows (N, 5) of a table trajectory, checked against the limits; for the other kinds one row of zeros."""
+    path = config.table_path
+    if path is None:
+        return np.zeros((1, 5))
+    try:
+        table = table_from_csv(path)
+    except (ValueError, OSError) as error:
+        raise ConfigurationError(f"{config.path}: trajectory.file: {error}") from None
+    if config.trajectory.kind == "table" and config.trajectory.repeat and not ends_meet(table):
+        raise ConfigurationError(f"{config.path}: trajectory.repeat (=True) needs a table that ends where it begins")
+    constants = new(TrajectoryConstants)
+    constants[0].kind, constants[0].table_rows = TrajectoryKind.TABLE, len(table)
+    peak = peak_of(constants[0], table)
+    problems = extremes_problems(config, peak.position_min_rad, peak.position_max_rad, peak.velocity_radps)
+    if problems:
+        raise ConfigurationProblems([f"{config.path}: {line}" for line in problems])
+    return table
+
+
+def _fill_law(law: Any, config: Config) -> None:
+    control, joint = config.control, config.joint
+    law.kind = ControllerKind[control.kind.upper()]
+    law.feed_forward = FeedForward[control.feed_forward.upper()]
+    law.zero_rule = ZeroSpeedRule[control.zero_rule.upper()]
+    law.matched_filter = int(control.matched_filter)
+    law.period_s = period_s(config)
+    law.inertia_kgm2 = joint.inertia_kgm2
+    law.coriolis_Nmspr = joint.coriolis_Nmspr
+    law.gravity_Nm = joint.gravity_Nm
+    law.gravity_zero_rad = joint.gravity_zero_rad
+    law.kp, law.kv = control.kp, control.kv
+    law.ki, law.integral_limit_rads = control.ki, control.integral_limit_rads
+    law.observer.bandwidth_radps = control.observer_radps
+    law.observer.delay_cycles = control.observer_delay_cycles
+    if control.learning is not None:
+        law.learning.gain = control.learning.gain
+        law.learning.error_gain_ps2 = control.learning.error_gain_ps2
+        law.learning.lead_cycles = control.learning.lead_cycles
+        law.learning.half_width = control.learning.half_width_cycles
+        law.learning.blend_s = control.learning.blend_s
+    law.reduction_ratio = joint.reduction_ratio
+    law.zero_band_radps = control.zero_band_radps
+    if config.friction is not None:
+        law.friction = friction_constants(config.friction, joint.reduction_ratio)[0]
+        if config.friction.lugre is not None:
+            law.lugre.stiffness_Nmprad = config.friction.lugre.stiffness_Nmprad
+            law.lugre.damping_Nmspr = config.friction.lugre.damping_Nmspr
+    network = law.network
+    _, p12, p22 = solve_lyapunov_p(control.kp, control.kv, control.q[0], control.q[-1])
+    network.p_b[0] = p12 / joint.inertia_kgm2
+    network.p_b[1] = p22 / joint.inertia_kgm2
+    centres = control.centres or tuple((c, c) for c in PAPER_CENTRES)
+    for i in range(NEURONS):
+        network.centres[i, 0], network.centres[i, 1] = centres[i]
+        width = control.widths[i if len(control.widths) > 1 else 0]
+        network.inverse_width[i] = 0.5 / width**2
+    network.learning_rate = control.learning_rate
+    network.initial_weight = control.initial_weight_Nm
+    network.leakage = control.leakage_1ps
+    network.weight_limit = control.weight_limit_Nm
+    network.dead_zone_rad = control.dead_zone_rad
+
+
+def _fill_trajectory(record: Any, config: Config) -> None:
+    trajectory = config.trajectory
+    record.kind = TrajectoryKind[trajectory.kind.upper()]
+    record.duration_s = trajectory.duration_s
+    if trajectory.kind == "sine":
+        record.amplitude_rad, record.offset_rad = trajectory.amplitude_rad, trajectory.offset_rad
+        record.omega_radps, record.shift_s = math.tau * trajectory.frequency_Hz, trajectory.shift_s
+        second = trajectory.switch
+        if second is not None:
+            record.switch_s = second.at_s
+            record.amplitude2_rad, record.offset2_rad = second.amplitude_rad, second.offset_rad
+            record.omega2_radps, record.shift2_s = math.tau * second.frequency_Hz, second.shift_s
+    elif trajectory.kind == "hold":
+        record.start_rad = record.target_rad = trajectory.position_rad
+    elif trajectory.kind == "table":
+        record.repeats = int(trajectory.repeat)
+        record.table_rows = len(trajectory_table(config))
+    else:
+        record.repeats = int(trajectory.repeat)
+        record.start_rad, record.target_rad = trajectory.start_rad, trajectory.target_rad
+        record.dwell_s = trajectory.dwell_s
+        if trajectory.kind == "min_jerk":
+            record.move_s = trajectory.move_s
+        else:
+            record.speed_radps = trajectory.speed_radps
+            record.acceleration_radps2 = trajectory.acceleration_radps2
+
+
+def _cycles(config: Config, time_s: float) -> int:
+    return max(1, round(time_s * config.loop.rate_Hz))
+
+
+def _fill_limits(record: Any, config: Config) -> None:
+    limits = config.limits
+    for key in (
+        "position_min_rad", "position_max_rad", "velocity_max_radps", "torque_max_Nm", "torque_rate_max_Nmps",
+        "following_error_max_rad", "position_jump_max_rad", "standstill_radps",
+    ):  # fmt: skip
+        setattr(record, key, getattr(limits, key))
+    share = FROZEN_SHARE_WITHOUT_MODEL if config.control.feed_forward == "none" else FROZEN_SHARE
+    if config.friction is not None:
+        static_Nm = max(
+            abs(branch.ts_Nm) * (config.joint.reduction_ratio if config.friction.torque_side == "motor" else 1.0)
+            for branch in (config.friction.positive, config.friction.negative)
+        )
+        record.frozen_torque_Nm = FROZEN_FRICTION * static_Nm + abs(config.joint.gravity_Nm)
+    record.frozen_tolerance_rad = FROZEN_COUNTS * abs(joint_rad_per_count(config))
+    record.frozen_max_rad = max(share * limits.following_error_max_rad, 5.0 * record.frozen_tolerance_rad)
+    record.sample_age_max_cycles = _cycles(config, limits.sample_age_max_s)
+    record.saturation_max_cycles = _cycles(config, limits.saturation_max_s)
+    record.skipped_max_cycles = _cycles(config, limits.skipped_max_s)
+
+
+def _fill_sequence(record: Any, config: Config, start_position_rad: float | None) -> None:
+    sequence = config.sequence
+    record.approach_s = approach_s(config, start_position_rad)
+    record.brake_radps2 = sequence.brake_radps2
+    record.release_s = sequence.release_s
+    record.settle_cycles = _cycles(config, sequence.settle_s)
+    record.wait_max_cycles = _cycles(config, sequence.wait_timeout_s)
+    record.enable_max_cycles = _cycles(config, sequence.enable_timeout_s)
+    record.stop_max_cycles = _cycles(config, sequence.stop_timeout_s)
+    record.off_max_cycles = _cycles(config, sequence.off_timeout_s)
+    record.may_enable = 1
+    record.supervisor_max_cycles = _cycles(config, sequence.supervisor_timeout_s)
+
+
+def approach_s(config: Config, start_position_rad: float | None = None) -> float:
+    """Time of the approach; "auto": the shortest within a quarter of the velocity limit, and 1 s at least.
+
+    Where the trajectory itself begins faster than that, its own speed at the start plus a fifth is allowed.  Without
+    `start_position_rad` it is the time from the farther end of the range of motion.
+    """
+    chosen = config.sequence.approach_s
+    if not isinstance(chosen, str):
+        return float(chosen)
+    limits = config.limits
+    constants = new(TrajectoryConstants)
+    _fill_trajectory(constants[0], config)
+    start = approach_start(constants[0], trajectory_table(config))
+    speed = max(APPROACH_SPEED * limits.velocity_max_radps, 1.2 * abs(float(start.velocity_radps)))
+    acceleration = max(config.sequence.brake_radps2, 1.2 * abs(float(start.acceleration_radps2)))
+    ends = (limits.position_min_rad, limits.position_max_rad)
+    origins = ends if start_position_rad is None else (start_position_rad,)
+    try:
+        return max(
+            approach_duration_s(origin, start, min(speed, limits.velocity_max_radps), acceleration, APPROACH_MIN_S)
+            for origin in origins
+        )
+    except ValueError as error:
+        raise ConfigurationError(f"{config.path}: sequence.approach_s (=auto): {error}") from None

@@ -1,0 +1,97 @@
+"""A run log in the formats of other programs: CSV, NPZ, Parquet for the records, candump's for the raw frames.
+
+Columns have the names and units of `LogRecord`; an array field becomes one column an element (`weights_0` ...).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivers.errors import DataError
+from tools.recording.can_log import candump_lines
+from tools.recording.run_log import RunLog
+
+_ROWS = 10_000  # turned into Python numbers at once
+
+
+def columns(records: Any) -> dict[str, np.ndarray]:
+    """Name -> values, shape (N,), of every field of a record array."""
+    found: dict[str, np.ndarray] = {}
+    for name in records.dtype.names:
+        values = np.asarray(records[name])
+        if values.ndim == 1:
+            found[name] = values
+        else:
+            found |= {f"{name}_{i}": values[:, i] for i in range(values.shape[1])}
+    return found
+
+
+def calendar_offset_ns(log: RunLog) -> int:
+    """What to add to the log's times for nanoseconds since 1970; 0 if the log does not tell."""
+    clock = log.metadata.get("clock", {})
+    try:
+        at_s = np.datetime64(clock["utc"].removesuffix("+00:00"), "ns").astype(np.int64)
+        return int(at_s) - int(clock["monotonic_ns"])
+    except (KeyError, ValueError):
+        return 0
+
+
+def csv_bytes(log: RunLog, path: Path) -> bytes:
+    """Comma, point, one header line; floats with all their digits."""
+    found = columns(log.records)
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(found)
+    for begin in range(0, len(log.records), _ROWS):
+        writer.writerows(zip(*(values[begin : begin + _ROWS].tolist() for values in found.values()), strict=True))
+    return text.getvalue().encode()
+
+
+def npz_bytes(log: RunLog, path: Path) -> bytes:
+    """One array a field, `weights` of shape (N, 15); the events as three arrays of the same length."""
+    data = io.BytesIO()
+    arrays: dict[str, Any] = {name: np.asarray(log.records[name]) for name in log.records.dtype.names}
+    arrays["event_time_ns"] = np.array([event.time_ns for event in log.events], np.int64)
+    arrays["event_level"] = np.array([event.level for event in log.events], np.int32)
+    arrays["event_text"] = np.array([f"{event.source}: {event.text}" for event in log.events], np.str_)
+    np.savez_compressed(data, allow_pickle=False, **arrays)
+    return data.getvalue()
+
+
+def parquet_bytes(log: RunLog, path: Path) -> bytes:
+    """A table of all columns, the metadata of the log as the table's."""
+    try:
+        pyarrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
+    except ImportError:
+        raise DataError(
+            f"{path}: Parquet needs the package pyarrow, which is not installed",
+            "install the extra `parquet`, or export to npz or csv",
+        ) from None
+    table = pyarrow.table({name: pyarrow.array(values) for name, values in columns(log.records).items()})
+    metadata = {f"{name}.{key}": value for name, values in log.metadata.items() for key, value in values.items()}
+    data = io.BytesIO()
+    parquet.write_table(table.replace_schema_metadata(metadata), data)
+    return data.getvalue()
+
+
+def candump_bytes(log: RunLog, path: Path) -> bytes:
+    """The raw frames in calendar time, for canplayer, cantools, Wireshark and the like."""
+    if not len(log.frames):
+        raise DataError(f"{path}: holds no CAN frames", "set log.frames = true in the configuration and run again")
+    return "".join(candump_lines(log.frames, calendar_offset_ns(log), "can0")).encode()
+
+
+# format -> (ending of the file, its maker)
+FORMATS: dict[str, tuple[str, Callable[[RunLog, Path], bytes]]] = {
+    "csv": (".csv", csv_bytes),
+    "npz": (".npz", npz_bytes),
+    "parquet": (".parquet", parquet_bytes),
+    "candump": (".candump.log", candump_bytes),
+}

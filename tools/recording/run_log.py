@@ -1,0 +1,271 @@
+"""Run logs: MCAP files that Foxglove, PlotJuggler and rosbag2 open.
+
+Each cycle is one message on `/joint`: a 4-byte CDR header and the bytes of the `LogRecord`.  An aligned little-endian
+record IS the CDR body: CDR aligns each number to its size counted from the end of the header, as C does, and sends
+fixed arrays without a length.  (Padding at the end of a record, if any, is ignored by readers.)  So writing costs no
+encoding and reading is `np.frombuffer`.
+
+Events are on `/events`, raw CAN frames, if they are recorded, on `/can`; what was run (configuration, versions,
+identity of the drive) is in metadata records at the beginning of the file.  Times are nanoseconds of CLOCK_MONOTONIC;
+`metadata["clock"]` relates them to the calendar.
+A file that was cut off, because the writer was killed or the disk is full, reads up to the last whole chunk.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from io import BytesIO
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Self
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Metadata, Schema
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from mcap.writer import CompressionType, Writer
+
+from drivers.errors import DataError
+from firmware_py.records import LogRecord
+from firmware_py.schema import dtype_of
+from tools.recording.can_log import CAN_DEFINITION, CAN_FRAME, CAN_SCHEMA, CAN_TOPIC, frame_times_ns
+from tools.recording.cdr import CDR_HEADER, event_body, event_from_body, message_definition
+
+RECORD_TOPIC, RECORD_SCHEMA = "/joint", "jointctl_msgs/msg/LogRecord"
+EVENT_TOPIC, EVENT_SCHEMA = "/events", "jointctl_msgs/msg/Event"
+EVENT_DEFINITION = "int64 time_ns\nint32 level\nstring source\nstring text\n"
+DEBUG, INFO, WARNING, ERROR = 10, 20, 30, 40  # levels, those of Python's logging
+_MAGIC = b"\x89MCAP0\r\n"
+_CHUNK_BYTES = 256 * 1024
+_BEFORE_BODY = 9  # bytes of opcode and length
+_MESSAGE_HEAD = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_ns", "<u8"),
+        ("sent_ns", "<u8"),
+    ]
+)
+
+
+@dataclass(frozen=True)
+class Event:
+    time_ns: int  # CLOCK_MONOTONIC
+    level: int  # 10 debug, 20 information, 30 warning, 40 error
+    source: str
+    text: str
+
+
+@dataclass(frozen=True)
+class RunLog:
+    records: Any  # record array of LogRecord, shape (N,), read-only
+    events: tuple[Event, ...]
+    metadata: dict[str, dict[str, str]]
+    complete: bool  # False: the file was cut off, its tail is lost
+    frames: Any = field(default_factory=lambda: np.zeros(0, CAN_FRAME))  # array of CAN_FRAME, shape (N,)
+
+
+class RunLogWriter:
+    """Writes one log; use it as a context manager, so that an exception still finishes the file.
+
+    What was written is in the hands of the operating system at the latest `flush_s` later (checked at each write, so
+    write at least that often) and at once after an event.  `clock` [s] is for tests.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        metadata: Mapping[str, Mapping[str, str]],
+        *,
+        flush_s: float = 0.5,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.path = Path(path)
+        self._clock, self._flush_s, self._flushed_at_s = clock, flush_s, clock()
+        self._written = 0
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file: IO[bytes] = self.path.open("xb")
+        except FileExistsError:
+            raise DataError(f"{self.path}: exists already, a log is never overwritten") from None
+        except OSError as error:
+            raise DataError(f"{self.path}: cannot be created: {error.strerror or error}") from None
+        # Any: some of the library's methods carry no types
+        self._writer: Any = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.NONE)
+        self._writer.start(profile="ros2", library="jointctl")
+        for name, values in {"clock": _clock_metadata(), **metadata}.items():
+            self._writer.add_metadata(name, {key: str(value) for key, value in values.items()})
+        definition = message_definition(dtype_of(LogRecord))
+        self._record_channel = self._channel(RECORD_TOPIC, RECORD_SCHEMA, definition)
+        self._event_channel = self._channel(EVENT_TOPIC, EVENT_SCHEMA, EVENT_DEFINITION)
+        self._can_channel: int | None = None  # only in logs with frames
+        self._file.flush()
+
+    def _channel(self, topic: str, name: str, definition: str) -> int:
+        schema = self._writer.register_schema(name, "ros2msg", definition.encode())
+        return self._writer.register_channel(topic, "cdr", schema)
+
+    def write_records(self, records: Any) -> None:
+        """Append log records, an array of shape (N,) of LogRecord in order of time."""
+        records = np.ascontiguousarray(records)
+        if records.dtype != dtype_of(LogRecord):
+            raise TypeError(f"records (of {records.dtype}) must be an array of LogRecord")
+        size, body = records.dtype.itemsize, records.tobytes()
+        for i, time_ns in enumerate(records["time_ns"].tolist()):
+            data = CDR_HEADER + body[i * size : (i + 1) * size]
+            self._writer.add_message(self._record_channel, time_ns, data, time_ns, self._written & 0xFFFFFFFF)
+            self._written += 1
+        if self._clock() - self._flushed_at_s >= self._flush_s:
+            self.flush()
+
+    def write_frames(self, frames: np.ndarray) -> None:
+        """Append raw CAN frames, an array of shape (N,) of CAN_FRAME in order of time."""
+        if self._can_channel is None:
+            self._can_channel = self._channel(CAN_TOPIC, CAN_SCHEMA, CAN_DEFINITION)
+        size, body = frames.dtype.itemsize, frames.tobytes()
+        for i, time_ns in enumerate(frame_times_ns(frames).tolist()):
+            data = CDR_HEADER + body[i * size : (i + 1) * size]
+            self._writer.add_message(self._can_channel, time_ns, data, time_ns)
+
+    def write_event(self, level: int, source: str, text: str, time_ns: int | None = None) -> None:
+        """Append an event and flush: it may be the last thing that this process does."""
+        time_ns = time.monotonic_ns() if time_ns is None else time_ns
+        data = CDR_HEADER + event_body(time_ns, level, source, text)
+        self._writer.add_message(self._event_channel, time_ns, data, time_ns)
+        self.flush()
+
+    def flush(self) -> None:
+        """Close the chunk in progress and hand everything to the operating system."""
+        self._writer.flush()
+        self._flushed_at_s = self._clock()
+
+    def close(self) -> None:
+        """Finish the file (index and summary); may be called twice."""
+        if not self._file.closed:
+            try:
+                self._writer.finish()
+            finally:
+                self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, _: TracebackType | None) -> None:
+        if value is not None:
+            self.write_event(ERROR, "log", f"{type(value).__name__}: {value}")
+        self.close()
+
+
+def _clock_metadata() -> dict[str, str]:
+    """One instant in both clocks, so that a log can be placed in the calendar."""
+    return {"utc": datetime.now(UTC).isoformat(), "monotonic_ns": str(time.monotonic_ns())}
+
+
+def read_run_log(path: str | Path) -> RunLog:
+    """Everything in a run log; `DataError` if it is not one. A cut-off tail is left out (`complete` is False)."""
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            if file.read(len(_MAGIC)) != _MAGIC:
+                raise DataError(f"{path}: is not an MCAP file")
+            file.seek(0)
+            return _read(file, path)
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file") from None
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+def _read(file: IO[bytes], path: Path) -> RunLog:
+    log = _Collector(path)
+    file_bytes = path.stat().st_size
+    complete = False
+    try:
+        for record in StreamReader(file, emit_chunks=True, record_size_limit=file_bytes).records:
+            if isinstance(record, Chunk):
+                log.take_chunk(record)
+            elif isinstance(record, Metadata):
+                log.metadata[record.name] = dict(record.metadata)
+        complete = True
+    except DataError:
+        raise
+    except Exception:
+        # the library meets a cut-off record in many ways (EndOfFile, struct.error, ValueError, ...); what was
+        # whole has been taken, and a file without anything whole is reported below
+        complete = False
+    if not log.metadata and not log.record_parts:
+        raise DataError(f"{path}: holds no run log")
+    dtype = dtype_of(LogRecord)
+    records = np.concatenate(log.record_parts) if log.record_parts else np.zeros(0, dtype)
+    records.flags.writeable = False
+    frames = np.concatenate(log.frame_parts) if log.frame_parts else np.zeros(0, CAN_FRAME)
+    return RunLog(records.view(np.recarray), tuple(log.events), log.metadata, complete, frames)
+
+
+class _Collector:
+    """Takes chunks apart: runs of log records or frames by one `np.frombuffer`, else message by message."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.record_parts: list[np.ndarray] = []
+        self.frame_parts: list[np.ndarray] = []
+        self.events: list[Event] = []
+        self.metadata: dict[str, dict[str, str]] = {}
+        self._topics: dict[int, str] = {}
+        self._definition = message_definition(dtype_of(LogRecord)).encode()
+        bodies = {RECORD_TOPIC: (dtype_of(LogRecord), self.record_parts), CAN_TOPIC: (CAN_FRAME, self.frame_parts)}
+        # topics whose messages all have the same size, so that a run of them is an array
+        self._runs = {
+            topic: (np.dtype([*_MESSAGE_HEAD.descr, ("cdr", "V4"), ("record", body)]), parts)
+            for topic, (body, parts) in bodies.items()
+        }
+
+    def take_chunk(self, chunk: Chunk) -> None:
+        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+        data = stream.read(size)
+        at = 0
+        while at + 9 <= size:
+            opcode, length = struct.unpack_from("<BQ", data, at)
+            if opcode == Opcode.MESSAGE:
+                (channel,) = struct.unpack_from("<H", data, at + 9)
+                topic = self._topics.get(channel, "")
+                message, parts = self._runs.get(topic, (None, None))
+                if message is not None and parts is not None and length == message.itemsize - _BEFORE_BODY:
+                    at += _take_run(data, at, channel, message, parts)
+                    continue
+                if topic == EVENT_TOPIC:
+                    body = data[at + _MESSAGE_HEAD.itemsize + len(CDR_HEADER) : at + 9 + length]
+                    self.events.append(Event(*event_from_body(body)))
+            elif opcode == Opcode.CHANNEL:
+                self._take_channel(Channel.read(_stream(data, at, length)))
+            elif opcode == Opcode.SCHEMA:
+                self._take_schema(Schema.read(_stream(data, at, length)))
+            at += 9 + length
+
+    def _take_channel(self, channel: Channel) -> None:
+        self._topics[channel.id] = channel.topic
+
+    def _take_schema(self, schema: Schema) -> None:
+        if schema.name == RECORD_SCHEMA and schema.data != self._definition:
+            raise DataError(f"{self.path}: was written by another version of jointctl, with other log fields")
+
+
+def _take_run(data: bytes, at: int, channel: int, message: np.dtype[Any], parts: list[np.ndarray]) -> int:
+    """Append the run of like messages that begins at `at` to `parts`; how many bytes it is long."""
+    rows = np.frombuffer(data, message, (len(data) - at) // message.itemsize, at)
+    length = message.itemsize - _BEFORE_BODY
+    same = (rows["opcode"] == Opcode.MESSAGE) & (rows["length"] == length) & (rows["channel"] == channel)
+    count = len(rows) if same.all() else int(np.argmin(same))
+    parts.append(rows["record"][:count].astype(message["record"]))
+    return count * message.itemsize
+
+
+def _stream(data: bytes, at: int, length: int) -> ReadDataStream:
+    return ReadDataStream(BytesIO(data[at + 9 : at + 9 + length]))

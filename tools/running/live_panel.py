@@ -1,0 +1,246 @@
+"""What `run` shows while the joint moves: one calm panel on a terminal, one line a phase elsewhere.
+
+The panel is drawn by a thread of its own, at most 4 times a second, from the newest `Snapshot`.  The supervisor only
+leaves the snapshot there, so a terminal that is slow, stopped (Ctrl-S) or gone cannot hold it up: a frame that the
+terminal does not take at once is dropped.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import select
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol, Self
+
+import numpy as np
+from rich.console import Console, Group
+from rich.live import Live
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from firmware_py.realtime import Histogram
+from firmware_py.states import AxisPhase, Fault, StopRequest
+from tools.output import Output
+from tools.recording.run_log import Event
+from tools.running.events import drive_state_name, phase_name
+from tools.running.loop_delay import quantile_s
+
+REFRESH_s = 0.25
+CLOSE_s = 1.0  # how long the end of a run waits for the last frame
+NOTES = 3  # how many of the newest remarks stay in the panel
+_QUANTILE = 0.99
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The newest cycle and what has been counted so far; `histograms` is the loop's own memory, read when drawn."""
+
+    record: Any  # LogRecord
+    skipped: int
+    histograms: np.ndarray
+    duration_s: float  # of the trajectory; 0 = until stopped
+    cia402: bool = True
+    records: Any = ()  # all new ones, array of LogRecord (N,)
+
+
+class Display(Protocol):
+    """Shows how a run goes; nothing in it may raise or wait."""
+
+    def note(self, text: str) -> None:
+        """A remark that stays."""
+
+    def phase(self, text: str) -> None:
+        """The run has entered a phase."""
+
+    def show(self, snapshot: Snapshot) -> None:
+        """The state of things, called many times a second."""
+
+    def event(self, event: Event) -> None:
+        """Something that went into the log as an event."""
+
+    def stop_request(self) -> StopRequest:
+        """What whoever watches asks for."""
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+class OnlyShows:
+    """The half of `Display` that a display leaves out when it neither tells events nor takes orders."""
+
+    def event(self, event: Event) -> None:
+        """Events are in the log."""
+
+    def stop_request(self) -> StopRequest:
+        """Nobody can ask for anything here; signals have their own way."""
+        return StopRequest.NONE
+
+
+class PhaseLines(OnlyShows):
+    """One line for each phase and remark; for pipes, files and `--json`."""
+
+    def __init__(self, output: Output) -> None:
+        self._output = output
+
+    def note(self, text: str) -> None:
+        """See `Display`."""
+        with contextlib.suppress(OSError):  # the terminal may have been closed: no reason to stop watching
+            self._output.note(f"  {text}")
+
+    phase = note
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Nothing: lines are for changes."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing to take away."""
+
+
+class _WholeFrames(io.StringIO):
+    """Collects what rich writes and hands it over in one piece, or not at all if the terminal would make us wait."""
+
+    def __init__(self, fd: int) -> None:
+        super().__init__()
+        self._fd = fd
+
+    def isatty(self) -> bool:
+        return True
+
+    def fileno(self) -> int:
+        return self._fd
+
+    def flush(self) -> None:
+        data = self.getvalue().encode("utf-8", "replace")
+        self.seek(0)
+        self.truncate()
+        if not data:
+            return
+        with contextlib.suppress(OSError, ValueError):
+            if select.select([], [self._fd], [], 0.0)[1]:
+                os.write(self._fd, data)
+
+
+class LivePanel(OnlyShows):
+    """The panel on the terminal behind file descriptor `fd`."""
+
+    def __init__(self, fd: int, title: str, refresh_s: float = REFRESH_s) -> None:
+        self._title = title
+        self._refresh_s = refresh_s
+        self._snapshot: Snapshot | None = None
+        self._phase = "starting"
+        self._notes: list[str] = []
+        self._ended = threading.Event()
+        self._console = Console(file=_WholeFrames(fd), highlight=False)
+        self._thread = threading.Thread(target=self._draw_until_ended, name="live panel", daemon=True)
+
+    def note(self, text: str) -> None:
+        """See `Display`."""
+        self._notes = [*self._notes, text][-NOTES:]
+
+    def phase(self, text: str) -> None:
+        """See `Display`."""
+        self._phase = text
+
+    def show(self, snapshot: Snapshot) -> None:
+        """See `Display`."""
+        self._snapshot = snapshot
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Take the panel away; a terminal that takes nothing is not waited for."""
+        self._ended.set()
+        self._thread.join(CLOSE_s)
+
+    def _draw_until_ended(self) -> None:
+        # whatever the terminal does wrong, the run goes on without its panel
+        with contextlib.suppress(Exception):
+            live = Live(
+                self._panel(), console=self._console, auto_refresh=False, transient=True,
+                redirect_stdout=False, redirect_stderr=False,
+            )  # fmt: skip
+            with live:
+                while not self._ended.wait(self._refresh_s):
+                    live.update(self._panel(), refresh=True)
+
+    def _panel(self) -> Panel:
+        return panel(self._title, self._phase, self._snapshot, self._notes)
+
+
+def panel(title: str, phase: str, snapshot: Snapshot | None, notes: list[str]) -> Panel:
+    """The picture of one moment; the same number of lines whatever happens, so that nothing jumps."""
+    grid = Table.grid()
+    for style, width in (("dim", 12), ("", 28), ("dim", 12), ("", 20)):
+        grid.add_column(style=style, no_wrap=True, width=width)
+    cells = _cells(phase, snapshot)
+    for left, right in zip(cells[::2], cells[1::2], strict=True):
+        grid.add_row(left[0], _indented(left[1]), right[0], _indented(right[1]))
+    lines = [Text(f"  {line}", style="dim", no_wrap=True) for line in [*notes, *[""] * (NOTES - len(notes))]]
+    border = "red" if snapshot is not None and int(snapshot.record.fault) else "blue"
+    foot = "Ctrl-C: brake and disable; again: quick stop"
+    return Panel(
+        Group(grid, *lines), title=title, subtitle=foot, title_align="left", subtitle_align="left",
+        border_style=border, width=78,
+    )  # fmt: skip
+
+
+def _indented(value: str | Text) -> Text:
+    """Two columns of space that belong to the value."""
+    return Text(f"  {value}") if isinstance(value, str) else Text(f"  {value.plain}", style=value.style)
+
+
+def _cells(phase: str, snapshot: Snapshot | None) -> list[tuple[str, str | Text]]:
+    """(name, value) of each field, in the order of reading."""
+    names = ("phase", "drive", "error", "fault", "angle", "torque", "time left", "wake-up p99", "measured", "skipped")
+    if snapshot is None:
+        return [(name, Text(phase, style="bold") if name == "phase" else "-") for name in names]
+    record = snapshot.record
+    active = AxisPhase.APPROACH <= int(record.phase) <= AxisPhase.RAMPING
+    fault = int(record.fault)
+    p99_s = quantile_s(snapshot.histograms[Histogram.WAKE], _QUANTILE)
+    values: tuple[str | Text, ...] = (
+        Text(phase_name(int(record.phase)), style="bold"),
+        drive_state_name(int(record.status_word), int(record.drive_state), cia402=snapshot.cia402),
+        f"{float(record.error_rad) * 1e3:+9.3f} mrad" if active else "-",
+        Text(_fault_name(fault), style="bold red") if fault else "none",
+        f"{float(record.position_rad):+9.4f} rad",
+        f"{float(record.command_torque_Nm):+8.2f} Nm",
+        time_left(float(record.trajectory_s), snapshot.duration_s, int(record.phase)),
+        f"{p99_s * 1e6:.0f} us" if np.isfinite(p99_s) else "-",
+        f"{float(record.measured_torque_Nm):+9.2f} Nm",
+        f"{snapshot.skipped} cycles",
+    )
+    return list(zip(names, values, strict=True))
+
+
+def _fault_name(code: int) -> str:
+    return Fault(code).name.lower().replace("_", " ") if code in list(Fault) else f"fault {code}"
+
+
+def time_left(trajectory_s: float, duration_s: float, phase: int) -> str:
+    """In words; while the joint approaches, trajectory time is negative and counts as well."""
+    if phase > AxisPhase.TRACKING:
+        return "stopping"
+    if duration_s <= 0.0:
+        return "until stopped"
+    minutes, seconds = divmod(max(0.0, duration_s - trajectory_s), 60.0)
+    return f"{int(minutes)}:{seconds:04.1f} min" if minutes else f"{seconds:.1f} s"
+
+
+def run_display(output: Output, title: str) -> Callable[[], Display]:
+    """The panel if stderr is a terminal that can move its cursor, else lines; made when the run begins."""
+    stream: Any = output.stderr
+    terminal = not output.json and not output.quiet and stream.isatty() and not Console(file=stream).is_dumb_terminal
+    return lambda: LivePanel(stream.fileno(), title) if terminal else PhaseLines(output)

@@ -1,0 +1,163 @@
+"""The loop process as seen by its supervisor: start it, let it go, listen to it, ask it to stop."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from drivers.errors import JointctlError, MotionFault
+from firmware_py.libc import NANOSECONDS
+from firmware_py.realtime import Word
+from firmware_py.sequence import reset_axis
+from firmware_py.states import AxisPhase, StopRequest
+from tools.configuration.config import Config
+from tools.running.loop_process import LoopOrder
+from tools.running.shared_block import SERIAL, SharedBlock
+
+READY_TIMEOUT_S = 180.0  # the first start compiles everything
+KILL_S = 1.0  # how long a killed process may take to go
+SILENT_S = 2.0  # without a cycle for so long, the loop hangs
+RECEIVE_SHARE = 0.6  # of a period: how long a cycle waits for its sample
+
+# what happens to the joint when the loop has gone
+_ON_CAN = "its heartbeat on the bus has ended with it, so the drive stops the joint by itself"
+_ON_SERIAL = "a serial drive does not notice that: it has been told to switch off"
+
+
+class LoopHandle:
+    """Owns the process and the shared memory; a context manager that never leaves the process behind.
+
+    `tail_path` is where the loop itself saves the ring if this process has gone when it ends.
+    """
+
+    def __init__(self, config: Config, table: Any, tail_path: Path | None = None) -> None:
+        self.block = SharedBlock.create(len(table), config.bus.interface)
+        self.block.table[:] = table
+        self._tail = 0
+        self.lost_records = 0
+        self._after_end = _ON_SERIAL if config.bus.interface == SERIAL else _ON_CAN
+        period_ns = round(NANOSECONDS / config.loop.rate_Hz)
+        order = LoopOrder(
+            supervisor_pid=os.getpid(),
+            block_fd=self.block.fd,
+            table_rows=len(table),
+            interface=config.bus.interface,
+            channel=config.bus.channel,
+            period_ns=period_ns,
+            receive_ns=int(RECEIVE_SHARE * period_ns),
+            bitrate_bitps=config.bus.bitrate_bitps,
+            cpu=config.loop.cpu,
+            priority=config.loop.priority,
+            tail_path=None if tail_path is None else str(tail_path.absolute()),
+        )
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "tools.running.loop_process", order.argument()],
+            pass_fds=(self.block.fd,),
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,  # keys that a terminal turns into signals are not for the loop
+        )
+
+    def __enter__(self) -> LoopHandle:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """A loop that still runs gets the word to switch off, and is killed only if it does not listen."""
+        if self._process.poll() is None:
+            self.request_stop(StopRequest.OFF)
+            try:
+                self._process.wait(1.0 if self.started else 0.0)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+
+    @property
+    def pid(self) -> int:
+        """Process id of the loop."""
+        return self._process.pid
+
+    @property
+    def started(self) -> bool:
+        """Whether the loop has been let go."""
+        return bool(self.block.words[Word.GO])
+
+    @property
+    def phase(self) -> AxisPhase:
+        """The axis' phase as of the last cycle."""
+        return AxisPhase(int(self.block.state[0].phase))
+
+    def wait_ready(self, alive: Any = lambda: None) -> None:
+        """Until the loop is compiled and warm; `alive` is called meanwhile and may raise."""
+        give_up = time.monotonic() + READY_TIMEOUT_S
+        while not self.block.words[Word.READY]:
+            alive()
+            if self._process.poll() is not None:
+                raise JointctlError(f"the loop process ended with code {self._process.returncode} before it was ready")
+            if time.monotonic() > give_up:
+                raise JointctlError("the loop process was not ready in time")
+            time.sleep(0.005)
+
+    def go(self, constants: Any, port: Any) -> None:
+        """Hand over the constants and the driver's memory, and let the loop begin."""
+        self.block.constants[:] = constants
+        self.block.port[:] = port
+        reset_axis(self.block.constants[0], self.block.state[0])
+        self.beat()
+        self.block.words[Word.LOOP_NS] = time.monotonic_ns()
+        self.block.words[Word.GO] = 1
+
+    @property
+    def cycles(self) -> int:
+        """Cycles that the loop has executed."""
+        return int(self.block.words[Word.HEAD])
+
+    def allow_enable(self) -> None:
+        """Let the axis leave WAITING (see `SequenceConstants.may_enable`)."""
+        self.block.constants[0].sequence.may_enable = 1
+
+    def beat(self) -> None:
+        """The supervisor's sign of life."""
+        self.block.words[Word.SUPERVISOR_NS] = time.monotonic_ns()
+
+    def request_stop(self, request: StopRequest) -> None:
+        """Ask for a stop; a stronger request replaces a weaker one, never the other way round."""
+        self.block.words[Word.STOP] = max(int(self.block.words[Word.STOP]), int(request))
+
+    def new_records(self) -> Any:
+        """Log records since the last call."""
+        head = int(self.block.words[Word.HEAD])
+        records, lost = self.block.new_records(self._tail, head)
+        self._tail = head
+        self.lost_records += lost
+        return records
+
+    def running(self) -> bool:
+        """True while the loop runs, False after its regular end.
+
+        Raises `MotionFault` if the process is gone, or hangs, without having ended regularly.
+        """
+        code = self._process.poll()
+        if self.block.words[Word.ENDED]:
+            return False
+        if code is None:
+            silent_s = (time.monotonic_ns() - int(self.block.words[Word.LOOP_NS])) * 1e-9
+            if silent_s <= SILENT_S:
+                return True
+            self._process.kill()  # whatever it would do next, it must not wake up beside a new run
+            with contextlib.suppress(subprocess.TimeoutExpired):  # stuck in the system: the drive must not wait for it
+                self._process.wait(KILL_S)
+            raise MotionFault(
+                f"the loop process did nothing for {silent_s:.1f} s and was ended",
+                self._after_end,
+            )
+        if self.block.words[Word.ENDED]:
+            return False
+        how = f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
+        raise MotionFault(
+            f"the loop process {how}",
+            self._after_end,
+        )

@@ -1,0 +1,192 @@
+"""The process that runs the loop and nothing else: `python -m tools.running.loop_process JSON`.
+
+The loop is the compiled one where the bus is a file descriptor, else the plain Python one of `portable_loop`.
+
+Signals that a terminal sends are blocked here: stopping is the supervisor's word, and if the supervisor dies the
+loop sees its silence and stops the joint.  If this process dies, its heartbeat on the bus ends and the drive stops
+the joint.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from drivers.errors import JointctlError
+from firmware_py.libc import NANOSECONDS
+from firmware_py.realtime import Word
+
+_MLOCK_CURRENT_AND_FUTURE = 3
+_POLL_S = 0.001
+_FOREVER = 1 << 62
+
+
+@dataclass(frozen=True)
+class LoopOrder:
+    """What the loop process is told."""
+
+    supervisor_pid: int
+    block_fd: int
+    table_rows: int
+    interface: str
+    channel: str
+    period_ns: int
+    receive_ns: int
+    cpu: int | None
+    priority: int | None
+    bitrate_bitps: int | None = None  # for interfaces that set it when they are opened
+    tail_path: str | None = None  # where the ring is saved if the supervisor has gone
+
+    def argument(self) -> str:
+        """As one command line argument."""
+        return json.dumps(asdict(self))
+
+
+def _block_signals() -> None:
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP})
+
+
+def become_realtime(cpu: int | None, priority: int | None) -> list[str]:
+    """Affinity, SCHED_FIFO and locked memory as far as the system allows; returns what it refused."""
+    refused = []
+    if cpu is not None:
+        try:
+            os.sched_setaffinity(0, {cpu})
+        except (OSError, AttributeError) as error:
+            refused.append(f"loop.cpu (={cpu}): {error}")
+    if priority is not None:
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        except (OSError, AttributeError) as error:
+            refused.append(f"loop.priority (={priority}): {error}; see `jointctl doctor`")
+    if ctypes.CDLL(None).mlockall(_MLOCK_CURRENT_AND_FUTURE) != 0:
+        refused.append("memory could not be locked: a page fault may delay a cycle")
+    return refused
+
+
+def compiled_call(block: Any, period_ns: int, receive_ns: int) -> Callable[[int], int]:
+    """`run_loop` on this memory as a function of the greatest number of cycles; 0 only compiles."""
+    from drivers.canopen.exchange import exchange_memory, receive, send
+    from firmware_py.realtime import run_loop
+
+    frames, scratch = exchange_memory()
+
+    def call(max_cycles: int) -> int:
+        return int(
+            run_loop(
+                receive, send, block.port, frames, scratch, block.constants, block.state, block.table, block.sample,
+                block.command, block.words, block.ring, block.histograms, period_ns, receive_ns, max_cycles,
+            )
+        )  # fmt: skip
+
+    return call
+
+
+@contextmanager
+def compiled_loop(order: LoopOrder, block: Any) -> Iterator[Callable[[], object]]:
+    """The compiled loop, warm and attached to the bus, as a function that runs it to its end."""
+    from drivers.can.open import open_cyclic_end
+
+    call = compiled_call(block, order.period_ns, order.receive_ns)
+    call(0)  # compiles, or loads from the cache
+    with open_cyclic_end(order.interface, order.channel) as end:
+
+        def go() -> None:
+            block.port[0].fd = end.fileno()
+            call(_FOREVER)
+
+        yield go
+
+
+@contextmanager
+def portable_loop(order: LoopOrder, block: Any) -> Iterator[Callable[[], object]]:
+    """The plain Python loop in the same way, and a line that tells its limits."""
+    from drivers.can.open import open_python_can
+    from tools.running.portable_loop import check_portable_rate, portable_note, run_portable_loop, warm_up
+
+    check_portable_rate(order.interface, NANOSECONDS / order.period_ns)
+    print(f"loop: {portable_note(order.interface)}", file=sys.stderr, flush=True)
+    warm_up()
+    bus = open_python_can(order.interface, order.channel, order.bitrate_bitps)
+    try:
+        yield lambda: run_portable_loop(bus, block, order.period_ns, order.receive_ns)
+    finally:
+        bus.shutdown()
+
+
+def run(order: LoopOrder) -> int:
+    """Warm up, wait for GO, run the loop; returns the exit code."""
+    from drivers.can.open import CYCLIC_INTERFACES
+    from tools.running.shared_block import SERIAL, SharedBlock
+
+    block = SharedBlock(order.block_fd, order.table_rows, order.interface)
+    if order.interface == SERIAL:
+        from tools.running.serial_loop import serial_loop as loop
+    else:
+        loop = compiled_loop if order.interface in CYCLIC_INTERFACES else portable_loop
+    with loop(order, block) as go:
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        for line in become_realtime(order.cpu, order.priority):
+            print(f"loop: {line}", file=sys.stderr, flush=True)
+        block.words[Word.READY] = 1
+        while block.words[Word.GO] == 0:
+            if os.getppid() != order.supervisor_pid:
+                return 1
+            time.sleep(_POLL_S)
+        go()
+        block.words[Word.ENDED] = 1
+    if order.tail_path is not None and os.getppid() != order.supervisor_pid:
+        save_tail(block, Path(order.tail_path))
+    return 0
+
+
+def save_tail(block: Any, path: Path) -> None:
+    """Write what the ring holds: the joint is off by now, and nobody else is left to keep the last seconds."""
+    from tools.recording.run_log import ERROR, RunLogWriter
+
+    records, lost = block.new_records(0, int(block.words[Word.HEAD]))
+    with RunLogWriter(path, {"tail": {"why": "the supervising process had gone", "records_before": str(lost)}}) as log:
+        log.write_records(records)
+        log.write_event(ERROR, "loop", "the supervising process had gone; these are the last records of the loop")
+
+
+def _place(error: BaseException) -> str:
+    """File and line where it was raised."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    return "" if trace is None else f" at {Path(trace.tb_frame.f_code.co_filename).name}:{trace.tb_lineno}"
+
+
+def main() -> int:
+    """Entry point of the process.
+
+    Whatever goes wrong is one line and an exit code: the end of this process ends the heartbeat, and with it the
+    joint's torque, so there is nothing to wait for.
+    """
+    _block_signals()
+    try:
+        return run(LoopOrder(**json.loads(sys.argv[1])))
+    except JointctlError as error:
+        print(f"loop: {error}", file=sys.stderr, flush=True)
+        return error.exit_code
+    except BaseException as error:
+        text = " ".join(str(error).split())
+        print(f"loop: {type(error).__name__}{_place(error)}: {text}", file=sys.stderr, flush=True)
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

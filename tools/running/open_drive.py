@@ -1,0 +1,72 @@
+"""The one place that knows which drive a configuration means: everything else goes through the `Drive` protocol."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import can
+
+from drivers.can.open import CYCLIC_INTERFACES, open_python_can
+from drivers.canopen.drive import CanopenDrive
+from drivers.drive import Drive
+from drivers.elmo.codes import motor_fault_text
+from drivers.elmo.drive import ElmoDrive
+from drivers.elmo.line_budget import command_time_s
+from firmware_py.realtime import Histogram
+from firmware_py.states import Fault
+from tools.configuration.config import Config
+from tools.configuration.conversions import torque_constant_NmpA
+from tools.configuration.drive_settings import canopen_settings, cyclic_bus_load
+from tools.configuration.elmo import ElmoSerial
+from tools.configuration.elmo_settings import elmo_settings, serial_line_share
+from tools.running.fault_text import FaultText, fault_text
+from tools.running.loop_delay import QUANTILE, measured_delay_s, quantile_s
+from tools.running.portable_loop import check_portable_rate
+from tools.running.serial_fault_text import SERIAL_FAULT_TEXTS
+
+
+def check_cyclic_rate(config: Config) -> None:
+    """`ConfigurationError` if bus or line do not carry the rate; before anything is opened."""
+    if isinstance(config.drive, ElmoSerial):
+        serial_line_share(config)
+        return
+    cyclic_bus_load(config)
+    # a name that python-can does not know is told when the bus is opened
+    if config.bus.interface not in CYCLIC_INTERFACES and config.bus.interface in can.VALID_INTERFACES:
+        check_portable_rate(config.bus.interface, config.loop.rate_Hz)
+
+
+def open_drive(config: Config) -> Drive:
+    """The drive of the configuration, its bus or port open; nothing has been said to it."""
+    if isinstance(config.drive, ElmoSerial):
+        return ElmoDrive(elmo_settings(config, torque_constant_NmpA(config)))
+    bus = open_python_can(config.bus.interface, config.bus.channel, config.bus.bitrate_bitps)
+    return CanopenDrive(bus, canopen_settings(config))
+
+
+def loop_delay_s(config: Config, histograms: Any) -> float:
+    """The loop delay as measured in the first cycles, with the drive off.
+
+    Serial: round trip of PX and work at their 99th percentile, and TC on the line; the drive takes it at its end.
+    """
+    drive = config.drive
+    if isinstance(drive, ElmoSerial):
+        path_s = quantile_s(histograms[Histogram.ROUND_TRIP], QUANTILE)
+        if math.isnan(path_s):
+            return 1.0 / config.loop.rate_Hz
+        return path_s + quantile_s(histograms[Histogram.WORK], QUANTILE) + command_time_s(drive.baud_rate_bitps)
+    return measured_delay_s(
+        histograms, drive.rpdo_transmission_type, 1.0 / config.loop.rate_Hz, 1.0 / config.bus.bitrate_bitps
+    )
+
+
+def drive_fault_text(config: Config, fault: Fault, value: float, drive_error: int) -> FaultText:
+    """A fault in the words that fit the drive and its line."""
+    if not isinstance(config.drive, ElmoSerial):
+        return fault_text(fault, value, drive_error)
+    text = SERIAL_FAULT_TEXTS.get(fault) or fault_text(fault, value, 0)
+    happened = text.happened.format(value=value, word=f"{round(value):X}h") if math.isfinite(value) else text.happened
+    if drive_error:
+        happened += f"; the drive says {motor_fault_text(drive_error)}"
+    return FaultText(happened, text.cause, text.next_step)

@@ -1,0 +1,54 @@
+"""What a run says at its end: the table on stdout, the picture beside the log, the fault in words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from drivers.errors import MotionFault
+from firmware_py.states import Fault
+from tools.output import Output
+from tools.recording.run_figure import save_run_figure
+from tools.recording.run_summary import summary_table
+from tools.running.supervisor import RunResult
+
+INTERRUPTED = 130
+
+
+def report_run(result: RunResult, output: Output, title: str) -> int:
+    """Print and save everything; returns the exit code (0, or 130 after an interruption); raises `MotionFault`."""
+    picture = result.log_path.with_suffix(".png")
+    try:
+        save_run_figure(result.records, picture, title)
+    except OSError as error:
+        output.warning(f"{picture}: cannot be written: {error.strerror or error}")
+    table = summary_table(result.summary)
+    table.add_row("bus load", f"{result.bus_load:.1%} at worst-case stuffing")
+    table.add_row("drive afterwards", result.drive_state)
+    table.add_row("log", str(result.log_path))
+    table.add_row("picture", str(picture))
+    output.result(table, _data(result, str(picture)))
+    if result.lost_records:
+        output.warning(f"{result.lost_records} log records were lost: the supervisor was too slow")
+    if result.fault_text is not None:
+        text = result.fault_text
+        raise MotionFault(
+            f"{result.fault.name} ({int(result.fault)}): {text.happened}",
+            f"likely cause: {text.cause}; next: {text.next_step}",
+        )
+    if result.stopped_by:
+        output.note(f"stopped by {result.stopped_by}; the joint is {result.drive_state}")
+        return INTERRUPTED
+    return 0
+
+
+def _data(result: RunResult, picture: str) -> dict[str, Any]:
+    return {
+        **result.summary.to_dict(),
+        "bus_load": result.bus_load,
+        "fault": None if result.fault is Fault.NONE else result.fault.name,
+        "stopped_by": result.stopped_by or None,
+        "drive_state": result.drive_state,
+        "lost_records": result.lost_records,
+        "log": str(result.log_path),
+        "picture": picture,
+    }

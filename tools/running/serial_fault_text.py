@@ -1,0 +1,50 @@
+"""What those faults mean that have another cause on a serial line than on a CAN bus."""
+
+from __future__ import annotations
+
+from firmware_py.states import Fault
+from tools.running.fault_text import FaultText
+
+# {value}: the number that tripped the limit; {word}: the same as a hexadecimal status register (SR)
+SERIAL_FAULT_TEXTS: dict[Fault, FaultText] = {
+    Fault.STALE_SAMPLE: FaultText(
+        "no usable position reply came for {value:.0f} cycles",
+        "cable or drive went silent, or noise garbles the replies",
+        "check the cable and its ground; the drive's own limits watched the joint meanwhile",
+    ),
+    Fault.BUS_ERROR: FaultText(
+        "the serial port is gone or takes no characters any more",
+        "adapter or cable unplugged",
+        "make sure that the joint stands: nothing could be said to the drive; then plug it in again",
+    ),
+    Fault.NO_SAMPLES: FaultText(
+        "not one position reply came from the drive",
+        "the drive went silent after commissioning",
+        "check the cable; run again",
+    ),
+    Fault.DRIVE_RESTARTED: FaultText(
+        "the drive restarted while the loop was running: its unit mode is another one (SR {word})",
+        "its supply dropped, or somebody reset it",
+        "check the supply; the drive has lost its limits, start again",
+    ),
+    Fault.DRIVE_FAULT: FaultText(
+        "the drive switched its motor off because of a fault (SR {word})",
+        "see the drive's motor fault",
+        "remove the cause; jointctl resets nothing by itself",
+    ),
+    Fault.DRIVE_NOT_ENABLED: FaultText(
+        "the motor was switched off without being asked (SR {word})",
+        "inhibit input or STO was opened, another program on the line, or a restart of the drive",
+        "check the inhibit and STO wiring and the supply",
+    ),
+    Fault.ENABLE_TIMEOUT: FaultText(
+        "the drive did not switch its motor on in time (SR {word})",
+        "no motor supply, STO open, or inhibit input active",
+        "check voltage, STO and inhibit; MO=1 is refused until they are right",
+    ),
+    Fault.OFF_TIMEOUT: FaultText(
+        "the drive did not confirm that its motor is off (SR {word})",
+        "the line is cut or the drive is silent",
+        "use the emergency stop; then check the line",
+    ),
+}

@@ -1,0 +1,274 @@
+"""One run from the configuration to the summary: commission, let the loop go, watch it, log it, make the drive safe.
+
+The supervisor never touches the torque.  It writes a sign of life and a stop word; everything that must happen in
+time happens in the loop process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivers.drive import CommissioningReport, Drive
+from drivers.errors import DataError, JointctlError, MotionFault
+from firmware_py.realtime import Word
+from firmware_py.states import AxisPhase, Fault, StopRequest
+from tools.analysis.margin_gate import require_margin
+from tools.configuration.config import Config
+from tools.configuration.records import axis_constants, trajectory_table
+from tools.output import Output
+from tools.recording.can_log import frame_array
+from tools.recording.run_log import RunLogWriter
+from tools.recording.run_metadata import run_metadata
+from tools.recording.run_summary import RunSummary, summarise
+from tools.running.events import EventFinder, phase_name
+from tools.running.fault_text import FaultText
+from tools.running.frame_recorder import FrameRecorder, recording
+from tools.running.live_panel import Display, PhaseLines, Snapshot
+from tools.running.loop_handle import LoopHandle
+from tools.running.open_drive import check_cyclic_rate, drive_fault_text, loop_delay_s, open_drive
+from tools.running.shared_block import SERIAL
+from tools.running.stop_signals import StopSignals, stop_signals
+
+POLL_S = 0.02
+DELAY_CYCLES = 300  # how many cycles with the drive off the loop delay is measured over
+INFORMATION, WARNING, ERROR = 20, 30, 40
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run left behind."""
+
+    summary: RunSummary
+    records: Any
+    histograms: np.ndarray[Any, Any]
+    fault: Fault
+    fault_text: FaultText | None
+    stopped_by: str  # name of the signal, or ""
+    drive_state: str  # in words, read after the run
+    bus_load: float  # measured share, worst-case stuffing
+    lost_records: int
+    log_path: Path
+
+
+class Supervisor:
+    """Carries out one run.  `confirm(report)` is asked before anything can move; False ends the run.
+
+    `display` makes what shows the run while it goes on; by default a line for each phase.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        output: Output,
+        log_path: Path,
+        confirm: Callable[[CommissioningReport], bool],
+        *,
+        allow_low_margin: bool = False,
+        display: Callable[[], Display] | None = None,
+    ) -> None:
+        self._config = config
+        self._output = output
+        self._log_path = log_path
+        self._confirm = confirm
+        self._allow_low_margin = allow_low_margin
+        self._phase = AxisPhase.WAITING
+        self._delay_s: float | None = None
+        self._make_display = display or (lambda: PhaseLines(output))
+        self._display: Display = PhaseLines(output)
+        self._recorder: FrameRecorder | None = None
+        self._events = EventFinder()
+        self._asked = StopRequest.NONE
+        self._stopped_by_viewer = ""
+
+    def run(self) -> RunResult | None:
+        """The whole run; None if the user declined.  The drive is disabled when this returns or raises."""
+        config = self._config
+        check_cyclic_rate(config)
+        tail_path = self._log_path.with_suffix(".tail.mcap")
+        with (
+            stop_signals() as signals,
+            LoopHandle(config, self._table(), tail_path) as loop,
+            recording(config) as self._recorder,
+        ):
+            drive = open_drive(config)
+            try:
+                report = drive.commission()
+                self._leave_if_asked(signals)
+                signals.raising = True
+                confirmed = self._confirm(report)
+                signals.raising = False
+                if not confirmed:
+                    return None
+                loop.wait_ready(lambda: self._leave_if_asked(signals))
+                self._leave_if_asked(signals)
+                return self._supervise(drive, loop, report, signals)
+            except OSError as error:
+                raise DataError(f"{self._log_path}: cannot be written: {error.strerror or error}") from None
+            finally:
+                signals.raising = False
+                state = drive.make_safe()
+                drive.close()
+                if state.startswith("unknown"):
+                    with contextlib.suppress(OSError):  # the terminal may have been closed
+                        self._output.warning(f"the drive did not confirm that it is off: {state}")
+
+    def _table(self) -> np.ndarray:
+        """Rows of the motion, (N, 5); their number is fixed before the drive is known."""
+        return trajectory_table(self._config)
+
+    def _constants(self, loop: LoopHandle, report: CommissioningReport) -> Any:
+        """`AxisConstants` for the joint as it was found; may still write the rows of `loop.block.table`."""
+        return axis_constants(self._config, start_position_rad=report.start_position_rad)
+
+    @staticmethod
+    def _leave_if_asked(signals: StopSignals) -> None:
+        if signals.count:
+            raise KeyboardInterrupt
+
+    def _supervise(
+        self, drive: Drive, loop: LoopHandle, report: CommissioningReport, signals: StopSignals
+    ) -> RunResult:
+        chunks: list[Any] = []
+        self._events = self._event_finder(loop)
+        with (
+            RunLogWriter(self._log_path, run_metadata(self._config, report)) as log,
+            self._make_display() as self._display,
+        ):
+            constants = self._constants(loop, report)
+            constants[0].sequence.may_enable = 0
+            drive.start_cyclic()
+            started_ns = time.monotonic_ns()
+            loop.go(constants, drive.port())
+            try:
+                while loop.running():
+                    self._watch(loop, log, chunks, signals)
+                    time.sleep(POLL_S)
+            except MotionFault as error:
+                state = drive.make_safe()
+                self._take_records(loop, log, chunks)
+                log.write_event(ERROR, "supervisor", str(error))
+                raise MotionFault(error.message, f"{error.hint}; drive state now: {state}") from None
+            except BaseException:
+                self._brake(loop, signals)
+                raise
+            elapsed_s = (time.monotonic_ns() - started_ns) * 1e-9
+            state = drive.make_safe()
+            self._take_records(loop, log, chunks)
+            log.write_event(INFORMATION, "drive", f"after the run: {state}")
+            if self._recorder is not None and self._recorder.dropped:
+                log.write_event(WARNING, "log", f"{self._recorder.dropped} CAN frames were not recorded: too slow")
+            return self._result(loop, chunks, signals, state, elapsed_s)
+
+    def _event_finder(self, loop: LoopHandle) -> EventFinder:
+        """Events in the words that fit the drive; a fault with the value that the loop has latched."""
+
+        def fault_words(fault: Fault, drive_error: int) -> str:
+            value = float(loop.block.state[0].fault_value)
+            return drive_fault_text(self._config, fault, value, drive_error).happened
+
+        return EventFinder(cia402=self._config.bus.interface != SERIAL, fault_words=fault_words)
+
+    def _check_delay(self, loop: LoopHandle, log: RunLogWriter) -> None:
+        """Once enough cycles have run with the drive off: refuse the gains, or let the loop enable."""
+        if self._delay_s is not None or loop.cycles < min(DELAY_CYCLES, self._config.loop.rate_Hz):
+            return
+        config = self._config
+        self._delay_s = loop_delay_s(config, loop.block.histograms)
+        found = require_margin(config, self._delay_s, allow_low_margin=self._allow_low_margin)
+        text = f"loop delay {self._delay_s * 1e3:.2f} ms measured, phase margin {found.phase_margin_deg:.0f} deg"
+        log.write_event(INFORMATION, "supervisor", text)
+        self._display.note(text)
+        loop.allow_enable()
+
+    def _brake(self, loop: LoopHandle, signals: StopSignals) -> None:
+        """The supervisor cannot go on (disk full, say), but the joint moves: brake it under control, unlogged.
+
+        The user may still ask for more than a ramp.
+        """
+        sequence = self._config.sequence
+        loop.request_stop(StopRequest.RAMP)
+        give_up_s = time.monotonic() + sequence.stop_timeout_s + sequence.release_s + sequence.off_timeout_s
+        with contextlib.suppress(MotionFault):
+            while loop.running() and time.monotonic() < give_up_s:
+                loop.request_stop(signals.request)
+                loop.beat()
+                time.sleep(POLL_S)
+
+    def _take_records(self, loop: LoopHandle, log: RunLogWriter, chunks: list[Any]) -> None:
+        frames = self._recorder.new_frames() if self._recorder is not None else []
+        if frames:
+            log.write_frames(frame_array(frames))
+        records = loop.new_records()
+        if not len(records):
+            return
+        self._keep(records, log, chunks)
+        for event in self._events.take(records):
+            log.write_event(event.level, event.source, event.text, event.time_ns)
+            self._display.event(event)
+        self._display.show(
+            Snapshot(
+                records[-1],
+                int(loop.block.words[Word.SKIPPED]),
+                loop.block.histograms,
+                self._config.trajectory.duration_s,
+                self._config.bus.interface != SERIAL,
+                records,
+            )
+        )
+
+    def _keep(self, records: Any, log: RunLogWriter, chunks: list[Any]) -> None:
+        """What becomes of new records: the log, and `chunks` for the summary at the end."""
+        chunks.append(records)
+        log.write_records(records)
+
+    def _watch(self, loop: LoopHandle, log: RunLogWriter, chunks: list[Any], signals: StopSignals) -> None:
+        loop.beat()
+        viewer = self._display.stop_request()
+        request = max(signals.request, viewer)
+        if request is not StopRequest.NONE:
+            loop.request_stop(request)
+        self._take_records(loop, log, chunks)
+        if request is not self._asked:
+            self._asked = request
+            if not signals.name:
+                self._stopped_by_viewer = "the scope's STOP"
+            who = signals.name or self._stopped_by_viewer
+            log.write_event(WARNING, "supervisor", f"{request.name.lower().replace('_', ' ')} asked for by {who}")
+        self._check_delay(loop, log)
+        phase = loop.phase
+        if phase is not self._phase:
+            self._phase = phase
+            self._display.phase(phase_name(phase))
+
+    def _result(
+        self, loop: LoopHandle, chunks: list[Any], signals: StopSignals, drive_state: str, elapsed_s: float
+    ) -> RunResult:
+        if not chunks:
+            raise JointctlError("the loop ended without one cycle")
+        records = np.concatenate(chunks).view(np.recarray)
+        state = loop.block.state[0]
+        fault = Fault(int(state.fault))
+        text = None
+        if fault is not Fault.NONE:
+            drive_error = int(state.fault_drive_error)
+            text = drive_fault_text(self._config, fault, float(state.fault_value), drive_error)
+        bits = float(loop.block.port[0].bits_sent)
+        return RunResult(
+            summary=summarise(records, loop.block.histograms),
+            records=records,
+            histograms=loop.block.histograms.copy(),
+            fault=fault,
+            fault_text=text,
+            stopped_by=signals.name or self._stopped_by_viewer,
+            drive_state=drive_state,
+            bus_load=bits / (self._config.bus.bitrate_bitps * elapsed_s),
+            lost_records=loop.lost_records,
+            log_path=self._log_path,
+        )

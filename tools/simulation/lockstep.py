@@ -1,0 +1,202 @@
+"""A commissioned virtual joint for the lockstep simulation: set up once, run many times.
+
+Commissioning goes through the real driver and the real SDO server, over a bus without a wire: a frame that is sent
+is handled at once.  Each run starts from a copy of the device as commissioning left it.
+"""
+
+from __future__ import annotations
+
+import queue
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import can
+import numpy as np
+
+from drivers.can.virtual_bus import decode, encode
+from drivers.canopen.drive import CanopenDrive
+from drivers.canopen.exchange import accept, begin, end, exchange_memory
+from drivers.drive import CommissioningReport
+from drivers.errors import ConfigurationError
+from firmware_py.records import AxisState, Command, LogRecord, Sample
+from firmware_py.schema import new
+from firmware_py.sequence import reset_axis
+from firmware_py.states import AxisPhase, Fault
+from hil.device import Cia402Device
+from hil.fault_lockstep import TRUTHS as FAULT_TRUTHS
+from hil.fault_lockstep import run_with_faults
+from hil.faults import fault_memory
+from hil.frames import FRAME_SIZE
+from hil.lockstep import TRUTHS, TRUE_POSITION_rad, run_lockstep
+from tools.configuration.config import Config
+from tools.configuration.drive_settings import canopen_settings
+from tools.configuration.records import axis_constants, trajectory_table
+from tools.simulation.virtual_joint import new_device
+
+_COMMISSIONING_STEP_NS = 1000  # the device's clock goes on a little with every frame
+_LISTENER_S = 0.0005
+NO_STOP = -1
+
+
+class DirectBus(can.BusABC):
+    """A python-can bus whose only other participant is a virtual device in the same process."""
+
+    def __init__(self, device: Cia402Device) -> None:
+        super().__init__(channel="direct")
+        self._device = device
+        self._answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self.now_ns = 1
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """The device handles the frame before this returns."""
+        self.now_ns += _COMMISSIONING_STEP_NS
+        for frame in self._device.handle(encode(msg), self.now_ns):
+            self._answers.put(frame)
+
+    def sleep(self, seconds: float) -> None:
+        """The device's time goes on; the thread that listens to the bus gets a chance to take what it sent."""
+        self.now_ns += round(seconds * 1e9)
+        for frame in self._device.advance(self.now_ns):
+            self._answers.put(frame)
+        time.sleep(_LISTENER_S)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        try:
+            return decode(self._answers.get(timeout=timeout), self.now_ns * 1e-9, self.channel_info), False
+        except queue.Empty:
+            return None, False
+
+
+@dataclass(frozen=True)
+class LockstepRun:
+    """What one simulated run left."""
+
+    log: Any  # LogRecord recarray, shape (N,)
+    state: Any  # AxisState record
+    plant: Any  # PlantState record
+    device: Any  # Device record
+    fault: Fault
+    truth: np.ndarray  # float64 (N, TRUTHS): what the joint truly did, columns `hil.lockstep.TRUE_*`
+
+    @property
+    def tracking(self) -> np.ndarray:
+        """bool (N,): the records of the trajectory itself, without approach and stop."""
+        return np.asarray(self.log.phase == AxisPhase.TRACKING)
+
+    @property
+    def true_error_rad(self) -> np.ndarray:
+        """Joint position minus desired position, (N,); the log's error is that of the encoder."""
+        return np.asarray(self.truth[:, TRUE_POSITION_rad] - self.log.desired_position_rad)
+
+
+class LockstepJoint:
+    """The joint of a configuration, commissioned, disabled and operational."""
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        virtual = new_device(config)
+        bus = DirectBus(virtual)
+        drive = CanopenDrive(bus, canopen_settings(config), sleep=bus.sleep)
+        try:
+            self.report: CommissioningReport = drive.commission()
+            drive.start_cyclic()
+            self._port = drive.port()
+        finally:
+            drive.close()
+        self.start_ns = bus.now_ns + _COMMISSIONING_STEP_NS
+        self._virtual = virtual
+        self.faults = virtual.faults
+        self.table = trajectory_table(config)
+        self.plant_constants = virtual.plant_constants.copy()
+        self.plant_state = virtual.plant_state.copy()
+
+    def constants(self) -> Any:
+        """Fresh `AxisConstants` for this joint where it stands; may be changed before `run`."""
+        constants = axis_constants(self.config, start_position_rad=self.report.start_position_rad)
+        constants[0].sequence.supervisor_max_cycles = 0  # nobody to watch: simulated time has no wall clock
+        return constants
+
+    def run(
+        self,
+        constants: Any = None,
+        *,
+        plant_constants: Any = None,
+        plant_state: Any = None,
+        log_every: int = 1,
+        stop_cycle: int = NO_STOP,
+        longest_s: float | None = None,
+        ideal_velocity: bool = False,
+    ) -> LockstepRun:
+        """One run from power off to FINISHED; the given record arrays are not changed.
+
+        Without `longest_s` a run may take ten seconds more than approach and trajectory together.
+        `ideal_velocity` gives the controller the true position and velocity, for textbook experiments.
+        """
+        constants = self.constants() if constants is None else constants
+        axis = constants[0]
+        if len(self._virtual.faults):
+            raise ConfigurationError(
+                "[[virtual.faults]] are carried out by run_with_faults(joint.faults), not by run()"
+            )
+        if ideal_velocity and axis.law.matched_filter != 0:
+            raise ConfigurationError("control.matched_filter (=true) must be false with an ideal velocity")
+        period_s = float(axis.law.period_s)
+        if longest_s is None:
+            longest_s = float(axis.sequence.approach_s + axis.trajectory.duration_s) + 10.0
+        cycles = int(longest_s / period_s)
+        log = new(LogRecord, cycles // log_every + 1 if log_every else 1)
+        truth = np.zeros((len(log), TRUTHS))
+        state, sample, command = new(AxisState), new(Sample), new(Command)
+        reset_axis(axis, state[0])
+        device = self._virtual.device.copy()
+        plant_constants = self.plant_constants if plant_constants is None else plant_constants
+        plant = (self.plant_state if plant_state is None else plant_state).copy()
+        frames, _ = exchange_memory()
+        frame_bytes = frames.view(np.ndarray).view(np.uint8).reshape(len(frames), FRAME_SIZE)
+        written = run_lockstep(
+            begin, accept, end, self._port.copy(), frames, frame_bytes, constants, state, self.table, sample, command,
+            device, plant_constants, plant, self._virtual.queue.copy(), log, log_every, self.start_ns,
+            round(period_s * 1e9), cycles, stop_cycle,
+            truth, ideal_velocity,
+        )  # fmt: skip
+        return LockstepRun(log[:written], state[0], plant[0], device[0], Fault(int(state[0].fault)), truth[:written])
+
+    def run_with_faults(
+        self,
+        faults: Any,
+        constants: Any = None,
+        *,
+        plant_constants: Any = None,
+        plant_state: Any = None,
+        epoch_at_start: bool = False,
+        stop_cycle: int = NO_STOP,
+        longest_s: float | None = None,
+        tail_s: float = 0.0,
+    ) -> LockstepRun:
+        """As `run`, with these `FaultConstants`; `truth` has the columns of `hil.fault_lockstep`, a row each period.
+
+        The faults' times count from the first time that the power stage is on, or from the start of the run.
+        The joint is watched for `tail_s` after the controller has ended and is silent.
+        """
+        constants = self.constants() if constants is None else constants
+        axis = constants[0]
+        period_s = float(axis.law.period_s)
+        if longest_s is None:
+            longest_s = float(axis.sequence.approach_s + axis.trajectory.duration_s) + 10.0
+        cycles, tail_cycles = int(longest_s / period_s), int(tail_s / period_s)
+        log, truth = new(LogRecord, cycles), np.zeros((cycles + tail_cycles, FAULT_TRUTHS))
+        state, sample, command = new(AxisState), new(Sample), new(Command)
+        reset_axis(axis, state[0])
+        device = self._virtual.device.copy()
+        plant_constants = self.plant_constants if plant_constants is None else plant_constants
+        plant = (self.plant_state if plant_state is None else plant_state).copy()
+        frames, _ = exchange_memory()
+        frame_bytes = frames.view(np.ndarray).view(np.uint8).reshape(len(frames), FRAME_SIZE)
+        written, rows = run_with_faults(
+            begin, accept, end, self._port.copy(), frames, frame_bytes, constants, state, self.table, sample, command,
+            device, plant_constants, plant, self._virtual.queue.copy(), log, truth, faults,
+            fault_memory(faults, -1 if epoch_at_start else 0), self.start_ns, round(period_s * 1e9), cycles,
+            stop_cycle, tail_cycles,
+        )  # fmt: skip
+        return LockstepRun(log[:written], state[0], plant[0], device[0], Fault(int(state[0].fault)), truth[:rows])

@@ -1,0 +1,135 @@
+"""The files of a sweep: rows are written as they are measured, so that an interrupted sweep keeps them.
+
+Beside the CSV (format: `tools.identification.friction_data`) lies its JSON sidecar; it also holds the plan's hash and
+which of the plan's points the rows are, so that a sweep can be resumed.  The row is written first: rows beyond the
+sidecar's list were cut off by a crash, and are measured again.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from drivers.errors import DataError
+from tools.identification.friction_data import SWEEP_COLUMNS, sidecar_contents
+from tools.sweeping.meter import MeasuredPoint
+
+HEADING = ",".join(SWEEP_COLUMNS) + "\n"
+
+
+def _replace(path: Path, text: str) -> None:
+    temporary = path.with_name(f".{path.name}.part")
+    temporary.write_text(text, encoding="utf-8")
+    os.replace(temporary, path)
+
+
+class SweepFile:
+    """CSV and sidecar of one sweep, open for appending; `done` are the indices of the points in the file."""
+
+    def __init__(self, path: Path, sidecar: dict[str, Any], torque_constant_NmpA: float) -> None:
+        self.path = path
+        self._sidecar = sidecar
+        self._torque_constant_NmpA = torque_constant_NmpA
+        self._stream = path.open("a", encoding="ascii", newline="")
+
+    @property
+    def done(self) -> set[int]:
+        return set(self._sidecar["measured"])
+
+    @property
+    def visits(self) -> Counter[int]:
+        """How many rows each point has."""
+        return Counter(self._sidecar["measured"])
+
+    @property
+    def unsettled(self) -> set[int]:
+        """Points whose last row did not settle."""
+        return {int(index) for index in self._sidecar["unsettled"]}
+
+    @property
+    def elapsed_s(self) -> float:
+        """Time column of the last row before this session, so that time goes on."""
+        return float(self._sidecar["elapsed_s"])
+
+    @classmethod
+    def create(
+        cls, path: Path, reduction_ratio: float, torque_constant_NmpA: float, plan: str, more: dict[str, Any]
+    ) -> SweepFile:
+        """New files; existing ones are never overwritten."""
+        for file in (path, path.with_suffix(".json")):
+            if file.exists():
+                raise DataError(f"{file}: exists already", "--resume goes on with it, -o gives another name")
+        sidecar = sidecar_contents(
+            reduction_ratio, torque_constant_NmpA, plan=plan, measured=[], elapsed_s=0.0, unsettled={}, **more
+        )
+        try:
+            _replace(path.with_suffix(".json"), json.dumps(sidecar, indent=1))
+            path.write_text(HEADING, encoding="ascii")
+        except OSError as error:
+            raise DataError(f"{path}: cannot be written: {error.strerror or error}") from None
+        return cls(path, sidecar, torque_constant_NmpA)
+
+    @classmethod
+    def resume(cls, path: Path, torque_constant_NmpA: float, plan: str) -> SweepFile:
+        """The files of an interrupted sweep of the same plan."""
+        beside = path.with_suffix(".json")
+        try:
+            sidecar = json.loads(beside.read_text(encoding="utf-8"))
+            lines = path.read_text(encoding="ascii").splitlines(keepends=True)
+        except OSError as error:
+            raise DataError(
+                f"{error.filename}: cannot be read: {error.strerror or error}", "--resume needs it"
+            ) from None
+        except ValueError:
+            raise DataError(
+                f"{path}: the sweep or its sidecar {beside.name} is damaged: it cannot be resumed"
+            ) from None
+        if not isinstance(sidecar, dict) or "plan" not in sidecar or "measured" not in sidecar:
+            raise DataError(f"{beside}: is not the sidecar of a sweep")
+        if sidecar["plan"] != plan:
+            raise DataError(
+                f"{beside}: was measured with another plan ({sidecar['plan']}, now {plan})",
+                "give the options and the configuration of the first time, or another -o",
+            )
+        rows = len(sidecar["measured"])
+        if len(lines) < rows + 1 or lines[0] != HEADING or not "".join(lines[: rows + 1]).endswith("\n"):
+            raise DataError(f"{path}: holds {max(0, len(lines) - 1)} rows, its sidecar counts {rows}")
+        if len(lines) > rows + 1:
+            _replace(path, "".join(lines[: rows + 1]))
+        return cls(path, sidecar, torque_constant_NmpA)
+
+    def add(self, measured: MeasuredPoint, temperature_degC: float | None = None) -> None:
+        """One row, on the disk when this returns."""
+        point, result = measured.point, measured.result
+        current = 1.0 / self._torque_constant_NmpA
+        values = (
+            f"{result.velocity_radps:.9g}", f"{result.motor_torque_Nm * current:.9g}", f"{result.motor_torque_Nm:.9g}",
+            f"{result.velocity_std_radps:.6g}", f"{result.motor_torque_std_Nm * current:.6g}", result.samples,
+            int(result.settled), f"{result.position_min_rad:.7g}", f"{result.position_max_rad:.7g}",
+            f"{measured.time_s:.3f}", "" if temperature_degC is None else f"{temperature_degC:.1f}", point.direction,
+            point.pass_number,
+        )  # fmt: skip
+        line = io.StringIO()
+        csv.writer(line, lineterminator="\n").writerow(values)
+        self._stream.write(line.getvalue())
+        self._stream.flush()
+        os.fsync(self._stream.fileno())
+        self._sidecar["measured"].append(point.index)
+        self._sidecar["elapsed_s"] = round(measured.time_s, 3)
+        if result.problem:
+            self._sidecar["unsettled"][str(point.index)] = result.problem
+        else:
+            self._sidecar["unsettled"].pop(str(point.index), None)
+        _replace(self.path.with_suffix(".json"), json.dumps(self._sidecar, indent=1))
+
+    def close(self) -> None:
+        """Files without one row are removed: nothing was measured, and they would be in the way of the next try."""
+        self._stream.close()
+        if not self._sidecar["measured"]:
+            self.path.unlink(missing_ok=True)
+            self.path.with_suffix(".json").unlink(missing_ok=True)

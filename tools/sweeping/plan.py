@@ -1,0 +1,269 @@
+"""The motion of a sweep: plateaus of constant speed back and forth within the travel, as an exact table.
+
+Every plateau is a stroke: accelerate, lead in until the loop has settled, measure at constant speed, brake.  The
+windows of measuring are known beforehand, so that acceleration never gets into the data.  A window covers whole
+periods of the ripple, so that it averages out:
+
+- fast and medium speeds: whole periods of the reducer's ripple at the joint (18 a turn), as many as the dwell time
+  asks for; what does not fit into the travel is repeated in further strokes;
+- slow speeds, where one such period would take too long: teeth of whole motor ripple periods (2 a motor turn),
+  spread evenly over one period at the joint, with a quick hop in between.  A sum over evenly spread positions cancels
+  the first harmonics of the ripple as well.
+
+Positions are relative to the middle of the motion.  The table has the rows of `trajectory.reference_at`: constant
+acceleration and constant speed are cubics, so nothing is approximated.  The acceleration jumps, as a trapezoid's does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from tools.sweeping.grid import SweepPoint, SweepUsageError
+
+TEETH = 4
+MOST_STROKES = 8  # of one point; more travel helps more than more strokes
+PATIENCE = 3.0  # a whole period at the joint may take this many dwell times before teeth take its place
+REVERSAL_s = 0.1
+LEAD_rad = 0.002  # several times the deflection of the bristles before sliding
+
+
+@dataclass(frozen=True)
+class PlanSettings:
+    """What shapes the motion; joint side."""
+
+    width_rad: float  # of the travel that may be used
+    acceleration_radps2: float
+    transit_radps: float  # highest speed of moves without measuring
+    dwell_s: float  # wanted time of measuring per point
+    settle_s: float  # between the end of acceleration and the window
+    reduction_ratio: float
+    ripple_per_joint_turn: float = 18.0
+    ripple_per_motor_turn: float = 2.0
+
+    @property
+    def joint_period_rad(self) -> float:
+        return math.tau / self.ripple_per_joint_turn
+
+    @property
+    def motor_period_rad(self) -> float:
+        return math.tau / (self.ripple_per_motor_turn * self.reduction_ratio)
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """How one speed is measured: `teeth` windows of `window_rad` a stroke, `strokes` times."""
+
+    speed_radps: float
+    window_rad: float
+    teeth: int
+    strokes: int
+    pitch_rad: float  # from the beginning of one window to that of the next
+    length_rad: float  # of the whole stroke, ramps included
+
+    @property
+    def measured_s(self) -> float:
+        return self.strokes * self.teeth * self.window_rad / self.speed_radps
+
+
+@dataclass(frozen=True)
+class Window:
+    """From start_s to end_s of the trajectory the joint moves at the speed of this point; `last` completes it."""
+
+    point: SweepPoint
+    start_s: float
+    end_s: float
+    last: bool
+
+
+@dataclass(frozen=True)
+class SweepMotion:
+    table: np.ndarray  # float64 (rows, 5)
+    windows: tuple[Window, ...]
+    low_rad: float
+    high_rad: float
+
+    @property
+    def duration_s(self) -> float:
+        return float(self.table[-1, 0])
+
+
+def _lead_rad(speed_radps: float, s: PlanSettings) -> float:
+    return speed_radps * s.settle_s + LEAD_rad
+
+
+def _ramps_rad(speed_radps: float, s: PlanSettings) -> float:
+    """Distance of speeding up and of braking."""
+    return speed_radps * speed_radps / s.acceleration_radps2
+
+
+ROUNDING = 1e-6  # the highest speed must fit in spite of rounding
+
+
+def room_rad(speed_radps: float, s: PlanSettings) -> float:
+    """Longest window that fits into the travel at this speed; negative if not even the ramps fit."""
+    return s.width_rad - _ramps_rad(speed_radps, s) - _lead_rad(speed_radps, s)
+
+
+def fastest_radps(s: PlanSettings) -> float:
+    """Highest speed at which one ripple period of the joint (of the motor, if that does not fit) is measured."""
+    for window in (s.joint_period_rad, s.motor_period_rad):
+        left = s.width_rad - LEAD_rad - window
+        if left > 0.0:
+            # v^2 / a + v settle = left
+            half = 0.5 * s.settle_s * s.acceleration_radps2
+            exact = math.sqrt(half * half + left * s.acceleration_radps2) - half
+            return exact * (1.0 - ROUNDING)
+    raise SweepUsageError(
+        f"the travel (={s.width_rad:.4f} rad) must be more than {s.motor_period_rad + LEAD_rad:.4f} rad, one ripple "
+        "period of the motor; see limits.position_min_rad and position_max_rad"
+    )
+
+
+def stroke_of(speed_radps: float, s: PlanSettings) -> Stroke:
+    """How a speed is measured within the travel; `SweepUsageError` if it cannot be."""
+    room = room_rad(speed_radps, s) * (1.0 - 1e-9)
+    joint, motor = s.joint_period_rad, s.motor_period_rad
+    if room < motor:
+        raise SweepUsageError(
+            f"speed (={speed_radps:.4g} rad/s) must be at most {fastest_radps(s):.4g} rad/s within a travel of "
+            f"{s.width_rad:.3f} rad at {s.acceleration_radps2:g} rad/s2; see --max-speed"
+        )
+    wanted = speed_radps * s.dwell_s
+    tooth = max(1, math.floor(wanted / (TEETH * motor) + 1e-9)) * motor
+    hop = joint / TEETH - tooth - _lead_rad(speed_radps, s)
+    if wanted * PATIENCE < joint and hop > 0.0 and room >= joint:
+        pitch = joint / TEETH
+        length = _ramps_rad(speed_radps, s) + _lead_rad(speed_radps, s) + (TEETH - 1) * pitch + tooth
+        return Stroke(speed_radps, tooth, TEETH, 1, pitch, length)
+    if room >= joint:
+        periods = max(1, round(wanted / joint))
+        window = min(periods, math.floor(room / joint)) * joint
+        strokes = math.ceil(periods * joint / window - 1e-9)
+    else:
+        periods = max(1, round(wanted / motor))
+        window = min(periods, math.floor(room / motor)) * motor
+        strokes = math.ceil(periods * motor / window - 1e-9)
+    length = _ramps_rad(speed_radps, s) + _lead_rad(speed_radps, s) + window
+    return Stroke(speed_radps, window, 1, min(strokes, MOST_STROKES), window, length)
+
+
+class _Builder:
+    """Collects table rows; keeps time, position and velocity of the end of what has been planned."""
+
+    def __init__(self, s: PlanSettings) -> None:
+        self._s = s
+        self._rows: list[tuple[float, float, float, float, float]] = []
+        self.t_s, self.q_rad, self.v_radps = 0.0, 0.0, 0.0
+        self.low_rad, self.high_rad = 0.0, 0.0
+
+    def _row(self, duration_s: float, acceleration: float) -> None:
+        if duration_s <= 0.0:
+            return
+        self._rows.append((self.t_s, self.q_rad, self.v_radps, 0.5 * acceleration, 0.0))
+        self.q_rad += duration_s * (self.v_radps + 0.5 * acceleration * duration_s)
+        self.t_s += duration_s
+        self.low_rad, self.high_rad = min(self.low_rad, self.q_rad), max(self.high_rad, self.q_rad)
+
+    def ramp(self, velocity_radps: float) -> None:
+        """To another velocity at the acceleration of the plan."""
+        change = velocity_radps - self.v_radps
+        acceleration = math.copysign(self._s.acceleration_radps2, change)
+        self._row(abs(change) / self._s.acceleration_radps2, acceleration)
+        self.v_radps = velocity_radps
+
+    def cruise(self, distance_rad: float) -> tuple[float, float]:
+        """A distance > 0 in the direction of motion at constant speed; returns start and end [s]."""
+        start_s = self.t_s
+        self._row(distance_rad / abs(self.v_radps), 0.0)
+        return start_s, self.t_s
+
+    def rest(self, duration_s: float) -> None:
+        self._row(duration_s, 0.0)
+
+    def hop(self, distance_rad: float) -> None:
+        """Quickly over a distance > 0 in the direction of motion, at the present speed again at its end."""
+        slow, a = self.v_radps, self._s.acceleration_radps2
+        peak = min(math.sqrt(slow * slow + a * distance_rad), max(self._s.transit_radps, abs(slow)))
+        ramps = (peak * peak - slow * slow) / a
+        self.ramp(math.copysign(peak, slow))
+        if distance_rad > ramps:
+            self.cruise(distance_rad - ramps)
+        self.ramp(slow)
+
+    def move_to(self, target_rad: float) -> None:
+        """From rest to rest."""
+        distance = target_rad - self.q_rad
+        if abs(distance) > 1e-12:
+            a = self._s.acceleration_radps2
+            peak = min(math.sqrt(a * abs(distance)), self._s.transit_radps)
+            self.ramp(math.copysign(peak, distance))
+            if abs(distance) > peak * peak / a:
+                self.cruise(abs(distance) - peak * peak / a)
+            self.ramp(0.0)
+            self.q_rad = target_rad  # rounding does not add up
+
+    def table(self) -> np.ndarray:
+        return np.array([*self._rows, (self.t_s, self.q_rad, 0.0, 0.0, 0.0)])
+
+
+def _measure(builder: _Builder, stroke: Stroke, direction: int, s: PlanSettings) -> list[tuple[float, float]]:
+    """One stroke from rest to rest; returns its windows."""
+    velocity = direction * stroke.speed_radps
+    builder.ramp(velocity)
+    spans = []
+    for tooth in range(stroke.teeth):
+        if tooth:
+            builder.hop(stroke.pitch_rad - stroke.window_rad - _lead_rad(stroke.speed_radps, s))
+        builder.cruise(_lead_rad(stroke.speed_radps, s))
+        spans.append(builder.cruise(stroke.window_rad))
+    builder.ramp(0.0)
+    return spans
+
+
+def plan_motion(points: list[SweepPoint], s: PlanSettings, warm_up_turns: float = 0.0) -> SweepMotion:
+    """The motion that visits `points` in their order; the two directions of a speed share their strokes."""
+    groups: list[list[SweepPoint]] = []
+    for point in points:
+        last = groups[-1] if groups else []
+        same = last and (abs(last[0].velocity_radps), last[0].pass_number) == (
+            abs(point.velocity_radps), point.pass_number,
+        )  # fmt: skip
+        if same and len(last) == 1 and last[0].direction != point.direction:
+            last.append(point)
+        else:
+            groups.append([point])
+    strokes = {abs(p.velocity_radps): stroke_of(abs(p.velocity_radps), s) for p in points}
+    builder = _Builder(s)
+    builder.rest(REVERSAL_s)
+    half = 0.5 * max((stroke.length_rad for stroke in strokes.values()), default=0.0)
+    left_rad = warm_up_turns * math.tau
+    side = 1.0
+    while left_rad > 0.0 and half > 0.0:
+        left_rad -= abs(side * half - builder.q_rad)
+        builder.move_to(side * half)
+        builder.rest(REVERSAL_s)
+        side = -side
+    windows: list[Window] = []
+    for group in groups:
+        stroke = strokes[abs(group[0].velocity_radps)]
+        for number in range(stroke.strokes):
+            for point in group:
+                builder.move_to(-point.direction * 0.5 * stroke.length_rad)
+                builder.rest(REVERSAL_s)
+                spans = _measure(builder, stroke, point.direction, s)
+                builder.rest(REVERSAL_s)
+                complete = number == stroke.strokes - 1
+                windows += [Window(point, *span, complete and span == spans[-1]) for span in spans]
+    builder.move_to(0.0)
+    builder.rest(REVERSAL_s)
+    return SweepMotion(builder.table(), tuple(windows), builder.low_rad, builder.high_rad)
+
+
+def shifted(motion: SweepMotion, middle_rad: float) -> SweepMotion:
+    """The same motion about another position."""
+    table = motion.table.copy()
+    table[:, 1] += middle_rad
+    return SweepMotion(table, motion.windows, motion.low_rad + middle_rad, motion.high_rad + middle_rad)

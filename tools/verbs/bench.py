@@ -1,0 +1,79 @@
+"""`jointctl bench`: the speed of this program against C, numpy and Python libraries, on this computer, in one run."""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from drivers.errors import JointctlError
+from tools.benchmarks.exchange_speed import exchange_rows
+from tools.benchmarks.law_speed import law_rows
+from tools.benchmarks.outcome import conditions, outcome_data, outcome_table, write_outcome
+from tools.benchmarks.paired import Row, skipped
+from tools.benchmarks.simulation_speed import lockstep_rows, swarm_rows
+from tools.benchmarks.start_speed import start_rows
+from tools.configuration.config import Config
+from tools.configuration.load import load_config, shipped_config
+from tools.configuration.records import axis_constants
+from tools.output import Output
+
+PARTS = ("law", "loop", "lockstep", "swarm", "start")
+
+
+class PartError(JointctlError):
+    """A part that does not exist was asked for."""
+
+    exit_code = 2
+
+
+def _part(name: str, config: Config, folder: Path, quick: bool) -> Iterator[Row]:
+    parts: dict[str, Callable[[], Iterator[Row]]] = {
+        "law": lambda: law_rows(axis_constants(config), folder, pairs=15 if quick else 61),
+        "loop": lambda: exchange_rows(
+            config, folder, pairs=1 if quick else 3, seconds=1.0 if quick else 2.0, quick=quick
+        ),
+        "lockstep": lambda: lockstep_rows(config, runs=3 if quick else 15),
+        "swarm": lambda: swarm_rows(pairs=1 if quick else 3, pyswarms_iterations=20 if quick else 100),
+        "start": lambda: start_rows(config, runs=2 if quick else 7, cold=not quick, every_verb=not quick),
+    }
+    return parts[name]()
+
+
+def bench(
+    output: Output,
+    *,
+    quick: bool = False,
+    out: Path | None = None,
+    only: Sequence[str] = (),
+    config_path: Path | None = None,
+) -> int:
+    """Measure and report; always 0, since a goal that is missed on a busy computer is no error.
+
+    `only`: names of `PARTS`, all if empty.  `out`: folder for bench.json and bench.png.  `quick` takes a minute or
+    two instead of about ten, with few pairs: no basis for a claim.  A virtual joint is started; no other is touched.
+    """
+    for name in only:
+        if name not in PARTS:
+            raise PartError(f"only (={name}) must be one of {', '.join(PARTS)}")
+    # under load the library tells of every SDO that it repeats; a failure comes as an exception anyway
+    logging.getLogger("canopen").setLevel(logging.CRITICAL)
+    config = load_config(config_path or shipped_config("virtual"))
+    found = conditions()
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory(prefix="jointctl-bench-") as folder:
+        for name in [part for part in PARTS if not only or part in only]:
+            output.note(f"  {name}")
+            try:
+                # one by one: what was measured before a part fails is kept
+                for row in _part(name, config, Path(folder), quick):
+                    rows.append(row)  # noqa: PERF402
+            except JointctlError as error:
+                rows.append(skipped(name, "the rest of this part", error.message))
+    data = outcome_data(rows, found)
+    output.result(outcome_table(rows), data)
+    if out is not None:
+        for path in write_outcome(out, rows, data):
+            output.note(f"wrote {path}")
+    return 0

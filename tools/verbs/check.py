@@ -1,0 +1,129 @@
+"""`jointctl check CONFIG`: is the control loop stable enough, and what does the theory promise?"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from tools.analysis.advice import Remedy, remedies
+from tools.analysis.linear_loop import LoopSettings
+from tools.analysis.loop_settings import Assumption, loop_settings, margin_settings, not_modelled
+from tools.analysis.margin_gate import learning_of, meets, refusal, refuse_diverging_learning
+from tools.analysis.margins import Margins, Theory, margins, theory
+from tools.configuration.config import Config
+from tools.output import Output
+
+
+def check(
+    config: Config,
+    output: Output,
+    delay_s: float | None = None,
+    *,
+    figure: Path | None = None,
+    allow_low_margin: bool = False,
+) -> int:
+    """Print the analysis; `MarginError` if the margin is too small.
+
+    `delay_s` is a measured loop delay (sample to torque command taking effect); `figure` a PNG to write;
+    `allow_low_margin` accepts a stable loop below the minimum.
+    """
+    minimum_deg = margin_settings(config).min_phase_margin_deg
+    settings, assumptions = loop_settings(config, delay_s)
+    found, ideal = margins(settings), theory(settings)
+    enough = meets(found, minimum_deg)
+    changes = [] if enough else remedies(settings, minimum_deg)
+    accepted = enough or (found.stable and allow_low_margin)
+    verdict = "ok" if enough else "below the minimum, accepted" if accepted else "too small"
+    table = _table(settings, found, ideal, assumptions, minimum_deg, verdict)
+    learning = learning_of(config, settings)
+    if learning is not None:
+        value = f"factor {learning.worst_factor:.2f} at {learning.worst_Hz:.1f} Hz"
+        table.add_row("learning", value, "what is left to learn after one repetition, below 1 it converges")
+    if figure is not None:
+        from tools.analysis.loop_figure import save_loop_figure
+
+        save_loop_figure(settings, figure, config.path.name, minimum_deg)
+        table.add_row("picture", str(figure), "")
+    output.result(table, _data(settings, found, ideal, assumptions, minimum_deg, verdict, changes, figure))
+    for text in not_modelled(config):
+        output.note(f"not in this analysis: {text}")
+    if not accepted:
+        raise refusal(settings, found, minimum_deg, changes)
+    refuse_diverging_learning(learning)
+    return 0
+
+
+def _table(
+    settings: LoopSettings,
+    found: Margins,
+    ideal: Theory,
+    assumptions: tuple[Assumption, ...],
+    minimum_deg: float,
+    verdict: str,
+) -> Table:
+    table = Table(title="Linear loop", title_justify="left")
+    for heading in ("quantity", "value", "note"):
+        table.add_column(heading, overflow="fold")  # a narrow terminal must not cut a number or a path
+    for a in assumptions:
+        table.add_row(a.name, f"{a.value:g} {a.unit}", a.origin)
+    table.add_section()
+    if ideal.p is not None and ideal.p_eigenvalues is not None:
+        p11, p12, p22 = ideal.p
+        table.add_row("P", f"{p11:.3f}  {p12:.6f}  {p22:.6f}", f"P11 P12 P22 for Q = diag{settings.q}")
+        table.add_row("eigenvalues of P", "{:.3f}  {:.3f}".format(*ideal.p_eigenvalues), "")
+        table.add_row("bound (30)", f"{ideal.bound_per_Nm:.4g}", "|x| for 1 Nm that the network cannot represent")
+        table.add_row("bound with |P B|", f"{ideal.tight_bound_per_Nm:.4g}", "the same, tighter")
+    table.add_row(
+        "modes, no delay",
+        f"{ideal.natural_frequency_radps:.1f} rad/s, damping {ideal.damping:.2f}",
+        "continuous time: the theory's loop, slowest mode " + f"{ideal.slowest_time_constant_s:.3g} s",
+    )
+    table.add_section()
+    table.add_row("stable", "yes" if found.stable else "NO", "with the delay, lag, filter and rate above")
+    if found.stable:
+        _add_margins(table, found)
+    if found.oscillation_Hz == found.oscillation_Hz:
+        oscillation = f"{found.oscillation_Hz:.2f} Hz, damping {found.oscillation_damping:.3f}"
+        table.add_row("oscillation", oscillation, "least damped pair of the sampled loop")
+    table.add_section()
+    table.add_row("verdict", verdict, f"at least {minimum_deg:g} deg wanted (margin.min_phase_margin_deg)")
+    return table
+
+
+def _add_margins(table: Table, found: Margins) -> None:
+    table.add_row("phase margin", f"{found.phase_margin_deg:.1f} deg", f"at {found.crossover_Hz:.2f} Hz")
+    table.add_row(
+        "gain margin up", f"x {found.gain_margin_up:.3g}", "inertia smaller, or torque constant larger, by this"
+    )
+    table.add_row("gain margin down", f"x {found.gain_margin_down:.3g}", "the other way")
+    table.add_row("delay margin", f"{found.delay_margin_s * 1e3:.2f} ms", "in addition to the loop delay above")
+    table.add_row("sensitivity peak Ms", f"{found.sensitivity_peak:.2f}", f"at {found.sensitivity_peak_Hz:.2f} Hz")
+    table.add_row("slowest mode", f"{found.slowest_time_constant_s:.3g} s", "time constant")
+
+
+def _data(
+    settings: LoopSettings,
+    found: Margins,
+    ideal: Theory,
+    assumptions: tuple[Assumption, ...],
+    minimum_deg: float,
+    verdict: str,
+    changes: list[Remedy],
+    figure: Path | None,
+) -> dict[str, Any]:
+    """For --json; a complex pole is a pair [real, imaginary]."""
+    measured = asdict(found)
+    measured["poles"] = [[pole.real, pole.imag] for pole in found.poles]
+    return {
+        "verdict": verdict,
+        "min_phase_margin_deg": minimum_deg,
+        "kind": settings.kind.name.lower(),
+        "assumptions": [asdict(a) for a in assumptions],
+        "theory": asdict(ideal),
+        "margins": measured,
+        "remedies": [{"change": r.text, "phase_margin_deg": r.phase_margin_deg} for r in changes],
+        "picture": None if figure is None else str(figure),
+    }

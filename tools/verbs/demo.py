@@ -1,0 +1,36 @@
+"""`jointctl demo`: the main job on a virtual joint in a process of its own; needs no hardware and no set-up."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from drivers.errors import ConfigurationError
+from tools.configuration.config import Config
+from tools.configuration.load import load_config, with_bus_overrides
+from tools.output import Output
+from tools.simulation.virtual_joint import separate_virtual_joint
+from tools.verbs.run import run
+
+LONGEST_S = 86_400.0
+
+
+def demo(config_path: Path, output: Output, *, duration_s: float | None = None) -> int:
+    """Start the virtual joint on a private bus, run the configuration on it, end it."""
+    config = load_config(config_path)
+    if config.virtual is None:
+        raise ConfigurationError(f"{config.path}: has no [virtual] section, so there is no virtual joint to move")
+    channel = f"demo-{os.getpid()}"
+    config = with_bus_overrides(config, interface="jointctl", channel=channel, environ={})
+    if duration_s is not None:
+        config = _with_duration(config, duration_s)
+    output.note("starting the virtual joint (the first start compiles, about a minute)")
+    with separate_virtual_joint(config_path, channel):
+        return run(config, output, assume_yes=True)
+
+
+def _with_duration(config: Config, duration_s: float) -> Config:
+    if not duration_s <= LONGEST_S:
+        raise ConfigurationError(f"--duration (={duration_s:g}) must be in [0.1..{LONGEST_S:g}] s")
+    trajectory = config.trajectory.model_copy(update={"duration_s": duration_s})
+    return config.model_copy(update={"trajectory": trajectory})

@@ -1,0 +1,80 @@
+"""`jointctl fault-campaign`: thousands of random faults against the virtual joint, faster than real time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from drivers.errors import ConfigurationError, DataError
+from tools.campaign.judge import judge
+from tools.campaign.report import rows_by_kind, table, violations, write_figure, write_json
+from tools.campaign.runner import run_campaign
+from tools.campaign.scenario import draw_scenario
+from tools.configuration.config import Config
+from tools.output import Output
+from tools.simulation.lockstep import LockstepJoint
+
+EXIT_VIOLATIONS = 10
+EXIT_INTERRUPTED = 130
+SHOWN = 20
+
+
+def fault_campaign(
+    config: Config,
+    output: Output,
+    *,
+    count: int = 10_000,
+    seed: int = 1,
+    scenario: int | None = None,
+    folder: Path = Path("fault-campaign"),
+    workers: int | None = None,
+) -> int:
+    """Run `count` scenarios, or replay one; 0 if nothing was violated, 10 if something was, 130 after Ctrl-C."""
+    if config.virtual is None or config.friction is None:
+        missing = "[virtual]" if config.virtual is None else "[friction]"
+        raise ConfigurationError(f"{config.path}: {missing} is missing: the campaign needs a virtual joint")
+    if config.virtual.faults:
+        raise ConfigurationError(f"{config.path}: [[virtual.faults]] must be empty: the campaign brings its own")
+    if scenario is not None:
+        return _replay(config, output, seed, scenario)
+    _prepare(folder)
+    with output.progress("fault campaign", float(count)) as advance:
+        verdicts, elapsed_s, interrupted = run_campaign(config.path, seed, count, advance, workers)
+    rows = rows_by_kind(verdicts)
+    found = violations(verdicts, seed)
+    if verdicts:
+        write_json(folder / "campaign.json", seed, verdicts, elapsed_s)
+        write_figure(folder / "campaign.png", verdicts, config.limits.velocity_max_radps)
+    data = {
+        "scenarios": len(verdicts), "violations": len(found), "seed": seed, "elapsed_s": round(elapsed_s, 1),
+        "interrupted": interrupted, "report": str(folder / "campaign.json"),
+    }  # fmt: skip
+    output.result(table(rows), data)
+    output.note(f"{len(verdicts)} scenarios in {elapsed_s:.0f} s, seed {seed}; report in {folder}")
+    for item in found[:SHOWN]:
+        output.warning(f"scenario {item['number']} ({item['kind']}): {'; '.join(item['violations'])}")
+    if found:
+        output.error(
+            f"{len(found)} of {len(verdicts)} scenarios violate an invariant",
+            f"replay one with: jointctl fault-campaign {config.path} --seed {seed} --scenario {found[0]['number']}",
+        )
+        return EXIT_VIOLATIONS
+    return EXIT_INTERRUPTED if interrupted else 0
+
+
+def _prepare(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{folder}: cannot be created: {error.strerror or error}") from None
+
+
+def _replay(config: Config, output: Output, seed: int, number: int) -> int:
+    """One scenario, with all that it consists of."""
+    chosen = draw_scenario(seed, number)
+    verdict = judge(config, LockstepJoint(config), chosen)
+    described = chosen.describe()
+    lines = [f"{key}: {value}" for key, value in described.items()]
+    lines += [f"told as {verdict.fault}, reaction {verdict.reaction}, greatest speed {verdict.peak_radps:.3f} rad/s"]
+    lines += [f"VIOLATION: {line}" for line in verdict.violations] or ["no invariant violated"]
+    output.result("\n".join(lines), {"scenario": described, "verdict": vars(verdict)})
+    return EXIT_VIOLATIONS if verdict.violations else 0

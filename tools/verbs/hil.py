@@ -1,0 +1,47 @@
+"""`jointctl hil CONFIG`: keep the virtual joint up, for jointctl or any other CAN tool to attach to."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import time
+
+from hil.bus import default_socket_path
+from tools.configuration.config import Config
+from tools.output import Output
+from tools.running.loop_process import become_realtime
+from tools.running.stop_signals import stop_signals
+from tools.simulation.virtual_joint import serve_virtual_joint
+
+_POLL_S = 0.05
+
+
+def hil(config: Config, output: Output, *, timing: bool = False, ready_fd: int | None = None) -> int:
+    """Serve until a stop signal; `ready_fd` gets one byte once the bus can be used, and its reader's end ends us."""
+    for line in become_realtime(None, config.loop.priority):
+        output.note(f"virtual joint: {line}")
+    with stop_signals() as signals, serve_virtual_joint(config, timing) as joint:
+        bus = config.bus
+        place = f"{bus.interface}:{bus.channel}"
+        if bus.interface == "jointctl":
+            place += f" ({default_socket_path(bus.channel)})"
+        output.note(f"virtual joint: node {config.canopen.node} on {place}; Ctrl-C ends it")
+        if bus.interface == "jointctl":
+            output.note(f'attach with python-can: can.Bus(interface="jointctl", channel="{bus.channel}")')
+        if ready_fd is not None:
+            os.set_blocking(ready_fd, False)
+            with contextlib.suppress(BrokenPipeError):
+                os.write(ready_fd, b"+")
+        while not signals.count and not joint.words[2] and not reader_gone(ready_fd):
+            time.sleep(_POLL_S)
+    return 0
+
+
+def reader_gone(ready_fd: int | None) -> bool:
+    """Whether whoever started us and waited on `ready_fd` has gone."""
+    if ready_fd is None:
+        return False
+    poll = select.poll()
+    poll.register(ready_fd, 0)
+    return bool(poll.poll(0))

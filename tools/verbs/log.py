@@ -1,0 +1,115 @@
+"""`jointctl log info | plot | export`: look at a run log without another program."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.console import Group
+from rich.table import Table
+
+from drivers.errors import DataError
+from tools.identification.friction_section import replace_file
+from tools.output import Output
+from tools.recording.log_export import FORMATS
+from tools.recording.log_facts import began_at, event_rows, level_name, missing_records
+from tools.recording.run_figure import save_run_figure
+from tools.recording.run_log import RunLog, read_run_log
+from tools.recording.run_summary import summarise, summary_table
+
+_SHOWN_EVENTS = 100
+
+
+def log_info(path: Path, output: Output) -> int:
+    """What the log holds, what was run, the summary of the run, its events."""
+    log = read_run_log(path)
+    summary = summarise(log.records)
+    drive = log.metadata.get("drive", {})
+    facts = {
+        "file": str(path),
+        "bytes": path.stat().st_size,
+        "complete": log.complete,
+        "began": began_at(log),
+        "configuration": log.metadata.get("run", {}).get("path", ""),
+        "records": len(log.records),
+        "missing_records": missing_records(log.records),
+        "events": len(log.events),
+        "can_frames": len(log.frames),
+    }
+    data = {
+        **facts,
+        "drive": drive,
+        "versions": log.metadata.get("versions", {}),
+        "friction_sha256": log.metadata.get("friction", {}).get("sha256", ""),
+        "summary": summary.to_dict(),
+        "event_list": [
+            {"time_ns": e.time_ns, "level": level_name(e), "source": e.source, "text": e.text} for e in log.events
+        ],
+    }
+    shown = [_facts_table(facts, drive), summary_table(summary), _event_table(log)]
+    output.result(Group(*shown[: 2 if not log.events else 3]), data)
+    if not log.complete:
+        output.warning(f"{path}: was cut off, its tail is lost")
+    return 0
+
+
+def _facts_table(facts: dict[str, Any], drive: dict[str, str]) -> Table:
+    table = Table(title="Log", show_header=False, title_justify="left")
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    for name, value in facts.items():
+        if value != "":
+            text = str(value) if not isinstance(value, bool) else "yes" if value else "no, cut off"
+            table.add_row(name.replace("_", " "), text)
+    identity = ", ".join(
+        f"{key} {drive[key]}" for key in ("name", "vendor", "product", "serial", "mode") if drive.get(key)
+    )
+    if identity:
+        table.add_row("drive", identity)
+    return table
+
+
+def _event_table(log: RunLog) -> Table:
+    rows = event_rows(log)
+    left_out = len(rows) - _SHOWN_EVENTS
+    table = Table(title="Events", title_justify="left", caption=f"and {left_out} more" if left_out > 0 else None)
+    table.add_column("time [s]", justify="right")
+    for heading in ("level", "source", "text"):
+        table.add_column(heading, overflow="fold")
+    for at, level, source, text in rows[:_SHOWN_EVENTS]:
+        style = {"error": "red", "warning": "yellow"}.get(level)
+        table.add_row(at, level, source, text, style=style)
+    return table
+
+
+def log_plot(path: Path, output: Output, out: Path | None = None) -> int:
+    """The picture of the run as a PNG; by default beside the log."""
+    log = read_run_log(path)
+    target = _target(path, out, ".png")
+    save_run_figure(log.records, target, path.stem)
+    output.result(str(target), {"picture": str(target)})
+    return 0
+
+
+def log_export(path: Path, output: Output, format: str, out: Path | None = None) -> int:
+    """Write the log in another format (see `log_export.FORMATS`); by default beside the log."""
+    if format not in FORMATS:
+        raise DataError(f"format (={format!r}) must be one of {', '.join(FORMATS)}")
+    ending, content = FORMATS[format]
+    log = read_run_log(path)
+    target = _target(path, out, ending)
+    replace_file(target, content(log, path))
+    count = len(log.frames) if format == "candump" else len(log.records)
+    output.result(str(target), {"file": str(target), "format": format, "rows": count})
+    if not log.complete:
+        output.warning(f"{path}: was cut off, its tail is lost")
+    return 0
+
+
+def _target(path: Path, out: Path | None, ending: str) -> Path:
+    target = out if out is not None else path.with_suffix(ending)
+    if target.resolve() == path.resolve():
+        raise DataError(f"{target}: is the log itself and would be overwritten", "choose another -o")
+    if not target.parent.is_dir():
+        raise DataError(f"{target}: cannot be written: no folder {target.parent}")
+    return target

@@ -1,0 +1,81 @@
+"""`jointctl report LOG...`: one self-contained page about one run, or about several beside each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from drivers.errors import DataError
+from firmware_py.states import Fault
+from tools.output import Output
+from tools.recording.run_log import RunLog, read_run_log
+from tools.recording.run_summary import RunSummary, summarise
+from tools.reporting.comparison import comparison
+from tools.reporting.page import Block, Details, Paragraph, Section, check_target, page, write_page
+from tools.reporting.run_figures import run_figures
+from tools.reporting.run_tables import events_table, figure_tables, what_ran
+
+MOST_LOGS = 6  # columns that fit on a page
+
+
+def report(paths: Sequence[Path], output: Output, out: Path | None = None) -> int:
+    """Write the page, by default beside the first log; returns the exit code."""
+    if not 1 <= len(paths) <= MOST_LOGS:
+        raise DataError(f"number of logs (={len(paths)}) must be in [1..{MOST_LOGS}]")
+    target = out if out is not None else paths[0].with_suffix(".html" if len(paths) == 1 else ".comparison.html")
+    check_target(target, paths)
+    logs = [read_run_log(path) for path in paths]
+    for path, log in zip(paths, logs, strict=True):
+        if len(log.records) < 2:
+            raise DataError(f"{path}: nothing to report, the run has {len(log.records)} records")
+    names = log_names(paths)
+    html = page(" and ".join(names), report_sections(names, logs), subtitle=", ".join(str(path) for path in paths))
+    write_page(target, html, paths)
+    output.result(str(target), {"report": str(target), "logs": [str(path) for path in paths]})
+    return 0
+
+
+def log_names(paths: Sequence[Path]) -> list[str]:
+    """Short and all different."""
+    stems = [path.stem for path in paths]
+    return [stem if stems.count(stem) == 1 else f"{stem} ({i})" for i, stem in enumerate(stems, 1)]
+
+
+def report_sections(names: Sequence[str], logs: Sequence[RunLog]) -> list[Section]:
+    """The body of the page."""
+    summaries = [summarise(log.records) for log in logs]
+    verdicts = [
+        Paragraph(verdict(name, s), "" if s.fault == Fault.NONE.name else "error")
+        for name, s in zip(names, summaries, strict=True)
+    ]
+    sections = [
+        Section("What ran", [*verdicts, what_ran(names, logs)]),
+        Section("In numbers", figure_tables(names, logs, summaries)),
+    ]
+    if len(logs) > 1:
+        sections.append(Section("Side by side", comparison(names, [log.records for log in logs])))
+    for name, log in zip(names, logs, strict=True):
+        title = "Figures" if len(logs) == 1 else f"Figures of {name}"
+        sections.append(Section(title, run_figures(log.records)))
+        events: list[Block] = [events_table(log)] if log.events else [Paragraph("The log holds no events.")]
+        sections.append(Section("Events" if len(logs) == 1 else f"Events of {name}", events))
+    details = [
+        Details(f"Configuration of {name}", log.metadata["run"]["configuration"])
+        for name, log in zip(names, logs, strict=True)
+        if log.metadata.get("run", {}).get("configuration")
+    ]
+    return [*sections, Section("Configuration", details)] if details else sections
+
+
+def verdict(name: str, summary: RunSummary) -> str:
+    """The run in one sentence."""
+    if summary.fault != Fault.NONE.name:
+        return f"{name} was ended by the fault {summary.fault} after {summary.tracked_s:.1f} s of tracking."
+    if summary.error is None:
+        return f"{name} never tracked."
+    low, high = summary.error.range_rad.least * 1e3, summary.error.range_rad.greatest * 1e3
+    return (
+        f"{name} tracked {summary.tracked_s:.1f} s without a fault: error {low:.3f} to {high:.3f} mrad, "
+        f"RMSE {summary.error.rmse_rad * 1e3:.3f} mrad, {summary.skipped_cycles} of "
+        f"{summary.cycles + summary.skipped_cycles} cycles skipped."
+    )

@@ -1,0 +1,100 @@
+"""`jointctl run CONFIG`: track the configured trajectory on a real or virtual joint."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from drivers.drive import CommissioningReport
+from drivers.errors import JointctlError
+from tools.configuration.config import Config
+from tools.output import Output
+from tools.running.envelope import motion_envelope
+from tools.running.live_panel import Display, run_display
+from tools.running.run_report import INTERRUPTED, report_run
+from tools.running.shared_block import SERIAL
+from tools.running.supervisor import Supervisor
+
+
+class UsageError(JointctlError):
+    """The command line asks for something that cannot be done as it stands."""
+
+    exit_code = 2
+
+
+def log_path(config: Config) -> Path:
+    """A new name in the log folder: configuration and local time."""
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    folder = Path(config.log.folder)
+    path = folder / f"{config.path.stem}-{stamp}.mcap"
+    number = 1
+    while path.exists():
+        number += 1
+        path = folder / f"{config.path.stem}-{stamp}-{number}.mcap"
+    return path
+
+
+def _ask(output: Output) -> bool:
+    output.note("Move the joint? [y/N] ")
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+
+def run(
+    config: Config,
+    output: Output,
+    *,
+    assume_yes: bool,
+    dry_run: bool = False,
+    allow_low_margin: bool = False,
+    scope: tuple[str, int] | None = None,
+) -> int:
+    """Commission, show the motion envelope, ask, track, report; returns the exit code.
+
+    `scope`: host and port at which a live page is to be served.
+    """
+    if not (assume_yes or dry_run or sys.stdin.isatty()):
+        raise UsageError("this moves the joint and there is no terminal to ask on", "give -y to move without asking")
+
+    def confirm(report: CommissioningReport) -> bool:
+        for line in motion_envelope(config, report):
+            output.note(line)
+        if dry_run:
+            output.note("dry run: nothing moves; the drive was commissioned and is disabled")
+            return False
+        return assume_yes or _ask(output)
+
+    title = f"{config.path.stem}: {config.trajectory.kind}"
+    with _displays(config, output, title, scope) as display:
+        supervisor = Supervisor(
+            config, output, log_path(config), confirm, allow_low_margin=allow_low_margin, display=display
+        )
+        try:
+            result = supervisor.run()
+        except KeyboardInterrupt:
+            output.note("interrupted; nothing moved")
+            return INTERRUPTED
+    if result is None:
+        if not dry_run:
+            output.note("nothing moved; the drive is disabled")
+        return 0
+    return report_run(result, output, title)
+
+
+@contextmanager
+def _displays(
+    config: Config, output: Output, title: str, scope: tuple[str, int] | None
+) -> Iterator[Callable[[], Display]]:
+    """What shows the run: the terminal, and the page if one is wanted."""
+    terminal = run_display(output, title)
+    if scope is None:
+        yield terminal
+        return
+    from tools.scoping.feed import Displays, scope_order, scope_server
+
+    order = scope_order(title, *scope, cia402=config.bus.interface != SERIAL)
+    output.note(f"scope: {order.url}")
+    with scope_server(order) as feed:
+        yield lambda: Displays([terminal(), feed])

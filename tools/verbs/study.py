@@ -1,0 +1,122 @@
+"""`jointctl study`: many random joints, many controllers, one table."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+from rich.markup import escape
+from rich.table import Table
+
+from tools.configuration.load import load_config, shipped_config
+from tools.experiments.controllers import controller_config
+from tools.experiments.study_runs import StudyResult, quantile, run_study, write_csv
+from tools.experiments.study_settings import StudySettings, study_controllers
+from tools.output import Output
+
+INTERRUPTED = 130
+_COLUMNS = (
+    ("peak_mrad", "peak"),
+    ("rmse_mrad", "RMSE"),
+    ("true_peak_mrad", "true peak"),
+    ("true_rmse_mrad", "true RMSE"),
+    ("settling_s", "settling [s]"),
+)
+
+
+def study(
+    settings: StudySettings,
+    output: Output,
+    *,
+    workers: int | None = None,
+    csv: Path | None = None,
+    figure: Path | None = None,
+) -> int:
+    """Run the study and print medians with 5-95 % ranges; `csv` and `figure` are files to write.
+
+    Ctrl-C keeps the plants that are done, says so, and gives exit code 130.
+    """
+    base_path = Path(settings.base)
+    base = load_config(base_path if base_path.exists() else shipped_config(settings.base))
+    controllers = study_controllers(settings)
+    for controller in controllers:
+        controller_config(base, controller)  # a contradiction is to be told before an hour of simulation
+    title = f"{settings.plants} plants, seed {settings.seed}, {settings.scenario}"
+    with output.progress(title, settings.plants) as advance:
+        result = run_study(
+            base,
+            controllers,
+            plants=settings.plants,
+            seed=settings.seed,
+            settings=settings.plant,
+            scenario=settings.scenario,
+            after_s=settings.after_s,
+            workers=workers,
+            progress=advance,
+        )
+    done = len(result.plants)
+    if result.interrupted:
+        title = f"INTERRUPTED: {done} of {title}"
+        output.warning(f"interrupted: only {done} of {settings.plants} plants are in the result")
+    if done:
+        if csv is not None:
+            write_csv(result, csv)
+        if figure is not None:
+            from tools.experiments.study_figure import save_study_figure
+
+            save_study_figure(result, figure, f"{title}, after {settings.after_s:g} s")
+        output.result(_table(result, title, settings.after_s), study_data(result, settings))
+        for path in (csv, figure):
+            if path is not None:
+                output.note(f"written: {path}")
+    return INTERRUPTED if result.interrupted else 0
+
+
+def _text(values: tuple[float, float, float], digits: int = 3) -> str:
+    median, low, high = values
+    if not math.isfinite(median):
+        return "never" if median > 0 else "-"
+    texts = [f"{x:.{digits}g}" if math.isfinite(x) else "never" for x in (median, low, high)]
+    return f"{texts[0]} ({texts[1]}..{texts[2]})"
+
+
+def _table(result: StudyResult, title: str, after_s: float) -> Table:
+    table = Table(
+        title=escape(f"{title}: errors after {after_s:g} s [mrad], median (5..95 %)"),
+        caption="peak and RMSE as the encoder shows them; true: of the joint itself; "
+        "settling: until the error stays within 1 mrad",
+        title_justify="left",
+        caption_justify="left",
+    )
+    table.add_column("controller", overflow="fold")
+    for _, heading in _COLUMNS:
+        table.add_column(escape(heading), justify="right")
+    table.add_column("faults", justify="right")
+    for name in result.controllers:
+        cells = [_text(spread(result, name, key)) for key, _ in _COLUMNS]
+        table.add_row(escape(name), *cells, str(result.faults(name)))
+    return table
+
+
+def spread(result: StudyResult, controller: str, figure: str) -> tuple[float, float, float]:
+    """(median, 5 %, 95 %) over the plants; a run ended by a fault counts as infinitely bad."""
+    values = result.values(controller, figure)
+    return quantile(values, 0.5), quantile(values, 0.05), quantile(values, 0.95)
+
+
+def study_data(result: StudyResult, settings: StudySettings) -> dict[str, Any]:
+    """For --json; null stands for infinite (a fault, or never settled)."""
+    rows = {}
+    for name in result.controllers:
+        row: dict[str, Any] = {"faults": result.faults(name)}
+        for key, _ in _COLUMNS:
+            median, low, high = spread(result, name, key)
+            row[key] = {"median": median, "p5": low, "p95": high}
+        rows[name] = row
+    return {
+        "interrupted": result.interrupted,
+        "plants_done": len(result.plants),
+        "settings": settings.model_dump(),
+        "controllers": rows,
+    }
