@@ -19,25 +19,14 @@ from drivers.errors import BusError
 from tools.analysis.wake_up import fifo, wake_up_lateness_ns
 from tools.configuration.config import Config
 from tools.configuration.load import load_config, shipped_config
+from tools.inspection import bus_health, computer
+from tools.inspection.bus_health import SDO_READS, adapters, bus_budget, drive_finding, sdo_round_trips_us
+from tools.inspection.computer import kernel_cache, kernel_findings, wake_up
+from tools.inspection.findings import NOTE, OK, PROBLEM, Finding
 from tools.output import Output
 from tools.running import start_time
 from tools.verbs import doctor as doctor_module
-from tools.verbs.doctor import (
-    NOTE,
-    OK,
-    PROBLEM,
-    SDO_READS,
-    Finding,
-    adapters,
-    bus_budget,
-    doctor,
-    drive_finding,
-    findings,
-    kernel_cache,
-    kernel_findings,
-    sdo_round_trips_us,
-    wake_up,
-)
+from tools.verbs.doctor import doctor, findings
 
 
 @pytest.fixture(scope="module")
@@ -88,13 +77,13 @@ class SdoBus:
 
 @pytest.fixture
 def short_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor_module, "_SDO_TIMEOUT_S", 0.01)
+    monkeypatch.setattr(bus_health, "_SDO_TIMEOUT_S", 0.01)
 
 
 class TestComputer:
     @pytest.mark.parametrize(("text", "status"), [("1\n", OK), ("0\n", NOTE), (None, NOTE)])
     def test_preempt_rt(self, tmp_path: Path, text: str | None, status: str, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(doctor_module.platform, "version", lambda: "#1 SMP PREEMPT_DYNAMIC")
+        monkeypatch.setattr(computer.platform, "version", lambda: "#1 SMP PREEMPT_DYNAMIC")
         if text is not None:
             write(tmp_path, "sys/kernel/realtime", text)
         kernel = next(kernel_findings(tmp_path))
@@ -145,7 +134,7 @@ class TestWakeUp:
         self, config: Config, worst_us: int, status: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         late = np.array([10_000] * 99 + [worst_us * 1000])
-        monkeypatch.setattr(doctor_module, "wake_up_lateness_ns", lambda rate, cycles: late)
+        monkeypatch.setattr(computer, "wake_up_lateness_ns", lambda rate, cycles: late)
         found = next(wake_up(config, 100))
         assert found.status == status
         assert (found.numbers["p50_us"], found.numbers["max_us"]) == (10.0, worst_us)
@@ -160,7 +149,7 @@ class TestCache:
 
     def test_cold_is_not_started_unless_asked(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         started: list[Path | None] = []
-        monkeypatch.setattr(doctor_module, "start_time_s", lambda cache: float(not started.append(cache)))
+        monkeypatch.setattr(computer, "start_time_s", lambda cache: float(not started.append(cache)))
         (found,) = kernel_cache(tmp_path, False)
         assert (found.status, found.numbers["warm"], started) == (NOTE, False, [])
         write(tmp_path, "firmware_py_1/realtime.run_loop-86.py311.1.nbc", "12345678")
@@ -178,7 +167,7 @@ class TestCache:
         def failing(cache: Path | None) -> float:
             raise subprocess.CalledProcessError(1, "python", stderr=b"Traceback\nImportError: no numba\n")
 
-        monkeypatch.setattr(doctor_module, "start_time_s", failing)
+        monkeypatch.setattr(computer, "start_time_s", failing)
         write(tmp_path, "x/realtime.run_loop-86.py311.1.nbc", "1")
         assert list(kernel_cache(tmp_path, False))[1].text == "the loop cannot be started: ImportError: no numba"
 
@@ -238,7 +227,7 @@ class TestBus:
         self, config: Config, answers: int, status: str, asked: int, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         bus = SdoBus(config.drive.node, answers)
-        monkeypatch.setattr(doctor_module, "open_python_can", lambda *_: bus)
+        monkeypatch.setattr(bus_health, "open_python_can", lambda *_: bus)
         found = drive_finding(config)
         assert (found.status, len(bus.sent), bus.closed) == (status, asked, True)
 
@@ -249,7 +238,7 @@ class TestBus:
             raise can.CanOperationError("bus off")
 
         monkeypatch.setattr(bus, "send", fail)
-        monkeypatch.setattr(doctor_module, "open_python_can", lambda *_: bus)
+        monkeypatch.setattr(bus_health, "open_python_can", lambda *_: bus)
         found = drive_finding(config)
         assert (found.status, bus.closed) == (PROBLEM, True)
         assert "bus off" in found.text
@@ -258,7 +247,7 @@ class TestBus:
         def fail(*_: Any) -> None:
             raise BusError("no virtual bus", "start one")
 
-        monkeypatch.setattr(doctor_module, "open_python_can", fail)
+        monkeypatch.setattr(bus_health, "open_python_can", fail)
         assert drive_finding(config) == Finding("drive", NOTE, "not asked: no virtual bus", "start one")
 
 
@@ -288,7 +277,7 @@ class TestReport:
         ]
 
     def test_on_this_computer(self, config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(doctor_module, "start_time_s", lambda cache: 1.0)
+        monkeypatch.setattr(computer, "start_time_s", lambda cache: 1.0)
         elsewhere = changed(config, channel="nobody-listens-here")
         found = list(findings(elsewhere, wake_cycles=10))
         topics = [f.topic for f in found]
