@@ -24,6 +24,7 @@ from tools.configuration.config import Config
 from tools.configuration.records import axis_constants, trajectory_table
 from tools.output import Output
 from tools.recording.can_log import frame_array
+from tools.recording.kept_records import KeptRecords
 from tools.recording.run_log import RunLogWriter
 from tools.recording.run_metadata import run_metadata
 from tools.recording.run_summary import RunSummary, summarise
@@ -135,10 +136,10 @@ class Supervisor:
     def _supervise(
         self, drive: Drive, loop: LoopHandle, report: CommissioningReport, signals: StopSignals
     ) -> RunResult:
-        chunks: list[Any] = []
         self._events = self._event_finder(loop)
         with (
             RunLogWriter(self._log_path, run_metadata(self._config, report)) as log,
+            KeptRecords(self._log_path.parent) as kept,
             self._make_display() as self._display,
         ):
             constants = self._constants(loop, report)
@@ -148,11 +149,11 @@ class Supervisor:
             loop.go(constants, drive.port())
             try:
                 while loop.running():
-                    self._watch(loop, log, chunks, signals)
+                    self._watch(loop, log, kept, signals)
                     time.sleep(POLL_S)
             except MotionFault as error:
                 state = drive.make_safe()
-                self._take_records(loop, log, chunks)
+                self._take_records(loop, log, kept)
                 log.write_event(ERROR, "supervisor", str(error))
                 raise MotionFault(error.message, f"{error.hint}; drive state now: {state}") from None
             except BaseException:
@@ -160,11 +161,11 @@ class Supervisor:
                 raise
             elapsed_s = (time.monotonic_ns() - started_ns) * 1e-9
             state = drive.make_safe()
-            self._take_records(loop, log, chunks)
+            self._take_records(loop, log, kept)
             log.write_event(INFORMATION, "drive", f"after the run: {state}")
             if self._recorder is not None and self._recorder.dropped:
                 log.write_event(WARNING, "log", f"{self._recorder.dropped} CAN frames were not recorded: too slow")
-            return self._result(loop, chunks, signals, state, elapsed_s)
+            return self._result(loop, kept, signals, state, elapsed_s)
 
     def _event_finder(self, loop: LoopHandle) -> EventFinder:
         """Events in the words that fit the drive; a fault with the value that the loop has latched."""
@@ -201,14 +202,14 @@ class Supervisor:
                 loop.beat()
                 time.sleep(POLL_S)
 
-    def _take_records(self, loop: LoopHandle, log: RunLogWriter, chunks: list[Any]) -> None:
+    def _take_records(self, loop: LoopHandle, log: RunLogWriter, kept: KeptRecords) -> None:
         frames = self._recorder.new_frames() if self._recorder is not None else []
         if frames:
             log.write_frames(frame_array(frames))
         records = loop.new_records()
         if not len(records):
             return
-        self._keep(records, log, chunks)
+        self._keep(records, log, kept)
         for event in self._events.take(records):
             log.write_event(event.level, event.source, event.text, event.time_ns)
             self._display.event(event)
@@ -223,18 +224,18 @@ class Supervisor:
             )
         )
 
-    def _keep(self, records: Any, log: RunLogWriter, chunks: list[Any]) -> None:
-        """What becomes of new records: the log, and `chunks` for the summary at the end."""
-        chunks.append(records)
+    def _keep(self, records: Any, log: RunLogWriter, kept: KeptRecords) -> None:
+        """What becomes of new records: the log, and `kept` for the summary at the end."""
+        kept.append(records)
         log.write_records(records)
 
-    def _watch(self, loop: LoopHandle, log: RunLogWriter, chunks: list[Any], signals: StopSignals) -> None:
+    def _watch(self, loop: LoopHandle, log: RunLogWriter, kept: KeptRecords, signals: StopSignals) -> None:
         loop.beat()
         viewer = self._display.stop_request()
         request = max(signals.request, viewer)
         if request is not StopRequest.NONE:
             loop.request_stop(request)
-        self._take_records(loop, log, chunks)
+        self._take_records(loop, log, kept)
         if request is not self._asked:
             self._asked = request
             if not signals.name:
@@ -248,11 +249,11 @@ class Supervisor:
             self._display.phase(phase_name(phase))
 
     def _result(
-        self, loop: LoopHandle, chunks: list[Any], signals: StopSignals, drive_state: str, elapsed_s: float
+        self, loop: LoopHandle, kept: KeptRecords, signals: StopSignals, drive_state: str, elapsed_s: float
     ) -> RunResult:
-        if not chunks:
+        if not len(kept):
             raise JointctlError("the loop ended without one cycle")
-        records = np.concatenate(chunks).view(np.recarray)
+        records = kept.records()
         state = loop.block.state[0]
         fault = Fault(int(state.fault))
         text = None

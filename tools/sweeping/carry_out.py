@@ -24,6 +24,7 @@ from tools.configuration.config import Config
 from tools.configuration.elmo import ElmoSerial
 from tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_constants
 from tools.output import Output
+from tools.recording.kept_records import KeptRecords
 from tools.recording.run_log import RunLogWriter
 from tools.running.loop_handle import LoopHandle
 from tools.running.open_drive import loop_delay_s
@@ -152,11 +153,11 @@ class SweepSupervisor(Supervisor):
             self._display.note(text)
             loop.allow_enable()
 
-    def _keep(self, records: Any, log: RunLogWriter, chunks: list[Any]) -> None:
+    def _keep(self, records: Any, log: RunLogWriter, kept: KeptRecords) -> None:
         chosen = records[-self._seen % LOG_EVERY :: LOG_EVERY]
         self._seen += len(records)
         if len(chosen):
-            chunks.append(chosen)
+            kept.append(chosen)
             log.write_records(chosen)
         self._meter.feed(records)
         with contextlib.suppress(OSError):  # the terminal may have been closed

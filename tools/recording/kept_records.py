@@ -1,0 +1,67 @@
+"""The log records of a run until its summary: a minute of them in memory, a longer run in a file without a name.
+
+An hour at 1 kHz is 1.2 GB; the supervisor's memory must not grow with the run.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Self
+
+import numpy as np
+
+from firmware_py.records import LogRecord
+from firmware_py.schema import dtype_of
+
+IN_MEMORY = 60_000  # records: 20 MB
+
+
+class KeptRecords:
+    """Takes arrays of LogRecord in order of time, gives them back as one.  The file is gone when this is closed."""
+
+    def __init__(self, folder: Path, in_memory: int = IN_MEMORY) -> None:
+        self._folder, self._in_memory = folder, in_memory
+        self._parts: list[Any] = []
+        self._count = 0
+        self._file: IO[bytes] | None = None
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def in_file(self) -> bool:
+        """Whether they have been moved to a file."""
+        return self._file is not None
+
+    def append(self, records: Any) -> None:
+        """Keep `records` (array of LogRecord, shape (N,)); `OSError` if the disk is full."""
+        self._count += len(records)
+        self._parts.append(records)
+        if self._file is None and self._count <= self._in_memory:
+            return
+        if self._file is None:
+            self._file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115 closed in close()
+        for part in self._parts:
+            self._file.write(np.ascontiguousarray(part).tobytes())
+        self._parts.clear()
+
+    def records(self) -> Any:
+        """All of them: record array of LogRecord, shape (N,); of a long run a view of the file, read-only."""
+        if self._file is None:
+            kept = np.concatenate(self._parts) if self._parts else np.zeros(0, dtype_of(LogRecord))
+            return kept.view(np.recarray)
+        self._file.flush()
+        return np.memmap(self._file, dtype_of(LogRecord), mode="r", shape=(self._count,)).view(np.recarray)
+
+    def close(self) -> None:
+        """Let go of the file; arrays that `records` has given stay valid."""
+        if self._file is not None:
+            self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, _: TracebackType | None) -> None:
+        self.close()
