@@ -126,7 +126,7 @@ class Cia402Device:
         alive = self.device[0].nmt not in (NmtState.BOOT_UP, NmtState.STOPPED)
         return bool(identifier == 0x600 + self.settings.node_id and alive)
 
-    def answer_sdo(self, frame: bytes) -> list[bytes]:
+    def answer_sdo(self, frame: bytes, now_ns: int) -> list[bytes]:
         """SDO response frames; the core notices what was written at its next `advance`."""
         resets = int(self.device[0].application_resets)
         if resets != self._resets:
@@ -134,7 +134,13 @@ class Cia402Device:
             self.objects.restore_strings()
             self.sdo = SdoServer(self.objects, self._write)
         size = min(frame[4], 8)
-        responses = self.sdo.handle(frame[8 : 8 + size])
+        return self._sdo_frames(self.sdo.handle(frame[8 : 8 + size], now_ns))
+
+    def expire_sdo(self, now_ns: int) -> list[bytes]:
+        """The abort frame of an SDO transfer whose client has fallen silent, if there is one."""
+        return self._sdo_frames(self.sdo.expire(now_ns))
+
+    def _sdo_frames(self, responses: list[bytes]) -> list[bytes]:
         return [struct.pack("<IB3x8s", 0x580 + self.settings.node_id, 8, data) for data in responses]
 
     def _take_queue(self) -> list[bytes]:
@@ -146,7 +152,7 @@ class Cia402Device:
     def advance(self, now_ns: int) -> list[bytes]:
         """Run drive and plant up to `now_ns`; the frames (16 bytes each) that were sent meanwhile."""
         advance(self.device[0], self.plant_constants[0], self.plant_state[0], now_ns, self.queue[0])
-        return self._take_queue()
+        return self._take_queue() + self.expire_sdo(now_ns)
 
     def handle(self, frame: bytes, now_ns: int) -> list[bytes]:
         """Take one frame (16 bytes) from the bus at `now_ns`; the frames sent up to then, then the answers to it."""
@@ -154,7 +160,7 @@ class Cia402Device:
             raise ValueError(f"frame length (={len(frame)}) must be {FRAME_SIZE}")
         sent = self.advance(now_ns)
         if self.is_sdo_request(frame):
-            responses = self.answer_sdo(frame)
+            responses = self.answer_sdo(frame, now_ns)
             self.device[0].next_due_ns = 0
             return sent + self.advance(now_ns) + responses
         self._frame[:] = np.frombuffer(frame, np.uint8)

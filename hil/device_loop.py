@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno as errno_codes
 import socket
 import threading
+import time
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,7 @@ ENDED_WORD = 2  # 1 = stopped, 2 = the bus has gone
 WORDS = 3
 
 _LONGEST_WAIT_NS = 2_000_000  # faults of the plant are seen at least this often
+_SDO_LOOK_S = 0.1
 _FRAMES_AT_ONCE = 64  # received before timers are looked at again
 
 
@@ -216,10 +218,20 @@ class RealtimeDevice:
         )
 
     def _serve(self, service: socket.socket) -> None:
-        """Answer SDO requests until the other end closes."""
+        """Answer SDO requests until the other end closes; an unfinished transfer is looked at now and then."""
+        device = self._device
         with service:
-            while frame := service.recv(FRAME_SIZE):
-                for response in self._device.answer_sdo(frame):
+            while True:
+                service.settimeout(_SDO_LOOK_S if device.sdo.busy else None)
+                try:
+                    frame = service.recv(FRAME_SIZE)
+                except TimeoutError:
+                    responses = device.expire_sdo(time.monotonic_ns())
+                else:
+                    if not frame:
+                        return
+                    responses = device.answer_sdo(frame, time.monotonic_ns())
+                for response in responses:
                     service.send(response)
 
     def start(self) -> None:

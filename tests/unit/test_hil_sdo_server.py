@@ -102,7 +102,7 @@ def test_toggle_unknown_command_and_stray_segment(device: Cia402Device) -> None:
     assert ask(device, bytes.fromhex("4008100000000000"))[0] == 0x41
     assert ask(device, bytes.fromhex("7000000000000000"))[4:] == struct.pack("<I", 0x05030000)
     assert ask(device, bytes.fromhex("6000000000000000"))[4:] == struct.pack("<I", 0x05040001)
-    assert ask(device, bytes.fromhex("a008100000000000"))[4:] == struct.pack("<I", 0x05040001)
+    assert ask(device, bytes.fromhex("e008100000000000"))[4:] == struct.pack("<I", 0x05040001)
     assert device.sdo.handle(bytes.fromhex("8008100000000000")) == []
     assert device.sdo.handle(b"\x40") == []
 
