@@ -131,6 +131,9 @@ class AxisConstants:
     velocity_command: VelocityCommandConstants
 
 
+LINE_GONE = 1_000_000  # of `Sample.bus_errors`: more than any limit
+
+
 @record
 class Sample:
     """One reading of the drive, in the units of the joint; filled by a driver."""
@@ -143,7 +146,7 @@ class Sample:
     status_word: i4  # as the drive sent it, for the log
     drive_error: i4  # the drive's own error code, 0 = none
     restarts: i4  # boot-ups of the drive seen since the loop began
-    bus_errors: i4  # sends that failed in a row
+    bus_errors: i4  # sends that failed in a row; LINE_GONE where nothing will ever be heard or said again
 
 
 @record

@@ -12,7 +12,7 @@ import numpy as np
 
 from firmware_py.computed_torque import reset_law
 from firmware_py.kernel import kernel
-from firmware_py.records import AxisConstants, AxisState, Command, Sample
+from firmware_py.records import LINE_GONE, AxisConstants, AxisState, Command, Sample
 from firmware_py.safety import motion_fault, reaction_to
 from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction, StopRequest
 from firmware_py.trajectory import plan_approach, reference_at
@@ -162,7 +162,13 @@ def released_torque_Nm(constants: AxisConstants, state: AxisState, elapsed_cycle
 
 @kernel
 def step_stopping(constants: AxisConstants, state: AxisState, sample: Sample) -> None:
-    """QUICK_STOPPING and DISABLING end when the drive says that its power stage is off, or when it never does."""
+    """QUICK_STOPPING and DISABLING end when the drive says that its power stage is off, or when it never does.
+
+    Without a line there is nothing to wait for: the supervisor shall tell the user at once.
+    """
+    if sample.bus_errors >= LINE_GONE and state.phase >= AxisPhase.QUICK_STOPPING:
+        enter(state, AxisPhase.FINISHED)
+        return
     off = sample.drive_state == DriveState.OFF or sample.drive_state == DriveState.FAULT
     off = off and state.sample_age_cycles == 0 and state.phase_cycle > ANSWER_CYCLES
     if state.phase == AxisPhase.QUICK_STOPPING:

@@ -63,10 +63,9 @@ class ElmoDevice:
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._origin_s = 0.0
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self.path = os.ttyname(self._slave)
+        self._master = self._slave = -1
+        self.path = ""
+        self.plug_in()
 
     # --- life ---
 
@@ -110,6 +109,14 @@ class ElmoDevice:
                     with contextlib.suppress(OSError):
                         os.close(fd)
             self._master = self._slave = -1
+
+    def plug_in(self) -> None:
+        """The port (again), under a new `path`."""
+        with self._lock:
+            self._master, self._slave = os.openpty()
+            tty.setraw(self._slave)
+            os.set_blocking(self._master, False)
+            self.path = os.ttyname(self._slave)
 
     def restart_drive(self) -> None:
         """The drive loses its supply for a moment."""

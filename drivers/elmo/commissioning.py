@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 
@@ -60,8 +61,7 @@ class ElmoCommissioning:
             remarks.append("the motor was on: it has been switched off")
         self._motor_off()
         self._refuse_fault()
-        for name, value in (("UM", int(UnitMode.TORQUE)), ("RM", 0)):
-            found[name] = f"{line.assign_verified(name, value):g}"
+        found.update(self._torque_mode())
         self._write_limits(found, remarks)
         self._compare_counts(found)
         measured = self.measure()
@@ -131,6 +131,25 @@ class ElmoCommissioning:
         self._line.assign("MO", 0)
         if self._line.integer("MO") != 0:
             raise DeviceError("MO (=1) of the drive does not become 0: the motor cannot be switched off")
+
+    def _torque_mode(self) -> dict[str, str]:
+        """UM=1 without the analog reference (RM=0), and TC known to be zero: MO=1 then applies no torque.
+
+        Before every MO=1; the motor is off.  Raises `DeviceError` where the drive does not confirm it.
+        """
+        line = self._line
+        found = {n: f"{line.assign_verified(n, v):g}" for n, v in (("UM", int(UnitMode.TORQUE)), ("RM", 0))}
+        kept_A = line.number("TC")
+        if kept_A != 0.0:
+            with contextlib.suppress(RefusedError):  # most drives take TC only with the motor on
+                line.assign("TC", 0)
+            kept_A = line.number("TC")
+        if kept_A != 0.0:
+            raise DeviceError(
+                f"TC (={kept_A:g}) of the drive must be 0 with the motor off: it would push at MO=1",
+                "switch the drive's supply off and on",
+            )
+        return found
 
     def _refuse_fault(self) -> None:
         """A drive that could not be enabled anyway; nothing is reset here."""

@@ -19,9 +19,9 @@ import math
 
 import numpy as np
 
-from drivers.elmo.port import EXPECTED_MAX, OUT_MAX, PORT_GONE, TEXT_MAX, ElmoPort, Question
+from drivers.elmo.port import EXPECTED_MAX, OUT_MAX, TEXT_MAX, ElmoPort, Question
 from firmware_py.kernel import kernel
-from firmware_py.records import Command, Sample
+from firmware_py.records import LINE_GONE, Command, Sample
 from firmware_py.states import DriveRequest, DriveState
 
 SILENT_CYCLES = 3
@@ -125,7 +125,7 @@ def begin_cycle(port: ElmoPort, sample: Sample) -> None:
     port.heard_bytes = 0
     if port.quiet == 0:
         put_command(port, Question.PX, 0, -1)
-    sample.bus_errors = PORT_GONE if port.gone != 0 else port.consecutive_failures
+    sample.bus_errors = LINE_GONE if port.gone != 0 else port.consecutive_failures
 
 
 @kernel
@@ -184,4 +184,4 @@ def note_written(port: ElmoPort, sample: Sample, error: int) -> None:
         port.consecutive_failures += 1
         port.send_failures += 1
         port.last_errno = error
-    sample.bus_errors = PORT_GONE if port.gone != 0 else port.consecutive_failures
+    sample.bus_errors = LINE_GONE if port.gone != 0 else port.consecutive_failures

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
+from drivers.drive import DriveIdentity
 from drivers.elmo.codes import (
     AMPLIFIER_MASK,
     FAULT_LATCHED,
-    MOTOR_MUST_BE_ON,
     UnitMode,
     motor_off_cause,
     status_text,
 )
 from drivers.elmo.commissioning import ElmoCommissioning
-from drivers.elmo.dialogue import RefusedError
+from drivers.elmo.inspection import Fact, read_facts
 from drivers.elmo.port import ElmoPort
+from drivers.elmo.switch_off import switch_off
 from drivers.errors import DeviceError, JointctlError
 from firmware_py.schema import new
 
-SAFE_ATTEMPTS = 5
 ENABLE_RETRY_S = 0.5
 
 
@@ -56,7 +56,7 @@ class ElmoDrive(ElmoCommissioning):
         line.assign("PM", 1)
         for name in ("AC", "DC", "SD"):
             line.assign_verified(name, round(acceleration_radps2 * per_rad))
-        line.assign("JV", 0)
+        line.assign_verified("JV", 0)
         line.assign("MO", 1, attempts=1)
         if line.integer("MO") != 1:
             raise DeviceError(f"the motor does not switch on: {self.fault_report()}")
@@ -72,6 +72,20 @@ class ElmoDrive(ElmoCommissioning):
         position_rad = (line.integer("PX") - settings.zero_counts) * settings.rad_per_count
         return position_rad, line.number("VX") * settings.rad_per_count, line.number("IQ") * settings.torque_NmpA
 
+    # --- looking without touching ---
+
+    def identify(self) -> DriveIdentity:
+        """Who answers; raises as `commission` does where nobody or another drive does.  Nothing is written."""
+        return self._identify()
+
+    def facts(self) -> list[Fact]:
+        """Everything that it tells about itself; after `identify`."""
+        return read_facts(self._line, self._settings)
+
+    def status(self) -> tuple[int, int]:
+        """(SR, MF) now."""
+        return self._line.integer("SR"), self._line.integer("MF")
+
     # --- the end ---
 
     def fault_report(self) -> str:
@@ -84,7 +98,7 @@ class ElmoDrive(ElmoCommissioning):
         if not self._taken:
             return "untouched"
         try:
-            return self._off()
+            return switch_off(self._byte_port, self._line)
         except JointctlError as error:
             return f"unknown: {error.message}; only the drive's own limits stop it now, use the emergency stop"
 
@@ -96,7 +110,8 @@ class ElmoDrive(ElmoCommissioning):
     def clear_fault(self) -> str:
         """See `Drive.clear_fault`.  MF and the latch in SR are cleared by MO=1 alone: in torque mode, with TC at zero.
 
-        So the motor is on for the time of one exchange, without torque, and is switched off again.
+        So the motor is on for the time of one exchange, without torque, and is switched off again.  Before that UM=1,
+        RM=0 and TC=0 have been read back: without that confirmation MO=1 is not said.
         """
         line = self._line
         self._identify()
@@ -108,7 +123,7 @@ class ElmoDrive(ElmoCommissioning):
         cause = motor_off_cause(status, fault)
         if status & AMPLIFIER_MASK:
             raise DeviceError(f"the fault cannot be cleared while its cause remains: {cause}")
-        line.assign_verified("UM", int(UnitMode.TORQUE))
+        self._torque_mode()
         try:
             line.assign("MO", 1, attempts=1)
         finally:
@@ -119,29 +134,6 @@ class ElmoDrive(ElmoCommissioning):
         if status & (FAULT_LATCHED | AMPLIFIER_MASK):
             raise DeviceError(f"the fault came back: {motor_off_cause(status, fault)}")
         return f"cleared: {cause}"
-
-    def _off(self) -> str:
-        line = self._line
-        line.interpreter.echo = None  # a drive that restarted has its own setting again
-        error: JointctlError | None = None
-        # at once and unheard, before any time is spent on a line that may be in disorder
-        self._byte_port.write(b"\rTC=0\rST\rMO=0\r")
-        for _ in range(SAFE_ATTEMPTS):
-            try:
-                line.resynchronise()
-                for command in ("TC=0", "ST", "MO=0"):
-                    try:
-                        line.ask(command.encode() + b"\r", 1)
-                    except RefusedError as refusal:
-                        if command == "MO=0" and refusal.code != MOTOR_MUST_BE_ON:
-                            raise
-                if line.integer("MO") == 0:
-                    status = line.integer("SR")
-                    cause = motor_off_cause(status, line.integer("MF"))
-                    return "off" if not status & (FAULT_LATCHED | AMPLIFIER_MASK) else f"off, fault: {cause}"
-            except JointctlError as failure:
-                error = failure
-        raise error or DeviceError("MO of the drive does not become 0")
 
     def close(self) -> None:
         """Leave the port."""

@@ -16,8 +16,6 @@ OUT_MAX = 64  # bytes of one write
 READ_MAX = 256
 SCRATCH_WORDS = 8
 
-PORT_GONE = 1_000_000  # `Sample.bus_errors` when the port has vanished: no point in counting up to a limit
-
 
 class Question(IntEnum):
     """The commands of the cyclic exchange; index into the table of their letters."""

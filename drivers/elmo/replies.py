@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from drivers.elmo.line_budget import BITS_PER_CHARACTER
 from drivers.elmo.port import EXPECTED_MAX, LINE_MAX, ElmoPort, Question
 from drivers.position_counts import WRAP, take_counts
 from firmware_py.kernel import kernel
 from firmware_py.records import Sample
 from firmware_py.states import DriveState
 
-BITS_PER_CHARACTER = 10  # 8N1
 NOTHING = -1
 FAULT_CAUSE_CYCLES = 4  # status replies to wait for MF before a fault is told without its cause
 _DIGITS_MAX = 17

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 import serial
 
+from drivers.elmo.port_users import users_text
 from drivers.errors import BusError
 
 READ_MAX = 512
@@ -32,12 +33,17 @@ class BytePort(Protocol):
 
 
 class SerialPort:
-    """8N1, no flow control.  Locked against a second `jointctl`; the loop process opens the same port without lock."""
+    """8N1, no flow control.  Locked against a second `jointctl`; the loop process opens the same port without lock.
 
-    def __init__(self, path: str, baud_rate_bitps: int) -> None:
+    `exclusive` False is for whoever has to switch the drive off whoever has the port.
+    """
+
+    def __init__(self, path: str, baud_rate_bitps: int, *, exclusive: bool = True) -> None:
         self.path = path
         try:
-            self._serial: Any = serial.Serial(path, baud_rate_bitps, timeout=0, write_timeout=1.0, exclusive=True)
+            self._serial: Any = serial.Serial(
+                path, baud_rate_bitps, timeout=0, write_timeout=1.0, exclusive=True if exclusive else None
+            )
         except (serial.SerialException, OSError, ValueError, termios.error) as error:
             raise _open_error(path, baud_rate_bitps, error) from None
 
@@ -97,7 +103,11 @@ def _open_error(path: str, baud_rate_bitps: int, error: Exception) -> BusError:
     if number in (errno.EACCES, errno.EPERM):
         return BusError(f"no permission to open {path}", "add the user to the group dialout and log in again")
     if number in (errno.EAGAIN, errno.EBUSY) or "lock" in str(error):
-        return BusError(f"serial port {path} is in use by another program", "end that program first")
+        users = users_text(path)
+        return BusError(
+            f"serial port {path} is in use by another program{f' ({users})' if users else ''}",
+            "end that program first; `jointctl stop` switches the drive off all the same",
+        )
     if number == errno.ENOTTY or "configure port" in str(error):
         return BusError(f"{path} is not a serial port")
     if isinstance(error, ValueError):

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from firmware_py.axis import step_axis
-from firmware_py.records import AxisState, Command, Sample
+from firmware_py.records import LINE_GONE, AxisState, Command, Sample
 from firmware_py.schema import new
 from firmware_py.sequence import reset_axis
 from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, FeedForward, Reaction, StopRequest
@@ -436,6 +436,21 @@ def test_bus_errors(rig: NewRig, errors: int, trips: bool) -> None:
         assert_fault(run, Fault.BUS_ERROR, Reaction.QUICK_STOP)
     else:
         assert_well(run)
+
+
+def test_without_a_line_the_run_ends_at_once(rig: NewRig) -> None:
+    run = rig(0.0).until(AxisPhase.TRACKING)
+    run.sample.bus_errors = LINE_GONE
+    run.tick()
+    assert_fault(run, Fault.BUS_ERROR, Reaction.QUICK_STOP)
+    assert run.state.phase == AxisPhase.FINISHED
+
+
+def test_with_a_line_that_only_fails_it_goes_on_stopping(rig: NewRig) -> None:
+    run = rig(0.0).until(AxisPhase.TRACKING)
+    run.sample.bus_errors = LINE_GONE - 1
+    run.tick()
+    assert run.state.phase == AxisPhase.QUICK_STOPPING
 
 
 @pytest.mark.parametrize("moves", [True, False])

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from drivers.elmo.cyclic import begin_cycle, current_mA, end_cycle, note_written, put_command
 from drivers.elmo.interpreter import ReplyKind, parse_reply
-from drivers.elmo.port import EXPECTED_MAX, LINE_MAX, PORT_GONE, ElmoPort, Question
+from drivers.elmo.port import EXPECTED_MAX, LINE_MAX, ElmoPort, Question
 from drivers.elmo.replies import parse_number, take_byte
-from firmware_py.records import Command, Sample
+from firmware_py.records import LINE_GONE, Command, Sample
 from firmware_py.schema import new
 from firmware_py.states import DriveRequest, DriveState
 from hil.elmo_commands import ElmoDeviceSettings
@@ -232,7 +232,7 @@ class TestFaultsOfTheLine:
         assert talk.sample.bus_errors == 1
         talk.port.gone = 1
         begin_cycle(talk.port, talk.sample)
-        assert talk.sample.bus_errors == PORT_GONE
+        assert talk.sample.bus_errors == LINE_GONE
 
     @settings(max_examples=150, deadline=None)
     @given(st.lists(st.binary(max_size=24), max_size=20), st.booleans())

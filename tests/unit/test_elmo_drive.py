@@ -144,6 +144,12 @@ class TestCommissioning:
             (lambda line, reply: b"CL[1]\r4.9;" if line == b"CL[1]" else reply, DeviceError, "does not read back"),
             (lambda line, reply: b"HL[2]\r1;" if line == b"HL[2]" else reply, DeviceError, "HL[2]"),
             (lambda line, reply: b"UM=1\r\x02?;" if line == b"UM=1" else reply, DeviceError, "bad command"),
+            (
+                lambda line, reply: b"TC\r1.5;" if line == b"TC" else reply,
+                DeviceError,
+                "TC (=1.5) of the drive must be 0",
+            ),
+            (lambda line, reply: b"RM\r1;" if line == b"RM" else reply, DeviceError, "RM (=0) does not read back"),
             (lambda line, reply: b"PX\rtwo;" if line == b"PX" else reply, DeviceError, "is not a number"),
         ],
     )
@@ -219,6 +225,40 @@ class TestClearFault:
         with pytest.raises(DeviceError, match="undervoltage"):
             port.drive().clear_fault()
         assert b"MO=1" not in port.commands
+
+    def test_the_motor_goes_on_only_after_torque_zero_was_read_back(self, port: MemoryPort) -> None:
+        port.device.m.motor_fault = 0x200000
+        port.device.execute(b"RM=1")
+        port.drive().clear_fault()
+        before = port.commands[: port.commands.index(b"MO=1")]
+        assert before[-5:] == [b"UM=1", b"UM", b"RM=0", b"RM", b"TC"]
+        after = port.commands[len(before) + 1 :]
+        assert after[:4] == [b"", b"TC=0", b"MO=0", b""]
+
+    @pytest.mark.parametrize(
+        ("spoilt", "reply", "words"),
+        [
+            (b"TC", b"TC\r0.500;", r"TC \(=0.5\) of the drive must be 0 with the motor off"),
+            (b"TC", b"TC\r:?;", "refused TC: EC 58"),
+            (b"RM", b"RM\r1;", r"RM \(=0\) does not read back"),
+            (b"UM", b"UM\r2;", r"UM \(=1\) does not read back"),
+            (b"MO", b"MO\r1;", "cannot be switched off"),
+        ],
+    )
+    def test_without_that_confirmation_it_stays_off(
+        self, port: MemoryPort, spoilt: bytes, reply: bytes, words: str
+    ) -> None:
+        port.device.m.motor_fault = 0x200000
+        port.answer = lambda line, good: reply if line == spoilt else good
+        with pytest.raises(DeviceError, match=words):
+            port.drive().clear_fault()
+        assert b"MO=1" not in port.commands
+
+    def test_a_torque_command_that_can_be_set_to_zero_is(self, port: MemoryPort) -> None:
+        port.device.m.motor_fault = 0x200000
+        kept = [b"0.500", b"0.000"]
+        port.answer = lambda line, good: b"TC\r" + kept.pop(0) + b";" if line == b"TC" else good
+        assert "motor stuck" in port.drive().clear_fault()
 
     def test_a_fault_that_comes_back_is_told(self, port: MemoryPort) -> None:
         def answer(line: bytes, reply: bytes) -> bytes:

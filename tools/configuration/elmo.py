@@ -49,7 +49,7 @@ class ElmoSerial(Section):
     limit_margin: Annotated[float, between(0.0, 2.0)] = 0.2  # HL, LL lie outside [limits] by this share
     speed_error_radps: Annotated[float, between(0.0, 1000.0, open_low=True)]  # ER[2], at the joint
     position_error_rad: Annotated[float, between(0.0, 10.0, open_low=True)]  # ER[3], at the joint
-    dead_man_s: Annotated[float, between(0.0, 1.0, open_low=True)] = 0.05  # torque zero after so long without position
+    dead_man_s: Annotated[float, between(0.0, 0.5, open_low=True)] = 0.05  # torque zero after so long without position
     counts_parameter: Annotated[str, AfterValidator(_counts_parameter)] | None = None  # compared with counts_per_turn
 
 

@@ -14,9 +14,9 @@ from contextlib import contextmanager
 from typing import Any
 
 from drivers.elmo.serial_port import open_descriptor
+from drivers.elmo.switch_off import SWITCH_OFF
 
 _FOREVER = 1 << 62
-_SWITCH_OFF = b"\rTC=0\rST\rMO=0\r"
 
 
 def serial_call(block: Any, period_ns: int, receive_ns: int) -> Callable[[int], int]:
@@ -54,7 +54,7 @@ def serial_loop(order: Any, block: Any) -> Iterator[Callable[[], object]]:
             call(_FOREVER)
         finally:
             with contextlib.suppress(OSError):
-                os.write(fd, _SWITCH_OFF)
+                os.write(fd, SWITCH_OFF)
             os.close(fd)
 
     yield go

@@ -1,0 +1,45 @@
+"""Who has a serial port open: asked of the system, so that nobody has to guess a process."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class PortUser:
+    """A process with the port open, ourselves not among them."""
+
+    pid: int
+    name: str
+
+
+def port_users(path: str, proc: Path = Path("/proc")) -> list[PortUser]:
+    """As far as this user may look into other processes; empty where the system has no /proc."""
+    real = os.path.realpath(path)
+    found = []
+    for folder in proc.glob("[0-9]*"):
+        pid = int(folder.name)
+        if pid == os.getpid():
+            continue
+        try:
+            if any(os.readlink(link) == real for link in (folder / "fd").iterdir()):
+                found.append(PortUser(pid, _name(folder)))
+        except OSError:  # gone, or another user's
+            continue
+    return sorted(found, key=lambda user: user.pid)
+
+
+def _name(folder: Path) -> str:
+    """The program as its command line tells it."""
+    words = [Path(word).name for word in (folder / "cmdline").read_text(errors="replace").split("\0") if word]
+    for at, word in enumerate(words):
+        if word == "-m" and at + 1 < len(words):
+            return words[at + 1]
+    return next((word for word in words if not word.startswith(("-", "python"))), words[0] if words else "?")
+
+
+def users_text(path: str) -> str:
+    """`jointctl, pid 1234`; empty where nobody is to be seen."""
+    return "; ".join(f"{user.name}, pid {user.pid}" for user in port_users(path))

@@ -1,0 +1,39 @@
+"""Torque zero and motor off on a serial line, for whoever has to say it: drive, loop, guard, `jointctl stop`."""
+
+from __future__ import annotations
+
+from drivers.elmo.codes import AMPLIFIER_MASK, FAULT_LATCHED, MOTOR_MUST_BE_ON, motor_off_cause
+from drivers.elmo.dialogue import Dialogue, RefusedError
+from drivers.elmo.serial_port import BytePort
+from drivers.errors import DeviceError, JointctlError
+
+SAFE_ATTEMPTS = 5
+# TC before MO: where the drive takes no MO=0 it is without torque all the same.  The first CR ends a half command.
+SWITCH_OFF = b"\rTC=0\rST\rMO=0\r"
+
+
+def switch_off(port: BytePort, line: Dialogue, attempts: int = SAFE_ATTEMPTS) -> str:
+    """TC=0, ST, MO=0 until MO reads 0; returns `off`, or `off, fault: ...`.
+
+    Raises the last error where the drive did not confirm; it has been told all the same, as far as the port took it.
+    """
+    line.interpreter.echo = None  # a drive that restarted has its own setting again
+    error: JointctlError | None = None
+    # at once and unheard, before any time is spent on a line that may be in disorder
+    port.write(SWITCH_OFF)
+    for _ in range(attempts):
+        try:
+            line.resynchronise()
+            for command in ("TC=0", "ST", "MO=0"):
+                try:
+                    line.ask(command.encode() + b"\r", 1)
+                except RefusedError as refusal:
+                    if command == "MO=0" and refusal.code != MOTOR_MUST_BE_ON:
+                        raise
+            if line.integer("MO") == 0:
+                status = line.integer("SR")
+                cause = motor_off_cause(status, line.integer("MF"))
+                return "off" if not status & (FAULT_LATCHED | AMPLIFIER_MASK) else f"off, fault: {cause}"
+        except JointctlError as failure:
+            error = failure
+    raise error or DeviceError("MO of the drive does not become 0")
