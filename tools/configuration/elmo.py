@@ -13,34 +13,40 @@ from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
 from drivers.errors import ConfigurationError
-from tools.configuration.sections import Ampere, Direction, Section, between
+from tools.configuration.sections import Ampere, Direction, Rule, Section, between
 
 KIND = "elmo_serial"
 INTERFACE = "serial"  # `Config.bus.interface` of a serial drive
 BAUD_RATES_bitps = (9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600)
 
 
+BAUD_RATES_TEXT = "one of " + ", ".join(map(str, BAUD_RATES_bitps))
+
+
 def _baud_rate(value: int) -> int:
     if value not in BAUD_RATES_bitps:
-        raise PydanticCustomError("baud", "must be one of {rates}", {"rates": ", ".join(map(str, BAUD_RATES_bitps))})
+        raise PydanticCustomError("baud", "must be {rates}", {"rates": BAUD_RATES_TEXT})
     return value
+
+
+COUNTS_PARAMETER_TEXT = 'a parameter with an index, such as "CA[18]"'
 
 
 def _counts_parameter(value: str) -> str:
     if not re.fullmatch(r"[A-Z]{2}\[\d{1,3}\]", value):
-        raise PydanticCustomError("parameter", 'must be a parameter with an index, such as "CA[18]"')
+        raise PydanticCustomError("parameter", f"must be {COUNTS_PARAMETER_TEXT}")
     return value
 
 
 class ElmoSerial(Section):
     """An Elmo drive on RS-232 or USB serial, spoken to over its ASCII interpreter."""
 
-    kind: Literal["elmo_serial"]
+    kind: Literal["elmo_serial"]  # an Elmo drive on its serial line
     port: Annotated[str, Field(min_length=1)]  # as the system names it
-    baud_rate_bitps: Annotated[int, AfterValidator(_baud_rate)]
+    baud_rate_bitps: Annotated[int, AfterValidator(Rule(BAUD_RATES_TEXT, _baud_rate))]  # as the drive is set
     echo: bool = True  # EO: replies carry their command, which proves what they answer; false is faster
     reply_timeout_s: Annotated[float, between(0.01, 2.0)] = 0.2  # of one command during commissioning
-    product: Annotated[str, Field(min_length=1)] | None = None  # VR must contain it; None = any
+    product: Annotated[str, Field(min_length=1)] | None = None  # VR must contain it; none = any
     ampere: Ampere = "sine_amplitude"  # of TC and IQ
     continuous_current_A: Annotated[float, between(0.0, 1000.0, open_low=True)]  # CL[1]
     peak_current_A: Annotated[float, between(0.0, 1000.0, open_low=True)]  # PL[1]
@@ -50,7 +56,9 @@ class ElmoSerial(Section):
     speed_error_radps: Annotated[float, between(0.0, 1000.0, open_low=True)]  # ER[2], at the joint
     position_error_rad: Annotated[float, between(0.0, 10.0, open_low=True)]  # ER[3], at the joint
     dead_man_s: Annotated[float, between(0.0, 0.5, open_low=True)] = 0.05  # torque zero after so long without position
-    counts_parameter: Annotated[str, AfterValidator(_counts_parameter)] | None = None  # compared with counts_per_turn
+    counts_parameter: Annotated[str, AfterValidator(Rule(COUNTS_PARAMETER_TEXT, _counts_parameter))] | None = (
+        None  # compared with counts_per_turn
+    )
 
 
 def with_serial_bus(data: Any) -> Any:

@@ -1,0 +1,37 @@
+"""docs/configuration.md is what the models say now, and leaves nothing out."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+from tools.configuration.config import Config
+from tools.configuration.reference import reference, rows_of
+from tools.configuration.sections import Limits
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_page_is_up_to_date() -> None:
+    told = "is stale: python -m tools.configuration.reference docs/configuration.md"
+    assert (ROOT / "docs" / "configuration.md").read_text() == reference(), told
+
+
+def test_every_key_has_a_meaning() -> None:
+    rows = [line for line in reference().splitlines() if line.startswith("| `")]
+    assert len(rows) > 150
+    assert [row for row in rows if row.endswith("|  |")] == []
+
+
+def test_a_row_tells_what_the_model_checks_with() -> None:
+    rows = {row[0]: row[1:] for row in rows_of(Limits)}
+    assert rows["`torque_max_Nm`"][:4] == ("Nm", "number", "(0..100000]", "required")
+
+
+def test_every_section_and_key_of_a_shipped_configuration_is_in_it() -> None:
+    text = reference()
+    for file in sorted((ROOT / "configs").glob("*.toml")):
+        for name, section in tomllib.loads(file.read_text()).items():
+            assert f"## [{name}]" in text, file
+            assert all(f"| `{key}` |" in text for key, value in section.items() if not isinstance(value, dict)), file
+    assert all(f"## [{name}]" in text for name in Config.model_fields)
