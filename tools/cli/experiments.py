@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from tools.cli.options import Json, Quiet, loaded
+from tools.cli.options import COMPARE, Json, Quiet, loaded
 from tools.output import Output
 
 
@@ -30,7 +30,7 @@ def study(
     file: Annotated[Path | None, typer.Option("--file", help="TOML with plants, seed and controllers")] = None,
     plants: Annotated[int | None, typer.Option("--plants", help="how many random plants")] = None,
     seed: Annotated[int | None, typer.Option("--seed")] = None,
-    after: Annotated[float | None, typer.Option("--after", help="errors are taken after this time [s]")] = None,
+    after: Annotated[float | None, typer.Option("--after", help="errors are taken after this time (s)")] = None,
     scenario: Annotated[str | None, typer.Option("--scenario", help="sine, frequency, amplitude or load")] = None,
     controller: Annotated[
         list[str] | None, typer.Option("--controller", help="name or configuration file; may be repeated")
@@ -95,7 +95,7 @@ def bench(
 
 def register(app: typer.Typer) -> None:
     """Add the verbs."""
-    app.command()(paper)
-    app.command()(study)
-    app.command("fault-campaign")(fault_campaign)
-    app.command()(bench)
+    app.command(rich_help_panel=COMPARE)(paper)
+    app.command(rich_help_panel=COMPARE)(study)
+    app.command("fault-campaign", rich_help_panel=COMPARE)(fault_campaign)
+    app.command(rich_help_panel=COMPARE)(bench)

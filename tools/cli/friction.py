@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tools.cli.options import Json, Quiet
+from tools.cli.options import FRICTION, Json, Quiet
 from tools.cli.sweep_command import sweep_command
 from tools.output import Output
 
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 Data = Annotated[Path, typer.Argument(metavar="DATA", help="CSV of velocity plateaus, from sweep or elsewhere")]
 VelocityColumn = Annotated[str | None, typer.Option("--velocity-column", help="name of the velocity column")]
-TorqueColumn = Annotated[str | None, typer.Option("--torque-column", help="name of the torque column [Nm]")]
-CurrentColumn = Annotated[str | None, typer.Option("--current-column", help="name of the current column [A]")]
+TorqueColumn = Annotated[str | None, typer.Option("--torque-column", help="name of the torque column (Nm)")]
+CurrentColumn = Annotated[str | None, typer.Option("--current-column", help="name of the current column (A)")]
 VelocityUnit = Annotated[str | None, typer.Option("--velocity-unit", help="deg/s, rad/s or r/min")]
 Side = Annotated[str | None, typer.Option("--side", help="of the velocity: joint or motor")]
 TorqueSide = Annotated[str | None, typer.Option("--torque-side", help="motor or joint")]
 Ratio = Annotated[float | None, typer.Option("--ratio", help="reduction ratio")]
-TorqueConstant = Annotated[float | None, typer.Option("--torque-constant", help="of the motor [Nm/A]")]
+TorqueConstant = Annotated[float | None, typer.Option("--torque-constant", help="of the motor (Nm/A)")]
 Delimiter = Annotated[str, typer.Option("--delimiter", help="between columns: auto, or the character")]
 Model = Annotated[str, typer.Option("--model", help="multi-stage, stribeck, coulomb-viscous, or auto (held-out error)")]
 
@@ -53,7 +53,7 @@ def _radps(speed_degps: float | None) -> float | None:
 
 def identify(
     data: Data,
-    into: Annotated[Path | None, typer.Option("--into", help="configuration whose [friction] to replace")] = None,
+    into: Annotated[Path | None, typer.Option("--into", help="configuration whose friction section to replace")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="TOML file to write instead")] = None,
     config: Annotated[Path | None, typer.Option("--config", help="configuration to check plausibility against")] = None,
     velocity_column: VelocityColumn = None,
@@ -68,11 +68,11 @@ def identify(
     model: Model = "multi-stage",
     continuous: Annotated[bool, typer.Option("--continuous", help="let the two stages meet at the knees")] = False,
     search_knee: Annotated[bool, typer.Option("--search-knee", help="search the knees as well")] = False,
-    knee: Annotated[float, typer.Option("--knee", help="speed at which the stages change [deg/s of the joint]")] = 40.0,
-    ws_min: Annotated[float | None, typer.Option("--ws-min", help="least Stribeck speed [deg/s]")] = None,
-    ws_max: Annotated[float, typer.Option("--ws-max", help="greatest Stribeck speed [deg/s]")] = 20.0,
+    knee: Annotated[float, typer.Option("--knee", help="speed at which the stages change (deg/s of the joint)")] = 40.0,
+    ws_min: Annotated[float | None, typer.Option("--ws-min", help="least Stribeck speed (deg/s)")] = None,
+    ws_max: Annotated[float, typer.Option("--ws-max", help="greatest Stribeck speed (deg/s)")] = 20.0,
     static_max: Annotated[
-        float | None, typer.Option("--static-max", help="greatest static friction [Nm, motor]")
+        float | None, typer.Option("--static-max", help="greatest static friction (Nm, motor)")
     ] = None,
     outlier_threshold: Annotated[float, typer.Option("--outlier-threshold", help="robust deviations; 0 = off")] = 5.0,
     folds: Annotated[int, typer.Option("--folds", help="of the held-out error")] = 10,
@@ -114,7 +114,9 @@ def identify(
 
 
 def validate(
-    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="configuration with the identified [friction]")],
+    config: Annotated[
+        Path, typer.Argument(metavar="CONFIG", help="configuration with the identified friction section")
+    ],
     data: Data,
     figure: Annotated[Path | None, typer.Option("--figure", help="PNG to write")] = None,
     velocity_column: VelocityColumn = None,
@@ -141,6 +143,6 @@ def validate(
 
 def register(app: typer.Typer) -> None:
     """Add the verbs."""
-    app.command("sweep")(sweep_command)
-    app.command()(identify)
-    app.command()(validate)
+    app.command("sweep", rich_help_panel=FRICTION)(sweep_command)
+    app.command(rich_help_panel=FRICTION)(identify)
+    app.command(rich_help_panel=FRICTION)(validate)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tools.cli.options import Json, Quiet
+from tools.cli.options import LOOK, Json, Quiet
 from tools.output import Output
 
 LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="run log (MCAP)")]
@@ -75,6 +75,6 @@ def scope(
 
 def register(app: typer.Typer) -> None:
     """Add the verbs."""
-    app.add_typer(log_app, name="log")
-    app.command()(report)
-    app.command()(scope)
+    app.add_typer(log_app, name="log", rich_help_panel=LOOK)
+    app.command(rich_help_panel=LOOK)(report)
+    app.command(rich_help_panel=LOOK)(scope)

@@ -13,6 +13,8 @@ from tools.cli import experiments as cli_experiments
 from tools.cli import friction as cli_friction
 from tools.cli import logs as cli_log
 from tools.cli.options import (
+    BEGIN,
+    MOVE,
     Bitrate,
     Channel,
     ConfigPath,
@@ -27,22 +29,40 @@ from tools.cli.options import (
 )
 from tools.output import Output
 
+EPILOG = (
+    "First steps: `jointctl demo` shows all of it on a virtual joint; `jointctl doctor` tells what this computer can "
+    "do; `jointctl new my_joint.toml` begins a configuration of your own. CONFIG is a TOML file or the name of a "
+    "shipped one: virtual, precise, paper, sweep_virtual, elmo_gold_can, elmo_serial."
+)
+
 app = typer.Typer(
     name="jointctl",
-    help="Robot joint controller: CANopen CiA 402 at 1 kHz, with a virtual joint to try it on.",
     no_args_is_help=True,
-    add_completion=False,
+    add_completion=True,
     pretty_exceptions_enable=False,
 )
 
-cli_friction.register(app)
-cli_experiments.register(app)
-cli_log.register(app)
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"jointctl {version('jointctl')}")
+        raise typer.Exit()
 
 
-@app.command()
+@app.callback(epilog=EPILOG)
+def callback(
+    version: Annotated[
+        bool, typer.Option("--version", help="print the version and end", callback=_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Robot joint controller: CANopen CiA 402 at 1 kHz, with a virtual joint to try it on."""
+
+
+@app.command(rich_help_panel=BEGIN)
 def demo(
-    config: Annotated[Path, typer.Option("--config", help="configuration with a [virtual] section")] = Path("virtual"),
+    config: Annotated[Path, typer.Option("--config", help="configuration with a virtual joint")] = Path("virtual"),
     duration: Annotated[float | None, typer.Option("--duration", help="seconds of the trajectory", min=0.1)] = None,
     json: Json = False,
     quiet: Quiet = False,
@@ -53,7 +73,7 @@ def demo(
     raise typer.Exit(run_demo(config_path(config), Output(json=json, quiet=quiet), duration_s=duration))
 
 
-@app.command()
+@app.command(rich_help_panel=MOVE)
 def run(
     config: ConfigPath,
     interface: Interface = None,
@@ -68,7 +88,7 @@ def run(
     allow_low_margin: Annotated[
         bool, typer.Option("--allow-low-margin", help="run a stable loop below margin.min_phase_margin_deg")
     ] = False,
-    scope: Annotated[bool, typer.Option("--scope", help="live page in the browser (extra: jointctl[scope])")] = False,
+    scope: Annotated[bool, typer.Option("--scope", help="live page in the browser (needs the extra scope)")] = False,
     scope_host: Annotated[
         str, typer.Option("--scope-host", help="address of the page; others need a token")
     ] = "127.0.0.1",
@@ -92,7 +112,19 @@ def run(
     )
 
 
-@app.command()
+@app.command(rich_help_panel=BEGIN)
+def new(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="configuration to write (TOML)")],
+    shipped: Annotated[str, typer.Option("--from", help="name of the shipped configuration")] = "elmo_gold_can",
+    quiet: Quiet = False,
+) -> None:
+    """Write a configuration of your own, a copy of a shipped one to fill in."""
+    from tools.verbs.new import new as run_new
+
+    raise typer.Exit(run_new(file, Output(quiet=quiet), shipped=shipped))
+
+
+@app.command(rich_help_panel=BEGIN)
 def hil(
     config: ConfigPath = Path("virtual"),
     interface: Interface = None,
@@ -119,7 +151,7 @@ def hil(
     raise typer.Exit(run_hil(joint, Output(quiet=quiet), timing=timing, ready_fd=ready_fd))
 
 
-@app.command()
+@app.command(rich_help_panel=MOVE)
 def stop(
     config: ConfigPath,
     interface: Interface = None,
@@ -136,7 +168,7 @@ def stop(
     raise typer.Exit(run_stop(joint, Output(json=json)))
 
 
-@app.command("clear-fault")
+@app.command("clear-fault", rich_help_panel=MOVE)
 def clear_fault(
     config: ConfigPath,
     interface: Interface = None,
@@ -153,7 +185,7 @@ def clear_fault(
     raise typer.Exit(run_clear_fault(joint, Output(json=json)))
 
 
-@app.command()
+@app.command(rich_help_panel=BEGIN)
 def doctor(
     config: ConfigPath = Path("virtual"),
     interface: Interface = None,
@@ -172,10 +204,10 @@ def doctor(
     raise typer.Exit(run_doctor(joint, Output(json=json, quiet=quiet), cold=cold))
 
 
-@app.command()
+@app.command(rich_help_panel=MOVE)
 def check(
     config: ConfigPath,
-    delay: Annotated[float | None, typer.Option("--delay", help="measured loop delay [s]", min=0.0)] = None,
+    delay: Annotated[float | None, typer.Option("--delay", help="measured loop delay (s)", min=0.0)] = None,
     figure: Annotated[Path | None, typer.Option("--figure", help="PNG to write: Bode, sensitivity, poles")] = None,
     allow_low_margin: Annotated[bool, typer.Option("--allow-low-margin", help="accept a stable loop below it")] = False,
     json: Json = False,
@@ -185,6 +217,11 @@ def check(
 
     joint = loaded(config)
     raise typer.Exit(run_check(joint, Output(json=json), delay, figure=figure, allow_low_margin=allow_low_margin))
+
+
+cli_friction.register(app)
+cli_log.register(app)
+cli_experiments.register(app)
 
 
 def main() -> None:

@@ -10,9 +10,9 @@ import typer
 if TYPE_CHECKING:
     from tools.configuration.config import Config
 
-Interface = Annotated[str | None, typer.Option("-i", "--interface", help="python-can interface [env CAN_INTERFACE]")]
-Channel = Annotated[str | None, typer.Option("-c", "--channel", help="bus channel [env CAN_CHANNEL]")]
-Bitrate = Annotated[int | None, typer.Option("-b", "--bitrate", help="bit/s [env CAN_BITRATE]")]
+Interface = Annotated[str | None, typer.Option("-i", "--interface", help="python-can interface (env CAN_INTERFACE)")]
+Channel = Annotated[str | None, typer.Option("-c", "--channel", help="bus channel (env CAN_CHANNEL)")]
+Bitrate = Annotated[int | None, typer.Option("-b", "--bitrate", help="bit/s (env CAN_BITRATE)")]
 Port = Annotated[str | None, typer.Option("-p", "--port", help="serial port of an elmo_serial drive")]
 Target = Annotated[
     int | None, typer.Option("-t", "--target", help="CANopen node instead of drive.node", min=1, max=127)
@@ -23,6 +23,10 @@ ConfigPath = Annotated[
     Path, typer.Argument(metavar="CONFIG", help="configuration file (TOML), or the name of a shipped one")
 ]
 Yes = Annotated[bool, typer.Option("-y", "--yes", help="move without asking")]
+
+
+# headings of `jointctl --help`, in this order
+BEGIN, MOVE, FRICTION, LOOK, COMPARE = "Begin", "Move a joint", "Friction", "Look at a run", "Compare and measure"
 
 
 def config_path(path: Path) -> Path:

@@ -16,17 +16,17 @@ def sweep_command(
     out: Annotated[
         Path, typer.Option("-o", "--out", help="CSV file to write; its sidecar is the same name with .json")
     ],
-    points: Annotated[int | None, typer.Option("--points", help="plateaus in both directions together [225]")] = None,
+    points: Annotated[int | None, typer.Option("--points", help="plateaus in both directions together (225)")] = None,
     grid: Annotated[str, typer.Option("--grid", help="near-zero, linear, log, or list")] = "near-zero",
     speeds: Annotated[
         Path | None, typer.Option("--speeds", metavar="FILE", help="of --grid list: velocities in rad/s, one a line")
     ] = None,
     max_speed: Annotated[
         float | None,
-        typer.Option("--max-speed", metavar="RAD/S", help="fastest plateau [what limits and travel allow]"),
+        typer.Option("--max-speed", metavar="RAD/S", help="fastest plateau (what limits and travel allow)"),
     ] = None,
     min_speed: Annotated[
-        float | None, typer.Option("--min-speed", metavar="RAD/S", help="slowest plateau [a thousandth of the fastest]")
+        float | None, typer.Option("--min-speed", metavar="RAD/S", help="slowest plateau (a thousandth of the fastest)")
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="as many points as fit into 8 minutes, 120 at most")] = False,
     warm_up: Annotated[float, typer.Option("--warm-up", metavar="TURNS", help="of the joint, before measuring")] = 1.0,
@@ -35,7 +35,7 @@ def sweep_command(
     ] = None,
     passes: Annotated[int, typer.Option("--passes", help="times that the whole grid is measured")] = 1,
     dwell: Annotated[
-        float | None, typer.Option("--dwell", metavar="S", help="wanted measuring time per point [1, quick 0.5]")
+        float | None, typer.Option("--dwell", metavar="S", help="wanted measuring time per point (1, quick 0.5)")
     ] = None,
     mode: Annotated[str, typer.Option("--mode", help="auto, csv, pv (the drive's velocity loop), or torque")] = "auto",
     resume: Annotated[bool, typer.Option("--resume", help="measure what is missing in an interrupted sweep")] = False,

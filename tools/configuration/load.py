@@ -24,7 +24,8 @@ def shipped_config(name: str) -> Path:
     return SHIPPED_FOLDER / (name if name.endswith(".toml") else f"{name}.toml")
 
 
-def _read_text(path: Path) -> str:
+def read_text(path: Path) -> str:
+    """Text of a configuration file; `ConfigurationError` if it cannot be read as such."""
     known = ", ".join(sorted(p.stem for p in SHIPPED_FOLDER.glob("*.toml")))
     try:
         return path.read_bytes().decode("utf-8")
@@ -41,7 +42,7 @@ def _read_text(path: Path) -> str:
 def load_config(path: str | Path) -> Config:
     """Read, check and freeze a configuration; `ConfigurationError` holds one line per problem."""
     path = Path(path)
-    text = _read_text(path)
+    text = read_text(path)
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
