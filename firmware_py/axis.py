@@ -281,8 +281,11 @@ def step_axis(
     if state.phase >= AxisPhase.APPROACH and state.phase <= AxisPhase.RAMPING:
         _move_reference(constants, state, table, elapsed_cycles)
     if gap_cycles > 0:
-        error_rad = sample.position_rad - state.reference.position_rad
-        step_velocity(constants.velocity, state.velocity, sample.position_rad, error_rad, gap_cycles)
+        # The drive samples when SYNC comes, and SYNC goes out when the loop wakes up.  Until then the joint moved on
+        # with about the desired velocity: without this, 0.1 ms at 0.2 rad/s would look like 20 urad of error.
+        state.measured_position_rad -= state.reference.velocity_radps * state.sample_late_s
+        error_rad = state.measured_position_rad - state.reference.position_rad
+        step_velocity(constants.velocity, state.velocity, state.measured_position_rad, error_rad, gap_cycles)
     if powered(state.phase):
         _check_motion(constants, state)
     if constants.command_kind == CommandKind.VELOCITY:

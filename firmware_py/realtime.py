@@ -130,6 +130,8 @@ def run_loop(
         elapsed_cycles = (deadline_ns - last_slot_ns) // period_ns
         last_slot_ns = deadline_ns
         waited_ns = receive(port, frames, scratch, sample, np.int64(wake_ns), np.int64(deadline_ns + receive_ns))
+        # a sample that answers an earlier SYNC belongs to no slot that could be told
+        now_state.sample_late_s = (wake_ns - deadline_ns) * 1e-9 if sample[0].time_ns > wake_ns else 0.0
         stop_request = load_acquire(words, Word.STOP)
         supervisor_age = (wake_ns - load_acquire(words, Word.SUPERVISOR_NS)) // period_ns
         step_axis(axis, now_state, table, sample[0], command[0], elapsed_cycles, stop_request, supervisor_age)

@@ -177,7 +177,8 @@ class AxisState:
     table_row: i4  # search hint of the trajectory table
     fault_value: f8  # the value that tripped the limit
     trajectory_s: f8
-    measured_position_rad: f8
+    sample_late_s: f8  # from the slot to the request of this cycle's sample; set by a real-time loop, else 0
+    measured_position_rad: f8  # at the slot
     measured_torque_Nm: f8
     command_torque_Nm: f8
     unlimited_torque_Nm: f8  # the law's output before limits, kept for the log

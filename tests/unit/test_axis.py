@@ -74,6 +74,35 @@ def test_the_trajectory_begins_where_the_approach_ends(rig: NewRig) -> None:
         run.tick()
 
 
+def test_a_sample_taken_late_is_brought_back_to_its_slot(rig: NewRig) -> None:
+    """A loop that wakes up late by a different time in every cycle sees neither error nor speed that are not there."""
+    late_s = 1e-6 * np.random.default_rng(1).uniform(0.0, 900.0, 300)
+    errors = []
+    for told in (True, False):
+        run = rig(0.0).until(AxisPhase.TRACKING).run(50)
+        worst_rad = worst_radps = 0.0
+        for k, late in enumerate(late_s):
+            # the joint is where the reference will be in this cycle, and moves on until SYNC comes
+            angle = 0.2 * math.pi * (run.state.trajectory_s + 1e-3)
+            velocity_radps = 0.35 * 0.2 * math.pi * math.cos(angle)
+            run.joint.position_rad, run.joint.velocity_radps = 0.35 * math.sin(angle), 0.0
+            run.state.sample_late_s = late if told else 0.0
+            run.sample.position_rad = run.joint.position_rad + velocity_radps * late
+            run.sample.count += 1
+            step_axis(run.axis, run.state, run.table, run.sample, run.command, 1, 0, 0)
+            assert run.phase is AxisPhase.TRACKING
+            if k < 100:  # the filter forgets how the joint got here
+                continue
+            worst_rad = max(worst_rad, abs(run.state.measured_position_rad - run.state.reference.position_rad))
+            worst_radps = max(worst_radps, abs(run.state.velocity.error_rate_radps))
+        errors.append((worst_rad, worst_radps))
+    (told_rad, told_radps), (untold_rad, untold_radps) = errors
+    assert told_rad < 1e-9
+    assert told_radps < 1e-5
+    assert untold_rad > 1e-4
+    assert untold_radps > 0.02
+
+
 def test_release_is_a_straight_line_to_zero(rig: NewRig) -> None:
     run = rig(0.0)
     run.axis.law.gravity_Nm, run.axis.law.gravity_zero_rad = 12.0, -math.pi / 2.0

@@ -27,7 +27,8 @@ ROOT = Path(__file__).resolve().parents[2]
 PERIOD_ns = 1_000_000
 # words of the stub drive's own memory
 CYCLE, BUSY_CYCLE, BUSY_ns, STOP_CYCLE, STOP, REQUEST, SENT, HEARD_AT_ns, LATEST_ns = range(9)
-STUB_WORDS = 9
+ANSWER_ns = 9
+STUB_WORDS = 10
 
 _I64 = types.Array(types.int64, 1, "C")
 _SAMPLES = record_array_type(dtype_of(Sample))
@@ -49,6 +50,7 @@ def stub_receive(stub: Any, words: Any, scratch: Any, samples: Any, now_ns: int,
         store_release(words, Word.STOP, stub[STOP])
     sample = samples[0]
     sample.count += 1
+    sample.time_ns = now_ns + stub[ANSWER_ns] if stub[ANSWER_ns] != 0 else 0
     sample.drive_state = DriveState.ENABLED if stub[REQUEST] == DriveRequest.ENABLE else DriveState.OFF
     return np.int64(1500)  # type: ignore[return-value]
 
@@ -141,6 +143,18 @@ def test_an_overrun_skips_slots_and_keeps_the_phase(loop: Callable[..., Loop]) -
     assert np.all(np.diff(log.time_ns) >= PERIOD_ns)
     assert log.cycle[21] - log.cycle[20] == 1 + log.skipped[21]
     assert built.words[Word.SKIPPED] == log.skipped.sum()
+
+
+@pytest.mark.parametrize("answer_ns", [1, -1], ids=["after SYNC", "of an earlier SYNC"])
+def test_the_axis_is_told_how_late_its_sample_was_asked_for(loop: Callable[..., Loop], answer_ns: int) -> None:
+    built = loop()
+    built.stub[ANSWER_ns] = answer_ns
+    for _ in range(5):
+        built.run(1)
+        record = built.ring[built.words[Word.HEAD] - 1]
+        late_s = (built.stub[HEARD_AT_ns] - record.time_ns) * 1e-9
+        assert late_s > 0.0
+        assert built.state[0].sample_late_s == (late_s if answer_ns > 0 else 0.0)
 
 
 @pytest.mark.parametrize(("stop", "phase"), [(1, AxisPhase.RAMPING), (2, AxisPhase.QUICK_STOPPING), (3, None)])
