@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,10 @@ import canopen
 import pytest
 import tomlkit
 
+from hil.elmo_device import ElmoDevice
+from tools.configuration.load import load_config
 from tools.recording.run_log import read_run_log
+from tools.verbs.hil_serial import serve_virtual_elmo
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
@@ -76,6 +79,11 @@ class Started:
         return [
             int(pid) for pid in Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
         ]
+
+    def child(self, module: str) -> int:
+        """The direct child that runs this module."""
+        (pid,) = [pid for pid in self.children() if module in Path(f"/proc/{pid}/cmdline").read_text()]
+        return pid
 
     def end(self) -> None:
         if self.process.poll() is None:
@@ -153,3 +161,60 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
     bench = Bench(tmp_path)
     yield bench
     bench.end()
+
+
+# a busy computer may stop this process, and with it the virtual drive, for tens of milliseconds
+# and 100 Hz leaves room for what it adds to the measured delay
+PATIENT: dict[str, Any] = {
+    "loop__rate_Hz": 100.0,
+    "control__kp": 64.0,
+    "control__kv": 16.0,
+    "control__q": 20.0,
+    "control__velocity_cutoff_Hz": 40.0,
+    "limits__sample_age_max_s": 0.5,
+    "limits__skipped_max_s": 0.5,
+    "limits__following_error_max_rad": 0.3,
+    "drive__dead_man_s": 0.3,
+    "log__folder": "runs",
+}
+
+
+class SerialBench:
+    """A configuration with the port of a running virtual drive in it; the drive is a thread of this process."""
+
+    def __init__(self, bench: Any) -> None:
+        self.bench = bench
+        self.device: ElmoDevice
+
+    def config(self, name: str = "serial.toml", **changes: Any) -> str:
+        values = {**PATIENT, "trajectory__duration_s": 20.0, "drive__port": self.device.path, **changes}
+        return serial_config(self.bench.folder, name, values)
+
+    def until(self, condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
+        give_up_s = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < give_up_s
+            time.sleep(0.02)
+
+    def standing(self) -> bool:
+        """Motor off and the joint at rest."""
+        device = self.device.interpreter
+        return not device.m.motor_on and abs(float(device.state[0].joint_velocity_radps)) < 1e-3
+
+
+def serial_config(folder: Path, name: str, values: dict[str, Any]) -> str:
+    document: Any = tomlkit.parse((CONFIGS / "elmo_serial.toml").read_text())
+    for path, value in values.items():
+        section, key = path.split("__")
+        document[section][key] = value
+    (folder / name).write_text(tomlkit.dumps(document))
+    return name
+
+
+@pytest.fixture
+def serial_bench(bench: Any) -> Iterator[SerialBench]:
+    found = SerialBench(bench)
+    (bench.folder / "device.toml").write_text((CONFIGS / "elmo_serial.toml").read_text())
+    with serve_virtual_elmo(load_config(bench.folder / "device.toml")) as device:
+        found.device = device
+        yield found

@@ -7,80 +7,16 @@ from __future__ import annotations
 
 import os
 import signal
-import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 from firmware_py.states import AxisPhase
 from hil.elmo_device import ElmoDevice
-from tools.configuration.load import load_config
-from tools.verbs.hil_serial import serve_virtual_elmo
-
-# a busy computer may stop this process, and with it the virtual drive, for tens of milliseconds
-# and 100 Hz leaves room for what it adds to the measured delay
-PATIENT: dict[str, Any] = {
-    "loop__rate_Hz": 100.0,
-    "control__kp": 64.0,
-    "control__kv": 16.0,
-    "control__q": 20.0,
-    "control__velocity_cutoff_Hz": 40.0,
-    "limits__sample_age_max_s": 0.5,
-    "limits__skipped_max_s": 0.5,
-    "limits__following_error_max_rad": 0.3,
-    "drive__dead_man_s": 0.3,
-    "log__folder": "runs",
-}
 
 
-class SerialBench:
-    """A configuration with the port of a running virtual drive in it."""
-
-    def __init__(self, bench: Any) -> None:
-        self.bench = bench
-        self.device: ElmoDevice
-
-    def config(self, name: str = "serial.toml", **changes: Any) -> str:
-        values = {**PATIENT, "trajectory__duration_s": 20.0, "drive__port": self.device.path, **changes}
-        return serial_config(self.bench.folder, name, values)
-
-    def until(self, condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
-        give_up_s = time.monotonic() + timeout_s
-        while not condition():
-            assert time.monotonic() < give_up_s
-            time.sleep(0.02)
-
-    def standing(self) -> bool:
-        """Motor off and the joint at rest."""
-        device = self.device.interpreter
-        return not device.m.motor_on and abs(float(device.state[0].joint_velocity_radps)) < 1e-3
-
-
-def serial_config(folder: Path, name: str, values: dict[str, Any]) -> str:
-    import tomlkit
-
-    from tools.configuration.load import shipped_config
-
-    document: Any = tomlkit.parse(shipped_config("elmo_serial").read_text())
-    for path, value in values.items():
-        section, key = path.split("__")
-        document[section][key] = value
-    (folder / name).write_text(tomlkit.dumps(document))
-    return name
-
-
-@pytest.fixture
-def serial_bench(bench: Any) -> Iterator[SerialBench]:
-    found = SerialBench(bench)
-    (bench.folder / "device.toml").write_text((Path(__file__).parents[2] / "configs" / "elmo_serial.toml").read_text())
-    with serve_virtual_elmo(load_config(bench.folder / "device.toml")) as device:
-        found.device = device
-        yield found
-
-
-def test_a_run_tracks_the_sine_and_ends_with_the_motor_off(serial_bench: SerialBench) -> None:
+def test_a_run_tracks_the_sine_and_ends_with_the_motor_off(serial_bench: Any) -> None:
     config = serial_bench.config(trajectory__duration_s=3.0)
     finished = serial_bench.bench.run("run", config, "-y")
     assert finished.code == 0, finished.err
@@ -94,7 +30,7 @@ def test_a_run_tracks_the_sine_and_ends_with_the_motor_off(serial_bench: SerialB
     assert "loop delay" in finished.err
 
 
-def test_gains_that_the_line_cannot_carry_are_refused_before_anything_moves(serial_bench: SerialBench) -> None:
+def test_gains_that_the_line_cannot_carry_are_refused_before_anything_moves(serial_bench: Any) -> None:
     config = serial_bench.config(control__kp=784.0, control__kv=56.0, control__q=1800.0)
     finished = serial_bench.bench.run("run", config, "-y")
     finished.refused(9, "a slower loop: control.kp", "loop delay")
@@ -102,17 +38,17 @@ def test_gains_that_the_line_cannot_carry_are_refused_before_anything_moves(seri
     assert "approach\n" not in finished.err
 
 
-def test_a_wrong_baud_rate_is_no_device_and_says_so(serial_bench: SerialBench) -> None:
+def test_a_wrong_baud_rate_is_no_device_and_says_so(serial_bench: Any) -> None:
     config = serial_bench.config(drive__baud_rate_bitps=230_400)
     serial_bench.bench.run("run", config, "-y").refused(5, "baud rate")
 
 
-def test_a_missing_port_is_a_bus_error(serial_bench: SerialBench) -> None:
+def test_a_missing_port_is_a_bus_error(serial_bench: Any) -> None:
     config = serial_bench.config(drive__port=str(serial_bench.bench.folder / "none"))
     serial_bench.bench.run("run", config, "-y").refused(4, "no such serial port")
 
 
-def test_a_second_controller_is_kept_out(serial_bench: SerialBench) -> None:
+def test_a_second_controller_is_kept_out(serial_bench: Any) -> None:
     first = serial_bench.bench.start("run", serial_bench.config(), "-y").saw("  tracking")
     serial_bench.bench.run("run", serial_bench.config(), "-y").refused(4, "in use by another program")
     first.signal(signal.SIGINT)
@@ -132,7 +68,7 @@ def test_a_second_controller_is_kept_out(serial_bench: SerialBench) -> None:
     ids=["restart", "switched off", "garbage", "half replies", "stuck reply"],
 )
 def test_faults_of_drive_and_line_end_with_the_joint_stopped(
-    serial_bench: SerialBench, spoil: Callable[[ElmoDevice], None], words: tuple[str, ...]
+    serial_bench: Any, spoil: Callable[[ElmoDevice], None], words: tuple[str, ...]
 ) -> None:
     run = serial_bench.bench.start("run", serial_bench.config(limits__sample_age_max_s=0.5), "-y").saw("  tracking")
     spoil(serial_bench.device)
@@ -141,7 +77,7 @@ def test_faults_of_drive_and_line_end_with_the_joint_stopped(
     serial_bench.until(serial_bench.standing)
 
 
-def test_an_unplugged_port_ends_the_run_and_the_drives_own_limits_end_the_motion(serial_bench: SerialBench) -> None:
+def test_an_unplugged_port_ends_the_run_and_the_drives_own_limits_end_the_motion(serial_bench: Any) -> None:
     run = serial_bench.bench.start("run", serial_bench.config(), "-y").saw("  tracking")
     serial_bench.device.vanish()
     run.finished().refused(7, "BUS_ERROR", "the serial port is gone")
@@ -152,9 +88,9 @@ def test_an_unplugged_port_ends_the_run_and_the_drives_own_limits_end_the_motion
     assert device.m.motor_fault in (0x20000, 0x400000)
 
 
-def test_a_killed_loop_is_switched_off_by_its_supervisor(serial_bench: SerialBench) -> None:
+def test_a_killed_loop_is_switched_off_by_its_supervisor(serial_bench: Any) -> None:
     run = serial_bench.bench.start("run", serial_bench.config(), "-y").saw("  tracking")
-    (loop,) = run.children()
+    loop = run.child("loop_process")
     os.kill(loop, signal.SIGKILL)
     finished = run.finished()
     finished.refused(7, "killed by signal 9", "drive state now: off")
@@ -162,7 +98,7 @@ def test_a_killed_loop_is_switched_off_by_its_supervisor(serial_bench: SerialBen
     serial_bench.until(serial_bench.standing)
 
 
-def test_a_killed_supervisor_is_seen_by_the_loop(serial_bench: SerialBench) -> None:
+def test_a_killed_supervisor_is_seen_by_the_loop(serial_bench: Any) -> None:
     run = serial_bench.bench.start("run", serial_bench.config(), "-y").saw("  tracking")
     run.signal(signal.SIGKILL)
     run.process.wait()

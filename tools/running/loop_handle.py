@@ -127,6 +127,11 @@ class LoopHandle:
         """Ask for a stop; a stronger request replaces a weaker one, never the other way round."""
         self.block.words[Word.STOP] = max(int(self.block.words[Word.STOP]), int(request))
 
+    @property
+    def stop_requested(self) -> bool:
+        """Whether anybody has asked for a stop: this process, or the guard of a serial line."""
+        return bool(self.block.words[Word.STOP])
+
     def new_records(self) -> Any:
         """Log records since the last call."""
         head = int(self.block.words[Word.HEAD])

@@ -31,6 +31,7 @@ from tools.recording.run_summary import RunSummary, summarise
 from tools.running.events import EventFinder, phase_name
 from tools.running.fault_text import FaultText
 from tools.running.frame_recorder import FrameRecorder, recording
+from tools.running.guard_handle import GUARD_ENDED, GuardHandle, start_guard
 from tools.running.live_panel import Display, PhaseLines, Snapshot
 from tools.running.loop_handle import LoopHandle
 from tools.running.open_drive import check_cyclic_rate, drive_fault_text, loop_delay_s, open_drive
@@ -87,6 +88,7 @@ class Supervisor:
         self._events = EventFinder()
         self._asked = StopRequest.NONE
         self._stopped_by_viewer = ""
+        self._guard: GuardHandle | None = None
 
     def run(self) -> RunResult | None:
         """The whole run; None if the user declined.  The drive is disabled when this returns or raises."""
@@ -100,6 +102,7 @@ class Supervisor:
         ):
             drive = open_drive(config)
             try:
+                self._guard = start_guard(config, loop)
                 report = drive.commission()
                 self._leave_if_asked(signals)
                 signals.raising = True
@@ -109,6 +112,8 @@ class Supervisor:
                     return None
                 loop.wait_ready(lambda: self._leave_if_asked(signals))
                 self._leave_if_asked(signals)
+                if self._guard is not None:
+                    self._guard.wait_ready()
                 return self._supervise(drive, loop, report, signals)
             except OSError as error:
                 raise DataError(f"{self._log_path}: cannot be written: {error.strerror or error}") from None
@@ -116,6 +121,8 @@ class Supervisor:
                 signals.raising = False
                 state = drive.make_safe()
                 drive.close()
+                if self._guard is not None:
+                    self._guard.release(state)
                 if state.startswith("unknown"):
                     with contextlib.suppress(OSError):  # the terminal may have been closed
                         self._output.warning(f"the drive did not confirm that it is off: {state}")
@@ -243,6 +250,9 @@ class Supervisor:
             who = signals.name or self._stopped_by_viewer
             log.write_event(WARNING, "supervisor", f"{request.name.lower().replace('_', ' ')} asked for by {who}")
         self._check_delay(loop, log)
+        if self._guard is not None and self._guard.just_ended():
+            log.write_event(WARNING, "supervisor", GUARD_ENDED)
+            self._display.note(GUARD_ENDED)
         phase = loop.phase
         if phase is not self._phase:
             self._phase = phase
@@ -267,7 +277,7 @@ class Supervisor:
             histograms=loop.block.histograms.copy(),
             fault=fault,
             fault_text=text,
-            stopped_by=signals.name or self._stopped_by_viewer,
+            stopped_by=signals.name or self._stopped_by_viewer or ("jointctl stop" if loop.stop_requested else ""),
             drive_state=drive_state,
             bus_load=bits / (self._config.bus.bitrate_bitps * elapsed_s),
             lost_records=loop.lost_records,

@@ -1,0 +1,259 @@
+"""The guard of a serial line: `python -m tools.running.line_guard JSON`, a small process that does next to nothing.
+
+A serial drive does not notice that the programs behind it have died: it holds its last torque command for ever.  So a
+third process waits, in a session of its own, and says TC=0, ST, MO=0
+
+* when loop and supervisor are both dead, however they died (the kernel tells it: pidfd);
+* when the loop has been silent for `silent_s` and the supervisor has done nothing about it;
+* when the supervisor could not reach the drive at the end of a run: for `REACH_S`, also on a port that comes back;
+* when `jointctl stop` asks for it (`guard_call`) and the loop does not obey at once.
+
+It cannot help where the computer loses its power or the cable is cut: only the drive's own limits work then.
+It imports no numba, so that it starts quickly and stays small.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import mmap
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from drivers.elmo.dialogue import Dialogue
+from drivers.elmo.serial_port import SerialPort, open_descriptor
+from drivers.elmo.switch_off import SWITCH_OFF, switch_off
+from drivers.errors import JointctlError
+from tools.running.guard_call import guard_address, heard_line, may_ask
+
+REACH_S = 10.0  # how long a drive that does not answer is tried again
+OBEY_S = 5.0  # how long a run may take to end after `jointctl stop`
+LATE_S = 0.2  # a loop without a cycle for so long does not obey at once
+REPEAT_S = 0.5
+POLL_S = 0.25  # the death of a process wakes it at once
+QUICK_POLL_S = 0.05
+HEARD_S = 0.2
+_NANOSECONDS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class GuardOrder:
+    """What the guard is told.  `*_word`: places of the shared int64 words; descriptors are inherited."""
+
+    port: str
+    baud_rate_bitps: int
+    reply_timeout_s: float
+    silent_s: float
+    control_fd: int  # the supervisor's word: {"state": ...}, then the guard's work is done
+    block_fd: int
+    supervisor_pidfd: int
+    loop_pidfd: int
+    supervisor_pid: int
+    go_word: int
+    stop_word: int
+    loop_word: int
+    ended_word: int
+    words: int
+    stop_value: int  # StopRequest.OFF
+
+    def argument(self) -> str:
+        """As one command line argument."""
+        return json.dumps(asdict(self))
+
+
+class LineGuard:
+    """`run` until the work is done; returns the exit code."""
+
+    def __init__(self, order: GuardOrder) -> None:
+        self._order = order
+        self._words = memoryview(mmap.mmap(order.block_fd, 8 * order.words)).cast("q")
+        self._control = socket.socket(fileno=order.control_fd)
+        self._tty = open_descriptor(order.port)
+        self._server = self._bound(guard_address(order.port))
+        self._callers: list[socket.socket] = []
+        self._asked_s: float | None = None  # when `jointctl stop` came
+        self._told_s = -REPEAT_S  # when the line was last told to switch off
+        self._dead: set[int] = set()
+        self._state: str | None = None  # of the drive, by the supervisor's word
+
+    @staticmethod
+    def _bound(address: bytes) -> socket.socket | None:
+        """None where another guard has the name: that of a run that ended just now."""
+        server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            server.bind(address)
+            server.listen(4)
+        except OSError:
+            server.close()
+            return None
+        return server
+
+    def run(self) -> int:
+        """Watch until the supervisor says that the drive is off, or until both are dead and it has been told."""
+        self._control.sendall(b"+")
+        poll = select.poll()
+        order = self._order
+        for fd in (order.supervisor_pidfd, order.loop_pidfd, order.control_fd):
+            poll.register(fd, select.POLLIN)
+        poll.register(self._tty, 0)
+        if self._server is not None:
+            poll.register(self._server, select.POLLIN)
+        while True:
+            for fd, _ in poll.poll(1000 * (POLL_S if self._asked_s is None else QUICK_POLL_S)):
+                if fd in (order.supervisor_pidfd, order.loop_pidfd):
+                    self._dead.add(fd)
+                    poll.unregister(fd)
+                elif fd == order.control_fd:
+                    self._take_word()
+                    poll.unregister(fd)
+                elif fd == self._tty:  # unplugged: a descriptor that stays open would keep the name of the port
+                    poll.unregister(fd)
+                    self._close_tty()
+                else:
+                    self._take_caller()
+            outcome = self._outcome()
+            if outcome is not None:
+                self._answer(outcome)
+                return 0
+
+    # --- what is known ---
+
+    @property
+    def _nobody(self) -> bool:
+        return len(self._dead) == 2
+
+    def _word(self, place: int) -> int:
+        return int(self._words[place])
+
+    def _loop_silent_s(self) -> float:
+        """Time since the loop's last cycle; 0 before it was let go and after its regular end."""
+        order = self._order
+        if not self._word(order.go_word) or self._word(order.ended_word):
+            return 0.0
+        return (time.monotonic_ns() - self._word(order.loop_word)) / _NANOSECONDS
+
+    def _outcome(self) -> str | None:
+        """The drive's state in words once there is nothing left to guard; None while there is."""
+        loop_over = self._order.loop_pidfd in self._dead or self._word(self._order.ended_word)
+        if self._state is not None and (loop_over or not self._word(self._order.go_word)):
+            return self._reach() if self._state.startswith("unknown") else self._state
+        if self._nobody:
+            return self._reach()
+        silent_s = self._loop_silent_s()
+        if silent_s > self._order.silent_s:
+            self._words[self._order.stop_word] = self._order.stop_value
+            self._tell()
+        if self._asked_s is not None:
+            asked_for_s = time.monotonic() - self._asked_s
+            if not self._word(self._order.go_word) or silent_s > LATE_S or asked_for_s > 1.0:
+                self._tell()
+            if asked_for_s > OBEY_S:
+                self._end_both()
+        return None
+
+    # --- what is done ---
+
+    def _tell(self) -> None:
+        """Unheard: the replies belong to whoever else reads the line."""
+        if time.monotonic() < self._told_s + REPEAT_S:
+            return
+        self._told_s = time.monotonic()
+        with contextlib.suppress(OSError):
+            os.write(self._tty, SWITCH_OFF)
+
+    def _close_tty(self) -> None:
+        if self._tty >= 0:
+            os.close(self._tty)
+        self._tty = -1
+
+    def _end_both(self) -> None:
+        """They had their time.  A pidfd cannot mean another process."""
+        for fd in (self._order.loop_pidfd, self._order.supervisor_pidfd):
+            with contextlib.suppress(OSError):
+                signal.pidfd_send_signal(fd, signal.SIGKILL)
+
+    def _reach(self) -> str:
+        """Nobody else has the line now: switch off and hear that it is, on a port that comes back as well."""
+        order = self._order
+        self._told_s = -REPEAT_S
+        self._tell()
+        give_up_s = time.monotonic() + REACH_S
+        while True:
+            port: SerialPort | None = None
+            try:
+                port = SerialPort(order.port, order.baud_rate_bitps)
+                state = switch_off(port, Dialogue(port, order.reply_timeout_s))
+                self._say(f"line guard: the drive on {order.port} is {state}")
+                return state
+            except JointctlError as error:
+                reason = error.message
+            finally:
+                if port is not None:
+                    port.close()
+            self._close_tty()
+            if time.monotonic() > give_up_s:
+                self._say(f"line guard: the drive on {order.port} could not be switched off: {reason}")
+                return f"unknown: {reason}"
+            time.sleep(REPEAT_S)
+
+    @staticmethod
+    def _say(text: str) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            print(text, file=sys.stderr, flush=True)
+
+    # --- words from outside ---
+
+    def _take_word(self) -> None:
+        """The end of the connection without a word is the supervisor's end, which its pidfd tells as well."""
+        message = heard_line(self._control, HEARD_S)
+        if message is not None:
+            self._state = str(message.get("state", "unknown: no word"))
+
+    def _take_caller(self) -> None:
+        assert self._server is not None
+        caller, _ = self._server.accept()
+        message = heard_line(caller, HEARD_S) if may_ask(caller) else None
+        if message is None:
+            caller.close()
+            return
+        self._send(caller, {"supervisor_pid": self._order.supervisor_pid})
+        if message.get("ask") != "stop":
+            caller.close()
+            return
+        self._callers.append(caller)
+        if self._asked_s is None:
+            self._asked_s = time.monotonic()
+            self._words[self._order.stop_word] = self._order.stop_value
+            if not self._word(self._order.go_word):  # it may wait for an answer of its user
+                with contextlib.suppress(OSError):
+                    signal.pidfd_send_signal(self._order.supervisor_pidfd, signal.SIGTERM)
+
+    def _answer(self, state: str) -> None:
+        for caller in self._callers:
+            self._send(caller, {"state": state})
+            caller.close()
+
+    @staticmethod
+    def _send(caller: socket.socket, message: dict[str, Any]) -> None:
+        with contextlib.suppress(OSError):
+            caller.sendall(json.dumps(message).encode() + b"\n")
+
+
+def main() -> int:
+    """Entry point of the process; the signals of a terminal are not for it."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP})
+    try:
+        return LineGuard(GuardOrder(**json.loads(sys.argv[1]))).run()
+    except JointctlError as error:
+        LineGuard._say(f"line guard: {error}")
+        return error.exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
