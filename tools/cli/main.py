@@ -11,6 +11,7 @@ import typer
 from drivers.errors import JointctlError
 from tools.cli import experiments as cli_experiments
 from tools.cli import friction as cli_friction
+from tools.cli import inspection as cli_inspection
 from tools.cli import logs as cli_log
 from tools.cli.options import (
     BEGIN,
@@ -219,6 +220,7 @@ def check(
     raise typer.Exit(run_check(joint, Output(json=json), delay, figure=figure, allow_low_margin=allow_low_margin))
 
 
+cli_inspection.register(app)
 cli_friction.register(app)
 cli_log.register(app)
 cli_experiments.register(app)

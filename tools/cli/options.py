@@ -26,7 +26,8 @@ Yes = Annotated[bool, typer.Option("-y", "--yes", help="move without asking")]
 
 
 # headings of `jointctl --help`, in this order
-BEGIN, MOVE, FRICTION, LOOK, COMPARE = "Begin", "Move a joint", "Friction", "Look at a run", "Compare and measure"
+BEGIN, MOVE, INSPECT, FRICTION = "Begin", "Move a joint", "Look at a bus and a drive", "Friction"
+LOOK, COMPARE = "Look at a run", "Compare and measure"
 
 
 def config_path(path: Path) -> Path:

@@ -1,0 +1,226 @@
+"""scan, info and monitor on the virtual drive of this process: what they find, and that they only ever read."""
+
+from __future__ import annotations
+
+import io
+import json
+import threading
+import time
+from typing import Any
+
+import can
+import pytest
+
+from drivers.errors import ConfigurationError, NoDeviceError
+from tools.configuration.load import load_config, shipped_config
+from tools.inspection import node_scan
+from tools.inspection.drive_info import drive_info, pdo_maps
+from tools.inspection.node_scan import Ear
+from tools.inspection.objects import Objects
+from tools.inspection.sdo_reading import SdoReader
+from tools.inspection.subject import Subject, canopen_network, subject_of_config, subject_of_flags
+from tools.output import Output
+from tools.verbs.info import info
+from tools.verbs.monitor import Selection, monitor, selection_of
+from tools.verbs.scan import scan
+
+SDO_READ = (0x40, 0x60, 0x70)  # initiate upload, upload segment with either toggle bit
+
+
+def subject(device: Any, node: int | None = 1, **more: Any) -> Subject:
+    return Subject("virtual", device.channel, None, node, **more)
+
+
+@pytest.fixture
+def quick_scan(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(node_scan, "PACE_S", 0.0)
+
+
+def output(**how: Any) -> tuple[Output, io.StringIO, io.StringIO]:
+    out, err = io.StringIO(), io.StringIO()
+    return Output(stdout=out, stderr=err, **how), out, err
+
+
+def only_reads(device: Any) -> bool:
+    return all(identifier & 0x780 == 0x600 and data[0] in SDO_READ for identifier, data in device.requests)
+
+
+@pytest.mark.usefixtures("quick_scan")
+class TestScan:
+    def test_finds_the_one_node(self, device_on_bus: Any) -> None:
+        told, out, _ = output(json=True)
+        assert scan(subject(device_on_bus, None), told, listen_s=0.0) == 0
+        found = json.loads(out.getvalue())
+        (node,) = found["nodes"]
+        assert (node["node"], node["answers_sdo"], node["drive_state"]) == (1, True, "switch on disabled")
+        assert node["name"] == "jointctl virtual joint"
+        assert node["device_type"] == "00020192h, CiA 402 (drives)"
+        assert found["controller_active"] is False
+        assert only_reads(device_on_bus)
+        assert {identifier for identifier, _ in device_on_bus.requests} == set(range(0x601, 0x680))
+
+    def test_asks_one_node_only_if_told_so(self, device_on_bus: Any) -> None:
+        told, out, _ = output()
+        assert scan(subject(device_on_bus, 1), told, listen_s=0.0) == 0
+        assert "jointctl virtual joint" in out.getvalue()
+        assert {identifier for identifier, _ in device_on_bus.requests} == {0x601}
+
+    def test_passive_sends_nothing_and_hears_heartbeats(self, device_on_bus: Any) -> None:
+        def beat() -> None:
+            with can.Bus(interface="virtual", channel=device_on_bus.channel) as bus:
+                for _ in range(20):
+                    bus.send(can.Message(arbitration_id=0x709, data=[4], is_extended_id=False))
+                    time.sleep(0.02)
+
+        thread = threading.Thread(target=beat)
+        thread.start()
+        told, out, _ = output(json=True)
+        assert scan(subject(device_on_bus, None), told, listen_s=0.2, passive=True) == 0
+        thread.join()
+        (node,) = json.loads(out.getvalue())["nodes"]
+        assert (node["node"], node["nmt_state"], node["answers_sdo"]) == (9, "stopped", False)
+        assert {identifier for identifier, _ in device_on_bus.requests} == {0x709}
+
+    def test_nobody_there(self, empty_bus: Any) -> None:
+        with pytest.raises(NoDeviceError, match="no frame came, no node answered") as caught:
+            scan(subject(empty_bus, 5), output()[0], listen_s=0.0)
+        assert "bit rate" in caught.value.hint
+
+    @pytest.mark.parametrize(
+        ("message", "words"),
+        [
+            (can.Message(arbitration_id=0x123456, is_extended_id=True), "1 frames came .* but no CANopen node"),
+            (can.Message(is_error_frame=True), "only error frames .*the bit rate is likely wrong"),
+        ],
+    )
+    def test_what_is_likely_wrong(self, empty_bus: Any, message: can.Message, words: str) -> None:
+        with can.Bus(interface="virtual", channel=empty_bus.channel) as bus:
+            timer = threading.Timer(0.1, lambda: bus.send(message))
+            timer.start()
+            with pytest.raises(NoDeviceError, match=words):
+                scan(subject(empty_bus, None), output()[0], listen_s=0.3, passive=True)
+            timer.join()
+
+    def test_an_answer_to_somebody_else_does_not_count(self) -> None:
+        ear = Ear()
+        ear.on_message_received(can.Message(arbitration_id=0x583, data=bytes(8), is_extended_id=False))
+        assert ear.nodes() == {3}
+
+        class Silent:
+            def send_message(self, *_: Any) -> None:
+                pass
+
+        network: Any = Silent()
+        assert node_scan.ask_everybody(network, ear, [3], sleep=lambda _: None) == set()
+
+
+class TestInfo:
+    def test_everything_by_name_and_nothing_written(self, device_on_bus: Any) -> None:
+        told, out, _ = output(json=True)
+        config = load_config(shipped_config("virtual"))
+        assert info(subject(device_on_bus, eds=config.eds_path), told) == 0
+        found = json.loads(out.getvalue())
+        assert found["identity"]["name"] == "jointctl virtual joint"
+        assert found["state"]["drive_state"] == "switch on disabled"
+        assert "cyclic synchronous torque (CST)" in found["state"]["supported_modes"]
+        assert found["ratings"]["torque_constant_NmpA"] == pytest.approx(0.1)
+        assert found["errors"]["error_code"] == "0000h, no error"
+        limits = {row["object"]: row for row in found["limits"]}
+        assert limits["6072"]["unit"] == "permille of rated torque"
+        assert found["supervision"]["on_quick_stop"].startswith("2 quick stop ramp")
+        (tpdo,) = [row for row in found["pdos"] if row["pdo"] == "TPDO2"]
+        assert (tpdo["cob_id"], tpdo["enabled"], tpdo["transmission"]) == ("281h", False, "every SYNC")
+        assert tpdo["objects"][1] == "6064 Position actual value (32 bit)"
+        assert only_reads(device_on_bus)
+
+    def test_without_an_eds_the_standard_names_do(self, device_on_bus: Any) -> None:
+        told, out, _ = output()
+        assert info(subject(device_on_bus), told) == 0
+        assert "Max torque" in out.getvalue()
+        assert "6041 Statusword (16 bit)" in out.getvalue()
+
+    def test_the_error_history(self, device_on_bus: Any) -> None:
+        device_on_bus.stop()
+        device_on_bus.device.device[0].inject_fault_code = 0x2310
+        for _ in range(20):
+            device_on_bus.now_ns += 1_000_000
+            device_on_bus.device.advance(device_on_bus.now_ns)
+        device_on_bus._ended.clear()
+        device_on_bus._thread = threading.Thread(target=device_on_bus._run, daemon=True)
+        device_on_bus._thread.start()
+        with canopen_network(subject(device_on_bus)) as network:
+            found = drive_info(SdoReader(network, 1, Objects()))
+        assert found["state"]["drive_state"] == "fault"
+        assert found["errors"]["error_code"] == "2310h, continuous overcurrent"
+        assert found["errors"]["history"][0].startswith("2310h, continuous overcurrent")
+
+    def test_a_silent_node(self, device_on_bus: Any) -> None:
+        with pytest.raises(NoDeviceError, match="node 7 does not answer"):
+            info(subject(device_on_bus, 7), output()[0])
+
+    def test_no_node_is_named(self, device_on_bus: Any) -> None:
+        with pytest.raises(ConfigurationError, match="which node"):
+            info(subject(device_on_bus, None), output()[0])
+
+    def test_an_absent_object_is_left_out(self, device_on_bus: Any) -> None:
+        with canopen_network(subject(device_on_bus)) as network:
+            reader = SdoReader(network, 1)
+            assert reader.value(0x2345) is None
+            refusal: Any = reader.upload(0x2345)
+            assert refusal.absent
+            assert "06020000h Object does not exist" in str(refusal)
+            assert len(pdo_maps(reader)) == 8
+
+
+class TestMonitor:
+    def test_listens_only(self, device_on_bus: Any) -> None:
+        told, out, err = output(json=True)
+        with can.Bus(interface="virtual", channel=device_on_bus.channel) as bus:
+            sender = bus.send_periodic(can.Message(arbitration_id=0x80, is_extended_id=False), 0.01)
+            assert monitor(subject(device_on_bus), told, Selection(count=3, kinds=frozenset({"sync"}))) == 0
+            sender.stop()
+        lines = [json.loads(line) for line in out.getvalue().splitlines()]
+        assert [line["kind"] for line in lines] == ["sync"] * 3
+        assert {identifier for identifier, _ in device_on_bus.requests} == {0x80}
+        assert "frames in" in err.getvalue()
+
+    def test_asks_for_the_mapping_if_told_so(self, device_on_bus: Any) -> None:
+        told, _, _ = output()
+        assert monitor(subject(device_on_bus), told, Selection(duration_s=0.0), ask=True) == 0
+        assert device_on_bus.requests
+        assert only_reads(device_on_bus)
+
+    def test_ends_in_time_on_a_silent_bus(self, empty_bus: Any) -> None:
+        told, out, err = output()
+        assert monitor(subject(empty_bus), told, Selection(duration_s=0.1)) == 0
+        assert (out.getvalue(), "0 frames in 0.1 s" in err.getvalue()) == ("", True)
+
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [((["xyz"], [], []), r"--cob-id \(=xyz\)"), (([], ["pdos"], []), r"--kind \(=pdos\) must be one of nmt")],
+    )
+    def test_bad_filters(self, arguments: Any, words: str) -> None:
+        with pytest.raises(ConfigurationError, match=words):
+            selection_of(*arguments, None, None, False)
+
+    def test_filters(self) -> None:
+        chosen = selection_of(["0x181", "80h"], [], [], None, None, False)
+        assert chosen.cob_ids == {0x181, 0x80}
+
+
+class TestSubject:
+    def test_flags_beat_the_environment(self) -> None:
+        environ = {"CAN_INTERFACE": "socketcan", "CAN_CHANNEL": "can0", "CAN_BITRATE": "250000"}
+        found = subject_of_flags(None, None, None, None, None, environ)
+        assert (found.interface, found.channel, found.bitrate_bitps) == ("socketcan", "can0", 250_000)
+        found = subject_of_flags("slcan", "x", 500_000, 3, None, environ)
+        assert (found.interface, found.channel, found.bitrate_bitps, found.node) == ("slcan", "x", 500_000, 3)
+
+    @pytest.mark.parametrize(("interface", "channel", "missing"), [(None, "x", "-i"), ("x", None, "-c")])
+    def test_a_bus_must_be_named(self, interface: str | None, channel: str | None, missing: str) -> None:
+        with pytest.raises(ConfigurationError, match=missing):
+            subject_of_flags(interface, channel, None, None, None, {})
+
+    def test_a_serial_drive_has_no_bus(self) -> None:
+        with pytest.raises(ConfigurationError, match=r"drive\.kind"):
+            subject_of_config(load_config(shipped_config("elmo_serial")))

@@ -1,0 +1,120 @@
+"""CANopen frames in words, by the predefined connection set of CiA 301 and what is known of PDOs and objects."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import can
+
+from drivers.can.error_frames import error_frame_text
+from tools.inspection import drive_words
+from tools.inspection.objects import Objects, Place
+from tools.inspection.pdo_maps import PdoMaps
+from tools.inspection.sdo_frames import SdoFrames
+from tools.running.emergency_text import emergency_text
+
+KINDS = ("nmt", "sync", "time", "emcy", "pdo", "sdo", "heartbeat", "lss", "error", "other")
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """`node` is 0 for what concerns all or none; `fields` are for --json."""
+
+    kind: str
+    node: int
+    text: str
+    fields: dict[str, Any] = field(default_factory=dict)
+
+
+class FrameDecoder:
+    """`objects` of the nodes whose EDS is at hand; all others are decoded by the standard's table."""
+
+    def __init__(self, objects: Mapping[int, Objects], maps: PdoMaps) -> None:
+        self._objects = dict(objects)
+        self._standard = Objects()
+        self.maps = maps
+        self._sdo = SdoFrames(self._of, maps.learn)
+
+    def _of(self, node: int) -> Objects:
+        return self._objects.get(node, self._standard)
+
+    def decode(self, message: can.Message) -> Decoded:
+        """Any frame; one that is not of CANopen is `other`."""
+        if message.is_error_frame:
+            text = error_frame_text(message.arbitration_id, bytes(message.data))
+            return Decoded("error", 0, text, {"class": message.arbitration_id & 0x1FFFFFFF})
+        cob_id, data = message.arbitration_id, bytes(message.data)
+        if message.is_extended_id or message.is_fd:
+            return Decoded("other", 0, "extended identifier" if message.is_extended_id else "CAN FD")
+        if message.is_remote_frame:
+            guard = cob_id & 0x780 == 0x700
+            return Decoded(
+                "heartbeat" if guard else "other", cob_id & 0x7F, "node guarding request" if guard else "RTR"
+            )
+        if cob_id == 0:
+            return _nmt(data)
+        if cob_id == 0x80:
+            return Decoded("sync", 0, f"SYNC {data[0]}" if data else "SYNC")
+        if cob_id == 0x100:
+            return Decoded("time", 0, "TIME")
+        if cob_id in (0x7E4, 0x7E5):
+            return Decoded("lss", 0, f"LSS {'answer' if cob_id == 0x7E4 else 'request'} {data[0] if data else 0:02X}h")
+        function, node = cob_id & 0x780, cob_id & 0x7F
+        pdo = self.maps.at(cob_id)
+        if pdo is not None and (pdo.enabled or 0x180 <= cob_id < 0x580):
+            return self._pdo(pdo, data)
+        if function == 0x80:
+            return _emergency(node, data)
+        if function == 0x580:
+            text, fields = self._sdo.response(node, data)
+            return Decoded("sdo", node, f"< {text}", fields)
+        if function == 0x600:
+            text, fields = self._sdo.request(node, data)
+            return Decoded("sdo", node, f"> {text}", fields)
+        if function == 0x700:
+            return _heartbeat(node, data)
+        return Decoded("other", 0, "")
+
+    def _pdo(self, pdo: Any, data: bytes) -> Decoded:
+        objects = self._of(pdo.node)
+        values = list(pdo.values(data, objects))
+        fields: dict[str, Any] = {"pdo": pdo.name, "values": {str(Place(i, s)): value for i, s, _, value in values}}
+        if not values:
+            return Decoded("pdo", pdo.node, f"{pdo.name} {data.hex(' ')}", fields)
+        texts = [
+            f"{objects.name(i, s) or Place(i, s)} {objects.value_text(i, s, value, bits)}"
+            for i, s, bits, value in values
+        ]
+        needed = (sum(bits for _, _, bits in pdo.entries) + 7) // 8
+        if len(data) < needed:
+            texts.append(f"too short: {len(data)} of {needed} bytes")
+            fields["malformed"] = True
+        return Decoded("pdo", pdo.node, f"{pdo.name} {', '.join(texts)}", fields)
+
+
+def _nmt(data: bytes) -> Decoded:
+    if len(data) < 2:
+        return Decoded("nmt", 0, "malformed", {"malformed": True})
+    command = drive_words.NMT_COMMANDS.get(data[0], f"unknown command {data[0]}")
+    node = data[1]
+    return Decoded("nmt", node, f"{command}, {f'node {node}' if node else 'all nodes'}", {"command": data[0]})
+
+
+def _emergency(node: int, data: bytes) -> Decoded:
+    if len(data) < 3:
+        return Decoded("emcy", node, f"malformed: {data.hex(' ')}", {"malformed": True})
+    code, register = struct.unpack_from("<HB", data)
+    text = "error reset or no error" if code & 0xFF00 == 0 else emergency_text(code)
+    own = data[3:].rstrip(b"\0")
+    text += f"; error register {drive_words.error_register_text(register)}"
+    text += f"; maker's data {data[3:].hex(' ')}" if own else ""
+    return Decoded("emcy", node, text, {"code": code, "error_register": register})
+
+
+def _heartbeat(node: int, data: bytes) -> Decoded:
+    if len(data) != 1:
+        return Decoded("heartbeat", node, f"malformed: {data.hex(' ')}", {"malformed": True})
+    return Decoded("heartbeat", node, drive_words.nmt_state(data[0]), {"state": data[0] & 0x7F})

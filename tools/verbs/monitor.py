@@ -1,0 +1,150 @@
+"""`jointctl monitor`: the traffic of a bus in words, line by line.  Listens only, unless it is asked to ask."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+import can
+
+from drivers.errors import BusError, ConfigurationError
+from tools.configuration.drive_settings import TORQUE_MODES
+from tools.inspection.drive_info import pdo_maps
+from tools.inspection.frame_decoder import KINDS, Decoded, FrameDecoder
+from tools.inspection.objects import Objects
+from tools.inspection.pdo_maps import PdoMaps
+from tools.inspection.sdo_reading import SdoReader
+from tools.inspection.subject import Subject, canopen_network
+from tools.output import Output
+from tools.running.stop_signals import stop_signals
+
+POLL_S = 0.1
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which frames are shown; an empty set means all.  `count` and `duration_s` end it, None = Ctrl-C does."""
+
+    cob_ids: frozenset[int] = frozenset()
+    kinds: frozenset[str] = frozenset()
+    nodes: frozenset[int] = frozenset()
+    count: int | None = None
+    duration_s: float | None = None
+    changes: bool = False  # only frames whose bytes differ from the last ones of the same identifier
+
+    def shows(self, cob_id: int, decoded: Decoded) -> bool:
+        """Whether a frame passes the filters."""
+        return (
+            (not self.cob_ids or cob_id in self.cob_ids)
+            and (not self.kinds or decoded.kind in self.kinds)
+            and (not self.nodes or decoded.node in self.nodes or (decoded.kind == "nmt" and decoded.node == 0))
+        )
+
+
+def selection_of(
+    cob_ids: list[str], kinds: list[str], nodes: list[int], count: int | None, duration_s: float | None, changes: bool
+) -> Selection:
+    """From the texts of the command line; identifiers are hexadecimal, as candump writes them."""
+    identifiers = set()
+    for text in cob_ids:
+        try:
+            identifiers.add(int(text.lower().removesuffix("h").removeprefix("0x"), 16))
+        except ValueError:
+            raise ConfigurationError(f"--cob-id (={text}) must be a hexadecimal identifier, such as 181") from None
+    for kind in kinds:
+        if kind not in KINDS:
+            raise ConfigurationError(f"--kind (={kind}) must be one of {', '.join(KINDS)}")
+    return Selection(frozenset(identifiers), frozenset(kinds), frozenset(nodes), count, duration_s, changes)
+
+
+def new_decoder(subject: Subject, *, ask: bool) -> FrameDecoder:
+    """With what the subject tells about objects and PDOs; `ask` reads the mapping from the drive over SDO."""
+    maps, objects = PdoMaps(), {}
+    if subject.eds is not None and subject.node is not None:
+        known = subject.objects()
+        objects[subject.node] = known
+        if known.dictionary is not None:
+            maps.learn_from_eds(known.dictionary, subject.node)
+    if subject.config is not None and subject.node is not None:
+        maps.learn_loop(subject.node, velocity=subject.config.canopen.mode not in TORQUE_MODES)
+    if ask:
+        node = subject.required_node()
+        with canopen_network(subject) as network:
+            reader = SdoReader(network, node, objects.get(node, Objects()))
+            reader.require_answer()
+            pdo_maps(reader, maps)
+    return FrameDecoder(objects, maps)
+
+
+def monitor(subject: Subject, output: Output, selection: Selection, *, ask: bool = False) -> int:
+    """Show frames until the selection or a stop signal ends it; 0.  A dead bus is a `BusError`."""
+    decoder = new_decoder(subject, ask=ask)
+    bus = subject.open_bus()
+    try:
+        with stop_signals() as signals:
+            output.note(f"listening on {subject.place}; Ctrl-C ends it")
+            _show(bus, decoder, output, selection, lambda: bool(signals.count))
+    except can.CanError as error:
+        raise BusError(f"{subject.place} failed: {error}", "wiring, bit rate, and whether it is up") from None
+    except BrokenPipeError:  # `jointctl monitor | head`
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115  (the interpreter would complain when it flushes)
+    finally:
+        bus.shutdown()
+    return 0
+
+
+def _show(bus: can.BusABC, decoder: FrameDecoder, output: Output, selection: Selection, asked: Any) -> None:
+    until_s = None if selection.duration_s is None else time.monotonic() + selection.duration_s
+    kinds: Counter[str] = Counter()
+    shown = 0
+    last: dict[int, bytes] = {}
+    started_s = time.monotonic()
+    while not asked() and (selection.count is None or shown < selection.count):
+        left_s = POLL_S if until_s is None else min(POLL_S, until_s - time.monotonic())
+        if left_s <= 0.0:
+            break
+        message = bus.recv(left_s)
+        if message is None:
+            continue
+        decoded = decoder.decode(message)
+        kinds[decoded.kind] += 1
+        if not selection.shows(message.arbitration_id, decoded):
+            continue
+        if selection.changes and last.get(message.arbitration_id) == bytes(message.data):
+            continue
+        last[message.arbitration_id] = bytes(message.data)
+        shown += 1
+        print(json_line(message, decoded) if output.json else text_line(message, decoded), file=output.stdout,
+              flush=True)  # fmt: skip
+    elapsed_s = time.monotonic() - started_s
+    told = ", ".join(f"{kind} {number}" for kind, number in kinds.most_common())
+    output.note(f"{sum(kinds.values())} frames in {elapsed_s:.1f} s{': ' + told if told else ''}")
+
+
+def text_line(message: can.Message, decoded: Decoded) -> str:
+    """`12:00:00.123456  181 [8]  node 1  pdo  TPDO1 Statusword ...`."""
+    clock = time.strftime("%H:%M:%S", time.localtime(message.timestamp)) + f"{message.timestamp % 1:.6f}"[1:]
+    name = "err" if message.is_error_frame else f"{message.arbitration_id:03X}"
+    node = f"node {decoded.node}" if decoded.node else ""
+    raw = bytes(message.data).hex(" ") if decoded.kind in ("other", "lss", "time") else ""
+    return f"{clock}  {name:>3} [{message.dlc}]  {node:<8} {decoded.kind:<9} {decoded.text} {raw}".rstrip()
+
+
+def json_line(message: can.Message, decoded: Decoded) -> str:
+    """One JSON object."""
+    return json.dumps(
+        {
+            "time_s": message.timestamp,
+            "cob_id": message.arbitration_id,
+            "kind": decoded.kind,
+            "node": decoded.node,
+            "data": bytes(message.data).hex(),
+            "text": decoded.text,
+            **decoded.fields,
+        }
+    )
