@@ -16,7 +16,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -56,8 +56,12 @@ def _block_signals() -> None:
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP})
 
 
-def become_realtime(cpu: int | None, priority: int | None) -> list[str]:
-    """Affinity, SCHED_FIFO and locked memory as far as the system allows; returns what it refused."""
+def become_realtime(cpu: int | None, priority: int | None, threads: Sequence[int] = (0,)) -> list[str]:
+    """Affinity, SCHED_FIFO and locked memory as far as the system allows; returns what it refused.
+
+    For the calling thread, or for those with the given numbers.  To be called when everything is compiled: a compiler
+    at this priority takes a core from everybody, other loops too, until the kernel throttles all real-time threads.
+    """
     refused = []
     if cpu is not None:
         try:
@@ -66,7 +70,8 @@ def become_realtime(cpu: int | None, priority: int | None) -> list[str]:
             refused.append(f"loop.cpu (={cpu}): {error}")
     if priority is not None:
         try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+            for thread in threads:
+                os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
         except (OSError, AttributeError) as error:
             refused.append(f"loop.priority (={priority}): {error}; see `jointctl doctor`")
     if ctypes.CDLL(None).mlockall(_MLOCK_CURRENT_AND_FUTURE) != 0:

@@ -19,9 +19,10 @@ _POLL_S = 0.05
 
 def hil(config: Config, output: Output, *, timing: bool = False, ready_fd: int | None = None) -> int:
     """Serve until a stop signal; `ready_fd` gets one byte once the bus can be used, and its reader's end ends us."""
-    for line in become_realtime(None, config.loop.priority):
-        output.note(f"virtual joint: {line}")
     with stop_signals() as signals, serve_virtual_joint(config, timing) as joint:
+        # only now, and every thread: bus, drive and SDO server are compiled and run
+        for line in become_realtime(None, config.loop.priority, [int(name) for name in os.listdir("/proc/self/task")]):
+            output.note(f"virtual joint: {line}")
         bus = config.bus
         place = f"{bus.interface}:{bus.channel}"
         if bus.interface == "jointctl":

@@ -47,9 +47,10 @@ def serve_virtual_elmo(config: Config, link: str | None = None) -> Iterator[Elmo
 
 def hil_serial(config: Config, output: Output, *, link: str | None = None, ready_fd: int | None = None) -> int:
     """Serve until a stop signal; prints the port on stdout.  `ready_fd` as in `tools.verbs.hil.hil`."""
-    for line in become_realtime(None, config.loop.priority):
-        output.note(f"virtual joint: {line}")
     with stop_signals() as signals, serve_virtual_elmo(config, link) as device:
+        # only now, and every thread: bus, drive and SDO server are compiled and run
+        for line in become_realtime(None, config.loop.priority, [int(name) for name in os.listdir("/proc/self/task")]):
+            output.note(f"virtual joint: {line}")
         path = link or device.path
         output.result(path, {"port": path, "baud_rate_bitps": device.baud_rate_bitps})
         output.note(f"virtual drive: {path} at {device.baud_rate_bitps} baud; Ctrl-C ends it")
