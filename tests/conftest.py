@@ -191,7 +191,8 @@ class DeviceOnBus:
     Its time moves on 1 ms with every frame, and faster than real time while nothing comes.
 
     `answers` replaces the value in expedited SDO upload responses, (index, sub) -> value; `mute` lists objects whose
-    next requests stay unanswered; `requests` are the frames that came in.
+    next requests stay unanswered; `requests` are the frames that came in.  `sequences` are answers used up one by one
+    before the true ones; `refused` are downloads answered with that SDO abort code; `deaf_frames` frames are lost.
     """
 
     def __init__(self, device: Cia402Device | None) -> None:
@@ -200,6 +201,9 @@ class DeviceOnBus:
         self.now_ns = 1_000_000
         self.answers: dict[tuple[int, int], int] = {}
         self.mute: list[tuple[int, int]] = []
+        self.refused: dict[tuple[int, int], int] = {}
+        self.sequences: dict[tuple[int, int], list[int]] = {}
+        self.deaf_frames = 0
         self.requests: list[tuple[int, bytes]] = []
         self._bus = can.Bus(interface="virtual", channel=self.channel)
         self._ended = threading.Event()
@@ -234,10 +238,17 @@ class DeviceOnBus:
             self.requests.append((message.arbitration_id, data))
             if self.device is None:
                 continue
+            if self.deaf_frames:
+                self.deaf_frames -= 1
+                continue
             if message.arbitration_id == 0x600 + self.device.settings.node_id:
                 place = struct.unpack_from("<HB", data, 1)
                 if place in self.mute:
                     self.mute.remove(place)
+                    continue
+                if data[0] & 0xE0 == 0x20 and place in self.refused:
+                    abort = struct.pack("<BHBI", 0x80, *place, self.refused[place])
+                    self._reply(_FRAME.pack(0x580 + self.device.settings.node_id, 8, abort))
                     continue
             self.now_ns += 1_000_000
             for frame in self.device.handle(_FRAME.pack(message.arbitration_id, len(data), data), self.now_ns):
@@ -247,8 +258,9 @@ class DeviceOnBus:
         identifier, size, payload = _FRAME.unpack(frame)
         if identifier & 0x780 == 0x580 and payload[0] & 0xE2 == 0x42:
             place = struct.unpack_from("<HB", payload, 1)
-            if place in self.answers:
-                value = self.answers[place] & 0xFFFFFFFF
+            if self.sequences.get(place) or place in self.answers:
+                value = self.sequences[place].pop(0) if self.sequences.get(place) else self.answers[place]
+                value &= 0xFFFFFFFF
                 payload = payload[:4] + struct.pack("<I", value)
         self._bus.send(can.Message(arbitration_id=identifier, data=payload[:size], is_extended_id=False))
 
@@ -274,8 +286,8 @@ def empty_bus() -> Iterator[DeviceOnBus]:
 
 @pytest.fixture
 def settings_of_virtual_joint() -> CanopenSettings:
-    """What configs/virtual.toml tells the driver."""
-    return dataclasses.replace(canopen_settings(load_config(CONFIGS / "virtual.toml")))
+    """What configs/virtual.toml tells the driver; it waits for nobody for long."""
+    return dataclasses.replace(canopen_settings(load_config(CONFIGS / "virtual.toml")), boot_timeout_s=0.2)
 
 
 @pytest.fixture

@@ -11,10 +11,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from drivers.canopen.cia402 import SUPPORTED_MODE_BIT, ControlWord, Mode, State, decode_state
+from drivers.canopen.eds_file import EdsFile
 from drivers.canopen.object_access import ObjectAccess
-from drivers.canopen.pdo_map import TARGET_TORQUE, TARGET_VELOCITY, configure_loop_pdos
+from drivers.canopen.pdo_layout import TARGET_TORQUE, TARGET_VELOCITY, PdoLayout
+from drivers.canopen.pdo_map import configure_loop_pdos
+from drivers.canopen.readiness import wait_until_ready
 from drivers.canopen.scaling import joint_torque_per_permille_Nm, joint_velocity_per_unit_radps
 from drivers.canopen.settings import CanopenSettings
+from drivers.canopen.synchronisation import set_sync
+from drivers.canopen.torque_slope import set_torque_slope
 from drivers.drive import DriveIdentity
 from drivers.errors import DeviceError
 
@@ -29,6 +34,7 @@ MODES = {
         Mode.CYCLIC_SYNC_VELOCITY, Mode.PROFILE_VELOCITY, Mode.CYCLIC_SYNC_TORQUE, Mode.TORQUE,
     ),
 }  # fmt: skip
+CYCLIC_MODES = (Mode.CYCLIC_SYNC_TORQUE, Mode.CYCLIC_SYNC_VELOCITY)
 VELOCITY_MODES = (Mode.CYCLIC_SYNC_VELOCITY, Mode.PROFILE_VELOCITY)
 LARGEST_UNSIGNED = 0xFFFFFFFF
 STEEP_RADPS2 = 1000.0  # profile acceleration at the joint, above any that the loop asks for
@@ -48,12 +54,13 @@ class Findings:
     torque_per_permille_Nm: float = 0.0
     max_permille: int = 0
     start_counts: int = 0
+    layout: PdoLayout | None = None  # of the loop's PDOs
     settings: dict[str, str] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
 
 
-def identify(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
-    """Device type and identity, compared with what the configuration expects."""
+def identify(objects: ObjectAccess, settings: CanopenSettings, eds: EdsFile, findings: Findings) -> None:
+    """Device type and identity, compared with what the configuration and the EDS expect."""
     profile = objects.read(0x1000, what="device type") & 0xFFFF
     if profile != CIA402_PROFILE:
         raise DeviceError(f"node {settings.node} has device profile {profile}, a drive has {CIA402_PROFILE} (CiA 402)")
@@ -69,9 +76,23 @@ def identify(objects: ObjectAccess, settings: CanopenSettings, findings: Finding
             raise DeviceError(
                 f"node {settings.node} is another device: {name} is {found:#x}, the configuration says {expected:#x}"
             )
+    _compare_with_eds(settings, eds, vendor, product, findings)
     findings.identity = DriveIdentity(
         f"{vendor:#010x}", f"{product:#010x}", f"{revision:#010x}", str(serial), objects.text(0x1008)
     )
+
+
+def _compare_with_eds(settings: CanopenSettings, eds: EdsFile, vendor: int, product: int, findings: Findings) -> None:
+    """An EDS of another maker is refused, unless the configuration names the drive's maker; another product is told."""
+    if eds.vendor_id and vendor and eds.vendor_id != vendor:
+        text = f"EDS {eds.name} is of vendor {eds.vendor_id:#x}, node {settings.node} is of vendor {vendor:#x}"
+        if settings.vendor_id is None:
+            raise DeviceError(text, hint=f"use the drive's own EDS file, or say drive.vendor_id = {vendor:#x}")
+        findings.remarks.append(text)
+    elif eds.product_code and product and eds.product_code != product:
+        findings.remarks.append(
+            f"EDS {eds.name} is of product {eds.product_code:#x}, node {settings.node} is product {product:#x}"
+        )
 
 
 def disable(objects: ObjectAccess, settings: CanopenSettings, pause: Pause) -> None:
@@ -93,6 +114,7 @@ def disable(objects: ObjectAccess, settings: CanopenSettings, pause: Pause) -> N
         )
     if state is State.OPERATION_ENABLED:
         raise DeviceError(f"node {settings.node} stays enabled although controlword 0 was written")
+    wait_until_ready(objects, settings.node, settings.boot_timeout_s, pause)
 
 
 def choose_mode(objects: ObjectAccess, settings: CanopenSettings, findings: Findings, pause: Pause) -> None:
@@ -118,10 +140,6 @@ def choose_mode(objects: ObjectAccess, settings: CanopenSettings, findings: Find
         pause(PAUSE_S)
     else:
         raise DeviceError(f"node {settings.node}: 6061 shows mode {shown}, mode {int(findings.mode)} was selected")
-    if findings.mode is Mode.TORQUE and objects.has(0x6087):
-        # profile torque ramps its target: make the ramp so steep that the loop's own rate limit decides
-        objects.write_verified(0x6087, 0, 1_000_000, what="torque slope")
-        findings.remarks.append("torque mode with profile (TQ) instead of cyclic synchronous torque")
     findings.settings["mode"] = findings.mode.name.lower()
 
 
@@ -165,30 +183,25 @@ def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
     if findings.max_permille < permille:
         findings.remarks.append(f"6072 holds at most {LARGEST_PERMILLE} permille: torque is limited to that")
     objects.write_verified(0x6072, 0, findings.max_permille, what="max torque")
+    if findings.mode is Mode.TORQUE:
+        findings.remarks += set_torque_slope(objects, scale, settings.torque_rate_max_Nmps)
     findings.settings["max torque"] = f"{findings.max_permille} permille = {findings.max_permille * scale:.1f} Nm"
-
-
-def synchronise(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
-    """60C2 = SYNC period, as value x 10^exponent s."""
-    period_us = round(1e6 / settings.rate_Hz)
-    exponent = -6
-    value = period_us
-    while value % 10 == 0 and exponent < 0:
-        value //= 10
-        exponent += 1
-    if value > 255:
-        raise DeviceError(f"loop.rate_Hz (={settings.rate_Hz:g}) has no 60C2 value: the period must be 1..255 x 10^n s")
-    objects.write_verified(0x60C2, 1, value, what="interpolation time period")
-    objects.write_verified(0x60C2, 2, exponent, what="interpolation time index")
-    findings.settings["60C2"] = f"{value}e{exponent} s"
 
 
 def arm_watchdog(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
     """The drive watches our heartbeat and stops by itself when it stays away; it sends its own as well."""
     milliseconds = round(settings.heartbeat_s * 1000.0)
     consumer = settings.master_node << 16 | milliseconds
+    if not objects.has(0x1016, 1):
+        raise DeviceError(
+            f"EDS {objects.eds_name} has no object 1016:1 (consumer heartbeat time), which jointctl needs: "
+            "without it the drive cannot notice that this computer has died",
+            hint="use the EDS file that belongs to this drive and firmware; a drive without a heartbeat consumer is "
+            "not enabled",
+        )
     objects.write_verified(0x1016, 1, consumer, what="consumer heartbeat time")
-    objects.write_verified(0x1017, 0, milliseconds, what="producer heartbeat time")
+    if not objects.write_if_present(0x1017, 0, milliseconds, what="producer heartbeat time"):
+        findings.remarks.append("no object 1017: a restarted drive is noticed by its boot-up message and its silence")
     if not objects.write_if_present(0x6007, 0, ABORT_QUICK_STOP, what="abort connection option"):
         findings.remarks.append("no object 6007: what the drive does when our heartbeat stops is up to the drive")
     objects.write_if_present(0x605A, 0, settings.quick_stop_option, what="quick stop option")
@@ -199,24 +212,33 @@ def arm_watchdog(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
 
 
 def commission(
-    objects: ObjectAccess, settings: CanopenSettings, pause: Pause, prove: Callable[[], str] | None = None
+    objects: ObjectAccess,
+    settings: CanopenSettings,
+    eds: EdsFile,
+    pause: Pause,
+    prove: Callable[[], str] | None = None,
 ) -> Findings:
     """All steps on a node in pre-operational; it ends disabled, with its PDOs mapped.
 
     `pause` sleeps; `prove` shows that the armed watchdog works and returns what the drive said (None: not proven).
     """
-    findings = Findings()
-    identify(objects, settings, findings)
+    findings = Findings(remarks=eds.all_remarks())
+    objects.remarks.clear()
+    identify(objects, settings, eds, findings)
     disable(objects, settings, pause)
     choose_mode(objects, settings, findings, pause)
     limit_torque(objects, settings, findings)
     if findings.mode in VELOCITY_MODES:
         limit_velocity(objects, settings, findings)
-    synchronise(objects, settings, findings)
+    findings.settings.update(set_sync(objects, settings.rate_Hz, cyclic=findings.mode in CYCLIC_MODES))
     arm_watchdog(objects, settings, findings)
     if prove is not None:
         findings.settings["watchdog proven"] = prove()
     target = TARGET_VELOCITY if findings.mode in VELOCITY_MODES else TARGET_TORQUE
-    configure_loop_pdos(objects, settings.node, settings.rpdo_transmission_type, target)
+    findings.layout = configure_loop_pdos(
+        objects, settings.node, settings.rpdo_transmission_type, target,
+        mode=findings.mode, max_permille=findings.max_permille,
+    )  # fmt: skip
     findings.start_counts = objects.read(0x6064, what="position actual value")
+    findings.remarks += objects.remarks
     return findings

@@ -139,7 +139,7 @@ def end_cycle(port: CanopenPort, frames: np.ndarray, sample: Sample, command: Co
     frame.can_id = port.rpdo_id
     frame.length = port.rpdo_length
     for i in range(8):
-        frame.payload[i] = 0
+        frame.payload[i] = port.rpdo_filler[i]
     put_u16(frame.payload, port.control_at, control_word(port.state, request))  # type: ignore[arg-type]
     enabled = request == DriveRequest.ENABLE and port.state == State.OPERATION_ENABLED
     if request != DriveRequest.ENABLE and port.state == State.OPERATION_ENABLED:

@@ -13,7 +13,9 @@ import canopen
 
 from drivers.canopen.cia402 import ControlWord, State, decode_state
 from drivers.canopen.commissioning import VELOCITY_MODES, Findings, commission
+from drivers.canopen.eds_file import read_eds
 from drivers.canopen.fault_reset import reset_fault
+from drivers.canopen.object_access import ATTEMPTS as SDO_ATTEMPTS
 from drivers.canopen.object_access import ObjectAccess
 from drivers.canopen.scaling import joint_angle_per_count_rad, new_port
 from drivers.canopen.settings import CanopenSettings
@@ -64,16 +66,25 @@ class CanopenDrive:
         self._network.listeners.append(on_failure)
         self._network.connect()
         try:
-            dictionary = canopen.import_od(str(settings.eds_path), settings.node)
-        except Exception as error:
+            self._eds = read_eds(settings.eds_path, settings.node)
+        except ConfigurationError:
             self.close()
-            raise ConfigurationError(f"drive.eds (={settings.eds_path}) is not a readable EDS file: {error}") from error
-        self._node = self._network.add_node(settings.node, dictionary)
-        self._node.sdo.RESPONSE_TIMEOUT = SDO_TIMEOUT_S
-        self._objects = ObjectAccess(self._node, settings.eds_path.name)
+            raise
+        self._node = self._network.add_node(settings.node, self._eds.dictionary)
+        self._node.sdo.RESPONSE_TIMEOUT = settings.sdo_timeout_s or SDO_TIMEOUT_S
+        self._objects = ObjectAccess(self._node, self._eds.name, self._eds.unusable)
 
     def _find(self) -> None:
-        """Make sure that the node answers; else say who does."""
+        """Make sure that the node answers, also one that is still booting; else say who does.
+
+        "Pre-operational" is said again each time: a node that boots in the meantime has not heard it, and some go
+        to operational by themselves.
+        """
+        for _ in range(round(self._settings.boot_timeout_s / (self._node.sdo.RESPONSE_TIMEOUT * SDO_ATTEMPTS))):
+            with contextlib.suppress(NoDeviceError):
+                self._objects.read(0x1000, what="device type")
+                break
+            self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
         try:
             self._objects.read(0x1000, what="device type")
         except NoDeviceError as error:
@@ -121,7 +132,7 @@ class CanopenDrive:
             self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
             self._find()
             self._objects.forget_verified()
-            findings = commission(self._objects, self._settings, self._sleep, self._prove_watchdog)
+            findings = commission(self._objects, self._settings, self._eds, self._sleep, self._prove_watchdog)
         except can.CanError as error:
             raise BusError(f"the bus failed during commissioning: {error}") from None
         self._findings = findings
@@ -162,7 +173,13 @@ class CanopenDrive:
             raise DeviceError("the drive has not been commissioned")
         found = self._findings
         velocity = found.mode in VELOCITY_MODES
-        return new_port(self._settings, found.torque_per_permille_Nm, found.max_permille, velocity=velocity)
+        return new_port(
+            self._settings,
+            found.torque_per_permille_Nm,
+            found.max_permille,
+            velocity=velocity,
+            layout=found.layout,
+        )
 
     def make_safe(self) -> str:
         """Pre-operational, quick stop if it is enabled, then controlword 0 until the statusword says disabled.

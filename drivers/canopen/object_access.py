@@ -5,9 +5,12 @@ Time-outs are retried (drives leave SDOs unanswered now and then); an abort is a
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import canopen
+from canopen.objectdictionary import ObjectDictionaryError
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from drivers.errors import DeviceError, NoDeviceError
@@ -27,6 +30,11 @@ ABORT_TEXT = {
 }
 
 
+def was_refused(error: Exception) -> bool:
+    """Whether the drive itself said no (SDO abort), rather than accepting a value and holding another."""
+    return isinstance(error.__cause__, SdoAbortedError)
+
+
 def object_name(index: int, sub: int = 0) -> str:
     """6040 or 1018:2."""
     return f"{index:04X}:{sub}" if sub else f"{index:04X}"
@@ -35,9 +43,14 @@ def object_name(index: int, sub: int = 0) -> str:
 class ObjectAccess:
     """Typed access to one node's object dictionary."""
 
-    def __init__(self, node: canopen.RemoteNode, eds_name: str) -> None:
+    def __init__(
+        self, node: canopen.RemoteNode, eds_name: str, unusable: Mapping[tuple[int, int], str] | None = None
+    ) -> None:
+        """`unusable`: objects that the EDS describes wrongly, and how."""
         self._node = node
-        self._eds_name = eds_name
+        self._eds_name = self.eds_name = eds_name
+        self._unusable = unusable or {}
+        self.remarks: list[str] = []  # what was tolerated
         self._verified: dict[tuple[int, int], tuple[int, str]] = {}  # what `write_verified` has set, and its name
 
     def has(self, index: int, sub: int = 0) -> bool:
@@ -53,6 +66,12 @@ class ObjectAccess:
 
     def _required(self, index: int, sub: int, what: str) -> Any:
         variable = self._variable(index, sub)
+        if variable is None and (index, sub) in self._unusable:
+            raise DeviceError(
+                f"EDS {self._eds_name}: object {object_name(index, sub)} ({what}) {self._unusable[index, sub]}, "
+                "and jointctl needs it",
+                hint="correct that line, or use the EDS file that belongs to this drive and firmware",
+            )
         if variable is None:
             raise DeviceError(
                 f"EDS {self._eds_name} has no object {object_name(index, sub)} ({what}), which jointctl needs",
@@ -67,31 +86,65 @@ class ObjectAccess:
             return DeviceError(f"{place} was refused: {reason} (SDO abort {error.code:08X}h)")
         return NoDeviceError(f"{place} got no answer in {ATTEMPTS} attempts")
 
+    def _number(self, variable: Any, data: bytes, what: str) -> int:
+        try:
+            value = variable.decode_raw(data)
+            if isinstance(value, (int, float)):
+                return int(value)
+        except (ObjectDictionaryError, ValueError, OverflowError):
+            pass
+        place = f"node {self._node.id}: object {object_name(variable.index, variable.subindex)} ({what})"
+        raise DeviceError(
+            f"{place} answers {len(data)} bytes, which is no {len(variable)} bit number",
+            hint="use the EDS file that belongs to this drive and firmware",
+        )
+
+    def _encoded(self, variable: Any, value: int, what: str) -> bytes:
+        try:
+            return bytes(variable.encode_raw(value))
+        except (ObjectDictionaryError, ValueError, TypeError):
+            place = f"EDS {self._eds_name}: object {object_name(variable.index, variable.subindex)} ({what})"
+            raise DeviceError(f"{place} has {len(variable)} bits, which do not hold {value}") from None
+
+    def highest(self, index: int, sub: int = 0) -> int | None:
+        """HighLimit of the EDS; None if it does not tell."""
+        variable = self._variable(index, sub)
+        return None if variable is None else variable.max
+
+    def indices(self, first: int, last: int) -> Iterator[int]:
+        """Objects of the EDS from `first` to `last`, in order."""
+        return (index for index in self._node.object_dictionary if first <= index <= last)
+
     def read(self, index: int, sub: int = 0, *, what: str) -> int:
         """Integer value of an object; `what` names it in messages."""
         variable = self._required(index, sub, what)
         for attempt in range(ATTEMPTS):
             try:
-                return int(variable.decode_raw(self._node.sdo.upload(index, sub)))
-            except (SdoAbortedError, SdoCommunicationError) as error:
+                return self._number(variable, self._node.sdo.upload(index, sub), what)
+            except (SdoAbortedError, SdoCommunicationError, struct.error) as error:
                 if isinstance(error, SdoAbortedError) or attempt == ATTEMPTS - 1:
                     raise self._failure(error, "reading", index, sub, what) from error
         raise AssertionError("unreachable")
 
     def write(self, index: int, sub: int, value: int, *, what: str) -> None:
         """Write an integer object; the type and so the length come from the EDS."""
-        variable = self._required(index, sub, what)
+        data = self._encoded(self._required(index, sub, what), value, what)
         for attempt in range(ATTEMPTS):
             try:
-                self._node.sdo.download(index, sub, variable.encode_raw(value))
+                self._node.sdo.download(index, sub, data)
                 return
-            except (SdoAbortedError, SdoCommunicationError) as error:
+            except (SdoAbortedError, SdoCommunicationError, struct.error) as error:
                 if isinstance(error, SdoAbortedError) or attempt == ATTEMPTS - 1:
                     raise self._failure(error, f"writing {value} to", index, sub, what) from error
 
     def write_verified(self, index: int, sub: int, value: int, *, what: str) -> int:
-        """Write, read back and compare."""
-        self.write(index, sub, value, what=what)
+        """Write, read back and compare.  A refused write is none where the object already holds the value."""
+        try:
+            self.write(index, sub, value, what=what)
+        except DeviceError:
+            if self.read(index, sub, what=what) != value:
+                raise
+            self.remarks.append(f"{object_name(index, sub)} ({what}) cannot be written; it is {value}, as it must be")
         found = self.read(index, sub, what=what)
         if found != value:
             place = f"node {self._node.id}: object {object_name(index, sub)} ({what})"
@@ -127,5 +180,5 @@ class ObjectAccess:
             return ""
         try:
             return bytes(self._node.sdo.upload(index, 0)).rstrip(b"\0").decode("latin-1").strip()
-        except (SdoAbortedError, SdoCommunicationError):
+        except (SdoAbortedError, SdoCommunicationError, struct.error):  # the last: an answer that is too short
             return ""

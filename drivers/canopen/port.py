@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from firmware_py.schema import f8, i4, i8, record, u4
+from typing import Annotated
+
+import numpy as np
+
+from firmware_py.schema import array_of, f8, i4, i8, record, u1, u4
 
 # slots of the frame array that goes with a port
 SLOT_SYNC = 0
@@ -34,6 +38,7 @@ class CanopenPort:
     torque_at: i4
     control_at: i4
     target_at: i4
+    rpdo_filler: Annotated[np.ndarray, array_of(u1, 8)]  # of the RPDO where nothing is written
     # scaling, directions included: all at the joint
     position_radpcount: f8
     zero_counts: i8

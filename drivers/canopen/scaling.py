@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from drivers.canopen.pdo_layout import PdoLayout, own_layout
 from drivers.canopen.port import CanopenPort
 from drivers.canopen.settings import CanopenSettings
 from firmware_py.schema import new
@@ -38,34 +39,38 @@ def joint_velocity_per_unit_radps(settings: CanopenSettings) -> float:
 
 
 def new_port(
-    settings: CanopenSettings, torque_per_permille_Nm: float, max_permille: int, *, velocity: bool = False
+    settings: CanopenSettings,
+    torque_per_permille_Nm: float,
+    max_permille: int,
+    *,
+    velocity: bool = False,
+    layout: PdoLayout | None = None,
 ) -> Any:
-    """A `CanopenPort` record array of one record for the loop's PDO layout; the file descriptor is still missing.
+    """A `CanopenPort` record array of one record; the file descriptor is still missing.
 
-    `velocity`: the drive is in a velocity mode and the RPDO carries 60FF.
+    `velocity`: the drive is in a velocity mode and the RPDO carries 60FF.  `layout`: of the PDOs (None: our own).
     """
+    layout = layout or own_layout(settings.node, velocity=velocity)
     ports = new(CanopenPort)
     port = ports[0]
     port.fd = -1
     port.node = settings.node
     port.sync_id = 0x80
-    port.tpdo_id = 0x180 + settings.node
-    port.rpdo_id = 0x200 + settings.node
     port.emergency_id = 0x80 + settings.node
     port.heartbeat_id = 0x700 + settings.node
     port.own_heartbeat_id = 0x700 + settings.master_node
     # three heartbeats within the drive's time-out, so that one or two lost ones do not stop the joint
     port.heartbeat_cycles = max(1, int(settings.heartbeat_s * settings.rate_Hz / 3.0))
-    port.tpdo_length = 8
-    port.rpdo_length = 6 if velocity else 4
+    for key in (
+        "tpdo_id", "rpdo_id", "tpdo_length", "rpdo_length",
+        "status_at", "position_at", "torque_at", "control_at", "target_at",
+    ):  # fmt: skip
+        setattr(port, key, getattr(layout, key))
+    for i, value in enumerate(layout.fill):
+        port.rpdo_filler[i] = value
     port.target_is_velocity = int(velocity)
     # the drive counts speed in the direction of its encoder
     port.velocity_radpspunit = joint_velocity_per_unit_radps(settings) * settings.encoder_direction
-    port.status_at = 0
-    port.position_at = 2
-    port.torque_at = 6
-    port.control_at = 0
-    port.target_at = 2
     port.position_radpcount = joint_angle_per_count_rad(settings) * settings.encoder_direction
     port.zero_counts = settings.zero_counts
     port.torque_Nmppermille = torque_per_permille_Nm * settings.torque_direction

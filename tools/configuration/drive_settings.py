@@ -45,6 +45,9 @@ def canopen_settings(config: Config) -> CanopenSettings:
         rated_tolerance=drive.rated_tolerance,
         max_torque_permille=drive.max_torque_permille,
         velocity_unit=drive.velocity_unit,
+        torque_rate_max_Nmps=config.limits.torque_rate_max_Nmps,
+        boot_timeout_s=drive.boot_timeout_s,
+        sdo_timeout_s=drive.sdo_timeout_s,
         velocity_max_radps=config.limits.velocity_max_radps,
     )
 

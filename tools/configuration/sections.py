@@ -130,6 +130,8 @@ class Drive(Section):
     velocity_unit: Literal["counts/s", "r/min", "0.1 r/min"] = "counts/s"  # of 60FF; counts of 6064, r/min of the motor
     heartbeat_s: Annotated[float, between(0.01, 2.0)]  # the drive stops itself when our heartbeat is older
     master_node: Node = 126  # whose heartbeat the drive watches
+    boot_timeout_s: Annotated[float, between(0.0, 60.0)] = 3.0  # for the first answer, and for leaving Not Ready
+    sdo_timeout_s: Annotated[float, between(0.02, 10.0)] | None = None  # of one SDO request (three times); None = 0.3 s
     quick_stop_option: Annotated[int, between(0, 8)] = 2  # 605A: 2 = brake on the quick stop ramp, then power off
     # 1 = the torque is taken over at the next SYNC, 254/255 = at once
     rpdo_transmission_type: Annotated[int, between(0, 255)] = 1

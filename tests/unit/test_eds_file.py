@@ -1,0 +1,213 @@
+"""EDS and DCF files as they are found: odd encodings, missing and wrong entries, and any mutation of a good one."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from canopen.objectdictionary import datatypes
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from drivers.canopen.eds_file import EdsFile, read_eds
+from drivers.canopen.eds_text import decoded, number_of, parse_sections
+from drivers.errors import ConfigurationError
+
+SHIPPED = Path(__file__).resolve().parents[2] / "configs" / "virtual_joint.eds"
+TEXT = SHIPPED.read_text()
+
+
+def eds_of(tmp_path: Path, text: str | bytes) -> EdsFile:
+    path = tmp_path / "drive.eds"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return read_eds(path, 5)
+
+
+def edited(section: str, line: str, replacement: str) -> str:
+    """The shipped EDS with one line of one section replaced."""
+    pattern = rf"(?ms)(^\[{section}\][^\[]*?^){line}$"
+    changed, count = re.subn(pattern, lambda match: match[1] + replacement, TEXT, count=1)
+    assert count == 1
+    return changed
+
+
+def test_a_good_file_gets_no_remark_and_is_what_the_library_reads() -> None:
+    import canopen
+
+    eds, library = read_eds(SHIPPED, 1), canopen.import_od(str(SHIPPED), 1)
+    assert eds.all_remarks() == []
+    assert not eds.unusable
+    for index in (i for i in library if i >= 0x1000):
+        theirs = library[index]
+        members = [None] if hasattr(theirs, "data_type") else list(theirs)
+        for sub in members:
+            right = theirs if sub is None else theirs[sub]
+            ours = eds.dictionary.get_variable(index, sub or 0)
+            assert ours is not None, (index, sub)
+            for key in ("data_type", "access_type", "default", "min", "max", "name", "pdo_mappable"):
+                assert getattr(ours, key) == getattr(right, key), (f"{index:04X}:{sub}", key)
+
+
+@pytest.mark.parametrize(
+    ("data", "remark"),
+    [
+        (TEXT.encode("utf-8-sig"), None),
+        (TEXT.replace("\n", "\r\n").encode(), None),
+        (TEXT.replace("\n", "\r").encode(), None),
+        (TEXT.replace("Device type", "Gerätetyp °").encode("latin-1"), "is not UTF-8: read as Latin-1"),
+        (TEXT.replace("Device type", "Gerätetyp °").encode(), None),
+        (TEXT.encode("utf-16"), "is UTF-16, CiA 306 asks for ASCII"),
+        (TEXT.encode() + b"\0\0", "holds NUL characters, which were skipped"),
+        (TEXT.replace("[6071]", "[ 0x6071 ]").encode(), None),
+        (TEXT.replace("sub1]", "SUB1]").replace("ParameterName", "PARAMETERNAME").encode(), None),
+        (TEXT.replace("0x00020192", "0X00020192 ; a drive").encode(), None),
+        (b"no section yet\n" + TEXT.encode(), "line 1: neither [section] nor key=value: skipped"),
+        (b"Key=too early\n" + TEXT.encode(), "line 1: before the first section: skipped"),
+        (TEXT.encode() + b"\n[DeviceComissioning]\nNodeID=0x7\n", "was made for node 7, this is node 5"),
+    ],
+)
+def test_the_same_objects_whatever_the_file_looks_like(tmp_path: Path, data: bytes, remark: str | None) -> None:
+    eds = eds_of(tmp_path, data)
+    assert eds.all_remarks() == ([f"EDS drive.eds: {remark}"] if remark else [])
+    assert eds.dictionary.get_variable(0x6071).data_type == datatypes.INTEGER16
+    assert eds.dictionary.get_variable(0x1000).default == 0x20192
+    assert eds.dictionary.get_variable(0x1018, 1).data_type == datatypes.UNSIGNED32
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("0x1F", 31), ("0X1f", 31), ("31", 31), ("1F", 31), ("ff", 255), ("017", 15), ("08", 8), (" 0x10 ", 16),
+        ("$NODEID+0x180", 0x185), ("0x180+$NODEID", 0x185), ("$nodeid", 5), ("$NODEID + 0x600", 0x605),
+        ("0x80000000UL", 1 << 31), ("-5", -5), ("", None), ("none", None), ("0x", None), ("1.5", None),
+        ("12h", None), ("9" * 5000, None), ("$NODEID+x", None),
+    ],
+)  # fmt: skip
+def test_numbers(text: str, value: int | None) -> None:
+    assert number_of(text, 5) == value
+
+
+def test_a_missing_data_type_is_that_of_the_standard(tmp_path: Path) -> None:
+    eds = eds_of(tmp_path, edited("6071", "DataType=0x0003", "Comment=none"))
+    assert eds.dictionary.get_variable(0x6071).data_type == datatypes.INTEGER16
+    assert eds.all_remarks() == ["EDS drive.eds: [6071] has no DataType: INTEGER16 of the standard is used"]
+
+
+def test_a_wrong_sign_is_that_of_the_standard(tmp_path: Path) -> None:
+    eds = eds_of(tmp_path, edited("6041", "DataType=0x0006", "DataType=0x0003"))
+    assert eds.dictionary.get_variable(0x6041).data_type == datatypes.UNSIGNED16
+    remark = "[6041] DataType (=INTEGER16) is UNSIGNED16 in the standard, which is used"
+    assert eds.all_remarks() == [f"EDS drive.eds: {remark}"]
+
+
+def test_another_length_is_believed_outside_the_pdos_and_not_inside(tmp_path: Path) -> None:
+    eds = eds_of(tmp_path, edited("6087", "DataType=0x0007", "DataType=0x0006"))
+    assert eds.dictionary.get_variable(0x6087).data_type == datatypes.UNSIGNED16
+    assert "[6087] DataType (=UNSIGNED16) is UNSIGNED32 in the standard: the file's is used" in eds.all_remarks()[0]
+    eds = eds_of(tmp_path, edited("6071", "DataType=0x0003", "DataType=0x0004"))
+    assert eds.dictionary.get_variable(0x6071) is None
+    assert eds.unusable == {(0x6071, 0): "DataType (=INTEGER32) must be INTEGER16"}
+
+
+def test_defects_of_objects_that_are_not_used_are_one_line(tmp_path: Path) -> None:
+    text = TEXT + "".join(f"\n[{index:04X}]\nParameterName=x\nObjectType=0x7\n" for index in range(0x3000, 0x3010))
+    eds = eds_of(tmp_path, text)
+    expected = "objects that jointctl does not use have 16 defects, such as [3000] has no DataType"
+    assert eds.all_remarks() == [f"EDS drive.eds: {expected}"]
+    assert len(eds.unusable) == 16
+
+
+@pytest.mark.parametrize(
+    ("limits", "remark"),
+    [
+        ("LowLimit=5\nHighLimit=4", "LowLimit (=5) is above HighLimit (=4): both ignored"),
+        ("LowLimit=1000", "lowlimit (=1000) is no INTEGER8: ignored"),
+        ("HighLimit=twelve\x1b[31m", "highlimit (=twelve?[31m) is no INTEGER8: ignored"),
+    ],
+)
+def test_limits_that_make_no_sense_are_ignored(tmp_path: Path, limits: str, remark: str) -> None:
+    text = re.sub(r"(?ms)^\[60C2sub2\].*?(?=^\[)", f"[60C2sub2]\nDataType=2\n{limits}\n", TEXT)
+    eds = eds_of(tmp_path, text)
+    assert eds.all_remarks() == [f"EDS drive.eds: [60C2sub2] {remark}"]
+    assert (eds.dictionary.get_variable(0x60C2, 2).min, eds.dictionary.get_variable(0x60C2, 2).max) == (None, None)
+
+
+def test_a_second_section_only_adds(tmp_path: Path) -> None:
+    eds = eds_of(tmp_path, TEXT + "\n[1018sub1]\nDataType=0x0007\nDefaultValue=7\n")
+    assert [line.partition(": ")[2].partition(": ")[2] for line in eds.all_remarks()] == [
+        "[1018sub1] a second time: only what the first lacks is taken",
+        "[1018sub1] defaultvalue a second time with another value: skipped",
+    ]
+    assert eds.dictionary.get_variable(0x1018, 1).default == 0
+
+
+def test_members_without_their_object_and_compact_ones(tmp_path: Path) -> None:
+    without = re.sub(r"(?ms)^\[1029\].*?(?=^\[)", "", TEXT)
+    eds = eds_of(tmp_path, without)
+    assert eds.dictionary.get_variable(0x1029, 1).data_type == datatypes.UNSIGNED8
+    assert any("belongs to no section [1029]" in line for line in eds.all_remarks())
+    compact = "\n[3001]\nParameterName=Row\nObjectType=0x8\nDataType=0x7\nAccessType=rw\nCompactSubObj=3\n"
+    eds = eds_of(tmp_path, TEXT + compact)
+    assert [eds.dictionary.get_variable(0x3001, k) is not None for k in range(5)] == [True, True, True, True, False]
+
+
+def test_a_file_without_objects_is_refused(tmp_path: Path) -> None:
+    for text in ("", "[FileInfo]\nA=1\n", "nonsense", "\0" * 100):
+        with pytest.raises(ConfigurationError, match="is not a readable EDS file: it describes no object"):
+            eds_of(tmp_path, text)
+    with pytest.raises(ConfigurationError, match="is not a readable EDS file"):
+        read_eds(tmp_path, 1)
+
+
+LINES = TEXT.splitlines()
+CUTS = st.lists(
+    st.tuples(
+        st.integers(0, len(LINES) - 1),
+        st.sampled_from(["drop", "double", "swap", "upper", "junk", "number", "header", "cut"]),
+        st.text(max_size=12),
+    ),
+    max_size=30,
+)
+
+
+def mutated(cuts: list[tuple[int, str, str]]) -> str:
+    """The shipped EDS with lines dropped, doubled, swapped, cut, or given other values."""
+    lines = list(LINES)
+    for at, kind, text in cuts:
+        line = lines[at % len(lines)]
+        key = line.partition("=")[0]
+        changed = {
+            "drop": [], "double": [line, line], "swap": [lines[at // 2], line], "upper": [line.upper()], "junk": [text],
+            "number": [f"{key}={text}"], "header": [f"[{text}]", line], "cut": [line[: len(text)]],
+        }[kind]  # fmt: skip
+        lines[at % len(lines) : at % len(lines) + 1] = changed
+    return "\n".join(lines)
+
+
+@settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(CUTS)
+@example([(0, "junk", "[6040]")])
+def test_any_mutation_of_a_file_is_read_or_refused_in_one_line(
+    tmp_path: Path, cuts: list[tuple[int, str, str]]
+) -> None:
+    data = mutated(cuts).encode("utf-8", errors="surrogatepass")
+    try:
+        eds = eds_of(tmp_path, data)
+    except ConfigurationError as error:
+        lines = str(error).splitlines()
+    else:
+        lines = [line for remark in eds.all_remarks() for line in remark.splitlines()]
+        assert len(lines) == len(eds.all_remarks())
+        assert all(eds.dictionary.get_variable(index, 0) is not None or index for index in eds.dictionary)
+        return
+    assert len(lines) == 1
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.binary(max_size=400))
+def test_any_bytes_are_text_and_sections(data: bytes) -> None:
+    text, _ = decoded(data)
+    sections, remarks = parse_sections(text)
+    assert all(isinstance(keys, dict) for keys in sections.values())
+    assert all(isinstance(line, str) for line in remarks)
