@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -11,8 +10,8 @@ from typing import Any
 import canopen
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
+from drivers.canopen.eds_file import read_eds
 from drivers.canopen.object_access import object_name
-from drivers.errors import ConfigurationError
 from tools.inspection import drive_words
 from tools.inspection.standard_objects import standard_variable
 from tools.running.emergency_text import emergency_text
@@ -25,11 +24,7 @@ _LONGEST_SHOWN = 32  # bytes of a domain
 
 def read_dictionary(path: Path, node: int) -> canopen.ObjectDictionary:
     """The objects of an EDS or DCF; `ConfigurationError` if it cannot be read."""
-    logging.getLogger("canopen").setLevel(logging.ERROR)
-    try:
-        return canopen.import_od(str(path), node)
-    except Exception as error:  # the parser raises whatever the sloppy file makes it raise
-        raise ConfigurationError(f"{path}: not a readable EDS or DCF file: {' '.join(str(error).split())}") from None
+    return read_eds(path, node).dictionary
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Any
 
 import canopen
 
-from drivers.canopen.pdo_map import CONTROL, DISABLED, POSITION, STATUS, TARGET_TORQUE, TARGET_VELOCITY, TORQUE
+from drivers.canopen.pdo_layout import CONTROL, DISABLED, POSITION, STATUS, TARGET_TORQUE, TARGET_VELOCITY, TORQUE
 from tools.inspection.objects import SIGNED, Objects
 
 PREDEFINED = 4  # PDOs of each direction in the predefined connection set
