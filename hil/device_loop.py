@@ -234,14 +234,18 @@ class RealtimeDevice:
                 for response in responses:
                     service.send(response)
 
+    def compile(self) -> None:
+        """Compile, or load from the cache, what `start` runs; nothing is sent."""
+        self.words[:] = 0
+        self.words[STOP_WORD] = 1
+        self._run(-1)
+        self.words[:] = 0
+
     def start(self) -> None:
         """Compile if need be, then boot: the boot-up message is sent."""
         if self._threads:
             raise RuntimeError("the device is running already")
-        self.words[:] = 0
-        self.words[STOP_WORD] = 1
-        self._run(-1)  # compiles, does nothing
-        self.words[:] = 0
+        self.compile()
         self._core_end, python_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._threads = [
             threading.Thread(target=self._run, args=(self._core_end.fileno(),), name="device", daemon=True),

@@ -59,7 +59,7 @@ class CanopenDrive:
         self._findings: Findings | None = None
         self._taken = False  # whether the drive has heard anything from us
         # the library warns about every heartbeat state and unknown frame; what matters is told by this driver
-        logging.getLogger("canopen").setLevel(logging.ERROR)
+        logging.getLogger("canopen").setLevel(logging.CRITICAL)
         self._network = canopen.Network(bus)
         self._network.NOTIFIER_CYCLE = 0.05
         on_failure: Any = _BusFailure(sleep)  # the library knows only its own kind of listener

@@ -38,6 +38,8 @@ def new_device(config: Config) -> Cia402Device:
 def serve_virtual_joint(config: Config, timing: bool = False) -> Iterator[RealtimeDevice | PumpedDevice]:
     """Drive in threads of this process; the bus as well if it is the virtual one, all others exist already."""
     device = new_device(config)
+    if config.bus.interface in CYCLIC_INTERFACES:
+        RealtimeDevice(device, -1).compile()  # a bus that can be found has a drive that answers
     with ExitStack() as stack:
         if config.bus.interface == "jointctl":
             path = default_socket_path(config.bus.channel)
