@@ -1,0 +1,43 @@
+"""docs/troubleshooting.md quotes messages as the program prints them, and knows every fault."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+from tools.running.fault_text import FAULT_TEXTS
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / "docs" / "troubleshooting.md").read_text()
+GAP = "…"
+
+
+def printed_texts() -> list[str]:
+    """Every text in the sources, with a gap where a value goes."""
+    found = []
+    for folder in ("drivers", "tools", "hil"):
+        for file in sorted((ROOT / folder).rglob("*.py")):
+            for node in ast.walk(ast.parse(file.read_text())):
+                if isinstance(node, ast.JoinedStr):
+                    found.append("".join(p.value if isinstance(p, ast.Constant) else GAP for p in node.values))
+                elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                    found.append(re.sub(r"{[^}]*}", GAP, node.value))
+    return found
+
+
+def test_every_quoted_message_is_in_the_sources() -> None:
+    rows = [line for line in PAGE.splitlines() if line.startswith("| `")]
+    messages = [line.split("`")[1] for line in rows]
+    everything = "\n".join(printed_texts())
+    assert len(messages) > 35
+    unknown = [
+        message for message in messages if not all(piece.strip(" :") in everything for piece in message.split(GAP))
+    ]
+    assert unknown == []
+
+
+def test_every_fault_is_there_in_the_words_of_the_program() -> None:
+    for fault, text in FAULT_TEXTS.items():
+        row = f"| {fault.name} | `{re.sub('{[^}]*}', GAP, text.happened)}` | {text.cause} | {text.next_step} |"
+        assert row in PAGE
