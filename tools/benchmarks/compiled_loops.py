@@ -21,6 +21,7 @@ from drivers.can.open import open_cyclic_end
 from drivers.drive import Drive
 from drivers.errors import JointctlError
 from firmware_py.states import StopRequest
+from tools.analysis.idle_states import cores_awake
 from tools.analysis.wake_up import fifo, wake_up_lateness_ns
 from tools.benchmarks.law_memory import setting_doubles
 from tools.benchmarks.load import load
@@ -91,7 +92,7 @@ def run_c(program: Path, config: Config, seconds: float, load_name: str) -> Loop
         drive.start_cyclic()
         fd = end.fileno()
         numbers = (fd, config.loop.priority or 0, period_ns, int(RECEIVE_SHARE * period_ns), cycles)
-        with load(load_name):
+        with load(load_name), cores_awake():  # as ours and cyclictest do
             result = subprocess.run(
                 [str(program), *map(str, numbers)],
                 input=setting.tobytes(),
@@ -134,6 +135,6 @@ def run_cyclictest(path: str, config: Config, seconds: float, load_name: str) ->
 
 def run_sleep_only(config: Config, seconds: float, load_name: str) -> LoopTimes:
     """Our compiled sleep without any exchange, in this process: what cyclictest does."""
-    with load(load_name), fifo(config.loop.priority or 1):
+    with load(load_name), fifo(config.loop.priority or 1), cores_awake():
         late_ns = wake_up_lateness_ns(config.loop.rate_Hz, round(seconds * config.loop.rate_Hz))
     return LoopTimes(late_ns * 1e-3, NO_VALUES, NO_VALUES)

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tools.analysis.idle_states import cores_awake
 from tools.analysis.wake_up import fifo, wake_up_lateness_ns
 from tools.configuration.config import Config
 from tools.inspection.findings import NOTE, OK, PROBLEM, Finding, file_text
@@ -29,6 +30,9 @@ _MCL_CURRENT = 1
 _MUCH_SLACK_NS = 50_000
 _LATE_US = 500.0
 _RIGHTS = "in /etc/security/limits.d/jointctl.conf: '{user} - rtprio 90' and '{user} - memlock unlimited'; log in again"
+_LATENCY_RIGHT = (
+    """a udev rule gives the right: KERNEL=="cpu_dma_latency", GROUP="realtime", MODE="0660", and you in that group"""
+)
 
 
 def _rights() -> str:
@@ -80,6 +84,10 @@ def scheduling() -> Iterator[Finding]:
     shown = "unlimited" if limit == resource.RLIM_INFINITY else f"{limit // 1024} KiB"
     text = f"{'permitted' if good else 'refused'}; limit {shown}"
     yield Finding("memory lock", OK if good else NOTE, text, "" if good else _rights())
+    with cores_awake() as refused:
+        good = not refused
+    text = "cores stay awake during a run" if good else f"cores may sleep deeply: {refused}"
+    yield Finding("idle states", OK if good else NOTE, text, "" if good else _LATENCY_RIGHT)
     slack_ns = int(libc.prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0))
     good = 0 < slack_ns <= _MUCH_SLACK_NS
     cure = "" if good else "without SCHED_FIFO every sleep is that much longer: start jointctl from an ordinary shell"
@@ -95,7 +103,8 @@ def wake_up(config: Config, cycles: int) -> Iterator[Finding]:
             if refused:
                 yield Finding(name, NOTE, f"not measured: {refused}", _rights())
                 continue
-            late_us = wake_up_lateness_ns(rate_Hz, cycles) / 1000.0
+            with cores_awake():
+                late_us = wake_up_lateness_ns(rate_Hz, cycles) / 1000.0
         p50, p99 = np.percentile(late_us, (50.0, 99.0))
         worst = float(late_us.max())
         numbers = {"rate_Hz": rate_Hz, "p50_us": float(p50), "p99_us": float(p99), "max_us": worst}

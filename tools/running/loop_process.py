@@ -25,6 +25,7 @@ from typing import Any
 from drivers.errors import JointctlError
 from firmware_py.libc import NANOSECONDS
 from firmware_py.realtime import Word
+from tools.analysis.idle_states import cores_awake
 
 _MLOCK_CURRENT_AND_FUTURE = 3
 _POLL_S = 0.001
@@ -145,13 +146,14 @@ def run(order: LoopOrder) -> int:
         gc.disable()
         for line in become_realtime(order.cpu, order.priority):
             print(f"loop: {line}", file=sys.stderr, flush=True)
-        block.words[Word.READY] = 1
-        while block.words[Word.GO] == 0:
-            if os.getppid() != order.supervisor_pid:
-                return 1
-            time.sleep(_POLL_S)
-        go()
-        block.words[Word.ENDED] = 1
+        with cores_awake():  # where that is refused, `doctor` says so
+            block.words[Word.READY] = 1
+            while block.words[Word.GO] == 0:
+                if os.getppid() != order.supervisor_pid:
+                    return 1
+                time.sleep(_POLL_S)
+            go()
+            block.words[Word.ENDED] = 1
     if order.tail_path is not None and os.getppid() != order.supervisor_pid:
         save_tail(block, Path(order.tail_path))
     return 0
