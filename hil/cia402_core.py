@@ -9,8 +9,9 @@ bit 9 follows the NMT state (0 while stopped).
 from __future__ import annotations
 
 from firmware_py.kernel import kernel
+from hil.cia402_homing import begin_homing, interrupt_homing
 from hil.device_errors import report_cleared, report_error
-from hil.device_records import Device, DriveObjects, Mode, NmtState, PowerState, int64
+from hil.device_records import Device, DriveObjects, HomingState, Mode, NmtState, PowerState, int64
 from hil.frames import FrameQueue
 
 _HALT = 0x0100
@@ -19,7 +20,7 @@ _HALT = 0x0100
 @kernel
 def mode_supported(mode: int) -> bool:
     """True for the modes that 6502 claims."""
-    return mode == 1 or mode == 3 or mode == 4 or mode == 8 or mode == 9 or mode == 10
+    return mode == 1 or mode == 3 or mode == 4 or mode == 6 or mode == 8 or mode == 9 or mode == 10
 
 
 @kernel
@@ -113,17 +114,36 @@ def fault_cause_present(device: Device) -> bool:
 
 @kernel
 def _take_setpoint(device: Device, word: int, last: int) -> None:
-    """Profile position handshake: bit 4 rising takes the target (bit 6: relative), falling ends the acknowledge."""
+    """Profile position handshake: bit 4 rising takes the target (bit 6: relative), falling ends the acknowledge.
+
+    With bit 5 the target replaces the one that is under way; without, it waits until that one is reached, and the
+    acknowledge lasts as long as it waits.  A third one is not taken.
+    """
     if word & 0x10 and not last & 0x10:
+        if device.setpoint_waiting and not word & 0x20:
+            return
         target = int64(device.drive.target_position) / device.counts_per_rad
         if word & 0x40:
-            start = device.setpoint_position_rad if device.setpoint_active else device.reference_position_rad
-            target += start
-        device.setpoint_position_rad = target
-        device.setpoint_active = 1
+            target += device.setpoint_position_rad if device.setpoint_active else device.reference_position_rad
+        if device.setpoint_active and not word & 0x20:
+            device.setpoint_next_rad = target
+            device.setpoint_waiting = 1
+        else:
+            device.setpoint_position_rad = target
+            device.setpoint_active = 1
+            device.setpoint_waiting = 0
         device.setpoint_acknowledged = 1
-    elif not word & 0x10:
+    elif not word & 0x10 and not device.setpoint_waiting:
         device.setpoint_acknowledged = 0
+
+
+@kernel
+def _command_homing(device: Device, word: int, last: int) -> None:
+    """Homing: bit 4 rising starts, falling or halt interrupts."""
+    if word & 0x10 and not last & 0x10 and not word & _HALT:
+        begin_homing(device)
+    elif not word & 0x10 or word & _HALT:
+        interrupt_homing(device)
 
 
 @kernel
@@ -182,6 +202,8 @@ def apply_controlword(device: Device, queue: FrameQueue) -> None:
         _command_enabled(device, word, command)
         if drive.mode_display == Mode.PROFILE_POSITION and command == 0x0F:
             _take_setpoint(device, word, last)
+        elif drive.mode_display == Mode.HOMING and command == 0x0F:
+            _command_homing(device, word, last)
     elif state == PowerState.QUICK_STOP_ACTIVE and command == 0x0F and drive.quick_stop_option >= 5:
         device.state = PowerState.OPERATION_ENABLED
         device.braking = 0
@@ -201,9 +223,12 @@ def _target_reached(device: Device) -> bool:
         return not moving
     if mode == Mode.PROFILE_POSITION:
         error = int64(drive.position) - int64(round(device.setpoint_position_rad * device.counts_per_rad))
-        return device.setpoint_active == 0 and abs(error) <= int64(drive.position_window)
+        idle = device.setpoint_active == 0 and device.setpoint_waiting == 0
+        return idle and abs(error) <= int64(drive.position_window)
     if mode == Mode.PROFILE_VELOCITY:
         return abs(int64(drive.velocity) - int64(drive.target_velocity)) <= int64(drive.velocity_window)
+    if mode == Mode.HOMING:
+        return device.homing != HomingState.SEARCHING and not moving
     if mode == Mode.TORQUE:
         target = 0.0 if drive.controlword & _HALT else float(drive.target_torque)
         return device.demand == target
@@ -244,8 +269,9 @@ def status_word(device: Device) -> int:
         (mode >= Mode.CYCLIC_POSITION and enabled and device.braking == 0)
         or (mode == Mode.PROFILE_VELOCITY and abs(int64(drive.velocity)) <= int64(drive.velocity_window))
         or (mode == Mode.PROFILE_POSITION and device.setpoint_acknowledged)
+        or (mode == Mode.HOMING and device.homing == HomingState.ATTAINED)
     ):
         word |= 0x1000
-    if device.following_time_s > 0.0:
+    if device.following_time_s > 0.0 or (mode == Mode.HOMING and device.homing == HomingState.FAILED):
         word |= 0x2000
     return word

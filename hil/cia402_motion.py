@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 
 from firmware_py.kernel import kernel
+from hil.cia402_homing import homing_target_radps, interrupt_homing
 from hil.device_records import Device, DriveObjects, Mode, PowerState, int64
 
 _HALT = 0x0100
@@ -112,7 +113,11 @@ def _profile_position(device: Device, position_rad: float, velocity_radps: float
         if abs(left) <= abs(device.segment_velocity_radps) * dt_s + 0.5 / abs(device.counts_per_rad):
             device.reference_position_rad = device.setpoint_position_rad
             device.segment_velocity_radps = 0.0
-            device.setpoint_active = 0
+            device.setpoint_active = device.setpoint_waiting
+            device.setpoint_position_rad = (
+                device.setpoint_next_rad if device.setpoint_waiting else device.setpoint_position_rad
+            )
+            device.setpoint_waiting = 0
             target_radps = 0.0
     device.reference_velocity_radps = device.segment_velocity_radps
     _ramp_velocity(device, target_radps, dt_s)
@@ -122,9 +127,10 @@ def _profile_position(device: Device, position_rad: float, velocity_radps: float
 
 
 @kernel
-def _mode_demand(device: Device, position_rad: float, velocity_radps: float, dt_s: float) -> float:
+def _mode_demand(device: Device, position: int, velocity_radps: float, dt_s: float) -> float:
     drive = device.drive
     mode = drive.mode_display
+    position_rad = position / device.counts_per_rad
     if mode == Mode.CYCLIC_TORQUE:
         torque = float(drive.target_torque) + float(drive.torque_offset)
         return -torque if device.torque_reversed else torque
@@ -143,6 +149,11 @@ def _mode_demand(device: Device, position_rad: float, velocity_radps: float, dt_
         return _cyclic_position(device, position_rad, velocity_radps, dt_s) + float(drive.torque_offset)
     if mode == Mode.PROFILE_POSITION:
         return _profile_position(device, position_rad, velocity_radps, dt_s)
+    if mode == Mode.HOMING:
+        target_radps = _limit(homing_target_radps(device, position, dt_s), _max_speed_radps(device))
+        step_radps = int64(drive.homing_acceleration) / abs(device.counts_per_rad) * dt_s
+        device.reference_velocity_radps += _limit(target_radps - device.reference_velocity_radps, step_radps)
+        return _velocity_loop(device, velocity_radps, dt_s)
     return 0.0
 
 
@@ -205,14 +216,16 @@ def demand_torque_Nm(device: Device, position: int, velocity_radps: float, dt_s:
         device.segment_target = position
         device.segment_left_s = 0.0
         device.setpoint_active = 0
+        device.setpoint_waiting = 0
         device.setpoint_acknowledged = 0
+        interrupt_homing(device)
         device.setpoint_position_rad = position_rad
         device.integral_Nm = 0.0
         device.demand = 0.0
     if device.braking != 0:
         demand = _brake(device, velocity_radps, dt_s)
     elif state == PowerState.OPERATION_ENABLED:
-        demand = _mode_demand(device, position_rad, velocity_radps, dt_s)
+        demand = _mode_demand(device, position, velocity_radps, dt_s)
     else:
         device.reference_velocity_radps = 0.0
         demand = _velocity_loop(device, velocity_radps, dt_s)

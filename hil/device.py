@@ -17,6 +17,7 @@ from hil.device_write_rules import check_write
 from hil.faults import no_faults
 from hil.frames import FRAME_SIZE, FrameQueue
 from hil.object_dictionary import ObjectDictionary
+from hil.parameter_store import ParameterStore
 from hil.plant_records import PlantConstants, PlantState
 from hil.sdo_server import SdoServer
 
@@ -41,6 +42,7 @@ class DeviceSettings:
     velocity_gain_Nmspr: float = 200.0
     velocity_integral_Nmprad: float = 10_000.0
     position_gain_ps: float = 30.0
+    parameter_file: Path | None = None  # keeps what 1010 saves; None = as long as the device exists
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -93,6 +95,8 @@ class Cia402Device:
         self._frame = np.zeros(FRAME_SIZE, np.uint8)
         self.objects = ObjectDictionary(eds_path, settings.node_id, self.device)
         self._configure()
+        self.parameters = ParameterStore(self.objects, settings.parameter_file)
+        self.objects.restore_strings()
         self.sdo = SdoServer(self.objects, self._write)
         power_on(self.device[0])
         self._resets = int(self.device[0].application_resets)
@@ -117,8 +121,12 @@ class Cia402Device:
     def _write(self, index: int, sub: int, data: bytes) -> None:
         """A complete SDO download."""
         value = self.objects.check(index, sub, data)
-        check_write(self.objects, index, sub, value, int(self.device[0].state))
-        self.objects.store(index, sub, data)
+        state = int(self.device[0].state)
+        check_write(self.objects, index, sub, value, state)
+        if index in (0x1010, 0x1011):
+            self.parameters.command(index, sub, value, state)
+        else:
+            self.objects.store(index, sub, data)
 
     def is_sdo_request(self, frame: bytes) -> bool:
         """True for a frame that `answer_sdo` is for, in a state in which SDO is alive."""

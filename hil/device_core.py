@@ -3,7 +3,7 @@
 The real-time process and the lockstep simulation call the same three functions: `power_on`, `accept_frame` for
 every frame but the SDO requests, `advance` up to the present time.  Time must not run backwards; all times [ns] are
 those of the caller's clock and greater than 0.  Plant and drive advance in substeps of the plant.
-Not modelled: node guarding, TIME, LSS, bus-off.
+Not modelled: TIME, LSS, bus-off; the only remote request that is answered is node guarding.
 """
 
 from __future__ import annotations
@@ -22,10 +22,12 @@ from hil.cia402_motion import demand_torque_Nm, following_error_tripped
 from hil.device_errors import (
     FOLLOWING_ERROR,
     POSITION_LIMIT,
+    SYNC_LENGTH,
     error_register,
+    send_emergency,
 )
-from hil.device_records import CONSUMERS, Device, NmtState, PowerState, int64
-from hil.device_timers import SYNC_ERROR, connection_back, enter_nmt, run_timers
+from hil.device_records import CONSUMERS, Device, HomingState, NmtState, PowerState, int64
+from hil.device_timers import SYNC_ERROR, answer_node_guard, connection_back, enter_nmt, run_timers
 from hil.frames import FrameQueue
 from hil.joint import encoder_counts, step_plant
 from hil.pdo_core import mark_events, receive_rpdo, receive_sync
@@ -45,6 +47,8 @@ def restart(device: Device, application: bool) -> None:
         device.last_controlword = 0
         device.state = PowerState.SWITCH_ON_DISABLED
         device.application_resets += 1
+        device.homing = HomingState.IDLE
+        device.home_shift_counts = 0
     if device.fault_code == 0:
         power_off(device)
     device.communication_errors = 0
@@ -54,6 +58,10 @@ def restart(device: Device, application: bool) -> None:
     device.heartbeat_period_ms = 0
     for i in range(CONSUMERS):
         device.consumer_heard_ns[i] = 0
+    device.guard_heard_ns = 0
+    device.guard_toggle = 0
+    device.emcy_sent_ns = 0
+    device.emcy_waiting = 0
     device.nmt = NmtState.BOOT_UP
     device.boot_pending = 1
     device.next_due_ns = 0
@@ -83,13 +91,19 @@ def _int32(value: float) -> int:
 
 
 @kernel
+def _position_counts(device: Device, plant_c: PlantConstants, plant_s: PlantState) -> int:
+    """6064: the encoder, counted from the home position."""
+    return int64(encoder_counts(plant_c, plant_s)) - int64(device.home_shift_counts)
+
+
+@kernel
 def sample_objects(device: Device, plant_c: PlantConstants, plant_s: PlantState) -> None:
     """Measured values of the plant into the objects, in their units; statusword last.
 
     A drive measures current: 6077 is the torque constant times current, without cogging and the reducer's ripple.
     """
     drive = device.drive
-    drive.position = encoder_counts(plant_c, plant_s)
+    drive.position = _position_counts(device, plant_c, plant_s)
     drive.velocity = _int32(plant_s.joint_velocity_radps * device.counts_per_rad)
     motor_torque_mNm = 1e3 * plant_c.torque_per_current_NmpA * plant_s.current_A / device.reduction_ratio
     drive.torque = _int16(1e3 * motor_torque_mNm / int64(drive.rated_torque_mNm))
@@ -111,8 +125,9 @@ def _substep(device: Device, plant_c: PlantConstants, plant_s: PlantState, dt_s:
     limits = device.drive.position_limit
     mode = device.drive.mode_display
     counts = int64(device.drive.position)
-    if limits[0] != 0 or limits[1] != 0 or mode == 1 or mode == 8 or device.resync:  # the encoder costs time
-        counts = int64(encoder_counts(plant_c, plant_s))
+    positioning = mode == 1 or mode == 8 or mode == 6
+    if limits[0] != 0 or limits[1] != 0 or positioning or device.resync:  # the encoder costs time
+        counts = _position_counts(device, plant_c, plant_s)
     if device.fault_code == 0:
         code = int64(device.inject_fault_code)
         if code != 0:
@@ -173,6 +188,24 @@ def _command_nmt(device: Device, command: int) -> None:
 
 
 @kernel
+def _accept_sync(device: Device, frame: np.ndarray, now_ns: int, queue: FrameQueue) -> None:
+    """SYNC in NMT operational; one without its counter byte, or with one too many, is reported once and ignored."""
+    counted = device.communication.sync_overflow != 0
+    if int64(frame[4]) != (1 if counted else 0):
+        if not device.sync_length_wrong:
+            device.sync_length_wrong = 1
+            send_emergency(device, SYNC_LENGTH, queue)
+        return
+    device.sync_length_wrong = 0
+    device.sync_heard_ns = now_ns
+    timeout_ns = int64(device.drive.sync_timeout_ms) * _MS
+    if timeout_ns:
+        device.next_due_ns = min(device.next_due_ns, now_ns + timeout_ns)
+    connection_back(device, SYNC_ERROR, queue)
+    receive_sync(device, now_ns, int64(frame[8]) if counted else 0, queue)
+
+
+@kernel
 def accept_frame(
     device: Device,
     plant_c: PlantConstants,
@@ -185,9 +218,12 @@ def accept_frame(
     advance(device, plant_c, plant_s, now_ns, queue)
     identifier = int64(frame[0]) | int64(frame[1]) << 8
     size = int64(frame[4])
-    if frame[3] & 0xE0 or frame[2] or identifier > 0x7FF or device.nmt == NmtState.BOOT_UP or size > 8:
-        return  # extended, remote and error frames are not for this device
-    if identifier == 0:
+    if frame[3] & 0xA0 or frame[2] or identifier > 0x7FF or device.nmt == NmtState.BOOT_UP or size > 8:
+        return  # extended and error frames are not for this device
+    if frame[3] & 0x40:
+        if identifier == 0x700 + device.node_id:
+            answer_node_guard(device, now_ns, queue)
+    elif identifier == 0:
         if size == 2 and (frame[9] == 0 or frame[9] == device.node_id):
             _command_nmt(device, int64(frame[8]))
             device.next_due_ns = 0
@@ -201,12 +237,7 @@ def accept_frame(
                 device.next_due_ns = 0
     elif device.nmt == NmtState.OPERATIONAL:
         if identifier == int64(device.communication.sync_cob_id) & 0x7FF:
-            device.sync_heard_ns = now_ns
-            timeout_ns = int64(device.drive.sync_timeout_ms) * _MS
-            if timeout_ns:
-                device.next_due_ns = min(device.next_due_ns, now_ns + timeout_ns)
-            connection_back(device, SYNC_ERROR, queue)
-            receive_sync(device, now_ns, queue)
+            _accept_sync(device, frame, now_ns, queue)
         else:
             receive_rpdo(device, identifier, frame, now_ns, queue)
     drive_status = status_word(device)

@@ -2,7 +2,7 @@
 
 Error register 1001: bit 0 generic (any error), 1 current, 2 voltage, 3 temperature, 4 communication, 5 device
 profile, 7 manufacturer.  An emergency message is [code lo, code hi, register, 0 x 5]; code 0000 = all clear.
-Not modelled: the inhibit time of emergency messages (1015).
+Messages that the inhibit time 1015 holds back wait in a list of 8; one more replaces the last of them.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from hil.frames import QUEUE_LENGTH, FrameQueue
 COB_ID_INVALID = 0x80000000
 HEARTBEAT_LOST = 0x8130
 RPDO_TOO_SHORT = 0x8210
+SYNC_LENGTH = 0x8240
 RPDO_TIMEOUT = 0x8250
 SYNC_LOST = 0x8700
 NMT_LEFT = 0x8100
@@ -63,16 +64,55 @@ def error_register(device: Device) -> int:
 
 
 @kernel
-def send_emergency(device: Device, code: int, queue: FrameQueue) -> None:
-    """Queue the emergency message; none while stopped, booting, or when 1014 is invalid."""
-    cob_id = int64(device.communication.emcy_cob_id)
-    if cob_id & COB_ID_INVALID or device.nmt == NmtState.STOPPED or device.nmt == NmtState.BOOT_UP:
-        return
-    slot = push_frame(queue, cob_id & 0x7FF, 8)
+def _push_emergency(device: Device, word: int, queue: FrameQueue) -> None:
+    slot = push_frame(queue, int64(device.communication.emcy_cob_id) & 0x7FF, 8)
     if slot >= 0:
-        queue.frames[slot, 8] = code & 0xFF
-        queue.frames[slot, 9] = (code >> 8) & 0xFF
-        queue.frames[slot, 10] = device.communication.error_register
+        queue.frames[slot, 8] = word & 0xFF
+        queue.frames[slot, 9] = (word >> 8) & 0xFF
+        queue.frames[slot, 10] = (word >> 16) & 0xFF
+    device.emcy_sent_ns = device.time_ns
+
+
+@kernel
+def _emergencies_off(device: Device) -> bool:
+    return (
+        int64(device.communication.emcy_cob_id) & COB_ID_INVALID != 0
+        or device.nmt == NmtState.STOPPED
+        or device.nmt == NmtState.BOOT_UP
+    )
+
+
+@kernel
+def send_emergency(device: Device, code: int, queue: FrameQueue) -> None:
+    """Queue the emergency message, or keep it for later; none while stopped, booting, or when 1014 is invalid."""
+    if _emergencies_off(device):
+        return
+    word = code | int64(device.communication.error_register) << 16
+    inhibit_ns = int64(device.communication.emcy_inhibit_100us) * 100_000
+    early = inhibit_ns and device.emcy_sent_ns and device.time_ns - device.emcy_sent_ns < inhibit_ns
+    if device.emcy_waiting or early:
+        slot = min(int64(device.emcy_waiting), HISTORY - 1)
+        device.emcy_waiting_words[slot] = word
+        device.emcy_waiting = slot + 1
+        device.next_due_ns = 0
+    else:
+        _push_emergency(device, word, queue)
+
+
+@kernel
+def send_waiting_emergencies(device: Device, next_ns: int, queue: FrameQueue) -> int:
+    """Send what the inhibit time no longer holds back; the earlier of `next_ns` and the next time to look."""
+    if _emergencies_off(device):
+        device.emcy_waiting = 0
+    while device.emcy_waiting:
+        due_ns = device.emcy_sent_ns + int64(device.communication.emcy_inhibit_100us) * 100_000
+        if device.time_ns < due_ns:
+            return min(next_ns, due_ns)
+        _push_emergency(device, int64(device.emcy_waiting_words[0]), queue)
+        for i in range(1, HISTORY):
+            device.emcy_waiting_words[i - 1] = device.emcy_waiting_words[i]
+        device.emcy_waiting -= 1
+    return next_ns
 
 
 @kernel

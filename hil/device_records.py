@@ -55,9 +55,19 @@ class Mode(IntEnum):
     PROFILE_POSITION = 1
     PROFILE_VELOCITY = 3
     TORQUE = 4
+    HOMING = 6
     CYCLIC_POSITION = 8
     CYCLIC_VELOCITY = 9
     CYCLIC_TORQUE = 10
+
+
+class HomingState(IntEnum):
+    """What bits 10, 12 and 13 of the statusword tell in homing mode, apart from standstill."""
+
+    IDLE = 0  # not started, or interrupted
+    SEARCHING = 1
+    ATTAINED = 2
+    FAILED = 3
 
 
 @record
@@ -67,9 +77,13 @@ class CommunicationObjects:
     error_history: Annotated[np.ndarray, array_of(u4, HISTORY)]
     sync_cob_id: u4
     sync_period_us: u4
+    guard_time_ms: u2
+    life_time_factor: u1
     emcy_cob_id: u4
+    emcy_inhibit_100us: u2
     consumer_heartbeat: Annotated[np.ndarray, array_of(u4, CONSUMERS)]  # node << 16 | ms
     producer_heartbeat_ms: u2
+    sync_overflow: u1  # highest value of the SYNC counter, 0 = none
     error_behaviour: u1
     identity: Annotated[np.ndarray, array_of(u4, 4)]
     rpdo_cob_id: Annotated[np.ndarray, array_of(u4, PDOS)]
@@ -81,6 +95,7 @@ class CommunicationObjects:
     tpdo_type: Annotated[np.ndarray, array_of(u1, PDOS)]
     tpdo_inhibit_100us: Annotated[np.ndarray, array_of(u2, PDOS)]
     tpdo_timer_ms: Annotated[np.ndarray, array_of(u2, PDOS)]
+    tpdo_sync_start: Annotated[np.ndarray, array_of(u1, PDOS)]
     tpdo_count: Annotated[np.ndarray, array_of(u1, PDOS)]
     tpdo_mapping: Annotated[np.ndarray, array_of(u4, PDOS, MAPPED)]
 
@@ -114,6 +129,7 @@ class DriveObjects:
     torque: i2
     current: i2
     target_position: i4
+    home_offset: i4
     position_limit: Annotated[np.ndarray, array_of(i4, 2)]
     max_profile_velocity: u4
     max_motor_speed_rpm: u4
@@ -123,6 +139,9 @@ class DriveObjects:
     quick_stop_deceleration: u4
     torque_slope: u4
     encoder_resolution: Annotated[np.ndarray, array_of(u4, 2)]
+    homing_method: i1
+    homing_speed: Annotated[np.ndarray, array_of(u4, 2)]
+    homing_acceleration: u4
     torque_offset: i2
     interpolation_time: u1
     interpolation_exponent: i1
@@ -162,12 +181,19 @@ class Device:
     consumer_entry: Annotated[np.ndarray, array_of(u4, CONSUMERS)]
     consumer_heard_ns: Annotated[np.ndarray, array_of(i8, CONSUMERS)]  # 0 = not yet heard
     sync_heard_ns: i8  # 0 = not yet heard
+    sync_length_wrong: i4  # reported already
+    guard_heard_ns: i8  # 0 = not yet asked by a node-guarding master
+    guard_toggle: i4
+    emcy_sent_ns: i8  # 0 = none yet
+    emcy_waiting: i4  # held back by the inhibit time, oldest first
+    emcy_waiting_words: Annotated[np.ndarray, array_of(u4, HISTORY)]  # register << 16 | code
     rpdo_heard_ns: Annotated[np.ndarray, array_of(i8, PDOS)]
     rpdo_waiting: Annotated[np.ndarray, array_of(i4, PDOS)]  # received, applied at the next SYNC
     rpdo_data: Annotated[np.ndarray, array_of(u1, PDOS, 8)]
     tpdo_sent_ns: Annotated[np.ndarray, array_of(i8, PDOS)]
     tpdo_event: Annotated[np.ndarray, array_of(i4, PDOS)]
     tpdo_syncs: Annotated[np.ndarray, array_of(i4, PDOS)]
+    tpdo_started: Annotated[np.ndarray, array_of(i4, PDOS)]  # the SYNC with the start value has been there
     event_status: i8  # status of which the event-driven TPDOs know
     communication_errors: i4  # bit mask of causes that are present
     fault_code: i4  # latched drive fault, 0 = none
@@ -187,6 +213,12 @@ class Device:
     setpoint_active: i4
     setpoint_acknowledged: i4
     setpoint_position_rad: f8
+    setpoint_waiting: i4  # a second one, taken when the first is reached
+    setpoint_next_rad: f8
+    homing: i4  # HomingState
+    homing_cell: i8  # index pulses passed, at the start
+    homing_time_left_s: f8
+    home_shift_counts: i8  # encoder minus reported position
     integral_Nm: f8
     demand: f8  # torque demand before limits [per mille of rated]
     saturated: i4
@@ -199,8 +231,12 @@ def _fields() -> dict[tuple[int, int], str]:
         (0x1003, 0): "error_count",
         (0x1005, 0): "sync_cob_id",
         (0x1006, 0): "sync_period_us",
+        (0x100C, 0): "guard_time_ms",
+        (0x100D, 0): "life_time_factor",
         (0x1014, 0): "emcy_cob_id",
+        (0x1015, 0): "emcy_inhibit_100us",
         (0x1017, 0): "producer_heartbeat_ms",
+        (0x1019, 0): "sync_overflow",
         (0x1029, 1): "error_behaviour",
         (0x2102, 0): "sync_timeout_ms",
         (0x6007, 0): "abort_option",
@@ -229,6 +265,7 @@ def _fields() -> dict[tuple[int, int], str]:
         (0x6077, 0): "torque",
         (0x6078, 0): "current",
         (0x607A, 0): "target_position",
+        (0x607C, 0): "home_offset",
         (0x607D, 1): "position_limit[0]",
         (0x607D, 2): "position_limit[1]",
         (0x607F, 0): "max_profile_velocity",
@@ -240,6 +277,10 @@ def _fields() -> dict[tuple[int, int], str]:
         (0x6087, 0): "torque_slope",
         (0x608F, 1): "encoder_resolution[0]",
         (0x608F, 2): "encoder_resolution[1]",
+        (0x6098, 0): "homing_method",
+        (0x6099, 1): "homing_speed[0]",
+        (0x6099, 2): "homing_speed[1]",
+        (0x609A, 0): "homing_acceleration",
         (0x60B2, 0): "torque_offset",
         (0x60C2, 1): "interpolation_time",
         (0x60C2, 2): "interpolation_exponent",
@@ -259,6 +300,7 @@ def _fields() -> dict[tuple[int, int], str]:
             for entry in range(MAPPED):
                 fields[base + 0x200 + pdo, 1 + entry] = f"{way}_mapping[{pdo * MAPPED + entry}]"
         fields[0x1800 + pdo, 3] = f"tpdo_inhibit_100us[{pdo}]"
+        fields[0x1800 + pdo, 6] = f"tpdo_sync_start[{pdo}]"
     return fields
 
 

@@ -17,6 +17,7 @@ from hil.device_errors import (
     push_frame,
     report_cleared,
     report_error,
+    send_waiting_emergencies,
 )
 from hil.device_records import CONSUMERS, PDOS, Device, NmtState, int64
 from hil.frames import FrameQueue
@@ -25,6 +26,7 @@ from hil.pdo_core import send_due_tpdos, start_pdos
 _FAR_NS = 1_000_000_000
 _MS = 1_000_000
 SYNC_ERROR = 0x04
+LIFE_GUARD_ERROR = 0x08
 RPDO_ERROR = 0x10
 
 
@@ -66,6 +68,8 @@ def _producer_heartbeat(device: Device, now_ns: int, next_ns: int, queue: FrameQ
         device.heartbeat_due_ns = now_ns  # a new period starts with a heartbeat at once
     if period_ms == 0:
         return next_ns
+    device.guard_heard_ns = 0  # heartbeat and node guarding exclude each other; heartbeat has precedence
+    connection_back(device, LIFE_GUARD_ERROR, queue)
     if now_ns >= device.heartbeat_due_ns:
         slot = push_frame(queue, 0x700 + device.node_id, 1)
         if slot >= 0:
@@ -74,6 +78,34 @@ def _producer_heartbeat(device: Device, now_ns: int, next_ns: int, queue: FrameQ
         if device.heartbeat_due_ns <= now_ns:  # far behind: keep no backlog
             device.heartbeat_due_ns = now_ns + period_ms * _MS
     return min(next_ns, device.heartbeat_due_ns)
+
+
+@kernel
+def answer_node_guard(device: Device, now_ns: int, queue: FrameQueue) -> None:
+    """A remote request for 700 + node (CiA 301, 7.2.8.2.2.1): NMT state and toggle bit, unless a heartbeat is set."""
+    if device.communication.producer_heartbeat_ms:
+        return
+    slot = push_frame(queue, 0x700 + device.node_id, 1)
+    if slot >= 0:
+        queue.frames[slot, 8] = int64(device.nmt) | int64(device.guard_toggle) << 7
+    device.guard_toggle ^= 1
+    device.guard_heard_ns = now_ns
+    device.next_due_ns = 0
+    connection_back(device, LIFE_GUARD_ERROR, queue)
+
+
+@kernel
+def _watch_guarding(device: Device, now_ns: int, next_ns: int, queue: FrameQueue) -> int:
+    """Life guarding: the master's requests must not stay away for 100C times 100D."""
+    group = device.communication
+    time_ns = int64(group.guard_time_ms) * int64(group.life_time_factor) * _MS
+    heard_ns = device.guard_heard_ns
+    if time_ns == 0 or heard_ns == 0 or device.communication_errors & LIFE_GUARD_ERROR:
+        return next_ns
+    if now_ns - heard_ns < time_ns:
+        return min(next_ns, heard_ns + time_ns)
+    _connection_lost(device, HEARTBEAT_LOST, LIFE_GUARD_ERROR, True, queue)
+    return next_ns
 
 
 @kernel
@@ -122,7 +154,9 @@ def run_timers(device: Device, now_ns: int, queue: FrameQueue) -> None:
         push_frame(queue, 0x700 + device.node_id, 1)
         device.nmt = NmtState.PRE_OPERATIONAL
     next_ns = _watch(device, now_ns, next_ns, queue)
+    next_ns = _watch_guarding(device, now_ns, next_ns, queue)
     next_ns = _producer_heartbeat(device, now_ns, next_ns, queue)
     if device.nmt == NmtState.OPERATIONAL:
         next_ns = send_due_tpdos(device, now_ns, next_ns, queue)
+    next_ns = send_waiting_emergencies(device, next_ns, queue)
     device.next_due_ns = next_ns

@@ -7,17 +7,18 @@ inhibit time of a valid PDO are fixed.  A COB-ID must be an 11-bit identifier ou
 from __future__ import annotations
 
 from hil.device_records import MAPPED, PowerState
-from hil.object_dictionary import INVALID_VALUE, ObjectDictionary, SdoAbort
+from hil.object_dictionary import DEVICE_STATE, INVALID_VALUE, ObjectDictionary, SdoAbort
 
 NOT_MAPPABLE = 0x06040041
 PDO_LENGTH = 0x06040042
 PARAMETER_CONFLICT = 0x06040043
-DEVICE_STATE = 0x08000022
 
 _INVALID = 0x80000000
 _EXTENDED = 0x20000000
 _QUICK_STOP_OPTIONS = (0, 1, 2, 5, 6)
-_MODES = (0, 1, 3, 4, 8, 9, 10)
+_MODES = (0, 1, 3, 4, 6, 8, 9, 10)
+_HOMING_METHODS = (0, 33, 34, 35, 37)
+_VALUES = {0x605A: _QUICK_STOP_OPTIONS, 0x6060: _MODES, 0x6098: _HOMING_METHODS, 0x1003: (0,)}
 
 
 def _restricted(identifier: int) -> bool:
@@ -84,7 +85,7 @@ def check_write(objects: ObjectDictionary, index: int, sub: int, value: int, pow
     elif pdo_parameter and sub == 2:
         if 240 < value < 254:
             raise SdoAbort(INVALID_VALUE)
-    elif pdo_parameter and sub == 3:
+    elif pdo_parameter and sub in (3, 6):
         if not objects.value(index, 1) & _INVALID:
             raise SdoAbort(DEVICE_STATE)
     elif 0x1600 <= index < 0x1800 or 0x1A00 <= index < 0x1C00:
@@ -95,8 +96,14 @@ def check_write(objects: ObjectDictionary, index: int, sub: int, value: int, pow
         raise SdoAbort(INVALID_VALUE)
     elif index == 0x1016:
         _check_heartbeat(objects, sub, value)
-    elif (index == 0x605A and value not in _QUICK_STOP_OPTIONS) or (index == 0x6060 and value not in _MODES):
-        raise SdoAbort(INVALID_VALUE)
+    elif index == 0x1019:
+        if value == 1:
+            raise SdoAbort(INVALID_VALUE)
+        if objects.value(0x1006, 0):
+            raise SdoAbort(DEVICE_STATE)
+    elif index in _VALUES:
+        if value not in _VALUES[index]:
+            raise SdoAbort(INVALID_VALUE)
     elif index in (0x6075, 0x6076) and power_state >= PowerState.OPERATION_ENABLED:
         # rescaling a running torque would step it
         raise SdoAbort(DEVICE_STATE)

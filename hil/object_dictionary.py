@@ -39,6 +39,10 @@ TOO_SHORT = 0x06070013
 INVALID_VALUE = 0x06090030
 TOO_HIGH = 0x06090031
 TOO_LOW = 0x06090032
+HARDWARE = 0x06060000
+CANNOT_STORE = 0x08000020
+DEVICE_STATE = 0x08000022
+NO_DATA = 0x08000024
 
 
 class SdoAbort(Exception):
@@ -120,6 +124,7 @@ class ObjectDictionary:
         self._live: dict[tuple[int, int], np.ndarray] = {}
         self._initial: dict[tuple[int, int], np.ndarray] = {}
         self._strings: dict[tuple[int, int], bytes] = {}
+        self._default_strings = {k: str(e.default).encode() for k, e in self.entries.items() if e.dtype is None}
         for key, field in FIELDS.items():
             if key not in self.entries:
                 raise ValueError(f"{eds_path.name}: object {key[0]:04X}:{key[1]} must be there, the drive uses it")
@@ -149,15 +154,21 @@ class ObjectDictionary:
             raise SdoAbort(NO_SUB_INDEX if index in self._indices else NO_OBJECT)
         return found
 
-    def set_default(self, index: int, sub: int, value: int) -> None:
+    def set_default(self, index: int, sub: int, value: int | bytes) -> None:
         """Change what a reset restores (settings of the device); the present value changes at the next reset."""
-        self._initial[index, sub][0] = value
+        if isinstance(value, bytes):
+            self._default_strings[index, sub] = value
+        else:
+            self._initial[index, sub][0] = value
+
+    def default(self, index: int, sub: int) -> int | bytes:
+        """What a reset restores."""
+        initial = self._initial.get((index, sub))
+        return int(initial[0]) if initial is not None else self._default_strings[index, sub]
 
     def restore_strings(self) -> None:
         """Reset of the objects that the core does not know."""
-        for key, entry in self.entries.items():
-            if entry.dtype is None:
-                self._strings[key] = str(entry.default).encode()
+        self._strings = dict(self._default_strings)
 
     def value(self, index: int, sub: int) -> int:
         """Present value of a number, whatever its access."""
@@ -169,6 +180,8 @@ class ObjectDictionary:
         entry = self.entry(index, sub)
         if not entry.readable:
             raise SdoAbort(WRITE_ONLY)
+        if index == 0x1003 and sub > self.value(0x1003, 0):
+            raise SdoAbort(NO_DATA)
         if entry.dtype is None:
             return self._strings[index, sub]
         return np.array(self.value(index, sub), entry.dtype).tobytes()
@@ -194,5 +207,5 @@ class ObjectDictionary:
         if (index, sub) in self._live:
             live = self._live[index, sub]
             live[0] = np.frombuffer(data, live.dtype)[0]
-        else:
+        elif self.entries[index, sub].dtype is None:
             self._strings[index, sub] = data

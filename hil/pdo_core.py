@@ -4,7 +4,8 @@ Transmission types: TPDO 0 (at the SYNC after an event), 1-240 (every n-th SYNC)
 every event timer); RPDO 0-240 (applied at the next SYNC), 254 and 255 (applied at once).  The event is a change of
 the statusword, 6061 or 603F in a TPDO that maps one of them, and entering NMT operational.  Positions and torques
 are no events: they change all the time.  At a SYNC the TPDOs are sampled before the RPDOs are applied.
-Not modelled: remote requests (types 252, 253), MPDO, dummy mapping, the SYNC counter.
+With a SYNC counter (1019), a synchronous TPDO with a start value (sub 6) begins at the SYNC that carries it.
+Not modelled: remote requests of PDOs (types 252, 253), MPDO, dummy mapping.
 """
 
 from __future__ import annotations
@@ -156,13 +157,21 @@ def receive_rpdo(device: Device, identifier: int, frame: np.ndarray, now_ns: int
 
 
 @kernel
-def receive_sync(device: Device, now_ns: int, queue: FrameQueue) -> None:
-    """SYNC in NMT operational: send the synchronous TPDOs, then apply the RPDOs that wait for it."""
+def receive_sync(device: Device, now_ns: int, counter: int, queue: FrameQueue) -> None:
+    """SYNC in NMT operational: send the synchronous TPDOs, then apply the RPDOs that wait for it.
+
+    `counter` is the value that the SYNC carries, 0 without one.
+    """
     group = device.communication
     for pdo in range(PDOS):
         kind = int64(group.tpdo_type[pdo])
         if int64(group.tpdo_cob_id[pdo]) & COB_ID_INVALID or group.tpdo_count[pdo] == 0 or kind > 240:
             continue
+        if counter and kind and not device.tpdo_started[pdo]:
+            start = int64(group.tpdo_sync_start[pdo])
+            if start and start != counter:
+                continue
+            device.tpdo_started[pdo] = 1
         device.tpdo_syncs[pdo] += 1
         if (kind == 0 and device.tpdo_event[pdo]) or (kind > 0 and device.tpdo_syncs[pdo] >= kind):
             device.tpdo_syncs[pdo] = 0
@@ -191,7 +200,9 @@ def start_pdos(device: Device) -> None:
         device.rpdo_waiting[pdo] = 0
         device.tpdo_sent_ns[pdo] = 0
         device.tpdo_syncs[pdo] = 0
+        device.tpdo_started[pdo] = 0
         device.tpdo_event[pdo] = 1
+    device.sync_length_wrong = 0
     device.sync_heard_ns = 0
 
 

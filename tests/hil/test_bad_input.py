@@ -117,7 +117,7 @@ def test_refusals_of_one_joint(bench: Any) -> None:
 
 def test_a_drive_that_lacks_the_mode(bench: Any) -> None:
     """The drive itself differs from the EDS that the user has."""
-    text = EDS.read_text().replace("DefaultValue=0x0000038D", "DefaultValue=0x00000008")
+    text = EDS.read_text().replace("DefaultValue=0x000003AD", "DefaultValue=0x00000008")
     assert text != EDS.read_text()
     (bench.folder / "poor.eds").write_text(text)
     bench.joint(bench.config("poor.toml", drive__eds="poor.eds"))

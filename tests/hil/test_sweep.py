@@ -129,8 +129,8 @@ def test_points_that_do_not_settle_are_visited_again_and_marked(config: Config, 
 def eds_with_modes(config: Config, folder: Path, supported: int) -> Config:
     """The configuration of a drive with other supported modes (6502)."""
     text = config.eds_path.read_text()
-    assert text.count("DefaultValue=0x0000038D") == 1
-    (folder / "drive.eds").write_text(text.replace("DefaultValue=0x0000038D", f"DefaultValue=0x{supported:08X}"))
+    assert text.count("DefaultValue=0x000003AD") == 1
+    (folder / "drive.eds").write_text(text.replace("DefaultValue=0x000003AD", f"DefaultValue=0x{supported:08X}"))
     (folder / "joint.toml").write_text(config.text.replace('eds = "virtual_joint.eds"', 'eds = "drive.eds"'))
     return load_config(folder / "joint.toml")
 
