@@ -120,8 +120,92 @@ def monitor(
     raise typer.Exit(run_monitor(subject, output, selection, ask=ask))
 
 
+params_app = typer.Typer(help="All objects of a drive to a file and back.", no_args_is_help=True)
+
+
+@params_app.command("dump")
+def params_dump(
+    config: MaybeConfig = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="file to write (.toml, .dcf); default: TOML on stdout")
+    ] = None,
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    target: Target = None,
+    eds: Eds = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Read every readable object of the EDS.  Reads only."""
+    from tools.verbs.params import dump
+
+    joint = config_of(config, interface, channel, bitrate, None, target)
+    subject = canopen_subject(joint, interface, channel, bitrate, target, eds)
+    raise typer.Exit(dump(subject, Output(json=json, quiet=quiet), out))
+
+
+@params_app.command("restore")
+def params_restore(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="a dump, or a DCF")],
+    config: MaybeConfig = None,
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    target: Target = None,
+    eds: Eds = None,
+    yes: Annotated[bool, typer.Option("-y", "--yes", help="write without asking")] = False,
+    other_device: Annotated[
+        bool, typer.Option("--other-device", help="write although maker, product or node differ")
+    ] = False,
+    skip: Annotated[list[str] | None, typer.Option("--skip", help="index to leave alone; may be repeated")] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write the parameters that differ, read each back, tell what was refused.  The drive must be off."""
+    from tools.verbs.params import place_index, restore_file
+
+    joint = config_of(config, interface, channel, bitrate, None, target)
+    subject = canopen_subject(joint, interface, channel, bitrate, target, eds)
+    indices = [place_index(text) for text in skip or []]
+    output = Output(json=json, quiet=quiet)
+    raise typer.Exit(restore_file(subject, file, output, assume_yes=yes, other_device=other_device, skip=indices))
+
+
+@params_app.command("diff")
+def params_diff(
+    first: Annotated[Path, typer.Argument(metavar="FIRST", help="dump, DCF, EDS; or configuration: its drive now")],
+    second: Annotated[Path, typer.Argument(metavar="SECOND", help="the same")],
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    target: Target = None,
+    readings: Annotated[bool, typer.Option("--readings", help="what is no parameter as well")] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Compare two files, or a file and a drive.  Exit code 11 if they differ."""
+    from tools.inspection.objects import Objects
+    from tools.inspection.parameter_file import is_parameter_file, load_parameters
+    from tools.verbs.params import diff, parameters_of_drive
+
+    output = Output(json=json, quiet=quiet)
+    objects, sides = Objects(), []
+    for path in (first, second):
+        if is_parameter_file(path):
+            sides.append(load_parameters(path, target or 1))
+        else:
+            joint = config_of(path, interface, channel, bitrate, None, target)
+            found, objects = parameters_of_drive(
+                canopen_subject(joint, interface, channel, bitrate, target, None), output
+            )
+            sides.append(found)
+    raise typer.Exit(diff(sides[0], sides[1], objects, output, readings=readings))
+
+
 def register(app: typer.Typer) -> None:
     """Add the verbs."""
     app.command(rich_help_panel=INSPECT)(scan)
     app.command(rich_help_panel=INSPECT)(info)
     app.command(rich_help_panel=INSPECT)(monitor)
+    app.add_typer(params_app, name="params", rich_help_panel=INSPECT)

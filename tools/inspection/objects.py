@@ -45,6 +45,12 @@ class Objects:
         self.dictionary = dictionary
         self.variable = lru_cache(maxsize=4096)(self._variable)
 
+    def required(self) -> canopen.ObjectDictionary:
+        """The dictionary, or `ConfigurationError`."""
+        if self.dictionary is None:
+            raise ConfigurationError("which objects does the drive have?", "give a configuration, or --eds FILE")
+        return self.dictionary
+
     def _variable(self, index: int, sub: int = 0) -> ODVariable | None:
         found = self.dictionary.get_variable(index, sub) if self.dictionary is not None else None
         return found if found is not None else standard_variable(index, sub)

@@ -1,0 +1,224 @@
+"""`jointctl params dump | restore | diff`: all objects of a drive to a file and back."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from drivers.errors import BusError, ConfigurationError, DataError, DeviceError, JointctlError
+from tools.inspection import drive_words
+from tools.inspection.node_scan import Ear
+from tools.inspection.objects import Objects, Place
+from tools.inspection.parameter_file import load_parameters, toml_text, write_dcf
+from tools.inspection.parameter_restore import Written, restore
+from tools.inspection.parameters import (
+    Difference,
+    ParameterSet,
+    Value,
+    differences,
+    identity_of,
+    is_parameter,
+    read_parameters,
+    shown,
+    variables,
+)
+from tools.inspection.sdo_reading import Refusal, SdoReader
+from tools.inspection.subject import Subject, canopen_network
+from tools.output import Output
+
+LISTEN_S = 0.1  # for the SYNC of another controller
+DIFFERENT = 11  # exit code of diff
+_SETTLE_S = 0.02
+_MOVING = ("operation enabled", "quick stop active", "fault reaction active")
+
+
+class AskError(JointctlError):
+    """There is nobody to ask."""
+
+    exit_code = 2
+
+
+def _known_objects(subject: Subject) -> Objects:
+    objects = subject.objects()
+    objects.required()
+    return objects
+
+
+def parameters_of_drive(subject: Subject, output: Output) -> tuple[ParameterSet, Objects]:
+    """All readable objects as the drive has them now."""
+    node, objects = subject.required_node(), _known_objects(subject)
+    total = len(list(variables(objects.required())))
+    output.note(f"reading node {node} on {subject.place}")
+    with canopen_network(subject) as network, output.progress("reading", total) as advance:
+        return read_parameters(SdoReader(network, node, objects), advance), objects
+
+
+def dump(subject: Subject, output: Output, out: Path | None = None) -> int:
+    """Write TOML to stdout or to `out`; a name that ends in .dcf makes a DCF."""
+    found, objects = parameters_of_drive(subject, output)
+    if out is not None:
+        if out.exists():
+            raise DataError(f"{out}: exists already", "give another name; a dump is never overwritten")
+        try:
+            if out.suffix.lower() == ".dcf":
+                write_dcf(found, objects.required(), out)
+            else:
+                out.write_text(toml_text(found, objects))
+        except OSError as error:
+            raise DataError(f"{out}: cannot be written: {error.strerror or error}") from None
+        output.note(
+            f"{out}: {len(found.parameters)} parameters, {len(found.readings)} readings, "
+            f"{len(found.unreadable)} objects could not be read"
+        )
+    if output.json:
+        output.result("", _as_data(found))
+    elif out is None:
+        print(toml_text(found, objects), end="", file=output.stdout)
+    return 0
+
+
+def _as_data(found: ParameterSet) -> dict[str, Any]:
+    return {
+        "device": found.device,
+        "parameters": {str(place): _plain(value) for place, value in found.parameters.items()},
+        "readings": {str(place): _plain(value) for place, value in found.readings.items()},
+        "unreadable": {str(place): why for place, why in found.unreadable.items()},
+    }
+
+
+def _plain(value: Value | None) -> Any:
+    return {"hex": value.hex()} if isinstance(value, bytes) else value
+
+
+def _table(objects: Objects, found: Iterable[Difference], first: str, second: str) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for title in ("object", "name", first, second):
+        table.add_column(title, overflow="fold")
+    for item in found:
+        place = item.place
+        cells = (str(place), objects.name(place.index, place.sub), shown(objects, place, item.first),
+                 shown(objects, place, item.second))  # fmt: skip
+        table.add_row(*(cell.replace("[", r"\[") for cell in cells))
+    return table
+
+
+def diff(first: ParameterSet, second: ParameterSet, objects: Objects, output: Output, *, readings: bool = False) -> int:
+    """Show what differs; 0 if nothing does, else DIFFERENT."""
+    found = differences(first, second, readings=readings)
+    rows = [{"object": str(item.place), "name": objects.name(item.place.index, item.place.sub),
+             "first": _plain(item.first), "second": _plain(item.second)} for item in found]  # fmt: skip
+    data = {"first": first.origin, "second": second.origin, "differences": rows}
+    output.result(_table(objects, found, first.origin, second.origin) if found else "no difference", data)
+    return DIFFERENT if found else 0
+
+
+def restore_file(
+    subject: Subject, path: Path, output: Output, *, assume_yes: bool, other_device: bool = False, skip: list[int]
+) -> int:
+    """Show what would change, ask, write, read back, report; `DeviceError` if something was not taken."""
+    node, objects = subject.required_node(), _known_objects(subject)
+    wanted = load_parameters(path, node)
+    ear = Ear()
+    with canopen_network(subject, ear) as network:
+        time.sleep(LISTEN_S)
+        if ear.heard.syncs:
+            raise BusError("another controller is active on this bus (SYNC)", "end it first")
+        reader = SdoReader(network, node, objects)
+        reader.require_answer()
+        _require_same_device(reader, wanted, path, other_device)
+        _require_off(reader)
+        changes = _changes(reader, wanted, skip)
+        if not changes:
+            output.result("nothing to restore: the drive has these values", {"restored": [], "failed": []})
+            return 0
+        output.note(f"{len(changes)} parameters differ; the drive as it is, and {path.name}:")
+        if not output.quiet:
+            output._messages.print(_table(objects, changes, "drive", "file"))
+        if not assume_yes and not _asked(output):
+            output.note("nothing was written")
+            return 0
+        network.send_message(0, bytes([0x80, node]))  # pre-operational: PDOs can only be changed there
+        time.sleep(_SETTLE_S)
+        _require_off(reader)
+        values = {change.place: change.second for change in changes if change.second is not None}
+        done = restore(reader, values, wanted.parameters)
+    return _report(done, objects, output)
+
+
+def _asked(output: Output) -> bool:
+    if not sys.stdin.isatty():
+        raise AskError("this writes into the drive and there is no terminal to ask on", "give -y to write")
+    output.note("Write these into the drive? [y/N] ")
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+
+def _require_off(reader: SdoReader) -> None:
+    word = reader.value(0x6041)
+    state = None if word is None else drive_words.drive_state(word)
+    if state in _MOVING:
+        raise DeviceError(
+            f"node {reader.node} is in {state}: nothing is written into a drive under power", "jointctl stop CONFIG"
+        )
+
+
+def _require_same_device(reader: SdoReader, wanted: ParameterSet, path: Path, other_device: bool) -> None:
+    present = identity_of(reader)
+    for key in ("vendor_id", "product_code", "node"):
+        expected = wanted.device.get(key)
+        if expected is not None and expected != present[key] and not other_device:
+            raise DeviceError(
+                f"{path}: {key} (={expected}) is not that of the drive (={present[key]})",
+                "give --other-device to write it all the same; identifiers contain the node number",
+            )
+
+
+def _changes(reader: SdoReader, wanted: ParameterSet, skip: list[int]) -> list[Difference]:
+    """What the file has otherwise than the drive, of the objects that may be written."""
+    found = []
+    for place, value in wanted.parameters.items():
+        variable = reader.objects.variable(place.index, place.sub)
+        if place.index in skip or variable is None or not is_parameter(variable):
+            continue
+        data = reader.upload(place.index, place.sub)
+        if isinstance(data, Refusal):
+            if not data.absent:
+                found.append(Difference(place, None, value))
+            continue
+        present = reader.objects.value(place.index, place.sub, data)
+        if present != value:
+            found.append(Difference(place, present, value))
+    return found
+
+
+def _report(done: list[Written], objects: Objects, output: Output) -> int:
+    failed = [item for item in done if item.failure]
+    table = Table(box=None, pad_edge=False)
+    for title in ("object", "name", "value", ""):
+        table.add_column(title, overflow="fold")
+    for item in done:
+        name = objects.name(item.place.index, item.place.sub)
+        table.add_row(str(item.place), name, shown(objects, item.place, item.wanted), item.failure or "restored")
+    data = {
+        "restored": [str(item.place) for item in done if not item.failure],
+        "failed": [{"object": str(item.place), "reason": item.failure} for item in failed],
+    }
+    output.result(table, data)
+    if failed:
+        raise DeviceError(f"{len(failed)} of {len(done)} parameters were not taken (see above)")
+    return 0
+
+
+def place_index(text: str) -> int:
+    """An index of the command line, hexadecimal; `ConfigurationError` for anything else."""
+    try:
+        index = int(text, 16)
+    except ValueError:
+        index = -1
+    if not 0 <= index <= 0xFFFF:
+        raise ConfigurationError(f"--skip (={text}) must be the index of an object, such as 2012")
+    return Place(index).index
