@@ -12,6 +12,7 @@ from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
 from drivers.canopen.eds_file import read_eds
 from drivers.canopen.object_access import object_name
+from drivers.errors import ConfigurationError
 from tools.inspection import drive_words
 from tools.inspection.standard_objects import standard_variable
 from tools.running.emergency_text import emergency_text
