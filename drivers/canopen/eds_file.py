@@ -118,13 +118,16 @@ def _variable(
     variable.access_type = keys.get("accesstype", "rw").lower()
     variable.pdo_mappable = bool(number_of(keys.get("pdomapping", "0"), node))
     if data_type in BITS:
-        for key, attribute in (("lowlimit", "min"), ("highlimit", "max"), ("defaultvalue", "default")):
+        for key, attribute in (
+            ("lowlimit", "min"), ("highlimit", "max"), ("defaultvalue", "default"), ("parametervalue", "value"),
+        ):  # fmt: skip
             setattr(variable, attribute, _value(eds, index, sub, key, keys.get(key, ""), data_type, node))
         if variable.min is not None and variable.max is not None and variable.min > variable.max:
             _defect(eds, index, sub, f"LowLimit (={variable.min}) is above HighLimit (={variable.max}): both ignored")
             variable.min = variable.max = None
     elif data_type in _STRINGS:
         variable.default = keys.get("defaultvalue")  # type: ignore[assignment]
+        variable.value = keys.get("parametervalue")  # type: ignore[assignment]
     return variable
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import can
 import pytest
 
+from drivers.errors import ConfigurationError
 from tools.configuration.load import shipped_config
 from tools.inspection import drive_words
 from tools.inspection.frame_decoder import Decoded, FrameDecoder
@@ -190,6 +191,6 @@ def test_any_bytes_are_decoded_without_an_exception(decoder: FrameDecoder) -> No
 
 
 def test_an_unreadable_eds(tmp_path: Path) -> None:
-    (tmp_path / "bad.eds").write_text("[1000]\nParameterName=x\n")
-    with pytest.raises(Exception, match=r"bad\.eds: not a readable EDS"):
+    (tmp_path / "bad.eds").write_text("[FileInfo]\n")
+    with pytest.raises(ConfigurationError, match=r"bad\.eds.* is not a readable EDS"):
         read_dictionary(tmp_path / "bad.eds", 1)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from drivers.canopen.pdo_map import DISABLED
+from drivers.canopen.pdo_layout import DISABLED
 from tools.inspection.objects import Place
 from tools.inspection.parameters import Value
 from tools.inspection.sdo_reading import ATTEMPTS, Refusal, SdoReader, abort_text
