@@ -12,12 +12,12 @@ from drivers.errors import DeviceError
 UNIT_MODES = {int(mode): mode.name.lower() for mode in UnitMode}
 # name, index, what it is, what one count or ampere of it means
 _QUESTIONS: tuple[tuple[str, int | None, str, str], ...] = (
+    ("EC", None, "last refused command", "code"),  # first: a question that is refused changes it
     ("SN", 4, "serial number", ""),
     ("MO", None, "motor", "switch"),
     ("UM", None, "unit mode", "mode"),
     ("SR", None, "status register", "status"),
     ("MF", None, "motor fault", "fault"),
-    ("EC", None, "last refused command", "code"),
     ("EO", None, "echo", "switch"),
     ("RM", None, "analog reference", "switch"),
     ("PX", None, "position", "position"),

@@ -6,6 +6,9 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+# who has one of these keeps up a pseudo-terminal, as `jointctl hil --serial` does, and is no user of it
+_TERMINAL_MAKERS = {"/dev/ptmx", "/dev/pts/ptmx"}
+
 
 @dataclass(frozen=True)
 class PortUser:
@@ -24,7 +27,8 @@ def port_users(path: str, proc: Path = Path("/proc")) -> list[PortUser]:
         if pid == os.getpid():
             continue
         try:
-            if any(os.readlink(link) == real for link in (folder / "fd").iterdir()):
+            opened = {os.readlink(link) for link in (folder / "fd").iterdir()}
+            if real in opened and not opened & _TERMINAL_MAKERS:
                 found.append(PortUser(pid, _name(folder)))
         except OSError:  # gone, or another user's
             continue

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from drivers.errors import ConfigurationError
 from tools.cli.options import INSPECT, Bitrate, Channel, Interface, Json, Port, Quiet, Target, config_path, loaded
 from tools.output import Output
 
@@ -31,6 +32,8 @@ def config_of(
     target: int | None,
 ) -> Config | None:
     """The configuration if one is named.  Its `drive.kind` tells which branch of a verb is meant."""
+    if path is None and port is not None:
+        raise ConfigurationError("-p needs a configuration: it tells the baud rate", "for example elmo_serial")
     return None if path is None else loaded(config_path(path), interface, channel, bitrate, port, target)
 
 
@@ -83,6 +86,10 @@ def info(
     """What a drive tells about itself: identity, state, errors by name, limits, ratings, PDO mapping.  Reads only."""
     joint = config_of(config, interface, channel, bitrate, port, target)
     output = Output(json=json, quiet=quiet)
+    if joint is not None and joint.drive.kind == "elmo_serial":
+        from tools.verbs.info_serial import info_serial
+
+        raise typer.Exit(info_serial(joint, output))
     from tools.verbs.info import info as run_info
 
     raise typer.Exit(run_info(canopen_subject(joint, interface, channel, bitrate, target, eds), output))
@@ -111,6 +118,10 @@ def monitor(
     """The traffic of a bus in words: NMT, SYNC, heartbeats, EMCY, SDO, PDO by their mapping.  Listens only."""
     joint = config_of(config, interface, channel, bitrate, port, target)
     output = Output(json=json, quiet=quiet)
+    if joint is not None and joint.drive.kind == "elmo_serial":
+        from tools.verbs.monitor_serial import monitor_serial
+
+        raise typer.Exit(monitor_serial(joint, output, count=count, duration_s=duration, changes=changes))
     from tools.verbs.monitor import monitor as run_monitor
     from tools.verbs.monitor import selection_of
 

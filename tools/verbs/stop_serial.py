@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 from drivers.elmo.dialogue import Dialogue
-from drivers.elmo.port_users import users_text
 from drivers.elmo.serial_port import SerialPort
 from drivers.elmo.switch_off import switch_off
 from drivers.errors import BusError, JointctlError
@@ -29,17 +28,24 @@ def stop_serial(drive: ElmoSerial, output: Output) -> str:
             if state is not None and not state.startswith("unknown"):
                 return state
             output.note("the run did not say that the drive is off: telling the drive itself")
-    users = users_text(drive.port)
-    if users:
-        output.note(f"{drive.port} is in use ({users}): telling the drive on the same line")
-    port = SerialPort(drive.port, drive.baud_rate_bitps, exclusive=not users)
+    port, shared = _opened(drive, output)
     try:
         line = Dialogue(port, drive.reply_timeout_s)
-        return switch_off(port, line, SHARED_ATTEMPTS) if users else switch_off(port, line)
+        return switch_off(port, line, SHARED_ATTEMPTS) if shared else switch_off(port, line)
     except JointctlError as error:
         return f"unknown: it was told to switch off, but {error.message}"
     finally:
         port.close()
+
+
+def _opened(drive: ElmoSerial, output: Output) -> tuple[SerialPort, bool]:
+    """The port, and whether another program has it as well."""
+    try:
+        return SerialPort(drive.port, drive.baud_rate_bitps), False
+    except BusError as error:
+        port = SerialPort(drive.port, drive.baud_rate_bitps, exclusive=False)
+        output.note(f"{error.message}: telling the drive on the same line")
+        return port, True
 
 
 def refuse_while_running(drive: ElmoSerial) -> None:
