@@ -82,16 +82,25 @@ def loop_process_of(parent: int) -> int | None:
 
 
 def long_config(folder: Path, duration_s: float) -> Path:
-    """configs/virtual.toml with a long trajectory, its log in `folder`, and limits that bear a machine standing still.
+    """configs/virtual.toml with a long trajectory, limits and gains that bear a standing machine.
 
-    On a shared machine the shipped limits (50 ms) end the run with a fault sooner or later, as they should.
+    On a shared machine the shipped ones (50 ms) end the run with a fault sooner or later, as they should.
     """
     shipped = shipped_config("virtual")
     document: Any = tomlkit.parse(shipped.read_text())
     document["trajectory"]["duration_s"] = duration_s
+    document["control"].update(kind="computed_torque", kp=100.0, kv=20.0)
     document["limits"].update(
-        sample_age_max_s=1.0, skipped_max_s=1.0, following_error_max_rad=0.3, saturation_max_s=5.0
+        position_min_rad=-3.0,
+        position_max_rad=3.0,
+        velocity_max_radps=50.0,
+        following_error_max_rad=2.0,
+        position_jump_max_rad=2.0,
+        sample_age_max_s=1.0,
+        skipped_max_s=1.0,
+        saturation_max_s=5.0,
     )
+    document["sequence"].update(brake_radps2=20.0)
     document["sequence"]["supervisor_timeout_s"] = 10.0
     document["drive"]["heartbeat_s"] = 2.0
     document["log"]["folder"] = str(folder)

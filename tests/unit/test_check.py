@@ -216,3 +216,34 @@ def test_what_the_model_leaves_out_is_said() -> None:
     ]  # fmt: skip
     assert not_modelled(changed("control", feed_forward="desired")) == []
     assert mapping.LAST_SYNCHRONOUS_TYPE == 240
+
+
+def precise_with(bits: int, side: str = "joint") -> Config:
+    config = load_config(shipped_config("precise"))
+    return changed("encoder", config, counts_per_turn=2**bits, side=side)
+
+
+@pytest.mark.parametrize(
+    ("bits", "side", "warned"), [(14, "joint", True), (16, "joint", True), (17, "joint", False), (14, "motor", False)]
+)
+def test_an_encoder_too_coarse_for_the_gains_is_told(bits: int, side: str, warned: bool) -> None:
+    texts = [text for text in not_modelled(precise_with(bits, side)) if "chatter" in text]
+    assert bool(texts) is warned
+
+
+def test_a_soft_reducer_is_told_with_its_resonance() -> None:
+    config = load_config(shipped_config("precise"))
+    assert not [text for text in not_modelled(config) if "reducer" in text]
+    soft = changed(
+        "virtual",
+        config,
+        flexible=True,
+        motor_side_inertia_kgm2=1.05,
+        reducer_stiffness_Nmprad=1.05 / 2 * 6283.2**2 / 1e4,
+    )
+    assert [text for text in not_modelled(soft) if "the reducer resonates at 10.0 Hz" in text]
+
+
+def test_of_a_real_joint_nobody_knows_the_reducer() -> None:
+    config = load_config(shipped_config("precise")).model_copy(update={"virtual": None})
+    assert [text for text in not_modelled(config) if "flexibility of the reducer" in text]

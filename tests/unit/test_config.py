@@ -323,3 +323,21 @@ def test_a_table_trajectory_is_read_and_checked(tmp_path: Path) -> None:
     way.write_text("time_s,position_rad\n0,0\n1,zero\n")
     with pytest.raises(ConfigurationError, match=r"trajectory\.file: .*way\.csv"):
         trajectory_table(load(tmp_path, text=text))
+
+
+@pytest.mark.parametrize(
+    ("pattern", "line", "told"),
+    [
+        ("rate_Hz = .*", "rate_kHz = 1.0", "loop.rate_kHz is not a known key"),
+        ("amplitude_rad = .*", "amplitude_deg = 20.0", "trajectory.amplitude_deg is not a known key"),
+        ("feed_forward = .*", 'feed_foward = "none"', "control.feed_foward is not a known key"),
+    ],
+)
+def test_a_key_in_the_wrong_unit_is_one_line_and_not_two(tmp_path: Path, pattern: str, line: str, told: str) -> None:
+    found = problems(tmp_path, pattern, line)
+    assert len(found) == 1
+    assert told in found[0]
+
+
+def test_a_key_that_is_missing_beside_an_unknown_one_is_still_told(tmp_path: Path) -> None:
+    assert len(problems(tmp_path, "node = .*", "colour = 1")) == 2

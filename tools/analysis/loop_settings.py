@@ -8,12 +8,14 @@ the drive adds inside is not visible on the bus: `margin.loop_delay_s` or a meas
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from drivers.errors import ConfigurationError
 from firmware_py.records import NEURONS
 from firmware_py.states import ControllerKind
+from firmware_py.velocity import low_pass_gain
 from tools.analysis.linear_loop import LoopSettings
 from tools.configuration.elmo import ElmoSerial
 from tools.configuration.records import PAPER_CENTRES
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from tools.configuration.config import Config
 
 LAST_SYNCHRONOUS_TYPE = 240
+STEP_SHARE = 0.2  # of the torque limit; `precise` with 17 bit is below, with 16 bit, where it chatters, above
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,4 +123,31 @@ def not_modelled(config: Config) -> list[str]:
         found.append(f"joint.coriolis_Nmspr (={joint.coriolis_Nmspr:g}): taken as compensated exactly")
     if control.kind == "computed_torque_rbf" and control.dead_zone_rad:
         found.append(f"control.dead_zone_rad (={control.dead_zone_rad:g}): taken as if the error were outside")
+    virtual = config.virtual
+    if virtual is None:
+        found.append("flexibility of the reducer: a soft one resonates and takes margin that is not counted here")
+    elif virtual.flexible:
+        motor_kgm2 = virtual.motor_side_inertia_kgm2
+        other_kgm2 = max(joint.inertia_kgm2 * virtual.inertia_scale - motor_kgm2, 1e-9)
+        stiffness = virtual.reducer_stiffness_Nmprad
+        resonance_Hz = math.sqrt(stiffness * (1.0 / motor_kgm2 + 1.0 / other_kgm2)) / math.tau
+        found.append(
+            f"virtual.flexible (=true): the reducer resonates at {resonance_Hz:.1f} Hz, "
+            "which takes margin that is not counted here"
+        )
+    step_Nm = encoder_step_Nm(config)
+    if step_Nm > STEP_SHARE * config.limits.torque_max_Nm:
+        found.append(
+            f"encoder.counts_per_turn (={config.encoder.counts_per_turn}): one count moves the torque by "
+            f"{step_Nm:.1f} Nm, more than {STEP_SHARE:.0%} of limits.torque_max_Nm: "
+            "it will chatter; lower kv or velocity_cutoff_Hz"
+        )
     return found
+
+
+def encoder_step_Nm(config: Config) -> float:
+    """By how much kp and kv move the torque when the reading changes by one count."""
+    turn_rad = math.tau / (config.joint.reduction_ratio if config.encoder.side == "motor" else 1.0)
+    control, rate_Hz = config.control, config.loop.rate_Hz
+    slope_1ps = low_pass_gain(control.velocity_cutoff_Hz, 1.0 / rate_Hz) * rate_Hz
+    return config.joint.inertia_kgm2 * (control.kp + control.kv * slope_1ps) * turn_rad / config.encoder.counts_per_turn

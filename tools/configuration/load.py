@@ -15,7 +15,7 @@ from tools.configuration.checks import problems_between_sections
 from tools.configuration.config import SHIPPED_FOLDER, Config
 from tools.configuration.elmo import ElmoSerial, with_serial_bus
 from tools.configuration.plant_settings import plant_problems
-from tools.configuration.problems import ConfigurationProblems, problem_line, raise_if
+from tools.configuration.problems import ConfigurationProblems, problem_line, problem_lines, raise_if
 from tools.configuration.sections import Bus, Drive
 
 
@@ -96,6 +96,5 @@ def _validated(data: Mapping[str, Any], name: str) -> Config:
     except ConfigurationError as error:
         raise ConfigurationProblems([f"{name}: {error.message}"]) from None
     except ValidationError as error:
-        lines = [problem_line(e, data, ()) for e in error.errors(include_url=False)]
-        raise_if([f"{name}: {line}" for line in dict.fromkeys(lines)])
+        raise_if([f"{name}: {line}" for line in problem_lines(error.errors(include_url=False), data)])
         raise

@@ -65,22 +65,48 @@ def _stem(key: str) -> str:
     return (head if head and tail.lower() in _UNITS else key).lower()
 
 
-def suggestion(unknown: str, known: list[str]) -> str:
-    """What the user probably meant by an unknown key, as the end of a message."""
-    for key in known:
-        if key != unknown and _stem(key) == _stem(unknown):
-            return f": use {key} (the unit is part of the key)"
+def meant(unknown: str, known: list[str]) -> str | None:
+    """The key that was probably meant by an unknown one; of the same name but for the unit, or spelt alike."""
+    same = [key for key in known if key != unknown and _stem(key) == _stem(unknown)]
     close = difflib.get_close_matches(unknown, known, 1, 0.6) or difflib.get_close_matches(
         _stem(unknown), known, 1, 0.5
     )
-    return f": did you mean {close[0]}?" if close else f": known are {', '.join(sorted(known))}"
+    return next(iter(same + close), None)
 
 
-def problem_line(error: Any, data: Mapping[str, Any], prefix: tuple[str, ...]) -> str:
+def suggestion(unknown: str, known: list[str]) -> str:
+    """What the user probably meant by an unknown key, as the end of a message."""
+    key = meant(unknown, known)
+    if key is None:
+        return f": known are {', '.join(sorted(known))}"
+    if key != unknown and _stem(key) == _stem(unknown):
+        return f": use {key} (the unit is part of the key)"
+    return f": did you mean {key}?"
+
+
+def _location(error: Any) -> list[str]:
     parts = [str(part) for part in error["loc"]]
     if len(parts) > 1 and parts[0] in _UNIONS:
         del parts[1]  # the tag of the union, which the user did not write
-    location = (*prefix, *parts)
+    return parts
+
+
+def problem_lines(errors: list[Any], data: Mapping[str, Any]) -> list[str]:
+    """One line for each problem; a key that is missing because it is written in another way is told once."""
+    told = set()
+    for error in errors:
+        if error["type"] == "extra_forbidden":
+            place = tuple(_location(error))
+            model = _model_at(place, data)
+            key = meant(place[-1], list(model.model_fields)) if model else None
+            told.add((*place[:-1], key))
+    left = [error for error in errors if error["type"] != "missing" or tuple(_location(error)) not in told]
+    return list(dict.fromkeys(problem_line(error, data, ()) for error in left))
+
+
+def problem_line(error: Any, data: Mapping[str, Any], prefix: tuple[str, ...]) -> str:
+    """The line of one error of pydantic; `prefix` is where in the file `data` begins."""
+    location = (*prefix, *_location(error))
     name = ".".join(location)
     kind, value = error["type"], error["input"]
     model = _model_at(location, data)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 from drivers.drive import CommissioningReport
 from drivers.errors import JointctlError
 from tools.configuration.config import Config
 from tools.output import Output
+from tools.recording.log_folder import log_path
 from tools.running.envelope import motion_envelope
 from tools.running.live_panel import Display, run_display
+from tools.running.readiness import prepare_log, require_ready
 from tools.running.run_report import INTERRUPTED, report_run
 from tools.running.shared_block import SERIAL
 from tools.running.supervisor import Supervisor
@@ -23,18 +23,6 @@ class UsageError(JointctlError):
     """The command line asks for something that cannot be done as it stands."""
 
     exit_code = 2
-
-
-def log_path(config: Config) -> Path:
-    """A new name in the log folder: configuration and local time."""
-    stamp = time.strftime("%Y%m%d-%H%M%S")
-    folder = Path(config.log.folder)
-    path = folder / f"{config.path.stem}-{stamp}.mcap"
-    number = 1
-    while path.exists():
-        number += 1
-        path = folder / f"{config.path.stem}-{stamp}-{number}.mcap"
-    return path
 
 
 def _ask(output: Output) -> bool:
@@ -64,13 +52,16 @@ def run(
         if dry_run:
             output.note("dry run: nothing moves; the drive was commissioned and is disabled")
             return False
-        return assume_yes or _ask(output)
+        require_ready(config, report, path)
+        agreed = assume_yes or _ask(output)
+        if agreed:
+            prepare_log(config, path, output)
+        return agreed
 
+    path = log_path(config)
     title = f"{config.path.stem}: {config.trajectory.kind}"
     with _displays(config, output, title, scope) as display:
-        supervisor = Supervisor(
-            config, output, log_path(config), confirm, allow_low_margin=allow_low_margin, display=display
-        )
+        supervisor = Supervisor(config, output, path, confirm, allow_low_margin=allow_low_margin, display=display)
         try:
             result = supervisor.run()
         except KeyboardInterrupt:

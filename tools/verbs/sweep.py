@@ -19,7 +19,9 @@ from firmware_py.states import Fault
 from tools.configuration.config import Config
 from tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
 from tools.output import Advance, Output
+from tools.recording.log_folder import log_path
 from tools.running.fault_text import FaultText, fault_text
+from tools.running.readiness import require_ready
 from tools.running.run_report import INTERRUPTED
 from tools.sweeping.carry_out import SweepSupervisor, approach_time_s, middle_rad, sweep_in_lockstep, with_mode
 from tools.sweeping.checks import constant_remarks, recorded_limits, refuse_constants, torque_source
@@ -29,7 +31,6 @@ from tools.sweeping.meter import JointModel, MeasuredPoint, SweepMeter
 from tools.sweeping.options import SweepOptions, check_files, make_plan
 from tools.sweeping.plan import PlanSettings, SweepMotion
 from tools.sweeping.statistics import Tolerance
-from tools.verbs.run import log_path
 
 RELATIVE_TOLERANCE = 0.01
 OVERHEAD_S = 3.0  # commissioning, enabling, release
@@ -186,6 +187,8 @@ class Sweep:
             if self.options.dry_run:
                 self.output.note("dry run: nothing moves; the drive was commissioned and is disabled")
                 return False
+            if not self.options.lockstep:
+                require_ready(self.config, report, log_path(self.config))
             if not (self.options.assume_yes or self.options.lockstep):
                 self.output.note("Move the joint? [y/N] ")
                 if sys.stdin.readline().strip().lower() not in ("y", "yes"):
