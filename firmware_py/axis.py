@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from firmware_py.change_records import MotionChange
 from firmware_py.computed_torque import step_law
 from firmware_py.kernel import kernel
+from firmware_py.live_change import step_change, step_new_motion
 from firmware_py.records import AxisConstants, AxisState, Command, LimitConstants, Sample
 from firmware_py.safety import drive_fault, limited_torque_Nm, motion_fault, reference_fault
 from firmware_py.sequence import (
@@ -104,6 +106,8 @@ def _move_reference(constants: AxisConstants, state: AxisState, table: np.ndarra
         react(state, Reaction.RAMP)
     if state.phase == AxisPhase.APPROACH:
         approach_at(state.approach, state.trajectory_s + constants.sequence.approach_s, state.reference)
+    elif state.phase == AxisPhase.TRACKING and state.change.motion != MotionChange.NONE:
+        step_new_motion(constants, state, table, elapsed_cycles)
     elif state.phase == AxisPhase.TRACKING:
         state.table_row = reference_at(
             constants.trajectory, table, state.table_row, state.trajectory_s, state.reference
@@ -278,6 +282,7 @@ def step_axis(
         step_waiting(constants, state, sample)
     elif state.phase == AxisPhase.ENABLING:
         step_enabling(constants, state, sample, table)
+    step_change(constants, state, table, elapsed_cycles)
     if state.phase >= AxisPhase.APPROACH and state.phase <= AxisPhase.RAMPING:
         _move_reference(constants, state, table, elapsed_cycles)
     if gap_cycles > 0:

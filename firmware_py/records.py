@@ -9,6 +9,10 @@ from typing import Annotated
 
 import numpy as np
 
+from firmware_py.change_records import ChangeConstants as ChangeConstants
+from firmware_py.change_records import ChangeRequest as ChangeRequest
+from firmware_py.change_records import ChangeState as ChangeState
+from firmware_py.change_records import Gains as Gains
 from firmware_py.law_records import LEARNING_BINS as LEARNING_BINS
 from firmware_py.law_records import NEURONS as NEURONS
 from firmware_py.law_records import TORQUE_HISTORY as TORQUE_HISTORY
@@ -23,6 +27,8 @@ from firmware_py.law_records import NetworkConstants as NetworkConstants
 from firmware_py.law_records import NetworkState as NetworkState
 from firmware_py.law_records import ObserverConstants as ObserverConstants
 from firmware_py.law_records import ObserverState as ObserverState
+from firmware_py.motion_records import Reference as Reference
+from firmware_py.motion_records import TrajectoryConstants as TrajectoryConstants
 from firmware_py.schema import array_of, f8, i4, i8, record, u4
 
 
@@ -40,40 +46,6 @@ class VelocityState:
     velocity_radps: f8
     last_error_rad: f8
     error_rate_radps: f8  # the matched filter's e'
-
-
-@record
-class Reference:
-    position_rad: f8
-    velocity_radps: f8
-    acceleration_radps2: f8
-
-
-@record
-class TrajectoryConstants:
-    """One trajectory; which fields matter depends on `kind`."""
-
-    kind: i4  # TrajectoryKind
-    repeats: i4  # point-to-point kinds and tables: start again at the end
-    table_rows: i4
-    duration_s: f8  # of the run; 0 = until stopped
-    # SINE: offset + amplitude sin(omega (t + shift)), with a second set from switch_s on (0 = no switch)
-    amplitude_rad: f8
-    omega_radps: f8
-    shift_s: f8
-    offset_rad: f8
-    switch_s: f8
-    amplitude2_rad: f8
-    omega2_radps: f8
-    shift2_s: f8
-    offset2_rad: f8
-    # MIN_JERK, TRAPEZOID: from start to target and, when repeated, back, resting dwell_s at each end
-    start_rad: f8
-    target_rad: f8
-    move_s: f8  # MIN_JERK: duration of one move
-    speed_radps: f8  # TRAPEZOID
-    acceleration_radps2: f8  # TRAPEZOID
-    dwell_s: f8
 
 
 @record
@@ -129,6 +101,7 @@ class AxisConstants:
     sequence: SequenceConstants
     command_kind: i4  # CommandKind
     velocity_command: VelocityCommandConstants
+    change: ChangeConstants
 
 
 LINE_GONE = 1_000_000  # of `Sample.bus_errors`: more than any limit
@@ -187,6 +160,7 @@ class AxisState:
     reference: Reference
     velocity: VelocityState
     law: LawState
+    change: ChangeState
 
 
 @record

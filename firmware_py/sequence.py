@@ -12,6 +12,7 @@ import numpy as np
 
 from firmware_py.computed_torque import reset_law
 from firmware_py.kernel import kernel
+from firmware_py.live_change import reset_change
 from firmware_py.records import LINE_GONE, AxisConstants, AxisState, Command, Sample
 from firmware_py.safety import motion_fault, reaction_to
 from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction, StopRequest
@@ -46,6 +47,7 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.command_velocity_radps = 0.0
     state.velocity.primed = 0
     reset_law(constants.law, state.law)
+    reset_change(state.change)
 
 
 @kernel

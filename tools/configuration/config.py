@@ -22,6 +22,7 @@ from tools.configuration.sections import (
     Friction,
     Joint,
     Limits,
+    Live,
     Log,
     Loop,
     Margin,
@@ -48,6 +49,7 @@ class Config(Section):
     friction: Friction | None = None
     virtual: Virtual | None = None
     margin: Margin = Margin()
+    live: Live = Live()
     log: Log = Log()
 
     _path: Path = PrivateAttr(default=Path())

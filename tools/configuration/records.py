@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from drivers.errors import ConfigurationError
+from firmware_py.live_change import gains_of
 from firmware_py.lyapunov import solve_lyapunov_p
-from firmware_py.records import NEURONS, AxisConstants, TrajectoryConstants
-from firmware_py.schema import new
+from firmware_py.records import NEURONS, AxisConstants, Gains, TrajectoryConstants
+from firmware_py.schema import dtype_of, new
 from firmware_py.states import ControllerKind, FeedForward, TrajectoryKind, ZeroSpeedRule
 from firmware_py.trajectory_table import approach_duration_s, approach_start, ends_meet, peak_of, table_from_csv
 from firmware_py.velocity import low_pass_gain
@@ -23,6 +24,7 @@ from tools.configuration.problems import ConfigurationProblems
 _PAPER_HALF = (0.05, 0.03, 0.01, 0.008, 0.004, 0.001, 0.0005)
 PAPER_CENTRES = (*_PAPER_HALF, 0.0, *(-c for c in _PAPER_HALF))
 APPROACH_MIN_S = 1.0
+MOVE_MIN_S = 0.2  # of a move to a new set-point, however near
 # way of the reference at a standing reading, as a share of the following error that is allowed: without friction
 # feed-forward a sound joint stands that long before it breaks away
 FROZEN_SHARE, FROZEN_SHARE_WITHOUT_MODEL = 0.1, 0.5
@@ -43,9 +45,10 @@ def axis_constants(config: Config, *, start_position_rad: float | None = None) -
     axis.velocity.period_s = period_s(config)
     axis.velocity.cutoff_Hz = config.control.velocity_cutoff_Hz
     axis.velocity.period_gain = low_pass_gain(config.control.velocity_cutoff_Hz, period_s(config))
-    _fill_trajectory(axis.trajectory, config)
+    fill_trajectory(axis.trajectory, config)
     _fill_limits(axis.limits, config)
     _fill_sequence(axis.sequence, config, start_position_rad)
+    fill_change(axis.change, axis.law, config)
     return constants
 
 
@@ -113,7 +116,23 @@ def _fill_law(law: Any, config: Config) -> None:
     network.dead_zone_rad = control.dead_zone_rad
 
 
-def _fill_trajectory(record: Any, config: Config) -> None:
+def fill_change(record: Any, law: Any, config: Config) -> None:
+    """The room for changes while the joint moves; moves are as quick as an automatic approach."""
+    factor = config.live.gain_factor
+    gains_of(law, record.low)
+    gains_of(law, record.high)
+    for name in dtype_of(Gains).names or ():
+        setattr(record.low, name, getattr(record.low, name) / factor)
+        setattr(record.high, name, getattr(record.high, name) * factor)
+    record.ramp_s = config.live.ramp_s
+    record.q1, record.q2 = config.control.q[0], config.control.q[-1]
+    record.move_speed_radps = APPROACH_SPEED * config.limits.velocity_max_radps
+    record.move_acceleration_radps2 = config.sequence.brake_radps2
+    record.move_min_s = MOVE_MIN_S
+
+
+def fill_trajectory(record: Any, config: Config) -> None:
+    """`TrajectoryConstants` of [trajectory]."""
     trajectory = config.trajectory
     record.kind = TrajectoryKind[trajectory.kind.upper()]
     record.duration_s = trajectory.duration_s
@@ -191,7 +210,7 @@ def approach_s(config: Config, start_position_rad: float | None = None) -> float
         return float(chosen)
     limits = config.limits
     constants = new(TrajectoryConstants)
-    _fill_trajectory(constants[0], config)
+    fill_trajectory(constants[0], config)
     start = approach_start(constants[0], trajectory_table(config))
     speed = max(APPROACH_SPEED * limits.velocity_max_radps, 1.2 * abs(float(start.velocity_radps)))
     acceleration = max(config.sequence.brake_radps2, 1.2 * abs(float(start.acceleration_radps2)))

@@ -274,6 +274,13 @@ class Margin(Section):
     current_lag_s: Annotated[float, between(0.0, 0.1)] = 0.0005  # of the drive's current loop, first order
 
 
+class Live(Section):
+    """What the live page may change while the joint moves."""
+
+    gain_factor: Annotated[float, between(1.0, 10.0)] = 2.0  # gains: configured / factor .. configured * factor
+    ramp_s: Annotated[float, between(0.05, 60.0)] = 0.5  # duration of a change of gains
+
+
 class Log(Section):
     folder: Annotated[str, Field(min_length=1)] = "runs"  # of the run logs, from where jointctl is started
     keep: Annotated[int, between(0, 100_000)] = 0  # newest runs to keep; 0 = all

@@ -12,7 +12,7 @@ import io
 import os
 import select
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
@@ -29,6 +29,7 @@ from tools.output import Output
 from tools.recording.run_log import Event
 from tools.running.events import drive_state_name, phase_name
 from tools.running.loop_delay import quantile_s
+from tools.running.viewer_request import ViewerRequest
 
 REFRESH_s = 0.25
 CLOSE_s = 1.0  # how long the end of a run waits for the last frame
@@ -67,6 +68,13 @@ class Display(Protocol):
         """What whoever watches asks for."""
         ...
 
+    def requests(self) -> Sequence[ViewerRequest]:
+        """What else they have asked for since the last call."""
+        ...
+
+    def settings(self, values: Mapping[str, Any]) -> None:
+        """What can be changed in this run, and how it stands."""
+
     def __enter__(self) -> Self: ...
 
     def __exit__(self, *_: object) -> None: ...
@@ -81,6 +89,13 @@ class OnlyShows:
     def stop_request(self) -> StopRequest:
         """Nobody can ask for anything here; signals have their own way."""
         return StopRequest.NONE
+
+    def requests(self) -> Sequence[ViewerRequest]:
+        """As above."""
+        return ()
+
+    def settings(self, values: Mapping[str, Any]) -> None:
+        """Nothing can be changed here."""
 
 
 class PhaseLines(OnlyShows):

@@ -25,7 +25,7 @@ from tools.configuration.records import axis_constants, trajectory_table
 from tools.output import Output
 from tools.recording.can_log import frame_array
 from tools.recording.kept_records import KeptRecords
-from tools.recording.run_log import RunLogWriter
+from tools.recording.run_log import Event, RunLogWriter
 from tools.recording.run_metadata import run_metadata
 from tools.recording.run_summary import RunSummary, summarise
 from tools.running.events import EventFinder, phase_name
@@ -37,6 +37,7 @@ from tools.running.loop_handle import LoopHandle
 from tools.running.open_drive import check_cyclic_rate, drive_fault_text, loop_delay_s, open_drive
 from tools.running.shared_block import SERIAL
 from tools.running.stop_signals import StopSignals, stop_signals
+from tools.running.viewer_orders import ViewerOrders
 
 POLL_S = 0.02
 DELAY_CYCLES = 300  # how many cycles with the drive off the loop delay is measured over
@@ -89,6 +90,7 @@ class Supervisor:
         self._asked = StopRequest.NONE
         self._stopped_by_viewer = ""
         self._guard: GuardHandle | None = None
+        self._orders: ViewerOrders | None = None  # what viewers may change, while the loop runs
 
     def run(self) -> RunResult | None:
         """The whole run; None if the user declined.  The drive is disabled when this returns or raises."""
@@ -144,10 +146,12 @@ class Supervisor:
         self, drive: Drive, loop: LoopHandle, report: CommissioningReport, signals: StopSignals
     ) -> RunResult:
         self._events = self._event_finder(loop)
+        metadata = run_metadata(self._config, report)
         with (
-            RunLogWriter(self._log_path, run_metadata(self._config, report)) as log,
+            RunLogWriter(self._log_path, metadata) as log,
             KeptRecords(self._log_path.parent) as kept,
             self._make_display() as self._display,
+            self._viewer_orders(loop, log, metadata) as self._orders,
         ):
             constants = self._constants(loop, report)
             constants[0].sequence.may_enable = 0
@@ -173,6 +177,21 @@ class Supervisor:
             if self._recorder is not None and self._recorder.dropped:
                 log.write_event(WARNING, "log", f"{self._recorder.dropped} CAN frames were not recorded: too slow")
             return self._result(loop, kept, signals, state, elapsed_s)
+
+    def _viewer_orders(self, loop: LoopHandle, log: RunLogWriter, metadata: Any) -> ViewerOrders:
+        def tell(level: int, text: str) -> None:
+            self._tell(log, Event(time.monotonic_ns(), level, "scope", text))
+
+        allow = self._allow_low_margin
+        return ViewerOrders(
+            self._config, loop.block, self._log_path, metadata, tell, lambda: self._delay_s, allow_low_margin=allow
+        )
+
+    def _tell(self, log: RunLogWriter, event: Event) -> None:
+        log.write_event(event.level, event.source, event.text, event.time_ns)
+        self._display.event(event)
+        if self._orders is not None:
+            self._orders.keep_event(event)
 
     def _event_finder(self, loop: LoopHandle) -> EventFinder:
         """Events in the words that fit the drive; a fault with the value that the loop has latched."""
@@ -217,9 +236,10 @@ class Supervisor:
         if not len(records):
             return
         self._keep(records, log, kept)
+        if self._orders is not None:
+            self._orders.keep(records)
         for event in self._events.take(records):
-            log.write_event(event.level, event.source, event.text, event.time_ns)
-            self._display.event(event)
+            self._tell(log, event)
         self._display.show(
             Snapshot(
                 records[-1],
@@ -248,11 +268,14 @@ class Supervisor:
             if not signals.name:
                 self._stopped_by_viewer = "the scope's STOP"
             who = signals.name or self._stopped_by_viewer
-            log.write_event(WARNING, "supervisor", f"{request.name.lower().replace('_', ' ')} asked for by {who}")
+            text = f"{request.name.lower().replace('_', ' ')} asked for by {who}"
+            self._tell(log, Event(time.monotonic_ns(), WARNING, "supervisor", text))
         self._check_delay(loop, log)
         if self._guard is not None and self._guard.just_ended():
             log.write_event(WARNING, "supervisor", GUARD_ENDED)
             self._display.note(GUARD_ENDED)
+        if self._orders is not None:
+            self._orders.serve(self._display)
         phase = loop.phase
         if phase is not self._phase:
             self._phase = phase

@@ -8,7 +8,8 @@ import secrets
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.util import find_spec
@@ -18,8 +19,10 @@ from drivers.errors import DataError
 from firmware_py.states import StopRequest
 from tools.recording.run_log import Event
 from tools.running.live_panel import Display, Snapshot
+from tools.running.viewer_request import LONGEST_BYTES, ViewerRequest, decoded
 
-RECORDS, EVENT = b"R", b"E"  # first byte of a message
+RECORDS, EVENT, SETTINGS = b"R", b"E", b"S"  # first byte of a message
+REQUESTS = 16  # of viewers, at most between two looks
 PIECE = 64  # records a message; less than the buffer of the socket
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
@@ -69,6 +72,7 @@ class ScopeFeed:
         end.setblocking(False)
         self.dropped = 0  # messages
         self._asked = StopRequest.NONE
+        self._requests: deque[ViewerRequest] = deque(maxlen=REQUESTS)
 
     def _send(self, kind: bytes, body: bytes) -> None:
         try:
@@ -91,13 +95,35 @@ class ScopeFeed:
         """Pass on an event."""
         self._send(EVENT, json.dumps(asdict(event)).encode())
 
-    def stop_request(self) -> StopRequest:
-        """The strongest stop that a viewer has asked for."""
+    def settings(self, values: Mapping[str, Any]) -> None:
+        """Tell the pages what can be changed, or in which stage things are."""
+        self._send(SETTINGS, json.dumps(dict(values)).encode())
+
+    def _receive(self) -> None:
         with contextlib.suppress(OSError):
-            while word := self._end.recv(16):
+            while word := self._end.recv(LONGEST_BYTES):
                 if word in (b"1", b"2"):
                     self._asked = max(self._asked, StopRequest(int(word)))
+                elif (request := decoded(word)) is not None:
+                    self._requests.append(request)
+
+    def stop_request(self) -> StopRequest:
+        """The strongest stop that a viewer has asked for."""
+        self._receive()
         return self._asked
+
+    def requests(self) -> Sequence[ViewerRequest]:
+        """What viewers have asked for since the last call."""
+        self._receive()
+        found = list(self._requests)
+        self._requests.clear()
+        return found
+
+    def forget(self) -> None:
+        """A new run is being prepared: what was asked for before was for another one."""
+        self._receive()
+        self._requests.clear()
+        self._asked = StopRequest.NONE
 
     def __enter__(self) -> Self:
         return self
@@ -136,6 +162,15 @@ class Displays:
     def stop_request(self) -> StopRequest:
         """See `Display`."""
         return max(display.stop_request() for display in self._displays)
+
+    def requests(self) -> Sequence[ViewerRequest]:
+        """See `Display`."""
+        return [request for display in self._displays for request in display.requests()]
+
+    def settings(self, values: Mapping[str, Any]) -> None:
+        """See `Display`."""
+        for display in self._displays:
+            display.settings(values)
 
     def __enter__(self) -> Self:
         for display in self._displays:

@@ -1,0 +1,226 @@
+"""Changes while the joint moves: gains along a straight line, a new motion by way of rest.
+
+The supervisor writes one `ChangeRequest` and then counts `order` up; the loop takes it at the beginning of a cycle and
+answers with the same number.  Until then the supervisor writes nothing, so that a request is never half old and half
+new.  The loop trusts nobody: what is not finite, outside of the limits, not from rest, or comes while the joint is
+being stopped, is refused and changes nothing.  That the control loop is stable with new gains, and on the way to
+them, is for the supervisor to know (`tools.analysis.margin_gate`).
+
+A new motion brakes the reference as a controlled stop does, moves it along the quintic of least jerk to the start of
+the new motion, where it is at rest, and begins it; `trajectory_s` is negative until then.  In each cycle the reference
+is checked as ever, and a stop request brakes from wherever it is.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from firmware_py.change_records import (
+    ChangeAnswer,
+    ChangeConstants,
+    ChangeKind,
+    ChangeRequest,
+    ChangeState,
+    Gains,
+    MotionChange,
+)
+from firmware_py.iterative_learning import reset_learning
+from firmware_py.kernel import kernel
+from firmware_py.libc import load_acquire
+from firmware_py.records import AxisConstants, AxisState, LawConstants, LawState, LimitConstants, TrajectoryConstants
+from firmware_py.safety import within
+from firmware_py.states import AxisPhase, ControllerKind, TrajectoryKind
+from firmware_py.trajectory import approach_at, brake_step, plan_approach, reference_at, trapezoid_times_s
+
+REST_radps = 1e-9  # what rounding leaves of the velocity at a crest
+_PEAK_SPEED = 1.875  # of a quintic of least jerk, in distance / duration
+_PEAK_ACCELERATION = 10.0 / math.sqrt(3.0)  # in distance / duration^2
+_LONGEST_s = 1e9
+
+
+@kernel
+def reset_change(state: ChangeState) -> None:
+    """Begin a run: nothing has been asked for."""
+    state.answered = 0
+    state.answer = ChangeAnswer.NONE
+    state.ramping = 0
+    state.ramp_s = 0.0
+    state.motion = MotionChange.NONE
+
+
+@kernel
+def gains_allowed(low: Gains, high: Gains, gains: Gains) -> bool:
+    """Every gain inside its limits; a NaN never is."""
+    return (
+        within(gains.kp, low.kp, high.kp)
+        and within(gains.kv, low.kv, high.kv)
+        and within(gains.ki, low.ki, high.ki)
+        and within(gains.observer_radps, low.observer_radps, high.observer_radps)
+        and within(gains.learning_rate, low.learning_rate, high.learning_rate)
+    )
+
+
+@kernel
+def trajectory_allowed(limits: LimitConstants, c: TrajectoryConstants, table_rows: int) -> bool:
+    """Whether the whole motion stays inside the position and velocity limits.
+
+    The rows of a table were checked when the run was prepared; only that very table may be followed.
+    """
+    low, high, top = limits.position_min_rad, limits.position_max_rad, limits.velocity_max_radps
+    if not within(c.duration_s, 0.0, _LONGEST_s):
+        return False
+    if c.kind == TrajectoryKind.TABLE:
+        return c.table_rows >= 2 and c.table_rows == table_rows
+    if c.kind == TrajectoryKind.SINE:
+        swing = abs(c.amplitude_rad)
+        inside = within(c.offset_rad - swing, low, high) and within(c.offset_rad + swing, low, high)
+        return (
+            inside and within(swing * abs(c.omega_radps), 0.0, top) and c.switch_s == 0.0 and math.isfinite(c.shift_s)
+        )
+    if c.kind == TrajectoryKind.HOLD:
+        return within(c.start_rad, low, high)
+    if not (within(c.start_rad, low, high) and within(c.target_rad, low, high) and within(c.dwell_s, 0.0, _LONGEST_s)):
+        return False
+    distance = abs(c.target_rad - c.start_rad)
+    if c.kind == TrajectoryKind.MIN_JERK:
+        return within(c.move_s, 0.0, _LONGEST_s) and within(_PEAK_SPEED * distance, 0.0, top * c.move_s)
+    if c.kind == TrajectoryKind.TRAPEZOID:
+        if not (within(c.speed_radps, 0.0, 1e9) and within(c.acceleration_radps2, 0.0, 1e9)):
+            return False
+        if c.speed_radps == 0.0 or c.acceleration_radps2 == 0.0:
+            return False
+        ramp_s, _ = trapezoid_times_s(distance, c.speed_radps, c.acceleration_radps2)
+        return within(c.acceleration_radps2 * ramp_s, 0.0, top)
+    return False
+
+
+@kernel
+def move_duration_s(constants: ChangeConstants, distance_rad: float) -> float:
+    """Of a move from rest to rest within the speed and acceleration of moves."""
+    by_speed_s = _PEAK_SPEED * abs(distance_rad) / constants.move_speed_radps
+    by_acceleration_s = math.sqrt(_PEAK_ACCELERATION * abs(distance_rad) / constants.move_acceleration_radps2)
+    return max(by_speed_s, by_acceleration_s, constants.move_min_s)
+
+
+@kernel
+def _copy_gains(source: Gains, target: Gains) -> None:
+    target.kp, target.kv, target.ki = source.kp, source.kv, source.ki
+    target.observer_radps, target.learning_rate = source.observer_radps, source.learning_rate
+
+
+@kernel
+def gains_of(law: LawConstants, gains: Gains) -> None:
+    """Fill `gains` with those in force."""
+    gains.kp, gains.kv, gains.ki = law.kp, law.kv, law.ki
+    gains.observer_radps, gains.learning_rate = law.observer.bandwidth_radps, law.network.learning_rate
+
+
+@kernel
+def set_gains(constants: ChangeConstants, law: LawConstants, state: LawState, gains: Gains) -> None:
+    """Put gains into force without a jump of the torque that has been integrated; P B follows from kp and kv."""
+    if law.kind == ControllerKind.PID and law.ki > 0.0 and gains.ki > 0.0:
+        state.integral_rads *= law.ki / gains.ki
+    before, now = law.observer.bandwidth_radps, gains.observer_radps
+    if before > 0.0 and now > 0.0:
+        state.observer.integral_Nms += state.observer.disturbance_Nm * (1.0 / now - 1.0 / before)
+    law.kp, law.kv, law.ki = gains.kp, gains.kv, gains.ki
+    law.observer.bandwidth_radps = now
+    law.network.learning_rate = gains.learning_rate
+    p12 = constants.q1 / (2.0 * gains.kp)  # as `lyapunov.solve_lyapunov_p`
+    law.network.p_b[0] = p12 / law.inertia_kgm2
+    law.network.p_b[1] = (constants.q2 + 2.0 * p12) / (2.0 * gains.kv) / law.inertia_kgm2
+
+
+@kernel
+def _take_gains(constants: AxisConstants, state: AxisState, request: ChangeRequest) -> int:
+    if state.phase != AxisPhase.APPROACH and state.phase != AxisPhase.TRACKING:
+        return ChangeAnswer.WRONG_PHASE
+    if not gains_allowed(constants.change.low, constants.change.high, request.gains):
+        return ChangeAnswer.GAIN_LIMIT
+    change = state.change
+    gains_of(constants.law, change.start)
+    _copy_gains(request.gains, change.target)
+    change.ramp_s = 0.0
+    change.ramping = 1
+    return ChangeAnswer.TAKEN
+
+
+@kernel
+def _take_motion(constants: AxisConstants, state: AxisState, table: np.ndarray, request: ChangeRequest) -> int:
+    if state.phase != AxisPhase.TRACKING:
+        return ChangeAnswer.WRONG_PHASE
+    if not trajectory_allowed(constants.limits, request.trajectory, table.shape[0]):
+        return ChangeAnswer.MOTION_LIMIT
+    change = state.change
+    reference_at(request.trajectory, table, 0, 0.0, change.goal)
+    if not abs(change.goal.velocity_radps) <= REST_radps:
+        return ChangeAnswer.NOT_FROM_REST
+    change.next_trajectory = request.trajectory
+    change.motion = MotionChange.BRAKING
+    speed = state.reference.velocity_radps
+    brake_s = abs(speed) / constants.sequence.brake_radps2
+    rest_rad = state.reference.position_rad + 0.5 * speed * brake_s
+    state.trajectory_s = -brake_s - move_duration_s(constants.change, change.goal.position_rad - rest_rad)
+    return ChangeAnswer.TAKEN
+
+
+@kernel
+def _ramp_gains(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> None:
+    change = state.change
+    change.ramp_s += elapsed_cycles * constants.law.period_s
+    if change.ramp_s >= constants.change.ramp_s:
+        change.ramping = 0
+        set_gains(constants.change, constants.law, state.law, change.target)
+        return
+    share = change.ramp_s / constants.change.ramp_s
+    a, b = change.start, change.target
+    now = change.now
+    now.kp, now.kv = a.kp + share * (b.kp - a.kp), a.kv + share * (b.kv - a.kv)
+    now.ki = a.ki + share * (b.ki - a.ki)
+    now.observer_radps = a.observer_radps + share * (b.observer_radps - a.observer_radps)
+    now.learning_rate = a.learning_rate + share * (b.learning_rate - a.learning_rate)
+    set_gains(constants.change, constants.law, state.law, now)
+
+
+@kernel
+def step_change(constants: AxisConstants, state: AxisState, table: np.ndarray, elapsed_cycles: int) -> None:
+    """Take a request, if there is a whole one, and go on with a change of gains; a stop freezes them as they are."""
+    request = constants.change.request
+    order = load_acquire(constants.change.order, 0)
+    if order != state.change.answered and request.first == order and request.last == order:
+        answer = ChangeAnswer.WRONG_KIND
+        if request.kind == ChangeKind.GAINS:
+            answer = _take_gains(constants, state, request)
+        elif request.kind == ChangeKind.MOTION:
+            answer = _take_motion(constants, state, table, request)
+        state.change.answer = answer
+        state.change.answered = order
+    if state.change.ramping != 0 and (state.phase == AxisPhase.APPROACH or state.phase == AxisPhase.TRACKING):
+        _ramp_gains(constants, state, elapsed_cycles)
+
+
+@kernel
+def step_new_motion(constants: AxisConstants, state: AxisState, table: np.ndarray, elapsed_cycles: int) -> None:
+    """The reference of this cycle on the way to the new motion, and its first one when it is there."""
+    change = state.change
+    if change.motion == MotionChange.BRAKING:
+        for _ in range(elapsed_cycles):
+            brake_step(state.reference, constants.sequence.brake_radps2, constants.law.period_s)
+        if state.reference.velocity_radps == 0.0:
+            at_rad = state.reference.position_rad
+            change.goal.velocity_radps = 0.0
+            change.goal.acceleration_radps2 = 0.0  # the move ends at rest; the new motion's acceleration sets in then
+            change.move_s = move_duration_s(constants.change, change.goal.position_rad - at_rad)
+            plan_approach(at_rad, change.goal, change.move_s, state.approach)
+            state.trajectory_s = -change.move_s
+            change.motion = MotionChange.MOVING
+        return
+    if state.trajectory_s < 0.0:
+        approach_at(state.approach, state.trajectory_s + change.move_s, state.reference)
+        return
+    change.motion = MotionChange.NONE
+    constants.trajectory = change.next_trajectory
+    reset_learning(state.law.learning)  # what was learned belongs to the motion before; its torque has faded out
+    state.table_row = reference_at(constants.trajectory, table, 0, state.trajectory_s, state.reference)
