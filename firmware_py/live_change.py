@@ -190,7 +190,7 @@ def step_change(constants: AxisConstants, state: AxisState, table: np.ndarray, e
     request = constants.change.request
     order = load_acquire(constants.change.order, 0)
     if order != state.change.answered and request.first == order and request.last == order:
-        answer = ChangeAnswer.WRONG_KIND
+        answer: int = ChangeAnswer.WRONG_KIND
         if request.kind == ChangeKind.GAINS:
             answer = _take_gains(constants, state, request)
         elif request.kind == ChangeKind.MOTION:

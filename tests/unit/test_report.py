@@ -182,6 +182,15 @@ def test_two_runs_are_compared_at_the_same_trajectory_time(tmp_path: Path) -> No
     assert (tmp_path / "a.comparison.html").exists()
 
 
+def test_runs_are_compared_until_one_of_them_changed_its_motion() -> None:
+    first, second = run_records(), run_records()
+    second.trajectory_s[2000:] = -1.0 + np.arange(len(second) - 2000) * 1e-3
+    until_s = float(second.trajectory_s[1999])
+    rows, chosen = aligned(first, second)
+    assert float(rows["trajectory_s"][-1]) <= until_s
+    assert np.flatnonzero(chosen)[-1] == 1999
+
+
 def test_runs_that_cannot_be_compared_say_so(tmp_path: Path) -> None:
     later, other = run_records(from_s=100.0), run_records()
     other.desired_position_rad += 2e-3

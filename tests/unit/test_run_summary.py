@@ -59,6 +59,17 @@ def test_the_late_part_may_begin_at_a_given_time() -> None:
     assert late.range_rad.greatest == 2e-3
 
 
+def test_a_changed_motion_sets_the_loops_time_back_but_not_the_summarys() -> None:
+    changed = run_records()
+    changed.trajectory_s[600:] = -1.0 + np.arange(500) * 1e-3
+    found, expected = summarise(changed), summarise(run_records())
+    assert found.tracked_s == pytest.approx(expected.tracked_s)
+    assert found.settling_s == pytest.approx(expected.settling_s)
+    assert found.late_error is not None
+    assert found.late_error.from_s == pytest.approx(0.5, abs=2e-3)
+    assert found.late_error.rmse_rad == pytest.approx(0.5e-3)
+
+
 def test_settling_time_is_when_the_error_stays_within_1_mrad() -> None:
     records = run_records()
     assert summarise(records).settling_s == pytest.approx(0.1)

@@ -85,7 +85,7 @@ def summarise(records: Any, histograms: Any = None, *, late_from_s: float | None
     `late_from_s` is a trajectory time.
     """
     tracking = records[records["phase"] == AxisPhase.TRACKING]
-    time_s = tracking["trajectory_s"]
+    time_s = tracking_time_s(tracking)
     late_from_s = late_from_s if late_from_s is not None else 0.5 * float(time_s[-1]) if len(time_s) else 0.0
     faults = records["fault"][records["fault"] != 0]
     duration_ns = int(records["time_ns"][-1]) - int(records["time_ns"][0]) if len(records) else 0
@@ -94,8 +94,8 @@ def summarise(records: Any, histograms: Any = None, *, late_from_s: float | None
         duration_s=duration_ns * 1e-9,
         tracked_s=float(time_s[-1] - time_s[0]) if len(time_s) else 0.0,
         fault=_fault_name(int(faults[0])) if len(faults) else Fault.NONE.name,
-        error=_error(tracking),
-        late_error=_error(tracking[time_s >= late_from_s]),
+        error=_error(tracking, time_s),
+        late_error=_error(tracking[time_s >= late_from_s], time_s[time_s >= late_from_s]),
         settling_s=_settling_s(tracking),
         command_torque_Nm=_range(tracking["command_torque_Nm"]),
         measured_torque_Nm=_range(tracking["measured_torque_Nm"]),
@@ -107,6 +107,15 @@ def summarise(records: Any, histograms: Any = None, *, late_from_s: float | None
     )
 
 
+def tracking_time_s(tracking: Any) -> np.ndarray:
+    """Trajectory time [s] of TRACKING records; goes on where a change of the motion has set the loop's own back."""
+    time_s: np.ndarray = tracking["trajectory_s"]
+    if len(time_s) < 2 or np.all(np.diff(time_s) >= 0.0):
+        return time_s
+    since: np.ndarray = (tracking["time_ns"] - tracking["time_ns"][0]) * 1e-9
+    return since + time_s[0]
+
+
 def _fault_name(code: int) -> str:
     return Fault(code).name if code in list(Fault) else f"FAULT_{code}"
 
@@ -116,20 +125,20 @@ def _range(values: Any) -> Range | None:
     return Range(float(values.min()), float(values.max())) if len(values) else None
 
 
-def _error(tracking: Any) -> ErrorSummary | None:
+def _error(tracking: Any, time_s: np.ndarray) -> ErrorSummary | None:
     error = tracking["error_rad"]
     found = _range(error)
     if found is None:
         return None
     rmse = float(np.sqrt(np.mean(np.square(error[np.isfinite(error)]))))
-    return ErrorSummary(float(tracking["trajectory_s"][0]), float(tracking["trajectory_s"][-1]), found, rmse)
+    return ErrorSummary(float(time_s[0]), float(time_s[-1]), found, rmse)
 
 
 def _settling_s(tracking: Any) -> float | None:
     outside = np.flatnonzero(~(np.abs(tracking["error_rad"]) <= SETTLED_RAD))
     if len(tracking) == 0 or (len(outside) and outside[-1] == len(tracking) - 1):
         return None
-    return float(tracking["trajectory_s"][outside[-1] + 1]) if len(outside) else float(tracking["trajectory_s"][0])
+    return float(tracking_time_s(tracking)[outside[-1] + 1 if len(outside) else 0])
 
 
 def _times(records: Any, histograms: Any, row: int) -> TimeSummary | None:

@@ -16,9 +16,19 @@ SAME_MOTION_rad = 1e-3
 _SHORTEST = 10  # samples in common
 
 
+def first_motion(records: Any) -> np.ndarray:
+    """bool[N]: TRACKING, and the motion has not been changed yet (that sets the trajectory time back)."""
+    tracking: np.ndarray = records["phase"] == AxisPhase.TRACKING
+    rows = np.flatnonzero(tracking)
+    back = np.flatnonzero(np.diff(records["trajectory_s"][rows]) < 0.0)
+    if len(back):
+        tracking = tracking & (np.arange(len(records)) <= rows[back[0]])
+    return tracking
+
+
 def aligned(first: Any, second: Any) -> tuple[Any, np.ndarray]:
     """(rows of `first` while TRACKING within the time common to both, bool[N] of `second`'s TRACKING rows)."""
-    a, in_b = first[first["phase"] == AxisPhase.TRACKING], second["phase"] == AxisPhase.TRACKING
+    a, in_b = first[first_motion(first)], first_motion(second)
     if not len(a) or not np.any(in_b):
         return a[:0], in_b
     time_b = second["trajectory_s"][in_b]
@@ -37,7 +47,7 @@ def _overlay(
     def paint(figure: Any) -> None:
         above, below = figure.subplots(2, 1, sharex=True)
         for i, (name, records) in enumerate(zip(names, runs, strict=True)):
-            rows = records[records["phase"] == AxisPhase.TRACKING]
+            rows = records[first_motion(records)]
             if len(rows):
                 line(above, rows["trajectory_s"], rows[field] * scale, SERIES[i % len(SERIES)], name, linewidth=1.0)
         for i, records in enumerate(runs[1:], 1):

@@ -56,8 +56,9 @@ def checked_gains(
             raise ConfigurationError(f"{str(name)[:40]!r} is no gain that can be changed: {', '.join(after)}")
         number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
         if not number or not low[name] <= value <= high[name]:
+            shown = f"{value:g}" if isinstance(value, float) else str(value)[:40]
             raise ConfigurationError(
-                f"control.{name} (={str(value)[:40]}) must be in [{low[name]:g}..{high[name]:g}], from live.gain_factor"
+                f"control.{name} (={shown}) must be in [{low[name]:g}..{high[name]:g}], from live.gain_factor"
             )
         after[name] = float(value)
     return after

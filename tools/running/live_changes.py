@@ -104,6 +104,8 @@ class LiveChanges:
             self._open = self._gains(request) if request.kind == "gains" else self._motion(request)
         except JointctlError as error:
             self._refuse(request.who, error)
+        except Exception as error:  # whatever a page sends, the joint's run goes on
+            self._refuse(request.who, JointctlError(f"not understood: {type(error).__name__}: {error}"))
 
     def _gains(self, request: ViewerRequest) -> _Change | None:
         delay_s = self._delay_s()
@@ -153,12 +155,13 @@ class LiveChanges:
         if change.number == 0:
             if change.gate is None or not change.gate.done():
                 return
-            try:
-                margin_deg = change.gate.result()
-            except JointctlError as error:
-                self._refuse(change.who, error)
+            error = change.gate.exception()
+            if error is not None:
+                words = error if isinstance(error, JointctlError) else JointctlError(f"the gate failed: {error}")
+                self._refuse(change.who, words)
                 self._open = None
                 return
+            margin_deg = change.gate.result()
             change.text += f" (phase margin {margin_deg:.0f} deg)"
             self._post(change)
             return

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from drivers.errors import ConfigurationError
 from firmware_py.records import TrajectoryConstants
@@ -17,10 +17,14 @@ from tools.configuration.checks import extremes_problems
 from tools.configuration.config import Config
 from tools.configuration.problems import problem_line
 from tools.configuration.records import fill_trajectory
+from tools.configuration.sections import Section
 from tools.configuration.trajectory import Trajectory
 
-_ADAPTER: TypeAdapter[Any] = TypeAdapter(Trajectory)
 CONFIGURED = "configured"
+
+
+class _Chosen(Section):
+    trajectory: Trajectory
 
 
 def new_motion(config: Config, table: Any, values: Mapping[str, Any]) -> tuple[Any, str]:
@@ -54,10 +58,11 @@ def _trajectory(config: Config, values: Mapping[str, Any]) -> Any:
         return config.trajectory
     if kind == "table":
         raise ConfigurationError('trajectory.kind (=table) can only be chosen as "configured"')
+    data = {"trajectory": dict(values)}
     try:
-        return _ADAPTER.validate_python(dict(values))
+        return _Chosen.model_validate(data).trajectory
     except ValidationError as error:
-        raise ConfigurationError(problem_line(error.errors(include_url=False)[0], values, ())) from None
+        raise ConfigurationError(problem_line(error.errors(include_url=False)[0], data, ())) from None
 
 
 def in_words(record: Any, speed_radps: float) -> str:
