@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +26,14 @@ from tools.recording.can_log import frame_array
 from tools.recording.kept_records import KeptRecords
 from tools.recording.run_log import Event, RunLogWriter
 from tools.recording.run_metadata import run_metadata
-from tools.recording.run_summary import RunSummary, summarise
+from tools.recording.run_summary import summarise
 from tools.running.events import EventFinder, phase_name
-from tools.running.fault_text import FaultText
 from tools.running.frame_recorder import FrameRecorder, recording
 from tools.running.guard_handle import GUARD_ENDED, GuardHandle, start_guard
 from tools.running.live_panel import Display, PhaseLines, Snapshot
 from tools.running.loop_handle import LoopHandle
 from tools.running.open_drive import check_cyclic_rate, drive_fault_text, loop_delay_s, open_drive
+from tools.running.run_result import RunResult as RunResult
 from tools.running.shared_block import SERIAL
 from tools.running.stop_signals import StopSignals, stop_signals
 from tools.running.viewer_orders import ViewerOrders
@@ -42,22 +41,6 @@ from tools.running.viewer_orders import ViewerOrders
 POLL_S = 0.02
 DELAY_CYCLES = 300  # how many cycles with the drive off the loop delay is measured over
 INFORMATION, WARNING, ERROR = 20, 30, 40
-
-
-@dataclass(frozen=True)
-class RunResult:
-    """What a run left behind."""
-
-    summary: RunSummary
-    records: Any
-    histograms: np.ndarray[Any, Any]
-    fault: Fault
-    fault_text: FaultText | None
-    stopped_by: str  # name of the signal, or ""
-    drive_state: str  # in words, read after the run
-    bus_load: float  # measured share, worst-case stuffing
-    lost_records: int
-    log_path: Path
 
 
 class Supervisor:
