@@ -13,9 +13,10 @@ import numpy as np
 
 from firmware_py.change_records import MotionChange
 from firmware_py.computed_torque import step_law
+from firmware_py.frozen_reading import check_reading
 from firmware_py.kernel import kernel
 from firmware_py.live_change import step_change, step_new_motion
-from firmware_py.records import AxisConstants, AxisState, Command, LimitConstants, Sample
+from firmware_py.records import AxisConstants, AxisState, Command, Sample
 from firmware_py.safety import drive_fault, limited_torque_Nm, motion_fault, reference_fault
 from firmware_py.sequence import (
     enter,
@@ -35,9 +36,6 @@ from firmware_py.velocity import step_velocity
 from firmware_py.velocity_command import limited_velocity_radps, velocity_command_radps
 
 REACTION_CYCLES = 2  # between seeing that the reference leaves its limits and the first braked cycle
-
-# at a torque that a sound joint gives way to: it moves by a milliradian in that time
-PUSHED_CYCLES = 20
 
 
 @kernel
@@ -146,31 +144,9 @@ def _brake(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> N
 
 
 @kernel
-def _check_reading(limits: LimitConstants, state: AxisState) -> None:
-    """A reading that stands still although the reference moves on, or although the joint is pushed hard.
-
-    It must be early: behind a stuck encoder the law pushes ever harder, and the joint moves unseen, long before the
-    following error is too large.
-    """
-    way_rad = state.reference.position_rad - state.frozen_from_rad
-    if state.frozen_samples == 0:
-        state.frozen_from_rad = state.reference.position_rad
-        state.pushed_cycles = 0
-    elif state.sample_age_cycles == 0:
-        if 0.0 < limits.frozen_max_rad < abs(way_rad):
-            trip(state, Fault.POSITION_FROZEN, way_rad, 0)
-        if 0.0 < limits.frozen_torque_Nm < abs(state.command_torque_Nm):
-            state.pushed_cycles += 1
-            if state.pushed_cycles > PUSHED_CYCLES:
-                trip(state, Fault.POSITION_FROZEN, way_rad, 0)
-        else:
-            state.pushed_cycles = 0
-
-
-@kernel
 def _check_motion(constants: AxisConstants, state: AxisState) -> None:
     """Measured position, velocity and following error against their limits."""
-    _check_reading(constants.limits, state)
+    check_reading(constants.limits, state)
     error_rad = state.measured_position_rad - state.reference.position_rad
     fault = motion_fault(constants.limits, state.measured_position_rad, state.velocity.velocity_radps, error_rad)
     value = state.measured_position_rad

@@ -1,0 +1,33 @@
+"""A reading of the position that stands still although the joint must move."""
+
+from __future__ import annotations
+
+from firmware_py.kernel import kernel
+from firmware_py.records import AxisState, LimitConstants
+from firmware_py.sequence import trip
+from firmware_py.states import Fault
+
+# at a torque that a sound joint gives way to: it moves by a milliradian in that time
+PUSHED_CYCLES = 20
+
+
+@kernel
+def check_reading(limits: LimitConstants, state: AxisState) -> None:
+    """A reading that stands still although the reference moves on, or although the joint is pushed hard.
+
+    It must be early: behind a stuck encoder the law pushes ever harder, and the joint moves unseen, long before the
+    following error is too large.
+    """
+    way_rad = state.reference.position_rad - state.frozen_from_rad
+    if state.frozen_samples == 0:
+        state.frozen_from_rad = state.reference.position_rad
+        state.pushed_cycles = 0
+    elif state.sample_age_cycles == 0:
+        if 0.0 < limits.frozen_max_rad < abs(way_rad):
+            trip(state, Fault.POSITION_FROZEN, way_rad, 0)
+        if 0.0 < limits.frozen_torque_Nm < abs(state.command_torque_Nm):
+            state.pushed_cycles += 1
+            if state.pushed_cycles > PUSHED_CYCLES:
+                trip(state, Fault.POSITION_FROZEN, way_rad, 0)
+        else:
+            state.pushed_cycles = 0
