@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -28,6 +29,9 @@ GENTLE = {
     "limits.sample_age_max_s": 0.5, "limits.skipped_max_s": 0.5, "limits.following_error_max_rad": 0.3,
     "limits.position_jump_max_rad": 0.1, "sequence.supervisor_timeout_s": 5.0, "drive.heartbeat_s": 0.6,
 }  # fmt: skip
+# as the driver of a controller makes it
+ERROR_PASSIVE = "20000004#0020000000008000"
+ERROR_PASSIVE_TEXT = "error passive (transmit); transmit errors 128"
 SLOW_GUEST = ("-y", "--allow-low-margin")
 
 
@@ -118,6 +122,8 @@ def test_an_interface_that_goes_down_in_the_run_stops_the_joint(tmp_path: Path, 
         rest = started.stderr.read()
     assert "Traceback" not in rest
     assert "error:" in rest
+    assert "vcan0" in rest
+    assert "ip link set vcan0 up" in rest
     # the drive is alone now: its own watchdog has switched it off, as the next commissioning finds
     subprocess.run(["ip", "link", "set", "vcan0", "up"], check=True)
     time.sleep(0.5)
@@ -154,3 +160,76 @@ def test_the_cyclic_end_is_non_blocking_and_shares_the_bus_with_python_can() -> 
         assert (int.from_bytes(frame[:4], "little"), frame[4], frame[8:10]) == (0x123, 2, b"\x01\x02")
     with pytest.raises(BusError, match="can9"):
         open_cyclic_end("socketcan", "can9")
+
+
+# --- what looks at the bus ---
+
+
+@pytest.mark.usefixtures("joint")
+def test_scan_info_and_monitor(tmp_path: Path) -> None:
+    found = run(tmp_path, "scan", *ON_VCAN, "--json", "--listen", "0.2")
+    assert found.returncode == 0, found.stderr
+    assert [node["node"] for node in json.loads(found.stdout)["nodes"]] == [1]
+    info = run(tmp_path, "info", *ON_VCAN, "-t", "1", "--json")
+    assert json.loads(info.stdout)["state"]["drive_state"] == "switch on disabled"
+    command = jointctl("monitor", *ON_VCAN, "--count", "2", "--json")
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as monitor:
+        assert monitor.stderr is not None
+        assert "listening on" in monitor.stderr.readline()
+        subprocess.run(["cansend", "vcan0", "705#7F"], check=True)
+        subprocess.run(["cansend", "vcan0", ERROR_PASSIVE], check=True)
+        out = monitor.communicate(timeout=60.0)[0]
+    first, second = (json.loads(line) for line in out.splitlines())
+    assert (first["kind"], first["text"]) == ("heartbeat", "pre-operational")
+    assert (second["kind"], second["text"]) == ("error", ERROR_PASSIVE_TEXT + ", receive errors 0")
+
+
+@pytest.mark.usefixtures("joint")
+def test_a_run_beside_foreign_traffic_tells_what_the_controller_complains_about(tmp_path: Path, config: str) -> None:
+    with subprocess.Popen(["cangen", "vcan0", "-g", "5", "-I", "500", "-L", "8"]) as foreign:
+        try:
+            with tracking(tmp_path, config) as started:
+                subprocess.run(["cansend", "vcan0", ERROR_PASSIVE], check=True)
+                assert started.stderr is not None
+                rest = started.stderr.read()
+                assert started.wait(60.0) == 0, rest
+        finally:
+            foreign.terminate()
+    assert ERROR_PASSIVE_TEXT in rest
+    assert "power of the drive" in rest
+
+
+@pytest.mark.usefixtures("joint")
+def test_a_full_transmit_queue_stops_the_joint_and_is_told(tmp_path: Path, config: str) -> None:
+    """A queue that lets next to nothing out fills up, as that of a controller whose frames nobody acknowledges."""
+    slow = ["qdisc", "add", "dev", "vcan0", "root", "tbf", "rate", "8kbit", "burst", "32", "limit", "64"]
+    with tracking(tmp_path, config) as started:
+        subprocess.run(["tc", *slow], check=True)
+        try:
+            assert started.stderr is not None
+            rest = started.stderr.read()
+            assert started.wait(60.0) == 7, rest
+        finally:
+            subprocess.run(["tc", "qdisc", "del", "dev", "vcan0", "root"], check=True)
+    assert "Traceback" not in rest
+    assert "transmit queue of vcan0 is full" in rest
+    assert "txqueuelen" in rest
+
+
+@pytest.mark.usefixtures("joint")
+def test_a_sweep(tmp_path: Path, config: str) -> None:
+    (tmp_path / "speeds").write_text("0.2\n-0.2\n")
+    options = ("--grid", "list", "--speeds", "speeds", "--warm-up", "0", "--dwell", "0.2", "-o", "friction.csv")
+    done = run(tmp_path, "sweep", config, *ON_VCAN, *SLOW_GUEST, *options)
+    assert done.returncode == 0, done.stderr
+    assert len((tmp_path / "friction.csv").read_text().splitlines()) >= 3
+
+
+@pytest.mark.usefixtures("interface")
+def test_doctor_tells_the_state_of_the_interface(tmp_path: Path, config: str) -> None:
+    subprocess.run(["ip", "link", "set", "vcan0", "down"], check=True)
+    down = run(tmp_path, "doctor", config, *ON_VCAN, "--json")
+    (found,) = [item for item in json.loads(down.stdout)["findings"] if item["topic"] == "interface"]
+    assert (down.returncode, found["status"]) == (1, "problem")
+    assert "vcan0 is down" in found["text"]
+    assert "ip link set vcan0 up" in found["cure"]

@@ -15,12 +15,20 @@ import can
 import numpy as np
 import pytest
 
+from drivers.can.link_state import parse_link
 from drivers.errors import BusError
 from tools.analysis.wake_up import fifo, wake_up_lateness_ns
 from tools.configuration.config import Config
 from tools.configuration.load import load_config, shipped_config
 from tools.inspection import bus_health, computer
-from tools.inspection.bus_health import SDO_READS, adapters, bus_budget, drive_finding, sdo_round_trips_us
+from tools.inspection.bus_health import (
+    SDO_READS,
+    adapters,
+    bus_budget,
+    drive_finding,
+    interface_state,
+    sdo_round_trips_us,
+)
 from tools.inspection.computer import kernel_cache, kernel_findings, wake_up
 from tools.inspection.findings import NOTE, OK, PROBLEM, Finding
 from tools.output import Output
@@ -249,6 +257,41 @@ class TestBus:
 
         monkeypatch.setattr(bus_health, "open_python_can", fail)
         assert drive_finding(config) == Finding("drive", NOTE, "not asked: no virtual bus", "start one")
+
+    @pytest.mark.parametrize(
+        ("data", "queue", "found"),
+        [
+            ({"state": "ERROR-ACTIVE"}, 1000, [("interface", OK)]),
+            ({"state": "ERROR-ACTIVE"}, 10, [("interface", OK), ("transmit queue", NOTE)]),
+            ({"state": "ERROR-WARNING"}, 1000, [("interface", NOTE)]),
+            ({"state": "ERROR-PASSIVE"}, 1000, [("interface", PROBLEM)]),
+            ({"state": "BUS-OFF"}, 1000, [("interface", PROBLEM)]),
+            ({"state": "ERROR-ACTIVE", "bittiming": {"bitrate": 500_000}}, 1000, [("interface", PROBLEM)]),
+        ],
+    )
+    def test_the_state_of_the_interface(
+        self, config: Config, data: Any, queue: int, found: Any, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        link = {"ifname": "can0", "flags": ["UP"], "txqlen": queue, "linkinfo": {"info_kind": "can", "info_data": data}}
+        monkeypatch.setattr(bus_health, "link_state", lambda name: parse_link(link))
+        told = list(interface_state(changed(config, interface="socketcan", channel="can0")))
+        assert [(finding.topic, finding.status) for finding in told] == found
+        assert all(finding.cure for finding in told if finding.status != OK)
+        assert list(interface_state(config)) == []  # another kind of bus
+
+    def test_a_missing_interface(self, config: Config) -> None:
+        (found,) = interface_state(changed(config, interface="socketcan", channel="jc_none0"))
+        assert found.status == PROBLEM
+        assert "ip link set jc_none0 up" in found.cure
+
+    @pytest.mark.parametrize(("rate_Hz", "status"), [(100.0, OK), (4000.0, NOTE)])
+    def test_a_slow_answer_limits_the_rate(
+        self, config: Config, rate_Hz: float, status: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(bus_health, "open_python_can", lambda *_: SdoBus(config.drive.node))
+        monkeypatch.setattr(bus_health, "sdo_round_trips_us", lambda *_: [1000.0] * SDO_READS)
+        found = drive_finding(changed(config, rate_Hz=rate_Hz))
+        assert (found.status, found.numbers["allowed_rate_Hz"]) == (status, 600.0)
 
 
 class TestReport:

@@ -16,11 +16,14 @@ import can
 import numpy as np
 
 from drivers.can.bit_timing import bus_load, highest_rate_Hz
+from drivers.can.link_state import SHORT_QUEUE, link_problem, link_state
 from drivers.can.open import CYCLIC_INTERFACES, open_python_can
+from drivers.can.socketcan import up_command
 from drivers.errors import BusError
 from tools.configuration.config import Config
 from tools.configuration.drive_settings import CYCLE_BYTES, HIGHEST_LOAD
 from tools.inspection.findings import NOTE, OK, PROBLEM, Finding, file_text
+from tools.running.loop_handle import RECEIVE_SHARE
 from tools.running.portable_loop import HIGHEST_RATE_HZ
 
 SDO_READS = 20
@@ -52,6 +55,43 @@ def adapters(config: Config, root: Path = Path("/")) -> Iterator[Finding]:
         return
     cure = "" if member else f"for serial adapters: sudo usermod -aG dialout {getpass.getuser()}; log in again"
     yield Finding("serial ports", OK if member else NOTE, "may be used" if member else "not in group dialout", cure)
+
+
+def interface_state(config: Config) -> Iterator[Finding]:
+    """State, error counters, bit rate and queue of a SocketCAN interface; nothing for other kinds of bus."""
+    if config.bus.interface != "socketcan":
+        return
+    name = config.bus.channel
+    link = link_state(name)
+    if link is None:
+        if (Path("/sys/class/net") / name).exists():
+            yield Finding(
+                "interface", NOTE, f"{name} exists, its state is unknown", "install iproute2 (the program ip)"
+            )
+        else:
+            cure = f"plug it in, then: {up_command(name)}"
+            yield Finding("interface", PROBLEM, f"there is no CAN interface {name}", cure)
+        return
+    problem = link_problem(link, config.bus.bitrate_bitps)
+    text = f"{name} is {'up' if link.up else 'down'}"
+    text += f", {link.state}" if link.state else ""
+    if link.transmit_errors is not None:
+        text += f", transmit errors {link.transmit_errors}, receive errors {link.receive_errors}"
+    text += f", {link.bitrate_bitps} bit/s" if link.bitrate_bitps else ""
+    past = {key: value for key, value in link.counts.items() if value}
+    if past:
+        text += ", since it is up: " + ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in past.items())
+    numbers: dict[str, Any] = {"counts": link.counts, "transmit_errors": link.transmit_errors}
+    if problem is not None:
+        yield Finding("interface", PROBLEM, problem[0], problem[1], numbers)
+        return
+    bad = link.state == "ERROR-WARNING" or any(past.get(key) for key in ("error_passive", "bus_off"))
+    cure = "frames have been failing: wiring, termination (60 ohm between H and L), bit rate" if bad else ""
+    yield Finding("interface", NOTE if bad else OK, text, cure, numbers)
+    queue = link.queue_frames
+    if queue is not None and queue < SHORT_QUEUE:
+        cure = f"sudo ip link set {name} txqueuelen 1000"
+        yield Finding("transmit queue", NOTE, f"{queue} frames: overflows when several programs send", cure)
 
 
 def bus_budget(config: Config) -> Finding:
@@ -107,6 +147,13 @@ def drive_finding(config: Config) -> Finding:
         return Finding("drive", PROBLEM, f"{name} does not answer", "power, wiring, bit rate, drive.node")
     p50, worst = float(np.median(times)), max(times)
     numbers = {"answers": len(times), "asked": SDO_READS, "p50_us": p50, "max_us": worst}
+    # a cycle waits for its sample for RECEIVE_SHARE of a period; drives answer SYNC no slower than SDO
+    allowed_Hz = RECEIVE_SHARE * 1e6 / p50
+    numbers["allowed_rate_Hz"] = allowed_Hz
     text = f"{name}: {len(times)} of {SDO_READS} reads answered in {p50:.0f} / {worst:.0f} us (p50/max)"
+    text += f", which allows {allowed_Hz:.0f} Hz at least"
     good = len(times) == SDO_READS
+    if good and config.loop.rate_Hz > allowed_Hz:
+        cure = "drives may answer SDO later than SYNC: look at the round trip that a run reports, or lower loop.rate_Hz"
+        return Finding("drive", NOTE, text, cure, numbers)
     return Finding("drive", OK if good else NOTE, text, "" if good else "SDO is being lost: wiring, bus load", numbers)

@@ -27,6 +27,7 @@ from tools.recording.kept_records import KeptRecords
 from tools.recording.run_log import Event, RunLogWriter
 from tools.recording.run_metadata import run_metadata
 from tools.recording.run_summary import summarise
+from tools.running.bus_watch import BusWatch, bus_watch
 from tools.running.events import EventFinder, phase_name
 from tools.running.frame_recorder import FrameRecorder, recording
 from tools.running.guard_handle import GUARD_ENDED, GuardHandle, start_guard
@@ -69,6 +70,7 @@ class Supervisor:
         self._make_display = display or (lambda: PhaseLines(output))
         self._display: Display = PhaseLines(output)
         self._recorder: FrameRecorder | None = None
+        self._bus_watch = BusWatch(config, None)
         self._events = EventFinder()
         self._asked = StopRequest.NONE
         self._stopped_by_viewer = ""
@@ -84,6 +86,7 @@ class Supervisor:
             stop_signals() as signals,
             LoopHandle(config, self._table(), tail_path) as loop,
             recording(config) as self._recorder,
+            bus_watch(config) as self._bus_watch,
         ):
             drive = open_drive(config)
             try:
@@ -254,6 +257,9 @@ class Supervisor:
             text = f"{request.name.lower().replace('_', ' ')} asked for by {who}"
             self._tell(log, Event(time.monotonic_ns(), WARNING, "supervisor", text))
         self._check_delay(loop, log)
+        for text in self._bus_watch.news():
+            log.write_event(WARNING, "bus", text)
+            self._display.note(text)
         if self._guard is not None and self._guard.just_ended():
             log.write_event(WARNING, "supervisor", GUARD_ENDED)
             self._display.note(GUARD_ENDED)
@@ -276,6 +282,7 @@ class Supervisor:
         if fault is not Fault.NONE:
             drive_error = int(state.fault_drive_error)
             text = drive_fault_text(self._config, fault, float(state.fault_value), drive_error)
+            text = self._bus_watch.explained(fault, text, int(loop.block.port[0].last_errno))
         bits = float(loop.block.port[0].bits_sent)
         return RunResult(
             summary=summarise(records, loop.block.histograms),

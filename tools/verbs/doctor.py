@@ -14,7 +14,7 @@ from rich.table import Table
 from firmware_py.kernel import cache_folder
 from tools.configuration.config import Config
 from tools.configuration.elmo import ElmoSerial
-from tools.inspection.bus_health import adapters, bus_budget, drive_finding
+from tools.inspection.bus_health import adapters, bus_budget, drive_finding, interface_state
 from tools.inspection.computer import kernel_cache, kernel_findings, scheduling, software, wake_up
 from tools.inspection.findings import NOTE, OK, PROBLEM, Finding
 from tools.inspection.serial_health import serial_findings
@@ -34,6 +34,7 @@ def findings(config: Config, *, cold: bool = False, wake_cycles: int | None = No
     yield from adapters(config)
     yield bus_budget(config)
     yield drive_finding(config)
+    yield from interface_state(config)  # last: a bus on which nobody acknowledges shows once something was sent
 
 
 def doctor(config: Config, output: Output, *, cold: bool = False) -> int:
