@@ -113,6 +113,19 @@ def fault_cause_present(device: Device) -> bool:
 
 
 @kernel
+def _start_afresh(device: Device) -> None:
+    """Another mode, or enabled: references start from where the joint is (at the next substep), nothing is under way.
+
+    What a master commands from now on counts, even if it comes before that substep.
+    """
+    device.resync = 1
+    device.setpoint_active = 0
+    device.setpoint_waiting = 0
+    device.setpoint_acknowledged = 0
+    interrupt_homing(device)
+
+
+@kernel
 def _take_setpoint(device: Device, word: int, last: int) -> None:
     """Profile position handshake: bit 4 rising takes the target (bit 6: relative), falling ends the acknowledge.
 
@@ -124,7 +137,9 @@ def _take_setpoint(device: Device, word: int, last: int) -> None:
             return
         target = int64(device.drive.target_position) / device.counts_per_rad
         if word & 0x40:
-            target += device.setpoint_position_rad if device.setpoint_active else device.reference_position_rad
+            present = int64(device.drive.position) / device.counts_per_rad
+            resting = present if device.resync else device.reference_position_rad
+            target += device.setpoint_position_rad if device.setpoint_active else resting
         if device.setpoint_active and not word & 0x20:
             device.setpoint_next_rad = target
             device.setpoint_waiting = 1
@@ -155,7 +170,7 @@ def _command_enabled(device: Device, word: int, command: int) -> None:
         begin_stop(device, int64(device.drive.shutdown_option), PowerState.READY_TO_SWITCH_ON)
     elif command == 0x0F and device.braking != 0:
         device.braking = 0
-        device.resync = 1
+        _start_afresh(device)
 
 
 @kernel
@@ -165,7 +180,7 @@ def apply_controlword(device: Device, queue: FrameQueue) -> None:
     mode = int64(drive.mode)
     if mode != drive.mode_display and (mode == 0 or mode_supported(mode)):
         drive.mode_display = mode
-        device.resync = 1
+        _start_afresh(device)
     word = int64(drive.controlword)
     last = int64(device.last_controlword)
     device.last_controlword = word
@@ -193,7 +208,7 @@ def apply_controlword(device: Device, queue: FrameQueue) -> None:
         if command == 0x0F:
             device.state = PowerState.OPERATION_ENABLED
             device.braking = 0
-            device.resync = 1
+            _start_afresh(device)
         elif command == 0x07:
             device.state = PowerState.SWITCHED_ON
         else:
@@ -207,7 +222,7 @@ def apply_controlword(device: Device, queue: FrameQueue) -> None:
     elif state == PowerState.QUICK_STOP_ACTIVE and command == 0x0F and drive.quick_stop_option >= 5:
         device.state = PowerState.OPERATION_ENABLED
         device.braking = 0
-        device.resync = 1
+        _start_afresh(device)
 
 
 @kernel

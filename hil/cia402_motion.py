@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from firmware_py.kernel import kernel
-from hil.cia402_homing import homing_target_radps, interrupt_homing
+from hil.cia402_homing import homing_target_radps
 from hil.device_records import Device, DriveObjects, Mode, PowerState, int64
 
 _HALT = 0x0100
@@ -215,11 +215,8 @@ def demand_torque_Nm(device: Device, position: int, velocity_radps: float, dt_s:
         device.segment_velocity_radps = velocity_radps
         device.segment_target = position
         device.segment_left_s = 0.0
-        device.setpoint_active = 0
-        device.setpoint_waiting = 0
-        device.setpoint_acknowledged = 0
-        interrupt_homing(device)
-        device.setpoint_position_rad = position_rad
+        if not device.setpoint_active:
+            device.setpoint_position_rad = position_rad
         device.integral_Nm = 0.0
         device.demand = 0.0
     if device.braking != 0:

@@ -119,6 +119,25 @@ def test_the_home_position_is_lost_with_a_reset_of_the_node_only() -> None:
     assert rig.get(0x6064) == 10_000
 
 
+@pytest.mark.parametrize("relative", [0x00, 0x40])
+def test_a_command_right_after_enabling_is_not_lost(relative: int) -> None:
+    """No substep of the plant lies between the two: the master is as fast as the bus."""
+    rig = Rig(step_s=1e-3, encoder_offset_counts=10_000)
+    rig.set(0x6060, 0, 1, 1)
+    rig.set(0x607A, 0, 12_000, 4)
+    for word in (0x06, 0x07, 0x0F, 0x1F | relative):
+        rig.set(0x6040, 0, word, 2)
+    rig.run(1500)
+    assert rig.get(0x6064) == pytest.approx(22_000 if relative else 12_000, abs=100)
+    rig.set(0x6098, 0, 37, 1)
+    for word in (0x00, 0x06, 0x07, 0x0F):
+        rig.set(0x6040, 0, word, 2)
+    rig.set(0x6060, 0, HOMING, 1)
+    rig.set(0x6040, 0, 0x1F, 2)
+    rig.run(3)
+    assert bits(rig) == ATTAINED
+
+
 def acknowledged(rig: Rig) -> bool:
     return bool(rig.get(0x6041) & 0x1000)
 
