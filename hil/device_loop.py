@@ -36,6 +36,7 @@ from hil.device_core import accept_frame, advance
 from hil.device_records import Device, NmtState, int64
 from hil.faults import FaultMemory, fault_memory
 from hil.frame_faults import pass_frame, take_due
+from hil.frame_stamps import OLDEST_STAMP_NS, STAMPED_LAG_NS, sent_ns_of
 from hil.frames import FRAME_SIZE, FrameQueue
 from hil.plant_faults import step_faults
 from hil.plant_records import PlantConstants, PlantState
@@ -141,6 +142,7 @@ def run_device(
     queue: FrameQueue = queues[0]
     memory: FaultMemory = memories[0]
     node_id = int64(device.node_id)
+    stamped_ns = int64(-OLDEST_STAMP_NS)  # when the last frame with a time came
     ended = 1
     while load_acquire(words, STOP_WORD) == 0 and ended == 1:
         now_ns = monotonic_ns(timespec)
@@ -150,9 +152,8 @@ def run_device(
             for i in range(memory.ready.count):
                 _take_frame(device, plant_c, plant_s, memory.ready.frames[i], service_fd, now_ns, queue)
             memory.ready.count = 0
-        advance(device, plant_c, plant_s, now_ns, queue)
-        _flush_through_faults(fd, faults, memory, node_id, now_ns, queue, words)
-        wait_ns = max(0, min(device.next_due_ns - now_ns, _LONGEST_WAIT_NS))
+        lag_ns = STAMPED_LAG_NS if now_ns - stamped_ns < OLDEST_STAMP_NS else 0
+        wait_ns = max(0, min(device.next_due_ns + lag_ns - now_ns, _LONGEST_WAIT_NS))
         polls[0] = fd
         polls[1] = POLLIN
         polls[2] = service_fd
@@ -160,6 +161,7 @@ def run_device(
         timespec[0] = 0
         timespec[1] = wait_ns
         ppoll(np.uintp(polls.ctypes.data), np.uintp(2), np.uintp(timespec.ctypes.data), np.uintp(0))
+        woken_ns = monotonic_ns(timespec)
         for _ in range(_FRAMES_AT_ONCE):
             got = _receive(fd, frame)
             if got <= 0:
@@ -170,7 +172,10 @@ def run_device(
                 continue
             now_ns = monotonic_ns(timespec)
             if len(faults) == 0:
-                _take_frame(device, plant_c, plant_s, frame, service_fd, now_ns, queue)
+                sent_ns = sent_ns_of(frame, now_ns)
+                if sent_ns != now_ns:
+                    stamped_ns = now_ns
+                _take_frame(device, plant_c, plant_s, frame, service_fd, sent_ns, queue)
             else:
                 pass_frame(faults, memory, frame, True, node_id, now_ns, memory.ready)
                 for i in range(memory.ready.count):
@@ -185,6 +190,9 @@ def run_device(
                 queue.frames[slot] = frame
                 queue.count = slot + 1
             _flush_through_faults(fd, faults, memory, node_id, monotonic_ns(timespec), queue, words)
+        # after the frames, which may be older: the plant does not go back
+        advance(device, plant_c, plant_s, woken_ns - lag_ns, queue)
+        _flush_through_faults(fd, faults, memory, node_id, woken_ns, queue, words)
     store_release(words, ENDED_WORD, ended)
     return ended
 

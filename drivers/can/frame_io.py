@@ -50,6 +50,20 @@ def send_frame(fd: int, frames: Any, index: int) -> int:
 
 
 @kernel
+def stamp_frame(frames: Any, index: int, now_ns: int) -> None:
+    """Write the time of sending into the three spare bytes: microseconds modulo 2^24, lowest byte first, never 0.
+
+    For the virtual bus only: the virtual drive then acts on the frame as of that time, however late its process got
+    the processor.  A real drive needs no such help, and on AF_CAN the bytes have to be 0.
+    """
+    time_us = max((now_ns // 1000) & 0xFFFFFF, 1)
+    frame = frames[index]
+    frame.padding = time_us & 0xFF
+    frame.reserved = (time_us >> 8) & 0xFF
+    frame.length8 = time_us >> 16
+
+
+@kernel
 def receive_frame(fd: int, frames: Any, index: int) -> int:
     """Take one waiting frame into `frames[index]`: 1 got one, 0 nothing is waiting, negative: -errno.
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numba.core import types
 
-from drivers.can.frame_io import receive_frame, send_frame, wait_readable_ns
+from drivers.can.frame_io import receive_frame, send_frame, stamp_frame, wait_readable_ns
 from drivers.can.frames import Frame
 from drivers.canopen.cyclic import accept_frame, begin_cycle, end_cycle
 from drivers.canopen.port import (
@@ -50,6 +50,14 @@ def _note_sent(port: CanopenPort, sample: Sample, error: int, last: bool) -> Non
 
 
 @kernel
+def _send(port: CanopenPort, frames: np.ndarray, slot: int) -> int:
+    """`send_frame`, stamped where the bus is the virtual one."""
+    if port.stamped:
+        stamp_frame(frames, slot, monotonic_ns(port.clock))
+    return send_frame(port.fd, frames, slot)
+
+
+@kernel
 def _drain(port: CanopenPort, frames: np.ndarray, sample: Sample, now_ns: int, wanted: bool) -> bool:
     """Take every frame that is waiting; stop at the TPDO if it is wanted."""
     while receive_frame(port.fd, frames, SLOT_RECEIVED) == 1:
@@ -69,7 +77,7 @@ def receive(ports: Any, frames: np.ndarray, scratch: np.ndarray, samples: Any, n
     _drain(port, frames, sample, now_ns, False)
     count = begin_cycle(port, frames)
     for slot in range(count):
-        _note_sent(port, sample, send_frame(port.fd, frames, slot), False)
+        _note_sent(port, sample, _send(port, frames, slot), False)
     started_ns = monotonic_ns(scratch)
     arrived_ns = started_ns
     while True:
@@ -86,7 +94,7 @@ def send(ports: Any, frames: np.ndarray, samples: Any, commands: Any) -> int:
     """Send the RPDO; returns 0 or the errno."""
     port = ports[0]
     end_cycle(port, frames, samples[0], commands[0])
-    error = send_frame(port.fd, frames, SLOT_RPDO)
+    error = _send(port, frames, SLOT_RPDO)
     _note_sent(port, samples[0], error, True)
     return np.int32(error)  # type: ignore[return-value]
 

@@ -22,6 +22,7 @@ class CanopenPort:
     """Identifiers, layout and scaling (set by commissioning), and what has been seen on the bus."""
 
     fd: i4
+    stamped: i4  # frames carry the time they were sent: virtual bus only
     node: i4
     sync_id: u4
     tpdo_id: u4
@@ -46,6 +47,7 @@ class CanopenPort:
     max_permille: i4
     target_is_velocity: i4  # the target is 60FF (32 bit) instead of 6071 (16 bit)
     velocity_radpspunit: f8  # of 60FF
+    clock: Annotated[np.ndarray, array_of(i8, 2)]  # scratch of the stamps
     # state
     primed: i4
     last_counts: i8  # as received, 32 bit

@@ -109,6 +109,7 @@ def compiled_loop(order: LoopOrder, block: Any) -> Iterator[Callable[[], object]
 
         def go() -> None:
             block.port[0].fd = end.fileno()
+            block.port[0].stamped = order.interface == "jointctl"
             call(_FOREVER)
 
         yield go
