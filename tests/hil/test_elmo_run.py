@@ -56,6 +56,14 @@ def test_a_second_controller_is_kept_out(serial_bench: Any) -> None:
     assert serial_bench.standing()
 
 
+def stick_position(device: ElmoDevice) -> None:
+    """PX does not change any more; everything else is answered as before."""
+    execute, stuck = device.interpreter.execute, device.interpreter.execute(b"PX")
+    device.interpreter.execute = (  # type: ignore[method-assign]
+        lambda line: stuck if line == b"PX" else execute(line)
+    )
+
+
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
@@ -63,9 +71,11 @@ def test_a_second_controller_is_kept_out(serial_bench: Any) -> None:
         (lambda device: device.interpreter.execute(b"MO=0"), ("DRIVE_NOT_ENABLED", "switched off without being asked")),
         (lambda device: setattr(device.faults, "garbage_every", 1), ("STALE_SAMPLE", "noise garbles the replies")),
         (lambda device: setattr(device.faults, "half_every", 1), ("STALE_SAMPLE", "no usable position reply")),
-        (lambda device: setattr(device.faults, "stuck_reply", b"8344;"), ("error: ",)),
+        (lambda device: setattr(device.faults, "mute", True), ("STALE_SAMPLE", "went silent", "did not confirm")),
+        (lambda device: setattr(device.faults, "stuck_reply", b"8344;"), ("error: ", "did not confirm that it is off")),
+        (lambda device: stick_position(device), ("POSITION_FROZEN",)),
     ],
-    ids=["restart", "switched off", "garbage", "half replies", "stuck reply"],
+    ids=["restart", "switched off", "garbage", "half replies", "silent", "stuck reply", "stuck position"],
 )
 def test_faults_of_drive_and_line_end_with_the_joint_stopped(
     serial_bench: Any, spoil: Callable[[ElmoDevice], None], words: tuple[str, ...]
@@ -86,6 +96,17 @@ def test_an_unplugged_port_ends_the_run_and_the_drives_own_limits_end_the_motion
     device.state[0].added_load_torque_Nm = -60.0
     serial_bench.until(lambda: not device.m.motor_on)
     assert device.m.motor_fault in (0x20000, 0x400000)
+
+
+def test_a_drive_that_comes_back_with_another_baud_rate(serial_bench: Any) -> None:
+    run = serial_bench.bench.start("run", serial_bench.config(), "-y").saw("  tracking")
+    serial_bench.device.baud_rate_bitps = 57_600
+    finished = run.finished()
+    finished.refused(7, "STALE_SAMPLE", "garbles the replies")
+    assert "did not confirm that it is off" in finished.err
+    # it has not understood a word: its own limits have stopped it by now, or the guard that goes on trying does
+    serial_bench.device.baud_rate_bitps = 115_200
+    serial_bench.until(serial_bench.standing)
 
 
 def test_a_killed_loop_is_switched_off_by_its_supervisor(serial_bench: Any) -> None:

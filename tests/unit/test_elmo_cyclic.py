@@ -306,3 +306,21 @@ class TestFaultsOfTheDrive:
         talk.device.execute(b"MO=0")
         talk.cycle(count=4)
         assert talk.sample.restarts == 0
+
+
+def test_a_digit_that_the_line_changed_is_taken_because_nothing_shows_it() -> None:
+    talk = Talk().enabled()
+    before_rad = float(talk.sample.position_rad)
+    talk.spoil = lambda reply: reply.replace(b"PX\r8", b"PX\r9")  # 8344 becomes 9344: the loop's jump limit is next
+    talk.cycle()
+    assert talk.sample.position_rad - before_rad == pytest.approx(1000 * math.tau / 2**19, rel=1e-3)
+
+
+@pytest.mark.parametrize("current_A", [9.9, 10.1])
+def test_a_damaged_torque_command_is_bounded_by_the_drives_peak_current(current_A: float) -> None:
+    talk = Talk().enabled()  # PL[1] is 10 A
+    talk.cycle(torque_Nm=12.1)
+    talk.device.execute(b"TC=%.1f" % current_A)
+    assert talk.device.m.torque_A == (current_A if current_A < 10.0 else 1.0)
+    talk.cycle(torque_Nm=12.1)
+    assert talk.device.m.torque_A == 1.0  # the next one, a period later

@@ -13,7 +13,7 @@ def test_every_test_that_the_document_names_exists() -> None:
     named = NAMED.findall((ROOT / "docs" / "safety.md").read_text())
     assert len(named) > 30
     for file, name in named:
-        assert re.search(rf"^def {name}\(", (ROOT / "tests" / file).read_text(), re.MULTILINE), f"{file}::{name}"
+        assert re.search(rf"^ *def {name}\(", (ROOT / "tests" / file).read_text(), re.MULTILINE), f"{file}::{name}"
 
 
 def test_every_row_of_the_watchers_names_one() -> None:

@@ -18,6 +18,15 @@ def elmo_section(config: Config) -> ElmoSerial:
     return config.drive
 
 
+def refuse_serial(config: Config, what: str) -> None:
+    """`ConfigurationError` for a serial drive: its joint is simulated in real time only, behind a pseudo-terminal."""
+    if isinstance(config.drive, ElmoSerial):
+        raise ConfigurationError(
+            f'{config.path}: drive.kind (={KIND}) must be "canopen" for {what}',
+            "the serial joint runs in real time only: `jointctl hil --serial`, then `jointctl run CONFIG -p PORT`",
+        )
+
+
 def with_port_override(config: Config, port: str | None) -> Config:
     """The configuration on another serial port; None leaves it as it is."""
     if port is None:

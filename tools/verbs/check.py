@@ -14,7 +14,9 @@ from tools.analysis.loop_settings import Assumption, loop_settings, margin_setti
 from tools.analysis.margin_gate import learning_of, meets, refusal, refuse_diverging_learning
 from tools.analysis.margins import Margins, Theory, margins, theory
 from tools.configuration.config import Config
+from tools.configuration.elmo import ElmoSerial
 from tools.output import Output
+from tools.verbs.check_serial import line_text, refuse_rate
 
 
 def check(
@@ -30,6 +32,9 @@ def check(
     `delay_s` is a measured loop delay (sample to torque command taking effect); `figure` a PNG to write;
     `allow_low_margin` accepts a stable loop below the minimum.
     """
+    serial = isinstance(config.drive, ElmoSerial)
+    if serial:
+        refuse_rate(config)
     minimum_deg = margin_settings(config).min_phase_margin_deg
     settings, assumptions = loop_settings(config, delay_s)
     found, ideal = margins(settings), theory(settings)
@@ -38,6 +43,8 @@ def check(
     accepted = enough or (found.stable and allow_low_margin)
     verdict = "ok" if enough else "below the minimum, accepted" if accepted else "too small"
     table = _table(settings, found, ideal, assumptions, minimum_deg, verdict)
+    if serial:
+        table.add_row("serial line", line_text(config), "characters of a cycle; measured before a run enables")
     learning = learning_of(config, settings)
     if learning is not None:
         value = f"factor {learning.worst_factor:.2f} at {learning.worst_Hz:.1f} Hz"

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from drivers.errors import ConfigurationError
 from tools.configuration.config import Config
+from tools.configuration.elmo_settings import refuse_serial
 from tools.configuration.load import load_config, with_bus_overrides
 from tools.output import Output
 from tools.simulation.virtual_joint import separate_virtual_joint
@@ -18,6 +19,7 @@ LONGEST_S = 86_400.0
 def demo(config_path: Path, output: Output, *, duration_s: float | None = None) -> int:
     """Start the virtual joint on a private bus, run the configuration on it, end it."""
     config = load_config(config_path)
+    refuse_serial(config, "demo")
     if config.virtual is None:
         raise ConfigurationError(f"{config.path}: has no [virtual] section, so there is no virtual joint to move")
     channel = f"demo-{os.getpid()}"

@@ -10,6 +10,7 @@ from tools.campaign.report import rows_by_kind, table, violations, write_figure,
 from tools.campaign.runner import run_campaign
 from tools.campaign.scenario import draw_scenario
 from tools.configuration.config import Config
+from tools.configuration.elmo_settings import refuse_serial
 from tools.output import Output
 from tools.simulation.lockstep import LockstepJoint
 
@@ -29,6 +30,7 @@ def fault_campaign(
     workers: int | None = None,
 ) -> int:
     """Run `count` scenarios, or replay one; 0 if nothing was violated, 10 if something was, 130 after Ctrl-C."""
+    refuse_serial(config, "fault-campaign")
     if config.virtual is None or config.friction is None:
         missing = "[virtual]" if config.virtual is None else "[friction]"
         raise ConfigurationError(f"{config.path}: {missing} is missing: the campaign needs a virtual joint")

@@ -9,6 +9,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
+from tools.configuration.elmo_settings import refuse_serial
 from tools.configuration.load import load_config, shipped_config
 from tools.experiments.controllers import controller_config
 from tools.experiments.study_runs import StudyResult, quantile, run_study, write_csv
@@ -39,6 +40,7 @@ def study(
     """
     base_path = Path(settings.base)
     base = load_config(base_path if base_path.exists() else shipped_config(settings.base))
+    refuse_serial(base, "study")
     controllers = study_controllers(settings)
     for controller in controllers:
         controller_config(base, controller)  # a contradiction is to be told before an hour of simulation
