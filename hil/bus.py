@@ -22,6 +22,7 @@ import signal
 import socket
 import stat
 import threading
+import time
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -46,6 +47,8 @@ from hil.frames import WireFrame
 _LONGEST_PATH = 107
 _CHANNEL_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 _PR_SET_TIMERSLACK = 29
+_LOCK_TRIES = 5
+_LOCK_PAUSE_S = 0.01
 
 
 class VirtualBusError(Exception):
@@ -75,6 +78,57 @@ def _prepare_folder(path: Path) -> None:
         raise VirtualBusError(f"cannot make the folder of the virtual bus {folder}: {error.strerror}") from None
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
         raise VirtualBusError(f"folder of the virtual bus (={folder}) must be a folder of this user with mode 0700")
+    remove_dead_sockets(folder)
+
+
+def _lock_path(path: Path) -> Path:
+    return Path(f"{path}.lock")
+
+
+def _lock(path: Path) -> int:
+    """Descriptor of the locked file beside the socket; BlockingIOError when a hub holds it.
+
+    The lock ends with its process, however that dies: whoever holds it may remove what a dead hub left.  A hub that
+    stops removes the file while it holds the lock, so that a lock counts only if the file still has its name.
+    """
+    name = _lock_path(path)
+    tries_left = _LOCK_TRIES
+    while True:
+        lock = os.open(name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(lock), os.stat(name)):
+                return lock
+        except FileNotFoundError:  # between our open and our lock, its hub has stopped
+            pass
+        except BlockingIOError:
+            tries_left -= 1
+            if tries_left == 0:
+                os.close(lock)
+                raise
+            time.sleep(_LOCK_PAUSE_S)  # who looks for dead hubs holds a lock for a moment
+        os.close(lock)
+
+
+def remove_dead_sockets(folder: Path) -> int:
+    """Remove the sockets and lock files of hubs in `folder` that were killed; how many there were."""
+    removed = 0
+    for name in folder.glob("*.sock.lock"):
+        try:
+            lock = os.open(name, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+        except OSError:
+            continue
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(lock), os.stat(name)):
+                name.with_suffix("").unlink(missing_ok=True)
+                name.unlink()
+                removed += 1
+        except OSError:  # its hub runs, or somebody else was faster
+            pass
+        finally:
+            os.close(lock)
+    return removed
 
 
 class VirtualBusHub:
@@ -141,11 +195,14 @@ class VirtualBusHub:
 
     def _listen(self) -> None:
         _prepare_folder(self.path)
-        # The lock ends with its process, however that dies: whoever holds it may remove what a dead hub left.
-        lock = os.open(f"{self.path}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        try:
+            lock = _lock(self.path)
+        except BlockingIOError:
+            raise VirtualBusError(f"a virtual bus already runs at {self.path}") from None
+        except OSError as error:
+            raise VirtualBusError(f"cannot listen at {self.path}: {error.strerror or error}") from None
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if self.path.is_socket():
                 self.path.unlink()
             listener.bind(str(self.path))
@@ -154,8 +211,6 @@ class VirtualBusHub:
         except OSError as error:
             listener.close()
             os.close(lock)
-            if isinstance(error, BlockingIOError):
-                raise VirtualBusError(f"a virtual bus already runs at {self.path}") from None
             raise VirtualBusError(f"cannot listen at {self.path}: {error.strerror or error}") from None
         self._lock, self._listener = lock, listener
 
@@ -178,7 +233,8 @@ class VirtualBusHub:
         self.path.unlink(missing_ok=True)
         self._listener.close()
         os.close(self._wake)
-        os.close(self._lock)  # the lock file stays: removing it would let two hubs lock two files of one name
+        _lock_path(self.path).unlink(missing_ok=True)
+        os.close(self._lock)
 
     def __enter__(self) -> VirtualBusHub:
         return self.start()

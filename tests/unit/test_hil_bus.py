@@ -7,6 +7,7 @@ import socket
 import stat
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +16,7 @@ import pytest
 
 import hil
 from firmware_py.schema import new
-from hil.bus import VirtualBusError, VirtualBusHub, default_socket_path
+from hil.bus import VirtualBusError, VirtualBusHub, default_socket_path, remove_dead_sockets
 from hil.bus_forwarding import MAX_CLIENTS
 from hil.bus_timing import frame_bits
 from hil.frames import WireFrame
@@ -64,7 +65,7 @@ def test_the_socket_is_for_this_user_and_goes_with_the_hub(path: Path) -> None:
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     hub.stop()
     hub.stop()
-    assert not path.exists()
+    assert list(path.parent.iterdir()) == []
     with hub, join(path) as a, join(path) as b:  # a hub can be started again
         a.send(FRAME)
         assert b.recv(64) == FRAME
@@ -98,6 +99,48 @@ def test_the_socket_of_a_killed_hub_is_replaced(path: Path) -> None:
     with VirtualBusHub(path), join(path) as a, join(path) as b:
         a.send(FRAME)
         assert b.recv(64) == FRAME
+        assert remove_dead_sockets(path.parent) == 0
+    assert list(path.parent.iterdir()) == []
+
+
+def test_what_killed_hubs_left_is_removed_and_what_lives_stays(tmp_path: Path) -> None:
+    for name in ("demo-1", "demo-2"):
+        (tmp_path / f"{name}.sock.lock").touch()
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as dead:
+            dead.bind(str(tmp_path / f"{name}.sock"))
+    (tmp_path / "notes.lock").touch()
+    with VirtualBusHub(tmp_path / "live.sock"), join(tmp_path / "live.sock") as a, join(tmp_path / "live.sock") as b:
+        assert remove_dead_sockets(tmp_path) == 2
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["live.sock", "live.sock.lock", "notes.lock"]
+        a.send(FRAME)
+        assert b.recv(64) == FRAME
+
+
+def test_two_hubs_never_share_a_name_while_others_come_and_go(path: Path) -> None:
+    """Many threads start and stop a hub of one name: each start either works alone or is refused."""
+    running, worst, refused = [0], [0], [0]
+
+    def come_and_go() -> None:
+        for _ in range(10):
+            hub = VirtualBusHub(path)
+            try:
+                hub.start()
+            except VirtualBusError:
+                refused[0] += 1
+                continue
+            running[0] += 1
+            worst[0] = max(worst[0], running[0])
+            running[0] -= 1
+            hub.stop()
+
+    threads = [threading.Thread(target=come_and_go) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert worst[0] == 1
+    assert refused[0] < 40
+    assert list(path.parent.iterdir()) == []
 
 
 def test_a_file_that_is_no_socket_is_not_removed(path: Path) -> None:
