@@ -5,6 +5,9 @@ from __future__ import annotations
 import pytest
 
 from drivers.can.bit_timing import bus_load, highest_rate_Hz, minimum_frame_bits, worst_cycle_bits, worst_frame_bits
+from drivers.errors import ConfigurationError
+from tools.configuration.drive_settings import cyclic_bus_load
+from tools.configuration.load import load_config, shipped_config
 
 SYNC, POSITION, TORQUE = 0, 8, 4
 
@@ -65,3 +68,32 @@ def test_other_bad_input_is_refused() -> None:
         highest_rate_Hz([], 1_000_000)
     with pytest.raises(ValueError, match="highest_load"):
         highest_rate_Hz([0], 1_000_000, 1.5)
+
+
+@pytest.mark.parametrize(
+    ("bitrate", "rate_Hz", "mode", "refused"),
+    [
+        (1_000_000, 2807.0, "cst", ""),
+        (1_000_000, 2808.0, "cst", "at most 2807"),
+        (500_000, 1000.0, "cst", ""),
+        (250_000, 1000.0, "cst", "= 285 bits a cycle, 114% of the bus, 80% allowed"),
+        (1_000_000, 2622.0, "cyclic_sync_velocity", ""),
+        (1_000_000, 2624.0, "cyclic_sync_velocity", r"SYNC \+ TPDO\(8\) \+ RPDO\(6\) = 305 bits a cycle"),
+    ],
+)
+def test_a_configuration_beyond_the_bus_is_refused_with_the_arithmetic(
+    bitrate: int, rate_Hz: float, mode: str, refused: str
+) -> None:
+    config = load_config(shipped_config("virtual"))
+    config = config.model_copy(
+        update={
+            "bus": config.bus.model_copy(update={"bitrate_bitps": bitrate}),
+            "loop": config.loop.model_copy(update={"rate_Hz": rate_Hz}),
+            "drive": config.drive.model_copy(update={"mode": mode}),
+        }
+    )
+    if refused:
+        with pytest.raises(ConfigurationError, match=refused):
+            cyclic_bus_load(config)
+    else:
+        assert 0.5 < cyclic_bus_load(config) <= 0.8
