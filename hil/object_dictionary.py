@@ -1,7 +1,7 @@
 """The object dictionary of the virtual drive: what the EDS states, laid over the memory of the compiled core.
 
 The EDS alone says what exists, its type, access, limits, default and PDO-mappability.  An object that the core uses
-lives in a field of `Device` (see `device_records.FIELDS`) and is read and written by one typed load or store, so
+lives in a field of `Device` (see `device_fields.FIELDS`) and is read and written by one typed load or store, so
 that the SDO server may run beside the core.  Strings and constants live here.
 """
 
@@ -18,7 +18,8 @@ import numpy as np
 from canopen.objectdictionary import ODVariable
 
 from firmware_py.schema import dtype_of
-from hil.device_records import FIELDS, CommunicationObjects, Device, DriveObjects
+from hil.device_fields import FIELDS
+from hil.device_records import CommunicationObjects, Device, DriveObjects
 
 _TYPES = {1: "u1", 2: "i1", 3: "<i2", 4: "<i4", 5: "u1", 6: "<u2", 7: "<u4"}
 _VISIBLE_STRING = 9

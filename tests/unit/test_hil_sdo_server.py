@@ -9,7 +9,8 @@ import pytest
 
 from firmware_py.schema import new
 from hil.device import Cia402Device, DeviceSettings
-from hil.device_records import FIELDS, Device
+from hil.device_fields import FIELDS
+from hil.device_records import Device
 from hil.joint import plant
 from hil.object_dictionary import load_entries
 from hil.pdo_core import read_object, write_object

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.records import AxisState, Command, Sample
+from firmware_py.records import LINE_GONE, AxisState, Command, Sample
 from firmware_py.schema import new
 from firmware_py.sequence import (
     ANSWER_CYCLES,
@@ -234,6 +234,18 @@ def test_only_a_fresh_answer_of_the_drive_ends_the_stop(
     confirmed = drive_state in (DriveState.OFF, DriveState.FAULT) and age_cycles == 0 and phase_cycle > ANSWER_CYCLES
     assert state.phase == (following if confirmed else phase)
     assert state.fault == Fault.NONE
+
+
+@pytest.mark.parametrize("bus_errors", [LINE_GONE - 1, LINE_GONE])
+@pytest.mark.parametrize("phase", [AxisPhase.QUICK_STOPPING, AxisPhase.DISABLING])
+def test_on_a_line_that_is_gone_there_is_nothing_to_wait_for(
+    axis: Any, state: Any, phase: AxisPhase, bus_errors: int
+) -> None:
+    enter(state, int(phase))
+    sample = sample_of(DriveState.ENABLED)
+    sample.bus_errors = bus_errors
+    step_stopping(axis, state, sample)
+    assert state.phase == (AxisPhase.FINISHED if bus_errors == LINE_GONE else phase)
 
 
 @pytest.mark.parametrize("phase", [p for p in AxisPhase if p not in (AxisPhase.QUICK_STOPPING, AxisPhase.DISABLING)])
