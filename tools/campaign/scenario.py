@@ -20,7 +20,6 @@ from tools.configuration.trajectory import Hold, MinJerk, Sine, Trapezoid
 HARMLESS_SHARE = 0.35
 REACH_RAD = 0.4  # of the trajectories; the limits are at 0.7
 TOP_SPEED_RADPS = 0.6  # of the trajectories; the limit is 1
-ENCODER_RESOLUTION_RAD = 2.0 * math.pi / 2**19
 
 
 @dataclass(frozen=True)

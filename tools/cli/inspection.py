@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from drivers.errors import ConfigurationError
-from tools.cli.options import INSPECT, Bitrate, Channel, Interface, Json, Port, Quiet, Target, config_path, loaded
+from tools.cli.options import INSPECT, Bitrate, Channel, Interface, Json, Port, Quiet, Target, loaded
 from tools.output import Output
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def config_of(
     """The configuration if one is named.  Its `drive.kind` tells which branch of a verb is meant."""
     if path is None and port is not None:
         raise ConfigurationError("-p needs a configuration: it tells the baud rate", "for example elmo_serial")
-    return None if path is None else loaded(config_path(path), interface, channel, bitrate, port, target)
+    return None if path is None else loaded(path, interface, channel, bitrate, port, target)
 
 
 def canopen_subject(

@@ -7,7 +7,6 @@ delay, no lag, no ripple.  R1 is realistic (configs/paper.toml): LuGre friction 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,9 +22,8 @@ from tools.experiments.scenarios import Scenario, run_scenario
 from tools.simulation.lockstep import LockstepJoint, LockstepRun
 
 AFTER_s = 75.0  # the paper looks at the errors from here on
-Q_SIMULATION, Q_PLATFORM = 2500.0, 1800.0
+Q_SIMULATION = 2500.0
 _ONE_INTEGRATOR_WIDTH = 1e4  # every h is 1 to within 1e-10: the network is exactly one integrator
-Runner = Callable[[], LockstepRun]
 
 
 @dataclass(frozen=True)

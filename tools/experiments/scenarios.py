@@ -11,13 +11,12 @@ Both changes of the trajectory come at a crest: position and velocity go on, the
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from drivers.errors import ConfigurationError
 from tools.simulation.lockstep import LockstepJoint, LockstepRun
 
 Scenario = Literal["sine", "frequency", "amplitude", "load"]
-SCENARIOS: tuple[Scenario, ...] = get_args(Scenario)
 CHANGE_s = 82.5
 LOAD_AT_s = 80.0
 LOAD_Nm = 3.0
