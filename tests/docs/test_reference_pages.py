@@ -1,0 +1,35 @@
+"""The pages on exit codes and file formats name what the program has."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from drivers.errors import JointctlError
+from tools.configuration.config import Config
+from tools.identification.friction_data import SWEEP_COLUMNS
+from tools.recording.can_log import CAN_TOPIC
+from tools.recording.run_log import EVENT_TOPIC, RECORD_TOPIC
+from tools.verbs.fault_campaign import EXIT_VIOLATIONS
+from tools.verbs.params import DIFFERENT
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+NO_CLASS = {0, 2, EXIT_VIOLATIONS, DIFFERENT, 130}
+
+
+def classes_of(root: type[JointctlError]) -> set[type[JointctlError]]:
+    return {root}.union(*(classes_of(each) for each in root.__subclasses__()))
+
+
+def test_every_exit_code_has_its_row() -> None:
+    rows = {int(code) for code in re.findall(r"^\| (\d+) \|", (DOCS / "exit-codes.md").read_text(), re.MULTILINE)}
+    assert rows == {each.exit_code for each in classes_of(JointctlError)} | NO_CLASS
+
+
+def test_every_section_column_and_topic_is_named() -> None:
+    page = (DOCS / "formats.md").read_text()
+    sections = re.findall(r"\[(\w+)\]", page[page.index("## Configuration") : page.index("; [configuration]")])
+    assert sections
+    assert set(sections) == set(Config.model_fields)
+    for name in (*SWEEP_COLUMNS, RECORD_TOPIC, EVENT_TOPIC, CAN_TOPIC):
+        assert f"`{name}`" in page, name
