@@ -17,7 +17,7 @@ from firmware_py.frozen_reading import check_reading
 from firmware_py.kernel import kernel
 from firmware_py.live_change import step_change, step_new_motion
 from firmware_py.records import AxisConstants, AxisState, Command, Sample
-from firmware_py.safety import drive_fault, limited_torque_Nm, motion_fault, reference_fault
+from firmware_py.safety import limited_torque_Nm, motion_fault, reference_fault
 from firmware_py.sequence import (
     enter,
     powered,
@@ -31,6 +31,7 @@ from firmware_py.sequence import (
     write_command,
 )
 from firmware_py.states import AxisPhase, CommandKind, Fault, Reaction
+from firmware_py.surroundings import check_surroundings
 from firmware_py.trajectory import approach_at, brake_step, reference_at, repetition
 from firmware_py.velocity import step_velocity
 from firmware_py.velocity_command import limited_velocity_radps, velocity_command_radps
@@ -55,7 +56,7 @@ def _take_position(constants: AxisConstants, state: AxisState, sample: Sample, e
         if not moved_rad <= constants.limits.position_jump_max_rad * gap_cycles:
             trip(state, Fault.POSITION_JUMP, moved_rad, 0)
     changed = not abs(sample.position_rad - state.frozen_at_rad) <= constants.limits.frozen_tolerance_rad
-    if changed or gap_cycles > 1:
+    if changed:
         state.frozen_at_rad = sample.position_rad
         state.frozen_samples = 0
     else:
@@ -66,29 +67,6 @@ def _take_position(constants: AxisConstants, state: AxisState, sample: Sample, e
     state.measured_position_rad = sample.position_rad
     state.measured_torque_Nm = sample.torque_Nm
     return gap_cycles
-
-
-@kernel
-def _check_surroundings(
-    constants: AxisConstants, state: AxisState, sample: Sample, skipped_cycles: int, supervisor_age_cycles: int
-) -> None:
-    """Faults of the drive, the bus, the schedule and the supervisor; the drive's first, it tells most of the cause."""
-    if state.phase >= AxisPhase.DISABLING:
-        return
-    if state.restarts_at_start < 0:
-        state.restarts_at_start = sample.restarts
-    fault = drive_fault(sample.drive_state, powered(state.phase), sample.restarts - state.restarts_at_start)
-    trip(state, fault, float(sample.status_word), sample.drive_error)
-    if state.phase >= AxisPhase.ENABLING and state.phase <= AxisPhase.RELEASING:
-        if state.sample_age_cycles > constants.limits.sample_age_max_cycles:
-            trip(state, Fault.STALE_SAMPLE, float(state.sample_age_cycles), sample.drive_error)
-        if sample.bus_errors > constants.limits.sample_age_max_cycles:
-            trip(state, Fault.BUS_ERROR, float(sample.bus_errors), 0)
-        # not before: in WAITING the power is off, and without the supervisor's word it stays off
-        if 0 < constants.sequence.supervisor_max_cycles < supervisor_age_cycles:
-            trip(state, Fault.SUPERVISOR_LOST, float(supervisor_age_cycles), 0)
-    if powered(state.phase) and skipped_cycles > constants.limits.skipped_max_cycles:
-        trip(state, Fault.OVERRUN, float(skipped_cycles), 0)
 
 
 @kernel
@@ -146,7 +124,7 @@ def _brake(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> N
 @kernel
 def _check_motion(constants: AxisConstants, state: AxisState) -> None:
     """Measured position, velocity and following error against their limits."""
-    check_reading(constants.limits, state)
+    check_reading(constants, state)
     error_rad = state.measured_position_rad - state.reference.position_rad
     fault = motion_fault(constants.limits, state.measured_position_rad, state.velocity.velocity_radps, error_rad)
     value = state.measured_position_rad
@@ -253,7 +231,7 @@ def step_axis(
     state.phase_cycle += elapsed_cycles
     gap_cycles = _take_position(constants, state, sample, elapsed_cycles)
     request_stop(state, stop_request)
-    _check_surroundings(constants, state, sample, elapsed_cycles - 1, supervisor_age_cycles)
+    check_surroundings(constants, state, sample, elapsed_cycles - 1, supervisor_age_cycles)
     if state.phase == AxisPhase.WAITING:
         step_waiting(constants, state, sample)
     elif state.phase == AxisPhase.ENABLING:

@@ -44,6 +44,7 @@ close = external("close", types.int32, types.int32)
 _errno_location = external("__errno_location", types.uintp)
 
 CLOCK_MONOTONIC = 1
+CLOCK_BOOTTIME = 7
 TIMER_ABSTIME = 1
 MSG_DONTWAIT = 0x40
 MSG_NOSIGNAL = 0x4000
@@ -113,6 +114,13 @@ def errno() -> int:
 def monotonic_ns(timespec: np.ndarray) -> int:
     """CLOCK_MONOTONIC [ns]; `timespec` is an int64[2] scratch array owned by the caller (no allocation)."""
     clock_gettime(np.int32(CLOCK_MONOTONIC), np.uintp(timespec.ctypes.data))
+    return timespec[0] * NANOSECONDS + timespec[1]
+
+
+@kernel
+def boottime_ns(timespec: np.ndarray) -> int:
+    """CLOCK_BOOTTIME [ns]: as CLOCK_MONOTONIC, but it goes on while the computer is suspended."""
+    clock_gettime(np.int32(CLOCK_BOOTTIME), np.uintp(timespec.ctypes.data))
     return timespec[0] * NANOSECONDS + timespec[1]
 
 

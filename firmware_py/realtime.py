@@ -15,9 +15,10 @@ import numpy as np
 
 from firmware_py.axis import step_axis
 from firmware_py.kernel import kernel
-from firmware_py.libc import load_acquire, monotonic_ns, sleep_until_ns, store_release
+from firmware_py.libc import boottime_ns, load_acquire, monotonic_ns, sleep_until_ns, store_release
 from firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
 from firmware_py.states import AxisPhase
+from firmware_py.surroundings import check_suspension
 
 HISTOGRAM_BINS = 4097  # 1 us each; the last one holds everything later
 
@@ -33,9 +34,12 @@ class Word(IntEnum):
     READY = 40  # the loop is compiled and warm
     SKIPPED = 48  # slots skipped so far
     ENDED = 56  # the loop has returned
+    LISTEN = 64  # the supervisor: what the bus says from now on is for the run
+    ASLEEP_NS = 72  # CLOCK_BOOTTIME - CLOCK_MONOTONIC when the run began: how long the computer has been suspended
 
 
-WORDS = 64
+WORDS = 80
+SUSPENDED_MIN_NS = 1_000_000  # shorter is how far apart two clocks can be read
 
 
 class Histogram(IntEnum):
@@ -88,6 +92,24 @@ def write_log(record: LogRecord, state: AxisState, sample: Sample, command: Comm
 
 
 @kernel
+def note_suspension(words: np.ndarray, state: AxisState, timespec: np.ndarray) -> None:
+    """Trip SUSPENDED if the computer has slept since ASLEEP_NS was written; 0 there: since the first call.
+
+    CLOCK_MONOTONIC stands still meanwhile, so that no deadline shows it.  Between two readings the processor may be
+    lost: with this order the slept time then seems shorter, never longer, and the next cycle sees it.
+    """
+    before_ns = load_acquire(words, Word.ASLEEP_NS)
+    if before_ns == 0:
+        start_ns = monotonic_ns(timespec)
+        store_release(words, Word.ASLEEP_NS, boottime_ns(timespec) - start_ns)
+        return
+    boot_ns = boottime_ns(timespec)
+    slept_ns = boot_ns - monotonic_ns(timespec) - before_ns
+    if slept_ns > SUSPENDED_MIN_NS:
+        check_suspension(state, slept_ns * 1e-9)
+
+
+@kernel
 def run_loop(
     receive: Any,
     send: Any,
@@ -134,6 +156,7 @@ def run_loop(
         now_state.sample_late_s = (wake_ns - deadline_ns) * 1e-9 if sample[0].time_ns > wake_ns else 0.0
         stop_request = load_acquire(words, Word.STOP)
         supervisor_age = (wake_ns - load_acquire(words, Word.SUPERVISOR_NS)) // period_ns
+        note_suspension(words, now_state, timespec)
         step_axis(axis, now_state, table, sample[0], command[0], elapsed_cycles, stop_request, supervisor_age)
         send(port, frames, sample, command)
         round_trip_ns = waited_ns

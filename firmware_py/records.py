@@ -63,6 +63,7 @@ class LimitConstants:
     frozen_torque_Nm: f8  # that a sound joint would not stand still under; 0 = not watched
     frozen_tolerance_rad: f8  # a reading that changes by no more stands still
     sample_age_max_cycles: i8
+    heartbeat_age_max_cycles: i8  # of the drive's own heartbeat; 0 = not watched
     saturation_max_cycles: i8
     skipped_max_cycles: i8  # in one overrun
     standstill_radps: f8
@@ -118,8 +119,9 @@ class Sample:
     drive_state: i4  # DriveState
     status_word: i4  # as the drive sent it, for the log
     drive_error: i4  # the drive's own error code, 0 = none
-    restarts: i4  # boot-ups of the drive seen since the loop began
+    restarts: i4  # boot-ups of the drive seen since it was commissioned
     bus_errors: i4  # sends that failed in a row; LINE_GONE where nothing will ever be heard or said again
+    heartbeat_age_cycles: i4  # since the drive's own last heartbeat; 0 where it sends none
 
 
 @record
@@ -142,7 +144,6 @@ class AxisState:
     sample_age_cycles: i8
     saturated_cycles: i8
     still_cycles: i8
-    restarts_at_start: i4
     frozen_samples: i8  # in a row, without a gap, that did not change
     pushed_cycles: i8  # of them with more torque than frozen_torque_Nm
     frozen_from_rad: f8  # the reference when the reading last changed

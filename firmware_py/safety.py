@@ -46,9 +46,9 @@ def reference_fault(
 
 
 @kernel
-def drive_fault(drive_state: int, enabled_expected: bool, restarts_since_start: int) -> Fault:
+def drive_fault(drive_state: int, enabled_expected: bool, restarts: int) -> Fault:
     """Fault of the drive's own state; a restart first: the drive has lost its configuration."""
-    if restarts_since_start != 0:
+    if restarts != 0:
         return Fault.DRIVE_RESTARTED
     if drive_state == DriveState.FAULT or drive_state == DriveState.FAULT_BRAKING:
         return Fault.DRIVE_FAULT

@@ -39,7 +39,6 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.still_cycles = 0
     state.frozen_samples = 0
     state.pushed_cycles = 0
-    state.restarts_at_start = -1
     state.table_row = 0
     state.trajectory_s = 0.0
     state.command_torque_Nm = 0.0
@@ -81,14 +80,20 @@ def react(state: AxisState, reaction: int) -> None:
 
 
 @kernel
-def trip(state: AxisState, fault: int, value: float, drive_error: int) -> None:
-    """Latch the first fault and the value that showed it, and take the stronger reaction."""
-    if fault == Fault.NONE:
-        return
+def latch_fault(state: AxisState, fault: int, value: float, drive_error: int) -> None:
+    """Keep the first fault and the value that showed it."""
     if state.fault == Fault.NONE:
         state.fault = fault
         state.fault_value = value
         state.fault_drive_error = drive_error
+
+
+@kernel
+def trip(state: AxisState, fault: int, value: float, drive_error: int) -> None:
+    """Latch the first fault and the value that showed it, and take the stronger reaction."""
+    if fault == Fault.NONE:
+        return
+    latch_fault(state, fault, value, drive_error)
     react(state, reaction_to(fault, state.phase))
 
 
@@ -121,13 +126,15 @@ def step_waiting(constants: AxisConstants, state: AxisState, sample: Sample) -> 
             return
     if state.phase_cycle > constants.sequence.wait_max_cycles:
         if state.sample_count == 0:
-            trip(state, Fault.NO_SAMPLES, 0.0, 0)
+            trip(state, Fault.NO_SAMPLES, 0.0, sample.drive_error)
         elif sample.drive_state == DriveState.ENABLED:
             trip(state, Fault.DRIVE_STAYS_ENABLED, float(sample.status_word), sample.drive_error)
         elif moving:
             trip(state, Fault.NOT_AT_STANDSTILL, state.velocity.velocity_radps, 0)
+        elif state.good_samples >= constants.sequence.settle_cycles:  # all is well, but nobody allows to enable
+            trip(state, Fault.SUPERVISOR_LOST, float(state.phase_cycle), 0)
         else:
-            trip(state, Fault.STALE_SAMPLE, float(state.sample_age_cycles), 0)
+            trip(state, Fault.STALE_SAMPLE, float(state.sample_age_cycles), sample.drive_error)
 
 
 @kernel

@@ -64,6 +64,8 @@ class Fault(IntEnum):
     POSITION_JUMP = 19  # the encoder moved faster than the joint can
     DRIVE_STAYS_ENABLED = 20  # enabled before the loop asked for it, and it does not switch off
     POSITION_FROZEN = 21  # the reading stands still although the reference moves
+    SUSPENDED = 22  # the computer slept
+    DRIVE_SILENT = 23  # the drive's own heartbeat stays away
 
 
 class Reaction(IntEnum):

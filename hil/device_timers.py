@@ -14,6 +14,7 @@ from hil.device_errors import (
     NMT_LEFT,
     RPDO_TIMEOUT,
     SYNC_LOST,
+    error_register,
     push_frame,
     report_cleared,
     report_error,
@@ -28,6 +29,7 @@ _MS = 1_000_000
 SYNC_ERROR = 0x04
 LIFE_GUARD_ERROR = 0x08
 RPDO_ERROR = 0x10
+HEARTBEAT_ERRORS = 0x03
 
 
 @kernel
@@ -35,6 +37,8 @@ def enter_nmt(device: Device, state: int) -> None:
     """Change the NMT state; leaving operational while the power stage is on is a lost connection (6007)."""
     if device.nmt == NmtState.OPERATIONAL and state != NmtState.OPERATIONAL:
         abort_connection(device, NMT_LEFT)
+        device.communication_errors &= HEARTBEAT_ERRORS | LIFE_GUARD_ERROR  # SYNC and RPDOs: in operational only
+        device.communication.error_register = error_register(device)
     if state == NmtState.OPERATIONAL and device.nmt != NmtState.OPERATIONAL:
         start_pdos(device)
     device.nmt = state

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from drivers.canopen.cia402 import SUPPORTED_MODE_BIT, ControlWord, Mode, State, decode_state
+from drivers.canopen.connection_loss import arm_reaction, arm_rpdo_deadline
 from drivers.canopen.eds_file import EdsFile
 from drivers.canopen.object_access import ObjectAccess
 from drivers.canopen.pdo_layout import TARGET_TORQUE, TARGET_VELOCITY, PdoLayout
@@ -39,7 +40,6 @@ VELOCITY_MODES = (Mode.CYCLIC_SYNC_VELOCITY, Mode.PROFILE_VELOCITY)
 LARGEST_UNSIGNED = 0xFFFFFFFF
 STEEP_RADPS2 = 1000.0  # profile acceleration at the joint, above any that the loop asks for
 LARGEST_PERMILLE = 32767  # 6071 is a signed 16 bit number
-ABORT_QUICK_STOP = 3  # object 6007
 ATTEMPTS = 20
 PAUSE_S = 0.01  # between two looks at a drive that has been told to change its state or mode
 Pause = Callable[[float], None]
@@ -55,6 +55,7 @@ class Findings:
     max_permille: int = 0
     start_counts: int = 0
     layout: PdoLayout | None = None  # of the loop's PDOs
+    heartbeat_watched: bool = True  # the drive sends its own
     settings: dict[str, str] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
 
@@ -200,14 +201,11 @@ def arm_watchdog(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
             "not enabled",
         )
     objects.write_verified(0x1016, 1, consumer, what="consumer heartbeat time")
-    if not objects.write_if_present(0x1017, 0, milliseconds, what="producer heartbeat time"):
+    findings.heartbeat_watched = objects.write_if_present(0x1017, 0, milliseconds, what="producer heartbeat time")
+    if not findings.heartbeat_watched:
         findings.remarks.append("no object 1017: a restarted drive is noticed by its boot-up message and its silence")
-    if not objects.write_if_present(0x6007, 0, ABORT_QUICK_STOP, what="abort connection option"):
-        findings.remarks.append("no object 6007: what the drive does when our heartbeat stops is up to the drive")
-    objects.write_if_present(0x605A, 0, settings.quick_stop_option, what="quick stop option")
-    if objects.has(0x1029, 1):
-        # 2 = stopped: a communication error must not leave the drive in operational
-        objects.write_verified(0x1029, 1, 2, what="error behaviour")
+    findings.settings["on a lost heartbeat"], remarks = arm_reaction(objects, settings)
+    findings.remarks += remarks
     findings.settings["watchdog"] = f"{milliseconds} ms on the heartbeat of node {settings.master_node}"
 
 
@@ -233,12 +231,16 @@ def commission(
     findings.settings.update(set_sync(objects, settings.rate_Hz, cyclic=findings.mode in CYCLIC_MODES))
     arm_watchdog(objects, settings, findings)
     if prove is not None:
-        findings.settings["watchdog proven"] = prove()
+        findings.settings["watchdog detects"] = prove()
     target = TARGET_VELOCITY if findings.mode in VELOCITY_MODES else TARGET_TORQUE
     findings.layout = configure_loop_pdos(
         objects, settings.node, settings.rpdo_transmission_type, target,
         mode=findings.mode, max_permille=findings.max_permille,
     )  # fmt: skip
+    deadline, remarks = arm_rpdo_deadline(objects, settings, findings.layout.rpdo_id)
+    if deadline:
+        findings.settings["RPDO deadline"] = deadline
+    findings.remarks += remarks
     findings.start_counts = objects.read(0x6064, what="position actual value")
     findings.remarks += objects.remarks
     return findings

@@ -26,6 +26,9 @@ NMT_OPERATIONAL = 5
 # A drive that was told to stop and still says that it is enabled, or says nothing, does not hear us (SYNC or RPDO
 # lost).  Its watchdog is what is left: after so many cycles the heartbeat is withheld for the rest of the run.
 UNHEEDED_MAX_CYCLES = 20
+ERROR_SHOWN_CYCLES = (
+    20  # an error code stays for so long although the drive has reset it: it may be why the joint stops
+)
 _WORST_BITS = np.array([worst_frame_bits(length) for length in range(9)])
 
 
@@ -63,6 +66,8 @@ def begin_cycle(port: CanopenPort, frames: np.ndarray) -> int:
     frames[SLOT_SYNC].can_id = port.sync_id
     frames[SLOT_SYNC].length = 0
     port.bits_sent += _WORST_BITS[0]
+    port.in_cycle = 1
+    port.answered = 0
     due = port.heartbeat_cycles > 0 and port.cycle % port.heartbeat_cycles == 0
     port.cycle += 1
     if not due or port.unheeded_cycles > UNHEEDED_MAX_CYCLES:
@@ -75,33 +80,53 @@ def begin_cycle(port: CanopenPort, frames: np.ndarray) -> int:
 
 
 @kernel
+def _accept_tpdo(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -> bool:
+    """Take statusword, position and torque; False if the TPDO is too short, or doubled or late.
+
+    The drive sends one TPDO for each SYNC.  One that comes between the cycles although the SYNC was answered repeats
+    or delays an old value: it must not look like a new sample.
+    """
+    if frame.length < port.tpdo_length:
+        port.malformed += 1
+        return False
+    if port.in_cycle == 0 and port.answered != 0:
+        port.surplus += 1
+        return False
+    port.answered = port.in_cycle
+    sample.status_word = get_u16(frame.payload, port.status_at)
+    port.state = decode_state(sample.status_word)
+    sample.drive_state = drive_state(port.state)
+    take_counts(port, get_i32(frame.payload, port.position_at))
+    sample.position_rad = (port.counts - port.zero_counts) * port.position_radpcount
+    if port.torque_at >= 0:
+        sample.torque_Nm = get_i16(frame.payload, port.torque_at) * port.torque_Nmppermille
+    sample.time_ns = now_ns
+    sample.count += 1
+    if port.error_reset != 0 and port.cycle - port.error_cycle > ERROR_SHOWN_CYCLES:
+        port.error_reset = 0
+        sample.drive_error = 0
+    return True
+
+
+@kernel
 def accept_frame(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -> bool:
     """Take one received frame; True if it was the TPDO with a new sample.  Foreign frames are only counted."""
     port.bits_sent += _WORST_BITS[min(frame.length, 8)]
     if frame.can_id & ERROR_FLAG != 0:
         port.error_frames += 1
     elif frame.can_id == port.tpdo_id:
-        if frame.length < port.tpdo_length:
-            port.malformed += 1
-            return False
-        sample.status_word = get_u16(frame.payload, port.status_at)
-        port.state = decode_state(sample.status_word)
-        sample.drive_state = drive_state(port.state)
-        take_counts(port, get_i32(frame.payload, port.position_at))
-        sample.position_rad = (port.counts - port.zero_counts) * port.position_radpcount
-        if port.torque_at >= 0:
-            sample.torque_Nm = get_i16(frame.payload, port.torque_at) * port.torque_Nmppermille
-        sample.time_ns = now_ns
-        sample.count += 1
-        return True
+        return _accept_tpdo(port, frame, sample, now_ns)
     elif frame.can_id == port.emergency_id:
         if frame.length >= 2:
             code = get_u16(frame.payload, 0)
             if code != 0:
                 sample.drive_error = code
+                port.error_cycle = port.cycle
+            port.error_reset = 1 if code == 0 else 0
     elif frame.can_id == port.heartbeat_id:
         if frame.length >= 1:
             port.nmt_state = frame.payload[0] & 0x7F
+            port.heartbeat_heard_cycle = port.cycle
             if port.nmt_state == 0:
                 sample.restarts += 1
     return False
@@ -132,6 +157,9 @@ def end_cycle(port: CanopenPort, frames: np.ndarray, sample: Sample, command: Co
 
     Once the heartbeat is withheld the drive's watchdog is dead: from then on enabling is refused.
     """
+    port.in_cycle = 0
+    if port.heartbeat_watched != 0:
+        sample.heartbeat_age_cycles = min(port.cycle - port.heartbeat_heard_cycle, 2147483647)
     request = np.int64(command.request)
     if request == DriveRequest.ENABLE and port.unheeded_cycles > UNHEEDED_MAX_CYCLES:
         request = np.int64(DriveRequest.OFF)

@@ -179,6 +179,7 @@ class CanopenDrive:
             found.max_permille,
             velocity=velocity,
             layout=found.layout,
+            heartbeat_watched=found.heartbeat_watched,
         )
 
     def make_safe(self) -> str:
@@ -249,6 +250,7 @@ class CanopenDrive:
         self._find()
         # nobody sends a heartbeat now: a watchdog that is still armed would keep its fault alive
         self._objects.write_if_present(0x1016, 1, 0, what="consumer heartbeat time")
+        self._objects.write_if_present(0x1400, 5, 0, what="RPDO event timer")
         return reset_fault(self._objects, self._sleep)
 
     def close(self) -> None:

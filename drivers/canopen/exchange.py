@@ -58,12 +58,12 @@ def _send(port: CanopenPort, frames: np.ndarray, slot: int) -> int:
 
 
 @kernel
-def _drain(port: CanopenPort, frames: np.ndarray, sample: Sample, now_ns: int, wanted: bool) -> bool:
-    """Take every frame that is waiting; stop at the TPDO if it is wanted."""
+def _drain(port: CanopenPort, frames: np.ndarray, sample: Sample, now_ns: int) -> bool:
+    """Take every frame that is waiting; True if a sample was among them (of several, the last one counts)."""
+    found = False
     while receive_frame(port.fd, frames, SLOT_RECEIVED) == 1:
-        if accept_frame(port, frames[SLOT_RECEIVED], sample, now_ns) and wanted:
-            return True
-    return False
+        found |= accept_frame(port, frames[SLOT_RECEIVED], sample, now_ns)
+    return found
 
 
 @exported(types.int64(_PORT, _FRAMES, _SCRATCH, _SAMPLE, types.int64, types.int64))
@@ -74,14 +74,14 @@ def receive(ports: Any, frames: np.ndarray, scratch: np.ndarray, samples: Any, n
     """
     port = ports[0]
     sample = samples[0]
-    _drain(port, frames, sample, now_ns, False)
+    _drain(port, frames, sample, now_ns)
     count = begin_cycle(port, frames)
     for slot in range(count):
         _note_sent(port, sample, _send(port, frames, slot), False)
     started_ns = monotonic_ns(scratch)
     arrived_ns = started_ns
     while True:
-        if _drain(port, frames, sample, arrived_ns, True):
+        if _drain(port, frames, sample, arrived_ns):
             return monotonic_ns(scratch) - started_ns
         if arrived_ns >= deadline_ns:
             return arrived_ns - started_ns

@@ -55,6 +55,13 @@ class CanopenPort:
     cycle: i8
     state: i4  # cia402.State
     nmt_state: i4
+    in_cycle: i4  # 1 from SYNC to RPDO
+    answered: i4  # the last SYNC has its TPDO
+    surplus: i8  # TPDOs after that: doubled or late
+    heartbeat_watched: i4  # the drive has been told to send its own
+    heartbeat_heard_cycle: i8
+    error_cycle: i8  # in which the last EMCY came
+    error_reset: i4  # the drive has said since that the error is gone
     unheeded_cycles: i4  # in a row in which the drive stayed enabled although it was asked to stop
     malformed: i8  # TPDOs that were too short
     error_frames: i8

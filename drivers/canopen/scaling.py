@@ -45,10 +45,12 @@ def new_port(
     *,
     velocity: bool = False,
     layout: PdoLayout | None = None,
+    heartbeat_watched: bool = True,
 ) -> Any:
     """A `CanopenPort` record array of one record; the file descriptor is still missing.
 
     `velocity`: the drive is in a velocity mode and the RPDO carries 60FF.  `layout`: of the PDOs (None: our own).
+    `heartbeat_watched`: the drive sends its own heartbeat.
     """
     layout = layout or own_layout(settings.node, velocity=velocity)
     ports = new(CanopenPort)
@@ -61,6 +63,7 @@ def new_port(
     port.own_heartbeat_id = 0x700 + settings.master_node
     # three heartbeats within the drive's time-out, so that one or two lost ones do not stop the joint
     port.heartbeat_cycles = max(1, int(settings.heartbeat_s * settings.rate_Hz / 3.0))
+    port.heartbeat_watched = int(heartbeat_watched)
     for key in (
         "tpdo_id", "rpdo_id", "tpdo_length", "rpdo_length",
         "status_at", "position_at", "torque_at", "control_at", "target_at",

@@ -1,7 +1,8 @@
 """Prove that the drive's watchdog works, before anything is enabled: stop the heartbeat once and see the drive react.
 
 An armed object 1016 proves nothing: a drive may accept the value and ignore it.  The proof also has its twin: while
-the heartbeat comes, the drive must stay quiet.
+the heartbeat comes, the drive must stay quiet.  What is proven is detection, not that the power goes off: for that see
+`connection_loss`.
 """
 
 from __future__ import annotations

@@ -297,7 +297,45 @@ def test_drive_fault_in_each_phase(rig: NewRig, phase: AxisPhase, drive_state: D
     assert_fault(run, Fault.DRIVE_FAULT, Reaction.OFF)
 
 
-@pytest.mark.parametrize("drive_state", [DriveState.OFF, DriveState.STARTING, DriveState.STOPPING, DriveState.UNKNOWN])
+def test_a_restart_before_the_first_cycle_ends_the_run_without_power(rig: NewRig) -> None:
+    """It was taken for one from before the run: a drive without its limits would have been enabled."""
+    run, twin = rig(0.0), rig(0.0)
+    run.sample.restarts = 1
+    run.tick()
+    assert_fault(run, Fault.DRIVE_RESTARTED, Reaction.OFF)
+    assert set(run.requests) == {DriveRequest.OFF}
+    twin.tick()
+    assert twin.until(AxisPhase.TRACKING).state.fault == Fault.NONE
+
+
+@pytest.mark.parametrize("phase", [AxisPhase.APPROACH, AxisPhase.TRACKING, AxisPhase.RAMPING, AxisPhase.RELEASING])
+def test_a_drive_that_brakes_by_itself_is_left_braking(rig: NewRig, phase: AxisPhase) -> None:
+    """Power off would make it coast; at standstill, or after the time for a stop, it is switched off."""
+    run = rig(0.05)
+    if phase >= AxisPhase.RAMPING:
+        run.until(AxisPhase.TRACKING).run(5)
+        run.stop = StopRequest.RAMP
+    run.until(phase)
+    before = len(run.requests)
+    run.joint.drive_state, run.joint.delay_cycles = DriveState.STOPPING, 50
+    run.run(40)
+    assert run.phase == AxisPhase.QUICK_STOPPING
+    assert set(run.requests[before:]) == {DriveRequest.QUICK_STOP}
+    assert set(run.torques_Nm[before:]) == {0.0}
+    run.joint.drive_state = DriveState.OFF
+    assert_fault(run, Fault.DRIVE_NOT_ENABLED, Reaction.QUICK_STOP)
+
+
+def test_a_drive_that_brakes_for_ever_is_switched_off(rig: NewRig) -> None:
+    run = rig(0.0).until(AxisPhase.TRACKING).run(5)
+    run.joint.drive_state, run.joint.delay_cycles = DriveState.STOPPING, 1000
+    run.run(int(run.axis.sequence.stop_max_cycles) + 2)
+    assert run.requests[-1] == DriveRequest.OFF
+    run.joint.drive_state = DriveState.OFF
+    assert_fault(run, Fault.DRIVE_NOT_ENABLED, Reaction.OFF)
+
+
+@pytest.mark.parametrize("drive_state", [DriveState.OFF, DriveState.STARTING, DriveState.UNKNOWN])
 def test_a_drive_that_leaves_enabled_unasked_is_switched_off_and_not_enabled_again(
     rig: NewRig, drive_state: DriveState
 ) -> None:
@@ -314,11 +352,10 @@ def test_a_drive_that_leaves_enabled_unasked_is_switched_off_and_not_enabled_aga
 @pytest.mark.parametrize("phase", [AxisPhase.WAITING, AxisPhase.ENABLING, AxisPhase.APPROACH, AxisPhase.TRACKING])
 def test_drive_restart(rig: NewRig, phase: AxisPhase) -> None:
     run = rig(0.0)
-    run.sample.restarts = 3  # before the loop began: the twin that must not trip
     run.tick()
     run.until(phase)
     assert run.state.fault == Fault.NONE
-    run.sample.restarts = 4
+    run.sample.restarts = 1
     run.tick()
     assert_fault(run, Fault.DRIVE_RESTARTED, Reaction.OFF)
 

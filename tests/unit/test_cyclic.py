@@ -14,6 +14,7 @@ from drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Frame
 from drivers.canopen import exchange
 from drivers.canopen.cia402 import State
 from drivers.canopen.cyclic import (
+    ERROR_SHOWN_CYCLES,
     accept_frame,
     begin_cycle,
     end_cycle,
@@ -238,10 +239,76 @@ def test_error_frames_of_the_bus_are_counted(wire: Wire) -> None:
 def test_an_emergency_is_latched(wire: Wire) -> None:
     wire.receive(0x85, bytes.fromhex("1033 01 0000000000"))
     assert wire.sample.drive_error == 0x3310
-    wire.receive(0x85, bytes(8))  # error reset: the cause of the stop must not be forgotten
-    assert wire.sample.drive_error == 0x3310
     wire.receive(0x85, b"\x30")
     assert wire.sample.drive_error == 0x3310
+    for _ in range(100):
+        begin_cycle(wire.port, wire.frames)
+        wire.tpdo()
+    assert wire.sample.drive_error == 0x3310
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_an_error_that_the_drive_has_reset_is_shown_for_a_while_and_then_cleared(wire: Wire, again: bool) -> None:
+    """At once it would be forgotten as the cause of the stop; never, a run later would be told an old one."""
+    wire.receive(0x85, bytes.fromhex("3081 11 0000000000"))
+    wire.receive(0x85, bytes(8))
+    for cycle in range(1, ERROR_SHOWN_CYCLES + 3):
+        begin_cycle(wire.port, wire.frames)
+        if again and cycle == 5:
+            wire.receive(0x85, bytes.fromhex("3081 11 0000000000"))
+        wire.tpdo()
+        expected = 0x8130 if again or cycle <= ERROR_SHOWN_CYCLES else 0
+        assert wire.sample.drive_error == expected, cycle
+
+
+# --- a TPDO that repeats or delays an old value ----------------------------------------------------------------
+
+
+def test_a_tpdo_after_the_answer_is_not_a_new_sample(wire: Wire) -> None:
+    """Doubled or late, it would make an old position look fresh."""
+    begin_cycle(wire.port, wire.frames)
+    assert wire.tpdo(counts=100)
+    wire.rpdo(0.0)
+    assert not wire.tpdo(STATUSWORDS[State.OPERATION_ENABLED], counts=50)
+    assert (wire.sample.count, wire.port.surplus, wire.port.state) == (1, 1, State.SWITCH_ON_DISABLED)
+    assert wire.sample.position_rad == pytest.approx(100 * RAD_PER_COUNT)
+    begin_cycle(wire.port, wire.frames)
+    assert wire.sample.count == 1  # the age goes on
+    assert wire.tpdo(counts=101)
+
+
+def test_a_tpdo_that_comes_after_its_cycle_but_is_the_first_answer_is_one(wire: Wire) -> None:
+    begin_cycle(wire.port, wire.frames)
+    wire.rpdo(0.0)
+    assert wire.tpdo(counts=7)
+    begin_cycle(wire.port, wire.frames)
+    wire.rpdo(0.0)
+    assert wire.tpdo(counts=8)
+    assert (wire.sample.count, wire.port.surplus) == (2, 0)
+
+
+def test_of_a_burst_the_last_one_counts(wire: Wire) -> None:
+    for _ in range(3):
+        begin_cycle(wire.port, wire.frames)
+        wire.rpdo(0.0)
+    for counts in (1, 2, 3):
+        assert wire.tpdo(counts=counts)
+    assert wire.sample.position_rad == pytest.approx(3 * RAD_PER_COUNT)
+
+
+# --- the drive's own heartbeat ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("watched", [0, 1])
+def test_the_age_of_the_drives_heartbeat(wire: Wire, watched: int) -> None:
+    wire.port.heartbeat_watched = watched
+    for cycle in range(1, 50):
+        begin_cycle(wire.port, wire.frames)
+        if cycle in (10, 30):
+            wire.receive(0x705, b"\x05")
+        wire.rpdo(0.0)
+        heard = 30 if cycle >= 30 else 10 if cycle >= 10 else 0
+        assert wire.sample.heartbeat_age_cycles == watched * (cycle - heard)
     assert wire.sample.count == 0
 
 

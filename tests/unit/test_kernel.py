@@ -128,9 +128,11 @@ def test_old_caches_are_removed_but_not_those_in_use(tmp_path: Path) -> None:
 
 PLAIN = (
     "test_safety", "test_sequence", "test_friction", "test_lugre", "test_rbfnn", "test_velocity", "test_cia402",
-    "test_live_change",
+    "test_live_change", "test_surroundings_edges",
 )  # fmt: skip
-FULLY_COVERED = ("firmware_py/safety.py", "firmware_py/sequence.py", "firmware_py/live_change.py")
+FULLY_COVERED = tuple(
+    f"firmware_py/{name}.py" for name in ("safety", "sequence", "surroundings", "frozen_reading", "live_change")
+)
 
 
 def test_the_same_tests_pass_in_plain_python_and_cover_the_safety_code(tmp_path: Path) -> None:

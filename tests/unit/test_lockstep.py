@@ -45,7 +45,7 @@ class Lockstep:
     def run(self, cycles: int, stop_cycle: int = -1, log_every: int = 1) -> Any:
         """The log records of up to `cycles` cycles."""
         device = self.device
-        written = run_lockstep(
+        written, _ = run_lockstep(
             begin, accept, end, self.port, self.frames, self.frames.view(np.uint8).reshape(-1, 16), self.constants,
             self.state, np.zeros((1, 5)), self.sample, self.command, device.device, device.plant_constants,
             device.plant_state, new(FrameQueue), self.log, log_every, self.start_ns, PERIOD_ns, cycles, stop_cycle,
@@ -148,3 +148,18 @@ def test_a_wrong_direction_of_the_torque_is_caught(
     assert run.state[0].phase == AxisPhase.FINISHED
     assert run.state[0].fault in (Fault.FOLLOWING_ERROR, Fault.VELOCITY_LIMIT, Fault.TORQUE_SATURATED)
     assert np.max(np.abs(log.position_rad - 0.1)) < 0.5
+
+
+def test_what_the_drive_says_when_an_rpdo_comes_is_heard(lockstep: Lockstep) -> None:
+    """A target torque that does not fit the RPDO: EMCY 8210.  It was dropped, as SYNC alone was listened to."""
+    lockstep.port[0].rpdo_length = 3
+    lockstep.run(50)
+    assert lockstep.sample[0].drive_error == 0x8210
+    lockstep.sample[0].drive_error = 0
+    lockstep.port[0].rpdo_length = 4  # the twin
+    lockstep.start_ns += 50 * PERIOD_ns
+    lockstep.run(2)
+    lockstep.sample[0].drive_error = 0
+    lockstep.start_ns += 2 * PERIOD_ns
+    lockstep.run(50)
+    assert lockstep.sample[0].drive_error == 0

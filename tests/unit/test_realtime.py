@@ -242,6 +242,7 @@ from tests.conftest import small_axis_constants
 from tests.unit import test_realtime as stub
 
 loop = stub.Loop(small_axis_constants(), period_ns=10_000)
+loop.constants[0].sequence.wait_max_cycles = 1 << 40  # of 10 us: a busy computer uses up 40 of them at once
 
 def stub_run(cycles):
     return loop.run(cycles)
@@ -260,7 +261,6 @@ def driver_run(cycles):
         port[0].fd, port[0].heartbeat_cycles, port[0].tpdo_length = ours.fileno(), 3, 8
         port[0].torque_Nmppermille = 0.06
         frames, scratch = exchange_memory()
-        loop.constants[0].sequence.wait_max_cycles = 1 << 40
     return run_loop(receive, send, port, frames, scratch, loop.constants, loop.state, np.zeros((1, 5)), loop.sample,
                     loop.command, loop.words, loop.ring, loop.histograms, 10_000, 0, cycles)
 

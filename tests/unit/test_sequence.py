@@ -53,12 +53,12 @@ def sample_of(drive_state: DriveState) -> Any:
 
 def test_reset_forgets_the_run_before(axis: Any, state: Any) -> None:
     state.phase, state.fault, state.reaction, state.cycle = AxisPhase.FINISHED, Fault.OVERRUN, Reaction.OFF, 99
-    state.command_torque_Nm, state.restarts_at_start, state.saturated_cycles = 7.0, 3, 8
+    state.command_torque_Nm, state.saturated_cycles = 7.0, 8
     state.velocity.primed, state.law.lugre_deflection_rad = 1, 0.1
     state.law.network.weights[:] = 5.0
     reset_axis(axis, state)
     assert (state.phase, state.fault, state.reaction, state.cycle) == (AxisPhase.WAITING, 0, 0, 0)
-    assert (state.command_torque_Nm, state.restarts_at_start, state.saturated_cycles) == (0.0, -1, 0)
+    assert (state.command_torque_Nm, state.saturated_cycles) == (0.0, 0)
     assert (state.velocity.primed, state.law.lugre_deflection_rad) == (0, 0.0)
     assert list(state.law.network.weights) == [0.01] * 15
 
@@ -165,6 +165,19 @@ def test_the_run_waits_until_it_may_enable(axis: Any, state: Any) -> None:
     axis.sequence.may_enable = 1
     step_waiting(axis, state, idle_sample())
     assert state.phase == AxisPhase.ENABLING
+
+
+@pytest.mark.parametrize(("settle_cycles", "fault"), [(4, Fault.SUPERVISOR_LOST), (5, Fault.STALE_SAMPLE)])
+def test_the_wait_for_the_supervisors_word_ends(axis: Any, state: Any, settle_cycles: int, fault: Fault) -> None:
+    axis.sequence.may_enable, axis.sequence.settle_cycles = 0, settle_cycles
+    settled(state)
+    state.phase_cycle = 40
+    step_waiting(axis, state, idle_sample())
+    assert (state.phase, state.fault) == (AxisPhase.WAITING, Fault.NONE)
+    state.phase_cycle = 41
+    step_waiting(axis, state, idle_sample())
+    assert (state.phase, state.fault) == (AxisPhase.DISABLING, fault)
+    assert state.fault_value == (41.0 if fault is Fault.SUPERVISOR_LOST else 0.0)
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,10 @@ _CLASSES = (
         FaultKind.CONTROLLER_HEARTBEAT_LOST, Sizes((0.4, LONG_s), (1.0, 1.0)), Sizes((0.001, 0.06), (1.0, 1.0)),
         _STALE | {Fault.DRIVE_NOT_ENABLED}, True, on_wire=True,
     ),
-    FaultClass(FaultKind.DRIVE_HEARTBEAT_LOST, None, Sizes(_ALWAYS, (0.0, 1.0)), on_wire=True),
+    FaultClass(
+        FaultKind.DRIVE_HEARTBEAT_LOST, Sizes((0.85, LONG_s), (1.0, 1.0)), Sizes((0.001, 0.35), (0.0, 1.0)),
+        frozenset({Fault.DRIVE_SILENT}), True, on_wire=True,
+    ),
     FaultClass(
         FaultKind.RPDO_DELAYED, Sizes((0.01, 5.0), (0.003, 0.05)), Sizes(_ALWAYS, (0.0001, 0.001)), MOTION,
         on_wire=True,

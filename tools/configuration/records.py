@@ -18,6 +18,7 @@ from firmware_py.velocity import low_pass_gain
 from tools.configuration.checks import extremes_problems
 from tools.configuration.config import Config
 from tools.configuration.conversions import friction_constants, joint_rad_per_count, period_s
+from tools.configuration.elmo import ElmoSerial
 from tools.configuration.problems import ConfigurationProblems
 
 # the paper's centres, in rad and in rad/s: -c_p, 0, c_p with c_p = 1e-2 [-5 -3 -1 -0.8 -0.4 -0.1 -0.05]
@@ -29,6 +30,7 @@ MOVE_MIN_S = 0.2  # of a move to a new set-point, however near
 # feed-forward a sound joint stands that long before it breaks away
 FROZEN_SHARE, FROZEN_SHARE_WITHOUT_MODEL = 0.1, 0.5
 FROZEN_FRICTION = 1.5  # times the static friction: what a sound joint does not stand still under
+HEARTBEATS_MISSED = 3  # periods of the drive's own heartbeat until it counts as silent
 FROZEN_COUNTS = 4  # encoder counts by which a standing reading may flicker
 APPROACH_SPEED = 0.25  # share of limits.velocity_max_radps that an automatic approach may use
 
@@ -183,6 +185,8 @@ def _fill_limits(record: Any, config: Config) -> None:
     record.sample_age_max_cycles = _cycles(config, limits.sample_age_max_s)
     record.saturation_max_cycles = _cycles(config, limits.saturation_max_s)
     record.skipped_max_cycles = _cycles(config, limits.skipped_max_s)
+    if not isinstance(config.drive, ElmoSerial):  # a serial drive answers in every cycle and sends nothing by itself
+        record.heartbeat_age_max_cycles = _cycles(config, HEARTBEATS_MISSED * config.drive.heartbeat_s)
 
 
 def _fill_sequence(record: Any, config: Config, start_position_rad: float | None) -> None:

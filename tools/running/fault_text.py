@@ -117,6 +117,16 @@ FAULT_TEXTS: dict[Fault, FaultText] = {
         "the encoder or its cable is dead, or the joint is blocked",
         "turn the joint by hand with the power off and watch the position; check the encoder cable",
     ),
+    Fault.SUSPENDED: FaultText(
+        "the computer slept for {value:.1f} s while the loop was running",
+        "standby or hibernation: lid, power button, energy saving",
+        "switch standby off (systemd-inhibit jointctl run ...); the drive's watchdog stopped the joint meanwhile",
+    ),
+    Fault.DRIVE_SILENT: FaultText(
+        "the drive's own heartbeat stayed away for {value:.0f} cycles although its samples came",
+        "the drive's communication is partly dead, or another program has set its object 1017",
+        "watch 700h + node with candump; restart the drive",
+    ),
     Fault.POSITION_JUMP: FaultText(
         "the position jumped by {value:.4f} rad between two samples",
         "encoder or its cable, or counts_per_turn too small by a factor",

@@ -101,12 +101,19 @@ class LoopHandle:
                 raise JointctlError("the loop process was not ready in time")
             time.sleep(0.005)
 
+    def listen(self) -> None:
+        """What the bus says from now on is for the run: call it when commissioning and its proofs are over."""
+        self.block.words[Word.LISTEN] = 1
+
     def go(self, constants: Any, port: Any) -> None:
         """Hand over the constants and the driver's memory, and let the loop begin."""
         self.block.constants[:] = constants
         self.block.port[:] = port
         reset_axis(self.block.constants[0], self.block.state[0])
         self.beat()
+        now_ns = time.monotonic_ns()
+        self.block.words[Word.ASLEEP_NS] = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - now_ns
+        self.listen()
         self.block.words[Word.LOOP_NS] = time.monotonic_ns()
         self.block.words[Word.GO] = 1
 

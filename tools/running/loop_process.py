@@ -9,11 +9,13 @@ the joint.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import gc
 import json
 import os
 import signal
+import socket
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -98,9 +100,22 @@ def compiled_call(block: Any, period_ns: int, receive_ns: int) -> Callable[[int]
     return call
 
 
+def _nothing() -> None:
+    """For a loop that does not listen before it goes."""
+
+
+@dataclass(frozen=True)
+class ReadyLoop:
+    """A loop that is warm: `go` runs it to its end, `flush` throws away what the bus has said so far."""
+
+    go: Callable[[], object]
+    flush: Callable[[], None] = _nothing
+
+
 @contextmanager
-def compiled_loop(order: LoopOrder, block: Any) -> Iterator[Callable[[], object]]:
-    """The compiled loop, warm and attached to the bus, as a function that runs it to its end."""
+def compiled_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
+    """The compiled loop, warm and attached to the bus."""
+    from drivers.can.frames import FRAME_BYTES
     from drivers.can.open import open_cyclic_end
 
     call = compiled_call(block, order.period_ns, order.receive_ns)
@@ -112,21 +127,28 @@ def compiled_loop(order: LoopOrder, block: Any) -> Iterator[Callable[[], object]
             block.port[0].stamped = order.interface == "jointctl"
             call(_FOREVER)
 
-        yield go
+        def flush() -> None:
+            with contextlib.suppress(OSError):  # nothing waits, or the bus is down: the loop will tell
+                while end.recv(FRAME_BYTES, socket.MSG_DONTWAIT):
+                    pass
+
+        yield ReadyLoop(go, flush)
 
 
 @contextmanager
-def portable_loop(order: LoopOrder, block: Any) -> Iterator[Callable[[], object]]:
+def portable_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
     """The plain Python loop in the same way, and a line that tells its limits."""
     from drivers.can.open import open_python_can
-    from tools.running.portable_loop import check_portable_rate, portable_note, run_portable_loop, warm_up
+    from tools.running.portable_loop import check_portable_rate, portable_note, run_portable_loop, throw_away, warm_up
 
     check_portable_rate(order.interface, NANOSECONDS / order.period_ns)
     print(f"loop: {portable_note(order.interface)}", file=sys.stderr, flush=True)
     warm_up()
     bus = open_python_can(order.interface, order.channel, order.bitrate_bitps)
     try:
-        yield lambda: run_portable_loop(bus, block, order.period_ns, order.receive_ns)
+        yield ReadyLoop(
+            lambda: run_portable_loop(bus, block, order.period_ns, order.receive_ns), lambda: throw_away(bus)
+        )
     finally:
         bus.shutdown()
 
@@ -138,10 +160,13 @@ def run(order: LoopOrder) -> int:
 
     block = SharedBlock(order.block_fd, order.table_rows, order.interface)
     if order.interface == SERIAL:
-        from tools.running.serial_loop import serial_loop as loop
+        from tools.running.serial_loop import serial_loop
+
+        loop: Any = serial_loop
     else:
         loop = compiled_loop if order.interface in CYCLIC_INTERFACES else portable_loop
-    with loop(order, block) as go:
+    with loop(order, block) as prepared:
+        ready = prepared if isinstance(prepared, ReadyLoop) else ReadyLoop(prepared)
         gc.collect()
         gc.freeze()
         gc.disable()
@@ -152,8 +177,10 @@ def run(order: LoopOrder) -> int:
             while block.words[Word.GO] == 0:
                 if os.getppid() != order.supervisor_pid:
                     return 1
+                if block.words[Word.LISTEN] == 0:  # commissioning, its proof of the watchdog, the user's thinking time
+                    ready.flush()
                 time.sleep(_POLL_S)
-            go()
+            ready.go()
             block.words[Word.ENDED] = 1
     if order.tail_path is not None and os.getppid() != order.supervisor_pid:
         save_tail(block, Path(order.tail_path))

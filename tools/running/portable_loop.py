@@ -34,7 +34,7 @@ from drivers.canopen.port import FRAME_SLOTS, SLOT_RECEIVED, SLOT_RPDO, SLOT_SYN
 from drivers.errors import ConfigurationError
 from firmware_py.axis import step_axis
 from firmware_py.libc import NANOSECONDS, sleep_until_ns
-from firmware_py.realtime import Histogram, Word, count, write_log
+from firmware_py.realtime import Histogram, Word, count, note_suspension, write_log
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, DriveRequest
 from tools.running.shared_block import SharedBlock
@@ -166,6 +166,13 @@ class PortableExchange:
             self._send(SLOT_SYNC)
 
 
+def throw_away(bus: Any) -> None:
+    """What waits at the bus; a bus that fails is told by the loop."""
+    with contextlib.suppress(Exception):
+        while bus.recv(0.0) is not None:
+            pass
+
+
 def run_portable_loop(bus: Any, block: SharedBlock, period_ns: int, receive_ns: int, max_cycles: int = FOREVER) -> int:
     """`firmware_py.realtime.run_loop` in Python on a python-can bus: until FINISHED or `max_cycles` slots.
 
@@ -199,6 +206,7 @@ def _cycles(exchange: PortableExchange, block: SharedBlock, period_ns: int, rece
         state.sample_late_s = (wake_ns - deadline_ns) * 1e-9 if sample.time_ns > wake_ns else 0.0
         stop_request = int(words[Word.STOP])
         supervisor_age_cycles = (wake_ns - int(words[Word.SUPERVISOR_NS])) // period_ns
+        note_suspension(words, state, timespec)
         step_axis(axis, state, block.table, sample, command, elapsed_cycles, stop_request, supervisor_age_cycles)
         exchange.send()
         end_ns = time.monotonic_ns()

@@ -141,6 +141,7 @@ class Supervisor:
         ):
             constants = self._constants(loop, report)
             constants[0].sequence.may_enable = 0
+            loop.listen()
             drive.start_cyclic()
             started_ns = time.monotonic_ns()
             loop.go(constants, drive.port())

@@ -24,8 +24,6 @@ from firmware_py.schema import new
 from firmware_py.sequence import reset_axis
 from firmware_py.states import AxisPhase, Fault
 from hil.device import Cia402Device
-from hil.fault_lockstep import TRUTHS as FAULT_TRUTHS
-from hil.fault_lockstep import run_with_faults
 from hil.faults import fault_memory
 from hil.frames import FRAME_SIZE
 from hil.lockstep import TRUTHS, TRUE_POSITION_rad, run_lockstep
@@ -154,7 +152,7 @@ class LockstepJoint:
         plant = (self.plant_state if plant_state is None else plant_state).copy()
         frames, _ = exchange_memory()
         frame_bytes = frames.view(np.ndarray).view(np.uint8).reshape(len(frames), FRAME_SIZE)
-        written = run_lockstep(
+        written, _ = run_lockstep(
             begin, accept, end, self._port.copy(), frames, frame_bytes, constants, state, self.table, sample, command,
             device, plant_constants, plant, self._virtual.queue.copy(), log, log_every, self.start_ns,
             round(period_s * 1e9), cycles, stop_cycle,
@@ -174,7 +172,7 @@ class LockstepJoint:
         longest_s: float | None = None,
         tail_s: float = 0.0,
     ) -> LockstepRun:
-        """As `run`, with these `FaultConstants`; `truth` has the columns of `hil.fault_lockstep`, a row each period.
+        """As `run`, with these `FaultConstants`; `truth` has a row each period.
 
         The faults' times count from the first time that the power stage is on, or from the start of the run.
         The joint is watched for `tail_s` after the controller has ended and is silent.
@@ -185,7 +183,7 @@ class LockstepJoint:
         if longest_s is None:
             longest_s = float(axis.sequence.approach_s + axis.trajectory.duration_s) + 10.0
         cycles, tail_cycles = int(longest_s / period_s), int(tail_s / period_s)
-        log, truth = new(LogRecord, cycles), np.zeros((cycles + tail_cycles, FAULT_TRUTHS))
+        log, truth = new(LogRecord, cycles), np.zeros((cycles + tail_cycles, TRUTHS))
         state, sample, command = new(AxisState), new(Sample), new(Command)
         reset_axis(axis, state[0])
         device = self._virtual.device.copy()
@@ -193,10 +191,10 @@ class LockstepJoint:
         plant = (self.plant_state if plant_state is None else plant_state).copy()
         frames, _ = exchange_memory()
         frame_bytes = frames.view(np.ndarray).view(np.uint8).reshape(len(frames), FRAME_SIZE)
-        written, rows = run_with_faults(
+        written, rows = run_lockstep(
             begin, accept, end, self._port.copy(), frames, frame_bytes, constants, state, self.table, sample, command,
-            device, plant_constants, plant, self._virtual.queue.copy(), log, truth, faults,
-            fault_memory(faults, -1 if epoch_at_start else 0), self.start_ns, round(period_s * 1e9), cycles,
-            stop_cycle, tail_cycles,
+            device, plant_constants, plant, self._virtual.queue.copy(), log, 1, self.start_ns,
+            round(period_s * 1e9), cycles, stop_cycle, truth,
+            faults=faults, memories=fault_memory(faults, -1 if epoch_at_start else 0), tail_cycles=tail_cycles,
         )  # fmt: skip
         return LockstepRun(log[:written], state[0], plant[0], device[0], Fault(int(state[0].fault)), truth[:rows])

@@ -1,0 +1,199 @@
+"""Suspension, the drive's own heartbeat, a supervisor that never says yes, and readings that stand still."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from firmware_py.frozen_reading import PUSHED_CYCLES
+from firmware_py.realtime import SUSPENDED_MIN_NS, Word
+from firmware_py.states import AxisPhase, CommandKind, DriveRequest, DriveState, Fault, Reaction, StopRequest
+from firmware_py.surroundings import check_suspension
+from tests.unit.test_realtime import Loop
+
+NewRig = Callable[..., Any]
+
+
+# --- the computer slept ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("phase", "reaction", "after"),
+    [
+        (AxisPhase.WAITING, Reaction.OFF, AxisPhase.DISABLING),
+        (AxisPhase.ENABLING, Reaction.OFF, AxisPhase.DISABLING),
+        (AxisPhase.APPROACH, Reaction.QUICK_STOP, AxisPhase.QUICK_STOPPING),
+        (AxisPhase.TRACKING, Reaction.QUICK_STOP, AxisPhase.QUICK_STOPPING),
+    ],
+)
+def test_a_computer_that_slept_does_not_go_on(
+    rig: NewRig, phase: AxisPhase, reaction: Reaction, after: AxisPhase
+) -> None:
+    run = rig(0.0).until(phase)
+    check_suspension(run.state, 5.0)
+    assert (run.state.fault, run.state.fault_value, run.state.reaction) == (Fault.SUSPENDED, 5.0, reaction)
+    run.tick()
+    assert run.phase == after
+    assert run.torques_Nm[-1] == 0.0
+    run.until(AxisPhase.FINISHED)
+
+
+@pytest.mark.parametrize("phase", [AxisPhase.QUICK_STOPPING, AxisPhase.DISABLING, AxisPhase.FINISHED])
+def test_a_stop_that_is_under_way_is_not_changed_by_it(rig: NewRig, phase: AxisPhase) -> None:
+    run = rig(0.0).until(AxisPhase.TRACKING)
+    run.stop = StopRequest.QUICK_STOP
+    run.until(phase)
+    check_suspension(run.state, 5.0)
+    assert (run.state.fault, run.phase) == (Fault.NONE, phase)
+
+
+@pytest.mark.parametrize(("slept_ns", "trips"), [(0, False), (SUSPENDED_MIN_NS // 2, False), (200_000_000, True)])
+@pytest.mark.parametrize("set_by", ["supervisor", "loop"])
+def test_the_loop_compares_its_clock_with_one_that_does_not_stand_still(
+    axis_constants: Any, slept_ns: int, trips: bool, set_by: str
+) -> None:
+    loop = Loop(axis_constants)
+    if set_by == "supervisor":
+        now_ns = time.monotonic_ns()
+        loop.words[Word.ASLEEP_NS] = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - now_ns
+    else:
+        loop.run(1)  # the first cycle takes the difference as it is
+    loop.run(30)
+    assert loop.state[0].fault == Fault.NONE
+    loop.words[Word.ASLEEP_NS] -= slept_ns  # as if the difference had grown
+    loop.run(30)
+    assert loop.state[0].fault == (Fault.SUSPENDED if trips else Fault.NONE)
+    if trips:
+        assert loop.state[0].fault_value == pytest.approx(slept_ns * 1e-9, rel=0.05)
+        assert loop.command[0].request != DriveRequest.ENABLE
+
+
+# --- the drive's own heartbeat ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("limit", "age", "trips"), [(600, 600, False), (600, 601, True), (0, 10**6, False)])
+@pytest.mark.parametrize("phase", [AxisPhase.ENABLING, AxisPhase.TRACKING, AxisPhase.RAMPING])
+def test_a_drive_whose_heartbeat_stays_away(rig: NewRig, limit: int, age: int, trips: bool, phase: AxisPhase) -> None:
+    run = rig(0.0)
+    run.axis.limits.heartbeat_age_max_cycles = limit
+    if phase is AxisPhase.RAMPING:
+        run.until(AxisPhase.TRACKING).run(5)
+        run.stop = StopRequest.RAMP
+    run.until(phase)
+    run.sample.heartbeat_age_cycles = age
+    run.tick()
+    assert run.state.fault == (Fault.DRIVE_SILENT if trips else Fault.NONE)
+    if trips:
+        assert run.state.fault_value == age
+        assert run.phase == (AxisPhase.DISABLING if phase is AxisPhase.ENABLING else AxisPhase.QUICK_STOPPING)
+
+
+def test_samples_that_stay_away_as_well_are_the_cause_that_is_told(rig: NewRig) -> None:
+    run = rig(0.0).until(AxisPhase.TRACKING).run(5)
+    run.axis.limits.heartbeat_age_max_cycles = 3
+    run.sample.heartbeat_age_cycles = 4
+    run.state.sample_age_cycles = run.axis.limits.sample_age_max_cycles
+    run.tick(fresh=False)
+    assert run.state.fault == Fault.STALE_SAMPLE
+
+
+# --- waiting ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("allowed_at", [None, 30])
+def test_without_the_supervisors_word_nothing_is_enabled_and_that_is_told(rig: NewRig, allowed_at: int | None) -> None:
+    """It was told as samples that are 0 cycles old."""
+    run = rig(0.0)
+    run.axis.sequence.may_enable = 0
+    for cycle in range(60):
+        run.axis.sequence.may_enable = int(allowed_at is not None and cycle >= allowed_at)
+        run.tick()
+    assert run.state.fault == (Fault.SUPERVISOR_LOST if allowed_at is None else Fault.NONE)
+    assert (DriveRequest.ENABLE in run.requests) is (allowed_at is not None)
+
+
+@pytest.mark.parametrize("fresh", [True, False])
+def test_a_drive_that_never_answers_is_told_with_its_error_code(rig: NewRig, fresh: bool) -> None:
+    run = rig(0.0)
+    run.sample.drive_error = 0x8130
+    for _ in range(50):
+        run.tick(fresh=fresh)
+    if fresh:
+        assert run.state.fault == Fault.NONE
+    else:
+        assert (run.state.fault, run.state.fault_drive_error) == (Fault.NO_SAMPLES, 0x8130)
+
+
+def test_after_the_supervisor_has_died_the_drive_is_told_to_switch_off(rig: NewRig) -> None:
+    run, twin = rig(0.0), rig(0.0)
+    for one, age in ((run, 11), (twin, 10)):
+        one.until(AxisPhase.TRACKING).run(5)
+        one.supervisor_age_cycles = age
+        one.run(1)
+    assert (twin.phase, twin.state.fault) == (AxisPhase.TRACKING, Fault.NONE)
+    run.until(AxisPhase.FINISHED)
+    assert run.state.fault == Fault.SUPERVISOR_LOST
+    asked = run.requests.index(DriveRequest.OFF, run.requests.index(DriveRequest.ENABLE))
+    assert set(run.requests[asked:]) == {DriveRequest.OFF}
+    assert len(run.requests[asked:]) >= 2
+    assert run.joint.drive_state is DriveState.OFF
+
+
+# --- readings that stand still -----------------------------------------------------------------------------------
+
+
+def stuck(rig: NewRig) -> Any:
+    run = rig(0.0)
+    run.axis.limits.frozen_max_rad = 0.01
+    run.axis.limits.saturation_max_cycles = 1 << 40
+    run.until(AxisPhase.TRACKING).run(20)
+    run.joint.step = lambda *_: None
+    return run
+
+
+@pytest.mark.parametrize("every", [1, 2, 5])
+def test_a_stuck_reading_with_holes_is_noticed_all_the_same(rig: NewRig, every: int) -> None:
+    """Each hole began the watch anew: a stuck encoder behind a bus with losses was not seen."""
+    run = stuck(rig)
+    for cycle in range(100):
+        run.tick(fresh=cycle % every == 0)
+        if run.state.fault:
+            break
+    assert run.state.fault == Fault.POSITION_FROZEN
+
+
+@pytest.mark.parametrize("every", [1, 2, 5])
+def test_its_twin_a_joint_that_moves_behind_holes_is_not_stuck(rig: NewRig, every: int) -> None:
+    run = rig(0.0)
+    run.axis.limits.frozen_max_rad = 0.01
+    run.until(AxisPhase.TRACKING).run(20)
+    for cycle in range(100):
+        run.tick(fresh=cycle % every == 0)
+    assert (run.state.fault, run.phase) == (Fault.NONE, AxisPhase.TRACKING)
+
+
+@pytest.mark.parametrize("kind", [CommandKind.TORQUE, CommandKind.VELOCITY])
+@pytest.mark.parametrize(("pushed", "trips"), [(PUSHED_CYCLES, False), (PUSHED_CYCLES + 1, True)])
+@pytest.mark.parametrize("enough", [True, False])
+def test_a_joint_that_is_pushed_and_reads_the_same(
+    rig: NewRig, kind: CommandKind, pushed: int, trips: bool, enough: bool
+) -> None:
+    """In the velocity modes the drive pushes: what counts is the torque that it measures."""
+    run = rig(0.0)
+    run.axis.trajectory.amplitude_rad = 0.0
+    run.axis.velocity_command.acceleration_max_radps2 = 10.0
+    run.axis.command_kind = kind
+    run.until(AxisPhase.TRACKING).run(20)
+    run.axis.limits.frozen_torque_Nm = 30.0
+    run.axis.limits.saturation_max_cycles = 1 << 40
+    run.joint.step = lambda *_: None
+    torque_Nm = 31.0 if enough else 29.0
+    run.tick()
+    for _ in range(pushed):
+        run.sample.torque_Nm = torque_Nm
+        run.state.command_torque_Nm = torque_Nm if kind is CommandKind.TORQUE else 0.0
+        run.tick()
+    assert run.state.fault == (Fault.POSITION_FROZEN if trips and enough else Fault.NONE)

@@ -1,0 +1,160 @@
+"""Drive, bus, schedule, supervisor and a reading that stands still: each limit at its edge, as pure functions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from firmware_py.frozen_reading import PUSHED_CYCLES, check_reading
+from firmware_py.records import AxisState, Sample
+from firmware_py.safety import reaction_to
+from firmware_py.schema import new
+from firmware_py.sequence import reset_axis
+from firmware_py.states import AxisPhase, CommandKind, DriveState, Fault, Reaction
+from firmware_py.surroundings import check_surroundings, check_suspension
+
+
+def after(fault: Fault, phase: AxisPhase) -> AxisPhase:
+    """The phase that follows the fault."""
+    goal = {
+        Reaction.RAMP: AxisPhase.RAMPING,
+        Reaction.QUICK_STOP: AxisPhase.QUICK_STOPPING,
+        Reaction.OFF: AxisPhase.DISABLING,
+    }
+    return max(phase, goal[Reaction(reaction_to(fault, phase))])
+
+
+@pytest.mark.parametrize(
+    ("what", "within", "beyond", "fault"),
+    [
+        ("restarts", 0, 1, Fault.DRIVE_RESTARTED),
+        ("drive_state", DriveState.ENABLED, DriveState.FAULT, Fault.DRIVE_FAULT),
+        ("drive_state", DriveState.ENABLED, DriveState.STOPPING, Fault.DRIVE_NOT_ENABLED),
+        ("sample_age_cycles", 7, 8, Fault.STALE_SAMPLE),
+        ("bus_errors", 7, 8, Fault.BUS_ERROR),
+        ("heartbeat_age_cycles", 9, 10, Fault.DRIVE_SILENT),
+        ("skipped", 5, 6, Fault.OVERRUN),
+        ("supervisor", 11, 12, Fault.SUPERVISOR_LOST),
+    ],
+)
+@pytest.mark.parametrize("phase", list(AxisPhase))
+def test_each_limit_at_its_edge_in_each_phase(
+    axis_constants: Any, what: str, within: int, beyond: int, fault: Fault, phase: AxisPhase
+) -> None:
+    axis = axis_constants[0]
+    axis.limits.sample_age_max_cycles, axis.limits.heartbeat_age_max_cycles = 7, 9
+    axis.limits.skipped_max_cycles, axis.sequence.supervisor_max_cycles = 5, 11
+    torque = AxisPhase.APPROACH <= phase <= AxisPhase.RELEASING
+    if phase >= AxisPhase.DISABLING:
+        counts = False
+    elif fault in (Fault.DRIVE_RESTARTED, Fault.DRIVE_FAULT):
+        counts = True
+    elif fault in (Fault.DRIVE_NOT_ENABLED, Fault.OVERRUN):
+        counts = torque
+    else:
+        counts = torque or phase == AxisPhase.ENABLING
+    for value, trips in ((within, False), (beyond, counts)):
+        state, sample = new(AxisState)[0], new(Sample)[0]
+        reset_axis(axis, state)
+        state.phase, sample.drive_state = phase, DriveState.ENABLED
+        if what == "sample_age_cycles":
+            state.sample_age_cycles = value
+        elif what not in ("skipped", "supervisor"):
+            setattr(sample, what, value)
+        check_surroundings(axis, state, sample, value if what == "skipped" else 0, value if what == "supervisor" else 0)
+        assert state.fault == (fault if trips else Fault.NONE)
+        if not trips:
+            assert (state.phase, state.reaction) == (phase, Reaction.NONE)
+        elif what == "drive_state" and beyond == DriveState.STOPPING:
+            assert (state.phase, state.reaction) == (AxisPhase.QUICK_STOPPING, Reaction.QUICK_STOP)
+        else:
+            assert state.phase == after(fault, phase)
+
+
+@pytest.mark.parametrize("limit", ["heartbeat_age_max_cycles", "supervisor_max_cycles"])
+def test_what_is_not_watched_does_not_trip(axis_constants: Any, limit: str) -> None:
+    axis, state, sample = axis_constants[0], new(AxisState)[0], new(Sample)[0]
+    axis.limits.heartbeat_age_max_cycles = axis.sequence.supervisor_max_cycles = 10
+    setattr(axis.limits if limit.startswith("heart") else axis.sequence, limit, 0)
+    reset_axis(axis, state)
+    state.phase, sample.drive_state = AxisPhase.TRACKING, DriveState.ENABLED
+    sample.heartbeat_age_cycles = 0 if limit.startswith("super") else 1_000_000
+    check_surroundings(axis, state, sample, 0, 1_000_000 if limit.startswith("super") else 0)
+    assert state.fault == Fault.NONE
+
+
+@pytest.mark.parametrize("phase", list(AxisPhase))
+def test_suspension_in_each_phase(axis_constants: Any, phase: AxisPhase) -> None:
+    state = new(AxisState)[0]
+    reset_axis(axis_constants[0], state)
+    state.phase = phase
+    check_suspension(state, 5.0)
+    if phase < AxisPhase.QUICK_STOPPING:
+        assert (state.phase, state.fault, state.fault_value) == (after(Fault.SUSPENDED, phase), Fault.SUSPENDED, 5.0)
+    else:
+        assert (state.phase, state.fault) == (phase, Fault.NONE)
+
+
+@pytest.fixture
+def stuck(axis_constants: Any) -> tuple[Any, Any]:
+    """Constants and state of a joint that tracks and whose reading has stood still for a cycle."""
+    axis, state = axis_constants[0], new(AxisState)[0]
+    reset_axis(axis, state)
+    axis.limits.frozen_max_rad, axis.limits.frozen_torque_Nm = 0.5, 3.0
+    state.phase, state.frozen_samples = AxisPhase.TRACKING, 1
+    return axis, state
+
+
+@pytest.mark.parametrize(("way_rad", "trips"), [(0.5, False), (0.501, True), (-0.5, False), (-0.501, True)])
+@pytest.mark.parametrize("how", ["stands", "moves", "no sample", "not watched"])
+def test_the_way_behind_a_reading_that_stands_still(
+    stuck: tuple[Any, Any], way_rad: float, trips: bool, how: str
+) -> None:
+    axis, state = stuck
+    state.frozen_from_rad, state.reference.position_rad = 1.0, 1.0 + way_rad
+    if how == "moves":
+        state.frozen_samples = 0
+    elif how == "no sample":
+        state.sample_age_cycles = 1
+    elif how == "not watched":
+        axis.limits.frozen_max_rad = 0.0
+    check_reading(axis, state)
+    trips = trips and how == "stands"
+    assert state.fault == (Fault.POSITION_FROZEN if trips else Fault.NONE)
+    assert state.fault_value == pytest.approx(way_rad if trips else 0.0)
+    assert state.frozen_from_rad == (1.0 + way_rad if how == "moves" else 1.0)
+
+
+@pytest.mark.parametrize(("torque_Nm", "pushed"), [(3.0, False), (3.001, True), (-3.0, False), (-3.001, True)])
+@pytest.mark.parametrize("kind", [CommandKind.TORQUE, CommandKind.VELOCITY])
+@pytest.mark.parametrize("watched", [True, False])
+def test_the_push_at_a_reading_that_stands_still(
+    stuck: tuple[Any, Any], torque_Nm: float, pushed: bool, kind: CommandKind, watched: bool
+) -> None:
+    axis, state = stuck
+    axis.command_kind = kind
+    if not watched:
+        axis.limits.frozen_torque_Nm = 0.0
+    pushed = pushed and watched
+    for cycle in range(PUSHED_CYCLES + 1):
+        assert state.fault == Fault.NONE
+        assert state.pushed_cycles == (cycle if pushed else 0)
+        if kind is CommandKind.VELOCITY:
+            state.measured_torque_Nm, state.command_torque_Nm = torque_Nm, 0.0
+        else:
+            state.measured_torque_Nm, state.command_torque_Nm = 0.0, torque_Nm
+        check_reading(axis, state)
+    assert state.fault == (Fault.POSITION_FROZEN if pushed else Fault.NONE)
+
+
+@pytest.mark.parametrize("by", ["less torque", "a reading that moves"])
+def test_pushing_counts_from_the_beginning_again(stuck: tuple[Any, Any], by: str) -> None:
+    axis, state = stuck
+    state.command_torque_Nm, state.pushed_cycles = 4.0, PUSHED_CYCLES
+    if by == "less torque":
+        state.command_torque_Nm = 3.0
+    else:
+        state.frozen_samples = 0
+    check_reading(axis, state)
+    assert (state.pushed_cycles, state.fault) == (0, Fault.NONE)
