@@ -26,18 +26,11 @@ from tools.identification.friction_section import section_values
 from tools.identification.identification import Options, identify_friction
 from tools.identification.pso import SwarmSettings
 from tools.output import Output
+from tools.recording.run_log import read_run_log
 from tools.sweeping.options import SweepOptions
 from tools.verbs.sweep import sweep
 
 QUANTISATION_Nm = 0.0005  # one per mille of the rated motor torque
-# `jointctl`, also where the verb is not in its list yet
-LAUNCHER = """
-from tools import cli
-from tools.cli.sweep_command import sweep_command
-if "sweep" not in {c.name or c.callback.__name__ for c in cli.app.registered_commands}:
-    cli.app.command("sweep")(sweep_command)
-cli.main()
-"""
 
 
 @pytest.fixture
@@ -214,7 +207,7 @@ class SweepProcess:
         self._err = bench.folder / f"sweep-{len(list(bench.folder.glob('sweep-*')))}.stderr"
         with self._err.open("wb") as err:
             self.process = subprocess.Popen(
-                [sys.executable, "-P", "-c", LAUNCHER, "sweep", *arguments], cwd=bench.folder,
+                [sys.executable, "-P", "-m", "tools.cli", "sweep", *arguments], cwd=bench.folder,
                 stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=err, start_new_session=True,
             )  # fmt: skip
 
@@ -255,6 +248,10 @@ def test_ctrl_c_keeps_the_rows_and_resume_measures_the_rest(joint: Any) -> None:
     assert joint.disabled()
     kept = out.read_text()
     assert 3 <= len(kept.splitlines()) < 7
+    (log,) = (joint.folder / "runs").glob("*.mcap")
+    time_s = read_run_log(log).records.time_ns * 1e-9
+    assert np.sum(time_s > time_s[-1] - 2.0) > 1000  # the last seconds are whole, the ones before are not
+    assert len(time_s) < 0.5 * 1000 * (time_s[-1] - time_s[0])
     code, err = SweepProcess(joint, "joint.toml", "-o", "data.csv", "-y", "--resume", *SHORT).finished()
     assert code == 0, err
     assert joint.disabled()

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import os
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -223,3 +226,31 @@ def test_damaged_files_are_one_line(path: Path) -> None:
         SweepFile.resume(path, 0.1, "abc")
     assert path.read_text() == whole
     assert whole.startswith(HEADING)
+
+
+def test_a_disk_that_takes_nothing_more_is_told_with_the_next_row_or_at_the_end(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = created(path, 3)
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    file.add(measured(SweepPoint(3, 0.2, 0)))
+    with pytest.raises(DataError, match=r"data\.csv: cannot be written: No space left"):
+        file.close()
+    assert len(path.read_text().splitlines()) == 5  # what the operating system took is there
+
+
+def test_a_slow_disk_does_not_hold_the_sweep_up(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = created(path)
+    confirmed = threading.Event()
+    monkeypatch.setattr(os, "fsync", lambda _: confirmed.wait(60.0) or None)
+    file.add(measured(SweepPoint(0, 0.1, 0)))
+    file.add(measured(SweepPoint(1, 0.2, 0)))
+    assert len(path.read_text().splitlines()) == 3
+    assert json.loads(path.with_suffix(".json").read_text())["measured"] == []
+    confirmed.set()
+    file.close()
+    assert json.loads(path.with_suffix(".json").read_text())["measured"] == [0, 1]

@@ -26,6 +26,7 @@ from tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_con
 from tools.output import Output
 from tools.recording.kept_records import KeptRecords
 from tools.recording.run_log import RunLogWriter
+from tools.recording.thinned_records import ThinnedRecords
 from tools.running.loop_handle import LoopHandle
 from tools.running.open_drive import loop_delay_s
 from tools.running.supervisor import DELAY_CYCLES, INFORMATION, Supervisor
@@ -40,6 +41,7 @@ POSITION_GAIN_ps = 5.0  # slow: far below any drive's velocity loop, fast enough
 OBSERVER_radps = 30.0  # of the law that takes the place of one without an integral action
 ACCELERATION_SPARE = 3.0  # limit of the velocity command's slope over sequence.brake_radps2
 LOG_EVERY = 20  # records of the run log: a sweep takes minutes, and its data are in its own file
+LOG_WHOLE_S = 2.0  # the last ones are in it whole
 LOCKSTEP_RECORDS = 250_000
 
 
@@ -108,7 +110,7 @@ def sweep_constants(config: Config, report: CommissioningReport, motion: SweepMo
 
 
 class SweepSupervisor(Supervisor):
-    """A supervised run along the motion of a sweep; records go to the meter, every LOG_EVERY-th one to the run log."""
+    """A supervised run along the motion of a sweep; its records go to the meter, and thinned to the run log."""
 
     def __init__(
         self,
@@ -127,7 +129,7 @@ class SweepSupervisor(Supervisor):
         self._meter = meter
         self._progress = progress
         self._velocity_mode = False
-        self._seen = 0
+        self._thinned = ThinnedRecords(LOG_EVERY, round(LOG_WHOLE_S * config.loop.rate_Hz))
 
     def _table(self) -> np.ndarray:
         return self._motion.table
@@ -153,12 +155,19 @@ class SweepSupervisor(Supervisor):
             self._display.note(text)
             loop.allow_enable()
 
+    @staticmethod
+    def _write(records: Any, log: RunLogWriter, kept: KeptRecords) -> None:
+        if len(records):
+            kept.append(records)
+            log.write_records(records)
+
+    def _take_records(self, loop: LoopHandle, log: RunLogWriter, kept: KeptRecords) -> None:
+        super()._take_records(loop, log, kept)
+        if not loop.running():
+            self._write(self._thinned.last(), log, kept)
+
     def _keep(self, records: Any, log: RunLogWriter, kept: KeptRecords) -> None:
-        chosen = records[-self._seen % LOG_EVERY :: LOG_EVERY]
-        self._seen += len(records)
-        if len(chosen):
-            kept.append(chosen)
-            log.write_records(chosen)
+        self._write(self._thinned.take(records), log, kept)
         self._meter.feed(records)
         with contextlib.suppress(OSError):  # the terminal may have been closed
             self._progress(float(records[-1].trajectory_s))

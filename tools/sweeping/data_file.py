@@ -2,7 +2,8 @@
 
 Beside the CSV (format: `tools.identification.friction_data`) lies its JSON sidecar; it also holds the plan's hash and
 which of the plan's points the rows are, so that a sweep can be resumed.  The row is written first: rows beyond the
-sidecar's list were cut off by a crash, and are measured again.
+sidecar's list were cut off by a crash, and are measured again.  A busy disk can take longer to confirm a row than the
+loop goes without its supervisor, so a thread waits for it.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import io
 import json
 import os
 from collections import Counter
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,8 @@ class SweepFile:
         self._sidecar = sidecar
         self._torque_constant_NmpA = torque_constant_NmpA
         self._stream = path.open("a", encoding="ascii", newline="")
+        self._to_disk = ThreadPoolExecutor(1, "sweep-file")
+        self._last: Future[None] | None = None
 
     @property
     def done(self) -> set[int]:
@@ -104,7 +108,12 @@ class SweepFile:
         return cls(path, sidecar, torque_constant_NmpA)
 
     def add(self, measured: MeasuredPoint, temperature_degC: float | None = None) -> None:
-        """One row, on the disk when this returns."""
+        """One row, in the hands of the operating system when this returns, and soon on the disk.
+
+        `DataError` if it or the one before could not be written.
+        """
+        if self._last is not None and self._last.done():
+            self._settle(self._last)
         point, result = measured.point, measured.result
         current = 1.0 / self._torque_constant_NmpA
         values = (
@@ -116,20 +125,38 @@ class SweepFile:
         )  # fmt: skip
         line = io.StringIO()
         csv.writer(line, lineterminator="\n").writerow(values)
-        self._stream.write(line.getvalue())
-        self._stream.flush()
-        os.fsync(self._stream.fileno())
+        try:
+            self._stream.write(line.getvalue())
+            self._stream.flush()
+        except OSError as error:
+            raise self._failure(error) from None
         self._sidecar["measured"].append(point.index)
         self._sidecar["elapsed_s"] = round(measured.time_s, 3)
         if result.problem:
             self._sidecar["unsettled"][str(point.index)] = result.problem
         else:
             self._sidecar["unsettled"].pop(str(point.index), None)
-        _replace(self.path.with_suffix(".json"), json.dumps(self._sidecar, indent=1))
+        self._last = self._to_disk.submit(self._keep, json.dumps(self._sidecar, indent=1))
+
+    def _keep(self, sidecar: str) -> None:
+        os.fsync(self._stream.fileno())
+        _replace(self.path.with_suffix(".json"), sidecar)
+
+    def _failure(self, error: OSError) -> DataError:
+        return DataError(f"{self.path}: cannot be written: {error.strerror or error}")
+
+    def _settle(self, kept: Future[None]) -> None:
+        try:
+            kept.result()
+        except OSError as error:
+            raise self._failure(error) from None
 
     def close(self) -> None:
         """Files without one row are removed: nothing was measured, and they would be in the way of the next try."""
+        self._to_disk.shutdown()
         self._stream.close()
         if not self._sidecar["measured"]:
             self.path.unlink(missing_ok=True)
             self.path.with_suffix(".json").unlink(missing_ok=True)
+        if self._last is not None:
+            self._settle(self._last)

@@ -38,7 +38,9 @@ def hil(config: Config, output: Output, *, timing: bool = False, ready_fd: int |
         while not signals.count and not joint.words[2] and not reader_gone(ready_fd):
             time.sleep(_POLL_S)
         if joint.words[LATE_WORD]:
-            output.note(f"virtual joint: {joint.words[LATE_WORD]} samples came too late to be sent, this computer was busy")
+            output.note(
+                f"virtual joint: {joint.words[LATE_WORD]} samples came too late to be sent, this computer was busy"
+            )
     return 0
 
 
