@@ -7,9 +7,11 @@ import json
 import math
 import threading
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from drivers.errors import ConfigurationError
 from firmware_py.states import ControllerKind
@@ -23,7 +25,7 @@ from tools.benchmarks.loop_times import times_from_ns
 from tools.benchmarks.numpy_law import NumpyLaw
 from tools.benchmarks.outcome import outcome_data, outcome_table, write_outcome
 from tools.benchmarks.paired import Row, compared, interleaved, measured, skipped
-from tools.benchmarks.start_speed import verbs
+from tools.cli.main import app
 from tools.configuration.load import load_config, shipped_config
 from tools.configuration.records import axis_constants
 from tools.output import Output
@@ -159,8 +161,11 @@ def test_another_rate_changes_nothing_else():
     assert config.loop.rate_Hz == 1000.0
 
 
-def test_every_verb_of_the_command_line_is_timed():
-    assert {"run", "hil", "check", "identify"} <= set(verbs())
+def test_every_verb_of_the_command_line_is_timed(monkeypatch: pytest.MonkeyPatch):
+    asked: dict[str, Any] = {}
+    monkeypatch.setattr("tools.verbs.bench.bench", lambda _, **options: asked.update(options) or 0)
+    assert CliRunner().invoke(app, ["bench"]).exit_code == 0
+    assert {"run", "hil", "check", "identify", "fault-campaign"} <= set(asked["verbs"])
 
 
 ROWS = [

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from drivers.errors import JointctlError
@@ -50,14 +50,6 @@ def command_s(*arguments: str) -> float:
         timeout=LONGEST_S,
     )
     return time.perf_counter() - begin_s
-
-
-def verbs() -> list[str]:
-    """Names of all verbs, as the command line registers them."""
-    from tools.cli.main import app
-
-    names = [command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands]
-    return sorted(name for name in names if name)
 
 
 def until_enabled_s(config_path: Path, channel: str, cache: Path | None = None) -> float:
@@ -100,13 +92,13 @@ def _wait_for(process: subprocess.Popen[bytes], words: tuple[str, ...], begin_s:
     raise JointctlError(f"`run` did not enable the drive: {last}")
 
 
-def start_rows(config: Config, *, runs: int, cold: bool, every_verb: bool) -> Iterator[Row]:
-    """Uses a virtual joint of its own for `run`."""
+def start_rows(config: Config, *, runs: int, cold: bool, verbs: Sequence[str]) -> Iterator[Row]:
+    """The start of `verbs`, and of `run` until the drive is enabled, on a virtual joint of its own."""
     command_s("-m", "tools.cli", "--help")
     cli, bare = interleaved(runs, lambda: command_s("-m", "tools.cli", "--help"), lambda: command_s("-c", "pass"))
     yield measured(GROUP, "jointctl --help", cli, "s", goal=HELP_GOAL_S, note=f"best {min(cli):.2f} s")
     yield compared(GROUP, "jointctl --help", cli, bare, "s", "python -c pass")
-    for verb in verbs() if every_verb else []:
+    for verb in verbs:
         taken = [command_s("-m", "tools.cli", verb, "--help") for _ in range(2)]
         yield measured(GROUP, f"jointctl {verb} --help", [min(taken)], "s")
     channel = f"benchstart{os.getpid()}"

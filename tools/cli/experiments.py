@@ -81,6 +81,7 @@ def fault_campaign(
 
 
 def bench(
+    context: typer.Context,
     quick: Annotated[bool, typer.Option("--quick", help="shorter, with more noise")] = False,
     out: Annotated[Path | None, typer.Option("--out", help="folder for bench.json and bench.png")] = None,
     only: Annotated[list[str] | None, typer.Option("--only", help="law, loop, lockstep, swarm or start")] = None,
@@ -90,7 +91,9 @@ def bench(
     """Speed as paired ratios: the law against C and numpy, the loop against C and others, lockstep, swarm, start."""
     from tools.verbs.bench import bench as run_bench
 
-    raise typer.Exit(run_bench(Output(json=json, quiet=quiet), quick=quick, out=out, only=tuple(only or ())))
+    verbs = sorted(getattr(context.find_root().command, "commands", {}))
+    output = Output(json=json, quiet=quiet)
+    raise typer.Exit(run_bench(output, quick=quick, out=out, only=tuple(only or ()), verbs=verbs))
 
 
 def register(app: typer.Typer) -> None:
