@@ -5,8 +5,10 @@ The virtual drive is a thread of this process, so that a test can break its line
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -124,3 +126,37 @@ def test_a_killed_supervisor_is_seen_by_the_loop(serial_bench: Any) -> None:
     run.signal(signal.SIGKILL)
     run.process.wait()
     serial_bench.until(serial_bench.standing)
+
+
+def test_their_twins_just_inside_the_limits_do_not_end_a_run(serial_bench: Any) -> None:
+    """Every fault of the line for less than `limits.sample_age_max_s`, one after the other, and the run goes on.
+
+    Stuck is the position alone: a status that sticks says sooner or later that the motor is off.
+    """
+    device, faults = serial_bench.device, serial_bench.device.faults
+    limits = {"limits__sample_age_max_s": 1.0, "limits__position_jump_max_rad": 0.2}
+    run = serial_bench.bench.start("run", serial_bench.config(**limits), "-y").saw("  tracking")
+
+    def for_a_while(change: Callable[[], None], back: Callable[[], None], time_s: float = 0.3) -> None:
+        change()
+        time.sleep(time_s)
+        back()
+        time.sleep(0.6)
+        assert run.process.poll() is None
+        assert device.interpreter.m.motor_on
+
+    def set_rate(baud_rate_bitps: int) -> None:
+        device.baud_rate_bitps = baud_rate_bitps
+
+    for name, bad, good in (("garbage_every", 1, 0), ("half_every", 1, 0), ("mute", True, False)):
+        for_a_while(functools.partial(setattr, faults, name, bad), functools.partial(setattr, faults, name, good))
+    for_a_while(lambda: stick_position(device), lambda: delattr(device.interpreter, "execute"), 0.1)
+    for_a_while(lambda: set_rate(57_600), lambda: set_rate(115_200))
+    faults.garbage_every, faults.half_every = 17, 23  # and now and then for the rest of it
+    time.sleep(2.0)
+    assert device.interpreter.m.motor_on
+    run.signal(signal.SIGINT)
+    finished = run.finished()
+    assert finished.code == 130, finished.err
+    assert "error:" not in finished.err
+    assert serial_bench.standing()

@@ -11,6 +11,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from typing import Any
 import pytest
 
 from tools.running.guard_call import guard_address, running_supervisor
+from tools.running.line_guard import GuardOrder
 
 GUARD, LOOP = "tools.running.line_guard", "tools.running.loop_process"
 
@@ -181,6 +183,26 @@ def test_clear_fault_is_refused_while_a_run_is_active(serial_bench: Any) -> None
     run.signal(signal.SIGINT)
     assert run.finished().code == 130
     assert serial_bench.bench.run("clear-fault", "serial.toml").out == "no fault\n"
+
+
+def test_a_dry_run_that_is_over_before_its_guard_is_up_says_nothing_of_it(serial_bench: Any) -> None:
+    ours, theirs = socket.socketpair()
+    ours.sendall(b'{"state": "off"}\n')
+    ours.close()
+    alive = os.pidfd_open(os.getpid())
+    with theirs, tempfile.TemporaryFile() as block:
+        block.truncate(8 * 8)
+        order = GuardOrder(
+            port=serial_bench.device.path, baud_rate_bitps=115_200, reply_timeout_s=0.2, silent_s=3.0,
+            control_fd=theirs.fileno(), block_fd=block.fileno(), supervisor_pidfd=alive, loop_pidfd=alive,
+            supervisor_pid=os.getpid(), go_word=0, stop_word=1, loop_word=2, ended_word=3, words=8, stop_value=3,
+        )  # fmt: skip
+        guard = subprocess.run(
+            [sys.executable, "-P", "-m", GUARD, order.argument()],
+            pass_fds=(theirs.fileno(), block.fileno(), alive), capture_output=True, timeout=60.0,
+        )  # fmt: skip
+    os.close(alive)
+    assert (guard.returncode, guard.stderr) == (0, b"")
 
 
 def test_whoever_says_nothing_or_nonsense_does_not_hold_up_the_guard(serial_bench: Any) -> None:

@@ -11,6 +11,7 @@ import pytest
 from drivers.errors import ConfigurationError, MarginError
 from tools.configuration.elmo_settings import refuse_serial
 from tools.configuration.load import load_config, shipped_config
+from tools.experiments.controllers import from_file
 from tools.output import Output
 from tools.verbs.check import check
 from tools.verbs.fault_campaign import fault_campaign
@@ -65,4 +66,6 @@ def test_what_is_simulated_in_lockstep_is_refused_in_one_line() -> None:
     config = load_config(shipped_config("elmo_serial"))
     with pytest.raises(ConfigurationError, match=r'drive.kind \(=elmo_serial\) must be "canopen" for fault-campaign'):
         fault_campaign(config, Output())
+    with pytest.raises(ConfigurationError, match=r'drive.kind \(=elmo_serial\) must be "canopen" for study'):
+        from_file("elmo_serial")
     refuse_serial(load_config(shipped_config("virtual")), "fault-campaign")  # the twin

@@ -70,8 +70,9 @@ def test_the_port_can_be_overridden_and_can_options_cannot(config: Config) -> No
     assert (elmo_section(other).port, other.bus.channel) == ("COM7", "COM7")
     assert with_port_override(config, None) is config
     assert with_bus_overrides(config, environ={"CAN_CHANNEL": "can3"}) is config
-    with pytest.raises(ConfigurationError, match="use -p"):
-        with_bus_overrides(config, channel="can3")
+    for option in ({"channel": "can3"}, {"interface": "socketcan"}, {"bitrate": 0}):
+        with pytest.raises(ConfigurationError, match="use -p"):
+            with_bus_overrides(config, **option)
     with pytest.raises(ConfigurationError, match="for a serial port"):
         with_port_override(load_config(shipped_config("virtual")), "COM7")
 

@@ -145,9 +145,10 @@ def hil(
     if serial and config == Path("virtual"):
         config = Path("elmo_serial")
     joint = loaded(config, interface, channel, bitrate, port, target)
-    if joint.drive.kind == "elmo_serial":
-        from tools.verbs.hil_serial import hil_serial
+    if serial or link is not None or joint.drive.kind == "elmo_serial":
+        from tools.verbs.hil_serial import hil_serial, refuse_options
 
+        refuse_options(joint, port=port, timing=timing)
         raise typer.Exit(hil_serial(joint, Output(quiet=quiet), link=link, ready_fd=ready_fd))
     raise typer.Exit(run_hil(joint, Output(quiet=quiet), timing=timing, ready_fd=ready_fd))
 

@@ -50,9 +50,7 @@ def loaded(
     from tools.configuration.elmo_settings import with_port_override
     from tools.configuration.load import load_config, with_bus_overrides
 
-    config = with_port_override(load_config(config_path(path)), port)
-    if config.drive.kind == "canopen":
-        config = with_bus_overrides(config, interface, channel, bitrate)
-        if target is not None:
-            config = config.model_copy(update={"drive": config.drive.model_copy(update={"node": target})})
-    return config
+    config = with_bus_overrides(with_port_override(load_config(config_path(path)), port), interface, channel, bitrate)
+    if target is None:
+        return config
+    return config.model_copy(update={"drive": config.canopen.model_copy(update={"node": target})})

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tools.cli.options import Bitrate, Channel, ConfigPath, Interface, Json, Quiet, Yes, config_path
+from tools.cli.options import Bitrate, Channel, ConfigPath, Interface, Json, Port, Quiet, Target, Yes, loaded
 from tools.output import Output
 
 
@@ -43,6 +43,8 @@ def sweep_command(
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = None,
+    port: Port = None,
+    target: Target = None,
     yes: Yes = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="commission, show the motion envelope, move nothing")
@@ -55,14 +57,13 @@ def sweep_command(
     quiet: Quiet = False,
 ) -> None:
     """Measure friction: plateaus of constant speed in both directions, into a CSV file for `identify`."""
-    from tools.configuration.load import load_config, with_bus_overrides
     from tools.sweeping.options import SweepOptions
     from tools.verbs.sweep import sweep
 
-    loaded = with_bus_overrides(load_config(config_path(config)), interface, channel, bitrate)
+    configuration = loaded(config, interface, channel, bitrate, port, target)
     options = SweepOptions(
         points=points, grid=grid, speeds=speeds, max_speed_radps=max_speed, min_speed_radps=min_speed, quick=quick,
         warm_up_turns=warm_up, shuffle_seed=shuffle, passes=passes, dwell_s=dwell, mode=mode, resume=resume,
         dry_run=dry_run, assume_yes=yes, lockstep=lockstep, allow_low_margin=allow_low_margin,
     )  # fmt: skip
-    raise typer.Exit(sweep(loaded, Output(json=json, quiet=quiet), out, options))
+    raise typer.Exit(sweep(configuration, Output(json=json, quiet=quiet), out, options))

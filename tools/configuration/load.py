@@ -66,7 +66,7 @@ def with_bus_overrides(
 ) -> Config:
     """The configuration on another bus: flag beats environment (CAN_INTERFACE, _CHANNEL, _BITRATE) beats file."""
     if isinstance(config.drive, ElmoSerial):
-        given = interface or channel or bitrate
+        given = next((value for value in (interface, channel, bitrate) if value is not None), None)
         if given is not None:
             raise ConfigurationError(f"command line: {given} names a CAN bus, the drive is on a serial port: use -p")
         return config  # the environment speaks of CAN only

@@ -16,6 +16,7 @@ from pydantic import ValidationError
 from drivers.errors import ConfigurationError
 from tools.configuration.checks import problems_between_sections
 from tools.configuration.config import Config
+from tools.configuration.elmo_settings import refuse_serial
 from tools.configuration.load import load_config, shipped_config
 from tools.configuration.records import axis_constants
 from tools.configuration.sections import Control, Friction
@@ -92,6 +93,7 @@ def from_file(name: str) -> Controller:
         known = ", ".join(TABLE)
         raise ConfigurationError(f"controller (={name}) must be a configuration file or one of {known}")
     config = load_config(path)
+    refuse_serial(config, "study")
     return Controller(path.stem, config.control, config.friction)
 
 

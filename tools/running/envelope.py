@@ -24,7 +24,7 @@ def motion_envelope(config: Config, report: CommissioningReport) -> list[str]:
     time_text = f"{approach + duration:.0f} s" if duration else "until Ctrl-C"
     lines = [
         f"drive      {report.identity.name or 'unnamed'}, vendor {report.identity.vendor}, serial "
-        f"{report.identity.serial}, {report.mode}",
+        f"{report.identity.serial or 'unknown'}, {report.mode}",
         f"now at     {report.start_position_rad:+.4f} rad",
         f"approach   to {first.position_rad:+.4f} rad in {approach:.1f} s"
         if approach

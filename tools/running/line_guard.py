@@ -32,7 +32,7 @@ from drivers.elmo.switch_off import SWITCH_OFF, switch_off
 from drivers.errors import JointctlError
 from tools.running.guard_call import guard_address, heard_line, may_ask
 
-REACH_S = 10.0  # how long a drive that does not answer is tried again
+REACH_S = 60.0  # how long a drive that does not answer is tried again: time to plug a cable in
 OBEY_S = 5.0  # how long a run may take to end after `jointctl stop`
 LATE_S = 0.2  # a loop without a cycle for so long does not obey at once
 REPEAT_S = 0.5
@@ -96,7 +96,8 @@ class LineGuard:
 
     def run(self) -> int:
         """Watch until the supervisor says that the drive is off, or until both are dead and it has been told."""
-        self._control.sendall(b"+")
+        with contextlib.suppress(OSError):  # a supervisor that has left already has said its word before
+            self._control.sendall(b"+")
         poll = select.poll()
         order = self._order
         for fd in (order.supervisor_pidfd, order.loop_pidfd, order.control_fd):

@@ -22,7 +22,10 @@ def report_run(result: RunResult, output: Output, title: str) -> int:
     except OSError as error:
         output.warning(f"{picture}: cannot be written: {error.strerror or error}")
     table = summary_table(result.summary)
-    table.add_row("bus load", f"{result.bus_load:.1%} at worst-case stuffing")
+    if result.serial:
+        table.add_row("line load", f"{result.bus_load:.1%} of the characters from the drive")
+    else:
+        table.add_row("bus load", f"{result.bus_load:.1%} at worst-case stuffing")
     table.add_row("drive afterwards", result.drive_state)
     table.add_row("log", str(result.log_path))
     table.add_row("picture", str(picture))

@@ -24,6 +24,7 @@ class RunResult:
     fault_text: FaultText | None
     stopped_by: str  # name of the signal, or ""
     drive_state: str  # in words, read after the run
-    bus_load: float  # measured share, worst-case stuffing
+    bus_load: float  # measured share: CAN with worst-case stuffing, a serial line in its busier direction
+    serial: bool
     lost_records: int
     log_path: Path

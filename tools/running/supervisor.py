@@ -294,6 +294,7 @@ class Supervisor:
             stopped_by=signals.name or self._stopped_by_viewer or ("jointctl stop" if loop.stop_requested else ""),
             drive_state=drive_state,
             bus_load=bits / (self._config.bus.bitrate_bitps * elapsed_s),
+            serial=self._config.bus.interface == SERIAL,
             lost_records=loop.lost_records,
             log_path=self._log_path,
         )

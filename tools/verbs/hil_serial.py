@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from drivers.errors import ConfigurationError
 from hil.elmo_device import ElmoDevice
 from hil.elmo_interpreter import ElmoInterpreter
 from hil.joint import plant
@@ -43,6 +44,18 @@ def serve_virtual_elmo(config: Config, link: str | None = None) -> Iterator[Elmo
             if link is not None:
                 with contextlib.suppress(FileNotFoundError):
                     os.unlink(link)
+
+
+def refuse_options(config: Config, *, port: str | None, timing: bool) -> None:
+    """`ConfigurationError` for a CANopen drive, and for options that mean nothing on a pseudo-terminal."""
+    elmo_section(config)
+    if port is not None:
+        raise ConfigurationError(
+            f"--port (={port}) must be absent for hil: the system names its port",
+            "--link PATH makes a name of yours for it",
+        )
+    if timing:
+        raise ConfigurationError("--timing is for a CAN bus: a serial line always takes the time of its baud rate")
 
 
 def hil_serial(config: Config, output: Output, *, link: str | None = None, ready_fd: int | None = None) -> int:
