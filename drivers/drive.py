@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-import numpy as np
-
 
 @dataclass(frozen=True)
 class DriveIdentity:
@@ -31,17 +29,6 @@ class CommissioningReport:
     settings: dict[str, str] = field(default_factory=dict)  # name -> value read back
     remarks: tuple[str, ...] = ()
     loop_delay_s: float | None = None  # measured, position sample to torque command; None = not measured
-
-
-@dataclass(frozen=True)
-class CyclicExchange:
-    """The driver's half of the loop: two C functions and the memory that they work on."""
-
-    receive: Any
-    send: Any
-    port: Any
-    frames: np.ndarray[Any, Any]
-    scratch: np.ndarray[Any, Any]
 
 
 class Drive(Protocol):

@@ -1,8 +1,8 @@
 """Every error that a user can meet, as one tree; the class decides the exit code of the command line.
 
 The message is one line that names the thing, its value and what is allowed.  The hint is one line that tells what
-to do about it (often a command to type), or empty.  Exit code 2 is a usage error and 130 an interruption: neither
-has a class here.
+to do about it (often a command to type), or empty.  Exit code 130 is an interruption: it has no
+class here.
 """
 
 from __future__ import annotations
@@ -22,6 +22,12 @@ class JointctlError(Exception):
 
     def __str__(self) -> str:
         return f"{self.message} ({self.hint})" if self.hint else self.message
+
+
+class UsageError(JointctlError):
+    """The command line asks for something that cannot be done as it stands."""
+
+    exit_code = 2
 
 
 class ConfigurationError(JointctlError):

@@ -18,7 +18,7 @@ from hil.joint import step_plant
 from hil.plant_records import PlantConstants, PlantState
 
 UM_TORQUE, UM_SPEED, UM_POSITION = 1, 2, 5
-MF_SPEED_ERROR, MF_POSITION_ERROR = 0x80, 0x100
+MF_SPEED_ERROR = 0x80
 MF_OVERSPEED, MF_POSITION_LIMIT = 0x20000, 0x400000
 SPEED_BANDWIDTH_RADPS = 60.0
 POSITION_BANDWIDTH_PS = 10.0
@@ -50,7 +50,6 @@ class ElmoMotor:
     position_error_counts: f8
     # state
     reference_cps: f8
-    reference_counts: f8
     integral_A: f8
     over_s: f8  # time above CL[1], at most PL[2]
     limited: i4

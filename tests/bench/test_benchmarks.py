@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from drivers.errors import ConfigurationError
+from drivers.errors import ConfigurationError, UsageError
 from firmware_py.states import ControllerKind
 from tools.benchmarks import c_programs
 from tools.benchmarks.c_programs import NoCompilerError, compiler
@@ -29,7 +29,7 @@ from tools.cli.main import app
 from tools.configuration.load import load_config, shipped_config
 from tools.configuration.records import axis_constants
 from tools.output import Output
-from tools.verbs.bench import PartError, bench
+from tools.verbs.bench import bench
 
 
 @pytest.fixture(scope="module")
@@ -192,5 +192,5 @@ def test_the_report_is_a_table_json_and_a_picture(tmp_path: Path):
 
 
 def test_a_part_that_does_not_exist_is_named():
-    with pytest.raises(PartError, match=r"only \(=lop\) must be one of law, loop, lockstep, swarm, start"):
+    with pytest.raises(UsageError, match=r"only \(=lop\) must be one of law, loop, lockstep, swarm, start"):
         bench(Output(quiet=True), only=["lop"])

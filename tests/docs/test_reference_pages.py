@@ -14,7 +14,7 @@ from tools.verbs.fault_campaign import EXIT_VIOLATIONS
 from tools.verbs.params import DIFFERENT
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-NO_CLASS = {0, 2, EXIT_VIOLATIONS, DIFFERENT, 130}
+NO_CLASS = {0, EXIT_VIOLATIONS, DIFFERENT, 130}
 
 
 def classes_of(root: type[JointctlError]) -> set[type[JointctlError]]:

@@ -10,6 +10,7 @@ from drivers import errors
 @pytest.mark.parametrize(
     ("name", "code"),
     [
+        ("UsageError", 2),
         ("ConfigurationError", 3),
         ("BusError", 4),
         ("NoDeviceError", 5),

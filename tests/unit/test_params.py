@@ -11,7 +11,7 @@ from typing import Any
 import can
 import pytest
 
-from drivers.errors import BusError, ConfigurationError, DataError, DeviceError
+from drivers.errors import BusError, ConfigurationError, DataError, DeviceError, UsageError
 from tools.configuration.load import shipped_config
 from tools.inspection.objects import Objects, Place, read_dictionary
 from tools.inspection.parameter_file import is_parameter_file, load_parameters, toml_text, write_dcf
@@ -20,7 +20,7 @@ from tools.inspection.sdo_reading import SdoReader
 from tools.inspection.subject import Subject, canopen_network
 from tools.output import Output
 from tools.verbs import params
-from tools.verbs.params import DIFFERENT, AskError, diff, dump, place_index, restore_file
+from tools.verbs.params import DIFFERENT, diff, dump, place_index, restore_file
 
 EDS = shipped_config("virtual").with_name("virtual_joint.eds")
 
@@ -196,7 +196,7 @@ class TestRestore:
     ) -> None:
         change(file, o6072="700")
         monkeypatch.setattr(params.sys, "stdin", io.StringIO("y\n"))
-        with pytest.raises(AskError):
+        with pytest.raises(UsageError):
             restored(device_on_bus, file, assume_yes=False)
         assert not writes(device_on_bus)
 

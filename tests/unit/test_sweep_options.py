@@ -9,13 +9,12 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import ConfigurationError, DataError, DeviceError, JointctlError
+from drivers.errors import ConfigurationError, DataError, DeviceError, JointctlError, UsageError
 from tools.configuration.config import Config
 from tools.configuration.load import load_config, shipped_config
 from tools.configuration.plant_settings import plant_settings
 from tools.output import Output
 from tools.sweeping.carry_out import middle_rad, with_mode, with_tracking_law
-from tools.sweeping.grid import SweepUsageError
 from tools.sweeping.options import QUICK_S, SweepOptions, make_plan
 from tools.verbs.sweep import sweep
 
@@ -94,7 +93,7 @@ def test_an_unbounded_joint_is_swept_about_where_it_stands(config: Config) -> No
     ],
 )
 def test_a_bad_option_is_one_line_with_exit_code_2(config: Config, options: dict[str, Any], text: str) -> None:
-    with pytest.raises(SweepUsageError, match=text) as error:
+    with pytest.raises(UsageError, match=text) as error:
         make_plan(config, SweepOptions(**options))
     assert error.value.exit_code == 2
     assert "\n" not in error.value.message
@@ -106,7 +105,7 @@ def test_a_list_of_speeds_is_used_as_it_is(config: Config, tmp_path: Path) -> No
     plan = make_plan(config, SweepOptions(grid="list", speeds=file))
     assert [p.velocity_radps for p in plan.points] == [0.5, -0.5, 1.5]
     file.write_text("0.5\n9\n")
-    with pytest.raises(SweepUsageError, match=r"fastest speed of .*speeds.txt \(=9\) must be at most"):
+    with pytest.raises(UsageError, match=r"fastest speed of .*speeds.txt \(=9\) must be at most"):
         make_plan(config, SweepOptions(grid="list", speeds=file))
 
 
@@ -135,7 +134,7 @@ def test_without_a_terminal_motion_needs_y(config: Config, tmp_path: Path, monke
 def test_modes(config: Config) -> None:
     assert with_mode(config, "torque").canopen.mode == config.canopen.mode
     assert with_mode(config, "csv").canopen.mode == "csv"
-    with pytest.raises(SweepUsageError, match=r"--mode \(=fast\) must be one of auto, csv, pv, torque"):
+    with pytest.raises(UsageError, match=r"--mode \(=fast\) must be one of auto, csv, pv, torque"):
         with_mode(config, "fast")
 
 

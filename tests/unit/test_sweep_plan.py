@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.errors import DataError
+from drivers.errors import DataError, UsageError
 from firmware_py.records import Reference, TrajectoryConstants
 from firmware_py.schema import new
 from firmware_py.states import TrajectoryKind
@@ -19,7 +19,6 @@ from firmware_py.trajectory import reference_at
 from firmware_py.trajectory_table import peak_of
 from tools.sweeping.grid import (
     SweepPoint,
-    SweepUsageError,
     both_directions,
     grid_speeds,
     listed_velocities,
@@ -148,9 +147,9 @@ def test_the_fastest_speed_just_fits_and_a_little_more_is_refused() -> None:
     assert stroke_of(fastest * (1.0 - 1e-6), s).length_rad <= s.width_rad
     narrow = plan_settings(width_rad=0.3)  # not even one ripple period of the joint
     assert stroke_of(fastest_radps(narrow) * (1.0 - 1e-6), narrow).length_rad <= narrow.width_rad
-    with pytest.raises(SweepUsageError, match=r"speed \(=20 rad/s\) must be at most"):
+    with pytest.raises(UsageError, match=r"speed \(=20 rad/s\) must be at most"):
         stroke_of(20.0, s)
-    with pytest.raises(SweepUsageError, match=r"the travel \(=0.0200 rad\) must be more than"):
+    with pytest.raises(UsageError, match=r"the travel \(=0.0200 rad\) must be more than"):
         fastest_radps(plan_settings(width_rad=0.02))
 
 
@@ -182,7 +181,7 @@ def test_near_zero_is_denser_near_zero_and_linear_is_even() -> None:
     near = np.diff(grid_speeds("near-zero", 50, 0.004, 3.2))
     assert np.all(np.diff(near) > 0.0)
     assert np.ptp(np.diff(grid_speeds("linear", 50, 0.004, 3.2))) < 1e-12
-    with pytest.raises(SweepUsageError, match=r"--grid \(=square\) must be one of near-zero, linear, log, list"):
+    with pytest.raises(UsageError, match=r"--grid \(=square\) must be one of near-zero, linear, log, list"):
         grid_speeds("square", 3, 0.1, 1.0)
 
 

@@ -68,7 +68,6 @@ class Direction:
     uncertainty: Uncertainty
     index: np.ndarray  # of the used points in the data
     outliers: np.ndarray  # indices in the data
-    outlier_scores: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -184,7 +183,7 @@ def identify_friction(
         first = FORMS[options.model]
     notes, warnings = list(data.notes), list(before.warnings)
     problems: dict[str, Problem] = {}
-    index, outliers, scores = {}, {}, {}
+    index, outliers = {}, {}
     for word, sign in DIRECTIONS:
         chosen = data.direction(sign)
         chosen = chosen[np.argsort(sign * data.velocity_radps[chosen], kind="stable")]
@@ -210,7 +209,7 @@ def identify_friction(
             problem = replace(problem, knee=project(problem, search_knee=True).knee)
         _stage_check(data, problem, word)
         problems[word], index[word] = problem, chosen[~out]
-        outliers[word], scores[word] = chosen[out], score[out]
+        outliers[word] = chosen[out]
 
     total = sum(len(p.x) for p in problems.values())
     rmse, held_out = {}, {}
@@ -235,9 +234,7 @@ def identify_friction(
     directions = {}
     for (word, problem), swarm in zip(problems.items(), swarms, strict=True):
         fit, projected, source = _best_fit(problem, swarm, warnings, word)
-        directions[word] = Direction(
-            fit, swarm, projected, source, uncertainty(fit), index[word], outliers[word], scores[word]
-        )  # fmt: skip
+        directions[word] = Direction(fit, swarm, projected, source, uncertainty(fit), index[word], outliers[word])
     for word, found in directions.items():
         share = found.fit.rmse_Nm / float(np.mean(np.abs(found.fit.problem.y_Nm)))
         if share > _BAD_FIT:

@@ -36,8 +36,6 @@ class Interval:
 @dataclass(frozen=True)
 class Uncertainty:
     intervals: dict[str, Interval]
-    profile_ws_radps: np.ndarray  # scanned ws, and the squared error at each
-    profile_rss: np.ndarray
     covariance: np.ndarray  # of (linear parameters, log ws); zero where held
     t_value: float
 
@@ -146,7 +144,7 @@ def uncertainty(fit: Fit) -> Uncertainty:
         if name in ("tc", "ts"):  # friction is not negative
             low = max(low, 0.0)
         intervals[name] = Interval(name, float(value), float(low), float(high), weak)
-    return Uncertainty(intervals, profile_ws, profile_rss, covariance, t_value)
+    return Uncertainty(intervals, covariance, t_value)
 
 
 def _profile(fit: Fit) -> tuple[np.ndarray, np.ndarray]:

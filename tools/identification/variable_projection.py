@@ -33,10 +33,6 @@ class Problem:
     ws_high: float
     static_max_Nm: float
 
-    @property
-    def degrees_of_freedom(self) -> int:
-        return len(self.x) - self.form.parameters
-
     def part(self, keep: np.ndarray) -> Problem:
         """The same problem with some of its points."""
         return replace(self, x=self.x[keep], y_Nm=self.y_Nm[keep])

@@ -39,7 +39,7 @@ from tools.recording.cdr import CDR_HEADER, event_body, event_from_body, message
 RECORD_TOPIC, RECORD_SCHEMA = "/joint", "jointctl_msgs/msg/LogRecord"
 EVENT_TOPIC, EVENT_SCHEMA = "/events", "jointctl_msgs/msg/Event"
 EVENT_DEFINITION = "int64 time_ns\nint32 level\nstring source\nstring text\n"
-DEBUG, INFO, WARNING, ERROR = 10, 20, 30, 40  # levels, those of Python's logging
+INFO, WARNING, ERROR = 20, 30, 40  # levels, those of Python's logging
 _MAGIC = b"\x89MCAP0\r\n"
 _CHUNK_BYTES = 256 * 1024
 _BEFORE_BODY = 9  # bytes of opcode and length

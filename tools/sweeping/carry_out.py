@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from drivers.drive import CommissioningReport
-from drivers.errors import ConfigurationError, DeviceError
+from drivers.errors import ConfigurationError, DeviceError, UsageError
 from firmware_py.records import Reference
 from firmware_py.schema import new
 from firmware_py.states import CommandKind, Fault, TrajectoryKind
@@ -31,7 +31,6 @@ from tools.running.loop_handle import LoopHandle
 from tools.running.open_drive import loop_delay_s
 from tools.running.supervisor import DELAY_CYCLES, INFORMATION, Supervisor
 from tools.simulation.lockstep import LockstepJoint
-from tools.sweeping.grid import SweepUsageError
 from tools.sweeping.meter import SweepMeter
 from tools.sweeping.plan import SweepMotion, shifted
 
@@ -48,7 +47,7 @@ LOCKSTEP_RECORDS = 250_000
 def with_mode(config: Config, mode: str) -> Config:
     """The configuration in the wanted mode: auto, csv, pv, or torque (as [drive] says)."""
     if mode not in (*DRIVE_MODES, "torque"):
-        raise SweepUsageError(f"--mode (={mode}) must be one of auto, csv, pv, torque")
+        raise UsageError(f"--mode (={mode}) must be one of auto, csv, pv, torque")
     if isinstance(config.drive, ElmoSerial):
         if mode not in ("auto", "torque"):
             raise DeviceError(f"--mode (={mode}) must be auto or torque: the serial drive is driven by torque only")
@@ -178,7 +177,7 @@ def sweep_in_lockstep(
 ) -> tuple[Fault, float] | None:
     """The whole motion on the virtual joint in simulated time; the fault and its value, None if `confirm` declined."""
     if isinstance(config.drive, ElmoSerial):
-        raise SweepUsageError('--lockstep is for drive.kind = "canopen": the serial joint runs in real time only')
+        raise UsageError('--lockstep is for drive.kind = "canopen": the serial joint runs in real time only')
     joint = LockstepJoint(config)
     if not confirm(joint.report):
         return None

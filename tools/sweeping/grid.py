@@ -13,19 +13,13 @@ import random
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.errors import DataError, JointctlError
+from drivers.errors import DataError, UsageError
 
 GRIDS = ("near-zero", "linear", "log", "list")
 DEFAULT_POINTS = 225
 SPEED_RATIO = 1000.0  # default: the slowest speed is this many times slower than the fastest
 MOST_POINTS = 5000
 _GRID_POWER = 2.0  # near-zero: speeds go with this power of their number
-
-
-class SweepUsageError(JointctlError):
-    """An option of the sweep is wrong, or the options do not fit the joint."""
-
-    exit_code = 2
 
 
 @dataclass(frozen=True)
@@ -42,15 +36,15 @@ class SweepPoint:
 
 
 def check_range(name: str, value: float, low: float, high: float) -> None:
-    """`SweepUsageError` unless low <= value <= high."""
+    """`UsageError` unless low <= value <= high."""
     if not low <= value <= high:
-        raise SweepUsageError(f"{name} (={value:g}) must be in [{low:g}..{high:g}]")
+        raise UsageError(f"{name} (={value:g}) must be in [{low:g}..{high:g}]")
 
 
 def grid_speeds(grid: str, count: int, slowest_radps: float, fastest_radps: float) -> list[float]:
     """`count` ascending speeds from the slowest to the fastest; linear is the paper's k/count of the fastest."""
     if grid not in GRIDS[:3]:
-        raise SweepUsageError(f"--grid (={grid}) must be one of {', '.join(GRIDS)}")
+        raise UsageError(f"--grid (={grid}) must be one of {', '.join(GRIDS)}")
     if count == 1:
         return [fastest_radps]
     if grid == "linear":

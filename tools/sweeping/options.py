@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from drivers.errors import DataError
+from drivers.errors import DataError, UsageError
 from tools.configuration.config import Config
 from tools.sweeping.carry_out import position_margin_rad
 from tools.sweeping.grid import (
@@ -13,7 +13,6 @@ from tools.sweeping.grid import (
     MOST_POINTS,
     SPEED_RATIO,
     SweepPoint,
-    SweepUsageError,
     both_directions,
     check_range,
     grid_speeds,
@@ -69,7 +68,7 @@ class SweepPlan:
 
 
 def make_plan(config: Config, options: SweepOptions) -> SweepPlan:
-    """Check the options against the joint and plan; `SweepUsageError` in one line."""
+    """Check the options against the joint and plan; `UsageError` in one line."""
     _check_options(options)
     limits = config.limits
     width = limits.position_max_rad - limits.position_min_rad - 2.0 * position_margin_rad(config)
@@ -93,7 +92,7 @@ def make_plan(config: Config, options: SweepOptions) -> SweepPlan:
         _check_fastest("--max-speed", fastest, reachable, allowed)
         slowest = options.min_speed_radps or fastest / (QUICK_RATIO if options.quick else SPEED_RATIO)
         if not slowest < fastest:
-            raise SweepUsageError(f"--min-speed (={slowest:g}) must be less than --max-speed, {fastest:g} rad/s")
+            raise UsageError(f"--min-speed (={slowest:g}) must be less than --max-speed, {fastest:g} rad/s")
 
         def grid(count: int) -> list[float]:
             return both_directions(grid_speeds(options.grid, (count + 1) // 2, slowest, fastest), count)
@@ -120,22 +119,22 @@ def _check_options(options: SweepOptions) -> None:
     if options.dwell_s is not None:
         check_range("--dwell", options.dwell_s, 0.1, 600.0)
     if (options.grid == "list") != (options.speeds is not None):
-        raise SweepUsageError(f"--speeds FILE goes with --grid list (={options.grid}), and --grid list with --speeds")
+        raise UsageError(f"--speeds FILE goes with --grid list (={options.grid}), and --grid list with --speeds")
     if options.grid == "list" and (options.points or options.max_speed_radps or options.min_speed_radps):
-        raise SweepUsageError("--points, --max-speed and --min-speed do not go with --grid list: the list says it all")
+        raise UsageError("--points, --max-speed and --min-speed do not go with --grid list: the list says it all")
     if options.quick and (options.points is not None or options.grid == "list"):
-        raise SweepUsageError("--quick chooses the number of points: it does not go with --points and --grid list")
+        raise UsageError("--quick chooses the number of points: it does not go with --points and --grid list")
 
 
 def _check_fastest(name: str, fastest: float, reachable: float, allowed: float) -> None:
     if fastest > reachable * (1.0 + 1e-9):
         why = f"{SPEED_SHARE:.0%} of limits.velocity_max_radps" if reachable == allowed else "what the travel allows"
-        raise SweepUsageError(f"{name} (={fastest:g}) must be at most {reachable:.4g} rad/s, {why}")
+        raise UsageError(f"{name} (={fastest:g}) must be at most {reachable:.4g} rad/s, {why}")
 
 
 def check_files(out: Path, resume: bool) -> None:
     if out.suffix != ".csv":
-        raise SweepUsageError(f"-o (={out}) must end in .csv; its sidecar gets the same name with .json")
+        raise UsageError(f"-o (={out}) must end in .csv; its sidecar gets the same name with .json")
     if not out.parent.is_dir():
         raise DataError(f"{out}: cannot be written: no folder {out.parent}")
     for file in (out, out.with_suffix(".json")):

@@ -21,7 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tools.sweeping.grid import SweepPoint, SweepUsageError
+from drivers.errors import UsageError
+from tools.sweeping.grid import SweepPoint
 
 TEETH = 4
 MOST_STROKES = 8  # of one point; more travel helps more than more strokes
@@ -116,18 +117,18 @@ def fastest_radps(s: PlanSettings) -> float:
             half = 0.5 * s.settle_s * s.acceleration_radps2
             exact = math.sqrt(half * half + left * s.acceleration_radps2) - half
             return exact * (1.0 - ROUNDING)
-    raise SweepUsageError(
+    raise UsageError(
         f"the travel (={s.width_rad:.4f} rad) must be more than {s.motor_period_rad + LEAD_rad:.4f} rad, one ripple "
         "period of the motor; see limits.position_min_rad and position_max_rad"
     )
 
 
 def stroke_of(speed_radps: float, s: PlanSettings) -> Stroke:
-    """How a speed is measured within the travel; `SweepUsageError` if it cannot be."""
+    """How a speed is measured within the travel; `UsageError` if it cannot be."""
     room = room_rad(speed_radps, s) * (1.0 - 1e-9)
     joint, motor = s.joint_period_rad, s.motor_period_rad
     if room < motor:
-        raise SweepUsageError(
+        raise UsageError(
             f"speed (={speed_radps:.4g} rad/s) must be at most {fastest_radps(s):.4g} rad/s within a travel of "
             f"{s.width_rad:.3f} rad at {s.acceleration_radps2:g} rad/s2; see --max-speed"
         )

@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from drivers.errors import JointctlError
+from drivers.errors import JointctlError, UsageError
 from tools.benchmarks.exchange_speed import exchange_rows
 from tools.benchmarks.law_speed import law_rows
 from tools.benchmarks.outcome import conditions, outcome_data, outcome_table, write_outcome
@@ -20,12 +20,6 @@ from tools.configuration.records import axis_constants
 from tools.output import Output
 
 PARTS = ("law", "loop", "lockstep", "swarm", "start")
-
-
-class PartError(JointctlError):
-    """A part that does not exist was asked for."""
-
-    exit_code = 2
 
 
 def _part(name: str, config: Config, folder: Path, quick: bool, verbs: Sequence[str]) -> Iterator[Row]:
@@ -58,7 +52,7 @@ def bench(
     """
     for name in only:
         if name not in PARTS:
-            raise PartError(f"only (={name}) must be one of {', '.join(PARTS)}")
+            raise UsageError(f"only (={name}) must be one of {', '.join(PARTS)}")
     # under load the library tells of every SDO that it repeats; a failure comes as an exception anyway
     logging.getLogger("canopen").setLevel(logging.CRITICAL)
     config = load_config(config_path or shipped_config("virtual"))

@@ -10,7 +10,7 @@ from typing import Any
 
 from rich.table import Table
 
-from drivers.errors import BusError, ConfigurationError, DataError, DeviceError, JointctlError
+from drivers.errors import BusError, ConfigurationError, DataError, DeviceError, UsageError
 from tools.inspection import drive_words
 from tools.inspection.node_scan import Ear
 from tools.inspection.objects import Objects, Place
@@ -35,12 +35,6 @@ LISTEN_S = 0.1  # for the SYNC of another controller
 DIFFERENT = 11  # exit code of diff
 _SETTLE_S = 0.02
 _MOVING = ("operation enabled", "quick stop active", "fault reaction active")
-
-
-class AskError(JointctlError):
-    """There is nobody to ask."""
-
-    exit_code = 2
 
 
 def _known_objects(subject: Subject) -> Objects:
@@ -152,7 +146,7 @@ def restore_file(
 
 def _asked(output: Output) -> bool:
     if not sys.stdin.isatty():
-        raise AskError("this writes into the drive and there is no terminal to ask on", "give -y to write")
+        raise UsageError("this writes into the drive and there is no terminal to ask on", "give -y to write")
     output.note("Write these into the drive? [y/N] ")
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from drivers.drive import CommissioningReport
-from drivers.errors import JointctlError
+from drivers.errors import UsageError
 from tools.configuration.config import Config
 from tools.output import Output
 from tools.recording.log_folder import log_path
@@ -17,12 +17,6 @@ from tools.running.readiness import prepare_log, require_ready
 from tools.running.run_report import INTERRUPTED, report_run
 from tools.running.shared_block import SERIAL
 from tools.running.supervisor import Supervisor
-
-
-class UsageError(JointctlError):
-    """The command line asks for something that cannot be done as it stands."""
-
-    exit_code = 2
 
 
 def _ask(output: Output) -> bool:

@@ -14,7 +14,7 @@ from typing import Any
 from rich.table import Table
 
 from drivers.drive import CommissioningReport
-from drivers.errors import MotionFault
+from drivers.errors import MotionFault, UsageError
 from firmware_py.states import Fault
 from tools.configuration.config import Config
 from tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
@@ -26,7 +26,7 @@ from tools.running.run_report import INTERRUPTED
 from tools.sweeping.carry_out import SweepSupervisor, approach_time_s, middle_rad, sweep_in_lockstep, with_mode
 from tools.sweeping.checks import constant_remarks, recorded_limits, refuse_constants, torque_source
 from tools.sweeping.data_file import SweepFile
-from tools.sweeping.grid import SweepPoint, SweepUsageError
+from tools.sweeping.grid import SweepPoint
 from tools.sweeping.meter import JointModel, MeasuredPoint, SweepMeter
 from tools.sweeping.options import SweepOptions, check_files, make_plan
 from tools.sweeping.plan import PlanSettings, SweepMotion
@@ -273,9 +273,7 @@ def sweep(config: Config, output: Output, out: Path, options: SweepOptions | Non
     """The whole command; returns the exit code."""
     options = options or SweepOptions()
     if not (options.assume_yes or options.dry_run or options.lockstep or sys.stdin.isatty()):
-        raise SweepUsageError(
-            "this moves the joint and there is no terminal to ask on", "give -y to move without asking"
-        )
+        raise UsageError("this moves the joint and there is no terminal to ask on", "give -y to move without asking")
     try:
         return Sweep(config, output, out, options).run()
     except KeyboardInterrupt:
