@@ -12,10 +12,15 @@ from typing import Any
 
 import can
 
-from drivers.can import socketcan, virtual_bus
+from drivers.can import serial_adapter, socketcan, virtual_bus
 from drivers.errors import BusError
 
 CYCLIC_INTERFACES = ("socketcan", "jointctl")
+# several programs can open them at once; any other may serve one at a time
+SHARED_INTERFACES = (*CYCLIC_INTERFACES, "udp_multicast", "virtual")
+# python-can waits 2 s for an Arduino to boot; an adapter for a control loop does not boot when its port is opened, and
+# a supervisor takes a loop that does nothing for 2 s for dead
+SLCAN_SETTLE_S = 0.2
 
 
 def open_cyclic_end(interface: str, channel: str) -> socket.socket:
@@ -30,14 +35,26 @@ def open_cyclic_end(interface: str, channel: str) -> socket.socket:
     )
 
 
-def open_python_can(interface: str, channel: str, bitrate: int | None = None, **settings: Any) -> can.BusABC:
+def known_interface(interface: str) -> None:
+    """`BusError` for a name that python-can does not know; no bus is opened."""
+    names = can.VALID_INTERFACES | {"jointctl"}
+    if interface not in names:
+        raise BusError(f"interface (={interface!r}) must be one of {', '.join(sorted(names))}")
+
+
+def open_python_can(
+    interface: str, channel: str, bitrate: int | None = None, *, exclusive: bool = True, **settings: Any
+) -> can.BusABC:
     """A python-can bus; everything that can go wrong while opening it becomes a BusError.
 
     `bitrate` [bit/s] is passed on where given; SocketCAN and the virtual bus ignore it.  `settings` go to the
-    interface unchanged.  The interface "jointctl" works even where the package is not installed.
+    interface unchanged.  The interface "jointctl" works even where the package is not installed.  `exclusive` False
+    is for whoever has to switch the drive off whoever has the serial adapter.
     """
     if bitrate is not None:
         settings["bitrate"] = bitrate
+    if interface == "slcan":
+        settings.setdefault("sleep_after_open", SLCAN_SETTLE_S)
     place = f"{interface}:{channel}"
     try:
         if interface == "jointctl":
@@ -45,11 +62,15 @@ def open_python_can(interface: str, channel: str, bitrate: int | None = None, **
         if interface == "socketcan":
             # python-can binds to an interface that is down without a word: ask the kernel first.
             socketcan.open_socket(channel).close()
+        if interface == "slcan":
+            with serial_adapter.reserved(channel, exclusive=exclusive):
+                bus = can.Bus(channel=channel, interface=interface, ignore_config=True, **settings)
+            if exclusive and "://" not in channel:
+                serial_adapter.lock(bus.fileno(), serial_adapter.port_path(channel))
+            return bus
         return can.Bus(channel=channel, interface=interface, ignore_config=True, **settings)
     except NotImplementedError as error:  # also CanInterfaceNotImplementedError
-        known = ", ".join(sorted(can.VALID_INTERFACES | {"jointctl"}))
-        if interface not in can.VALID_INTERFACES:
-            raise BusError(f"interface (={interface!r}) must be one of {known}") from None
+        known_interface(interface)
         raise BusError(f"interface {interface} cannot be used here: {error}", "install its driver") from None
     except ImportError as error:
         raise BusError(f"interface {interface} needs a module that is not installed: {error}", "install it") from None

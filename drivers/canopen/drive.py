@@ -34,6 +34,8 @@ SAFE_ATTEMPTS = 5
 QUICK_STOP_S = 1.0  # how long a moving joint may brake before its power is taken
 SAFE_POLL_S = 0.02
 FAILURE_PAUSE_S = 0.05
+REOPEN_ATTEMPTS = 10
+REOPEN_PAUSE_S = 0.3  # an adapter that was plugged in again needs a second or two
 
 
 class _BusFailure(can.Listener):
@@ -51,13 +53,26 @@ class _BusFailure(can.Listener):
 
 
 class CanopenDrive:
-    """Implements `drivers.drive.Drive`.  `bus` is a python-can bus of its own, closed by `close`."""
+    """Implements `drivers.drive.Drive`.  `bus` is a python-can bus of its own, closed by `close`.
 
-    def __init__(self, bus: can.BusABC, settings: CanopenSettings, sleep: Callable[[float], None] = time.sleep) -> None:
+    Where an adapter serves one program at a time, `reopen` is given: `start_cyclic` closes the bus for the loop, and
+    `make_safe` opens it again.  In between nobody but the loop talks to the drive; it is disabled until the loop
+    enables it, and from the loop's first heartbeat on its own watchdog stops it when the loop ends.
+    """
+
+    def __init__(
+        self,
+        bus: can.BusABC,
+        settings: CanopenSettings,
+        sleep: Callable[[float], None] = time.sleep,
+        reopen: Callable[[], can.BusABC] | None = None,
+    ) -> None:
         self._settings = settings
         self._sleep = sleep
         self._findings: Findings | None = None
         self._taken = False  # whether the drive has heard anything from us
+        self._reopen = reopen
+        self._lent = False
         # the library warns about every heartbeat state and unknown frame; what matters is told by this driver
         logging.getLogger("canopen").setLevel(logging.CRITICAL)
         self._network = canopen.Network(bus)
@@ -166,6 +181,25 @@ class CanopenDrive:
             self._node.nmt.send_command(NMT_OPERATIONAL)
         except can.CanError as error:
             raise BusError(f"the bus failed before the run: {error}") from None
+        if self._reopen is not None:
+            self._lent = True
+            with contextlib.suppress(Exception):  # whoever opens it next is told
+                self._network.disconnect()
+
+    def _take_back(self) -> None:
+        """Open the bus again if the loop has had it; `BusError` if it cannot be opened."""
+        if not self._lent or self._reopen is None:
+            return
+        for attempt in range(1, REOPEN_ATTEMPTS + 1):
+            try:
+                self._network.bus = self._reopen()
+                break
+            except BusError:
+                if attempt == REOPEN_ATTEMPTS:
+                    raise
+                self._sleep(REOPEN_PAUSE_S)
+        self._network.connect()
+        self._lent = False
 
     def port(self) -> Any:
         """See `Drive.port`."""
@@ -190,6 +224,13 @@ class CanopenDrive:
         """
         if not self._taken:
             return "untouched"
+        try:
+            self._take_back()
+        except JointctlError as error:
+            return (
+                f"unknown: the bus cannot be opened again ({error.message}); the loop's heartbeat has ended, "
+                f"the drive's own watchdog stops the joint within {self._settings.heartbeat_s:g} s"
+            )
         try:
             return self._off()
         except JointctlError:

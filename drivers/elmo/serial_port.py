@@ -10,8 +10,8 @@ from typing import Any, Protocol
 
 import serial
 
-from drivers.elmo.port_users import users_text
 from drivers.errors import BusError
+from drivers.port_users import users_text
 
 READ_MAX = 512
 

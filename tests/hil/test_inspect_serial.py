@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from drivers.elmo.port_users import port_users
+from drivers.port_users import port_users
 from tools.inspection.findings import NOTE, OK, PROBLEM
 from tools.inspection.serial_health import latency_finding, port_finding
 

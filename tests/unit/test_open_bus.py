@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import errno
+import gc
 import os
 import socket
 import tomllib
+import tty
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -247,3 +249,32 @@ def test_the_entry_point_names_the_class() -> None:
     assert project["project"]["entry-points"]["can.interface"]["jointctl"] == (
         f"{VirtualBus.__module__}:{VirtualBus.__qualname__}"
     )
+
+
+@pytest.fixture
+def serial_line() -> Iterator[str]:
+    """The port of a serial adapter that says nothing."""
+    near, far = os.openpty()
+    tty.setraw(far)
+    yield os.ttyname(far)
+    os.close(near)
+    os.close(far)
+
+
+def test_a_serial_adapter_serves_one_program_at_a_time(serial_line: str) -> None:
+    first = open_python_can("slcan", serial_line, 500_000, sleep_after_open=0.0)
+    try:
+        with pytest.raises(BusError, match=f"the adapter on {serial_line} is in use by another program") as caught:
+            open_python_can("slcan", f"{serial_line}@115200", 500_000)
+        assert "jointctl stop" in (caught.value.hint or "")
+        open_python_can("slcan", serial_line, 500_000, exclusive=False, sleep_after_open=0.0).shutdown()
+    finally:
+        first.shutdown()
+    open_python_can("slcan", serial_line, 500_000, sleep_after_open=0.0).shutdown()
+
+
+def test_an_adapter_that_is_refused_leaves_the_port_free(serial_line: str) -> None:
+    with pytest.raises(BusError, match="Invalid bitrate"):
+        open_python_can("slcan", serial_line, 444_444, sleep_after_open=0.0)
+    gc.collect()
+    open_python_can("slcan", serial_line, 500_000, sleep_after_open=0.0).shutdown()

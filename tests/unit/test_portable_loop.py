@@ -21,7 +21,13 @@ from firmware_py.states import AxisPhase, Fault, StopRequest, TrajectoryKind
 from tools.configuration.load import load_config, shipped_config
 from tools.configuration.records import axis_constants
 from tools.running import loop_process, portable_loop
-from tools.running.portable_loop import check_portable_rate, run_portable_loop
+from tools.running.portable_loop import (
+    HIGHEST_RATE_HZ,
+    check_portable_rate,
+    held_rate_Hz,
+    portable_note,
+    run_portable_loop,
+)
 from tools.running.shared_block import SharedBlock
 
 PERIOD_NS = 1_000_000
@@ -342,3 +348,13 @@ def test_an_unexpected_exception_is_one_line_too(
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("loop: TypeError at loop_process.py:")
     assert "surprise" in line
+
+
+def test_the_rate_that_is_held_is_told_and_one_beyond_it_warned_of() -> None:
+    assert "holds about 400 Hz now; expect" in portable_note("slcan", 400.0, 400.0)
+    assert "holds about 400 Hz now, LESS than loop.rate_Hz (=401)" in portable_note("slcan", 401.0, 400.0)
+
+
+def test_the_rate_that_is_held_follows_from_wake_up_and_work() -> None:
+    assert 0.0 < held_rate_Hz(0.6) <= HIGHEST_RATE_HZ
+    assert held_rate_Hz(0.999) < 100.0  # of a period, 10 us and less are left for both

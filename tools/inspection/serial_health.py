@@ -11,8 +11,8 @@ from pathlib import Path
 from drivers.elmo.codes import AMPLIFIER_MASK, FAULT_LATCHED, motor_off_cause, status_text
 from drivers.elmo.drive import ElmoDrive
 from drivers.elmo.line_budget import cycle_characters, highest_rate_Hz
-from drivers.elmo.port_users import users_text
 from drivers.errors import BusError, JointctlError
+from drivers.port_users import users_text
 from tools.configuration.config import Config
 from tools.configuration.elmo_settings import elmo_section
 from tools.inspection.findings import NOTE, OK, PROBLEM, Finding, file_text

@@ -18,7 +18,7 @@ from typing import Any
 
 import can
 
-from drivers.can.open import open_python_can
+from drivers.can.open import SHARED_INTERFACES, open_python_can
 from drivers.errors import ConfigurationError
 from tools.configuration.config import Config
 from tools.running.shared_block import SERIAL
@@ -83,6 +83,12 @@ def recording(config: Config) -> Iterator[FrameRecorder | None]:
     bus = config.bus
     if bus.interface == SERIAL:
         raise ConfigurationError(f"{config.path}: log.frames (=true) must be false on a serial line, it has no frames")
+    if bus.interface not in SHARED_INTERFACES:
+        raise ConfigurationError(
+            f"{config.path}: log.frames (=true) must be false over bus.interface (={bus.interface}): "
+            "the loop needs the adapter for itself",
+            f"these can be shared: {', '.join(SHARED_INTERFACES)}",
+        )
     recorder = FrameRecorder(open_python_can(bus.interface, bus.channel, bus.bitrate_bitps))
     try:
         yield recorder

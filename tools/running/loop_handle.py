@@ -22,6 +22,7 @@ from tools.running.shared_block import SERIAL, SharedBlock
 READY_TIMEOUT_S = 180.0  # the first start compiles everything
 KILL_S = 1.0  # how long a killed process may take to go
 SILENT_S = 2.0  # without a cycle for so long, the loop hangs
+OPENING_S = 6.0  # before its first cycle it may have to open an adapter; the drive is disabled meanwhile
 RECEIVE_SHARE = 0.6  # of a period: how long a cycle waits for its sample
 
 # what happens to the joint when the loop has gone
@@ -157,7 +158,7 @@ class LoopHandle:
             return False
         if code is None:
             silent_s = (time.monotonic_ns() - int(self.block.words[Word.LOOP_NS])) * 1e-9
-            if silent_s <= SILENT_S:
+            if silent_s <= (SILENT_S if self.cycles else OPENING_S):
                 return True
             self._process.kill()  # whatever it would do next, it must not wake up beside a new run
             with contextlib.suppress(subprocess.TimeoutExpired):  # stuck in the system: the drive must not wait for it

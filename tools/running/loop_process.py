@@ -135,22 +135,50 @@ def compiled_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
         yield ReadyLoop(go, flush)
 
 
+def _leave(bus: Any) -> None:
+    """Close it; of an adapter that is gone, what failed before counts."""
+    with contextlib.suppress(Exception):
+        bus.shutdown()
+
+
 @contextmanager
 def portable_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
-    """The plain Python loop in the same way, and a line that tells its limits."""
-    from drivers.can.open import open_python_can
-    from tools.running.portable_loop import check_portable_rate, portable_note, run_portable_loop, throw_away, warm_up
+    """The plain Python loop in the same way, and a line that tells what it can hold.
 
-    check_portable_rate(order.interface, NANOSECONDS / order.period_ns)
-    print(f"loop: {portable_note(order.interface)}", file=sys.stderr, flush=True)
+    An adapter that serves one program at a time belongs to commissioning until the loop is let go, which opens it then
+    (see `CanopenDrive.start_cyclic`).
+    """
+    from drivers.can.open import SHARED_INTERFACES, known_interface, open_python_can
+    from tools.running.portable_loop import (
+        check_portable_rate,
+        held_rate_Hz,
+        portable_note,
+        run_portable_loop,
+        throw_away,
+        warm_up,
+    )
+
+    rate_Hz = NANOSECONDS / order.period_ns
+    known_interface(order.interface)
+    check_portable_rate(order.interface, rate_Hz)
     warm_up()
-    bus = open_python_can(order.interface, order.channel, order.bitrate_bitps)
-    try:
-        yield ReadyLoop(
-            lambda: run_portable_loop(bus, block, order.period_ns, order.receive_ns), lambda: throw_away(bus)
-        )
-    finally:
-        bus.shutdown()
+    held_Hz = held_rate_Hz(order.receive_ns / order.period_ns)
+    print(f"loop: {portable_note(order.interface, rate_Hz, held_Hz)}", file=sys.stderr, flush=True)
+
+    with contextlib.ExitStack() as stack:
+
+        def opened() -> Any:
+            bus = open_python_can(order.interface, order.channel, order.bitrate_bitps)
+            stack.callback(_leave, bus)
+            return bus
+
+        if order.interface in SHARED_INTERFACES:
+            bus = opened()
+            yield ReadyLoop(
+                lambda: run_portable_loop(bus, block, order.period_ns, order.receive_ns), lambda: throw_away(bus)
+            )
+        else:
+            yield ReadyLoop(lambda: run_portable_loop(opened(), block, order.period_ns, order.receive_ns))
 
 
 def run(order: LoopOrder) -> int:

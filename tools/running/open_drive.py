@@ -7,7 +7,7 @@ from typing import Any
 
 import can
 
-from drivers.can.open import CYCLIC_INTERFACES, open_python_can
+from drivers.can.open import CYCLIC_INTERFACES, SHARED_INTERFACES, open_python_can
 from drivers.canopen.drive import CanopenDrive
 from drivers.drive import Drive
 from drivers.elmo.codes import motor_fault_text
@@ -37,12 +37,20 @@ def check_cyclic_rate(config: Config) -> None:
         check_portable_rate(config.bus.interface, config.loop.rate_Hz)
 
 
-def open_drive(config: Config) -> Drive:
-    """The drive of the configuration, its bus or port open; nothing has been said to it."""
+def open_drive(config: Config, *, exclusive: bool = True) -> Drive:
+    """The drive of the configuration, its bus or port open; nothing has been said to it.
+
+    `exclusive` False opens a serial CAN adapter that another program has: see `open_python_can`.
+    """
     if isinstance(config.drive, ElmoSerial):
         return ElmoDrive(elmo_settings(config, torque_constant_NmpA(config)))
-    bus = open_python_can(config.bus.interface, config.bus.channel, config.bus.bitrate_bitps)
-    return CanopenDrive(bus, canopen_settings(config))
+
+    def open_bus() -> can.BusABC:
+        bus = config.bus
+        return open_python_can(bus.interface, bus.channel, bus.bitrate_bitps, exclusive=exclusive)
+
+    reopen = None if config.bus.interface in SHARED_INTERFACES else open_bus
+    return CanopenDrive(open_bus(), canopen_settings(config), reopen=reopen)
 
 
 def loop_delay_s(config: Config, histograms: Any) -> float:

@@ -10,7 +10,8 @@ Limits; the figures are of a 2-core virtual machine over udp_multicast, virtual 
   used samples up to 5 cycles old; load inside the process makes Python late by tens of ms (p99 38-57 ms).
   Slots are then skipped, the phase of the schedule is kept, and skipped_max_s and sample_age_max_s decide whether the
   run goes on.  An adapter adds its own latency, so that more than HIGHEST_RATE_HZ is refused.
-* Two programs use the bus at once (this loop, and commissioning): an adapter that only one may open does not serve.
+* Many adapters serve one program at a time: commissioning hands the bus to this loop and takes it back, so that
+  `jointctl stop`, `monitor` and `log.frames` beside the run need an interface that several programs can open.
 * An interface that blocks in `send` or `recv` in spite of the time-out delays the cycle; the heartbeat then stays away
   and the drive stops the joint by itself.
 * The sleep is clock_nanosleep of Linux: other operating systems are not served yet.
@@ -37,10 +38,12 @@ from firmware_py.libc import NANOSECONDS, sleep_until_ns
 from firmware_py.realtime import Histogram, Word, count, note_suspension, write_log
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, DriveRequest
+from tools.running.loop_delay import QUANTILE, quantile_s
 from tools.running.shared_block import SharedBlock
 
 HIGHEST_RATE_HZ = 500.0
 FOREVER = 1 << 62
+PROBE_PERIOD_NS, PROBE_CYCLES = 2_000_000, 100
 _FRAMES_AT_ONCE = 256  # a flooded bus must not keep a cycle from its end
 _INT32_MAX = 2_147_483_647
 _UNKNOWN_ERROR = 5  # EIO
@@ -56,12 +59,27 @@ def check_portable_rate(interface: str, rate_Hz: float) -> None:
         )
 
 
-def portable_note(interface: str) -> str:
-    """What the user should know when this loop starts."""
+def portable_note(interface: str, rate_Hz: float, held_Hz: float) -> str:
+    """What the user should know when this loop starts; `held_Hz` as measured."""
+    short = "" if rate_Hz <= held_Hz else f", LESS than loop.rate_Hz (={rate_Hz:g}): expect skipped cycles"
     return (
-        f"plain Python loop over {interface}: expect wake-ups late by tens of ms under load; "
-        f"rate limited to {HIGHEST_RATE_HZ:g} Hz"
+        f"plain Python loop over {interface}: this computer holds about {held_Hz:.0f} Hz now{short}; "
+        f"expect wake-ups late by tens of ms under load; rate limited to {HIGHEST_RATE_HZ:g} Hz"
     )
+
+
+def held_rate_Hz(receive_share: float) -> float:
+    """The rate at which wake-up and work, at their 99th percentile, leave `receive_share` of a period to the drive.
+
+    Measured for a fifth of a second on a bus that takes everything; the adapter's own latency comes on top.
+    """
+    block = SharedBlock.create(1)
+    try:
+        run_portable_loop(_SilentBus(), block, PROBE_PERIOD_NS, 0, max_cycles=PROBE_CYCLES)
+        busy_s = sum(quantile_s(block.histograms[row], QUANTILE) for row in (Histogram.WAKE, Histogram.WORK))
+    finally:
+        os.close(block.fd)
+    return min(HIGHEST_RATE_HZ, (1.0 - receive_share) / busy_s)
 
 
 class PortableExchange:

@@ -27,7 +27,7 @@ def stop(config: Config, output: Output) -> int:
 
 
 def _stop_canopen(config: Config) -> str:
-    drive = open_drive(config)
+    drive = open_drive(config, exclusive=False)
     try:
         return drive.stop_now()
     finally:
