@@ -141,6 +141,11 @@ def test_a_wrong_cause_and_a_fault_that_is_not_noticed_are_violations(config: Co
     assert judge_module._cause(run, scenario, 1e-3, joint.start_ns) == []
     wrong = dataclasses.replace(run, fault=Fault.VELOCITY_LIMIT)
     assert "the cause is told as VELOCITY_LIMIT" in judge_module._cause(wrong, scenario, 1e-3, joint.start_ns)[0]
+    left = dataclasses.replace(run, fault=Fault.DRIVE_NOT_ENABLED)
+    for code, told in ((0x8250, False), (0x8130, True)):
+        left.state.fault_drive_error = code
+        lines = judge_module._cause(left, dataclasses.replace(scenario, kind=FaultKind.RPDO_LOST), 1e-3, joint.start_ns)
+        assert any("told as 8130h, not 8250h" in line for line in lines) is told
     harmless = dataclasses.replace(scenario, harmless=True)
     assert "a harmless fault tripped" in judge_module._cause(run, harmless, 1e-3, joint.start_ns)[0]
     early = dataclasses.replace(scenario, at_s=1e6)

@@ -43,6 +43,24 @@ def test_a_drive_that_does_not_hear_the_loop_is_stopped_by_its_own_watchdog(
     assert run.truth[-1, TRUE_POWER_STATE] == PowerState.SWITCH_ON_DISABLED
 
 
+@pytest.mark.parametrize(("kind", "magnitude"), [(FaultKind.RPDO_LOST, 1.0), (FaultKind.RPDO_LENGTH, 2.0)])
+@pytest.mark.parametrize(("duration_s", "stops"), [(0.098, False), (0.102, True)])
+def test_a_joint_that_holds_while_its_rpdos_stay_away_is_stopped_by_the_deadline_of_the_drive(
+    joint: LockstepJoint, one_fault: MakeFault, kind: FaultKind, magnitude: float, duration_s: float, stops: bool
+) -> None:
+    """It stands still, so that no limit of the loop sees the loss; the drive's own error code is told as the cause."""
+    constants = joint.constants()
+    constants[0].trajectory.amplitude_rad = 0.0
+    run = joint.run_with_faults(one_fault(kind, 4.0, duration_s, magnitude), constants, tail_s=1.0)
+    if stops:
+        assert (run.fault, int(run.state.fault_drive_error)) == (Fault.DRIVE_NOT_ENABLED, 0x8250)
+        assert run.truth[-1, TRUE_POWER_STATE] == PowerState.SWITCH_ON_DISABLED
+        assert PowerState.QUICK_STOP_ACTIVE in run.truth[:, TRUE_POWER_STATE]
+    else:
+        assert run.fault is Fault.NONE
+        assert run.state.phase == AxisPhase.FINISHED
+
+
 def test_its_twin_a_drive_that_hears_again_in_time_is_not_left_alone(
     joint: LockstepJoint, one_fault: MakeFault
 ) -> None:

@@ -36,7 +36,10 @@ class Sizes:
 
 @dataclass(frozen=True)
 class FaultClass:
-    """`certain`: a harmful fault that begins while the joint tracks must be noticed, whatever the motion."""
+    """`certain`: a harmful fault that begins while the joint tracks must be noticed, whatever the motion.
+
+    `emergency`: the drive's own error code that must be told with DRIVE_NOT_ENABLED; 0: any.
+    """
 
     kind: FaultKind
     harmful: Sizes | None
@@ -44,21 +47,28 @@ class FaultClass:
     causes: frozenset[Fault] = frozenset()
     certain: bool = False
     on_wire: bool = False
+    emergency: int = 0
 
 
-def _lost(kind: FaultKind, causes: frozenset[Fault], *, certain: bool, harmless_s: float = 0.045) -> FaultClass:
+def _lost(
+    kind: FaultKind, causes: frozenset[Fault], *, certain: bool, harmless_s: float = 0.045, emergency: int = 0
+) -> FaultClass:
     return FaultClass(
         kind, Sizes((0.06, LONG_s), (1.0, 1.0), log_duration=True), Sizes((0.001, harmless_s), (1.0, 1.0)),
-        causes, certain, on_wire=True,
+        causes, certain, True, emergency,
     )  # fmt: skip
 
 
+RPDO_DEADLINE = 0x8250  # EMCY of a drive whose RPDOs stay away
 _ALWAYS = (0.001, LONG_s)
 _STALE = frozenset({Fault.STALE_SAMPLE})
 _CLASSES = (
     _lost(FaultKind.FRAMES_LOST, _STALE | {Fault.DRIVE_NOT_ENABLED}, certain=True),
     _lost(FaultKind.SYNC_LOST, _STALE, certain=True),
-    _lost(FaultKind.RPDO_LOST, MOTION | _STALE, certain=False, harmless_s=0.01),
+    _lost(
+        FaultKind.RPDO_LOST, MOTION | _STALE | {Fault.DRIVE_NOT_ENABLED}, certain=False, harmless_s=0.01,
+        emergency=RPDO_DEADLINE,
+    ),
     _lost(FaultKind.TPDO_LOST, _STALE | MOTION, certain=True),
     _lost(FaultKind.BUS_OFF, _STALE | {Fault.BUS_ERROR}, certain=True, harmless_s=0.015),
     FaultClass(
@@ -92,7 +102,7 @@ _CLASSES = (
     ),
     FaultClass(
         FaultKind.RPDO_LENGTH, Sizes((0.06, LONG_s), (0.0, 3.99)), Sizes((0.001, 0.01), (0.0, 8.99)),
-        MOTION | _STALE, on_wire=True,
+        MOTION | _STALE | {Fault.DRIVE_NOT_ENABLED}, on_wire=True, emergency=RPDO_DEADLINE,
     ),
     FaultClass(
         FaultKind.TPDO_LENGTH, Sizes((0.06, LONG_s), (0.0, 7.99)), Sizes((0.001, 0.045), (0.0, 8.99)),

@@ -151,6 +151,9 @@ def _cause(run: LockstepRun, scenario: Scenario, period_s: float, start_ns: int)
     causes = expected.causes | LATE_CAUSES if expected.on_wire else expected.causes
     if fault not in causes:
         return [f"the cause is told as {fault.name} (={run.state.fault_value:.4f})"]
+    code = int(run.state.fault_drive_error)
+    if fault is Fault.DRIVE_NOT_ENABLED and expected.emergency not in (0, code):
+        return [f"the drive's error code is told as {code:04X}h, not {expected.emergency:04X}h"]
     if scenario.kind is FaultKind.DRIVE_FAULT and run.state.fault_drive_error != scenario.magnitude:
         return [f"the drive's error code is told as {int(run.state.fault_drive_error):04X}h"]
     return []
