@@ -14,6 +14,7 @@ from hil.bus import VirtualBusHub
 from hil.device import Cia402Device, DeviceSettings
 from hil.device_loop import RealtimeDevice
 from hil.joint import plant
+from tests.hil.conftest import bench as bench
 
 EDS = Path(__file__).resolve().parents[2] / "configs" / "virtual_joint.eds"
 NODE = 5

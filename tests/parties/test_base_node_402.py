@@ -139,6 +139,21 @@ def test_cyclic_position_by_pdo_and_sync(joint: Any, node: Any) -> None:
     assert wait(lambda: node.sdo[0x6064].raw == pytest.approx(4000, abs=50))
 
 
+def test_the_program_in_the_documentation(joint: Any) -> None:
+    page = (joint.eds.parents[1] / "docs" / "virtual-joint.md").read_text()
+    program = page.split("```text\n")[1].split("```")[0]
+    for shown, here in (('"vcan"', repr(joint.channel)), ("(1,", f"({joint.node_id},"), ('"configs/', '"')):
+        assert shown in program
+        program = program.replace(shown, here, 1)
+    names: dict[str, Any] = {}
+    exec(program.replace('"virtual_joint.eds"', repr(str(joint.eds))), names)
+    try:
+        assert wait(lambda: names["node"].sdo[0x606C].raw == pytest.approx(20_000, rel=0.02))
+        names["node"].state = "SWITCH ON DISABLED"
+    finally:
+        names["network"].disconnect()
+
+
 def test_node_guarding_and_blocks_over_a_real_bus(joint: Any, node: Any) -> None:
     node.nmt.start_node_guarding(0.02)
     assert node.nmt.wait_for_heartbeat(timeout=2.0) == "OPERATIONAL"

@@ -121,6 +121,26 @@ def test_no_frame_is_malformed(joint: Any, tmp_path: Path) -> None:
         assert service.lower() in told.lower(), (service, told[:3000])
 
 
+@pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
+def test_no_frame_of_a_real_run_is_malformed(bench: Any) -> None:
+    """`run` on the joint of another process: its log, exported as docs/virtual-joint.md says, and read by tshark."""
+    config = bench.config(trajectory__duration_s=1.0, log__frames=True)
+    bench.joint(config)
+    assert bench.run("run", config, "-y").code == 0
+    (log,) = bench.folder.glob("runs/*.mcap")
+    exported = bench.run("log", "export", str(log), "--format", "candump", "-o", "run.log")
+    assert exported.code == 0, exported.err
+    packets = dissect(bench.folder / "run.log")
+    assert len(packets) > 3000  # SYNC, RPDO and TPDO at 1 kHz
+    for packet in packets:
+        assert not packet["_ws.col.Info"].startswith("ID:"), packet
+        assert "_ws.malformed" not in packet, packet
+        assert "_ws.expert.message" not in packet, packet
+    told = {packet["_ws.col.Info"].split(" 0x")[0] for packet in packets}
+    assert any("SYNC" in text for text in told), told
+    assert any("PDO1 (tx)" in text for text in told), told
+
+
 def test_the_writer_and_the_frames_agree() -> None:
     """A remote frame and a data frame in the text that tshark reads."""
     found = rows(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from pathlib import Path
 
@@ -15,7 +16,8 @@ from hil.joint import plant
 from hil.object_dictionary import load_entries
 from hil.pdo_core import read_object, write_object
 
-EDS = Path(__file__).resolve().parents[2] / "configs" / "virtual_joint.eds"
+ROOT = Path(__file__).resolve().parents[2]
+EDS = ROOT / "configs" / "virtual_joint.eds"
 
 
 @pytest.fixture
@@ -97,6 +99,32 @@ def test_one_producer_is_watched_once(device: Cia402Device) -> None:
     assert write(device, 0x1016, 1, struct.pack("<I", 7 << 16 | 100)) == 0
     assert write(device, 0x1016, 2, struct.pack("<I", 7 << 16 | 50)) == 0x06040043
     assert write(device, 0x1016, 2, struct.pack("<I", 8 << 16 | 50)) == 0
+
+
+def test_the_page_lists_every_abort_code_and_each_has_a_test() -> None:
+    used = {
+        f"{int(code, 16):08X}"
+        for file in (ROOT / "hil").glob("*.py")
+        for code in re.findall(r"^[A-Z_]+ = (0x0[568][0-9a-fA-F]{6})$", file.read_text(), re.MULTILINE)
+    }
+    page = (ROOT / "docs" / "virtual-joint.md").read_text()
+    listed = re.findall(r"\b([0-9A-F]{4}) ([0-9A-F]{4})\b", page.split("Abort codes:")[1].split("(`tests")[0])
+    assert {high + low for high, low in listed} == used
+    tests = "".join(file.read_text() for file in (ROOT / "tests" / "unit").glob("test_hil_*.py")).upper()
+    assert {code for code in used if f"0X{code}" not in tests} == set()
+
+
+def test_an_object_that_is_write_only_in_another_eds(tmp_path: Path) -> None:
+    text = EDS.read_text()
+    at = text.index("AccessType=rw", text.index("[6087]"))
+    eds = tmp_path / "other.eds"
+    eds.write_text(text[:at] + "AccessType=wo" + text[at + len("AccessType=rw") :])
+    for path, code in ((eds, 0x06010001), (EDS, 0)):
+        made = Cia402Device(path, DeviceSettings(node_id=5), *plant())
+        made.advance(1_000_000)
+        answer = ask(made, bytes.fromhex("4087600000000000"))
+        assert (answer[0] == 0x80, struct.unpack_from("<I", answer, 4)[0]) == ((True, code) if code else (False, 1000))
+        assert write(made, 0x6087, 0, struct.pack("<I", 500)) == 0
 
 
 def test_toggle_unknown_command_and_stray_segment(device: Cia402Device) -> None:
