@@ -242,7 +242,8 @@ from tests.conftest import small_axis_constants
 from tests.unit import test_realtime as stub
 
 loop = stub.Loop(small_axis_constants(), period_ns=10_000)
-loop.constants[0].sequence.wait_max_cycles = 1 << 40  # of 10 us: a busy computer uses up 40 of them at once
+sequence = loop.constants[0].sequence
+sequence.wait_max_cycles = sequence.enable_max_cycles = 1 << 40  # of 10 us: a busy computer uses up 30 at once
 
 def stub_run(cycles):
     return loop.run(cycles)
