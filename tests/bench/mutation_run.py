@@ -29,6 +29,8 @@ ROOT = Path(__file__).resolve().parents[2]
 TESTS = {
     "firmware_py/safety.py": ("test_safety", "test_axis"),
     "firmware_py/sequence.py": ("test_sequence", "test_axis"),
+    "firmware_py/surroundings.py": ("test_surroundings_edges", "test_axis"),
+    "firmware_py/frozen_reading.py": ("test_surroundings_edges", "test_axis"),
     "drivers/canopen/cia402.py": ("test_cia402",),
 }
 LONGEST_S = 120
@@ -37,7 +39,17 @@ COMPARISONS: dict[type, tuple[type, ...]] = {
     ast.Eq: (ast.NotEq,), ast.NotEq: (ast.Eq,),
 }  # fmt: skip
 OPERATIONS: dict[type, type] = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult}
-ENUMERATIONS = ("Fault", "Reaction", "AxisPhase", "DriveState", "DriveRequest", "State", "ControlWord", "StopRequest")
+ENUMERATIONS = (
+    "Fault",
+    "Reaction",
+    "AxisPhase",
+    "DriveState",
+    "DriveRequest",
+    "State",
+    "ControlWord",
+    "StopRequest",
+    "CommandKind",
+)
 
 
 def _variants(node: ast.AST) -> Iterator[tuple[str, Any]]:
