@@ -29,11 +29,11 @@ ROOT = Path(__file__).resolve().parents[2]
 TESTS = {
     "firmware_py/safety.py": ("test_safety", "test_axis"),
     "firmware_py/sequence.py": ("test_sequence", "test_axis"),
-    "firmware_py/surroundings.py": ("test_surroundings_edges", "test_axis"),
-    "firmware_py/frozen_reading.py": ("test_surroundings_edges", "test_axis"),
+    "firmware_py/surroundings.py": ("test_surroundings_edges",),
+    "firmware_py/frozen_reading.py": ("test_surroundings_edges",),
     "drivers/canopen/cia402.py": ("test_cia402",),
 }
-LONGEST_S = 120
+LONGEST_S = 120.0  # of processor time: on a busy computer a sound mutant must not count as one that hangs
 COMPARISONS: dict[type, tuple[type, ...]] = {
     ast.Lt: (ast.LtE, ast.GtE), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.LtE), ast.GtE: (ast.Gt, ast.Lt),
     ast.Eq: (ast.NotEq,), ast.NotEq: (ast.Eq,),
@@ -148,7 +148,7 @@ def killed(module: str, tree: ast.Module) -> bool:
     """Whether a test fails on the changed module, in a child process; one that hangs counts as killed."""
     child = os.fork()
     if child == 0:
-        signal.alarm(LONGEST_S)
+        signal.setitimer(signal.ITIMER_PROF, LONGEST_S)
         import pytest
 
         sys.meta_path.insert(0, _Changed(module, tree))

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
+from drivers.canopen.cia402 import State, decode_state
 from firmware_py.states import Fault
+from tools.running.emergency_text import emergency_text
 
 
 @dataclass(frozen=True)
 class FaultText:
-    """`happened` may hold {value}, the number that tripped the limit."""
+    """`happened` may hold {value}, the number that tripped the limit, and {word}, the same as a statusword (6041h)."""
 
     happened: str
     cause: str
@@ -53,12 +56,12 @@ FAULT_TEXTS: dict[Fault, FaultText] = {
         "turn the joint by hand with the power off, then look at the friction values",
     ),
     Fault.DRIVE_FAULT: FaultText(
-        "the drive reported a fault (statusword {value:.0f})",
+        "the drive reported a fault (statusword {word})",
         "see the drive's error code",
         "remove the cause, then reset the drive's fault; jointctl never does it by itself",
     ),
     Fault.DRIVE_NOT_ENABLED: FaultText(
-        "the drive left Operation Enabled by itself (statusword {value:.0f})",
+        "the drive left Operation Enabled by itself (statusword {word})",
         "its enable input or STO was opened, a limit switch, or another master on the bus",
         "check the enable and STO wiring",
     ),
@@ -68,7 +71,7 @@ FAULT_TEXTS: dict[Fault, FaultText] = {
         "check the supply; the drive has lost its configuration, start again",
     ),
     Fault.ENABLE_TIMEOUT: FaultText(
-        "the drive did not reach Operation Enabled in time (statusword {value:.0f})",
+        "the drive did not reach Operation Enabled in time (statusword {word})",
         "no motor supply, STO open, or an interlock of the drive",
         "check voltage and STO; the statusword's bit 4 is the motor supply",
     ),
@@ -88,7 +91,7 @@ FAULT_TEXTS: dict[Fault, FaultText] = {
         "lower the gains; look at the last seconds of the run log",
     ),
     Fault.OFF_TIMEOUT: FaultText(
-        "the drive did not confirm that its power stage is off (statusword {value:.0f})",
+        "the drive did not confirm that its power stage is off (statusword {word})",
         "the drive is unreachable",
         "use the emergency stop; then check the bus",
     ),
@@ -108,7 +111,7 @@ FAULT_TEXTS: dict[Fault, FaultText] = {
         "run `jointctl doctor`; set loop.priority and loop.cpu",
     ),
     Fault.DRIVE_STAYS_ENABLED: FaultText(
-        "the drive is enabled although nobody asked for it, and does not switch off (statusword {value:.0f})",
+        "the drive is enabled although nobody asked for it, and does not switch off (statusword {word})",
         "another master on the bus, or a drive that ignores the controlword",
         "use the emergency stop; check who else writes object 6040",
     ),
@@ -135,10 +138,30 @@ FAULT_TEXTS: dict[Fault, FaultText] = {
 }
 
 
+_decode: Callable[[int], int] = getattr(decode_state, "py_func", decode_state)  # nothing to compile for one word
+# EMCY classes of CiA 301 with which a drive says that it does not hear this computer as it should
+_COMMUNICATION_ERRORS = (0x8100, 0x8200)
+
+
+def _word_text(value: float) -> str:
+    """`0297h, quick stop active`."""
+    if not 0.0 <= value <= 65535.0:
+        return f"{value}"
+    word = round(value)
+    return f"{word:04X}h, {State(_decode(word)).name.lower().replace('_', ' ')}"
+
+
 def fault_text(fault: Fault, value: float, drive_error: int) -> FaultText:
-    """The text of a fault with its numbers filled in."""
+    """The text of a fault with its numbers filled in; a drive that stopped because it did not hear us says so."""
     text = FAULT_TEXTS[fault]
-    happened = text.happened.format(value=value)
+    happened = text.happened.format(value=value, word=_word_text(value))
     if drive_error:
-        happened += f"; the drive's error code is {drive_error:04X}h"
+        happened += f"; the drive's error code is {emergency_text(drive_error)}"
+    if fault in (Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED) and drive_error & 0xFF00 in _COMMUNICATION_ERRORS:
+        return FaultText(
+            happened,
+            "the drive heard our frames too seldom or damaged and stopped by itself: cable, bus load, or a computer "
+            "that was held up",
+            "check wiring, termination and bus load; `jointctl doctor` tells what holds this computer up",
+        )
     return FaultText(happened, text.cause, text.next_step)

@@ -37,6 +37,11 @@ SERIAL_FAULT_TEXTS: dict[Fault, FaultText] = {
         "inhibit input or STO was opened, another program on the line, or a restart of the drive",
         "check the inhibit and STO wiring and the supply",
     ),
+    Fault.DRIVE_STAYS_ENABLED: FaultText(
+        "the motor is on although nobody asked for it, and does not switch off (SR {word})",
+        "another program on the line, or a drive that ignores MO=0",
+        "use the emergency stop; check who else uses the port",
+    ),
     Fault.ENABLE_TIMEOUT: FaultText(
         "the drive did not switch its motor on in time (SR {word})",
         "no motor supply, STO open, or inhibit input active",
