@@ -183,7 +183,10 @@ def output() -> tuple[Output, StringIO, StringIO]:
 
 def test_the_verb_writes_table_json_and_picture(config: Config, tmp_path: Path) -> None:
     shown, out, _ = output()
-    assert fault_campaign(config, shown, count=KINDS, seed=5, folder=tmp_path / "new", workers=1) == 0
+    page = tmp_path / "campaign.html"
+    assert fault_campaign(config, shown, count=KINDS, seed=5, folder=tmp_path / "new", workers=1, report=page) == 0
+    assert "data:image/png;base64," in page.read_text()
+    assert f"0 of {KINDS} scenarios violate an invariant, seed 5." in page.read_text()
     data = json.loads(out.getvalue())
     assert (data["scenarios"], data["violations"], data["interrupted"]) == (KINDS, 0, False)
     report = json.loads((tmp_path / "new" / "campaign.json").read_text())
@@ -197,7 +200,9 @@ def test_a_violation_is_told_with_the_command_that_replays_it(
 ) -> None:
     monkeypatch.setattr(judge_module, "_motion", lambda run, allowed: ["made up"])
     shown, _, err = output()
-    assert fault_campaign(config, shown, count=2, seed=5, folder=tmp_path, workers=1) == 10
+    page = tmp_path / "campaign.html"
+    assert fault_campaign(config, shown, count=2, seed=5, folder=tmp_path, workers=1, report=page) == 10
+    assert page.read_text().count("made up") == 2
     assert "--seed 5 --scenario 0" in err.getvalue()
     report = json.loads((tmp_path / "campaign.json").read_text())
     assert report["violations"][1]["violations"] == ["made up"]

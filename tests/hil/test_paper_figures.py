@@ -129,7 +129,9 @@ def test_the_verb_prints_one_table_and_draws_a_page_for_each_figure(
     few = Options(swarm=SwarmSettings(particles=60, iterations=200))
     monkeypatch.setattr("tools.verbs.paper.identify_paper_friction", lambda: identify_paper_friction(few))
     out, err = io.StringIO(), io.StringIO()
-    assert paper(Output(json=True, stdout=out, stderr=err), folder=tmp_path) == 0
+    page = tmp_path / "paper.html"
+    assert paper(Output(json=True, stdout=out, stderr=err), folder=tmp_path, report=page) == 0
+    assert page.read_text().count("data:image/png;base64,") == 6
     data = json.loads(out.getvalue())
     assert len(data["rows"]) == 13
     assert data["runs"]["precise, R1"]["rmse_mrad"] < 0.02

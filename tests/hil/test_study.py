@@ -138,7 +138,10 @@ def test_the_verb_prints_json_and_says_when_it_was_interrupted(
     monkeypatch.setattr("tools.verbs.study.load_config", lambda _: base)
     settings = checked({"plants": 2, "after_s": 1.0, "controllers": ["precise"]}, "test")
     out, err = io.StringIO(), io.StringIO()
-    assert study(settings, Output(json=True, stdout=out, stderr=err), workers=1, csv=tmp_path / "a.csv") == 0
+    page = tmp_path / "a.html"
+    shown = Output(json=True, stdout=out, stderr=err)
+    assert study(settings, shown, workers=1, csv=tmp_path / "a.csv", report=page) == 0
+    assert page.read_text().count("data:image/png;base64,") == 1
     data = json.loads(out.getvalue())
     assert data["plants_done"] == 2
     assert 0.0 < data["controllers"]["precise"]["rmse_mrad"]["median"] < 1.0

@@ -175,7 +175,10 @@ def test_a_fault_keeps_what_was_measured_and_resume_completes_it(config: Config,
     error_Nm = found["motor_torque_Nm"] - truth_Nm(config, found["velocity_radps"])
     assert np.max(np.abs(error_Nm)) < 0.002
     output = Output(stdout=StringIO(), stderr=StringIO())
-    assert sweep(config, output, out, SweepOptions(lockstep=True, points=12, resume=True)) == 0
+    page = tmp_path / "sweep.html"
+    assert sweep(config, output, out, SweepOptions(lockstep=True, points=12, resume=True, report=page)) == 0
+    assert "<svg" in page.read_text()
+    assert "12 of 12" in page.read_text()
     assert "nothing is left" in output.stderr.getvalue()  # type: ignore[attr-defined]
 
 

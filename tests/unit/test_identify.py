@@ -64,6 +64,21 @@ def contents(folder):
     return {p.name: p.read_bytes() for p in folder.iterdir()}
 
 
+def test_the_report_of_an_identification_holds_tables_pictures_and_section(sweep):
+    out, page = output(), sweep.parent / "found.html"
+    assert identify(sweep, out, options=QUICK, report=page) == 0
+    html = page.read_text()
+    assert html.count("data:image/png;base64,") == 2
+    for word in ("95 % interval", "held out", "multi-stage (chosen)", "tc+", "[friction.positive]", "SHA-256"):
+        assert word in html
+    assert f"written: {page}" in out.stderr.getvalue()
+    for wrong, told in ((sweep.parent / "found.txt", "must end in .html"), (sweep.parent / "no" / "a.html", "folder")):
+        before = contents(sweep.parent)
+        with pytest.raises(DataError, match=told):
+            identify(sweep, output(), options=QUICK, report=wrong)
+        assert contents(sweep.parent) == before
+
+
 def test_identify_writes_a_section_a_report_and_pictures_beside_the_data(sweep):
     out = output()
     assert identify(sweep, out, options=QUICK) == 0

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from tools.cli.options import COMPARE, Json, Quiet, loaded
+from tools.cli.options import COMPARE, Json, Quiet, Report, loaded
 from tools.output import Output
 
 
@@ -16,6 +16,7 @@ def paper(
     no_identification: Annotated[
         bool, typer.Option("--no-identification", help="leave the identification figures out")
     ] = False,
+    report: Report = None,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -23,7 +24,7 @@ def paper(
     from tools.verbs.paper import paper as run_paper
 
     output = Output(json=json, quiet=quiet)
-    raise typer.Exit(run_paper(output, folder=figures, identification=not no_identification))
+    raise typer.Exit(run_paper(output, folder=figures, identification=not no_identification, report=report))
 
 
 def study(
@@ -39,6 +40,7 @@ def study(
     workers: Annotated[int | None, typer.Option("--workers", help="processes; default: one a core")] = None,
     csv: Annotated[Path | None, typer.Option("--csv", help="file for all single results")] = None,
     figure: Annotated[Path | None, typer.Option("--figure", help="PNG with a box plot")] = None,
+    report: Report = None,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -58,7 +60,7 @@ def study(
     settings = load_study(file) if file is not None else StudySettings()
     settings = checked({**settings.model_dump(), **flags}, "command line")
     output = Output(json=json, quiet=quiet)
-    raise typer.Exit(run_study(settings, output, workers=workers, csv=csv, figure=figure))
+    raise typer.Exit(run_study(settings, output, workers=workers, csv=csv, figure=figure, report=report))
 
 
 def fault_campaign(
@@ -68,6 +70,7 @@ def fault_campaign(
     scenario: Annotated[int | None, typer.Option("--scenario", help="replay this one alone")] = None,
     folder: Annotated[Path, typer.Option("--folder", help="for report, JSON and picture")] = Path("fault-campaign"),
     workers: Annotated[int | None, typer.Option("--workers", help="processes; default: one a core")] = None,
+    report: Report = None,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -76,7 +79,16 @@ def fault_campaign(
 
     output = Output(json=json, quiet=quiet)
     raise typer.Exit(
-        run_campaign(loaded(config), output, count=count, seed=seed, scenario=scenario, folder=folder, workers=workers)
+        run_campaign(
+            loaded(config),
+            output,
+            count=count,
+            seed=seed,
+            scenario=scenario,
+            folder=folder,
+            workers=workers,
+            report=report,
+        )
     )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tools.cli.options import FRICTION, Json, Quiet
+from tools.cli.options import FRICTION, Json, Quiet, Report
 from tools.cli.sweep_command import sweep_command
 from tools.output import Output
 
@@ -85,6 +85,7 @@ def identify(
     stall: Annotated[
         int, typer.Option("--stall", help="stop after so many iterations without progress; 0 = never")
     ] = 0,
+    report: Report = None,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -110,7 +111,9 @@ def identify(
         swarm=SwarmSettings(particles, iterations, inertia, cognitive, social, seed, stall),
     )
     output = Output(json=json, quiet=quiet)
-    raise typer.Exit(run_identify(data, output, into=into, out=out, config=config, told=told, options=options))
+    raise typer.Exit(
+        run_identify(data, output, into=into, out=out, config=config, told=told, options=options, report=report)
+    )
 
 
 def validate(

@@ -19,6 +19,9 @@ Target = Annotated[
 ]
 Json = Annotated[bool, typer.Option("--json", help="result as one JSON document on stdout")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="no progress on stderr")]
+Report = Annotated[
+    Path | None, typer.Option("--report", metavar="FILE.html", help="the result as one self-contained page as well")
+]
 ConfigPath = Annotated[
     Path, typer.Argument(metavar="CONFIG", help="configuration file (TOML), or the name of a shipped one")
 ]

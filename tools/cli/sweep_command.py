@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tools.cli.options import Bitrate, Channel, ConfigPath, Interface, Json, Port, Quiet, Target, Yes, loaded
+from tools.cli.options import Bitrate, Channel, ConfigPath, Interface, Json, Port, Quiet, Report, Target, Yes, loaded
 from tools.output import Output
 
 
@@ -53,6 +53,7 @@ def sweep_command(
         bool,
         typer.Option("--allow-low-margin", help="torque mode: run a stable loop below margin.min_phase_margin_deg"),
     ] = False,
+    report: Report = None,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -65,5 +66,6 @@ def sweep_command(
         points=points, grid=grid, speeds=speeds, max_speed_radps=max_speed, min_speed_radps=min_speed, quick=quick,
         warm_up_turns=warm_up, shuffle_seed=shuffle, passes=passes, dwell_s=dwell, mode=mode, resume=resume,
         dry_run=dry_run, assume_yes=yes, lockstep=lockstep, allow_low_margin=allow_low_margin,
+        report=report,
     )  # fmt: skip
     raise typer.Exit(sweep(configuration, Output(json=json, quiet=quiet), out, options))

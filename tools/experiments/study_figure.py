@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,17 @@ _BLUE, _GREY = "#1f5fa8", "#555555"
 
 
 def save_study_figure(result: StudyResult, path: Path, title: str) -> Path:
-    """Draw the boxes (quartiles; whiskers 5 and 95 %; dots beyond) into a PNG at `path`; returns the path."""
+    """The picture of `study_png` as a file; returns the path."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(study_png(result, title))
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written: {error.strerror or error}") from None
+    return path
+
+
+def study_png(result: StudyResult, title: str) -> bytes:
+    """The boxes (quartiles; whiskers 5 and 95 %; dots beyond) as PNG."""
     # slow to import, and only wanted here; no display is needed
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -38,12 +49,9 @@ def save_study_figure(result: StudyResult, path: Path, title: str) -> Path:
     axes[0].set_yticks(range(1, count + 1), [name.replace("_", " ") for name in result.controllers])
     axes[0].invert_yaxis()
     figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=110, format="png")
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written: {error.strerror or error}") from None
-    return path
+    data = io.BytesIO()
+    figure.savefig(data, dpi=110, format="png")
+    return data.getvalue()
 
 
 def _boxes(axis: Any, result: StudyResult, key: str) -> None:

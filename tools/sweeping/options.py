@@ -52,6 +52,7 @@ class SweepOptions:
     assume_yes: bool = False
     lockstep: bool = False
     allow_low_margin: bool = False
+    report: Path | None = None  # HTML page to write as well
 
 
 @dataclass(frozen=True)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from drivers.errors import ConfigurationError, DataError
-from tools.campaign.judge import judge
+from tools.campaign.judge import Verdict, judge
 from tools.campaign.report import rows_by_kind, table, violations, write_figure, write_json
 from tools.campaign.runner import run_campaign
 from tools.campaign.scenario import draw_scenario
 from tools.configuration.config import Config
 from tools.configuration.elmo_settings import refuse_serial
 from tools.output import Output
+from tools.reporting.page import Details, Paragraph, Section, Table, check_target
+from tools.reporting.verb_page import from_terminal, picture, write_verb_page
 from tools.simulation.lockstep import LockstepJoint
 
 EXIT_VIOLATIONS = 10
@@ -28,6 +31,7 @@ def fault_campaign(
     scenario: int | None = None,
     folder: Path = Path("fault-campaign"),
     workers: int | None = None,
+    report: Path | None = None,
 ) -> int:
     """Run `count` scenarios, or replay one; 0 if nothing was violated, 10 if something was, 130 after Ctrl-C."""
     refuse_serial(config, "fault-campaign")
@@ -38,6 +42,8 @@ def fault_campaign(
         raise ConfigurationError(f"{config.path}: [[virtual.faults]] must be empty: the campaign brings its own")
     if scenario is not None:
         return _replay(config, output, seed, scenario)
+    if report is not None:
+        check_target(report)
     _prepare(folder)
     with output.progress("fault campaign", float(count)) as advance:
         verdicts, elapsed_s, interrupted = run_campaign(config.path, seed, count, advance, workers)
@@ -51,6 +57,8 @@ def fault_campaign(
         "interrupted": interrupted, "report": str(folder / "campaign.json"),
     }  # fmt: skip
     output.result(table(rows), data)
+    if report is not None and verdicts:
+        _write_page(report, config, verdicts, found, folder / "campaign.png", seed, output)
     output.note(f"{len(verdicts)} scenarios in {elapsed_s:.0f} s, seed {seed}; report in {folder}")
     for item in found[:SHOWN]:
         output.warning(f"scenario {item['number']} ({item['kind']}): {'; '.join(item['violations'])}")
@@ -61,6 +69,26 @@ def fault_campaign(
         )
         return EXIT_VIOLATIONS
     return EXIT_INTERRUPTED if interrupted else 0
+
+
+def _write_page(
+    path: Path, config: Config, verdicts: list[Verdict], found: list[dict[str, Any]], png: Path, seed: int,
+    output: Output,
+) -> None:  # fmt: skip
+    tone = "error" if found else "good"
+    said = f"{len(found)} of {len(verdicts)} scenarios violate an invariant, seed {seed}."
+    listed = Table(
+        ["scenario", "kind", "violations"],
+        [(item["number"], item["kind"], "; ".join(item["violations"])) for item in found],
+    )
+    sections = [
+        Section("Verdict", [Paragraph(said, tone)]),
+        Section("By kind of fault", [from_terminal(table(rows_by_kind(verdicts)))]),
+        Section("Violations", [listed] if found else []),
+        Section("Figures", [picture(png, "Greatest speed, and time until off, of each scenario by kind of fault")]),
+        Section("Configuration", [Details("Configuration", config.text)]),
+    ]
+    write_verb_page(path, "Fault campaign", sections, output, subtitle=str(config.path))
 
 
 def _prepare(folder: Path) -> None:

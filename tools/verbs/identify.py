@@ -18,8 +18,11 @@ from tools.identification.friction_data import ForeignFormat, read_friction_data
 from tools.identification.friction_section import replace_file, section_values, snippet, write_into
 from tools.identification.identification import Identification, Options, identify_friction
 from tools.identification.plausibility import JointLimits
-from tools.identification.report import identification_report
+from tools.identification.report import error_table, identification_report, model_table, parameter_table
 from tools.output import Output
+from tools.reporting.page import Block, Details, Section, check_target
+from tools.reporting.verb_page import from_terminal, picture, write_verb_page
+from tools.reporting.verb_page import remarks as notes_of
 
 
 def joint_limits(config_path: Path) -> JointLimits:
@@ -65,16 +68,19 @@ def identify(
     config: Path | None = None,
     told: ForeignFormat | None = None,
     options: Options | None = None,
+    report: Path | None = None,
 ) -> int:
     """Identify, report, write; returns the exit code.
 
     `into`: configuration whose [friction] is replaced; `out`: TOML file with the section alone (default, if `into` is
     not given: DATA.friction.toml).  `config` only serves to compare with limits and constants of the joint.  Figures
-    and a JSON report go beside the TOML file, or beside the data with `into`.
+    and a JSON report go beside the TOML file, or beside the data with `into`.  `report`: HTML page to write as well.
     """
     options = options or Options()
     if out is not None and out.suffix != ".toml":
         raise DataError(f"{out}: the name of the section's file (-o) must end in .toml")
+    if report is not None:
+        check_target(report, [path for path in (data_path, into, config) if path is not None])
     limits = _limits(into, config, output)
     data = read_friction_data(data_path, told)
     if limits is None and data.recorded_limits is None:
@@ -95,14 +101,14 @@ def identify(
     stem = out.with_suffix("") if out is not None else data_path.with_suffix(".friction")
     used = {word: direction.index for word, direction in found.directions.items()}
     outliers = np.concatenate([direction.outliers for direction in found.directions.values()])
-    picture = fit_png(
+    fit_picture = fit_png(
         data, found.branches, used, f"{data_path.name}: {found.model}", outliers=outliers, identified=found
     )
     convergence = convergence_png(found)
     values = section_values(found.branches["positive"], found.branches["negative"])
     result = {**found.to_dict(), "friction": values}
     files = {
-        stem.with_name(stem.name + ".png"): picture,
+        stem.with_name(stem.name + ".png"): fit_picture,
         stem.with_name(stem.name + ".report.json"): json.dumps(result, indent=1, allow_nan=False).encode("utf-8"),
     }
     if convergence is not None:
@@ -122,4 +128,23 @@ def identify(
     output.result(identification_report(found), {**result, "files": [str(p) for p in files]})
     for path in ([into] if into is not None else []) + list(files):
         output.note(f"written: {path}")
+    if report is not None:
+        _write_page(report, found, fit_picture, convergence, snippet(values, remarks(found)), output)
     return 0
+
+
+def _write_page(
+    path: Path, found: Identification, fit: bytes, convergence: bytes | None, section: str, output: Output
+) -> None:
+    errors = error_table(found.errors_Nm, found.measured_Nm, found.data.reduction_ratio)
+    pictures: list[Block] = [picture(fit, "Measured friction torque and the model, and the error between them")]
+    if convergence is not None:
+        pictures.append(picture(convergence, "How the particle swarm converged", "the swarm"))
+    sections = [
+        Section("Fit", [*notes_of(found.warnings), from_terminal(model_table(found)), from_terminal(errors)]),
+        Section("Parameters", [from_terminal(parameter_table(found))]),
+        Section("Figures", pictures),
+        Section("Origin", [*notes_of(remarks(found), ""), Details("The section for a configuration", section)]),
+    ]
+    title = f"Friction of {found.data.path.stem}: {found.model}"
+    write_verb_page(path, title, sections, output, subtitle=str(found.data.path), inputs=(found.data.path,))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from rich.markup import escape
 from rich.table import Table
@@ -18,6 +19,8 @@ from tools.experiments.paper_identification import (
 from tools.experiments.paper_rows import PaperRow, PaperRun, paper_rows
 from tools.experiments.paper_runs import AFTER_s, experiments
 from tools.output import Output
+from tools.reporting.page import Section, check_target
+from tools.reporting.verb_page import from_terminal, picture, write_verb_page
 
 PAPER = (
     "Shen, Zhou, Yu, Wang: Design of Adaptive RBFNN and Computed-torque Control for Manipulator Joint "
@@ -25,8 +28,15 @@ PAPER = (
 )
 
 
-def paper(output: Output, *, folder: Path | None = None, identification: bool = True) -> int:
-    """Run all experiments (some seconds), print one table, draw the figures into `folder` (None: no figures)."""
+def paper(
+    output: Output, *, folder: Path | None = None, identification: bool = True, report: Path | None = None
+) -> int:
+    """Run all experiments (some seconds), print one table, draw the figures into `folder` (None: no figures).
+
+    `report`: HTML page to write as well, with the figures in it.
+    """
+    if report is not None:
+        check_target(report)
     listed = experiments()
     runs: dict[str, PaperRun] = {}
     identified: PaperIdentification | None = None
@@ -48,6 +58,12 @@ def paper(output: Output, *, folder: Path | None = None, identification: bool = 
     output.result(_table(rows), data)
     for path in pictures:
         output.note(f"written: {path}")
+    if report is not None:
+        with TemporaryDirectory() as elsewhere:
+            drawn = pictures or _pictures(runs, identified, Path(elsewhere))
+            blocks = [picture(path, path.stem.replace("_", " "), path.stem.replace("_", " ")) for path in drawn]
+        sections = [Section("In numbers", [from_terminal(_table(rows))]), Section("Figures", blocks)]
+        write_verb_page(report, "The paper's experiments", sections, output, subtitle=PAPER)
     return 0
 
 

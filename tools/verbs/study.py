@@ -15,6 +15,8 @@ from tools.experiments.controllers import controller_config
 from tools.experiments.study_runs import StudyResult, quantile, run_study, write_csv
 from tools.experiments.study_settings import StudySettings, study_controllers
 from tools.output import Output
+from tools.reporting.page import Details, Section, check_target
+from tools.reporting.verb_page import from_terminal, picture, write_verb_page
 
 INTERRUPTED = 130
 _COLUMNS = (
@@ -33,14 +35,17 @@ def study(
     workers: int | None = None,
     csv: Path | None = None,
     figure: Path | None = None,
+    report: Path | None = None,
 ) -> int:
-    """Run the study and print medians with 5-95 % ranges; `csv` and `figure` are files to write.
+    """Run the study and print medians with 5-95 % ranges; `csv`, `figure` and `report` are files to write.
 
     Ctrl-C keeps the plants that are done, says so, and gives exit code 130.
     """
     base_path = Path(settings.base)
     base = load_config(base_path if base_path.exists() else shipped_config(settings.base))
     refuse_serial(base, "study")
+    if report is not None:
+        check_target(report)
     controllers = study_controllers(settings)
     for controller in controllers:
         controller_config(base, controller)  # a contradiction is to be told before an hour of simulation
@@ -72,7 +77,21 @@ def study(
         for path in (csv, figure):
             if path is not None:
                 output.note(f"written: {path}")
+        if report is not None:
+            _write_page(report, result, settings, title, output)
     return INTERRUPTED if result.interrupted else 0
+
+
+def _write_page(path: Path, result: StudyResult, settings: StudySettings, title: str, output: Output) -> None:
+    from tools.experiments.study_figure import study_png
+
+    late = f"{title}, after {settings.after_s:g} s"
+    sections = [
+        Section("In numbers", [from_terminal(_table(result, title, settings.after_s))]),
+        Section("Figures", [picture(study_png(result, late), "Errors of each controller over all plants, as boxes")]),
+        Section("Settings", [Details("Settings", settings.model_dump_json(indent=1))]),
+    ]
+    write_verb_page(path, "Study", sections, output, subtitle=title)
 
 
 def _text(values: tuple[float, float, float], digits: int = 3) -> str:

@@ -20,6 +20,7 @@ from tools.configuration.config import Config
 from tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
 from tools.output import Advance, Output
 from tools.recording.log_folder import log_path
+from tools.reporting.page import check_target
 from tools.running.fault_text import FaultText, fault_text
 from tools.running.readiness import require_ready
 from tools.running.run_report import INTERRUPTED
@@ -31,6 +32,7 @@ from tools.sweeping.meter import JointModel, MeasuredPoint, SweepMeter
 from tools.sweeping.options import SweepOptions, check_files, make_plan
 from tools.sweeping.plan import PlanSettings, SweepMotion
 from tools.sweeping.statistics import Tolerance
+from tools.sweeping.sweep_page import write_sweep_page
 
 RELATIVE_TOLERANCE = 0.01
 OVERHEAD_S = 3.0  # commissioning, enabling, release
@@ -97,6 +99,8 @@ class Sweep:
         """Returns the exit code: 0, or 130 after an interruption; raises `MotionFault` and the other errors."""
         options = self.options
         check_files(self.out, options.resume)
+        if options.report is not None:
+            check_target(options.report)
         todo = list(self.plan.points)
         try:
             if options.resume:
@@ -107,6 +111,7 @@ class Sweep:
                 self.output.note(f"{self.out}: {len(done)} of {len(self.plan.points)} points are there already")
                 if not todo and not self._to_revisit():
                     self.output.note("nothing is left to measure")
+                    self._write_page()
                     return 0
             stopped: str | None = ""
             if todo:
@@ -248,6 +253,24 @@ class Sweep:
             return 0
         assert self.file is not None
         done = len(self.file.done)
+        data = {"points": done, "planned": len(self.plan.points), "unsettled": len(self._unsettled),
+                "stopped_by": stopped or None, "data": str(self.out), "plan": self.plan.hash}  # fmt: skip
+        self.output.result(self._table(), data)
+        self._write_page()
+        if self._unsettled:
+            shown = ", ".join(f"{p.velocity_radps:+.4g}" for p in list(self._unsettled.values())[:8])
+            self.output.warning(f"{len(self._unsettled)} points never settled (settled = 0 in the file): {shown} rad/s")
+        if stopped:
+            self.output.note(f"stopped by {stopped}; what was measured is in {self.out}, --resume goes on")
+            return INTERRUPTED
+        return 0
+
+    def _write_page(self) -> None:
+        if self.options.report is not None and self.file is not None and self.file.done:
+            write_sweep_page(self.options.report, self.out, self._table(), self.output)
+
+    def _table(self) -> Table:
+        done = len(self.file.done) if self.file is not None else 0
         table = Table(title="Sweep", title_justify="left", show_header=False)
         for name, value in (
             ("points", f"{done} of {len(self.plan.points)}"),
@@ -257,16 +280,7 @@ class Sweep:
             ("sidecar", str(self.out.with_suffix(".json"))),
         ):
             table.add_row(name, value)
-        data = {"points": done, "planned": len(self.plan.points), "unsettled": len(self._unsettled),
-                "stopped_by": stopped or None, "data": str(self.out), "plan": self.plan.hash}  # fmt: skip
-        self.output.result(table, data)
-        if self._unsettled:
-            shown = ", ".join(f"{p.velocity_radps:+.4g}" for p in list(self._unsettled.values())[:8])
-            self.output.warning(f"{len(self._unsettled)} points never settled (settled = 0 in the file): {shown} rad/s")
-        if stopped:
-            self.output.note(f"stopped by {stopped}; what was measured is in {self.out}, --resume goes on")
-            return INTERRUPTED
-        return 0
+        return table
 
 
 def sweep(config: Config, output: Output, out: Path, options: SweepOptions | None = None) -> int:

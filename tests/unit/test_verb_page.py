@@ -1,0 +1,45 @@
+"""Tables of the terminal on a page: the same words, without markup."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
+
+from tools.output import Output
+from tools.reporting.page import Section
+from tools.reporting.verb_page import from_terminal, picture, remarks, write_verb_page
+
+
+def test_a_table_of_the_terminal_keeps_its_words() -> None:
+    table = Table(title=escape("errors [mrad]"), caption="after 5 s")
+    table.add_column("[bold]name")
+    table.add_column(escape("peak [mrad]"), justify="right")
+    table.add_row("a [red]red[/red] one", "1.5", style="red")
+    table.add_section()
+    table.add_row(escape("[b]"), Text("<2>"))
+    found = from_terminal(table)
+    assert list(found.headings) == ["name", "peak [mrad]"]
+    assert [tuple(row) for row in found.rows] == [("a red one", "1.5"), ("[b]", "<2>")]
+    assert found.caption == "errors [mrad]. after 5 s"
+
+
+def test_a_table_without_rows_or_header_is_one_as_well() -> None:
+    table = Table(show_header=False)
+    table.add_column("hidden")
+    assert list(from_terminal(table).headings) == [""]
+    assert list(from_terminal(table).rows) == []
+
+
+def test_sections_without_content_are_left_out_and_text_is_escaped(tmp_path: Path) -> None:
+    err, path = io.StringIO(), tmp_path / "a.html"
+    sections = [Section("Full", [*remarks(["<b>"]), picture(b"\x89PNG", "dots")]), Section("Empty", [])]
+    write_verb_page(path, "T", sections, Output(stderr=err), subtitle="what")
+    html = path.read_text()
+    assert "&lt;b&gt;" in html
+    assert "Empty" not in html
+    assert "data:image/png;base64,iVBORw==" in html
+    assert err.getvalue() == f"written: {path}\n"

@@ -1,0 +1,67 @@
+"""The page of a sweep: what was measured, drawn and listed, from the files that the sweep has written."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table as TerminalTable
+
+from tools.output import Output
+from tools.reporting.figure import BLUE, ORANGE, RED, draw
+from tools.reporting.page import Block, Details, Figure, Section, Table
+from tools.reporting.verb_page import from_terminal, write_verb_page
+
+
+def write_sweep_page(path: Path, data: Path, summary: TerminalTable, output: Output) -> None:
+    """`summary` is the table that the terminal shows; the points come from the CSV file `data`, its JSON beside it."""
+    with data.open(encoding="ascii", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    beside = data.with_suffix(".json")
+    about = json.loads(beside.read_text(encoding="utf-8"))
+    blocks: list[Block] = [_figure(rows)] if rows else []
+    tones = {i: "warning" for i, row in enumerate(rows) if row["settled"] == "0"}
+    listed = Table(
+        ["velocity [rad/s]", "motor torque [Nm]", "deviation of velocity [rad/s]", "samples", "settled", "time [s]"],
+        [
+            (
+                f"{float(row['velocity_radps']):.6g}", f"{float(row['motor_torque_Nm']):.5g}",
+                f"{float(row['velocity_std_radps']):.2g}", row["samples"], "yes" if row["settled"] == "1" else "no",
+                row["time_s"],
+            )
+            for row in rows
+        ],
+        tones=tones,
+    )  # fmt: skip
+    sections = [
+        Section("What was measured", [from_terminal(summary)]),
+        Section("Friction", blocks),
+        Section("Points", [listed]),
+        Section("Configuration", [Details("Configuration", str(about.get("configuration", "")))]),
+    ]
+    write_verb_page(path, f"Sweep {data.stem}", sections, output, subtitle=str(data), inputs=(data, beside))
+
+
+def _figure(rows: list[dict[str, Any]]) -> Figure:
+    velocity, torque = (np.array([float(row[key]) for row in rows]) for key in ("velocity_radps", "motor_torque_Nm"))
+    settled = np.array([row["settled"] == "1" for row in rows])
+
+    def paint(figure: Any) -> None:
+        whole, near = figure.subplots(1, 2, width_ratios=(3, 2))
+        for axis in (whole, near):
+            for mask, colour, label in ((settled & (velocity > 0), BLUE, "positive"),
+                                        (settled & (velocity < 0), ORANGE, "negative"),
+                                        (~settled, RED, "not settled")):  # fmt: skip
+                if np.any(mask):
+                    axis.plot(np.abs(velocity[mask]), np.abs(torque[mask]), ".", color=colour, label=label)
+            axis.set_xlabel("speed of the joint [rad/s]")
+            axis.margins(x=0.03)
+        whole.set_ylabel("size of the motor torque [Nm]")
+        whole.legend()
+        near.set_xscale("log")
+        near.set_title("the same, slow speeds spread")
+
+    return draw(4.2, paint, "Motor torque over the speed of the joint, both directions", "each point one plateau")
