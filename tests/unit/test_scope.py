@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import io
+import math
 import socket
+import time
 from collections.abc import Iterator
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -15,13 +18,18 @@ from firmware_py.realtime import HISTOGRAM_BINS
 from firmware_py.records import LogRecord
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, StopRequest
+from tools.configuration.load import load_config, shipped_config
 from tools.output import Output
 from tools.recording.run_log import INFO, Event
 from tools.running.live_panel import PhaseLines, Snapshot
-from tools.scoping import feed as feed_module
+from tools.running.viewer_orders import UNWATCHED, ViewerOrders
+from tools.running.viewer_request import ViewerRequest
+from tools.scoping import order as order_module
 from tools.scoping.access import COOKIE, allowed
-from tools.scoping.feed import EVENT, PIECE, RECORDS, Displays, ScopeFeed, ScopeOrder, scope_order
+from tools.scoping.displays import Displays
+from tools.scoping.feed import EVENT, PIECE, RECORDS, SETTINGS, ScopeFeed
 from tools.scoping.history import EVENTS, POINTS, SIGNALS, History, crossing_s, percentiles_us
+from tools.scoping.order import ScopeOrder, scope_order
 
 
 def records(count: int, first: int = 0) -> Any:
@@ -77,16 +85,90 @@ def test_a_server_that_reads_nothing_or_is_gone_costs_the_run_nothing(
     assert feed.stop_request() is StopRequest.NONE
 
 
+def asked(kind: str, **values: Any) -> bytes:
+    return ViewerRequest(kind, "a viewer", values).encoded()
+
+
 def test_stop_is_the_strongest_word_that_came(ends: tuple[socket.socket, socket.socket]) -> None:
     feed = ScopeFeed(ends[0])
+    none = [b"0", b"1", b"x", b"11", b"{}", *(asked("stop", strength=bad) for bad in (0, 3, -1, "1", None, [1]))]
     for words, expected in (
-        ([], StopRequest.NONE), ([b"", b"0", b"3", b"x", b"11"], StopRequest.NONE), ([b"1"], StopRequest.RAMP),
-        ([b"2", b"1"], StopRequest.QUICK_STOP), ([b"1"], StopRequest.QUICK_STOP),
+        ([], StopRequest.NONE), (none, StopRequest.NONE), ([asked("stop", strength=1)], StopRequest.RAMP),
+        ([asked("stop", strength=2), asked("stop", strength=1)], StopRequest.QUICK_STOP),
+        ([asked("stop", strength=1)], StopRequest.QUICK_STOP),
     ):  # fmt: skip
         for word in words:
-            if word:
-                ends[1].send(word)
+            ends[1].send(word)
         assert feed.stop_request() is expected
+    assert feed.stop_reason() == "the scope's STOP, a viewer"
+    feed.forget()
+    assert (feed.stop_request(), feed.stop_reason()) == (StopRequest.NONE, "")
+
+
+def test_the_run_is_told_when_the_last_page_closes_and_when_one_opens_again(
+    ends: tuple[socket.socket, socket.socket],
+) -> None:
+    feed = ScopeFeed(ends[0], in_charge=True)
+    for count, told in ((0, []), (1, []), (2, []), (1, []), (0, [0]), (0, []), (1, [1]), (0, [0]), ("x", [])):
+        ends[1].send(asked("viewers", count=count))
+        assert [request.values["count"] for request in feed.requests()] == told
+    feed.forget()
+    with feed:  # nobody there when the run begins: told as well
+        assert [request.values["count"] for request in feed.requests()] == [0]
+    assert feed.stop_request() is StopRequest.NONE
+
+
+@pytest.mark.parametrize(("limit_s", "expected"), [(None, StopRequest.NONE), (0.3, StopRequest.RAMP)])
+def test_a_run_that_nobody_watches_brakes_if_that_is_wanted(
+    ends: tuple[socket.socket, socket.socket], limit_s: float | None, expected: StopRequest
+) -> None:
+    feed = ScopeFeed(ends[0], unwatched_s=limit_s)
+    ends[1].send(asked("viewers", count=0))
+    time.sleep(0.4)
+    assert feed.stop_request() is StopRequest.NONE  # nobody has been there yet
+    for count in (1, 0, 1):
+        ends[1].send(asked("viewers", count=count))
+        assert feed.stop_request() is StopRequest.NONE
+    time.sleep(0.4)
+    assert feed.stop_request() is StopRequest.NONE  # somebody is there
+    ends[1].send(asked("viewers", count=0))
+    assert feed.stop_request() is StopRequest.NONE
+    time.sleep(0.4)
+    assert feed.stop_request() is expected
+    assert feed.stop_reason() == ("the scope: no page open for 0.3 s" if limit_s else "")
+
+
+@pytest.mark.parametrize("in_charge", [True, False])
+def test_the_end_of_the_server_brakes_what_is_led_from_the_page(
+    ends: tuple[socket.socket, socket.socket], in_charge: bool
+) -> None:
+    feed = ScopeFeed(ends[0], in_charge=in_charge)
+    assert feed.stop_request() is StopRequest.NONE
+    ends[1].close()
+    assert feed.stop_request() is (StopRequest.RAMP if in_charge else StopRequest.NONE)
+    (told,) = feed.requests()
+    assert "server has ended" in told.values["text"]
+    assert feed.requests() == []
+
+
+def test_nobody_watching_is_an_event_and_a_line_in_the_terminal(tmp_path: Path) -> None:
+    events: list[str] = []
+    config = load_config(shipped_config("virtual"))
+    orders = ViewerOrders(config, None, tmp_path / "a.mcap", {}, lambda level, text: events.append(text), lambda: None)
+    orders._told_s = math.inf  # how things stand is not told
+    err = io.StringIO()
+
+    class Asking(PhaseLines):
+        left: ClassVar[list[ViewerRequest]] = [ViewerRequest("viewers", "", {"count": count}) for count in (0, 1)]
+
+        def requests(self) -> list[ViewerRequest]:
+            return [self.left.pop(0)] if self.left else []
+
+    display = Asking(Output(stderr=err))
+    for _ in range(3):
+        orders.serve(display)
+    assert events == [UNWATCHED, "a page is open again"]
+    assert err.getvalue() == f"  {UNWATCHED}\n  a page is open again\n"
 
 
 def test_several_displays_are_one(ends: tuple[socket.socket, socket.socket]) -> None:
@@ -97,10 +179,11 @@ def test_several_displays_are_one(ends: tuple[socket.socket, socket.socket]) -> 
         display.note("delay")
         display.show(snapshot(records(3)))
         display.event(Event(0, INFO, "a", "b"))
-        ends[1].send(b"1")
+        ends[1].send(asked("stop", strength=1))
         assert display.stop_request() is StopRequest.RAMP
+        assert display.stop_reason() == "the scope's STOP, a viewer"
     assert err.getvalue() == "  tracking\n  delay\n"
-    assert [ends[1].recv(1 << 20)[:1] for _ in range(2)] == [RECORDS, EVENT]
+    assert [ends[1].recv(1 << 20)[:1] for _ in range(3)] == [SETTINGS, RECORDS, EVENT]
 
 
 def test_the_memory_is_a_ring() -> None:
@@ -214,10 +297,10 @@ def test_beyond_this_computer_the_token_is_asked_for(query: str, cookie: str, pa
 
 
 def test_orders_are_checked_and_beyond_this_computer_get_a_token(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(feed_module, "find_spec", lambda name: None)
+    monkeypatch.setattr(order_module, "find_spec", lambda name: None)
     with pytest.raises(DataError, match="needs the package nicegui"):
         scope_order("t", "127.0.0.1", 8642)
-    monkeypatch.setattr(feed_module, "find_spec", lambda name: object())
+    monkeypatch.setattr(order_module, "find_spec", lambda name: object())
     with pytest.raises(DataError, match=r"--port \(=0\) must be in \[1..65535\]"):
         scope_order("t", "127.0.0.1", 0)
     with socket.socket() as taken:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tools.cli.options import LOOK, Json, Quiet
+from tools.cli.options import LOOK, Bitrate, Channel, Interface, Json, Quiet, Target, loaded
 from tools.output import Output
 
 LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="run log (MCAP)")]
@@ -60,17 +60,36 @@ def report(
 
 
 def scope(
-    log: LogPath,
+    path: Annotated[Path, typer.Argument(metavar="LOG|CONFIG", help="run log (MCAP), or configuration of a joint")],
     host: Annotated[
         str, typer.Option("--host", help="address to serve at; beyond this computer with a token")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port")] = 8642,
+    port: Annotated[int, typer.Option("--port", help="of the page")] = 8642,
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    target: Target = None,
+    allow_low_margin: Annotated[
+        bool, typer.Option("--allow-low-margin", help="run a stable loop below margin.min_phase_margin_deg")
+    ] = False,
+    stop_unwatched: Annotated[
+        float | None,
+        typer.Option("--stop-unwatched", metavar="S", min=1.0, help="brake when no page has been open for S seconds"),
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """A run log in a local web page, to zoom into.  For a live one: jointctl run CONFIG --scope."""
+    """A local web page: a run log to zoom into, or a joint to start, watch, change and stop from the browser."""
+    from tools.verbs.scope import live_scope
     from tools.verbs.scope import scope as run_scope
 
-    raise typer.Exit(run_scope(log, Output(quiet=quiet), host=host, port=port))
+    output = Output(quiet=quiet)
+    if path.suffix == ".mcap":
+        raise typer.Exit(run_scope(path, output, host=host, port=port))
+    joint = loaded(path, interface, channel, bitrate, None, target)
+    code = live_scope(
+        joint, output, host=host, port=port, allow_low_margin=allow_low_margin, unwatched_s=stop_unwatched
+    )
+    raise typer.Exit(code)
 
 
 def register(app: typer.Typer) -> None:

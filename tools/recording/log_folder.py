@@ -54,7 +54,9 @@ def remove_oldest(config: Config, path: Path) -> list[Path]:
     """
     if not config.log.keep:
         return []
-    name = re.compile(rf"({re.escape(config.path.stem)}-\d{{8}}-\d{{6}}(?:-\d+)?)(?:\.tail)?\.(?:mcap|png|html)")
+    name = re.compile(
+        rf"({re.escape(config.path.stem)}-\d{{8}}-\d{{6}}(?:-\d+)?)(?:\.tail|\.recording-\d+)?\.(?:mcap|png|html)"
+    )
     runs: dict[str, list[Path]] = {}
     for file in path.parent.iterdir():
         if (found := name.fullmatch(file.name)) and found[1] != path.stem:

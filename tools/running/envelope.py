@@ -21,7 +21,7 @@ def motion_envelope(config: Config, report: CommissioningReport) -> list[str]:
     approach = float(constants.sequence.approach_s)
     limits = config.limits
     duration = config.trajectory.duration_s
-    time_text = f"{approach + duration:.0f} s" if duration else "until Ctrl-C"
+    time_text = f"{approach + duration:.0f} s" if duration else "until stopped"
     lines = [
         f"drive      {report.identity.name or 'unnamed'}, vendor {report.identity.vendor}, serial "
         f"{report.identity.serial or 'unknown'}, {report.mode}",

@@ -68,6 +68,10 @@ class Display(Protocol):
         """What whoever watches asks for."""
         ...
 
+    def stop_reason(self) -> str:
+        """Who or what asked for that stop; "" if nobody did."""
+        ...
+
     def requests(self) -> Sequence[ViewerRequest]:
         """What else they have asked for since the last call."""
         ...
@@ -89,6 +93,10 @@ class OnlyShows:
     def stop_request(self) -> StopRequest:
         """Nobody can ask for anything here; signals have their own way."""
         return StopRequest.NONE
+
+    def stop_reason(self) -> str:
+        """As above."""
+        return ""
 
     def requests(self) -> Sequence[ViewerRequest]:
         """As above."""

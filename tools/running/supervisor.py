@@ -61,9 +61,7 @@ class Supervisor:
         display: Callable[[], Display] | None = None,
     ) -> None:
         self._config = config
-        self._output = output
-        self._log_path = log_path
-        self._confirm = confirm
+        self._output, self._log_path, self._confirm = output, log_path, confirm
         self._allow_low_margin = allow_low_margin
         self._phase = AxisPhase.WAITING
         self._delay_s: float | None = None
@@ -73,6 +71,7 @@ class Supervisor:
         self._bus_watch = BusWatch(config, None)
         self._events = EventFinder()
         self._asked = StopRequest.NONE
+        self.signals = StopSignals()  # that came during the run
         self._stopped_by_viewer = ""
         self._guard: GuardHandle | None = None
         self._orders: ViewerOrders | None = None  # what viewers may change, while the loop runs
@@ -83,12 +82,12 @@ class Supervisor:
         check_cyclic_rate(config)
         tail_path = self._log_path.with_suffix(".tail.mcap")
         with (
-            stop_signals() as signals,
+            stop_signals() as self.signals,
             LoopHandle(config, self._table(), tail_path) as loop,
             recording(config) as self._recorder,
             bus_watch(config) as self._bus_watch,
         ):
-            drive = open_drive(config)
+            signals, drive = self.signals, open_drive(config)
             try:
                 self._guard = start_guard(config, loop)
                 report = drive.commission()
@@ -253,7 +252,7 @@ class Supervisor:
         if request is not self._asked:
             self._asked = request
             if not signals.name:
-                self._stopped_by_viewer = "the scope's STOP"
+                self._stopped_by_viewer = self._display.stop_reason()
             who = signals.name or self._stopped_by_viewer
             text = f"{request.name.lower().replace('_', ' ')} asked for by {who}"
             self._tell(log, Event(time.monotonic_ns(), WARNING, "supervisor", text))

@@ -12,8 +12,10 @@ from tools.configuration.config import Config
 from tools.recording.run_log import INFO, WARNING, Event, RunLogWriter
 from tools.running.live_changes import LiveChanges, settings_of
 from tools.running.live_panel import Display
+from tools.running.viewer_request import ViewerRequest
 
 SETTINGS_s = 0.5  # how often the page is told how things stand
+UNWATCHED = "no page is open any more; the joint goes on, Ctrl-C or `jointctl stop` brakes it"
 
 
 class ViewerOrders:
@@ -46,12 +48,21 @@ class ViewerOrders:
                 self._changes.take(request)
             elif request.kind == "record":
                 self._record(bool(request.values.get("on")), request.who)
+            elif request.kind == "viewers":
+                self._count_viewers(request, display)
         self._changes.poll()
         now_s = time.monotonic()
         if now_s - self._told_s >= SETTINGS_s:
             self._told_s = now_s
             recording = self._recording.path.name if self._recording is not None else ""
             display.settings({**settings_of(self._changes, self._config), "recording": recording})
+
+    def _count_viewers(self, request: ViewerRequest, display: Display) -> None:
+        """Whether anybody can see the joint move: told in the terminal and in the log."""
+        watched = bool(request.values.get("count"))
+        text = "a page is open again" if watched else str(request.values.get("text") or UNWATCHED)
+        self._tell(INFO if watched else WARNING, text)
+        display.note(text)
 
     def _record(self, on: bool, who: str) -> None:
         if on == (self._recording is not None):

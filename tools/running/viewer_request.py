@@ -12,7 +12,10 @@ LONGEST_BYTES = 4096
 
 @dataclass(frozen=True)
 class ViewerRequest:
-    """`kind` is gains, set_point, trajectory, record, start or prepare; `values` belong to it."""
+    """`kind` is gains, set_point, trajectory, record, start or prepare; `values` belong to it.
+
+    Two kinds come from the page's server itself: viewers, with the `count` of open pages, and stop, with `strength`.
+    """
 
     kind: str
     who: str
@@ -21,6 +24,11 @@ class ViewerRequest:
     def encoded(self) -> bytes:
         """As one message."""
         return json.dumps(asdict(self)).encode()
+
+
+def viewer(address: str | None) -> str:
+    """What a viewer is called in events."""
+    return f"a viewer at {address or 'an unknown address'}"
 
 
 def decoded(message: bytes) -> ViewerRequest | None:

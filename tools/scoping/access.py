@@ -12,7 +12,7 @@ from http.cookies import SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from tools.scoping.feed import LOOPBACK
+from tools.scoping.order import LOOPBACK
 
 COOKIE = "jointctl_scope"
 Scope = MutableMapping[str, Any]

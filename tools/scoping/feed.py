@@ -1,78 +1,49 @@
-"""The supervisor's end: log records and events out, the word of the STOP button back."""
+"""The supervisor's end: log records and events out; stops, requests and the number of open pages back."""
 
 from __future__ import annotations
 
 import contextlib
 import json
-import secrets
 import socket
 import subprocess
 import sys
+import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
-from importlib.util import find_spec
+from dataclasses import asdict
 from typing import Any, Self
 
-from drivers.errors import DataError
 from firmware_py.states import StopRequest
 from tools.recording.run_log import Event
-from tools.running.live_panel import Display, Snapshot
+from tools.running.live_panel import Snapshot
 from tools.running.viewer_request import LONGEST_BYTES, ViewerRequest, decoded
+from tools.scoping.order import ScopeOrder
 
 RECORDS, EVENT, SETTINGS = b"R", b"E", b"S"  # first byte of a message
 REQUESTS = 16  # of viewers, at most between two looks
 PIECE = 64  # records a message; less than the buffer of the socket
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
-
-
-@dataclass(frozen=True)
-class ScopeOrder:
-    """What the server is told."""
-
-    title: str
-    host: str
-    port: int
-    token: str  # "" = none is asked for
-    cia402: bool = True
-    feed_fd: int = -1  # -1: show `log` instead
-    log: str = ""
-
-    @property
-    def url(self) -> str:
-        """What to open."""
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"http://{host}:{self.port}/" + (f"?token={self.token}" if self.token else "")
-
-
-def scope_order(title: str, host: str, port: int, **more: Any) -> ScopeOrder:
-    """A checked order; beyond this computer a token is made.  `DataError` if the scope cannot be served."""
-    if find_spec("nicegui") is None:
-        raise DataError("the scope needs the package nicegui, which is not installed", "install the extra `scope`")
-    if not 1 <= port <= 65535:
-        raise DataError(f"--port (={port}) must be in [1..65535]")
-    try:
-        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((host, port))
-    except OSError as error:
-        raise DataError(
-            f"the scope cannot be served at {host}:{port}: {error.strerror or error}", "choose another --port"
-        ) from None
-    token = "" if host in LOOPBACK else secrets.token_urlsafe(16)
-    return ScopeOrder(title, host, port, token, **more)
+SERVER_ENDED = "the scope's server has ended: no page shows or stops the joint"
 
 
 class ScopeFeed:
-    """A `Display` that passes everything on to the server; nothing in it raises or waits."""
+    """A `Display` that passes everything on to the server; nothing in it raises or waits.
 
-    def __init__(self, end: socket.socket) -> None:
+    `in_charge`: the run is led from the page, so it brakes when the server has ended.  `unwatched_s`: it brakes when no
+    page has been open for so long; None = it goes on.  In any case the terminal and the log are told.
+    """
+
+    def __init__(self, end: socket.socket, *, in_charge: bool = False, unwatched_s: float | None = None) -> None:
         self._end = end
         end.setblocking(False)
+        self._in_charge, self._unwatched_limit_s = in_charge, unwatched_s
         self.dropped = 0  # messages
+        self.gone = False  # the server has ended
         self._asked = StopRequest.NONE
+        self._reason = ""
         self._requests: deque[ViewerRequest] = deque(maxlen=REQUESTS)
+        self._viewers = 0
+        self._unwatched_since_s: float | None = None  # None: somebody watches, or nobody ever has
 
     def _send(self, kind: bytes, body: bytes) -> None:
         try:
@@ -101,16 +72,59 @@ class ScopeFeed:
 
     def _receive(self) -> None:
         with contextlib.suppress(OSError):
-            while word := self._end.recv(LONGEST_BYTES):
-                if word in (b"1", b"2"):
-                    self._asked = max(self._asked, StopRequest(int(word)))
-                elif (request := decoded(word)) is not None:
+            while True:
+                word = self._end.recv(LONGEST_BYTES)
+                if not word:
+                    self._server_ended()
+                    break
+                if (request := decoded(word)) is None:
+                    continue
+                if request.kind == "stop":
+                    self._ask_stop(request.values.get("strength"), f"the scope's STOP, {request.who}")
+                elif request.kind == "viewers":
+                    self._count_viewers(request.values.get("count"))
+                else:
                     self._requests.append(request)
 
+    def _ask_stop(self, strength: Any, reason: str) -> None:
+        if strength not in (1, 2):
+            return
+        if self._asked is StopRequest.NONE:
+            self._reason = reason
+        self._asked = max(self._asked, StopRequest(strength))
+
+    def _count_viewers(self, count: Any, text: str = "") -> None:
+        """A change between nobody and somebody is passed on as a request."""
+        if not isinstance(count, int) or count == self._viewers:
+            return
+        told = (count > 0) is not (self._viewers > 0) and (count == 0 or self._unwatched_since_s is not None)
+        self._viewers = count
+        self._unwatched_since_s = None if count else time.monotonic()
+        if told:
+            self._requests.append(ViewerRequest("viewers", "", {"count": count, "text": text}))
+
+    def _server_ended(self) -> None:
+        if self.gone:
+            return
+        self.gone = True
+        self._viewers = max(self._viewers, 1)  # told whether or not a page was open
+        self._count_viewers(
+            0, SERVER_ENDED + (", braking" if self._in_charge else "; Ctrl-C or `jointctl stop` brakes")
+        )
+        if self._in_charge:
+            self._ask_stop(1, "the end of the scope's server")
+
     def stop_request(self) -> StopRequest:
-        """The strongest stop that a viewer has asked for."""
+        """The strongest stop that a viewer, or the absence of viewers, has asked for."""
         self._receive()
+        limit_s, since_s = self._unwatched_limit_s, self._unwatched_since_s
+        if limit_s is not None and since_s is not None and time.monotonic() - since_s >= limit_s:
+            self._ask_stop(1, f"the scope: no page open for {limit_s:g} s")
         return self._asked
+
+    def stop_reason(self) -> str:
+        """Who asked first."""
+        return self._reason
 
     def requests(self) -> Sequence[ViewerRequest]:
         """What viewers have asked for since the last call."""
@@ -123,68 +137,25 @@ class ScopeFeed:
         """A new run is being prepared: what was asked for before was for another one."""
         self._receive()
         self._requests.clear()
-        self._asked = StopRequest.NONE
+        self._asked, self._reason = StopRequest.NONE, ""
+        if self._unwatched_since_s is not None:
+            self._unwatched_since_s = time.monotonic()
 
     def __enter__(self) -> Self:
+        self.settings({"stage": "running"})
+        if self._unwatched_since_s is not None and not any(found.kind == "viewers" for found in self._requests):
+            self._requests.append(ViewerRequest("viewers", "", {"count": 0}))
         return self
 
     def __exit__(self, *_: object) -> None:
         """The server sees the end of the socket when the process that owns it is done with it."""
 
 
-class Displays:
-    """Several displays as one."""
-
-    def __init__(self, displays: Sequence[Display]) -> None:
-        self._displays = displays
-        self._stack = contextlib.ExitStack()
-
-    def note(self, text: str) -> None:
-        """See `Display`."""
-        for display in self._displays:
-            display.note(text)
-
-    def phase(self, text: str) -> None:
-        """See `Display`."""
-        for display in self._displays:
-            display.phase(text)
-
-    def show(self, snapshot: Snapshot) -> None:
-        """See `Display`."""
-        for display in self._displays:
-            display.show(snapshot)
-
-    def event(self, event: Event) -> None:
-        """See `Display`."""
-        for display in self._displays:
-            display.event(event)
-
-    def stop_request(self) -> StopRequest:
-        """See `Display`."""
-        return max(display.stop_request() for display in self._displays)
-
-    def requests(self) -> Sequence[ViewerRequest]:
-        """See `Display`."""
-        return [request for display in self._displays for request in display.requests()]
-
-    def settings(self, values: Mapping[str, Any]) -> None:
-        """See `Display`."""
-        for display in self._displays:
-            display.settings(values)
-
-    def __enter__(self) -> Self:
-        for display in self._displays:
-            self._stack.enter_context(display)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Leave all of them."""
-        self._stack.close()
-
-
 @contextmanager
-def scope_server(order: ScopeOrder) -> Iterator[ScopeFeed]:
-    """The server process for one run; it ends by itself a moment after this does."""
+def scope_server(
+    order: ScopeOrder, *, in_charge: bool = False, unwatched_s: float | None = None
+) -> Iterator[ScopeFeed]:
+    """The server process; it ends by itself a moment after this does.  For the rest see `ScopeFeed`."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     fed = ScopeOrder(**{**asdict(order), "feed_fd": theirs.fileno()})
     process = subprocess.Popen(
@@ -196,7 +167,7 @@ def scope_server(order: ScopeOrder) -> Iterator[ScopeFeed]:
     )
     theirs.close()
     try:
-        yield ScopeFeed(ours)
+        yield ScopeFeed(ours, in_charge=in_charge, unwatched_s=unwatched_s)
     finally:
         ours.close()
         try:

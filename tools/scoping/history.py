@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from typing import Any
 
@@ -48,7 +49,9 @@ class History:
         self._lock = threading.Lock()
         self.skipped = 0
         self.events: deque[Event] = deque(maxlen=EVENTS)
+        self.settings: dict[str, Any] = {}  # what the supervisor tells: gains, motion, stage, ...
         self.ended = False
+        self.heard_s = time.monotonic()  # of the last message of the supervisor
 
     def take(self, records: Any) -> None:
         """Append records, shape (N,), in order of time."""
@@ -62,6 +65,14 @@ class History:
             self._head += len(records)
             self.skipped += int(records["skipped"].sum())
 
+    def begin(self) -> None:
+        """A new run: what was seen of the one before goes."""
+        with self._lock:
+            self._head = 0
+            self._start_ns = 0
+            self.skipped = 0
+        self.events.clear()
+
     def take_bytes(self, body: bytes) -> None:
         """As `take`, of records as they came through the socket."""
         self.take(np.frombuffer(body, dtype_of(LogRecord)))
@@ -70,12 +81,16 @@ class History:
         """A copy of the records of the last `span_s`, up to `before_s` since the start if that is given."""
         with self._lock:
             count = min(self._head, len(self._ring))
-            rows = self._ring[np.arange(self._head - count, self._head) % len(self._ring)]
-        if not count:
-            return rows
-        time_s = self.seconds(rows)
-        end_s = float(time_s[-1]) if before_s is None else before_s
-        return rows[(time_s > end_s - span_s) & (time_s <= end_s)]
+            index = np.arange(self._head - count, self._head) % len(self._ring)
+            if not count:
+                return self._ring[index]
+            time_s = (self._ring["time_ns"][index] - self._start_ns) * 1e-9
+            end_s = float(time_s[-1]) if before_s is None else before_s
+            return self._ring[index[(time_s > end_s - span_s) & (time_s <= end_s)]]
+
+    def second(self, time_ns: int) -> float:
+        """Seconds since the first record ever taken."""
+        return (time_ns - self._start_ns) * 1e-9 if self._start_ns else 0.0
 
     def seconds(self, records: Any) -> np.ndarray:
         """float64[N] since the first record ever taken."""

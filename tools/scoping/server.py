@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import socket
@@ -9,14 +10,23 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 from tools.recording.run_log import Event, read_run_log
+from tools.running.viewer_request import ViewerRequest, viewer
 from tools.scoping.access import AccessControl
-from tools.scoping.feed import EVENT, RECORDS, ScopeOrder
+from tools.scoping.feed import EVENT, RECORDS, SETTINGS
 from tools.scoping.history import EVENTS, RING_RECORDS, History
+from tools.scoping.order import ScopeOrder
 
 _LONGEST = 1 << 20  # bytes of a message
+MESSAGES = 20  # that a page which was cut off for a moment gets again
+RECONNECT_S = 10.0  # a page that was cut off for less goes on where it was
 _AFTER_END_S = 1.5  # for the pages to show the end of the run
+COUNT_S = 0.5  # how often the open pages are counted
+COUNT_AGAIN_S = 2.0  # and the supervisor told, changed or not
+NICE = 5  # whoever looks on comes after the supervisor, but STOP has to arrive on a busy computer
+RELOAD_S = 3.0  # nobody for so long: the last page is closed, not reloaded
 
 
 class Feed(threading.Thread):
@@ -26,6 +36,7 @@ class Feed(threading.Thread):
         super().__init__(name="scope feed", daemon=True)
         self._end = end
         self._history = history
+        self._stops = 0  # since the stage has changed
 
     def run(self) -> None:
         """See `Thread`."""
@@ -40,16 +51,33 @@ class Feed(threading.Thread):
                 self._history.take_bytes(message[1:])
             elif message[:1] == EVENT:
                 self._history.events.append(Event(**json.loads(message[1:])))
+            elif message[:1] == SETTINGS:
+                found = json.loads(message[1:])
+                if found.get("stage") == "running" != self._history.settings.get("stage"):
+                    self._history.begin()
+                if found.get("stage", self._history.settings.get("stage")) != self._history.settings.get("stage"):
+                    self._stops = 0
+                self._history.settings.update(found)
+            self._history.heard_s = time.monotonic()
         self._history.ended = True
         time.sleep(_AFTER_END_S)
         os._exit(0)  # the server itself would wait for every open page
 
-    def stop(self, strength: int) -> None:
-        """The word of the STOP button: 1 brake, 2 quick stop."""
+    def stop(self, who: str) -> int:
+        """A press of STOP: 1 brake, 2 quick stop if it was pressed before, 0 if the supervisor does not take it."""
+        strength = 2 if self._stops else 1
+        if not self.ask(ViewerRequest("stop", who, {"strength": strength})):
+            return 0
+        self._stops += 1
+        return strength
+
+    def ask(self, request: ViewerRequest) -> bool:
+        """Pass on what a viewer asks for, without waiting; False if it is not taken."""
         try:
-            self._end.send(str(strength).encode())
+            self._end.send(request.encoded(), socket.MSG_DONTWAIT)
         except OSError:
-            self._history.ended = True  # nobody listens: the run is over
+            return False
+        return True
 
 
 def history_of_log(path: str) -> History:
@@ -62,12 +90,42 @@ def history_of_log(path: str) -> History:
     return history
 
 
+def stop_route(feed: Feed) -> Any:
+    """The answer to a press of STOP."""
+    from starlette.responses import PlainTextResponse
+
+    async def stop(request: Any) -> Any:
+        strength = feed.stop(viewer(request.client.host if request.client else None))
+        if not strength:
+            return PlainTextResponse("not taken: jointctl does not listen", 503)
+        return PlainTextResponse("STOP taken; again: quick stop" if strength == 1 else "STOP taken: quick stop")
+
+    return stop
+
+
+async def count_viewers(feed: Feed) -> None:
+    """Tell the supervisor how many pages are open; a reload is no absence."""
+    from nicegui import Client
+
+    told, told_s, seen_s = -1, 0.0, 0.0
+    while True:
+        count = sum(client.has_socket_connection for client in list(Client.instances.values()))
+        now_s = time.monotonic()
+        if count:
+            seen_s = now_s
+        if (count or now_s - seen_s > RELOAD_S) and (count != told or now_s - told_s > COUNT_AGAIN_S):
+            told, told_s = count, now_s
+            feed.ask(ViewerRequest("viewers", "server", {"count": count}))
+        await asyncio.sleep(COUNT_S)
+
+
 def serve(order: ScopeOrder) -> None:
     """Until the run ends, or for a log until it is interrupted."""
     # the import takes seconds, and only this process needs it
     from nicegui import app, ui
 
     from tools.scoping.page import build_page
+    from tools.scoping.stop_button import STOP_PATH
 
     feed: Feed | None = None
     if order.feed_fd >= 0:
@@ -79,18 +137,22 @@ def serve(order: ScopeOrder) -> None:
 
     @ui.page("/", title=f"jointctl: {order.title}")
     def index() -> None:
-        build_page(order, history, feed.stop if feed is not None else None)
+        build_page(order, history, feed)
 
+    if feed is not None:
+        app.add_route(STOP_PATH, stop_route(feed), methods=["POST"])
+        app.on_startup(lambda: count_viewers(feed))
     app.add_middleware(AccessControl, token=order.token)
     ui.run(
-        host=order.host, port=order.port, show=False, reload=False, show_welcome_message=False, dark=None,
+        host=order.host, port=order.port, show=False, reload=False, show_welcome_message=False, dark=False,
+        message_history_length=MESSAGES, reconnect_timeout=RECONNECT_S,
         uvicorn_logging_level="error",
     )  # fmt: skip
 
 
 def main() -> int:
     """Entry point of the process."""
-    os.nice(10)  # whoever looks on comes last
+    os.nice(NICE)
     serve(ScopeOrder(**json.loads(sys.argv[1])))
     return 0
 

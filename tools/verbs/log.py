@@ -85,6 +85,8 @@ def _event_table(log: RunLog) -> Table:
 def log_plot(path: Path, output: Output, out: Path | None = None) -> int:
     """The picture of the run as a PNG; by default beside the log."""
     log = read_run_log(path)
+    if not len(log.records):
+        raise DataError(f"{path}: nothing to draw, the run has 0 records")
     target = _target(path, out, ".png")
     save_run_figure(log.records, target, path.stem)
     output.result(str(target), {"picture": str(target)})

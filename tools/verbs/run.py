@@ -77,9 +77,12 @@ def _displays(
     if scope is None:
         yield terminal
         return
-    from tools.scoping.feed import Displays, scope_order, scope_server
+    from tools.scoping.displays import Displays
+    from tools.scoping.feed import scope_server
+    from tools.scoping.order import scope_order
 
     order = scope_order(title, *scope, cia402=config.bus.interface != SERIAL)
     output.note(f"scope: {order.url}")
     with scope_server(order) as feed:
+        feed.settings({"stage": "terminal"})
         yield lambda: Displays([terminal(), feed])

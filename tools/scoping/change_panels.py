@@ -1,0 +1,111 @@
+"""What may be changed while the joint moves: set-point, trajectory, gains; and the recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from nicegui import ui
+
+Ask = Callable[[str, dict[str, Any]], None]
+# kind -> key -> (label, first value)
+FIELDS: dict[str, dict[str, tuple[str, float]]] = {
+    "configured": {},
+    "sine": {
+        "amplitude_rad": ("amplitude [rad]", 0.1), "frequency_Hz": ("frequency [Hz]", 0.2),
+        "offset_rad": ("offset [rad]", 0.0),
+    },
+    "min_jerk": {
+        "start_rad": ("start [rad]", 0.0), "target_rad": ("target [rad]", 0.1), "move_s": ("move [s]", 2.0),
+        "dwell_s": ("rest [s]", 0.5),
+    },
+    "trapezoid": {
+        "start_rad": ("start [rad]", 0.0), "target_rad": ("target [rad]", 0.1), "speed_radps": ("speed [rad/s]", 0.1),
+        "acceleration_radps2": ("acceleration [rad/s2]", 0.5), "dwell_s": ("rest [s]", 0.5),
+    },
+}  # fmt: skip
+UNITS = {"kp": "kp [1/s2]", "kv": "kv [1/s]", "ki": "ki [1/s3]", "observer_radps": "observer [rad/s]",
+         "learning_rate": "learning rate"}  # fmt: skip
+
+
+class ChangePanels:
+    """The right-hand side of the page; nothing here is more than a wish: the supervisor checks each."""
+
+    def __init__(self, ask: Ask) -> None:
+        self._ask = ask
+        self._gains: dict[str, Any] = {}
+        self._given: dict[str, Any] = {}
+        self._recording = False
+        with ui.column().classes("w-64 shrink-0 gap-2") as self._column:
+            with _card("Set-point"), ui.row().classes("w-full no-wrap items-end gap-2"):
+                self._set_point = ui.number("angle [rad]", value=0.0, step=0.01, format="%.4f")
+                self._set_point.classes("grow").props('dense data-testid="set-point"')
+                _button("Go", self._go, "go")
+            with _card("Trajectory"):
+                kinds = {kind: kind.replace("_", " ") for kind in FIELDS}
+                self._kind = ui.select(kinds, value="configured", on_change=self._on_kind).classes("w-full")
+                self._kind.props('dense options-dense data-testid="kind"')
+                self._fields = ui.grid(columns=2).classes("w-full gap-x-2 gap-y-0")
+                _button("Follow it", self._follow, "follow")
+            with _card("Gains"):
+                self._gain_rows = ui.grid(columns=2).classes("w-full gap-x-2 gap-y-0")
+                _button("Apply", self._apply, "apply")
+            self._record = _button("Record", self._on_record, "record").classes("w-full")
+            self._recorded = ui.label("the run log has everything in any case").classes("text-xs text-grey-7")
+
+    def _go(self) -> None:
+        self._ask("set_point", {"position_rad": _number(self._set_point)})
+
+    def _on_kind(self) -> None:
+        self._given = {}
+        self._fields.clear()
+        with self._fields:
+            for key, (label, value) in FIELDS[self._kind.value].items():
+                self._given[key] = ui.number(label, value=value, format="%.4g").props(f'dense data-testid="{key}"')
+
+    def _follow(self) -> None:
+        kind = self._kind.value
+        values: dict[str, Any] = {"kind": kind}
+        if kind != "configured":
+            values |= {"duration_s": 0.0, **{key: _number(field) for key, field in self._given.items()}}
+        if kind in ("min_jerk", "trapezoid"):
+            values["repeat"] = True
+        self._ask("trajectory", values)
+
+    def _apply(self) -> None:
+        self._ask("gains", {name: _number(field) for name, field in self._gains.items()})
+
+    def _on_record(self) -> None:
+        self._ask("record", {"on": not self._recording})
+
+    def show(self, settings: Mapping[str, Any]) -> None:
+        """Gains appear when the supervisor tells them; what the viewer has typed stays."""
+        gains: Mapping[str, Any] = settings.get("gains", {})
+        self._column.visible = settings.get("stage") == "running" and bool(gains)
+        if set(gains) != set(self._gains):
+            self._gain_rows.clear()
+            self._gains = {}
+            with self._gain_rows:
+                for name, (low, now, high) in gains.items():
+                    field = ui.number(UNITS.get(name, name), value=now, min=low, max=high, format="%.5g")
+                    self._gains[name] = field.props(f'dense data-testid="gain-{name}"')
+        for name, (low, now, high) in gains.items():
+            self._gains[name].props(f'hint="now {now:.5g}, {low:.4g} to {high:.4g}"')
+        self._recording = bool(settings.get("recording"))
+        self._record.text = "Stop recording" if self._recording else "Record"
+        self._recorded.text = str(settings.get("recording") or "the run log has everything in any case")
+
+
+def _number(field: Any) -> float | None:
+    return None if field.value is None else float(field.value)
+
+
+def _card(title: str) -> Any:
+    card = ui.card().classes("w-full p-3 gap-1").props("flat bordered")
+    with card:
+        ui.label(title).classes("font-bold leading-tight")
+    return card
+
+
+def _button(text: str, action: Callable[[], None], name: str) -> Any:
+    return ui.button(text, on_click=action).props(f'no-caps dense outline data-testid="{name}"').classes("px-4")

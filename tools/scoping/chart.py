@@ -1,0 +1,116 @@
+"""The scope's picture: chosen signals over time, with pause, zoom and trigger."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from nicegui import ui
+
+from tools.scoping.history import SIGNALS, History, crossing_s
+
+SPANS_s = (2, 5, 10, 30, 60)
+FIRST_SIGNALS = ("desired angle [rad]", "angle [rad]", "command torque [Nm]")
+AFTER_TRIGGER = 0.5  # share of the span that is shown after the trigger
+COLOURS = ("#1f5fa8", "#d9731a", "#2e8b57", "#a8323e", "#6a51a3", "#5f6b76")
+_AXIS = {"type": "value", "scale": True, "nameTextStyle": {"fontSize": 12}, "splitLine": {"lineStyle": {"width": 0.6}}}
+
+
+class Chart:
+    """Refreshed ten times a second; what is not live or is paused is drawn only when something about it changes."""
+
+    def __init__(self, history: History, *, live: bool) -> None:
+        self._history = history
+        self._held_s: float | None = None  # right end of the picture while it stands
+        self._drawn: Any = None
+        self._names: list[str] = []
+        with ui.row().classes("w-full items-center gap-3"):
+            self._signals = ui.select(list(SIGNALS), value=list(FIRST_SIGNALS), multiple=True, label="signals")
+            self._signals.classes("grow min-w-40").props('dense options-dense data-testid="signals"')
+            self._span = ui.select(list(SPANS_s), value=10 if live else 60, label="span [s]").classes("w-20")
+            self._span.props("dense options-dense")
+            self._pause = ui.switch("pause", on_change=self._on_pause).props('dense data-testid="pause"')
+            ui.button("reset zoom", on_click=self._reset_zoom).props("flat dense no-caps")
+        with ui.row().classes("w-full items-center gap-3"):
+            self._armed = ui.switch("trigger", on_change=self._on_arm).props('dense data-testid="trigger"')
+            self._source = ui.select(list(SIGNALS), value="angle [rad]", label="on").classes("w-48")
+            self._source.props("dense options-dense")
+            self._edge = ui.toggle({True: "rising", False: "falling"}, value=True).props("dense no-caps")
+            self._level = ui.number("level", value=0.0, format="%.4g").classes("w-24").props("dense")
+            ui.label("holds the picture with the crossing in its middle").classes("text-xs text-grey-7")
+        self._chart = ui.echart(_options()).classes("w-full").style("height: 390px").props('data-testid="chart"')
+
+    def _on_pause(self) -> None:
+        rows = self._history.newest(1.0)
+        if not self._pause.value:
+            self._held_s = None
+        elif self._held_s is None and len(rows):
+            self._held_s = float(self._history.seconds(rows)[-1])
+
+    def _on_arm(self) -> None:
+        if self._armed.value:
+            self._held_s = None
+            self._pause.value = False
+
+    def _reset_zoom(self) -> None:
+        self._chart.run_chart_method("dispatchAction", {"type": "dataZoom", "start": 0, "end": 100})
+
+    def refresh(self) -> None:
+        """Draw what is new."""
+        span_s = float(self._span.value)
+        rows = self._history.newest(span_s, self._held_s)
+        if not len(rows):
+            return
+        if self._armed.value and not self._pause.value:
+            self._look_for_trigger(rows, span_s)
+        names = list(self._signals.value or [])
+        now = (int(rows["time_ns"][0]), int(rows["time_ns"][-1]), names, span_s)
+        if now != self._drawn:
+            self._drawn = now
+            self._draw(rows, names)
+
+    def _look_for_trigger(self, rows: Any, span_s: float) -> None:
+        """Hold the picture when the newest crossing stands in its middle."""
+        field, factor = SIGNALS[self._source.value]
+        time_s = self._history.seconds(rows)
+        values = rows[field] * factor
+        older = time_s <= time_s[-1] - AFTER_TRIGGER * span_s
+        level = float(self._level.value or 0.0)
+        at_s = crossing_s(time_s[older], values[older], level, rising=bool(self._edge.value))
+        if at_s is not None:
+            self._held_s = at_s + AFTER_TRIGGER * span_s
+            self._armed.value = False
+            self._pause.value = True
+
+    def _draw(self, rows: Any, names: list[str]) -> None:
+        units = list(dict.fromkeys(name[name.index("[") :] for name in names))
+        options = self._chart.options
+        options["yAxis"] = [
+            {**_AXIS, "name": unit, "position": "left" if i == 0 else "right", "offset": max(0, i - 1) * 56}
+            for i, unit in enumerate(units or [""])
+        ]
+        options["grid"]["right"] = 24 + 56 * max(0, len(units) - 1)
+        options["series"] = [
+            {"type": "line", "name": name, "showSymbol": False, "lineStyle": {"width": 1.4}, "animation": False,
+             "color": COLOURS[i % len(COLOURS)],
+             "yAxisIndex": units.index(name[name.index("[") :]), "data": self._history.series(rows, name)}
+            for i, name in enumerate(names)
+        ]  # fmt: skip
+        if names != self._names:  # axes that are left over would stay otherwise; the zoom begins anew
+            self._names = names
+            self._chart.run_chart_method("clear")
+        self._chart.update()
+
+
+def _options() -> dict[str, Any]:
+    return {
+        "animation": False,
+        "legend": {"top": 0},
+        "grid": {"left": 56, "right": 24, "top": 52, "bottom": 74},
+        "tooltip": {"trigger": "axis"},
+        "xAxis": {"type": "value", "name": "s", "min": "dataMin", "max": "dataMax", "splitLine": {"show": False},
+                  "axisLine": {"onZero": False},
+                  "axisLabel": {"showMinLabel": False, "showMaxLabel": False}},
+        "yAxis": [dict(_AXIS)],
+        "dataZoom": [{"type": "inside"}, {"type": "slider", "bottom": 8, "height": 22, "labelPrecision": 1}],
+        "series": [],
+    }  # fmt: skip
