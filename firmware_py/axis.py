@@ -17,8 +17,9 @@ from firmware_py.frozen_reading import check_reading
 from firmware_py.kernel import kernel
 from firmware_py.live_change import step_change, step_new_motion
 from firmware_py.records import AxisConstants, AxisState, Command, Sample
-from firmware_py.safety import limited_torque_Nm, motion_fault, reference_fault
+from firmware_py.safety import limit_position_rad, limited_torque_Nm, motion_fault, reference_fault
 from firmware_py.sequence import (
+    compare_encoders,
     enter,
     powered,
     react,
@@ -65,7 +66,9 @@ def _take_position(constants: AxisConstants, state: AxisState, sample: Sample, e
     state.sample_age_cycles = 0
     state.good_samples += 1
     state.measured_position_rad = sample.position_rad
+    state.second_position_rad = sample.second_position_rad
     state.measured_torque_Nm = sample.torque_Nm
+    compare_encoders(constants.limits, state, sample)
     return gap_cycles
 
 
@@ -126,8 +129,8 @@ def _check_motion(constants: AxisConstants, state: AxisState) -> None:
     """Measured position, velocity and following error against their limits."""
     check_reading(constants, state)
     error_rad = state.measured_position_rad - state.reference.position_rad
-    fault = motion_fault(constants.limits, state.measured_position_rad, state.velocity.velocity_radps, error_rad)
-    value = state.measured_position_rad
+    value = limit_position_rad(constants.limits, state.measured_position_rad, state.second_position_rad)
+    fault = motion_fault(constants.limits, value, state.velocity.velocity_radps, error_rad)
     if fault == Fault.VELOCITY_LIMIT:
         value = state.velocity.velocity_radps
     elif fault == Fault.FOLLOWING_ERROR:

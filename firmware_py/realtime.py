@@ -63,6 +63,7 @@ def write_log(record: LogRecord, state: AxisState, sample: Sample, command: Comm
     record.cycle = state.cycle
     record.trajectory_s = state.trajectory_s
     record.position_rad = state.measured_position_rad
+    record.second_position_rad = state.second_position_rad
     record.velocity_radps = state.velocity.velocity_radps
     record.desired_position_rad = state.reference.position_rad
     record.desired_velocity_radps = state.reference.velocity_radps

@@ -67,6 +67,10 @@ class LimitConstants:
     saturation_max_cycles: i8
     skipped_max_cycles: i8  # in one overrun
     standstill_radps: f8
+    # a second encoder of the joint; 0 = there is none
+    disagreement_max_rad: f8
+    twist_radpNm: f8  # by how much they may differ more for each Nm of torque: the reducer's compliance
+    limit_source: i4  # LimitSource
 
 
 @record
@@ -113,6 +117,7 @@ class Sample:
     """One reading of the drive, in the units of the joint; filled by a driver."""
 
     position_rad: f8
+    second_position_rad: f8  # of the encoder that does not feed the law, where there is one
     torque_Nm: f8
     time_ns: i8  # when it was received
     count: i8  # samples received so far: unchanged means that nothing new arrived
@@ -153,6 +158,7 @@ class AxisState:
     trajectory_s: f8
     sample_late_s: f8  # from the slot to the request of this cycle's sample; set by a real-time loop, else 0
     measured_position_rad: f8  # at the slot
+    second_position_rad: f8
     measured_torque_Nm: f8
     command_torque_Nm: f8
     unlimited_torque_Nm: f8  # the law's output before limits, kept for the log
@@ -172,6 +178,7 @@ class LogRecord:
     cycle: i8
     trajectory_s: f8
     position_rad: f8
+    second_position_rad: f8  # of the encoder that does not feed the law, where there is one
     velocity_radps: f8
     desired_position_rad: f8
     desired_velocity_radps: f8

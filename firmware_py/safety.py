@@ -9,7 +9,7 @@ import math
 
 from firmware_py.kernel import kernel
 from firmware_py.records import LimitConstants
-from firmware_py.states import AxisPhase, DriveState, Fault, Reaction
+from firmware_py.states import AxisPhase, DriveState, Fault, LimitSource, Reaction
 
 
 @kernel
@@ -28,6 +28,27 @@ def motion_fault(limits: LimitConstants, position_rad: float, velocity_radps: fl
     if not within(error_rad, -limits.following_error_max_rad, limits.following_error_max_rad):
         return Fault.FOLLOWING_ERROR
     return Fault.NONE
+
+
+@kernel
+def limit_position_rad(limits: LimitConstants, law_rad: float, other_rad: float) -> float:
+    """The position that the position limits are checked with; of both, the one farther from the middle, or NaN."""
+    if limits.limit_source == LimitSource.OTHER:
+        return other_rad
+    if limits.limit_source == LimitSource.BOTH:
+        middle_rad = 0.5 * (limits.position_min_rad + limits.position_max_rad)
+        if not abs(other_rad - middle_rad) <= abs(law_rad - middle_rad):
+            return other_rad
+    return law_rad
+
+
+@kernel
+def encoders_disagree(limits: LimitConstants, law_rad: float, other_rad: float, torque_Nm: float) -> bool:
+    """Whether two encoders of one joint differ by more than allowed; a flexible reducer twists under `torque_Nm`."""
+    if limits.disagreement_max_rad <= 0.0:
+        return False
+    allowed_rad = limits.disagreement_max_rad + limits.twist_radpNm * abs(torque_Nm)
+    return not abs(law_rad - other_rad) <= allowed_rad
 
 
 @kernel

@@ -13,8 +13,8 @@ import numpy as np
 from firmware_py.computed_torque import reset_law
 from firmware_py.kernel import kernel
 from firmware_py.live_change import reset_change
-from firmware_py.records import LINE_GONE, AxisConstants, AxisState, Command, Sample
-from firmware_py.safety import motion_fault, reaction_to
+from firmware_py.records import LINE_GONE, AxisConstants, AxisState, Command, LimitConstants, Sample
+from firmware_py.safety import encoders_disagree, limit_position_rad, motion_fault, reaction_to
 from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction, StopRequest
 from firmware_py.trajectory import plan_approach, reference_at
 
@@ -39,6 +39,7 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.still_cycles = 0
     state.frozen_samples = 0
     state.pushed_cycles = 0
+    state.second_position_rad = 0.0
     state.table_row = 0
     state.trajectory_s = 0.0
     state.command_torque_Nm = 0.0
@@ -98,6 +99,15 @@ def trip(state: AxisState, fault: int, value: float, drive_error: int) -> None:
 
 
 @kernel
+def compare_encoders(limits: LimitConstants, state: AxisState, sample: Sample) -> None:
+    """A new sample of a joint with two encoders.  Not while the drive brakes: one reaction is enough."""
+    if state.phase <= AxisPhase.RELEASING and encoders_disagree(
+        limits, sample.position_rad, sample.second_position_rad, state.command_torque_Nm
+    ):
+        trip(state, Fault.POSITION_DISAGREEMENT, sample.second_position_rad - sample.position_rad, sample.drive_error)
+
+
+@kernel
 def request_stop(state: AxisState, stop_request: int) -> None:
     """A stop asked for by the user is no fault; before torque is applied it just switches off."""
     if stop_request == StopRequest.NONE:
@@ -116,9 +126,10 @@ def step_waiting(constants: AxisConstants, state: AxisState, sample: Sample) -> 
     limits = constants.limits
     moving = not abs(state.velocity.velocity_radps) <= limits.standstill_radps
     if state.good_samples >= constants.sequence.settle_cycles:
-        fault = motion_fault(limits, state.measured_position_rad, 0.0, 0.0)
+        position_rad = limit_position_rad(limits, state.measured_position_rad, state.second_position_rad)
+        fault = motion_fault(limits, position_rad, 0.0, 0.0)
         if fault != Fault.NONE:
-            trip(state, fault, state.measured_position_rad, 0)
+            trip(state, fault, position_rad, 0)
             return
         enabled = sample.drive_state == DriveState.ENABLED  # it should be off: nobody has asked for more
         if not moving and not enabled and constants.sequence.may_enable != 0:

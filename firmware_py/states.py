@@ -66,6 +66,7 @@ class Fault(IntEnum):
     POSITION_FROZEN = 21  # the reading stands still although the reference moves
     SUSPENDED = 22  # the computer slept
     DRIVE_SILENT = 23  # the drive's own heartbeat stays away
+    POSITION_DISAGREEMENT = 24  # the two encoders of the joint differ by more than they may
 
 
 class Reaction(IntEnum):
@@ -111,6 +112,14 @@ class TrajectoryKind(IntEnum):
     MIN_JERK = 2
     TRAPEZOID = 3
     TABLE = 4
+
+
+class LimitSource(IntEnum):
+    """Which position the position limits are checked with, where a joint has two encoders."""
+
+    LAW = 0  # the one that feeds the law
+    OTHER = 1
+    BOTH = 2
 
 
 class CommandKind(IntEnum):

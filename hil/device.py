@@ -14,6 +14,7 @@ from firmware_py.schema import dtype_of, new
 from hil.device_core import accept_frame, advance, power_on
 from hil.device_records import Device, NmtState
 from hil.device_write_rules import check_write
+from hil.encoder_node import EncoderSettings, VirtualEncoder
 from hil.faults import no_faults
 from hil.frames import FRAME_SIZE, FrameQueue
 from hil.object_dictionary import ObjectDictionary
@@ -43,6 +44,9 @@ class DeviceSettings:
     velocity_integral_Nmprad: float = 10_000.0
     position_gain_ps: float = 30.0
     parameter_file: Path | None = None  # keeps what 1010 saves; None = as long as the device exists
+    second_counts_prad: float = 0.0  # of 60E4:1, on the joint, with the sign of its direction
+    second_offset_counts: float = 0.0
+    encoder: EncoderSettings | None = None  # an encoder node on the joint
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -98,6 +102,7 @@ class Cia402Device:
         self.parameters = ParameterStore(self.objects, settings.parameter_file)
         self.objects.restore_strings()
         self.sdo = SdoServer(self.objects, self._write)
+        self.encoder = VirtualEncoder(settings.encoder, self.device) if settings.encoder is not None else None
         power_on(self.device[0])
         self._resets = int(self.device[0].application_resets)
 
@@ -109,6 +114,8 @@ class Cia402Device:
         device.velocity_gain_Nmspr = settings.velocity_gain_Nmspr
         device.velocity_integral_Nmprad = settings.velocity_integral_Nmprad
         device.position_gain_ps = settings.position_gain_ps
+        device.second_counts_prad = settings.second_counts_prad
+        device.second_offset_counts = settings.second_offset_counts
         device.counts_per_rad = self.plant_constants[0].counts_prad
         objects.set_default(0x608F, 1, round(abs(device.counts_per_rad) * 2.0 * math.pi))
         objects.set_default(0x608F, 2, max(1, round(settings.reduction_ratio)))
@@ -132,10 +139,21 @@ class Cia402Device:
         """True for a frame that `answer_sdo` is for, in a state in which SDO is alive."""
         identifier = struct.unpack_from("<I", frame)[0]
         alive = self.device[0].nmt not in (NmtState.BOOT_UP, NmtState.STOPPED)
+        if self._is_for_encoder(frame):
+            return True
         return bool(identifier == 0x600 + self.settings.node_id and alive)
+
+    def _is_for_encoder(self, frame: bytes) -> bool:
+        encoder = self.encoder
+        return encoder is not None and struct.unpack_from("<I", frame)[0] == 0x600 + encoder.settings.node_id
 
     def answer_sdo(self, frame: bytes, now_ns: int) -> list[bytes]:
         """SDO response frames; the core notices what was written at its next `advance`."""
+        if self.encoder is not None and self._is_for_encoder(frame):
+            if not self.encoder.answers_sdo:
+                return []
+            answers = self.encoder.sdo.handle(frame[8 : 8 + min(frame[4], 8)], now_ns)
+            return [struct.pack("<IB3x8s", 0x580 + self.encoder.settings.node_id, 8, data) for data in answers]
         resets = int(self.device[0].application_resets)
         if resets != self._resets:
             self._resets = resets

@@ -8,6 +8,8 @@ Not modelled: TIME, LSS, bus-off; the only remote request that is answered is no
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from firmware_py.kernel import kernel
@@ -28,6 +30,7 @@ from hil.device_errors import (
 )
 from hil.device_records import CONSUMERS, Device, HomingState, NmtState, PowerState, int64
 from hil.device_timers import SYNC_ERROR, answer_node_guard, connection_back, enter_nmt, run_timers
+from hil.encoder_core import accept_encoder_frame, step_encoder
 from hil.frames import FrameQueue
 from hil.joint import encoder_counts, step_plant
 from hil.pdo_core import mark_events, receive_rpdo, receive_sync
@@ -104,6 +107,9 @@ def sample_objects(device: Device, plant_c: PlantConstants, plant_s: PlantState)
     """
     drive = device.drive
     drive.position = _position_counts(device, plant_c, plant_s)
+    drive.second_position = _int32(
+        math.floor(plant_s.joint_position_rad * device.second_counts_prad + device.second_offset_counts + 0.5)
+    )
     drive.velocity = _int32(plant_s.joint_velocity_radps * device.counts_per_rad)
     motor_torque_mNm = 1e3 * plant_c.torque_per_current_NmpA * plant_s.current_A / device.reduction_ratio
     drive.torque = _int16(1e3 * motor_torque_mNm / int64(drive.rated_torque_mNm))
@@ -171,6 +177,7 @@ def advance(device: Device, plant_c: PlantConstants, plant_s: PlantState, until_
     _notice_status(device)
     if until_ns >= device.next_due_ns:
         run_timers(device, until_ns, queue)
+    step_encoder(device.encoder, plant_s, until_ns, queue)
 
 
 @kernel
@@ -218,6 +225,8 @@ def accept_frame(
     advance(device, plant_c, plant_s, now_ns, queue)
     identifier = int64(frame[0]) | int64(frame[1]) << 8
     size = int64(frame[4])
+    if not (frame[3] & 0xE0 or frame[2] or identifier > 0x7FF):
+        accept_encoder_frame(device.encoder, plant_s, identifier, frame, queue)
     if frame[3] & 0xA0 or frame[2] or identifier > 0x7FF or device.nmt == NmtState.BOOT_UP or size > 8:
         return  # extended and error frames are not for this device
     if frame[3] & 0x40:

@@ -64,6 +64,7 @@ def _fields() -> dict[tuple[int, int], str]:
         (0x60B2, 0): "torque_offset",
         (0x60C2, 1): "interpolation_time",
         (0x60C2, 2): "interpolation_exponent",
+        (0x60E4, 1): "second_position",
         (0x60F4, 0): "following_error",
         (0x60FF, 0): "target_velocity",
         (0x6502, 0): "supported_modes",

@@ -113,7 +113,10 @@ def _take_frame(
 ) -> None:
     """One frame at the drive's end: SDO requests go to the Python thread, all others to the core."""
     identifier = int64(frame[0]) | int64(frame[1]) << 8 | int64(frame[3]) << 24
-    if identifier == 0x600 + device.node_id:
+    if device.encoder.node_id != 0 and identifier == 0x600 + device.encoder.node_id:
+        address = np.uintp(frame.ctypes.data)
+        send(np.int32(service_fd), address, np.uintp(FRAME_SIZE), np.int32(MSG_DONTWAIT | MSG_NOSIGNAL))
+    elif identifier == 0x600 + device.node_id:
         advance(device, plant_c, plant_s, now_ns, queue)
         if device.nmt != NmtState.STOPPED and device.nmt != NmtState.BOOT_UP:
             address = np.uintp(frame.ctypes.data)

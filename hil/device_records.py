@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from firmware_py.schema import array_of, f8, i1, i2, i4, i8, record, u1, u2, u4
+from hil.encoder_records import EncoderNode
 
 # Widens an object's value before arithmetic (uint8 << 8 would overflow in plain Python); typed for mypy.
 int64: Callable[[Any], int] = np.int64  # type: ignore[assignment]
@@ -115,6 +116,7 @@ class DriveObjects:
     mode_display: i1
     demand_position: i4
     position: i4
+    second_position: i4
     following_window: u4
     following_timeout_ms: u2
     position_window: u4
@@ -158,6 +160,9 @@ class Device:
     drive: DriveObjects
     default_communication: CommunicationObjects
     default_drive: DriveObjects
+    encoder: EncoderNode  # a second encoder on the same joint and bus
+    second_counts_prad: f8  # of 60E4:1; 0 = there is none
+    second_offset_counts: f8
     # settings, fixed after construction
     node_id: i4
     reduction_ratio: f8

@@ -105,14 +105,20 @@ def load_entries(eds_path: Path, node_id: int) -> dict[tuple[int, int], Entry]:
     return entries
 
 
-def _field_view(memory: np.ndarray, group: str, field: str) -> np.ndarray:
-    """A one-element view of `field` ("name" or "name[flat element]") inside the first record of `memory`."""
+def split_field(field: str) -> tuple[str, int]:
+    """ "name" or "name[flat element]" as (name, element)."""
     match = re.fullmatch(r"(\w+)(?:\[(\d+)\])?", field)
     assert match is not None
+    return match[1], int(match[2] or 0)
+
+
+def _field_view(memory: np.ndarray, group: str, field: str) -> np.ndarray:
+    """A one-element view of `field` ("name" or "name[flat element]") inside the first record of `memory`."""
+    name, number = split_field(field)
     record = dtype_of(CommunicationObjects if group.endswith("communication") else DriveObjects)
-    element, offset = record.fields[match[1]][:2]  # type: ignore[index]
+    element, offset = record.fields[name][:2]  # type: ignore[index]
     dtype = element.subdtype[0] if element.subdtype else element
-    offset += int(match[2] or 0) * dtype.itemsize + dtype_of(Device).fields[group][1]  # type: ignore[index]
+    offset += number * dtype.itemsize + dtype_of(Device).fields[group][1]  # type: ignore[index]
     return np.ndarray((1,), dtype, buffer=memory.view(np.ndarray).view(np.uint8).data, offset=offset)
 
 
@@ -120,12 +126,7 @@ class ObjectDictionary:
     """Values of all objects of one device; `memory` is its `Device` record array of one element."""
 
     def __init__(self, eds_path: Path, node_id: int, memory: Any) -> None:
-        self.entries = load_entries(eds_path, node_id)
-        self._indices = {index for index, _ in self.entries}
-        self._live: dict[tuple[int, int], np.ndarray] = {}
-        self._initial: dict[tuple[int, int], np.ndarray] = {}
-        self._strings: dict[tuple[int, int], bytes] = {}
-        self._default_strings = {k: str(e.default).encode() for k, e in self.entries.items() if e.dtype is None}
+        self._take_entries(load_entries(eds_path, node_id))
         for key, field in FIELDS.items():
             if key not in self.entries:
                 raise ValueError(f"{eds_path.name}: object {key[0]:04X}:{key[1]} must be there, the drive uses it")
@@ -144,6 +145,14 @@ class ObjectDictionary:
                 place, kind = f"{key[0]:04X}:{key[1]}", self._live[key].dtype
                 raise ValueError(f"{eds_path.name}: DefaultValue of {place} (={default}) must be a {kind}") from None
         self.restore_strings()
+
+    def _take_entries(self, entries: dict[tuple[int, int], Entry]) -> None:
+        self.entries = entries
+        self._indices = {index for index, _ in entries}
+        self._live: dict[tuple[int, int], np.ndarray] = {}
+        self._initial: dict[tuple[int, int], np.ndarray] = {}
+        self._strings: dict[tuple[int, int], bytes] = {}
+        self._default_strings = {k: str(e.default).encode() for k, e in entries.items() if e.dtype is None}
 
     def __iter__(self) -> Iterator[Entry]:
         return iter(self.entries.values())

@@ -30,6 +30,8 @@ def read_object(drive: DriveObjects, entry: int) -> int:
         value = int64(drive.statusword)
     elif key == 0x606400:
         value = int64(drive.position)
+    elif key == 0x60E401:
+        value = int64(drive.second_position)
     elif key == 0x607700:
         value = int64(drive.torque)
     elif key == 0x606C00:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from drivers.canopen.cia402 import SUPPORTED_MODE_BIT, ControlWord, Mode, State, decode_state
 from drivers.canopen.connection_loss import arm_reaction, arm_rpdo_deadline
 from drivers.canopen.eds_file import EdsFile
+from drivers.canopen.encoder_node import EncoderFindings, commission_drive_object
 from drivers.canopen.object_access import ObjectAccess
 from drivers.canopen.pdo_layout import TARGET_TORQUE, TARGET_VELOCITY, PdoLayout
 from drivers.canopen.pdo_map import configure_loop_pdos
@@ -56,6 +57,7 @@ class Findings:
     start_counts: int = 0
     layout: PdoLayout | None = None  # of the loop's PDOs
     heartbeat_watched: bool = True  # the drive sends its own
+    second: EncoderFindings | None = None
     settings: dict[str, str] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
 
@@ -241,6 +243,10 @@ def commission(
     if deadline:
         findings.settings["RPDO deadline"] = deadline
     findings.remarks += remarks
+    second = settings.joint_encoder
+    if second is not None and second.node is None:
+        findings.second = commission_drive_object(objects, second, settings.node)
+        findings.settings["joint encoder"] = findings.second.words
     findings.start_counts = objects.read(0x6064, what="position actual value")
     findings.remarks += objects.remarks
     return findings

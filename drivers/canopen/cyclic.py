@@ -17,6 +17,7 @@ from drivers.can.bit_timing import worst_frame_bits
 from drivers.can.frames import ERROR_FLAG, Frame
 from drivers.canopen.cia402 import State, control_word, decode_state, drive_state
 from drivers.canopen.port import SLOT_HEARTBEAT, SLOT_RPDO, SLOT_SYNC, CanopenPort
+from drivers.canopen.second_position import SEEN_FIRST, SEEN_SECOND, publish_sample, take_second_counts, watch_second
 from drivers.position_counts import HALF_WRAP, WRAP, take_counts
 from firmware_py.kernel import kernel
 from firmware_py.records import Command, Sample
@@ -70,6 +71,7 @@ def begin_cycle(port: CanopenPort, frames: np.ndarray) -> int:
     port.answered = 0
     due = port.heartbeat_cycles > 0 and port.cycle % port.heartbeat_cycles == 0
     port.cycle += 1
+    port.seen = 0
     if not due or port.unheeded_cycles > UNHEEDED_MAX_CYCLES:
         return 1
     frames[SLOT_HEARTBEAT].can_id = port.own_heartbeat_id
@@ -97,15 +99,28 @@ def _accept_tpdo(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -
     port.state = decode_state(sample.status_word)
     sample.drive_state = drive_state(port.state)
     take_counts(port, get_i32(frame.payload, port.position_at))
-    sample.position_rad = (port.counts - port.zero_counts) * port.position_radpcount
+    port.first_rad = (port.counts - port.zero_counts) * port.position_radpcount
     if port.torque_at >= 0:
         sample.torque_Nm = get_i16(frame.payload, port.torque_at) * port.torque_Nmppermille
-    sample.time_ns = now_ns
-    sample.count += 1
     if port.error_reset != 0 and port.cycle - port.error_cycle > ERROR_SHOWN_CYCLES:
         port.error_reset = 0
         sample.drive_error = 0
-    return True
+    port.seen |= SEEN_FIRST
+    return publish_sample(port, sample, now_ns)
+
+
+@kernel
+def _accept_second(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -> bool:
+    """Take the position of a second encoder; as for the drive's, one that repeats an old value is none."""
+    if frame.length < port.second.tpdo_length:
+        port.malformed += 1
+        return False
+    if port.in_cycle == 0 and port.seen & SEEN_SECOND != 0:
+        port.surplus += 1
+        return False
+    take_second_counts(port.second, get_i32(frame.payload, port.second.position_at))
+    port.seen |= SEEN_SECOND
+    return publish_sample(port, sample, now_ns)
 
 
 @kernel
@@ -116,6 +131,12 @@ def accept_frame(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -
         port.error_frames += 1
     elif frame.can_id == port.tpdo_id:
         return _accept_tpdo(port, frame, sample, now_ns)
+    elif port.second.tpdo_id != 0 and frame.can_id == port.second.tpdo_id:
+        return _accept_second(port, frame, sample, now_ns)
+    elif port.second.emergency_id != 0 and (
+        frame.can_id == port.second.emergency_id or frame.can_id == port.second.heartbeat_id
+    ):
+        watch_second(port.second, frame, sample)
     elif frame.can_id == port.emergency_id:
         if frame.length >= 2:
             code = get_u16(frame.payload, 0)

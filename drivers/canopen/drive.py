@@ -14,10 +14,12 @@ import canopen
 from drivers.canopen.cia402 import ControlWord, State, decode_state
 from drivers.canopen.commissioning import VELOCITY_MODES, Findings, commission
 from drivers.canopen.eds_file import read_eds
+from drivers.canopen.encoder_end import EncoderEnd
+from drivers.canopen.encoder_settings import DRIVE_RANGE_COUNTS
 from drivers.canopen.fault_reset import reset_fault
 from drivers.canopen.object_access import ATTEMPTS as SDO_ATTEMPTS
 from drivers.canopen.object_access import ObjectAccess
-from drivers.canopen.scaling import joint_angle_per_count_rad, new_port
+from drivers.canopen.scaling import joint_angle_per_count_rad, new_port, start_position_rad
 from drivers.canopen.settings import CanopenSettings
 from drivers.canopen.watchdog_proof import prove_watchdog
 from drivers.drive import CommissioningReport
@@ -88,6 +90,11 @@ class CanopenDrive:
         self._node = self._network.add_node(settings.node, self._eds.dictionary)
         self._node.sdo.RESPONSE_TIMEOUT = settings.sdo_timeout_s or SDO_TIMEOUT_S
         self._objects = ObjectAccess(self._node, self._eds.name, self._eds.unusable)
+        try:
+            self._encoder = EncoderEnd(self._network, settings, self._node.sdo.RESPONSE_TIMEOUT)
+        except ConfigurationError:
+            self.close()
+            raise
 
     def _find(self) -> None:
         """Make sure that the node answers, also one that is still booting; else say who does.
@@ -148,15 +155,26 @@ class CanopenDrive:
             self._find()
             self._objects.forget_verified()
             findings = commission(self._objects, self._settings, self._eds, self._sleep, self._prove_watchdog)
+            encoder = self._encoder.commission()
+            if encoder is not None:
+                findings.second = encoder[0]
+                findings.settings["joint encoder"] = encoder[0].words
+                findings.remarks += encoder[1]
         except can.CanError as error:
             raise BusError(f"the bus failed during commissioning: {error}") from None
         self._findings = findings
         angle_rad = joint_angle_per_count_rad(self._settings)
-        counts = findings.start_counts - self._settings.zero_counts
+        second = findings.second
+        start_rad = start_position_rad(
+            self._settings,
+            findings.start_counts,
+            second.start_counts if second is not None else 0,
+            second.range_counts if second is not None else DRIVE_RANGE_COUNTS,
+        )
         return CommissioningReport(
             identity=findings.identity,
             mode=findings.settings["mode"],
-            start_position_rad=counts * angle_rad * self._settings.encoder_direction,
+            start_position_rad=start_rad,
             torque_resolution_Nm=findings.torque_per_permille_Nm,
             position_resolution_rad=angle_rad,
             settings=findings.settings,
@@ -178,6 +196,8 @@ class CanopenDrive:
                 raise DeviceError(
                     f"node {self._settings.node}: 6061 shows mode {shown}, it was {self._findings.mode:d}"
                 )
+            self._encoder.verify_again()
+            self._encoder.tell(NMT_OPERATIONAL)
             self._node.nmt.send_command(NMT_OPERATIONAL)
         except can.CanError as error:
             raise BusError(f"the bus failed before the run: {error}") from None
@@ -214,6 +234,7 @@ class CanopenDrive:
             velocity=velocity,
             layout=found.layout,
             heartbeat_watched=found.heartbeat_watched,
+            second_range_counts=found.second.range_counts if found.second is not None else DRIVE_RANGE_COUNTS,
         )
 
     def make_safe(self) -> str:
@@ -252,6 +273,7 @@ class CanopenDrive:
     def _off(self) -> str:
         """One attempt of `make_safe`; the state in words."""
         state = State.UNDEFINED
+        self._encoder.tell(NMT_PRE_OPERATIONAL)
         self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
         self._brake()
         for _ in range(SAFE_ATTEMPTS):

@@ -99,11 +99,13 @@ def configure_loop_pdos(
     *,
     mode: int = 0,
     max_permille: int = 0,
+    spare: frozenset[int] = frozenset(),
 ) -> PdoLayout:
     """TPDO1 = statusword, position, torque at every SYNC; RPDO1 = controlword, `target`; the others off.
 
     Where the drive refuses that, the first of its PDOs that holds what is needed is used as it is; `mode` and
-    `max_permille` then fill 6060 and 6072 in it.  Raises `DeviceError` with what is missing.
+    `max_permille` then fill 6060 and 6072 in it.  PDOs in `spare` stay as they are.
+    Raises `DeviceError` with what is missing.
     """
     for item in (STATUS, POSITION, CONTROL, target):
         objects.require(item.index, item.sub, what=item.name)
@@ -113,7 +115,7 @@ def configure_loop_pdos(
     rpdo = _map_or_find(objects, COMMUNICATION_RPDO, own.rpdo_id, rpdo_transmission_type, (CONTROL, target))
     for first, kept in ((COMMUNICATION_TPDO, tpdo), (COMMUNICATION_RPDO, rpdo)):
         for base in pdos_of(objects, first):
-            if base != (first if kept is None else kept.base):
+            if base != (first if kept is None else kept.base) and base not in spare:
                 disable_pdo(objects, base)
     layout = own
     if tpdo is not None:

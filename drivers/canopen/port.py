@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import IntEnum
 from typing import Annotated
 
 import numpy as np
@@ -15,6 +16,38 @@ SLOT_RPDO = 2
 SLOT_RECEIVED = 3
 FRAME_SLOTS = 4
 SCRATCH_WORDS = 8
+
+
+class AlignTo(IntEnum):
+    """What to do about an encoder that does not know its angle when it is switched on."""
+
+    NOTHING = 0  # both are absolute
+    FIRST = 1  # the second one takes the angle of the first
+    SECOND = 2
+
+
+@record
+class SecondPosition:
+    """A second encoder of the joint: a node of its own (CiA 406), or another object of the drive."""
+
+    tpdo_id: u4  # 0 = there is none
+    tpdo_length: i4
+    position_at: i4  # byte position of 32 bits
+    emergency_id: u4  # of an encoder node; 0 = none
+    heartbeat_id: u4
+    range_counts: i8  # the reading runs over at this many counts
+    zero_counts: i8
+    radpcount: f8  # direction included, at the joint
+    align: i4  # AlignTo
+    feeds_law: i4
+    # state
+    primed: i4
+    aligned: i4
+    last_counts: i8  # as received
+    counts: i8  # since zero_counts, unwrapped
+    offset_rad: f8
+    error: i4  # EMCY error code that is present
+    lost: i4  # it has restarted: what it counts from is not known any more
 
 
 @record
@@ -48,7 +81,11 @@ class CanopenPort:
     target_is_velocity: i4  # the target is 60FF (32 bit) instead of 6071 (16 bit)
     velocity_radpspunit: f8  # of 60FF
     clock: Annotated[np.ndarray, array_of(i8, 2)]  # scratch of the stamps
+    second: SecondPosition
     # state
+    seen: i4  # TPDOs since the last SYNC: 1 the drive's, 2 the second encoder's
+    first_rad: f8  # position by 6064
+    first_offset_rad: f8
     primed: i4
     last_counts: i8  # as received, 32 bit
     counts: i8  # unwrapped

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from drivers.canopen.encoder_settings import DRIVE_RANGE_COUNTS, JointEncoderSettings
 from drivers.canopen.pdo_layout import PdoLayout, own_layout
-from drivers.canopen.port import CanopenPort
+from drivers.canopen.port import AlignTo, CanopenPort
+from drivers.canopen.second_position import centred
 from drivers.canopen.settings import CanopenSettings
 from firmware_py.schema import new
 
@@ -46,6 +48,7 @@ def new_port(
     velocity: bool = False,
     layout: PdoLayout | None = None,
     heartbeat_watched: bool = True,
+    second_range_counts: int = DRIVE_RANGE_COUNTS,
 ) -> Any:
     """A `CanopenPort` record array of one record; the file descriptor is still missing.
 
@@ -79,4 +82,40 @@ def new_port(
     port.torque_Nmppermille = torque_per_permille_Nm * settings.torque_direction
     port.max_permille = max_permille
     port.state = 8
+    if settings.joint_encoder is not None:
+        _fill_second(port.second, settings, settings.joint_encoder, second_range_counts)
     return ports
+
+
+def _fill_second(second: Any, settings: CanopenSettings, encoder: JointEncoderSettings, range_counts: int) -> None:
+    """The second encoder of the joint."""
+    if encoder.node is None:
+        second.tpdo_id = 0x280 + settings.node
+    else:
+        second.tpdo_id = 0x180 + encoder.node
+        second.emergency_id = 0x80 + encoder.node
+        second.heartbeat_id = 0x700 + encoder.node
+    second.tpdo_length = 4
+    second.position_at = 0
+    second.range_counts = range_counts
+    second.zero_counts = encoder.zero_counts
+    second.radpcount = encoder.rad_per_count
+    second.feeds_law = int(encoder.feeds_law)
+    if encoder.incremental:
+        second.align = AlignTo.FIRST
+    elif settings.encoder_incremental:
+        second.align = AlignTo.SECOND
+
+
+def start_position_rad(settings: CanopenSettings, first_counts: int, second_counts: int, range_counts: int) -> float:
+    """Where the joint stands by the encoder that feeds the law; an incremental one takes the other's angle."""
+    first_rad = (first_counts - settings.zero_counts) * joint_angle_per_count_rad(settings) * settings.encoder_direction
+    encoder = settings.joint_encoder
+    if encoder is None:
+        return first_rad
+    second_rad = centred(second_counts - encoder.zero_counts, range_counts) * encoder.rad_per_count
+    if encoder.incremental:
+        return first_rad
+    if settings.encoder_incremental or encoder.feeds_law:
+        return second_rad
+    return first_rad

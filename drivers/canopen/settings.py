@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from drivers.canopen.encoder_settings import JointEncoderSettings
+
 
 @dataclass(frozen=True)
 class CanopenSettings:
@@ -36,5 +38,7 @@ class CanopenSettings:
     velocity_unit: str = "counts/s"  # of 60FF: a key of `scaling.VELOCITY_UNITS`
     torque_rate_max_Nmps: float = 0.0  # of the loop, at the joint; what a torque slope (6087) must follow
     boot_timeout_s: float = 0.0  # how long a drive may take to answer and to leave Not Ready to Switch On
+    joint_encoder: JointEncoderSettings | None = None
+    encoder_incremental: bool = False
     sdo_timeout_s: float | None = None  # of one SDO request; None: `drive.SDO_TIMEOUT_S`
     velocity_max_radps: float | None = None  # at the joint, for the drive's own limit in the velocity modes

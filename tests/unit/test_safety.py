@@ -11,9 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_py.records import LimitConstants
-from firmware_py.safety import drive_fault, limited_torque_Nm, motion_fault, reaction_to, reference_fault, within
+from firmware_py.safety import (
+    drive_fault,
+    encoders_disagree,
+    limit_position_rad,
+    limited_torque_Nm,
+    motion_fault,
+    reaction_to,
+    reference_fault,
+    within,
+)
 from firmware_py.schema import new
-from firmware_py.states import AxisPhase, DriveState, Fault, Reaction
+from firmware_py.states import AxisPhase, DriveState, Fault, LimitSource, Reaction
 
 NOT_FINITE = (math.nan, math.inf, -math.inf)
 
@@ -190,3 +199,52 @@ def test_a_reference_must_be_able_to_brake_inside_the_limits(sign: float, past_r
     assert reference_fault(LIMITS, position, sign * velocity, brake, ahead) == fault
     # moving away from that limit, the same place is no danger
     assert reference_fault(LIMITS, position, -sign * 0.1, brake, ahead) == Fault.NONE
+
+
+# --- two encoders ----------------------------------------------------------------------------------------------
+
+
+def limits_of_two_encoders() -> Any:
+    limits = new(LimitConstants)[0]
+    limits.position_min_rad, limits.position_max_rad = -1.0, 3.0
+    limits.disagreement_max_rad, limits.twist_radpNm = 0.01, 1e-4
+    return limits
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize(("torque_Nm", "allowed_rad"), [(0.0, 0.01), (50.0, 0.015), (-50.0, 0.015)])
+def test_disagreement_is_dense_at_its_boundary(sign: float, torque_Nm: float, allowed_rad: float) -> None:
+    limits = limits_of_two_encoders()
+    for share in (0.0, 0.5, 0.99, 0.9999):
+        assert not encoders_disagree(limits, 0.0, sign * share * allowed_rad, torque_Nm)
+    for share in (1.0001, 1.01, 2.0, 1e6, float("inf"), float("nan")):
+        assert encoders_disagree(limits, 0.0, sign * share * allowed_rad, torque_Nm)
+    assert encoders_disagree(limits, float("nan"), 0.0, torque_Nm)
+
+
+def test_one_encoder_never_disagrees() -> None:
+    limits = limits_of_two_encoders()
+    limits.disagreement_max_rad = 0.0
+    assert not encoders_disagree(limits, 0.0, 1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("source", "law_rad", "other_rad", "seen_rad"),
+    [
+        (LimitSource.LAW, 0.5, 9.0, 0.5),
+        (LimitSource.OTHER, 0.5, 9.0, 9.0),
+        (LimitSource.BOTH, 1.2, 2.9, 2.9),  # the middle is 1
+        (LimitSource.BOTH, -0.95, 2.9, -0.95),
+        (LimitSource.BOTH, 3.1, 1.0, 3.1),
+    ],
+)
+def test_which_position_the_limits_see(source: LimitSource, law_rad: float, other_rad: float, seen_rad: float) -> None:
+    limits = limits_of_two_encoders()
+    limits.limit_source = source
+    assert limit_position_rad(limits, law_rad, other_rad) == seen_rad
+
+
+def test_of_both_a_position_that_is_no_number_is_seen() -> None:
+    limits = limits_of_two_encoders()
+    limits.limit_source = LimitSource.BOTH
+    assert math.isnan(limit_position_rad(limits, 0.0, float("nan")))

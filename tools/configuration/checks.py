@@ -173,9 +173,30 @@ def _drive_problems(config: Config) -> list[str]:
         ]
     else:
         weak = []
+    weak += _joint_encoder_problems(config)
     if isinstance(config.drive, ElmoSerial):
         return weak + serial_problems(config)
     return weak + _canopen_problems(config)
+
+
+def _joint_encoder_problems(config: Config) -> list[str]:
+    encoder, found = config.joint_encoder, []
+    if encoder is None:
+        return []
+    if isinstance(config.drive, ElmoSerial):
+        return ['[joint_encoder] needs a CANopen drive: drive.kind must be "canopen"']
+    if (encoder.source == "node") != (encoder.node is not None):
+        found.append('joint_encoder.node must be given with source = "node", and only then')
+    if encoder.node is not None and encoder.node in (config.canopen.node, config.canopen.master_node):
+        found.append(f"joint_encoder.node (={encoder.node}) must differ from drive.node and drive.master_node")
+    if encoder.kind == "incremental" and config.encoder.kind == "incremental":
+        found.append("joint_encoder.kind and encoder.kind are both incremental: one of them must know its angle")
+    if encoder.disagreement_max_rad >= config.limits.following_error_max_rad * 10.0:
+        found.append(
+            f"joint_encoder.disagreement_max_rad (={encoder.disagreement_max_rad:g}) must be less than ten times "
+            "limits.following_error_max_rad"
+        )
+    return found
 
 
 def _canopen_problems(config: Config) -> list[str]:

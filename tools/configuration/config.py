@@ -13,6 +13,7 @@ from pydantic import Field, PrivateAttr
 
 from drivers.errors import ConfigurationError
 from tools.configuration.elmo import ElmoSerial
+from tools.configuration.joint_encoder import JointEncoder
 from tools.configuration.plant import Virtual
 from tools.configuration.sections import (
     Bus,
@@ -41,6 +42,7 @@ class Config(Section):
     drive: Annotated[Drive | ElmoSerial, Field(discriminator="kind")]
     encoder: Encoder
     joint: Joint
+    joint_encoder: JointEncoder | None = None
     limits: Limits
     sequence: Sequence
     loop: Loop
@@ -76,6 +78,12 @@ class Config(Section):
     def eds_path(self) -> Path:
         """The EDS file: beside the configuration, else a shipped one."""
         return _beside(self._path, self.canopen.eds)
+
+    @property
+    def encoder_eds_path(self) -> Path | None:
+        """The EDS file of the joint's encoder node."""
+        encoder = self.joint_encoder
+        return _beside(self._path, encoder.eds) if encoder is not None and encoder.source == "node" else None
 
     @property
     def table_path(self) -> Path | None:

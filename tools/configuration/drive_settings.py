@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 from drivers.can.bit_timing import bus_load, highest_rate_Hz
+from drivers.canopen.encoder_settings import JointEncoderSettings
 from drivers.canopen.settings import CanopenSettings
 from drivers.errors import ConfigurationError
 from hil.device import DeviceSettings
+from hil.encoder_node import EncoderSettings
 from tools.configuration.config import Config
 from tools.configuration.conversions import torque_constant_NmpA
 
 CYCLE_BYTES = (0, 8, 4)  # SYNC, TPDO, RPDO
 VELOCITY_CYCLE_BYTES = (0, 8, 6)  # 60FF is longer than 6071
+SECOND_POSITION_BYTES = 4
 TORQUE_MODES = ("cst", "tq", "auto")  # of `CanopenSettings.mode`; the others may end in a velocity mode
 HIGHEST_LOAD = 0.8  # of the bus by the cyclic frames; the rest is for heartbeats, SDO and EMCY
 DEFAULT_RATED_CURRENT_A = 5.0
@@ -47,8 +53,29 @@ def canopen_settings(config: Config) -> CanopenSettings:
         velocity_unit=drive.velocity_unit,
         torque_rate_max_Nmps=config.limits.torque_rate_max_Nmps,
         boot_timeout_s=drive.boot_timeout_s,
+        joint_encoder=joint_encoder_settings(config),
+        encoder_incremental=config.encoder.kind == "incremental",
         sdo_timeout_s=drive.sdo_timeout_s,
         velocity_max_radps=config.limits.velocity_max_radps,
+    )
+
+
+def joint_encoder_settings(config: Config) -> JointEncoderSettings | None:
+    """Section [joint_encoder] for commissioning."""
+    encoder = config.joint_encoder
+    if encoder is None:
+        return None
+    index, _, sub = encoder.object.partition(":")
+    return JointEncoderSettings(
+        counts_per_turn=encoder.counts_per_turn,
+        direction=encoder.direction,
+        zero_counts=encoder.zero_counts,
+        incremental=encoder.kind == "incremental",
+        feeds_law=encoder.law == "joint_encoder",
+        node=encoder.node if encoder.source == "node" else None,
+        eds_path=config.encoder_eds_path,
+        index=int(index, 16),
+        sub=int(sub or 0),
     )
 
 
@@ -63,13 +90,28 @@ def device_settings(config: Config) -> DeviceSettings:
         motor_torque_constant_NmpA=torque_constant_NmpA(config),
         vendor_id=drive.vendor_id or 0,
         product_code=drive.product_code or 1,
+        **_second_encoder(config),
     )
+
+
+def _second_encoder(config: Config) -> dict[str, Any]:
+    """The virtual joint's second encoder: true to the configuration, but for [virtual]."""
+    encoder = config.joint_encoder
+    if encoder is None:
+        return {}
+    counts, zero = encoder.counts_per_turn, encoder.zero_counts
+    path = config.encoder_eds_path
+    if encoder.source == "drive" or path is None or encoder.node is None:
+        return {"second_counts_prad": encoder.direction * counts / math.tau, "second_offset_counts": float(zero)}
+    return {"encoder": EncoderSettings(path, encoder.node, counts, encoder.direction, zero)}
 
 
 def cyclic_bus_load(config: Config) -> float:
     """Share of the bus that the cyclic frames take at worst-case stuffing; refuses more than HIGHEST_LOAD."""
     rate_Hz, bitrate = config.loop.rate_Hz, config.bus.bitrate_bitps
-    cycle_bytes = CYCLE_BYTES if config.canopen.mode in TORQUE_MODES else VELOCITY_CYCLE_BYTES
+    cycle_bytes: tuple[int, ...] = CYCLE_BYTES if config.canopen.mode in TORQUE_MODES else VELOCITY_CYCLE_BYTES
+    if config.joint_encoder is not None:
+        cycle_bytes = (*cycle_bytes, SECOND_POSITION_BYTES)
     load = bus_load(cycle_bytes, rate_Hz, bitrate)
     if load > HIGHEST_LOAD:
         highest = highest_rate_Hz(cycle_bytes, bitrate, HIGHEST_LOAD)

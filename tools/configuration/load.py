@@ -51,7 +51,11 @@ def load_config(path: str | Path) -> Config:
     config._path, config._text = path, text
     raise_if([f"{path}: {line}" for line in problems_between_sections(config) + plant_problems(config)])
     eds_path = config.eds_path if isinstance(config.drive, Drive) else None
-    for key, file in (("drive.eds", eds_path), ("trajectory.file", config.table_path)):
+    for key, file in (
+        ("drive.eds", eds_path),
+        ("joint_encoder.eds", config.encoder_eds_path),
+        ("trajectory.file", config.table_path),
+    ):
         if file is not None and not file.is_file():
             raise_if([f"{path}: {key} (={file.name}) must name a file beside the configuration or a shipped one"])
     return config

@@ -12,7 +12,7 @@ from firmware_py.live_change import gains_of
 from firmware_py.lyapunov import solve_lyapunov_p
 from firmware_py.records import NEURONS, AxisConstants, Gains, TrajectoryConstants
 from firmware_py.schema import dtype_of, new
-from firmware_py.states import ControllerKind, FeedForward, TrajectoryKind, ZeroSpeedRule
+from firmware_py.states import ControllerKind, FeedForward, LimitSource, TrajectoryKind, ZeroSpeedRule
 from firmware_py.trajectory_table import approach_duration_s, approach_start, ends_meet, peak_of, table_from_csv
 from firmware_py.velocity import low_pass_gain
 from tools.configuration.checks import extremes_problems
@@ -180,7 +180,17 @@ def _fill_limits(record: Any, config: Config) -> None:
             for branch in (config.friction.positive, config.friction.negative)
         )
         record.frozen_torque_Nm = FROZEN_FRICTION * static_Nm + abs(config.joint.gravity_Nm)
-    record.frozen_tolerance_rad = FROZEN_COUNTS * abs(joint_rad_per_count(config))
+    second = config.joint_encoder
+    resolution_rad = abs(joint_rad_per_count(config))
+    if second is not None:
+        record.disagreement_max_rad = second.disagreement_max_rad
+        record.twist_radpNm = 1.0 / second.stiffness_Nmprad if second.stiffness_Nmprad is not None else 0.0
+        record.limit_source = LimitSource.BOTH
+        if second.limits != "both":
+            record.limit_source = LimitSource.LAW if second.limits == second.law else LimitSource.OTHER
+        if second.law == "joint_encoder":
+            resolution_rad = math.tau / second.counts_per_turn
+    record.frozen_tolerance_rad = FROZEN_COUNTS * resolution_rad
     record.frozen_max_rad = max(share * limits.following_error_max_rad, 5.0 * record.frozen_tolerance_rad)
     record.sample_age_max_cycles = _cycles(config, limits.sample_age_max_s)
     record.saturation_max_cycles = _cycles(config, limits.saturation_max_s)

@@ -141,6 +141,7 @@ class Encoder(Section):
     counts_per_turn: Annotated[int, between(4, 2**31 - 1)]  # counts of 6064 for one turn of the shaft that it sits on
     side: Literal["joint", "motor"]  # the shaft that it sits on
     direction: Direction  # of the counts against the joint angle
+    kind: Literal["absolute", "incremental"] = "absolute"  # incremental: with [joint_encoder] it takes that one's angle
     zero_counts: Annotated[int, between(-(2**31), 2**31 - 1)]  # the drive's reading at joint angle 0
 
 

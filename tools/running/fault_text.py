@@ -130,6 +130,11 @@ FAULT_TEXTS: dict[Fault, FaultText] = {
         "the drive's communication is partly dead, or another program has set its object 1017",
         "watch 700h + node with candump; restart the drive",
     ),
+    Fault.POSITION_DISAGREEMENT: FaultText(
+        "the two encoders of the joint differ by {value:.4f} rad (the other one minus the one that feeds the law)",
+        "one encoder or its cable, a slipping coupling, or zero, counts, direction or reduction_ratio of one are wrong",
+        "turn the joint by hand with the power off and compare both; see [encoder] and [joint_encoder]",
+    ),
     Fault.POSITION_JUMP: FaultText(
         "the position jumped by {value:.4f} rad between two samples",
         "encoder or its cable, or counts_per_turn too small by a factor",

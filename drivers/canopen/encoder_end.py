@@ -1,0 +1,50 @@
+"""The joint's encoder node as the drive's driver sees it; where there is none, every method does nothing."""
+
+from __future__ import annotations
+
+import canopen
+
+from drivers.canopen.eds_file import read_eds
+from drivers.canopen.encoder_node import EncoderFindings, commission_encoder
+from drivers.canopen.object_access import ObjectAccess
+from drivers.canopen.settings import CanopenSettings
+
+NMT_PRE_OPERATIONAL = 128
+
+
+class EncoderEnd:
+    """One encoder node (CiA 406), or none.  `ConfigurationError` if its EDS cannot be read."""
+
+    def __init__(self, network: canopen.Network, settings: CanopenSettings, timeout_s: float) -> None:
+        encoder = settings.joint_encoder
+        self._network, self._settings = network, settings
+        self._node = encoder.node if encoder is not None else None
+        self._objects: ObjectAccess | None = None
+        self._eds_remarks: list[str] = []
+        if encoder is not None and encoder.node is not None and encoder.eds_path is not None:
+            eds = read_eds(encoder.eds_path, encoder.node)
+            node = network.add_node(encoder.node, eds.dictionary)
+            node.sdo.RESPONSE_TIMEOUT = timeout_s
+            self._eds_remarks = eds.all_remarks()
+            self._objects = ObjectAccess(node, eds.name, eds.unusable)
+
+    def tell(self, command: int) -> None:
+        """An NMT command."""
+        if self._node is not None:
+            self._network.send_message(0, bytes([command, self._node]))
+
+    def commission(self) -> tuple[EncoderFindings, list[str]] | None:
+        """Identify, check and map; findings and remarks."""
+        encoder = self._settings.joint_encoder
+        if self._objects is None or encoder is None:
+            return None
+        self.tell(NMT_PRE_OPERATIONAL)
+        self._objects.forget_verified()
+        self._objects.remarks.clear()
+        found = commission_encoder(self._objects, encoder, self._settings.rate_Hz, self._settings.heartbeat_s)
+        return found, self._eds_remarks + self._objects.remarks
+
+    def verify_again(self) -> None:
+        """See `ObjectAccess.verify_again`."""
+        if self._objects is not None:
+            self._objects.verify_again()

@@ -1,0 +1,325 @@
+"""A second encoder of the joint: the virtual CiA 406 node, its commissioning, and the two positions in the loop."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import struct
+from pathlib import Path
+from typing import Any
+
+import canopen
+import numpy as np
+import pytest
+import tomlkit
+
+from drivers.can.frames import Frame
+from drivers.canopen.cyclic import accept_frame, begin_cycle
+from drivers.canopen.second_position import centred
+from drivers.errors import ConfigurationError, DeviceError
+from firmware_py.records import Sample
+from firmware_py.schema import new
+from firmware_py.states import AxisPhase, Fault
+from hil.faults import FaultConstants, FaultKind
+from tools.configuration.config import Config
+from tools.configuration.drive_settings import canopen_settings, cyclic_bus_load
+from tools.configuration.load import load_config
+from tools.simulation.lockstep import LockstepJoint
+from tools.simulation.virtual_joint import new_device
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+NODE = {
+    "source": "node", "node": 2, "counts_per_turn": 524288, "direction": 1, "zero_counts": 100_000,
+    "disagreement_max_rad": 0.005,
+}  # fmt: skip
+DRIVE = {**{k: v for k, v in NODE.items() if k != "node"}, "source": "drive"}
+
+
+def config_with(folder: Path, encoder: dict[str, Any], **changes: Any) -> Config:
+    """configs/virtual.toml with its own encoder on the motor and this [joint_encoder]."""
+    document = tomlkit.parse((CONFIGS / "virtual.toml").read_text())
+    document["joint_encoder"] = encoder
+    short: dict[str, Any] = {
+        "encoder__side": "motor", "encoder__counts_per_turn": 65536, "trajectory__duration_s": 1.0,
+        "virtual__initial_position_rad": 0.0,
+    }  # fmt: skip
+    for path, value in {**short, **changes}.items():
+        section, key = path.split("__")
+        document[section][key] = value  # type: ignore[index]
+    path = folder / "joint.toml"
+    path.write_text(tomlkit.dumps(document))
+    return load_config(path)
+
+
+# --- the virtual node ------------------------------------------------------------------------------------------
+
+
+def frame(identifier: int, data: bytes) -> bytes:
+    return struct.pack("<IB3x8s", identifier, len(data), data)
+
+
+def words(frames: list[bytes]) -> list[tuple[int, bytes]]:
+    return [(struct.unpack_from("<I", f)[0], f[8 : 8 + f[4]]) for f in frames]
+
+
+@pytest.fixture
+def device(tmp_path: Path) -> Any:
+    return new_device(config_with(tmp_path, NODE, virtual__initial_position_rad=0.25))
+
+
+def test_the_eds_is_read_by_the_library_and_is_that_of_an_encoder() -> None:
+    dictionary = canopen.import_od(str(CONFIGS / "joint_encoder.eds"), 2)
+    assert dictionary[0x1000].default & 0xFFFF == 406
+    assert dictionary[0x6004].pdo_mappable
+    assert dictionary[0x1800][1].default == 0x40000182
+
+
+def test_boot_up_heartbeat_and_nmt_of_its_own(device: Any) -> None:
+    assert (0x702, b"\0") in words(device.advance(1_000_000))
+    sent = device.handle(frame(0x602, struct.pack("<BHBI", 0x2B, 0x1017, 0, 100)), 2_000_000)
+    assert (0x702, b"\x7f") in words(sent + device.advance(3_000_000))
+    device.handle(frame(0, b"\x01\x02"), 4_000_000)
+    assert (0x702, b"\x05") in words(device.advance(110_000_000))
+    assert device.device[0].nmt == 127  # the drive was not meant
+    device.handle(frame(0, b"\x81\x02"), 111_000_000)
+    assert (0x702, b"\0") in words(device.advance(112_000_000))
+
+
+def test_its_position_at_every_sync(device: Any) -> None:
+    device.advance(1_000_000)
+    device.handle(frame(0x602, struct.pack("<BHBI", 0x2F, 0x1800, 2, 1)), 2_000_000)
+    assert not [f for f in words(device.handle(frame(0x80, b""), 3_000_000)) if f[0] == 0x182]
+    device.handle(frame(0, b"\x01\x02"), 4_000_000)
+    sent = dict(words(device.handle(frame(0x80, b""), 5_000_000)))
+    assert int.from_bytes(sent[0x182], "little") == round(0.25 / math.tau * 524288) + 100_000
+
+
+def test_an_error_is_an_emergency_and_an_alarm(device: Any) -> None:
+    device.advance(1_000_000)
+    device.device[0].encoder.error_code = 0x5000
+    assert (0x82, b"\x00\x50\x21\0\0\0\0\0") in words(device.advance(2_000_000))
+    answer = words(device.handle(frame(0x602, struct.pack("<BHB4x", 0x40, 0x6503, 0)), 3_000_000))[-1]
+    assert (answer[0], answer[1][4]) == (0x582, 1)
+    device.device[0].encoder.error_code = 0
+    assert (0x82, bytes(8)) in words(device.advance(4_000_000))
+
+
+def test_every_object_of_the_node_can_be_read(device: Any) -> None:
+    device.advance(1_000_000)
+    for entry in device.encoder.objects:
+        request = struct.pack("<BHB4x", 0x40, entry.index, entry.sub)
+        answer = words(device.handle(frame(0x602, request), 2_000_000))[-1][1]
+        assert answer[0] & 0xE0 == 0x40, f"{entry.index:04X}:{entry.sub}"
+
+
+# --- readings --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("counts", "range_counts", "result"),
+    [(0, 1024, 0), (511, 1024, 511), (512, 1024, -512), (1023, 1024, -1), (-513, 1024, 511), (5 * 1024 + 3, 1024, 3)],
+)
+def test_centred(counts: int, range_counts: int, result: int) -> None:
+    assert centred(counts, range_counts) == result
+
+
+def port_of(folder: Path, encoder: dict[str, Any], **changes: Any) -> Any:
+    from drivers.canopen.scaling import new_port
+
+    return new_port(canopen_settings(config_with(folder, encoder, **changes)), 0.06, 1000, second_range_counts=1 << 20)
+
+
+def cycle(port: Any, sample: Any, first: int | None, second: int | None) -> None:
+    """One SYNC, and the TPDOs that answer it."""
+    frames = new(Frame, 4)
+    begin_cycle(port[0], frames)
+    for identifier, data in (
+        (0x181, None if first is None else struct.pack("<HiH", 0x1237, first, 0)),
+        (0x182, None if second is None else struct.pack("<I", second)),
+    ):
+        if data is not None:
+            frames[3].can_id, frames[3].length = identifier, len(data)
+            for at, byte in enumerate(data):
+                frames[3].payload[at] = byte
+            accept_frame(port[0], frames[3], sample, 1)
+
+
+def test_a_sample_needs_both_positions_of_one_cycle(tmp_path: Path) -> None:
+    port, sample = port_of(tmp_path, NODE), new(Sample)[0]
+    cycle(port, sample, 0, 100_000)
+    assert sample.count == 1
+    cycle(port, sample, 0, None)
+    cycle(port, sample, None, 100_000)
+    assert sample.count == 1
+    assert sample.status_word == 0x1237  # the drive is heard all the same
+    cycle(port, sample, 0, 100_000)
+    assert sample.count == 2
+
+
+@pytest.mark.parametrize(("law", "swapped"), [("joint_encoder", True), ("encoder", False)])
+def test_which_one_feeds_the_law(tmp_path: Path, law: str, swapped: bool) -> None:
+    port, sample = port_of(tmp_path, {**NODE, "law": law}), new(Sample)[0]
+    cycle(port, sample, 121 * 65536 // 8, 100_000 + 524288 // 4)
+    found = sample.position_rad, sample.second_position_rad
+    expected = (math.tau / 4, math.tau / 8) if swapped else (math.tau / 8, math.tau / 4)
+    assert found == pytest.approx(expected)
+
+
+def test_a_range_that_runs_over_and_a_direction_against_the_joint(tmp_path: Path) -> None:
+    port, sample = port_of(tmp_path, {**NODE, "direction": -1, "zero_counts": 10}), new(Sample)[0]
+    for reading, counts in ((5, -5), ((1 << 20) - 5, -15), (20, 10)):
+        cycle(port, sample, 0, reading)
+        assert sample.position_rad == pytest.approx(-counts * math.tau / 524288)
+
+
+def test_an_incremental_one_takes_the_angle_of_the_other(tmp_path: Path) -> None:
+    for encoder, changes in (
+        ({**NODE, "kind": "incremental"}, {}),
+        (NODE, {"encoder__kind": "incremental"}),
+    ):
+        port, sample = port_of(tmp_path, encoder, **changes), new(Sample)[0]
+        cycle(port, sample, 1000, 90_000)
+        assert sample.position_rad == pytest.approx(sample.second_position_rad)
+        start_rad = 1000 * math.tau / (121 * 65536) if encoder is not NODE else -10_000 * math.tau / 524288
+        assert sample.position_rad == pytest.approx(start_rad)
+        cycle(port, sample, 1000, 90_100)
+        assert sample.position_rad - sample.second_position_rad == pytest.approx(100 * math.tau / 524288)
+
+
+@pytest.mark.parametrize(("identifier", "data"), [(0x82, b"\x00\x50\x21\0\0\0\0\0"), (0x702, b"\0")])
+def test_an_encoder_with_an_error_or_restarted_is_not_believed(tmp_path: Path, identifier: int, data: bytes) -> None:
+    port, sample, received = port_of(tmp_path, NODE), new(Sample)[0], new(Frame)[0]
+    cycle(port, sample, 0, 100_000)
+    received.can_id, received.length = identifier, len(data)
+    for at, byte in enumerate(data):
+        received.payload[at] = byte
+    accept_frame(port[0], received, sample, 1)
+    cycle(port, sample, 0, 100_000)
+    assert sample.count == 1
+    assert sample.drive_error == (0x5000 if identifier == 0x82 else 0)
+
+
+# --- commissioning and runs in lockstep ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("encoder", [NODE, DRIVE, {**NODE, "law": "encoder"}, {**NODE, "kind": "incremental"}])
+def test_a_run_with_two_encoders(tmp_path: Path, encoder: dict[str, Any]) -> None:
+    joint = LockstepJoint(config_with(tmp_path, encoder, virtual__initial_position_rad=0.1))
+    assert joint.report.start_position_rad == pytest.approx(0.1, abs=1e-4)
+    run = joint.run()
+    assert run.fault is Fault.NONE
+    tracked = run.log[run.tracking]
+    assert np.abs(tracked.position_rad - tracked.second_position_rad).max() < 1e-4
+    assert np.abs(run.true_error_rad[run.tracking]).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"counts_per_turn": 4096}, ""),
+        ({"eds": "virtual_joint.eds"}, "EDS virtual_joint.eds has no object 6001"),
+    ],
+)
+def test_commissioning_refuses(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    good = config_with(tmp_path, NODE)
+    device = new_device(good)
+    from drivers.canopen.drive import CanopenDrive
+    from tools.simulation.lockstep import DirectBus
+
+    bus = DirectBus(device)
+    settings = canopen_settings(config_with(tmp_path, {**NODE, **change}))
+    drive = CanopenDrive(bus, settings, sleep=bus.sleep)
+    message = message or r"joint_encoder.counts_per_turn (=4096) differs from the encoder's 6001, 524288"
+    with pytest.raises(DeviceError, match=re.escape(message)):
+        drive.commission()
+    drive.close()
+    assert device.device[0].state == 1
+
+
+def test_an_encoder_with_an_alarm_is_refused(tmp_path: Path) -> None:
+    from drivers.canopen.drive import CanopenDrive
+    from tools.simulation.lockstep import DirectBus
+
+    config = config_with(tmp_path, NODE)
+    device = new_device(config)
+    device.device[0].encoder.error_code = 0x5000
+    bus = DirectBus(device)
+    drive = CanopenDrive(bus, canopen_settings(config), sleep=bus.sleep)
+    with pytest.raises(DeviceError, match="node 2: the encoder reports alarms"):
+        drive.commission()
+    drive.close()
+
+
+def drift(rate_radps: float) -> Any:
+    faults = new(FaultConstants, 1)
+    faults[0].kind, faults[0].start_s, faults[0].duration_s = FaultKind.ENCODER_DRIFT, 1.5, 100.0
+    faults[0].magnitude = rate_radps
+    return faults
+
+
+@pytest.mark.parametrize(("rate_radps", "fault"), [(0.02, Fault.POSITION_DISAGREEMENT), (0.002, Fault.NONE)])
+def test_an_encoder_that_drifts_is_found_by_the_other_one(tmp_path: Path, rate_radps: float, fault: Fault) -> None:
+    """The drive's encoder drifts for 1.5 s or so: by 30 mrad, or by 3 of the 5 that are allowed."""
+    joint = LockstepJoint(config_with(tmp_path, NODE, trajectory__duration_s=2.0))
+    run = joint.run_with_faults(drift(rate_radps), tail_s=0.1)
+    assert run.fault is fault
+    if fault is not Fault.NONE:
+        assert abs(run.state.fault_value) == pytest.approx(0.005, abs=1e-3)
+        assert AxisPhase.QUICK_STOPPING in run.log.phase
+        assert run.device.state in (1, 7)
+
+
+@pytest.mark.parametrize(("key", "value"), [("encoder__direction", -1), ("encoder__counts_per_turn", 32768)])
+def test_a_configuration_that_is_wrong_about_one_encoder(tmp_path: Path, key: str, value: int) -> None:
+    """The joint is what the file says; the controller is told otherwise."""
+    good = LockstepJoint(config_with(tmp_path, NODE, virtual__initial_position_rad=0.1))
+    wrong = canopen_settings(config_with(tmp_path, NODE, virtual__initial_position_rad=0.1, **{key: value}))
+    from drivers.canopen.scaling import joint_angle_per_count_rad
+
+    good._port[0].position_radpcount = joint_angle_per_count_rad(wrong) * wrong.encoder_direction
+    run = good.run()
+    assert run.fault is Fault.POSITION_DISAGREEMENT
+    assert not (run.log.drive_state == 3).any()  # found before the drive was enabled
+
+
+def test_losing_the_encoder_node_ends_the_run(tmp_path: Path) -> None:
+    joint = LockstepJoint(config_with(tmp_path, NODE))
+    joint._virtual.device[0].encoder.node_id = 0
+    assert joint.run().fault is Fault.NO_SAMPLES
+
+
+# --- configuration ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"node": 1}, "joint_encoder.node (=1) must differ from drive.node"),
+        ({"source": "drive"}, 'joint_encoder.node must be given with source = "node", and only then'),
+        ({"eds": "missing.eds"}, "joint_encoder.eds (=missing.eds) must name a file"),
+        ({"object": "60E"}, "joint_encoder.object"),
+        ({"disagreement_max_rad": 0.0}, "joint_encoder.disagreement_max_rad (=0) must be in (0..1]"),
+        ({"disagreement_max_rad": 0.9}, "must be less than ten times"),
+    ],
+)
+def test_problems(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigurationError, match=re.escape(message)):
+        config_with(tmp_path, {**NODE, **change})
+
+
+def test_two_incremental_encoders_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="both incremental"):
+        config_with(tmp_path, {**NODE, "kind": "incremental"}, encoder__kind="incremental")
+
+
+def test_the_bus_load_counts_the_second_position(tmp_path: Path) -> None:
+    with_one = cyclic_bus_load(load_config(CONFIGS / "virtual.toml"))
+    assert cyclic_bus_load(config_with(tmp_path, NODE)) == pytest.approx(with_one + 95e3 / 1e6)
+
+
+def test_settings_of_the_driver(tmp_path: Path) -> None:
+    settings = canopen_settings(config_with(tmp_path, {**DRIVE, "object": "2ABC:3"}))
+    assert settings.joint_encoder is not None
+    assert (settings.joint_encoder.index, settings.joint_encoder.sub) == (0x2ABC, 3)
+    assert dataclasses.replace(settings, joint_encoder=None).joint_encoder is None
