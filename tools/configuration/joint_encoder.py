@@ -29,7 +29,7 @@ class JointEncoder(Section):
     node: Node | None = None  # of the encoder node
     eds: Annotated[str, Field(min_length=1)] = "joint_encoder.eds"  # of the encoder node
     counts_per_turn: Annotated[int, between(4, 2**31 - 1)]  # of the joint
-    direction: Direction
+    direction: Direction  # of its counts against the joint angle
     zero_counts: Annotated[int, between(-(2**31), 2**32 - 1)]  # its reading at joint angle 0
     kind: Literal["absolute", "incremental"] = "absolute"  # incremental: it takes the angle of [encoder] at the start
     law: Literal["encoder", "joint_encoder"] = "joint_encoder"  # which of the two feeds the law
