@@ -119,6 +119,7 @@ class Rig:
         self.sample = new(Sample)[0]
         self.command = new(Command)[0]
         self.table = np.zeros((1, 5))
+        self.twin_rad = 0.0  # by how much a second encoder is off the one that feeds the law
         self.stop = StopRequest.NONE
         self.supervisor_age_cycles = 0
         self.phases: list[AxisPhase] = []
@@ -135,6 +136,7 @@ class Rig:
         self.joint.step(int(self.command.request), float(self.command.torque_Nm), elapsed_cycles)
         if fresh:
             self.sample.position_rad = self.joint.position_rad + offset_rad
+            self.sample.second_position_rad = self.sample.position_rad + self.twin_rad
             self.sample.drive_state = self.joint.drive_state
             self.sample.count += 1
         step_axis(

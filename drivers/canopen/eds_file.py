@@ -33,6 +33,7 @@ class EdsFile:
 
     name: str
     dictionary: canopen.ObjectDictionary
+    encoder: bool = False  # of an encoder (CiA 406), else of a drive (CiA 402)
     vendor_id: int | None = None  # None: the file does not tell
     product_code: int | None = None
     remarks: list[str] = field(default_factory=list)  # about the file and the objects that jointctl uses
@@ -48,12 +49,12 @@ class EdsFile:
         return lines
 
 
-def read_eds(path: Path, node: int) -> EdsFile:
-    """Read the file for `node` ($NODEID); `ConfigurationError` if it holds no object at all."""
+def read_eds(path: Path, node: int, *, encoder: bool = False) -> EdsFile:
+    """Read the file for `node` ($NODEID), a drive or encoder; `ConfigurationError` if it holds no object at all."""
     text, remarks = read_text(path)
     sections, defects = parse_sections(text)
     dictionary: Any = canopen.ObjectDictionary
-    eds = EdsFile(path.name, dictionary(), remarks=remarks + defects)
+    eds = EdsFile(path.name, dictionary(), encoder, remarks=remarks + defects)
     eds.dictionary.node_id = node
     for name, keys in sections.items():
         match = _INDEX.fullmatch(name)
@@ -64,14 +65,15 @@ def read_eds(path: Path, node: int) -> EdsFile:
         if match is not None and int(match[1], 16) >= DEFTYPES:
             _take_member(eds, int(match[1], 16), int(match[2], 16), keys, sections, node)
     if not len(eds.dictionary):
-        raise ConfigurationError(f"drive.eds (={path}) is not a readable EDS file: it describes no object")
+        key = "joint_encoder.eds" if encoder else "drive.eds"
+        raise ConfigurationError(f"{key} (={path}) is not a readable EDS file: it describes no object")
     _take_identity(eds, sections, node)
     return eds
 
 
 def _defect(eds: EdsFile, index: int, sub: int, text: str) -> None:
     place = f"[{index:04X}sub{sub:X}]" if sub else f"[{index:04X}]"
-    used = standard_type(index, sub) is not None
+    used = standard_type(index, sub, encoder=eds.encoder) is not None
     (eds.remarks if used else eds.other_defects).append(f"{place} {text}")
 
 
@@ -133,7 +135,7 @@ def _variable(
 
 def _data_type(eds: EdsFile, index: int, sub: int, keys: dict[str, str], sections: Sections, node: int) -> int | None:
     """The type to use; None where the file leaves it open and no standard helps."""
-    standard = standard_type(index, sub)
+    standard = standard_type(index, sub, encoder=eds.encoder)
     text = keys.get("datatype")
     found = None if text is None else number_of(text, node)
     if found is not None and found >= 0x40:

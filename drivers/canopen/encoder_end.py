@@ -22,7 +22,7 @@ class EncoderEnd:
         self._objects: ObjectAccess | None = None
         self._eds_remarks: list[str] = []
         if encoder is not None and encoder.node is not None and encoder.eds_path is not None:
-            eds = read_eds(encoder.eds_path, encoder.node)
+            eds = read_eds(encoder.eds_path, encoder.node, encoder=True)
             node = network.add_node(encoder.node, eds.dictionary)
             node.sdo.RESPONSE_TIMEOUT = timeout_s
             self._eds_remarks = eds.all_remarks()

@@ -1,4 +1,4 @@
-"""Data types that CiA 301 and CiA 402 give the objects that jointctl uses: what an EDS file is measured by."""
+"""Data types of the objects that jointctl uses, by CiA 301, 402 and 406: what an EDS file is measured by."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ BITS = {
     types.UNSIGNED56: 56, types.INTEGER64: 64, types.UNSIGNED64: 64,
 }  # fmt: skip
 
-_SINGLE = {
-    0x1000: U32, 0x1001: U8, 0x1005: U32, 0x1006: U32, 0x1014: U32, 0x1017: U16, 0x1019: U8,
+_EVERY_DEVICE = {0x1000: U32, 0x1001: U8, 0x1005: U32, 0x1006: U32, 0x1014: U32, 0x1017: U16, 0x1019: U8}
+_DRIVE = _EVERY_DEVICE | {
     0x6007: I16, 0x603F: U16, 0x6040: U16, 0x6041: U16, 0x605A: I16, 0x6060: I8, 0x6061: I8, 0x6064: I32,
     0x6071: I16, 0x6072: U16, 0x6075: U32, 0x6076: U32, 0x6077: I16, 0x607F: U32, 0x6083: U32, 0x6084: U32,
-    0x6001: U32, 0x6002: U32, 0x6004: U32, 0x6200: U16, 0x6503: U16, 0x6087: U32, 0x60B2: I16, 0x60FF: I32, 0x6502: U32,
+    0x6087: U32, 0x60B2: I16, 0x60FF: I32, 0x6502: U32,
 }  # fmt: skip
+_ENCODER = _EVERY_DEVICE | {0x6001: U32, 0x6002: U32, 0x6004: U32, 0x6200: U16, 0x6503: U16}
 _MEMBERS = {
     (0x1018, 1): U32, (0x1018, 2): U32, (0x1018, 3): U32, (0x1018, 4): U32, (0x1029, 1): U8,
     (0x60E4, 1): I32, (0x60C2, 1): U8, (0x60C2, 2): I8,
@@ -32,10 +33,11 @@ _COMMUNICATION = {0: U8, 1: U32, 2: U8, 3: U16, 5: U16, 6: U8}
 CYCLIC = frozenset({(0x6040, 0), (0x6041, 0), (0x6064, 0), (0x6071, 0), (0x6077, 0), (0x60FF, 0), (0x6004, 0)})
 
 
-def standard_type(index: int, sub: int) -> int | None:
-    """DataType (CiA 301, table 44) of an object; None for one that jointctl does not use."""
-    if sub == 0 and index in _SINGLE:
-        return _SINGLE[index]
+def standard_type(index: int, sub: int, *, encoder: bool = False) -> int | None:
+    """DataType (CiA 301, table 44) of an object of a drive or encoder; None for one that jointctl does not use."""
+    single = _ENCODER if encoder else _DRIVE
+    if sub == 0 and index in single:
+        return single[index]
     if (index, sub) in _MEMBERS:
         return _MEMBERS[index, sub]
     if 0x1400 <= index < 0x1600 or 0x1800 <= index < 0x1A00:

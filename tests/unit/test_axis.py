@@ -438,6 +438,42 @@ def test_a_reference_that_will_leave_the_limits_is_braked_inside_them(rig: NewRi
     assert_fault(run, Fault.REFERENCE_LIMIT, Reaction.RAMP)
 
 
+@pytest.mark.parametrize(("apart_rad", "trips"), [(0.0101, True), (-0.0101, True), (0.0099, False), (-0.0099, False)])
+@pytest.mark.parametrize("phase", [AxisPhase.WAITING, AxisPhase.APPROACH, AxisPhase.TRACKING])
+def test_the_other_encoder(rig: NewRig, phase: AxisPhase, apart_rad: float, trips: bool) -> None:
+    run = rig(0.05)
+    run.axis.limits.disagreement_max_rad = 0.01
+    run.until(phase).run(2)
+    assert run.state.fault == Fault.NONE
+    run.twin_rad = apart_rad
+    run.run(5)
+    if trips:
+        assert run.state.fault_value == pytest.approx(apart_rad)
+        assert_fault(
+            run, Fault.POSITION_DISAGREEMENT, Reaction.OFF if phase is AxisPhase.WAITING else Reaction.QUICK_STOP
+        )
+    else:
+        assert run.state.fault == Fault.NONE
+
+
+@pytest.mark.parametrize(("source", "fault"), [(0, Fault.NONE), (1, Fault.POSITION_LIMIT), (2, Fault.POSITION_LIMIT)])
+def test_the_limits_see_the_encoder_that_they_are_told(rig: NewRig, source: int, fault: Fault) -> None:
+    run = rig(0.05)
+    run.axis.limits.disagreement_max_rad = 0.9
+    run.axis.limits.limit_source = source
+    run.until(AxisPhase.TRACKING).run(5)
+    run.twin_rad = 0.899  # of limits -1 .. 1; the joint is between 0 and 0.1
+    run.run(5)
+    assert_well(run)
+    run.axis.limits.position_max_rad = 0.8
+    run.tick()
+    if fault is Fault.NONE:
+        assert_well(run)
+    else:
+        assert run.state.fault_value > 0.8
+        assert_fault(run, fault, Reaction.QUICK_STOP)
+
+
 @pytest.mark.parametrize(("limit_rad", "trips"), [(0.0040, True), (0.0100, False)])
 def test_following_error(rig: NewRig, limit_rad: float, trips: bool) -> None:
     run = rig(0.0)

@@ -16,6 +16,7 @@ import tomlkit
 
 from drivers.can.frames import Frame
 from drivers.canopen.cyclic import accept_frame, begin_cycle
+from drivers.canopen.eds_file import read_eds
 from drivers.canopen.second_position import centred
 from drivers.errors import ConfigurationError, DeviceError
 from firmware_py.records import Sample
@@ -73,6 +74,11 @@ def test_the_eds_is_read_by_the_library_and_is_that_of_an_encoder() -> None:
     assert dictionary[0x1000].default & 0xFFFF == 406
     assert dictionary[0x6004].pdo_mappable
     assert dictionary[0x1800][1].default == 0x40000182
+
+
+def test_the_eds_needs_no_remark_and_is_not_measured_as_that_of_a_drive() -> None:
+    assert read_eds(CONFIGS / "joint_encoder.eds", 2, encoder=True).all_remarks() == []
+    assert "[6502]" in "".join(read_eds(CONFIGS / "joint_encoder.eds", 2).all_remarks())
 
 
 def test_boot_up_heartbeat_and_nmt_of_its_own(device: Any) -> None:

@@ -13,6 +13,7 @@ from firmware_py.records import LINE_GONE, AxisState, Command, Sample
 from firmware_py.schema import new
 from firmware_py.sequence import (
     ANSWER_CYCLES,
+    compare_encoders,
     enter,
     powered,
     react,
@@ -305,3 +306,32 @@ def test_phases_follow_each_other_in_a_whole_run(rig: Callable[..., Any]) -> Non
     run.until(AxisPhase.FINISHED)
     order = [phase for phase, _ in itertools.groupby(run.phases)]
     assert order == [p for p in AxisPhase if p is not AxisPhase.QUICK_STOPPING]
+
+
+@pytest.mark.parametrize("phase", AxisPhase)
+@pytest.mark.parametrize("apart_rad", [-0.0101, -0.0099, 0.0099, 0.0101])
+def test_two_encoders_are_compared_until_the_drive_brakes(
+    axis: Any, state: Any, phase: AxisPhase, apart_rad: float
+) -> None:
+    axis.limits.disagreement_max_rad = 0.01
+    state.phase = phase
+    sample = sample_of(DriveState.ENABLED)
+    sample.position_rad, sample.second_position_rad = 0.5, 0.5 + apart_rad
+    compare_encoders(axis.limits, state, sample)
+    if abs(apart_rad) < 0.01 or phase > AxisPhase.RELEASING:
+        assert (state.fault, state.phase) == (Fault.NONE, phase)
+        return
+    assert state.fault == Fault.POSITION_DISAGREEMENT
+    assert state.fault_value == pytest.approx(apart_rad)
+    assert state.phase == (AxisPhase.QUICK_STOPPING if phase >= AxisPhase.APPROACH else AxisPhase.DISABLING)
+
+
+@pytest.mark.parametrize("torque_Nm", [-20.0, 20.0])
+def test_a_flexible_reducer_between_two_encoders_may_twist(axis: Any, state: Any, torque_Nm: float) -> None:
+    axis.limits.disagreement_max_rad, axis.limits.twist_radpNm = 0.01, 1e-3
+    state.phase, state.command_torque_Nm = AxisPhase.TRACKING, torque_Nm
+    sample = sample_of(DriveState.ENABLED)
+    for apart_rad, fault in ((0.0299, Fault.NONE), (0.0301, Fault.POSITION_DISAGREEMENT)):
+        sample.second_position_rad = apart_rad
+        compare_encoders(axis.limits, state, sample)
+        assert state.fault == fault
