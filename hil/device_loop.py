@@ -113,16 +113,14 @@ def _take_frame(
 ) -> None:
     """One frame at the drive's end: SDO requests go to the Python thread, all others to the core."""
     identifier = int64(frame[0]) | int64(frame[1]) << 8 | int64(frame[3]) << 24
-    if device.encoder.node_id != 0 and identifier == 0x600 + device.encoder.node_id:
+    to_encoder = device.encoder.node_id != 0 and identifier == 0x600 + device.encoder.node_id
+    if not to_encoder and identifier != 0x600 + device.node_id:
+        accept_frame(device, plant_c, plant_s, frame, now_ns, queue)
+        return
+    advance(device, plant_c, plant_s, now_ns, queue)
+    if to_encoder or (device.nmt != NmtState.STOPPED and device.nmt != NmtState.BOOT_UP):
         address = np.uintp(frame.ctypes.data)
         send(np.int32(service_fd), address, np.uintp(FRAME_SIZE), np.int32(MSG_DONTWAIT | MSG_NOSIGNAL))
-    elif identifier == 0x600 + device.node_id:
-        advance(device, plant_c, plant_s, now_ns, queue)
-        if device.nmt != NmtState.STOPPED and device.nmt != NmtState.BOOT_UP:
-            address = np.uintp(frame.ctypes.data)
-            send(np.int32(service_fd), address, np.uintp(FRAME_SIZE), np.int32(MSG_DONTWAIT | MSG_NOSIGNAL))
-    else:
-        accept_frame(device, plant_c, plant_s, frame, now_ns, queue)
 
 
 @kernel
