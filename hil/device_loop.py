@@ -57,12 +57,8 @@ _FRAMES_AT_ONCE = 64  # received before timers are looked at again
 def _flush(fd: int, queue: FrameQueue, words: np.ndarray) -> None:
     """Send the queue; what the bus does not take is lost and counted, as on a real bus."""
     for i in range(queue.count):
-        sent = send(
-            np.int32(fd),
-            np.uintp(queue.frames[i].ctypes.data),
-            np.uintp(FRAME_SIZE),
-            np.int32(MSG_DONTWAIT | MSG_NOSIGNAL),
-        )
+        address = np.uintp(queue.frames[i].ctypes.data)
+        sent = send(np.int32(fd), address, np.uintp(FRAME_SIZE), np.int32(MSG_DONTWAIT | MSG_NOSIGNAL))
         if sent != FRAME_SIZE:
             store_release(words, SEND_ERRORS_WORD, load_acquire(words, SEND_ERRORS_WORD) + 1)
     queue.count = 0
