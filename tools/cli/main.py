@@ -196,13 +196,27 @@ def doctor(
     port: Port = None,
     target: Target = None,
     cold: Annotated[bool, typer.Option("--cold", help="measure the cold start as well (about a minute)")] = False,
+    motion: Annotated[
+        bool, typer.Option("--motion", help="instead: pull the joint a little; are torque and encoders right?")
+    ] = False,
+    torque: Annotated[
+        float | None, typer.Option("--torque", help="Nm at the joint at most, with --motion", min=0.0)
+    ] = None,
+    yes: Yes = False,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """What this computer and bus allow: real-time rights, wake-up times, kernel cache, bus budget.  Moves nothing."""
+    """What this computer and bus allow: real-time rights, wake-up times, kernel cache, bus budget.
+
+    Moves nothing; with --motion it asks first, then checks the directions of torque and encoders and their counts.
+    """
+    joint = loaded(config, interface, channel, bitrate, port, target)
+    if motion:
+        from tools.verbs.doctor_motion import doctor_motion
+
+        raise typer.Exit(doctor_motion(joint, Output(json=json, quiet=quiet), assume_yes=yes, torque_Nm=torque))
     from tools.verbs.doctor import doctor as run_doctor
 
-    joint = loaded(config, interface, channel, bitrate, port, target)
     raise typer.Exit(run_doctor(joint, Output(json=json, quiet=quiet), cold=cold))
 
 

@@ -43,7 +43,12 @@ def doctor(config: Config, output: Output, *, cold: bool = False) -> int:
     for finding in findings(config, cold=cold):
         output.note(f"  {finding.topic}")
         found.append(finding)
-    table = Table(title="Doctor", title_justify="left")
+    return report_findings(found, output, "Doctor")
+
+
+def report_findings(found: list[Finding], output: Output, title: str) -> int:
+    """The table, and 0 or 1 as for `doctor`."""
+    table = Table(title=title, title_justify="left")
     for column in ("", "finding", "cure"):
         table.add_column(column, overflow="fold")
     colours = {OK: "green", NOTE: "yellow", PROBLEM: "red"}

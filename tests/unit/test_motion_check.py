@@ -1,0 +1,245 @@
+"""`doctor --motion`: what it says to a joint that is right, and to each thing that may be the wrong way round."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomlkit
+
+from drivers.drive import CommissioningReport, DriveIdentity
+from drivers.errors import ConfigurationError
+from firmware_py.schema import new
+from firmware_py.states import AxisPhase, Fault
+from hil.faults import FaultConstants, FaultKind
+from tools.configuration.config import Config
+from tools.configuration.load import load_config
+from tools.inspection.drive_scale import judged
+from tools.inspection.findings import NOTE, OK, PROBLEM, Finding
+from tools.motion_check.carry_out import check_in_lockstep
+from tools.motion_check.plan import check_constants, config_of_check, make_plan, motion_table, require_room
+from tools.motion_check.verdict import motion_findings
+from tools.running.fault_text import fault_text
+from tools.simulation.lockstep import LockstepJoint
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+SECOND = {
+    "source": "node", "node": 2, "counts_per_turn": 524288, "direction": 1, "zero_counts": 100_000,
+    "disagreement_max_rad": 0.005,
+}  # fmt: skip
+
+
+def config_with(folder: Path, second: dict[str, Any] | None = None, **changes: Any) -> Config:
+    document = tomlkit.parse((CONFIGS / "virtual.toml").read_text())
+    if second is not None:
+        document["joint_encoder"] = second
+        changes = {"encoder__side": "motor", "encoder__counts_per_turn": 65536, **changes}
+    for path, value in changes.items():
+        section, key = path.split("__")
+        document[section][key] = value  # type: ignore[index]
+    path = folder / "joint.toml"
+    path.write_text(tomlkit.dumps(document))
+    return load_config(path)
+
+
+def checked(config: Config, change: Any = None, faults: Any = None) -> tuple[dict[str, Finding], Any, Fault]:
+    """Findings by topic, records and fault; `change` may spoil the joint."""
+    plan = make_plan(config, None)
+    joint = LockstepJoint(config)
+    if change is not None:
+        change(joint)
+    records, fault = check_in_lockstep(joint, config, plan, faults)
+    text = fault_text(fault, 0.0, 0) if fault is not Fault.NONE else None
+    return {f.topic: f for f in motion_findings(config, plan, records, fault, text)}, records, fault
+
+
+def assert_gentle(config: Config, records: Any) -> None:
+    """Whatever is wrong: little torque, a little way, and switched off at the end."""
+    plan = make_plan(config, None)
+    assert np.abs(records.command_torque_Nm).max() <= plan.torque_Nm + 1e-9
+    assert np.abs(records.position_rad - records.position_rad[0]).max() < 0.1
+    assert records.phase[-1] >= AxisPhase.DISABLING
+
+
+@pytest.mark.parametrize("second", [None, SECOND, {**SECOND, "law": "encoder"}])
+@pytest.mark.parametrize("scale", [0.5, 1.1])
+def test_a_joint_that_is_right(tmp_path: Path, second: dict[str, Any] | None, scale: float) -> None:
+    friction = {"virtual__friction_positive_scale": scale, "virtual__friction_negative_scale": scale}
+    config = config_with(tmp_path, second, **friction)
+    found, records, fault = checked(config)
+    assert fault is Fault.NONE
+    assert {f.status for f in found.values()} == {OK}, found
+    assert set(found) == {"direction", "measured torque", "friction"} | ({"two encoders"} if second else set())
+    assert "began to move at" in found["friction"].text
+    assert_gentle(config, records)
+
+
+def reverse_encoder(joint: Any) -> None:
+    """The configuration is wrong about the sign of 6064; it still knows where the joint stands."""
+    port, angle = joint._port[0], joint.report.start_position_rad
+    port.position_radpcount *= -1.0
+    port.zero_counts += 2 * round(angle / port.position_radpcount) * -1
+
+
+def reverse_torque(joint: Any) -> None:
+    joint._port[0].torque_Nmppermille *= -1.0
+
+
+@pytest.mark.parametrize("change", [reverse_encoder, reverse_torque])
+def test_a_wrong_sign(tmp_path: Path, change: Any) -> None:
+    config = config_with(tmp_path)
+    found, records, fault = checked(config, change)
+    assert fault in (Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR)
+    assert found["direction"].status == PROBLEM
+    assert "encoder.direction; else drive.torque_direction" in found["direction"].cure
+    assert_gentle(config, records)
+
+
+@pytest.mark.parametrize(("law", "wrong"), [("encoder", "encoder"), ("joint_encoder", "encoder")])
+def test_with_two_encoders_the_wrong_one_is_named(tmp_path: Path, law: str, wrong: str) -> None:
+    config = config_with(tmp_path, {**SECOND, "law": law}, virtual__initial_position_rad=0.0)
+    found, records, _ = checked(config, reverse_encoder)
+    assert found["two encoders"].status == PROBLEM
+    assert found["two encoders"].cure.startswith(f"{wrong}.direction")
+    assert_gentle(config, records)
+
+
+def test_with_two_encoders_a_wrong_torque_sign_is_told_from_a_wrong_encoder(tmp_path: Path) -> None:
+    found, _, _ = checked(config_with(tmp_path, SECOND), reverse_torque)
+    assert found["two encoders"].status == OK
+    assert found["direction"].status == PROBLEM
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_counts_wrong_by_a_factor(tmp_path: Path, factor: float) -> None:
+    def change(joint: Any) -> None:
+        joint._port[0].position_radpcount *= factor
+
+    config = config_with(tmp_path, SECOND, virtual__initial_position_rad=0.0)
+    found, records, _ = checked(config, change)
+    assert found["scale"].status == PROBLEM
+    assert f"[encoder] moves {factor:.3g}" in found["scale"].text.replace("1.99", "2").replace("2.01", "2")
+    assert_gentle(config, records)
+
+
+def test_a_joint_that_is_stuck(tmp_path: Path) -> None:
+    friction = {"virtual__friction_positive_scale": 5.0, "virtual__friction_negative_scale": 5.0}
+    config = config_with(tmp_path, **friction)
+    found, records, _ = checked(config)
+    assert found["motion"].status == PROBLEM
+    assert "stood still" in found["motion"].text
+    assert_gentle(config, records)
+
+
+@pytest.mark.parametrize("second", [None, SECOND])
+def test_a_dead_encoder_is_found_before_the_joint_has_gone_far(tmp_path: Path, second: dict[str, Any] | None) -> None:
+    config = config_with(tmp_path, second)
+    faults = new(FaultConstants, 1)
+    faults[0].kind, faults[0].start_s, faults[0].duration_s = FaultKind.ENCODER_STUCK, 0.5, 100.0
+    plan, joint = make_plan(config, None), LockstepJoint(config)
+    constants = check_constants(
+        config_of_check(config, plan), plan, joint.report, motion_table(plan, joint.report.start_position_rad)
+    )
+    constants[0].sequence.supervisor_max_cycles = 0
+    joint.table = motion_table(plan, joint.report.start_position_rad)
+    run = joint.run_with_faults(faults, constants, tail_s=0.2)
+    assert run.fault in (Fault.POSITION_FROZEN, Fault.POSITION_DISAGREEMENT)
+    assert abs(float(run.plant.joint_position_rad) - joint.report.start_position_rad) < 0.1
+
+
+def test_the_records_name_the_encoder_that_stood(tmp_path: Path) -> None:
+    config = config_with(tmp_path, {**SECOND, "law": "encoder"})
+    _, records, _ = checked(config)
+    still = records.copy()
+    still.position_rad[:] = still.position_rad[0]
+    (found,) = motion_findings(config, make_plan(config, None), still, Fault.POSITION_DISAGREEMENT, None)
+    assert (found.status, found.cure.startswith("[encoder] is dead")) == (PROBLEM, True)
+    still = records.copy()
+    still.second_position_rad[:] = 0.0
+    topics = {f.topic: f for f in motion_findings(config, make_plan(config, None), still, Fault.NONE, None)}
+    assert topics["two encoders"].text == "[joint_encoder] stood still while [encoder] moved"
+
+
+def test_a_check_that_was_never_enabled_tells_the_fault(tmp_path: Path) -> None:
+    config = config_with(tmp_path)
+    _, records, _ = checked(config)
+    waiting = records[records.phase == AxisPhase.WAITING]
+    text = fault_text(Fault.POSITION_DISAGREEMENT, 0.3, 0)
+    (found,) = motion_findings(config, make_plan(config, None), waiting, Fault.POSITION_DISAGREEMENT, text)
+    assert found.text.startswith("ended before the drive was enabled: POSITION_DISAGREEMENT: the two encoders")
+
+
+# --- the plan --------------------------------------------------------------------------------------------------
+
+
+def test_the_torque_is_that_of_friction_and_gravity_and_never_above_the_limit(tmp_path: Path) -> None:
+    static_Nm = 0.1575 * 121.0
+    assert make_plan(config_with(tmp_path), None).torque_Nm == pytest.approx(2.0 * static_Nm)
+    assert make_plan(config_with(tmp_path, joint__gravity_Nm=5.0), None).torque_Nm == pytest.approx(2.0 * static_Nm + 5)
+    assert make_plan(config_with(tmp_path, limits__torque_max_Nm=25.0), None).torque_Nm == 25.0
+    assert make_plan(config_with(tmp_path), 12.0).torque_Nm == 12.0
+    with pytest.raises(ConfigurationError, match=re.escape("--torque (=60.1) must be in (0..60]")):
+        make_plan(config_with(tmp_path), 60.1)
+
+
+def test_the_check_only_narrows_torque_speed_and_travel(tmp_path: Path) -> None:
+    config = config_with(tmp_path)
+    plan = make_plan(config, None)
+    report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.1, 0.06, 1e-5)
+    made = check_constants(config_of_check(config, plan), plan, report, motion_table(plan, 0.1))[0].limits
+    assert made.torque_max_Nm == plan.torque_Nm < config.limits.torque_max_Nm
+    assert made.velocity_max_radps == 0.5 < config.limits.velocity_max_radps
+    assert (made.position_min_rad, made.position_max_rad) == pytest.approx((0.0, 0.2))
+    assert made.sample_age_max_cycles == round(config.limits.sample_age_max_s * config.loop.rate_Hz)
+    assert config_of_check(config, plan).canopen.max_torque_permille is None
+
+
+def test_the_motion_is_smooth_and_ends_where_it_begins(tmp_path: Path) -> None:
+    plan = make_plan(config_with(tmp_path), None)
+    table = motion_table(plan, 0.3)
+    assert table[0, 1] == table[-1, 1] == pytest.approx(0.3)
+    assert np.ptp(table[:, 1]) == pytest.approx(2.0 * plan.travel_rad)
+    assert np.abs(table[:, 2]).max() < plan.velocity_radps / 2.0
+    assert np.all(np.diff(table[:, 0]) > 0.0)
+
+
+@pytest.mark.parametrize(("start_rad", "refused"), [(0.659, False), (0.661, True), (-0.659, False), (-0.661, True)])
+def test_room_on_both_sides_is_needed(tmp_path: Path, start_rad: float, refused: bool) -> None:
+    config = config_with(tmp_path)
+    plan = make_plan(config, None)
+    if not refused:
+        require_room(config, plan, start_rad)
+        return
+    with pytest.raises(ConfigurationError, match=r"needs \[-0\.66\.\.0\.66\]"):
+        require_room(config, plan, start_rad)
+
+
+def test_a_coarse_encoder_takes_more_travel(tmp_path: Path) -> None:
+    config = config_with(tmp_path, encoder__counts_per_turn=4096)
+    assert make_plan(config, None).travel_rad == pytest.approx(60.0 * math.tau / 4096)
+    assert make_plan(config_with(tmp_path, encoder__counts_per_turn=512), None).travel_rad == 0.3
+
+
+@pytest.mark.parametrize(
+    ("side", "own", "per_motor_turn", "status"),
+    [
+        ("motor", 65536, 65536.0, OK), ("motor", 131072, 65536.0, NOTE), ("joint", 524288, 524288.0, OK),
+        ("joint", 524288, 524288.0 / 121.0, OK), ("joint", 262144, 524288.0, NOTE),
+    ],
+)  # fmt: skip
+def test_the_drives_own_counts(tmp_path: Path, side: str, own: int, per_motor_turn: float, status: str) -> None:
+    config = config_with(tmp_path, encoder__side=side, encoder__counts_per_turn=own)
+    found = judged(config, per_motor_turn)
+    assert found.status == status
+    assert (found.cure == "") is (status == OK)
+
+
+def test_figures_of_a_finding_are_plain_numbers(tmp_path: Path) -> None:
+    found, _, _ = checked(config_with(tmp_path))
+    for finding in found.values():
+        assert all(isinstance(value, float) for value in dataclasses.asdict(finding)["numbers"].values())

@@ -1,0 +1,144 @@
+"""What the check is going to do: a soft spring between joint and reference pulls it a little to and fro.
+
+The spring is the loop's own law with gains that are made for it, so every limit, watchdog and stop of a run is in
+force.  Its torque grows with the distance of the reference and is limited to a small share; a joint that is free
+follows as soon as the torque exceeds its friction, one that is stuck does not, and one with a wrong sign runs into
+the velocity limit or the following error of the check, which are narrow.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from drivers.drive import CommissioningReport
+from drivers.errors import ConfigurationError
+from firmware_py.states import TrajectoryKind
+from tools.configuration.config import Config
+from tools.configuration.conversions import joint_rad_per_count
+from tools.configuration.elmo import ElmoSerial
+from tools.configuration.records import APPROACH_MIN_S, axis_constants
+
+TRAVEL_rad, TRAVEL_MAX_rad = 0.04, 0.3  # of the reference, to each side
+TRAVEL_COUNTS = 60.0  # so coarse an encoder takes more travel
+REACH = 2.5  # times the travel: where the position limits of the check are
+VELOCITY_MAX_radps = 0.5
+STATIC_FRICTIONS = 2.0  # torque limit of the check, over the static friction that is configured
+TORQUE_SHARE = 0.1  # of limits.torque_max_Nm, where no friction is configured
+SPRING_SHARE = 0.7  # of the torque limit, at full travel; the rest is for damping and gravity
+DAMPING = 0.5
+RAMP_s, REST_s = 0.4, 0.4
+STOPS = (1.0, 0.0, -1.0, 0.0)  # where the reference goes, in travels
+_ROWS_PER_RAMP = 16
+
+
+@dataclass(frozen=True)
+class CheckPlan:
+    """The numbers that the user is told before anything moves; joint side."""
+
+    torque_Nm: float
+    travel_rad: float
+    velocity_radps: float
+    static_friction_Nm: float | None  # that is configured
+
+    @property
+    def duration_s(self) -> float:
+        return APPROACH_MIN_S + len(STOPS) * (RAMP_s + REST_s)
+
+
+def static_friction_Nm(config: Config) -> float | None:
+    """The larger one of both directions, at the joint; None where no friction is configured."""
+    friction = config.friction
+    if friction is None:
+        return None
+    ratio = config.joint.reduction_ratio if friction.torque_side == "motor" else 1.0
+    return max(abs(friction.positive.ts_Nm), abs(friction.negative.ts_Nm)) * ratio
+
+
+def make_plan(config: Config, torque_Nm: float | None) -> CheckPlan:
+    """`torque_Nm` is the user's; else twice the static friction, or a tenth of what a run may use."""
+    limits, static_Nm = config.limits, static_friction_Nm(config)
+    if torque_Nm is None:
+        own_Nm = STATIC_FRICTIONS * static_Nm if static_Nm else TORQUE_SHARE * limits.torque_max_Nm
+        torque_Nm = min(own_Nm + abs(config.joint.gravity_Nm), limits.torque_max_Nm)
+    elif not 0.0 < torque_Nm <= limits.torque_max_Nm:
+        raise ConfigurationError(
+            f"--torque (={torque_Nm:g}) must be in (0..{limits.torque_max_Nm:g}], which is limits.torque_max_Nm"
+        )
+    resolutions = [abs(joint_rad_per_count(config))]
+    if config.joint_encoder is not None:
+        resolutions.append(math.tau / config.joint_encoder.counts_per_turn)
+    travel = min(max(TRAVEL_rad, TRAVEL_COUNTS * max(resolutions)), TRAVEL_MAX_rad)
+    return CheckPlan(torque_Nm, travel, min(VELOCITY_MAX_radps, limits.velocity_max_radps), static_Nm)
+
+
+def config_of_check(config: Config, plan: CheckPlan) -> Config:
+    """The configuration with the limits and the law of the check; the drive's own torque limit follows from it."""
+    limits = config.limits.model_copy(
+        update={
+            "torque_max_Nm": plan.torque_Nm,
+            "velocity_max_radps": plan.velocity_radps,
+            "following_error_max_rad": 1.25 * plan.travel_rad,
+        }
+    )
+    spring_Nm = max(plan.torque_Nm - abs(config.joint.gravity_Nm), 0.2 * plan.torque_Nm)
+    kp = SPRING_SHARE * spring_Nm / plan.travel_rad / config.joint.inertia_kgm2
+    law = {
+        "kind": "computed_torque", "kp": kp, "kv": 2.0 * DAMPING * math.sqrt(kp), "feed_forward": "none",
+        "learning": None,
+    }  # fmt: skip
+    control = config.control.model_copy(update=law)
+    drive = config.drive
+    if not isinstance(drive, ElmoSerial):
+        drive = drive.model_copy(update={"max_torque_permille": None})
+    return config.model_copy(update={"limits": limits, "control": control, "drive": drive})
+
+
+def require_room(config: Config, plan: CheckPlan, start_rad: float) -> None:
+    """`ConfigurationError` if the joint stands too near to a limit."""
+    low, high = config.limits.position_min_rad, config.limits.position_max_rad
+    if not low + plan.travel_rad <= start_rad <= high - plan.travel_rad:
+        raise ConfigurationError(
+            f"the joint stands at {start_rad:.4f} rad; the check moves it by up to {plan.travel_rad:g} rad to both "
+            f"sides and needs [{low + plan.travel_rad:g}..{high - plan.travel_rad:g}]",
+            "turn it by hand with the power off, or mend limits.position_*, encoder.zero_counts",
+        )
+
+
+def motion_table(plan: CheckPlan, start_rad: float) -> np.ndarray:
+    """Rows of `trajectory.reference_at`, float64 (N, 5): smooth ramps from stop to stop, and a rest at each."""
+    times_s, places, end_s, place = [0.0], [0.0], 0.0, 0.0
+    for stop in STOPS:
+        for share in np.linspace(0.0, 1.0, _ROWS_PER_RAMP + 1)[1:]:
+            times_s.append(end_s + share * RAMP_s)
+            places.append(place + (stop - place) * share**3 * (10.0 - 15.0 * share + 6.0 * share**2))
+        for share in (0.5, 1.0):
+            times_s.append(end_s + RAMP_s + share * REST_s)
+            places.append(stop)
+        end_s, place = times_s[-1], stop
+    position_rad = start_rad + plan.travel_rad * np.array(places)
+    table = np.zeros((len(times_s), 5))
+    table[:, 0] = times_s
+    table[:-1, 1:] = CubicSpline(times_s, position_rad, bc_type="clamped").c[::-1].T
+    table[-1, 1] = position_rad[-1]
+    return table
+
+
+def check_constants(config: Config, plan: CheckPlan, report: CommissioningReport, table: np.ndarray) -> Any:
+    """`AxisConstants` of the check; `config` is that of `config_of_check`."""
+    start_rad = report.start_position_rad
+    hold = config.model_copy(update={"sequence": config.sequence.model_copy(update={"approach_s": APPROACH_MIN_S})})
+    constants = axis_constants(hold, start_position_rad=start_rad)
+    axis = constants[0]
+    axis.trajectory.kind, axis.trajectory.repeats = TrajectoryKind.TABLE, 0
+    axis.trajectory.table_rows, axis.trajectory.duration_s = len(table), float(table[-1, 0])
+    reach_rad = REACH * plan.travel_rad
+    axis.limits.position_min_rad = max(axis.limits.position_min_rad, start_rad - reach_rad)
+    axis.limits.position_max_rad = min(axis.limits.position_max_rad, start_rad + reach_rad)
+    # the spring must be able to reach its torque before a standing reading is held against the joint
+    axis.limits.frozen_max_rad = 0.95 * plan.travel_rad
+    return constants

@@ -1,0 +1,186 @@
+"""What the records of the check say about directions and scale."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from firmware_py.states import AxisPhase, Fault
+from tools.configuration.config import Config
+from tools.configuration.conversions import joint_rad_per_count
+from tools.inspection.findings import NOTE, OK, PROBLEM, Finding
+from tools.motion_check.plan import CheckPlan
+from tools.running.fault_text import FaultText
+
+MOVED_SHARE = 0.03  # of the travel: less is no motion
+MOVED_COUNTS = 10.0
+SAME_SCALE = 0.2  # by which two encoders may differ over the small way: backlash, twist
+FRICTION_FACTOR = 2.5  # measured over configured static friction, either way
+TORQUE_FACTOR = 2.0  # measured over commanded torque, either way
+_POWERED = (AxisPhase.APPROACH, AxisPhase.TRACKING, AxisPhase.RAMPING)
+_WAY_FAULTS = (Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR, Fault.POSITION_LIMIT, Fault.POSITION_DISAGREEMENT)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Figures of the motion, by the encoder that feeds the law."""
+
+    moved_rad: float  # farthest from the start, with its sign
+    work_J: float  # of the commanded torque without gravity: negative if the joint moved against it
+    break_away_Nm: float  # commanded when the joint began to move
+    torque_max_Nm: float
+    torque_ratio: float | None  # measured over commanded; None where the drive measures none
+    other_ratio: float | None  # way of the other encoder over that of this one
+    other_moved_rad: float
+
+
+def motion_of(records: Any, threshold_rad: float) -> Motion | None:
+    """None if the drive was never enabled."""
+    rows = records[np.isin(records.phase, [*_POWERED, AxisPhase.QUICK_STOPPING])]
+    powered = np.isin(rows.phase, _POWERED)
+    if powered.sum() < 2:
+        return None
+    way = np.asarray(rows.position_rad - rows.position_rad[0])
+    other = np.asarray(rows.second_position_rad - rows.second_position_rad[0])
+    torque = np.where(powered, rows.command_torque_Nm, 0.0)
+    pushed = np.where(powered, rows.command_torque_Nm - rows.gravity_torque_Nm, 0.0)
+    work = float(np.sum(pushed[:-1] * np.diff(way)))
+    moved = np.nonzero(np.abs(way) >= threshold_rad)[0]
+    first = int(moved[0]) if len(moved) else -1
+    strong = np.abs(torque) > 0.5 * np.abs(torque).max()
+    measured = np.asarray(rows.measured_torque_Nm)
+    ratio = None
+    if measured.any() and strong.any():
+        ratio = float(np.sum(measured[strong] * torque[strong]) / np.sum(torque[strong] ** 2))
+    square = float(np.sum(way**2))
+    return Motion(
+        moved_rad=float(way[np.argmax(np.abs(way))]),
+        work_J=work,
+        break_away_Nm=float(np.abs(torque[: first + 1 or None]).max()),
+        torque_max_Nm=float(np.abs(torque).max()),
+        torque_ratio=ratio,
+        other_ratio=float(np.sum(way * other) / square) if square > 0.0 else None,
+        other_moved_rad=float(other[np.argmax(np.abs(other))]),
+    )
+
+
+def motion_findings(
+    config: Config, plan: CheckPlan, records: Any, fault: Fault, text: FaultText | None
+) -> Iterator[Finding]:
+    """Every finding of one check; `config` is the user's own."""
+    resolution_rad = abs(joint_rad_per_count(config))
+    second = config.joint_encoder
+    law, other = "encoder", "joint_encoder"
+    if second is not None and second.law == "joint_encoder":
+        law, other = other, law
+        resolution_rad = math.tau / second.counts_per_turn
+    threshold_rad = max(MOVED_SHARE * plan.travel_rad, MOVED_COUNTS * resolution_rad)
+    motion = motion_of(records, threshold_rad)
+    if motion is None:
+        yield _ended(fault, text, "before the drive was enabled")
+        return
+    numbers = {key: value for key, value in vars(motion).items() if value is not None}
+    if abs(motion.moved_rad) < threshold_rad:
+        yield _standing(motion, law, other, threshold_rad, second is not None, numbers)
+        return
+    if second is not None:
+        yield from _encoders(motion, law, other)
+    yield _direction(motion, law, other, numbers)
+    if motion.torque_ratio is not None:
+        yield _measured_torque(motion.torque_ratio)
+    if motion.work_J > 0.0:
+        yield from _friction(motion, plan)
+    if fault is not Fault.NONE and not (fault in _WAY_FAULTS and (motion.work_J <= 0.0 or second is not None)):
+        yield _ended(fault, text, "while the joint moved")
+
+
+def _ended(fault: Fault, text: FaultText | None, when: str) -> Finding:
+    if text is None:
+        return Finding("check", PROBLEM, f"ended {when}", "repeat it")
+    return Finding("check", PROBLEM, f"ended {when}: {fault.name}: {text.happened}", text.next_step)
+
+
+def _standing(
+    motion: Motion, law: str, other: str, threshold_rad: float, two: bool, numbers: dict[str, Any]
+) -> Finding:
+    reading = f"the reading of [{law}] stood still (within {threshold_rad * 1e3:.2g} mrad)"
+    reading += f" at up to {motion.torque_max_Nm:.1f} Nm"
+    if two and abs(motion.other_moved_rad) > threshold_rad:
+        cure = f"[{law}] is dead or its cable, object or node is wrong: [{other}] moved"
+        return Finding("motion", PROBLEM, f"{reading}, that of [{other}] moved", cure, numbers)
+    cure = "turn the joint by hand with the power off and watch the position: a reading that stands is the encoder; "
+    cure += "else brake, blocked joint, motor supply, torque constant, or more friction than --torque"
+    return Finding("motion", PROBLEM, reading, cure, numbers)
+
+
+def _encoders(motion: Motion, law: str, other: str) -> Iterator[Finding]:
+    ratio = motion.other_ratio
+    if ratio is None:
+        return
+    numbers = {"other_ratio": ratio}
+    if abs(ratio) < 0.02:
+        yield Finding(
+            "two encoders",
+            PROBLEM,
+            f"[{other}] stood still while [{law}] moved",
+            f"cable or object of [{other}]",
+            numbers,
+        )
+    elif ratio < 0.0:
+        wrong = other if motion.work_J > 0.0 else law
+        text = f"[{law}] and [{other}] count against each other"
+        cure = f"{wrong}.direction: [{law if wrong == other else other}] agrees with the torque"
+        yield Finding("two encoders", PROBLEM, text, cure, numbers)
+    if abs(ratio) >= 0.02 and abs(abs(ratio) - 1.0) > SAME_SCALE:
+        text = f"[{other}] moves {abs(ratio):.3g} times as far as [{law}]"
+        cure = "counts_per_turn of one of them, encoder.side or joint.reduction_ratio, by that factor"
+        yield Finding("scale", PROBLEM, text, cure, numbers)
+    elif ratio > 0.0:
+        yield Finding("two encoders", OK, f"the same direction, and {ratio:.3f} times the same way", "", numbers)
+
+
+def _direction(motion: Motion, law: str, other: str, numbers: dict[str, Any]) -> Finding:
+    way = f"by up to {abs(motion.moved_rad) * 1e3:.1f} mrad ({math.degrees(abs(motion.moved_rad)):.2f} deg)"
+    if motion.work_J <= 0.0:
+        cure = (
+            f"if the joint turned the way that you call positive at first: {law}.direction; else drive.torque_direction"
+        )
+        if motion.other_ratio is not None and motion.other_ratio < -0.02:
+            cure = f"{law}.direction: [{other}] agrees with the torque"
+        text = f"by [{law}] the joint moved against the torque, {way}: feedback would be positive"
+        return Finding("direction", PROBLEM, text, cure, numbers)
+    cure = ""
+    if motion.moved_rad:
+        cure = "by eye: it turned to positive first; if not, reverse every direction of [encoder], [joint_encoder] and "
+        cure += "drive.torque_direction together; and as far as told, else counts_per_turn"
+    return Finding("direction", OK, f"the joint moved with the torque, {way} by [{law}]", cure, numbers)
+
+
+def _measured_torque(ratio: float) -> Finding:
+    numbers = {"torque_ratio": ratio}
+    text = f"the drive measures {ratio:.2f} times the torque that it is sent"
+    if ratio < 0.0:
+        return Finding(
+            "measured torque", PROBLEM, text, "the drive's own polarity (607E), its current sensors", numbers
+        )
+    if not 1.0 / TORQUE_FACTOR <= ratio <= TORQUE_FACTOR:
+        cure = "drive.torque_reference, rated values, the drive's own current limit"
+        return Finding("measured torque", NOTE, text, cure, numbers)
+    return Finding("measured torque", OK, text, "", numbers)
+
+
+def _friction(motion: Motion, plan: CheckPlan) -> Iterator[Finding]:
+    text = f"it began to move at {motion.break_away_Nm:.1f} Nm"
+    numbers = {"break_away_Nm": motion.break_away_Nm}
+    static_Nm = plan.static_friction_Nm
+    if not static_Nm:
+        yield Finding("friction", OK, text, "", numbers)
+    elif 1.0 / FRICTION_FACTOR <= motion.break_away_Nm / static_Nm <= FRICTION_FACTOR:
+        yield Finding("friction", OK, f"{text}; [friction] says {static_Nm:.1f} Nm", "", numbers)
+    else:
+        cure = "joint.torque_constant_NmpA and its ampere, joint.reduction_ratio, units of [friction]; then sweep"
+        yield Finding("friction", NOTE, f"{text}; [friction] says {static_Nm:.1f} Nm", cure, numbers)

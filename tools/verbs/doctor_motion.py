@@ -1,0 +1,69 @@
+"""`jointctl doctor --motion`: is torque and encoder the right way round, before the first run?"""
+
+from __future__ import annotations
+
+import sys
+
+from drivers.drive import CommissioningReport
+from drivers.errors import UsageError
+from tools.configuration.config import Config
+from tools.inspection.drive_scale import scale_finding
+from tools.motion_check.carry_out import CheckSupervisor
+from tools.motion_check.plan import CheckPlan, make_plan, require_room
+from tools.motion_check.verdict import motion_findings
+from tools.output import Output
+from tools.recording.log_folder import log_path
+from tools.running.readiness import prepare_log, require_ready
+from tools.running.run_report import INTERRUPTED
+from tools.verbs.doctor import report_findings
+
+
+def check_envelope(config: Config, plan: CheckPlan, report: CommissioningReport) -> list[str]:
+    """What is about to happen, in lines."""
+    start = report.start_position_rad
+    lines = [
+        f"drive      {report.identity.name or 'unnamed'}, vendor {report.identity.vendor}, {report.mode}",
+        f"now at     {start:+.4f} rad",
+        f"motion     a soft spring pulls the joint towards {start + plan.travel_rad:+.3f}, then "
+        f"{start - plan.travel_rad:+.3f} rad, {plan.duration_s:.0f} s",
+        f"limits     {plan.torque_Nm:.1f} Nm, {plan.velocity_radps:.2f} rad/s; it is braked beyond 0.1 rad or so: "
+        "keep it free and unloaded, a hand on the emergency stop",
+        "watch      which way it turns first: it must be the one that you call positive",
+    ]
+    return lines + [f"remark     {remark}" for remark in report.remarks]
+
+
+def doctor_motion(config: Config, output: Output, *, assume_yes: bool, torque_Nm: float | None = None) -> int:
+    """Commission, tell, ask, pull, judge; 0, or 1 if something is wrong, 130 after an interruption."""
+    if not (assume_yes or sys.stdin.isatty()):
+        raise UsageError("this moves the joint and there is no terminal to ask on", "give -y to move without asking")
+    plan = make_plan(config, torque_Nm)
+    path = log_path(config)
+    found = [finding for finding in (scale_finding(config),) if finding is not None]
+
+    def confirm(report: CommissioningReport) -> bool:
+        for line in check_envelope(config, plan, report):
+            output.note(line)
+        require_ready(config, report, path)
+        require_room(config, plan, report.start_position_rad)
+        if not assume_yes:
+            output.note("Move the joint? [y/N] ")
+            if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+                return False
+        prepare_log(config, path, output)
+        return True
+
+    try:
+        result = CheckSupervisor(config, output, path, confirm, plan).run()
+    except KeyboardInterrupt:
+        output.note("interrupted; nothing moved")
+        return INTERRUPTED
+    if result is None:
+        output.note("nothing moved; the drive is disabled")
+        return 0
+    if result.stopped_by:
+        output.note(f"stopped by {result.stopped_by}; the joint is {result.drive_state}; nothing was judged")
+        return INTERRUPTED
+    found += motion_findings(config, plan, result.records, result.fault, result.fault_text)
+    output.note(f"  drive afterwards: {result.drive_state}; log: {result.log_path}")
+    return report_findings(found, output, "Motion")
