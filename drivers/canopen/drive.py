@@ -11,6 +11,7 @@ from typing import Any
 import can
 import canopen
 
+from drivers.canopen.bus_watchers import BusFailure, refuse_second_controller
 from drivers.canopen.cia402 import ControlWord, State, decode_state
 from drivers.canopen.commissioning import VELOCITY_MODES, Findings, commission
 from drivers.canopen.eds_file import read_eds
@@ -27,31 +28,14 @@ from drivers.errors import BusError, ConfigurationError, DeviceError, JointctlEr
 
 SDO_TIMEOUT_S = 0.3
 SEARCH_S = 0.3
-LISTEN_S = 0.05  # five SYNC periods of the slowest loop
-SYNC_ID = 0x80
 NMT_PRE_OPERATIONAL = 128
 NMT_OPERATIONAL = 1
 NMT_STOPPED = 2
 SAFE_ATTEMPTS = 5
 QUICK_STOP_S = 1.0  # how long a moving joint may brake before its power is taken
 SAFE_POLL_S = 0.02
-FAILURE_PAUSE_S = 0.05
 REOPEN_ATTEMPTS = 10
 REOPEN_PAUSE_S = 0.3  # an adapter that was plugged in again needs a second or two
-
-
-class _BusFailure(can.Listener):
-    """Keeps a bus that fails from ending the receiving thread with a traceback; whoever sends next is told."""
-
-    def __init__(self, sleep: Callable[[float], None]) -> None:
-        self._sleep = sleep
-
-    def on_message_received(self, msg: can.Message) -> None:
-        """Messages are for the other listeners."""
-
-    def on_error(self, exc: Exception) -> None:
-        """The thread receives again at once: a dead bus must not make it spin."""
-        self._sleep(FAILURE_PAUSE_S)
 
 
 class CanopenDrive:
@@ -79,7 +63,7 @@ class CanopenDrive:
         logging.getLogger("canopen").setLevel(logging.CRITICAL)
         self._network = canopen.Network(bus)
         self._network.NOTIFIER_CYCLE = 0.05
-        on_failure: Any = _BusFailure(sleep)  # the library knows only its own kind of listener
+        on_failure: Any = BusFailure(sleep)  # the library knows only its own kind of listener
         self._network.listeners.append(on_failure)
         self._network.connect()
         try:
@@ -122,22 +106,6 @@ class CanopenDrive:
                 hint="power, wiring, termination, and the bit rate of the drive",
             ) from error
 
-    def _refuse_second_controller(self) -> None:
-        """Who sends SYNC controls a joint on this bus: two of them would fight over the same drive."""
-        seen: list[float] = []
-
-        def on_sync(_: int, data: bytearray, timestamp_s: float) -> None:
-            seen.append(timestamp_s)
-
-        self._network.subscribe(SYNC_ID, on_sync)
-        self._sleep(LISTEN_S)
-        self._network.unsubscribe(SYNC_ID, on_sync)
-        if seen:
-            raise BusError(
-                f"another controller is active on this bus: {len(seen)} SYNC frames (080h) in {LISTEN_S:g} s",
-                hint="end it first; only one controller may use the bus",
-            )
-
     def _prove_watchdog(self) -> str:
         """See `prove_watchdog`; afterwards the node is brought back to pre-operational."""
         settings = self._settings
@@ -148,7 +116,7 @@ class CanopenDrive:
     def commission(self) -> CommissioningReport:
         """See `Drive.commission`; the node is left in pre-operational."""
         try:
-            self._refuse_second_controller()
+            refuse_second_controller(self._network, self._sleep)
             self._taken = True
             # first: a node that its watchdog or an earlier run left in "stopped" does not answer SDO
             self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
@@ -307,7 +275,7 @@ class CanopenDrive:
 
     def clear_fault(self) -> str:
         """Reset the drive's fault on the user's word; refuses while another controller is active."""
-        self._refuse_second_controller()
+        refuse_second_controller(self._network, self._sleep)
         self._taken = True
         self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
         self._find()
