@@ -1,0 +1,109 @@
+"""Whatever a drive answers to an SDO request: a number of the object's type, or one error of the driver's own kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import canopen
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from drivers.canopen.eds_file import read_eds
+from drivers.canopen.object_access import ATTEMPTS, ObjectAccess
+from drivers.errors import DeviceError, NoDeviceError
+
+quick = settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+OBJECTS = ((0x6041, 0), (0x6064, 0), (0x1000, 0), (0x1018, 1), (0x6060, 0), (0x6077, 0))
+
+
+def multiplexed(command: int, place: tuple[int, int], data: bytes) -> bytes:
+    return bytes([command]) + place[0].to_bytes(2, "little") + bytes([place[1]]) + data
+
+
+# what belongs to the request, what nearly does, and noise of any length
+replies = st.one_of(
+    st.builds(
+        multiplexed,
+        st.sampled_from([0x40, 0x41, 0x42, 0x43, 0x47, 0x4B, 0x4F, 0x60, 0x80, 0xC2]),
+        st.sampled_from(OBJECTS),
+        st.binary(min_size=4, max_size=4),
+    ),
+    st.builds(
+        lambda command, data: bytes([command]) + data,
+        st.sampled_from([0x00, 0x01, 0x0D, 0x10, 0x1D, 0x20, 0x30]),
+        st.binary(min_size=7, max_size=7),
+    ),
+    st.binary(min_size=0, max_size=8),
+)
+
+
+class Wire:
+    """In the place of the network: each request gets the next replies; then there is silence."""
+
+    def __init__(self, answers: list[list[bytes]]) -> None:
+        self.answers, self.sdo = list(answers), None
+
+    def send_message(self, _identifier: int, _data: bytes, _remote: bool = False) -> None:
+        sdo: Any = self.sdo
+        for reply in self.answers.pop(0) if self.answers else []:
+            sdo.on_response(0x581, bytearray(reply), 0.0)
+
+
+@pytest.fixture
+def access(settings_of_virtual_joint: Any) -> Callable[[list[list[bytes]]], ObjectAccess]:
+    eds = read_eds(settings_of_virtual_joint.eds_path, 1)
+
+    def build(answers: list[list[bytes]]) -> ObjectAccess:
+        node = canopen.RemoteNode(1, eds.dictionary)
+        wire: Any = Wire(answers)
+        wire.sdo = node.sdo
+        node.sdo.network, node.sdo.RESPONSE_TIMEOUT = wire, 1e-4
+        return ObjectAccess(node, eds.name)
+
+    return build
+
+
+def attempt(call: Callable[[], int]) -> tuple[str, int]:
+    """(message of the driver's error in one line, or empty; value)."""
+    try:
+        return "", call()
+    except (DeviceError, NoDeviceError) as error:
+        message = error.message
+    assert message
+    assert "\n" not in message
+    return message, 0
+
+
+@quick
+@given(answers=st.lists(st.lists(replies, max_size=2), max_size=8), place=st.sampled_from(OBJECTS))
+def test_any_sdo_replies_to_a_read(
+    access: Callable[[list[list[bytes]]], ObjectAccess], answers: list[list[bytes]], place: tuple[int, int]
+) -> None:
+    objects = access(answers)
+    bits = len(objects._variable(*place))
+    message, value = attempt(lambda: objects.read(*place, what="fuzzed"))
+    if message:
+        assert f"{place[0]:04X}" in message
+    else:
+        assert -(1 << (bits - 1)) <= value < 1 << bits
+
+
+@quick
+@given(answers=st.lists(st.lists(replies, max_size=2), max_size=8), value=st.integers(-128, 127))
+def test_any_sdo_replies_to_a_verified_write(
+    access: Callable[[list[list[bytes]]], ObjectAccess], answers: list[list[bytes]], value: int
+) -> None:
+    objects = access(answers)
+    message, found = attempt(lambda: objects.write_verified(0x6060, 0, value, what="fuzzed"))
+    assert "6060" in message if message else found == value
+
+
+def test_its_twin_the_right_reply_is_taken(access: Callable[[list[list[bytes]]], ObjectAccess]) -> None:
+    right = multiplexed(0x4B, (0x6041, 0), b"\x37\x12\0\0")
+    assert access([[right]]).read(0x6041, what="statusword") == 0x1237
+    silent: list[list[bytes]] = [[]] * (2 * (ATTEMPTS - 1))  # each attempt that fails also sends an abort
+    assert access([*silent, [right]]).read(0x6041, what="statusword") == 0x1237
+    with pytest.raises(NoDeviceError, match="no answer in 3 attempts"):
+        access([*silent, [], [], [right]]).read(0x6041, what="statusword")
