@@ -77,10 +77,10 @@ def tracking(folder: Path, config: str) -> Iterator[subprocess.Popen[str]]:
     command = jointctl("run", config, *ON_VCAN, *SLOW_GUEST)
     with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True) as started:
         assert started.stderr is not None
-        seen = ""
-        while "tracking" not in seen:
-            seen = started.stderr.readline()
-            assert seen, f"ended with {started.wait()}"
+        seen = [""]
+        while "tracking" not in seen[-1]:
+            seen.append(started.stderr.readline())
+            assert seen[-1], f"ended with {started.wait()}: {''.join(seen)}"
         yield started
 
 

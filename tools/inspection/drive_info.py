@@ -55,7 +55,7 @@ def state(reader: SdoReader) -> dict[str, Any]:
     """6041 in words, the mode, and the modes that there are."""
     word, modes = reader.value(0x6041), reader.value(0x6502)
     return {
-        "status_word": word,
+        "status_word": None if word is None else f"{word:04X}h",
         "drive_state": None if word is None else drive_words.drive_state(word),
         "status_bits": [] if word is None else drive_words.status_bits(word),
         "mode_selected": reader.text(0x6060),

@@ -17,6 +17,7 @@ import os
 import signal
 import socket
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -32,6 +33,7 @@ from tools.analysis.idle_states import cores_awake
 _MLOCK_CURRENT_AND_FUTURE = 3
 _POLL_S = 0.001
 _FOREVER = 1 << 62
+_SLOW_START_S = 4.0
 
 
 @dataclass(frozen=True)
@@ -193,7 +195,12 @@ def run(order: LoopOrder) -> int:
         loop: Any = serial_loop
     else:
         loop = compiled_loop if order.interface in CYCLIC_INTERFACES else portable_loop
+    text = "loop: compiling, which only the first start does; it takes a minute or two"
+    slow = threading.Timer(_SLOW_START_S, print, [text], {"file": sys.stderr, "flush": True})
+    slow.daemon = True
+    slow.start()
     with loop(order, block) as prepared:
+        slow.cancel()
         ready = prepared if isinstance(prepared, ReadyLoop) else ReadyLoop(prepared)
         gc.collect()
         gc.freeze()
