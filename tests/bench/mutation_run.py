@@ -81,43 +81,37 @@ def _variants(node: ast.AST) -> Iterator[tuple[str, Any]]:
 
 
 def mutants(source: str, module: str) -> list[tuple[int, str, ast.Module]]:
-    """(line, what was done, changed tree) for every mutant of the functions of a module."""
+    """(line, what was done, changed tree) for every mutant of the functions of a module.
+
+    Each is made in a copy of its own: a change must neither be lost nor be left behind in the next mutant.
+    """
     tree = ast.parse(source)
+    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
+    inside = {id(node) for function in functions for node in ast.walk(function)}
+    skipped = {id(n) for f in functions for d in (*f.decorator_list, f.args) for n in ast.walk(d)}
     found = []
-    nodes = [node for function in tree.body if isinstance(function, ast.FunctionDef) for node in ast.walk(function)]
-    skipped = {id(n) for f in tree.body if isinstance(f, ast.FunctionDef) for d in (*f.decorator_list, f.args)
-               for n in ast.walk(d)}  # fmt: skip
-    for node in nodes:
-        if id(node) in skipped:
+    for place_in_tree, original in enumerate(ast.walk(tree)):
+        if id(original) not in inside - skipped:
             continue
-        for what, (field, place, value) in _variants(node):
-            original = {key: copy.copy(item) for key, item in vars(node).items()}
+        for what, (field, place, value) in _variants(original):
+            changed = copy.deepcopy(tree)
+            node: Any = list(ast.walk(changed))[place_in_tree]
             if field == "next":
-                members = _members(module, node.value.id)  # type: ignore[attr-defined]
-                node.attr = members[(members.index(node.attr) + 1) % len(members)]  # type: ignore[attr-defined]
+                members = _members(module, node.value.id)
+                node.attr = members[(members.index(node.attr) + 1) % len(members)]
             elif field == "pass":
-                line, end = node.lineno, node.end_lineno  # type: ignore[attr-defined]
-                node.__class__ = ast.Pass  # type: ignore[assignment]
+                line, end = node.lineno, node.end_lineno
+                node.__class__ = ast.Pass
                 vars(node).clear()
-                node.lineno, node.end_lineno, node.col_offset, node.end_col_offset = line, end, 0, 0  # type: ignore[attr-defined]
+                node.lineno, node.end_lineno, node.col_offset, node.end_col_offset = line, end, 0, 0
             elif place is None:
                 setattr(node, field, value)
             else:
                 getattr(node, field)[place] = value
-            changed = ast.fix_missing_locations(copy.deepcopy(tree))
-            found.append((getattr(node, "lineno", 0), what, changed))
-            if field == "pass":
-                node.__class__ = original_class(original)  # type: ignore[assignment]
-                vars(node).clear()
-            vars(node).update(original)
+            if ast.dump(changed) == ast.dump(tree):
+                raise AssertionError(f"{module}:{original.lineno}: {what} changes nothing")  # type: ignore[attr-defined]
+            found.append((getattr(original, "lineno", 0), what, ast.fix_missing_locations(changed)))
     return found
-
-
-def original_class(fields: dict[str, Any]) -> type[ast.AST]:
-    """Of a statement that was replaced by `pass`."""
-    if "op" in fields:
-        return ast.AugAssign
-    return ast.Assign if "targets" in fields else ast.Expr
 
 
 def _members(module: str, enumeration: str) -> list[str]:
