@@ -153,10 +153,8 @@ def _direction(motion: Motion, law: str, other: str, numbers: dict[str, Any]) ->
             cure = f"{law}.direction: [{other}] agrees with the torque"
         text = f"by [{law}] the joint moved against the torque, {way}: feedback would be positive"
         return Finding("direction", PROBLEM, text, cure, numbers)
-    cure = ""
-    if motion.moved_rad:
-        cure = "by eye: it turned to positive first; if not, reverse every direction of [encoder], [joint_encoder] and "
-        cure += "drive.torque_direction together; and as far as told, else counts_per_turn"
+    cure = "by eye: it must turn to positive first, and as far as told; else reverse encoder.direction, "
+    cure += "joint_encoder.direction and drive.torque_direction together, or mend counts_per_turn"
     return Finding("direction", OK, f"the joint moved with the torque, {way} by [{law}]", cure, numbers)
 
 
