@@ -123,6 +123,7 @@ def test_the_way_behind_a_reading_that_stands_still(
     trips = trips and how == "stands"
     assert state.fault == (Fault.POSITION_FROZEN if trips else Fault.NONE)
     assert state.fault_value == pytest.approx(way_rad if trips else 0.0)
+    assert state.fault_drive_error == 0
     assert state.frozen_from_rad == (1.0 + way_rad if how == "moves" else 1.0)
 
 
@@ -146,6 +147,15 @@ def test_the_push_at_a_reading_that_stands_still(
             state.measured_torque_Nm, state.command_torque_Nm = 0.0, torque_Nm
         check_reading(axis, state)
     assert state.fault == (Fault.POSITION_FROZEN if pushed else Fault.NONE)
+    assert state.fault_drive_error == 0
+
+
+@pytest.mark.parametrize("pushed", [False, True])
+def test_a_joint_that_gives_way_to_little_is_watched_as_well(stuck: tuple[Any, Any], pushed: bool) -> None:
+    axis, state = stuck
+    axis.limits.frozen_torque_Nm, state.command_torque_Nm = 0.5, 0.501 if pushed else 0.5
+    check_reading(axis, state)
+    assert state.pushed_cycles == int(pushed)
 
 
 @pytest.mark.parametrize("by", ["less torque", "a reading that moves"])
