@@ -62,6 +62,7 @@ class Chart:
             return
         if self._armed.value and not self._pause.value:
             self._look_for_trigger(rows, span_s)
+            rows = self._history.newest(span_s, self._held_s)
         names = list(self._signals.value or [])
         now = (int(rows["time_ns"][0]), int(rows["time_ns"][-1]), names, span_s)
         if now != self._drawn:
