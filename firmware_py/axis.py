@@ -170,8 +170,8 @@ def _command_torque(constants: AxisConstants, state: AxisState, table: np.ndarra
         state.saturated_cycles += elapsed_cycles
         if state.saturated_cycles > limits.saturation_max_cycles:
             trip(state, Fault.TORQUE_SATURATED, torque_Nm, 0)
-    else:
-        state.saturated_cycles = 0
+    else:  # a torque that jumps from limit to limit passes through here, and is none the better for it
+        state.saturated_cycles = max(state.saturated_cycles - elapsed_cycles, 0)
     state.command_torque_Nm = torque_Nm if powered(state.phase) else 0.0
 
 
@@ -208,8 +208,8 @@ def _command_velocity(constants: AxisConstants, state: AxisState, elapsed_cycles
         state.saturated_cycles += elapsed_cycles
         if state.saturated_cycles > limits.saturation_max_cycles:
             trip(state, Fault.TORQUE_SATURATED, state.measured_torque_Nm, 0)
-    else:
-        state.saturated_cycles = 0
+    else:  # a torque that jumps from limit to limit passes through here, and is none the better for it
+        state.saturated_cycles = max(state.saturated_cycles - elapsed_cycles, 0)
     state.command_velocity_radps = velocity_radps if powered(state.phase) else 0.0
 
 

@@ -36,7 +36,7 @@ from hil.device_core import accept_frame, advance
 from hil.device_records import Device, NmtState, int64
 from hil.faults import FaultMemory, fault_memory
 from hil.frame_faults import pass_frame, take_due
-from hil.frame_stamps import OLDEST_STAMP_NS, STAMPED_LAG_NS, leave_out_late, sent_ns_of
+from hil.frame_stamps import OLDEST_STAMP_NS, STAMPED_LAG_NS, sent_ns_of, stamp_answers
 from hil.frames import FRAME_SIZE, FrameQueue
 from hil.plant_faults import step_faults
 from hil.plant_records import PlantConstants, PlantState
@@ -45,8 +45,7 @@ ENETDOWN = errno_codes.ENETDOWN
 STOP_WORD = 0  # not zero: leave the loop
 SEND_ERRORS_WORD = 1  # frames that could not be sent
 ENDED_WORD = 2  # 1 = stopped, 2 = the bus has gone
-LATE_WORD = 3  # answers to SYNC that would have come too late and were not sent
-WORDS = 4
+WORDS = 3
 
 _LONGEST_WAIT_NS = 2_000_000  # faults of the plant are seen at least this often
 _SDO_LOOK_S = 0.1
@@ -146,7 +145,6 @@ def run_device(
     memory: FaultMemory = memories[0]
     node_id = int64(device.node_id)
     stamped_ns = int64(-OLDEST_STAMP_NS)  # when the last frame with a time came
-    sync_ns = int64(0)  # when the last SYNC with a time was sent
     ended = 1
     while load_acquire(words, STOP_WORD) == 0 and ended == 1:
         now_ns = monotonic_ns(timespec)
@@ -183,9 +181,7 @@ def run_device(
                     stamped_ns = now_ns
                 _take_frame(device, plant_c, plant_s, frame, service_fd, sent_ns, queue)
                 if sent_ns != now_ns and _is_sync(device, frame):
-                    late = leave_out_late(queue, monotonic_ns(timespec) - sent_ns, sent_ns - sync_ns)
-                    store_release(words, LATE_WORD, load_acquire(words, LATE_WORD) + late)
-                    sync_ns = sent_ns
+                    stamp_answers(queue, frame)
             else:
                 pass_frame(faults, memory, frame, True, node_id, now_ns, memory.ready)
                 for i in range(memory.ready.count):

@@ -3,9 +3,9 @@
 Without it the virtual drive would sample and act as late as its process gets the processor, which no drive does.  With
 it, drive and plant follow the bus a little behind, so that a frame that comes late still finds the plant at its time.
 
-An answer cannot be brought back in the same way.  A drive answers SYNC within a fraction of a millisecond; one that
-comes while the controller already waits for the next would pass for that one's, and a joint at speed would seem to
-leap.  So a SYNC is not answered at all once half of its period is over: the controller sees a lost sample.
+An answer cannot be brought back in the same way: one that comes while the controller already waits for the next would
+pass for that one's, and a joint at speed would seem to leap.  So it bears the stamp of its SYNC, and the controller
+leaves an answer to another SYNC out: what a busy computer holds up is a lost sample.
 """
 
 from __future__ import annotations
@@ -33,19 +33,10 @@ def sent_ns_of(frame: np.ndarray, now_ns: int) -> int:
 
 
 @kernel
-def leave_out_late(queue: FrameQueue, age_ns: int, period_ns: int) -> int:
-    """Remove the answers to a SYNC sent `age_ns` ago from `queue` if that is too long; how many they were.
-
-    `period_ns`: between this SYNC and the one before.
-    """
-    if 2 * age_ns <= period_ns:
-        return 0
-    kept = 0
+def stamp_answers(queue: FrameQueue, sync: np.ndarray) -> None:
+    """The stamp of `sync` (uint8[16]) into the TPDOs of `queue`, which answer it."""
     for i in range(queue.count):
         identifier = int64(queue.frames[i][0]) | int64(queue.frames[i][1]) << 8
-        if not FIRST_TPDO <= identifier <= LAST_PDO:
-            queue.frames[kept] = queue.frames[i]
-            kept += 1
-    removed = queue.count - kept
-    queue.count = kept
-    return removed
+        if FIRST_TPDO <= identifier <= LAST_PDO:
+            for byte in range(5, 8):
+                queue.frames[i][byte] = sync[byte]

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.can.frames import FRAME_BYTES
+from drivers.can.frames import FRAME_BYTES, Frame
 from firmware_py.kernel import kernel
 from firmware_py.libc import EINTR, MSG_DONTWAIT, MSG_NOSIGNAL, NANOSECONDS, POLLIN, errno, ppoll, recv, send
 
@@ -61,6 +61,12 @@ def stamp_frame(frames: Any, index: int, now_ns: int) -> None:
     frame.padding = time_us & 0xFF
     frame.reserved = (time_us >> 8) & 0xFF
     frame.length8 = time_us >> 16
+
+
+@kernel
+def stamp_of(frame: Frame) -> int:
+    """What `stamp_frame` wrote; the virtual drive's answer bears that of its SYNC.  0 = none, as on every other bus."""
+    return int(frame.padding) | int(frame.reserved) << 8 | int(frame.length8) << 16
 
 
 @kernel

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numba.core import types
 
-from drivers.can.frame_io import receive_frame, send_frame, stamp_frame, wait_readable_ns
+from drivers.can.frame_io import receive_frame, send_frame, stamp_frame, stamp_of, wait_readable_ns
 from drivers.can.frames import Frame
 from drivers.canopen.cyclic import accept_frame, begin_cycle, end_cycle
 from drivers.canopen.port import (
@@ -18,6 +18,7 @@ from drivers.canopen.port import (
     SCRATCH_WORDS,
     SLOT_RECEIVED,
     SLOT_RPDO,
+    SLOT_SYNC,
     CanopenPort,
 )
 from firmware_py.kernel import exported, kernel, record_array_type
@@ -58,10 +59,20 @@ def _send(port: CanopenPort, frames: np.ndarray, slot: int) -> int:
 
 
 @kernel
-def _drain(port: CanopenPort, frames: np.ndarray, sample: Sample, now_ns: int) -> bool:
+def _belated(port: CanopenPort, frame: Frame, sync_stamp: int) -> bool:
+    """Whether a TPDO bears the stamp of another SYNC: a busy computer held the virtual bus up, as no real one is."""
+    of_ours = frame.can_id == port.tpdo_id or (port.second.tpdo_id != 0 and frame.can_id == port.second.tpdo_id)
+    return of_ours and stamp_of(frame) != 0 and stamp_of(frame) != sync_stamp
+
+
+@kernel
+def _drain(port: CanopenPort, frames: np.ndarray, sample: Sample, now_ns: int, sync_stamp: int) -> bool:
     """Take every frame that is waiting; True if a sample was among them (of several, the last one counts)."""
     found = False
     while receive_frame(port.fd, frames, SLOT_RECEIVED) == 1:
+        if port.stamped and _belated(port, frames[SLOT_RECEIVED], sync_stamp):
+            port.surplus += 1
+            continue
         found |= accept_frame(port, frames[SLOT_RECEIVED], sample, now_ns)
     return found
 
@@ -74,14 +85,15 @@ def receive(ports: Any, frames: np.ndarray, scratch: np.ndarray, samples: Any, n
     """
     port = ports[0]
     sample = samples[0]
-    _drain(port, frames, sample, now_ns)
+    _drain(port, frames, sample, now_ns, 0)
     count = begin_cycle(port, frames)
     for slot in range(count):
         _note_sent(port, sample, _send(port, frames, slot), False)
+    sync_stamp = stamp_of(frames[SLOT_SYNC])
     started_ns = monotonic_ns(scratch)
     arrived_ns = started_ns
     while True:
-        if _drain(port, frames, sample, arrived_ns):
+        if _drain(port, frames, sample, arrived_ns, sync_stamp):
             return monotonic_ns(scratch) - started_ns
         if arrived_ns >= deadline_ns:
             return arrived_ns - started_ns

@@ -505,8 +505,28 @@ def test_saturation(rig: NewRig, blocked_cycles: int, trips: bool) -> None:
         assert run.torques_Nm[-1] == 60.0
         run.axis.law.gravity_Nm = run.joint.load_Nm = 0.0
         run.tick()
-        assert run.state.saturated_cycles == 0
+        assert run.state.saturated_cycles == 19  # forgotten as slowly as it came
         assert run.state.fault == Fault.NONE
+
+
+@pytest.mark.parametrize(("free_every", "trips"), [(2, False), (3, True)])
+def test_a_torque_that_jumps_from_limit_to_limit_is_saturated_all_the_same(
+    rig: NewRig, free_every: int, trips: bool
+) -> None:
+    """At the limit in half of the cycles, and in two thirds of them, with the sign changing each time."""
+    run = rig(0.0)
+    run.axis.limits.torque_rate_max_Nmps = 1e9
+    run.until(AxisPhase.TRACKING).run(20)
+    for cycle in range(90):
+        free = cycle % free_every == 0
+        run.axis.law.gravity_Nm = 0.0 if free else 1e4 * (-1.0) ** cycle
+        run.axis.law.gravity_zero_rad = -math.pi / 2.0
+        run.joint.load_Nm = -run.command.torque_Nm
+        run.tick()
+        if run.state.fault != Fault.NONE:
+            break
+    assert (run.state.fault == Fault.TORQUE_SATURATED) == trips
+    assert run.state.fault in (Fault.NONE, Fault.TORQUE_SATURATED)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])

@@ -76,7 +76,8 @@ def become_realtime(cpu: int | None, priority: int | None, threads: Sequence[int
     if priority is not None:
         try:
             for thread in threads:
-                os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
+                with contextlib.suppress(ProcessLookupError):  # a thread that has ended meanwhile
+                    os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
         except (OSError, AttributeError) as error:
             refused.append(f"loop.priority (={priority}): {error}; see `jointctl doctor`")
     if ctypes.CDLL(None).mlockall(_MLOCK_CURRENT_AND_FUTURE) != 0:

@@ -9,7 +9,6 @@ import threading
 import time
 
 from hil.bus import default_socket_path
-from hil.device_loop import LATE_WORD
 from tools.configuration.config import Config
 from tools.output import Output
 from tools.running.loop_process import become_realtime
@@ -44,10 +43,6 @@ def hil(config: Config, output: Output, *, timing: bool = False, ready_fd: int |
                 os.write(ready_fd, b"+")
         while not signals.count and not joint.words[2] and not reader_gone(ready_fd):
             time.sleep(_POLL_S)
-        if joint.words[LATE_WORD]:
-            output.note(
-                f"virtual joint: {joint.words[LATE_WORD]} samples came too late to be sent, this computer was busy"
-            )
     return 0
 
 
