@@ -222,6 +222,15 @@ def test_disagreement_is_dense_at_its_boundary(sign: float, torque_Nm: float, al
     assert encoders_disagree(limits, float("nan"), 0.0, torque_Nm)
 
 
+def test_at_exactly_the_limit_they_still_agree_and_of_two_equally_far_the_one_of_the_law_counts() -> None:
+    limits = new(LimitConstants)[0]
+    limits.disagreement_max_rad = 0.25
+    assert not encoders_disagree(limits, 0.5, 0.25, 0.0)
+    limits.limit_source = LimitSource.BOTH
+    limits.position_min_rad, limits.position_max_rad = -1.0, 1.0
+    assert limit_position_rad(limits, 0.5, -0.5) == 0.5
+
+
 def test_one_encoder_never_disagrees() -> None:
     limits = limits_of_two_encoders()
     limits.disagreement_max_rad = 0.0
