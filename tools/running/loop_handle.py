@@ -7,10 +7,11 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from drivers.errors import JointctlError, MotionFault
+from drivers.errors import MotionFault
 from firmware_py.libc import NANOSECONDS
 from firmware_py.realtime import Word
 from firmware_py.sequence import reset_axis
@@ -18,8 +19,8 @@ from firmware_py.states import AxisPhase, StopRequest
 from tools.configuration.config import Config
 from tools.running.loop_process import LoopOrder
 from tools.running.shared_block import SERIAL, SharedBlock
+from tools.simulation.starting import Starting
 
-READY_TIMEOUT_S = 180.0  # the first start compiles everything
 KILL_S = 1.0  # how long a killed process may take to go
 SILENT_S = 2.0  # without a cycle for so long, the loop hangs
 OPENING_S = 6.0  # before its first cycle it may have to open an adapter; the drive is disabled meanwhile
@@ -91,15 +92,15 @@ class LoopHandle:
         """The axis' phase as of the last cycle."""
         return AxisPhase(int(self.block.state[0].phase))
 
-    def wait_ready(self, alive: Any = lambda: None) -> None:
-        """Until the loop is compiled and warm; `alive` is called meanwhile and may raise."""
-        give_up = time.monotonic() + READY_TIMEOUT_S
+    def wait_ready(self, alive: Any = lambda: None, tell: Callable[[str], None] = lambda _: None) -> None:
+        """Until the loop is compiled and warm; `alive` is called meanwhile and may raise, `tell` gets what it does.
+
+        Raises `JointctlError` if it ends, or hangs, before that.
+        """
+        starting = Starting("the loop process", self._process, tell)
         while not self.block.words[Word.READY]:
             alive()
-            if self._process.poll() is not None:
-                raise JointctlError(f"the loop process ended with code {self._process.returncode} before it was ready")
-            if time.monotonic() > give_up:
-                raise JointctlError("the loop process was not ready in time")
+            starting.check()
             time.sleep(0.005)
 
     def listen(self) -> None:

@@ -97,7 +97,7 @@ class Supervisor:
                 signals.raising = False
                 if not confirmed:
                     return None
-                loop.wait_ready(lambda: self._leave_if_asked(signals))
+                loop.wait_ready(lambda: self._leave_if_asked(signals), self._output.note)
                 self._leave_if_asked(signals)
                 if self._guard is not None:
                     self._guard.wait_ready()

@@ -7,7 +7,7 @@ import select
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -21,8 +21,9 @@ from tools.configuration.config import Config
 from tools.configuration.drive_settings import device_settings
 from tools.configuration.plant_settings import fault_constants, plant_settings
 from tools.simulation.device_pump import PumpedDevice
+from tools.simulation.starting import Starting
 
-READY_TIMEOUT_S = 120.0  # the first start compiles everything
+_POLL_S = 0.1
 
 
 def new_device(config: Config) -> Cia402Device:
@@ -62,17 +63,25 @@ def serve_virtual_joint(config: Config, timing: bool = False) -> Iterator[Realti
 
 
 @contextmanager
-def separate_virtual_joint(config_path: Path, channel: str) -> Iterator[subprocess.Popen[bytes]]:
-    """`jointctl hil` as a process of its own on a bus of the given name; ended when the block is left."""
+def separate_virtual_joint(
+    config_path: Path, channel: str, tell: Callable[[str], None] = lambda _: None
+) -> Iterator[subprocess.Popen[bytes]]:
+    """`jointctl hil` as a process of its own on a bus of the given name; ended when the block is left.
+
+    `tell` gets a line now and then while it compiles.  Raises `BusError` if it ends, or hangs, before it is ready.
+    """
     read_end, write_end = os.pipe()
     command = [sys.executable, "-P", "-m", "tools.cli", "hil", str(config_path), "--interface", "jointctl"]
     command += ["--channel", channel, "--ready-fd", str(write_end), "--quiet"]
     process = subprocess.Popen(command, pass_fds=(write_end,), stdin=subprocess.DEVNULL, start_new_session=True)
     os.close(write_end)
     try:
-        ready, _, _ = select.select([read_end], [], [], READY_TIMEOUT_S)
-        if not ready or os.read(read_end, 1) != b"+":
-            raise BusError("the virtual joint did not start; see its message above")
+        starting = Starting("the virtual joint", process, tell, BusError)
+        while not select.select([read_end], [], [], _POLL_S)[0]:
+            starting.check()
+        if os.read(read_end, 1) != b"+":  # its end of the pipe has gone, and so will it
+            process.wait()
+            starting.check()
         yield process
     finally:
         os.close(read_end)

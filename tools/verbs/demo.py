@@ -27,7 +27,7 @@ def demo(config_path: Path, output: Output, *, duration_s: float | None = None) 
     if duration_s is not None:
         config = _with_duration(config, duration_s)
     output.note("starting the virtual joint (the first start compiles, about a minute)")
-    with separate_virtual_joint(config_path, channel):
+    with separate_virtual_joint(config_path, channel, output.note):
         return run(config, output, assume_yes=True)
 
 

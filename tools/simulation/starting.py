@@ -1,0 +1,77 @@
+"""Waiting for a process that compiles before it is ready: for as long as it works, and saying what it does meanwhile.
+
+A fixed time would be wrong: the first start takes a minute on an idle computer and many on a busy one.  A process
+that works uses processor time; one that hangs does not.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from drivers.errors import JointctlError
+
+TELL_S = 15.0  # how often it is told that it still compiles
+IDLE_S = 60.0  # alive, but at work for less than WORK_S in so long: it hangs
+WORK_S = 0.05
+_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+
+
+def processor_time_s(pid: int) -> float:
+    """What the process has used of all processors, its threads included; 0 where it has gone."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / _TICKS_PER_S
+
+
+def end_text(code: int) -> str:
+    """How a process ended, by its return code; one that ended by itself has told why on its stderr."""
+    if code < 0:
+        name = signal.Signals(-code).name if -code in list(signal.Signals) else str(-code)
+        return f"was killed by signal {-code} ({name})"
+    return f"ended with exit code {code}, see its message above" if code else "ended without a message"
+
+
+class Starting:
+    """`check()` it many times until it is ready.  `name` as in "the virtual joint", `error` is what is raised."""
+
+    def __init__(
+        self,
+        name: str,
+        process: subprocess.Popen[bytes],
+        tell: Callable[[str], None],
+        error: type[JointctlError] = JointctlError,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        used: Callable[[int], float] = processor_time_s,
+    ) -> None:
+        self._name, self._process, self._tell, self._error = name, process, tell, error
+        self._clock, self._used = clock, used
+        self._started_s = self._told_s = self._worked_s = clock()
+        self._used_s = 0.0
+
+    def check(self) -> None:
+        """Tell now and then what it does; raises if it has ended, or hangs."""
+        now_s = self._clock()
+        so_far = f"{now_s - self._started_s:.0f} s"
+        code = self._process.poll()
+        if code is not None:
+            raise self._error(f"{self._name} {end_text(code)}; it was starting, for {so_far}")
+        used_s = self._used(self._process.pid)
+        if used_s - self._used_s > WORK_S:
+            self._used_s, self._worked_s = used_s, now_s
+        elif now_s - self._worked_s > IDLE_S:
+            raise self._error(
+                f"{self._name} did not start: after {so_far} it has not worked for {IDLE_S:.0f} s "
+                f"({used_s:.0f} s of processor time before)",
+                "it may have been stopped, or the computer is out of memory; then start again",
+            )
+        if now_s - self._told_s >= TELL_S:
+            self._told_s = now_s
+            self._tell(f"{self._name} is compiling: {so_far} so far, {used_s:.0f} s of processor time")
