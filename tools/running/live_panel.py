@@ -26,7 +26,7 @@ from rich.text import Text
 from firmware_py.realtime import Histogram
 from firmware_py.states import AxisPhase, Fault, StopRequest
 from tools.output import Output
-from tools.recording.run_log import Event
+from tools.recording.run_log import ERROR, Event
 from tools.running.events import drive_state_name, phase_name
 from tools.running.loop_delay import quantile_s
 from tools.running.viewer_request import ViewerRequest
@@ -119,6 +119,11 @@ class PhaseLines(OnlyShows):
 
     phase = note
 
+    def event(self, event: Event) -> None:
+        """A fault is told when it happens, not only at the end of the run; the other events are in the log."""
+        if event.level >= ERROR:
+            self.note(event.text)
+
     def show(self, snapshot: Snapshot) -> None:
         """Nothing: lines are for changes."""
 
@@ -169,6 +174,11 @@ class LivePanel(OnlyShows):
     def note(self, text: str) -> None:
         """See `Display`."""
         self._notes = [*self._notes, text][-NOTES:]
+
+    def event(self, event: Event) -> None:
+        """As in `PhaseLines`."""
+        if event.level >= ERROR:
+            self.note(event.text)
 
     def phase(self, text: str) -> None:
         """See `Display`."""

@@ -1,0 +1,53 @@
+"""The end of a run: what is told first, and the exit code."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from firmware_py.realtime import HISTOGRAM_BINS, Histogram
+from firmware_py.states import Fault
+from tests.unit.test_run_summary import run_records
+from tools.output import Output
+from tools.recording.run_log import ERROR, WARNING, Event
+from tools.recording.run_summary import summarise
+from tools.running import run_report
+from tools.running.fault_text import fault_text
+from tools.running.live_panel import PhaseLines
+from tools.running.run_result import RunResult
+
+
+def result(folder: Path, fault: Fault) -> RunResult:
+    records = run_records()
+    histograms = np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64)
+    return RunResult(
+        summary=summarise(records, histograms), records=records, histograms=histograms, fault=fault,
+        fault_text=fault_text(fault, 5.0, 0) if fault is not Fault.NONE else None, stopped_by="", drive_state="off",
+        bus_load=0.3, serial=True, lost_records=0, log_path=folder / "run.mcap",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("fault", "code"), [(Fault.BUS_ERROR, 7), (Fault.NONE, 0)])
+def test_the_cause_is_told_before_the_picture_is_drawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: Fault, code: int
+) -> None:
+    out, err = io.StringIO(), io.StringIO()
+    told: list[str] = []
+    monkeypatch.setattr(run_report, "save_run_figure", lambda *_: told.append(err.getvalue()))
+    assert run_report.report_run(result(tmp_path, fault), Output(stdout=out, stderr=err), "t") == code
+    assert err.getvalue() == told[0]  # nothing more comes after it
+    assert told[0].startswith("error: BUS_ERROR") == (fault is Fault.BUS_ERROR)
+    assert ("hint: likely cause" in told[0]) == (fault is Fault.BUS_ERROR)
+    assert "picture" in out.getvalue()
+
+
+@pytest.mark.parametrize(("level", "told"), [(ERROR, True), (WARNING, False)])
+def test_a_fault_is_told_when_it_happens(level: int, told: bool) -> None:
+    err = io.StringIO()
+    lines: Any = PhaseLines(Output(stderr=err))
+    lines.event(Event(0, level, "loop", "BUS_ERROR (13): the serial port is gone"))
+    assert ("BUS_ERROR (13)" in err.getvalue()) == told
