@@ -18,8 +18,9 @@ MOTOR_FIELDS = {
     ("HL", 3): "position_high_counts", ("LL", 3): "position_low_counts",
     ("ER", 2): "speed_error_cps", ("ER", 3): "position_error_counts",
     ("SP", 0): "profile_cps", ("AC", 0): "acceleration_cps2", ("DC", 0): "deceleration_cps2",
+    ("SD", 0): "stop_deceleration_cps2",
 }  # fmt: skip
-WHOLE = frozenset(("HL", "LL", "ER", "SP", "AC", "DC"))
+WHOLE = frozenset(("HL", "LL", "ER", "SP", "AC", "DC", "SD"))
 INDEXED = frozenset(("CL", "PL", "HL", "LL", "ER", "VL", "VH", "CA"))
 
 

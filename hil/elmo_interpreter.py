@@ -77,13 +77,13 @@ class ElmoInterpreter:
         m.position_high_counts, m.position_low_counts = 1e9, -1e9
         m.speed_error_cps, m.position_error_counts = 5.0 * per_rad, 1e9
         m.profile_cps = 0.2 * per_rad
-        m.acceleration_cps2 = m.deceleration_cps2 = 2.0 * per_rad
+        m.acceleration_cps2 = m.deceleration_cps2 = m.stop_deceleration_cps2 = 2.0 * per_rad
         inertia = float(c.driven_inertia_kgm2)
         m.gain_Apcps = SPEED_BANDWIDTH_RADPS * inertia / float(c.torque_per_current_NmpA) / per_rad
         m.target_counts = position_counts(c, s)
         self.target_counts = float(m.target_counts)
         self.jog_cps, self.error_code, self.echo = 0.0, 0, True
-        self._plain = {("RM", 0): 0.0, ("PM", 0): 1.0, ("SD", 0): float(m.deceleration_cps2)}
+        self._plain = {("RM", 0): 0.0, ("PM", 0): 1.0}
 
     def advance_to(self, time_s: float) -> None:
         """Move drive and joint on to `time_s` of the plant's own clock."""
@@ -175,10 +175,10 @@ class ElmoInterpreter:
         elif not m.motor_on:
             if self.amplifier:
                 raise RefusedCommandError(AMPLIFIER_NOT_READY)
-            m.motor_fault, m.motor_on = 0, 1
+            m.motor_fault, m.motor_on, m.stopping = 0, 1, 0
             m.torque_A = m.reference_cps = m.integral_A = m.jog_cps = 0.0
             m.target_counts = position_counts(self._c, self._s)
-            self.jog_cps, self.target_counts = 0.0, float(m.target_counts)
+            self.target_counts = float(m.target_counts)
         return ""
 
     def _unit_mode(self, value: float | None) -> str:
@@ -228,15 +228,15 @@ class ElmoInterpreter:
         self._no_value(value)
         self._need(UM_SPEED, UM_POSITION)
         if self.m.unit_mode == UM_SPEED:
-            self.m.jog_cps = self.jog_cps
+            self.m.jog_cps, self.m.stopping = self.jog_cps, 0
         else:
-            self.m.target_counts, self.m.moving = self.target_counts, 1
+            self.m.target_counts, self.m.moving, self.m.stopping = self.target_counts, 1, 0
         return ""
 
     def _stop(self, value: float | None) -> str:
         self._no_value(value)
         m = self.m
-        m.jog_cps, self.jog_cps = 0.0, 0.0
+        m.jog_cps, m.stopping = 0.0, 1  # JV stays as it was said: another BG would jog again
         if m.unit_mode == UM_POSITION and m.motor_on:
             m.target_counts = position_counts(self._c, self._s)
             m.moving = 0

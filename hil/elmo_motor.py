@@ -20,7 +20,8 @@ from hil.plant_records import PlantConstants, PlantState
 UM_TORQUE, UM_SPEED, UM_POSITION = 1, 2, 5
 MF_SPEED_ERROR = 0x80
 MF_OVERSPEED, MF_POSITION_LIMIT = 0x20000, 0x400000
-SPEED_BANDWIDTH_RADPS = 60.0
+SPEED_BANDWIDTH_RADPS = 95.0  # tuned as the virtual CANopen drive is
+INTEGRAL_SHARE = 0.5  # of that bandwidth: damping 0.7
 POSITION_BANDWIDTH_PS = 10.0
 SETTLED_COUNTS = 2.0
 
@@ -37,6 +38,7 @@ class ElmoMotor:
     jog_cps: f8  # JV as the last BG took it over
     acceleration_cps2: f8
     deceleration_cps2: f8
+    stop_deceleration_cps2: f8  # SD, from ST on until the next BG
     profile_cps: f8  # SP
     target_counts: f8  # PA as the last BG took it over
     continuous_A: f8
@@ -55,6 +57,7 @@ class ElmoMotor:
     limited: i4
     demand_A: f8
     moving: i4
+    stopping: i4
     gain_Apcps: f8
 
 
@@ -78,12 +81,13 @@ def _approach(value: float, target: float, up: float, down: float) -> float:
 
 @kernel
 def _speed_demand_A(m: ElmoMotor, target_cps: float, speed_cps: float, step_s: float) -> float:
-    m.reference_cps = _approach(m.reference_cps, target_cps, m.acceleration_cps2 * step_s, m.deceleration_cps2 * step_s)
+    down_cps2 = m.stop_deceleration_cps2 if m.stopping != 0 else m.deceleration_cps2
+    m.reference_cps = _approach(m.reference_cps, target_cps, m.acceleration_cps2 * step_s, down_cps2 * step_s)
     error_cps = m.reference_cps - speed_cps
     if abs(error_cps) > m.speed_error_cps:
         switch_off(m, MF_SPEED_ERROR)
         return 0.0
-    rate = m.gain_Apcps * 0.25 * SPEED_BANDWIDTH_RADPS
+    rate = m.gain_Apcps * INTEGRAL_SHARE * SPEED_BANDWIDTH_RADPS
     m.integral_A = min(max(m.integral_A + rate * error_cps * step_s, -m.peak_A), m.peak_A)
     return m.gain_Apcps * error_cps + m.integral_A
 

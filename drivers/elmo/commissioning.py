@@ -1,8 +1,7 @@
-"""Commissioning of an Elmo drive over the ASCII interpreter: who it is, torque mode, limits, what the line carries."""
+"""Commissioning of an Elmo drive over the ASCII interpreter: who it is, unit mode, limits, what the line carries."""
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Callable
 
@@ -10,15 +9,16 @@ from drivers.drive import CommissioningReport, DriveIdentity
 from drivers.elmo.codes import (
     AMPLIFIER_MASK,
     FAULT_LATCHED,
-    UnitMode,
     motor_off_cause,
     status_text,
 )
 from drivers.elmo.dialogue import Dialogue, RefusedError
 from drivers.elmo.interpreter import encode
+from drivers.elmo.limits import write_limits
 from drivers.elmo.line_budget import LARGEST_SHARE, MeasuredExchange, highest_rate_Hz, measured_exchange
 from drivers.elmo.serial_port import BytePort, SerialPort
 from drivers.elmo.settings import ElmoSettings
+from drivers.elmo.unit_modes import SPEED_MODE, TORQUE_MODE, set_speed_mode, set_torque_mode
 from drivers.errors import BusError, ConfigurationError, DeviceError, NoDeviceError
 
 MEASURED_CYCLES = 20
@@ -40,11 +40,12 @@ class ElmoCommissioning:
         self._clock = clock
         self._taken = False  # whether a drive has been found and told anything
         self._commissioned = False
+        self._speed_mode = False
 
     # --- commissioning ---
 
     def commission(self) -> CommissioningReport:
-        """See `Drive.commission`.  The motor is off and the drive in torque mode when this returns."""
+        """See `Drive.commission`.  The motor is off and the drive in torque or speed mode when this returns."""
         settings, line = self._settings, self._line
         budget_Hz = highest_rate_Hz(settings.baud_rate_bitps, settings.echo)
         if settings.rate_Hz > budget_Hz:
@@ -61,20 +62,13 @@ class ElmoCommissioning:
             remarks.append("the motor was on: it has been switched off")
         self._motor_off()
         self._refuse_fault()
-        found.update(self._torque_mode())
-        self._write_limits(found, remarks)
         self._compare_counts(found)
-        measured = self.measure()
-        self._refuse_rate(measured)
-        found["exchange"] = (
-            f"{measured.cycle_s * 1e3:.2f} ms, worst {measured.worst_cycle_s * 1e3:.2f} ms: "
-            f"up to {measured.highest_rate_Hz:.0f} Hz; {budget_Hz:.0f} Hz by the baud rate"
-        )
+        measured = self._choose_mode(found, remarks)
         start_counts = line.integer("PX")
         self._commissioned = True
         return CommissioningReport(
             identity=identity,
-            mode="torque (UM=1)",
+            mode=SPEED_MODE if self._speed_mode else TORQUE_MODE,
             start_position_rad=(start_counts - settings.zero_counts) * settings.rad_per_count,
             torque_resolution_Nm=TC_STEP_A * abs(settings.torque_NmpA),
             position_resolution_rad=abs(settings.rad_per_count),
@@ -132,24 +126,42 @@ class ElmoCommissioning:
         if self._line.integer("MO") != 0:
             raise DeviceError("MO (=1) of the drive does not become 0: the motor cannot be switched off")
 
-    def _torque_mode(self) -> dict[str, str]:
-        """UM=1 without the analog reference (RM=0), and TC known to be zero: MO=1 then applies no torque.
+    def _choose_mode(self, found: dict[str, str], remarks: list[str]) -> MeasuredExchange:
+        """Speed mode where it is wanted and can be had with all its limits, else torque mode; what the line carries."""
+        if self._settings.mode != "torque":
+            try:
+                return self._set_mode(True, found, remarks)
+            except (DeviceError, ConfigurationError) as reason:
+                if self._settings.mode == "speed":
+                    raise
+                remarks.append(f"torque mode, because speed mode cannot be had: {reason.message}")
+        return self._set_mode(False, found, remarks)
 
-        Before every MO=1; the motor is off.  Raises `DeviceError` where the drive does not confirm it.
-        """
-        line = self._line
-        found = {n: f"{line.assign_verified(n, v):g}" for n, v in (("UM", int(UnitMode.TORQUE)), ("RM", 0))}
-        kept_A = line.number("TC")
-        if kept_A != 0.0:
-            with contextlib.suppress(RefusedError):  # most drives take TC only with the motor on
-                line.assign("TC", 0)
-            kept_A = line.number("TC")
-        if kept_A != 0.0:
-            raise DeviceError(
-                f"TC (={kept_A:g}) of the drive must be 0 with the motor off: it would push at MO=1",
-                "switch the drive's supply off and on",
+    def _set_mode(self, speed: bool, found: dict[str, str], remarks: list[str]) -> MeasuredExchange:
+        settings, line = self._settings, self._line
+        digits = settings.velocity_digits if speed else 0
+        budget_Hz = highest_rate_Hz(settings.baud_rate_bitps, settings.echo, digits)
+        if settings.rate_Hz > budget_Hz:
+            raise ConfigurationError(
+                f"loop.rate_Hz (={settings.rate_Hz:g}) must be at most {budget_Hz:.0f} at drive.baud_rate_bitps "
+                f"(={settings.baud_rate_bitps}) for JV and BG in every cycle"
             )
-        return found
+        set_here = set_torque_mode(line)  # in either case: the limits are written, and TC is known to be zero
+        missing = write_limits(line, settings, set_here, speed_mode=speed)
+        if speed:
+            if missing:
+                raise DeviceError(f"in speed mode all limits must be in force: {missing[0]}")
+            set_here |= set_speed_mode(line, settings)
+        measured = self.measure(digits)
+        self._refuse_rate(measured)
+        set_here["exchange"] = (
+            f"{measured.cycle_s * 1e3:.2f} ms, worst {measured.worst_cycle_s * 1e3:.2f} ms: "
+            f"up to {measured.highest_rate_Hz:.0f} Hz; {budget_Hz:.0f} Hz by the baud rate"
+        )
+        found.update(set_here)
+        remarks.extend(missing)
+        self._speed_mode = speed
+        return measured
 
     def _refuse_fault(self) -> None:
         """A drive that could not be enabled anyway; nothing is reset here."""
@@ -159,41 +171,6 @@ class ElmoCommissioning:
                 f"the drive is in fault: {motor_off_cause(status, fault)} (SR {status:X}h: {status_text(status)})",
                 "remove the cause, then `jointctl clear-fault`; nothing is reset by itself",
             )
-
-    def _write_limits(self, found: dict[str, str], remarks: list[str]) -> None:
-        """The drive's own limits, read back.  They are all that watches the joint when the line is cut."""
-        settings, line = self._settings, self._line
-        maximum_A = line.number("MC")
-        for key, value in (("peak", settings.peak_current_A), ("continuous", settings.continuous_current_A)):
-            if value > maximum_A:
-                raise DeviceError(f"drive.{key}_current_A (={value:g}) must be at most {maximum_A:g}, the drive's MC")
-        found["MC"] = f"{maximum_A:g} A"
-        # lower the continuous limit first: it may not be above the peak limit at any moment
-        current = line.number("PL", 1)
-        order = [("CL", 1, settings.continuous_current_A, "A"), ("PL", 1, settings.peak_current_A, "A")]
-        if settings.continuous_current_A > current:
-            order.reverse()
-        for name, index, value, unit in [*order, ("PL", 2, settings.peak_time_s, "s")]:
-            found[f"{name}[{index}]"] = f"{line.assign_verified(name, value, index):g} {unit}"
-        per_rad = 1.0 / abs(settings.rad_per_count)
-        speed = round((1.0 + settings.limit_margin) * settings.velocity_max_radps * per_rad)
-        slack_rad = settings.limit_margin * (settings.position_max_rad - settings.position_min_rad)
-        ends = sorted(
-            settings.counts_at(position)
-            for position in (settings.position_min_rad - slack_rad, settings.position_max_rad + slack_rad)
-        )
-        limits = [
-            ("HL", 2, speed), ("LL", 2, -speed), ("HL", 3, ends[1]), ("LL", 3, ends[0]),
-            ("ER", 2, round(settings.speed_error_radps * per_rad)),
-            ("ER", 3, round(settings.position_error_rad * per_rad)),
-        ]  # fmt: skip
-        for name, index, count in limits:
-            try:
-                found[f"{name}[{index}]"] = f"{line.assign_verified(name, count, index):.0f} counts"
-            except RefusedError as error:
-                if (name, index) in (("HL", 2), ("LL", 2)):
-                    raise  # without a speed limit of the drive nothing would stop a joint whose line is cut
-                remarks.append(f"{name}[{index}] is not in force: {error.message}")
 
     def _compare_counts(self, found: dict[str, str]) -> None:
         parameter = self._settings.counts_parameter
@@ -205,18 +182,20 @@ class ElmoCommissioning:
             raise DeviceError(f"encoder.counts_per_turn (={expected}) differs from the drive's {parameter}, {counts}")
         found[parameter] = f"{counts} counts a turn"
 
-    def measure(self, cycles: int = MEASURED_CYCLES) -> MeasuredExchange:
-        """Time the questions of a cycle; nothing moves."""
+    def measure(self, velocity_digits: int = 0, cycles: int = MEASURED_CYCLES) -> MeasuredExchange:
+        """Time the questions of a cycle, of speed mode with `velocity_digits` > 0; nothing moves."""
         position_s, rest_s = [], []
+        target = "JV" if velocity_digits else "TC"
         for _ in range(cycles):
             started_s = self._clock()
             self._line.query("PX")
             half_s = self._clock()
-            self._line.query("TC")
+            self._line.query(target)
             self._line.query("SR")
             position_s.append(half_s - started_s)
             rest_s.append(self._clock() - half_s)
-        return measured_exchange(position_s, rest_s, self._settings.baud_rate_bitps, self._settings.echo)
+        baud_rate_bitps, echo = self._settings.baud_rate_bitps, self._settings.echo
+        return measured_exchange(position_s, rest_s, baud_rate_bitps, echo, velocity_digits)
 
     def _refuse_rate(self, measured: MeasuredExchange) -> None:
         rate_Hz = self._settings.rate_Hz

@@ -2,15 +2,16 @@
 
     begin_cycle  ->  PX                                  position, at the start of the cycle
     take_byte    <-  replies, one byte at a time
-    end_cycle    ->  TC=.. (or MO=1; TC=0, ST, MO=0), then SR, IQ or MF in turn
+    end_cycle    ->  TC=.. or JV=.., BG (or MO=1; TC=0 or JV=0, BG; ST, MO=0), then SR, IQ or MF in turn
 
-The torque command follows the position as fast as the line allows; status and current use the rest of the cycle.
+The command follows the position as fast as the line allows; status and current use the rest of the cycle.
 
 A reply is only taken if its echo is the whole command (echo on), else by its order (echo off).  After three cycles
 without a reply that is due, the driver says nothing until the line is silent for a cycle, and starts again.
 
 A quick stop is no braking here: in torque mode (UM=1) the drive knows no other torque than the commanded one, and UM
 cannot change with the motor on.  So TC=0, ST and MO=0 follow each other, and friction (or a brake) stops the joint.
+In speed mode (UM=2) it is the same with JV=0, BG: a drive that hears only the first half brakes along DC and stands.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ _LETTERS = np.array([[ord(c) for c in q.name] for q in Question], np.uint8)
 _CR, _SEMICOLON, _QUESTION_MARK = 0x0D, 0x3B, 0x3F
 _PLUS, _MINUS, _POINT, _ZERO, _NINE, _EQUALS = 0x2B, 0x2D, 0x2E, 0x30, 0x39, 0x3D
 _AMPLIFIER, _SERVO_ON, _FAULT = 0xF, 1 << 4, 1 << 6
+_SPEED_MODE = 2
 
 
 # --- commands ---
@@ -91,6 +93,27 @@ def current_mA(port: ElmoPort, torque_Nm: float) -> int:
 
 
 @kernel
+def velocity_cps(port: ElmoPort, velocity_radps: float) -> int:
+    """Joint velocity [rad/s] as the value of JV [counts/s], saturated before the cast; 0 if not finite."""
+    value = velocity_radps / port.position_radpcount
+    if not math.isfinite(value):
+        return 0
+    limit = float(port.max_velocity_cps)
+    return round(min(max(value, -limit), limit))
+
+
+@kernel
+def _put_target(port: ElmoPort, command: Command, live: bool) -> None:
+    """Torque or velocity of this cycle, zero unless `live`.  No BG in another unit mode: it begins another motion."""
+    if port.target_is_velocity != 0:
+        put_command(port, Question.JV, 1000 * velocity_cps(port, command.velocity_radps) if live else 0, 0)
+        if port.unit_mode == _SPEED_MODE:
+            put_command(port, Question.BG, 0, -1)
+    else:
+        put_command(port, Question.TC, current_mA(port, command.torque_Nm) if live else 0, 3)
+
+
+@kernel
 def _forget_expected(port: ElmoPort) -> None:
     port.expected_count = 0
     port.line_length = 0
@@ -129,13 +152,13 @@ def begin_cycle(port: ElmoPort, sample: Sample) -> None:
 
 
 @kernel
-def _put_stop(port: ElmoPort) -> None:
-    """Torque zero, stop, motor off: said whatever else waits for a reply, and in every cycle until it is off."""
+def _put_stop(port: ElmoPort, command: Command) -> None:
+    """Target zero, stop, motor off: said whatever else waits for a reply, and in every cycle until it is off."""
     if port.expected_count > EXPECTED_MAX - 4 or port.quiet != 0:
         _forget_expected(port)
         port.quiet = 0
     if port.status & _SERVO_ON != 0:
-        put_command(port, Question.TC, 0, 3)
+        _put_target(port, command, False)
         put_command(port, Question.ST, 0, -1)
     put_command(port, Question.MO, 0, 0)
 
@@ -148,10 +171,8 @@ def end_cycle(port: ElmoPort, sample: Sample, command: Command) -> None:
         if port.quiet != 0:
             return
         if port.status & _SERVO_ON != 0:
-            milli = 0
-            if sample.drive_state == DriveState.ENABLED and port.no_sample_cycles <= port.dead_man_cycles:
-                milli = current_mA(port, command.torque_Nm)
-            put_command(port, Question.TC, milli, 3)
+            heard = port.no_sample_cycles <= port.dead_man_cycles
+            _put_target(port, command, heard and sample.drive_state == DriveState.ENABLED)
         elif port.has_been_on != 0 or port.fault_seen > 0:
             pass  # the drive switched itself off: never on again without the user
         elif port.enable_wait_cycles == 0:
@@ -164,7 +185,7 @@ def end_cycle(port: ElmoPort, sample: Sample, command: Command) -> None:
         or sample.drive_state != DriveState.OFF
         or port.enable_wait_cycles > 0  # MO=1 was said: a status that says "off" may be older than that
     ):
-        _put_stop(port)
+        _put_stop(port, command)
     if port.quiet != 0:
         return  # the answer to a question would keep the line from becoming silent
     if port.fault_seen > 0 and port.motor_fault == 0:

@@ -8,7 +8,6 @@ from drivers.drive import DriveIdentity
 from drivers.elmo.codes import (
     AMPLIFIER_MASK,
     FAULT_LATCHED,
-    UnitMode,
     motor_off_cause,
     status_text,
 )
@@ -16,6 +15,7 @@ from drivers.elmo.commissioning import ElmoCommissioning
 from drivers.elmo.inspection import Fact, read_facts
 from drivers.elmo.port import ElmoPort
 from drivers.elmo.switch_off import switch_off
+from drivers.elmo.unit_modes import set_torque_mode
 from drivers.errors import DeviceError, JointctlError
 from firmware_py.schema import new
 
@@ -41,38 +41,20 @@ class ElmoDrive(ElmoCommissioning):
         port.position_radpcount = settings.rad_per_count
         port.zero_counts = settings.zero_counts
         port.torque_NmpA = settings.torque_NmpA
+        port.target_is_velocity = int(self._speed_mode)
+        port.max_velocity_cps = settings.max_velocity_cps
         port.max_current_mA = int(1000.0 * min(settings.max_current_A, settings.peak_current_A))
         port.enable_retry_cycles = max(1, round(ENABLE_RETRY_S * settings.rate_Hz))
         port.dead_man_cycles = max(1, round(settings.dead_man_s * settings.rate_Hz))
         return ports
 
-    # --- for the sweep: the drive's own speed loop ---
-
-    def start_speed_mode(self, acceleration_radps2: float) -> None:
-        """UM=2 with ramps, motor on, at standstill.  `make_safe` ends it."""
-        line, per_rad = self._line, 1.0 / abs(self._settings.rad_per_count)
-        self._motor_off()
-        line.assign_verified("UM", int(UnitMode.SPEED))
-        line.assign("PM", 1)
-        for name in ("AC", "DC", "SD"):
-            line.assign_verified(name, round(acceleration_radps2 * per_rad))
-        line.assign_verified("JV", 0)
-        line.assign("MO", 1, attempts=1)
-        if line.integer("MO") != 1:
-            raise DeviceError(f"the motor does not switch on: {self.fault_report()}")
-
-    def jog(self, velocity_radps: float) -> None:
-        """Go to a joint speed along the ramp."""
-        self._line.assign("JV", round(velocity_radps / self._settings.rad_per_count))
-        self._line.command("BG")
+    # --- looking without touching ---
 
     def motion(self) -> tuple[float, float, float]:
         """(position [rad], velocity [rad/s], torque from IQ [Nm]) of the joint now."""
         settings, line = self._settings, self._line
         position_rad = (line.integer("PX") - settings.zero_counts) * settings.rad_per_count
         return position_rad, line.number("VX") * settings.rad_per_count, line.number("IQ") * settings.torque_NmpA
-
-    # --- looking without touching ---
 
     def identify(self) -> DriveIdentity:
         """Who answers; raises as `commission` does where nobody or another drive does.  Nothing is written."""
@@ -94,7 +76,7 @@ class ElmoDrive(ElmoCommissioning):
         return f"{motor_off_cause(status, fault)}; {status_text(status)}"
 
     def make_safe(self) -> str:
-        """TC=0, ST, MO=0 until MO reads 0.  Never raises; a drive that was never found is left alone."""
+        """TC=0, JV=0, ST, MO=0 until MO reads 0.  Never raises; a drive that was never found is left alone."""
         if not self._taken:
             return "untouched"
         try:
@@ -123,7 +105,7 @@ class ElmoDrive(ElmoCommissioning):
         cause = motor_off_cause(status, fault)
         if status & AMPLIFIER_MASK:
             raise DeviceError(f"the fault cannot be cleared while its cause remains: {cause}")
-        self._torque_mode()
+        set_torque_mode(line)
         try:
             line.assign("MO", 1, attempts=1)
         finally:

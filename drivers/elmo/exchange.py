@@ -115,7 +115,7 @@ def receive(ports: Any, data: np.ndarray, scratch: np.ndarray, samples: Any, now
 
 @exported(types.int32(_PORT, _BYTES, _SAMPLE, _COMMAND))
 def send(ports: Any, data: np.ndarray, samples: Any, commands: Any) -> int:
-    """Send the torque command and the slower questions; returns 0 or the errno."""
+    """Send torque or velocity and the slower questions; returns 0 or the errno."""
     port = ports[0]
     end_cycle(port, samples[0], commands[0])
     return np.int32(_flush(port, samples[0]))  # type: ignore[return-value]

@@ -9,7 +9,7 @@ import numpy as np
 
 from firmware_py.schema import array_of, f8, i4, i8, record, u1
 
-TEXT_MAX = 16  # longest cyclic command: TC=-999.999 and CR
+TEXT_MAX = 16  # longest cyclic command: JV=-12345678901 and CR
 EXPECTED_MAX = 8  # commands that wait for their reply
 LINE_MAX = 64  # longest cyclic reply, echo included
 OUT_MAX = 64  # bytes of one write
@@ -27,6 +27,8 @@ class Question(IntEnum):
     MF = 4
     MO = 5
     ST = 6
+    JV = 7
+    BG = 8
 
 
 @record
@@ -40,6 +42,8 @@ class ElmoPort:
     zero_counts: i8
     torque_NmpA: f8
     max_current_mA: i8
+    target_is_velocity: i4  # JV and BG (UM=2) instead of TC (UM=1)
+    max_velocity_cps: i8  # of JV
     enable_retry_cycles: i8
     dead_man_cycles: i8  # without a sample for so long the torque command is zero
     # commands that wait for their reply, oldest first in a ring

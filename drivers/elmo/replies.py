@@ -20,7 +20,7 @@ _DIGITS_MAX = 17
 _CR, _SEMICOLON, _QUESTION_MARK = 0x0D, 0x3B, 0x3F
 _PLUS, _MINUS, _POINT, _ZERO, _NINE, _EQUALS = 0x2B, 0x2D, 0x2E, 0x30, 0x39, 0x3D
 _AMPLIFIER, _SERVO_ON, _FAULT = 0xF, 1 << 4, 1 << 6
-_TORQUE_MODE = 1
+_TORQUE_MODE, _SPEED_MODE = 1, 2
 
 
 @kernel
@@ -81,7 +81,8 @@ def _take_status(port: ElmoPort, sample: Sample, status: int) -> None:
     port.no_status_cycles = 0
     sample.status_word = status & 0x7FFFFFFF
     mode = status >> 7 & 7
-    if port.unit_mode == _TORQUE_MODE and mode != _TORQUE_MODE:
+    run_mode = _SPEED_MODE if port.target_is_velocity != 0 else _TORQUE_MODE
+    if port.unit_mode == run_mode and mode != run_mode:
         sample.restarts += 1
     port.unit_mode = mode
     if status & (_FAULT | _AMPLIFIER) != 0:

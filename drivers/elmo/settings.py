@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,8 @@ class ElmoSettings:
     speed_error_radps: float  # ER[2]
     position_error_rad: float  # ER[3]
     dead_man_s: float
+    ramp_radps2: float  # AC, DC, SD of speed mode, at the joint
+    mode: Literal["torque", "speed", "auto"] = "torque"  # auto: speed where the drive has it
     product: str | None = None  # VR must contain it
     counts_parameter: str | None = None  # such as "CA[18]": compared with counts_per_turn
 
@@ -51,6 +54,16 @@ class ElmoSettings:
     def max_current_A(self) -> float:
         """The current of `torque_max_Nm`: no TC is greater."""
         return self.torque_max_Nm / abs(self.torque_NmpA)
+
+    @property
+    def max_velocity_cps(self) -> int:
+        """JV of `velocity_max_radps`: none is greater, and HL[2] and LL[2] lie outside of it."""
+        return round(self.velocity_max_radps / abs(self.rad_per_count))
+
+    @property
+    def velocity_digits(self) -> int:
+        """Digits of the greatest JV."""
+        return len(str(self.max_velocity_cps))
 
     def counts_at(self, position_rad: float) -> int:
         """PX at a joint angle."""

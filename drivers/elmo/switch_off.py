@@ -1,4 +1,4 @@
-"""Torque zero and motor off on a serial line, for whoever has to say it: drive, loop, guard, `jointctl stop`."""
+"""Torque and speed zero, motor off on a serial line, for whoever has to say it: drive, loop, guard, `jointctl stop`."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ from drivers.elmo.serial_port import BytePort
 from drivers.errors import DeviceError, JointctlError
 
 SAFE_ATTEMPTS = 5
-# TC before MO: where the drive takes no MO=0 it is without torque all the same.  The first CR ends a half command.
-SWITCH_OFF = b"\rTC=0\rST\rMO=0\r"
+# TC and ST before MO: where the drive takes no MO=0 it is without torque, or its jog has ended, all the same.  JV=0, so
+# that no later BG jogs on; without a BG, which in a unit mode that somebody else has chosen would begin a motion.
+# The first CR ends a half command.
+COMMANDS = (b"TC=0", b"JV=0", b"ST", b"MO=0")
+SWITCH_OFF = b"\r" + b"".join(command + b"\r" for command in COMMANDS)
 
 
 def switch_off(port: BytePort, line: Dialogue, attempts: int = SAFE_ATTEMPTS) -> str:
-    """TC=0, ST, MO=0 until MO reads 0; returns `off`, or `off, fault: ...`.
+    """TC=0, JV=0, ST, MO=0 until MO reads 0; returns `off`, or `off, fault: ...`.
 
     Raises the last error where the drive did not confirm; it has been told all the same, as far as the port took it.
     """
@@ -24,11 +27,11 @@ def switch_off(port: BytePort, line: Dialogue, attempts: int = SAFE_ATTEMPTS) ->
     for _ in range(attempts):
         try:
             line.resynchronise()
-            for command in ("TC=0", "ST", "MO=0"):
+            for command in COMMANDS:
                 try:
-                    line.ask(command.encode() + b"\r", 1)
+                    line.ask(command + b"\r", 1)
                 except RefusedError as refusal:
-                    if command == "MO=0" and refusal.code != MOTOR_MUST_BE_ON:
+                    if command == b"MO=0" and refusal.code != MOTOR_MUST_BE_ON:
                         raise
             if line.integer("MO") == 0:
                 status = line.integer("SR")

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.elmo.cyclic import begin_cycle, current_mA, end_cycle, note_written, put_command
+from drivers.elmo.cyclic import begin_cycle, current_mA, end_cycle, note_written, put_command, velocity_cps
 from drivers.elmo.interpreter import ReplyKind, parse_reply
 from drivers.elmo.port import EXPECTED_MAX, LINE_MAX, ElmoPort, Question
 from drivers.elmo.replies import parse_number, take_byte
@@ -23,20 +23,24 @@ from hil.elmo_motor import switch_off
 from hil.joint import plant
 
 PERIOD_S = 1.0 / 150.0
+PER_RAD = 2**19 / math.tau
+RAMP_CPS2 = round(8.0 * PER_RAD)
 
 
 class Talk:
-    """A port in torque mode with the virtual drive at its other end; `spoil` may change what comes back."""
+    """A port in torque or speed mode, the virtual drive at its other end; `spoil` may change what comes back."""
 
-    def __init__(self, echo: bool = True) -> None:
+    def __init__(self, echo: bool = True, *, speed: bool = False) -> None:
         constants, state = plant(initial_position_rad=0.1, encoder_counts_per_turn=2**19)
         self.device = ElmoInterpreter(ElmoDeviceSettings(), constants, state)
-        self.device.execute(b"UM=1")
+        for line in (b"UM=2", b"AC=%d" % RAMP_CPS2, b"DC=%d" % RAMP_CPS2) if speed else (b"UM=1",):
+            assert self.device.execute(line) == b";"
         self.port = new(ElmoPort)[0]
         self.sample, self.command = new(Sample)[0], new(Command)[0]
         port = self.port
         port.echo, port.torque_NmpA, port.max_current_mA = int(echo), 12.1, 5000
         port.position_radpcount, port.zero_counts = math.tau / 2**19, 0
+        port.target_is_velocity, port.max_velocity_cps = int(speed), 80_000
         port.enable_retry_cycles, port.dead_man_cycles = 75, 6
         self.said: list[bytes] = []
         self.mute = False
@@ -58,11 +62,18 @@ class Talk:
             got = bool(take_byte(self.port, byte, self.sample, 1)) or got
         return got
 
-    def cycle(self, request: DriveRequest = DriveRequest.ENABLE, torque_Nm: float = 0.0, count: int = 1) -> list[bytes]:
+    def cycle(
+        self,
+        request: DriveRequest = DriveRequest.ENABLE,
+        torque_Nm: float = 0.0,
+        count: int = 1,
+        velocity_radps: float = 0.0,
+    ) -> list[bytes]:
         """Whole cycles; returns what was said in the last one."""
         for _ in range(count):
             self.said = []
             self.command.request, self.command.torque_Nm = request, torque_Nm
+            self.command.velocity_radps = velocity_radps
             begin_cycle(self.port, self.sample)
             self._exchange()
             end_cycle(self.port, self.sample, self.command)
@@ -122,7 +133,92 @@ class TestNormal:
         assert talk.sample.position_rad == pytest.approx((2**31 + 5) * math.tau / 2**19)
 
 
+@pytest.fixture(params=[True, False], ids=["echo", "no echo"])
+def jog(request: pytest.FixtureRequest) -> Talk:
+    return Talk(request.param, speed=True).enabled()
+
+
+class TestSpeedMode:
+    def test_every_cycle_says_jog_and_begin_and_the_joint_follows(self, jog: Talk) -> None:
+        said = [tuple(jog.cycle(velocity_radps=-0.5)) for _ in range(150)]
+        assert set(said) == {(b"PX", b"JV=-41722", b"BG", b"SR"), (b"PX", b"JV=-41722", b"BG", b"IQ")}
+        assert jog.device.speed_cps() == pytest.approx(-0.5 * PER_RAD, rel=0.01)
+        assert jog.sample.position_rad < 0.1 - 0.3
+        assert (jog.port.garbled, jog.port.lost, jog.port.unexpected, jog.port.refused) == (0, 0, 0, 0)
+
+    def test_nothing_moves_before_the_drive_says_that_it_is_enabled(self) -> None:
+        talk = Talk(speed=True)
+        talk.cycle(DriveRequest.OFF, count=4)
+        said = []
+        while talk.sample.drive_state != DriveState.ENABLED:
+            said += talk.cycle(velocity_radps=0.5)
+        assert b"MO=1" in said
+        assert not {line for line in said if line.startswith(b"JV")} - {b"JV=0"}
+        assert talk.cycle(velocity_radps=0.5)[1:3] == [b"JV=41722", b"BG"]
+
+    @pytest.mark.parametrize("request_", [DriveRequest.QUICK_STOP, DriveRequest.OFF])
+    def test_a_stop_is_jog_zero_begin_stop_and_motor_off(self, jog: Talk, request_: DriveRequest) -> None:
+        jog.cycle(velocity_radps=0.5, count=20)
+        assert jog.cycle(request_, velocity_radps=0.5)[1:5] == [b"JV=0", b"BG", b"ST", b"MO=0"]
+        jog.cycle(request_, count=2)
+        assert (jog.sample.drive_state, jog.device.m.motor_on) == (DriveState.OFF, 0)
+
+    def test_a_stop_whose_motor_off_is_lost_brakes_all_the_same(self, jog: Talk) -> None:
+        jog.cycle(velocity_radps=0.5, count=60)
+        execute = jog.device.execute
+        jog.device.execute = lambda line: b";" if line == b"MO=0" else execute(line)  # type: ignore[method-assign]
+        jog.cycle(DriveRequest.QUICK_STOP, count=60)
+        assert jog.device.m.motor_on
+        assert abs(jog.device.speed_cps()) < 0.01 * PER_RAD
+
+    def test_the_dead_man_commands_a_stop_and_its_twin_does_not(self, jog: Talk) -> None:
+        jog.cycle(velocity_radps=0.5)
+        for late, word in ((0, b"JV=41722\r"), (1, b"JV=0\r")):
+            jog.port.expected_count = 0
+            jog.port.no_sample_cycles = jog.port.dead_man_cycles + late
+            end_cycle(jog.port, jog.sample, jog.command)
+            assert bytes(jog.port.out[: jog.port.out_length]).startswith(word + b"BG\r")
+
+    def test_a_restart_shows_by_the_unit_mode_and_nothing_is_begun_in_another_one(self, jog: Talk) -> None:
+        jog.cycle(velocity_radps=0.5, count=4)
+        assert jog.sample.restarts == 0
+        jog.device.restart()
+        jog.device.execute(b"MO=1")  # position mode: a BG would begin another motion
+        jog.cycle(count=4)
+        assert jog.sample.restarts == 1
+        assert b"BG" not in jog.cycle(velocity_radps=0.5) + jog.cycle(DriveRequest.QUICK_STOP)
+
+    def test_its_twin_a_drive_that_goes_off_and_stays_in_speed_mode_has_not_restarted(self, jog: Talk) -> None:
+        jog.device.execute(b"MO=0")
+        jog.cycle(count=4)
+        assert jog.sample.restarts == 0
+
+    @pytest.mark.parametrize("speed_cps", [99_000, 101_000])
+    def test_a_damaged_jog_is_bounded_by_the_drives_speed_limit_and_its_ramp(self, jog: Talk, speed_cps: int) -> None:
+        jog.device.execute(b"HL[2]=100000")
+        jog.cycle(velocity_radps=0.1, count=60)
+        before_cps = jog.device.speed_cps()
+        jog.device.execute(b"JV=%d" % speed_cps)
+        jog.device.execute(b"BG")
+        assert jog.device.m.jog_cps == (99_000 if speed_cps == 99_000 else round(0.1 * PER_RAD))
+        jog.device.advance_to((jog.cycle_number + 1) * PERIOD_S)
+        gained = jog.device.speed_cps() - before_cps
+        assert (gained if speed_cps == 99_000 else 0.0) <= RAMP_CPS2 * PERIOD_S
+        jog.cycle(velocity_radps=0.1)
+        assert jog.device.m.jog_cps == round(0.1 * PER_RAD)  # the next one, a period later
+
+
 class TestNumbers:
+    @pytest.mark.parametrize(
+        ("velocity_radps", "cps"),
+        [(0.0, 0), (0.5, 41722), (-0.5, -41722), (1.0, 80_000), (-1e9, -80_000), (math.nan, 0), (math.inf, 0)],
+    )
+    @pytest.mark.parametrize("direction", [1, -1])
+    def test_velocity_is_saturated_before_the_cast(self, velocity_radps: float, cps: int, direction: int) -> None:
+        port = new(ElmoPort)[0]
+        port.position_radpcount, port.max_velocity_cps = direction / PER_RAD, 80_000
+        assert velocity_cps(port, velocity_radps) == direction * cps
+
     @pytest.mark.parametrize(
         ("torque_Nm", "milli"),
         [(0.0, 0), (12.1, 1000), (60.5, 5000), (60.6, 5000), (-1e9, -5000), (math.nan, 0), (math.inf, 0), (0.00605, 0),

@@ -115,6 +115,36 @@ class TestMotion:
         drive.advance_to(2.0)
         assert abs(int(say(drive, "VX")[:-1])) < 300
 
+    @pytest.mark.parametrize(("command", "ramp"), [("ST", "SD"), ("JV=0", "DC")])
+    def test_st_brakes_along_sd_and_jog_zero_along_dc(self, drive: ElmoInterpreter, command: str, ramp: str) -> None:
+        say(drive, "UM=2", "AC=400000", "DC=400000", "SD=400000", f"{ramp}=20000", "MO=1", "JV=20000", "BG")
+        drive.advance_to(1.0)
+        say(drive, command, "BG" if command == "JV=0" else "SR")
+        drive.advance_to(1.5)
+        assert int(say(drive, "VX")[:-1]) == pytest.approx(10_000, rel=0.1)
+        drive.advance_to(3.0)
+        assert abs(int(say(drive, "VX")[:-1])) < 300
+
+    def test_after_st_the_jog_is_kept_and_another_bg_goes_on(self, drive: ElmoInterpreter) -> None:
+        say(drive, "UM=2", "MO=1", "JV=20000", "BG")
+        drive.advance_to(0.5)
+        say(drive, "ST")
+        drive.advance_to(1.5)
+        assert say(drive, "JV") == b"20000;"
+        say(drive, "BG")
+        drive.advance_to(2.5)
+        assert int(say(drive, "VX")[:-1]) == pytest.approx(20_000, rel=0.05)
+
+    def test_a_jog_goes_on_without_commands_until_the_drives_position_limit(self) -> None:
+        drive = interpreter(friction_kind=2)
+        say(drive, "HL[3]=40000", "UM=2", "MO=1", "JV=20000", "BG")
+        drive.advance_to(1.5)
+        assert say(drive, "MO") == b"1;"  # its twin: inside the limit nothing ends it
+        assert int(say(drive, "VX")[:-1]) == pytest.approx(20_000, rel=0.05)
+        drive.advance_to(4.0)
+        assert (say(drive, "MO"), say(drive, "MF")) == (b"0;", b"%d;" % MF_POSITION_LIMIT)
+        assert int(say(drive, "PX")[:-1]) == pytest.approx(40_000, rel=0.05)
+
     def test_position_mode_arrives(self, drive: ElmoInterpreter) -> None:
         say(drive, "MO=1", "SP=50000", "AC=200000", "DC=200000", "PA=20000", "BG")
         drive.advance_to(0.1)

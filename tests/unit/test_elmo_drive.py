@@ -25,7 +25,7 @@ SETTINGS = ElmoSettings(
     torque_constant_NmpA=0.1, torque_direction=1, reduction_ratio=121.0, counts_per_turn=COUNTS,
     encoder_on_motor=False, encoder_direction=1, zero_counts=0, continuous_current_A=5.0, peak_current_A=6.0,
     peak_time_s=2.0, velocity_max_radps=1.0, position_min_rad=-0.7, position_max_rad=0.7, limit_margin=0.2,
-    speed_error_radps=1.0, position_error_rad=0.2, dead_man_s=0.04,
+    speed_error_radps=1.0, position_error_rad=0.2, dead_man_s=0.04, ramp_radps2=8.0,
 )  # fmt: skip
 
 
@@ -186,6 +186,13 @@ class TestBudget:
         assert highest_rate_Hz(115_200, True) == pytest.approx(202.1, abs=0.1)
         assert highest_rate_Hz(19_200, False) == pytest.approx(48.0)
 
+    def test_speed_mode_costs_jog_and_begin(self) -> None:
+        # JV=-83443 with its CR is one character less than TC; BG, its CR and its reply come on top
+        assert (cycle_characters(False, 5), cycle_characters(True, 5)) == (43, 62)
+        assert measured_exchange([0.001] * 9, [0.002] * 9, 115_200, True, 5).cycle_s == pytest.approx(
+            0.003 + (2 * (7 + 3) + 1) * 10 / 115_200
+        )
+
     def test_the_measurement_adds_the_value_that_was_not_sent(self) -> None:
         measured = measured_exchange([0.001] * 9 + [0.002], [0.002] * 10, 115_200, False)
         assert measured.cycle_s == pytest.approx(0.003 + 80 / 115_200)
@@ -193,18 +200,75 @@ class TestBudget:
         assert measured.loop_delay_s == pytest.approx(0.002 + 110 / 115_200)
 
 
+def lacks(*names: bytes) -> Callable[[bytes, bytes], bytes]:
+    """A drive that knows none of these commands."""
+    return lambda line, reply: line + b"\r\x02?;" if line.startswith(names) else reply
+
+
 class TestSpeedMode:
-    def test_the_joint_jogs_and_stops(self, port: MemoryPort) -> None:
+    @pytest.mark.parametrize("mode", ["auto", "speed"])
+    def test_the_report_and_what_the_drive_has_afterwards(self, port: MemoryPort, mode: str) -> None:
+        drive = port.drive(mode=mode)
+        report = drive.commission()
+        m, ramp = port.device.m, round(8.0 * COUNTS / math.tau)
+        assert report.mode == "speed (UM=2)"
+        assert (m.unit_mode, m.motor_on, port.device.jog_cps) == (2, 0, 0.0)
+        assert (m.acceleration_cps2, m.deceleration_cps2, m.stop_deceleration_cps2) == (ramp, ramp, ramp)
+        cyclic = drive.port()[0]
+        assert (cyclic.target_is_velocity, cyclic.max_velocity_cps) == (1, round(COUNTS / math.tau))
+        assert cyclic.max_velocity_cps < m.speed_high_cps
+
+    def test_torque_mode_is_what_a_run_gets(self, port: MemoryPort) -> None:
         drive = port.drive()
+        assert drive.commission().mode == "torque (UM=1)"
+        assert drive.port()[0].target_is_velocity == 0
+        assert b"UM=2" not in port.commands
+
+    @pytest.mark.parametrize(("torque_max_Nm", "peak_A"), [(60.0, 1.02 * 60.0 / 12.1), (72.0, 6.0)])
+    def test_the_peak_current_stands_for_the_torque_limit(
+        self, port: MemoryPort, torque_max_Nm: float, peak_A: float
+    ) -> None:
+        port.drive(mode="speed", torque_max_Nm=torque_max_Nm).commission()
+        assert port.device.m.peak_A == pytest.approx(peak_A, abs=1e-3)
+        port.drive(torque_max_Nm=torque_max_Nm).commission()
+        assert port.device.m.peak_A == 6.0  # the loop itself limits the torque
+
+    @pytest.mark.parametrize("name", [b"UM=2", b"AC", b"SD", b"JV", b"HL[3]", b"LL[3]", b"ER[2]"])
+    def test_without_speed_mode_or_one_of_its_limits_auto_is_torque_mode_and_says_so(
+        self, port: MemoryPort, name: bytes
+    ) -> None:
+        port.answer = lacks(name)
+        report = port.drive(mode="auto").commission()
+        assert (report.mode, port.device.m.unit_mode, port.device.m.peak_A) == ("torque (UM=1)", 1, 6.0)
+        assert any("torque mode, because speed mode cannot be had" in remark for remark in report.remarks)
+        with pytest.raises(DeviceError, match="EC 2"):
+            port.drive(mode="speed").commission()
+
+    def test_a_jog_that_is_not_zero_is_refused(self, port: MemoryPort) -> None:
+        port.answer = lambda line, reply: b"JV\r1000;" if line == b"JV" else reply
+        with pytest.raises(DeviceError, match=r"JV \(=0\) does not read back"):
+            port.drive(mode="speed").commission()
+
+    @pytest.mark.parametrize(("rate_Hz", "mode"), [(178.0, "speed (UM=2)"), (187.0, "torque (UM=1)")])
+    def test_the_rate_of_the_line_decides(self, rate_Hz: float, mode: str) -> None:
+        port = MemoryPort()
+        port.character_s *= 0.5  # the measurement is not what decides here
+        assert port.drive(mode="auto", rate_Hz=rate_Hz).commission().mode == mode
+        if mode.startswith("torque"):
+            with pytest.raises(ConfigurationError, match=r"at most 186 .* for JV and BG"):
+                port.drive(mode="speed", rate_Hz=rate_Hz).commission()
+
+    def test_make_safe_ends_a_jog(self, port: MemoryPort) -> None:
+        drive = port.drive(mode="speed")
         drive.commission()
-        drive.start_speed_mode(2.0)
-        assert (port.device.m.unit_mode, port.device.m.motor_on) == (2, 1)
-        drive.jog(0.2)
+        for line in (b"MO=1", b"JV=20000", b"BG"):
+            port.device.execute(line)
         port.device.advance_to(1.0)
-        position_rad, velocity_radps, _ = drive.motion()
-        assert velocity_radps == pytest.approx(0.2, abs=0.01)
-        assert position_rad > 0.15
+        assert drive.motion()[1] == pytest.approx(20_000 * math.tau / COUNTS, rel=0.05)
+        port.commands.clear()
         assert drive.make_safe() == "off"
+        assert port.commands[1:5] == [b"TC=0", b"JV=0", b"ST", b"MO=0"]
+        assert (port.device.m.motor_on, port.device.jog_cps) == (0, 0.0)
 
 
 class TestClearFault:
@@ -285,7 +349,7 @@ class TestMakeSafe:
             port.device.execute(line)
         port.commands.clear()
         assert drive.make_safe() == "off"
-        assert port.commands[1:4] == [b"TC=0", b"ST", b"MO=0"]
+        assert port.commands[1:5] == [b"TC=0", b"JV=0", b"ST", b"MO=0"]
         assert port.device.m.motor_on == 0
         drive.close()
         assert port.closed

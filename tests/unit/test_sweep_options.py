@@ -11,10 +11,11 @@ import pytest
 
 from drivers.errors import ConfigurationError, DataError, DeviceError, JointctlError, UsageError
 from tools.configuration.config import Config
+from tools.configuration.elmo_settings import elmo_section, elmo_settings
 from tools.configuration.load import load_config, shipped_config
 from tools.configuration.plant_settings import plant_settings
 from tools.output import Output
-from tools.sweeping.carry_out import middle_rad, with_mode, with_tracking_law
+from tools.sweeping.carry_out import ACCELERATION_SPARE, middle_rad, with_mode, with_tracking_law
 from tools.sweeping.options import QUICK_S, SweepOptions, make_plan
 from tools.verbs.sweep import sweep
 
@@ -134,8 +135,20 @@ def test_without_a_terminal_motion_needs_y(config: Config, tmp_path: Path, monke
 def test_modes(config: Config) -> None:
     assert with_mode(config, "torque").canopen.mode == config.canopen.mode
     assert with_mode(config, "csv").canopen.mode == "csv"
-    with pytest.raises(UsageError, match=r"--mode \(=fast\) must be one of auto, csv, pv, torque"):
+    with pytest.raises(UsageError, match=r"--mode \(=fast\) must be one of auto, csv, pv, speed, torque"):
         with_mode(config, "fast")
+    with pytest.raises(DeviceError, match=r"--mode \(=speed\) must be auto, csv, pv or torque"):
+        with_mode(config, "speed")
+
+
+def test_modes_of_a_serial_drive() -> None:
+    serial = load_config(shipped_config("elmo_serial"))
+    assert elmo_section(serial).unit_mode == "torque"  # what `run` gets
+    for mode in ("auto", "speed", "torque"):
+        assert elmo_settings(with_mode(serial, mode), 0.1).mode == mode
+    assert elmo_settings(serial, 0.1).ramp_radps2 > ACCELERATION_SPARE * serial.sequence.brake_radps2
+    with pytest.raises(DeviceError, match=r"--mode \(=csv\) must be auto, speed or torque"):
+        with_mode(serial, "csv")
 
 
 def test_a_law_without_integral_action_gets_an_observer_for_torque_mode() -> None:

@@ -37,7 +37,9 @@ def sweep_command(
     dwell: Annotated[
         float | None, typer.Option("--dwell", metavar="S", help="wanted measuring time per point (1, quick 0.5)")
     ] = None,
-    mode: Annotated[str, typer.Option("--mode", help="auto, csv, pv (the drive's velocity loop), or torque")] = "auto",
+    mode: Annotated[
+        str, typer.Option("--mode", help="auto, csv, pv or speed (the drive's velocity loop), torque")
+    ] = "auto",
     resume: Annotated[bool, typer.Option("--resume", help="measure what is missing in an interrupted sweep")] = False,
     lockstep: Annotated[bool, typer.Option("--lockstep", help="virtual joint in simulated time: seconds")] = False,
     interface: Interface = None,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, PrivateAttr
 from pydantic_core import PydanticCustomError
 
 from drivers.errors import ConfigurationError
@@ -38,6 +38,9 @@ def _counts_parameter(value: str) -> str:
     return value
 
 
+UnitModeChoice = Literal["torque", "speed", "auto"]
+
+
 class ElmoSerial(Section):
     """An Elmo drive on RS-232 or USB serial, spoken to over its ASCII interpreter."""
 
@@ -59,6 +62,18 @@ class ElmoSerial(Section):
     counts_parameter: Annotated[str, AfterValidator(Rule(COUNTS_PARAMETER_TEXT, _counts_parameter))] | None = (
         None  # compared with counts_per_turn
     )
+    _unit_mode: UnitModeChoice = PrivateAttr("torque")
+
+    @property
+    def unit_mode(self) -> UnitModeChoice:
+        """Torque, except for a sweep: `run` needs the torque."""
+        return self._unit_mode
+
+    def in_unit_mode(self, mode: UnitModeChoice) -> ElmoSerial:
+        """The same drive in another unit mode; auto: speed where the drive has it."""
+        drive = self.model_copy()
+        drive._unit_mode = mode
+        return drive
 
 
 def with_serial_bus(data: Any) -> Any:

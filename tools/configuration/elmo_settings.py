@@ -10,6 +10,8 @@ from tools.configuration.config import Config
 from tools.configuration.conversions import torque_constant_NmpA
 from tools.configuration.elmo import KIND, ElmoSerial
 
+RAMP_SPARE = 4.0  # of the drive's ramps in speed mode over sequence.brake_radps2: steeper than what the sweep asks for
+
 
 def elmo_section(config: Config) -> ElmoSerial:
     """[drive] of a serial drive; `ConfigurationError` for any other."""
@@ -62,6 +64,8 @@ def elmo_settings(config: Config, torque_constant_NmpA: float) -> ElmoSettings:
         speed_error_radps=drive.speed_error_radps,
         position_error_rad=drive.position_error_rad,
         dead_man_s=drive.dead_man_s,
+        ramp_radps2=RAMP_SPARE * config.sequence.brake_radps2,
+        mode=drive.unit_mode,
         product=drive.product,
         counts_parameter=drive.counts_parameter,
     )

@@ -1,7 +1,7 @@
 """The guard of a serial line: `python -m tools.running.line_guard JSON`, a small process that does next to nothing.
 
 A serial drive does not notice that the programs behind it have died: it holds its last torque command for ever.  So a
-third process waits, in a session of its own, and says TC=0, ST, MO=0
+third process waits, in a session of its own, and says TC=0, JV=0, ST, MO=0
 
 * when loop and supervisor are both dead, however they died (the kernel tells it: pidfd);
 * when the loop has been silent for `silent_s` and the supervisor has done nothing about it;

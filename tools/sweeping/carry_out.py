@@ -1,7 +1,7 @@
 """Carrying out the motion of a sweep: on the drive through the same loop and supervisor as `run`, or in lockstep.
 
-The drive is in a velocity mode if it has one (CSV, else PV); else our own law closes the velocity loop on torque.  In
-every mode the torque is the one that the drive measures.
+The drive is in a velocity mode if it has one (CSV, else PV; UM=2 on a serial line); else our own law closes the
+velocity loop on torque.  In every mode the torque is the one that the drive measures.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 
 from drivers.drive import CommissioningReport
+from drivers.elmo.unit_modes import SPEED_MODE
 from drivers.errors import ConfigurationError, DeviceError, UsageError
 from firmware_py.records import Reference
 from firmware_py.schema import new
 from firmware_py.states import CommandKind, Fault, TrajectoryKind
 from firmware_py.trajectory_table import approach_duration_s
 from tools.configuration.config import Config
-from tools.configuration.elmo import ElmoSerial
+from tools.configuration.elmo import ElmoSerial, UnitModeChoice
 from tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_constants
 from tools.output import Output
 from tools.recording.kept_records import KeptRecords
@@ -35,7 +36,8 @@ from tools.sweeping.meter import SweepMeter
 from tools.sweeping.plan import SweepMotion, shifted
 
 DRIVE_MODES = {"auto": "velocity or torque", "csv": "csv", "pv": "pv"}  # option: `CanopenSettings.mode`
-VELOCITY_MODES = ("cyclic_sync_velocity", "profile_velocity")  # as commissioning reports them
+SERIAL_MODES: dict[str, UnitModeChoice] = {"auto": "auto", "speed": "speed", "torque": "torque"}
+VELOCITY_MODES = ("cyclic_sync_velocity", "profile_velocity", SPEED_MODE)  # as commissioning reports them
 POSITION_GAIN_ps = 5.0  # slow: far below any drive's velocity loop, fast enough to keep the joint on the plan
 OBSERVER_radps = 30.0  # of the law that takes the place of one without an integral action
 ACCELERATION_SPARE = 3.0  # limit of the velocity command's slope over sequence.brake_radps2
@@ -45,13 +47,15 @@ LOCKSTEP_RECORDS = 250_000
 
 
 def with_mode(config: Config, mode: str) -> Config:
-    """The configuration in the wanted mode: auto, csv, pv, or torque (as [drive] says)."""
-    if mode not in (*DRIVE_MODES, "torque"):
-        raise UsageError(f"--mode (={mode}) must be one of auto, csv, pv, torque")
+    """The configuration in the wanted mode: auto, csv, pv, speed (serial drive), or torque (as [drive] says)."""
+    if mode not in (*DRIVE_MODES, "speed", "torque"):
+        raise UsageError(f"--mode (={mode}) must be one of auto, csv, pv, speed, torque")
     if isinstance(config.drive, ElmoSerial):
-        if mode not in ("auto", "torque"):
-            raise DeviceError(f"--mode (={mode}) must be auto or torque: the serial drive is driven by torque only")
-        return config
+        if mode not in SERIAL_MODES:
+            raise DeviceError(f"--mode (={mode}) must be auto, speed or torque: it is a serial drive")
+        return config.model_copy(update={"drive": config.drive.in_unit_mode(SERIAL_MODES[mode])})
+    if mode == "speed":
+        raise DeviceError("--mode (=speed) must be auto, csv, pv or torque: it is a CANopen drive")
     if mode == "torque":
         return config
     drive = config.drive.model_copy(update={"mode": DRIVE_MODES[mode]})

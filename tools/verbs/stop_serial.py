@@ -20,7 +20,7 @@ SHARED_ATTEMPTS = 10  # the other user of the line takes some replies
 
 
 def stop_serial(drive: ElmoSerial, output: Output) -> str:
-    """The drive's state in words after TC=0, ST, MO=0; raises `BusError` where the port cannot be opened at all."""
+    """The drive's state in words after zero, stop, MO=0; raises `BusError` where the port cannot be opened at all."""
     with GuardCall(drive.port, "stop") as call:
         if call.supervisor_pid is not None:
             output.note(f"stopping the run that has {drive.port} (pid {call.supervisor_pid})")
