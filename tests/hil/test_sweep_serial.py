@@ -9,12 +9,14 @@ import json
 import os
 import signal
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
 from firmware_py.friction import friction_curve_Nm
+from hil.elmo_device import ElmoDevice
 from hil.elmo_motor import MF_POSITION_LIMIT
 from tools.configuration.conversions import friction_constants
 from tools.configuration.load import load_config
@@ -86,6 +88,32 @@ def test_its_twin_without_a_guard_jogs_on_to_the_drives_own_position_limit(seria
     assert abs(device.speed_cps()) > 10_000
     serial_bench.until(serial_bench.standing)
     assert device.m.motor_fault == MF_POSITION_LIMIT
+
+
+def stick_position(device: ElmoDevice) -> None:
+    """PX does not change any more; everything else is answered as before."""
+    execute, stuck = device.interpreter.execute, device.interpreter.execute(b"PX")
+    device.interpreter.execute = (  # type: ignore[method-assign]
+        lambda line: stuck if line == b"PX" else execute(line)
+    )
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda device: device.restart_drive(), "DRIVE_RESTARTED"),
+        (lambda device: setattr(device.faults, "mute", True), "STALE_SAMPLE"),
+        (stick_position, "POSITION_FROZEN"),
+        (lambda device: setattr(device.interpreter.m, "speed_error_cps", 0.0), "speed tracking error (ER[2])"),
+    ],
+    ids=["restart", "silent", "stuck position", "speed error"],
+)
+def test_faults_end_with_the_joint_stopped(serial_bench: Any, spoil: Callable[[ElmoDevice], None], words: str) -> None:
+    run = jogging(serial_bench)
+    spoil(serial_bench.device)
+    run.finished().refused(7, words)
+    serial_bench.until(serial_bench.standing)
+    assert serial_bench.device.interpreter.m.motor_fault != MF_POSITION_LIMIT
 
 
 def test_an_unplugged_port_is_told_and_the_drives_own_position_limit_ends_the_jog(serial_bench: Any) -> None:
