@@ -232,6 +232,8 @@ def step_axis(
     """
     state.cycle += elapsed_cycles
     state.phase_cycle += elapsed_cycles
+    if state.fault == Fault.NONE:
+        state.fault_encoder_error = sample.encoder_error
     gap_cycles = _take_position(constants, state, sample, elapsed_cycles)
     request_stop(state, stop_request)
     check_surroundings(constants, state, sample, elapsed_cycles - 1, supervisor_age_cycles)

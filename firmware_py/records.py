@@ -78,6 +78,8 @@ class SequenceConstants:
     """Times of the run's phases."""
 
     approach_s: f8  # 0 = start the trajectory at once, where the joint stands
+    start_rad: f8  # where the joint stood when the motion was shown, which `approach_s` was made for
+    moved_max_rad: f8  # by which it may be elsewhere when it is enabled; 0 = not checked, `start_rad` is not known
     brake_radps2: f8  # deceleration of a controlled stop
     release_s: f8  # torque ramp to zero at standstill
     settle_cycles: i8  # consecutive good samples before enabling
@@ -110,6 +112,7 @@ class AxisConstants:
 
 
 LINE_GONE = 1_000_000  # of `Sample.bus_errors`: more than any limit
+ENCODER_RESTARTED = 0x1_0000  # of `Sample.encoder_error`: more than any EMCY error code
 
 
 @record
@@ -124,6 +127,7 @@ class Sample:
     drive_state: i4  # DriveState
     status_word: i4  # as the drive sent it, for the log
     drive_error: i4  # the drive's own error code, 0 = none
+    encoder_error: i4  # the same of an encoder node; ENCODER_RESTARTED: it has lost its count
     restarts: i4  # boot-ups of the drive seen since it was commissioned
     bus_errors: i4  # sends that failed in a row; LINE_GONE where nothing will ever be heard or said again
     heartbeat_age_cycles: i4  # since the drive's own last heartbeat; 0 where it sends none
@@ -142,6 +146,7 @@ class AxisState:
     fault: i4  # Fault, the first one
     reaction: i4  # Reaction in force
     fault_drive_error: i4
+    fault_encoder_error: i4  # `Sample.encoder_error` in the cycle of the fault, or of the last cycle if there is none
     cycle: i8
     phase_cycle: i8  # cycles since the phase began
     good_samples: i8

@@ -29,6 +29,7 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.fault = Fault.NONE
     state.reaction = Reaction.NONE
     state.fault_drive_error = 0
+    state.fault_encoder_error = 0
     state.fault_value = 0.0
     state.cycle = 0
     state.phase_cycle = 0
@@ -121,6 +122,17 @@ def request_stop(state: AxisState, stop_request: int) -> None:
 
 
 @kernel
+def moved_before_start(constants: AxisConstants, state: AxisState) -> bool:
+    """End a run whose joint is not where it was when the motion was shown: a longer way in the same time is faster."""
+    sequence = constants.sequence
+    moved_rad = state.measured_position_rad - sequence.start_rad
+    if sequence.moved_max_rad <= 0.0 or abs(moved_rad) <= sequence.moved_max_rad:
+        return False
+    trip(state, Fault.MOVED_BEFORE_START, moved_rad, 0)
+    return True
+
+
+@kernel
 def step_waiting(constants: AxisConstants, state: AxisState, sample: Sample) -> None:
     """WAITING: some good samples at standstill inside the limits, then ask the drive to enable."""
     limits = constants.limits
@@ -130,6 +142,8 @@ def step_waiting(constants: AxisConstants, state: AxisState, sample: Sample) -> 
         fault = motion_fault(limits, position_rad, 0.0, 0.0)
         if fault != Fault.NONE:
             trip(state, fault, position_rad, 0)
+            return
+        if moved_before_start(constants, state):
             return
         enabled = sample.drive_state == DriveState.ENABLED  # it should be off: nobody has asked for more
         if not moving and not enabled and constants.sequence.may_enable != 0:
@@ -152,6 +166,8 @@ def step_waiting(constants: AxisConstants, state: AxisState, sample: Sample) -> 
 def step_enabling(constants: AxisConstants, state: AxisState, sample: Sample, table: np.ndarray) -> None:
     """ENABLING: once the drive is on, plan the way from where the joint stands to the trajectory's start."""
     if sample.drive_state == DriveState.ENABLED and state.sample_age_cycles == 0:
+        if moved_before_start(constants, state):  # a brake that has opened, say
+            return
         approach_s = constants.sequence.approach_s
         state.table_row = reference_at(constants.trajectory, table, 0, 0.0, state.reference)
         plan_approach(state.measured_position_rad, state.reference, approach_s, state.approach)

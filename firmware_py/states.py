@@ -67,6 +67,7 @@ class Fault(IntEnum):
     SUSPENDED = 22  # the computer slept
     DRIVE_SILENT = 23  # the drive's own heartbeat stays away
     POSITION_DISAGREEMENT = 24  # the two encoders of the joint differ by more than they may
+    MOVED_BEFORE_START = 25  # the joint is not where it was when the motion was shown
 
 
 class Reaction(IntEnum):

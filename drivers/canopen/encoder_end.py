@@ -5,7 +5,7 @@ from __future__ import annotations
 import canopen
 
 from drivers.canopen.eds_file import read_eds
-from drivers.canopen.encoder_node import EncoderFindings, commission_encoder
+from drivers.canopen.encoder_node import EncoderFindings, commission_encoder, require_no_alarm
 from drivers.canopen.object_access import ObjectAccess
 from drivers.canopen.settings import CanopenSettings
 
@@ -45,6 +45,10 @@ class EncoderEnd:
         return found, self._eds_remarks + self._objects.remarks
 
     def verify_again(self) -> None:
-        """See `ObjectAccess.verify_again`."""
-        if self._objects is not None:
+        """See `ObjectAccess.verify_again`; `DeviceError` as well if the encoder has an alarm by now.
+
+        Its EMCY may have come while nobody listened.
+        """
+        if self._objects is not None and self._node is not None:
             self._objects.verify_again()
+            require_no_alarm(self._objects, self._node)

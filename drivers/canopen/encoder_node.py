@@ -48,9 +48,7 @@ def commission_encoder(
     range_counts = objects.read(0x6002, what="total measuring range") or 1 << 32
     if range_counts < per_turn:
         raise DeviceError(f"node {node}: 6002 (total measuring range, {range_counts}) is below one turn ({per_turn})")
-    alarms = objects.read(ALARMS, what="alarms") if objects.has(ALARMS) else 0
-    if alarms:
-        raise DeviceError(f"node {node}: the encoder reports alarms (6503 = {alarms:04X}h): its position is not valid")
+    require_no_alarm(objects, node)
     listen_to_our_sync(objects, rate_Hz)
     if not objects.write_if_present(0x1017, 0, round(heartbeat_s * 1000.0), what="producer heartbeat time"):
         objects.remarks.append(f"node {node}: no object 1017: a restart is seen by its boot-up message")
@@ -63,6 +61,13 @@ def commission_encoder(
     start = objects.read(POSITION_VALUE.index, what="position value")
     name = objects.text(0x1008)
     return EncoderFindings(range_counts, start, f"node {node} {name}, {per_turn} counts a turn of {range_counts}")
+
+
+def require_no_alarm(objects: ObjectAccess, node: int) -> None:
+    """`DeviceError` if the encoder says that its position is not valid (6503, CiA 406)."""
+    alarms = objects.read(ALARMS, what="alarms") if objects.has(ALARMS) else 0
+    if alarms:
+        raise DeviceError(f"node {node}: the encoder reports alarms (6503 = {alarms:04X}h): its position is not valid")
 
 
 def commission_drive_object(objects: ObjectAccess, settings: JointEncoderSettings, node: int) -> EncoderFindings:

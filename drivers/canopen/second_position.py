@@ -9,7 +9,7 @@ from __future__ import annotations
 from drivers.can.frames import Frame
 from drivers.canopen.port import AlignTo, CanopenPort, SecondPosition
 from firmware_py.kernel import kernel
-from firmware_py.records import Sample
+from firmware_py.records import ENCODER_RESTARTED, Sample
 
 SEEN_FIRST, SEEN_SECOND = 1, 2
 _BOTH = SEEN_FIRST | SEEN_SECOND
@@ -43,10 +43,11 @@ def watch_second(second: SecondPosition, frame: Frame, sample: Sample) -> None:
         if frame.length >= 2:
             low, high = int(frame.payload[0]), int(frame.payload[1])
             second.error = low | high << 8
-            if second.error != 0:
-                sample.drive_error = second.error
+            if second.lost == 0:
+                sample.encoder_error = second.error
     elif frame.length >= 1 and frame.payload[0] & 0x7F == 0:
         second.lost = 1
+        sample.encoder_error = ENCODER_RESTARTED
 
 
 @kernel

@@ -297,6 +297,23 @@ def test_drive_fault_in_each_phase(rig: NewRig, phase: AxisPhase, drive_state: D
     assert_fault(run, Fault.DRIVE_FAULT, Reaction.OFF)
 
 
+@pytest.mark.parametrize("cleared_before", [False, True])
+def test_the_encoders_error_of_the_first_fault_is_kept(rig: NewRig, cleared_before: bool) -> None:
+    run = rig(0.05).until(AxisPhase.TRACKING)
+    run.sample.encoder_error = 0x5000
+    run.tick()
+    if cleared_before:
+        run.sample.encoder_error = 0
+    run.joint.drive_state = DriveState.FAULT
+    run.tick()
+    assert run.state.fault == Fault.DRIVE_FAULT
+    run.sample.encoder_error = 0x7300
+    run.tick()
+    assert run.state.fault_encoder_error == (0 if cleared_before else 0x5000)
+    reset_axis(run.axis, run.state)
+    assert run.state.fault_encoder_error == 0
+
+
 def test_a_restart_before_the_first_cycle_ends_the_run_without_power(rig: NewRig) -> None:
     """It was taken for one from before the run: a drive without its limits would have been enabled."""
     run, twin = rig(0.0), rig(0.0)

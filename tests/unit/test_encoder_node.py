@@ -19,13 +19,14 @@ from drivers.canopen.cyclic import accept_frame, begin_cycle
 from drivers.canopen.eds_file import read_eds
 from drivers.canopen.second_position import centred
 from drivers.errors import ConfigurationError, DeviceError
-from firmware_py.records import Sample
+from firmware_py.records import ENCODER_RESTARTED, Sample
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, Fault
 from hil.faults import FaultConstants, FaultKind
 from tools.configuration.config import Config
 from tools.configuration.drive_settings import canopen_settings, cyclic_bus_load
 from tools.configuration.load import load_config
+from tools.running.open_drive import drive_fault_text
 from tools.simulation.lockstep import LockstepJoint
 from tools.simulation.virtual_joint import new_device
 
@@ -203,7 +204,8 @@ def test_an_encoder_with_an_error_or_restarted_is_not_believed(tmp_path: Path, i
     accept_frame(port[0], received, sample, 1)
     cycle(port, sample, 0, 100_000)
     assert sample.count == 1
-    assert sample.drive_error == (0x5000 if identifier == 0x82 else 0)
+    assert sample.encoder_error == (0x5000 if identifier == 0x82 else ENCODER_RESTARTED)
+    assert sample.drive_error == 0
 
 
 # --- commissioning and runs in lockstep ------------------------------------------------------------------------
@@ -257,6 +259,27 @@ def test_an_encoder_with_an_alarm_is_refused(tmp_path: Path) -> None:
     drive.close()
 
 
+@pytest.mark.parametrize("alarm", [True, False])
+def test_an_alarm_that_comes_while_the_question_is_open_is_refused(tmp_path: Path, alarm: bool) -> None:
+    """Its EMCY comes while nobody listens."""
+    from drivers.canopen.drive import CanopenDrive
+    from tools.simulation.lockstep import DirectBus
+
+    config = config_with(tmp_path, NODE)
+    device = new_device(config)
+    bus = DirectBus(device)
+    drive = CanopenDrive(bus, canopen_settings(config), sleep=bus.sleep)
+    drive.commission()
+    if alarm:
+        device.device[0].encoder.error_code = 0x5000
+        bus.sleep(0.05)
+        with pytest.raises(DeviceError, match=re.escape("node 2: the encoder reports alarms (6503 = 0001h)")):
+            drive.start_cyclic()
+    else:
+        drive.start_cyclic()
+    drive.close()
+
+
 def drift(rate_radps: float) -> Any:
     faults = new(FaultConstants, 1)
     faults[0].kind, faults[0].start_s, faults[0].duration_s = FaultKind.ENCODER_DRIFT, 1.5, 100.0
@@ -293,6 +316,41 @@ def test_losing_the_encoder_node_ends_the_run(tmp_path: Path) -> None:
     joint = LockstepJoint(config_with(tmp_path, NODE))
     joint._virtual.device[0].encoder.node_id = 0
     assert joint.run().fault is Fault.NO_SAMPLES
+
+
+def emergency(port: Any, sample: Any, code: int) -> None:
+    received = new(Frame)[0]
+    received.can_id, received.length = 0x82, 8
+    received.payload[0], received.payload[1] = code & 0xFF, code >> 8
+    accept_frame(port[0], received, sample, 1)
+
+
+@pytest.mark.parametrize("cleared", [False, True])
+def test_an_error_of_the_encoder_is_not_the_drives_and_ends_when_it_is_cleared(tmp_path: Path, cleared: bool) -> None:
+    """It was taken for the drive's, even 200 cycles after it had been cleared."""
+    port, sample = port_of(tmp_path, NODE), new(Sample)[0]
+    cycle(port, sample, 0, 100_000)
+    emergency(port, sample, 0x5000)
+    if cleared:
+        emergency(port, sample, 0)
+    cycle(port, sample, 0, 100_000)
+    assert (sample.count, sample.encoder_error) == ((2, 0) if cleared else (1, 0x5000))
+    assert sample.drive_error == 0
+
+
+@pytest.mark.parametrize("code", [0x5000, 0])
+def test_a_run_that_the_encoder_ends_says_so(tmp_path: Path, code: int) -> None:
+    config = config_with(tmp_path, NODE)
+    joint = LockstepJoint(config)
+    joint._virtual.device[0].encoder.error_code = code
+    run = joint.run()
+    assert run.fault is (Fault.NO_SAMPLES if code else Fault.NONE)
+    errors = int(run.state.fault_drive_error), int(run.state.fault_encoder_error)
+    assert errors == (0, code)
+    if code:
+        told = drive_fault_text(config, run.fault, float(run.state.fault_value), *errors)
+        assert "from both encoders of the joint; the encoder node's error code is 5000h" in told.happened
+        assert "not believed" in told.cause
 
 
 # --- configuration ---------------------------------------------------------------------------------------------

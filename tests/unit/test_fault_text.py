@@ -6,8 +6,9 @@ import math
 
 import pytest
 
+from firmware_py.records import ENCODER_RESTARTED
 from firmware_py.states import Fault
-from tools.running.fault_text import FAULT_TEXTS, fault_text
+from tools.running.fault_text import FAULT_TEXTS, TWO_ENCODER_TEXTS, fault_text
 from tools.running.serial_fault_text import SERIAL_FAULT_TEXTS
 
 FAULTS = [fault for fault in Fault if fault is not Fault.NONE]
@@ -52,3 +53,25 @@ def test_a_drive_that_did_not_hear_us_does_not_send_the_user_to_its_sto_wiring(
     assert ("heard our frames too seldom" in text.cause) is communication
     assert (text.cause == FAULT_TEXTS[fault].cause) is not communication
     assert fault_text(Fault.STALE_SAMPLE, 51.0, code).cause == FAULT_TEXTS[Fault.STALE_SAMPLE].cause
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_an_error_is_told_as_that_of_the_node_that_has_it(fault: Fault) -> None:
+    """The encoder's EMCY was told as the drive's."""
+    told = fault_text(fault, 6.0, 0, 0x5000, two_encoders=True).happened
+    assert "the encoder node's error code is 5000h" in told
+    assert "drive's error code" not in told
+    assert "encoder node restarted" in fault_text(fault, 6.0, 0, ENCODER_RESTARTED, two_encoders=True).happened
+    told = fault_text(fault, 6.0, 0x5000, two_encoders=True).happened
+    assert "the drive's error code is 5000h" in told
+    assert "encoder node" not in told
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_missing_sample_of_two_encoders_may_be_that_of_either(fault: Fault) -> None:
+    two, one = fault_text(fault, 6.0, 0, two_encoders=True), fault_text(fault, 6.0, 0)
+    assert (two != one) is (fault in TWO_ENCODER_TEXTS) is (fault in (Fault.STALE_SAMPLE, Fault.NO_SAMPLES))
+    if two != one:
+        assert "encoder" in two.happened
+        assert "the joint's encoder" in two.cause
+        assert "not believed" in fault_text(fault, 6.0, 0, 0x5000, two_encoders=True).cause

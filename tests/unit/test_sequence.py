@@ -146,6 +146,32 @@ def test_enabling_is_only_asked_at_standstill_inside_the_limits(
     assert (state.phase, state.fault) == (phase, fault)
 
 
+@pytest.mark.parametrize("phase", [AxisPhase.WAITING, AxisPhase.ENABLING])
+@pytest.mark.parametrize(
+    ("start_rad", "max_rad", "position_rad", "moved"),
+    [
+        (0.25, 0.125, 0.375, False), (0.25, 0.125, 0.125, False), (0.25, 0.125, 0.375 + 1e-12, True),
+        (0.25, 0.125, 0.125 - 1e-12, True), (-0.5, 0.125, 0.5, True), (0.25, 0.0, 0.9, False),
+        (float("nan"), 0.0, 0.9, False), (float("nan"), 0.125, 0.9, True),
+    ],
+)  # fmt: skip
+def test_a_joint_that_was_moved_since_the_motion_was_shown_is_not_driven(
+    axis: Any, state: Any, phase: AxisPhase, start_rad: float, max_rad: float, position_rad: float, moved: bool
+) -> None:
+    axis.sequence.start_rad, axis.sequence.moved_max_rad = start_rad, max_rad
+    settled(state, position_rad)
+    state.phase = phase
+    if phase is AxisPhase.WAITING:
+        step_waiting(axis, state, idle_sample())
+    else:
+        step_enabling(axis, state, idle_sample(DriveState.ENABLED), axis_table())
+    if moved:
+        assert (state.phase, state.fault) == (AxisPhase.DISABLING, Fault.MOVED_BEFORE_START)
+        assert state.fault_value == pytest.approx(position_rad - start_rad, nan_ok=True)
+    else:
+        assert (state.phase, state.fault) == (phase + 1, Fault.NONE)
+
+
 @pytest.mark.parametrize("drive_state", [DriveState.OFF, DriveState.STARTING, DriveState.ENABLED])
 def test_a_drive_that_is_enabled_already_is_not_taken_over(axis: Any, state: Any, drive_state: DriveState) -> None:
     settled(state)

@@ -18,6 +18,8 @@ MOTION = frozenset(
         Fault.TORQUE_SATURATED, Fault.STOP_TIMEOUT,
     }
 )  # fmt: skip
+# what a joint that seems to move, or does, shows before it is enabled
+NOT_STARTED = frozenset({Fault.NOT_AT_STANDSTILL, Fault.MOVED_BEFORE_START})
 DRIVE = frozenset({Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED, Fault.DRIVE_RESTARTED})
 # before the joint is enabled, or after it was asked to stop, a fault of the wire shows as one of these
 LATE_CAUSES = frozenset(
@@ -98,7 +100,7 @@ _CLASSES = (
     FaultClass(FaultKind.RPDO_CORRUPTED, Sizes((0.0005, 0.003), (0.3, 1.0)), None, MOTION | DRIVE, on_wire=True),
     FaultClass(
         FaultKind.TPDO_CORRUPTED, Sizes((0.0015, 0.05), (0.3, 1.0)), None,
-        MOTION | DRIVE | {Fault.NOT_AT_STANDSTILL, Fault.DRIVE_STAYS_ENABLED}, on_wire=True,
+        MOTION | DRIVE | NOT_STARTED | {Fault.DRIVE_STAYS_ENABLED}, on_wire=True,
     ),
     FaultClass(
         FaultKind.RPDO_LENGTH, Sizes((0.06, LONG_s), (0.0, 3.99)), Sizes((0.001, 0.01), (0.0, 8.99)),
@@ -116,17 +118,17 @@ _CLASSES = (
     FaultClass(FaultKind.DRIVE_FAULT, Sizes((0.01, LONG_s), (1.0, 1.0)), None, frozenset({Fault.DRIVE_FAULT}), True),
     FaultClass(
         FaultKind.ENCODER_STUCK, Sizes((0.05, LONG_s), (1.0, 1.0)), Sizes((0.001, 0.002), (1.0, 1.0)),
-        MOTION | {Fault.NOT_AT_STANDSTILL},
+        MOTION | NOT_STARTED,
     ),
     FaultClass(
         FaultKind.ENCODER_JUMP, Sizes(_ALWAYS, (0.0205, 1.0)), Sizes(_ALWAYS, (0.00001, 0.0005)),
-        MOTION | {Fault.NOT_AT_STANDSTILL}, True,
+        MOTION | NOT_STARTED, True,
     ),
     FaultClass(
         FaultKind.ENCODER_DRIFT, Sizes(_ALWAYS, (0.05, 1.0)), Sizes((0.001, 1.0), (0.0001, 0.01)),
-        MOTION | {Fault.NOT_AT_STANDSTILL, Fault.REFERENCE_LIMIT},
+        MOTION | NOT_STARTED | {Fault.REFERENCE_LIMIT},
     ),
-    FaultClass(FaultKind.ENCODER_REVERSED, Sizes((0.3, LONG_s), (1.0, 1.0)), None, MOTION | {Fault.NOT_AT_STANDSTILL}),
+    FaultClass(FaultKind.ENCODER_REVERSED, Sizes((0.3, LONG_s), (1.0, 1.0)), None, MOTION | NOT_STARTED),
     FaultClass(FaultKind.TORQUE_REVERSED, Sizes((0.3, LONG_s), (1.0, 1.0)), None, MOTION),
     FaultClass(
         FaultKind.TORQUE_SATURATED, Sizes((0.05, LONG_s), (0.0, 30.0)), Sizes(_ALWAYS, (58.0, 100.0)), MOTION
@@ -136,7 +138,7 @@ _CLASSES = (
     ),
     FaultClass(
         FaultKind.LOAD_JUMP, Sizes((0.01, 0.2), (15.0, 40.0)), Sizes(_ALWAYS, (0.5, 4.0)),
-        MOTION | {Fault.NOT_AT_STANDSTILL},
+        MOTION | NOT_STARTED,
     ),
     FaultClass(
         FaultKind.LOOP_HELD_UP, Sizes((0.06, 1.0), (1.0, 1.0)), Sizes((0.001, 0.025), (1.0, 1.0)),

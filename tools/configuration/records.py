@@ -31,6 +31,7 @@ MOVE_MIN_S = 0.2  # of a move to a new set-point, however near
 FROZEN_SHARE, FROZEN_SHARE_WITHOUT_MODEL = 0.1, 0.5
 FROZEN_FRICTION = 1.5  # times the static friction: what a sound joint does not stand still under
 HEARTBEATS_MISSED = 3  # periods of the drive's own heartbeat until it counts as silent
+MOVED_COUNTS = 4  # encoder counts by which a joint that nobody has moved may seem to have moved
 FROZEN_COUNTS = 4  # encoder counts by which a standing reading may flicker
 APPROACH_SPEED = 0.25  # share of limits.velocity_max_radps that an automatic approach may use
 
@@ -38,8 +39,8 @@ APPROACH_SPEED = 0.25  # share of limits.velocity_max_radps that an automatic ap
 def axis_constants(config: Config, *, start_position_rad: float | None = None) -> Any:
     """A record array of one `AxisConstants`.
 
-    `start_position_rad` is where the joint stands; it only matters for `approach_s = "auto"`, which takes the whole
-    range of motion as the distance when it is not known.
+    `start_position_rad` is where the joint stands; a joint that is elsewhere at the start ends the run.  Where it is
+    not known, that is not checked, and `approach_s = "auto"` takes the whole range of motion as the distance.
     """
     constants = new(AxisConstants)
     axis = constants[0]
@@ -166,6 +167,14 @@ def _cycles(config: Config, time_s: float) -> int:
     return max(1, round(time_s * config.loop.rate_Hz))
 
 
+def law_resolution_rad(config: Config) -> float:
+    """One count of the encoder that feeds the law, at the joint."""
+    second = config.joint_encoder
+    if second is not None and second.law == "joint_encoder":
+        return math.tau / second.counts_per_turn
+    return abs(joint_rad_per_count(config))
+
+
 def _fill_limits(record: Any, config: Config) -> None:
     limits = config.limits
     for key in (
@@ -181,16 +190,13 @@ def _fill_limits(record: Any, config: Config) -> None:
         )
         record.frozen_torque_Nm = FROZEN_FRICTION * static_Nm + abs(config.joint.gravity_Nm)
     second = config.joint_encoder
-    resolution_rad = abs(joint_rad_per_count(config))
     if second is not None:
         record.disagreement_max_rad = second.disagreement_max_rad
         record.twist_radpNm = 1.0 / second.stiffness_Nmprad if second.stiffness_Nmprad is not None else 0.0
         record.limit_source = LimitSource.BOTH
         if second.limits != "both":
             record.limit_source = LimitSource.LAW if second.limits == second.law else LimitSource.OTHER
-        if second.law == "joint_encoder":
-            resolution_rad = math.tau / second.counts_per_turn
-    record.frozen_tolerance_rad = FROZEN_COUNTS * resolution_rad
+    record.frozen_tolerance_rad = FROZEN_COUNTS * law_resolution_rad(config)
     record.frozen_max_rad = max(share * limits.following_error_max_rad, 5.0 * record.frozen_tolerance_rad)
     record.sample_age_max_cycles = _cycles(config, limits.sample_age_max_s)
     record.saturation_max_cycles = _cycles(config, limits.saturation_max_s)
@@ -202,6 +208,9 @@ def _fill_limits(record: Any, config: Config) -> None:
 def _fill_sequence(record: Any, config: Config, start_position_rad: float | None) -> None:
     sequence = config.sequence
     record.approach_s = approach_s(config, start_position_rad)
+    if start_position_rad is not None:
+        record.start_rad = start_position_rad
+        record.moved_max_rad = max(config.limits.following_error_max_rad, MOVED_COUNTS * law_resolution_rad(config))
     record.brake_radps2 = sequence.brake_radps2
     record.release_s = sequence.release_s
     record.settle_cycles = _cycles(config, sequence.settle_s)

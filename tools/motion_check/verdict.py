@@ -22,7 +22,9 @@ SAME_SCALE = 0.2  # by which two encoders may differ over the small way: backlas
 FRICTION_FACTOR = 2.5  # measured over configured static friction, either way
 TORQUE_FACTOR = 2.0  # measured over commanded torque, either way
 _POWERED = (AxisPhase.APPROACH, AxisPhase.TRACKING, AxisPhase.RAMPING)
+# what a joint that runs the wrong way, or whose reading stands, ends with
 _WAY_FAULTS = (Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR, Fault.POSITION_LIMIT, Fault.POSITION_DISAGREEMENT)
+_STANDING_FAULTS = (*_WAY_FAULTS, Fault.POSITION_FROZEN, Fault.TORQUE_SATURATED)
 
 
 @dataclass(frozen=True)
@@ -81,24 +83,33 @@ def motion_findings(
     threshold_rad = max(MOVED_SHARE * plan.travel_rad, MOVED_COUNTS * resolution_rad)
     motion = motion_of(records, threshold_rad)
     if motion is None:
-        yield _ended(fault, text, "before the drive was enabled")
+        yield ended_finding(records, fault, text)
         return
     numbers = {key: value for key, value in vars(motion).items() if value is not None}
     if abs(motion.moved_rad) < threshold_rad:
         yield _standing(motion, law, other, threshold_rad, second is not None, numbers)
+        if fault is not Fault.NONE and fault not in _STANDING_FAULTS:
+            yield ended_finding(records, fault, text)
         return
-    if second is not None:
-        yield from _encoders(motion, law, other)
-    yield _direction(motion, law, other, numbers)
+    encoders = list(_encoders(motion, law, other)) if second is not None else []
+    yield from encoders
+    direction = _direction(motion, law, other, numbers)
+    yield direction
     if motion.torque_ratio is not None:
         yield _measured_torque(motion.torque_ratio)
     if motion.work_J > 0.0:
         yield from _friction(motion, plan)
-    if fault is not Fault.NONE and not (fault in _WAY_FAULTS and (motion.work_J <= 0.0 or second is not None)):
-        yield _ended(fault, text, "while the joint moved")
+    explained = direction.status == PROBLEM and fault in _WAY_FAULTS
+    if fault is Fault.POSITION_DISAGREEMENT:
+        explained = explained or any(finding.status == PROBLEM for finding in encoders)
+    if fault is not Fault.NONE and not explained:
+        yield ended_finding(records, fault, text)
 
 
-def _ended(fault: Fault, text: FaultText | None, when: str) -> Finding:
+def ended_finding(records: Any, fault: Fault, text: FaultText | None) -> Finding:
+    """The fault that ended the check."""
+    moved = np.isin(records.phase, _POWERED).any()
+    when = "while the joint moved" if moved else "before the drive was enabled"
     if text is None:
         return Finding("check", PROBLEM, f"ended {when}", "repeat it")
     return Finding("check", PROBLEM, f"ended {when}: {fault.name}: {text.happened}", text.next_step)

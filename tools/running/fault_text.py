@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivers.canopen.cia402 import State, decode_state
+from firmware_py.records import ENCODER_RESTARTED
 from firmware_py.states import Fault
 from tools.running.emergency_text import emergency_text
 
@@ -135,6 +136,11 @@ FAULT_TEXTS: dict[Fault, FaultText] = {
         "one encoder or its cable, a slipping coupling, or zero, counts, direction or reduction_ratio of one are wrong",
         "turn the joint by hand with the power off and compare both; see [encoder] and [joint_encoder]",
     ),
+    Fault.MOVED_BEFORE_START: FaultText(
+        "the joint was moved by {value:.4f} rad since the motion was shown",
+        "somebody turned it, or it sank under its load while the drive was off",
+        "let it rest, then start again: the motion is planned anew from where it stands",
+    ),
     Fault.POSITION_JUMP: FaultText(
         "the position jumped by {value:.4f} rad between two samples",
         "encoder or its cable, or counts_per_turn too small by a factor",
@@ -143,6 +149,20 @@ FAULT_TEXTS: dict[Fault, FaultText] = {
 }
 
 
+# with [joint_encoder] a sample counts only once both encoders have answered
+TWO_ENCODER_TEXTS: dict[Fault, FaultText] = {
+    Fault.STALE_SAMPLE: FaultText(
+        "no position of both encoders came for {value:.0f} cycles",
+        "frames lost, cable, bus load, or the drive or the joint's encoder went silent",
+        "check wiring and termination; watch the bus with candump: which of the two is missing?",
+    ),
+    Fault.NO_SAMPLES: FaultText(
+        "not one sample came from both encoders of the joint",
+        "the drive or the joint's encoder does not answer SYNC: PDOs disabled, or not operational",
+        "look for SYNC (080) and the TPDOs of both (180 + node, 280 + node of the drive) with candump",
+    ),
+}
+_ENCODER_CURE = "check the encoder's supply, cable and mounting; its manual tells the error code"
 _decode: Callable[[int], int] = getattr(decode_state, "py_func", decode_state)  # nothing to compile for one word
 # EMCY classes of CiA 301 with which a drive says that it does not hear this computer as it should
 _COMMUNICATION_ERRORS = (0x8100, 0x8200)
@@ -156,12 +176,29 @@ def _word_text(value: float) -> str:
     return f"{word:04X}h, {State(_decode(word)).name.lower().replace('_', ' ')}"
 
 
-def fault_text(fault: Fault, value: float, drive_error: int) -> FaultText:
-    """The text of a fault with its numbers filled in; a drive that stopped because it did not hear us says so."""
+def _encoder_words(encoder_error: int) -> str:
+    if encoder_error == ENCODER_RESTARTED:
+        return "the encoder node restarted"
+    return f"the encoder node's error code is {emergency_text(encoder_error)}"
+
+
+def fault_text(
+    fault: Fault, value: float, drive_error: int, encoder_error: int = 0, *, two_encoders: bool = False
+) -> FaultText:
+    """The text of a fault with its numbers filled in; a drive that stopped because it did not hear us says so.
+
+    `encoder_error`: see `Sample.encoder_error`.  `two_encoders`: a sample is the answer of both.
+    """
     text = FAULT_TEXTS[fault]
+    if two_encoders:
+        text = TWO_ENCODER_TEXTS.get(fault, text)
+    if encoder_error and fault in TWO_ENCODER_TEXTS:
+        text = FaultText(text.happened, "an encoder with an error, or that restarted, is not believed", _ENCODER_CURE)
     happened = text.happened.format(value=value, word=_word_text(value))
     if drive_error:
         happened += f"; the drive's error code is {emergency_text(drive_error)}"
+    if encoder_error:
+        happened += f"; {_encoder_words(encoder_error)}"
     if fault in (Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED) and drive_error & 0xFF00 in _COMMUNICATION_ERRORS:
         return FaultText(
             happened,

@@ -69,10 +69,11 @@ def loop_delay_s(config: Config, histograms: Any) -> float:
     )
 
 
-def drive_fault_text(config: Config, fault: Fault, value: float, drive_error: int) -> FaultText:
-    """A fault in the words that fit the drive and its line."""
+def drive_fault_text(config: Config, fault: Fault, value: float, drive_error: int, encoder_error: int = 0) -> FaultText:
+    """A fault in the words that fit the drive, its line and the joint's encoders."""
     if not isinstance(config.drive, ElmoSerial):
-        return fault_text(fault, value, drive_error)
+        two_encoders = config.joint_encoder is not None
+        return fault_text(fault, value, drive_error, encoder_error, two_encoders=two_encoders)
     text = SERIAL_FAULT_TEXTS.get(fault) or fault_text(fault, value, 0)
     happened = text.happened.format(value=value, word=f"{round(value):X}h") if math.isfinite(value) else text.happened
     if drive_error:

@@ -183,8 +183,9 @@ class Supervisor:
         """Events in the words that fit the drive; a fault with the value that the loop has latched."""
 
         def fault_words(fault: Fault, drive_error: int) -> str:
-            value = float(loop.block.state[0].fault_value)
-            return drive_fault_text(self._config, fault, value, drive_error).happened
+            state = loop.block.state[0]
+            value, encoder_error = float(state.fault_value), int(state.fault_encoder_error)
+            return drive_fault_text(self._config, fault, value, drive_error, encoder_error).happened
 
         return EventFinder(cia402=self._config.bus.interface != SERIAL, fault_words=fault_words)
 
@@ -280,8 +281,8 @@ class Supervisor:
         fault = Fault(int(state.fault))
         text = None
         if fault is not Fault.NONE:
-            drive_error = int(state.fault_drive_error)
-            text = drive_fault_text(self._config, fault, float(state.fault_value), drive_error)
+            errors = int(state.fault_drive_error), int(state.fault_encoder_error)
+            text = drive_fault_text(self._config, fault, float(state.fault_value), *errors)
             text = self._bus_watch.explained(fault, text, int(loop.block.port[0].last_errno))
         bits = float(loop.block.port[0].bits_sent)
         return RunResult(

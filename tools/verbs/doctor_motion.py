@@ -6,11 +6,12 @@ import sys
 
 from drivers.drive import CommissioningReport
 from drivers.errors import UsageError
+from firmware_py.states import Fault
 from tools.configuration.config import Config
 from tools.inspection.drive_scale import scale_finding
 from tools.motion_check.carry_out import CheckSupervisor
 from tools.motion_check.plan import CheckPlan, make_plan, require_room
-from tools.motion_check.verdict import motion_findings
+from tools.motion_check.verdict import ended_finding, motion_findings
 from tools.output import Output
 from tools.recording.log_folder import log_path
 from tools.running.readiness import prepare_log, require_ready
@@ -63,7 +64,9 @@ def doctor_motion(config: Config, output: Output, *, assume_yes: bool, torque_Nm
         return 0
     if result.stopped_by:
         output.note(f"stopped by {result.stopped_by}; the joint is {result.drive_state}; nothing was judged")
-        return INTERRUPTED
+        if result.fault is Fault.NONE:
+            return INTERRUPTED
+        return report_findings([ended_finding(result.records, result.fault, result.fault_text)], output, "Motion")
     found += motion_findings(config, plan, result.records, result.fault, result.fault_text)
     output.note(f"  drive afterwards: {result.drive_state}; log: {result.log_path}")
     return report_findings(found, output, "Motion")
