@@ -139,6 +139,7 @@ class ElmoCommissioning:
 
     def _set_mode(self, speed: bool, found: dict[str, str], remarks: list[str]) -> MeasuredExchange:
         settings, line = self._settings, self._line
+        line.forget_verified()
         digits = settings.velocity_digits if speed else 0
         budget_Hz = highest_rate_Hz(settings.baud_rate_bitps, settings.echo, digits)
         if settings.rate_Hz > budget_Hz:

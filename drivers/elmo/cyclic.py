@@ -7,7 +7,8 @@
 The command follows the position as fast as the line allows; status and current use the rest of the cycle.
 
 A reply is only taken if its echo is the whole command (echo on), else by its order (echo off).  After three cycles
-without a reply that is due, the driver says nothing until the line is silent for a cycle, and starts again.
+without a reply that is due, the driver says nothing until the line is silent for a cycle, and starts again; the zero
+target of the dead-man and a stop are said all the same.
 
 A quick stop is no braking here: in torque mode (UM=1) the drive knows no other torque than the commanded one, and UM
 cannot change with the motor on.  So TC=0, ST and MO=0 follow each other, and friction (or a brake) stops the joint.
@@ -121,6 +122,15 @@ def _forget_expected(port: ElmoPort) -> None:
 
 
 @kernel
+def _become_quiet(port: ElmoPort) -> None:
+    port.silent_cycles = 0
+    port.resyncs += 1
+    port.lost += port.expected_count
+    port.quiet = 1
+    _forget_expected(port)
+
+
+@kernel
 def begin_cycle(port: ElmoPort, sample: Sample) -> None:
     """The question for the position; says nothing while the line must become silent."""
     port.cycle += 1
@@ -133,16 +143,11 @@ def begin_cycle(port: ElmoPort, sample: Sample) -> None:
         sample.drive_state = DriveState.UNKNOWN
     if port.quiet != 0:
         _forget_expected(port)
-        if port.heard_bytes == 0:
-            port.quiet = 0
+        port.quiet = 0 if port.heard_bytes == 0 else port.quiet + 1
     elif port.expected_count > 0:
         port.silent_cycles += 1
         if port.silent_cycles > SILENT_CYCLES:
-            port.silent_cycles = 0
-            port.resyncs += 1
-            port.lost += port.expected_count
-            port.quiet = 1
-            _forget_expected(port)
+            _become_quiet(port)
     else:
         port.silent_cycles = 0
     port.heard_bytes = 0
@@ -164,10 +169,27 @@ def _put_stop(port: ElmoPort, command: Command) -> None:
 
 
 @kernel
+def _put_dead_man(port: ElmoPort, command: Command) -> None:
+    """Target zero where the line is in disorder or full of commands without a reply; its own reply is not waited for.
+
+    In every other cycle of a disorder that lasts: the replies must not keep the line from becoming silent.
+    """
+    if port.status & _SERVO_ON == 0:
+        return
+    if port.quiet == 0 and port.expected_count > EXPECTED_MAX - 2:
+        _become_quiet(port)
+    if port.quiet % 2 != 0:
+        _put_target(port, command, False)
+        _forget_expected(port)
+
+
+@kernel
 def end_cycle(port: ElmoPort, sample: Sample, command: Command) -> None:
     """What the drive is told in this cycle, and one of the slower questions."""
     port.out_length = 0
     if command.request == DriveRequest.ENABLE:
+        if port.no_sample_cycles > port.dead_man_cycles:
+            _put_dead_man(port, command)
         if port.quiet != 0:
             return
         if port.status & _SERVO_ON != 0:
@@ -175,6 +197,8 @@ def end_cycle(port: ElmoPort, sample: Sample, command: Command) -> None:
             _put_target(port, command, heard and sample.drive_state == DriveState.ENABLED)
         elif port.has_been_on != 0 or port.fault_seen > 0:
             pass  # the drive switched itself off: never on again without the user
+        elif port.unit_mode == 0 or sample.restarts != 0:
+            pass  # its unit mode is not known, or not the one that it was commissioned for
         elif port.enable_wait_cycles == 0:
             port.enable_wait_cycles = port.enable_retry_cycles
             put_command(port, Question.MO, 1000, 0)

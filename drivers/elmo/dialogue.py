@@ -34,6 +34,7 @@ class Dialogue:
         self._clock = clock
         self.interpreter = Interpreter()
         self.retries = 0
+        self._verified: dict[tuple[str, int | None], float] = {}  # what `assign_verified` read back last
 
     def resynchronise(self) -> None:
         """End whatever half command the drive may have, and wait until the line is quiet."""
@@ -107,13 +108,37 @@ class Dialogue:
         """Set, read back and compare; returns what the drive keeps."""
         self.assign(name, value, index)
         kept = self.number(name, index)
-        if abs(kept - value) > ABSOLUTE_TOLERANCE + RELATIVE_TOLERANCE * abs(value):
+        if _differ(kept, value):
             raise DeviceError(f"{_shown(name, index)} (={value:g}) does not read back: the drive has {kept:g}")
+        self._verified[name, index] = kept
         return kept
+
+    def forget_verified(self) -> None:
+        """Commissioning begins anew, or in another unit mode."""
+        self._verified.clear()
+
+    def verify_again(self) -> None:
+        """Read everything that was verified once more; `DeviceError` if the drive has changed in the meantime."""
+        for (name, index), kept in self._verified.items():
+            found = self.number(name, index)
+            if _differ(found, kept):
+                raise changed(_shown(name, index), f"{found:g}", f"{kept:g}")
 
     def command(self, name: str) -> None:
         """A command without value, such as BG; sent once, because it may act twice."""
         self.ask(encode(name), 1)
+
+
+def _differ(found: float, wanted: float) -> bool:
+    return not abs(found - wanted) <= ABSOLUTE_TOLERANCE + RELATIVE_TOLERANCE * abs(wanted)
+
+
+def changed(shown: str, found: str, wanted: str) -> DeviceError:
+    """The error for a drive that is not as commissioning left it."""
+    return DeviceError(
+        f"the drive has changed since it was commissioned: {shown} is {found}, {wanted} was set",
+        "it was restarted, or another program has used it; start the run again",
+    )
 
 
 def _shown(name: str, index: int | None) -> str:

@@ -12,7 +12,9 @@ from drivers.elmo.codes import (
     status_text,
 )
 from drivers.elmo.commissioning import ElmoCommissioning
+from drivers.elmo.dialogue import changed
 from drivers.elmo.inspection import Fact, read_facts
+from drivers.elmo.interpreter import ReplyKind, encode
 from drivers.elmo.port import ElmoPort
 from drivers.elmo.switch_off import switch_off
 from drivers.elmo.unit_modes import set_torque_mode
@@ -26,8 +28,23 @@ class ElmoDrive(ElmoCommissioning):
     """Implements `drivers.drive.Drive`: commissioning is inherited, here are the cyclic half and making it safe."""
 
     def start_cyclic(self) -> None:
-        """From here on the loop has the line; this object is silent until `make_safe`."""
-        self._line.resynchronise()
+        """From here on the loop has the line; this object is silent until `make_safe`.
+
+        The user may have taken minutes to confirm.  A drive whose supply was switched off meanwhile, or that another
+        program has used, has its own unit mode, reference and limits again: all is read back once more before MO=1.
+        """
+        line, echo = self._line, self._settings.echo
+        line.resynchronise()
+        line.interpreter.echo = None
+        answer = line.once(encode("MO"))
+        line.interpreter.echo = echo
+        if answer.kind is ReplyKind.VALUE and answer.echoed != echo:
+            raise changed("EO", str(int(answer.echoed)), str(int(echo)))
+        line.verify_again()
+        for name in ("MO",) if self._speed_mode else ("MO", "TC"):
+            if (found := line.number(name)) != 0.0:
+                raise changed(name, f"{found:g}", "0")
+        line.resynchronise()
 
     def port(self) -> Any:
         """See `Drive.port`: an `ElmoPort`."""

@@ -72,7 +72,7 @@ class ElmoPort:
     no_sample_cycles: i8
     no_status_cycles: i8
     silent_cycles: i8  # cycles since a reply came although one was due
-    quiet: i4  # 1: says nothing until the line is silent, so that old replies are not taken for new ones
+    quiet: i4  # cycles in which it says nothing until the line is silent: old replies are not taken for new ones
     heard_bytes: i8  # in this cycle
     gone: i4  # the port has vanished
     # counters

@@ -76,13 +76,16 @@ def parse_number(line: np.ndarray, start: int, end: int) -> tuple[bool, float, b
 
 @kernel
 def _take_status(port: ElmoPort, sample: Sample, status: int) -> None:
-    """SR: servo, fault, and the unit mode, which is another one after a restart of the drive."""
+    """SR: servo, fault, and the unit mode, which is another one after a restart of the drive.
+
+    The first status counts as well: commissioning has read the unit mode back.
+    """
     port.status = status
     port.no_status_cycles = 0
     sample.status_word = status & 0x7FFFFFFF
     mode = status >> 7 & 7
     run_mode = _SPEED_MODE if port.target_is_velocity != 0 else _TORQUE_MODE
-    if port.unit_mode == run_mode and mode != run_mode:
+    if mode != run_mode and (port.unit_mode == run_mode or port.unit_mode == 0):
         sample.restarts += 1
     port.unit_mode = mode
     if status & (_FAULT | _AMPLIFIER) != 0:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
@@ -179,6 +180,30 @@ class TestSpeedMode:
             end_cycle(jog.port, jog.sample, jog.command)
             assert bytes(jog.port.out[: jog.port.out_length]).startswith(word + b"BG\r")
 
+    @pytest.mark.parametrize("noise", [b"", b"\x55\x13"], ids=["silent", "chattering"])
+    def test_the_dead_man_stops_the_jog_on_a_silent_and_on_a_chattering_line(self, jog: Talk, noise: bytes) -> None:
+        jog.cycle(velocity_radps=0.5, count=4)
+        jog.mute = True
+        said = []
+        for _ in range(24):
+            jog.hear(noise)
+            said.append(b"JV=0 BG" in b" ".join(jog.cycle(velocity_radps=0.5)))
+            jog.hear(noise)
+        dead_man = int(jog.port.dead_man_cycles)
+        assert not any(said[:dead_man])
+        assert all(a or (noise and b) for a, b in itertools.pairwise(said[dead_man:]))
+        assert jog.device.m.jog_cps == 0.0
+
+    @pytest.mark.parametrize("lost_cycles", range(1, 18))
+    def test_its_twin_a_line_that_comes_back_jogs_on(self, jog: Talk, lost_cycles: int) -> None:
+        jog.cycle(velocity_radps=0.5, count=4)
+        jog.mute = True
+        said = [line for _ in range(lost_cycles) for line in jog.cycle(velocity_radps=0.5)]
+        assert (b"JV=0" in said) == (lost_cycles > jog.port.dead_man_cycles)
+        jog.mute = False
+        jog.cycle(velocity_radps=0.5, count=5)
+        assert (jog.port.no_sample_cycles, jog.device.m.jog_cps) == (0, 41722)
+
     def test_a_restart_shows_by_the_unit_mode_and_nothing_is_begun_in_another_one(self, jog: Talk) -> None:
         jog.cycle(velocity_radps=0.5, count=4)
         assert jog.sample.restarts == 0
@@ -304,6 +329,34 @@ class TestFaultsOfTheLine:
         end_cycle(talk.port, talk.sample, talk.command)
         assert b"TC=0.000\r" in bytes(talk.port.out[: talk.port.out_length])
 
+    @pytest.mark.parametrize("noise", [b"", b"\x55\x13"], ids=["silent", "chattering"])
+    def test_the_dead_man_speaks_on_a_silent_and_on_a_chattering_line(self, talk: Talk, noise: bytes) -> None:
+        talk.enabled().cycle(torque_Nm=24.2, count=4)
+        assert talk.device.m.torque_A == 2.0
+        talk.mute = True
+        zero_said = []
+        for _ in range(24):
+            talk.hear(noise)
+            zero_said.append(b"TC=0.000" in talk.cycle(torque_Nm=24.2))
+            talk.hear(noise)
+        dead_man = int(talk.port.dead_man_cycles)
+        assert not any(zero_said[:dead_man])
+        if noise:
+            assert all(a or b for a, b in itertools.pairwise(zero_said[dead_man:]))
+        else:
+            assert all(zero_said[dead_man:])
+        assert talk.device.m.torque_A == 0.0
+
+    @pytest.mark.parametrize("lost_cycles", range(1, 18))
+    def test_its_twin_a_line_that_comes_back_is_used_again(self, talk: Talk, lost_cycles: int) -> None:
+        talk.enabled().cycle(torque_Nm=24.2, count=4)
+        talk.mute = True
+        said = [line for _ in range(lost_cycles) for line in talk.cycle(torque_Nm=24.2)]
+        assert (b"TC=0.000" in said) == (lost_cycles > talk.port.dead_man_cycles)
+        talk.mute = False
+        talk.cycle(torque_Nm=24.2, count=5)
+        assert (talk.port.no_sample_cycles, talk.device.m.torque_A) == (0, 2.0)
+
     def test_a_stop_is_said_even_while_the_line_is_in_disorder(self, talk: Talk) -> None:
         talk.enabled()
         talk.mute = True
@@ -396,6 +449,16 @@ class TestFaultsOfTheDrive:
         talk.cycle(count=4)
         assert talk.sample.restarts == 1
         assert talk.sample.drive_state == DriveState.OFF
+
+    def test_a_restart_before_the_first_status_is_one_and_nothing_is_switched_on(self, talk: Talk) -> None:
+        talk.device.execute(b"UM=5")
+        talk.cycle(DriveRequest.OFF, count=2)
+        assert talk.sample.restarts == 1
+        said = [line for _ in range(2 * int(talk.port.enable_retry_cycles)) for line in talk.cycle()]
+        assert (b"MO=1" in said, talk.device.m.motor_on, talk.sample.restarts) == (False, 0, 1)
+
+    def test_without_a_status_nothing_is_switched_on(self, talk: Talk) -> None:
+        assert b"MO=1" not in talk.cycle()
 
     def test_its_twin_a_drive_that_goes_off_and_stays_in_torque_mode_has_not_restarted(self) -> None:
         talk = Talk().enabled()

@@ -271,6 +271,75 @@ class TestSpeedMode:
         assert (port.device.m.motor_on, port.device.jog_cps) == (0, 0.0)
 
 
+def its_supply_is_switched_off_and_on(port: MemoryPort) -> None:
+    port.device.restart()
+
+
+def somebody_sends(line: bytes) -> Callable[[MemoryPort], None]:
+    return lambda port: port.device.execute(line) and None
+
+
+def it_says_another_torque(port: MemoryPort) -> None:
+    port.answer = lambda line, reply: reply[:-5] + b"500;" if line == b"TC" else reply
+
+
+class TestWhileTheQuestionIsOpen:
+    """The user may take minutes to confirm what commissioning has found."""
+
+    @pytest.mark.parametrize("echo", [True, False])
+    @pytest.mark.parametrize(
+        "happens",
+        [
+            its_supply_is_switched_off_and_on, it_says_another_torque,
+            *[somebody_sends(b) for b in (b"UM=5", b"RM=1", b"PL[1]=6.1", b"CL[1]=4.9", b"HL[2]=200000", b"MO=1")],
+        ],
+    )  # fmt: skip
+    def test_a_drive_that_has_changed_is_not_started(
+        self, port: MemoryPort, happens: Callable[[MemoryPort], None], echo: bool
+    ) -> None:
+        drive = port.drive(echo=echo)
+        drive.commission()
+        happens(port)
+        port.commands.clear()
+        with pytest.raises(DeviceError, match="has changed since it was commissioned") as caught:
+            drive.start_cyclic()
+        assert "start the run again" in caught.value.hint
+        assert not any(b"=" in line for line in port.commands)
+
+    @pytest.mark.parametrize("line", [b"UM=1", b"JV=5", b"AC=1000000", b"PM=0", b"PL[1]=9"])
+    def test_nor_one_in_speed_mode(self, port: MemoryPort, line: bytes) -> None:
+        drive = port.drive(mode="speed", rate_Hz=100.0)
+        drive.commission()
+        drive.start_cyclic()
+        port.device.execute(line)
+        with pytest.raises(DeviceError, match="has changed since it was commissioned"):
+            drive.start_cyclic()
+
+    def test_its_twin_torque_mode_because_speed_mode_was_refused(self, port: MemoryPort) -> None:
+        port.answer = lambda line, reply: b"SD\r1;" if line == b"SD" else reply
+        drive = port.drive(mode="auto", rate_Hz=100.0)
+        drive.commission()
+        port.device.execute(b"PM=0")  # of no importance in torque mode
+        drive.start_cyclic()
+        assert drive.port()[0].target_is_velocity == 0
+
+    @pytest.mark.parametrize("echo", [True, False])
+    def test_its_twin_nothing_has_changed(self, port: MemoryPort, echo: bool) -> None:
+        drive = port.drive(echo=echo)
+        drive.commission()
+        for line in (b"PL[1]=6.01", b"UM=1"):
+            port.device.execute(line)
+        drive.start_cyclic()
+        assert {b"UM", b"RM", b"TC", b"MO", b"CL[1]", b"PL[1]", b"HL[2]", b"LL[3]"} <= set(port.commands[-20:])
+
+    def test_a_drive_that_has_gone_is_not_started(self, port: MemoryPort) -> None:
+        drive = port.drive()
+        drive.commission()
+        port.answer = lambda line, reply: b""
+        with pytest.raises(NoDeviceError):
+            drive.start_cyclic()
+
+
 class TestClearFault:
     def test_a_latched_fault_is_cleared_and_the_motor_is_off(self, port: MemoryPort) -> None:
         port.device.execute(b"MO=1")
