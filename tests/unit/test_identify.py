@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -105,6 +106,15 @@ def test_the_identified_curve_comes_back_out_of_the_configuration(sweep, config)
     velocity = np.concatenate([np.linspace(-200.0, -3.0, 150), np.linspace(3.0, 200.0, 150)]) * DEGREE
     truth = friction_curve_Nm(paper_friction(), velocity)
     assert np.max(np.abs(friction_curve_Nm(constants, velocity) - truth)) < 0.03 * np.max(np.abs(truth))
+
+
+@pytest.mark.parametrize("used", [False, True])
+def test_a_law_that_does_not_use_what_was_identified_is_told(sweep, config, used):
+    if not used:
+        config.write_text(re.sub(r'feed_forward = "\w+"', 'feed_forward = "none"', config.read_text()))
+    out = output()
+    identify(sweep, out, into=config, options=QUICK)
+    assert ("leaves the friction to the feedback" in out.stderr.getvalue()) != used
 
 
 def test_comments_and_other_sections_of_the_configuration_stay(sweep, config):

@@ -168,3 +168,35 @@ def test_pushing_counts_from_the_beginning_again(stuck: tuple[Any, Any], by: str
         state.frozen_samples = 0
     check_reading(axis, state)
     assert (state.pushed_cycles, state.fault) == (0, Fault.NONE)
+
+
+@pytest.mark.parametrize(
+    ("what", "fault", "told"),
+    [
+        ("bus_errors", Fault.BUS_ERROR, False),
+        ("supervisor", Fault.SUPERVISOR_LOST, False),
+        ("skipped", Fault.OVERRUN, False),
+        ("suspended", Fault.SUSPENDED, False),
+        ("sample_age_cycles", Fault.STALE_SAMPLE, True),
+        ("heartbeat_age_cycles", Fault.DRIVE_SILENT, True),
+    ],
+)
+def test_the_error_code_of_the_drive_belongs_to_faults_that_the_drive_has_a_part_in(
+    axis_constants: Any, what: str, fault: Fault, told: bool
+) -> None:
+    """With limits of one cycle, the smallest that are no limit of zero, which means none."""
+    axis = axis_constants[0]
+    axis.limits.sample_age_max_cycles = axis.limits.heartbeat_age_max_cycles = 1
+    axis.limits.skipped_max_cycles = axis.sequence.supervisor_max_cycles = 1
+    state, sample = new(AxisState)[0], new(Sample)[0]
+    reset_axis(axis, state)
+    state.phase, sample.drive_state, sample.drive_error = AxisPhase.TRACKING, DriveState.ENABLED, 0x2310
+    if what in ("bus_errors", "heartbeat_age_cycles"):
+        sample[what] = 2
+    elif what == "sample_age_cycles":
+        state.sample_age_cycles = 2
+    if what == "suspended":
+        check_suspension(state, 2.0)
+    else:
+        check_surroundings(axis, state, sample, 2 * (what == "skipped"), 2 * (what == "supervisor"))
+    assert (state.fault, state.fault_drive_error) == (fault, 0x2310 if told else 0)

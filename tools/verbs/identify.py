@@ -49,6 +49,14 @@ def _limits(into: Path | None, config: Path | None, output: Output) -> JointLimi
         return None
 
 
+def _not_compensated(path: Path) -> bool:
+    """Whether the configuration has a friction section that its law does not use; False if it cannot be read yet."""
+    try:
+        return load_config(path).control.feed_forward == "none"
+    except ConfigurationError:
+        return False
+
+
 def remarks(found: Identification) -> list[str]:
     """Comment lines above the section: where the numbers come from."""
     swarm = found.options.swarm
@@ -128,6 +136,8 @@ def identify(
     output.result(identification_report(found), {**result, "files": [str(p) for p in files]})
     for path in ([into] if into is not None else []) + list(files):
         output.note(f"written: {path}")
+    if into is not None and _not_compensated(into):
+        output.warning(f'{into}: control.feed_forward (="none") leaves the friction to the feedback; "desired" uses it')
     if report is not None:
         _write_page(report, found, fit_picture, convergence, snippet(values, remarks(found)), output)
     return 0
