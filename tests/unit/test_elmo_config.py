@@ -108,6 +108,21 @@ def test_every_fault_text_takes_its_value(config: Config, fault: Fault) -> None:
     assert motor_fault_text(0x20000) in text.happened
 
 
+@pytest.mark.parametrize("fault", [fault for fault in Fault if fault is not Fault.NONE])
+def test_no_fault_speaks_of_a_watchdog_that_a_serial_drive_has_not(config: Config, fault: Fault) -> None:
+    text = drive_fault_text(config, fault, 5.0, 0)
+    assert "watchdog" not in f"{text.happened} {text.cause} {text.next_step}"
+
+
+def test_after_standby_the_user_hears_that_the_drive_held_its_torque(config: Config) -> None:
+    text = drive_fault_text(config, Fault.SUSPENDED, 3600.0, 0)
+    assert "slept for 3600.0 s" in text.happened
+    assert "the drive held its last command meanwhile" in text.happened
+    assert "systemd-inhibit" in text.next_step
+    canopen = drive_fault_text(load_config(shipped_config("virtual")), Fault.SUSPENDED, 3600.0, 0)
+    assert "the drive's watchdog stopped the joint" in canopen.next_step
+
+
 def test_a_text_with_a_status_shows_it_in_hexadecimal(config: Config) -> None:
     assert "(SR 90h)" in drive_fault_text(config, Fault.DRIVE_FAULT, 144.0, 0).happened
     assert "CANopen" not in drive_fault_text(config, Fault.POSITION_LIMIT, 0.5, 0).happened

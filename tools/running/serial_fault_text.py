@@ -27,6 +27,11 @@ SERIAL_FAULT_TEXTS: dict[Fault, FaultText] = {
         "its supply dropped, or somebody reset it",
         "check the supply; the drive has lost its limits, start again",
     ),
+    Fault.SUSPENDED: FaultText(
+        "the computer slept for {value:.1f} s while the loop was running; the drive held its last command meanwhile",
+        "standby or hibernation: lid, power button, energy saving",
+        "make sure that the joint stands; switch standby off, or try systemd-inhibit --what=sleep jointctl ...",
+    ),
     Fault.DRIVE_FAULT: FaultText(
         "the drive switched its motor off because of a fault (SR {word})",
         "see the drive's motor fault",

@@ -31,6 +31,7 @@ from tools.running.bus_watch import BusWatch, bus_watch
 from tools.running.events import EventFinder, phase_name
 from tools.running.frame_recorder import FrameRecorder, recording
 from tools.running.guard_handle import GUARD_ENDED, GuardHandle, start_guard
+from tools.running.kept_awake import kept_awake
 from tools.running.live_panel import Display, PhaseLines, Snapshot
 from tools.running.loop_handle import LoopHandle
 from tools.running.open_drive import check_cyclic_rate, drive_fault_text, loop_delay_s, open_drive
@@ -60,8 +61,7 @@ class Supervisor:
         allow_low_margin: bool = False,
         display: Callable[[], Display] | None = None,
     ) -> None:
-        self._config = config
-        self._output, self._log_path, self._confirm = output, log_path, confirm
+        self._config, self._output, self._log_path, self._confirm = config, output, log_path, confirm
         self._allow_low_margin = allow_low_margin
         self._phase = AxisPhase.WAITING
         self._delay_s: float | None = None
@@ -86,6 +86,7 @@ class Supervisor:
             LoopHandle(config, self._table(), tail_path) as loop,
             recording(config) as self._recorder,
             bus_watch(config) as self._bus_watch,
+            kept_awake(config, self._output),
         ):
             signals, drive = self.signals, open_drive(config)
             try:
@@ -227,16 +228,9 @@ class Supervisor:
             self._orders.keep(records)
         for event in self._events.take(records):
             self._tell(log, event)
-        self._display.show(
-            Snapshot(
-                records[-1],
-                int(loop.block.words[Word.SKIPPED]),
-                loop.block.histograms,
-                self._config.trajectory.duration_s,
-                self._config.bus.interface != SERIAL,
-                records,
-            )
-        )
+        skipped, histograms = int(loop.block.words[Word.SKIPPED]), loop.block.histograms
+        duration_s, cia402 = self._config.trajectory.duration_s, self._config.bus.interface != SERIAL
+        self._display.show(Snapshot(records[-1], skipped, histograms, duration_s, cia402, records))
 
     def _keep(self, records: Any, log: RunLogWriter, kept: KeptRecords) -> None:
         """What becomes of new records: the log, and `kept` for the summary at the end."""
