@@ -5,6 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+UNTOUCHED = "untouched"  # of `Drive.make_safe`: this program has not taken the drive over
+SAFE_STATES = ("switch on disabled", "fault", "off")
+
+
+def is_safe(state: str) -> bool:
+    """Whether the drive's words for its state mean that its power stage is off ("fault reaction active" does not)."""
+    return state.partition(",")[0] in SAFE_STATES
+
 
 @dataclass(frozen=True)
 class DriveIdentity:

@@ -60,20 +60,35 @@ def _record_of(objects: ObjectAccess, rpdo_id: int) -> tuple[int, int]:
 
 
 def arm_rpdo_deadline(objects: ObjectAccess, settings: CanopenSettings, rpdo_id: int) -> tuple[str, list[str]]:
-    """Event timer of the loop's RPDO (CiA 301: deadline monitoring, EMCY 8250h); ("", remarks) where there is none.
-
-    The PDO is disabled while it is written, as some drives insist.
-    """
+    """Event timer of the loop's RPDO (CiA 301: deadline monitoring, EMCY 8250h); ("", remarks) where there is none."""
     base, cob_id = _record_of(objects, rpdo_id)
     if not objects.has(base, EVENT_TIMER):
         return "", [f"no object {base:04X}:5 (RPDO event timer): {_ALONE}"]
     milliseconds = rpdo_deadline_ms(settings)
+    error = _write_event_timer(objects, base, cob_id, milliseconds)
+    if error is not None:
+        return "", [f"{error.message}: {_ALONE}"]
+    return f"{milliseconds} ms", []
+
+
+def _write_event_timer(objects: ObjectAccess, base: int, cob_id: int, milliseconds: int) -> DeviceError | None:
+    """Why the drive does not take it, or None.  The PDO is disabled meanwhile, as some drives insist."""
     what = f"PDO {base:04X} COB-ID"
     objects.write(base, 1, cob_id | DISABLED, what=what)
     try:
         objects.write_verified(base, EVENT_TIMER, milliseconds, what="RPDO event timer")
     except DeviceError as error:
-        return "", [f"{error.message}: {_ALONE}"]
+        return error
     finally:
         objects.write_verified(base, 1, cob_id, what=what)
-    return f"{milliseconds} ms", []
+    return None
+
+
+def clear_rpdo_deadlines(objects: ObjectAccess) -> None:
+    """Event timers of all RPDOs to zero: which one an earlier run has armed is not known."""
+    for base in pdos_of(objects, COMMUNICATION_RPDO):
+        if objects.has(base, EVENT_TIMER) and objects.read(base, EVENT_TIMER, what="RPDO event timer"):
+            cob_id = objects.read(base, 1, what=f"PDO {base:04X} COB-ID") & 0xFFFFFFFF
+            error = _write_event_timer(objects, base, cob_id, 0)
+            if error is not None:
+                raise error

@@ -12,8 +12,8 @@ import can
 import canopen
 
 from drivers.canopen.bus_watchers import BusFailure, refuse_second_controller
-from drivers.canopen.cia402 import ControlWord, State, decode_state
 from drivers.canopen.commissioning import VELOCITY_MODES, Findings, commission
+from drivers.canopen.connection_loss import clear_rpdo_deadlines
 from drivers.canopen.eds_file import read_eds
 from drivers.canopen.encoder_end import EncoderEnd
 from drivers.canopen.encoder_settings import DRIVE_RANGE_COUNTS
@@ -22,18 +22,13 @@ from drivers.canopen.object_access import ATTEMPTS as SDO_ATTEMPTS
 from drivers.canopen.object_access import ObjectAccess
 from drivers.canopen.scaling import joint_angle_per_count_rad, new_port, start_position_rad
 from drivers.canopen.settings import CanopenSettings
+from drivers.canopen.switch_off import NMT_PRE_OPERATIONAL, SDO_TIMEOUT_S, SwitchOff
 from drivers.canopen.watchdog_proof import prove_watchdog
-from drivers.drive import CommissioningReport
+from drivers.drive import UNTOUCHED, CommissioningReport
 from drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
 
-SDO_TIMEOUT_S = 0.3
 SEARCH_S = 0.3
-NMT_PRE_OPERATIONAL = 128
 NMT_OPERATIONAL = 1
-NMT_STOPPED = 2
-SAFE_ATTEMPTS = 5
-QUICK_STOP_S = 1.0  # how long a moving joint may brake before its power is taken
-SAFE_POLL_S = 0.02
 REOPEN_ATTEMPTS = 10
 REOPEN_PAUSE_S = 0.3  # an adapter that was plugged in again needs a second or two
 
@@ -57,6 +52,8 @@ class CanopenDrive:
         self._sleep = sleep
         self._findings: Findings | None = None
         self._taken = False  # whether the drive has heard anything from us
+        self._started = False  # whether the loop may send SYNC
+        self._stopping = False  # on the user's word, whoever controls it
         self._reopen = reopen
         self._lent = False
         # the library warns about every heartbeat state and unknown frame; what matters is told by this driver
@@ -79,6 +76,8 @@ class CanopenDrive:
         except ConfigurationError:
             self.close()
             raise
+        encoder = settings.joint_encoder.node if settings.joint_encoder is not None else None
+        self._switch_off = SwitchOff(self._network, settings.node, self._objects, encoder, sleep)
 
     def _find(self) -> None:
         """Make sure that the node answers, also one that is still booting; else say who does.
@@ -117,7 +116,7 @@ class CanopenDrive:
         """See `Drive.commission`; the node is left in pre-operational."""
         try:
             refuse_second_controller(self._network, self._sleep)
-            self._taken = True
+            self._taken, self._started = True, False
             # first: a node that its watchdog or an earlier run left in "stopped" does not answer SDO
             self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
             self._find()
@@ -153,7 +152,8 @@ class CanopenDrive:
         """NMT operational: PDOs are valid from here on.  The drive stays disabled until the loop enables it.
 
         The user may have taken minutes to confirm.  A drive that was switched off meanwhile, or that another program
-        has made safe, has lost its watchdog or its limits: everything is read back once more.
+        has made safe, has lost its watchdog or its limits: everything is read back once more.  `BusError` if another
+        controller is active by now.
         """
         if self._findings is None:
             raise DeviceError("the drive has not been commissioned")
@@ -165,6 +165,9 @@ class CanopenDrive:
                     f"node {self._settings.node}: 6061 shows mode {shown}, it was {self._findings.mode:d}"
                 )
             self._encoder.verify_again()
+            # whoever came after our commissioning has the drive: its load must not be dropped by our controlword
+            refuse_second_controller(self._network, self._sleep)
+            self._started = True
             self._encoder.tell(NMT_OPERATIONAL)
             self._node.nmt.send_command(NMT_OPERATIONAL)
         except can.CanError as error:
@@ -206,13 +209,18 @@ class CanopenDrive:
         )
 
     def make_safe(self) -> str:
-        """Pre-operational, quick stop if it is enabled, then controlword 0 until the statusword says disabled.
+        """See `SwitchOff.make_safe`.
 
-        NMT stop if SDO does not answer.  The controlword is also in an RPDO, so leave operational first: two writers
-        would fight over it.  A drive that `commission` has not taken over is left alone: it may be another's.
+        A drive that `commission` has not taken over is left alone, and so is one that another controller has taken
+        before our loop was started: its motion is not ours to end.
         """
         if not self._taken:
-            return "untouched"
+            return UNTOUCHED
+        if not self._started and not self._stopping:
+            try:
+                refuse_second_controller(self._network, self._sleep)
+            except BusError:
+                return UNTOUCHED
         try:
             self._take_back()
         except JointctlError as error:
@@ -220,57 +228,11 @@ class CanopenDrive:
                 f"unknown: the bus cannot be opened again ({error.message}); the loop's heartbeat has ended, "
                 f"the drive's own watchdog stops the joint within {self._settings.heartbeat_s:g} s"
             )
-        try:
-            return self._off()
-        except JointctlError:
-            pass
-        except can.CanError as error:
-            return f"unknown: the bus does not take frames any more ({error})"
-        # the watchdog may have put the node into "stopped" in this very moment, where it does not answer SDO
-        try:
-            return self._off()
-        except JointctlError as error:
-            try:
-                self._node.nmt.send_command(NMT_STOPPED)
-            except can.CanError:
-                return f"unknown: {error}; the bus does not take frames any more"
-            return f"unknown: {error}; NMT stop was sent"
-        except can.CanError as error:
-            return f"unknown: the bus does not take frames any more ({error})"
-
-    def _off(self) -> str:
-        """One attempt of `make_safe`; the state in words."""
-        state = State.UNDEFINED
-        self._encoder.tell(NMT_PRE_OPERATIONAL)
-        self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
-        self._brake()
-        for _ in range(SAFE_ATTEMPTS):
-            self._objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
-            state = State(decode_state(self._objects.read(0x6041, what="statusword")))
-            if state in (State.SWITCH_ON_DISABLED, State.FAULT):
-                break
-            self._sleep(SAFE_POLL_S)
-        self._objects.write_if_present(0x6071, 0, 0, what="target torque")
-        self._objects.write_if_present(0x60FF, 0, 0, what="target velocity")
-        # our heartbeat has ended with the loop; disabled, the drive need not watch it any more.  A drive that did
-        # not obey keeps its watchdog: nothing else is left to stop it.
-        if state in (State.SWITCH_ON_DISABLED, State.FAULT):
-            self._objects.write_if_present(0x1016, 1, 0, what="consumer heartbeat time")
-        return state.name.lower().replace("_", " ")
-
-    def _brake(self) -> None:
-        """If the drive is enabled, its quick stop, until it is off or QUICK_STOP_S is over."""
-        for attempt in range(round(QUICK_STOP_S / SAFE_POLL_S)):
-            state = decode_state(self._objects.read(0x6041, what="statusword"))
-            if state not in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE):
-                return
-            if attempt == 0 and state == State.OPERATION_ENABLED:
-                self._objects.write(0x6040, 0, ControlWord.QUICK_STOP, what="controlword")
-            self._sleep(SAFE_POLL_S)
+        return self._switch_off.make_safe()
 
     def stop_now(self) -> str:
         """Stop and disable the drive whoever controls it: leaving operational takes it from another controller."""
-        self._taken = True
+        self._taken = self._stopping = True
         return self.make_safe()
 
     def clear_fault(self) -> str:
@@ -281,7 +243,7 @@ class CanopenDrive:
         self._find()
         # nobody sends a heartbeat now: a watchdog that is still armed would keep its fault alive
         self._objects.write_if_present(0x1016, 1, 0, what="consumer heartbeat time")
-        self._objects.write_if_present(0x1400, 5, 0, what="RPDO event timer")
+        clear_rpdo_deadlines(self._objects)
         return reset_fault(self._objects, self._sleep)
 
     def close(self) -> None:

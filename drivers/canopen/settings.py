@@ -40,5 +40,5 @@ class CanopenSettings:
     boot_timeout_s: float = 0.0  # how long a drive may take to answer and to leave Not Ready to Switch On
     joint_encoder: JointEncoderSettings | None = None
     encoder_incremental: bool = False
-    sdo_timeout_s: float | None = None  # of one SDO request; None: `drive.SDO_TIMEOUT_S`
+    sdo_timeout_s: float | None = None  # of one SDO request; None: `switch_off.SDO_TIMEOUT_S`
     velocity_max_radps: float | None = None  # at the joint, for the drive's own limit in the velocity modes

@@ -14,6 +14,7 @@ from drivers.canopen import exchange
 from drivers.canopen.cia402 import ControlWord, State
 from drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES, accept_frame, end_cycle, get_i16, get_u16
 from drivers.canopen.port import FRAME_SLOTS, SCRATCH_WORDS, SLOT_RPDO, CanopenPort
+from drivers.drive import is_safe
 from drivers.errors import DeviceError
 from firmware_py.realtime import Histogram
 from firmware_py.records import Command, Sample
@@ -24,7 +25,6 @@ from hil.device_records import NmtState
 from tests.unit.test_elmo_cyclic import Talk
 from tests.unit.test_realtime import ANSWER_ns, Loop
 from tools.running.supervisor import Supervisor
-from tools.verbs.stop import is_safe
 
 ENABLED, DISABLED = 0x0637, 0x0650
 WATCHDOG = 126 << 16 | 200  # 1016:1 as configs/virtual.toml arms it
@@ -62,13 +62,13 @@ def test_make_safe_reaches_a_drive_that_its_watchdog_stops_meanwhile(
     drive = device_on_bus.drive(settings_of_virtual_joint)
     try:
         drive.commission()
-        brake = drive._brake
+        brake = drive._switch_off._brake
 
         def stopped_meanwhile() -> None:
-            drive._brake = brake
+            drive._switch_off._brake = brake
             drive._node.nmt.send_command(2)
 
-        drive._brake = stopped_meanwhile
+        drive._switch_off._brake = stopped_meanwhile
         assert drive.make_safe() == "switch on disabled"  # "stopped" answers no SDO: pre-operational once more
     finally:
         drive.close()

@@ -39,6 +39,20 @@ def test_stop_ends_a_run_of_another_terminal(bench: Any) -> None:
     assert bench.disabled()
 
 
+def test_stop_is_not_lost_to_a_file_that_is_being_edited(bench: Any) -> None:
+    config = bench.config(trajectory__duration_s=30.0)
+    bench.joint(config)
+    run = bench.start("run", config, "-y").saw("tracking")
+    path = bench.folder / config
+    path.write_text(path.read_text().replace("[control]", "[control]\nkp = -3\nki =", 1))
+    bench.run("check", config).refused(3)  # no TOML any more
+    stopped = bench.run("stop", config)
+    assert (stopped.code, "switch on disabled" in stopped.out) == (0, True), stopped
+    assert "the configuration does not hold" in stopped.err
+    run.finished(20.0).refused(7)
+    assert bench.disabled()
+
+
 def test_stop_of_a_resting_joint_is_harmless(bench: Any) -> None:
     config = bench.config()
     bench.joint(config)

@@ -164,10 +164,11 @@ def stop(
     json: Json = False,
 ) -> None:
     """Stop and disable the drive now, also while another program controls it."""
+    from tools.configuration.stop_target import GivenTarget
     from tools.verbs.stop import stop as run_stop
 
-    joint = loaded(config, interface, channel, bitrate, port, target)
-    raise typer.Exit(run_stop(joint, Output(json=json)))
+    given = GivenTarget(interface, channel, bitrate, port, target)
+    raise typer.Exit(run_stop(config_path(config), Output(json=json), given))
 
 
 @app.command("clear-fault", rich_help_panel=MOVE)

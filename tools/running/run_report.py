@@ -9,6 +9,7 @@ from firmware_py.states import Fault
 from tools.output import Output
 from tools.recording.run_figure import save_run_figure
 from tools.recording.run_summary import summary_table
+from tools.running.drive_end import require_off
 from tools.running.supervisor import RunResult
 
 INTERRUPTED = 130
@@ -17,7 +18,8 @@ INTERRUPTED = 130
 def report_run(result: RunResult, output: Output, title: str) -> int:
     """Print and save everything; returns the exit code: 0, that of `MotionFault`, or 130 after an interruption.
 
-    The cause of a fault comes before all else: on a busy computer the picture takes seconds.
+    The cause of a fault comes before all else: on a busy computer the picture takes seconds.  `DeviceError` where the
+    drive did not confirm that it is off.
     """
     if result.fault_text is not None:
         text = result.fault_text
@@ -43,6 +45,7 @@ def report_run(result: RunResult, output: Output, title: str) -> int:
         output.warning(f"{result.lost_records} log records were lost: the supervisor was too slow")
     if result.fault_text is not None:
         return MotionFault.exit_code
+    require_off(result.drive_state)
     if result.stopped_by:
         output.note(f"stopped by {result.stopped_by}; the joint is {result.drive_state}")
         return INTERRUPTED

@@ -28,6 +28,7 @@ from tools.recording.run_log import Event, RunLogWriter
 from tools.recording.run_metadata import run_metadata
 from tools.recording.run_summary import summarise
 from tools.running.bus_watch import BusWatch, bus_watch
+from tools.running.drive_end import warn_unless_off
 from tools.running.events import EventFinder, phase_name
 from tools.running.frame_recorder import FrameRecorder, recording
 from tools.running.guard_handle import GUARD_ENDED, GuardHandle, start_guard
@@ -73,11 +74,12 @@ class Supervisor:
         self._asked = StopRequest.NONE
         self.signals = StopSignals()  # that came during the run
         self._stopped_by_viewer = ""
+        self.drive_state = ""  # in words, after the run
         self._guard: GuardHandle | None = None
         self._orders: ViewerOrders | None = None  # what viewers may change, while the loop runs
 
     def run(self) -> RunResult | None:
-        """The whole run; None if the user declined.  The drive is disabled when this returns or raises."""
+        """The whole run; None if the user declined.  Afterwards the drive is off, or `drive_state` says otherwise."""
         config = self._config
         check_cyclic_rate(config)
         tail_path = self._log_path.with_suffix(".tail.mcap")
@@ -107,13 +109,11 @@ class Supervisor:
                 raise DataError(f"{self._log_path}: cannot be written: {error.strerror or error}") from None
             finally:
                 signals.raising = False
-                state = drive.make_safe()
+                self.drive_state = drive.make_safe()
                 drive.close()
                 if self._guard is not None:
-                    self._guard.release(state)
-                if state.startswith("unknown"):
-                    with contextlib.suppress(OSError):  # the terminal may have been closed
-                        self._output.warning(f"the drive did not confirm that it is off: {state}")
+                    self._guard.release(self.drive_state)
+                warn_unless_off(self.drive_state, self._output)
 
     def _table(self) -> np.ndarray:
         """Rows of the motion, (N, 5); their number is fixed before the drive is known."""

@@ -55,7 +55,7 @@ class ViewerOrders:
         if now_s - self._told_s >= SETTINGS_s:
             self._told_s = now_s
             recording = self._recording.path.name if self._recording is not None else ""
-            display.settings({**settings_of(self._changes, self._config), "recording": recording})
+            display.settings({"stage": "running", **settings_of(self._changes, self._config), "recording": recording})
 
     def _count_viewers(self, request: ViewerRequest, display: Display) -> None:
         """Whether anybody can see the joint move: told in the terminal and in the log."""

@@ -14,6 +14,8 @@ from tools.motion_check.plan import CheckPlan, make_plan, require_room
 from tools.motion_check.verdict import ended_finding, motion_findings
 from tools.output import Output
 from tools.recording.log_folder import log_path
+from tools.running import drive_end
+from tools.running.drive_end import require_off
 from tools.running.readiness import prepare_log, require_ready
 from tools.running.run_report import INTERRUPTED
 from tools.verbs.doctor import report_findings
@@ -54,14 +56,17 @@ def doctor_motion(config: Config, output: Output, *, assume_yes: bool, torque_Nm
         prepare_log(config, path, output)
         return True
 
+    supervisor = CheckSupervisor(config, output, path, confirm, plan)
     try:
-        result = CheckSupervisor(config, output, path, confirm, plan).run()
+        result = supervisor.run()
     except KeyboardInterrupt:
         output.note("interrupted; nothing moved")
+        require_off(supervisor.drive_state)
         return INTERRUPTED
     if result is None:
-        output.note("nothing moved; the drive is disabled")
+        output.note(f"nothing moved; {drive_end.words(supervisor.drive_state)}")
         return 0
+    require_off(result.drive_state)
     if result.stopped_by:
         output.note(f"stopped by {result.stopped_by}; the joint is {result.drive_state}; nothing was judged")
         if result.fault is Fault.NONE:

@@ -11,6 +11,8 @@ from drivers.errors import UsageError
 from tools.configuration.config import Config
 from tools.output import Output
 from tools.recording.log_folder import log_path
+from tools.running import drive_end
+from tools.running.drive_end import require_off
 from tools.running.envelope import motion_envelope
 from tools.running.live_panel import Display, run_display
 from tools.running.readiness import prepare_log, require_ready
@@ -44,7 +46,6 @@ def run(
         for line in motion_envelope(config, report):
             output.note(line)
         if dry_run:
-            output.note("dry run: nothing moves; the drive was commissioned and is disabled")
             return False
         require_ready(config, report, path)
         agreed = assume_yes or _ask(output)
@@ -60,10 +61,13 @@ def run(
             result = supervisor.run()
         except KeyboardInterrupt:
             output.note("interrupted; nothing moved")
+            require_off(supervisor.drive_state)
             return INTERRUPTED
     if result is None:
-        if not dry_run:
-            output.note("nothing moved; the drive is disabled")
+        left = drive_end.words(supervisor.drive_state)
+        output.note(
+            f"dry run: nothing moved; the drive was commissioned; {left}" if dry_run else f"nothing moved; {left}"
+        )
         return 0
     return report_run(result, output, title)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from drivers.drive import CommissioningReport
 from drivers.errors import JointctlError
@@ -13,8 +13,10 @@ from firmware_py.states import StopRequest
 from tools.output import Output
 from tools.recording.log_folder import log_path
 from tools.recording.run_log import read_run_log
+from tools.running.drive_end import require_off, words
 from tools.running.envelope import motion_envelope
 from tools.running.live_panel import run_display
+from tools.running.readiness import prepare_log, require_ready
 from tools.running.run_report import report_run
 from tools.running.shared_block import SERIAL
 from tools.running.supervisor import Supervisor
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
 
 HOST, PORT = "127.0.0.1", 8642
 POLL_S = 0.05
+TELL_AGAIN_S = 1.0
 PREPARED_S = 300.0  # what was found and shown holds for so long; then the run is to be prepared again
 
 
@@ -53,59 +56,76 @@ def live_scope(
     title = f"{config.path.stem}: {config.trajectory.kind}"
     order = scope_order(title, host, port, cia402=config.bus.interface != SERIAL)
     output.note(f"scope: {order.url}  (Ctrl-C ends it; nothing moves before Start on the page)")
-    code = 0
     with scope_server(order, in_charge=True, unwatched_s=unwatched_s) as feed:
+        runs = _Runs(config, output, feed, title, allow_low_margin=allow_low_margin)
         try:
-            while True:
-                code, ended = _one_run(config, output, feed, title, allow_low_margin=allow_low_margin)
-                if ended:
-                    return code
-                _wait_for_prepare(feed)
+            while not runs.one():
+                _wait_for_prepare(feed, runs.told)
+            return runs.code
         except KeyboardInterrupt:
+            require_off(runs.drive_state)
             output.note("scope ended; the drive is disabled")
-            return code
+            return runs.code
 
 
-def _one_run(
-    config: Config, output: Output, feed: ScopeFeed, title: str, *, allow_low_margin: bool
-) -> tuple[int, bool]:
-    """(exit code, whether a signal has ended the program as well)."""
-    feed.forget()
-    feed.settings({"stage": "preparing", "lines": []})
+class _Runs:
+    """One run after another, each prepared, confirmed and watched from the page."""
 
-    def confirm(report: CommissioningReport) -> bool:
-        lines = motion_envelope(config, report)
-        for line in lines:
-            output.note(line)
-        return confirmed(feed, lines)
+    def __init__(self, config: Config, output: Output, feed: ScopeFeed, title: str, *, allow_low_margin: bool) -> None:
+        self._config, self._output, self._feed, self._title = config, output, feed, title
+        self._allow_low_margin = allow_low_margin
+        self.code = 0  # exit code of the last one
+        self.drive_state = ""  # after the last one
+        self.told: dict[str, Any] = {}  # to the page, of how the last one ended
 
-    terminal = run_display(output, title)
-    supervisor = Supervisor(
-        config,
-        output,
-        log_path(config),
-        confirm,
-        allow_low_margin=allow_low_margin,
-        display=lambda: Displays([terminal(), feed]),
-    )
-    try:
-        result = supervisor.run()
-        if result is None:
-            why = "stopped before it began" if feed.stop_request() else f"not started within {PREPARED_S:g} s"
-            feed.settings({"stage": "declined", "lines": [f"{why}; nothing moved"]})
-            return 0, False
-        code = report_run(result, output, title)
-    except ServerGone:
-        raise
-    except JointctlError as error:
-        output.error(error.message, error.hint)
-        feed.settings({"stage": "ended", "lines": [error.message, error.hint]})
-        return error.exit_code, supervisor.signals.count > 0
-    lines = [f"log      {result.log_path}", f"drive    {result.drive_state}"]
-    if result.summary.error is not None:
-        lines.insert(0, f"error    RMSE {result.summary.error.rmse_rad * 1e3:.3f} mrad")
-    feed.settings({"stage": "ended", "lines": lines})
-    return code, result.stopped_by.startswith("SIG")
+    def _tell(self, stage: str, lines: list[str]) -> None:
+        self.told = {"stage": stage, "lines": lines}
+        self._feed.settings(self.told)
+
+    def one(self) -> bool:
+        """Prepare, wait for Start, run, report; whether a signal has ended the program as well."""
+        output, feed, path = self._output, self._feed, log_path(self._config)
+        feed.forget()
+        self._tell("preparing", [])
+
+        def confirm(report: CommissioningReport) -> bool:
+            lines = motion_envelope(self._config, report)
+            for line in lines:
+                output.note(line)
+            require_ready(self._config, report, path)
+            agreed = confirmed(feed, lines)
+            if agreed:
+                prepare_log(self._config, path, output)
+            return agreed
+
+        terminal = run_display(output, self._title)
+        supervisor = Supervisor(
+            self._config, output, path, confirm, allow_low_margin=self._allow_low_margin,
+            display=lambda: Displays([terminal(), feed]),
+        )  # fmt: skip
+        try:
+            try:
+                result = supervisor.run()
+            finally:
+                self.drive_state = supervisor.drive_state
+            if result is None:
+                self.code = 0
+                why = "stopped before it began" if feed.stop_request() else f"not started within {PREPARED_S:g} s"
+                self._tell("declined", [f"{why}; nothing moved; {words(self.drive_state)}"])
+                return False
+            self.code = report_run(result, output, self._title)
+        except ServerGone:
+            raise
+        except JointctlError as error:
+            output.error(error.message, error.hint)
+            self.code = error.exit_code
+            self._tell("ended", [error.message, error.hint])
+            return supervisor.signals.count > 0
+        lines = [f"log      {result.log_path}", f"drive    {result.drive_state}"]
+        if result.summary.error is not None:
+            lines.insert(0, f"error    RMSE {result.summary.error.rmse_rad * 1e3:.3f} mrad")
+        self._tell("ended", lines)
+        return result.stopped_by.startswith("SIG")
 
 
 def confirmed(feed: ScopeFeed, lines: list[str], patience_s: float = PREPARED_S) -> bool:
@@ -122,16 +142,21 @@ def confirmed(feed: ScopeFeed, lines: list[str], patience_s: float = PREPARED_S)
             if request.kind == "start" and given == (number, True):
                 return True
         _require_server(feed)
-        if time.monotonic() - told_s > 1.0:
+        if time.monotonic() - told_s > TELL_AGAIN_S:
             told_s = time.monotonic()
             feed.settings({"stage": "ready", "number": number, "lines": lines})
         time.sleep(POLL_S)
     return False
 
 
-def _wait_for_prepare(feed: ScopeFeed) -> None:
+def _wait_for_prepare(feed: ScopeFeed, told: dict[str, Any]) -> None:
+    """Until a viewer asks for the next run.  How the last one ended is said again: a full socket may drop it."""
+    told_s = time.monotonic()
     while not any(request.kind == "prepare" for request in feed.requests()):
         _require_server(feed)
+        if time.monotonic() - told_s > TELL_AGAIN_S:
+            told_s = time.monotonic()
+            feed.settings(told)
         time.sleep(POLL_S)
 
 

@@ -2,36 +2,46 @@
 
 from __future__ import annotations
 
-from drivers.errors import DeviceError
+from pathlib import Path
+
+from drivers.can.open import open_python_can
+from drivers.canopen.switch_off import stop_node
+from drivers.errors import ConfigurationError
 from tools.configuration.config import Config
 from tools.configuration.elmo import ElmoSerial
+from tools.configuration.stop_target import CanTarget, GivenTarget, SerialTarget, stop_target
 from tools.output import Output
+from tools.running.drive_end import require_off
 from tools.running.open_drive import open_drive
 from tools.verbs.stop_serial import refuse_while_running, stop_serial
 
-SAFE_STATES = ("switch on disabled", "fault", "off")
 
+def stop(path: Path, output: Output, given: GivenTarget | None = None) -> int:
+    """Stop and disable the drive, even while another program controls it; `DeviceError` if it does not confirm.
 
-def is_safe(state: str) -> bool:
-    """Whether the drive's words for its state mean that its power stage is off ("fault reaction active" does not)."""
-    return state.partition(",")[0] in SAFE_STATES
-
-
-def stop(config: Config, output: Output) -> int:
-    """Stop and disable the drive, even while another program controls it; `DeviceError` if it does not confirm."""
-    state = stop_serial(config.drive, output) if isinstance(config.drive, ElmoSerial) else _stop_canopen(config)
+    Nothing but the address is taken from the configuration, which need not hold; what is wrong with it is told after.
+    """
+    target = stop_target(path, given)
+    state = stop_serial(target, output) if isinstance(target, SerialTarget) else _stop_canopen(target)
     output.result(f"the drive is {state}", {"drive_state": state})
-    if not is_safe(state):
-        raise DeviceError(f"the drive did not confirm that it is off (={state})", "use the emergency stop")
+    _warn_of(path, output)
+    require_off(state)
     return 0
 
 
-def _stop_canopen(config: Config) -> str:
-    drive = open_drive(config, exclusive=False)
+def _stop_canopen(target: CanTarget) -> str:
+    bus = open_python_can(target.interface, target.channel, target.bitrate_bitps, exclusive=False)
+    return stop_node(bus, target.node, encoder_node=target.encoder_node, sdo_timeout_s=target.sdo_timeout_s)
+
+
+def _warn_of(path: Path, output: Output) -> None:
+    from tools.configuration.load import load_config  # the stop itself does not wait for its modules
+
     try:
-        return drive.stop_now()
-    finally:
-        drive.close()
+        load_config(path)
+    except ConfigurationError as error:
+        for line in error.message.splitlines():
+            output.warning(f"the stop was sent, but the configuration does not hold: {line}")
 
 
 def clear_fault(config: Config, output: Output) -> int:

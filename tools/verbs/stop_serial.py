@@ -13,13 +13,14 @@ from drivers.elmo.serial_port import SerialPort
 from drivers.elmo.switch_off import switch_off
 from drivers.errors import BusError, JointctlError
 from tools.configuration.elmo import ElmoSerial
+from tools.configuration.stop_target import SerialTarget
 from tools.output import Output
 from tools.running.guard_call import GuardCall, running_supervisor
 
 SHARED_ATTEMPTS = 10  # the other user of the line takes some replies
 
 
-def stop_serial(drive: ElmoSerial, output: Output) -> str:
+def stop_serial(drive: SerialTarget, output: Output) -> str:
     """The drive's state in words after zero, stop, MO=0; raises `BusError` where the port cannot be opened at all."""
     with GuardCall(drive.port, "stop") as call:
         if call.supervisor_pid is not None:
@@ -38,7 +39,7 @@ def stop_serial(drive: ElmoSerial, output: Output) -> str:
         port.close()
 
 
-def _opened(drive: ElmoSerial, output: Output) -> tuple[SerialPort, bool]:
+def _opened(drive: SerialTarget, output: Output) -> tuple[SerialPort, bool]:
     """The port, and whether another program has it as well."""
     try:
         return SerialPort(drive.port, drive.baud_rate_bitps), False

@@ -21,6 +21,7 @@ from tools.configuration.conversions import joint_rad_per_count, torque_constant
 from tools.output import Advance, Output
 from tools.recording.log_folder import log_path
 from tools.reporting.page import check_target
+from tools.running import drive_end
 from tools.running.fault_text import FaultText, fault_text
 from tools.running.readiness import require_ready
 from tools.running.run_report import INTERRUPTED
@@ -168,10 +169,12 @@ class Sweep:
                 config, self.output, log_path(config), confirm_then_show, motion, meter,
                 lambda done_s: self._progress(bars, done_s), allow_low_margin=options.allow_low_margin,
             )  # fmt: skip
-            result = supervisor.run()
+            try:
+                result = supervisor.run()
+            finally:
+                self.drive_state = supervisor.drive_state
         if result is None:
             return None
-        self.drive_state = result.drive_state
         if meter.lost_points:
             shown = ", ".join(f"{p.velocity_radps:+.4g}" for p in meter.lost_points[:8])
             self.output.warning(f"too few samples came for {len(meter.lost_points)} points: {shown} rad/s; --resume")
@@ -190,7 +193,6 @@ class Sweep:
             for line in envelope(self.config, report, motion, points):
                 self.output.note(line)
             if self.options.dry_run:
-                self.output.note("dry run: nothing moves; the drive was commissioned and is disabled")
                 return False
             if not self.options.lockstep:
                 require_ready(self.config, report, log_path(self.config))
@@ -248,9 +250,10 @@ class Sweep:
 
     def _report(self, stopped: str | None) -> int:
         if stopped is None:
-            if not self.options.dry_run:
-                self.output.note("nothing moved; the drive is disabled")
+            left = "nothing moved; " + drive_end.words(self.drive_state)
+            self.output.note(f"dry run: {left}" if self.options.dry_run else left)
             return 0
+        drive_end.require_off(self.drive_state)
         assert self.file is not None
         done = len(self.file.done)
         data = {"points": done, "planned": len(self.plan.points), "unsettled": len(self._unsettled),
@@ -288,8 +291,10 @@ def sweep(config: Config, output: Output, out: Path, options: SweepOptions | Non
     options = options or SweepOptions()
     if not (options.assume_yes or options.dry_run or options.lockstep or sys.stdin.isatty()):
         raise UsageError("this moves the joint and there is no terminal to ask on", "give -y to move without asking")
+    command = Sweep(config, output, out, options)
     try:
-        return Sweep(config, output, out, options).run()
+        return command.run()
     except KeyboardInterrupt:
         output.note("interrupted; nothing moved")
+        drive_end.require_off(command.drive_state)
         return INTERRUPTED

@@ -1,0 +1,154 @@
+"""Taking the power from a CiA 402 drive over SDO, for whoever has to: the driver after a run, `jointctl stop`.
+
+`stop_node` needs neither a configuration that holds nor an EDS: the few objects have the types that CiA 301 and 402
+give them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from collections.abc import Callable
+from typing import Any
+
+import can
+import canopen
+from canopen.objectdictionary import ODArray, ODVariable
+
+from drivers.canopen.bus_watchers import BusFailure
+from drivers.canopen.cia402 import ControlWord, State, decode_state
+from drivers.canopen.object_access import ObjectAccess
+from drivers.canopen.standard_objects import standard_type
+from drivers.errors import DeviceError, JointctlError
+
+SDO_TIMEOUT_S = 0.3
+NMT_PRE_OPERATIONAL = 128
+NMT_STOPPED = 2
+QUICK_STOP_S = 1.0  # how long a moving joint may brake before its power is taken
+OFF_S = 1.0  # how long a drive may take to be off; some run through a brake delay of their own first
+POLL_S = 0.02
+OFF_STATES = (State.SWITCH_ON_DISABLED, State.FAULT)
+POWERED_STATES = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE)
+_OBJECTS = (0x6040, 0x6041, 0x6071, 0x60FF)
+
+
+class SwitchOff:
+    """Takes the power from one drive; `encoder_node` is brought to pre-operational with it."""
+
+    def __init__(
+        self, network: canopen.Network, node: int, objects: ObjectAccess, encoder_node: int | None,
+        sleep: Callable[[float], None],
+    ) -> None:  # fmt: skip
+        self._network, self._node, self._objects, self._encoder_node = network, node, objects, encoder_node
+        self._sleep = sleep
+
+    def _tell(self, command: int, node: int | None) -> None:
+        if node is not None:
+            self._network.send_message(0, bytes([command, node]))
+
+    def make_safe(self) -> str:
+        """Pre-operational, quick stop if it is enabled, then controlword 0 until the statusword says disabled.
+
+        NMT stop if SDO does not answer, or if the drive stays enabled.  The controlword is also in an RPDO, so leave
+        operational first: two writers would fight over it.  The state in words, "unknown: ..." if there is none.
+        """
+        try:
+            return self._attempt()
+        except JointctlError:
+            pass
+        except can.CanError as error:
+            return f"unknown: the bus does not take frames any more ({error})"
+        # the watchdog may have put the node into "stopped" in this very moment, where it does not answer SDO
+        try:
+            return self._attempt()
+        except JointctlError as error:
+            try:
+                self._tell(NMT_STOPPED, self._node)
+            except can.CanError:
+                return f"unknown: {error}; the bus does not take frames any more"
+            return f"unknown: {error}; NMT stop was sent"
+        except can.CanError as error:
+            return f"unknown: the bus does not take frames any more ({error})"
+
+    def _state(self) -> State:
+        return State(decode_state(self._objects.read(0x6041, what="statusword")))
+
+    def _attempt(self) -> str:
+        state = State.UNDEFINED
+        self._tell(NMT_PRE_OPERATIONAL, self._encoder_node)
+        self._tell(NMT_PRE_OPERATIONAL, self._node)
+        self._brake()
+        for _ in range(round(OFF_S / POLL_S)):
+            self._objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
+            state = self._state()
+            if state in OFF_STATES:
+                break
+            self._sleep(POLL_S)
+        for index, what in ((0x6071, "target torque"), (0x60FF, "target velocity")):
+            with contextlib.suppress(DeviceError):  # a drive that has no such target refuses it
+                self._objects.write_if_present(index, 0, 0, what=what)
+        words = state.name.lower().replace("_", " ")
+        if state in OFF_STATES:
+            # our heartbeat has ended with the loop; disabled, the drive need not watch it any more.  A drive that
+            # did not obey keeps its watchdog: little else is left to stop it.
+            with contextlib.suppress(DeviceError):
+                self._objects.write_if_present(0x1016, 1, 0, what="consumer heartbeat time")
+        elif state in POWERED_STATES:
+            self._tell(NMT_STOPPED, self._node)
+            return f"{words}, it did not obey; NMT stop was sent"
+        return words
+
+    def _brake(self) -> None:
+        """If the drive is enabled, its quick stop, until it is off or QUICK_STOP_S is over."""
+        for attempt in range(round(QUICK_STOP_S / POLL_S)):
+            state = self._state()
+            if state not in POWERED_STATES:
+                return
+            if attempt == 0 and state is State.OPERATION_ENABLED:
+                self._objects.write(0x6040, 0, ControlWord.QUICK_STOP, what="controlword")
+            self._sleep(POLL_S)
+
+
+def _standard_objects(node: int) -> canopen.ObjectDictionary:
+    """What `SwitchOff` uses, as the standard has it."""
+    new_dictionary: Any = canopen.ObjectDictionary
+    dictionary = new_dictionary()
+    dictionary.node_id = node
+
+    def variable(index: int, sub: int) -> Any:
+        found: Any = ODVariable(f"{index:04X}:{sub}", index, sub)
+        found.data_type = standard_type(index, sub)
+        return found
+
+    for index in _OBJECTS:
+        dictionary.add_object(variable(index, 0))
+    heartbeats: Any = ODArray("1016", 0x1016)
+    heartbeats.add_member(variable(0x1016, 0))
+    heartbeats.add_member(variable(0x1016, 1))
+    dictionary.add_object(heartbeats)
+    return dictionary
+
+
+def stop_node(
+    bus: can.BusABC,
+    node: int,
+    *,
+    encoder_node: int | None = None,
+    sdo_timeout_s: float | None = None,
+    sleep: Callable[[float], None] = time.sleep,
+) -> str:
+    """Stop and disable the drive at `node` whoever controls it; closes `bus`.  See `SwitchOff.make_safe`."""
+    logging.getLogger("canopen").setLevel(logging.CRITICAL)
+    network = canopen.Network(bus)
+    network.NOTIFIER_CYCLE = 0.05
+    on_failure: Any = BusFailure(sleep)
+    network.listeners.append(on_failure)
+    network.connect()
+    try:
+        remote = network.add_node(node, _standard_objects(node))
+        remote.sdo.RESPONSE_TIMEOUT = sdo_timeout_s or SDO_TIMEOUT_S
+        return SwitchOff(network, node, ObjectAccess(remote, "CiA 402"), encoder_node, sleep).make_safe()
+    finally:
+        with contextlib.suppress(Exception):  # what went wrong on it has been told
+            network.disconnect()

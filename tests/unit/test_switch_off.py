@@ -1,0 +1,237 @@
+"""Taking the power from a drive: without an EDS, one that is slow, one that does not obey, never another's."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import can
+import pytest
+
+from drivers.canopen.switch_off import stop_node
+from drivers.drive import UNTOUCHED, CommissioningReport, DriveIdentity, is_safe
+from drivers.errors import BusError, DeviceError
+from hil.device_records import PowerState
+from tools.output import Output
+from tools.running import supervisor as supervisor_module
+from tools.running.drive_end import require_off, words
+from tools.verbs import run as run_module
+from tools.verbs import stop as stop_module
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+ENABLED, SWITCHED_ON = 0x27, 0x23
+NMT_STOP = (0x000, b"\x02\x01")
+
+
+def bus_of(device_on_bus: Any) -> can.BusABC:
+    return can.Bus(interface="virtual", channel=device_on_bus.channel)
+
+
+def stopped(device_on_bus: Any) -> str:
+    return stop_node(bus_of(device_on_bus), 1, sdo_timeout_s=0.15, sleep=lambda s: time.sleep(s / 4.0))
+
+
+def power_up(device_on_bus: Any) -> None:
+    with bus_of(device_on_bus) as bus:
+        for control in (0x06, 0x07, 0x0F, 0x0F):
+            data = bytes((0x2B, 0x40, 0x60, 0x00, control, 0, 0, 0))
+            bus.send(can.Message(arbitration_id=0x601, data=data, is_extended_id=False))
+            time.sleep(0.05)
+    assert powered(device_on_bus)
+
+
+def powered(device_on_bus: Any) -> bool:
+    return int(device_on_bus.device.device[0].state) == PowerState.OPERATION_ENABLED
+
+
+def test_no_eds_is_needed(device_on_bus: Any) -> None:
+    power_up(device_on_bus)
+    assert stopped(device_on_bus) == "switch on disabled"
+    assert not powered(device_on_bus)
+    words_ = [data[4] for cob, data in device_on_bus.requests if cob == 0x601 and data[:3] == b"\x2b\x40\x60"]
+    assert (words_[4], words_[-1]) == (2, 0)  # after the four of power_up: quick stop, then disable voltage
+    assert NMT_STOP not in device_on_bus.requests
+
+
+def test_a_drive_that_stays_enabled_is_told_so_and_gets_nmt_stop(device_on_bus: Any) -> None:
+    device_on_bus.answers[0x6041, 0] = ENABLED
+    state = stopped(device_on_bus)
+    assert state.startswith("operation enabled,")
+    assert "NMT stop was sent" in state
+    assert not is_safe(state)
+    assert NMT_STOP in device_on_bus.requests
+
+
+def test_a_drive_that_takes_its_time_is_waited_for(device_on_bus: Any) -> None:
+    device_on_bus.sequences[0x6041, 0] = [SWITCHED_ON] * 20
+    assert stopped(device_on_bus) == "switch on disabled"
+    assert NMT_STOP not in device_on_bus.requests
+
+
+def test_nobody_answers(empty_bus: Any) -> None:
+    state = stopped(empty_bus)
+    assert state.startswith("unknown: ")
+    assert NMT_STOP in empty_bus.requests
+
+
+# --- the verb ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("spoilt", [True, False])
+def test_stop_is_sent_whatever_the_file_says_elsewhere(
+    device_on_bus: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoilt: bool, capsys: Any
+) -> None:
+    text = (CONFIGS / "virtual.toml").read_text()
+    path = tmp_path / "joint.toml"
+    path.write_text(text.replace("[control]", "[control]\nkp = -3", 1) if spoilt else text)
+    monkeypatch.setattr(stop_module, "open_python_can", lambda *_, **__: bus_of(device_on_bus))
+    power_up(device_on_bus)
+    assert stop_module.stop(path, Output()) == 0
+    assert not powered(device_on_bus)
+    told = capsys.readouterr()
+    assert "the drive is switch on disabled" in told.out
+    assert ("warning: the stop was sent, but the configuration does not hold" in told.err) is spoilt
+
+
+def test_a_stop_that_is_not_confirmed_is_an_error(
+    device_on_bus: Any, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.setattr(stop_module, "open_python_can", lambda *_, **__: bus_of(device_on_bus))
+    device_on_bus.answers[0x6041, 0] = ENABLED
+    with pytest.raises(DeviceError, match="use the emergency stop"):
+        stop_module.stop(CONFIGS / "virtual.toml", Output())
+    assert "operation enabled" in capsys.readouterr().out
+
+
+# --- another controller, after ours has commissioned ---------------------------------------------------------------
+
+
+@contextmanager
+def another_controller(device_on_bus: Any) -> Iterator[None]:
+    ended = threading.Event()
+
+    def send() -> None:
+        with bus_of(device_on_bus) as bus:
+            while not ended.wait(0.002):
+                bus.send(can.Message(arbitration_id=0x80, data=b"", is_extended_id=False))
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+@pytest.fixture
+def waiting(device_on_bus: Any, settings_of_virtual_joint: Any) -> Iterator[Any]:
+    """Commissioned; the user is being asked."""
+    drive = device_on_bus.drive(settings_of_virtual_joint)
+    drive.commission()
+    device_on_bus.requests.clear()
+    yield drive
+    drive.close()
+
+
+def commands(device_on_bus: Any) -> list[tuple[int, bytes]]:
+    """NMT commands and SDO downloads to the drive."""
+    return [(cob, data) for cob, data in device_on_bus.requests if cob == 0 or (cob == 0x601 and data[0] != 0x40)]
+
+
+def test_a_yes_that_comes_after_another_controller_is_refused(device_on_bus: Any, waiting: Any) -> None:
+    with another_controller(device_on_bus):
+        with pytest.raises(BusError, match="another controller is active"):
+            waiting.start_cyclic()
+        assert waiting.make_safe() == UNTOUCHED  # its motion is not ours to end
+        assert commands(device_on_bus) == []
+        assert waiting.stop_now() == "switch on disabled"  # the user's own word is another matter
+
+
+def test_its_twin_starts_and_is_made_safe_beside_its_own_loop(device_on_bus: Any, waiting: Any) -> None:
+    waiting.start_cyclic()
+    with another_controller(device_on_bus):  # now it may be our own loop that still sends
+        assert waiting.make_safe() == "switch on disabled"
+    assert (0x000, b"\x01\x01") in device_on_bus.requests
+
+
+def test_a_no_leaves_the_drive_to_the_other_controller(device_on_bus: Any, waiting: Any) -> None:
+    with another_controller(device_on_bus):
+        assert waiting.make_safe() == UNTOUCHED
+        assert commands(device_on_bus) == []
+    assert waiting.make_safe() == "switch on disabled"  # the twin: nobody else is there
+
+
+# --- clear-fault ---------------------------------------------------------------------------------------------------
+
+
+def test_clear_fault_takes_every_rpdo_timer_away(device_on_bus: Any, settings_of_virtual_joint: Any) -> None:
+    drive = device_on_bus.drive(settings_of_virtual_joint)
+    try:
+        objects = drive._objects
+        before = {}
+        for base, milliseconds in ((0x1400, 100), (0x1402, 70)):
+            before[base] = objects.read(base, 1, what="COB-ID")
+            objects.write(base, 5, milliseconds, what="event timer")
+        device_on_bus.requests.clear()
+        drive.clear_fault()
+        for base, cob_id in before.items():
+            assert objects.read(base, 5, what="event timer") == 0
+            assert objects.read(base, 1, what="COB-ID") == cob_id
+        written = {data[1] | data[2] << 8 for cob, data in commands(device_on_bus) if cob == 0x601}
+        assert {0x1400, 0x1402} <= written
+        assert 0x1401 not in written  # it had none
+    finally:
+        drive.close()
+
+
+# --- what a run says at its end ------------------------------------------------------------------------------------
+
+
+class NoLoop:
+    def __init__(self, *_: Any) -> None: ...
+    def __enter__(self) -> NoLoop:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+def left_by_a_dry_run(monkeypatch: pytest.MonkeyPatch, config: Any, state: str) -> int:
+    report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.0, 0.1, 1e-5)
+    drive = SimpleNamespace(commission=lambda: report, make_safe=lambda: state, close=lambda: None)
+    monkeypatch.setattr(supervisor_module, "LoopHandle", NoLoop)
+    monkeypatch.setattr(supervisor_module, "open_drive", lambda _: drive)
+    monkeypatch.setattr(supervisor_module, "start_guard", lambda *_: None)
+    return run_module.run(config, Output(), assume_yes=True, dry_run=True)
+
+
+@pytest.mark.parametrize("state", ["operation enabled, it did not obey", "quick stop active", "unknown: no answer"])
+def test_a_drive_that_is_not_off_is_never_called_disabled(
+    monkeypatch: pytest.MonkeyPatch, virtual_config: Any, capsys: Any, state: str
+) -> None:
+    with pytest.raises(DeviceError, match=f"={state}.*use the emergency stop"):
+        left_by_a_dry_run(monkeypatch, virtual_config, state)
+    told = capsys.readouterr().err
+    assert f"did not confirm that it is off: {state}; use the emergency stop" in told
+    assert "disabled" not in told
+
+
+def test_its_twin_is_off(monkeypatch: pytest.MonkeyPatch, virtual_config: Any, capsys: Any) -> None:
+    assert left_by_a_dry_run(monkeypatch, virtual_config, "switch on disabled") == 0
+    told = capsys.readouterr().err
+    assert "dry run: nothing moved; the drive was commissioned; the drive is disabled" in told
+    assert "warning" not in told
+
+
+@pytest.mark.parametrize(
+    ("state", "said"),
+    [("off", "disabled"), ("fault", "disabled"), (UNTOUCHED, "left alone: another controller"), ("", "no drive")],
+)
+def test_the_words_for_a_run_that_was_not_begun(state: str, said: str) -> None:
+    require_off(state)
+    assert said in words(state)
