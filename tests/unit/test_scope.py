@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import math
 import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,7 +26,9 @@ from tools.recording.run_log import INFO, Event
 from tools.running.live_panel import PhaseLines, Snapshot
 from tools.running.viewer_orders import UNWATCHED, ViewerOrders
 from tools.running.viewer_request import ViewerRequest
+from tools.scoping import feed as feed_module
 from tools.scoping import order as order_module
+from tools.scoping import server as server_module
 from tools.scoping.access import COOKIE, allowed
 from tools.scoping.displays import Displays
 from tools.scoping.feed import EVENT, PIECE, RECORDS, SETTINGS, ScopeFeed
@@ -136,6 +140,54 @@ def test_a_run_that_nobody_watches_brakes_if_that_is_wanted(
     time.sleep(0.4)
     assert feed.stop_request() is expected
     assert feed.stop_reason() == ("the scope: no page open for 0.3 s" if limit_s else "")
+
+
+@pytest.mark.parametrize(("limit_s", "expected"), [(None, StopRequest.NONE), (0.1, StopRequest.RAMP)])
+def test_a_server_that_hangs_counts_as_nobody(
+    ends: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch, limit_s: float | None,
+    expected: StopRequest,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(feed_module, "SILENT_S", 0.5)
+    feed = ScopeFeed(ends[0], unwatched_s=limit_s)
+    for _ in range(6):  # longer than that, but the server repeats its word
+        ends[1].send(asked("viewers", count=1))
+        time.sleep(0.15)
+        assert feed.stop_request() is StopRequest.NONE
+    assert feed.requests() == []
+    time.sleep(0.5)
+    assert feed.stop_request() is expected
+    (told,) = feed.requests()
+    assert "no word from the scope's server" in told.values["text"]
+    ends[1].send(asked("viewers", count=1))
+    assert [request.values["count"] for request in feed.requests()] == [1]
+
+
+@pytest.mark.parametrize(("present", "word"), [(True, 2), (False, 2), (None, 0)])
+def test_the_server_repeats_its_count_also_during_a_reload(
+    monkeypatch: pytest.MonkeyPatch, present: bool | None, word: int
+) -> None:
+    """present: two pages; False: they are being reloaded, which is no absence; None: nobody for longer."""
+    nicegui = pytest.importorskip("nicegui")
+    pages = [SimpleNamespace(has_socket_connection=True) for _ in range(2)]
+    monkeypatch.setattr(nicegui.Client, "instances", dict(enumerate(pages)))
+    monkeypatch.setattr(server_module, "COUNT_S", 0.02)
+    monkeypatch.setattr(server_module, "COUNT_AGAIN_S", 0.1)
+    monkeypatch.setattr(server_module, "RELOAD_S", 0.2 if present is None else 10.0)
+    told: list[int] = []
+    feed: Any = SimpleNamespace(ask=lambda request: told.append(request.values["count"]))
+
+    async def count() -> None:
+        task = asyncio.create_task(server_module.count_viewers(feed))
+        await asyncio.sleep(0.05)
+        for page in pages:
+            page.has_socket_connection = bool(present)
+        await asyncio.sleep(0.5)
+        task.cancel()
+
+    asyncio.run(count())
+    assert told[0] == 2
+    assert told[-1] == word
+    assert len(told) >= 3
 
 
 @pytest.mark.parametrize("in_charge", [True, False])

@@ -23,6 +23,11 @@ from tools.scoping.order import ScopeOrder
 RECORDS, EVENT, SETTINGS = b"R", b"E", b"S"  # first byte of a message
 REQUESTS = 16  # of viewers, at most between two looks
 PIECE = 64  # records a message; less than the buffer of the socket
+COUNT_AGAIN_S = 2.0  # how often the server tells the number of open pages, changed or not
+SILENT_S = 3.0 * COUNT_AGAIN_S  # without that word nobody is there: the server hangs, and STOP with it
+SERVER_SILENT = (
+    f"no word from the scope's server for {SILENT_S:g} s: it counts as no page open; Ctrl-C or `jointctl stop` brakes"
+)
 SERVER_ENDED = "the scope's server has ended: no page shows or stops the joint"
 
 
@@ -43,6 +48,7 @@ class ScopeFeed:
         self._reason = ""
         self._requests: deque[ViewerRequest] = deque(maxlen=REQUESTS)
         self._viewers = 0
+        self._counted_s: float | None = None  # when the server told their number last
         self._unwatched_since_s: float | None = None  # None: somebody watches, or nobody ever has
 
     def _send(self, kind: bytes, body: bytes) -> None:
@@ -95,13 +101,23 @@ class ScopeFeed:
 
     def _count_viewers(self, count: Any, text: str = "") -> None:
         """A change between nobody and somebody is passed on as a request."""
-        if not isinstance(count, int) or count == self._viewers:
+        if not isinstance(count, int):
+            return
+        self._counted_s = time.monotonic()
+        if count == self._viewers:
             return
         told = (count > 0) is not (self._viewers > 0) and (count == 0 or self._unwatched_since_s is not None)
         self._viewers = count
         self._unwatched_since_s = None if count else time.monotonic()
         if told:
             self._requests.append(ViewerRequest("viewers", "", {"count": count, "text": text}))
+
+    def _check_silence(self) -> None:
+        """Silence is no presence: from the last word on nobody is known to watch."""
+        if self._viewers and self._counted_s is not None and time.monotonic() - self._counted_s > SILENT_S:
+            last_s = self._counted_s
+            self._count_viewers(0, SERVER_SILENT)
+            self._counted_s = self._unwatched_since_s = last_s
 
     def _server_ended(self) -> None:
         if self.gone:
@@ -117,6 +133,7 @@ class ScopeFeed:
     def stop_request(self) -> StopRequest:
         """The strongest stop that a viewer, or the absence of viewers, has asked for."""
         self._receive()
+        self._check_silence()
         limit_s, since_s = self._unwatched_limit_s, self._unwatched_since_s
         if limit_s is not None and since_s is not None and time.monotonic() - since_s >= limit_s:
             self._ask_stop(1, f"the scope: no page open for {limit_s:g} s")

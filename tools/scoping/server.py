@@ -15,7 +15,7 @@ from typing import Any
 from tools.recording.run_log import Event, read_run_log
 from tools.running.viewer_request import ViewerRequest, viewer
 from tools.scoping.access import AccessControl
-from tools.scoping.feed import EVENT, RECORDS, SETTINGS
+from tools.scoping.feed import COUNT_AGAIN_S, EVENT, RECORDS, SETTINGS
 from tools.scoping.history import EVENTS, RING_RECORDS, History
 from tools.scoping.order import ScopeOrder
 
@@ -24,7 +24,6 @@ MESSAGES = 20  # that a page which was cut off for a moment gets again
 RECONNECT_S = 10.0  # a page that was cut off for less goes on where it was
 _AFTER_END_S = 1.5  # for the pages to show the end of the run
 COUNT_S = 0.5  # how often the open pages are counted
-COUNT_AGAIN_S = 2.0  # and the supervisor told, changed or not
 NICE = 5  # whoever looks on comes after the supervisor, but STOP has to arrive on a busy computer
 RELOAD_S = 3.0  # nobody for so long: the last page is closed, not reloaded
 
@@ -104,7 +103,7 @@ def stop_route(feed: Feed) -> Any:
 
 
 async def count_viewers(feed: Feed) -> None:
-    """Tell the supervisor how many pages are open; a reload is no absence."""
+    """Tell the supervisor how many pages are open, again and again; a reload is no absence."""
     from nicegui import Client
 
     told, told_s, seen_s = -1, 0.0, 0.0
@@ -113,7 +112,9 @@ async def count_viewers(feed: Feed) -> None:
         now_s = time.monotonic()
         if count:
             seen_s = now_s
-        if (count or now_s - seen_s > RELOAD_S) and (count != told or now_s - told_s > COUNT_AGAIN_S):
+        if not count and now_s - seen_s <= RELOAD_S:
+            count = told
+        if count >= 0 and (count != told or now_s - told_s > COUNT_AGAIN_S):
             told, told_s = count, now_s
             feed.ask(ViewerRequest("viewers", "server", {"count": count}))
         await asyncio.sleep(COUNT_S)
