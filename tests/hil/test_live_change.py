@@ -92,7 +92,7 @@ def test_gains_and_motions_change_on_the_way_and_are_told(bench: Any) -> None:
     assert len(told) == 4, told
     assert told[0].startswith("parameter change: control.kp 784 -> 700, control.kv 56 -> 70 (phase margin ")
     assert told[1].startswith(
-        "parameter change: motion sine -0.3500 .. +0.3500 rad, up to 0.22 rad/s -> set-point -0.3"
+        "parameter change: motion sine -0.3500 .. +0.3500 rad, up to 0.22 rad/s, until stopped -> set-point -0.3"
     )
     assert "-> sine +0.1000 .. +0.3000 rad, up to 0.314 rad/s" in told[2]
     assert "-> sine -0.3500 .. +0.3500 rad" in told[3]

@@ -87,6 +87,11 @@ class LiveChanges:
         return in_words(trajectory, speed)
 
     @property
+    def reference_rad(self) -> float:
+        """Where the joint is to be now."""
+        return float(self._block.state[0].reference.position_rad)
+
+    @property
     def under_way(self) -> bool:
         """Whether a change has not yet come to its end."""
         state = self._block.state[0]
@@ -191,5 +196,6 @@ def settings_of(changes: LiveChanges, config: Config) -> dict[str, Any]:
         "gains": {name: (low, now[name], high) for name, (low, high) in changes.limits().items()},
         "motion": changes.motion(),
         "range": (config.limits.position_min_rad, config.limits.position_max_rad),
+        "reference_rad": changes.reference_rad,
         "under_way": changes.under_way,
     }

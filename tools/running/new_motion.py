@@ -66,7 +66,11 @@ def _trajectory(config: Config, values: Mapping[str, Any]) -> Any:
 
 
 def in_words(record: Any, speed_radps: float) -> str:
-    """`sine -0.350 .. +0.350 rad, up to 0.22 rad/s`."""
+    """`sine -0.350 .. +0.350 rad, up to 0.22 rad/s`; without a duration `, until stopped`."""
+    return _what(record, speed_radps) + ("" if record.duration_s > 0.0 else ", until stopped")
+
+
+def _what(record: Any, speed_radps: float) -> str:
     kind = TrajectoryKind(int(record.kind))
     if kind is TrajectoryKind.HOLD:
         return f"set-point {record.start_rad:+.4f} rad"

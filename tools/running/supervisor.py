@@ -229,7 +229,8 @@ class Supervisor:
         for event in self._events.take(records):
             self._tell(log, event)
         skipped, histograms = int(loop.block.words[Word.SKIPPED]), loop.block.histograms
-        duration_s, cia402 = self._config.trajectory.duration_s, self._config.bus.interface != SERIAL
+        duration_s = float(loop.block.constants[0].trajectory.duration_s)  # a viewer may have changed the motion
+        cia402 = self._config.bus.interface != SERIAL
         self._display.show(Snapshot(records[-1], skipped, histograms, duration_s, cia402, records))
 
     def _keep(self, records: Any, log: RunLogWriter, kept: KeptRecords) -> None:
