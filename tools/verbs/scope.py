@@ -124,6 +124,9 @@ class _Runs:
         lines = [f"log      {result.log_path}", f"drive    {result.drive_state}"]
         if result.summary.error is not None:
             lines.insert(0, f"error    RMSE {result.summary.error.rmse_rad * 1e3:.3f} mrad")
+        if result.fault_text is not None:
+            text = result.fault_text
+            lines.insert(0, f"{result.fault.name}: {text.happened}; likely cause: {text.cause}; next: {text.next_step}")
         self._tell("ended", lines)
         return result.stopped_by.startswith("SIG")
 
