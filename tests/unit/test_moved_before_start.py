@@ -16,6 +16,9 @@ from tools.configuration.load import load_config
 from tools.configuration.records import MOVED_COUNTS, axis_constants
 from tools.motion_check.plan import check_constants, config_of_check, make_plan, motion_table
 from tools.simulation.lockstep import LockstepJoint
+from tools.sweeping.carry_out import middle_rad, sweep_constants
+from tools.sweeping.grid import both_directions, ordered_points
+from tools.sweeping.plan import PlanSettings, plan_motion, shifted
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
@@ -66,7 +69,23 @@ def test_the_tolerance(tmp_path: Path) -> None:
     assert sequence.moved_max_rad == pytest.approx(MOVED_COUNTS * math.tau / 256)
 
 
-def test_sweep_and_motion_check_look_as_well(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("by_rad", "fault"), [(0.6, Fault.MOVED_BEFORE_START), (0.04, Fault.NONE)])
+def test_a_sweep_is_not_begun_elsewhere(by_rad: float, fault: Fault) -> None:
+    joint = LockstepJoint(load_config(CONFIGS / "sweep_virtual.toml"))
+    settings = PlanSettings(
+        width_rad=0.2, acceleration_radps2=4.0, transit_radps=0.5, dwell_s=0.3, settle_s=0.1, reduction_ratio=121.0
+    )
+    motion = plan_motion(ordered_points(both_directions([0.2], 2), 1, None), settings)
+    placed = shifted(motion, middle_rad(joint.config, motion, joint.report.start_position_rad))
+    joint.table = placed.table
+    constants = sweep_constants(joint.config, joint.report, placed)
+    constants[0].sequence.supervisor_max_cycles = 0
+    run = joint.run(constants, plant_state=moved(joint, by_rad))
+    assert run.fault is fault
+    assert (run.log.drive_state == DriveState.ENABLED).any() is np.bool_(fault is Fault.NONE)
+
+
+def test_the_motion_check_looks_as_well(tmp_path: Path) -> None:
     config = config_with(tmp_path)
     plan = make_plan(config, None)
     report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.1, 0.06, 1e-5)
