@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import pytest
 
 from drivers.errors import DataError, MotionFault
+from firmware_py.records import LogRecord
+from firmware_py.schema import dtype_of
 from tools.configuration.config import Config
 from tools.recording.log_folder import log_path, remove_oldest, require_room
 from tools.running.readiness import require_ready
@@ -94,7 +96,7 @@ def test_a_disk_without_room_for_the_run_is_told(
     in_folder: Callable[..., Config], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factor: float, refused: bool
 ) -> None:
     config = in_folder()
-    needed = 10.0 * 1000.0 * (336 + 40)
+    needed = 10.0 * 1000.0 * (dtype_of(LogRecord).itemsize + 40)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, int(needed * factor)))
     if refused:
         with pytest.raises(DataError, match="MB are free, the log of this run takes about 4 MB"):
