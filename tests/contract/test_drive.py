@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import pytest
 
@@ -158,6 +158,7 @@ class TestCanopenDrive(DriveContract):
 
 class TestElmoDrive(DriveContract):
     off = "off"
+    mode: ClassVar[Literal["torque", "speed"]] = "torque"
 
     @pytest.fixture
     def bench(self) -> Iterator[Bench]:
@@ -165,6 +166,10 @@ class TestElmoDrive(DriveContract):
         with serve_virtual_elmo(config) as device:
             settings = elmo_settings(with_port_override(config, device.path), torque_constant_NmpA(config))
             # slow: a busy computer delays the virtual drive, and the measured line is not the subject here
-            drive = ElmoDrive(dataclasses.replace(settings, rate_Hz=20.0))
+            drive = ElmoDrive(dataclasses.replace(settings, rate_Hz=20.0, mode=self.mode))
             yield ElmoBench(device, drive)
             drive.close()
+
+
+class TestElmoDriveInSpeedMode(TestElmoDrive):
+    mode = "speed"
