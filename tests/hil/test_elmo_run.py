@@ -45,6 +45,18 @@ def test_a_wrong_baud_rate_is_no_device_and_says_so(serial_bench: Any) -> None:
     serial_bench.bench.run("run", config, "-y").refused(5, "baud rate")
 
 
+def test_a_drive_that_restarts_while_the_question_is_open_is_not_started(serial_bench: Any) -> None:
+    leader, follower = os.openpty()
+    run = serial_bench.bench.start("run", serial_bench.config(), stdin=follower).saw("Move the joint?")
+    serial_bench.device.restart_drive()
+    os.write(leader, b"y\n")
+    finished = run.finished()
+    finished.refused(6, "the drive has changed since it was commissioned: UM is 5, 1 was set", "start the run again")
+    assert not serial_bench.device.interpreter.m.motor_on
+    os.close(leader)
+    os.close(follower)
+
+
 def test_a_missing_port_is_a_bus_error(serial_bench: Any) -> None:
     config = serial_bench.config(drive__port=str(serial_bench.bench.folder / "none"))
     serial_bench.bench.run("run", config, "-y").refused(4, "no such serial port")
