@@ -111,6 +111,16 @@ def test_samples_with_holes_prove_standstill_too(joint: LockstepJoint, one_fault
     assert run.state.phase == AxisPhase.FINISHED
 
 
+@pytest.mark.parametrize(("share", "fault"), [(0.05, Fault.NONE), (0.26, Fault.STALE_SAMPLE)])
+def test_nothing_is_enabled_on_a_bus_that_mixes_up_every_fourth_sample(
+    joint: LockstepJoint, one_fault: MakeFault, share: float, fault: Fault
+) -> None:
+    """An answer that comes after its cycle is none; the campaign took this for harmless at any time."""
+    run = joint.run_with_faults(one_fault(FaultKind.TPDO_REORDERED, 0.0, magnitude=share), epoch_at_start=True)
+    assert run.fault is fault
+    assert (PowerState.OPERATION_ENABLED in run.truth[:, TRUE_POWER_STATE]) == (fault is Fault.NONE)
+
+
 def test_a_watchdog_that_trips_is_told_by_its_error_code(joint: LockstepJoint, one_fault: MakeFault) -> None:
     """A stopped node sends no TPDO: the loop saw stale samples only, and did not tell the drive's 8130h."""
     run = joint.run_with_faults(one_fault(FaultKind.CONTROLLER_HEARTBEAT_LOST, AT_s))

@@ -95,7 +95,8 @@ _CLASSES = (
         FaultKind.RPDO_REORDERED, Sizes(_ALWAYS, (0.3, 1.0)), Sizes(_ALWAYS, (0.0, 0.3)), MOTION, on_wire=True
     ),
     FaultClass(
-        FaultKind.TPDO_REORDERED, Sizes(_ALWAYS, (0.3, 1.0)), Sizes(_ALWAYS, (0.0, 0.3)), MOTION, on_wire=True
+        # before enabling, settle_s of good samples in a row are asked for
+        FaultKind.TPDO_REORDERED, Sizes(_ALWAYS, (0.3, 1.0)), Sizes(_ALWAYS, (0.0, 0.05)), MOTION, on_wire=True
     ),
     FaultClass(FaultKind.RPDO_CORRUPTED, Sizes((0.0005, 0.003), (0.3, 1.0)), None, MOTION | DRIVE, on_wire=True),
     FaultClass(

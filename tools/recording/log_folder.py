@@ -30,14 +30,17 @@ def log_path(config: Config) -> Path:
 
 
 def require_room(config: Config, path: Path) -> None:
-    """`DataError` if the log of a run of this configuration could not be written to `path`; makes its folder."""
+    """`DataError` if the log of a run of this configuration could not be written to `path`; leaves nothing behind."""
     records = (config.trajectory.duration_s or UNKNOWN_S) * config.loop.rate_Hz
     needed = records * (MESSAGE_BYTES + (dtype_of(LogRecord).itemsize if records > IN_MEMORY else 0))
     try:
+        new = [folder for folder in (path.parent, *path.parent.parents) if not folder.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(path.parent).free
         path.touch(exist_ok=False)
         path.unlink()
+        for folder in new:
+            folder.rmdir()
     except OSError as error:
         raise DataError(f"{path}: cannot be written: {error.strerror or error}") from None
     if free < needed:
@@ -52,7 +55,7 @@ def remove_oldest(config: Config, path: Path) -> list[Path]:
 
     A run is its log with the pictures and pages beside it, by name; nothing else in the folder is touched.
     """
-    if not config.log.keep:
+    if not config.log.keep or not path.parent.is_dir():
         return []
     name = re.compile(
         rf"({re.escape(config.path.stem)}-\d{{8}}-\d{{6}}(?:-\d+)?)(?:\.tail|\.recording-\d+)?\.(?:mcap|png|html)"
