@@ -64,6 +64,19 @@ def test_reset_forgets_the_run_before(axis: Any, state: Any) -> None:
     assert list(state.law.network.weights) == [0.01] * 15
 
 
+# written in a cycle before they are read in it
+WRITTEN_FIRST = {"frozen_from_rad", "frozen_at_rad", "sample_late_s", "measured_position_rad", "measured_torque_Nm"}
+
+
+def test_reset_leaves_nothing_of_the_run_before_behind(axis: Any, state: Any) -> None:
+    used = new(AxisState)[0]
+    plain = [name for name in used.dtype.names if used.dtype[name].kind in "if"]
+    for name in plain:
+        used[name] = 3
+    reset_axis(axis, used)
+    assert [name for name in plain if name not in WRITTEN_FIRST and used[name] != state[name]] == []
+
+
 @pytest.mark.parametrize("phase", AxisPhase)
 def test_torque_is_only_commanded_between_enabled_and_released(phase: AxisPhase) -> None:
     assert powered(int(phase)) is (phase.name in ("APPROACH", "TRACKING", "RAMPING", "RELEASING"))
