@@ -17,7 +17,6 @@ import os
 import signal
 import socket
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -29,11 +28,11 @@ from drivers.errors import JointctlError
 from firmware_py.libc import NANOSECONDS
 from firmware_py.realtime import Word
 from tools.analysis.idle_states import cores_awake
+from tools.running.slow_start import slow_start
 
 _MLOCK_CURRENT_AND_FUTURE = 3
 _POLL_S = 0.001
 _FOREVER = 1 << 62
-_SLOW_START_S = 4.0
 
 
 @dataclass(frozen=True)
@@ -197,11 +196,8 @@ def run(order: LoopOrder) -> int:
     else:
         loop = compiled_loop if order.interface in CYCLIC_INTERFACES else portable_loop
     text = "loop: compiling, which only the first start does; it takes a minute or two"
-    slow = threading.Timer(_SLOW_START_S, print, [text], {"file": sys.stderr, "flush": True})
-    slow.daemon = True
-    slow.start()
-    with loop(order, block) as prepared:
-        slow.cancel()
+    with slow_start(lambda: print(text, file=sys.stderr, flush=True)) as started, loop(order, block) as prepared:
+        started()
         ready = prepared if isinstance(prepared, ReadyLoop) else ReadyLoop(prepared)
         gc.collect()
         gc.freeze()

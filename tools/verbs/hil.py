@@ -5,28 +5,28 @@ from __future__ import annotations
 import contextlib
 import os
 import select
-import threading
 import time
 
 from hil.bus import default_socket_path
 from tools.configuration.config import Config
 from tools.output import Output
 from tools.running.loop_process import become_realtime
+from tools.running.slow_start import slow_start
 from tools.running.stop_signals import stop_signals
 from tools.simulation.virtual_joint import serve_virtual_joint
 
 _POLL_S = 0.05
-_SLOW_START_S = 4.0
 
 
 def hil(config: Config, output: Output, *, timing: bool = False, ready_fd: int | None = None) -> int:
     """Serve until a stop signal; `ready_fd` gets one byte once the bus can be used, and its reader's end ends us."""
     text = "virtual joint: compiling, which only the first start does; it takes a minute or two"
-    slow = threading.Timer(_SLOW_START_S, output.note, [text])
-    slow.daemon = True
-    slow.start()
-    with stop_signals() as signals, serve_virtual_joint(config, timing) as joint:
-        slow.cancel()
+    with (
+        slow_start(lambda: output.note(text)) as started,
+        stop_signals() as signals,
+        serve_virtual_joint(config, timing) as joint,
+    ):
+        started()
         # only now, and every thread: bus, drive and SDO server are compiled and run
         for line in become_realtime(None, config.loop.priority, [int(name) for name in os.listdir("/proc/self/task")]):
             output.note(f"virtual joint: {line}")
