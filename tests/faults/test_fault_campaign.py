@@ -19,6 +19,7 @@ from firmware_py.schema import new
 from firmware_py.states import AxisPhase, DriveRequest, Fault
 from hil.device_records import PowerState
 from hil.faults import FaultKind
+from hil.lockstep import TRUE_POWER_STATE, TRUTHS
 from tools.campaign import judge as judge_module
 from tools.campaign import runner
 from tools.campaign.envelope import Envelope, envelope, reaction_s
@@ -72,13 +73,13 @@ def test_number_and_seed_decide_everything(config: Config, joint: LockstepJoint)
 def good_run(cycles: int = 300, tail: int = 100) -> LockstepRun:
     """A made-up run that satisfies every invariant: off, enabled with a torque that varies, off."""
     log = new(LogRecord, cycles)
-    truth = np.zeros((cycles + tail, 4))
+    truth = np.zeros((cycles + tail, TRUTHS))
     log.time_ns = np.arange(cycles) * 1_000_000
     log.phase[:50], log.phase[50:250], log.phase[250:] = AxisPhase.WAITING, AxisPhase.TRACKING, AxisPhase.DISABLING
     log.request[50:250] = DriveRequest.ENABLE
     log.command_torque_Nm[51:240] = 10.0 * np.sin(np.arange(189) / 20.0)
-    truth[:, 3] = PowerState.SWITCH_ON_DISABLED
-    truth[53:252, 3] = PowerState.OPERATION_ENABLED
+    truth[:, TRUE_POWER_STATE] = PowerState.SWITCH_ON_DISABLED
+    truth[53:252, TRUE_POWER_STATE] = PowerState.OPERATION_ENABLED
     state = type("State", (), {"phase": AxisPhase.FINISHED, "fault_value": 0.0, "fault_drive_error": 0})()
     return LockstepRun(log, state, None, None, Fault.NONE, truth)
 
@@ -113,9 +114,9 @@ def true(column: int, rows: Any, value: Any) -> Any:
         (true(0, 399, -9.1), "position"),
         (true(1, 60, -9.1), "speed 9.10"),
         (true(1, 60, float("nan")), "not finite"),
-        (true(3, 399, PowerState.OPERATION_ENABLED), "not off and at rest"),
+        (true(TRUE_POWER_STATE, 399, PowerState.OPERATION_ENABLED), "not off and at rest"),
         (true(1, 399, 0.03), "not off and at rest"),
-        (true(3, slice(300, 310), PowerState.OPERATION_ENABLED), "enabled again 51 ms after"),
+        (true(TRUE_POWER_STATE, slice(300, 310), PowerState.OPERATION_ENABLED), "enabled again 51 ms after"),
         (set_("request", slice(260, 270), DriveRequest.ENABLE), "asked to enable again"),
         (lambda run: setattr(run.state, "phase", AxisPhase.DISABLING), "did not finish"),
     ],
@@ -129,7 +130,7 @@ def test_each_invariant_notices(spoil: Any, words: str) -> None:
 @pytest.mark.parametrize(("off_row", "late"), [(1299, False), (1302, True)])
 def test_the_time_to_stop_is_checked_at_its_boundary(off_row: int, late: bool) -> None:
     run = good_run(300, 1200)
-    run.truth[253:off_row, 3] = PowerState.QUICK_STOP_ACTIVE
+    run.truth[253:off_row, TRUE_POWER_STATE] = PowerState.QUICK_STOP_ACTIVE
     lines = judge_module._ending(run, WIDE, 300, 1e-3)[0]
     assert any("after the fault" in line for line in lines) is late
 

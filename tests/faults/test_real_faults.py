@@ -77,7 +77,8 @@ HARMFUL: list[tuple[FaultKind, float, float, tuple[Fault, ...]]] = [
     (FaultKind.SYNC_LOST, LONG, 1.0, GONE),
     (FaultKind.TPDO_LOST, LONG, 1.0, GONE),
     (FaultKind.CONTROLLER_HEARTBEAT_LOST, LONG, 1.0, (*GONE, Fault.DRIVE_NOT_ENABLED)),
-    (FaultKind.RPDO_LENGTH, LONG, 2.0, (*MOTION, *GONE)),
+    (FaultKind.RPDO_LENGTH, LONG, 2.0, (*MOTION, *GONE, Fault.DRIVE_NOT_ENABLED)),  # the last: by 1400:5
+    (FaultKind.DRIVE_HEARTBEAT_LOST, LONG, 1.0, (Fault.DRIVE_SILENT,)),
     (FaultKind.TPDO_LENGTH, LONG, 7.0, GONE),
     (FaultKind.TPDO_CORRUPTED, 0.05, 1.0, (*MOTION, Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED)),
     (FaultKind.DRIVE_REBOOT, 1.0, 1.0, (Fault.DRIVE_RESTARTED,)),
@@ -96,7 +97,7 @@ HARMLESS: list[tuple[FaultKind, float, float]] = [
     (FaultKind.RPDO_DUPLICATED, LONG, 1.0),
     (FaultKind.TPDO_DUPLICATED, LONG, 0.5),
     (FaultKind.FOREIGN_FRAMES, LONG, 3.0),
-    (FaultKind.DRIVE_HEARTBEAT_LOST, LONG, 1.0),
+    (FaultKind.DRIVE_HEARTBEAT_LOST, 0.5, 1.0),
     (FaultKind.ENCODER_JUMP, LONG, 0.0003),
     (FaultKind.LOAD_JUMP, LONG, 3.0),
 ]

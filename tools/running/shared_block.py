@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers.canopen.port import CanopenPort
 from drivers.elmo.port import ElmoPort
-from firmware_py.realtime import HISTOGRAM_BINS, WORDS, Histogram
+from firmware_py.realtime import HISTOGRAM_BINS, WORDS, Histogram, Word
 from firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
 from firmware_py.schema import dtype_of
 
@@ -69,7 +69,13 @@ class SharedBlock:
         return self._take(dtype_of(cls), count).view(np.recarray)
 
     def new_records(self, tail: int, head: int) -> tuple[Any, int]:
-        """(copy of the log records from `tail` to `head`, how many of them had been overwritten before)."""
+        """(copy of the log records from `tail` to `head`, how many of them had been overwritten before).
+
+        The loop goes on meanwhile: what it has written over while this was copying, and may be writing over now, counts
+        as lost too.
+        """
         lost = max(0, head - RING_RECORDS - tail)
-        index = np.arange(tail + lost, head) % RING_RECORDS
-        return self.ring[index], lost
+        records = self.ring[np.arange(tail + lost, head) % RING_RECORDS]
+        now = int(self.words[Word.HEAD])
+        late = min(len(records), max(0, now + 1 - RING_RECORDS - tail - lost)) if now > head else 0
+        return records[late:], lost + late
