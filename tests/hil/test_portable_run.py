@@ -155,6 +155,7 @@ def test_a_run_in_threads_on_the_bus_of_one_process(config: Config) -> None:
             reset_axis(block.constants[0], block.state[0])
             block.port[:] = drive.port()
             block.words[Word.SUPERVISOR_NS] = time.monotonic_ns()
+            loop_end.drain()  # as the loop process does until the run begins: boot-up and the watchdog's proof
             drive.start_cyclic()
             arguments = (loop_end.bus, block, PERIOD_NS, 6_000_000, 2000)
             thread = threading.Thread(target=run_portable_loop, args=arguments)
