@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
 import math
 from pathlib import Path
@@ -21,6 +22,7 @@ from tools.experiments.study_figure import save_study_figure
 from tools.experiments.study_runs import PlantResult, StudyResult, quantile, run_study, write_csv
 from tools.experiments.study_settings import StudySettings, checked, load_study, study_controllers
 from tools.output import Output
+from tools.simulation.lockstep import DirectBus
 from tools.verbs.study import INTERRUPTED, study
 
 
@@ -74,6 +76,20 @@ def test_same_seed_same_result_with_one_process_and_with_two(base: Config) -> No
     assert short_study(base, 1, 2) == alone
     assert [plant.index for plant in alone.plants] == [0, 1, 2]
     assert short_study(base, 2, 1).plants[0].figures != alone.plants[0].figures
+
+
+def test_no_bit_depends_on_how_long_commissioning_took(base: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A busy computer hands frames over later, and the device's clock goes on meanwhile."""
+    quick = short_study(base, 1, 1)
+    waits_ns = itertools.cycle((0, 1_234_567, 50_000, 777_777))
+    sleep = DirectBus.sleep
+
+    def slow(bus: DirectBus, seconds: float) -> None:
+        bus.now_ns += next(waits_ns)
+        sleep(bus, seconds)
+
+    monkeypatch.setattr(DirectBus, "sleep", slow)
+    assert short_study(base, 1, 1) == quick
 
 
 def test_an_interruption_keeps_what_is_done(base: Config) -> None:
