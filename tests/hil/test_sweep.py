@@ -271,7 +271,7 @@ def test_ctrl_c_keeps_the_rows_and_resume_measures_the_rest(joint: Any) -> None:
 def test_a_dry_run_and_a_missing_y_move_nothing(joint: Any) -> None:
     code, err = SweepProcess(joint, "joint.toml", "-o", "data.csv", "--dry-run", *SHORT).finished()
     assert code == 0, err
-    assert "nothing moves" in err
+    assert "dry run: nothing moved; the drive is disabled" in err
     code, err = SweepProcess(joint, "joint.toml", "-o", "data.csv", *SHORT).finished()
     assert code == 2, err
     assert "no terminal to ask on" in err
@@ -285,7 +285,7 @@ def test_options_type_matches_the_command(config: Config) -> None:
     from tools.cli.sweep_command import sweep_command
 
     parameters = set(signature(sweep_command).parameters) - {
-        "config", "out", "interface", "channel", "bitrate", "json", "quiet",
+        "config", "out", "interface", "channel", "bitrate", "port", "target", "json", "quiet",
     }  # fmt: skip
     assert len(parameters) == len(dataclasses.fields(SweepOptions))
 
