@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import struct
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from tools.inspection.parameters import COMMANDS, ParameterSet, differences, is_
 from tools.inspection.sdo_reading import SdoReader
 from tools.inspection.subject import Subject, canopen_network
 from tools.output import Output
-from tools.verbs import params
 from tools.verbs.params import DIFFERENT, diff, dump, place_index, restore_file
 
 EDS = shipped_config("virtual").with_name("virtual_joint.eds")
@@ -187,7 +187,7 @@ class TestRestore:
                 return True
 
         change(file, o6072="700")
-        monkeypatch.setattr(params.sys, "stdin", Terminal(answer))
+        monkeypatch.setattr(sys, "stdin", Terminal(answer))
         assert restored(device_on_bus, file, assume_yes=False) == 0
         assert bool(writes(device_on_bus)) == written
 
@@ -195,7 +195,7 @@ class TestRestore:
         self, device_on_bus: Any, file: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         change(file, o6072="700")
-        monkeypatch.setattr(params.sys, "stdin", io.StringIO("y\n"))
+        monkeypatch.setattr(sys, "stdin", io.StringIO("y\n"))
         with pytest.raises(UsageError):
             restored(device_on_bus, file, assume_yes=False)
         assert not writes(device_on_bus)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-
 from drivers.drive import CommissioningReport
-from drivers.errors import UsageError
 from firmware_py.states import Fault
 from tools.configuration.config import Config
 from tools.inspection.drive_scale import scale_finding
@@ -15,6 +12,7 @@ from tools.motion_check.verdict import ended_finding, motion_findings
 from tools.output import Output
 from tools.recording.log_folder import log_path
 from tools.running import drive_end
+from tools.running.consent import agreed, require_terminal
 from tools.running.drive_end import require_off
 from tools.running.readiness import prepare_log, require_ready
 from tools.running.run_report import INTERRUPTED
@@ -38,8 +36,8 @@ def check_envelope(config: Config, plan: CheckPlan, report: CommissioningReport)
 
 def doctor_motion(config: Config, output: Output, *, assume_yes: bool, torque_Nm: float | None = None) -> int:
     """Commission, tell, ask, pull, judge; 0, or 1 if something is wrong, 130 after an interruption."""
-    if not (assume_yes or sys.stdin.isatty()):
-        raise UsageError("this moves the joint and there is no terminal to ask on", "give -y to move without asking")
+    if not assume_yes:
+        require_terminal()
     plan = make_plan(config, torque_Nm)
     path = log_path(config)
     found = [finding for finding in (scale_finding(config),) if finding is not None]
@@ -49,10 +47,8 @@ def doctor_motion(config: Config, output: Output, *, assume_yes: bool, torque_Nm
             output.note(line)
         require_ready(config, report, path)
         require_room(config, plan, report.start_position_rad)
-        if not assume_yes:
-            output.note("Move the joint? [y/N] ")
-            if sys.stdin.readline().strip().lower() not in ("y", "yes"):
-                return False
+        if not (assume_yes or agreed(output)):
+            return False
         prepare_log(config, path, output)
         return True
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 from rich.table import Table
 
-from drivers.errors import BusError, ConfigurationError, DataError, DeviceError, UsageError
+from drivers.errors import BusError, ConfigurationError, DataError, DeviceError
 from tools.inspection import drive_words
 from tools.inspection.node_scan import Ear
 from tools.inspection.objects import Objects, Place
@@ -30,6 +29,7 @@ from tools.inspection.parameters import (
 from tools.inspection.sdo_reading import Refusal, SdoReader
 from tools.inspection.subject import Subject, canopen_network
 from tools.output import Output
+from tools.running.consent import agreed, require_terminal
 
 LISTEN_S = 0.1  # for the SYNC of another controller
 DIFFERENT = 11  # exit code of diff
@@ -133,7 +133,9 @@ def restore_file(
         output.note(f"{len(changes)} parameters differ; the drive as it is, and {path.name}:")
         if not output.quiet:
             output._messages.print(_table(objects, changes, "drive", "file"))
-        if not assume_yes and not _asked(output):
+        if not assume_yes:
+            require_terminal("this writes into the drive and there is no terminal to ask on", "give -y to write")
+        if not (assume_yes or agreed(output, "Write these into the drive?")):
             output.note("nothing was written")
             return 0
         network.send_message(0, bytes([0x80, node]))  # pre-operational: PDOs can only be changed there
@@ -142,13 +144,6 @@ def restore_file(
         values = {change.place: change.second for change in changes if change.second is not None}
         done = restore(reader, values, wanted.parameters)
     return _report(done, objects, output)
-
-
-def _asked(output: Output) -> bool:
-    if not sys.stdin.isatty():
-        raise UsageError("this writes into the drive and there is no terminal to ask on", "give -y to write")
-    output.note("Write these into the drive? [y/N] ")
-    return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 def _require_off(reader: SdoReader) -> None:

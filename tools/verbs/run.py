@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from drivers.drive import CommissioningReport
-from drivers.errors import UsageError
 from tools.configuration.config import Config
 from tools.output import Output
 from tools.recording.log_folder import log_path
 from tools.running import drive_end
+from tools.running.consent import agreed, require_terminal
 from tools.running.drive_end import require_off
 from tools.running.envelope import motion_envelope
 from tools.running.live_panel import Display, run_display
@@ -19,11 +18,6 @@ from tools.running.readiness import prepare_log, require_ready
 from tools.running.run_report import INTERRUPTED, report_run
 from tools.running.shared_block import SERIAL
 from tools.running.supervisor import Supervisor
-
-
-def _ask(output: Output) -> bool:
-    output.note("Move the joint? [y/N] ")
-    return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 def run(
@@ -39,8 +33,8 @@ def run(
 
     `scope`: host and port at which a live page is to be served.
     """
-    if not (assume_yes or dry_run or sys.stdin.isatty()):
-        raise UsageError("this moves the joint and there is no terminal to ask on", "give -y to move without asking")
+    if not (assume_yes or dry_run):
+        require_terminal()
 
     def confirm(report: CommissioningReport) -> bool:
         for line in motion_envelope(config, report):
@@ -48,10 +42,10 @@ def run(
         if dry_run:
             return False
         require_ready(config, report, path)
-        agreed = assume_yes or _ask(output)
-        if agreed:
-            prepare_log(config, path, output)
-        return agreed
+        if not (assume_yes or agreed(output)):
+            return False
+        prepare_log(config, path, output)
+        return True
 
     path = log_path(config)
     title = f"{config.path.stem}: {config.trajectory.kind}"

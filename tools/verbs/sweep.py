@@ -14,7 +14,7 @@ from typing import Any
 from rich.table import Table
 
 from drivers.drive import CommissioningReport
-from drivers.errors import MotionFault, UsageError
+from drivers.errors import MotionFault
 from firmware_py.states import Fault
 from tools.configuration.config import Config
 from tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
@@ -22,6 +22,7 @@ from tools.output import Advance, Output
 from tools.recording.log_folder import log_path
 from tools.reporting.page import check_target
 from tools.running import drive_end
+from tools.running.consent import agreed, require_terminal
 from tools.running.fault_text import FaultText, fault_text
 from tools.running.readiness import require_ready
 from tools.running.run_report import INTERRUPTED
@@ -196,10 +197,8 @@ class Sweep:
                 return False
             if not self.options.lockstep:
                 require_ready(self.config, report, log_path(self.config))
-            if not (self.options.assume_yes or self.options.lockstep):
-                self.output.note("Move the joint? [y/N] ")
-                if sys.stdin.readline().strip().lower() not in ("y", "yes"):
-                    return False
+            if not (self.options.assume_yes or self.options.lockstep or agreed(self.output)):
+                return False
             self._confirmed = True
         if self.file is None:
             constant = torque_constant_NmpA(self.config)
@@ -289,8 +288,8 @@ class Sweep:
 def sweep(config: Config, output: Output, out: Path, options: SweepOptions | None = None) -> int:
     """The whole command; returns the exit code."""
     options = options or SweepOptions()
-    if not (options.assume_yes or options.dry_run or options.lockstep or sys.stdin.isatty()):
-        raise UsageError("this moves the joint and there is no terminal to ask on", "give -y to move without asking")
+    if not (options.assume_yes or options.dry_run or options.lockstep):
+        require_terminal()
     command = Sweep(config, output, out, options)
     try:
         return command.run()
