@@ -10,19 +10,19 @@ from tools.running.slow_start import slow_start
 
 def test_a_slow_start_is_told_once() -> None:
     told = threading.Event()
-    with slow_start(told.set, 0.01):
+    with slow_start(lambda _: told.set(), "loop", 0.01):
         assert told.wait(10.0)
 
 
 def test_a_quick_one_is_not() -> None:
     told = threading.Event()
-    with slow_start(told.set, 0.2) as started:
+    with slow_start(lambda _: told.set(), "loop", 0.2) as started:
         started()
         assert not told.wait(0.4)
 
 
 def test_one_that_fails_leaves_nothing_behind_that_speaks_later() -> None:
     told = threading.Event()
-    with contextlib.suppress(ValueError), slow_start(told.set, 0.2):
+    with contextlib.suppress(ValueError), slow_start(lambda _: told.set(), "loop", 0.2):
         raise ValueError
     assert not told.wait(0.4)

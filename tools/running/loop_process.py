@@ -19,7 +19,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -28,11 +28,11 @@ from drivers.errors import JointctlError
 from firmware_py.libc import NANOSECONDS
 from firmware_py.realtime import Word
 from tools.analysis.idle_states import cores_awake
+from tools.running.ready_loop import FOREVER, ReadyLoop, loop_call
 from tools.running.slow_start import slow_start
 
 _MLOCK_CURRENT_AND_FUTURE = 3
 _POLL_S = 0.001
-_FOREVER = 1 << 62
 
 
 @dataclass(frozen=True)
@@ -85,33 +85,10 @@ def become_realtime(cpu: int | None, priority: int | None, threads: Sequence[int
 
 
 def compiled_call(block: Any, period_ns: int, receive_ns: int) -> Callable[[int], int]:
-    """`run_loop` on this memory as a function of the greatest number of cycles; 0 only compiles."""
-    from drivers.canopen.exchange import exchange_memory, receive, send
-    from firmware_py.realtime import run_loop
+    """`loop_call` on a CAN bus that is a descriptor."""
+    from drivers.canopen import exchange
 
-    frames, scratch = exchange_memory()
-
-    def call(max_cycles: int) -> int:
-        return int(
-            run_loop(
-                receive, send, block.port, frames, scratch, block.constants, block.state, block.table, block.sample,
-                block.command, block.words, block.ring, block.histograms, period_ns, receive_ns, max_cycles,
-            )
-        )  # fmt: skip
-
-    return call
-
-
-def _nothing() -> None:
-    """For a loop that does not listen before it goes."""
-
-
-@dataclass(frozen=True)
-class ReadyLoop:
-    """A loop that is warm: `go` runs it to its end, `flush` throws away what the bus has said so far."""
-
-    go: Callable[[], object]
-    flush: Callable[[], None] = _nothing
+    return loop_call(exchange, block, period_ns, receive_ns)
 
 
 @contextmanager
@@ -127,7 +104,7 @@ def compiled_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
         def go() -> None:
             block.port[0].fd = end.fileno()
             block.port[0].stamped = order.interface == "jointctl"
-            call(_FOREVER)
+            call(FOREVER)
 
         def flush() -> None:
             with contextlib.suppress(OSError):  # nothing waits, or the bus is down: the loop will tell
@@ -192,13 +169,15 @@ def run(order: LoopOrder) -> int:
     if order.interface == SERIAL:
         from tools.running.serial_loop import serial_loop
 
-        loop: Any = serial_loop
+        loop: Callable[[LoopOrder, Any], AbstractContextManager[ReadyLoop]] = serial_loop
     else:
         loop = compiled_loop if order.interface in CYCLIC_INTERFACES else portable_loop
-    text = "loop: compiling, which only the first start does; it takes a minute or two"
-    with slow_start(lambda: print(text, file=sys.stderr, flush=True)) as started, loop(order, block) as prepared:
+
+    def tell(text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
+
+    with slow_start(tell, "loop") as started, loop(order, block) as ready:
         started()
-        ready = prepared if isinstance(prepared, ReadyLoop) else ReadyLoop(prepared)
         gc.collect()
         gc.freeze()
         gc.disable()

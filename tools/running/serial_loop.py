@@ -9,52 +9,35 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from drivers.elmo.serial_port import open_descriptor
 from drivers.elmo.switch_off import SWITCH_OFF
-
-_FOREVER = 1 << 62
-
-
-def serial_call(block: Any, period_ns: int, receive_ns: int) -> Callable[[int], int]:
-    """`run_loop` on this memory as a function of the greatest number of cycles; 0 only compiles."""
-    from drivers.elmo.exchange import exchange_memory, receive, send
-    from firmware_py.realtime import run_loop
-
-    data, scratch = exchange_memory()
-
-    def call(max_cycles: int) -> int:
-        return int(
-            run_loop(
-                receive, send, block.port, data, scratch, block.constants, block.state, block.table, block.sample,
-                block.command, block.words, block.ring, block.histograms, period_ns, receive_ns, max_cycles,
-            )
-        )  # fmt: skip
-
-    return call
+from tools.running.ready_loop import FOREVER, ReadyLoop, loop_call
 
 
 @contextmanager
-def serial_loop(order: Any, block: Any) -> Iterator[Callable[[], object]]:
-    """The loop, warm, as a function that runs it to its end.
+def serial_loop(order: Any, block: Any) -> Iterator[ReadyLoop]:
+    """The loop, warm.
 
     The port is opened when the loop is let go: by then the supervisor has locked and configured it.  However the
     loop ends, the drive is told to switch off: it would keep its last torque command for ever.
     """
-    call = serial_call(block, order.period_ns, order.receive_ns)
+    from drivers.elmo import exchange
+
+    call = loop_call(exchange, block, order.period_ns, order.receive_ns)
     call(0)  # compiles, or loads from the cache
 
     def go() -> None:
         fd = open_descriptor(order.channel)
         try:
             block.port[0].fd = fd
-            call(_FOREVER)
+            call(FOREVER)
         finally:
             with contextlib.suppress(OSError):
                 os.write(fd, SWITCH_OFF)
             os.close(fd)
 
-    yield go
+    yield ReadyLoop(go)

@@ -10,9 +10,11 @@ SLOW_START_S = 4.0
 
 
 @contextmanager
-def slow_start(tell: Callable[[], object], after_s: float = SLOW_START_S) -> Iterator[Callable[[], None]]:
-    """Calls `tell` after `after_s`, unless what this gives has been called, or the block has ended, before."""
-    timer = threading.Timer(after_s, tell)
+def slow_start(tell: Callable[[str], object], who: str, after_s: float = SLOW_START_S) -> Iterator[Callable[[], None]]:
+    """Tells after `after_s` that `who` compiles, unless what this gives has been called, or the block has ended."""
+    timer = threading.Timer(
+        after_s, tell, [f"{who}: compiling, which only the first start does; it takes a minute or two"]
+    )
     timer.daemon = True
     timer.start()
     try:

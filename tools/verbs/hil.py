@@ -20,9 +20,8 @@ _POLL_S = 0.05
 
 def hil(config: Config, output: Output, *, timing: bool = False, ready_fd: int | None = None) -> int:
     """Serve until a stop signal; `ready_fd` gets one byte once the bus can be used, and its reader's end ends us."""
-    text = "virtual joint: compiling, which only the first start does; it takes a minute or two"
     with (
-        slow_start(lambda: output.note(text)) as started,
+        slow_start(output.note, "virtual joint") as started,
         stop_signals() as signals,
         serve_virtual_joint(config, timing) as joint,
     ):
