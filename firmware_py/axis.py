@@ -16,7 +16,7 @@ from firmware_py.computed_torque import step_law
 from firmware_py.frozen_reading import check_reading
 from firmware_py.kernel import kernel
 from firmware_py.live_change import step_change, step_new_motion
-from firmware_py.records import AxisConstants, AxisState, Command, Sample
+from firmware_py.records import AxisConstants, AxisState, Command, LimitConstants, Sample
 from firmware_py.safety import limit_position_rad, limited_torque_Nm, motion_fault, reference_fault
 from firmware_py.sequence import (
     compare_encoders,
@@ -139,6 +139,20 @@ def _check_motion(constants: AxisConstants, state: AxisState) -> None:
 
 
 @kernel
+def _check_saturation(limits: LimitConstants, state: AxisState, torque_Nm: float, elapsed_cycles: int) -> None:
+    """A torque at its limit, or none that is a number, for too long.
+
+    It is forgotten as slowly as it came: a torque that jumps from limit to limit is none the better for it.
+    """
+    if not abs(torque_Nm) < limits.torque_max_Nm:
+        state.saturated_cycles += elapsed_cycles
+        if state.saturated_cycles > limits.saturation_max_cycles:
+            trip(state, Fault.TORQUE_SATURATED, torque_Nm, 0)
+    else:
+        state.saturated_cycles = max(state.saturated_cycles - elapsed_cycles, 0)
+
+
+@kernel
 def _command_torque(constants: AxisConstants, state: AxisState, table: np.ndarray, elapsed_cycles: int) -> None:
     """The torque of this cycle; a torque that is not finite is never sent."""
     if state.phase == AxisPhase.RELEASING:
@@ -166,12 +180,7 @@ def _command_torque(constants: AxisConstants, state: AxisState, table: np.ndarra
     )
     if not finite:
         trip(state, Fault.NOT_FINITE, state.unlimited_torque_Nm, 0)
-    if abs(torque_Nm) >= limits.torque_max_Nm:
-        state.saturated_cycles += elapsed_cycles
-        if state.saturated_cycles > limits.saturation_max_cycles:
-            trip(state, Fault.TORQUE_SATURATED, torque_Nm, 0)
-    else:  # a torque that jumps from limit to limit passes through here, and is none the better for it
-        state.saturated_cycles = max(state.saturated_cycles - elapsed_cycles, 0)
+    _check_saturation(limits, state, torque_Nm, elapsed_cycles)
     state.command_torque_Nm = torque_Nm if powered(state.phase) else 0.0
 
 
@@ -204,12 +213,7 @@ def _command_velocity(constants: AxisConstants, state: AxisState, elapsed_cycles
     )
     if not finite:
         trip(state, Fault.NOT_FINITE, unlimited_radps, 0)
-    if not abs(state.measured_torque_Nm) < limits.torque_max_Nm:
-        state.saturated_cycles += elapsed_cycles
-        if state.saturated_cycles > limits.saturation_max_cycles:
-            trip(state, Fault.TORQUE_SATURATED, state.measured_torque_Nm, 0)
-    else:  # a torque that jumps from limit to limit passes through here, and is none the better for it
-        state.saturated_cycles = max(state.saturated_cycles - elapsed_cycles, 0)
+    _check_saturation(limits, state, state.measured_torque_Nm, elapsed_cycles)
     state.command_velocity_radps = velocity_radps if powered(state.phase) else 0.0
 
 

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import can
 import canopen
 
+from drivers.canopen.synchronisation import SYNC_ID
 from drivers.errors import BusError
 
 LISTEN_S = 0.05  # five SYNC periods of the slowest loop
-SYNC_ID = 0x80
 FAILURE_PAUSE_S = 0.05
 
 

@@ -27,9 +27,8 @@ NMT_OPERATIONAL = 5
 # A drive that was told to stop and still says that it is enabled, or says nothing, does not hear us (SYNC or RPDO
 # lost).  Its watchdog is what is left: after so many cycles the heartbeat is withheld for the rest of the run.
 UNHEEDED_MAX_CYCLES = 20
-ERROR_SHOWN_CYCLES = (
-    20  # an error code stays for so long although the drive has reset it: it may be why the joint stops
-)
+# an error code stays for so long although the drive has reset it: it may be why the joint stops
+ERROR_SHOWN_CYCLES = 20
 _WORST_BITS = np.array([worst_frame_bits(length) for length in range(9)])
 
 

@@ -53,6 +53,19 @@ def canopen_subject(
     return subject_of_config(config, eds)
 
 
+def subject_of(
+    path: Path | None,
+    interface: str | None,
+    channel: str | None,
+    bitrate: int | None,
+    target: int | None,
+    eds: Path | None = None,
+) -> Subject:
+    """For a verb that has a CANopen branch only."""
+    config = config_of(path, interface, channel, bitrate, None, target)
+    return canopen_subject(config, interface, channel, bitrate, target, eds)
+
+
 def scan(
     config: MaybeConfig = None,
     interface: Interface = None,
@@ -67,8 +80,7 @@ def scan(
     """Which CANopen nodes are on the bus: identity, device type, NMT state, drive state.  Reads only."""
     from tools.verbs.scan import scan as run_scan
 
-    joint = config_of(config, interface, channel, bitrate, None, target)
-    subject = canopen_subject(joint, interface, channel, bitrate, target, None)
+    subject = subject_of(config, interface, channel, bitrate, target)
     raise typer.Exit(run_scan(subject, Output(json=json, quiet=quiet), listen_s=listen, passive=passive))
 
 
@@ -151,8 +163,7 @@ def params_dump(
     """Read every readable object of the EDS.  Reads only."""
     from tools.verbs.params import dump
 
-    joint = config_of(config, interface, channel, bitrate, None, target)
-    subject = canopen_subject(joint, interface, channel, bitrate, target, eds)
+    subject = subject_of(config, interface, channel, bitrate, target, eds)
     raise typer.Exit(dump(subject, Output(json=json, quiet=quiet), out))
 
 
@@ -176,8 +187,7 @@ def params_restore(
     """Write the parameters that differ, read each back, tell what was refused.  The drive must be off."""
     from tools.verbs.params import place_index, restore_file
 
-    joint = config_of(config, interface, channel, bitrate, None, target)
-    subject = canopen_subject(joint, interface, channel, bitrate, target, eds)
+    subject = subject_of(config, interface, channel, bitrate, target, eds)
     indices = [place_index(text) for text in skip or []]
     output = Output(json=json, quiet=quiet)
     raise typer.Exit(restore_file(subject, file, output, assume_yes=yes, other_device=other_device, skip=indices))
@@ -206,10 +216,8 @@ def params_diff(
         if is_parameter_file(path):
             sides.append(load_parameters(path, target or 1))
         else:
-            joint = config_of(path, interface, channel, bitrate, None, target)
-            found, objects = parameters_of_drive(
-                canopen_subject(joint, interface, channel, bitrate, target, None), output
-            )
+            subject = subject_of(path, interface, channel, bitrate, target)
+            found, objects = parameters_of_drive(subject, output)
             sides.append(found)
     raise typer.Exit(diff(sides[0], sides[1], objects, output, readings=readings))
 

@@ -15,11 +15,10 @@ import can
 import canopen
 
 from drivers.can.open import open_python_can
+from drivers.canopen.bus_watchers import BusFailure
 from drivers.errors import BusError, ConfigurationError
 from tools.configuration.config import Config
 from tools.inspection.objects import Objects, read_dictionary
-
-FAILURE_PAUSE_S = 0.05
 
 
 @dataclass(frozen=True)
@@ -87,24 +86,13 @@ def subject_of_flags(
     return Subject(interface, channel, bitrate, node, eds)
 
 
-class _BusFailure(can.Listener):
-    """A bus that fails must not end the receiving thread with a traceback; whoever sends next is told."""
-
-    def on_message_received(self, msg: can.Message) -> None:
-        """Messages are for the other listeners."""
-
-    def on_error(self, exc: Exception) -> None:
-        """The thread receives again at once: a dead bus must not make it spin."""
-        time.sleep(FAILURE_PAUSE_S)
-
-
 @contextmanager
 def canopen_network(subject: Subject, *listeners: can.Listener) -> Iterator[canopen.Network]:
     """The `canopen` library on an end of the bus of its own; it sends nothing by itself."""
     logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what matters is told by whoever asks
     network = canopen.Network(subject.open_bus())
     network.NOTIFIER_CYCLE = 0.05
-    added: list[Any] = [_BusFailure(), *listeners]  # the library knows only its own kind of listener
+    added: list[Any] = [BusFailure(time.sleep), *listeners]  # the library knows only its own kind of listener
     network.listeners.extend(added)
     try:
         network.connect()

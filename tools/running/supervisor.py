@@ -24,7 +24,7 @@ from tools.configuration.records import axis_constants, trajectory_table
 from tools.output import Output
 from tools.recording.can_log import frame_array
 from tools.recording.kept_records import KeptRecords
-from tools.recording.run_log import Event, RunLogWriter
+from tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter
 from tools.recording.run_metadata import run_metadata
 from tools.recording.run_summary import summarise
 from tools.running.bus_watch import BusWatch, bus_watch
@@ -43,7 +43,6 @@ from tools.running.viewer_orders import ViewerOrders
 
 POLL_S = 0.02
 DELAY_CYCLES = 300  # how many cycles with the drive off the loop delay is measured over
-INFORMATION, WARNING, ERROR = 20, 30, 40
 
 
 class Supervisor:
@@ -160,7 +159,7 @@ class Supervisor:
             elapsed_s = (time.monotonic_ns() - started_ns) * 1e-9
             state = drive.make_safe()
             self._take_records(loop, log, kept)
-            log.write_event(INFORMATION, "drive", f"after the run: {state}")
+            log.write_event(INFO, "drive", f"after the run: {state}")
             if self._recorder is not None and self._recorder.dropped:
                 log.write_event(WARNING, "log", f"{self._recorder.dropped} CAN frames were not recorded: too slow")
             return self._result(loop, kept, signals, state, elapsed_s)
@@ -198,7 +197,7 @@ class Supervisor:
         self._delay_s = loop_delay_s(config, loop.block.histograms)
         found = require_margin(config, self._delay_s, allow_low_margin=self._allow_low_margin)
         text = f"loop delay {self._delay_s * 1e3:.2f} ms measured, phase margin {found.phase_margin_deg:.0f} deg"
-        log.write_event(INFORMATION, "supervisor", text)
+        log.write_event(INFO, "supervisor", text)
         self._display.note(text)
         loop.allow_enable()
 

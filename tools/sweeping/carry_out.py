@@ -26,11 +26,11 @@ from tools.configuration.elmo import ElmoSerial, UnitModeChoice
 from tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_constants
 from tools.output import Output
 from tools.recording.kept_records import KeptRecords
-from tools.recording.run_log import RunLogWriter
+from tools.recording.run_log import INFO, RunLogWriter
 from tools.recording.thinned_records import ThinnedRecords
 from tools.running.loop_handle import LoopHandle
 from tools.running.open_drive import loop_delay_s
-from tools.running.supervisor import DELAY_CYCLES, INFORMATION, Supervisor
+from tools.running.supervisor import DELAY_CYCLES, Supervisor
 from tools.simulation.lockstep import LockstepJoint
 from tools.sweeping.meter import SweepMeter
 from tools.sweeping.plan import SweepMotion, shifted
@@ -154,7 +154,7 @@ class SweepSupervisor(Supervisor):
             margin_deg = math.degrees(0.5 * math.pi - POSITION_GAIN_ps * self._delay_s)
             text = f"loop delay {self._delay_s * 1e3:.2f} ms measured, "
             text += f"position correction with {margin_deg:.0f} deg phase margin"
-            log.write_event(INFORMATION, "supervisor", text)
+            log.write_event(INFO, "supervisor", text)
             self._display.note(text)
             loop.allow_enable()
 
