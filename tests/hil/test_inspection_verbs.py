@@ -18,7 +18,7 @@ def lines(text: str) -> list[dict[str, Any]]:
 
 
 def test_a_run_goes_on_beside_monitor_info_and_scan(bench: Any) -> None:
-    config = bench.config(trajectory__duration_s=6.0)
+    config = bench.config(trajectory__duration_s=12.0)
     bench.joint(config)
     monitor = bench.start("monitor", config, "--json").saw("listening on")
     run = bench.start("run", config, "-y").saw("tracking")

@@ -115,12 +115,14 @@ class Terminal:
 
     def saw(self, text: str, timeout_s: float = 180.0) -> Terminal:
         give_up = time.monotonic() + timeout_s
-        while text not in self.text:
+        while text not in " ".join(self.text.split()):  # lines are as long as the terminal is wide
             assert time.monotonic() < give_up, self.text
             try:
                 self.text += os.read(self.master, 4096).decode()
             except BlockingIOError:
                 time.sleep(0.01)
+            except OSError as error:  # EIO: it has ended
+                raise AssertionError(f"ended before {text!r}: {self.text}") from error
         return self
 
 
