@@ -115,7 +115,7 @@ class Terminal:
 
     def saw(self, text: str, timeout_s: float = 180.0) -> Terminal:
         give_up = time.monotonic() + timeout_s
-        while text not in " ".join(self.text.split()):  # lines are as long as the terminal is wide
+        while text not in self.text and text not in " ".join(self.text.split()):  # a terminal breaks long lines
             assert time.monotonic() < give_up, self.text
             try:
                 self.text += os.read(self.master, 4096).decode()
