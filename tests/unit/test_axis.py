@@ -297,6 +297,15 @@ def test_drive_fault_in_each_phase(rig: NewRig, phase: AxisPhase, drive_state: D
     assert_fault(run, Fault.DRIVE_FAULT, Reaction.OFF)
 
 
+def test_its_twin_a_warning_of_the_drive_is_no_fault(rig: NewRig) -> None:
+    """An EMCY code and the warning bit (7) of the statusword, while the drive stays enabled."""
+    run = rig(0.05).until(AxisPhase.TRACKING)
+    run.sample.drive_error, run.sample.status_word = 0x4210, 0x12B7
+    run.run(20)
+    assert_well(run)
+    assert run.state.fault_drive_error == 0
+
+
 @pytest.mark.parametrize("cleared_before", [False, True])
 def test_the_encoders_error_of_the_first_fault_is_kept(rig: NewRig, cleared_before: bool) -> None:
     run = rig(0.05).until(AxisPhase.TRACKING)
@@ -506,6 +515,37 @@ def test_following_error(rig: NewRig, limit_rad: float, trips: bool) -> None:
         assert_well(run)
 
 
+def disturbed(rig: NewRig) -> Any:
+    """A run that tracks, and then reads one position 5 mrad off: a short peak of velocity and of following error."""
+    return rig(0.0).until(AxisPhase.TRACKING).run(20)
+
+
+@pytest.mark.parametrize("offset_rad", [-0.005, 0.005])
+@pytest.mark.parametrize(("past", "trips"), [(-1e-9, False), (0.0, False), (1e-9, True)])
+@pytest.mark.parametrize("fault", [Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR])
+def test_velocity_and_following_error_are_dense_at_their_limits(
+    rig: NewRig, fault: Fault, offset_rad: float, past: float, trips: bool
+) -> None:
+    """The run is the same each time, so that its first peak is known to the last bit: the limit is put beside it."""
+    scout = disturbed(rig)
+    scout.tick(offset_rad=offset_rad)
+    run = disturbed(rig)
+    if fault is Fault.VELOCITY_LIMIT:
+        peak = float(scout.state.velocity.velocity_radps)
+        run.axis.limits.velocity_max_radps = abs(peak) * (1.0 - past)
+    else:
+        peak = float(scout.state.measured_position_rad - scout.state.reference.position_rad)
+        run.axis.limits.following_error_max_rad = abs(peak) * (1.0 - past)
+    assert peak * offset_rad > 0.0
+    run.tick(offset_rad=offset_rad)
+    if trips:
+        assert run.state.fault_value == peak
+        assert (run.torques_Nm[-1], run.requests[-1]) == (0.0, DriveRequest.QUICK_STOP)
+        assert_fault(run, fault, Reaction.QUICK_STOP)
+    else:
+        assert_well(run)
+
+
 @pytest.mark.parametrize(("blocked_cycles", "trips"), [(20, False), (21, True)])
 def test_saturation(rig: NewRig, blocked_cycles: int, trips: bool) -> None:
     run = rig(0.0)
@@ -553,6 +593,16 @@ def test_a_law_that_is_not_finite_sends_zero_and_stops(rig: NewRig, value: float
     run.tick()
     assert (run.torques_Nm[-1], run.requests[-1]) == (0.0, DriveRequest.QUICK_STOP)
     assert_fault(run, Fault.NOT_FINITE, Reaction.QUICK_STOP)
+
+
+def test_its_twin_a_law_of_an_enormous_but_finite_torque_is_limited(rig: NewRig) -> None:
+    run = rig(0.0).until(AxisPhase.TRACKING).run(20)
+    before_Nm = run.torques_Nm[-1]
+    run.state.law.network.weights[3] = 1e300
+    run.tick()
+    assert 1e290 < abs(run.state.unlimited_torque_Nm) < math.inf
+    assert abs(run.torques_Nm[-1] - before_Nm) == pytest.approx(20.0)  # the rate limit
+    assert_well(run)
 
 
 @pytest.mark.parametrize("phase", [AxisPhase.WAITING, AxisPhase.TRACKING])
@@ -605,6 +655,23 @@ def test_stop_timeout(rig: NewRig, moves: bool) -> None:
     else:
         finish(run)
         assert run.state.fault == Fault.NONE
+
+
+@pytest.mark.parametrize("missing_cycles", [0, 1])
+def test_standstill_is_complete_in_the_last_cycle_or_one_too_late(rig: NewRig, missing_cycles: int) -> None:
+    run = rig(0.0).until(AxisPhase.TRACKING).run(5)
+    run.stop = StopRequest.RAMP
+    run.until(AxisPhase.RAMPING)
+    while run.state.still_cycles == 0:
+        run.tick()
+    assert run.phase == AxisPhase.RAMPING
+    run.state.phase_cycle = run.axis.sequence.stop_max_cycles
+    run.state.still_cycles = run.axis.sequence.settle_cycles - 1 - missing_cycles
+    run.tick()
+    if missing_cycles:
+        assert_fault(run, Fault.STOP_TIMEOUT, Reaction.QUICK_STOP)
+    else:
+        assert (run.phase, run.state.fault) == (AxisPhase.RELEASING, Fault.NONE)
 
 
 def test_no_samples_at_all(rig: NewRig) -> None:

@@ -191,10 +191,14 @@ def test_a_drive_that_is_enabled_already_is_not_taken_over(axis: Any, state: Any
     step_waiting(axis, state, idle_sample(drive_state))
     enabled = drive_state is DriveState.ENABLED
     assert state.phase == (AxisPhase.WAITING if enabled else AxisPhase.ENABLING)
-    state.phase_cycle = axis.sequence.wait_max_cycles + 1
     if enabled:
-        step_waiting(axis, state, idle_sample(drive_state))
+        state.phase_cycle = axis.sequence.wait_max_cycles
+        step_waiting(axis, state, sample_of(drive_state))
+        assert (state.phase, state.fault) == (AxisPhase.WAITING, Fault.NONE)  # the twin: the last cycle of the wait
+        state.phase_cycle += 1
+        step_waiting(axis, state, sample_of(drive_state))
         assert (state.phase, state.fault) == (AxisPhase.DISABLING, Fault.DRIVE_STAYS_ENABLED)
+        assert (state.fault_value, state.fault_drive_error) == (0x1237, 0x3310)
 
 
 def test_the_run_waits_until_it_may_enable(axis: Any, state: Any) -> None:
