@@ -3,8 +3,8 @@
     NUMBA_DISABLE_JIT=1 python tests/bench/mutation_run.py [--module firmware_py/safety.py] [--part 1/2]
 
 Mutants: another comparison, `and` for `or`, the operands' sign or operation, a constant one off, a condition negated,
-another member of an enumeration, a statement left out.  Each runs in a child process that loads the changed module in
-place of the file, first with the module's own tests, then with those of the axis; the file itself is not touched.
+another member of an enumeration, a statement left out.  Each runs in a child process whose functions have the changed
+code, with the module's own tests and those of the axis, until one fails; the file itself is not touched.
 Survivors are explained in docs/safety-mutations.md.
 """
 
@@ -14,8 +14,7 @@ import argparse
 import ast
 import contextlib
 import copy
-import importlib.abc
-import importlib.machinery
+import importlib
 import json
 import os
 import signal
@@ -122,42 +121,88 @@ def _members(module: str, enumeration: str) -> list[str]:
     raise ValueError(f"enumeration (={enumeration}) must be in firmware_py/states.py or {module}")
 
 
-class _Changed(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Loads one module from a changed tree."""
+def changed_code(module: str, tree: ast.Module) -> dict[str, Any]:
+    """Function name -> the code object that the changed module gives it; module-level values are as they were."""
+    loaded = importlib.import_module(module[:-3].replace("/", "."))
+    space = dict(vars(loaded))
+    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
+    exec(compile(ast.Module([*functions], []), str(ROOT / module), "exec"), space)
+    return {node.name: (getattr(loaded, node.name), space[node.name].__code__) for node in functions}
 
-    def __init__(self, module: str, tree: ast.Module) -> None:
-        self._name, self._tree, self._path = module[:-3].replace("/", "."), tree, ROOT / module
 
-    def find_spec(self, name: str, path: Any = None, target: Any = None) -> Any:
-        if name != self._name:
+class Session:
+    """A pytest plugin: the tests of one module are collected once, and run in a child process for each mutant.
+
+    Without the JIT a kernel is its Python function, so that whoever has imported it runs the changed code.  The tests
+    that have noticed most mutants so far come first, then the quick ones.
+    """
+
+    def __init__(self, module: str, part: int, parts: int) -> None:
+        self._module, self._part, self._parts = module, part, parts
+        self.survivors: list[dict[str, Any]] = []
+        self.refused = False
+
+    def pytest_runtestloop(self, session: Any) -> bool:
+        """In place of running the tests once."""
+        source = (ROOT / self._module).read_text()
+        items, durations_s = list(session.items), [0.0] * len(session.items)
+        noticed = [0] * len(items)
+        if self._first_failure(session, items, range(len(items)), None, durations_s) is not None:
+            print(f"{self._module}: its tests fail without any change", file=sys.stderr)
+            self.refused = True
+            return True
+        found = mutants(source, self._module)[self._part - 1 :: self._parts]
+        started, lines = time.monotonic(), source.splitlines()
+        for line, what, tree in found:
+            order = sorted(range(len(items)), key=lambda i: (-noticed[i], durations_s[i]))
+            by = self._first_failure(session, items, order, changed_code(self._module, tree), None)
+            if by is None:
+                text = lines[line - 1].strip()
+                print(f"  {self._module}:{line}: {what}: {text}", flush=True)
+                self.survivors.append({"module": self._module, "line": line, "mutation": what, "text": text})
+            elif by >= 0:
+                noticed[by] += 1
+        passed_s, alive = time.monotonic() - started, len(self.survivors)
+        print(f"{self._module}: {len(found)} mutants, {alive} survive, {passed_s:.0f} s", flush=True)
+        return True
+
+    @staticmethod
+    def _first_failure(
+        session: Any, items: list[Any], order: Any, code: dict[str, Any] | None, durations_s: list[float] | None
+    ) -> int | None:
+        """Index of the first test that fails in a child process; -1 if it hangs or dies, None if all pass."""
+        read_fd, write_fd = os.pipe()
+        child = os.fork()
+        if child == 0:
+            signal.setitimer(signal.ITIMER_PROF, LONGEST_S)
+            quiet = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(quiet, 1)
+            os.dup2(quiet, 2)
+            for function, changed in (code or {}).values():
+                function.__code__ = changed
+            with contextlib.suppress(BaseException):
+                ordered = [items[i] for i in order]
+                for place, (item, following) in enumerate(zip(ordered, [*ordered[1:], None], strict=True)):
+                    began_s = time.process_time()
+                    item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
+                    passed = not session.testsfailed
+                    os.write(write_fd, f"{order[place]} {time.process_time() - began_s} {passed:d}\n".encode())
+                    if not passed:
+                        break
+                else:
+                    os.write(write_fd, b"all\n")
+            os._exit(0)
+        os.close(write_fd)
+        with os.fdopen(read_fd) as answers:
+            told = answers.read().splitlines()
+        os.waitpid(child, 0)
+        if told and told[-1] == "all":
+            if durations_s is not None:
+                for line in told[:-1]:
+                    durations_s[int(line.split()[0])] = float(line.split()[1])
             return None
-        return importlib.machinery.ModuleSpec(name, self, origin=str(self._path))
-
-    def exec_module(self, module: Any) -> None:
-        module.__file__ = str(self._path)
-        exec(compile(self._tree, str(self._path), "exec"), module.__dict__)
-
-
-def killed(module: str, tree: ast.Module) -> bool:
-    """Whether a test fails on the changed module, in a child process; one that hangs counts as killed."""
-    child = os.fork()
-    if child == 0:
-        signal.setitimer(signal.ITIMER_PROF, LONGEST_S)
-        import pytest
-
-        sys.meta_path.insert(0, _Changed(module, tree))
-        quiet = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(quiet, 1)
-        os.dup2(quiet, 2)
-        options = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:randomly", "--hypothesis-seed=0"]
-        code = 1
-        with contextlib.suppress(BaseException):
-            for name in TESTS[module]:
-                code = int(pytest.main([*options, str(ROOT / "tests" / "unit" / f"{name}.py")]))
-                if code:
-                    break
-        os._exit(1 if code else 0)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 0
+        last = told[-1].split() if told else ["-1", "0", "1"]
+        return int(last[0]) if last[2] == "0" else -1
 
 
 def main() -> int:
@@ -171,26 +216,18 @@ def main() -> int:
         return 2
     sys.path.insert(0, str(ROOT))
     os.chdir(ROOT)
-    import numba  # once for all children; what pytest rewrites (hypothesis) must not be imported here
+    import pytest
 
-    print(f"numba {numba.__version__}, part {chosen.part}", flush=True)
+    print(f"part {chosen.part}", flush=True)
     part, parts = (int(text) for text in chosen.part.split("/"))
+    options = ["-s", "-qq", "-p", "no:cacheprovider", "-p", "no:randomly", "-p", "no:xdist", "--hypothesis-seed=0"]
     survivors: list[dict[str, Any]] = []
     for module in chosen.module or TESTS:
-        if killed(module, ast.parse((ROOT / module).read_text())):
-            print(f"{module}: its tests fail without any change, or cannot run", file=sys.stderr)
+        session = Session(module, part, parts)
+        code = pytest.main([*options, *(f"tests/unit/{name}.py" for name in TESTS[module])], plugins=[session])
+        if code or session.refused:
             return 1
-        found = mutants((ROOT / module).read_text(), module)[part - 1 :: parts]
-        started = time.monotonic()
-        lines = (ROOT / module).read_text().splitlines()
-        alive = 0
-        for line, what, tree in found:
-            if not killed(module, tree):
-                alive += 1
-                text = lines[line - 1].strip()
-                print(f"  {module}:{line}: {what}: {text}", flush=True)
-                survivors.append({"module": module, "line": line, "mutation": what, "text": text})
-        print(f"{module}: {len(found)} mutants, {alive} survive, {time.monotonic() - started:.0f} s", flush=True)
+        survivors += session.survivors
     if chosen.json is not None:
         chosen.json.write_text(json.dumps(survivors, indent=1) + "\n")
     return 0

@@ -15,6 +15,7 @@ from drivers.canopen import exchange
 from drivers.canopen.cia402 import State
 from drivers.canopen.cyclic import (
     ERROR_SHOWN_CYCLES,
+    UNHEEDED_MAX_CYCLES,
     accept_frame,
     begin_cycle,
     end_cycle,
@@ -99,6 +100,20 @@ def test_heartbeat_says_operational(wire: Wire) -> None:
 def test_heartbeat_schedule(wire: Wire, every: int, expected: list[int]) -> None:
     wire.port.heartbeat_cycles = every
     assert [begin_cycle(wire.port, wire.frames) for _ in range(7)] == expected
+
+
+@pytest.mark.parametrize(("cycles", "frames"), [(UNHEEDED_MAX_CYCLES, 2), (UNHEEDED_MAX_CYCLES + 1, 1)])
+def test_a_drive_that_stays_enabled_loses_the_heartbeat(enabled: Wire, cycles: int, frames: int) -> None:
+    enabled.port.heartbeat_cycles = 1
+    for _ in range(cycles):
+        assert begin_cycle(enabled.port, enabled.frames) == 2
+        enabled.rpdo(0.0, DriveRequest.QUICK_STOP)
+    assert begin_cycle(enabled.port, enabled.frames) == frames
+    # a drive that obeys in the end: within the limit all is forgotten, beyond it its watchdog stays without a heartbeat
+    enabled.tpdo(STATUSWORDS[State.SWITCH_ON_DISABLED])
+    enabled.rpdo(0.0, DriveRequest.QUICK_STOP)
+    assert enabled.port.unheeded_cycles == (0 if frames == 2 else cycles)
+    assert begin_cycle(enabled.port, enabled.frames) == frames
 
 
 def test_rpdo_of_an_enabled_drive(enabled: Wire) -> None:

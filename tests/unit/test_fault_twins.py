@@ -1,0 +1,265 @@
+"""Each fault of the loop and each watcher in docs/safety.md has a test that trips and a twin just inside the limit.
+
+A place is `file::test`, below `tests/`, and after a bar words of that test (its parameters as they are written there):
+the case that trips, or the one just inside the limit.  That the words are there is checked here; that the cases do what
+is said of them is what those tests check.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from firmware_py.states import Fault
+
+ROOT = Path(__file__).resolve().parents[2]
+AXIS, SEQUENCE, SAFETY = "unit/test_axis.py::", "unit/test_sequence.py::", "unit/test_safety.py::"
+EDGES, SURROUNDINGS = "unit/test_surroundings_edges.py::", "unit/test_surroundings.py::"
+EDGE = EDGES + "test_each_limit_at_its_edge_in_each_phase | "
+DENSE = AXIS + "test_velocity_and_following_error_are_dense_at_their_limits | "
+PLACE = re.compile(r"(\w+/\w+\.py)::(\w+)(?: \| (.+))?")
+
+FAULTS: dict[Fault, tuple[str, str]] = {  # what trips, and its twin
+    Fault.POSITION_LIMIT: (
+        AXIS + "test_position_limit | (1.001, Fault.POSITION_LIMIT)",
+        AXIS + "test_position_limit | (0.999, Fault.NONE)",
+    ),
+    Fault.VELOCITY_LIMIT: (DENSE + "(1e-9, True)", DENSE + "(0.0, False)"),
+    Fault.REFERENCE_LIMIT: (
+        SAFETY + "test_a_reference_must_be_able_to_brake_inside_the_limits | (1e-9, Fault.REFERENCE_LIMIT)",
+        SAFETY + "test_a_reference_must_be_able_to_brake_inside_the_limits | (-1e-9, Fault.NONE)",
+    ),
+    Fault.FOLLOWING_ERROR: (DENSE + "(1e-9, True)", DENSE + "(0.0, False)"),
+    Fault.STALE_SAMPLE: (AXIS + "test_stale_sample | (6, True)", AXIS + "test_stale_sample | (5, False)"),
+    Fault.NOT_FINITE: (
+        AXIS + "test_a_law_that_is_not_finite_sends_zero_and_stops | Fault.NOT_FINITE",
+        AXIS + "test_its_twin_a_law_of_an_enormous_but_finite_torque_is_limited | 1e300",
+    ),
+    Fault.TORQUE_SATURATED: (AXIS + "test_saturation | (21, True)", AXIS + "test_saturation | (20, False)"),
+    Fault.DRIVE_FAULT: (
+        AXIS + "test_drive_fault_in_each_phase | Fault.DRIVE_FAULT",
+        AXIS + "test_its_twin_a_warning_of_the_drive_is_no_fault",
+    ),
+    Fault.DRIVE_NOT_ENABLED: (
+        EDGE + '("drive_state", DriveState.ENABLED, DriveState.STOPPING, Fault.DRIVE_NOT_ENABLED)',
+        EDGE + "((within, False), (beyond, counts))",
+    ),
+    Fault.DRIVE_RESTARTED: (
+        AXIS + "test_a_restart_before_the_first_cycle_ends_the_run_without_power | Fault.DRIVE_RESTARTED",
+        AXIS + "test_a_restart_before_the_first_cycle_ends_the_run_without_power | twin.until(AxisPhase.TRACKING)",
+    ),
+    Fault.ENABLE_TIMEOUT: (
+        SEQUENCE + "test_enable_timeout | (31, Fault.ENABLE_TIMEOUT)",
+        SEQUENCE + "test_enable_timeout | (30, Fault.NONE)",
+    ),
+    Fault.SUPERVISOR_LOST: (AXIS + "test_supervisor_lost | (11, True)", AXIS + "test_supervisor_lost | (10, False)"),
+    Fault.BUS_ERROR: (AXIS + "test_bus_errors | (6, True)", AXIS + "test_bus_errors | (5, False)"),
+    Fault.STOP_TIMEOUT: (
+        AXIS + "test_standstill_is_complete_in_the_last_cycle_or_one_too_late | Fault.STOP_TIMEOUT",
+        AXIS + "test_standstill_is_complete_in_the_last_cycle_or_one_too_late | (AxisPhase.RELEASING, Fault.NONE)",
+    ),
+    Fault.OFF_TIMEOUT: (
+        SEQUENCE + "test_off_timeout | (21, AxisPhase.FINISHED, Fault.OFF_TIMEOUT)",
+        SEQUENCE + "test_off_timeout | (20, AxisPhase.DISABLING, Fault.NONE)",
+    ),
+    Fault.NO_SAMPLES: (
+        SEQUENCE + "test_waiting_ends | (0, 0.0, Fault.NO_SAMPLES)",
+        SEQUENCE + "test_waiting_ends | (AxisPhase.WAITING, Fault.NONE)",
+    ),
+    Fault.NOT_AT_STANDSTILL: (
+        SEQUENCE + "test_waiting_ends | (4, 0.5, Fault.NOT_AT_STANDSTILL)",
+        SEQUENCE + "test_enabling_is_only_asked_at_standstill_inside_the_limits | (1.0, 0.02, 4, AxisPhase.ENABLING",
+    ),
+    Fault.OVERRUN: (AXIS + "test_overrun | (9, True)", AXIS + "test_overrun | (8, False)"),
+    Fault.POSITION_JUMP: (
+        AXIS + "test_position_jump_scales_with_the_gap | 1.001 if trips",
+        AXIS + "test_position_jump_scales_with_the_gap | else 0.999",
+    ),
+    Fault.DRIVE_STAYS_ENABLED: (
+        SEQUENCE + "test_a_drive_that_is_enabled_already_is_not_taken_over | Fault.DRIVE_STAYS_ENABLED",
+        SEQUENCE + "test_a_drive_that_is_enabled_already_is_not_taken_over | (AxisPhase.WAITING, Fault.NONE)",
+    ),
+    Fault.POSITION_FROZEN: (
+        EDGES + "test_the_way_behind_a_reading_that_stands_still | (0.501, True)",
+        EDGES + "test_the_way_behind_a_reading_that_stands_still | (0.5, False)",
+    ),
+    Fault.SUSPENDED: (
+        SURROUNDINGS + "test_standby_just_shorter_and_just_longer_than_it_can_be_measured | (100_000, True)",
+        SURROUNDINGS + "test_standby_just_shorter_and_just_longer_than_it_can_be_measured | (-100_000, False)",
+    ),
+    Fault.DRIVE_SILENT: (
+        SURROUNDINGS + "test_a_drive_whose_heartbeat_stays_away | (600, 601, True)",
+        SURROUNDINGS + "test_a_drive_whose_heartbeat_stays_away | (600, 600, False)",
+    ),
+    Fault.POSITION_DISAGREEMENT: (
+        AXIS + "test_the_other_encoder | (0.0101, True)",
+        AXIS + "test_the_other_encoder | (0.0099, False)",
+    ),
+    Fault.MOVED_BEFORE_START: (
+        SEQUENCE + "test_a_joint_that_was_moved_since_the_motion_was_shown_is_not_driven | 0.375 + 1e-12, True",
+        SEQUENCE + "test_a_joint_that_was_moved_since_the_motion_was_shown_is_not_driven | 0.375, False",
+    ),
+}
+
+# (watcher, watches) of the tables of docs/safety.md; for those that watch for a member of `Fault`, the fault
+CAN: dict[tuple[str, str], tuple[str, str] | tuple[Fault, ...]] = {
+    ("drive", "the loop"): (
+        "unit/test_hil_device.py::test_heartbeat_loss_reacts_as_6007_says | rig.run(1)",
+        "unit/test_hil_device.py::test_heartbeat_that_keeps_coming_changes_nothing | rig.run(49)",
+    ),
+    ("driver", "that watchdog"): (
+        "unit/test_watchdog_proof.py::test_a_watchdog_that_does_nothing_is_refused",
+        "unit/test_watchdog_proof.py::test_a_working_watchdog_is_seen",
+    ),
+    ("driver", "that the drive says how it stops"): (
+        "unit/test_connection_loss.py::test_a_drive_without_any_reaction_to_a_lost_connection_is_refused",
+        "unit/test_connection_loss.py::test_the_twins_that_say_how_they_stop",
+    ),
+    ("drive", "the loop's RPDOs"): (
+        "faults/test_fault_regressions.py::test_a_joint_that_holds_while_its_rpdos_stay_away_is_stopped_by_the_deadline"
+        "_of_the_drive | (0.102, True)",
+        "faults/test_fault_regressions.py::test_a_joint_that_holds_while_its_rpdos_stay_away_is_stopped_by_the_deadline"
+        "_of_the_drive | (0.098, False)",
+    ),
+    ("loop", "that it is heard"): (
+        "unit/test_cyclic.py::test_a_drive_that_stays_enabled_loses_the_heartbeat | (UNHEEDED_MAX_CYCLES + 1, 1)",
+        "unit/test_cyclic.py::test_a_drive_that_stays_enabled_loses_the_heartbeat | (UNHEEDED_MAX_CYCLES, 2)",
+    ),
+    ("loop", "the drive"): (Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED, Fault.DRIVE_RESTARTED),
+    ("loop", "the drive's communication"): (Fault.DRIVE_SILENT,),
+    ("loop", "the samples"): (Fault.STALE_SAMPLE, Fault.NO_SAMPLES, Fault.POSITION_JUMP, Fault.POSITION_FROZEN),
+    ("loop", "that the joint stands where it stood when the motion was shown"): (Fault.MOVED_BEFORE_START,),
+    ("loop", "old values"): (
+        "faults/test_late_samples.py::test_the_age_counts_on_although_old_frames_come",
+        "faults/test_late_samples.py::test_the_twins_with_a_sound_encoder_go_on",
+    ),
+    ("loop", "one encoder by the other"): (Fault.POSITION_DISAGREEMENT,),
+    ("loop", "the motion"): (
+        Fault.POSITION_LIMIT, Fault.VELOCITY_LIMIT, Fault.REFERENCE_LIMIT, Fault.FOLLOWING_ERROR,
+        Fault.TORQUE_SATURATED, Fault.NOT_AT_STANDSTILL,
+    ),
+    ("loop", "its own law"): (Fault.NOT_FINITE,),
+    ("loop", "the bus"): (Fault.BUS_ERROR,),
+    ("loop", "the schedule"): (Fault.OVERRUN,),
+    ("loop", "the computer"): (Fault.SUSPENDED,),
+    ("loop", "the supervisor"): (Fault.SUPERVISOR_LOST,),
+    ("supervisor", "the loop process"): (
+        "unit/test_hang_limits.py::test_the_supervisor_ends_a_loop_that_hangs_and_no_other | (MICROSECOND_ns, True)",
+        "unit/test_hang_limits.py::test_the_supervisor_ends_a_loop_that_hangs_and_no_other | (0, False)",
+    ),
+    ("supervisor", "the user"): (
+        "hil/test_run_cli.py::test_one_stop_signal_while_tracking_ramps_down",
+        "hil/test_run_cli.py::test_two_runs_on_one_joint_and_it_is_disabled_after_each",
+    ),
+    ("user", "everything"): (
+        "hil/test_stop_and_clear.py::test_stop_ends_a_run_of_another_terminal",
+        "hil/test_stop_and_clear.py::test_stop_of_a_resting_joint_is_harmless",
+    ),
+}  # fmt: skip
+SERIAL: dict[tuple[str, str], tuple[str, str] | tuple[Fault, ...]] = {
+    ("loop", "that positions come"): (
+        "unit/test_elmo_cyclic.py::test_the_dead_man_commands_a_stop_and_its_twin_does_not | (1, b\"JV=0\\r\")",
+        "unit/test_elmo_cyclic.py::test_the_dead_man_commands_a_stop_and_its_twin_does_not | (0, b\"JV=41722\\r\")",
+    ),
+    ("loop", "its own end, however it comes about"): (
+        "hil/test_elmo_run.py::test_a_killed_supervisor_is_seen_by_the_loop",
+        "hil/test_elmo_run.py::test_a_run_tracks_the_sine_and_ends_with_the_motor_off",
+    ),
+    ("supervisor", "the loop process"): (
+        "hil/test_elmo_run.py::test_a_killed_loop_is_switched_off_by_its_supervisor",
+        "unit/test_hang_limits.py::test_the_supervisor_ends_a_loop_that_hangs_and_no_other | (0, False)",
+    ),
+    ("guard", "loop and supervisor"): (
+        "hil/test_line_guard.py::test_loop_and_supervisor_killed_the_guard_switches_off",
+        "hil/test_line_guard.py::test_a_run_that_ends_well_leaves_no_guard_behind",
+    ),
+    ("guard", "a loop that hangs"): (
+        "unit/test_hang_limits.py::test_the_guard_switches_off_behind_a_loop_that_hangs_and_behind_no_other"
+        " | (MICROSECOND_ns, True)",
+        "unit/test_hang_limits.py::test_the_guard_switches_off_behind_a_loop_that_hangs_and_behind_no_other"
+        " | (-MICROSECOND_ns, False)",
+    ),
+    ("guard", "a drive that was not reached at the end of a run"): (
+        "hil/test_line_guard.py::test_a_port_that_comes_back_is_told_to_switch_off",
+        "hil/test_line_guard.py::test_a_run_that_ends_well_leaves_no_guard_behind",
+    ),
+    ("user", "everything"): (
+        "unit/test_hang_limits.py::test_a_run_that_does_not_obey_a_stop_is_ended_by_force_and_not_before"
+        " | (OBEY_S + 0.01, True, True)",
+        "unit/test_hang_limits.py::test_a_run_that_does_not_obey_a_stop_is_ended_by_force_and_not_before"
+        " | (OBEY_S - 0.01, True, False)",
+    ),
+    ("drive", "current, speed, position"): (
+        "unit/test_elmo_device.py::test_leaving_the_position_limits_switches_off | (9_999, MF_POSITION_LIMIT)",
+        "unit/test_elmo_device.py::test_leaving_the_position_limits_switches_off | (10_001, 0)",
+    ),
+}  # fmt: skip
+
+
+@cache
+def functions(file: str) -> dict[str, str]:
+    """Name -> source, decorators included, of each test of a file."""
+    text = (ROOT / "tests" / file).read_text()
+    lines, found = text.splitlines(), {}
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef):
+            first = min([node.lineno, *(d.lineno for d in node.decorator_list)])
+            found[node.name] = " ".join(" ".join(lines[first - 1 : node.end_lineno]).split())
+    return found
+
+
+def source_of(place: str) -> str:
+    """The test's source; fails unless it is there and has the words."""
+    match = PLACE.fullmatch(place)
+    assert match, place
+    file, name, words = match.groups()
+    assert name in functions(file), place
+    assert words is None or " ".join(words.split()) in functions(file)[name], place
+    return functions(file)[name]
+
+
+def watchers(heading: str, following: str) -> list[tuple[str, str]]:
+    """(watcher, watches) of each row of the first table between two headings of docs/safety.md."""
+    text = (ROOT / "docs" / "safety.md").read_text()
+    text = text[text.index(heading) : text.index(following)]
+    table = re.search(r"(?:^\|.*\n)+", text, re.MULTILINE)
+    assert table
+    rows = [[cell.strip() for cell in line.split("|")[1:3]] for line in table[0].splitlines()[2:]]
+    return [(first, second) for first, second in rows]
+
+
+def test_no_fault_is_without_its_twin() -> None:
+    assert set(FAULTS) == set(Fault) - {Fault.NONE}
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+def test_a_fault_has_a_test_that_trips_and_a_twin(fault: Fault) -> None:
+    trip, twin = FAULTS[fault]
+    assert trip != twin
+    assert f"Fault.{fault.name}" in source_of(trip)
+    source = source_of(twin)
+    assert "Fault.NONE" in source or "assert_well(" in source
+
+
+@pytest.mark.parametrize(
+    ("table", "heading", "following"),
+    [(CAN, "## Who watches whom", "## Reactions"), (SERIAL, "## On a serial line", "How long the drive keeps")],
+    ids=["CAN", "serial"],
+)
+def test_every_watcher_has_a_test_that_trips_and_a_twin(
+    table: dict[tuple[str, str], tuple[str, str] | tuple[Fault, ...]], heading: str, following: str
+) -> None:
+    rows = watchers(heading, following)
+    assert sorted(rows) == sorted(table)
+    for place in table.values():
+        if isinstance(place[0], Fault):
+            assert all(fault in FAULTS for fault in place)
+            continue
+        trip, twin = (str(text) for text in place)
+        assert trip != twin
+        assert source_of(trip)
+        assert source_of(twin)
