@@ -37,6 +37,7 @@ class CommissioningReport:
     settings: dict[str, str] = field(default_factory=dict)  # name -> value read back
     remarks: tuple[str, ...] = ()
     loop_delay_s: float | None = None  # measured, position sample to torque command; None = not measured
+    measures_torque: bool = True  # False: the drive does not tell its torque in the cyclic exchange, it reads as zero
 
 
 class Drive(Protocol):

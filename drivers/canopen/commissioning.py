@@ -20,6 +20,7 @@ from drivers.canopen.pdo_map import configure_loop_pdos
 from drivers.canopen.readiness import wait_until_ready
 from drivers.canopen.scaling import joint_torque_per_permille_Nm, joint_velocity_per_unit_radps
 from drivers.canopen.settings import CanopenSettings
+from drivers.canopen.switch_off import brake
 from drivers.canopen.synchronisation import set_sync
 from drivers.canopen.torque_slope import set_torque_slope
 from drivers.drive import DriveIdentity
@@ -99,7 +100,12 @@ def _compare_with_eds(settings: CanopenSettings, eds: EdsFile, vendor: int, prod
 
 
 def disable(objects: ObjectAccess, settings: CanopenSettings, pause: Pause) -> None:
-    """Zero every target that could move the motor at enable, take the power stage off, refuse a drive in fault."""
+    """Zero every target that could move the motor at enable, take the power stage off, refuse a drive in fault.
+
+    A drive that is found enabled brakes by its quick stop first: a joint that moves would coast, and a load fall.
+    """
+    if brake(objects, pause):
+        objects.remarks.append("the drive was enabled: it has been braked by its quick stop and switched off")
     objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
     objects.write_verified(0x6071, 0, 0, what="target torque")
     for index, what in ((0x60FF, "target velocity"), (0x60B2, "torque offset")):
@@ -182,6 +188,12 @@ def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
     permille = settings.max_torque_permille
     if permille is None:
         permille = int(-(-settings.torque_max_Nm // scale))
+    elif settings.torque_max_Nm > permille * scale * (1.0 + settings.rated_tolerance):
+        raise DeviceError(
+            f"limits.torque_max_Nm (={settings.torque_max_Nm:g}) must be in (0..{permille * scale:g}], what "
+            f"drive.max_torque_permille (={permille}) allows by the drive's own rated value: the loop would not notice "
+            "that its torque is cut"
+        )
     findings.max_permille = min(permille, LARGEST_PERMILLE)
     if findings.max_permille < permille:
         findings.remarks.append(f"6072 holds at most {LARGEST_PERMILLE} permille: torque is limited to that")

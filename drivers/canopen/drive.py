@@ -12,6 +12,7 @@ import can
 import canopen
 
 from drivers.canopen.bus_watchers import BusFailure, refuse_second_controller
+from drivers.canopen.cia402 import State
 from drivers.canopen.commissioning import VELOCITY_MODES, Findings, commission
 from drivers.canopen.connection_loss import clear_rpdo_deadlines
 from drivers.canopen.eds_file import read_eds
@@ -22,7 +23,7 @@ from drivers.canopen.object_access import ATTEMPTS as SDO_ATTEMPTS
 from drivers.canopen.object_access import ObjectAccess
 from drivers.canopen.scaling import joint_angle_per_count_rad, new_port, start_position_rad
 from drivers.canopen.settings import CanopenSettings
-from drivers.canopen.switch_off import NMT_PRE_OPERATIONAL, SDO_TIMEOUT_S, SwitchOff
+from drivers.canopen.switch_off import NMT_PRE_OPERATIONAL, SDO_TIMEOUT_S, SwitchOff, state_of
 from drivers.canopen.watchdog_proof import prove_watchdog
 from drivers.drive import UNTOUCHED, CommissioningReport
 from drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
@@ -146,6 +147,7 @@ class CanopenDrive:
             position_resolution_rad=angle_rad,
             settings=findings.settings,
             remarks=tuple(findings.remarks),
+            measures_torque=findings.layout is None or findings.layout.torque_at >= 0,
         )
 
     def start_cyclic(self) -> None:
@@ -236,8 +238,17 @@ class CanopenDrive:
         return self.make_safe()
 
     def clear_fault(self) -> str:
-        """Reset the drive's fault on the user's word; refuses while another controller is active."""
+        """Reset the drive's fault on the user's word; refuses while another controller is active, or it is enabled.
+
+        An enabled drive has no fault, and somebody needs it so, perhaps without SYNC: its watchdog and power stay.
+        """
         refuse_second_controller(self._network, self._sleep)
+        with contextlib.suppress(NoDeviceError):  # one that was stopped does not answer yet
+            if state_of(self._objects) is State.OPERATION_ENABLED:
+                raise DeviceError(
+                    f"node {self._settings.node} is in operation enabled: there is no fault, and it was left as it is",
+                    hint="`jointctl stop` switches it off",
+                )
         self._taken = True
         self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
         self._find()

@@ -33,6 +33,23 @@ POWERED_STATES = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE)
 _OBJECTS = (0x6040, 0x6041, 0x6071, 0x60FF)
 
 
+def state_of(objects: ObjectAccess) -> State:
+    """By the statusword."""
+    return State(decode_state(objects.read(0x6041, what="statusword")))
+
+
+def brake(objects: ObjectAccess, sleep: Callable[[float], None]) -> bool:
+    """If the drive is powered, its quick stop, until it is off or QUICK_STOP_S is over; whether it was powered."""
+    for attempt in range(round(QUICK_STOP_S / POLL_S)):
+        state = state_of(objects)
+        if state not in POWERED_STATES:
+            return attempt > 0
+        if attempt == 0 and state is State.OPERATION_ENABLED:
+            objects.write(0x6040, 0, ControlWord.QUICK_STOP, what="controlword")
+        sleep(POLL_S)
+    return True
+
+
 class SwitchOff:
     """Takes the power from one drive; `encoder_node` is brought to pre-operational with it."""
 
@@ -71,17 +88,14 @@ class SwitchOff:
         except can.CanError as error:
             return f"unknown: the bus does not take frames any more ({error})"
 
-    def _state(self) -> State:
-        return State(decode_state(self._objects.read(0x6041, what="statusword")))
-
     def _attempt(self) -> str:
         state = State.UNDEFINED
         self._tell(NMT_PRE_OPERATIONAL, self._encoder_node)
         self._tell(NMT_PRE_OPERATIONAL, self._node)
-        self._brake()
+        brake(self._objects, self._sleep)
         for _ in range(round(OFF_S / POLL_S)):
             self._objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
-            state = self._state()
+            state = state_of(self._objects)
             if state in OFF_STATES:
                 break
             self._sleep(POLL_S)
@@ -98,16 +112,6 @@ class SwitchOff:
             self._tell(NMT_STOPPED, self._node)
             return f"{words}, it did not obey; NMT stop was sent"
         return words
-
-    def _brake(self) -> None:
-        """If the drive is enabled, its quick stop, until it is off or QUICK_STOP_S is over."""
-        for attempt in range(round(QUICK_STOP_S / POLL_S)):
-            state = self._state()
-            if state not in POWERED_STATES:
-                return
-            if attempt == 0 and state is State.OPERATION_ENABLED:
-                self._objects.write(0x6040, 0, ControlWord.QUICK_STOP, what="controlword")
-            self._sleep(POLL_S)
 
 
 def _standard_objects(node: int) -> canopen.ObjectDictionary:

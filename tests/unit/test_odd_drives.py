@@ -117,7 +117,7 @@ def test_without_1016_the_drive_is_not_enabled(commission: Any) -> None:
 
 
 def test_without_6077_the_torque_is_not_measured(commission: Any, device_on_bus: Any) -> None:
-    commission(without=("6077",))
+    assert not commission(without=("6077",)).measures_torque
     port = commission.port[0]
     assert (port.torque_at, port.tpdo_length) == (-1, 6)
     assert [value(device_on_bus, 0x1A00, k) for k in range(3)] == [2, 0x60410010, 0x60640020]
@@ -197,7 +197,7 @@ def test_not_ready_to_switch_on_for_too_long(commission: Any, device_on_bus: Any
 
 
 def test_no_statusword_until_the_first_controlword_that_is_not_zero(commission: Any, device_on_bus: Any) -> None:
-    device_on_bus.sequences[(0x6041, 0)] = [0, 0]
+    device_on_bus.sequences[(0x6041, 0)] = [0, 0, 0]
     commission(boot_timeout_s=1.0)
     words = [data[4] for cob, data in device_on_bus.requests if cob == 0x601 and data[:3] == b"\x2b\x40\x60"]
     assert words[:2] == [0x00, 0x06]
@@ -407,3 +407,14 @@ def test_a_value_that_does_not_fit_the_type_of_the_eds_is_one_line(
     text = re.sub(r"(?s)(\[6072\].*?)DataType=0x0006\n", r"\1DataType=0x0005\n", text, count=1)
     with pytest.raises(DeviceError, match=r"6072 \(max torque\) has 8 bits, which do not hold 1000"):
         commissioned_with(device_on_bus, settings_of_virtual_joint, tmp_path / "short.eds", text)
+
+
+@pytest.mark.parametrize(("torque_Nm", "refused"), [(48.4, False), (49.0, True)])
+def test_a_torque_limit_that_6072_would_cut_unseen_is_refused(commission: Any, torque_Nm: float, refused: bool) -> None:
+    """1000 permille of 5 A and 0.08 Nm/A at 121:1 are 48.4 Nm; the configuration alone cannot know it."""
+    how = {"torque_reference": "rated_current", "torque_constant_NmpA": 0.08, "max_torque_permille": 1000}
+    if refused:
+        with pytest.raises(DeviceError, match=r"limits.torque_max_Nm \(=49\) must be in \(0..48.4\], what drive.max"):
+            commission(torque_max_Nm=torque_Nm, **how)
+    else:
+        assert commission(torque_max_Nm=torque_Nm, **how).settings["max torque"] == "1000 permille = 48.4 Nm"

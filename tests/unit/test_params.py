@@ -191,6 +191,34 @@ class TestRestore:
         assert restored(device_on_bus, file, assume_yes=False) == 0
         assert bool(writes(device_on_bus)) == written
 
+    @pytest.mark.parametrize("what", ["SYNC", "under power", "nothing"])
+    def test_what_came_while_the_question_was_open_is_seen(
+        self, device_on_bus: Any, file: Path, what: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """A joint that moves by now must not lose its controller: not even pre-operational is said."""
+
+        class Terminal(io.StringIO):
+            def isatty(self) -> bool:
+                return True
+
+            def readline(self, *_: Any) -> str:
+                if what == "SYNC":
+                    with can.Bus(interface="virtual", channel=device_on_bus.channel) as bus:
+                        bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+                elif what == "under power":
+                    device_on_bus.answers[0x6041, 0] = 0x0237
+                return "y\n"
+
+        change(file, o6072="700")
+        monkeypatch.setattr(sys, "stdin", Terminal())
+        if what == "nothing":
+            assert restored(device_on_bus, file, assume_yes=False) == 0
+        else:
+            with pytest.raises((BusError, DeviceError), match=r"another controller|under power"):
+                restored(device_on_bus, file, assume_yes=False)
+        pre_operational = (0, b"\x80\x01") in device_on_bus.requests
+        assert (bool(writes(device_on_bus)), pre_operational) == ((True, True) if what == "nothing" else (False, False))
+
     def test_without_a_terminal_it_does_not_write(
         self, device_on_bus: Any, file: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

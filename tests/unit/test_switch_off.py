@@ -235,3 +235,49 @@ def test_its_twin_is_off(monkeypatch: pytest.MonkeyPatch, virtual_config: Any, c
 def test_the_words_for_a_run_that_was_not_begun(state: str, said: str) -> None:
     require_off(state)
     assert said in words(state)
+
+
+# --- a drive that somebody else has enabled, without SYNC ----------------------------------------------------------
+
+
+def control_words(device_on_bus: Any) -> list[int]:
+    return [data[4] for cob, data in device_on_bus.requests if cob == 0x601 and data[:3] == b"\x2b\x40\x60"]
+
+
+def test_a_drive_that_is_found_enabled_brakes_before_its_power_goes_off(
+    device_on_bus: Any, settings_of_virtual_joint: Any
+) -> None:
+    power_up(device_on_bus)
+    device_on_bus.requests.clear()
+    drive = device_on_bus.drive(settings_of_virtual_joint)
+    try:
+        report = drive.commission()
+    finally:
+        drive.close()
+    assert control_words(device_on_bus)[:2] == [2, 0]  # quick stop, then disable voltage
+    assert any("the drive was enabled" in remark for remark in report.remarks)
+
+
+def test_its_twin_that_is_off_is_not_braked(device_on_bus: Any, settings_of_virtual_joint: Any) -> None:
+    drive = device_on_bus.drive(settings_of_virtual_joint)
+    try:
+        report = drive.commission()
+    finally:
+        drive.close()
+    assert 2 not in control_words(device_on_bus)
+    assert not any("the drive was enabled" in remark for remark in report.remarks)
+
+
+def test_clear_fault_leaves_an_enabled_drive_alone(device_on_bus: Any, settings_of_virtual_joint: Any) -> None:
+    power_up(device_on_bus)
+    device_on_bus.requests.clear()
+    drive = device_on_bus.drive(settings_of_virtual_joint)
+    try:
+        with pytest.raises(DeviceError, match="operation enabled: there is no fault, and it was left as it is"):
+            drive.clear_fault()
+        assert powered(device_on_bus)
+        assert commands(device_on_bus) == []
+        drive.stop_now()
+        assert drive.clear_fault() == "no fault: the drive is switch on disabled"  # the twin
+    finally:
+        drive.close()

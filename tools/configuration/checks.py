@@ -11,6 +11,7 @@ from tools.configuration.elmo_settings import serial_problems
 from tools.configuration.sections import Friction, FrictionDirection
 
 CAN_RATE_HZ = (100.0, 4000.0)
+SWITCH_rad, SWITCH_radps = 1e-3, 1e-2  # what rounding of the numbers in a file may leave at a switch
 
 
 def trajectory_extremes(trajectory: Any) -> tuple[float, float, float] | None:
@@ -49,6 +50,29 @@ def extremes_problems(config: Config, low_rad: float, high_rad: float, speed_rad
             f"trajectory: peak speed (={speed_radps:g} rad/s) must be in [0..{limits.velocity_max_radps:g}], "
             "up to limits.velocity_max_radps"
         )
+    return found
+
+
+def switch_problems(trajectory: Any) -> list[str]:
+    """The second sine must go on where the first one is, and as fast: a step of the reference asks for all torque."""
+    switch = trajectory.switch if trajectory.kind == "sine" else None
+    if switch is None or 0.0 < trajectory.duration_s <= switch.at_s:
+        return []
+    places, speeds = [], []
+    for part in (trajectory, switch):
+        omega = math.tau * part.frequency_Hz
+        angle = omega * (switch.at_s + part.shift_s)
+        places.append(part.offset_rad + part.amplitude_rad * math.sin(angle))
+        speeds.append(part.amplitude_rad * omega * math.cos(angle))
+    found = []
+    for name, (before, after), allowed, unit in (
+        ("position", places, SWITCH_rad, "rad"), ("speed", speeds, SWITCH_radps, "rad/s"),
+    ):  # fmt: skip
+        if not abs(after - before) <= allowed:
+            found.append(
+                f"trajectory.switch.at_s (={switch.at_s:g}): the {name} would jump from {before:.4f} to {after:.4f} "
+                f"{unit}; it may by {allowed:g}: mend shift_s, offset_rad or amplitude_rad of the second sine"
+            )
     return found
 
 
@@ -91,6 +115,7 @@ def _limit_problems(config: Config) -> list[str]:
     extremes = trajectory_extremes(config.trajectory)
     if extremes is not None:
         found += extremes_problems(config, *extremes)
+    found += switch_problems(config.trajectory)
     braking = limits.velocity_max_radps / config.sequence.brake_radps2
     if braking >= config.sequence.stop_timeout_s:
         found.append(

@@ -175,7 +175,7 @@ class Limits(Section):
 
 
 class Sequence(Section):
-    # time to the start of the trajectory; 0 = start where the joint stands
+    # time to the start of the trajectory; 0 = none, the joint must stand there
     approach_s: Annotated[float | Literal["auto"], _auto_or_number(0.0, 600.0)]
     brake_radps2: Annotated[float, between(0.0, 10_000.0, open_low=True)]  # of a controlled stop
     release_s: Annotated[float, between(0.0, 60.0)]  # torque to zero at standstill

@@ -28,7 +28,7 @@ def motion_envelope(config: Config, report: CommissioningReport) -> list[str]:
         f"now at     {report.start_position_rad:+.4f} rad",
         f"approach   to {first.position_rad:+.4f} rad in {approach:.1f} s"
         if approach
-        else "approach   none: the trajectory starts where the joint stands",
+        else f"approach   none: at once to {first.position_rad:+.4f} rad",
         f"trajectory {config.trajectory.kind}: {low:+.4f} .. {high:+.4f} rad, up to {speed:.3f} rad/s "
         f"and {acceleration:.3f} rad/s2, {time_text}",
         f"limits     {limits.position_min_rad:+.3f} .. {limits.position_max_rad:+.3f} rad, "

@@ -16,7 +16,7 @@ import numpy as np
 
 from drivers.drive import CommissioningReport, Drive
 from drivers.errors import DataError, JointctlError, MotionFault
-from firmware_py.realtime import Word
+from firmware_py.realtime import Histogram, Word
 from firmware_py.states import AxisPhase, Fault, StopRequest
 from tools.analysis.margin_gate import require_margin
 from tools.configuration.config import Config
@@ -36,6 +36,7 @@ from tools.running.kept_awake import kept_awake
 from tools.running.live_panel import Display, PhaseLines, Snapshot
 from tools.running.loop_handle import LoopHandle
 from tools.running.open_drive import check_cyclic_rate, drive_fault_text, loop_delay_s, open_drive
+from tools.running.readiness import require_same_motion
 from tools.running.run_result import RunResult as RunResult
 from tools.running.shared_block import SERIAL
 from tools.running.stop_signals import StopSignals, stop_signals
@@ -120,7 +121,9 @@ class Supervisor:
 
     def _constants(self, loop: LoopHandle, report: CommissioningReport) -> Any:
         """`AxisConstants` for the joint as it was found; may still write the rows of `loop.block.table`."""
-        return axis_constants(self._config, start_position_rad=report.start_position_rad)
+        constants = axis_constants(self._config, start_position_rad=report.start_position_rad)
+        require_same_motion(self._config, loop.block.table)
+        return constants
 
     @staticmethod
     def _leave_if_asked(signals: StopSignals) -> None:
@@ -194,6 +197,8 @@ class Supervisor:
         if self._delay_s is not None or loop.cycles < min(DELAY_CYCLES, self._config.loop.rate_Hz):
             return
         config = self._config
+        if not loop.block.histograms[Histogram.ROUND_TRIP].any():
+            return  # nothing has been heard: the loop ends that itself, and tells it
         self._delay_s = loop_delay_s(config, loop.block.histograms)
         found = require_margin(config, self._delay_s, allow_low_margin=self._allow_low_margin)
         text = f"loop delay {self._delay_s * 1e3:.2f} ms measured, phase margin {found.phase_margin_deg:.0f} deg"

@@ -17,6 +17,7 @@ import numpy as np
 from drivers.drive import CommissioningReport
 from drivers.elmo.unit_modes import SPEED_MODE
 from drivers.errors import ConfigurationError, DeviceError, UsageError
+from firmware_py.realtime import Histogram
 from firmware_py.records import Reference
 from firmware_py.schema import new
 from firmware_py.states import CommandKind, Fault, TrajectoryKind
@@ -148,7 +149,11 @@ class SweepSupervisor(Supervisor):
     def _check_delay(self, loop: LoopHandle, log: RunLogWriter) -> None:
         if not self._velocity_mode:
             super()._check_delay(loop, log)
-        elif self._delay_s is None and loop.cycles >= min(DELAY_CYCLES, self._config.loop.rate_Hz):
+        elif (
+            self._delay_s is None
+            and loop.cycles >= min(DELAY_CYCLES, self._config.loop.rate_Hz)
+            and loop.block.histograms[Histogram.ROUND_TRIP].any()
+        ):
             # the drive closes its loop itself; ours is the slow position correction
             self._delay_s = loop_delay_s(self._config, loop.block.histograms)
             margin_deg = math.degrees(0.5 * math.pi - POSITION_GAIN_ps * self._delay_s)

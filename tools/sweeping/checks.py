@@ -8,7 +8,8 @@ A serial drive tells amperes and has no rated torque: its torque constant cannot
 
 from __future__ import annotations
 
-from drivers.errors import ConfigurationError
+from drivers.drive import CommissioningReport
+from drivers.errors import ConfigurationError, DeviceError
 from tools.configuration.config import Config
 from tools.configuration.conversions import torque_constant_NmpA
 from tools.configuration.elmo import ElmoSerial
@@ -39,6 +40,16 @@ def refuse_constants(config: Config) -> None:
     factor = _factor(config)
     if factor is not None and not 1.0 / WRONG_FACTOR <= factor <= WRONG_FACTOR:
         raise ConfigurationError(f"{config.path}: {_text(config, factor)}", "nothing was moved; see the data sheets")
+
+
+def require_torque(report: CommissioningReport) -> None:
+    """`DeviceError` where the torque of every sample would be zero."""
+    if not report.measures_torque:
+        raise DeviceError(
+            "the drive does not tell its torque in the cyclic exchange (object 6077): friction would read as zero, "
+            "and a blocked joint would not be noticed",
+            "use an EDS with 6077, and let it be mapped to a PDO",
+        )
 
 
 def constant_remarks(config: Config) -> list[str]:

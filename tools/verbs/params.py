@@ -119,9 +119,7 @@ def restore_file(
     wanted = load_parameters(path, node)
     ear = Ear()
     with canopen_network(subject, ear) as network:
-        time.sleep(LISTEN_S)
-        if ear.heard.syncs:
-            raise BusError("another controller is active on this bus (SYNC)", "end it first")
+        _refuse_controller(ear)
         reader = SdoReader(network, node, objects)
         reader.require_answer()
         _require_same_device(reader, wanted, path, other_device)
@@ -138,12 +136,22 @@ def restore_file(
         if not (assume_yes or agreed(output, "Write these into the drive?")):
             output.note("nothing was written")
             return 0
+        # the answer may have taken minutes: a joint that moves by now must not lose its controller
+        _refuse_controller(ear)
+        _require_off(reader)
         network.send_message(0, bytes([0x80, node]))  # pre-operational: PDOs can only be changed there
         time.sleep(_SETTLE_S)
         _require_off(reader)
         values = {change.place: change.second for change in changes if change.second is not None}
         done = restore(reader, values, wanted.parameters)
     return _report(done, objects, output)
+
+
+def _refuse_controller(ear: Ear) -> None:
+    """`BusError` if SYNC comes, or has come since `ear` was opened."""
+    time.sleep(LISTEN_S)
+    if ear.heard.syncs:
+        raise BusError("another controller is active on this bus (SYNC)", "end it first")
 
 
 def _require_off(reader: SdoReader) -> None:

@@ -14,7 +14,7 @@ from tools.running.consent import agreed, require_terminal
 from tools.running.drive_end import require_off
 from tools.running.envelope import motion_envelope
 from tools.running.live_panel import Display, run_display
-from tools.running.readiness import prepare_log, require_ready
+from tools.running.readiness import prepare_log, require_ready, require_start
 from tools.running.run_report import INTERRUPTED, report_run
 from tools.running.shared_block import SERIAL
 from tools.running.supervisor import Supervisor
@@ -42,6 +42,7 @@ def run(
         if dry_run:
             return False
         require_ready(config, report, path)
+        require_start(config, report.start_position_rad)
         if not (assume_yes or agreed(output)):
             return False
         prepare_log(config, path, output)

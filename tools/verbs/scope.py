@@ -13,10 +13,10 @@ from firmware_py.states import StopRequest
 from tools.output import Output
 from tools.recording.log_folder import log_path
 from tools.recording.run_log import read_run_log
-from tools.running.drive_end import require_off, words
+from tools.running.drive_end import words
 from tools.running.envelope import motion_envelope
 from tools.running.live_panel import run_display
-from tools.running.readiness import prepare_log, require_ready
+from tools.running.readiness import prepare_log, require_ready, require_start
 from tools.running.run_report import report_run
 from tools.running.shared_block import SERIAL
 from tools.running.supervisor import Supervisor
@@ -63,8 +63,7 @@ def live_scope(
                 _wait_for_prepare(feed, runs.told)
             return runs.code
         except KeyboardInterrupt:
-            require_off(runs.drive_state)
-            output.note("scope ended; the drive is disabled")
+            output.note(f"scope ended; {words(runs.drive_state)}")
             return runs.code
 
 
@@ -93,6 +92,7 @@ class _Runs:
             for line in lines:
                 output.note(line)
             require_ready(self._config, report, path)
+            require_start(self._config, report.start_position_rad)
             agreed = confirmed(feed, lines)
             if agreed:
                 prepare_log(self._config, path, output)

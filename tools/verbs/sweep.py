@@ -27,7 +27,7 @@ from tools.running.fault_text import FaultText, fault_text
 from tools.running.readiness import require_ready
 from tools.running.run_report import INTERRUPTED
 from tools.sweeping.carry_out import SweepSupervisor, approach_time_s, middle_rad, sweep_in_lockstep, with_mode
-from tools.sweeping.checks import constant_remarks, recorded_limits, refuse_constants, torque_source
+from tools.sweeping.checks import constant_remarks, recorded_limits, refuse_constants, require_torque, torque_source
 from tools.sweeping.data_file import SweepFile
 from tools.sweeping.grid import SweepPoint
 from tools.sweeping.meter import JointModel, MeasuredPoint, SweepMeter
@@ -145,6 +145,7 @@ class Sweep:
 
         def confirm(report: CommissioningReport) -> bool:
             resolution_Nm = report.torque_resolution_Nm / config.joint.reduction_ratio
+            require_torque(report)
             meter.tolerance = Tolerance(RELATIVE_TOLERANCE, 0.5 * resolution_Nm)
             return self._confirm(report, motion, points)
 
@@ -294,6 +295,6 @@ def sweep(config: Config, output: Output, out: Path, options: SweepOptions | Non
     try:
         return command.run()
     except KeyboardInterrupt:
-        output.note("interrupted; nothing moved")
+        output.note("interrupted; nothing moved" + ("" if command.file is None else " any more"))
         drive_end.require_off(command.drive_state)
         return INTERRUPTED

@@ -1,0 +1,196 @@
+"""Between what the user was shown and what the joint does nothing may change, and nothing may jump."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.drive import UNTOUCHED, CommissioningReport, DriveIdentity
+from drivers.errors import ConfigurationError, DeviceError, MotionFault
+from firmware_py.realtime import HISTOGRAM_BINS, Histogram
+from firmware_py.states import Fault
+from tools.configuration.config import Config
+from tools.configuration.load import load_config, shipped_config
+from tools.configuration.records import trajectory_table
+from tools.output import Output
+from tools.running.envelope import motion_envelope
+from tools.running.readiness import require_start
+from tools.running.supervisor import Supervisor
+from tools.simulation.lockstep import LockstepJoint
+from tools.sweeping.carry_out import SweepSupervisor
+from tools.sweeping.checks import require_torque
+from tools.verbs import scope as scope_module
+
+VIRTUAL = shipped_config("virtual").read_text()
+AT_ONCE = ('approach_s = "auto"', "approach_s = 0")
+
+
+def config_of(tmp_path: Path, *changes: tuple[str, str]) -> Config:
+    text = VIRTUAL
+    for old, new in changes:
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    path = tmp_path / "joint.toml"
+    path.write_text(text)
+    return load_config(path)
+
+
+def report(start_rad: float = 0.1, **more: Any) -> CommissioningReport:
+    return CommissioningReport(DriveIdentity("", "", "", ""), "cyclic_sync_torque", start_rad, 0.06, 1e-5, **more)
+
+
+# --- no approach ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("start_rad", "refused"), [(0.0, False), (0.005, False), (0.0051, True), (-0.04, True)])
+def test_without_an_approach_the_joint_must_stand_where_the_trajectory_begins(
+    tmp_path: Path, start_rad: float, refused: bool
+) -> None:
+    config = config_of(tmp_path, AT_ONCE)
+    with pytest.raises(MotionFault, match="approach_s") if refused else contextlib.nullcontext():
+        require_start(config, start_rad)
+    require_start(config_of(tmp_path), start_rad)  # with one it may stand elsewhere
+    lines = motion_envelope(config, report(start_rad))
+    assert "approach   none: at once to +0.0000 rad" in lines
+
+
+def test_that_is_why_it_would_be_pulled_there_with_all_its_torque(tmp_path: Path) -> None:
+    config = config_of(tmp_path, AT_ONCE, ("frequency_Hz = 0.1", "frequency_Hz = 0.1\noffset_rad = 0.14"))
+    joint = LockstepJoint(config)
+    run = joint.run()
+    assert run.fault is Fault.NONE  # 0.04 rad are less than the following error that is allowed
+    assert np.max(np.abs(run.log.command_torque_Nm)) == config.limits.torque_max_Nm
+    with pytest.raises(MotionFault, match="approach_s"):
+        require_start(config, joint.report.start_position_rad)
+
+
+# --- the second sine -----------------------------------------------------------------------------------------------
+
+CREST_s = 2.5
+
+
+@pytest.mark.parametrize(
+    ("switch", "told"),
+    [
+        (f"at_s = {CREST_s}\namplitude_rad = 0.35\nfrequency_Hz = 0.05\nshift_s = 2.5\noffset_rad = 0.0", ""),
+        (f"at_s = {CREST_s}\namplitude_rad = 0.35\nfrequency_Hz = 0.1\nshift_s = 0.0\noffset_rad = 0.0009", ""),
+        (f"at_s = {CREST_s}\namplitude_rad = 0.35\nfrequency_Hz = 0.1\nshift_s = 0.0\noffset_rad = 0.0011", "position"),
+        ("at_s = 3.0\namplitude_rad = 0.35\nfrequency_Hz = 0.1\nshift_s = 0.2\noffset_rad = 0.0", "position"),
+        ("at_s = 5.0\namplitude_rad = -0.35\nfrequency_Hz = 0.1\nshift_s = 0.0\noffset_rad = 0.0", "speed"),
+        ("at_s = 10.0\namplitude_rad = 0.3\nfrequency_Hz = 0.2\nshift_s = 0.0\noffset_rad = 0.0", ""),  # never reached
+    ],
+)
+def test_the_reference_does_not_jump_at_a_switch(tmp_path: Path, switch: str, told: str) -> None:
+    change = ("frequency_Hz = 0.1", f"frequency_Hz = 0.1\n[trajectory.switch]\n{switch}")
+    if not told:
+        config_of(tmp_path, change)
+        return
+    with pytest.raises(ConfigurationError, match=rf"trajectory.switch.at_s .* the {told} would jump"):
+        config_of(tmp_path, change)
+
+
+# --- a table that is edited while the question is open -------------------------------------------------------------
+
+
+def with_table(tmp_path: Path) -> tuple[Config, Path]:
+    way = tmp_path / "way.csv"
+    way.write_text("time_s,position_rad\n0,0\n1,0.1\n2,0.2\n3,0.2\n")
+    start, end = VIRTUAL.index("[trajectory]"), VIRTUAL.index("[virtual]")
+    path = tmp_path / "joint.toml"
+    path.write_text(
+        VIRTUAL[:start] + '[trajectory]\nkind = "table"\nduration_s = 3.0\nfile = "way.csv"\n\n' + VIRTUAL[end:]
+    )
+    return load_config(path), way
+
+
+@pytest.mark.parametrize(
+    ("text", "same"),
+    [
+        ("time_s,position_rad\n0,0\n1,0.1\n2,0.2\n3,0.2\n", True),
+        ("time_s,position_rad\n0,0\n1,0.1\n2,0.2\n", False),  # shorter: the loop would stop dead at its second row
+        ("time_s,position_rad\n0,0.4\n1,0.1\n2,0.2\n3,0.2\n", False),
+    ],
+)
+def test_a_table_that_was_edited_meanwhile_is_not_carried_out(tmp_path: Path, text: str, same: bool) -> None:
+    config, way = with_table(tmp_path)
+    supervisor = Supervisor(config, Output(), tmp_path / "log.mcap", lambda _: True)
+    loop: Any = SimpleNamespace(block=SimpleNamespace(table=trajectory_table(config)))
+    way.write_text(text)
+    if same:
+        assert supervisor._constants(loop, report())[0].trajectory.table_rows == 4
+        return
+    with pytest.raises(ConfigurationError, match=r"trajectory\.file was changed after it had been read"):
+        supervisor._constants(loop, report())
+
+
+# --- what the user is told -----------------------------------------------------------------------------------------
+
+
+class SilentLoop:
+    """300 cycles without one sample."""
+
+    def __init__(self, samples: int) -> None:
+        histograms = np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64)
+        histograms[Histogram.WORK, 20] = histograms[Histogram.WAKE, 5] = 300
+        histograms[Histogram.ROUND_TRIP, 100] = samples
+        self.block = SimpleNamespace(histograms=histograms)
+        self.cycles = 300
+        self.may_enable = False
+
+    def allow_enable(self) -> None:
+        self.may_enable = True
+
+
+@pytest.mark.parametrize("velocity", [False, True])
+@pytest.mark.parametrize("samples", [0, 300])
+def test_a_drive_that_says_nothing_is_told_by_the_loop_and_not_as_a_delay(
+    tmp_path: Path, samples: int, velocity: bool
+) -> None:
+    config = config_of(tmp_path)
+    log: Any = SimpleNamespace(write_event=lambda *_: None)
+    loop: Any = SilentLoop(samples)
+    common: Any = (config, Output(), tmp_path / "log.mcap", lambda _: True)
+    supervisor = Supervisor(*common)
+    if velocity:
+        nothing: Any = None
+        supervisor = SweepSupervisor(*common, nothing, nothing, lambda _: None)
+        supervisor._velocity_mode = True
+    supervisor._check_delay(loop, log)
+    assert loop.may_enable is (samples > 0)
+    assert (supervisor._delay_s is None) is (samples == 0)
+    if samples:
+        assert supervisor._delay_s == pytest.approx(1e-3)
+
+
+@pytest.mark.parametrize(
+    ("state", "said"),
+    [("switch on disabled", "the drive is disabled"), (UNTOUCHED, "another controller has it"), ("", "no drive")],
+)
+def test_the_end_of_the_scope_tells_how_the_drive_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: Any, virtual_config: Any, state: str, said: str
+) -> None:
+    class Runs:
+        code, drive_state, told = 0, state, {}
+
+        def __init__(self, *_: Any, **__: Any) -> None: ...
+        def one(self) -> bool:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(scope_module, "_Runs", Runs)
+    monkeypatch.setattr(scope_module, "scope_order", lambda *_, **__: SimpleNamespace(url=""))
+    monkeypatch.setattr(scope_module, "scope_server", lambda *_, **__: contextlib.nullcontext())
+    scope_module.live_scope(virtual_config, Output())
+    told = capsys.readouterr().err
+    assert said in told
+    assert ("disabled" in told) is (state == "switch on disabled")
+
+
+def test_a_sweep_on_a_drive_that_does_not_tell_its_torque_is_refused() -> None:
+    with pytest.raises(DeviceError, match="object 6077"):
+        require_torque(report(measures_torque=False))
+    require_torque(report())
