@@ -42,7 +42,7 @@ class Margins:
     sensitivity_peak: float  # Ms = max |1 / (1 + L)|
     sensitivity_peak_Hz: float
     slowest_time_constant_s: float  # of the closed loop's slowest mode; inf if unstable
-    oscillation_Hz: float  # of the least damped complex pair; nan without one
+    oscillation_Hz: float  # of the complex pair that decays slowest; nan without one
     oscillation_damping: float  # its damping ratio, negative if it grows
     poles: tuple[complex, ...]  # eigenvalues z, largest first
 
@@ -56,7 +56,7 @@ class Theory:
     bound_per_Nm: float | None  # |x| <= this times |eps|, as (30) prints it
     tight_bound_per_Nm: float | None  # with |P B|
     polynomial: tuple[float, ...]  # characteristic polynomial, highest power first
-    natural_frequency_radps: float  # of the least damped pair; nan without one
+    natural_frequency_radps: float  # of the pair that decays slowest; nan without one
     damping: float
     slowest_time_constant_s: float
 

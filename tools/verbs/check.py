@@ -94,7 +94,7 @@ def _table(
         _add_margins(table, found)
     if found.oscillation_Hz == found.oscillation_Hz:
         oscillation = f"{found.oscillation_Hz:.2f} Hz, damping {found.oscillation_damping:.3f}"
-        table.add_row("oscillation", oscillation, "least damped pair of the sampled loop")
+        table.add_row("oscillation", oscillation, "pair of the sampled loop that decays slowest")
     table.add_section()
     table.add_row("verdict", verdict, f"at least {minimum_deg:g} deg wanted (margin.min_phase_margin_deg)")
     return table
