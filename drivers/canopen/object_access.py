@@ -13,6 +13,7 @@ import canopen
 from canopen.objectdictionary import ObjectDictionaryError
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
+from drivers.canopen.sdo_download import download
 from drivers.errors import DeviceError, NoDeviceError
 
 ATTEMPTS = 3
@@ -131,7 +132,7 @@ class ObjectAccess:
         data = self._encoded(self._required(index, sub, what), value, what)
         for attempt in range(ATTEMPTS):
             try:
-                self._node.sdo.download(index, sub, data)
+                download(self._node.sdo, index, sub, data)
                 return
             except (SdoAbortedError, SdoCommunicationError, struct.error) as error:
                 if isinstance(error, SdoAbortedError) or attempt == ATTEMPTS - 1:

@@ -9,6 +9,7 @@ import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
 
+from drivers.canopen.sdo_download import download
 from hil.device import Cia402Device, DeviceSettings
 from hil.joint import plant
 from tests.virtual_drive import EDS, NODE, Network
@@ -61,7 +62,7 @@ WRITABLE = [v for v in VARIABLES if v.writable]
 def code_of(node: Any, variable: ODVariable, data: bytes) -> int:
     """Abort code of a download, 0 = accepted."""
     try:
-        node.sdo.download(variable.index, variable.subindex, data)
+        download(node.sdo, variable.index, variable.subindex, data)
     except canopen.SdoAbortedError as abort:
         return int(abort.code)
     return 0

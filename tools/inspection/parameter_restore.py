@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from drivers.canopen.pdo_layout import DISABLED
+from drivers.canopen.sdo_download import download
 from tools.inspection.objects import Place
 from tools.inspection.parameters import Value
 from tools.inspection.sdo_reading import ATTEMPTS, Refusal, SdoReader, abort_text
@@ -52,7 +53,7 @@ def write_value(reader: SdoReader, place: Place, value: Value) -> str:
 def _download(reader: SdoReader, place: Place, data: bytes) -> str:
     for _ in range(ATTEMPTS):
         try:
-            reader.remote.sdo.download(place.index, place.sub, data)
+            download(reader.remote.sdo, place.index, place.sub, data)
             return ""
         except SdoAbortedError as error:
             return abort_text(error.code)
