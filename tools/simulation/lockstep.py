@@ -143,26 +143,12 @@ class LockstepJoint:
             )
         if ideal_velocity and axis.law.matched_filter != 0:
             raise ConfigurationError("control.matched_filter (=true) must be false with an ideal velocity")
-        period_s = float(axis.law.period_s)
-        if longest_s is None:
-            longest_s = float(axis.sequence.approach_s + axis.trajectory.duration_s) + 10.0
-        cycles = int(longest_s / period_s)
-        log = new(LogRecord, cycles // log_every + 1 if log_every else 1)
-        truth = np.zeros((len(log), TRUTHS))
-        state, sample, command = new(AxisState), new(Sample), new(Command)
-        reset_axis(axis, state[0])
-        device = self._virtual.device.copy()
-        plant_constants = self.plant_constants if plant_constants is None else plant_constants
-        plant = (self.plant_state if plant_state is None else plant_state).copy()
-        frames, _ = exchange_memory()
-        frame_bytes = frames.view(np.ndarray).view(np.uint8).reshape(len(frames), FRAME_SIZE)
-        written, _ = run_lockstep(
-            begin, accept, end, self._port.copy(), frames, frame_bytes, constants, state, self.table, sample, command,
-            device, plant_constants, plant, self._virtual.queue.copy(), log, log_every, self.start_ns,
-            round(period_s * 1e9), cycles, stop_cycle,
-            truth, ideal_velocity,
+        cycles = self._longest_cycles(axis, longest_s)
+        records = cycles // log_every + 1 if log_every else 1
+        return self._carry_out(
+            constants, plant_constants, plant_state, new(LogRecord, records), np.zeros((records, TRUTHS)),
+            log_every=log_every, cycles=cycles, stop_cycle=stop_cycle, ideal_velocity=ideal_velocity,
         )  # fmt: skip
-        return LockstepRun(log[:written], state[0], plant[0], device[0], Fault(int(state[0].fault)), truth[:written])
 
     def run_with_faults(
         self,
@@ -182,12 +168,26 @@ class LockstepJoint:
         The joint is watched for `tail_s` after the controller has ended and is silent.
         """
         constants = self.constants() if constants is None else constants
-        axis = constants[0]
-        period_s = float(axis.law.period_s)
+        cycles = self._longest_cycles(constants[0], longest_s)
+        tail_cycles = int(tail_s / float(constants[0].law.period_s))
+        return self._carry_out(
+            constants, plant_constants, plant_state, new(LogRecord, cycles), np.zeros((cycles + tail_cycles, TRUTHS)),
+            log_every=1, cycles=cycles, stop_cycle=stop_cycle, tail_cycles=tail_cycles,
+            faults=faults, memories=fault_memory(faults, -1 if epoch_at_start else 0),
+        )  # fmt: skip
+
+    @staticmethod
+    def _longest_cycles(axis: Any, longest_s: float | None) -> int:
+        """How many cycles a run may take; by default ten seconds more than approach and trajectory together."""
         if longest_s is None:
             longest_s = float(axis.sequence.approach_s + axis.trajectory.duration_s) + 10.0
-        cycles, tail_cycles = int(longest_s / period_s), int(tail_s / period_s)
-        log, truth = new(LogRecord, cycles), np.zeros((cycles + tail_cycles, TRUTHS))
+        return int(longest_s / float(axis.law.period_s))
+
+    def _carry_out(
+        self, constants: Any, plant_constants: Any, plant_state: Any, log: Any, truth: np.ndarray, **how: Any
+    ) -> LockstepRun:
+        """A run from copies of device and plant; `how`: arguments of `run_lockstep` by their names."""
+        axis = constants[0]
         state, sample, command = new(AxisState), new(Sample), new(Command)
         reset_axis(axis, state[0])
         device = self._virtual.device.copy()
@@ -197,8 +197,7 @@ class LockstepJoint:
         frame_bytes = frames.view(np.ndarray).view(np.uint8).reshape(len(frames), FRAME_SIZE)
         written, rows = run_lockstep(
             begin, accept, end, self._port.copy(), frames, frame_bytes, constants, state, self.table, sample, command,
-            device, plant_constants, plant, self._virtual.queue.copy(), log, 1, self.start_ns,
-            round(period_s * 1e9), cycles, stop_cycle, truth,
-            faults=faults, memories=fault_memory(faults, -1 if epoch_at_start else 0), tail_cycles=tail_cycles,
+            device, plant_constants, plant, self._virtual.queue.copy(), log,
+            start_ns=self.start_ns, period_ns=round(float(axis.law.period_s) * 1e9), truth=truth, **how,
         )  # fmt: skip
         return LockstepRun(log[:written], state[0], plant[0], device[0], Fault(int(state[0].fault)), truth[:rows])
