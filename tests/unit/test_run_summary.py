@@ -169,6 +169,22 @@ def test_the_figure_is_a_png_and_marks_the_fault(tmp_path: Path) -> None:
         save_run_figure(records[:0], tmp_path / "none.png")
 
 
+def height_of(png: Path) -> int:
+    return int.from_bytes(png.read_bytes()[20:24], "big")  # of the IHDR chunk
+
+
+def test_a_law_without_network_has_neither_its_panel_nor_its_row(tmp_path: Path) -> None:
+    records = run_records()
+    high = height_of(save_run_figure(records, tmp_path / "with.png"))
+    records.network_torque_Nm = 0.0
+    records.observer_torque_Nm[100:] = 2.0
+    assert height_of(save_run_figure(records, tmp_path / "without.png")) < 0.9 * high
+    text = io.StringIO()
+    Console(file=text, width=100).print(summary_table(summarise(records)))
+    assert "command torque" in text.getvalue()
+    assert "network torque" not in text.getvalue()
+
+
 @pytest.mark.parametrize("count", [2, 4000, 4001, 100_003])
 def test_no_peak_is_lost_in_the_figure(count: int) -> None:
     values = np.sin(np.arange(count))

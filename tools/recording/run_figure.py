@@ -1,4 +1,4 @@
-"""One picture of a run: trajectory, error, torque in its parts, network output, over time.
+"""One picture of a run over time: trajectory, error, torque in its parts, the network's output where there is one.
 
 The approach is shaded, the time of a fault is marked, stopping is shaded in another tone.
 """
@@ -16,6 +16,10 @@ from firmware_py.states import AxisPhase, Fault
 
 POINTS = 4000  # a bucket of samples is drawn by its least and greatest value, so that no peak is lost
 _BLUE, _ORANGE, _GREEN, _RED, _GREY = "#1f5fa8", "#d9822b", "#3a8f4d", "#b3282d", "#555555"
+_PARTS = {
+    "friction": _ORANGE, "inertia": _GREEN, "feedback": _BLUE, "gravity": _GREY, "observer": "#7b4fa3",
+    "learned": "#3b8ea5",
+}  # fmt: skip
 
 
 def drawn_indices(values: np.ndarray, points: int = POINTS) -> np.ndarray:
@@ -41,12 +45,14 @@ def save_run_figure(records: Any, path: str | Path, title: str = "") -> Path:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10.0, 9.5), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(4, 1, sharex=True, height_ratios=(3, 3, 4, 2.4))
     time_s = (records["time_ns"] - records["time_ns"][0]) * 1e-9
     # while RELEASING the law rests and its parts keep their last values
     powered = (records["phase"] >= AxisPhase.APPROACH) & (records["phase"] <= AxisPhase.RAMPING)
+    with_network = bool(np.any(records["network_torque_Nm"][powered] != 0.0))
+    heights = (3.0, 3.0, 4.0, 2.4) if with_network else (3.0, 3.0, 4.0)
+    figure = Figure(figsize=(10.0, 0.77 * sum(heights)), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
 
     def draw(axis: Any, values: np.ndarray, label: str, color: str, **style: Any) -> None:
         values = np.where(powered, values, np.nan) if style.pop("powered", True) else values
@@ -59,14 +65,15 @@ def save_run_figure(records: Any, path: str | Path, title: str = "") -> Path:
     draw(axes[1], records["error_rad"] * 1e3, "error", _BLUE)
     axes[1].set_ylabel("error q - q$_d$ [mrad]")
     draw(axes[2], records["command_torque_Nm"], "command", "black", powered=False, linewidth=1.4)
-    for name, color in (("friction", _ORANGE), ("inertia", _GREEN), ("feedback", _BLUE), ("gravity", _GREY)):
+    for name, color in _PARTS.items():
         values = records[f"{name}_torque_Nm"]
         if np.any(values[powered] != 0.0):
             draw(axes[2], values, name, color, linewidth=0.9)
     axes[2].set_ylabel("joint torque [Nm]")
-    draw(axes[3], records["network_torque_Nm"], "network", _RED)
-    axes[3].set_ylabel("network output,\nsubtracted [Nm]")
-    axes[3].set_xlabel("time [s]")
+    if with_network:
+        draw(axes[3], records["network_torque_Nm"], "network", _RED)
+        axes[3].set_ylabel("network output,\nsubtracted [Nm]")
+    axes[-1].set_xlabel("time [s]")
 
     _mark_phases(axes, records["phase"], time_s)
     _mark_fault(axes, records["fault"], time_s)

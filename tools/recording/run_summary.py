@@ -189,7 +189,7 @@ def summary_table(summary: RunSummary) -> Table:
         ("friction feed-forward", summary.friction_torque_Nm),
         ("network torque", summary.network_torque_Nm),
     ):
-        if torque is not None:
+        if torque is not None and (torque.least, torque.greatest) != (0.0, 0.0):  # zero: the law has no such part
             table.add_row(name, f"{torque.least:.2f} .. {torque.greatest:.2f} Nm")
     for name, times in (
         ("wake-up late", summary.wake_late),
