@@ -9,7 +9,6 @@ from drivers.elmo.codes import (
     AMPLIFIER_MASK,
     FAULT_LATCHED,
     motor_off_cause,
-    status_text,
 )
 from drivers.elmo.commissioning import ElmoCommissioning
 from drivers.elmo.dialogue import changed
@@ -86,11 +85,6 @@ class ElmoDrive(ElmoCommissioning):
         return self._line.integer("SR"), self._line.integer("MF")
 
     # --- the end ---
-
-    def fault_report(self) -> str:
-        """What the drive says about itself, in words."""
-        status, fault = self._line.integer("SR"), self._line.integer("MF")
-        return f"{motor_off_cause(status, fault)}; {status_text(status)}"
 
     def make_safe(self) -> str:
         """TC=0, JV=0, ST, MO=0 until MO reads 0.  Never raises; a drive that was never found is left alone."""
