@@ -78,7 +78,7 @@ def error_table(errors_Nm: np.ndarray, measured_Nm: np.ndarray, ratio: float) ->
         ("greatest", np.max(np.abs(errors_Nm)), np.max(np.abs(relative))),
         ("mean", np.mean(errors_Nm), np.mean(relative)),
     ):
-        table.add_row(word, f"{1e3 * value:.4g}", f"{ratio * value:.4g}", f"{share:.2%}")
+        table.add_row(word, f"{1e3 * value:.4g}", f"{ratio * value:.4g}", f"{share:z.2%}")
     return table
 
 

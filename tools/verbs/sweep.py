@@ -278,7 +278,7 @@ class Sweep:
         for name, value in (
             ("points", f"{done} of {len(self.plan.points)}"),
             ("not settled", str(len(self._unsettled))),
-            ("drive afterwards", self.drive_state or "simulated"),
+            ("drive afterwards", self.drive_state or "none, it was simulated"),
             ("data", str(self.out)),
             ("sidecar", str(self.out.with_suffix(".json"))),
         ):
