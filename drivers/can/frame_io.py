@@ -101,7 +101,7 @@ def wait_readable_ns(fd: int, timeout_ns: int, scratch: Any) -> bool:
     `scratch` is int64[3] of `new_wait_scratch`.
     """
     limited_ns = max(timeout_ns, 0)
-    scratch[0] = (POLLIN << 32) | fd
+    scratch[0] = (POLLIN << 32) | np.int64(fd)
     scratch[1] = limited_ns // NANOSECONDS
     scratch[2] = limited_ns % NANOSECONDS
     address = scratch.ctypes.data

@@ -81,6 +81,16 @@ def begin_cycle(port: CanopenPort, frames: np.ndarray) -> int:
 
 
 @kernel
+def answer_owed(port: CanopenPort) -> bool:
+    """Before `begin_cycle`: whether the last SYNC still lacks a TPDO, so that the next one may belong to it.
+
+    Not on the virtual bus, where a stamp tells.
+    """
+    wanted = SEEN_FIRST if port.second.tpdo_id == 0 else SEEN_FIRST | SEEN_SECOND
+    return port.cycle > 0 and port.stamped == 0 and port.seen & wanted != wanted
+
+
+@kernel
 def _accept_tpdo(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -> bool:
     """Take statusword, position and torque; False if the TPDO is too short, or doubled or late.
 
@@ -90,10 +100,11 @@ def _accept_tpdo(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -
     if frame.length < port.tpdo_length:
         port.malformed += 1
         return False
-    if port.in_cycle == 0 and port.answered != 0:
+    if port.in_cycle == 0 and port.answered & SEEN_FIRST != 0:
         port.surplus += 1
         return False
-    port.answered = port.in_cycle
+    if port.in_cycle != 0:
+        port.answered |= SEEN_FIRST
     sample.status_word = get_u16(frame.payload, port.status_at)
     port.state = decode_state(sample.status_word)
     sample.drive_state = drive_state(port.state)
@@ -114,9 +125,11 @@ def _accept_second(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int)
     if frame.length < port.second.tpdo_length:
         port.malformed += 1
         return False
-    if port.in_cycle == 0 and port.seen & SEEN_SECOND != 0:
+    if port.in_cycle == 0 and port.answered & SEEN_SECOND != 0:
         port.surplus += 1
         return False
+    if port.in_cycle != 0:
+        port.answered |= SEEN_SECOND
     take_second_counts(port.second, get_i32(frame.payload, port.second.position_at))
     port.seen |= SEEN_SECOND
     return publish_sample(port, sample, now_ns)

@@ -12,7 +12,7 @@ from numba.core import types
 
 from drivers.can.frame_io import receive_frame, send_frame, stamp_frame, stamp_of, wait_readable_ns
 from drivers.can.frames import Frame
-from drivers.canopen.cyclic import accept_frame, begin_cycle, end_cycle
+from drivers.canopen.cyclic import accept_frame, answer_owed, begin_cycle, end_cycle
 from drivers.canopen.port import (
     FRAME_SLOTS,
     SCRATCH_WORDS,
@@ -81,11 +81,14 @@ def _drain(port: CanopenPort, frames: np.ndarray, sample: Sample, now_ns: int, s
 def receive(ports: Any, frames: np.ndarray, scratch: np.ndarray, samples: Any, now_ns: int, deadline_ns: int) -> int:
     """Send SYNC and wait for the answering TPDO until `deadline_ns`; returns the time waited [ns].
 
-    Frames that came since the last cycle are taken first, so that a late TPDO is not mistaken for the answer.
+    Frames that came since the last cycle are taken first, so that a late TPDO is not mistaken for the answer.  One
+    that is later still comes after this SYNC: where the last one has no answer yet, the whole time is waited and the
+    last TPDO counts.
     """
     port = ports[0]
     sample = samples[0]
     _drain(port, frames, sample, now_ns, 0)
+    owed = answer_owed(port)
     count = begin_cycle(port, frames)
     for slot in range(count):
         _note_sent(port, sample, _send(port, frames, slot), False)
@@ -93,7 +96,7 @@ def receive(ports: Any, frames: np.ndarray, scratch: np.ndarray, samples: Any, n
     started_ns = monotonic_ns(scratch)
     arrived_ns = started_ns
     while True:
-        if _drain(port, frames, sample, arrived_ns, sync_stamp):
+        if _drain(port, frames, sample, arrived_ns, sync_stamp) and not owed:
             return monotonic_ns(scratch) - started_ns
         if arrived_ns >= deadline_ns:
             return arrived_ns - started_ns

@@ -83,7 +83,6 @@ class CanopenPort:
     clock: Annotated[np.ndarray, array_of(i8, 2)]  # scratch of the stamps
     second: SecondPosition
     # state
-    seen: i4  # TPDOs since the last SYNC: 1 the drive's, 2 the second encoder's
     first_rad: f8  # position by 6064
     first_offset_rad: f8
     primed: i4
@@ -93,8 +92,9 @@ class CanopenPort:
     state: i4  # cia402.State
     nmt_state: i4
     in_cycle: i4  # 1 from SYNC to RPDO
-    answered: i4  # the last SYNC has its TPDO
-    surplus: i8  # TPDOs after that: doubled or late
+    seen: i4  # TPDOs since the last SYNC: 1 the drive's, 2 the second encoder's
+    answered: i4  # those of them that came before the RPDO
+    surplus: i8  # TPDOs after those: doubled or late
     heartbeat_watched: i4  # the drive has been told to send its own
     heartbeat_heard_cycle: i8
     error_cycle: i8  # in which the last EMCY came

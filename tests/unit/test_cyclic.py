@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import math
+import socket
 import struct
+import threading
+import time
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -17,6 +21,7 @@ from drivers.canopen.cyclic import (
     ERROR_SHOWN_CYCLES,
     UNHEEDED_MAX_CYCLES,
     accept_frame,
+    answer_owed,
     begin_cycle,
     end_cycle,
     get_i16,
@@ -51,7 +56,8 @@ class Wire:
         port.position_radpcount, port.torque_Nmppermille, port.max_permille = RAD_PER_COUNT, 0.0605, 1000
         port.state, port.heartbeat_cycles = State.UNDEFINED, 3
         self.frames = new(Frame, FRAME_SLOTS)
-        self.sample, self.command = new(Sample)[0], new(Command)[0]
+        self.samples = new(Sample)
+        self.sample, self.command = self.samples[0], new(Command)[0]
 
     def receive(self, identifier: int, data: bytes, now_ns: int = 1) -> bool:
         frame = self.frames[3]
@@ -309,6 +315,76 @@ def test_of_a_burst_the_last_one_counts(wire: Wire) -> None:
     for counts in (1, 2, 3):
         assert wire.tpdo(counts=counts)
     assert wire.sample.position_rad == pytest.approx(3 * RAD_PER_COUNT)
+
+
+class Line:
+    """`exchange.receive` on a bus without stamps, with a drive whose answers come when the test says."""
+
+    def __init__(self, wire: Wire) -> None:
+        self.wire = wire
+        self.drive, self.ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        wire.port.fd = self.ours.fileno()
+        _, self.scratch = exchange.exchange_memory()
+
+    def cycle(self, *answers: tuple[float, int], window_s: float) -> float:
+        """One cycle with the drive's (pause [s], counts) after SYNC; returns the counts that it ends with."""
+        thread = threading.Thread(target=self._answer, args=(answers,))
+        thread.start()
+        wire, now_ns = self.wire, time.monotonic_ns()
+        exchange.receive(
+            wire.ports, wire.frames, self.scratch, wire.samples, np.int64(now_ns), np.int64(now_ns + window_s * 1e9)
+        )
+        taken = float(wire.sample.position_rad) / RAD_PER_COUNT
+        thread.join()
+        wire.rpdo(0.0)
+        return taken
+
+    def _answer(self, answers: tuple[tuple[float, int], ...]) -> None:
+        while struct.unpack_from("<I", self.drive.recv(16))[0] != 0x80:
+            pass
+        for pause_s, counts in answers:
+            time.sleep(pause_s)
+            self.drive.send(struct.pack("<IB3xHih", 0x185, 8, 0x0250, counts, 0))
+
+
+@pytest.fixture
+def line(wire: Wire) -> Iterator[Line]:
+    made = Line(wire)
+    yield made
+    made.drive.close()
+    made.ours.close()
+
+
+def test_after_a_cycle_without_answer_the_last_tpdo_counts(line: Line) -> None:
+    """Its answer may come behind the next SYNC, and then in front of the next answer: a position one period old."""
+    assert line.cycle((0.0, 10), window_s=30.0) == pytest.approx(10)
+    assert line.cycle(window_s=0.01) == pytest.approx(10)
+    assert line.cycle((0.0, 20), (0.05, 30), window_s=1.0) == pytest.approx(30)
+    assert line.wire.port.surplus == 0
+    assert line.cycle((0.0, 40), window_s=30.0) == pytest.approx(40)  # no need to wait any more
+
+
+def test_after_an_answered_cycle_the_first_tpdo_ends_the_wait(line: Line) -> None:
+    assert line.cycle((0.0, 10), window_s=30.0) == pytest.approx(10)
+    assert line.cycle((0.0, 20), (0.1, 30), window_s=30.0) == pytest.approx(20)
+    assert line.cycle((0.0, 40), window_s=30.0) == pytest.approx(40)
+    assert line.wire.port.surplus == 1
+
+
+def test_an_answer_that_comes_between_the_cycles_is_not_owed(line: Line) -> None:
+    line.cycle(window_s=0.01)
+    line.wire.tpdo(counts=20)
+    assert line.cycle((0.0, 30), window_s=30.0) == pytest.approx(30)
+
+
+@pytest.mark.parametrize(
+    ("cycle", "stamped", "second_id", "seen", "owed"),
+    [(0, 0, 0, 0, 0), (1, 0, 0, 0, 1), (1, 0, 0, 1, 0), (1, 1, 0, 0, 0), (1, 0, 0x186, 1, 1), (1, 0, 0x186, 2, 1),
+     (1, 0, 0x186, 3, 0)],
+)  # fmt: skip
+def test_when_an_answer_is_owed(wire: Wire, cycle: int, stamped: int, second_id: int, seen: int, owed: int) -> None:
+    wire.port.cycle, wire.port.stamped, wire.port.seen, wire.port.second.tpdo_id = cycle, stamped, seen, second_id
+    assert answer_owed(wire.port) == owed
 
 
 # --- the drive's own heartbeat ---------------------------------------------------------------------------------

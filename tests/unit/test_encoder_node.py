@@ -15,17 +15,18 @@ import pytest
 import tomlkit
 
 from drivers.can.frames import Frame
-from drivers.canopen.cyclic import accept_frame, begin_cycle
+from drivers.canopen.cyclic import accept_frame, begin_cycle, end_cycle
 from drivers.canopen.eds_file import read_eds
 from drivers.canopen.second_position import centred
 from drivers.errors import ConfigurationError, DeviceError
-from firmware_py.records import ENCODER_RESTARTED, Sample
+from firmware_py.records import ENCODER_RESTARTED, Command, Sample
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, Fault
 from hil.faults import FaultConstants, FaultKind
 from tools.configuration.config import Config
 from tools.configuration.drive_settings import canopen_settings, cyclic_bus_load
 from tools.configuration.load import load_config
+from tools.inspection.bus_health import bus_budget
 from tools.running.open_drive import drive_fault_text
 from tools.simulation.lockstep import LockstepJoint
 from tools.simulation.virtual_joint import new_device
@@ -139,8 +140,13 @@ def port_of(folder: Path, encoder: dict[str, Any], **changes: Any) -> Any:
 
 def cycle(port: Any, sample: Any, first: int | None, second: int | None) -> None:
     """One SYNC, and the TPDOs that answer it."""
+    begin_cycle(port[0], new(Frame, 4))
+    tell(port, sample, first, second)
+
+
+def tell(port: Any, sample: Any, first: int | None, second: int | None) -> None:
+    """The TPDOs of drive and encoder."""
     frames = new(Frame, 4)
-    begin_cycle(port[0], frames)
     for identifier, data in (
         (0x181, None if first is None else struct.pack("<HiH", 0x1237, first, 0)),
         (0x182, None if second is None else struct.pack("<I", second)),
@@ -162,6 +168,28 @@ def test_a_sample_needs_both_positions_of_one_cycle(tmp_path: Path) -> None:
     assert sample.status_word == 0x1237  # the drive is heard all the same
     cycle(port, sample, 0, 100_000)
     assert sample.count == 2
+
+
+def test_of_a_burst_the_last_position_of_each_counts(tmp_path: Path) -> None:
+    """The answers to two SYNCs come together, behind their cycles: the two positions are of the same one."""
+    port, sample, frames = port_of(tmp_path, NODE), new(Sample)[0], new(Frame, 4)
+    cycle(port, sample, 0, 100_000)
+    for _ in range(2):
+        begin_cycle(port[0], frames)
+        end_cycle(port[0], frames, sample, new(Command)[0])
+    for turns in (0.01, 0.02):
+        tell(port, sample, round(turns * 121 * 65536), 100_000 + round(turns * 524288))
+    assert sample.position_rad == pytest.approx(0.02 * math.tau, abs=1e-5)
+    assert sample.second_position_rad == pytest.approx(0.02 * math.tau, abs=1e-5)
+    assert port[0].surplus == 0
+
+
+def test_a_position_after_the_answer_of_each_is_not_a_new_one(tmp_path: Path) -> None:
+    port, sample, frames = port_of(tmp_path, NODE), new(Sample)[0], new(Frame, 4)
+    cycle(port, sample, 0, 100_000)
+    end_cycle(port[0], frames, sample, new(Command)[0])
+    tell(port, sample, 1000, 100_100)
+    assert (sample.count, port[0].surplus, sample.second_position_rad) == (1, 2, 0.0)
 
 
 @pytest.mark.parametrize(("law", "swapped"), [("joint_encoder", True), ("encoder", False)])
@@ -380,6 +408,19 @@ def test_two_incremental_encoders_are_refused(tmp_path: Path) -> None:
 def test_the_bus_load_counts_the_second_position(tmp_path: Path) -> None:
     with_one = cyclic_bus_load(load_config(CONFIGS / "virtual.toml"))
     assert cyclic_bus_load(config_with(tmp_path, NODE)) == pytest.approx(with_one + 95e3 / 1e6)
+
+
+@pytest.mark.parametrize(("rate_Hz", "refused"), [(2105.0, False), (2106.0, True)])
+def test_the_arithmetic_names_the_second_position(tmp_path: Path, rate_Hz: float, refused: bool) -> None:
+    """SYNC 55, TPDO 135, RPDO 95 and 95 bits; `doctor` reckons alike."""
+    config = config_with(tmp_path, NODE)
+    config = config.model_copy(update={"loop": config.loop.model_copy(update={"rate_Hz": rate_Hz})})
+    assert bus_budget(config).status == ("problem" if refused else "ok")
+    if refused:
+        with pytest.raises(ConfigurationError, match=re.escape("TPDO(8) + RPDO(4) + second encoder(4) = 380 bits")):
+            cyclic_bus_load(config)
+    else:
+        assert cyclic_bus_load(config) == pytest.approx(380 * rate_Hz / 1e6)
 
 
 def test_settings_of_the_driver(tmp_path: Path) -> None:

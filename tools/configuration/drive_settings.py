@@ -14,9 +14,10 @@ from hil.encoder_node import EncoderSettings
 from tools.configuration.config import Config
 from tools.configuration.conversions import torque_constant_NmpA
 
-CYCLE_BYTES = (0, 8, 4)  # SYNC, TPDO, RPDO
-VELOCITY_CYCLE_BYTES = (0, 8, 6)  # 60FF is longer than 6071
+TPDO_BYTES, RPDO_BYTES = 8, 4
+VELOCITY_RPDO_BYTES = 6  # 60FF is longer than 6071
 SECOND_POSITION_BYTES = 4
+_FRAMES = ("TPDO", "RPDO", "second encoder")
 TORQUE_MODES = ("cst", "tq", "auto")  # of `CanopenSettings.mode`; the others may end in a velocity mode
 HIGHEST_LOAD = 0.8  # of the bus by the cyclic frames; the rest is for heartbeats, SDO and EMCY
 DEFAULT_RATED_CURRENT_A = 5.0
@@ -106,18 +107,24 @@ def _second_encoder(config: Config) -> dict[str, Any]:
     return {"encoder": EncoderSettings(path, encoder.node, counts, encoder.direction, zero)}
 
 
+def cycle_bytes(config: Config) -> tuple[int, ...]:
+    """Data bytes of the frames of one cycle: SYNC, TPDO, RPDO, and the TPDO of a second encoder."""
+    rpdo = RPDO_BYTES if config.canopen.mode in TORQUE_MODES else VELOCITY_RPDO_BYTES
+    second = () if config.joint_encoder is None else (SECOND_POSITION_BYTES,)
+    return (0, TPDO_BYTES, rpdo, *second)
+
+
 def cyclic_bus_load(config: Config) -> float:
     """Share of the bus that the cyclic frames take at worst-case stuffing; refuses more than HIGHEST_LOAD."""
     rate_Hz, bitrate = config.loop.rate_Hz, config.bus.bitrate_bitps
-    cycle_bytes: tuple[int, ...] = CYCLE_BYTES if config.canopen.mode in TORQUE_MODES else VELOCITY_CYCLE_BYTES
-    if config.joint_encoder is not None:
-        cycle_bytes = (*cycle_bytes, SECOND_POSITION_BYTES)
-    load = bus_load(cycle_bytes, rate_Hz, bitrate)
+    lengths = cycle_bytes(config)
+    load = bus_load(lengths, rate_Hz, bitrate)
     if load > HIGHEST_LOAD:
-        highest = highest_rate_Hz(cycle_bytes, bitrate, HIGHEST_LOAD)
+        highest = highest_rate_Hz(lengths, bitrate, HIGHEST_LOAD)
+        frames = " + ".join(("SYNC", *(f"{name}({n})" for name, n in zip(_FRAMES, lengths[1:], strict=False))))
         raise ConfigurationError(
             f"loop.rate_Hz (={rate_Hz:g}) must be at most {highest:.0f} at bus.bitrate_bitps (={bitrate}): "
-            f"SYNC + TPDO(8) + RPDO({cycle_bytes[-1]}) = {load * bitrate / rate_Hz:.0f} bits a cycle, "
+            f"{frames} = {load * bitrate / rate_Hz:.0f} bits a cycle, "
             f"{load:.0%} of the bus, {HIGHEST_LOAD:.0%} allowed"
         )
     return load

@@ -21,7 +21,7 @@ from drivers.can.open import CYCLIC_INTERFACES, open_python_can
 from drivers.can.socketcan import up_command
 from drivers.errors import BusError
 from tools.configuration.config import Config
-from tools.configuration.drive_settings import CYCLE_BYTES, HIGHEST_LOAD
+from tools.configuration.drive_settings import HIGHEST_LOAD, cycle_bytes
 from tools.inspection.findings import NOTE, OK, PROBLEM, Finding, file_text
 from tools.running.loop_handle import RECEIVE_SHARE
 from tools.running.portable_loop import HIGHEST_RATE_HZ
@@ -97,8 +97,9 @@ def interface_state(config: Config) -> Iterator[Finding]:
 def bus_budget(config: Config) -> Finding:
     """Worst-case share of the bus that the cyclic frames take, and the rate that the bus allows."""
     rate_Hz, bitrate = config.loop.rate_Hz, config.bus.bitrate_bitps
-    load = bus_load(CYCLE_BYTES, rate_Hz, bitrate)
-    highest = highest_rate_Hz(CYCLE_BYTES, bitrate, HIGHEST_LOAD)
+    lengths = cycle_bytes(config)
+    load = bus_load(lengths, rate_Hz, bitrate)
+    highest = highest_rate_Hz(lengths, bitrate, HIGHEST_LOAD)
     numbers = {"load": load, "highest_rate_Hz": highest}
     text = f"{load:.1%} at {rate_Hz:g} Hz and {bitrate} bit/s; up to {highest:.0f} Hz at {HIGHEST_LOAD:.0%}"
     if config.bus.interface not in CYCLIC_INTERFACES:

@@ -30,7 +30,7 @@ import numpy as np
 
 from drivers.can.frames import ERROR_FLAG, Frame
 from drivers.can.virtual_bus import decode, encode
-from drivers.canopen.cyclic import accept_frame, begin_cycle, end_cycle
+from drivers.canopen.cyclic import accept_frame, answer_owed, begin_cycle, end_cycle
 from drivers.canopen.port import FRAME_SLOTS, SLOT_RECEIVED, SLOT_RPDO, SLOT_SYNC
 from drivers.errors import ConfigurationError
 from firmware_py.axis import step_axis
@@ -152,6 +152,7 @@ class PortableExchange:
             if message is None:
                 break
             self._accept(message, time.monotonic_ns())
+        owed = answer_owed(self._port)  # as in `drivers.canopen.exchange`
         for slot in range(SLOT_SYNC, begin_cycle(self._port, self._frames)):
             self._send(slot)
         self.sync_ns = started_ns = now_ns = time.monotonic_ns()
@@ -159,7 +160,7 @@ class PortableExchange:
         while now_ns < until_ns:
             message = self._receive((until_ns - now_ns) * 1e-9)
             now_ns = time.monotonic_ns()
-            if message is None or self._accept(message, now_ns):
+            if message is None or (self._accept(message, now_ns) and not owed):
                 break  # time-out, failure, or the sample
         self._note_cycle()
         return now_ns - started_ns
