@@ -8,10 +8,13 @@ from __future__ import annotations
 import errno
 import json
 import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 from drivers.can.socketcan import up_command
+from drivers.errors import BusError, NoDeviceError
 
 _TIMEOUT_S = 2.0
 SHORT_QUEUE = 50  # frames; Linux' default of 10 overflows when two programs send
@@ -106,3 +109,18 @@ def send_problem(channel: str, code: int) -> tuple[str, str] | None:
     if code in (errno.ENODEV, errno.ENXIO):
         return f"CAN interface {channel} has gone", f"plug the adapter in again, then: {up_command(channel)}"
     return None
+
+
+@contextmanager
+def interface_blamed(interface: str, channel: str, bitrate_bitps: int | None) -> Iterator[None]:
+    """A failure of the bus, or the silence of everybody on it, inside also tells what is wrong with a SocketCAN
+    interface, if something is, and the command that mends it."""
+    try:
+        yield
+    except (BusError, NoDeviceError) as error:
+        link = link_state(channel) if interface == "socketcan" else None
+        problem = link_problem(link, bitrate_bitps) if link is not None else None
+        if problem is None or problem[0] in error.message:
+            raise
+        hint = f"{problem[1]}; {error.hint}" if error.hint else problem[1]
+        raise type(error)(f"{error.message}; {problem[0]}", hint=hint) from error

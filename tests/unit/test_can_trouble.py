@@ -3,12 +3,29 @@
 from __future__ import annotations
 
 import errno
+from collections.abc import Callable
 from typing import Any
 
+import can
 import pytest
 
 from drivers.can.error_frames import BUS_OFF, CONTROLLER, COUNTERS, NO_ACK, PROTOCOL, error_frame_text, trouble
-from drivers.can.link_state import LinkState, link_problem, link_state, parse_link, send_problem
+from drivers.can.link_state import (
+    LinkState,
+    interface_blamed,
+    link_problem,
+    link_state,
+    parse_link,
+    send_problem,
+)
+from drivers.canopen.settings import CanopenSettings
+from drivers.errors import BusError, JointctlError, NoDeviceError
+from tools.inspection.subject import Subject
+from tools.output import Output
+from tools.running.open_drive import commission
+from tools.verbs.info import info
+from tools.verbs.scan import scan
+from tools.verbs.stop import clear_fault
 
 
 @pytest.mark.parametrize(
@@ -81,6 +98,70 @@ def test_a_virtual_interface_tells_less() -> None:
 
 def test_an_interface_that_does_not_exist() -> None:
     assert link_state("jc_none0") is None
+
+
+SILENCE = NoDeviceError("node 1 does not answer", hint="power, wiring")
+
+
+@pytest.mark.parametrize(
+    ("data", "words", "cure"),
+    [
+        ({"bittiming": {"bitrate": 500000}}, "runs at 500000 bit/s, the configuration says 1000000", "bitrate 1000000"),
+        ({"state": "BUS-OFF"}, "can0 is bus-off", "restart-ms 100"),
+        ({"state": "ERROR-PASSIVE"}, "can0 is error passive", "60 ohm"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("failure", [SILENCE, BusError("the bus failed during commissioning")])
+def test_silence_on_a_sick_interface_tells_its_trouble_and_the_cure(
+    data: dict[str, Any], words: str, cure: str, failure: JointctlError, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("drivers.can.link_state.link_state", lambda channel: parse_link(real_interface(**data)))
+    with pytest.raises(type(failure)) as caught, interface_blamed("socketcan", "can0", 1_000_000):
+        raise failure
+    assert caught.value.message.startswith(f"{failure.message}; CAN interface can0 ")
+    assert words in caught.value.message
+    assert cure in caught.value.hint
+    assert caught.value.hint.endswith(failure.hint)
+
+
+@pytest.mark.parametrize(
+    ("interface", "state"), [("socketcan", "ERROR-ACTIVE"), ("jointctl", "BUS-OFF"), ("socketcan", "")]
+)
+def test_silence_on_a_sound_interface_or_another_bus_stays_as_it_is(
+    interface: str, state: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link = parse_link(real_interface(state=state)) if state else None  # None: no such interface, or no program `ip`
+    monkeypatch.setattr("drivers.can.link_state.link_state", lambda channel: link)
+    with pytest.raises(NoDeviceError) as caught, interface_blamed(interface, "can0", 1_000_000):
+        raise SILENCE
+    assert caught.value is SILENCE
+
+
+@pytest.mark.parametrize("verb", ["scan", "info", "commission", "clear_fault"])
+def test_who_hears_nobody_on_an_interface_of_another_bit_rate_says_so(
+    empty_bus: Any, virtual_config: Any, settings_of_virtual_joint: CanopenSettings, verb: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    link = parse_link(real_interface(bittiming={"bitrate": 500000}))
+    monkeypatch.setattr("drivers.can.link_state.link_state", lambda channel: link)
+    monkeypatch.setattr(
+        "tools.inspection.subject.open_python_can", lambda *_: can.Bus(interface="virtual", channel=empty_bus.channel)
+    )
+    monkeypatch.setattr("tools.verbs.stop.open_drive", lambda config: empty_bus.drive(settings_of_virtual_joint))
+    bus = virtual_config.bus.model_copy(update={"interface": "socketcan", "channel": "can0"})
+    config, output = virtual_config.model_copy(update={"bus": bus}), Output(quiet=True)
+    subject = Subject("socketcan", "can0", 1_000_000, 1)
+    verbs: dict[str, Callable[[], Any]] = {
+        "scan": lambda: scan(subject, output, listen_s=0.0),
+        "info": lambda: info(subject, output),
+        "commission": lambda: commission(config, drive),
+        "clear_fault": lambda: clear_fault(config, output),
+    }
+    drive = empty_bus.drive(settings_of_virtual_joint)
+    told = "; CAN interface can0 runs at 500000 bit/s, the configuration says 1000000"
+    with pytest.raises(NoDeviceError, match=told):
+        verbs[verb]()
+    drive.close()
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from typing import Any
 import can
 import canopen
 
+from drivers.can.link_state import interface_blamed
 from drivers.can.open import open_python_can
 from drivers.canopen.bus_watchers import BusFailure
 from drivers.errors import BusError, ConfigurationError
@@ -94,11 +95,12 @@ def canopen_network(subject: Subject, *listeners: can.Listener) -> Iterator[cano
     network.NOTIFIER_CYCLE = 0.05
     added: list[Any] = [BusFailure(time.sleep), *listeners]  # the library knows only its own kind of listener
     network.listeners.extend(added)
-    try:
-        network.connect()
-        yield network
-    except can.CanError as error:
-        raise BusError(f"{subject.place} failed: {error}", "wiring, bit rate, and whether it is up") from None
-    finally:
-        with suppress(Exception):  # what went wrong on the bus has been told
-            network.disconnect()
+    with interface_blamed(subject.interface, subject.channel, subject.bitrate_bitps):
+        try:
+            network.connect()
+            yield network
+        except can.CanError as error:
+            raise BusError(f"{subject.place} failed: {error}", "wiring, bit rate, and whether it is up") from None
+        finally:
+            with suppress(Exception):  # what went wrong on the bus has been told
+                network.disconnect()

@@ -7,9 +7,10 @@ from typing import Any
 
 import can
 
+from drivers.can.link_state import interface_blamed
 from drivers.can.open import CYCLIC_INTERFACES, SHARED_INTERFACES, open_python_can
 from drivers.canopen.drive import CanopenDrive
-from drivers.drive import Drive
+from drivers.drive import CommissioningReport, Drive
 from drivers.elmo.codes import motor_fault_text
 from drivers.elmo.drive import ElmoDrive
 from drivers.elmo.line_budget import command_time_s
@@ -51,6 +52,12 @@ def open_drive(config: Config, *, exclusive: bool = True) -> Drive:
 
     reopen = None if config.bus.interface in SHARED_INTERFACES else open_bus
     return CanopenDrive(open_bus(), canopen_settings(config), reopen=reopen)
+
+
+def commission(config: Config, drive: Drive) -> CommissioningReport:
+    """`Drive.commission`; a failure also tells what is wrong with the interface, if something is."""
+    with interface_blamed(config.bus.interface, config.bus.channel, config.bus.bitrate_bitps):
+        return drive.commission()
 
 
 def loop_delay_s(config: Config, histograms: Any) -> float:

@@ -35,7 +35,7 @@ from tools.running.guard_handle import GUARD_ENDED, GuardHandle, start_guard
 from tools.running.kept_awake import kept_awake
 from tools.running.live_panel import Display, PhaseLines, Snapshot
 from tools.running.loop_handle import LoopHandle
-from tools.running.open_drive import check_cyclic_rate, drive_fault_text, loop_delay_s, open_drive
+from tools.running.open_drive import check_cyclic_rate, commission, drive_fault_text, loop_delay_s, open_drive
 from tools.running.readiness import require_same_motion
 from tools.running.run_result import RunResult as RunResult
 from tools.running.shared_block import SERIAL
@@ -93,7 +93,7 @@ class Supervisor:
             signals, drive = self.signals, open_drive(config)
             try:
                 self._guard = start_guard(config, loop)
-                report = drive.commission()
+                report = commission(config, drive)
                 self._leave_if_asked(signals)
                 signals.raising = True
                 confirmed = self._confirm(report)

@@ -34,8 +34,8 @@ def scan(subject: Subject, output: Output, *, listen_s: float = LISTEN_S, passiv
             answered = ask_everybody(network, ear, wanted)
         nodes = sorted(answered | heard_first | ear.nodes())
         rows = [describe(network, node, node in answered, ear.heard.heartbeats.get(node)) for node in nodes]
-    if not rows:
-        raise _nobody(subject, ear.heard)
+        if not rows:
+            raise _nobody(subject, ear.heard)
     table = Table(box=None, pad_edge=False)
     for title in ("node", "NMT state", "device", "name", "vendor", "product", "revision", "serial", "drive state"):
         table.add_column(title, overflow="fold")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from drivers.can.link_state import interface_blamed
 from drivers.can.open import open_python_can
 from drivers.canopen.switch_off import stop_node
 from drivers.errors import ConfigurationError
@@ -50,7 +51,8 @@ def clear_fault(config: Config, output: Output) -> int:
         refuse_while_running(config.drive)
     drive = open_drive(config)
     try:
-        done = drive.clear_fault()
+        with interface_blamed(config.bus.interface, config.bus.channel, config.bus.bitrate_bitps):
+            done = drive.clear_fault()
     finally:
         drive.close()
     output.result(done, {"result": done})
