@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import threading
 import time
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import can
 import pytest
 
+from drivers.canopen.standard_objects import standard_type
 from drivers.errors import ConfigurationError, NoDeviceError
 from tools.configuration.load import load_config, shipped_config
 from tools.inspection import node_scan
@@ -18,6 +20,7 @@ from tools.inspection.drive_info import drive_info, pdo_maps
 from tools.inspection.node_scan import Ear
 from tools.inspection.objects import Objects
 from tools.inspection.sdo_reading import SdoReader
+from tools.inspection.standard_objects import standard_variable
 from tools.inspection.subject import Subject, canopen_network, subject_of_config, subject_of_flags
 from tools.output import Output
 from tools.verbs.info import info
@@ -139,6 +142,12 @@ class TestInfo:
         assert "Max torque" in out.getvalue()
         assert "6041 Statusword (16 bit)" in out.getvalue()
 
+    def test_the_heartbeats_that_it_watches(self, device_on_bus: Any) -> None:
+        device_on_bus.device.objects.store(0x1016, 1, (126 << 16 | 200).to_bytes(4, "little"))
+        told, out, _ = output()
+        assert info(subject(device_on_bus), told) == 0
+        assert re.search(r"watched heartbeats +node 126, 200 ms", out.getvalue())
+
     def test_the_error_history(self, device_on_bus: Any) -> None:
         device_on_bus.stop()
         device_on_bus.device.device[0].inject_fault_code = 0x2310
@@ -224,3 +233,12 @@ class TestSubject:
     def test_a_serial_drive_has_no_bus(self) -> None:
         with pytest.raises(ConfigurationError, match=r"drive\.kind"):
             subject_of_config(load_config(shipped_config("elmo_serial")))
+
+
+def test_the_types_of_the_standard_are_those_that_the_driver_measures_an_eds_by() -> None:
+    """Two tables: what `monitor` and `info` can name without an EDS, and what the driver uses of a drive."""
+    places = [(index, sub) for index in range(0x1000, 0x7000) for sub in range(9)]
+    used = {place: kind for place in places if (kind := standard_type(*place)) is not None}
+    found = {place: variable.data_type for place in used if (variable := standard_variable(*place)) is not None}
+    assert found == used
+    assert len(used) > 100

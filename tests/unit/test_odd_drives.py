@@ -273,6 +273,35 @@ def test_a_drive_that_makes_sync_itself_is_told_not_to(commission: Any, device_o
     assert (value(device_on_bus, 0x1005), value(device_on_bus, 0x1006)) == (0x80, 1000)
 
 
+@pytest.mark.parametrize(("asked", "taken"), [(1, True), (255, False)])
+def test_a_drive_that_only_answers_to_sync(commission: Any, device_on_bus: Any, asked: int, taken: bool) -> None:
+    """Its PDOs are synchronous and stay so; between two SYNCs it says nothing."""
+    for base in (*range(0x1400, 0x1404), *range(0x1800, 0x1804)):
+        store(device_on_bus, base, 2, 1)
+        device_on_bus.refused[base, 2] = OUT_OF_RANGE
+    if not taken:
+        with pytest.raises(DeviceError, match=r"transmission type 1, .*set drive\.rpdo_transmission_type = 1,"):
+            commission(rpdo_transmission_type=asked)
+        return
+    report = commission(rpdo_transmission_type=asked)
+    for base in (0x1400, 0x1800):
+        told = f"{base:04X}:2 (PDO {base:04X} transmission type) cannot be written; it is 1, as it must be"
+        assert told in report.remarks
+    device_on_bus.stop()
+    device, now_ns = device_on_bus.device, device_on_bus.now_ns
+
+    def tpdos(frames: list[bytes]) -> int:
+        return sum(struct.unpack_from("<I", frame)[0] == commission.port[0].tpdo_id for frame in frames)
+
+    device.handle(struct.pack("<IB3x8s", 0, 2, b"\x01\x01"), now_ns)
+    sync = struct.pack("<IB3x8s", commission.port[0].sync_id, 0, b"")
+    heard = []
+    for cycle in range(1, 4):
+        at_ns = now_ns + cycle * 20_000_000
+        heard.append((tpdos(device.advance(at_ns)), tpdos(device.handle(sync, at_ns))))
+    assert heard == [(0, 1)] * 3
+
+
 STATUS, POSITION, TORQUE, VELOCITY = 0x60410010, 0x60640020, 0x60770010, 0x606C0020
 CONTROL, TARGET, MODE, LIMIT, TARGET_VELOCITY, SPEED_LIMIT = (
     0x60400010, 0x60710010, 0x60600008, 0x60720010, 0x60FF0020, 0x607F0020,

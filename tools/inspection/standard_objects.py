@@ -20,7 +20,8 @@ _TABLE = """
 1010:* u32 Store parameters|1011:0 u8 Highest sub-index|1011:* u32 Restore default parameters|1012 u32 COB-ID TIME
 1014 u32 COB-ID EMCY|1015 u16 Inhibit time EMCY|1016:0 u8 Highest sub-index|1016:* u32 Consumer heartbeat time
 1017 u16 Producer heartbeat time|1018:0 u8 Highest sub-index|1018:1 u32 Vendor-ID|1018:2 u32 Product code
-1018:3 u32 Revision number|1018:4 u32 Serial number|1029:0 u8 Highest sub-index|1029:* u8 Error behaviour
+1018:3 u32 Revision number|1018:4 u32 Serial number|1019 u8 Synchronous counter overflow value
+1029:0 u8 Highest sub-index|1029:* u8 Error behaviour
 6007 i16 Abort connection option code|603F u16 Error code|6040 u16 Controlword|6041 u16 Statusword
 605A i16 Quick stop option code|605B i16 Shutdown option code|605C i16 Disable operation option code
 605D i16 Halt option code|605E i16 Fault reaction option code|6060 i8 Modes of operation
@@ -40,7 +41,8 @@ _TABLE = """
 6099:0 u8 Highest sub-index|6099:1 u32 Speed during search for switch|6099:2 u32 Speed during search for zero
 609A u32 Homing acceleration|60B0 i32 Position offset|60B1 i32 Velocity offset|60B2 i16 Torque offset
 60C2:0 u8 Highest sub-index|60C2:1 u8 Interpolation time period value|60C2:2 i8 Interpolation time index
-60C5 u32 Max acceleration|60C6 u32 Max deceleration|60F4 i32 Following error actual value
+60C5 u32 Max acceleration|60C6 u32 Max deceleration|60E4:0 u8 Highest sub-index
+60E4:* i32 Additional position actual value|60F4 i32 Following error actual value
 60FD u32 Digital inputs|60FE:0 u8 Highest sub-index|60FE:1 u32 Digital outputs|60FF i32 Target velocity
 6402 u16 Motor type|6502 u32 Supported drive modes
 """

@@ -70,5 +70,5 @@ def _list_rows(content: list[dict[str, Any]]) -> Iterator[tuple[str, str, str]]:
 
 def _plain_text(value: Any) -> str:
     if isinstance(value, dict):
-        return ", ".join(f"{key} {item}" for key, item in value.items())
+        return ", ".join(f"{item} ms" if key == "ms" else f"{key} {item}" for key, item in value.items())
     return f"{value:g}" if isinstance(value, float) else str(value)
