@@ -108,7 +108,7 @@ def disable(objects: ObjectAccess, settings: CanopenSettings, pause: Pause) -> N
         objects.remarks.append("the drive was enabled: it has been braked by its quick stop and switched off")
     objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
     objects.write_verified(0x6071, 0, 0, what="target torque")
-    for index, what in ((0x60FF, "target velocity"), (0x60B2, "torque offset")):
+    for index, what in ((0x60FF, "target velocity"), (0x60B1, "velocity offset"), (0x60B2, "torque offset")):
         objects.write_if_present(index, 0, 0, what=what)
     for _ in range(ATTEMPTS):
         state = State(decode_state(objects.read(0x6041, what="statusword")))

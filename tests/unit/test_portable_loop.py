@@ -358,3 +358,18 @@ def test_the_rate_that_is_held_is_told_and_one_beyond_it_warned_of() -> None:
 def test_the_rate_that_is_held_follows_from_wake_up_and_work() -> None:
     assert 0.0 < held_rate_Hz(0.6) <= HIGHEST_RATE_HZ
     assert held_rate_Hz(0.999) < 100.0  # of a period, 10 us and less are left for both
+
+
+@pytest.mark.parametrize("late", [True, False])
+def test_a_sample_of_an_earlier_sync_belongs_to_no_slot(block: SharedBlock, late: bool) -> None:
+    """As in the compiled loop: it is not moved on by how late this cycle woke up."""
+
+    class LateBus(DriveBus):
+        """Answers come when the next cycle begins."""
+
+        def recv(self, timeout: float | None = None) -> can.Message | None:
+            return super().recv(timeout) if timeout == 0.0 or not late else None
+
+    run(LateBus(), block, 4)
+    assert block.state[0].sample_age_cycles == 0
+    assert bool(block.state[0].sample_late_s == 0.0) == late

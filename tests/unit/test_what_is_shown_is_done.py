@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers.canopen.commissioning import disable
 from drivers.drive import UNTOUCHED, CommissioningReport, DriveIdentity
 from drivers.errors import ConfigurationError, DeviceError, MotionFault
 from firmware_py.realtime import HISTOGRAM_BINS, Histogram
@@ -24,6 +25,7 @@ from tools.running.supervisor import Supervisor
 from tools.simulation.lockstep import LockstepJoint
 from tools.sweeping.carry_out import SweepSupervisor
 from tools.sweeping.checks import require_torque
+from tools.sweeping.options import SweepOptions, make_plan
 from tools.verbs import scope as scope_module
 
 VIRTUAL = shipped_config("virtual").read_text()
@@ -194,3 +196,75 @@ def test_a_sweep_on_a_drive_that_does_not_tell_its_torque_is_refused() -> None:
     with pytest.raises(DeviceError, match="object 6077"):
         require_torque(report(measures_torque=False))
     require_torque(report())
+
+
+# --- feed-forward beyond what was measured -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("more", "refused"),
+    [
+        ((), True),
+        ((("velocity_max_radps = 1.0 ", "velocity_max_radps = 0.85 "),), False),  # zero at 50 deg/s = 0.873 rad/s
+        ((('feed_forward = "lugre_desired"', 'feed_forward = "none"'),), False),
+    ],
+)
+def test_a_friction_curve_that_pushes_with_the_motion_below_the_velocity_limit_is_refused(
+    tmp_path: Path, more: tuple[tuple[str, str], ...], refused: bool
+) -> None:
+    """LuGre on such a curve has no steady state: the run ended in the middle of the motion as NOT_FINITE."""
+    curve = (
+        ("a0 = 0.17995 ", "a0 = 0.2 "), ("a1 = 0.0012298\n", "a1 = -0.004\n"), ("a2 = -6.5261e-7\n", "a2 = 0.0\n"),
+        ("a3 = -7.6969e-9\n", "a3 = 0.0\n"), ("\nknee = 40.0", "\nknee = 10.0"), ("max = 200.0 ", "max = 20.0 "),
+    )  # fmt: skip
+    if refused:
+        with pytest.raises(ConfigurationError, match=r"friction.positive: .* oppose .* at 50\.\d+ deg/s it does not"):
+            config_of(tmp_path, *curve, *more)
+    else:
+        config_of(tmp_path, *curve, *more)
+
+
+# --- a sweep that is resumed with another configuration ------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "same"),
+    [
+        (("torque_constant_NmpA = 0.1 ", "torque_constant_NmpA = 0.141 "), False),
+        (("torque_constant_NmpA = 0.1 ", "gravity_Nm = 5.0\ntorque_constant_NmpA = 0.1 "), False),
+        (("\ndirection = 1 ", "\ndirection = -1 "), False),
+        (("kp = 784.0 ", "kp = 700.0 "), True),
+    ],
+)
+def test_points_that_were_measured_with_other_constants_are_another_plan(
+    tmp_path: Path, change: tuple[str, str], same: bool
+) -> None:
+    options = SweepOptions(points=4)
+    first = make_plan(config_of(tmp_path), options).hash
+    assert (make_plan(config_of(tmp_path, change), options).hash == first) is same
+
+
+# --- what a drive adds to its target by itself ---------------------------------------------------------------------
+
+
+class Offsets:
+    """Objects of a drive that is off."""
+
+    remarks: tuple[str, ...] = ()
+
+    def __init__(self) -> None:
+        self.values = {0x6041: 0x40, 0x60FF: 5, 0x60B1: 1000, 0x60B2: 30, 0x6071: 9}
+
+    def read(self, index: int, sub: int = 0, *, what: str) -> int:
+        return self.values[index]
+
+    def write(self, index: int, sub: int, value: int, *, what: str) -> None:
+        self.values[index] = value
+
+    write_verified = write_if_present = write
+
+
+def test_no_target_and_no_offset_is_left_from_before(settings_of_virtual_joint: Any) -> None:
+    objects: Any = Offsets()
+    disable(objects, settings_of_virtual_joint, lambda _: None)
+    assert [objects.values[index] for index in (0x6071, 0x60FF, 0x60B1, 0x60B2)] == [0, 0, 0, 0]

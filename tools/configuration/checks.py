@@ -6,11 +6,13 @@ import math
 from typing import Any
 
 from tools.configuration.config import Config
+from tools.configuration.conversions import RADPS_PER_UNIT
 from tools.configuration.elmo import ElmoSerial
 from tools.configuration.elmo_settings import serial_problems
 from tools.configuration.sections import Friction, FrictionDirection
 
 CAN_RATE_HZ = (100.0, 4000.0)
+CURVE_POINTS = 200  # at which a friction curve is looked at
 SWITCH_rad, SWITCH_radps = 1e-3, 1e-2  # what rounding of the numbers in a file may leave at a switch
 
 
@@ -172,9 +174,37 @@ def _friction_problems(config: Config) -> list[str]:
     elif config.control.feed_forward == "lugre_desired" and friction.lugre is None:
         found.append("[friction.lugre] is missing: control.feed_forward (=lugre_desired) needs it")
     if friction is not None:
-        found += _shape_problems("friction", friction)
+        shape = _shape_problems("friction", friction)
+        found += shape or _feed_forward_problems(config, friction)
     if config.virtual is not None and config.virtual.friction is not None:
         found += _shape_problems("virtual.friction", config.virtual.friction)
+    return found
+
+
+def _sliding_Nm(d: FrictionDirection, sign: float, speed: float) -> float:
+    """Of the curve as the law continues it, `speed` > 0 in its own unit; positive where it opposes the motion."""
+    if speed <= sign * d.knee:
+        return d.tc_Nm + (d.ts_Nm - d.tc_Nm) * math.exp(-speed / d.ws) + d.tv * speed
+    inside = sign * min(speed, sign * d.max)
+    slope = d.a1 + inside * (2.0 * d.a2 + 3.0 * d.a3 * inside)
+    return sign * _cubic(d, inside) + max(speed - sign * d.max, 0.0) * slope
+
+
+def _feed_forward_problems(config: Config, friction: Friction) -> list[str]:
+    """It must oppose the motion up to the velocity limit: where it does not, LuGre has no steady state."""
+    if config.control.feed_forward == "none":
+        return []
+    ratio = config.joint.reduction_ratio if friction.velocity_side == "motor" else 1.0
+    top = config.limits.velocity_max_radps * ratio / RADPS_PER_UNIT[friction.velocity_unit]
+    found = []
+    for name, direction, sign in (("positive", friction.positive, 1.0), ("negative", friction.negative, -1.0)):
+        speeds = [top * k / CURVE_POINTS for k in range(1, CURVE_POINTS + 1)]
+        against = next((v for v in speeds if not _sliding_Nm(direction, sign, v) >= 0.0), None)
+        if against is not None:
+            found.append(
+                f"friction.{name}: the curve must oppose the motion up to limits.velocity_max_radps "
+                f"(={config.limits.velocity_max_radps:g}); at {against:.4g} {friction.velocity_unit} it does not"
+            )
     return found
 
 

@@ -222,7 +222,8 @@ def _cycles(exchange: PortableExchange, block: SharedBlock, period_ns: int, rece
         elapsed_cycles = (deadline_ns - last_slot_ns) // period_ns
         last_slot_ns = deadline_ns
         waited_ns = exchange.receive(deadline_ns + receive_ns, receive_ns // 2)
-        state.sample_late_s = (wake_ns - deadline_ns) * 1e-9 if sample.time_ns > wake_ns else 0.0
+        # as in `run_loop`: a sample that answers an earlier SYNC belongs to no slot that could be told
+        state.sample_late_s = (wake_ns - deadline_ns) * 1e-9 if sample.time_ns >= exchange.sync_ns else 0.0
         stop_request = int(words[Word.STOP])
         supervisor_age_cycles = (wake_ns - int(words[Word.SUPERVISOR_NS])) // period_ns
         note_suspension(words, state, timespec)

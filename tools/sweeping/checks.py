@@ -11,7 +11,7 @@ from __future__ import annotations
 from drivers.drive import CommissioningReport
 from drivers.errors import ConfigurationError, DeviceError
 from tools.configuration.config import Config
-from tools.configuration.conversions import torque_constant_NmpA
+from tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
 from tools.configuration.elmo import ElmoSerial
 
 DOUBTFUL_FACTOR = 1.25  # motors are rated at a speed, where losses take part of the torque
@@ -66,6 +66,21 @@ def recorded_limits(config: Config) -> dict[str, float]:
         "torque_max_Nm": config.limits.torque_max_Nm,
         "velocity_max_radps": config.limits.velocity_max_radps,
     }
+
+
+def measuring_constants(config: Config) -> dict[str, float]:
+    """What turns readings into velocity and friction: points measured with other numbers are not one sweep."""
+    drive = config.drive
+    found = {
+        "torque_constant_NmpA": torque_constant_NmpA(config),
+        "torque_direction": float(drive.torque_direction),
+        "rad_per_count": joint_rad_per_count(config),
+        "gravity_Nm": config.joint.gravity_Nm,
+        "gravity_zero_rad": config.joint.gravity_zero_rad,
+    }
+    if not isinstance(drive, ElmoSerial):
+        found["rated_torque"] = float(drive.torque_reference == "rated_torque")
+    return found
 
 
 def torque_source(config: Config) -> str:

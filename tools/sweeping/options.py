@@ -8,6 +8,7 @@ from pathlib import Path
 from drivers.errors import DataError, UsageError
 from tools.configuration.config import Config
 from tools.sweeping.carry_out import position_margin_rad
+from tools.sweeping.checks import measuring_constants
 from tools.sweeping.grid import (
     DEFAULT_POINTS,
     MOST_POINTS,
@@ -106,7 +107,7 @@ def make_plan(config: Config, options: SweepOptions) -> SweepPlan:
         while plan_motion(points, chosen, options.warm_up_turns).duration_s > QUICK_S and count > QUICK_LEAST:
             count -= 4
             points = ordered_points(grid(count), options.passes, options.shuffle_seed)
-    return SweepPlan(points, chosen, plan_hash(points, asdict(chosen)))
+    return SweepPlan(points, chosen, plan_hash(points, asdict(chosen) | measuring_constants(config)))
 
 
 def _check_options(options: SweepOptions) -> None:
