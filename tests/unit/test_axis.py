@@ -674,6 +674,18 @@ def test_standstill_is_complete_in_the_last_cycle_or_one_too_late(rig: NewRig, m
         assert (run.phase, run.state.fault) == (AxisPhase.RELEASING, Fault.NONE)
 
 
+def test_a_lost_sample_while_the_joint_comes_to_rest_proves_nothing_either_way(rig: NewRig) -> None:
+    run = rig(0.0).until(AxisPhase.TRACKING).run(5)
+    run.stop = StopRequest.RAMP
+    while run.state.still_cycles == 0:
+        run.tick()
+    counted = int(run.state.still_cycles)
+    run.tick(fresh=False)
+    assert (run.phase, run.state.still_cycles) == (AxisPhase.RAMPING, counted)
+    run.tick()
+    assert run.state.still_cycles == counted + 1
+
+
 def test_no_samples_at_all(rig: NewRig) -> None:
     run = rig(0.0)
     for _ in range(80):

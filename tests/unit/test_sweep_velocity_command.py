@@ -120,23 +120,45 @@ def test_a_velocity_that_is_not_finite_stops_the_joint(velocity: VelocityRig) ->
     assert velocity.commands[-1] == 0.0
 
 
+def test_its_twin_a_velocity_of_an_enormous_but_finite_gain_is_limited(velocity: VelocityRig) -> None:
+    velocity.until(AxisPhase.TRACKING)
+    before_radps = velocity.commands[-1]
+    velocity.rig.axis.velocity_command.position_gain_ps = 1e300
+    velocity.tick(1)
+    assert velocity.rig.state.fault == Fault.NONE
+    assert abs(velocity.commands[-1] - before_radps) <= 60.0 * PERIOD_s + 1e-12
+
+
 @pytest.mark.parametrize(("torque_Nm", "trips"), [(59.9, False), (-59.9, False), (60.0, True), (-60.0, True)])
 def test_a_drive_at_the_torque_limit_for_too_long_trips(velocity: VelocityRig, torque_Nm: float, trips: bool) -> None:
     velocity.until(AxisPhase.TRACKING)
     velocity.rig.sample.torque_Nm = torque_Nm
     velocity.tick(20)
     assert velocity.rig.state.fault == Fault.NONE
-    velocity.tick(2)
+    velocity.tick(1)
     assert velocity.rig.state.fault == (Fault.TORQUE_SATURATED if trips else Fault.NONE)
 
 
-def test_a_joint_that_does_not_follow_trips(velocity: VelocityRig) -> None:
+@pytest.mark.parametrize(("limit_share", "trips"), [(1.0 - 1e-9, True), (1.0, False)])
+def test_a_joint_that_does_not_follow_trips(velocity: VelocityRig, limit_share: float, trips: bool) -> None:
+    """It stands still while the reference moves on evenly: the error of each cycle is known before."""
     velocity.until(AxisPhase.TRACKING)
+    rig = velocity.rig
+    for _ in range(100):
+        rig.tick()
+    assert rig.state.fault == Fault.NONE
+    at_rad = float(rig.sample.position_rad)
+    reference = rig.axis.trajectory
+    next_rad = reference.amplitude_rad * math.sin(reference.omega_radps * (rig.state.trajectory_s + PERIOD_s))
+    rig.axis.limits.following_error_max_rad = abs(at_rad - next_rad) * limit_share
+    rig.tick()
+    assert rig.state.fault == (Fault.FOLLOWING_ERROR if trips else Fault.NONE)
+    rig.axis.limits.following_error_max_rad = 0.2
     for _ in range(2000):
-        velocity.rig.tick()  # the joint stands still
-        if velocity.rig.state.fault:
+        if rig.state.fault:
             break
-    assert velocity.rig.state.fault == Fault.FOLLOWING_ERROR
+        rig.tick()
+    assert rig.state.fault == Fault.FOLLOWING_ERROR
 
 
 # --- 60FF ---

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -99,17 +100,22 @@ def write_figure(path: Path, verdicts: Sequence[Verdict], velocity_max_radps: fl
     figure = Figure(figsize=(12.0, 8.0), layout="constrained")
     FigureCanvasAgg(figure)
     speed, off = figure.subplots(2, 1, sharex=True)
+    points: dict[str, list[tuple[float, float, float]]] = {"tab:blue": [], "tab:green": [], "tab:red": []}
     for place, kind in enumerate(kinds):
         mine = [verdict for verdict in verdicts if verdict.kind == kind]
         for i, verdict in enumerate(mine):
             across = place - 0.3 + 0.6 * i / max(len(mine) - 1, 1)
             colour = "tab:red" if verdict.violations else "tab:green" if verdict.harmless else "tab:blue"
-            speed.plot(across, verdict.peak_radps, ".", color=colour, markersize=2.5)
-            if verdict.off_s is not None:
-                off.plot(across, max(verdict.off_s, 1e-3), ".", color=colour, markersize=2.5)
+            off_s = math.nan if verdict.off_s is None else max(verdict.off_s, 1e-3)
+            points[colour].append((across, verdict.peak_radps, off_s))
+    for colour, some in points.items():  # a line object for each point would take a minute
+        if some:
+            across_all, speeds_radps, offs_s = zip(*some, strict=True)
+            speed.plot(across_all, speeds_radps, ".", color=colour, markersize=2.5)
+            off.plot(across_all, offs_s, ".", color=colour, markersize=2.5)
     speed.axhline(velocity_max_radps, color="black", linewidth=0.8, linestyle="--", label="velocity limit")
     speed.set_ylabel("greatest speed [rad/s]")
-    speed.legend()
+    speed.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False)
     off.set_ylabel("off and at rest after the fault [s]")
     off.set_yscale("log")
     off.set_xticks(range(len(kinds)), kinds, rotation=70, ha="right", fontsize=8)
