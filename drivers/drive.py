@@ -40,6 +40,23 @@ class CommissioningReport:
     measures_torque: bool = True  # False: the drive does not tell its torque in the cyclic exchange, it reads as zero
 
 
+@dataclass(frozen=True)
+class Reading:
+    """What has come of one request: `temperature_degC` is None where nothing has, and `problem` says why."""
+
+    time_ns: int  # CLOCK_MONOTONIC, when the answer came
+    temperature_degC: float | None
+    problem: str = ""
+
+
+class Thermometer(Protocol):
+    """Reads a temperature now and then, at its own pace."""
+
+    def poll(self) -> Reading | None:
+        """What is new, or None.  Never waits and never raises for what the drive or its line does."""
+        ...
+
+
 class Drive(Protocol):
     """A drive on the way from unknown to commissioned, and back to safe."""
 
@@ -56,6 +73,13 @@ class Drive(Protocol):
 
     def port(self) -> Any:
         """The record array for the cyclic exchange, without a file descriptor; valid after `commission`."""
+        ...
+
+    def thermometer(self) -> Thermometer | None:
+        """What reads the drive's temperature beside the cyclic exchange; None where nothing can.
+
+        Valid from `start_cyclic` until `make_safe`.
+        """
         ...
 
     def make_safe(self) -> str:

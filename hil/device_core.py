@@ -114,6 +114,7 @@ def sample_objects(device: Device, plant_c: PlantConstants, plant_s: PlantState)
     motor_torque_mNm = 1e3 * plant_c.torque_per_current_NmpA * plant_s.current_A / device.reduction_ratio
     drive.torque = _int16(1e3 * motor_torque_mNm / int64(drive.rated_torque_mNm))
     drive.current = _int16(1e6 * plant_s.current_A / int64(drive.rated_current_mA))
+    drive.motor_temperature_ddegC = _int16(10.0 * plant_s.motor_temperature_degC)
     drive.demand_torque = _int16(device.demand)
     mode = drive.mode_display
     if (mode == 1 or mode == 8) and device.state == PowerState.OPERATION_ENABLED and not device.resync:

@@ -19,6 +19,7 @@ def _fields() -> dict[tuple[int, int], str]:
         (0x1019, 0): "sync_overflow",
         (0x1029, 1): "error_behaviour",
         (0x2102, 0): "sync_timeout_ms",
+        (0x2103, 0): "motor_temperature_ddegC",
         (0x6007, 0): "abort_option",
         (0x603F, 0): "error_code",
         (0x6040, 0): "controlword",

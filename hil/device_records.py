@@ -104,6 +104,7 @@ class CommunicationObjects:
 @record
 class DriveObjects:
     sync_timeout_ms: u2
+    motor_temperature_ddegC: i2  # tenths of a degree
     abort_option: i2
     error_code: u2
     controlword: u2

@@ -24,6 +24,7 @@ from drivers.canopen.object_access import ObjectAccess
 from drivers.canopen.scaling import joint_angle_per_count_rad, new_port, start_position_rad
 from drivers.canopen.settings import CanopenSettings
 from drivers.canopen.switch_off import NMT_PRE_OPERATIONAL, SDO_TIMEOUT_S, SwitchOff, state_of
+from drivers.canopen.thermometer import Thermometer
 from drivers.canopen.watchdog_proof import prove_watchdog
 from drivers.drive import UNTOUCHED, CommissioningReport
 from drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
@@ -57,6 +58,7 @@ class CanopenDrive:
         self._stopping = False  # on the user's word, whoever controls it
         self._reopen = reopen
         self._lent = False
+        self._thermometer: Thermometer | None = None
         # the library warns about every heartbeat state and unknown frame; what matters is told by this driver
         logging.getLogger("canopen").setLevel(logging.CRITICAL)
         self._network = canopen.Network(bus)
@@ -121,6 +123,9 @@ class CanopenDrive:
             # first: a node that its watchdog or an earlier run left in "stopped" does not answer SDO
             self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
             self._find()
+            if self._thermometer is None and self._settings.temperature is not None:
+                wanted = self._settings.temperature
+                self._thermometer = Thermometer(self._network, self._node, wanted, self._eds.name)
             self._objects.forget_verified()
             findings = commission(self._objects, self._settings, self._eds, self._sleep, self._prove_watchdog)
             encoder = self._encoder.commission()
@@ -209,6 +214,10 @@ class CanopenDrive:
             heartbeat_watched=found.heartbeat_watched,
             second_range_counts=found.second.range_counts if found.second is not None else DRIVE_RANGE_COUNTS,
         )
+
+    def thermometer(self) -> Thermometer | None:
+        """See `Drive.thermometer`; a bus that the loop has for itself carries no SDO of ours."""
+        return None if self._lent else self._thermometer
 
     def make_safe(self) -> str:
         """See `SwitchOff.make_safe`.

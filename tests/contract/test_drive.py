@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Iterator
 from typing import Any, ClassVar, Literal, Protocol
 
@@ -99,6 +100,16 @@ class DriveContract:
         bench.fall_silent()
         assert bench.drive.make_safe().startswith("unknown")
 
+    def test_whoever_reads_the_temperature_neither_waits_nor_raises(self, bench: Bench) -> None:
+        bench.drive.commission()
+        bench.drive.start_cyclic()
+        meter = bench.drive.thermometer()
+        bench.fall_silent()
+        began_s = time.monotonic()
+        readings = [meter.poll() for _ in range(100)] if meter is not None else []
+        assert time.monotonic() - began_s < 0.2
+        assert all(found is None or found.temperature_degC is None for found in readings)
+
     def test_close_may_be_called_twice(self, bench: Bench) -> None:
         bench.drive.close()
         bench.drive.close()
@@ -154,6 +165,19 @@ class TestCanopenDrive(DriveContract):
         bench = CanopenBench(device_on_bus, settings_of_virtual_joint)
         yield bench
         bench.drive.close()
+
+    def test_the_temperature_is_read_while_the_exchange_goes_on(self, bench: Bench) -> None:
+        assert bench.drive.thermometer() is None
+        bench.drive.commission()
+        bench.drive.start_cyclic()
+        meter = bench.drive.thermometer()
+        assert meter is not None
+        give_up_s = time.monotonic() + 5.0
+        while (found := meter.poll()) is None:
+            assert time.monotonic() < give_up_s
+            time.sleep(0.01)
+        assert (found.temperature_degC, found.problem) == (25.0, "")
+        assert bench.drive.make_safe() == self.off
 
 
 class TestElmoDrive(DriveContract):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import fcntl
 import io
 import os
@@ -38,19 +39,36 @@ def snapshot(**fields: Any) -> Snapshot:
     return Snapshot(record[0], 3, histograms, 10.0)
 
 
-def text_of(shown: Any) -> str:
+def text_of(shown: Any, width: int = 100) -> str:
     from rich.console import Console
 
     out = io.StringIO()
-    Console(file=out, width=100).print(shown)
+    Console(file=out, width=width).print(shown)
     return out.getvalue()
 
 
 def test_the_panel_tells_state_error_torque_deadlines_and_time_left() -> None:
     text = text_of(panel("joint: sine", "tracking", snapshot(), ["loop delay 1.00 ms"]))
-    for words in ("  tracking", "operation enabled", "+1.500 mrad", "-20.00 Nm", "41 us", "3 cycles", "6.0 s", "none"):
+    for words in (" tracking", "operation enabled", "+1.500 mrad", "-20.00 Nm", "41 us", "3 cycles", "6.0 s", "none"):
         assert words in text
     assert "loop delay 1.00 ms" in text
+
+
+@pytest.mark.parametrize(("temperature_degC", "words"), [(41.26, "temperature 41.3 °C"), (None, "temperature -")])
+def test_the_panel_tells_the_temperature_where_the_drive_does(temperature_degC: float | None, words: str) -> None:
+    shown = dataclasses.replace(snapshot(velocity_radps=-0.25), temperature_degC=temperature_degC)
+    text = text_of(panel("joint: sine", "tracking", shown, []))
+    assert words in text
+    assert "-0.250 rad/s" in text
+
+
+@pytest.mark.parametrize("width", [120, 80, 60, 40])
+def test_no_name_and_no_value_is_cut_off_in_a_narrow_terminal(width: int) -> None:
+    shown = dataclasses.replace(snapshot(), temperature_degC=41.26)
+    text = text_of(panel("joint: sine", "tracking", shown, []), width)
+    for words in ("wake-up p99", "temperature", "operation enabled", "+1.500 mrad", "-20.00 Nm", "41.3 °C", "3 cycles"):
+        assert words in text
+    assert max(map(len, text.splitlines())) == min(width, 78)
 
 
 def test_the_panel_keeps_its_height() -> None:
@@ -125,7 +143,7 @@ def test_a_terminal_that_takes_it_gets_the_panel() -> None:
         with LivePanel(slave, "joint: sine", refresh_s=0.01) as live:
             live.show(snapshot())
             text, give_up = "", time.monotonic() + 30.0
-            while "  tracking" not in text:
+            while " tracking" not in text:
                 assert time.monotonic() < give_up, text
                 text += read_all(master)
                 time.sleep(0.01)
@@ -164,7 +182,7 @@ def test_run_on_a_terminal_shows_the_panel_and_its_log_has_every_cycle_and_frame
         os.close(master)
     done = started.finished()
     assert done.code == 0, text
-    for words in (ESCAPE, "operation enabled", "time left", "wake-up p99", "  tracking", "phase margin"):
+    for words in (ESCAPE, "operation enabled", "time left", "wake-up p99", " tracking", "phase margin"):
         assert words in text
     assert "records were lost" not in text
     assert ESCAPE not in done.out
@@ -205,7 +223,7 @@ def test_a_run_on_a_stopped_terminal_goes_on_to_its_end(bench: Any) -> None:
     try:
         started = bench.start("run", config, "-y", stderr=slave, env=TERMINAL)
         text, give_up = "", time.monotonic() + 180.0
-        while "  tracking" not in text:
+        while " tracking" not in text:
             assert time.monotonic() < give_up, text
             text += read_all(master)
             time.sleep(0.01)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import os
 import pty
+import re
 import resource
 import signal
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,7 @@ import pytest
 
 from firmware_py.states import AxisPhase, DriveRequest, DriveState
 
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 LARGEST_STEP_radps = 0.02  # of the desired velocity in one cycle; braking at 2 rad/s2 is a tenth of it
 
 
@@ -40,6 +43,35 @@ def test_two_runs_on_one_joint_and_it_is_disabled_after_each(bench: Any) -> None
         assert "now at" in done.err
         assert "trajectory sine" in done.err
         assert "limits" in done.err
+
+
+def test_a_motor_that_warms_up_is_seen_in_summary_log_and_export(bench: Any) -> None:
+    heat = {"virtual__thermal": True, "virtual__heating_KpA2": 20.0, "virtual__thermal_time_s": 10.0}
+    config = bench.config(trajectory__duration_s=4.0, **heat)
+    bench.joint(config)
+    done = bench.run("run", config, "-y", "--json")
+    assert done.code == 0, done.err
+    told = json.loads(done.out)["temperature_degC"]
+    assert 25.0 <= told["least"] < told["greatest"] - 2.0
+    read = bench.log().temperatures
+    assert read["temperature_degC"][[0, -1]].tolist() == [told["least"], told["greatest"]]
+    assert 3 <= len(read) <= 10
+    assert np.all(np.diff(read["time_ns"]) > 0.9e9)
+
+
+def test_a_temperature_that_the_drive_refuses_ends_no_run(bench: Any) -> None:
+    bench.joint(bench.config("joint.toml"))
+    text = (CONFIGS / "virtual_joint.eds").read_text().replace("SupportedObjects=3\n", "SupportedObjects=4\n4=0x2104\n")
+    odd = re.sub(r"\[2103\]\n(.*?\n)\n", r"[2103]\n\1\n[2104]\n\1\n", text, flags=re.DOTALL)
+    (bench.folder / "odd.eds").write_text(odd)
+    config = bench.config("odd.toml", drive__eds="odd.eds", drive__temperature_object="2104")
+    done = bench.run("run", config, "-y", "--json")
+    assert done.code == 0, done.err
+    assert json.loads(done.out)["temperature_degC"] is None
+    log = bench.log()
+    told = [event.text for event in log.events if "temperature" in event.text]
+    assert told == ["object 2104 (temperature): object does not exist (SDO abort 06020000h)"]
+    assert len(log.temperatures) == 0
 
 
 @pytest.mark.parametrize(("number", "name"), [(signal.SIGINT, "SIGINT"), (signal.SIGTERM, "SIGTERM")])

@@ -246,6 +246,14 @@ def test_sync_timeout(rig: Rig, silence_ms: int, tripped: bool) -> None:
     assert rig.emergencies() == ([0x8700] if tripped else [])
 
 
+def test_the_motors_temperature_in_tenths_of_a_degree(rig: Rig) -> None:
+    assert rig.get(0x2103) == 250
+    rig.device.plant_state[0].motor_temperature_degC = -12.34
+    rig.run(1)
+    assert rig.get(0x2103) == -123
+    assert rig.write(0x2103, 0, 0, 2) == 0x06010002
+
+
 def test_rpdo_needs_operational_and_its_length(rig: Rig) -> None:
     rig.send(0x205, b"\x06\x00")
     rig.run(1)

@@ -17,6 +17,8 @@ from rich.table import Table
 from tools.campaign.judge import Verdict
 from tools.campaign.scenario import draw_scenario
 
+MANY = 1000  # scenarios: more are drawn as specks
+
 
 @dataclass(frozen=True)
 class KindRow:
@@ -59,8 +61,9 @@ def table(rows: Sequence[KindRow]) -> Table:
     """For people."""
     shown = Table(title="fault campaign")
     for name, justify in (
-        ("fault", "left"), ("runs", "right"), ("harmless", "right"), ("violations", "right"), ("speed rad/s", "right"),
-        ("beyond limit rad", "right"), ("allowed rad", "right"), ("off after s", "right"), ("told as", "left"),
+        ("fault", "left"), ("runs", "right"), ("harmless", "right"), ("violations", "right"),
+        ("speed [rad/s]", "right"), ("beyond limit [rad]", "right"), ("allowed [rad]", "right"),
+        ("off after [s]", "right"), ("told as", "left"),
     ):  # fmt: skip
         shown.add_column(name, justify=justify)  # type: ignore[arg-type]
     for row in rows:
@@ -99,6 +102,7 @@ def write_figure(path: Path, verdicts: Sequence[Verdict], velocity_max_radps: fl
     kinds = list(dict.fromkeys(verdict.kind for verdict in verdicts))
     figure = Figure(figsize=(12.0, 8.0), layout="constrained")
     FigureCanvasAgg(figure)
+    size = 2.5 if len(verdicts) > MANY else 6.0
     speed, off = figure.subplots(2, 1, sharex=True)
     points: dict[str, list[tuple[float, float, float]]] = {"tab:blue": [], "tab:green": [], "tab:red": []}
     for place, kind in enumerate(kinds):
@@ -111,8 +115,8 @@ def write_figure(path: Path, verdicts: Sequence[Verdict], velocity_max_radps: fl
     for colour, some in points.items():  # a line object for each point would take a minute
         if some:
             across_all, speeds_radps, offs_s = zip(*some, strict=True)
-            speed.plot(across_all, speeds_radps, ".", color=colour, markersize=2.5)
-            off.plot(across_all, offs_s, ".", color=colour, markersize=2.5)
+            speed.plot(across_all, speeds_radps, ".", color=colour, markersize=size)
+            off.plot(across_all, offs_s, ".", color=colour, markersize=size)
     speed.axhline(velocity_max_radps, color="black", linewidth=0.8, linestyle="--", label="velocity limit")
     speed.set_ylabel("greatest speed [rad/s]")
     speed.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False)

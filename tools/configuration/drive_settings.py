@@ -8,11 +8,13 @@ from typing import Any
 from drivers.can.bit_timing import bus_load, highest_rate_Hz
 from drivers.canopen.encoder_settings import JointEncoderSettings
 from drivers.canopen.settings import CanopenSettings
+from drivers.canopen.thermometer import TemperatureObject
 from drivers.errors import ConfigurationError
 from hil.device import DeviceSettings
 from hil.encoder_node import EncoderSettings
 from tools.configuration.config import Config
 from tools.configuration.conversions import torque_constant_NmpA
+from tools.configuration.object_place import index_and_sub
 
 TPDO_BYTES, RPDO_BYTES = 8, 4
 VELOCITY_RPDO_BYTES = 6  # 60FF is longer than 6071
@@ -58,7 +60,17 @@ def canopen_settings(config: Config) -> CanopenSettings:
         encoder_incremental=config.encoder.kind == "incremental",
         sdo_timeout_s=drive.sdo_timeout_s,
         velocity_max_radps=config.limits.velocity_max_radps,
+        temperature=temperature_object(config),
     )
+
+
+def temperature_object(config: Config) -> TemperatureObject | None:
+    """Which object of the drive tells its temperature."""
+    drive = config.canopen
+    if drive.temperature_object is None:
+        return None
+    place = index_and_sub(drive.temperature_object)
+    return TemperatureObject(*place, drive.temperature_unit_degC, drive.temperature_offset_degC)
 
 
 def joint_encoder_settings(config: Config) -> JointEncoderSettings | None:
@@ -66,7 +78,7 @@ def joint_encoder_settings(config: Config) -> JointEncoderSettings | None:
     encoder = config.joint_encoder
     if encoder is None:
         return None
-    index, _, sub = encoder.object.partition(":")
+    index, sub = index_and_sub(encoder.object)
     return JointEncoderSettings(
         counts_per_turn=encoder.counts_per_turn,
         direction=encoder.direction,
@@ -75,8 +87,8 @@ def joint_encoder_settings(config: Config) -> JointEncoderSettings | None:
         feeds_law=encoder.law == "joint_encoder",
         node=encoder.node if encoder.source == "node" else None,
         eds_path=config.encoder_eds_path,
-        index=int(index, 16),
-        sub=int(sub or 0),
+        index=index,
+        sub=sub,
     )
 
 

@@ -5,27 +5,19 @@ The comment behind a key is its meaning, as in `sections`.
 
 from __future__ import annotations
 
-import re
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field
-from pydantic_core import PydanticCustomError
+from pydantic import Field
 
+from tools.configuration.object_place import ObjectPlace
 from tools.configuration.sections import Direction, Node, Section, between
-
-
-def _object_place(value: str) -> str:
-    match = re.fullmatch(r"([0-9A-Fa-f]{4})(?::([0-9]{1,3}))?", value)
-    if match is None or int(match[1], 16) < 0x2000 or int(match[2] or 0) > 254:
-        raise PydanticCustomError("object", 'must be an object such as "60E4:1" (index in hexadecimal, sub-index)')
-    return value
 
 
 class JointEncoder(Section):
     """A second encoder of the joint; [encoder] is the drive's own (6064)."""
 
     source: Literal["drive", "node"]  # another object of the drive, or an encoder node (CiA 406) on the bus
-    object: Annotated[str, AfterValidator(_object_place)] = "60E4:1"  # of the drive
+    object: ObjectPlace = "60E4:1"  # of the drive
     node: Node | None = None  # of the encoder node
     eds: Annotated[str, Field(min_length=1)] = "joint_encoder.eds"  # of the encoder node
     counts_per_turn: Annotated[int, between(4, 2**31 - 1)]  # of the joint

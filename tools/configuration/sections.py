@@ -15,6 +15,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from pydantic_core import PydanticCustomError
 
 from firmware_py.records import NEURONS
+from tools.configuration.object_place import ObjectPlace
 
 
 def interval_text(low: float, high: float, open_low: bool = False) -> str:
@@ -135,6 +136,9 @@ class Drive(Section):
     quick_stop_option: Annotated[int, between(0, 8)] = 2  # 605A: 2 = brake on the quick stop ramp, then power off
     # 1 = the torque is taken over at the next SYNC, 254/255 = at once
     rpdo_transmission_type: Annotated[int, between(0, 255)] = 1
+    temperature_object: ObjectPlace | None = None  # the drive's own, "2103"; read once a second, to be shown and logged
+    temperature_unit_degC: Annotated[float, between(0.0, 1000.0, open_low=True)] = 1.0  # of one count of it
+    temperature_offset_degC: Annotated[float, between(-1000.0, 1000.0)] = 0.0  # at 0 counts; -273.15 for kelvin
 
 
 class Encoder(Section):

@@ -78,7 +78,9 @@ def error_table(errors_Nm: np.ndarray, measured_Nm: np.ndarray, ratio: float) ->
         ("greatest", np.max(np.abs(errors_Nm)), np.max(np.abs(relative))),
         ("mean", np.mean(errors_Nm), np.mean(relative)),
     ):
-        table.add_row(word, f"{1e3 * value:.4g}", f"{ratio * value:.4g}", f"{share:z.2%}")
+        # a fit's mean error is rounding noise: zero, in the digits that mean something
+        motor_mNm, joint_Nm = round(1e3 * value, 9), round(ratio * value, 9)
+        table.add_row(word, f"{motor_mNm:z.4g}", f"{joint_Nm:z.4g}", f"{share:z.2%}")
     return table
 
 

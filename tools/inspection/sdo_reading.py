@@ -1,7 +1,7 @@
 """Reading objects of a node over SDO with the `canopen` library.  Nothing is ever written.
 
 A node has one SDO channel for every master: reading beside a run works, because the run itself uses it only before
-and after its motion.  An answer that got mixed up is asked for again.
+and after its motion, and for a temperature only when it is quiet.  An answer that got mixed up is asked for again.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """A run log in the formats of other programs: CSV, NPZ, Parquet for the records, candump's for the raw frames.
 
-Columns have the names and units of `LogRecord`; an array field becomes one column an element (`weights_0` ...).
+Columns have the names and units of `LogRecord`; an array field becomes one column an element (`weights_0` ...).  The
+drive's temperature, if the log has it, is a column as well: in each line the newest reading, nan before the first one.
 """
 
 from __future__ import annotations
@@ -33,6 +34,16 @@ def columns(records: Any) -> dict[str, np.ndarray]:
     return found
 
 
+def table_columns(log: RunLog) -> dict[str, np.ndarray]:
+    """`columns` of the records, and the temperature where there is one."""
+    found = columns(log.records)
+    if len(log.temperatures):
+        newest = np.searchsorted(log.temperatures["time_ns"], found["time_ns"], side="right") - 1
+        read = log.temperatures["temperature_degC"][np.maximum(newest, 0)]
+        found["temperature_degC"] = np.where(newest >= 0, read, np.nan)
+    return found
+
+
 def calendar_offset_ns(log: RunLog) -> int:
     """What to add to the log's times for nanoseconds since 1970; 0 if the log does not tell."""
     clock = log.metadata.get("clock", {})
@@ -45,7 +56,7 @@ def calendar_offset_ns(log: RunLog) -> int:
 
 def csv_bytes(log: RunLog, path: Path) -> bytes:
     """Comma, point, one header line; floats with all their digits."""
-    found = columns(log.records)
+    found = table_columns(log)
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(found)
@@ -55,9 +66,11 @@ def csv_bytes(log: RunLog, path: Path) -> bytes:
 
 
 def npz_bytes(log: RunLog, path: Path) -> bytes:
-    """One array a field, `weights` of shape (N, 15); the events as three arrays of the same length."""
+    """One array a field, `weights` of shape (N, 15); events and temperatures as arrays of their own."""
     data = io.BytesIO()
     arrays: dict[str, Any] = {name: np.asarray(log.records[name]) for name in log.records.dtype.names}
+    arrays["temperature_time_ns"] = log.temperatures["time_ns"]
+    arrays["temperature_degC"] = log.temperatures["temperature_degC"]
     arrays["event_time_ns"] = np.array([event.time_ns for event in log.events], np.int64)
     arrays["event_level"] = np.array([event.level for event in log.events], np.int32)
     arrays["event_text"] = np.array([f"{event.source}: {event.text}" for event in log.events], np.str_)
@@ -74,7 +87,7 @@ def parquet_bytes(log: RunLog, path: Path) -> bytes:
             f"{path}: Parquet needs the package pyarrow, which is not installed",
             "install the extra `parquet`, or export to npz or csv",
         ) from None
-    table = pyarrow.table({name: pyarrow.array(values) for name, values in columns(log.records).items()})
+    table = pyarrow.table({name: pyarrow.array(values) for name, values in table_columns(log).items()})
     metadata = {f"{name}.{key}": value for name, values in log.metadata.items() for key, value in values.items()}
     data = io.BytesIO()
     parquet.write_table(table.replace_schema_metadata(metadata), data)

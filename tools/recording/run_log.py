@@ -5,7 +5,8 @@ record IS the CDR body: CDR aligns each number to its size counted from the end 
 fixed arrays without a length.  (Padding at the end of a record, if any, is ignored by readers.)  So writing costs no
 encoding and reading is `np.frombuffer`.
 
-Events are on `/events`, raw CAN frames, if they are recorded, on `/can`; what was run (configuration, versions,
+Events are on `/events`, the drive's temperature, if it tells one, on `/temperature`, raw CAN frames, if they are
+recorded, on `/can`; what was run (configuration, versions,
 identity of the drive) is in metadata records at the beginning of the file.  Times are nanoseconds of CLOCK_MONOTONIC;
 `metadata["clock"]` relates them to the calendar.
 A file that was cut off, because the writer was killed or the disk is full, reads up to the last whole chunk.
@@ -39,6 +40,8 @@ from tools.recording.cdr import CDR_HEADER, event_body, event_from_body, message
 RECORD_TOPIC, RECORD_SCHEMA = "/joint", "jointctl_msgs/msg/LogRecord"
 EVENT_TOPIC, EVENT_SCHEMA = "/events", "jointctl_msgs/msg/Event"
 EVENT_DEFINITION = "int64 time_ns\nint32 level\nstring source\nstring text\n"
+TEMPERATURE_TOPIC, TEMPERATURE_SCHEMA = "/temperature", "jointctl_msgs/msg/Temperature"
+TEMPERATURE = np.dtype([("time_ns", "<i8"), ("temperature_degC", "<f8")])
 INFO, WARNING, ERROR = 20, 30, 40  # levels, those of Python's logging
 _MAGIC = b"\x89MCAP0\r\n"
 _CHUNK_BYTES = 256 * 1024
@@ -70,6 +73,7 @@ class RunLog:
     metadata: dict[str, dict[str, str]]
     complete: bool  # False: the file was cut off, its tail is lost
     frames: Any = field(default_factory=lambda: np.zeros(0, CAN_FRAME))  # array of CAN_FRAME, shape (N,)
+    temperatures: Any = field(default_factory=lambda: np.zeros(0, TEMPERATURE))  # array of TEMPERATURE, shape (N,)
 
 
 class RunLogWriter:
@@ -106,6 +110,7 @@ class RunLogWriter:
         self._record_channel = self._channel(RECORD_TOPIC, RECORD_SCHEMA, definition)
         self._event_channel = self._channel(EVENT_TOPIC, EVENT_SCHEMA, EVENT_DEFINITION)
         self._can_channel: int | None = None  # only in logs with frames
+        self._temperature_channel: int | None = None  # only where the drive tells one
         self._file.flush()
 
     def _channel(self, topic: str, name: str, definition: str) -> int:
@@ -140,6 +145,14 @@ class RunLogWriter:
         data = CDR_HEADER + event_body(time_ns, level, source, text)
         self._writer.add_message(self._event_channel, time_ns, data, time_ns)
         self.flush()
+
+    def write_temperature(self, time_ns: int, temperature_degC: float) -> None:
+        """Append a reading of the drive's temperature."""
+        if self._temperature_channel is None:
+            definition = message_definition(TEMPERATURE)
+            self._temperature_channel = self._channel(TEMPERATURE_TOPIC, TEMPERATURE_SCHEMA, definition)
+        data = CDR_HEADER + np.array((time_ns, temperature_degC), TEMPERATURE).tobytes()
+        self._writer.add_message(self._temperature_channel, time_ns, data, time_ns)
 
     def flush(self) -> None:
         """Close the chunk in progress and hand everything to the operating system."""
@@ -206,7 +219,8 @@ def _read(file: IO[bytes], path: Path) -> RunLog:
     records = np.concatenate(log.record_parts) if log.record_parts else np.zeros(0, dtype)
     records.flags.writeable = False
     frames = np.concatenate(log.frame_parts) if log.frame_parts else np.zeros(0, CAN_FRAME)
-    return RunLog(records.view(np.recarray), tuple(log.events), log.metadata, complete, frames)
+    temperatures = np.concatenate([np.zeros(0, TEMPERATURE), *log.temperature_parts])
+    return RunLog(records.view(np.recarray), tuple(log.events), log.metadata, complete, frames, temperatures)
 
 
 class _Collector:
@@ -216,11 +230,16 @@ class _Collector:
         self.path = path
         self.record_parts: list[np.ndarray] = []
         self.frame_parts: list[np.ndarray] = []
+        self.temperature_parts: list[np.ndarray] = []
         self.events: list[Event] = []
         self.metadata: dict[str, dict[str, str]] = {}
         self._topics: dict[int, str] = {}
         self._definition = message_definition(dtype_of(LogRecord)).encode()
-        bodies = {RECORD_TOPIC: (dtype_of(LogRecord), self.record_parts), CAN_TOPIC: (CAN_FRAME, self.frame_parts)}
+        bodies = {
+            RECORD_TOPIC: (dtype_of(LogRecord), self.record_parts),
+            CAN_TOPIC: (CAN_FRAME, self.frame_parts),
+            TEMPERATURE_TOPIC: (TEMPERATURE, self.temperature_parts),
+        }
         # topics whose messages all have the same size, so that a run of them is an array
         self._runs = {
             topic: (np.dtype([*_MESSAGE_HEAD.descr, ("cdr", "V4"), ("record", body)]), parts)

@@ -5,7 +5,8 @@ Errors and torques are those of the TRACKING phase (e = q - q_d, at the joint); 
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -71,18 +72,25 @@ class RunSummary:
     work: TimeSummary | None
     skipped_cycles: int
     oldest_sample_cycles: int
+    temperature_degC: Range | None = None  # of the drive, as it tells it
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers and texts for JSON; the unit of each is in its key."""
         return asdict(self)
 
 
-def summarise(records: Any, histograms: Any = None, *, late_from_s: float | None = None) -> RunSummary:
+def summarise(
+    records: Any,
+    histograms: Any = None,
+    *,
+    late_from_s: float | None = None,
+    temperatures_degC: Sequence[float] | np.ndarray = (),
+) -> RunSummary:
     """Summary of `records` (array of LogRecord, shape (N,)).
 
     `histograms` int64[3, bins of 1 us], rows wake-up, round trip, work, the last bin open: where given, the deadline
     statistics come from it, because the loop counts every cycle there even if the log lost some.
-    `late_from_s` is a trajectory time.
+    `late_from_s` is a trajectory time, `temperatures_degC` what the drive has told.
     """
     tracking = records[records["phase"] == AxisPhase.TRACKING]
     time_s = tracking_time_s(tracking)
@@ -104,6 +112,7 @@ def summarise(records: Any, histograms: Any = None, *, late_from_s: float | None
         **{name: _times(records, histograms, row) for row, name in enumerate(_TIMES)},
         skipped_cycles=int(records["skipped"].sum()),
         oldest_sample_cycles=int(records["sample_age_cycles"].max()) if len(records) else 0,
+        temperature_degC=_range(np.asarray(temperatures_degC, float)),
     )
 
 
@@ -143,7 +152,10 @@ def _settling_s(tracking: Any) -> float | None:
 
 def _times(records: Any, histograms: Any, row: int) -> TimeSummary | None:
     if histograms is not None:
-        return histogram_times(histograms[row])
+        found = histogram_times(histograms[row])
+        # what lies beyond the histogram is in the records, unless they were lost
+        beyond_us = float(records[f"{_TIMES[row]}_ns"].max()) / 1000.0 if len(records) else 0.0
+        return replace(found, max_us=max(found.max_us, beyond_us)) if found is not None and found.over_range else found
     values = records[f"{_TIMES[row]}_ns"] / 1000.0
     if _TIMES[row] == "round_trip":
         values = values[values > 0.0]  # 0 = no sample in this cycle
@@ -200,9 +212,12 @@ def summary_table(summary: RunSummary) -> Table:
             table.add_row(f"{name}, p50/p99/p99.9/max", _times_text(times))
     table.add_row("cycles, skipped", f"{summary.cycles}, {summary.skipped_cycles}")
     table.add_row("oldest sample", f"{summary.oldest_sample_cycles} cycles")
+    if summary.temperature_degC is not None:
+        low_degC, high_degC = summary.temperature_degC.least, summary.temperature_degC.greatest
+        table.add_row("temperature", f"{low_degC:.1f} .. {high_degC:.1f} °C")
     return table
 
 
 def _times_text(times: TimeSummary) -> str:
-    values = " / ".join(f"{v:.4g}" for v in (times.p50_us, times.p99_us, times.p99_9_us, times.max_us))
+    values = " / ".join(f"{v:.0f}" for v in (times.p50_us, times.p99_us, times.p99_9_us, times.max_us))
     return f"{values} us" + (f" ({times.over_range} beyond the range)" if times.over_range else "")

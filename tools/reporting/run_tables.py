@@ -94,6 +94,7 @@ def motion_of(summary: RunSummary) -> Figures:
         ("network torque", summary.network_torque_Nm),
     ):
         rows += _ends(name, torque, "Nm", 1.0, 2)
+    rows += _ends("temperature of the drive", summary.temperature_degC, "°C", 1.0, 1)
     return rows
 
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
 import numpy as np
-from rich.console import Console, Group
+from rich.console import Console, ConsoleOptions, Group, RenderResult
 from rich.live import Live
 from rich.panel import Panel
 from rich.table import Table
@@ -35,6 +35,7 @@ REFRESH_s = 0.25
 CLOSE_s = 1.0  # how long the end of a run waits for the last frame
 NOTES = 3  # how many of the newest remarks stay in the panel
 _QUANTILE = 0.99
+_NAME_WIDTH, _LEAST_WIDTH, _RIGHT_WIDTH = 11, 15, 19  # columns of the panel
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,7 @@ class Snapshot:
     duration_s: float  # of the trajectory; 0 = until stopped
     cia402: bool = True
     records: Any = ()  # all new ones, array of LogRecord (N,)
+    temperature_degC: float | None = None  # None: the drive tells none, or not now
 
 
 class Display(Protocol):
@@ -214,29 +216,45 @@ class LivePanel(OnlyShows):
 
 def panel(title: str, phase: str, snapshot: Snapshot | None, notes: list[str]) -> Panel:
     """The picture of one moment; the same number of lines whatever happens, so that nothing jumps."""
-    grid = Table.grid()
-    for style, width in (("dim", 12), ("", 28), ("dim", 12), ("", 20)):
-        grid.add_column(style=style, no_wrap=True, width=width)
-    cells = _cells(phase, snapshot)
-    for left, right in zip(cells[::2], cells[1::2], strict=True):
-        grid.add_row(left[0], _indented(left[1]), right[0], _indented(right[1]))
     lines = [Text(f"  {line}", style="dim", no_wrap=True) for line in [*notes, *[""] * (NOTES - len(notes))]]
     border = "red" if snapshot is not None and int(snapshot.record.fault) else "blue"
     foot = "Ctrl-C: brake and disable; again: quick stop"
     return Panel(
-        Group(grid, *lines), title=title, subtitle=foot, title_align="left", subtitle_align="left",
-        border_style=border, width=78,
+        Group(_Grid(_cells(phase, snapshot)), *lines), title=title, subtitle=foot, title_align="left",
+        subtitle_align="left", border_style=border, width=78,
     )  # fmt: skip
 
 
+class _Grid:
+    """Two fields a line where they fit, else one."""
+
+    def __init__(self, cells: list[tuple[str, str | Text]]) -> None:
+        self._cells = cells
+
+    def __rich_console__(self, _: Console, options: ConsoleOptions) -> RenderResult:
+        left = min(28, options.max_width - 2 * _NAME_WIDTH - _RIGHT_WIDTH)
+        widths = [_NAME_WIDTH, options.max_width - _NAME_WIDTH]
+        if left >= _LEAST_WIDTH:
+            widths = [_NAME_WIDTH, left, _NAME_WIDTH, _RIGHT_WIDTH]
+        grid, step = Table.grid(), len(widths) // 2
+        for width, style in zip(widths, ("dim", "") * step, strict=True):
+            grid.add_column(style=style, no_wrap=True, width=width)
+        for at in range(0, len(self._cells), step):
+            grid.add_row(*(part for name, value in self._cells[at : at + step] for part in (name, _indented(value))))
+        yield grid
+
+
 def _indented(value: str | Text) -> Text:
-    """Two columns of space that belong to the value."""
-    return Text(f"  {value}") if isinstance(value, str) else Text(f"  {value.plain}", style=value.style)
+    """A column of space that belongs to the value."""
+    return Text(f" {value}") if isinstance(value, str) else Text(f" {value.plain}", style=value.style)
 
 
 def _cells(phase: str, snapshot: Snapshot | None) -> list[tuple[str, str | Text]]:
     """(name, value) of each field, in the order of reading."""
-    names = ("phase", "drive", "error", "fault", "angle", "torque", "time left", "wake-up p99", "measured", "skipped")
+    names = (
+        "phase", "drive", "error", "fault", "angle", "torque", "velocity", "measured", "time left", "temperature",
+        "wake-up p99", "skipped",
+    )  # fmt: skip
     if snapshot is None:
         return [(name, Text(phase, style="bold") if name == "phase" else "-") for name in names]
     record = snapshot.record
@@ -246,13 +264,15 @@ def _cells(phase: str, snapshot: Snapshot | None) -> list[tuple[str, str | Text]
     values: tuple[str | Text, ...] = (
         Text(phase_name(int(record.phase)), style="bold"),
         drive_state_name(int(record.status_word), int(record.drive_state), cia402=snapshot.cia402),
-        f"{float(record.error_rad) * 1e3:+9.3f} mrad" if active else "-",
+        f"{float(record.error_rad) * 1e3:+8.3f} mrad" if active else "-",
         Text(_fault_name(fault), style="bold red") if fault else "none",
-        f"{float(record.position_rad):+9.4f} rad",
+        f"{float(record.position_rad):+8.4f} rad",
         f"{float(record.command_torque_Nm):+8.2f} Nm",
+        f"{float(record.velocity_radps):+7.3f} rad/s",
+        f"{float(record.measured_torque_Nm):+8.2f} Nm",
         time_left(float(record.trajectory_s), snapshot.duration_s, int(record.phase)),
+        "-" if snapshot.temperature_degC is None else f"{snapshot.temperature_degC:.1f} °C",
         f"{p99_s * 1e6:.0f} us" if np.isfinite(p99_s) else "-",
-        f"{float(record.measured_torque_Nm):+9.2f} Nm",
         f"{snapshot.skipped} cycles",
     )
     return list(zip(names, values, strict=True))

@@ -40,6 +40,7 @@ from tools.running.readiness import require_same_motion
 from tools.running.run_result import RunResult as RunResult
 from tools.running.shared_block import SERIAL
 from tools.running.stop_signals import StopSignals, stop_signals
+from tools.running.temperature_watch import TemperatureWatch
 from tools.running.viewer_orders import ViewerOrders
 
 POLL_S = 0.02
@@ -71,6 +72,7 @@ class Supervisor:
         self._recorder: FrameRecorder | None = None
         self._bus_watch = BusWatch(config, None)
         self._events = EventFinder()
+        self._temperature = TemperatureWatch()
         self._asked = StopRequest.NONE
         self.signals = StopSignals()  # that came during the run
         self._stopped_by_viewer = ""
@@ -145,6 +147,7 @@ class Supervisor:
             constants[0].sequence.may_enable = 0
             loop.listen()
             drive.start_cyclic()
+            self._temperature = TemperatureWatch(drive.thermometer(), log)
             started_ns = time.monotonic_ns()
             loop.go(constants, drive.port())
             try:
@@ -221,11 +224,9 @@ class Supervisor:
                 time.sleep(POLL_S)
 
     def _take_records(self, loop: LoopHandle, log: RunLogWriter, kept: KeptRecords) -> None:
-        frames = self._recorder.new_frames() if self._recorder is not None else []
-        if frames:
+        if self._recorder is not None and (frames := self._recorder.new_frames()):
             log.write_frames(frame_array(frames))
-        records = loop.new_records()
-        if not len(records):
+        if not len(records := loop.new_records()):
             return
         self._keep(records, log, kept)
         if self._orders is not None:
@@ -235,7 +236,8 @@ class Supervisor:
         skipped, histograms = int(loop.block.words[Word.SKIPPED]), loop.block.histograms
         duration_s = float(loop.block.constants[0].trajectory.duration_s)  # a viewer may have changed the motion
         cia402 = self._config.bus.interface != SERIAL
-        self._display.show(Snapshot(records[-1], skipped, histograms, duration_s, cia402, records))
+        degC = self._temperature.newest_degC
+        self._display.show(Snapshot(records[-1], skipped, histograms, duration_s, cia402, records, degC))
 
     def _keep(self, records: Any, log: RunLogWriter, kept: KeptRecords) -> None:
         """What becomes of new records: the log, and `kept` for the summary at the end."""
@@ -244,8 +246,7 @@ class Supervisor:
 
     def _watch(self, loop: LoopHandle, log: RunLogWriter, kept: KeptRecords, signals: StopSignals) -> None:
         loop.beat()
-        viewer = self._display.stop_request()
-        request = max(signals.request, viewer)
+        request = max(signals.request, self._display.stop_request())
         if request is not StopRequest.NONE:
             loop.request_stop(request)
         self._take_records(loop, log, kept)
@@ -257,6 +258,7 @@ class Supervisor:
             text = f"{request.name.lower().replace('_', ' ')} asked for by {who}"
             self._tell(log, Event(time.monotonic_ns(), WARNING, "supervisor", text))
         self._check_delay(loop, log)
+        self._temperature.poll()
         for text in self._bus_watch.news():
             log.write_event(WARNING, "bus", text)
             self._display.note(text)
@@ -265,8 +267,7 @@ class Supervisor:
             self._display.note(GUARD_ENDED)
         if self._orders is not None:
             self._orders.serve(self._display)
-        phase = loop.phase
-        if phase is not self._phase:
+        if (phase := loop.phase) is not self._phase:
             self._phase = phase
             self._display.phase(phase_name(phase))
 
@@ -285,7 +286,7 @@ class Supervisor:
             text = self._bus_watch.explained(fault, text, int(loop.block.port[0].last_errno))
         bits = float(loop.block.port[0].bits_sent)
         return RunResult(
-            summary=summarise(records, loop.block.histograms),
+            summary=summarise(records, loop.block.histograms, temperatures_degC=self._temperature.values_degC),
             records=records,
             histograms=loop.block.histograms.copy(),
             fault=fault,

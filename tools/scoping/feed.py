@@ -49,6 +49,7 @@ class ScopeFeed:
         self._requests: deque[ViewerRequest] = deque(maxlen=REQUESTS)
         self._viewers = 0
         self._counted_s: float | None = None  # when the server told their number last
+        self._temperature_degC: float | None = None  # as it was passed on
         self._unwatched_since_s: float | None = None  # None: somebody watches, or nobody ever has
 
     def _send(self, kind: bytes, body: bytes) -> None:
@@ -65,6 +66,9 @@ class ScopeFeed:
 
     def show(self, snapshot: Snapshot) -> None:
         """Pass on the records of the snapshot."""
+        if snapshot.temperature_degC != self._temperature_degC:
+            self._temperature_degC = snapshot.temperature_degC
+            self.settings({"temperature_degC": self._temperature_degC})
         for at in range(0, len(snapshot.records), PIECE):
             self._send(RECORDS, snapshot.records[at : at + PIECE].tobytes())
 

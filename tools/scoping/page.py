@@ -130,6 +130,9 @@ class ScopePage:
         last = rows[-1]
         drive = drive_state_name(int(last["status_word"]), int(last["drive_state"]), cia402=self._order.cia402)
         words = [phase_name(int(last["phase"])), f"drive: {drive}"]
+        temperature_degC = self._history.settings.get("temperature_degC")
+        if temperature_degC is not None and not self._history.ended:
+            words.append(f"{temperature_degC:.1f} °C")
         fault = int(last["fault"])
         if fault:
             name = Fault(fault).name.lower().replace("_", " ") if fault in list(Fault) else str(fault)

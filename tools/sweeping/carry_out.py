@@ -176,6 +176,7 @@ class SweepSupervisor(Supervisor):
 
     def _keep(self, records: Any, log: RunLogWriter, kept: KeptRecords) -> None:
         self._write(self._thinned.take(records), log, kept)
+        self._meter.temperature_degC = self._temperature.newest_degC
         self._meter.feed(records)
         with contextlib.suppress(OSError):  # the terminal may have been closed
             self._progress(float(records[-1].trajectory_s))

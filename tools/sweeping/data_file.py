@@ -107,7 +107,7 @@ class SweepFile:
             _replace(path, "".join(lines[: rows + 1]))
         return cls(path, sidecar, torque_constant_NmpA)
 
-    def add(self, measured: MeasuredPoint, temperature_degC: float | None = None) -> None:
+    def add(self, measured: MeasuredPoint) -> None:
         """One row, in the hands of the operating system when this returns, and soon on the disk.
 
         `DataError` if it or the one before could not be written.
@@ -115,7 +115,7 @@ class SweepFile:
         if self._last is not None and self._last.done():
             self._settle(self._last)
         point, result = measured.point, measured.result
-        current = 1.0 / self._torque_constant_NmpA
+        current, temperature_degC = 1.0 / self._torque_constant_NmpA, measured.temperature_degC
         values = (
             f"{result.velocity_radps:.9g}", f"{result.motor_torque_Nm * current:.9g}", f"{result.motor_torque_Nm:.9g}",
             f"{result.velocity_std_radps:.6g}", f"{result.motor_torque_std_Nm * current:.6g}", result.samples,

@@ -33,6 +33,7 @@ class MeasuredPoint:
     point: SweepPoint
     result: PlateauResult
     time_s: float  # trajectory time at the end of its last window
+    temperature_degC: float | None = None  # of the drive, if it tells one
 
 
 class SweepMeter:
@@ -47,6 +48,7 @@ class SweepMeter:
         self._windows = windows
         self._model = model
         self.tolerance = Tolerance(0.01, 0.0)  # set once the drive's resolution is known
+        self.temperature_degC: float | None = None  # the drive's newest, set before `feed`
         self._on_point = on_point
         self._next = 0
         self._chunks: list[np.ndarray] = []
@@ -97,4 +99,4 @@ class SweepMeter:
             return
         result = plateau(taken, window.point.velocity_radps, model.orders_prad, self.tolerance, model.resolution_rad)
         if math.isfinite(result.velocity_radps) and math.isfinite(result.motor_torque_Nm):
-            self._on_point(MeasuredPoint(window.point, result, window.end_s))
+            self._on_point(MeasuredPoint(window.point, result, window.end_s, self.temperature_degC))

@@ -24,13 +24,15 @@ def write_sweep_page(path: Path, data: Path, summary: TerminalTable, output: Out
     about = json.loads(beside.read_text(encoding="utf-8"))
     blocks: list[Block] = [_figure(rows)] if rows else []
     tones = {i: "warning" for i, row in enumerate(rows) if row["settled"] == "0"}
+    warm = any(row["temperature_degC"] for row in rows)
     listed = Table(
-        ["velocity [rad/s]", "motor torque [Nm]", "deviation of velocity [rad/s]", "samples", "settled", "time [s]"],
+        ["velocity [rad/s]", "motor torque [Nm]", "deviation of velocity [rad/s]", "samples", "settled", "time [s]",
+         *(["temperature [°C]"] if warm else [])],
         [
             (
-                f"{float(row['velocity_radps']):.6g}", f"{float(row['motor_torque_Nm']):.5g}",
-                f"{float(row['velocity_std_radps']):.2g}", row["samples"], "yes" if row["settled"] == "1" else "no",
-                row["time_s"],
+                f"{float(row['velocity_radps']):.5f}", f"{float(row['motor_torque_Nm']):.5f}",
+                f"{float(row['velocity_std_radps']):.4f}", row["samples"], "yes" if row["settled"] == "1" else "no",
+                f"{float(row['time_s']):.1f}", *([row["temperature_degC"] or "-"] if warm else []),
             )
             for row in rows
         ],
@@ -42,7 +44,7 @@ def write_sweep_page(path: Path, data: Path, summary: TerminalTable, output: Out
         Section("Points", [listed]),
         Section("Configuration", [Details("Configuration", str(about.get("configuration", "")))]),
     ]
-    write_verb_page(path, f"Sweep {data.stem}", sections, output, subtitle=str(data), inputs=(data, beside))
+    write_verb_page(path, f"Friction sweep: {data.stem}", sections, output, subtitle=str(data), inputs=(data, beside))
 
 
 def _figure(rows: list[dict[str, Any]]) -> Figure:

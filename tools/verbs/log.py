@@ -23,7 +23,7 @@ _SHOWN_EVENTS = 100
 def log_info(path: Path, output: Output) -> int:
     """What the log holds, what was run, the summary of the run, its events."""
     log = read_run_log(path)
-    summary = summarise(log.records)
+    summary = summarise(log.records, temperatures_degC=log.temperatures["temperature_degC"])
     drive = log.metadata.get("drive", {})
     facts = {
         "file": str(path),

@@ -61,7 +61,7 @@ def paper(
     if report is not None:
         with TemporaryDirectory() as elsewhere:
             drawn = pictures or _pictures(runs, identified, Path(elsewhere))
-            blocks = [picture(path, path.stem.replace("_", " "), path.stem.replace("_", " ")) for path in drawn]
+            blocks = [picture(path, path.stem.replace("_", " ")) for path in drawn]
         sections = [Section("In numbers", [from_terminal(_table(rows))]), Section("Figures", blocks)]
         write_verb_page(report, "The paper's experiments", sections, output, subtitle=PAPER)
     return 0

@@ -14,6 +14,7 @@ from tools.reporting.comparison import comparison
 from tools.reporting.page import Block, Details, Paragraph, Section, check_target, page, write_page
 from tools.reporting.run_figures import run_figures
 from tools.reporting.run_tables import events_table, figure_tables, what_ran
+from tools.reporting.temperature_figure import temperature_figure
 
 MOST_LOGS = 6  # columns that fit on a page
 
@@ -43,7 +44,7 @@ def log_names(paths: Sequence[Path]) -> list[str]:
 
 def report_sections(names: Sequence[str], logs: Sequence[RunLog]) -> list[Section]:
     """The body of the page."""
-    summaries = [summarise(log.records) for log in logs]
+    summaries = [summarise(log.records, temperatures_degC=log.temperatures["temperature_degC"]) for log in logs]
     verdicts = [
         Paragraph(verdict(name, s), "" if s.fault == Fault.NONE.name else "error")
         for name, s in zip(names, summaries, strict=True)
@@ -56,7 +57,7 @@ def report_sections(names: Sequence[str], logs: Sequence[RunLog]) -> list[Sectio
         sections.append(Section("Side by side", comparison(names, [log.records for log in logs])))
     for name, log in zip(names, logs, strict=True):
         title = "Figures" if len(logs) == 1 else f"Figures of {name}"
-        sections.append(Section(title, run_figures(log.records)))
+        sections.append(Section(title, [*run_figures(log.records), *temperature_figure(log)]))
         events: list[Block] = [events_table(log)] if log.events else [Paragraph("The log holds no events.")]
         sections.append(Section("Events" if len(logs) == 1 else f"Events of {name}", events))
     details = [

@@ -20,10 +20,10 @@ from tools.reporting.verb_page import from_terminal, picture, write_verb_page
 
 INTERRUPTED = 130
 _COLUMNS = (
-    ("peak_mrad", "peak"),
-    ("rmse_mrad", "RMSE"),
-    ("true_peak_mrad", "true peak"),
-    ("true_rmse_mrad", "true RMSE"),
+    ("peak_mrad", "peak [mrad]"),
+    ("rmse_mrad", "RMSE [mrad]"),
+    ("true_peak_mrad", "true peak [mrad]"),
+    ("true_rmse_mrad", "true RMSE [mrad]"),
     ("settling_s", "settling [s]"),
 )
 

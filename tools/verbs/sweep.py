@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -224,7 +224,7 @@ class Sweep:
 
     def _on_point(self, measured: MeasuredPoint) -> None:
         assert self.file is not None
-        self.file.add(MeasuredPoint(measured.point, measured.result, measured.time_s + self._time_offset_s))
+        self.file.add(replace(measured, time_s=measured.time_s + self._time_offset_s))
         result = measured.result
         if result.problem:
             self._unsettled[measured.point.index] = measured.point

@@ -1,0 +1,306 @@
+"""The drive's temperature: read beside the loop without waiting, logged, exported, and harmless if it fails."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import canopen
+import numpy as np
+import pytest
+from canopen.objectdictionary import ODVariable
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from drivers.canopen.thermometer import TemperatureObject, Thermometer
+from drivers.drive import Reading
+from drivers.errors import ConfigurationError, DeviceError
+from firmware_py.records import LogRecord
+from firmware_py.schema import dtype_of
+from tools.configuration.drive_settings import temperature_object
+from tools.configuration.load import load_config
+from tools.recording.log_export import csv_bytes, npz_bytes, table_columns
+from tools.recording.run_log import RunLogWriter, read_run_log
+from tools.recording.run_summary import summarise
+from tools.reporting.temperature_figure import temperature_figure
+from tools.running.temperature_watch import STALE_S, TemperatureWatch
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+INDEX, NODE = 0x2103, 5
+S = 1_000_000_000
+INTEGER16, UNSIGNED8, REAL32, VISIBLE_STRING, INTEGER64 = 3, 5, 8, 9, 21
+
+
+class Line:
+    """What the thermometer sees of a network: requests are kept, answers come when the test says so."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[int, bytes]] = []
+        self.broken = False
+        self.answer: Callable[..., None] | None = None
+
+    def subscribe(self, identifier: int, callback: Callable[..., None]) -> None:
+        assert identifier == 0x580 + NODE
+        self.answer = callback
+
+    def send_message(self, identifier: int, data: bytes) -> None:
+        if self.broken:
+            raise OSError(100, "network is down")
+        self.sent.append((identifier, data))
+
+
+class Bench:
+    """A thermometer with its line and its clock."""
+
+    def __init__(self, data_type: int = INTEGER16, **wanted: Any) -> None:
+        node = canopen.RemoteNode(NODE, canopen.ObjectDictionary())
+        variable = ODVariable("temperature", INDEX, 0)
+        variable.data_type = data_type
+        node.object_dictionary.add_object(variable)
+        self.line, self.now_ns = Line(), 10 * S
+        place = {"index": INDEX, "unit_degC": 0.1, **wanted}
+        self.meter = Thermometer(self.line, node, TemperatureObject(**place), "x.eds", lambda: self.now_ns)  # type: ignore[arg-type]
+
+    def after(self, seconds: float) -> Reading | None:
+        self.now_ns += round(seconds * S)
+        return self.meter.poll()
+
+    def says(self, data: bytes) -> Reading | None:
+        assert self.line.answer is not None
+        self.line.answer(0x580 + NODE, bytearray(data), 0.0)
+        return self.meter.poll()
+
+
+def upload(value: bytes, index: int = INDEX) -> bytes:
+    return struct.pack("<BHB4s", 0x43 | (4 - len(value)) << 2, index, 0, value)
+
+
+def test_one_request_a_second_however_often_it_is_asked() -> None:
+    bench = Bench()
+    for _ in range(150):  # 3 s of the supervisor's pace
+        asked = len(bench.line.sent)
+        bench.after(0.02)
+        if len(bench.line.sent) > asked:
+            bench.says(upload(struct.pack("<h", 251)))
+    assert [identifier for identifier, _ in bench.line.sent] == [0x600 + NODE] * 3
+    assert bench.line.sent[0][1] == bytes.fromhex("4003210000000000")
+
+
+@pytest.mark.parametrize(
+    ("data_type", "wanted", "answer", "expected_degC"),
+    [
+        (INTEGER16, {}, struct.pack("<h", -405), -40.5),
+        (INTEGER16, {}, struct.pack("<hH", 251, 0), 25.1),  # a server that always answers with 4 bytes
+        (UNSIGNED8, {"unit_degC": 1.0}, b"\xc8", 200.0),
+        (UNSIGNED8, {"unit_degC": 1.0, "offset_degC": -40.0}, b"\x3c", 20.0),
+        (REAL32, {"unit_degC": 1.0}, struct.pack("<f", 36.5), 36.5),
+    ],
+)
+def test_types_unit_and_offset(data_type: int, wanted: dict[str, float], answer: bytes, expected_degC: float) -> None:
+    bench = Bench(data_type, **wanted)
+    bench.after(0.0)
+    found = bench.says(upload(answer))
+    assert found is not None
+    assert found.temperature_degC == pytest.approx(expected_degC)
+    assert (found.time_ns, found.problem) == (10 * S, "")
+
+
+def test_without_an_answer_it_is_unknown_and_asked_again() -> None:
+    bench = Bench()
+    assert bench.after(0.0) is None
+    assert bench.after(0.999) is None  # the twin: an answer may take so long
+    found = bench.after(0.001)
+    assert found is not None
+    assert (found.temperature_degC, found.problem) == (None, "object 2103 (temperature): no answer within 1 s")
+    assert len(bench.line.sent) == 2
+    found = bench.says(upload(struct.pack("<h", 300)))
+    assert found is not None
+    assert found.temperature_degC == pytest.approx(30.0)
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        (struct.pack("<BHBI", 0x80, INDEX, 0, 0x06020000), "object does not exist (SDO abort 06020000h)"),
+        (struct.pack("<BHBI", 0x80, INDEX, 0, 0x08000000), "refused (SDO abort 08000000h)"),
+        (upload(b"\x01"), "16 bits are expected"),
+        (struct.pack("<BHBI", 0x41, INDEX, 0, 20), "16 bits are expected"),  # a segmented transfer: not a number
+    ],
+)
+def test_an_abort_and_nonsense_make_it_unknown(answer: bytes, words: str) -> None:
+    bench = Bench()
+    bench.after(0.0)
+    found = bench.says(answer)
+    assert found is not None
+    assert found.temperature_degC is None
+    assert words in found.problem
+    assert bench.after(0.5) is None
+    bench.after(0.5)
+    assert len(bench.line.sent) == 2  # it may recover
+
+
+def test_not_a_number_is_none() -> None:
+    bench = Bench(REAL32)
+    bench.after(0.0)
+    found = bench.says(upload(struct.pack("<f", float("nan"))))
+    assert found is not None
+    assert found.temperature_degC is None
+
+
+@pytest.mark.parametrize(
+    "foreign",
+    [
+        upload(struct.pack("<h", 251), 0x6064),  # another program's answer on the same SDO channel
+        struct.pack("<BHB4x", 0x60, INDEX, 0),  # a download's
+        b"\x43\x03",
+        bytes(8),
+    ],
+)
+def test_answers_to_others_are_not_taken(foreign: bytes) -> None:
+    bench = Bench()
+    bench.after(0.0)
+    assert bench.says(foreign) is None
+    assert bench.says(upload(struct.pack("<h", 251))) is not None
+    assert bench.says(upload(struct.pack("<h", 252))) is None  # nobody has asked
+
+
+@pytest.mark.parametrize(("pause_s", "asked"), [(0.049, 1), (0.05, 2)])
+def test_it_waits_while_somebody_else_uses_the_channel(pause_s: float, asked: int) -> None:
+    """One node has one SDO server: a request in the midst of `jointctl info` would disturb it."""
+    bench = Bench()
+    bench.after(0.0)
+    bench.says(upload(struct.pack("<h", 251)))
+    bench.now_ns += S
+    bench.says(upload(b"\x01", 0x6502))
+    assert len(bench.line.sent) == 1
+    bench.after(pause_s)
+    assert len(bench.line.sent) == asked
+
+
+def test_a_bus_that_takes_nothing_is_the_loops_business() -> None:
+    bench = Bench()
+    bench.line.broken = True
+    assert bench.after(0.0) is None
+    assert bench.after(1.0) is None
+    bench.line.broken = False
+    bench.after(1.0)
+    assert bench.says(upload(struct.pack("<h", 251))) is not None
+
+
+@pytest.mark.parametrize("data_type", [VISIBLE_STRING, INTEGER64])
+def test_what_is_no_short_number_in_the_eds_is_refused(data_type: int) -> None:
+    with pytest.raises(DeviceError, match=r"x\.eds has no object 2103 \(temperature\) that is a number"):
+        Bench(data_type)
+
+
+def test_an_object_that_the_eds_has_not_is_refused() -> None:
+    with pytest.raises(DeviceError, match=r"x\.eds has no object 2104 \(temperature\)"):
+        Bench(index=0x2104)
+
+
+# --- configuration ---------------------------------------------------------------------------------------------
+
+
+def config_with(folder: Path, line: str) -> Path:
+    text = (CONFIGS / "virtual.toml").read_text()
+    path = folder / "joint.toml"
+    shown = [row for row in text.splitlines() if not row.startswith("temperature_")]
+    path.write_text("\n".join(shown).replace("[encoder]", f"{line}\n\n[encoder]", 1))
+    return path
+
+
+def test_the_configuration_names_object_unit_and_offset(tmp_path: Path) -> None:
+    lines = 'temperature_object = "2203:2"\ntemperature_unit_degC = 0.01\ntemperature_offset_degC = -273.15'
+    found = temperature_object(load_config(config_with(tmp_path, lines)))
+    assert found == TemperatureObject(0x2203, 2, 0.01, -273.15)
+    assert temperature_object(load_config(config_with(tmp_path, ""))) is None
+
+
+@pytest.mark.parametrize("wrong", ['"1000"', '"2203:255"', '"temperature"', "0x2203", '""'])
+def test_a_place_that_is_none_is_refused(tmp_path: Path, wrong: str) -> None:
+    with pytest.raises(ConfigurationError, match=r"drive\.temperature_object"):
+        load_config(config_with(tmp_path, f"temperature_object = {wrong}"))
+
+
+# --- watch, log and what is made of it -------------------------------------------------------------------------
+
+
+class Told:
+    """A thermometer that says what the test wants."""
+
+    def __init__(self, *readings: Reading | None) -> None:
+        self._readings = list(readings)
+
+    def poll(self) -> Reading | None:
+        return self._readings.pop(0) if self._readings else None
+
+
+def log_with(path: Path, *readings: Reading | None, cycles: int = 4) -> Any:
+    records = np.zeros(cycles, dtype_of(LogRecord))
+    records["time_ns"] = np.arange(1, cycles + 1) * S
+    with RunLogWriter(path, {}) as log:
+        watch = TemperatureWatch(Told(*readings), log)
+        for _ in readings:
+            watch.poll()
+        log.write_records(records)
+    return read_run_log(path)
+
+
+def test_readings_are_logged_and_each_trouble_is_told_once(tmp_path: Path) -> None:
+    silent = Reading(3 * S, None, "no answer")
+    log = log_with(tmp_path / "a.mcap", Reading(2 * S, 25.5), None, silent, silent, Reading(4 * S, 26.0))
+    assert log.temperatures["time_ns"].tolist() == [2 * S, 4 * S]
+    assert log.temperatures["temperature_degC"].tolist() == [25.5, 26.0]
+    assert [(event.time_ns, event.source, event.text) for event in log.events] == [(3 * S, "drive", "no answer")]
+    found = summarise(log.records, temperatures_degC=log.temperatures["temperature_degC"])
+    assert found.temperature_degC is not None
+    assert (found.temperature_degC.least, found.temperature_degC.greatest) == (25.5, 26.0)
+
+
+def test_the_newest_reading_goes_stale(monkeypatch: pytest.MonkeyPatch) -> None:
+    watch = TemperatureWatch(Told(Reading(10 * S, 25.5)))
+    assert watch.newest_degC is None
+    watch.poll()
+    limit_ns = 10 * S + round(STALE_S * S)
+    for now_ns, expected in ((limit_ns, 25.5), (limit_ns + 1, None)):
+        monkeypatch.setattr("time.monotonic_ns", lambda now_ns=now_ns: now_ns)
+        assert watch.newest_degC == expected
+
+
+def test_a_drive_without_a_thermometer_tells_nothing(tmp_path: Path) -> None:
+    watch = TemperatureWatch(None)
+    watch.poll()
+    assert (watch.newest_degC, watch.values_degC) == (None, [])
+    log = log_with(tmp_path / "a.mcap")
+    assert len(log.temperatures) == 0
+    assert "temperature_degC" not in table_columns(log)
+    assert summarise(log.records).temperature_degC is None
+
+
+def test_mcaps_own_ros_2_decoder_reads_the_topic(tmp_path: Path) -> None:
+    log_with(tmp_path / "a.mcap", Reading(2 * S, 25.5))
+    with (tmp_path / "a.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        found = [message for *_, message in reader.iter_decoded_messages(topics=["/temperature"])]
+    assert [(message.time_ns, message.temperature_degc) for message in found] == [(2 * S, 25.5)]
+
+
+def test_exports_hold_the_newest_reading_of_each_cycle(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    log = log_with(path, Reading(2 * S, 25.5), Reading(4 * S - 1, 26.0))
+    column = table_columns(log)["temperature_degC"]
+    np.testing.assert_array_equal(column, [np.nan, 25.5, 25.5, 26.0])
+    assert csv_bytes(log, path).splitlines()[2].endswith(b",25.5")
+    (tmp_path / "a.npz").write_bytes(npz_bytes(log, path))
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert arrays["temperature_degC"].tolist() == [25.5, 26.0]
+        assert arrays["temperature_time_ns"].tolist() == [2 * S, 4 * S - 1]
+
+
+def test_the_report_draws_it_from_ten_readings_on(tmp_path: Path) -> None:
+    readings = [Reading(second * S, 25.0 + second) for second in range(1, 11)]
+    (figure,) = temperature_figure(log_with(tmp_path / "a.mcap", *readings, cycles=12))
+    assert "°C" in figure.svg
+    assert temperature_figure(log_with(tmp_path / "b.mcap", *readings[:9], cycles=12)) == []
