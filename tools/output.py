@@ -15,6 +15,7 @@ from typing import IO, Any, Protocol
 
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
 
 
 class Advance(Protocol):
@@ -47,6 +48,8 @@ class Output:
             if data is not None:
                 print(json_format.dumps(_plain(data), allow_nan=False), file=self.stdout, flush=True)
         else:
+            for column in shown.columns if isinstance(shown, Table) else ():
+                column.overflow = "fold"  # a narrow terminal must not cut a number or a path
             self._results.print(shown)
 
     def note(self, text: str) -> None:

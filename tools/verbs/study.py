@@ -99,7 +99,7 @@ def _text(values: tuple[float, float, float], digits: int = 3) -> str:
     if not math.isfinite(median):
         return "never" if median > 0 else "-"
     texts = [f"{x:.{digits}g}" if math.isfinite(x) else "never" for x in (median, low, high)]
-    return f"{texts[0]} ({texts[1]}..{texts[2]})"
+    return f"{texts[0]} ({texts[1]} .. {texts[2]})"
 
 
 def _table(result: StudyResult, title: str, after_s: float) -> Table:
