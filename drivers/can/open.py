@@ -75,9 +75,8 @@ def open_python_can(
     except ImportError as error:
         raise BusError(f"interface {interface} needs a module that is not installed: {error}", "install it") from None
     except PermissionError:
-        raise BusError(
-            f"no permission to open {place}", "add the user to the device's group and log in again"
-        ) from None
+        cure = "sudo usermod -aG dialout $USER" if interface == "slcan" else "add the user to the device's group"
+        raise BusError(f"no permission to open {place}", f"{cure}; log in again") from None
     except OSError as error:
         if error.errno in (errno.ENODEV, errno.ENOENT, errno.ENXIO):
             raise BusError(f"no such device: {place}", "plug in the adapter") from None

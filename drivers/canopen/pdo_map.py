@@ -52,7 +52,12 @@ def configure_pdo(
     found = objects.read(base, 1, what=f"{what} COB-ID") & 0xFFFFFFFF
     cob_id |= found & NO_REMOTE_REQUEST
     objects.write(base, 1, cob_id | DISABLED, what=f"{what} COB-ID")
-    objects.write_verified(base, 2, transmission_type, what=f"{what} transmission type")
+    try:
+        objects.write_verified(base, 2, transmission_type, what=f"{what} transmission type")
+    except DeviceError as error:
+        if base < COMMUNICATION_TPDO and transmission_type > LAST_SYNCHRONOUS:
+            raise DeviceError(error.message, hint="set drive.rpdo_transmission_type = 1") from error.__cause__
+        raise
     objects.write(mapping, 0, 0, what=f"{what} number of mapped objects")
     for position, item in enumerate(mapped, start=1):
         objects.write_verified(mapping, position, item.entry(), what=f"{what} mapping of {item.name}")
@@ -153,7 +158,7 @@ def _map_or_find(
         raise DeviceError(
             f"{refused.message}; and none of the drive's own {'TPDOs' if base >= COMMUNICATION_TPDO else 'RPDOs'} "
             f"holds {missing} together",
-            hint=FIXED_HINT,
+            hint=refused.hint or FIXED_HINT,
         )
     found = _use_as_it_is(objects, before if found.base == base and before.holds(*needed) else found, kind)
     objects.remarks.append(f"{refused.message}: PDO {found.base:04X} is used as it is, on {found.identifier:03X}h")

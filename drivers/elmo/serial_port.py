@@ -101,7 +101,7 @@ def _open_error(path: str, baud_rate_bitps: int, error: Exception) -> BusError:
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
         return BusError(f"no such serial port: {path}", "plug in the adapter; -p names the port")
     if number in (errno.EACCES, errno.EPERM):
-        return BusError(f"no permission to open {path}", "add the user to the group dialout and log in again")
+        return BusError(f"no permission to open {path}", "sudo usermod -aG dialout $USER; log in again")
     if number in (errno.EAGAIN, errno.EBUSY) or "lock" in str(error):
         users = users_text(path)
         return BusError(

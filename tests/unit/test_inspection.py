@@ -68,6 +68,16 @@ class TestScan:
         assert "jointctl virtual joint" in out.getvalue()
         assert {identifier for identifier, _ in device_on_bus.requests} == {0x601}
 
+    @pytest.mark.parametrize("active", [True, False])
+    def test_beside_a_controller_its_heartbeat_is_explained(self, device_on_bus: Any, active: bool) -> None:
+        told, _, err = output()
+        with can.Bus(interface="virtual", channel=device_on_bus.channel) as bus:
+            identifier = 0x80 if active else 0x7E5
+            sender = bus.send_periodic(can.Message(arbitration_id=identifier, is_extended_id=False), 0.01)
+            assert scan(subject(device_on_bus, 1), told, listen_s=0.3) == 0
+            sender.stop()
+        assert ("may be the heartbeat of that controller" in err.getvalue()) is active
+
     def test_passive_sends_nothing_and_hears_heartbeats(self, device_on_bus: Any) -> None:
         def beat() -> None:
             with can.Bus(interface="virtual", channel=device_on_bus.channel) as bus:

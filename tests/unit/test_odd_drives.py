@@ -302,6 +302,22 @@ def test_a_drive_that_only_answers_to_sync(commission: Any, device_on_bus: Any, 
     assert heard == [(0, 1)] * 3
 
 
+@pytest.mark.parametrize("asked", [1, 255])
+def test_a_drive_that_refuses_an_asynchronous_command_and_can_be_mapped(
+    commission: Any, device_on_bus: Any, asked: int
+) -> None:
+    """None of its own maps would do: not the map has to be changed, but what is asked for."""
+    for base in range(0x1400, 0x1404):
+        fixed_map(device_on_bus, base, 0x80000201, 1, CONTROL)
+        device_on_bus.refused[base, 2] = OUT_OF_RANGE
+    if asked == 1:
+        assert commission(rpdo_transmission_type=asked).settings["mode"]
+        return
+    with pytest.raises(DeviceError, match=r"1400:2 .*was refused: value out of range") as caught:
+        commission(rpdo_transmission_type=asked)
+    assert caught.value.hint == "set drive.rpdo_transmission_type = 1"
+
+
 STATUS, POSITION, TORQUE, VELOCITY = 0x60410010, 0x60640020, 0x60770010, 0x606C0020
 CONTROL, TARGET, MODE, LIMIT, TARGET_VELOCITY, SPEED_LIMIT = (
     0x60400010, 0x60710010, 0x60600008, 0x60720010, 0x60FF0020, 0x607F0020,

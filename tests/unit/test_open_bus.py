@@ -174,6 +174,17 @@ def test_a_serial_adapter_that_is_not_there() -> None:
         open_python_can("slcan", "/dev/ttyJC_none", 1_000_000)
 
 
+@pytest.mark.parametrize(("interface", "cure"), [("slcan", "sudo usermod -aG dialout $USER"), ("pcan", "group")])
+def test_a_missing_right_is_told_with_its_cure(interface: str, cure: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(**settings: Any) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(can, "Bus", fail)
+    with pytest.raises(BusError, match="no permission to open") as caught:
+        open_python_can(interface, "socket://nowhere")
+    assert cure in caught.value.hint
+
+
 def test_errors_of_an_interface_become_bus_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     causes: list[tuple[Exception, str]] = [
         (PermissionError(errno.EACCES, "Permission denied"), "no permission to open pcan:x"),

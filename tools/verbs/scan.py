@@ -24,6 +24,7 @@ def scan(subject: Subject, output: Output, *, listen_s: float = LISTEN_S, passiv
         active = ear.heard.syncs > 0
         if active:
             output.note("SYNC is on the bus: a controller is active; asking goes on beside it")
+            output.note("a node that answers no SDO may be the heartbeat of that controller")
         answered: set[int] = set()
         if not passive:
             if subject.node is None or subject.config is not None:
