@@ -245,7 +245,7 @@ def _target_reached(device: Device) -> bool:
     if mode == Mode.HOMING:
         return device.homing != HomingState.SEARCHING and not moving
     if mode == Mode.TORQUE:
-        target = 0.0 if drive.controlword & _HALT else float(drive.target_torque)
+        target = 0.0 if drive.controlword & _HALT else device.torque_sign * float(drive.target_torque)
         return device.demand == target
     return False
 

@@ -132,21 +132,22 @@ def _mode_demand(device: Device, position: int, velocity_radps: float, dt_s: flo
     mode = drive.mode_display
     position_rad = position / device.counts_per_rad
     if mode == Mode.CYCLIC_TORQUE:
-        torque = float(drive.target_torque) + float(drive.torque_offset)
+        torque = device.torque_sign * (float(drive.target_torque) + float(drive.torque_offset))
         return -torque if device.torque_reversed else torque
     if mode == Mode.TORQUE:
-        target = 0.0 if drive.controlword & _HALT else float(drive.target_torque)
+        target = 0.0 if drive.controlword & _HALT else device.torque_sign * float(drive.target_torque)
         return device.demand + _limit(target - device.demand, int64(drive.torque_slope) * dt_s)
     if mode == Mode.CYCLIC_VELOCITY:
         target_radps = int64(drive.target_velocity) / device.counts_per_rad
         device.reference_velocity_radps = _limit(target_radps, _max_speed_radps(device))
-        return _velocity_loop(device, velocity_radps, dt_s) + float(drive.torque_offset)
+        return _velocity_loop(device, velocity_radps, dt_s) + device.torque_sign * float(drive.torque_offset)
     if mode == Mode.PROFILE_VELOCITY:
         target_radps = 0.0 if drive.controlword & _HALT else int64(drive.target_velocity) / device.counts_per_rad
         _ramp_velocity(device, _limit(target_radps, _max_speed_radps(device)), dt_s)
         return _velocity_loop(device, velocity_radps, dt_s)
     if mode == Mode.CYCLIC_POSITION:
-        return _cyclic_position(device, position_rad, velocity_radps, dt_s) + float(drive.torque_offset)
+        offset = device.torque_sign * float(drive.torque_offset)
+        return _cyclic_position(device, position_rad, velocity_radps, dt_s) + offset
     if mode == Mode.PROFILE_POSITION:
         return _profile_position(device, position_rad, velocity_radps, dt_s)
     if mode == Mode.HOMING:

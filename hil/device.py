@@ -44,6 +44,7 @@ class DeviceSettings:
     velocity_integral_Nmprad: float = 10_000.0
     position_gain_ps: float = 30.0
     parameter_file: Path | None = None  # keeps what 1010 saves; None = as long as the device exists
+    torque_direction: int = 1  # -1: positive motor torque drives the joint to negative angles
     second_counts_prad: float = 0.0  # of 60E4:1, on the joint, with the sign of its direction
     second_offset_counts: float = 0.0
     encoder: EncoderSettings | None = None  # an encoder node on the joint
@@ -65,6 +66,8 @@ class DeviceSettings:
             value = getattr(self, name)
             if not low <= value <= high:
                 raise ValueError(f"{name} (={value}) must be in [{low}..{high}]")
+        if self.torque_direction not in (1, -1):
+            raise ValueError(f"torque_direction (={self.torque_direction}) must be 1 or -1")
         constant = self.motor_torque_constant_NmpA
         if constant is not None and not 0.0 < constant < math.inf:
             raise ValueError(f"motor_torque_constant_NmpA (={constant}) must be greater than 0")
@@ -114,6 +117,7 @@ class Cia402Device:
         device.velocity_gain_Nmspr = settings.velocity_gain_Nmspr
         device.velocity_integral_Nmprad = settings.velocity_integral_Nmprad
         device.position_gain_ps = settings.position_gain_ps
+        device.torque_sign = float(settings.torque_direction)
         device.second_counts_prad = settings.second_counts_prad
         device.second_offset_counts = settings.second_offset_counts
         device.counts_per_rad = self.plant_constants[0].counts_prad

@@ -111,11 +111,12 @@ def sample_objects(device: Device, plant_c: PlantConstants, plant_s: PlantState)
         math.floor(plant_s.joint_position_rad * device.second_counts_prad + device.second_offset_counts + 0.5)
     )
     drive.velocity = _int32(plant_s.joint_velocity_radps * device.counts_per_rad)
-    motor_torque_mNm = 1e3 * plant_c.torque_per_current_NmpA * plant_s.current_A / device.reduction_ratio
+    current_A = device.torque_sign * plant_s.current_A
+    motor_torque_mNm = 1e3 * plant_c.torque_per_current_NmpA * current_A / device.reduction_ratio
     drive.torque = _int16(1e3 * motor_torque_mNm / int64(drive.rated_torque_mNm))
-    drive.current = _int16(1e6 * plant_s.current_A / int64(drive.rated_current_mA))
+    drive.current = _int16(1e6 * current_A / int64(drive.rated_current_mA))
     drive.motor_temperature_ddegC = _int16(10.0 * plant_s.motor_temperature_degC)
-    drive.demand_torque = _int16(device.demand)
+    drive.demand_torque = _int16(device.torque_sign * device.demand)
     mode = drive.mode_display
     if (mode == 1 or mode == 8) and device.state == PowerState.OPERATION_ENABLED and not device.resync:
         reference = device.reference_position_rad * device.counts_per_rad

@@ -174,6 +174,7 @@ class Device:
     position_gain_ps: f8  # 1/s
     # test access: while not zero the cause of this fault (an EMCY code) is present
     inject_fault_code: u2
+    torque_sign: f8  # -1.0: positive torque of the motor drives the joint to negative angles
     torque_reversed: i4  # test access: the target torque counts the other way
     # NMT and errors
     nmt: i4  # NmtState

@@ -16,7 +16,9 @@ from firmware_py.sequence import reset_axis
 from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault
 from hil.frames import FrameQueue
 from hil.lockstep import RECEIVED_SLOT, RPDO_SLOT, run_lockstep
+from tools.configuration.load import load_config, shipped_config
 from tools.configuration.records import axis_constants
+from tools.simulation.lockstep import LockstepJoint
 
 PERIOD_ns = 1_000_000
 
@@ -148,6 +150,25 @@ def test_a_wrong_direction_of_the_torque_is_caught(
     assert run.state[0].phase == AxisPhase.FINISHED
     assert run.state[0].fault in (Fault.FOLLOWING_ERROR, Fault.VELOCITY_LIMIT, Fault.TORQUE_SATURATED)
     assert np.max(np.abs(log.position_rad - 0.1)) < 0.5
+
+
+def test_a_motor_that_turns_the_other_way_can_be_tried() -> None:
+    """The virtual drive is mounted as the configuration says: every figure of the joint is the same, to the bit."""
+    config = load_config(shipped_config("virtual"))
+    trajectory = config.trajectory.model_copy(update={"duration_s": 2.0})
+    logs = {}
+    for torque, encoder in ((1, 1), (-1, 1), (1, -1), (-1, -1)):
+        drive = config.drive.model_copy(update={"torque_direction": torque})
+        sensor = config.encoder.model_copy(update={"direction": encoder})
+        turned = config.model_copy(update={"drive": drive, "encoder": sensor, "trajectory": trajectory})
+        run = LockstepJoint(turned).run()
+        assert run.fault is Fault.NONE
+        logs[torque, encoder] = run.log
+    for key, log in logs.items():
+        same = logs[1, key[1]]  # counts of an encoder are rounded down, which is another way round
+        assert np.array_equal(log.position_rad, same.position_rad)
+        assert np.array_equal(log.measured_torque_Nm, same.measured_torque_Nm)
+        assert np.max(np.abs(log.measured_torque_Nm)) > 10.0
 
 
 def test_what_the_drive_says_when_an_rpdo_comes_is_heard(lockstep: Lockstep) -> None:

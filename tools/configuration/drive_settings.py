@@ -101,6 +101,7 @@ def device_settings(config: Config) -> DeviceSettings:
         rated_torque_mNm=round((drive.rated_torque_Nm or DEFAULT_RATED_TORQUE_NM) * 1000.0),
         reduction_ratio=config.joint.reduction_ratio,
         motor_torque_constant_NmpA=torque_constant_NmpA(config),
+        torque_direction=drive.torque_direction,
         vendor_id=drive.vendor_id or 0,
         product_code=drive.product_code or 1,
         **_second_encoder(config),
