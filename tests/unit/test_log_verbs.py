@@ -22,7 +22,7 @@ from firmware_py.schema import new
 from firmware_py.states import AxisPhase, DriveState
 from tools.output import Output
 from tools.recording.can_log import frame_array, frame_times_ns
-from tools.recording.log_export import FORMATS
+from tools.recording.log_export import FORMATS, columns, parquet_bytes
 from tools.recording.log_facts import missing_records
 from tools.recording.run_log import RunLogWriter, read_run_log
 from tools.running.events import EventFinder
@@ -166,6 +166,20 @@ def test_a_ros_2_decoder_reads_the_frames(log_path: Path) -> None:
     assert bytes(messages[4].data) == bytes(range(0xF8, 0x100))
     assert (messages[4].header.stamp.sec, messages[4].header.stamp.nanosec) == (5, 4_000_000)
     np.testing.assert_array_equal(read_run_log(log_path).frames, some_frames())
+
+
+def test_parquet_holds_every_column_and_the_metadata(log_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    log = read_run_log(log_path)
+    target = log_path.with_suffix(".parquet")
+    target.write_bytes(parquet_bytes(log, log_path))
+    table = parquet.read_table(target)
+    found = columns(log.records)
+    assert table.column_names == list(found)
+    for name, values in found.items():
+        np.testing.assert_array_equal(table[name].to_numpy(), values)
+    expected = {f"{name}.{key}": value for name, values in log.metadata.items() for key, value in values.items()}
+    assert {key.decode(): value.decode() for key, value in table.schema.metadata.items()} == expected
 
 
 def test_parquet_without_pyarrow_says_what_to_install(log_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
