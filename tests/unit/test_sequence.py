@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -17,6 +18,7 @@ from firmware_py.sequence import (
     enter,
     powered,
     react,
+    released_torque_Nm,
     request_stop,
     reset_axis,
     step_enabling,
@@ -26,6 +28,7 @@ from firmware_py.sequence import (
     write_command,
 )
 from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction, StopRequest
+from firmware_py.trajectory import approach_at
 
 GOAL = {
     Reaction.RAMP: AxisPhase.RAMPING,
@@ -73,8 +76,12 @@ def test_reset_leaves_nothing_of_the_run_before_behind(axis: Any, state: Any) ->
     plain = [name for name in used.dtype.names if used.dtype[name].kind in "if"]
     for name in plain:
         used[name] = 3
+    changed = ("answered", "answer", "ramping", "ramp_s", "motion")
+    for name in changed:
+        used.change[name] = 3
     reset_axis(axis, used)
-    assert [name for name in plain if name not in WRITTEN_FIRST and used[name] != state[name]] == []
+    assert [name for name in plain if name not in WRITTEN_FIRST and used[name] != 0] == []
+    assert [name for name in changed if used.change[name] != 0] == []
 
 
 @pytest.mark.parametrize("phase", AxisPhase)
@@ -259,6 +266,37 @@ def axis_table() -> Any:
     return np.zeros((1, 5))
 
 
+def test_the_approach_leads_from_where_the_joint_stands_into_the_trajectory(axis: Any, state: Any) -> None:
+    state.phase, state.measured_position_rad, state.velocity.last_position_rad = AxisPhase.ENABLING, 0.3, 0.30001
+    state.velocity.last_error_rad, state.velocity.error_rate_radps = 5.0, 5.0
+    state.table_row, state.frozen_from_rad = 3, 9.0
+    step_enabling(axis, state, sample_of(DriveState.ENABLED), axis_table())
+    assert (state.trajectory_s, state.table_row, state.frozen_from_rad) == (-0.2, 0, 0.3)
+    # the error has no history yet
+    assert state.velocity.last_error_rad == pytest.approx(1e-5, rel=1e-6)
+    assert state.velocity.error_rate_radps == 0.0
+    for at_s, position_rad, velocity_radps in ((0.0, 0.3, 0.0), (0.2, 0.0, 0.35 * 0.2 * math.pi)):
+        approach_at(state.approach, at_s, state.reference)
+        assert state.reference.position_rad == pytest.approx(position_rad, abs=1e-12)
+        assert state.reference.velocity_radps == pytest.approx(velocity_radps, abs=1e-12)
+
+
+@pytest.mark.parametrize("elapsed_cycles", [1, 3])
+@pytest.mark.parametrize(
+    ("release_cycles", "phase_cycle"), [(10.0, 1), (10.0, 5), (10.0, 9), (9.5, 9), (10.0, 10), (10.0, 11)]
+)
+def test_the_torque_is_released_along_a_straight_line(
+    axis: Any, state: Any, release_cycles: float, phase_cycle: int, elapsed_cycles: int
+) -> None:
+    """In proportion to the time that is left, from what it was `elapsed_cycles` before."""
+    axis.sequence.release_s = release_cycles * axis.law.period_s
+    state.phase, state.phase_cycle, state.command_torque_Nm = AxisPhase.RELEASING, phase_cycle, 12.0
+    torque_Nm = released_torque_Nm(axis, state, elapsed_cycles)
+    left = max(release_cycles - phase_cycle, 0.0)
+    assert torque_Nm == pytest.approx(12.0 * left / (left + elapsed_cycles), abs=1e-9)
+    assert state.phase == (AxisPhase.RELEASING if left else AxisPhase.DISABLING)
+
+
 def test_without_an_approach_the_trajectory_begins_at_once(axis: Any, state: Any) -> None:
     axis.sequence.approach_s = 0.0
     state.phase = AxisPhase.ENABLING
@@ -331,9 +369,13 @@ def test_off_timeout(axis: Any, state: Any, phase_cycle: int, phase: AxisPhase, 
 
 @pytest.mark.parametrize("phase", AxisPhase)
 def test_request_of_every_phase(state: Any, phase: AxisPhase) -> None:
+    state.phase_cycle = state.good_samples = 7
     enter(state, int(phase))
+    assert (state.phase, state.phase_cycle, state.good_samples) == (phase, 0, 0)
     command = new(Command)[0]
+    state.command_torque_Nm, state.command_velocity_radps = 1.5, 0.25
     write_command(state, command)
+    assert (command.torque_Nm, command.velocity_radps) == (1.5, 0.25)
     if phase is AxisPhase.QUICK_STOPPING:
         assert command.request == DriveRequest.QUICK_STOP
     elif AxisPhase.ENABLING <= phase <= AxisPhase.RELEASING:
