@@ -162,8 +162,9 @@ def test_enabling_is_only_asked_at_standstill_inside_the_limits(
     axis: Any, state: Any, position_rad: float, velocity_radps: float, good_samples: int, phase: int, fault: int
 ) -> None:
     settled(state, position_rad, velocity_radps, good_samples)
-    step_waiting(axis, state, idle_sample())
-    assert (state.phase, state.fault) == (phase, fault)
+    step_waiting(axis, state, sample_of(DriveState.OFF))
+    assert (state.phase, state.fault, state.fault_drive_error) == (phase, fault, 0)
+    assert state.fault_value == pytest.approx(position_rad if fault else 0.0, nan_ok=True)
 
 
 @pytest.mark.parametrize("phase", [AxisPhase.WAITING, AxisPhase.ENABLING])
@@ -188,6 +189,7 @@ def test_a_joint_that_was_moved_since_the_motion_was_shown_is_not_driven(
     if moved:
         assert (state.phase, state.fault) == (AxisPhase.DISABLING, Fault.MOVED_BEFORE_START)
         assert state.fault_value == pytest.approx(position_rad - start_rad, nan_ok=True)
+        assert state.fault_drive_error == 0
     else:
         assert (state.phase, state.fault) == (phase + 1, Fault.NONE)
 
@@ -226,9 +228,10 @@ def test_the_wait_for_the_supervisors_word_ends(axis: Any, state: Any, settle_cy
     step_waiting(axis, state, idle_sample())
     assert (state.phase, state.fault) == (AxisPhase.WAITING, Fault.NONE)
     state.phase_cycle = 41
-    step_waiting(axis, state, idle_sample())
+    step_waiting(axis, state, sample_of(DriveState.OFF))
     assert (state.phase, state.fault) == (AxisPhase.DISABLING, fault)
     assert state.fault_value == (41.0 if fault is Fault.SUPERVISOR_LOST else 0.0)
+    assert state.fault_drive_error == (0 if fault is Fault.SUPERVISOR_LOST else 0x3310)
 
 
 @pytest.mark.parametrize(
@@ -237,12 +240,14 @@ def test_the_wait_for_the_supervisors_word_ends(axis: Any, state: Any, settle_cy
 )
 def test_waiting_ends(axis: Any, state: Any, samples: int, velocity_radps: float, fault: Fault) -> None:
     settled(state, 0.0, velocity_radps, samples)
-    state.phase_cycle = 40
+    state.phase_cycle, state.sample_age_cycles = 40, 2
     step_waiting(axis, state, idle_sample())
     assert (state.phase, state.fault) == (AxisPhase.WAITING, Fault.NONE)
     state.phase_cycle = 41
-    step_waiting(axis, state, idle_sample())
+    step_waiting(axis, state, sample_of(DriveState.OFF))
     assert (state.phase, state.fault) == (AxisPhase.DISABLING, fault)
+    assert state.fault_value == {Fault.NO_SAMPLES: 0.0, Fault.STALE_SAMPLE: 2.0, Fault.NOT_AT_STANDSTILL: 0.5}[fault]
+    assert state.fault_drive_error == (0 if fault is Fault.NOT_AT_STANDSTILL else 0x3310)
 
 
 @pytest.mark.parametrize("drive_state", DriveState)
@@ -365,6 +370,7 @@ def test_off_timeout(axis: Any, state: Any, phase_cycle: int, phase: AxisPhase, 
     state.phase, state.phase_cycle = AxisPhase.DISABLING, phase_cycle
     step_stopping(axis, state, sample_of(DriveState.ENABLED))
     assert (state.phase, state.fault) == (phase, fault)
+    assert (state.fault_value, state.fault_drive_error) == ((0x1237, 0x3310) if fault else (0.0, 0))
 
 
 @pytest.mark.parametrize("phase", AxisPhase)
@@ -373,6 +379,7 @@ def test_request_of_every_phase(state: Any, phase: AxisPhase) -> None:
     enter(state, int(phase))
     assert (state.phase, state.phase_cycle, state.good_samples) == (phase, 0, 0)
     command = new(Command)[0]
+    command.request = -1  # each phase says what it wants
     state.command_torque_Nm, state.command_velocity_radps = 1.5, 0.25
     write_command(state, command)
     assert (command.torque_Nm, command.velocity_radps) == (1.5, 0.25)
@@ -408,6 +415,7 @@ def test_two_encoders_are_compared_until_the_drive_brakes(
         return
     assert state.fault == Fault.POSITION_DISAGREEMENT
     assert state.fault_value == pytest.approx(apart_rad)
+    assert state.fault_drive_error == 0x3310
     assert state.phase == (AxisPhase.QUICK_STOPPING if phase >= AxisPhase.APPROACH else AxisPhase.DISABLING)
 
 
