@@ -11,11 +11,14 @@ from rich.text import Text
 from tools.output import Output
 from tools.reporting.page import Block, Figure, Paragraph, Section, Table, page, write_page
 
+_RANGE = "\N{NO-BREAK SPACE}..\N{NO-BREAK SPACE}"
+
 
 def from_terminal(table: TerminalTable) -> Table:
     """A table of the terminal as one of the page; without markup and styles."""
     headings = [_plain(column.header) if table.show_header else "" for column in table.columns]
-    columns = [[_plain(cell) for cell in column.cells] for column in table.columns]
+    # a range is not broken in its middle
+    columns = [[_plain(cell).replace(" .. ", _RANGE) for cell in column.cells] for column in table.columns]
     notes = [_plain(part) for part in (table.title, table.caption) if part]
     return Table(headings, list(zip(*columns, strict=True)), caption=". ".join(notes))
 

@@ -131,7 +131,7 @@ class ScopePage:
         drive = drive_state_name(int(last["status_word"]), int(last["drive_state"]), cia402=self._order.cia402)
         words = [phase_name(int(last["phase"])), f"drive: {drive}"]
         temperature_degC = self._history.settings.get("temperature_degC")
-        if temperature_degC is not None and not self._history.ended:
+        if temperature_degC is not None and not self._history.ended and stage != "ended":
             words.append(f"{temperature_degC:.1f} °C")
         fault = int(last["fault"])
         if fault:
