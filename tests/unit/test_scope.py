@@ -278,6 +278,21 @@ def test_a_series_keeps_its_peaks_and_leaves_out_what_is_no_number() -> None:
         assert history.series(history.newest(0.1), signal)
 
 
+@pytest.mark.parametrize(("missing", "gap"), [(99, False), (100, True)])
+def test_records_that_did_not_come_are_a_gap_in_the_line(missing: int, gap: bool) -> None:
+    history = History()
+    history.take(records(200))
+    history.take(records(200, 200 + missing))
+    found = history.series(history.newest(1e9), "angle [rad]")
+    empty = [i for i, (_, value) in enumerate(found) if value is None]
+    assert len(empty) == gap
+    if gap:
+        assert found[empty[0]][0] == pytest.approx(0.199)
+        assert found[empty[0] + 1][0] == pytest.approx(0.3)
+    times = [time_s for time_s, _ in found if time_s is not None]
+    assert times == sorted(times)
+
+
 def test_the_error_is_only_drawn_while_the_law_is_at_work() -> None:
     history, rows = History(), records(300)
     rows.phase[:100], rows.phase[200:] = AxisPhase.WAITING, AxisPhase.DISABLING

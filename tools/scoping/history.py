@@ -17,6 +17,7 @@ from tools.reporting.run_figures import powered
 
 RING_RECORDS = 1 << 16  # 65 s at 1 kHz
 EVENTS = 50
+GAP_s = 0.1  # far above what the loop skips and what a sweep's log leaves out
 POINTS = 1000  # of one signal on the page
 
 # name on the page -> (field of LogRecord, factor)
@@ -97,16 +98,24 @@ class History:
         since: np.ndarray = (records["time_ns"] - self._start_ns) * 1e-9
         return since
 
-    def series(self, records: Any, signal: str) -> list[list[float]]:
-        """[seconds, value] of a signal, at most about POINTS of them, least and greatest of each stretch."""
+    def series(self, records: Any, signal: str) -> list[list[float | None]]:
+        """[seconds, value] of a signal, at most about POINTS of them, least and greatest of each stretch.
+
+        Where records are missing for GAP_s the value is None: a line across them would show a motion that was not.
+        """
         field, factor = SIGNALS[signal]
         values = np.asarray(records[field], float) * factor
         if field in _OF_THE_LAW:
             values = np.where(powered(records), values, np.nan)
         keep = drawn_indices(values, POINTS)
         keep = keep[np.isfinite(values[keep])]
-        pairs = np.stack([self.seconds(records)[keep], values[keep]], axis=1)
-        return np.round(pairs, 6).tolist()
+        time_s = self.seconds(records)
+        pairs: list[list[float | None]] = np.round(np.stack([time_s[keep], values[keep]], axis=1), 6).tolist()
+        for before in np.flatnonzero(np.diff(records["time_ns"]) > GAP_s * 1e9)[::-1].tolist():
+            at = int(np.searchsorted(keep, before, side="right"))
+            if 0 < at < len(pairs):
+                pairs.insert(at, [round(float(time_s[before]), 6), None])
+        return pairs
 
 
 def crossing_s(time_s: np.ndarray, values: np.ndarray, level: float, *, rising: bool) -> float | None:
