@@ -162,6 +162,7 @@ def test_enabling_is_only_asked_at_standstill_inside_the_limits(
     axis: Any, state: Any, position_rad: float, velocity_radps: float, good_samples: int, phase: int, fault: int
 ) -> None:
     settled(state, position_rad, velocity_radps, good_samples)
+    axis.limits.velocity_max_radps = axis.limits.following_error_max_rad = 0.02
     step_waiting(axis, state, sample_of(DriveState.OFF))
     assert (state.phase, state.fault, state.fault_drive_error) == (phase, fault, 0)
     assert state.fault_value == pytest.approx(position_rad if fault else 0.0, nan_ok=True)
