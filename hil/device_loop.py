@@ -31,15 +31,15 @@ from firmware_py.libc import (
     store_release,
 )
 from firmware_py.schema import new
-from hil.device import Cia402Device
-from hil.device_core import accept_frame, advance
-from hil.device_records import Device, NmtState, int64
-from hil.faults import FaultMemory, fault_memory
-from hil.frame_faults import pass_frame, take_due
+from hil.bus.frames import FRAME_SIZE, FrameQueue
+from hil.canopen.device import Cia402Device
+from hil.canopen.device_core import accept_frame, advance
+from hil.canopen.device_records import Device, NmtState, int64
+from hil.faults.frame_faults import pass_frame, take_due
+from hil.faults.kinds import FaultMemory, fault_memory, no_faults
+from hil.faults.plant_faults import step_faults
 from hil.frame_stamps import OLDEST_STAMP_NS, STAMPED_LAG_NS, sent_ns_of, stamp_answers
-from hil.frames import FRAME_SIZE, FrameQueue
-from hil.plant_faults import step_faults
-from hil.plant_records import PlantConstants, PlantState
+from hil.plant.records import PlantConstants, PlantState
 
 ENETDOWN = errno_codes.ENETDOWN
 STOP_WORD = 0  # not zero: leave the loop
@@ -136,7 +136,7 @@ def run_device(
     """Serve the bus until the stop word; scratch: `frame` uint8[16], `polls` int32[4], `timespec` int64[2].
 
     `devices`, `plant_constants`, `plant_states`, `queues` are record arrays of one element, `words` int64[WORDS].
-    `faults` FaultConstants[N] and `memories` FaultMemory[1]: see `hil.faults`.  Returns the value of ENDED_WORD.
+    `faults` FaultConstants[N] and `memories` FaultMemory[1]: see `hil.faults.kinds`.  Returns the value of ENDED_WORD.
     """
     device: Device = devices[0]
     plant_c: PlantConstants = plant_constants[0]
@@ -211,7 +211,8 @@ class RealtimeDevice:
         self._device = device
         self._fd = fd
         self.words = np.zeros(WORDS, np.int64)
-        self.fault_memory = fault_memory(device.faults)
+        self._faults = device.faults if len(device.faults) else no_faults()
+        self.fault_memory = fault_memory(self._faults)
         self._threads: list[threading.Thread] = []
         self._core_end: socket.socket | None = None
 
@@ -223,7 +224,7 @@ class RealtimeDevice:
             device.plant_constants,
             device.plant_state,
             new(FrameQueue),
-            device.faults,
+            self._faults,
             self.fault_memory,
             self.words,
             service_fd,

@@ -5,9 +5,10 @@ only the bus is replaced: a frame arrives in the instant in which it was sent, i
 computer's own delay is not modelled either: with a synchronous RPDO (transmission type 1) a command takes effect one
 period after the sample it was computed from, as on a real bus whose round trip fits into the period.
 
-With faults (`hil.faults`) every frame goes through the wire of `hil.frame_faults`; late frames arrive at the beginning
-of a cycle.  After the axis has finished, the controller is silent, and drive and joint may go on for a while: nobody
-sends a heartbeat then.
+With faults (`hil.faults.kinds`) every frame goes through the wire of `hil.faults.frame_faults`; late frames arrive at
+the beginning of a cycle.
+After the axis has finished, the controller is silent, and drive and joint may go on for a while: nobody sends a
+heartbeat then.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from firmware_py.axis import step_axis
 from firmware_py.kernel import kernel
 from firmware_py.realtime import write_log
 from firmware_py.states import AxisPhase, StopRequest
-from hil.device_core import accept_frame, advance
-from hil.fault_wire import clock_step_cycles, collect, hand_over, to_drive
-from hil.faults import FaultKind, fault_memory, kind_active, no_faults
-from hil.frame_faults import take_due
-from hil.frames import FRAME_SIZE
-from hil.plant_faults import step_faults
+from hil.bus.frames import FRAME_SIZE
+from hil.canopen.device_core import accept_frame, advance
+from hil.faults.frame_faults import take_due
+from hil.faults.kinds import FaultKind, fault_memory, kind_active, no_faults
+from hil.faults.plant_faults import step_faults
+from hil.faults.wire import clock_step_cycles, collect, hand_over, to_drive
 
 # columns of the array of true values that a run may leave
 TRUE_POSITION_rad, TRUE_VELOCITY_radps, TRUE_FRICTION_Nm, TRUE_ACTUATOR_Nm, TRUE_POWER_STATE = range(5)

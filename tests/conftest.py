@@ -24,7 +24,7 @@ from firmware_py.schema import new
 from firmware_py.sequence import reset_axis
 from firmware_py.states import AxisPhase, ControllerKind, DriveRequest, DriveState, StopRequest, TrajectoryKind
 from firmware_py.velocity import low_pass_gain
-from hil.device import Cia402Device
+from hil.canopen.device import Cia402Device
 from tools.configuration.drive_settings import canopen_settings
 from tools.configuration.load import load_config
 from tools.simulation.virtual_joint import new_device

@@ -8,8 +8,8 @@ from typing import Any
 
 import canopen
 
-from hil.device import Cia402Device, DeviceSettings
-from hil.joint import plant
+from hil.canopen.device import Cia402Device, DeviceSettings
+from hil.plant.joint import plant
 
 EDS = Path(__file__).resolve().parents[1] / "configs" / "virtual_joint.eds"
 NODE = 5

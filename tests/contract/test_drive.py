@@ -13,8 +13,8 @@ from drivers.canopen.settings import CanopenSettings
 from drivers.drive import Drive
 from drivers.elmo.drive import ElmoDrive
 from drivers.errors import DeviceError, NoDeviceError
-from hil.device_records import PowerState
-from hil.elmo_device import ElmoDevice
+from hil.canopen.device_records import PowerState
+from hil.elmo.device import ElmoDevice
 from tools.configuration.conversions import torque_constant_NmpA
 from tools.configuration.elmo_settings import elmo_settings, with_port_override
 from tools.configuration.load import load_config, shipped_config

@@ -19,11 +19,11 @@ from drivers.canopen.exchange import end, exchange_memory, receive
 from drivers.canopen.port import CanopenPort
 from firmware_py.records import Command, Sample
 from firmware_py.schema import new
-from hil.device import Cia402Device, DeviceSettings
+from hil.canopen.device import Cia402Device, DeviceSettings
 from hil.device_loop import RealtimeDevice
 from hil.frame_stamps import OLDEST_STAMP_NS, sent_ns_of
-from hil.joint import plant
-from hil.plant_records import FrictionKind
+from hil.plant.joint import plant
+from hil.plant.records import FrictionKind
 
 EDS = Path(__file__).resolve().parents[2] / "configs" / "virtual_joint.eds"
 NODE = 5

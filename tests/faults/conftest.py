@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from hil.faults import FaultKind, no_faults
+from hil.faults.kinds import FaultKind, no_faults
 from tools.configuration.load import load_config
 from tools.simulation.lockstep import LockstepJoint
 

@@ -17,8 +17,8 @@ import pytest
 from firmware_py.records import LogRecord
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, DriveRequest, Fault
-from hil.device_records import PowerState
-from hil.faults import FaultKind
+from hil.canopen.device_records import PowerState
+from hil.faults.kinds import FaultKind
 from hil.lockstep import TRUE_POWER_STATE, TRUTHS
 from tools.campaign import judge as judge_module
 from tools.campaign import runner

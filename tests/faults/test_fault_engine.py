@@ -10,9 +10,9 @@ import pytest
 
 from firmware_py.schema import new
 from firmware_py.states import Fault
-from hil.faults import MAX_FAULTS, FaultConstants, FaultKind, fault_memory, is_active, no_faults
-from hil.frame_faults import pass_frame, take_due
-from hil.frames import FRAME_SIZE, FrameQueue
+from hil.bus.frames import FRAME_SIZE, FrameQueue
+from hil.faults.frame_faults import pass_frame, take_due
+from hil.faults.kinds import MAX_FAULTS, FaultConstants, FaultKind, fault_memory, is_active, no_faults
 from hil.lockstep import TRUE_ACTUATOR_Nm, TRUE_POSITION_rad
 from tools.simulation.lockstep import LockstepJoint
 

@@ -10,8 +10,8 @@ import pytest
 
 from drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES
 from firmware_py.states import AxisPhase, Fault
-from hil.device_records import PowerState
-from hil.faults import FaultKind
+from hil.canopen.device_records import PowerState
+from hil.faults.kinds import FaultKind
 from hil.lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
 from tools.simulation.lockstep import LockstepJoint, LockstepRun
 

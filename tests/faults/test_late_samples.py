@@ -10,7 +10,7 @@ import pytest
 
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, Fault
-from hil.faults import FaultConstants, FaultKind
+from hil.faults.kinds import FaultConstants, FaultKind
 from tools.simulation.lockstep import LockstepJoint
 
 MakeFault = Callable[..., Any]

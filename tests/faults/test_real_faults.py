@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from firmware_py.states import AxisPhase, DriveRequest, Fault
-from hil.faults import LOCKSTEP_ONLY, FaultKind
+from hil.faults.kinds import LOCKSTEP_ONLY, FaultKind
 from tools.configuration.config import Config
 from tools.configuration.load import load_config
 from tools.configuration.plant import FAULT_KINDS

@@ -20,8 +20,8 @@ from firmware_py.realtime import Histogram
 from firmware_py.records import Command, Sample
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, StopRequest
-from hil.device_core import power_on
-from hil.device_records import NmtState
+from hil.canopen.device_core import power_on
+from hil.canopen.device_records import NmtState
 from tests.unit.test_elmo_cyclic import Talk
 from tests.unit.test_realtime import ANSWER_ns, Loop
 from tools.running.supervisor import Supervisor

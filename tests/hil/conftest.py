@@ -19,7 +19,7 @@ import canopen
 import pytest
 import tomlkit
 
-from hil.elmo_device import ElmoDevice
+from hil.elmo.device import ElmoDevice
 from tools.configuration.load import load_config
 from tools.recording.run_log import read_run_log
 from tools.verbs.hil_serial import serve_virtual_elmo

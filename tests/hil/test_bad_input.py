@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from hil.bus import VirtualBusHub, default_socket_path
+from hil.bus.virtual_bus import VirtualBusHub, default_socket_path
 
 EDS = Path(__file__).resolve().parents[2] / "configs" / "virtual_joint.eds"
 CONTROL_WORD_ID = 0x201  # RPDO1 of node 1: only the loop sends it

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from firmware_py.friction import friction_curve_Nm
-from hil.elmo_device import ElmoDevice
-from hil.elmo_motor import MF_POSITION_LIMIT
+from hil.elmo.device import ElmoDevice
+from hil.elmo.motor import MF_POSITION_LIMIT
 from tools.configuration.conversions import friction_constants
 from tools.configuration.load import load_config
 

@@ -10,10 +10,10 @@ import canopen
 import pytest
 
 from drivers.can.open import open_cyclic_end
-from hil.bus import VirtualBusHub
-from hil.device import Cia402Device, DeviceSettings
+from hil.bus.virtual_bus import VirtualBusHub
+from hil.canopen.device import Cia402Device, DeviceSettings
 from hil.device_loop import RealtimeDevice
-from hil.joint import plant
+from hil.plant.joint import plant
 from tests.hil.conftest import bench as bench
 
 EDS = Path(__file__).resolve().parents[2] / "configs" / "virtual_joint.eds"

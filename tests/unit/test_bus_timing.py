@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from drivers.can.bit_timing import minimum_frame_bits, worst_frame_bits
 from firmware_py.schema import new
-from hil.bus_timing import (
+from hil.bus.frames import WireFrame
+from hil.bus.timing import (
     EXTENDED,
     NO_NODE,
     REMOTE,
@@ -22,7 +23,6 @@ from hil.bus_timing import (
     frame_bits,
     pend_frame,
 )
-from hil.frames import WireFrame
 
 
 def wire_frame(identifier: int, payload: bytes = b"") -> Any:

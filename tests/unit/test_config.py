@@ -296,7 +296,7 @@ def test_shipped_checks_agree_with_the_trajectory_itself(tmp_path: Path) -> None
 
 
 def test_plant_settings_are_accepted_by_the_plant() -> None:
-    from hil.joint import plant
+    from hil.plant.joint import plant
 
     settings = plant_settings(load_config(shipped_config("virtual")))
     constants, state = plant(**settings)

@@ -13,7 +13,7 @@ import pytest
 from drivers.canopen.connection_loss import rpdo_deadline_ms
 from drivers.canopen.settings import CanopenSettings
 from drivers.errors import DeviceError
-from hil.device_records import PowerState
+from hil.canopen.device_records import PowerState
 
 MS = 1_000_000
 

@@ -18,10 +18,10 @@ from drivers.elmo.replies import parse_number, take_byte
 from firmware_py.records import LINE_GONE, Command, Sample
 from firmware_py.schema import new
 from firmware_py.states import DriveRequest, DriveState
-from hil.elmo_commands import ElmoDeviceSettings
-from hil.elmo_interpreter import ElmoInterpreter
-from hil.elmo_motor import switch_off
-from hil.joint import plant
+from hil.elmo.commands import ElmoDeviceSettings
+from hil.elmo.interpreter import ElmoInterpreter
+from hil.elmo.motor import switch_off
+from hil.plant.joint import plant
 
 PERIOD_S = 1.0 / 150.0
 PER_RAD = 2**19 / math.tau

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 import serial
 
-from hil.elmo_commands import ElmoDeviceSettings
-from hil.elmo_device import ElmoDevice
-from hil.elmo_interpreter import ElmoInterpreter
-from hil.elmo_motor import MF_OVERSPEED, MF_POSITION_LIMIT, MF_SPEED_ERROR
-from hil.joint import plant
+from hil.elmo.commands import ElmoDeviceSettings
+from hil.elmo.device import ElmoDevice
+from hil.elmo.interpreter import ElmoInterpreter
+from hil.elmo.motor import MF_OVERSPEED, MF_POSITION_LIMIT, MF_SPEED_ERROR
+from hil.plant.joint import plant
 
 COUNTS = 2**19
 PER_RAD = COUNTS / 6.283185307179586

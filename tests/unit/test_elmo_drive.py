@@ -14,10 +14,10 @@ from drivers.elmo.line_budget import cycle_characters, highest_rate_Hz, measured
 from drivers.elmo.serial_port import SerialPort
 from drivers.elmo.settings import ElmoSettings
 from drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
-from hil.elmo_commands import ElmoDeviceSettings
-from hil.elmo_interpreter import ElmoInterpreter
-from hil.elmo_motor import switch_off
-from hil.joint import plant
+from hil.elmo.commands import ElmoDeviceSettings
+from hil.elmo.interpreter import ElmoInterpreter
+from hil.elmo.motor import switch_off
+from hil.plant.joint import plant
 
 COUNTS = 2**19
 SETTINGS = ElmoSettings(

@@ -15,10 +15,10 @@ from collections.abc import Iterator
 import pytest
 import serial
 
-from hil.elmo_commands import ElmoDeviceSettings
-from hil.elmo_device import ElmoDevice
-from hil.elmo_interpreter import ElmoInterpreter
-from hil.joint import plant
+from hil.elmo.commands import ElmoDeviceSettings
+from hil.elmo.device import ElmoDevice
+from hil.elmo.interpreter import ElmoInterpreter
+from hil.plant.joint import plant
 
 COUNTS = 2**19
 SERVO_ON, MOVING = 1 << 4, 0x3 << 14

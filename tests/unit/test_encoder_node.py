@@ -22,7 +22,7 @@ from drivers.errors import ConfigurationError, DeviceError
 from firmware_py.records import ENCODER_RESTARTED, Command, Sample
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, Fault
-from hil.faults import FaultConstants, FaultKind
+from hil.faults.kinds import FaultConstants, FaultKind
 from tools.configuration.config import Config
 from tools.configuration.drive_settings import canopen_settings, cyclic_bus_load
 from tools.configuration.load import load_config

@@ -29,7 +29,7 @@ from drivers.can.frames import Frame
 from drivers.can.virtual_bus import connect
 from firmware_py.kernel import kernel
 from firmware_py.schema import new
-from hil.bus import VirtualBusHub
+from hil.bus.virtual_bus import VirtualBusHub
 
 @numba.njit(error_model="numpy", nogil=True)
 def exchange(source, sink, frames, scratch, count):

@@ -15,7 +15,7 @@ from drivers.errors import ConfigurationError, DataError
 from firmware_py.records import LogRecord
 from firmware_py.schema import dtype_of
 from firmware_py.trajectory_table import table_from_csv
-from hil.object_dictionary import ObjectDictionary
+from hil.canopen.object_dictionary import ObjectDictionary
 from tools.configuration.config import Config
 from tools.configuration.load import load_config
 from tools.identification.friction_data import read_friction_data

@@ -16,10 +16,10 @@ import pytest
 
 import hil
 from firmware_py.schema import new
-from hil.bus import VirtualBusError, VirtualBusHub, default_socket_path, remove_dead_sockets
-from hil.bus_forwarding import MAX_CLIENTS
-from hil.bus_timing import frame_bits
-from hil.frames import WireFrame
+from hil.bus.forwarding import MAX_CLIENTS
+from hil.bus.frames import WireFrame
+from hil.bus.timing import frame_bits
+from hil.bus.virtual_bus import VirtualBusError, VirtualBusHub, default_socket_path, remove_dead_sockets
 
 FRAME = b"\x81\x01\x00\x00\x08\x00\x00\x00" + bytes(range(8))
 
@@ -82,7 +82,7 @@ def test_a_live_hub_is_a_clear_error_and_stays_alive(path: Path) -> None:
 
 def test_the_socket_of_a_killed_hub_is_replaced(path: Path) -> None:
     program = (
-        "import sys; from hil.bus import VirtualBusHub as Hub; "
+        "import sys; from hil.bus.virtual_bus import VirtualBusHub as Hub; "
         "Hub(sys.argv[1]).start(); print('up', flush=True); input()"
     )
     environment = {**os.environ, "PYTHONPATH": str(Path(hil.__file__).parent.parent)}

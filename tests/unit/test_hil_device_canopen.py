@@ -10,9 +10,9 @@ from typing import Any
 import canopen
 import pytest
 
-from hil.device import Cia402Device, DeviceSettings
+from hil.canopen.device import Cia402Device, DeviceSettings
 from hil.device_loop import SEND_ERRORS_WORD, RealtimeDevice
-from hil.joint import plant
+from hil.plant.joint import plant
 from tests.virtual_drive import EDS, NODE, Network
 
 

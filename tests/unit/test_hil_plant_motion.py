@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from firmware_py.kernel import kernel
-from hil.joint import R1, FrictionKind, plant, step_plant
+from hil.plant.joint import R1, FrictionKind, plant, step_plant
 
 STEP_s = 50e-6
 

@@ -12,9 +12,9 @@ from typing import Any
 import canopen
 import pytest
 
-from hil.device import Cia402Device, DeviceSettings
-from hil.joint import plant
-from hil.sdo_server import TIMEOUT_NS, SdoServer
+from hil.canopen.device import Cia402Device, DeviceSettings
+from hil.canopen.sdo_server import TIMEOUT_NS, SdoServer
+from hil.plant.joint import plant
 
 EDS = Path(__file__).resolve().parents[2] / "configs" / "virtual_joint.eds"
 NODE = 5

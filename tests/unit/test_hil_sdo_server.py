@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from firmware_py.schema import new
-from hil.device import Cia402Device, DeviceSettings
-from hil.device_fields import FIELDS
-from hil.device_records import Device
-from hil.joint import plant
-from hil.object_dictionary import load_entries
-from hil.pdo_core import read_object, write_object
+from hil.canopen.device import Cia402Device, DeviceSettings
+from hil.canopen.device_fields import FIELDS
+from hil.canopen.device_records import Device
+from hil.canopen.object_dictionary import load_entries
+from hil.canopen.pdo_core import read_object, write_object
+from hil.plant.joint import plant
 
 ROOT = Path(__file__).resolve().parents[2]
 EDS = ROOT / "configs" / "virtual_joint.eds"
@@ -104,7 +104,7 @@ def test_one_producer_is_watched_once(device: Cia402Device) -> None:
 def test_the_page_lists_every_abort_code_and_each_has_a_test() -> None:
     used = {
         f"{int(code, 16):08X}"
-        for file in (ROOT / "hil").glob("*.py")
+        for file in (ROOT / "hil").rglob("*.py")
         for code in re.findall(r"^[A-Z_]+ = (0x0[568][0-9a-fA-F]{6})$", file.read_text(), re.MULTILINE)
     }
     page = (ROOT / "docs" / "virtual-joint.md").read_text()

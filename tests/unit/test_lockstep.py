@@ -14,7 +14,7 @@ from firmware_py.records import AxisState, Command, LogRecord, Sample
 from firmware_py.schema import new
 from firmware_py.sequence import reset_axis
 from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault
-from hil.frames import FrameQueue
+from hil.bus.frames import FrameQueue
 from hil.lockstep import RECEIVED_SLOT, RPDO_SLOT, run_lockstep
 from tools.configuration.load import load_config, shipped_config
 from tools.configuration.records import axis_constants

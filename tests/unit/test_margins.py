@@ -18,8 +18,8 @@ from firmware_py.records import LawConstants, LawState, Reference, VelocityConst
 from firmware_py.schema import new
 from firmware_py.states import ControllerKind
 from firmware_py.velocity import low_pass_gain, step_velocity
-from hil.joint import plant, step_plant
-from hil.plant_records import DELAY_SLOTS
+from hil.plant.joint import plant, step_plant
+from hil.plant.records import DELAY_SLOTS
 from tools.analysis.advice import longest_delay_s, remedies
 from tools.analysis.linear_loop import LoopSettings, linear_loop
 from tools.analysis.margins import delay_margin_s, margins, phase_margin_deg, theory

@@ -18,7 +18,7 @@ from drivers.errors import ConfigurationError
 from firmware_py.records import LogRecord
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, Fault
-from hil.faults import FaultConstants, FaultKind
+from hil.faults.kinds import FaultConstants, FaultKind
 from tools.configuration.config import Config
 from tools.configuration.load import load_config
 from tools.inspection.drive_scale import judged

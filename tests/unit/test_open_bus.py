@@ -20,7 +20,7 @@ from drivers.can import socketcan, virtual_bus
 from drivers.can.open import open_cyclic_end, open_python_can
 from drivers.can.virtual_bus import VirtualBus
 from drivers.errors import BusError
-from hil.bus import VirtualBusHub
+from hil.bus.virtual_bus import VirtualBusHub
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ import pytest
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from drivers.canopen.sdo_download import download
-from hil.device import Cia402Device, DeviceSettings
-from hil.joint import plant
+from hil.canopen.device import Cia402Device, DeviceSettings
+from hil.plant.joint import plant
 from tests.virtual_drive import EDS, NODE, Network
 
 NAME = 0x2100  # a text of the virtual drive that can be written

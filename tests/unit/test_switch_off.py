@@ -16,7 +16,7 @@ import pytest
 from drivers.canopen.switch_off import stop_node
 from drivers.drive import UNTOUCHED, CommissioningReport, DriveIdentity, is_safe
 from drivers.errors import BusError, DeviceError
-from hil.device_records import PowerState
+from hil.canopen.device_records import PowerState
 from tools.output import Output
 from tools.running import supervisor as supervisor_module
 from tools.running.drive_end import require_off, words

@@ -30,7 +30,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES
-from hil.faults import FaultKind
+from hil.faults.kinds import FaultKind
 from tools.campaign.scenario import Scenario
 from tools.configuration.config import Config
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from firmware_py.states import Fault
-from hil.faults import FaultKind
+from hil.faults.kinds import FaultKind
 
 LONG_s = 30.0  # longer than any scenario
 MOTION = frozenset(

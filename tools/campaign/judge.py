@@ -11,8 +11,8 @@ from firmware_py.records import Reference
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, DriveRequest, Fault, Reaction
 from firmware_py.trajectory import reference_at
-from hil.device_records import PowerState
-from hil.faults import FaultKind
+from hil.canopen.device_records import PowerState
+from hil.faults.kinds import FaultKind
 from hil.lockstep import TRUE_POWER_STATE, TRUE_POSITION_rad, TRUE_VELOCITY_radps
 from tools.campaign.envelope import STANDSTILL_RADPS, Envelope, envelope
 from tools.campaign.fault_classes import FAULT_CLASSES, LATE_CAUSES

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from firmware_py.schema import new
-from hil.faults import FaultConstants, FaultKind
-from hil.joint import plant
-from hil.plant_records import FrictionKind
+from hil.faults.kinds import FaultConstants, FaultKind
+from hil.plant.joint import plant
+from hil.plant.records import FrictionKind
 from tools.campaign.fault_classes import EMERGENCY_CODES, FAULT_CLASSES, SIGNED, Sizes
 from tools.configuration.config import Config
 from tools.configuration.plant_settings import plant_settings

@@ -10,8 +10,8 @@ from drivers.canopen.encoder_settings import JointEncoderSettings
 from drivers.canopen.settings import CanopenSettings
 from drivers.canopen.thermometer import TemperatureObject
 from drivers.errors import ConfigurationError
-from hil.device import DeviceSettings
-from hil.encoder_node import EncoderSettings
+from hil.canopen.device import DeviceSettings
+from hil.canopen.encoder_node import EncoderSettings
 from tools.configuration.config import Config
 from tools.configuration.conversions import torque_constant_NmpA
 from tools.configuration.object_place import index_and_sub

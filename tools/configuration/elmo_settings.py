@@ -5,7 +5,7 @@ from __future__ import annotations
 from drivers.elmo.line_budget import highest_rate_Hz
 from drivers.elmo.settings import ElmoSettings
 from drivers.errors import ConfigurationError
-from hil.elmo_commands import ElmoDeviceSettings
+from hil.elmo.commands import ElmoDeviceSettings
 from tools.configuration.config import Config
 from tools.configuration.conversions import torque_constant_NmpA
 from tools.configuration.elmo import KIND, ElmoSerial

@@ -3,7 +3,7 @@
 What is not repeated here (reduction ratio, torque constant, encoder) is taken from the other sections; inertia and
 friction are those of the controller times a scale: the difference is the model error under study.  With a table of
 its own, [virtual.friction], the joint has friction of which the controller knows nothing.  Keys have the
-names of `hil.plant_records.PlantSettings`, whose checks apply too.
+names of `hil.plant.records.PlantSettings`, whose checks apply too.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator
 from pydantic_core import PydanticCustomError
 
-from hil.faults import LOCKSTEP_ONLY, MAX_FAULTS, FaultKind
+from hil.faults.kinds import LOCKSTEP_ONLY, MAX_FAULTS, FaultKind
 from tools.configuration.sections import Friction, Rule, Section, between
 
 OWN_KEYS = ("friction_kind", "inertia_scale", "friction", "faults")
@@ -42,12 +42,12 @@ def _kind(value: Any) -> Any:
 
 
 class VirtualFault(Section):
-    """One fault on purpose; what `magnitude` means for each kind is told in `hil.faults`."""
+    """One fault on purpose; what `magnitude` means for each kind is told in `hil.faults.kinds`."""
 
     kind: Annotated[str, BeforeValidator(Rule(FAULT_KINDS_TEXT, _kind))]  # what goes wrong
     at_s: Annotated[float, between(0.0, 1e6)]  # after the power stage is on for the first time
     duration_s: Annotated[float, between(0.0, 1e6, open_low=True)] = 1e6  # how long
-    magnitude: Annotated[float, between(-1e6, 1e6)] = 1.0  # its meaning for each kind is in hil/faults.py
+    magnitude: Annotated[float, between(-1e6, 1e6)] = 1.0  # its meaning for each kind is in hil/faults/kinds.py
     seed: Annotated[int, between(1, 2**31 - 1)] = 1  # of random ones
 
 

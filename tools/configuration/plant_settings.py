@@ -6,9 +6,9 @@ from typing import Any
 
 from drivers.errors import ConfigurationError
 from firmware_py.schema import new
-from hil.faults import FaultConstants, FaultKind, no_faults
-from hil.plant_records import EncoderSide, FrictionKind
-from hil.plant_settings import PlantSettings
+from hil.faults.kinds import FaultConstants, FaultKind, no_faults
+from hil.plant.records import EncoderSide, FrictionKind
+from hil.plant.settings import PlantSettings
 from tools.configuration.config import Config
 from tools.configuration.conversions import friction_constants, torque_constant_NmpA
 from tools.configuration.plant import OWN_KEYS, Virtual
@@ -28,7 +28,7 @@ def fault_constants(config: Config) -> Any:
 
 
 def plant_keywords(config: Config, torque_constant_NmpA: float, friction: Any = None) -> dict[str, Any]:
-    """Keyword arguments of `hil.joint.plant`; the torque constant is in the drive's ampere."""
+    """Keyword arguments of `hil.plant.joint.plant`; the torque constant is in the drive's ampere."""
     assert config.virtual is not None
     settings = {k: getattr(config.virtual, k) for k in Virtual.model_fields if k not in OWN_KEYS}
     return {
@@ -57,7 +57,7 @@ def plant_problems(config: Config) -> list[str]:
 
 
 def plant_settings(config: Config) -> dict[str, Any]:
-    """Keyword arguments for `hil.joint.plant`; needs a [virtual] section."""
+    """Keyword arguments for `hil.plant.joint.plant`; needs a [virtual] section."""
     if config.virtual is None:
         raise ConfigurationError(f"{config.path}: [virtual] is missing: the virtual joint needs its true values")
     friction = None

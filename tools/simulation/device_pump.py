@@ -15,7 +15,7 @@ import can
 import numpy as np
 
 from drivers.can.virtual_bus import decode, encode
-from hil.device import Cia402Device
+from hil.canopen.device import Cia402Device
 from hil.device_loop import ENDED_WORD, SEND_ERRORS_WORD, STOP_WORD, WORDS
 
 _LONGEST_WAIT_NS = 2_000_000  # timers and the plant move on at least this often

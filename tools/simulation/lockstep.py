@@ -23,9 +23,9 @@ from firmware_py.records import AxisState, Command, LogRecord, Sample
 from firmware_py.schema import new
 from firmware_py.sequence import reset_axis
 from firmware_py.states import AxisPhase, Fault
-from hil.device import Cia402Device
-from hil.faults import fault_memory
-from hil.frames import FRAME_SIZE
+from hil.bus.frames import FRAME_SIZE
+from hil.canopen.device import Cia402Device
+from hil.faults.kinds import fault_memory
 from hil.lockstep import TRUTHS, TRUE_POSITION_rad, run_lockstep
 from tools.configuration.config import Config
 from tools.configuration.drive_settings import canopen_settings

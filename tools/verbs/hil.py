@@ -7,7 +7,7 @@ import os
 import select
 import time
 
-from hil.bus import default_socket_path
+from hil.bus.virtual_bus import default_socket_path
 from tools.configuration.config import Config
 from tools.output import Output
 from tools.running.loop_process import become_realtime

@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from drivers.errors import ConfigurationError
-from hil.elmo_device import ElmoDevice
-from hil.elmo_interpreter import ElmoInterpreter
-from hil.joint import plant
+from hil.elmo.device import ElmoDevice
+from hil.elmo.interpreter import ElmoInterpreter
+from hil.plant.joint import plant
 from tools.configuration.config import Config
 from tools.configuration.elmo_settings import elmo_device_settings, elmo_section
 from tools.configuration.plant_settings import plant_settings

@@ -1,0 +1,1 @@
+"""The virtual CAN bus: its process, arbitration and timing, frames."""

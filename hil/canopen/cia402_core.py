@@ -1,0 +1,292 @@
+"""CiA 402 power state machine of the virtual drive: controlword in, statusword out, stops and faults.
+
+Transitions 0 and 1 (power on to Switch On Disabled) need no time here.  Commands with bit 7 set are ignored except
+for its rising edge in Fault.  Stop ramps are carried out by `cia402_motion`; here they are only started.
+Not modelled: halt option 605D (halt ramps down in modes 1, 3, 4), a missing power supply (bit 4 is always set),
+bit 9 follows the NMT state (0 while stopped).
+"""
+
+from __future__ import annotations
+
+from firmware_py.kernel import kernel
+from hil.bus.frames import FrameQueue
+from hil.canopen.cia402_homing import begin_homing, interrupt_homing
+from hil.canopen.device_errors import report_cleared, report_error
+from hil.canopen.device_records import Device, DriveObjects, HomingState, Mode, NmtState, PowerState, int64
+
+_HALT = 0x0100
+
+
+@kernel
+def mode_supported(mode: int) -> bool:
+    """True for the modes that 6502 claims."""
+    return mode == 1 or mode == 3 or mode == 4 or mode == 6 or mode == 8 or mode == 9 or mode == 10
+
+
+@kernel
+def outside_position_limit(drive: DriveObjects, position: int) -> bool:
+    """Software position limit 607D [counts]; both limits 0 = off."""
+    low = drive.position_limit[0]
+    high = drive.position_limit[1]
+    return (low != 0 or high != 0) and (position < low or position > high)
+
+
+@kernel
+def begin_stop(device: Device, option: int, after: int) -> None:
+    """Brake along 6084 (option 1, 5) or 6085 (2, 6), then enter `after`; option 0 enters it at once (coasting)."""
+    if option == 0:
+        device.braking = 0
+        device.state = after
+        return
+    drive = device.drive
+    deceleration = int64(drive.profile_deceleration)
+    if option == 2 or option == 6:
+        deceleration = int64(drive.quick_stop_deceleration)
+    device.brake_deceleration_radps2 = deceleration / abs(device.counts_per_rad)
+    device.after_brake = after
+    device.braking = 2
+
+
+@kernel
+def quick_stop(device: Device) -> None:
+    """Transition 11 with the reaction of 605A; 5 and 6 stay in Quick Stop Active and hold standstill."""
+    option = int64(device.drive.quick_stop_option)
+    device.state = PowerState.QUICK_STOP_ACTIVE
+    if option >= 5:
+        begin_stop(device, option, PowerState.QUICK_STOP_ACTIVE)
+    else:
+        begin_stop(device, option, PowerState.SWITCH_ON_DISABLED)
+
+
+@kernel
+def power_off(device: Device) -> None:
+    """Torque off at once (transitions 7, 9, 10, 12)."""
+    device.braking = 0
+    device.state = PowerState.SWITCH_ON_DISABLED
+
+
+@kernel
+def latch_fault(device: Device, code: int) -> None:
+    """Transition 13 with the reaction of 605E (14 follows at its end); the first fault is the one that stays."""
+    if device.fault_code != 0:
+        return
+    device.fault_code = code
+    if device.state == PowerState.OPERATION_ENABLED or device.state == PowerState.QUICK_STOP_ACTIVE:
+        device.state = PowerState.FAULT_REACTION_ACTIVE
+        begin_stop(device, int64(device.drive.fault_reaction_option), PowerState.FAULT)
+    else:
+        device.braking = 0
+        device.state = PowerState.FAULT
+
+
+@kernel
+def raise_fault(device: Device, code: int, queue: FrameQueue) -> None:
+    """A drive fault: latch, react, report.  Nothing while an earlier fault is latched."""
+    if device.fault_code == 0:
+        latch_fault(device, code)
+        report_error(device, code, queue)
+
+
+@kernel
+def abort_connection(device: Device, code: int) -> None:
+    """Reaction 6007 to a lost connection, power stage on: 0 none, 1 fault, 2 disable voltage, 3 quick stop."""
+    option = device.drive.abort_option
+    enabled = device.state == PowerState.OPERATION_ENABLED
+    if not (enabled or device.state == PowerState.QUICK_STOP_ACTIVE):
+        return
+    if option == 1:
+        latch_fault(device, code)
+    elif option == 2:
+        power_off(device)
+    elif option == 3 and enabled:
+        quick_stop(device)
+
+
+@kernel
+def fault_cause_present(device: Device) -> bool:
+    """True while a fault reset must be refused."""
+    return (
+        device.inject_fault_code != 0
+        or device.communication_errors != 0
+        or outside_position_limit(device.drive, device.drive.position)
+    )
+
+
+@kernel
+def _start_afresh(device: Device) -> None:
+    """Another mode, or enabled: references start from where the joint is (at the next substep), nothing is under way.
+
+    What a master commands from now on counts, even if it comes before that substep.
+    """
+    device.resync = 1
+    device.setpoint_active = 0
+    device.setpoint_waiting = 0
+    device.setpoint_acknowledged = 0
+    interrupt_homing(device)
+
+
+@kernel
+def _take_setpoint(device: Device, word: int, last: int) -> None:
+    """Profile position handshake: bit 4 rising takes the target (bit 6: relative), falling ends the acknowledge.
+
+    With bit 5 the target replaces the one that is under way; without, it waits until that one is reached, and the
+    acknowledge lasts as long as it waits.  A third one is not taken.
+    """
+    if word & 0x10 and not last & 0x10:
+        if device.setpoint_waiting and not word & 0x20:
+            return
+        target = int64(device.drive.target_position) / device.counts_per_rad
+        if word & 0x40:
+            present = int64(device.drive.position) / device.counts_per_rad
+            resting = present if device.resync else device.reference_position_rad
+            target += device.setpoint_position_rad if device.setpoint_active else resting
+        if device.setpoint_active and not word & 0x20:
+            device.setpoint_next_rad = target
+            device.setpoint_waiting = 1
+        else:
+            device.setpoint_position_rad = target
+            device.setpoint_active = 1
+            device.setpoint_waiting = 0
+        device.setpoint_acknowledged = 1
+    elif not word & 0x10 and not device.setpoint_waiting:
+        device.setpoint_acknowledged = 0
+
+
+@kernel
+def _command_homing(device: Device, word: int, last: int) -> None:
+    """Homing: bit 4 rising starts, falling or halt interrupts."""
+    if word & 0x10 and not last & 0x10 and not word & _HALT:
+        begin_homing(device)
+    elif not word & 0x10 or word & _HALT:
+        interrupt_homing(device)
+
+
+@kernel
+def _command_enabled(device: Device, word: int, command: int) -> None:
+    """Operation Enabled: the ways out of it, and its resumption while a stop ramp of 605B or 605C runs."""
+    if command == 0x07 and device.braking == 0:
+        begin_stop(device, int64(device.drive.disable_option), PowerState.SWITCHED_ON)
+    elif command & 0x07 == 0x06 and device.braking == 0:
+        begin_stop(device, int64(device.drive.shutdown_option), PowerState.READY_TO_SWITCH_ON)
+    elif command == 0x0F and device.braking != 0:
+        device.braking = 0
+        _start_afresh(device)
+
+
+@kernel
+def apply_controlword(device: Device, queue: FrameQueue) -> None:
+    """Carry out the present controlword and mode request; call after every write of 6040 or 6060."""
+    drive = device.drive
+    mode = int64(drive.mode)
+    if mode != drive.mode_display and (mode == 0 or mode_supported(mode)):
+        drive.mode_display = mode
+        _start_afresh(device)
+    word = int64(drive.controlword)
+    last = int64(device.last_controlword)
+    device.last_controlword = word
+    state = int64(device.state)
+    if state == PowerState.FAULT:
+        if word & 0x80 and not last & 0x80 and not fault_cause_present(device):
+            device.fault_code = 0
+            device.state = PowerState.SWITCH_ON_DISABLED
+            report_cleared(device, queue)
+        return
+    if word & 0x80 or state == PowerState.FAULT_REACTION_ACTIVE or state == PowerState.NOT_READY:
+        return
+    command = word & 0x0F
+    if not command & 0x02:
+        power_off(device)
+    elif not command & 0x04:
+        if state == PowerState.OPERATION_ENABLED:
+            quick_stop(device)
+        elif state != PowerState.QUICK_STOP_ACTIVE:
+            power_off(device)
+    elif state == PowerState.SWITCH_ON_DISABLED:
+        if command & 0x07 == 0x06:
+            device.state = PowerState.READY_TO_SWITCH_ON
+    elif state == PowerState.READY_TO_SWITCH_ON or state == PowerState.SWITCHED_ON:
+        if command == 0x0F:
+            device.state = PowerState.OPERATION_ENABLED
+            device.braking = 0
+            _start_afresh(device)
+        elif command == 0x07:
+            device.state = PowerState.SWITCHED_ON
+        else:
+            device.state = PowerState.READY_TO_SWITCH_ON
+    elif state == PowerState.OPERATION_ENABLED:
+        _command_enabled(device, word, command)
+        if drive.mode_display == Mode.PROFILE_POSITION and command == 0x0F:
+            _take_setpoint(device, word, last)
+        elif drive.mode_display == Mode.HOMING and command == 0x0F:
+            _command_homing(device, word, last)
+    elif state == PowerState.QUICK_STOP_ACTIVE and command == 0x0F and drive.quick_stop_option >= 5:
+        device.state = PowerState.OPERATION_ENABLED
+        device.braking = 0
+        _start_afresh(device)
+
+
+@kernel
+def _target_reached(device: Device) -> bool:
+    drive = device.drive
+    if device.state == PowerState.QUICK_STOP_ACTIVE:
+        return device.braking == 0
+    if device.state != PowerState.OPERATION_ENABLED:
+        return False
+    mode = drive.mode_display
+    moving = abs(int64(drive.velocity)) > int64(drive.velocity_window)
+    if drive.controlword & _HALT and (mode == 1 or mode == 3):
+        return not moving
+    if mode == Mode.PROFILE_POSITION:
+        error = int64(drive.position) - int64(round(device.setpoint_position_rad * device.counts_per_rad))
+        idle = device.setpoint_active == 0 and device.setpoint_waiting == 0
+        return idle and abs(error) <= int64(drive.position_window)
+    if mode == Mode.PROFILE_VELOCITY:
+        return abs(int64(drive.velocity) - int64(drive.target_velocity)) <= int64(drive.velocity_window)
+    if mode == Mode.HOMING:
+        return device.homing != HomingState.SEARCHING and not moving
+    if mode == Mode.TORQUE:
+        target = 0.0 if drive.controlword & _HALT else device.torque_sign * float(drive.target_torque)
+        return device.demand == target
+    return False
+
+
+@kernel
+def status_word(device: Device) -> int:
+    """6041 of the present state."""
+    state = device.state
+    drive = device.drive
+    word = 0x10
+    enabled = state == PowerState.OPERATION_ENABLED
+    if state == PowerState.SWITCH_ON_DISABLED:
+        word |= 0x40
+    elif state == PowerState.READY_TO_SWITCH_ON:
+        word |= 0x21
+    elif state == PowerState.SWITCHED_ON:
+        word |= 0x23
+    elif enabled:
+        word |= 0x27
+    elif state == PowerState.QUICK_STOP_ACTIVE:
+        word |= 0x07
+    elif state == PowerState.FAULT_REACTION_ACTIVE:
+        word |= 0x0F
+    elif state == PowerState.FAULT:
+        word |= 0x08
+    if device.communication_errors != 0:
+        word |= 0x80
+    if device.nmt != NmtState.STOPPED:
+        word |= 0x200
+    if _target_reached(device):
+        word |= 0x400
+    if device.saturated or outside_position_limit(drive, drive.position):
+        word |= 0x800
+    mode = drive.mode_display
+    if (
+        (mode >= Mode.CYCLIC_POSITION and enabled and device.braking == 0)
+        or (mode == Mode.PROFILE_VELOCITY and abs(int64(drive.velocity)) <= int64(drive.velocity_window))
+        or (mode == Mode.PROFILE_POSITION and device.setpoint_acknowledged)
+        or (mode == Mode.HOMING and device.homing == HomingState.ATTAINED)
+    ):
+        word |= 0x1000
+    if device.following_time_s > 0.0 or (mode == Mode.HOMING and device.homing == HomingState.FAILED):
+        word |= 0x2000
+    return word

@@ -1,0 +1,235 @@
+"""Torque demand of the virtual drive in every mode of operation, at the plant's substep rate.
+
+CST and TQ set the torque; CSV and PV run a PI velocity loop; CSP and PP a P position loop around it.  A stop
+ramp (quick stop, fault reaction, disable) uses the velocity loop in every mode.  Result in per mille of the rated
+motor torque, limited by 6072 and by 6073 through the torque constant.  Positive = positive joint motion.
+Not modelled: velocity estimation inside the drive (the loop sees the plant's velocity), jerk limits, 60B0, 60B1.
+"""
+
+from __future__ import annotations
+
+import math
+
+from firmware_py.kernel import kernel
+from hil.canopen.cia402_homing import homing_target_radps
+from hil.canopen.device_records import Device, DriveObjects, Mode, PowerState, int64
+
+_HALT = 0x0100
+_STANDSTILL_RADPS = 0.01
+_BRAKE_SPARE_S = 1.0  # a stop ramp that is this much late ends all the same
+_UNLIMITED_WINDOW = 0xFFFFFFFF
+
+
+@kernel
+def torque_limit(device: Device) -> float:
+    """The smaller of 6072 and of what current 6073 yields [per mille of rated motor torque]."""
+    drive = device.drive
+    per_current = device.motor_torque_constant_NmpA * int64(drive.rated_current_mA) / int64(drive.rated_torque_mNm)
+    return min(float(drive.max_torque), float(drive.max_current) * per_current)
+
+
+@kernel
+def permille_torque_Nm(device: Device) -> float:
+    """Joint torque of one per mille of the rated motor torque [Nm]."""
+    return 1e-6 * int64(device.drive.rated_torque_mNm) * device.reduction_ratio
+
+
+@kernel
+def _limit(value: float, bound: float) -> float:
+    return min(max(value, -bound), bound)
+
+
+@kernel
+def _max_speed_radps(device: Device) -> float:
+    drive = device.drive
+    motor = int64(drive.max_motor_speed_rpm) * (2.0 * math.pi / 60.0) / device.reduction_ratio
+    return min(int64(drive.max_profile_velocity) / abs(device.counts_per_rad), motor)
+
+
+@kernel
+def _velocity_loop(device: Device, velocity_radps: float, dt_s: float) -> float:
+    """PI on the reference velocity; the integral stands still while the output is limited in its direction."""
+    error = device.reference_velocity_radps - velocity_radps
+    scale = permille_torque_Nm(device)
+    bound = torque_limit(device) * scale
+    torque = device.velocity_gain_Nmspr * error + device.integral_Nm
+    if abs(torque) < bound or torque * error < 0.0:
+        device.integral_Nm = _limit(device.integral_Nm + device.velocity_integral_Nmprad * error * dt_s, bound)
+    return torque / scale
+
+
+@kernel
+def _ramp_velocity(device: Device, target_radps: float, dt_s: float) -> None:
+    """Move the reference velocity towards the target with 6083 away from zero and 6084 towards it."""
+    reference = device.reference_velocity_radps
+    rate = int64(device.drive.profile_acceleration)
+    if abs(target_radps) < abs(reference) or target_radps * reference < 0.0:
+        rate = int64(device.drive.profile_deceleration)
+    step = rate / abs(device.counts_per_rad) * dt_s
+    device.reference_velocity_radps = reference + _limit(target_radps - reference, step)
+
+
+@kernel
+def _position_loop(device: Device, position_rad: float, velocity_radps: float, feed_radps: float, dt_s: float) -> float:
+    """P on the reference position plus the velocity of the reference."""
+    speed = feed_radps + device.position_gain_ps * (device.reference_position_rad - position_rad)
+    device.reference_velocity_radps = _limit(speed, _max_speed_radps(device))
+    return _velocity_loop(device, velocity_radps, dt_s)
+
+
+@kernel
+def _interpolation_period_s(drive: DriveObjects) -> float:
+    return float(drive.interpolation_time) * 10.0 ** float(drive.interpolation_exponent)
+
+
+@kernel
+def _cyclic_position(device: Device, position_rad: float, velocity_radps: float, dt_s: float) -> float:
+    """CSP: straight line from the last reference to the new target within 60C2."""
+    target = int64(device.drive.target_position)
+    if target != device.segment_target:
+        period_s = max(_interpolation_period_s(device.drive), dt_s)
+        device.segment_target = target
+        device.segment_left_s = period_s
+        device.segment_velocity_radps = (target / device.counts_per_rad - device.reference_position_rad) / period_s
+    feed_radps = 0.0
+    if device.segment_left_s > 0.5 * dt_s:
+        feed_radps = device.segment_velocity_radps
+        device.reference_position_rad += feed_radps * dt_s
+        device.segment_left_s -= dt_s
+    return _position_loop(device, position_rad, velocity_radps, feed_radps, dt_s)
+
+
+@kernel
+def _profile_position(device: Device, position_rad: float, velocity_radps: float, dt_s: float) -> float:
+    """PP: trapezoidal reference towards the last set-point; its velocity is kept in segment_velocity_radps."""
+    drive = device.drive
+    target_radps = 0.0
+    if device.setpoint_active and not drive.controlword & _HALT:
+        left = device.setpoint_position_rad - device.reference_position_rad
+        deceleration = int64(drive.profile_deceleration) / abs(device.counts_per_rad)
+        speed = min(int64(drive.profile_velocity) / abs(device.counts_per_rad), _max_speed_radps(device))
+        speed = min(speed, math.sqrt(2.0 * deceleration * abs(left)))
+        target_radps = math.copysign(speed, left)
+        if abs(left) <= abs(device.segment_velocity_radps) * dt_s + 0.5 / abs(device.counts_per_rad):
+            device.reference_position_rad = device.setpoint_position_rad
+            device.segment_velocity_radps = 0.0
+            device.setpoint_active = device.setpoint_waiting
+            device.setpoint_position_rad = (
+                device.setpoint_next_rad if device.setpoint_waiting else device.setpoint_position_rad
+            )
+            device.setpoint_waiting = 0
+            target_radps = 0.0
+    device.reference_velocity_radps = device.segment_velocity_radps
+    _ramp_velocity(device, target_radps, dt_s)
+    device.segment_velocity_radps = device.reference_velocity_radps
+    device.reference_position_rad += device.segment_velocity_radps * dt_s
+    return _position_loop(device, position_rad, velocity_radps, device.segment_velocity_radps, dt_s)
+
+
+@kernel
+def _mode_demand(device: Device, position: int, velocity_radps: float, dt_s: float) -> float:
+    drive = device.drive
+    mode = drive.mode_display
+    position_rad = position / device.counts_per_rad
+    if mode == Mode.CYCLIC_TORQUE:
+        torque = device.torque_sign * (float(drive.target_torque) + float(drive.torque_offset))
+        return -torque if device.torque_reversed else torque
+    if mode == Mode.TORQUE:
+        target = 0.0 if drive.controlword & _HALT else device.torque_sign * float(drive.target_torque)
+        return device.demand + _limit(target - device.demand, int64(drive.torque_slope) * dt_s)
+    if mode == Mode.CYCLIC_VELOCITY:
+        target_radps = int64(drive.target_velocity) / device.counts_per_rad
+        device.reference_velocity_radps = _limit(target_radps, _max_speed_radps(device))
+        return _velocity_loop(device, velocity_radps, dt_s) + device.torque_sign * float(drive.torque_offset)
+    if mode == Mode.PROFILE_VELOCITY:
+        target_radps = 0.0 if drive.controlword & _HALT else int64(drive.target_velocity) / device.counts_per_rad
+        _ramp_velocity(device, _limit(target_radps, _max_speed_radps(device)), dt_s)
+        return _velocity_loop(device, velocity_radps, dt_s)
+    if mode == Mode.CYCLIC_POSITION:
+        offset = device.torque_sign * float(drive.torque_offset)
+        return _cyclic_position(device, position_rad, velocity_radps, dt_s) + offset
+    if mode == Mode.PROFILE_POSITION:
+        return _profile_position(device, position_rad, velocity_radps, dt_s)
+    if mode == Mode.HOMING:
+        target_radps = _limit(homing_target_radps(device, position, dt_s), _max_speed_radps(device))
+        step_radps = int64(drive.homing_acceleration) / abs(device.counts_per_rad) * dt_s
+        device.reference_velocity_radps += _limit(target_radps - device.reference_velocity_radps, step_radps)
+        return _velocity_loop(device, velocity_radps, dt_s)
+    return 0.0
+
+
+@kernel
+def _brake(device: Device, velocity_radps: float, dt_s: float) -> float:
+    """One substep of a stop ramp; enters `after_brake` at standstill."""
+    if device.braking == 2:
+        device.braking = 1
+        device.integral_Nm = 0.0
+        device.reference_velocity_radps = velocity_radps
+        device.brake_time_left_s = abs(velocity_radps) / device.brake_deceleration_radps2 + _BRAKE_SPARE_S
+    reference = device.reference_velocity_radps
+    device.reference_velocity_radps = reference - _limit(reference, device.brake_deceleration_radps2 * dt_s)
+    device.brake_time_left_s -= dt_s
+    demand = _velocity_loop(device, velocity_radps, dt_s)
+    stopped = device.reference_velocity_radps == 0.0 and abs(velocity_radps) < _STANDSTILL_RADPS
+    if stopped or device.brake_time_left_s <= 0.0:
+        device.braking = 0
+        device.state = device.after_brake
+    return demand
+
+
+@kernel
+def following_error_tripped(device: Device, position: int, dt_s: float) -> bool:
+    """60F4 outside 6065 for longer than 6066, in the position modes of Operation Enabled."""
+    drive = device.drive
+    mode = drive.mode_display
+    positioning = mode == Mode.CYCLIC_POSITION or mode == Mode.PROFILE_POSITION
+    if not positioning or device.state != PowerState.OPERATION_ENABLED or device.braking != 0 or device.resync:
+        device.following_time_s = 0.0
+        return False
+    error = device.reference_position_rad * device.counts_per_rad - position
+    window = int64(drive.following_window)
+    if window == _UNLIMITED_WINDOW or abs(error) <= window:
+        device.following_time_s = 0.0
+        return False
+    device.following_time_s += dt_s
+    return device.following_time_s > 1e-3 * int64(drive.following_timeout_ms)
+
+
+@kernel
+def demand_torque_Nm(device: Device, position: int, velocity_radps: float, dt_s: float) -> float:
+    """Limited joint torque [Nm] for the next substep; `position` [counts] and velocity at the joint; 0 when off."""
+    state = device.state
+    device.saturated = 0
+    powered = (
+        state == PowerState.OPERATION_ENABLED
+        or state == PowerState.QUICK_STOP_ACTIVE
+        or state == PowerState.FAULT_REACTION_ACTIVE
+    )
+    if not powered:
+        device.demand = 0.0
+        return 0.0
+    position_rad = position / device.counts_per_rad
+    if device.resync:
+        device.resync = 0
+        device.reference_position_rad = position_rad
+        device.reference_velocity_radps = velocity_radps
+        device.segment_velocity_radps = velocity_radps
+        device.segment_target = position
+        device.segment_left_s = 0.0
+        if not device.setpoint_active:
+            device.setpoint_position_rad = position_rad
+        device.integral_Nm = 0.0
+        device.demand = 0.0
+    if device.braking != 0:
+        demand = _brake(device, velocity_radps, dt_s)
+    elif state == PowerState.OPERATION_ENABLED:
+        demand = _mode_demand(device, position, velocity_radps, dt_s)
+    else:
+        device.reference_velocity_radps = 0.0
+        demand = _velocity_loop(device, velocity_radps, dt_s)
+    bound = torque_limit(device)
+    if abs(demand) > bound:
+        device.saturated = 1
+        demand = _limit(demand, bound)
+    device.demand = demand
+    return demand * permille_torque_Nm(device)

@@ -1,0 +1,258 @@
+"""The virtual drive without any I/O: frames in, frames out, time given by the caller (`now_ns`).
+
+The real-time process and the lockstep simulation call the same three functions: `power_on`, `accept_frame` for
+every frame but the SDO requests, `advance` up to the present time.  Time must not run backwards; all times [ns] are
+those of the caller's clock and greater than 0.  Plant and drive advance in substeps of the plant.
+Not modelled: TIME, LSS, bus-off; the only remote request that is answered is node guarding.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from firmware_py.kernel import kernel
+from hil.bus.frames import FrameQueue
+from hil.canopen.cia402_core import (
+    apply_controlword,
+    outside_position_limit,
+    power_off,
+    raise_fault,
+    status_word,
+)
+from hil.canopen.cia402_motion import demand_torque_Nm, following_error_tripped
+from hil.canopen.device_errors import (
+    FOLLOWING_ERROR,
+    POSITION_LIMIT,
+    SYNC_LENGTH,
+    error_register,
+    send_emergency,
+)
+from hil.canopen.device_records import CONSUMERS, Device, HomingState, NmtState, PowerState, int64
+from hil.canopen.device_timers import SYNC_ERROR, answer_node_guard, connection_back, enter_nmt, run_timers
+from hil.canopen.encoder_core import accept_encoder_frame, step_encoder
+from hil.canopen.pdo_core import mark_events, receive_rpdo, receive_sync
+from hil.plant.joint import encoder_counts, step_plant
+from hil.plant.records import PlantConstants, PlantState
+
+_FAR_NS = 1_000_000_000
+_MS = 1_000_000
+
+
+@kernel
+def restart(device: Device, application: bool) -> None:
+    """Restore the defaults (communication only, or all of them) and boot again with the power stage off."""
+    device.communication = device.default_communication
+    if application:
+        device.drive = device.default_drive
+        device.fault_code = 0
+        device.last_controlword = 0
+        device.state = PowerState.SWITCH_ON_DISABLED
+        device.application_resets += 1
+        device.homing = HomingState.IDLE
+        device.home_shift_counts = 0
+    if device.fault_code == 0:
+        power_off(device)
+    device.communication_errors = 0
+    device.communication.error_register = error_register(device)
+    device.following_time_s = 0.0
+    device.demand = 0.0
+    device.heartbeat_period_ms = 0
+    for i in range(CONSUMERS):
+        device.consumer_heard_ns[i] = 0
+    device.guard_heard_ns = 0
+    device.guard_toggle = 0
+    device.emcy_sent_ns = 0
+    device.emcy_waiting = 0
+    device.nmt = NmtState.BOOT_UP
+    device.boot_pending = 1
+    device.next_due_ns = 0
+
+
+@kernel
+def power_on(device: Device) -> None:
+    """Start the device from its defaults; the first `advance` sends the boot-up message."""
+    device.primed = 0
+    device.inject_fault_code = 0
+    restart(device, True)
+
+
+@kernel
+def _int16(value: float) -> int:
+    """Rounded and saturated: a plain cast would wrap; not-a-number gives 0."""
+    if not np.isfinite(value):
+        return 0
+    return int64(np.rint(min(max(value, -32768.0), 32767.0)))
+
+
+@kernel
+def _int32(value: float) -> int:
+    if not np.isfinite(value):
+        return 0
+    return int64(np.rint(min(max(value, -2147483648.0), 2147483647.0)))
+
+
+@kernel
+def _position_counts(device: Device, plant_c: PlantConstants, plant_s: PlantState) -> int:
+    """6064: the encoder, counted from the home position."""
+    return int64(encoder_counts(plant_c, plant_s)) - int64(device.home_shift_counts)
+
+
+@kernel
+def sample_objects(device: Device, plant_c: PlantConstants, plant_s: PlantState) -> None:
+    """Measured values of the plant into the objects, in their units; statusword last.
+
+    A drive measures current: 6077 is the torque constant times current, without cogging and the reducer's ripple.
+    """
+    drive = device.drive
+    drive.position = _position_counts(device, plant_c, plant_s)
+    drive.second_position = _int32(
+        math.floor(plant_s.joint_position_rad * device.second_counts_prad + device.second_offset_counts + 0.5)
+    )
+    drive.velocity = _int32(plant_s.joint_velocity_radps * device.counts_per_rad)
+    current_A = device.torque_sign * plant_s.current_A
+    motor_torque_mNm = 1e3 * plant_c.torque_per_current_NmpA * current_A / device.reduction_ratio
+    drive.torque = _int16(1e3 * motor_torque_mNm / int64(drive.rated_torque_mNm))
+    drive.current = _int16(1e6 * current_A / int64(drive.rated_current_mA))
+    drive.motor_temperature_ddegC = _int16(10.0 * plant_s.motor_temperature_degC)
+    drive.demand_torque = _int16(device.torque_sign * device.demand)
+    mode = drive.mode_display
+    if (mode == 1 or mode == 8) and device.state == PowerState.OPERATION_ENABLED and not device.resync:
+        reference = device.reference_position_rad * device.counts_per_rad
+        drive.demand_position = _int32(reference)
+        drive.following_error = _int32(reference - drive.position)
+    else:
+        drive.demand_position = drive.position
+        drive.following_error = 0
+    drive.statusword = status_word(device)
+
+
+@kernel
+def _substep(device: Device, plant_c: PlantConstants, plant_s: PlantState, dt_s: float, queue: FrameQueue) -> None:
+    limits = device.drive.position_limit
+    mode = device.drive.mode_display
+    counts = int64(device.drive.position)
+    positioning = mode == 1 or mode == 8 or mode == 6
+    if limits[0] != 0 or limits[1] != 0 or positioning or device.resync:  # the encoder costs time
+        counts = _position_counts(device, plant_c, plant_s)
+    if device.fault_code == 0:
+        code = int64(device.inject_fault_code)
+        if code != 0:
+            raise_fault(device, code, queue)
+        elif outside_position_limit(device.drive, counts):
+            raise_fault(device, POSITION_LIMIT, queue)
+        elif following_error_tripped(device, counts, dt_s):
+            raise_fault(device, FOLLOWING_ERROR, queue)
+    torque_Nm = demand_torque_Nm(device, counts, plant_s.joint_velocity_radps, dt_s)
+    step_plant(plant_c, plant_s, torque_Nm)
+
+
+@kernel
+def _notice_status(device: Device) -> None:
+    """A changed status is a TPDO event."""
+    state = int64(device.state) | int64(device.drive.mode_display) << 8 | int64(device.fault_code) << 16
+    state = state << 16 | int64(device.drive.statusword)
+    if state != device.event_status:
+        device.event_status = state
+        mark_events(device)
+        device.next_due_ns = 0
+
+
+@kernel
+def advance(device: Device, plant_c: PlantConstants, plant_s: PlantState, until_ns: int, queue: FrameQueue) -> None:
+    """Integrate drive and plant up to `until_ns` and append the frames that became due meanwhile to `queue`."""
+    step_ns = int64(np.rint(plant_c.step_s * 1e9))
+    if not device.primed:
+        device.primed = 1
+        device.time_ns = until_ns
+    apply_controlword(device, queue)  # SDO may have written 6040 or 6060
+    while device.time_ns + step_ns <= until_ns:
+        _substep(device, plant_c, plant_s, plant_c.step_s, queue)
+        device.time_ns += step_ns
+        before = int64(device.event_status) >> 16
+        if int64(device.state) != before & 0xFF or device.time_ns >= device.next_due_ns:
+            sample_objects(device, plant_c, plant_s)
+            _notice_status(device)
+            run_timers(device, device.time_ns, queue)
+    sample_objects(device, plant_c, plant_s)
+    _notice_status(device)
+    if until_ns >= device.next_due_ns:
+        run_timers(device, until_ns, queue)
+    step_encoder(device.encoder, plant_s, until_ns, queue)
+
+
+@kernel
+def _command_nmt(device: Device, command: int) -> None:
+    if command == 0x01:
+        enter_nmt(device, NmtState.OPERATIONAL)
+    elif command == 0x02:
+        enter_nmt(device, NmtState.STOPPED)
+    elif command == 0x80:
+        enter_nmt(device, NmtState.PRE_OPERATIONAL)
+    elif command == 0x81:
+        restart(device, True)
+    elif command == 0x82:
+        restart(device, False)
+
+
+@kernel
+def _accept_sync(device: Device, frame: np.ndarray, now_ns: int, queue: FrameQueue) -> None:
+    """SYNC in NMT operational; one without its counter byte, or with one too many, is reported once and ignored."""
+    counted = device.communication.sync_overflow != 0
+    if int64(frame[4]) != (1 if counted else 0):
+        if not device.sync_length_wrong:
+            device.sync_length_wrong = 1
+            send_emergency(device, SYNC_LENGTH, queue)
+        return
+    device.sync_length_wrong = 0
+    device.sync_heard_ns = now_ns
+    timeout_ns = int64(device.drive.sync_timeout_ms) * _MS
+    if timeout_ns:
+        device.next_due_ns = min(device.next_due_ns, now_ns + timeout_ns)
+    connection_back(device, SYNC_ERROR, queue)
+    receive_sync(device, now_ns, int64(frame[8]) if counted else 0, queue)
+
+
+@kernel
+def accept_frame(
+    device: Device,
+    plant_c: PlantConstants,
+    plant_s: PlantState,
+    frame: np.ndarray,
+    now_ns: int,
+    queue: FrameQueue,
+) -> None:
+    """One frame (uint8[16]) from the bus; SDO requests and everything foreign are ignored; advances to `now_ns`."""
+    advance(device, plant_c, plant_s, now_ns, queue)
+    identifier = int64(frame[0]) | int64(frame[1]) << 8
+    size = int64(frame[4])
+    if not (frame[3] & 0xE0 or frame[2] or identifier > 0x7FF):
+        accept_encoder_frame(device.encoder, plant_s, identifier, frame, queue)
+    if frame[3] & 0xA0 or frame[2] or identifier > 0x7FF or device.nmt == NmtState.BOOT_UP or size > 8:
+        return  # extended and error frames are not for this device
+    if frame[3] & 0x40:
+        if identifier == 0x700 + device.node_id:
+            answer_node_guard(device, now_ns, queue)
+    elif identifier == 0:
+        if size == 2 and (frame[9] == 0 or frame[9] == device.node_id):
+            _command_nmt(device, int64(frame[8]))
+            device.next_due_ns = 0
+    elif 0x700 < identifier <= 0x77F:
+        for i in range(CONSUMERS):
+            entry = int64(device.communication.consumer_heartbeat[i])
+            if entry & 0xFFFF and entry >> 16 == identifier - 0x700:
+                device.consumer_entry[i] = entry
+                device.consumer_heard_ns[i] = now_ns
+                connection_back(device, 1 << i, queue)
+                device.next_due_ns = 0
+    elif device.nmt == NmtState.OPERATIONAL:
+        if identifier == int64(device.communication.sync_cob_id) & 0x7FF:
+            _accept_sync(device, frame, now_ns, queue)
+        else:
+            receive_rpdo(device, identifier, frame, now_ns, queue)
+    drive_status = status_word(device)
+    device.drive.statusword = drive_status
+    _notice_status(device)
+    if now_ns >= device.next_due_ns:
+        run_timers(device, now_ns, queue)

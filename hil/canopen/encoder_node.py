@@ -1,0 +1,92 @@
+"""The encoder node's object dictionary and SDO server, laid over its record inside the virtual drive's memory."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from firmware_py.schema import dtype_of
+from hil.canopen.device_records import Device, NmtState
+from hil.canopen.device_write_rules import check_write
+from hil.canopen.encoder_core import restart_encoder
+from hil.canopen.encoder_records import FIELDS, EncoderNode, EncoderObjects
+from hil.canopen.object_dictionary import ObjectDictionary, load_entries, split_field
+from hil.canopen.sdo_server import SdoServer
+
+
+@dataclass(frozen=True)
+class EncoderSettings:
+    """An encoder on the joint: its reading at joint angle 0 is `zero_counts`."""
+
+    eds_path: Path
+    node_id: int
+    counts_per_turn: int
+    direction: int = 1
+    zero_counts: int = 0
+    range_counts: int = 1 << 31
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("node_id", 1, 127),
+            ("counts_per_turn", 4, 0xFFFFFFFF),
+            ("range_counts", self.counts_per_turn, 0xFFFFFFFF),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ValueError(f"{name} (={value}) must be in [{low}..{high}]")
+        if self.direction not in (-1, 1):
+            raise ValueError(f"direction (={self.direction}) must be 1 or -1")
+
+
+def _view(memory: Any, group: str, field: str) -> np.ndarray:
+    """A one-element view of a field of the node inside the first `Device` of `memory`."""
+    name, element = split_field(field)
+    dtype, offset = dtype_of(EncoderObjects).fields[name][:2]  # type: ignore[index]
+    dtype = dtype.subdtype[0] if dtype.subdtype else dtype
+    offset += element * dtype.itemsize + dtype_of(EncoderNode).fields[group][1]  # type: ignore[index]
+    offset += dtype_of(Device).fields["encoder"][1]  # type: ignore[index]
+    return np.ndarray((1,), dtype, buffer=memory.view(np.ndarray).view(np.uint8).data, offset=offset)
+
+
+class EncoderDictionary(ObjectDictionary):
+    """Values of the encoder node's objects."""
+
+    def __init__(self, eds_path: Path, node_id: int, memory: Any) -> None:
+        self._take_entries(load_entries(eds_path, node_id))
+        for key, field in FIELDS.items():
+            if key not in self.entries:
+                raise ValueError(f"{eds_path.name}: object {key[0]:04X}:{key[1]} must be there, the encoder uses it")
+            self._live[key] = _view(memory, "objects", field)
+            self._initial[key] = _view(memory, "default_objects", field)
+            self.set_default(*key, int(self.entries[key].default))
+        self.restore_strings()
+
+
+class VirtualEncoder:
+    """Sets up the node inside `memory` (a `Device` record array) and answers its SDO requests."""
+
+    def __init__(self, settings: EncoderSettings, memory: Any) -> None:
+        self.settings = settings
+        self.node = memory[0].encoder
+        self.node.node_id = settings.node_id
+        self.node.counts_prad = settings.direction * settings.counts_per_turn / math.tau
+        self.node.offset_counts = settings.zero_counts
+        self.objects = EncoderDictionary(settings.eds_path, settings.node_id, memory)
+        self.objects.set_default(0x6001, 0, settings.counts_per_turn)
+        self.objects.set_default(0x6002, 0, settings.range_counts)
+        self.sdo = SdoServer(self.objects, self._write)
+        restart_encoder(self.node)
+
+    def _write(self, index: int, sub: int, data: bytes) -> None:
+        value = self.objects.check(index, sub, data)
+        check_write(self.objects, index, sub, value, 0)
+        self.objects.store(index, sub, data)
+
+    @property
+    def answers_sdo(self) -> bool:
+        """Whether SDO is alive in its NMT state."""
+        return self.node.nmt not in (NmtState.BOOT_UP, NmtState.STOPPED)

@@ -1,0 +1,1 @@
+"""The virtual drive with the ASCII interpreter on a pseudo-terminal."""

@@ -1,0 +1,300 @@
+"""The command interpreter of the virtual Elmo drive: one command in, one reply out, the plant behind it.
+
+Written from the description of the protocol, not from the driver: a constant that is wrong on one side cannot
+cancel out.  Replies here are without echo; `hil.elmo.device` adds it, with the times of the line.
+
+Not modelled: programs, recorder, homing, PVT, tables, digital outputs, saving to flash (SV is taken and does nothing),
+and the limits that real drives put on the order in which HL, LL, VH and VL may be written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from firmware_py.schema import new
+from hil.elmo.commands import (
+    AMPLIFIER_NOT_READY,
+    BAD_COMMAND,
+    BAD_INDEX,
+    BAD_UNIT_MODE,
+    COMMAND,
+    INDEXED,
+    MOTOR_FIELDS,
+    MOTOR_MUST_BE_OFF,
+    MOTOR_MUST_BE_ON,
+    NOT_ASSIGNABLE,
+    NOT_IN_THIS_MODE,
+    NUMBER,
+    OUT_OF_LIMIT,
+    OUT_OF_RANGE,
+    SYNTAX,
+    WHOLE,
+    ElmoDeviceSettings,
+    RefusedCommandError,
+)
+from hil.elmo.motor import (
+    SPEED_BANDWIDTH_RADPS,
+    UM_POSITION,
+    UM_SPEED,
+    UM_TORQUE,
+    ElmoMotor,
+    advance_motor,
+    position_counts,
+    status_register,
+    switch_off,
+)
+
+SUBSTEPS_AT_ONCE_S = 2.0  # after a longer sleep of this process, time is lost rather than caught up
+
+
+class ElmoInterpreter:
+    """`execute(line)` one command without its end; `advance_s(time)` moves drive and joint on."""
+
+    def __init__(self, settings: ElmoDeviceSettings, plant_constants: Any, plant_state: Any) -> None:
+        self.settings = settings
+        self.constants, self.state = plant_constants, plant_state
+        self.motor: Any = new(ElmoMotor)
+        self._c, self._s, self.m = plant_constants[0], plant_state[0], self.motor[0]
+        self.echo = True
+        self.amplifier = 0  # SR bits 0-3: set from outside, as a voltage that is missing would
+        self.jog_cps = 0.0
+        self.target_counts = 0.0
+        self._plain: dict[tuple[str, int], float] = {}
+        self.restart()
+
+    # --- life ---
+
+    def restart(self) -> None:
+        """Power off and on: everything that was not saved is as it was made."""
+        c, s, m = self._c, self._s, self.m
+        self.motor[:] = new(ElmoMotor)
+        m.unit_mode = self.settings.power_on_unit_mode
+        m.current_sign = self.settings.current_sign
+        per_rad = abs(float(c.counts_prad))
+        m.continuous_A, m.peak_A, m.peak_s = 5.0, 10.0, 3.0
+        m.speed_high_cps, m.speed_low_cps = 10.0 * per_rad, -10.0 * per_rad
+        m.position_high_counts, m.position_low_counts = 1e9, -1e9
+        m.speed_error_cps, m.position_error_counts = 5.0 * per_rad, 1e9
+        m.profile_cps = 0.2 * per_rad
+        m.acceleration_cps2 = m.deceleration_cps2 = m.stop_deceleration_cps2 = 2.0 * per_rad
+        inertia = float(c.driven_inertia_kgm2)
+        m.gain_Apcps = SPEED_BANDWIDTH_RADPS * inertia / float(c.torque_per_current_NmpA) / per_rad
+        m.target_counts = position_counts(c, s)
+        self.target_counts = float(m.target_counts)
+        self.jog_cps, self.error_code, self.echo = 0.0, 0, True
+        self._plain = {("RM", 0): 0.0, ("PM", 0): 1.0}
+
+    def advance_to(self, time_s: float) -> None:
+        """Move drive and joint on to `time_s` of the plant's own clock."""
+        substeps = int((time_s - float(self._s.time_s)) / float(self._c.step_s))
+        limit = int(SUBSTEPS_AT_ONCE_S / float(self._c.step_s))
+        if substeps > 0:
+            advance_motor(self.m, self._c, self._s, min(substeps, limit))
+
+    # --- commands ---
+
+    def execute(self, line: bytes) -> bytes:
+        """The reply with its `;`, or error byte and `?;`."""
+        try:
+            return self._reply(line.decode("latin-1").strip()).encode() + b";"
+        except RefusedCommandError as refusal:
+            self.error_code = refusal.code
+            return bytes((refusal.code,)) + b"?;"
+
+    def _reply(self, text: str) -> str:
+        if not text:
+            return ""
+        match = COMMAND.fullmatch(text)
+        if match is None:
+            raise RefusedCommandError(SYNTAX)
+        name, index_text, value_text = match.groups()
+        if (index_text is not None) != (name in INDEXED):
+            known = name in INDEXED or name in _HANDLERS or (name, 0) in {**MOTOR_FIELDS, **self._plain}
+            raise RefusedCommandError(BAD_INDEX if known else BAD_COMMAND)
+        index = int(index_text or 0)
+        value = None
+        if value_text is not None:
+            if not NUMBER.fullmatch(value_text):
+                raise RefusedCommandError(SYNTAX)
+            value = float(value_text)
+        handler = _HANDLERS.get(name)
+        if handler is not None:
+            return handler(self, value)
+        return self._parameter(name, index, value)
+
+    def _parameter(self, name: str, index: int, value: float | None) -> str:
+        field = MOTOR_FIELDS.get((name, index))
+        if (name, index) == ("CA", 18):
+            return self._constant(value, self.settings.counts_per_turn)
+        if (name, index) in (("VL", 2), ("VH", 2)):
+            return self._constant(value, round(float(self.m.speed_low_cps if name == "VL" else self.m.speed_high_cps)))
+        if field is None and (name, index) not in self._plain:
+            raise RefusedCommandError(BAD_INDEX if name in INDEXED else BAD_COMMAND)
+        if value is None:
+            number = float(getattr(self.m, field)) if field else self._plain[(name, index)]
+            return str(round(number)) if name in WHOLE or field is None else f"{number:.4f}"
+        self._check(name, index, value)
+        if field:
+            setattr(self.m, field, value)
+        else:
+            self._plain[(name, index)] = value
+        return ""
+
+    def _check(self, name: str, index: int, value: float) -> None:
+        m = self.m
+        if name in ("CL", "PL") and (index == 1 or name == "CL"):
+            low_enough = value <= (float(m.peak_A) if name == "CL" else self.settings.maximum_current_A)
+            if not 0.0 < value <= self.settings.maximum_current_A:
+                raise RefusedCommandError(OUT_OF_RANGE)
+            if not low_enough or (name == "PL" and value < float(m.continuous_A)):
+                raise RefusedCommandError(OUT_OF_LIMIT)
+        elif (name in ("AC", "DC", "SD", "SP", "ER") or (name, index) == ("PL", 2)) and value <= 0.0:
+            raise RefusedCommandError(OUT_OF_RANGE)
+        elif name in ("RM", "PM"):
+            if m.motor_on:
+                raise RefusedCommandError(MOTOR_MUST_BE_OFF)
+            if value not in (0.0, 1.0):
+                raise RefusedCommandError(OUT_OF_RANGE)
+
+    @staticmethod
+    def _constant(value: float | None, present: float) -> str:
+        if value is not None:
+            raise RefusedCommandError(NOT_ASSIGNABLE)
+        return f"{present:g}" if isinstance(present, float) else str(present)
+
+    def _on(self, value: float | None) -> str:
+        if value is None:
+            return str(int(self.m.motor_on))
+        if value not in (0.0, 1.0):
+            raise RefusedCommandError(OUT_OF_RANGE)
+        m = self.m
+        if value == 0.0:
+            if m.motor_on:
+                switch_off(m, 0)
+        elif not m.motor_on:
+            if self.amplifier:
+                raise RefusedCommandError(AMPLIFIER_NOT_READY)
+            m.motor_fault, m.motor_on, m.stopping = 0, 1, 0
+            m.torque_A = m.reference_cps = m.integral_A = m.jog_cps = 0.0
+            m.target_counts = position_counts(self._c, self._s)
+            self.target_counts = float(m.target_counts)
+        return ""
+
+    def _unit_mode(self, value: float | None) -> str:
+        if value is None:
+            return str(int(self.m.unit_mode))
+        if self.m.motor_on:
+            raise RefusedCommandError(MOTOR_MUST_BE_OFF)
+        if not 1.0 <= value <= 6.0:
+            raise RefusedCommandError(OUT_OF_RANGE)
+        if value not in (UM_TORQUE, UM_SPEED, UM_POSITION):
+            raise RefusedCommandError(BAD_UNIT_MODE)
+        self.m.unit_mode = int(value)
+        return ""
+
+    def _need(self, *unit_modes: int) -> None:
+        if not self.m.motor_on:
+            raise RefusedCommandError(MOTOR_MUST_BE_ON)
+        if self.m.unit_mode not in unit_modes:
+            raise RefusedCommandError(NOT_IN_THIS_MODE)
+
+    def _torque(self, value: float | None) -> str:
+        if value is None:
+            return f"{float(self.m.torque_A):.3f}"
+        self._need(UM_TORQUE)
+        if abs(value) > float(self.m.peak_A):
+            raise RefusedCommandError(OUT_OF_LIMIT)
+        self.m.torque_A = value
+        return ""
+
+    def _jog(self, value: float | None) -> str:
+        if value is None:
+            return str(round(self.jog_cps))
+        if not float(self.m.speed_low_cps) <= value <= float(self.m.speed_high_cps):
+            raise RefusedCommandError(OUT_OF_RANGE)
+        self.jog_cps = value
+        return ""
+
+    def _absolute(self, value: float | None) -> str:
+        if value is None:
+            return str(round(self.target_counts))
+        if not float(self.m.position_low_counts) <= value <= float(self.m.position_high_counts):
+            raise RefusedCommandError(OUT_OF_LIMIT)
+        self.target_counts = value
+        return ""
+
+    def _begin(self, value: float | None) -> str:
+        self._no_value(value)
+        self._need(UM_SPEED, UM_POSITION)
+        if self.m.unit_mode == UM_SPEED:
+            self.m.jog_cps, self.m.stopping = self.jog_cps, 0
+        else:
+            self.m.target_counts, self.m.moving, self.m.stopping = self.target_counts, 1, 0
+        return ""
+
+    def _stop(self, value: float | None) -> str:
+        self._no_value(value)
+        m = self.m
+        m.jog_cps, m.stopping = 0.0, 1  # JV stays as it was said: another BG would jog again
+        if m.unit_mode == UM_POSITION and m.motor_on:
+            m.target_counts = position_counts(self._c, self._s)
+            m.moving = 0
+        elif m.unit_mode == UM_TORQUE:
+            m.torque_A = 0.0
+        return ""
+
+    def _no_value(self, value: float | None) -> None:
+        if value is not None:
+            raise RefusedCommandError(NOT_ASSIGNABLE)
+
+    def _read_only(self, value: float | None, text: str) -> str:
+        self._no_value(value)
+        return text
+
+    def _position(self, value: float | None) -> str:
+        if value is None:
+            return str(position_counts(self._c, self._s))
+        if self.m.motor_on:
+            raise RefusedCommandError(MOTOR_MUST_BE_OFF)
+        self._c.encoder_offset_counts += round(value) - position_counts(self._c, self._s)
+        return ""
+
+    def _echo(self, value: float | None) -> str:
+        if value is None:
+            return str(int(self.echo))
+        if value not in (0.0, 1.0):
+            raise RefusedCommandError(OUT_OF_RANGE)
+        self.echo = bool(value)
+        return ""
+
+    def status(self) -> int:
+        """SR."""
+        return status_register(self.m, self.amplifier)
+
+    def speed_cps(self) -> float:
+        """VX."""
+        return float(self._s.joint_velocity_radps) * float(self._c.counts_prad)
+
+
+_HANDLERS: dict[str, Callable[[ElmoInterpreter, float | None], str]] = {
+    "MO": ElmoInterpreter._on,
+    "UM": ElmoInterpreter._unit_mode,
+    "TC": ElmoInterpreter._torque,
+    "JV": ElmoInterpreter._jog,
+    "PA": ElmoInterpreter._absolute,
+    "BG": ElmoInterpreter._begin,
+    "ST": ElmoInterpreter._stop,
+    "PX": ElmoInterpreter._position,
+    "EO": ElmoInterpreter._echo,
+    "VR": lambda d, v: d._read_only(v, d.settings.version),
+    "SR": lambda d, v: d._read_only(v, str(d.status())),
+    "MF": lambda d, v: d._read_only(v, str(int(d.m.motor_fault))),
+    "EC": lambda d, v: d._read_only(v, str(d.error_code)),
+    "VX": lambda d, v: d._read_only(v, str(round(d.speed_cps()))),
+    "IQ": lambda d, v: d._read_only(v, f"{float(d._s.current_A):.4f}"),
+    "MC": lambda d, v: d._read_only(v, f"{d.settings.maximum_current_A:.4f}"),
+    "MS": lambda d, v: d._read_only(v, "2" if d.m.motor_on and d.m.moving else "0"),
+    "IP": lambda d, v: d._read_only(v, "0"),
+    "SV": lambda d, v: d._read_only(v, ""),
+}

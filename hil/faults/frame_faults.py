@@ -1,0 +1,205 @@
+"""What becomes of a frame between controller and drive while faults of the wire are present.
+
+`pass_frame` takes each frame and appends what arrives to a queue: nothing, the frame, the frame twice, a damaged one;
+frames that are late wait in the memory until `take_due`.  CAN's own checksum finds nearly every damaged frame: the
+corrupted and shortened ones stand for a faulty gateway, adapter or drive.
+Not modelled: error frames, the error counters of CAN.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+from firmware_py.kernel import kernel
+from hil.bus.frames import FRAME_SIZE, QUEUE_LENGTH, FrameQueue
+from hil.canopen.device_records import int64
+from hil.faults.kinds import LATE_FRAMES, FaultKind, FaultMemory, draw, is_active
+
+
+class FrameClass(IntEnum):
+    """What a frame is, between this drive and its controller."""
+
+    OTHER = 0
+    SYNC = 1
+    RPDO = 2
+    TPDO = 3
+    CONTROLLER_HEARTBEAT = 4
+    DRIVE_HEARTBEAT = 5
+
+
+@kernel
+def frame_class(frame: np.ndarray, to_drive: bool, node_id: int) -> FrameClass:
+    """By identifier and direction; the predefined connection set of CiA 301."""
+    identifier = int64(frame[0]) | int64(frame[1]) << 8
+    if to_drive:
+        if identifier == 0x80:
+            return FrameClass.SYNC
+        if identifier == 0x200 + node_id:
+            return FrameClass.RPDO
+        if identifier > 0x700 and identifier <= 0x77F:
+            return FrameClass.CONTROLLER_HEARTBEAT
+        return FrameClass.OTHER
+    if identifier == 0x180 + node_id:
+        return FrameClass.TPDO
+    if identifier == 0x700 + node_id:
+        return FrameClass.DRIVE_HEARTBEAT
+    return FrameClass.OTHER
+
+
+@kernel
+def append_frame(queue: FrameQueue, frame: np.ndarray) -> int:
+    """Copy a frame to the end of a queue; its slot, or -1 when full."""
+    slot = int64(queue.count)
+    if slot >= QUEUE_LENGTH:
+        queue.overflowed += 1
+        return -1
+    for i in range(FRAME_SIZE):
+        queue.frames[slot, i] = frame[i]
+    queue.count = slot + 1
+    return slot
+
+
+@kernel
+def _keep(memory: FaultMemory, frame: np.ndarray, to_drive: bool, due_ns: int) -> None:
+    slot = int64(memory.late_count)
+    if slot >= LATE_FRAMES:
+        memory.late_lost += 1
+        return
+    memory.late_due_ns[slot] = due_ns
+    memory.late_to_drive[slot] = 1 if to_drive else 0
+    for i in range(FRAME_SIZE):
+        memory.late_frames[slot, i] = frame[i]
+    memory.late_count = slot + 1
+
+
+@kernel
+def take_due(memory: FaultMemory, to_drive: bool, now_ns: int, after_next: bool, queue: FrameQueue) -> None:
+    """Move late frames of one direction to `queue`: those due by now, or (`after_next`) those that were overtaken."""
+    kept = 0
+    wanted = 1 if to_drive else 0
+    for slot in range(memory.late_count):
+        due_ns = int64(memory.late_due_ns[slot])
+        ready = due_ns == 0 if after_next else (due_ns != 0 and due_ns <= now_ns)
+        if ready and memory.late_to_drive[slot] == wanted:
+            append_frame(queue, memory.late_frames[slot])
+            continue
+        memory.late_due_ns[kept] = due_ns
+        memory.late_to_drive[kept] = memory.late_to_drive[slot]
+        for i in range(FRAME_SIZE):
+            memory.late_frames[kept, i] = memory.late_frames[slot, i]
+        kept += 1
+    memory.late_count = kept
+
+
+@kernel
+def _one_waits(memory: FaultMemory, to_drive: bool) -> bool:
+    """Whether a frame of this direction waits to be overtaken by the next."""
+    wanted = 1 if to_drive else 0
+    for slot in range(memory.late_count):
+        if memory.late_due_ns[slot] == 0 and memory.late_to_drive[slot] == wanted:
+            return True
+    return False
+
+
+@kernel
+def _concerned(kind: int, of: int) -> bool:
+    """Whether a fault of this kind acts on frames of this class."""
+    if kind == FaultKind.FRAMES_LOST or kind == FaultKind.BUS_OFF:
+        return True
+    if kind == FaultKind.SYNC_LOST:
+        return of == FrameClass.SYNC
+    if kind == FaultKind.CONTROLLER_HEARTBEAT_LOST:
+        return of == FrameClass.CONTROLLER_HEARTBEAT
+    if kind == FaultKind.DRIVE_HEARTBEAT_LOST:
+        return of == FrameClass.DRIVE_HEARTBEAT
+    if kind == FaultKind.FOREIGN_FRAMES:
+        return of == FrameClass.TPDO
+    if kind == FaultKind.RPDO_LOST:
+        return of == FrameClass.RPDO
+    if kind == FaultKind.TPDO_LOST:
+        return of == FrameClass.TPDO
+    if kind >= FaultKind.RPDO_DELAYED and kind <= FaultKind.TPDO_LENGTH:
+        return of == (FrameClass.RPDO if (kind - FaultKind.RPDO_DELAYED) % 2 == 0 else FrameClass.TPDO)
+    return False
+
+
+@kernel
+def _foreign(memory: FaultMemory, count: int, node_id: int, queue: FrameQueue) -> None:
+    """Frames of other nodes, with every data byte at random: PDOs, EMCY, heartbeats and boot-ups."""
+    for _ in range(count):
+        slot = int64(queue.count)
+        if slot >= QUEUE_LENGTH:
+            return
+        other = 1 + int64(draw(memory) * 126.0)
+        if other == node_id:
+            other += 1
+        base = (0x80, 0x180, 0x200, 0x280, 0x380, 0x580, 0x700)[int64(draw(memory) * 7.0)]
+        for i in range(FRAME_SIZE):
+            queue.frames[slot, i] = 0
+        identifier = base + other
+        queue.frames[slot, 0] = identifier & 0xFF
+        queue.frames[slot, 1] = identifier >> 8
+        length = int64(draw(memory) * 9.0)
+        queue.frames[slot, 4] = length
+        for i in range(length):
+            queue.frames[slot, 8 + i] = int64(draw(memory) * 256.0)
+        queue.count = slot + 1
+
+
+@kernel
+def pass_frame(
+    faults: np.ndarray,
+    memory: FaultMemory,
+    frame: np.ndarray,
+    to_drive: bool,
+    node_id: int,
+    now_ns: int,
+    queue: FrameQueue,
+) -> None:
+    """Send one frame (uint8[16]) through the wire; what arrives now is appended to `queue`."""
+    of = frame_class(frame, to_drive, node_id)
+    lost, twice, overtaken, corrupted, length, late_ns = False, False, False, False, -1, 0
+    for i in range(len(faults)):
+        fault = faults[i]
+        kind = fault.kind
+        if not _concerned(kind, of) or not is_active(fault, memory, now_ns):
+            continue
+        if kind == FaultKind.BUS_OFF:
+            lost = True
+        elif kind == FaultKind.FOREIGN_FRAMES:
+            _foreign(memory, int64(fault.magnitude), node_id, queue)
+        elif kind == FaultKind.RPDO_DELAYED or kind == FaultKind.TPDO_DELAYED:
+            late_ns = int64(fault.magnitude * 1e9)
+        elif kind == FaultKind.RPDO_LENGTH or kind == FaultKind.TPDO_LENGTH:
+            length = int64(fault.magnitude)
+        elif draw(memory) < fault.magnitude:
+            if kind <= FaultKind.DRIVE_HEARTBEAT_LOST:
+                lost = True
+            elif kind <= FaultKind.TPDO_DUPLICATED:
+                twice = True
+            elif kind <= FaultKind.TPDO_REORDERED:
+                overtaken = True
+            else:
+                corrupted = True
+    if lost or twice or overtaken or corrupted or length >= 0 or late_ns > 0:
+        memory.affected += 1
+    if lost:
+        return
+    if late_ns > 0:
+        _keep(memory, frame, to_drive, now_ns + late_ns)
+        return
+    if overtaken and not _one_waits(memory, to_drive):
+        _keep(memory, frame, to_drive, 0)
+        return
+    slot = append_frame(queue, frame)
+    if slot >= 0 and corrupted:
+        for i in range(int64(frame[4])):
+            queue.frames[slot, 8 + i] = int64(draw(memory) * 256.0)
+    if slot >= 0 and length >= 0:
+        queue.frames[slot, 4] = length
+    if twice and slot >= 0:
+        append_frame(queue, queue.frames[slot])
+    if memory.late_count > 0:
+        take_due(memory, to_drive, now_ns, True, queue)

@@ -1,0 +1,1 @@
+"""The virtual joint: motor, reducer, friction, encoder, load."""
