@@ -20,8 +20,8 @@ from drivers.can.frame_io import new_wait_scratch, receive_frame, send_frame, wa
 from drivers.can.frames import Frame
 from drivers.can.open import open_cyclic_end, open_python_can
 from firmware_py.schema import new
+from hil.bus import virtual_bus as hil_bus
 from hil.bus.virtual_bus import VirtualBusHub
-from hil.bus.virtual_bus import virtual_bus as hil_bus
 
 LONG_S = 10.0  # far more than is ever needed: a limit against hanging, not a measure of speed
 SHORT_S = 0.05
