@@ -36,9 +36,10 @@ class Word(IntEnum):
     ENDED = 56  # the loop has returned
     LISTEN = 64  # the supervisor: what the bus says from now on is for the run
     ASLEEP_NS = 72  # CLOCK_BOOTTIME - CLOCK_MONOTONIC when the run began: how long the computer has been suspended
+    HELD_UP_NS = 80  # how long the guard of a serial line saw the loop do nothing, when it switched the drive off
 
 
-WORDS = 80
+WORDS = 88
 SUSPENDED_MIN_NS = 1_000_000  # shorter is how far apart two clocks can be read
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from drivers.can.frames import Frame
-from drivers.canopen import exchange
+from drivers.canopen import exchange, switch_off
 from drivers.canopen.cia402 import ControlWord, State
 from drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES, accept_frame, end_cycle, get_i16, get_u16
 from drivers.canopen.port import FRAME_SLOTS, SCRATCH_WORDS, SLOT_RPDO, CanopenPort
@@ -57,18 +57,19 @@ def test_the_watchdog_is_only_disarmed_in_a_drive_that_is_off(
 
 
 def test_make_safe_reaches_a_drive_that_its_watchdog_stops_meanwhile(
-    device_on_bus: Any, settings_of_virtual_joint: Any
+    device_on_bus: Any, settings_of_virtual_joint: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drive = device_on_bus.drive(settings_of_virtual_joint)
     try:
         drive.commission()
-        brake = drive._switch_off._brake
+        brake = switch_off.brake
 
-        def stopped_meanwhile() -> None:
-            drive._switch_off._brake = brake
+        def stopped_meanwhile(objects: Any, sleep: Any) -> bool:
+            monkeypatch.setattr(switch_off, "brake", brake)
             drive._node.nmt.send_command(2)
+            return brake(objects, sleep)
 
-        drive._switch_off._brake = stopped_meanwhile
+        monkeypatch.setattr(switch_off, "brake", stopped_meanwhile)
         assert drive.make_safe() == "switch on disabled"  # "stopped" answers no SDO: pre-operational once more
     finally:
         drive.close()

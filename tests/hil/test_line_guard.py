@@ -74,7 +74,8 @@ def test_loop_and_supervisor_that_hang_are_seen(serial_bench: Any) -> None:
     serial_bench.until(serial_bench.standing)
     run.signal(signal.SIGCONT)
     os.kill(loop, signal.SIGCONT)
-    assert run.finished().code == 7
+    done = run.finished()
+    assert done.code == 7, done
     assert serial_bench.standing()
 
 
@@ -195,7 +196,8 @@ def test_a_dry_run_that_is_over_before_its_guard_is_up_says_nothing_of_it(serial
         order = GuardOrder(
             port=serial_bench.device.path, baud_rate_bitps=115_200, reply_timeout_s=0.2, silent_s=3.0,
             control_fd=theirs.fileno(), block_fd=block.fileno(), supervisor_pidfd=alive, loop_pidfd=alive,
-            supervisor_pid=os.getpid(), go_word=0, stop_word=1, loop_word=2, ended_word=3, words=8, stop_value=3,
+            supervisor_pid=os.getpid(), go_word=0, stop_word=1, loop_word=2, ended_word=3, held_up_word=4, words=8,
+            stop_value=3,
         )  # fmt: skip
         guard = subprocess.run(
             [sys.executable, "-P", "-m", GUARD, order.argument()],

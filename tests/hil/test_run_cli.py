@@ -186,7 +186,7 @@ def test_ctrl_c_at_the_question_ends_it(bench: Any) -> None:
 def test_a_terminal_that_is_closed_while_tracking_ramps_down(bench: Any) -> None:
     config = bench.config(trajectory__duration_s=30.0)
     bench.joint(config)
-    terminal = Terminal(bench, "run", config, "-y").saw("  tracking")
+    terminal = Terminal(bench, "run", config, "-y").saw(" tracking")
     os.close(terminal.master)  # from now on writing to it is an error
     terminal.started.signal(signal.SIGHUP)
     terminal.started.finished(20.0)

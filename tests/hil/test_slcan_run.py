@@ -19,6 +19,8 @@ from typing import Any
 import can
 import pytest
 
+from tests.hil.conftest import end_line_guards
+
 RATE_HZ = 100.0
 
 
@@ -32,6 +34,7 @@ class SlcanAdapter:
     def __init__(self, channel: str, port: Path) -> None:
         self._master, self._slave = pty.openpty()  # the slave stays open here: a program that leaves is no hang-up
         tty.setraw(self._slave)
+        end_line_guards(os.ttyname(self._slave))  # of a test that had a terminal of this name before
         self._link = port
         self.loose = False
         self.plug_in()

@@ -11,7 +11,7 @@ import pytest
 from drivers.elmo.switch_off import SWITCH_OFF
 from drivers.errors import MotionFault
 from firmware_py.realtime import WORDS, Word
-from firmware_py.states import StopRequest
+from firmware_py.states import Fault, StopRequest
 from tools.running import line_guard, loop_handle
 from tools.running.guard_handle import SPARE_S
 from tools.running.line_guard import LATE_S, OBEY_S, GuardOrder, LineGuard
@@ -79,7 +79,8 @@ class Guard:
         self.guard._order = GuardOrder(
             port="", baud_rate_bitps=115_200, reply_timeout_s=0.1, silent_s=GUARD_SILENT_S, control_fd=-1, block_fd=-1,
             supervisor_pidfd=-1, loop_pidfd=-2, supervisor_pid=0, go_word=Word.GO, stop_word=Word.STOP,
-            loop_word=Word.LOOP_NS, ended_word=Word.ENDED, words=WORDS, stop_value=StopRequest.OFF,
+            loop_word=Word.LOOP_NS, ended_word=Word.ENDED, held_up_word=Word.HELD_UP_NS, words=WORDS,
+            stop_value=StopRequest.OFF,
         )  # fmt: skip
 
     def looks(self) -> bytes:
@@ -115,6 +116,7 @@ def test_the_guard_switches_off_behind_a_loop_that_hangs_and_behind_no_other(
     hangs = hangs and over is None
     assert guard.looks() == (SWITCH_OFF if hangs else b"")
     assert guard.words[Word.STOP] == (StopRequest.OFF if hangs else StopRequest.NONE)
+    assert (guard.words[Word.HELD_UP_NS] > GUARD_SILENT_S * 1e9) is hangs
 
 
 @pytest.mark.parametrize(("past_ns", "late"), [(-MICROSECOND_ns, False), (MICROSECOND_ns, True)])
@@ -136,3 +138,18 @@ def test_a_run_that_does_not_obey_a_stop_is_ended_by_force_and_not_before(
     guard.guard._asked_s = NOW_ns * 1e-9 - asked_for_s
     assert guard.looks() == (SWITCH_OFF if told else b"")
     assert guard.ended_both is ended
+
+
+@pytest.mark.parametrize(("own", "held_up_s", "told"), [
+    (Fault.NONE, 0.0, (Fault.NONE, 0.0)), (Fault.NONE, 3.5, (Fault.OVERRUN, 3500.0)),
+    (Fault.STALE_SAMPLE, 3.5, (Fault.STALE_SAMPLE, 7.0)),
+])  # fmt: skip
+def test_a_loop_that_stood_still_and_then_obeyed_the_guard_was_not_stopped_by_its_user(
+    own: Fault, held_up_s: float, told: tuple[Fault, float]
+) -> None:
+    words = [0] * WORDS
+    words[Word.STOP], words[Word.HELD_UP_NS] = StopRequest.OFF, round(held_up_s * 1e9)
+    handle: Any = LoopHandle.__new__(LoopHandle)
+    state = SimpleNamespace(fault=own, fault_value=7.0 if own else 0.0)
+    handle.block, handle._period_ns = SimpleNamespace(words=words, state=[state]), 1_000_000
+    assert handle.verdict() == told

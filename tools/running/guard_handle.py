@@ -36,7 +36,7 @@ class GuardHandle:
             reply_timeout_s=drive.reply_timeout_s, silent_s=SILENT_S + SPARE_S,
             control_fd=passed[0], block_fd=passed[1], supervisor_pidfd=passed[2], loop_pidfd=passed[3],
             supervisor_pid=os.getpid(), go_word=Word.GO, stop_word=Word.STOP, loop_word=Word.LOOP_NS,
-            ended_word=Word.ENDED, words=WORDS, stop_value=int(StopRequest.OFF),
+            ended_word=Word.ENDED, held_up_word=Word.HELD_UP_NS, words=WORDS, stop_value=int(StopRequest.OFF),
         )  # fmt: skip
         try:
             self._process = subprocess.Popen(

@@ -59,6 +59,7 @@ class GuardOrder:
     stop_word: int
     loop_word: int
     ended_word: int
+    held_up_word: int
     words: int
     stop_value: int  # StopRequest.OFF
 
@@ -148,6 +149,7 @@ class LineGuard:
             return self._reach()
         silent_s = self._loop_silent_s()
         if silent_s > self._order.silent_s:
+            self._words[self._order.held_up_word] = round(silent_s * _NANOSECONDS)
             self._words[self._order.stop_word] = self._order.stop_value
             self._tell()
         if self._asked_s is not None:

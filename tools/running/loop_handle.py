@@ -15,7 +15,7 @@ from drivers.errors import MotionFault
 from firmware_py.libc import NANOSECONDS
 from firmware_py.realtime import Word
 from firmware_py.sequence import reset_axis
-from firmware_py.states import AxisPhase, StopRequest
+from firmware_py.states import AxisPhase, Fault, StopRequest
 from tools.configuration.config import Config
 from tools.running.loop_process import LoopOrder
 from tools.running.shared_block import SERIAL, SharedBlock
@@ -43,7 +43,7 @@ class LoopHandle:
         self._tail = 0
         self.lost_records = 0
         self._after_end = _ON_SERIAL if config.bus.interface == SERIAL else _ON_CAN
-        period_ns = round(NANOSECONDS / config.loop.rate_Hz)
+        self._period_ns = period_ns = round(NANOSECONDS / config.loop.rate_Hz)
         order = LoopOrder(
             supervisor_pid=os.getpid(),
             block_fd=self.block.fd,
@@ -140,6 +140,17 @@ class LoopHandle:
     def stop_requested(self) -> bool:
         """Whether anybody has asked for a stop: this process, or the guard of a serial line."""
         return bool(self.block.words[Word.STOP])
+
+    def verdict(self) -> tuple[Fault, float]:
+        """The loop's fault and the value that tripped it.
+
+        OVERRUN as well where a guard switched the drive off behind a loop that stood still and then obeyed: its own
+        watch over skipped cycles ends with its power.
+        """
+        state, held_up_ns = self.block.state[0], int(self.block.words[Word.HELD_UP_NS])
+        if state.fault == Fault.NONE and held_up_ns:
+            return Fault.OVERRUN, held_up_ns / self._period_ns
+        return Fault(int(state.fault)), float(state.fault_value)
 
     def new_records(self) -> Any:
         """Log records since the last call."""

@@ -278,11 +278,11 @@ class Supervisor:
             raise JointctlError("the loop ended without one cycle")
         records = kept.records()
         state = loop.block.state[0]
-        fault = Fault(int(state.fault))
+        fault, value = loop.verdict()
         text = None
         if fault is not Fault.NONE:
             errors = int(state.fault_drive_error), int(state.fault_encoder_error)
-            text = drive_fault_text(self._config, fault, float(state.fault_value), *errors)
+            text = drive_fault_text(self._config, fault, value, *errors)
             text = self._bus_watch.explained(fault, text, int(loop.block.port[0].last_errno))
         bits = float(loop.block.port[0].bits_sent)
         return RunResult(
