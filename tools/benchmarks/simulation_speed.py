@@ -84,7 +84,7 @@ def _cost(problem: Problem) -> Callable[[np.ndarray], np.ndarray]:
 
 def _pyswarms_s(problems: list[Problem], iterations: int) -> float:
     """Seconds that pyswarms takes for the whole budget, scaled from `iterations`."""
-    import pyswarms.single as single  # type: ignore[import-not-found]  # no dependency of ours
+    import pyswarms.single as single  # no dependency of ours
 
     total_s = 0.0
     for problem in problems:
