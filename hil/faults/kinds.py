@@ -18,6 +18,7 @@ from firmware_py.kernel import kernel
 from firmware_py.schema import array_of, dtype_of, f8, i4, i8, new, record, u1
 from hil.bus.frames import FRAME_SIZE, FrameQueue
 from hil.plant.records import u8
+from hil.plant.xorshift import next_state, unit_number
 
 MAX_FAULTS = 8
 LATE_FRAMES = 256  # that wait in the delay line; more are lost
@@ -105,20 +106,12 @@ def no_faults() -> Any:
     return np.zeros(0, dtype_of(FaultConstants)).view(np.recarray)
 
 
-_TO_UNIT = 2.0**-53
-_SHIFTS = (np.uint64(13), np.uint64(7), np.uint64(17))  # Marsaglia's triple, as in hil.plant.encoder
-_DROP = np.uint64(11)
-
-
 @kernel
 def draw(memory: FaultMemory) -> float:
     """The next number in [0, 1)."""
-    x = np.uint64(memory.random)
-    x = x ^ (x << _SHIFTS[0])
-    x = x ^ (x >> _SHIFTS[1])
-    x = x ^ (x << _SHIFTS[2])
+    x = next_state(memory.random)
     memory.random = x  # type: ignore[assignment]
-    return float(x >> _DROP) * _TO_UNIT
+    return unit_number(x)
 
 
 @kernel

@@ -10,26 +10,17 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from firmware_py.kernel import kernel
 from hil.plant.records import PlantConstants, PlantState
-
-_TO_UNIT = 2.0**-53
-# Marsaglia's full-period triple of shifts (Xorshift RNGs, 2003); no product, which would overflow aloud in plain Python
-_SHIFTS = (np.uint64(13), np.uint64(7), np.uint64(17))
-_DROP = np.uint64(11)
+from hil.plant.xorshift import next_state, unit_number
 
 
 @kernel
 def _uniform(s: PlantState) -> float:
     """The next number in [0, 1)."""
-    x = np.uint64(s.noise_state)
-    x = x ^ (x << _SHIFTS[0])
-    x = x ^ (x >> _SHIFTS[1])
-    x = x ^ (x << _SHIFTS[2])
+    x = next_state(s.noise_state)
     s.noise_state = x  # type: ignore[assignment]
-    return float(x >> _DROP) * _TO_UNIT
+    return unit_number(x)
 
 
 @kernel
