@@ -125,9 +125,9 @@ def _brake(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> N
 
 
 @kernel
-def _check_motion(constants: AxisConstants, state: AxisState) -> None:
+def _check_motion(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> None:
     """Measured position, velocity and following error against their limits."""
-    check_reading(constants, state)
+    check_reading(constants, state, elapsed_cycles)
     error_rad = state.measured_position_rad - state.reference.position_rad
     value = limit_position_rad(constants.limits, state.measured_position_rad, state.second_position_rad)
     fault = motion_fault(constants.limits, value, state.velocity.velocity_radps, error_rad)
@@ -255,7 +255,7 @@ def step_axis(
         error_rad = state.measured_position_rad - state.reference.position_rad
         step_velocity(constants.velocity, state.velocity, state.measured_position_rad, error_rad, gap_cycles)
     if powered(state.phase):
-        _check_motion(constants, state)
+        _check_motion(constants, state, elapsed_cycles)
     if constants.command_kind == CommandKind.VELOCITY:
         _command_velocity(constants, state, elapsed_cycles)
     else:

@@ -12,19 +12,22 @@ PUSHED_CYCLES = 20
 
 
 @kernel
-def check_reading(constants: AxisConstants, state: AxisState) -> None:
+def check_reading(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> None:
     """A reading that stands still although the reference moves on, or although the joint is pushed hard.
 
     It must be early: behind a stuck encoder the law pushes ever harder, and the joint moves unseen, long before the
     following error is too large.  Where the drive closes the velocity loop, the torque is the one that it measures.
+    Of an overrun's `elapsed_cycles`, the reference's way counts for one: the drive was told of no other.
     """
     limits = constants.limits
     torque_Nm = state.command_torque_Nm
     if constants.command_kind == CommandKind.VELOCITY:
         torque_Nm = state.measured_torque_Nm
-    way_rad = state.reference.position_rad - state.frozen_from_rad
+    state.frozen_way_rad += (state.reference.position_rad - state.frozen_reference_rad) / elapsed_cycles
+    state.frozen_reference_rad = state.reference.position_rad
+    way_rad = state.frozen_way_rad
     if state.frozen_samples == 0:
-        state.frozen_from_rad = state.reference.position_rad
+        state.frozen_way_rad = 0.0
         state.pushed_cycles = 0
     elif state.sample_age_cycles == 0:
         if 0.0 < limits.frozen_max_rad < abs(way_rad):

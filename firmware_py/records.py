@@ -156,7 +156,8 @@ class AxisState:
     still_cycles: i8
     frozen_samples: i8  # in a row, without a gap, that did not change
     pushed_cycles: i8  # of them with more torque than frozen_torque_Nm
-    frozen_from_rad: f8  # the reference when the reading last changed
+    frozen_way_rad: f8  # how far the reference has moved since the reading last changed
+    frozen_reference_rad: f8  # where the reference was when that was last looked at
     frozen_at_rad: f8  # that reading
     table_row: i4  # search hint of the trajectory table
     fault_value: f8  # the value that tripped the limit

@@ -181,7 +181,8 @@ def step_enabling(constants: AxisConstants, state: AxisState, sample: Sample, ta
         state.velocity.last_error_rad = state.velocity.last_position_rad - state.reference.position_rad
         state.velocity.error_rate_radps = 0.0
         reset_law(constants.law, state.law)
-        state.frozen_from_rad = state.reference.position_rad
+        state.frozen_way_rad = 0.0
+        state.frozen_reference_rad = state.reference.position_rad
     elif state.phase_cycle > constants.sequence.enable_max_cycles:
         trip(state, Fault.ENABLE_TIMEOUT, float(sample.status_word), sample.drive_error)
 

@@ -26,6 +26,9 @@ from firmware_py.libc import monotonic_ns
 from firmware_py.records import Command, Sample
 from firmware_py.schema import dtype_of, new
 
+# A look at the bus so long after the window's end still counts: a wait may end a little late.
+LOOK_LATE_NS = 200_000
+
 _PORT = record_array_type(dtype_of(CanopenPort))
 _FRAMES = record_array_type(dtype_of(Frame))
 _SAMPLE = record_array_type(dtype_of(Sample))
@@ -84,6 +87,9 @@ def receive(ports: Any, frames: np.ndarray, scratch: np.ndarray, samples: Any, n
     Frames that came since the last cycle are taken first, so that a late TPDO is not mistaken for the answer.  One
     that is later still comes after this SYNC: where the last one has no answer yet, the whole time is waited and the
     last TPDO counts.
+
+    A cycle that was held up past its window does not look any more.  What waits then may have been sampled at any
+    time since, when SYNC was late as well; as a sample of this slot it would be a leap.  The next cycle takes it.
     """
     port = ports[0]
     sample = samples[0]
@@ -95,13 +101,14 @@ def receive(ports: Any, frames: np.ndarray, scratch: np.ndarray, samples: Any, n
     sync_stamp = stamp_of(frames[SLOT_SYNC])
     started_ns = monotonic_ns(scratch)
     arrived_ns = started_ns
-    while True:
+    while arrived_ns <= deadline_ns + LOOK_LATE_NS:
         if _drain(port, frames, sample, arrived_ns, sync_stamp) and not owed:
             return monotonic_ns(scratch) - started_ns
         if arrived_ns >= deadline_ns:
             return arrived_ns - started_ns
         wait_readable_ns(port.fd, deadline_ns - arrived_ns, scratch)
         arrived_ns = monotonic_ns(scratch)
+    return arrived_ns - started_ns
 
 
 @exported(types.int32(_PORT, _FRAMES, _SAMPLE, _COMMAND))

@@ -68,7 +68,14 @@ def test_reset_forgets_the_run_before(axis: Any, state: Any) -> None:
 
 
 # written in a cycle before they are read in it
-WRITTEN_FIRST = {"frozen_from_rad", "frozen_at_rad", "sample_late_s", "measured_position_rad", "measured_torque_Nm"}
+WRITTEN_FIRST = {
+    "frozen_way_rad",
+    "frozen_reference_rad",
+    "frozen_at_rad",
+    "sample_late_s",
+    "measured_position_rad",
+    "measured_torque_Nm",
+}
 
 
 def test_reset_leaves_nothing_of_the_run_before_behind(axis: Any, state: Any) -> None:
@@ -275,9 +282,10 @@ def axis_table() -> Any:
 def test_the_approach_leads_from_where_the_joint_stands_into_the_trajectory(axis: Any, state: Any) -> None:
     state.phase, state.measured_position_rad, state.velocity.last_position_rad = AxisPhase.ENABLING, 0.3, 0.30001
     state.velocity.last_error_rad, state.velocity.error_rate_radps = 5.0, 5.0
-    state.table_row, state.frozen_from_rad = 3, 9.0
+    state.table_row, state.frozen_way_rad, state.frozen_reference_rad = 3, 9.0, 9.0
     step_enabling(axis, state, sample_of(DriveState.ENABLED), axis_table())
-    assert (state.trajectory_s, state.table_row, state.frozen_from_rad) == (-0.2, 0, 0.3)
+    assert (state.trajectory_s, state.table_row) == (-0.2, 0)
+    assert (state.frozen_way_rad, state.frozen_reference_rad) == (0.0, 0.3)
     # the error has no history yet
     assert state.velocity.last_error_rad == pytest.approx(1e-5, rel=1e-6)
     assert state.velocity.error_rate_radps == 0.0

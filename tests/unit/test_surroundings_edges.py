@@ -112,19 +112,37 @@ def test_the_way_behind_a_reading_that_stands_still(
     stuck: tuple[Any, Any], way_rad: float, trips: bool, how: str
 ) -> None:
     axis, state = stuck
-    state.frozen_from_rad, state.reference.position_rad = 1.0, 1.0 + way_rad
+    state.frozen_way_rad, state.frozen_reference_rad = way_rad - 0.25, 1.0
+    state.reference.position_rad = 1.25
     if how == "moves":
         state.frozen_samples = 0
     elif how == "no sample":
         state.sample_age_cycles = 1
     elif how == "not watched":
         axis.limits.frozen_max_rad = 0.0
-    check_reading(axis, state)
+    check_reading(axis, state, 1)
     trips = trips and how == "stands"
     assert state.fault == (Fault.POSITION_FROZEN if trips else Fault.NONE)
     assert state.fault_value == pytest.approx(way_rad if trips else 0.0)
     assert state.fault_drive_error == 0
-    assert state.frozen_from_rad == (1.0 + way_rad if how == "moves" else 1.0)
+    assert state.frozen_way_rad == (0.0 if how == "moves" else way_rad)
+    assert state.frozen_reference_rad == 1.25
+
+
+@pytest.mark.parametrize(("last_rad", "trips"), [(50.0, False), (50.1, True)])
+def test_what_the_reference_does_in_skipped_slots_is_not_held_against_the_reading(
+    stuck: tuple[Any, Any], last_rad: float, trips: bool
+) -> None:
+    """The drive was not told of it: a joint that stood when the loop was held up stands still."""
+    axis, state = stuck
+    axis.limits.frozen_max_rad = 1.0
+    state.reference.position_rad = 40.0
+    check_reading(axis, state, 80)
+    assert (state.fault, state.frozen_way_rad) == (Fault.NONE, 0.5)
+    state.reference.position_rad = last_rad
+    check_reading(axis, state, 20)
+    assert state.frozen_way_rad == pytest.approx(1.0 if not trips else 1.005)
+    assert state.fault == (Fault.POSITION_FROZEN if trips else Fault.NONE)
 
 
 @pytest.mark.parametrize(("torque_Nm", "pushed"), [(3.0, False), (3.001, True), (-3.0, False), (-3.001, True)])
@@ -145,7 +163,7 @@ def test_the_push_at_a_reading_that_stands_still(
             state.measured_torque_Nm, state.command_torque_Nm = torque_Nm, 0.0
         else:
             state.measured_torque_Nm, state.command_torque_Nm = 0.0, torque_Nm
-        check_reading(axis, state)
+        check_reading(axis, state, 1)
     assert state.fault == (Fault.POSITION_FROZEN if pushed else Fault.NONE)
     assert state.fault_drive_error == 0
 
@@ -154,7 +172,7 @@ def test_the_push_at_a_reading_that_stands_still(
 def test_a_joint_that_gives_way_to_little_is_watched_as_well(stuck: tuple[Any, Any], pushed: bool) -> None:
     axis, state = stuck
     axis.limits.frozen_torque_Nm, state.command_torque_Nm = 0.5, 0.501 if pushed else 0.5
-    check_reading(axis, state)
+    check_reading(axis, state, 1)
     assert state.pushed_cycles == int(pushed)
 
 
@@ -166,7 +184,7 @@ def test_pushing_counts_from_the_beginning_again(stuck: tuple[Any, Any], by: str
         state.command_torque_Nm = 3.0
     else:
         state.frozen_samples = 0
-    check_reading(axis, state)
+    check_reading(axis, state, 1)
     assert (state.pushed_cycles, state.fault) == (0, Fault.NONE)
 
 
