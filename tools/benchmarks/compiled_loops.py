@@ -34,11 +34,17 @@ from tools.running.open_drive import open_drive
 SETTLE_S = 0.5  # from the start of the loop until the drive is enabled, and a little more
 POLL_S = 0.02
 END_S = 3.0
+PATIENCE_S = 0.25
 
 
 def at_rate(config: Config, rate_Hz: float) -> Config:
-    """The same joint with another loop rate."""
-    return config.model_copy(update={"loop": config.loop.model_copy(update={"rate_Hz": rate_Hz})})
+    """The same joint with another loop rate, and limits that let a computer stand still without ending the run."""
+    return config.model_copy(
+        update={
+            "loop": config.loop.model_copy(update={"rate_Hz": rate_Hz}),
+            "limits": config.limits.model_copy(update={"sample_age_max_s": PATIENCE_S, "skipped_max_s": PATIENCE_S}),
+        }
+    )
 
 
 @contextmanager
@@ -66,14 +72,14 @@ def run_ours(config: Config, seconds: float, load_name: str) -> LoopTimes:
                 loop.beat()
                 chunks.append(loop.new_records())
                 time.sleep(POLL_S)
-        ended_early = not loop.running()
+        ended_early, (fault, value) = not loop.running(), loop.verdict()
         loop.request_stop(StopRequest.OFF)
         end_s = time.monotonic() + END_S
         while time.monotonic() < end_s and loop.running():
             loop.beat()
             time.sleep(POLL_S)
     if ended_early:
-        raise JointctlError("the control loop stopped by itself while it was measured")
+        raise JointctlError(f"the control loop stopped by itself while it was measured: {fault.name} ({value:g})")
     records = np.concatenate(chunks)[round(SETTLE_S * config.loop.rate_Hz) :]
     rows = np.column_stack([records["wake_late_ns"], records["round_trip_ns"], records["work_ns"]])
     return times_from_ns(rows.astype(np.int64))

@@ -9,8 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -84,9 +87,9 @@ def compared(
     )  # fmt: skip
 
 
-def interleaved(pairs: int, *measure: Callable[[], float]) -> list[list[float]]:
+def interleaved(pairs: int, *measure: Callable[[], _T]) -> list[list[_T]]:
     """The values of each function, called in turn `pairs` times; the order turns round each time."""
-    values: list[list[float]] = [[] for _ in measure]
+    values: list[list[_T]] = [[] for _ in measure]
     for pair in range(pairs):
         order = range(len(measure)) if pair % 2 == 0 else reversed(range(len(measure)))
         for index in order:
