@@ -22,6 +22,9 @@ from firmware_py.schema import dtype_of
 _read = external("read", types.intp, types.int32, types.uintp, types.uintp)
 _write = external("write", types.intp, types.int32, types.uintp, types.uintp)
 
+# A look at the line so long after the window's end still counts: a wait may end a little late.
+LOOK_LATE_NS = 200_000
+
 _PORT = record_array_type(dtype_of(ElmoPort))
 _SAMPLE = record_array_type(dtype_of(Sample))
 _COMMAND = record_array_type(dtype_of(Command))
@@ -95,7 +98,9 @@ def _flush(port: ElmoPort, sample: Sample) -> int:
 def receive(ports: Any, data: np.ndarray, scratch: np.ndarray, samples: Any, now_ns: int, deadline_ns: int) -> int:
     """Ask for the position and wait for it until `deadline_ns`; returns the time waited [ns].
 
-    The late replies of the last cycle are taken first.
+    The late replies of the last cycle are taken first.  A cycle that was held up past its window does not look any
+    more: PX may have gone out late as well, and as the position of this slot its answer would be a leap.  The next
+    cycle takes it.
     """
     port = ports[0]
     sample = samples[0]
@@ -104,13 +109,14 @@ def receive(ports: Any, data: np.ndarray, scratch: np.ndarray, samples: Any, now
     _flush(port, sample)
     started_ns = monotonic_ns(scratch)
     arrived_ns = started_ns
-    while True:
+    while arrived_ns <= deadline_ns + LOOK_LATE_NS:
         if _drain(port, data, sample, arrived_ns):
             return monotonic_ns(scratch) - started_ns
         if arrived_ns >= deadline_ns or port.gone != 0:
             return arrived_ns - started_ns
         _wait_ns(port, deadline_ns - arrived_ns, scratch)
         arrived_ns = monotonic_ns(scratch)
+    return arrived_ns - started_ns
 
 
 @exported(types.int32(_PORT, _BYTES, _SAMPLE, _COMMAND))

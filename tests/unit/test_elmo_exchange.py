@@ -1,0 +1,82 @@
+"""The compiled exchange on a descriptor: a cycle that was held up, and its twin in time."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import threading
+import time
+
+import pytest
+
+from drivers.elmo.exchange import exchange_memory, receive
+from drivers.elmo.port import ElmoPort
+from firmware_py.records import Sample
+from firmware_py.schema import new
+
+REPLY = b"PX\r42;"
+LOOK_S = struct.pack("ll", 0, 1000)  # how long a look at an empty line takes: its descriptor is one that blocks
+
+
+class Line:
+    """The loop's end of a line that may be full; its other end answers before it takes the question."""
+
+    def __init__(self) -> None:
+        self.ours, self.its = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        self.ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, LOOK_S)
+        self.its.setblocking(False)
+        self.port, self.sample = new(ElmoPort, 1), new(Sample, 1)
+        port = self.port[0]
+        port.fd, port.echo, port.position_radpcount = self.ours.fileno(), 1, 1e-3
+        self._data, self._scratch = exchange_memory()
+
+    def __enter__(self) -> Line:
+        self.cycle(0)  # compiled, or loaded, by now: the first one takes long
+        self._empty()
+        self.port[0].expected_count = 0
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.ours.close()
+        self.its.close()
+
+    def fill(self) -> None:
+        """The next write waits until somebody reads."""
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                self.ours.send(bytes(4096), socket.MSG_DONTWAIT)
+
+    def _empty(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                self.its.recv(1 << 20)
+
+    def answer_after(self, delay_s: float) -> threading.Thread:
+        def answer() -> None:
+            time.sleep(delay_s)
+            self.its.send(REPLY)
+            self._empty()
+
+        drive = threading.Thread(target=answer)
+        drive.start()
+        return drive
+
+    def cycle(self, window_ns: int) -> int:
+        """How many samples one cycle brings that waits for its own until `window_ns` after its wake-up."""
+        before, now_ns = int(self.sample[0].count), time.monotonic_ns()
+        receive(self.port, self._data, self._scratch, self.sample, now_ns, now_ns + window_ns)
+        return int(self.sample[0].count) - before
+
+
+@pytest.mark.parametrize(("window_ns", "samples"), [(20_000_000, 0), (10_000_000_000, 1)])
+def test_a_cycle_held_up_past_its_window_leaves_the_position_to_the_next(window_ns: int, samples: int) -> None:
+    with Line() as line:
+        line.fill()
+        drive = line.answer_after(0.1)
+        assert line.cycle(window_ns) == samples
+        drive.join()
+        taken_from_ns = time.monotonic_ns()
+        assert line.cycle(1_000_000) == 1 - samples
+        assert line.sample[0].position_rad == pytest.approx(0.042)
+        assert (line.sample[0].time_ns >= taken_from_ns) == (samples == 0)
