@@ -32,6 +32,7 @@ from tools.running.drive_end import warn_unless_off
 from tools.running.events import EventFinder, phase_name
 from tools.running.frame_recorder import FrameRecorder, recording
 from tools.running.guard_handle import GUARD_ENDED, GuardHandle, start_guard
+from tools.running.held_up import held_up_text
 from tools.running.kept_awake import kept_awake
 from tools.running.live_panel import Display, PhaseLines, Snapshot
 from tools.running.loop_handle import LoopHandle
@@ -65,7 +66,7 @@ class Supervisor:
     ) -> None:
         self._config, self._output, self._log_path, self._confirm = config, output, log_path, confirm
         self._allow_low_margin = allow_low_margin
-        self._phase = AxisPhase.WAITING
+        self._phase, self._asked = AxisPhase.WAITING, StopRequest.NONE
         self._delay_s: float | None = None
         self._make_display = display or (lambda: PhaseLines(output))
         self._display: Display = PhaseLines(output)
@@ -73,7 +74,6 @@ class Supervisor:
         self._bus_watch = BusWatch(config, None)
         self._events = EventFinder()
         self._temperature = TemperatureWatch()
-        self._asked = StopRequest.NONE
         self.signals = StopSignals()  # that came during the run
         self._stopped_by_viewer = ""
         self.drive_state = ""  # in words, after the run
@@ -197,9 +197,9 @@ class Supervisor:
 
     def _check_delay(self, loop: LoopHandle, log: RunLogWriter) -> None:
         """Once enough cycles have run with the drive off: refuse the gains, or let the loop enable."""
-        if self._delay_s is not None or loop.cycles < min(DELAY_CYCLES, self._config.loop.rate_Hz):
-            return
         config = self._config
+        if self._delay_s is not None or loop.cycles < min(DELAY_CYCLES, config.loop.rate_Hz):
+            return
         if not loop.block.histograms[Histogram.ROUND_TRIP].any():
             return  # nothing has been heard: the loop ends that itself, and tells it
         self._delay_s = loop_delay_s(config, loop.block.histograms)
@@ -283,8 +283,8 @@ class Supervisor:
         if fault is not Fault.NONE:
             errors = int(state.fault_drive_error), int(state.fault_encoder_error)
             text = drive_fault_text(self._config, fault, value, *errors)
+            text = held_up_text(fault, value, text, records, self._config.loop.rate_Hz)
             text = self._bus_watch.explained(fault, text, int(loop.block.port[0].last_errno))
-        bits = float(loop.block.port[0].bits_sent)
         return RunResult(
             summary=summarise(records, loop.block.histograms, temperatures_degC=self._temperature.values_degC),
             records=records,
@@ -293,7 +293,7 @@ class Supervisor:
             fault_text=text,
             stopped_by=signals.name or self._stopped_by_viewer or ("jointctl stop" if loop.stop_requested else ""),
             drive_state=drive_state,
-            bus_load=bits / (self._config.bus.bitrate_bitps * elapsed_s),
+            bus_load=float(loop.block.port[0].bits_sent) / (self._config.bus.bitrate_bitps * elapsed_s),
             serial=self._config.bus.interface == SERIAL,
             lost_records=loop.lost_records,
             log_path=self._log_path,
