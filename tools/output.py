@@ -8,6 +8,7 @@ from __future__ import annotations
 import json as json_format
 import math
 import sys
+import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -24,6 +25,7 @@ class Advance(Protocol):
     def __call__(self, completed: float) -> None: ...
 
 
+FACT_COLUMN = 11  # where the text of a `fact` begins
 PIPE_COLUMNS = 140  # of a table that goes to a file or a pipe: nothing may be cut off there
 
 
@@ -56,6 +58,15 @@ class Output:
         """Progress in words; not with `--quiet`."""
         if not self.quiet:
             self._messages.print(text, markup=False)
+
+    def fact(self, text: str) -> None:
+        """A note that begins with a heading of `FACT_COLUMN` characters: what a terminal has to wrap goes below it."""
+        if self.stderr.isatty():
+            text = textwrap.fill(
+                text, self._messages.width, subsequent_indent=" " * FACT_COLUMN, break_long_words=False,
+                break_on_hyphens=False,
+            )  # fmt: skip
+        self.note(text)
 
     def warning(self, text: str) -> None:
         self._messages.print(f"warning: {text}", style="yellow", markup=False)

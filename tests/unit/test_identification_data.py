@@ -51,11 +51,19 @@ def test_a_sweep_is_read_with_its_constants(tmp_path):
     assert len(data.direction(1)) == len(data.direction(-1)) == 13
 
 
-def test_unsorted_points_are_sorted_and_it_is_told(tmp_path):
+def test_a_sweep_goes_to_and_fro_and_is_sorted_without_a_word(tmp_path):
     data = read_friction_data(write_sweep(tmp_path, rows()[::-1]))
     assert data.velocity_radps == pytest.approx(SPEEDS)
     assert data.line[0] == 27
-    assert any("sorted" in note for note in data.notes)
+    assert data.notes == ()
+
+
+@pytest.mark.parametrize(("step", "told"), [(-1, True), (1, False)])
+def test_unsorted_points_of_others_are_sorted_and_it_is_told(tmp_path, step, told):
+    lines = [f"{v:.6g},{math.copysign(0.1 + 0.05 * abs(v), v):.6g}" for v in SPEEDS[::step]]
+    data = read_friction_data(write_foreign(tmp_path, "\n".join(["speed,torque", *lines]) + "\n"), FOREIGN)
+    assert data.velocity_radps == pytest.approx(SPEEDS)
+    assert any("sorted" in note for note in data.notes) is told
 
 
 def test_repeated_speeds_are_kept_but_an_exact_copy_counts_once(tmp_path):

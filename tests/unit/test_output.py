@@ -31,3 +31,15 @@ def test_a_table_in_a_narrow_terminal_loses_nothing(columns: int, monkeypatch: p
     assert max(len(line) for line in shown) <= columns
     read = ["".join(cells) for cells in zip(*lines, strict=True)]
     assert [re.sub(r"\s", "", cell) for cell in read] == [re.sub(r"\s", "", text) for text in (PATH, *NUMBERS)]
+
+
+def test_what_a_terminal_wraps_of_a_fact_goes_below_its_text(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    text = "motion     -0.477 .. +0.650 rad, back and forth, about 7 min"
+    terminal, pipe = Terminal(), io.StringIO()
+    Output(stdout=io.StringIO(), stderr=terminal).fact(text)
+    Output(stdout=io.StringIO(), stderr=pipe).fact(text)
+    assert terminal.getvalue().splitlines() == [
+        "motion     -0.477 .. +0.650 rad, back", "           and forth, about 7 min",
+    ]  # fmt: skip
+    assert pipe.getvalue() == text + "\n"  # a line of a file is not broken

@@ -83,6 +83,23 @@ def test_settling_time_is_when_the_error_stays_within_1_mrad() -> None:
     assert summarise(records).settling_s is None
 
 
+def settled_row(records: np.recarray) -> str:
+    text = io.StringIO()
+    Console(file=text, width=100).print(summary_table(summarise(records)))
+    return next(line for line in text.getvalue().splitlines() if "within 1 mrad for good" in line)
+
+
+def test_an_error_that_was_never_outside_is_told_in_words() -> None:
+    records = run_records()
+    assert "after 0.10 s" in settled_row(records)
+    records.error_rad[100:] = 0.5e-3
+    assert "from the start" in settled_row(records)
+    records.error_rad[100] = 1.1e-3  # the first cycle alone
+    assert "after 0.00 s" in settled_row(records)
+    records.error_rad[-1] = 2e-3
+    assert "not reached" in settled_row(records)
+
+
 def test_torques_are_those_of_tracking() -> None:
     summary = summarise(run_records())
     assert summary.command_torque_Nm is not None

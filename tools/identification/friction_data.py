@@ -95,7 +95,7 @@ def read_friction_data(path: str | Path, told: ForeignFormat | None = None, *, b
             f"it has {', '.join(table.columns)}",
             "tell --velocity-column and --torque-column or --current-column",
         )
-    data = _tidy(data)
+    data = _tidy(data, ordered=not ours)
     _check_directions(data, both)
     return data
 
@@ -233,7 +233,8 @@ def _data(
     return FrictionData(table.path, table.sha256, velocity, torque, line, settled, ratio, constant)
 
 
-def _tidy(data: FrictionData) -> FrictionData:
+def _tidy(data: FrictionData, *, ordered: bool) -> FrictionData:
+    """`ordered`: the file is expected to be in order of velocity, so that it is told where it is not."""
     notes = []
     cells = np.column_stack([data.velocity_radps, data.motor_torque_Nm])
     _, first = np.unique(cells, axis=0, return_index=True)
@@ -249,7 +250,7 @@ def _tidy(data: FrictionData) -> FrictionData:
     if never.any():
         notes.append(f"{_lines(data.line[never])}: never settled: not used")
     index = np.flatnonzero(keep)
-    if np.any(np.diff(data.velocity_radps[index]) < 0.0):
+    if ordered and np.any(np.diff(data.velocity_radps[index]) < 0.0):
         notes.append("the points were not in order of velocity: sorted")
     index = index[np.argsort(data.velocity_radps[index], kind="stable")]
     speeds = data.velocity_radps[index]

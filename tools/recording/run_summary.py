@@ -193,8 +193,7 @@ def summary_table(summary: RunSummary) -> Table:
             low, high = error.range_rad.least * 1e3, error.range_rad.greatest * 1e3
             span = f"{error.from_s:.1f}..{error.to_s:.1f} s"
             table.add_row(f"{name} ({span})", f"{low:.3f} .. {high:.3f} mrad, RMSE {error.rmse_rad * 1e3:.3f}")
-    settled = "not reached" if summary.settling_s is None else f"after {summary.settling_s:.2f} s"
-    table.add_row("within 1 mrad for good", settled)
+    table.add_row("within 1 mrad for good", _settled_text(summary))
     for name, torque in (
         ("command torque", summary.command_torque_Nm),
         ("measured torque", summary.measured_torque_Nm),
@@ -216,6 +215,13 @@ def summary_table(summary: RunSummary) -> Table:
         low_degC, high_degC = summary.temperature_degC.least, summary.temperature_degC.greatest
         table.add_row("temperature", f"{low_degC:.1f} .. {high_degC:.1f} °C")
     return table
+
+
+def _settled_text(summary: RunSummary) -> str:
+    if summary.settling_s is None:
+        return "not reached"
+    inside = summary.error is not None and summary.settling_s <= summary.error.from_s
+    return "from the start" if inside else f"after {summary.settling_s:.2f} s"
 
 
 def _times_text(times: TimeSummary) -> str:

@@ -44,7 +44,7 @@ def doctor_motion(config: Config, output: Output, *, assume_yes: bool, torque_Nm
 
     def confirm(report: CommissioningReport) -> bool:
         for line in check_envelope(config, plan, report):
-            output.note(line)
+            output.fact(line)
         require_ready(config, report, path)
         require_room(config, plan, report.start_position_rad)
         if not (assume_yes or agreed(output)):

@@ -38,7 +38,7 @@ def run(
 
     def confirm(report: CommissioningReport) -> bool:
         for line in motion_envelope(config, report):
-            output.note(line)
+            output.fact(line)
         if dry_run:
             return False
         require_ready(config, report, path)

@@ -159,17 +159,15 @@ class Sweep:
         with contextlib.ExitStack() as stack:
             bars: list[Advance] = []
 
-            def confirm_then_show(report: CommissioningReport) -> bool:
-                # not before: a bar that is redrawn would paint over the question
-                agreed = confirm(report)
-                if agreed:
+            def progress(done_s: float) -> None:
+                if not bars:  # not before: it would paint over the question, and what the loop says while it starts
                     title = "1 point" if len(points) == 1 else f"{len(points)} points"
                     bars.append(stack.enter_context(self.output.progress(title, motion.duration_s)))
-                return agreed
+                bars[0](max(0.0, done_s))
 
             supervisor = SweepSupervisor(
-                config, self.output, log_path(config), confirm_then_show, motion, meter,
-                lambda done_s: self._progress(bars, done_s), allow_low_margin=options.allow_low_margin,
+                config, self.output, log_path(config), confirm, motion, meter, progress,
+                allow_low_margin=options.allow_low_margin,
             )  # fmt: skip
             try:
                 result = supervisor.run()
@@ -185,15 +183,10 @@ class Sweep:
         self._raise_fault(result.fault, result.fault_text)
         return result.stopped_by
 
-    @staticmethod
-    def _progress(bars: list[Advance], done_s: float) -> None:
-        for advance in bars:
-            advance(max(0.0, done_s))
-
     def _confirm(self, report: CommissioningReport, motion: SweepMotion, points: list[SweepPoint]) -> bool:
         if not self._confirmed:
             for line in envelope(self.config, report, motion, points):
-                self.output.note(line)
+                self.output.fact(line)
             if self.options.dry_run:
                 return False
             if not self.options.lockstep:
