@@ -6,7 +6,7 @@ import ast
 import re
 from pathlib import Path
 
-from tools.running.fault_text import FAULT_TEXTS
+from tools.running.events.fault_text import FAULT_TEXTS
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "troubleshooting.md").read_text()

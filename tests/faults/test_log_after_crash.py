@@ -17,9 +17,9 @@ from firmware_py.states import AxisPhase, Fault, StopRequest
 from tools.configuration.load import load_config
 from tools.configuration.records import axis_constants, trajectory_table
 from tools.recording.run_log import RunLogWriter, read_run_log
-from tools.running.loop_handle import LoopHandle
+from tools.running.loop.loop_handle import LoopHandle
+from tools.running.loop.shared_block import RING_RECORDS, SharedBlock
 from tools.running.open_drive import open_drive
-from tools.running.shared_block import RING_RECORDS, SharedBlock
 
 
 @pytest.fixture

@@ -250,5 +250,5 @@ def end_line_guards(port: str) -> None:
     for process in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):
             arguments = process.read_text().split("\0")
-            if "tools.running.line_guard" in arguments and any(f'"port": "{port}"' in text for text in arguments):
+            if "tools.running.guard.line_guard" in arguments and any(f'"port": "{port}"' in text for text in arguments):
                 os.kill(int(process.parent.name), signal.SIGKILL)

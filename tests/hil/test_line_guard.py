@@ -18,10 +18,10 @@ from typing import Any
 
 import pytest
 
-from tools.running.guard_call import guard_address, running_supervisor
-from tools.running.line_guard import GuardOrder
+from tools.running.guard.guard_call import guard_address, running_supervisor
+from tools.running.guard.line_guard import GuardOrder
 
-GUARD, LOOP = "tools.running.line_guard", "tools.running.loop_process"
+GUARD, LOOP = "tools.running.guard.line_guard", "tools.running.loop.loop_process"
 
 
 def gone(pid: int) -> bool:

@@ -15,9 +15,9 @@ from firmware_py.states import AxisPhase, StopRequest
 from tools.configuration.load import load_config
 from tools.output import Output
 from tools.recording.run_log import Event, read_run_log
-from tools.running.live_panel import OnlyShows, Snapshot
+from tools.running.display.live_panel import OnlyShows, Snapshot
+from tools.running.display.viewer_request import ViewerRequest
 from tools.running.supervisor import RunResult, Supervisor
-from tools.running.viewer_request import ViewerRequest
 
 WHO = "a test"
 SINE = {"kind": "sine", "duration_s": 0.0, "amplitude_rad": 0.1, "frequency_Hz": 0.5, "offset_rad": 0.2}

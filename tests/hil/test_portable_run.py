@@ -34,8 +34,8 @@ from tools.configuration.config import Config
 from tools.configuration.drive_settings import canopen_settings
 from tools.configuration.load import load_config, shipped_config
 from tools.configuration.records import axis_constants
-from tools.running.portable_loop import run_portable_loop, warm_up
-from tools.running.shared_block import SharedBlock
+from tools.running.loop.portable_loop import run_portable_loop, warm_up
+from tools.running.loop.shared_block import SharedBlock
 from tools.simulation.device_pump import PumpedDevice
 from tools.simulation.virtual_joint import new_device, serve_virtual_joint
 
@@ -235,7 +235,7 @@ def loop_pid(parent: int) -> int | None:
         with contextlib.suppress(OSError):
             text = path.read_text()
             if int(text.rpartition(")")[2].split()[1]) == parent:
-                if b"tools.running.loop_process" in (path.parent / "cmdline").read_bytes():
+                if b"tools.running.loop.loop_process" in (path.parent / "cmdline").read_bytes():
                     return int(path.parent.name)
     return None
 

@@ -21,7 +21,7 @@ from hil.elmo.motor import MF_POSITION_LIMIT
 from tools.configuration.conversions import friction_constants
 from tools.configuration.load import load_config
 
-GUARD, LOOP = "tools.running.line_guard", "tools.running.loop_process"
+GUARD, LOOP = "tools.running.guard.line_guard", "tools.running.loop.loop_process"
 SHORT = ("--points", "2", "--grid", "log", "--max-speed", "0.3", "--min-speed", "0.29", "--warm-up", "0", "-y")
 
 

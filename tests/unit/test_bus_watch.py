@@ -15,9 +15,9 @@ from drivers.can.link_state import LinkState
 from firmware_py.states import Fault
 from tools.configuration.config import Config
 from tools.configuration.load import load_config, shipped_config
-from tools.running import bus_watch as module
-from tools.running.bus_watch import BusWatch, bus_watch
-from tools.running.fault_text import fault_text
+from tools.running.events.fault_text import fault_text
+from tools.running.watch import bus_watch as module
+from tools.running.watch.bus_watch import BusWatch, bus_watch
 
 TEXT = fault_text(Fault.STALE_SAMPLE, 5.0, 0)
 

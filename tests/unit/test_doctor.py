@@ -32,7 +32,7 @@ from tools.inspection.bus_health import (
 from tools.inspection.computer import kernel_cache, kernel_findings, wake_up
 from tools.inspection.findings import NOTE, OK, PROBLEM, Finding
 from tools.output import Output
-from tools.running import start_time
+from tools.running.loop import start_time
 from tools.verbs import doctor as doctor_module
 from tools.verbs.doctor import doctor, findings
 

@@ -14,8 +14,8 @@ from tools.analysis.margin_gate import require_margin
 from tools.configuration.config import Config
 from tools.configuration.elmo_settings import elmo_section, serial_line_share, with_port_override
 from tools.configuration.load import load_config, shipped_config, with_bus_overrides
+from tools.running.events.serial_fault_text import SERIAL_FAULT_TEXTS
 from tools.running.open_drive import check_cyclic_rate, drive_fault_text
-from tools.running.serial_fault_text import SERIAL_FAULT_TEXTS
 
 SHIPPED = shipped_config("elmo_serial").read_text()
 

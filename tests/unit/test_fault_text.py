@@ -8,8 +8,8 @@ import pytest
 
 from firmware_py.records import ENCODER_RESTARTED
 from firmware_py.states import Fault
-from tools.running.fault_text import FAULT_TEXTS, TWO_ENCODER_TEXTS, fault_text
-from tools.running.serial_fault_text import SERIAL_FAULT_TEXTS
+from tools.running.events.fault_text import FAULT_TEXTS, TWO_ENCODER_TEXTS, fault_text
+from tools.running.events.serial_fault_text import SERIAL_FAULT_TEXTS
 
 FAULTS = [fault for fault in Fault if fault is not Fault.NONE]
 WITH_STATUSWORD = (

@@ -10,8 +10,8 @@ import pytest
 from firmware_py.records import LogRecord
 from firmware_py.schema import new
 from firmware_py.states import Fault
-from tools.running.fault_text import FaultText
-from tools.running.held_up import held_up_text, longest_pause_s
+from tools.running.events.fault_text import FaultText
+from tools.running.events.held_up import held_up_text, longest_pause_s
 
 RATE_Hz = 125.0
 TEXT = FaultText("it happened", "the cable", "check it")

@@ -15,8 +15,8 @@ import pytest
 from tools.configuration.config import Config
 from tools.configuration.load import load_config, shipped_config
 from tools.output import Output
-from tools.running import kept_awake as module
-from tools.running.kept_awake import kept_awake
+from tools.running.guard import kept_awake as module
+from tools.running.guard.kept_awake import kept_awake
 
 GRANTS = """#!/bin/sh
 echo "asked $*" >>"$0.log"

@@ -16,7 +16,7 @@ from firmware_py.records import LogRecord
 from firmware_py.schema import dtype_of
 from tools.configuration.config import Config
 from tools.recording.log_folder import log_path, remove_oldest, require_room
-from tools.running.readiness import require_ready
+from tools.running.permission.readiness import require_ready
 
 
 class Usage(NamedTuple):

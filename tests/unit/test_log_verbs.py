@@ -25,8 +25,8 @@ from tools.recording.can_log import frame_array, frame_times_ns
 from tools.recording.log_export import FORMATS, columns, parquet_bytes
 from tools.recording.log_facts import missing_records
 from tools.recording.run_log import RunLogWriter, read_run_log
-from tools.running.events import EventFinder
-from tools.running.frame_recorder import FrameRecorder, recording
+from tools.running.events.event_finder import EventFinder
+from tools.running.watch.frame_recorder import FrameRecorder, recording
 from tools.verbs.log import log_export, log_info, log_plot
 
 START_NS = 5_000_000_000

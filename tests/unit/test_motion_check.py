@@ -27,7 +27,7 @@ from tools.motion_check.carry_out import check_in_lockstep
 from tools.motion_check.plan import check_constants, config_of_check, make_plan, motion_table, require_room
 from tools.motion_check.verdict import motion_findings
 from tools.output import Output
-from tools.running.fault_text import fault_text
+from tools.running.events.fault_text import fault_text
 from tools.simulation.lockstep import LockstepJoint
 from tools.verbs import doctor_motion as doctor_motion_module
 

@@ -20,15 +20,15 @@ from firmware_py.sequence import reset_axis
 from firmware_py.states import AxisPhase, Fault, StopRequest, TrajectoryKind
 from tools.configuration.load import load_config, shipped_config
 from tools.configuration.records import axis_constants
-from tools.running import loop_process, portable_loop
-from tools.running.portable_loop import (
+from tools.running.loop import loop_process, portable_loop
+from tools.running.loop.portable_loop import (
     HIGHEST_RATE_HZ,
     check_portable_rate,
     held_rate_Hz,
     portable_note,
     run_portable_loop,
 )
-from tools.running.shared_block import SharedBlock
+from tools.running.loop.shared_block import SharedBlock
 
 PERIOD_NS = 1_000_000
 RECEIVE_NS = 600_000

@@ -10,8 +10,8 @@ import pytest
 from firmware_py.records import LogRecord
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, DriveState, Fault
-from tools.running.emergency_text import emergency_text
-from tools.running.events import OVERRUN_CYCLES, EventFinder
+from tools.running.events.emergency_text import emergency_text
+from tools.running.events.event_finder import OVERRUN_CYCLES, EventFinder
 
 START_NS = 5_000_000_000
 WORDS = {DriveState.OFF: 0x0250, DriveState.STARTING: 0x0233, DriveState.ENABLED: 0x1237, DriveState.FAULT: 0x0218}

@@ -23,9 +23,9 @@ from firmware_py.states import AxisPhase, StopRequest
 from tools.configuration.load import load_config, shipped_config
 from tools.output import Output
 from tools.recording.run_log import INFO, Event
-from tools.running.live_panel import PhaseLines, Snapshot
-from tools.running.viewer_orders import UNWATCHED, ViewerOrders
-from tools.running.viewer_request import ViewerRequest
+from tools.running.changes.viewer_orders import UNWATCHED, ViewerOrders
+from tools.running.display.live_panel import PhaseLines, Snapshot
+from tools.running.display.viewer_request import ViewerRequest
 from tools.scoping import feed as feed_module
 from tools.scoping import order as order_module
 from tools.scoping import server as server_module

@@ -19,7 +19,7 @@ from drivers.errors import BusError, DeviceError
 from hil.canopen.device_records import PowerState
 from tools.output import Output
 from tools.running import supervisor as supervisor_module
-from tools.running.drive_end import require_off, words
+from tools.running.result.drive_end import require_off, words
 from tools.verbs import run as run_module
 from tools.verbs import stop as stop_module
 

@@ -25,7 +25,7 @@ from tools.recording.log_export import csv_bytes, npz_bytes, table_columns
 from tools.recording.run_log import RunLogWriter, read_run_log
 from tools.recording.run_summary import summarise
 from tools.reporting.temperature_figure import temperature_figure
-from tools.running.temperature_watch import STALE_S, TemperatureWatch
+from tools.running.watch.temperature_watch import STALE_S, TemperatureWatch
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 INDEX, NODE = 0x2103, 5

@@ -19,8 +19,8 @@ from tools.configuration.config import Config
 from tools.configuration.load import load_config, shipped_config
 from tools.configuration.records import trajectory_table
 from tools.output import Output
-from tools.running.envelope import motion_envelope
-from tools.running.readiness import require_start
+from tools.running.permission.envelope import motion_envelope
+from tools.running.permission.readiness import require_start
 from tools.running.supervisor import Supervisor
 from tools.simulation.lockstep import LockstepJoint
 from tools.sweeping.carry_out import SweepSupervisor

@@ -28,7 +28,7 @@ from tools.benchmarks.load import load
 from tools.benchmarks.loop_times import NO_VALUES, LoopTimes, times_from_ns
 from tools.configuration.config import Config
 from tools.configuration.records import axis_constants, trajectory_table
-from tools.running.loop_handle import RECEIVE_SHARE, LoopHandle
+from tools.running.loop.loop_handle import RECEIVE_SHARE, LoopHandle
 from tools.running.open_drive import open_drive
 
 SETTLE_S = 0.5  # from the start of the loop until the drive is enabled, and a little more

@@ -18,7 +18,7 @@ from tools.benchmarks.compiled_loops import commissioned
 from tools.benchmarks.load import load
 from tools.benchmarks.loop_times import NO_VALUES, LoopTimes, times_from_ns
 from tools.configuration.config import Config
-from tools.running.loop_handle import RECEIVE_SHARE
+from tools.running.loop.loop_handle import RECEIVE_SHARE
 
 
 def _frame(identifier: int, data: bytes = b"") -> can.Message:

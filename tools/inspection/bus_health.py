@@ -23,8 +23,8 @@ from drivers.errors import BusError
 from tools.configuration.config import Config
 from tools.configuration.drive_settings import HIGHEST_LOAD, cycle_bytes
 from tools.inspection.findings import NOTE, OK, PROBLEM, Finding, file_text
-from tools.running.loop_handle import RECEIVE_SHARE
-from tools.running.portable_loop import HIGHEST_RATE_HZ
+from tools.running.loop.loop_handle import RECEIVE_SHARE
+from tools.running.loop.portable_loop import HIGHEST_RATE_HZ
 
 SDO_READS = 20
 _SDO_TIMEOUT_S = 0.3

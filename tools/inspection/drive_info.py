@@ -11,7 +11,7 @@ from tools.inspection import drive_words
 from tools.inspection.objects import Place
 from tools.inspection.pdo_maps import PdoMap, PdoMaps
 from tools.inspection.sdo_reading import SdoReader
-from tools.running.emergency_text import emergency_text
+from tools.running.events.emergency_text import emergency_text
 
 HISTORY = 8  # entries of 1003 that are shown
 CONSUMERS = 4  # entries of 1016

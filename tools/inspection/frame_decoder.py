@@ -14,7 +14,7 @@ from tools.inspection import drive_words
 from tools.inspection.objects import Objects, Place
 from tools.inspection.pdo_maps import PdoMaps
 from tools.inspection.sdo_frames import SdoFrames
-from tools.running.emergency_text import emergency_text
+from tools.running.events.emergency_text import emergency_text
 
 KINDS = ("nmt", "sync", "time", "emcy", "pdo", "sdo", "heartbeat", "lss", "error", "other")
 

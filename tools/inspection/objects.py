@@ -15,7 +15,7 @@ from drivers.canopen.object_access import object_name
 from drivers.errors import ConfigurationError
 from tools.inspection import drive_words
 from tools.inspection.standard_objects import standard_variable
-from tools.running.emergency_text import emergency_text
+from tools.running.events.emergency_text import emergency_text
 
 SIGNED = frozenset(datatypes.SIGNED_TYPES)
 INTEGERS = frozenset(datatypes.INTEGER_TYPES)

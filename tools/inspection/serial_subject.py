@@ -11,7 +11,7 @@ from drivers.errors import BusError
 from tools.configuration.config import Config
 from tools.configuration.conversions import torque_constant_NmpA
 from tools.configuration.elmo_settings import elmo_section, elmo_settings
-from tools.running.guard_call import running_supervisor
+from tools.running.guard.guard_call import running_supervisor
 
 
 @contextmanager

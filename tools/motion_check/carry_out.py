@@ -13,7 +13,7 @@ from firmware_py.states import Fault
 from tools.configuration.config import Config
 from tools.motion_check.plan import CheckPlan, check_constants, config_of_check, motion_table
 from tools.output import Output
-from tools.running.loop_handle import LoopHandle
+from tools.running.loop.loop_handle import LoopHandle
 from tools.running.supervisor import Supervisor
 from tools.simulation.lockstep import LockstepJoint
 

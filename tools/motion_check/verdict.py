@@ -14,7 +14,7 @@ from tools.configuration.config import Config
 from tools.configuration.conversions import joint_rad_per_count
 from tools.inspection.findings import NOTE, OK, PROBLEM, Finding
 from tools.motion_check.plan import CheckPlan
-from tools.running.fault_text import FaultText
+from tools.running.events.fault_text import FaultText
 
 MOVED_SHARE = 0.03  # of the travel: less is no motion
 MOVED_COUNTS = 10.0

@@ -21,10 +21,10 @@ from tools.configuration.conversions import torque_constant_NmpA
 from tools.configuration.drive_settings import canopen_settings, cyclic_bus_load
 from tools.configuration.elmo import ElmoSerial
 from tools.configuration.elmo_settings import elmo_settings, serial_line_share
-from tools.running.fault_text import FaultText, fault_text
-from tools.running.loop_delay import QUANTILE, measured_delay_s, quantile_s
-from tools.running.portable_loop import check_portable_rate
-from tools.running.serial_fault_text import SERIAL_FAULT_TEXTS
+from tools.running.events.fault_text import FaultText, fault_text
+from tools.running.events.serial_fault_text import SERIAL_FAULT_TEXTS
+from tools.running.loop.loop_delay import QUANTILE, measured_delay_s, quantile_s
+from tools.running.loop.portable_loop import check_portable_rate
 
 
 def check_cyclic_rate(config: Config) -> None:

@@ -27,22 +27,22 @@ from tools.recording.kept_records import KeptRecords
 from tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter
 from tools.recording.run_metadata import run_metadata
 from tools.recording.run_summary import summarise
-from tools.running.bus_watch import BusWatch, bus_watch
-from tools.running.drive_end import warn_unless_off
-from tools.running.events import EventFinder, phase_name
-from tools.running.frame_recorder import FrameRecorder, recording
-from tools.running.guard_handle import GUARD_ENDED, GuardHandle, start_guard
-from tools.running.held_up import held_up_text
-from tools.running.kept_awake import kept_awake
-from tools.running.live_panel import Display, PhaseLines, Snapshot
-from tools.running.loop_handle import LoopHandle
+from tools.running.changes.viewer_orders import ViewerOrders
+from tools.running.display.live_panel import Display, PhaseLines, Snapshot
+from tools.running.events.event_finder import EventFinder, phase_name
+from tools.running.events.held_up import held_up_text
+from tools.running.guard.guard_handle import GUARD_ENDED, GuardHandle, start_guard
+from tools.running.guard.kept_awake import kept_awake
+from tools.running.loop.loop_handle import LoopHandle
+from tools.running.loop.shared_block import SERIAL
 from tools.running.open_drive import check_cyclic_rate, commission, drive_fault_text, loop_delay_s, open_drive
-from tools.running.readiness import require_same_motion
-from tools.running.run_result import RunResult as RunResult
-from tools.running.shared_block import SERIAL
+from tools.running.permission.readiness import require_same_motion
+from tools.running.result.drive_end import warn_unless_off
+from tools.running.result.run_result import RunResult as RunResult
 from tools.running.stop_signals import StopSignals, stop_signals
-from tools.running.temperature_watch import TemperatureWatch
-from tools.running.viewer_orders import ViewerOrders
+from tools.running.watch.bus_watch import BusWatch, bus_watch
+from tools.running.watch.frame_recorder import FrameRecorder, recording
+from tools.running.watch.temperature_watch import TemperatureWatch
 
 POLL_S = 0.02
 DELAY_CYCLES = 300  # how many cycles with the drive off the loop delay is measured over

@@ -16,8 +16,8 @@ from typing import Any, Self
 
 from firmware_py.states import StopRequest
 from tools.recording.run_log import Event
-from tools.running.live_panel import Snapshot
-from tools.running.viewer_request import LONGEST_BYTES, ViewerRequest, decoded
+from tools.running.display.live_panel import Snapshot
+from tools.running.display.viewer_request import LONGEST_BYTES, ViewerRequest, decoded
 from tools.scoping.order import ScopeOrder
 
 RECORDS, EVENT, SETTINGS = b"R", b"E", b"S"  # first byte of a message

@@ -9,8 +9,8 @@ from nicegui import ui
 
 from firmware_py.states import Fault
 from tools.recording.run_log import Event
-from tools.running.events import drive_state_name, phase_name
-from tools.running.viewer_request import ViewerRequest, viewer
+from tools.running.display.viewer_request import ViewerRequest, viewer
+from tools.running.events.event_finder import drive_state_name, phase_name
 from tools.scoping.change_panels import ChangePanels
 from tools.scoping.chart import Chart
 from tools.scoping.history import History, percentiles_us

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from tools.recording.run_log import Event, read_run_log
-from tools.running.viewer_request import ViewerRequest, viewer
+from tools.running.display.viewer_request import ViewerRequest, viewer
 from tools.scoping.access import AccessControl
 from tools.scoping.feed import COUNT_AGAIN_S, EVENT, RECORDS, SETTINGS
 from tools.scoping.history import EVENTS, RING_RECORDS, History

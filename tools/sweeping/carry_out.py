@@ -29,7 +29,7 @@ from tools.output import Output
 from tools.recording.kept_records import KeptRecords
 from tools.recording.run_log import INFO, RunLogWriter
 from tools.recording.thinned_records import ThinnedRecords
-from tools.running.loop_handle import LoopHandle
+from tools.running.loop.loop_handle import LoopHandle
 from tools.running.open_drive import loop_delay_s
 from tools.running.supervisor import DELAY_CYCLES, Supervisor
 from tools.simulation.lockstep import LockstepJoint

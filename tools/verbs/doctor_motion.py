@@ -11,11 +11,11 @@ from tools.motion_check.plan import CheckPlan, make_plan, require_room
 from tools.motion_check.verdict import ended_finding, motion_findings
 from tools.output import Output
 from tools.recording.log_folder import log_path
-from tools.running import drive_end
-from tools.running.consent import agreed, require_terminal
-from tools.running.drive_end import require_off
-from tools.running.readiness import prepare_log, require_ready
-from tools.running.run_report import INTERRUPTED
+from tools.running.permission.consent import agreed, require_terminal
+from tools.running.permission.readiness import prepare_log, require_ready
+from tools.running.result import drive_end
+from tools.running.result.drive_end import require_off
+from tools.running.result.run_report import INTERRUPTED
 from tools.verbs.doctor import report_findings
 
 

@@ -10,8 +10,8 @@ import time
 from hil.bus.virtual_bus import default_socket_path
 from tools.configuration.config import Config
 from tools.output import Output
-from tools.running.loop_process import become_realtime
-from tools.running.slow_start import slow_start
+from tools.running.loop.loop_process import become_realtime
+from tools.running.loop.slow_start import slow_start
 from tools.running.stop_signals import stop_signals
 from tools.simulation.virtual_joint import serve_virtual_joint
 

@@ -16,7 +16,7 @@ from tools.configuration.config import Config
 from tools.configuration.elmo_settings import elmo_device_settings, elmo_section
 from tools.configuration.plant_settings import plant_settings
 from tools.output import Output
-from tools.running.loop_process import become_realtime
+from tools.running.loop.loop_process import become_realtime
 from tools.running.stop_signals import stop_signals
 from tools.verbs.hil import reader_gone
 

@@ -29,7 +29,7 @@ from tools.inspection.parameters import (
 from tools.inspection.sdo_reading import Refusal, SdoReader
 from tools.inspection.subject import Subject, canopen_network
 from tools.output import Output
-from tools.running.consent import agreed, require_terminal
+from tools.running.permission.consent import agreed, require_terminal
 
 LISTEN_S = 0.1  # for the SYNC of another controller
 DIFFERENT = 11  # exit code of diff

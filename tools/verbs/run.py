@@ -9,14 +9,14 @@ from drivers.drive import CommissioningReport
 from tools.configuration.config import Config
 from tools.output import Output
 from tools.recording.log_folder import log_path
-from tools.running import drive_end
-from tools.running.consent import agreed, require_terminal
-from tools.running.drive_end import require_off
-from tools.running.envelope import motion_envelope
-from tools.running.live_panel import Display, run_display
-from tools.running.readiness import prepare_log, require_ready, require_start
-from tools.running.run_report import INTERRUPTED, report_run
-from tools.running.shared_block import SERIAL
+from tools.running.display.live_panel import Display, run_display
+from tools.running.loop.shared_block import SERIAL
+from tools.running.permission.consent import agreed, require_terminal
+from tools.running.permission.envelope import motion_envelope
+from tools.running.permission.readiness import prepare_log, require_ready, require_start
+from tools.running.result import drive_end
+from tools.running.result.drive_end import require_off
+from tools.running.result.run_report import INTERRUPTED, report_run
 from tools.running.supervisor import Supervisor
 
 

@@ -13,12 +13,12 @@ from firmware_py.states import StopRequest
 from tools.output import Output
 from tools.recording.log_folder import log_path
 from tools.recording.run_log import read_run_log
-from tools.running.drive_end import words
-from tools.running.envelope import motion_envelope
-from tools.running.live_panel import run_display
-from tools.running.readiness import prepare_log, require_ready, require_start
-from tools.running.run_report import report_run
-from tools.running.shared_block import SERIAL
+from tools.running.display.live_panel import run_display
+from tools.running.loop.shared_block import SERIAL
+from tools.running.permission.envelope import motion_envelope
+from tools.running.permission.readiness import prepare_log, require_ready, require_start
+from tools.running.result.drive_end import words
+from tools.running.result.run_report import report_run
 from tools.running.supervisor import Supervisor
 from tools.scoping.displays import Displays
 from tools.scoping.feed import ScopeFeed, scope_server

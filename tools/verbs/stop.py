@@ -12,8 +12,8 @@ from tools.configuration.config import Config
 from tools.configuration.elmo import ElmoSerial
 from tools.configuration.stop_target import CanTarget, GivenTarget, SerialTarget, stop_target
 from tools.output import Output
-from tools.running.drive_end import require_off
 from tools.running.open_drive import open_drive
+from tools.running.result.drive_end import require_off
 from tools.verbs.stop_serial import refuse_while_running, stop_serial
 
 

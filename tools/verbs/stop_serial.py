@@ -15,7 +15,7 @@ from drivers.errors import BusError, JointctlError
 from tools.configuration.elmo import ElmoSerial
 from tools.configuration.stop_target import SerialTarget
 from tools.output import Output
-from tools.running.guard_call import GuardCall, running_supervisor
+from tools.running.guard.guard_call import GuardCall, running_supervisor
 
 SHARED_ATTEMPTS = 10  # the other user of the line takes some replies
 

@@ -21,11 +21,11 @@ from tools.configuration.conversions import joint_rad_per_count, torque_constant
 from tools.output import Advance, Output
 from tools.recording.log_folder import log_path
 from tools.reporting.page import check_target
-from tools.running import drive_end
-from tools.running.consent import agreed, require_terminal
-from tools.running.fault_text import FaultText, fault_text
-from tools.running.readiness import require_ready
-from tools.running.run_report import INTERRUPTED
+from tools.running.events.fault_text import FaultText, fault_text
+from tools.running.permission.consent import agreed, require_terminal
+from tools.running.permission.readiness import require_ready
+from tools.running.result import drive_end
+from tools.running.result.run_report import INTERRUPTED
 from tools.sweeping.carry_out import SweepSupervisor, approach_time_s, middle_rad, sweep_in_lockstep, with_mode
 from tools.sweeping.checks import constant_remarks, recorded_limits, refuse_constants, require_torque, torque_source
 from tools.sweeping.data_file import SweepFile

@@ -14,8 +14,8 @@ from firmware_py.realtime import WORDS, Word
 from firmware_py.states import StopRequest
 from tools.configuration.config import Config
 from tools.configuration.elmo import ElmoSerial
-from tools.running.line_guard import GuardOrder
-from tools.running.loop_handle import SILENT_S, LoopHandle
+from tools.running.guard.line_guard import GuardOrder
+from tools.running.loop.loop_handle import SILENT_S, LoopHandle
 
 READY_TIMEOUT_S = 20.0
 SPARE_S = 1.0  # the supervisor is to be first
@@ -40,7 +40,7 @@ class GuardHandle:
         )  # fmt: skip
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "tools.running.line_guard", order.argument()],
+                [sys.executable, "-P", "-m", "tools.running.guard.line_guard", order.argument()],
                 pass_fds=passed, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True,
             )  # fmt: skip
         finally:

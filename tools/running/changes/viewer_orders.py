@@ -10,9 +10,9 @@ from typing import Any, Self
 from drivers.errors import DataError
 from tools.configuration.config import Config
 from tools.recording.run_log import INFO, WARNING, Event, RunLogWriter
-from tools.running.live_changes import LiveChanges, settings_of
-from tools.running.live_panel import Display
-from tools.running.viewer_request import ViewerRequest
+from tools.running.changes.live_changes import LiveChanges, settings_of
+from tools.running.display.live_panel import Display
+from tools.running.display.viewer_request import ViewerRequest
 
 SETTINGS_s = 0.5  # how often the page is told how things stand
 UNWATCHED = "no page is open any more; the joint goes on, Ctrl-C or `jointctl stop` brakes it"

@@ -1,4 +1,4 @@
-"""The guard of a serial line: `python -m tools.running.line_guard JSON`, a small process that does next to nothing.
+"""The guard of a serial line: `python -m tools.running.guard.line_guard JSON`, a small process that does little.
 
 A serial drive does not notice that the programs behind it have died: it holds its last torque command for ever.  So a
 third process waits, in a session of its own, and says TC=0, JV=0, ST, MO=0
@@ -30,7 +30,7 @@ from drivers.elmo.dialogue import Dialogue
 from drivers.elmo.serial_port import SerialPort, open_descriptor
 from drivers.elmo.switch_off import SWITCH_OFF, switch_off
 from drivers.errors import JointctlError
-from tools.running.guard_call import guard_address, heard_line, may_ask
+from tools.running.guard.guard_call import guard_address, heard_line, may_ask
 
 REACH_S = 60.0  # how long a drive that does not answer is tried again: time to plug a cable in
 OBEY_S = 5.0  # how long a run may take to end after `jointctl stop`

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from firmware_py.states import Fault
-from tools.running.fault_text import FaultText
+from tools.running.events.fault_text import FaultText
 
 # {value}: the number that tripped the limit; {word}: the same as a hexadecimal status register (SR)
 SERIAL_FAULT_TEXTS: dict[Fault, FaultText] = {

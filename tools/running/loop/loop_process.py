@@ -1,4 +1,4 @@
-"""The process that runs the loop and nothing else: `python -m tools.running.loop_process JSON`.
+"""The process that runs the loop and nothing else: `python -m tools.running.loop.loop_process JSON`.
 
 The loop is the compiled one where the bus is a file descriptor, else the plain Python one of `portable_loop`.
 
@@ -28,8 +28,8 @@ from drivers.errors import JointctlError
 from firmware_py.libc import NANOSECONDS
 from firmware_py.realtime import Word
 from tools.analysis.idle_states import cores_awake
-from tools.running.ready_loop import FOREVER, ReadyLoop, loop_call
-from tools.running.slow_start import slow_start
+from tools.running.loop.ready_loop import FOREVER, ReadyLoop, loop_call
+from tools.running.loop.slow_start import slow_start
 
 _MLOCK_CURRENT_AND_FUTURE = 3
 _POLL_S = 0.001
@@ -128,7 +128,7 @@ def portable_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
     (see `CanopenDrive.start_cyclic`).
     """
     from drivers.can.open import SHARED_INTERFACES, known_interface, open_python_can
-    from tools.running.portable_loop import (
+    from tools.running.loop.portable_loop import (
         check_portable_rate,
         held_rate_Hz,
         portable_note,
@@ -163,11 +163,11 @@ def portable_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
 def run(order: LoopOrder) -> int:
     """Warm up, wait for GO, run the loop; returns the exit code."""
     from drivers.can.open import CYCLIC_INTERFACES
-    from tools.running.shared_block import SERIAL, SharedBlock
+    from tools.running.loop.shared_block import SERIAL, SharedBlock
 
     block = SharedBlock(order.block_fd, order.table_rows, order.interface)
     if order.interface == SERIAL:
-        from tools.running.serial_loop import serial_loop
+        from tools.running.loop.serial_loop import serial_loop
 
         loop: Callable[[LoopOrder, Any], AbstractContextManager[ReadyLoop]] = serial_loop
     else:

@@ -15,7 +15,7 @@ from typing import Any
 
 from drivers.elmo.serial_port import open_descriptor
 from drivers.elmo.switch_off import SWITCH_OFF
-from tools.running.ready_loop import FOREVER, ReadyLoop, loop_call
+from tools.running.loop.ready_loop import FOREVER, ReadyLoop, loop_call
 
 
 @contextmanager

@@ -10,7 +10,7 @@ import numpy as np
 
 from firmware_py.states import Fault
 from tools.recording.run_summary import RunSummary
-from tools.running.fault_text import FaultText
+from tools.running.events.fault_text import FaultText
 
 
 @dataclass(frozen=True)

@@ -38,8 +38,8 @@ from firmware_py.libc import NANOSECONDS, sleep_until_ns
 from firmware_py.realtime import Histogram, Word, count, note_suspension, write_log
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, DriveRequest
-from tools.running.loop_delay import QUANTILE, quantile_s
-from tools.running.shared_block import SharedBlock
+from tools.running.loop.loop_delay import QUANTILE, quantile_s
+from tools.running.loop.shared_block import SharedBlock
 
 HIGHEST_RATE_HZ = 500.0
 FOREVER = 1 << 62

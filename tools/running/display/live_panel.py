@@ -27,9 +27,9 @@ from firmware_py.realtime import Histogram
 from firmware_py.states import AxisPhase, Fault, StopRequest
 from tools.output import Output
 from tools.recording.run_log import ERROR, Event
-from tools.running.events import drive_state_name, phase_name
-from tools.running.loop_delay import quantile_s
-from tools.running.viewer_request import ViewerRequest
+from tools.running.display.viewer_request import ViewerRequest
+from tools.running.events.event_finder import drive_state_name, phase_name
+from tools.running.loop.loop_delay import quantile_s
 
 REFRESH_s = 0.25
 CLOSE_s = 1.0  # how long the end of a run waits for the last frame

@@ -21,7 +21,7 @@ import can
 from drivers.can.open import SHARED_INTERFACES, open_python_can
 from drivers.errors import ConfigurationError
 from tools.configuration.config import Config
-from tools.running.shared_block import SERIAL
+from tools.running.loop.shared_block import SERIAL
 
 QUEUE_FRAMES = 1 << 16  # more than 20 s at 1 kHz
 RECEIVE_S = 0.1  # how long the thread waits before it looks whether it is to end

@@ -19,7 +19,7 @@ from drivers.can.link_state import link_problem, link_state, send_problem
 from drivers.errors import BusError
 from firmware_py.states import Fault
 from tools.configuration.config import Config
-from tools.running.fault_text import FaultText
+from tools.running.events.fault_text import FaultText
 
 _FRAME = struct.Struct("<IB3x8s")
 _SOL_CAN_RAW = 101

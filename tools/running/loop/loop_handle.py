@@ -17,8 +17,8 @@ from firmware_py.realtime import Word
 from firmware_py.sequence import reset_axis
 from firmware_py.states import AxisPhase, Fault, StopRequest
 from tools.configuration.config import Config
-from tools.running.loop_process import LoopOrder
-from tools.running.shared_block import SERIAL, SharedBlock
+from tools.running.loop.loop_process import LoopOrder
+from tools.running.loop.shared_block import SERIAL, SharedBlock
 from tools.simulation.starting import Starting
 
 KILL_S = 1.0  # how long a killed process may take to go
@@ -58,7 +58,7 @@ class LoopHandle:
             tail_path=None if tail_path is None else str(tail_path.absolute()),
         )
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "tools.running.loop_process", order.argument()],
+            [sys.executable, "-P", "-m", "tools.running.loop.loop_process", order.argument()],
             pass_fds=(self.block.fd,),
             stdin=subprocess.DEVNULL,
             start_new_session=True,  # keys that a terminal turns into signals are not for the loop

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from drivers.canopen.cia402 import State, decode_state
 from firmware_py.records import ENCODER_RESTARTED
 from firmware_py.states import Fault
-from tools.running.emergency_text import emergency_text
+from tools.running.events.emergency_text import emergency_text
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ from firmware_py.states import AxisPhase, CommandKind
 from firmware_py.trajectory_table import peak_of
 from tools.configuration.config import Config
 from tools.recording.run_log import INFO, WARNING
-from tools.running.change_gate import checked_gains, require_change
-from tools.running.new_motion import in_words, new_motion
-from tools.running.viewer_request import ViewerRequest
+from tools.running.changes.change_gate import checked_gains, require_change
+from tools.running.changes.new_motion import in_words, new_motion
+from tools.running.display.viewer_request import ViewerRequest
 
 NAMES = tuple(dtype_of(Gains).names or ())
 # the plain function: nothing is to be compiled or loaded while the supervisor watches

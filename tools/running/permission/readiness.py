@@ -16,7 +16,7 @@ from tools.configuration.config import Config
 from tools.configuration.records import fill_trajectory, trajectory_table
 from tools.output import Output
 from tools.recording.log_folder import remove_oldest, require_room
-from tools.running.fault_text import fault_text
+from tools.running.events.fault_text import fault_text
 
 START_SHARE = 0.1  # of the following error: how far from the trajectory a run without an approach may begin
 

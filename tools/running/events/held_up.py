@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from firmware_py.states import Fault
-from tools.running.fault_text import FaultText
+from tools.running.events.fault_text import FaultText
 
 BEFORE_s = 0.5  # a pause longer ago has shown what it could do
 LEAST_s = 0.005

@@ -15,8 +15,8 @@ from drivers.canopen.cia402 import State, decode_state
 from drivers.elmo.codes import motor_fault_text
 from firmware_py.states import AxisPhase, DriveState, Fault
 from tools.recording.run_log import ERROR, INFO, WARNING, Event
-from tools.running.emergency_text import emergency_text
-from tools.running.fault_text import FAULT_TEXTS
+from tools.running.events.emergency_text import emergency_text
+from tools.running.events.fault_text import FAULT_TEXTS
 
 OVERRUN_CYCLES = 10  # so many skipped slots in one go are worth a line
 # the plain function: a compiled one would be loaded, or compiled, while the supervisor has no time for it

@@ -9,8 +9,8 @@ from firmware_py.states import Fault
 from tools.output import Output
 from tools.recording.run_figure import save_run_figure
 from tools.recording.run_summary import summary_table
-from tools.running.drive_end import require_off
-from tools.running.supervisor import RunResult
+from tools.running.result.drive_end import require_off
+from tools.running.result.run_result import RunResult
 
 INTERRUPTED = 130
 
