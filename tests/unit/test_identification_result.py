@@ -1,5 +1,6 @@
 """Outliers, selection, intervals, plausibility and the whole identification on synthetic Table 3 data."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -237,7 +238,13 @@ def test_a_knee_with_too_few_points_on_one_side_is_refused(knee_degps, fits):
         ({"swarm": SwarmSettings(iterations=0)}, r"--iterations \(=0\)"),
         ({"swarm": SwarmSettings(inertia=float("nan"))}, r"--inertia \(=nan\)"),
         ({"swarm": SwarmSettings(seed=-1)}, r"--seed \(=-1\)"),
-        ({"ws_min_radps": 1.0}, r"--ws-min \(=1 rad/s\) must be in"),
+        ({"ws_min_radps": 30 * DEGREE}, r"--ws-min \(=30 deg/s\) must be in \(0..20\) deg/s"),
+        ({"ws_max_radps": 0.0}, r"--ws-max \(=0 deg/s\) must be in"),
+        ({"knee_radps": float("nan")}, r"--knee \(=nan deg/s\) must be in \[0.0001..60000\] deg/s"),
+        ({"knee_radps": 7e4 * DEGREE}, r"--knee \(=70000 deg/s\) must be in"),
+        ({"static_max_Nm": 0.0}, r"--static-max \(=0 Nm\) must be in \(0..1000\]"),
+        ({"static_max_Nm": -1.0}, r"--static-max \(=-1 Nm\) must be in"),
+        ({"static_max_Nm": float("nan")}, r"--static-max \(=nan Nm\) must be in"),
     ],
 )
 def test_options_out_of_range_are_refused(change, message):
@@ -245,7 +252,29 @@ def test_options_out_of_range_are_refused(change, message):
         identify_friction(paper_data(0), Options(**change))
 
 
+@pytest.mark.parametrize("change", [{"static_max_Nm": 0.2}, {"static_max_Nm": 1e3}, {"ws_min_radps": 19.9 * DEGREE}])
+def test_options_at_the_edge_of_their_range_are_taken(change):
+    assert identify_friction(paper_data(0), replace(QUICK, **change)).rmse_Nm < 0.1
+
+
+def test_friction_without_speed_and_noise_is_compared_with_rounding_by_nobody():
+    data = paper_data(0)
+    data = replace(data, motor_torque_Nm=0.1 * np.sign(data.velocity_radps))
+    found = identify_friction(data, QUICK)
+    assert found.rmse_Nm < 1e-6
+    assert not [w for w in found.warnings if "held-out" in w or "the least RMSE" in w]
+
+
 # --- plausibility: K_m, ratio, unit, side, sign wrong on purpose ---
+
+
+def test_one_point_far_off_on_the_wrong_side_is_told_as_such():
+    data = paper_data(0)
+    torque = data.motor_torque_Nm.copy()
+    torque[0] = 1e300
+    problems = check_data(replace(data, motor_torque_Nm=torque), None).problems
+    assert "mean torque at negative velocity drives the motion" in problems[0]
+    assert not any("a factor of" in problem for problem in problems)
 
 
 def test_right_data_raise_nothing():

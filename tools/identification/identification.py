@@ -21,6 +21,9 @@ from tools.identification.variable_projection import Fit, Problem, make_problem,
 
 DIRECTIONS = (("positive", 1), ("negative", -1))
 _BAD_FIT = 0.15  # RMSE over mean friction
+_EXACT = 1e-6  # of the greatest friction: between errors below nothing measured decides
+SLOWEST_degps, FASTEST_degps = 1e-4, 6e4
+STATIC_MAX_Nm = 1e3  # at the motor
 MODELS = ("multi-stage", "stribeck", "coulomb-viscous", "auto")
 
 
@@ -43,7 +46,6 @@ class Options:
         """Raise `DataError` for a value out of range."""
         s = self.swarm
         for name, value, low, high in (
-            ("--knee [rad/s]", self.knee_radps, 1e-6, 1e3), ("--ws-max [rad/s]", self.ws_max_radps, 1e-9, 1e3),
             ("--outlier-threshold", self.outlier_threshold, 0.0, 100.0), ("--folds", self.folds, 2, 100),
             ("--particles", s.particles, 2, 100_000), ("--iterations", s.iterations, 1, 1_000_000),
             ("--inertia", s.inertia, 0.0, 1.0), ("--cognitive", s.cognitive, 0.0, 4.0),
@@ -51,8 +53,16 @@ class Options:
         ):  # fmt: skip
             if not low <= value <= high:
                 raise DataError(f"{name} (={value:g}) must be in [{low:g}..{high:g}]")
+        # as they are given on the command line: in deg/s
+        for name, value_radps in (("--knee", self.knee_radps), ("--ws-max", self.ws_max_radps)):
+            if not SLOWEST_degps <= value_radps / DEGREE <= FASTEST_degps:
+                allowed = f"[{SLOWEST_degps:g}..{FASTEST_degps:g}] deg/s"
+                raise DataError(f"{name} (={value_radps / DEGREE:g} deg/s) must be in {allowed}")
         if self.ws_min_radps is not None and not 0.0 < self.ws_min_radps < self.ws_max_radps:
-            raise DataError(f"--ws-min (={self.ws_min_radps:g} rad/s) must be in (0..{self.ws_max_radps:g})")
+            allowed = f"(0..{self.ws_max_radps / DEGREE:g}) deg/s"
+            raise DataError(f"--ws-min (={self.ws_min_radps / DEGREE:g} deg/s) must be in {allowed}")
+        if self.static_max_Nm is not None and not 0.0 < self.static_max_Nm <= STATIC_MAX_Nm:
+            raise DataError(f"--static-max (={self.static_max_Nm:g} Nm) must be in (0..{STATIC_MAX_Nm:g}]")
         if self.model not in MODELS:
             raise DataError(f"--model (={self.model}) must be one of {', '.join(MODELS)}")
 
@@ -221,7 +231,8 @@ def identify_friction(
         held_out[name] = float(np.sqrt(squared / total))
     model = choose(held_out) if options.model == "auto" else first.name
     best = choose(held_out)
-    if model != best and held_out[best] < held_out[model] / 1.02:
+    rounding_Nm = _EXACT * max(float(np.max(np.abs(p.y_Nm))) for p in problems.values())
+    if model != best and held_out[best] < held_out[model] / 1.02 and held_out[model] > rounding_Nm:
         warnings.append(
             f"the model {best} predicts held-out points better: {held_out[best]:.4g} against {held_out[model]:.4g} Nm"
         )
@@ -256,7 +267,7 @@ def _best_fit(problem: Problem, swarm: SwarmResult | None, warnings: list[str], 
     polished = polish(swarm.fit)
     if polished.rss <= projected.rss * (1.0 + 1e-6):
         return polished, projected.rmse_Nm, "swarm and polish"
-    if polished.rmse_Nm > 1.01 * projected.rmse_Nm:
+    if polished.rmse_Nm > max(1.01 * projected.rmse_Nm, _EXACT * float(np.max(np.abs(problem.y_Nm)))):
         warnings.append(
             f"the swarm at {word} velocity ended {polished.rmse_Nm / projected.rmse_Nm - 1.0:.1%} above the least "
             "RMSE: more particles or iterations, or another seed; the variable projection is used"

@@ -68,7 +68,13 @@ def check_data(data: FrictionData, limits: JointLimits | None) -> Verdict:
     if verdict.problems:
         return verdict
     larger, smaller = max(means.values()), min(means.values())
-    if larger > _ASYMMETRIC * smaller:
+    if smaller <= 0.0:
+        word = min(means, key=lambda key: means[key])
+        verdict.problems.append(
+            f"mean torque at {word} velocity drives the motion ({abs(smaller):.4g} Nm at the motor), although most of "
+            "its points oppose it: some of them are far off, or a load was attached"
+        )
+    elif larger > _ASYMMETRIC * smaller:
         text = (
             f"mean friction is {means['positive']:.4g} Nm at positive and {means['negative']:.4g} Nm at negative "
             f"velocity, a factor of {larger / smaller:.1f}: a load (offset {(larger - smaller) / 2:.3g} Nm)?"

@@ -9,8 +9,10 @@ from tools.running.events.fault_text import FaultText
 SERIAL_FAULT_TEXTS: dict[Fault, FaultText] = {
     Fault.STALE_SAMPLE: FaultText(
         "no usable position reply came for {value:.0f} cycles",
-        "cable or drive went silent, or noise garbles the replies",
-        "check the cable and its ground; the drive's own limits watched the joint meanwhile",
+        # Linux hands over what a serial port received by a worker of ordinary priority, however urgent the loop is
+        "cable or drive went silent, noise garbles the replies, or a busy computer hands them over late",
+        "check the cable and its ground, and what else the computer does; the drive's own limits watched the joint "
+        "meanwhile",
     ),
     Fault.BUS_ERROR: FaultText(
         "the serial port is gone or takes no characters any more",
