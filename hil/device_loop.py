@@ -1,16 +1,14 @@
 """The virtual drive in real time, on a file descriptor that carries 16-byte frames (AF_CAN, or AF_UNIX SEQPACKET).
 
-The core runs in one compiled loop without the interpreter lock.  SDO requests go through a socket pair to a Python
-thread, and its responses come back the same way: the core first acts on what was written, then sends the response, so
-that a master which has its answer finds the controlword carried out.  The loop is the only sender on the bus.
+One compiled loop without the interpreter lock.  SDO requests go through a socket pair to the Python thread of
+`hil.realtime_device`, and its responses come back the same way: the core first acts on what was written, then sends the
+response, so that a master which has its answer finds the controlword carried out.  The loop is the only sender on the
+bus.
 """
 
 from __future__ import annotations
 
 import errno as errno_codes
-import socket
-import threading
-import time
 from typing import Any
 
 import numpy as np
@@ -30,13 +28,11 @@ from firmware_py.libc import (
     send,
     store_release,
 )
-from firmware_py.schema import new
 from hil.bus.frames import FRAME_SIZE, FrameQueue
-from hil.canopen.device import Cia402Device
 from hil.canopen.device_core import accept_frame, advance
 from hil.canopen.device_records import Device, NmtState, int64
 from hil.faults.frame_faults import pass_frame, take_due
-from hil.faults.kinds import FaultMemory, fault_memory, no_faults
+from hil.faults.kinds import FaultMemory
 from hil.faults.plant_faults import step_faults
 from hil.frame_stamps import OLDEST_STAMP_NS, STAMPED_LAG_NS, sent_ns_of, stamp_answers
 from hil.plant.records import PlantConstants, PlantState
@@ -48,7 +44,6 @@ ENDED_WORD = 2  # 1 = stopped, 2 = the bus has gone
 WORDS = 3
 
 _LONGEST_WAIT_NS = 2_000_000  # faults of the plant are seen at least this often
-_SDO_LOOK_S = 0.1
 _FRAMES_AT_ONCE = 64  # received before timers are looked at again
 
 
@@ -119,6 +114,22 @@ def _take_frame(
 
 
 @kernel
+def _take_frames(
+    device: Device,
+    plant_c: PlantConstants,
+    plant_s: PlantState,
+    ready: FrameQueue,
+    service_fd: int,
+    now_ns: int,
+    queue: FrameQueue,
+) -> None:
+    """`_take_frame` for all that the wire's faults let through."""
+    for i in range(ready.count):
+        _take_frame(device, plant_c, plant_s, ready.frames[i], service_fd, now_ns, queue)
+    ready.count = 0
+
+
+@kernel
 def run_device(
     fd: int,
     devices: Any,
@@ -148,13 +159,12 @@ def run_device(
     ended = 1
     while load_acquire(words, STOP_WORD) == 0 and ended == 1:
         now_ns = monotonic_ns(timespec)
-        if len(faults) > 0:
-            step_faults(faults, memory, device, plant_c, plant_s, now_ns)
-            take_due(memory, True, now_ns, False, memory.ready)
-            for i in range(memory.ready.count):
-                _take_frame(device, plant_c, plant_s, memory.ready.frames[i], service_fd, now_ns, queue)
-            memory.ready.count = 0
         lag_ns = STAMPED_LAG_NS if now_ns - stamped_ns < OLDEST_STAMP_NS else 0
+        if len(faults) > 0:
+            plant_ns = now_ns - lag_ns
+            step_faults(faults, memory, device, plant_c, plant_s, plant_ns)
+            take_due(memory, True, plant_ns, False, memory.ready)
+            _take_frames(device, plant_c, plant_s, memory.ready, service_fd, plant_ns, queue)
         wait_ns = max(0, min(device.next_due_ns + lag_ns - now_ns, _LONGEST_WAIT_NS))
         polls[0] = fd
         polls[1] = POLLIN
@@ -175,18 +185,17 @@ def run_device(
             if got != FRAME_SIZE:
                 continue
             now_ns = monotonic_ns(timespec)
+            sent_ns = sent_ns_of(frame, now_ns)
             if len(faults) == 0:
-                sent_ns = sent_ns_of(frame, now_ns)
-                if sent_ns != now_ns:
-                    stamped_ns = now_ns
                 _take_frame(device, plant_c, plant_s, frame, service_fd, sent_ns, queue)
-                if sent_ns != now_ns and _is_sync(device, frame):
-                    stamp_answers(queue, frame)
             else:
-                pass_frame(faults, memory, frame, True, node_id, now_ns, memory.ready)
-                for i in range(memory.ready.count):
-                    _take_frame(device, plant_c, plant_s, memory.ready.frames[i], service_fd, now_ns, queue)
-                memory.ready.count = 0
+                step_faults(faults, memory, device, plant_c, plant_s, sent_ns)
+                pass_frame(faults, memory, frame, True, node_id, sent_ns, memory.ready)
+                _take_frames(device, plant_c, plant_s, memory.ready, service_fd, sent_ns, queue)
+            if sent_ns != now_ns:
+                stamped_ns = now_ns
+                if _is_sync(device, frame):
+                    stamp_answers(queue, frame)
             _flush_through_faults(fd, faults, memory, node_id, now_ns, queue, words)
         while _receive(service_fd, frame) == FRAME_SIZE:
             device.next_due_ns = 0
@@ -202,90 +211,6 @@ def run_device(
             _flush_through_faults(fd, faults, memory, node_id, woken_ns, queue, words)
     store_release(words, ENDED_WORD, ended)
     return ended
-
-
-class RealtimeDevice:
-    """Runs a device on a connected socket: `start`, `stop`, or a `with` block.  The descriptor stays the caller's."""
-
-    def __init__(self, device: Cia402Device, fd: int) -> None:
-        self._device = device
-        self._fd = fd
-        self.words = np.zeros(WORDS, np.int64)
-        self._faults = device.faults if len(device.faults) else no_faults()
-        self.fault_memory = fault_memory(self._faults)
-        self._threads: list[threading.Thread] = []
-        self._core_end: socket.socket | None = None
-
-    def _run(self, service_fd: int) -> None:
-        device = self._device
-        run_device(
-            self._fd,
-            device.device,
-            device.plant_constants,
-            device.plant_state,
-            new(FrameQueue),
-            self._faults,
-            self.fault_memory,
-            self.words,
-            service_fd,
-            np.zeros(FRAME_SIZE, np.uint8),
-            np.zeros(4, np.int32),
-            np.zeros(2, np.int64),
-        )
-
-    def _serve(self, service: socket.socket) -> None:
-        """Answer SDO requests until the other end closes; an unfinished transfer is looked at now and then."""
-        device = self._device
-        with service:
-            while True:
-                service.settimeout(_SDO_LOOK_S if device.sdo.busy else None)
-                try:
-                    frame = service.recv(FRAME_SIZE)
-                except TimeoutError:
-                    responses = device.expire_sdo(time.monotonic_ns())
-                else:
-                    if not frame:
-                        return
-                    responses = device.answer_sdo(frame, time.monotonic_ns())
-                for response in responses:
-                    service.send(response)
-
-    def compile(self) -> None:
-        """Compile, or load from the cache, what `start` runs; nothing is sent."""
-        self.words[:] = 0
-        self.words[STOP_WORD] = 1
-        self._run(-1)
-        self.words[:] = 0
-
-    def start(self) -> None:
-        """Compile if need be, then boot: the boot-up message is sent."""
-        if self._threads:
-            raise RuntimeError("the device is running already")
-        self.compile()
-        self._core_end, python_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._threads = [
-            threading.Thread(target=self._run, args=(self._core_end.fileno(),), name="device", daemon=True),
-            threading.Thread(target=self._serve, args=(python_end,), name="device-sdo", daemon=True),
-        ]
-        for thread in self._threads:
-            thread.start()
-
-    def stop(self) -> None:
-        """End both threads; the plant stays where it is.  Harmless when not running."""
-        if not self._threads or self._core_end is None:
-            return
-        store_release_word(self.words, STOP_WORD, 1)
-        self._threads[0].join()
-        self._core_end.close()
-        self._threads[1].join()
-        self._threads = []
-
-    def __enter__(self) -> RealtimeDevice:
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
 
 
 @kernel

@@ -62,6 +62,13 @@ def append_frame(queue: FrameQueue, frame: np.ndarray) -> int:
 
 
 @kernel
+def _unstamp(frame: np.ndarray) -> None:
+    """A frame that the wire makes late or doubles shall count when it comes: see `hil.frame_stamps`."""
+    for i in range(5, 8):
+        frame[i] = 0
+
+
+@kernel
 def _keep(memory: FaultMemory, frame: np.ndarray, to_drive: bool, due_ns: int) -> None:
     slot = int64(memory.late_count)
     if slot >= LATE_FRAMES:
@@ -71,6 +78,7 @@ def _keep(memory: FaultMemory, frame: np.ndarray, to_drive: bool, due_ns: int) -
     memory.late_to_drive[slot] = 1 if to_drive else 0
     for i in range(FRAME_SIZE):
         memory.late_frames[slot, i] = frame[i]
+    _unstamp(memory.late_frames[slot])
     memory.late_count = slot + 1
 
 
@@ -200,6 +208,8 @@ def pass_frame(
     if slot >= 0 and length >= 0:
         queue.frames[slot, 4] = length
     if twice and slot >= 0:
-        append_frame(queue, queue.frames[slot])
+        slot = append_frame(queue, queue.frames[slot])
+        if slot >= 0:
+            _unstamp(queue.frames[slot])
     if memory.late_count > 0:
         take_due(memory, to_drive, now_ns, True, queue)

@@ -71,7 +71,11 @@ def step_faults(
     plant_s: PlantState,
     now_ns: int,
 ) -> None:
-    """Begin and end the faults of drive and plant that are due; call it before the device advances to `now_ns`."""
+    """Begin and end the faults of drive and plant that are due; call it before the device advances to `now_ns`.
+
+    An earlier time than the last one is taken for that: time does not go back.
+    """
+    now_ns = max(now_ns, int64(memory.last_ns))
     if memory.epoch_ns == 0 and device.state == PowerState.OPERATION_ENABLED:
         memory.epoch_ns = now_ns
     for i in range(len(faults)):

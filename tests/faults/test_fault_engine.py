@@ -20,6 +20,7 @@ MakeFault = Callable[..., Any]
 NODE = 1
 MS = 1_000_000
 EPOCH_ns = 7 * MS
+STAMP = (7, 8, 9)  # when it was sent, see hil.frame_stamps
 SYNC, RPDO, OWN_HEARTBEAT = (0x80, 0), (0x201, 4), (0x77E, 1)
 TPDO, HEARTBEAT, EMCY = (0x181, 8), (0x701, 1), (0x81, 8)
 TO_DRIVE, TO_CONTROLLER = (SYNC, RPDO, OWN_HEARTBEAT), (TPDO, HEARTBEAT, EMCY)
@@ -36,6 +37,7 @@ class Wire:
         """What arrives at once when a frame of this identifier and length is sent; its data is a running number."""
         frame = np.zeros(FRAME_SIZE, np.uint8)
         frame[0], frame[1], frame[4] = kind[0] & 0xFF, kind[0] >> 8, kind[1]
+        frame[5:8] = STAMP
         frame[8 : 8 + kind[1]] = self.count % 256
         self.count += 1
         queue = new(FrameQueue)
@@ -99,7 +101,8 @@ def test_late_frames_come_when_they_are_due_in_their_order(
     assert wire.send(frame, to_drive, 1.0) == []
     assert wire.due(to_drive, 1.99) == []
     assert wire.due(not to_drive, 10.0) == []
-    assert [data[8] for data in wire.due(to_drive, 2.0)] == [0]
+    (first,) = wire.due(to_drive, 2.0)
+    assert (first[8], tuple(first[5:8])) == (0, (0, 0, 0))  # it counts when it comes
     assert [data[8] for data in wire.due(to_drive, 9.0)] == [1]
     assert wire.due(to_drive, 99.0) == []
 
@@ -110,10 +113,11 @@ def test_doubled_reordered_corrupted_and_of_another_length(
 ) -> None:
     twice = Wire(one_fault(FaultKind[f"{kind}_DUPLICATED"])).send(frame, to_drive)
     assert len(twice) == 2
-    assert twice[0] == twice[1]
+    assert (twice[0][:5], twice[0][8:]) == (twice[1][:5], twice[1][8:])
+    assert (tuple(twice[0][5:8]), tuple(twice[1][5:8])) == (STAMP, (0, 0, 0))
     wire = Wire(one_fault(FaultKind[f"{kind}_REORDERED"]))
-    came = [data[8] for _ in range(6) for data in wire.send(frame, to_drive)]
-    assert came == [1, 0, 3, 2, 5, 4]
+    came = [(data[8], data[5]) for _ in range(6) for data in wire.send(frame, to_drive)]
+    assert came == [(1, 7), (0, 0), (3, 7), (2, 0), (5, 7), (4, 0)]
     (damaged,) = Wire(one_fault(FaultKind[f"{kind}_CORRUPTED"])).send(frame, to_drive)
     assert damaged[:5] == bytes([frame[0] & 0xFF, frame[0] >> 8, 0, 0, frame[1]])
     assert len(set(damaged[8 : 8 + frame[1]])) > 1

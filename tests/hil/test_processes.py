@@ -72,13 +72,17 @@ class Moving:
     def __init__(self, bench: Any, **changes: Any) -> None:
         self.bench = bench
         self.config = bench.config(
-            trajectory__duration_s=60.0, sequence__supervisor_timeout_s=0.3, **changes
+            trajectory__duration_s=60.0, sequence__supervisor_timeout_s=0.8, **changes
         )  # fmt: skip
         self.hil = bench.joint(self.config)
         self.witness = Witness(bench)
-        self.run = bench.start("run", self.config, "-y").saw("  tracking")
-        (self.loop,) = self.run.children()
-        assert self.witness.saw(ENABLED)
+        try:
+            self.run = bench.start("run", self.config, "-y").saw("  tracking")
+            (self.loop,) = self.run.children()
+            assert self.witness.saw(ENABLED)
+        except BaseException:
+            self.close()  # or its thread tells the next test that the bus has gone
+            raise
         self.since_s = time.time()
 
     def close(self) -> None:

@@ -12,8 +12,8 @@ import pytest
 from drivers.can.open import open_cyclic_end
 from hil.bus.virtual_bus import VirtualBusHub
 from hil.canopen.device import Cia402Device, DeviceSettings
-from hil.device_loop import RealtimeDevice
 from hil.plant.joint import plant
+from hil.realtime_device import RealtimeDevice
 from tests.hil.conftest import bench as bench
 
 EDS = Path(__file__).resolve().parents[2] / "configs" / "virtual_joint.eds"

@@ -11,8 +11,9 @@ import canopen
 import pytest
 
 from hil.canopen.device import Cia402Device, DeviceSettings
-from hil.device_loop import SEND_ERRORS_WORD, RealtimeDevice
+from hil.device_loop import SEND_ERRORS_WORD
 from hil.plant.joint import plant
+from hil.realtime_device import RealtimeDevice
 from tests.virtual_drive import EDS, NODE, Network
 
 

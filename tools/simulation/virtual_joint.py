@@ -15,8 +15,8 @@ from drivers.can.open import CYCLIC_INTERFACES, open_cyclic_end, open_python_can
 from drivers.errors import BusError, ConfigurationError
 from hil.bus.virtual_bus import VirtualBusError, VirtualBusHub, default_socket_path
 from hil.canopen.device import Cia402Device
-from hil.device_loop import RealtimeDevice
 from hil.plant.joint import plant
+from hil.realtime_device import RealtimeDevice
 from tools.configuration.config import Config
 from tools.configuration.drive_settings import device_settings
 from tools.configuration.plant_settings import fault_constants, plant_settings
