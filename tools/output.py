@@ -16,7 +16,8 @@ from typing import IO, Any, Protocol
 
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
+
+from tools.narrow_table import fitted, widest
 
 
 class Advance(Protocol):
@@ -26,7 +27,7 @@ class Advance(Protocol):
 
 
 FACT_COLUMN = 11  # where the text of a `fact` begins
-PIPE_COLUMNS = 140  # of a table that goes to a file or a pipe: nothing may be cut off there
+PIPE_COLUMNS = 140  # of a table that goes to a file or a pipe, or more if it needs them
 
 
 @dataclass
@@ -50,9 +51,9 @@ class Output:
             if data is not None:
                 print(json_format.dumps(_plain(data), allow_nan=False), file=self.stdout, flush=True)
         else:
-            for column in shown.columns if isinstance(shown, Table) else ():
-                column.overflow = "fold"  # a narrow terminal must not cut a number or a path
-            self._results.print(shown)
+            if not self.stdout.isatty():
+                self._results.width = max(PIPE_COLUMNS, widest(shown))
+            self._results.print(fitted(shown, self._results.width))
 
     def note(self, text: str) -> None:
         """Progress in words; not with `--quiet`."""

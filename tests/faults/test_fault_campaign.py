@@ -20,15 +20,17 @@ from firmware_py.states import AxisPhase, DriveRequest, Fault
 from hil.canopen.device_records import PowerState
 from hil.faults.kinds import FaultKind
 from hil.lockstep import TRUE_POWER_STATE, TRUTHS
+from tests.page_figures import foreign_colours, svgs
 from tools.campaign import judge as judge_module
 from tools.campaign import runner
 from tools.campaign.envelope import Envelope, envelope, reaction_s
 from tools.campaign.fault_classes import FAULT_CLASSES
 from tools.campaign.judge import judge, run_scenario
-from tools.campaign.report import rows_by_kind, write_figure
+from tools.campaign.report import campaign_figure, rows_by_kind
 from tools.campaign.scenario import draw_scenario
 from tools.configuration.config import Config
 from tools.configuration.load import load_config
+from tools.drawing import png
 from tools.output import Output
 from tools.simulation.lockstep import LockstepJoint, LockstepRun
 from tools.verbs.fault_campaign import fault_campaign
@@ -186,7 +188,7 @@ def test_the_verb_writes_table_json_and_picture(config: Config, tmp_path: Path) 
     shown, out, _ = output()
     page = tmp_path / "campaign.html"
     assert fault_campaign(config, shown, count=KINDS, seed=5, folder=tmp_path / "new", workers=1, report=page) == 0
-    assert "data:image/png;base64," in page.read_text()
+    assert [foreign_colours(svg) for svg in svgs(page.read_text())] == [set()]
     assert f"0 of {KINDS} scenarios violate an invariant, seed 5." in page.read_text()
     data = json.loads(out.getvalue())
     assert (data["scenarios"], data["violations"], data["interrupted"]) == (KINDS, 0, False)
@@ -243,5 +245,4 @@ def test_workers_give_the_same_verdicts_as_one_process(config: Config, joint: Lo
     assert [dataclasses.astuple(v)[:8] for v in found] == [dataclasses.astuple(v)[:8] for v in alone]
     rows = rows_by_kind(found)
     assert sum(row.scenarios for row in rows) == 40
-    write_figure(tmp_path / "a.png", found, 1.0)
-    assert (tmp_path / "a.png").stat().st_size > 10_000
+    assert len(png(campaign_figure(found, 1.0))) > 10_000

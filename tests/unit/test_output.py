@@ -6,8 +6,12 @@ import io
 import re
 
 import pytest
+from rich.console import Group, RenderableType
+from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
+from tools.narrow_table import width_of
 from tools.output import Output
 
 NUMBERS = ["0.0949 .. 0.358", "0.00788 .. 0.0162", "0.00762 .. 0.00944"]
@@ -19,18 +23,48 @@ class Terminal(io.StringIO):
         return True
 
 
-@pytest.mark.parametrize("columns", [40, 80, 200])
-def test_a_table_in_a_narrow_terminal_loses_nothing(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def shown_at(columns: int, table: RenderableType, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The lines in a terminal of that width, which none of them exceeds; without colours."""
     monkeypatch.setenv("COLUMNS", str(columns))
-    table = Table("file", "peak", "RMSE", "true RMSE")
-    table.add_row(PATH, *NUMBERS)
     out = Terminal()
     Output(stdout=out, stderr=io.StringIO()).result(table)
-    shown = re.sub(r"\x1b\[[0-9;]*m", "", out.getvalue()).splitlines()
-    lines = [line.split("│")[1:-1] for line in shown if line.startswith("│")]
-    assert max(len(line) for line in shown) <= columns
-    read = ["".join(cells) for cells in zip(*lines, strict=True)]
-    assert [re.sub(r"\s", "", cell) for cell in read] == [re.sub(r"\s", "", text) for text in (PATH, *NUMBERS)]
+    lines = re.sub(r"\x1b\[[0-9;]*m", "", out.getvalue()).splitlines()
+    assert max(len(line) for line in lines) <= columns
+    return [line.rstrip() for line in lines]
+
+
+def wide() -> Table:
+    table = Table("file", "peak", escape("RMSE [mrad]"), "true RMSE", title="T", caption="C")
+    table.add_row(PATH, *NUMBERS)
+    table.add_row("[bold]two[/]", "1", "", Text("[2]"))
+    return table
+
+
+def test_a_wide_terminal_shows_the_table_and_a_narrow_one_a_list_of_its_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    needed = width_of(wide())
+    assert needed == len(PATH) + len("0.0949") + len("0.00788") + len("0.00762") + 4 * 3 + 1
+    assert any(line.startswith("│") for line in shown_at(needed, wide(), monkeypatch))
+    assert shown_at(needed - 1, wide(), monkeypatch) == [
+        "T", PATH, f"  peak {NUMBERS[0]}, RMSE [mrad] {NUMBERS[1]}", f"  true RMSE {NUMBERS[2]}",
+        "two", "  peak 1, true RMSE [2]", "C",
+    ]  # fmt: skip
+
+
+def test_a_table_of_names_and_values_and_one_in_a_group_lose_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    table = Table("name", "value")
+    table.add_row("log", PATH)
+    lines = shown_at(40, Group(table, "after"), monkeypatch)
+    cells = [line.split("│")[2] for line in lines if line.startswith("│")]
+    assert "".join(cell.strip() for cell in cells) == PATH
+    assert lines[-1] == "after"
+
+
+def test_a_pipe_is_as_wide_as_the_table_needs() -> None:
+    table = Table(*"abcdefgh")
+    table.add_row(*["0.123456789012345678901"] * 8)
+    out = io.StringIO()
+    Output(stdout=out).result(Group(table))
+    assert out.getvalue().count("0.123456789012345678901") == 8
 
 
 def test_what_a_terminal_wraps_of_a_fact_goes_below_its_text(monkeypatch: pytest.MonkeyPatch) -> None:

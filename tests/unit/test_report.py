@@ -16,11 +16,12 @@ from drivers.errors import DataError
 from firmware_py.records import LogRecord
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, DriveState, Fault
+from tools.drawing import COLOURS
 from tools.output import Output
 from tools.recording.run_log import INFO, RunLogWriter
 from tools.recording.run_summary import summarise
 from tools.reporting.comparison import aligned, at_times
-from tools.reporting.figure import COLOURS, draw
+from tools.reporting.figure import draw
 from tools.reporting.page import Details, Figure, Paragraph, Section, Table, page, write_page
 from tools.reporting.run_figures import binned, friction_points, run_figures
 from tools.verbs.report import MOST_LOGS, log_names, report, verdict
@@ -246,7 +247,7 @@ def test_logs_of_one_name_are_told_apart() -> None:
 
 def test_the_page_takes_every_block(tmp_path: Path) -> None:
     table = Table(["<name>", "value"], [["a", "1.5"], ["b", "-2 %"]], "caption", {1: "error"})
-    picture = Figure("a dot", png=b"\x89PNG")
+    picture = Figure("a dot", '<svg><circle r="1"/></svg>')
     blocks = [Paragraph("5 < 6"), table, picture, Details("more", "<x>"), draw(1.0, lambda f: f.subplots(), "axes")]
     html = page("T & T", [Section("One", blocks), Section("Two", [draw(1.0, lambda f: f.subplots(), "again")])])
     check(html)
@@ -255,7 +256,7 @@ def test_the_page_takes_every_block(tmp_path: Path) -> None:
         "5 &lt; 6",
         "&lt;name&gt;",
         'class="error"',
-        "data:image/png;base64,iVBORw==",
+        '<svg><circle r="1"/></svg>',
         "&lt;x&gt;",
     ):
         assert text in html

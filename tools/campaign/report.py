@@ -10,12 +10,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from rich.markup import escape
 from rich.table import Table
 
 from tools.campaign.judge import Verdict
 from tools.campaign.scenario import draw_scenario
+from tools.drawing import INK, MID_BLUE, MID_GREEN, MID_RED, canvas
 
 MANY = 1000  # scenarios: more are drawn as specks
 
@@ -65,7 +65,7 @@ def table(rows: Sequence[KindRow]) -> Table:
         ("speed [rad/s]", "right"), ("beyond limit [rad]", "right"), ("allowed [rad]", "right"),
         ("off after [s]", "right"), ("told as", "left"),
     ):  # fmt: skip
-        shown.add_column(name, justify=justify)  # type: ignore[arg-type]
+        shown.add_column(escape(name), justify=justify)  # type: ignore[arg-type]
     for row in rows:
         causes = ", ".join(f"{name.lower()} {count}" for name, count in row.causes.items())
         shown.add_row(
@@ -97,31 +97,32 @@ def write_json(path: Path, seed: int, verdicts: Sequence[Verdict], elapsed_s: fl
     path.write_text(text + "\n")
 
 
-def write_figure(path: Path, verdicts: Sequence[Verdict], velocity_max_radps: float) -> None:
+def campaign_figure(verdicts: Sequence[Verdict], velocity_max_radps: float) -> Any:
     """Speed reached and time until off, a column of points for each kind; violations in red."""
     kinds = list(dict.fromkeys(verdict.kind for verdict in verdicts))
-    figure = Figure(figsize=(12.0, 8.0), layout="constrained")
-    FigureCanvasAgg(figure)
-    size = 2.5 if len(verdicts) > MANY else 6.0
-    speed, off = figure.subplots(2, 1, sharex=True)
-    points: dict[str, list[tuple[float, float, float]]] = {"tab:blue": [], "tab:green": [], "tab:red": []}
+    many = len(verdicts) > MANY
+    points: dict[str, list[tuple[float, float, float]]] = {MID_BLUE: [], MID_GREEN: [], MID_RED: []}
     for place, kind in enumerate(kinds):
         mine = [verdict for verdict in verdicts if verdict.kind == kind]
         for i, verdict in enumerate(mine):
             across = place - 0.3 + 0.6 * i / max(len(mine) - 1, 1)
-            colour = "tab:red" if verdict.violations else "tab:green" if verdict.harmless else "tab:blue"
+            colour = MID_RED if verdict.violations else MID_GREEN if verdict.harmless else MID_BLUE
             off_s = math.nan if verdict.off_s is None else max(verdict.off_s, 1e-3)
             points[colour].append((across, verdict.peak_radps, off_s))
-    for colour, some in points.items():  # a line object for each point would take a minute
-        if some:
-            across_all, speeds_radps, offs_s = zip(*some, strict=True)
-            speed.plot(across_all, speeds_radps, ".", color=colour, markersize=size)
-            off.plot(across_all, offs_s, ".", color=colour, markersize=size)
-    speed.axhline(velocity_max_radps, color="black", linewidth=0.8, linestyle="--", label="velocity limit")
-    speed.set_ylabel("greatest speed [rad/s]")
-    speed.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False)
-    off.set_ylabel("off and at rest after the fault [s]")
-    off.set_yscale("log")
-    off.set_xticks(range(len(kinds)), kinds, rotation=70, ha="right", fontsize=8)
-    speed.set_title("harmful faults blue, harmless twins green, violations red")
-    figure.savefig(path, dpi=120)
+    with canvas(8.0) as figure:
+        speed, off = figure.subplots(2, 1, sharex=True)
+        for colour, some in points.items():  # a line object for each point would take a minute
+            if some:
+                across_all, speeds_radps, offs_s = zip(*some, strict=True)
+                style: Any = {"color": colour, "markersize": 2.5 if many else 6.0, "rasterized": many}
+                speed.plot(across_all, speeds_radps, ".", **style)
+                off.plot(across_all, offs_s, ".", **style)
+        speed.axhline(velocity_max_radps, color=INK, linewidth=0.8, linestyle="--", label="velocity limit")
+        speed.set_ylabel("greatest speed [rad/s]")
+        speed.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))
+        speed.set_xlim(-0.6, len(kinds) - 0.4)
+        off.set_ylabel("off and at rest after the fault [s]")
+        off.set_yscale("log")
+        off.set_xticks(range(len(kinds)), kinds, rotation=70, ha="right", rotation_mode="anchor", fontsize=8)
+        speed.set_title("harmful faults blue, harmless twins green, violations red")
+        return figure

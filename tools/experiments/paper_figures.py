@@ -1,13 +1,12 @@
-"""The paper's figures 8 to 14, redrawn from our runs: one PNG each."""
+"""The paper's figures 8 to 14, redrawn from our runs."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from drivers.errors import DataError
+from tools.drawing import BLUE, GREEN, GREY, ORANGE, RED, canvas
 from tools.experiments.paper_rows import Runs
 from tools.experiments.paper_runs import friction_estimate, hidden_outputs
 from tools.experiments.scenarios import event_s
@@ -15,43 +14,18 @@ from tools.recording.run_figure import drawn_indices
 from tools.simulation.lockstep import LockstepRun
 
 _START_s = 1.0
-_BLUE, _ORANGE, _GREEN, _RED, _GREY = "#1f5fa8", "#d9822b", "#3a8f4d", "#b3282d", "#555555"
 
 
-def _figure(title: str, height: float) -> Any:
-    # slow to import, and only wanted here; no display is needed
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
-    return figure
-
-
-def _save(figure: Any, path: Path) -> Path:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=110, format="png")
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written: {error.strerror or error}") from None
-    return path
-
-
-def _draw(axis: Any, time_s: np.ndarray, values: np.ndarray, label: str = "", color: Any = _BLUE, **style: Any) -> None:
+def _draw(axis: Any, time_s: np.ndarray, values: np.ndarray, label: str = "", color: Any = BLUE, **style: Any) -> None:
     keep = drawn_indices(values)
     axis.plot(time_s[keep], values[keep], label=label, color=color, **{"linewidth": 1.0, **style})
 
 
 def _tidy(axis: Any, ylabel: str, title: str, *, legend: bool = False) -> None:
     axis.set_ylabel(ylabel)
-    axis.set_title(title, loc="left", fontsize=10)
-    axis.grid(True, color="#dddddd", linewidth=0.6)
-    axis.margins(x=0.0)
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.set_axisbelow(True)
+    axis.set_title(title)
     if legend:
-        axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=9)
+        axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
 def _scale_to_later(axis: Any, *curves: tuple[np.ndarray, np.ndarray]) -> None:
@@ -67,114 +41,115 @@ def _tracked(run: LockstepRun) -> tuple[Any, np.ndarray]:
     return log, log.trajectory_s
 
 
-def draw_simulation(runs: Runs, folder: Path) -> Path:
+def draw_simulation(runs: Runs) -> Any:
     """Fig. 8: inputs of the network, estimate against truth, weights, hidden outputs."""
     made = runs["4.2 more friction"]
     experiment, run = made.experiment, made.run
     virtual = experiment.plant.virtual
     assert virtual is not None
     log, time_s = _tracked(run)
-    figure = _figure("Fig. 8: simulation, true friction 10 % above the model, Q = 2500, ideal velocity", 12.0)
-    axes = figure.subplots(5, 1, sharex=True, height_ratios=(2, 2, 3, 2.4, 2.4))
-    _draw(axes[0], time_s, log.error_rad * 1e3)
-    start = float(np.max(np.abs(log.error_rad[time_s < _START_s]))) * 1e3
-    _tidy(axes[0], "e [mrad]", f"(a) inputs of the network: position error; {start:.2f} mrad in the first instant")
-    _draw(axes[1], time_s, log.error_rate_radps * 1e3, color=_ORANGE)
-    axes[1].set_ylim(-12.0, 12.0)
-    first = float(log.error_rate_radps[0]) * 1e3
-    _tidy(axes[1], "e' [mrad/s]", f"(a) velocity error; it begins at {first:.0f} mrad/s, the joint being at rest")
-    estimate = friction_estimate(run, virtual.friction_positive_scale, virtual.friction_negative_scale)
-    _draw(axes[2], time_s, estimate.true_Nm, "true model error f", _GREY, linewidth=1.6)
-    _draw(axes[2], time_s, estimate.estimate_Nm, "estimate", _RED)
-    text = f"(b) estimated and true model error; after 75 s correlation {estimate.correlation:.3f}"
-    _scale_to_later(axes[2], (time_s, estimate.true_Nm), (time_s, estimate.estimate_Nm))
-    _tidy(axes[2], "[Nm]", text, legend=True)
-    # all weights move as one (b = 5): drawing one in three is drawing them all
-    for index, color in zip((0, 7, 14), (_BLUE, _ORANGE, _GREEN), strict=True):
-        _draw(axes[3], time_s, log.weights[:, index], f"w{index + 1}", color, linewidth=2.6 - 0.09 * index)
-    _scale_to_later(axes[3], (time_s, log.weights[:, 0]))
-    _tidy(axes[3], "[Nm]", "(c) weights: they differ by less than a line's width", legend=True)
-    hidden = hidden_outputs(run, experiment.plant, experiment.controller)
-    for index, color in zip((0, 7, 14), (_BLUE, _ORANGE, _GREEN), strict=True):
-        _draw(axes[4], time_s, hidden[:, index], f"h{index + 1}", color)
-    axes[4].ticklabel_format(axis="y", useOffset=False)
-    _scale_to_later(axes[4], (time_s, hidden[:, 0]), (time_s, hidden[:, 7]), (time_s, hidden[:, 14]))
-    _tidy(axes[4], "", "(d) outputs of the hidden layer: near 1 throughout", legend=True)
-    axes[4].set_xlabel("time [s]")
-    figure.align_ylabels(axes)
-    return _save(figure, folder / "fig08_simulation.png")
+    title = "Fig. 8: simulation, true friction 10 % above the model, Q = 2500, ideal velocity"
+    with canvas(12.0, title) as figure:
+        axes = figure.subplots(5, 1, sharex=True, height_ratios=(2, 2, 3, 2.4, 2.4))
+        _draw(axes[0], time_s, log.error_rad * 1e3)
+        start = float(np.max(np.abs(log.error_rad[time_s < _START_s]))) * 1e3
+        _tidy(axes[0], "e [mrad]", f"(a) inputs of the network: position error; {start:.2f} mrad in the first instant")
+        _draw(axes[1], time_s, log.error_rate_radps * 1e3, color=ORANGE)
+        axes[1].set_ylim(-12.0, 12.0)
+        first = float(log.error_rate_radps[0]) * 1e3
+        _tidy(axes[1], "e' [mrad/s]", f"(a) velocity error; it begins at {first:.0f} mrad/s, the joint being at rest")
+        estimate = friction_estimate(run, virtual.friction_positive_scale, virtual.friction_negative_scale)
+        _draw(axes[2], time_s, estimate.true_Nm, "true model error f", GREY, linewidth=1.6)
+        _draw(axes[2], time_s, estimate.estimate_Nm, "estimate", RED)
+        text = f"(b) estimated and true model error; after 75 s correlation {estimate.correlation:.3f}"
+        _scale_to_later(axes[2], (time_s, estimate.true_Nm), (time_s, estimate.estimate_Nm))
+        _tidy(axes[2], "[Nm]", text, legend=True)
+        # all weights move as one (b = 5): drawing one in three is drawing them all
+        for index, color in zip((0, 7, 14), (BLUE, ORANGE, GREEN), strict=True):
+            _draw(axes[3], time_s, log.weights[:, index], f"w{index + 1}", color, linewidth=2.6 - 0.09 * index)
+        _scale_to_later(axes[3], (time_s, log.weights[:, 0]))
+        _tidy(axes[3], "[Nm]", "(c) weights: they differ by less than a line's width", legend=True)
+        hidden = hidden_outputs(run, experiment.plant, experiment.controller)
+        for index, color in zip((0, 7, 14), (BLUE, ORANGE, GREEN), strict=True):
+            _draw(axes[4], time_s, hidden[:, index], f"h{index + 1}", color)
+        axes[4].ticklabel_format(axis="y", useOffset=False)
+        _scale_to_later(axes[4], (time_s, hidden[:, 0]), (time_s, hidden[:, 7]), (time_s, hidden[:, 14]))
+        _tidy(axes[4], "", "(d) outputs of the hidden layer: near 1 throughout", legend=True)
+        axes[4].set_xlabel("time [s]")
+        figure.align_ylabels(axes)
+        return figure
 
 
-def draw_friction_model(runs: Runs, folder: Path) -> Path:
+def draw_friction_model(runs: Runs) -> Any:
     """Figs. 9 to 11: with and without friction model on R1."""
     without, with_model, precise = (runs[key].run for key in ("no model, R1", "model, R1", "precise, R1"))
-    figure = _figure("Figs. 9-11: with and without friction model, realistic joint R1, Q = 1800", 12.0)
-    axes = figure.subplots(5, 1, sharex=True, height_ratios=(2, 2.4, 2.4, 2.4, 2))
-    log, time_s = _tracked(with_model)
-    bare, bare_s = _tracked(without)
-    fine, fine_s = _tracked(precise)
-    _draw(axes[0], time_s, log.desired_position_rad, "desired", _ORANGE, linewidth=2.2)
-    _draw(axes[0], time_s, log.position_rad, "with model", _BLUE)
-    _draw(axes[0], bare_s, bare.position_rad, "without", _GREY, linestyle="--")
-    _tidy(axes[0], "joint angle [rad]", "tracking", legend=True)
-    _draw(axes[1], bare_s, bare.network_torque_Nm, "without", _GREY)
-    _draw(axes[1], time_s, log.network_torque_Nm, "with model", _RED)
-    _scale_to_later(axes[1], (bare_s, bare.network_torque_Nm), (time_s, log.network_torque_Nm))
-    _tidy(axes[1], "network [Nm]", "output of the network, subtracted from the torque", legend=True)
-    _draw(axes[2], bare_s, bare.error_rad * 1e3, "without", _GREY)
-    _draw(axes[2], time_s, log.error_rad * 1e3, "with model", _BLUE)
-    _scale_to_later(axes[2], (bare_s, bare.error_rad * 1e3), (time_s, log.error_rad * 1e3))
-    _tidy(axes[2], "error [mrad]", "error; the first instants, when the joint starts at rest, are cut off", legend=True)
-    _draw(axes[3], time_s, log.command_torque_Nm, "with model", _BLUE)
-    _draw(axes[3], bare_s, bare.command_torque_Nm, "without", _GREY)
-    _scale_to_later(axes[3], (bare_s, bare.command_torque_Nm), (time_s, log.command_torque_Nm))
-    _tidy(axes[3], "torque [Nm]", "torque at the joint", legend=True)
-    _draw(axes[4], fine_s, fine.error_rad * 1e3, "precise.toml", _GREEN)
-    axes[4].set_ylim(-0.4, 0.4)
-    _tidy(
-        axes[4],
-        "error [mrad]",
-        "not in the paper: configs/precise.toml on the same joint (note the scale)",
-        legend=True,
-    )
-    axes[4].set_xlabel("time [s]")
-    figure.align_ylabels(axes)
-    return _save(figure, folder / "fig09_11_friction_model.png")
+    with canvas(12.0, "Figs. 9-11: with and without friction model, realistic joint R1, Q = 1800") as figure:
+        axes = figure.subplots(5, 1, sharex=True, height_ratios=(2, 2.4, 2.4, 2.4, 2))
+        log, time_s = _tracked(with_model)
+        bare, bare_s = _tracked(without)
+        fine, fine_s = _tracked(precise)
+        _draw(axes[0], time_s, log.desired_position_rad, "desired", ORANGE, linewidth=2.2)
+        _draw(axes[0], time_s, log.position_rad, "with model", BLUE)
+        _draw(axes[0], bare_s, bare.position_rad, "without", GREY, linestyle="--")
+        _tidy(axes[0], "joint angle [rad]", "tracking", legend=True)
+        _draw(axes[1], bare_s, bare.network_torque_Nm, "without", GREY)
+        _draw(axes[1], time_s, log.network_torque_Nm, "with model", RED)
+        _scale_to_later(axes[1], (bare_s, bare.network_torque_Nm), (time_s, log.network_torque_Nm))
+        _tidy(axes[1], "network [Nm]", "output of the network, subtracted from the torque", legend=True)
+        _draw(axes[2], bare_s, bare.error_rad * 1e3, "without", GREY)
+        _draw(axes[2], time_s, log.error_rad * 1e3, "with model", BLUE)
+        _scale_to_later(axes[2], (bare_s, bare.error_rad * 1e3), (time_s, log.error_rad * 1e3))
+        _tidy(axes[2], "error [mrad]", "error; the first instants, from rest, are cut off", legend=True)
+        _draw(axes[3], time_s, log.command_torque_Nm, "with model", BLUE)
+        _draw(axes[3], bare_s, bare.command_torque_Nm, "without", GREY)
+        _scale_to_later(axes[3], (bare_s, bare.command_torque_Nm), (time_s, log.command_torque_Nm))
+        _tidy(axes[3], "torque [Nm]", "torque at the joint", legend=True)
+        _draw(axes[4], fine_s, fine.error_rad * 1e3, "precise.toml", GREEN)
+        axes[4].set_ylim(-0.4, 0.4)
+        _tidy(
+            axes[4],
+            "error [mrad]",
+            "not in the paper: configs/precise.toml on the same joint (note the scale)",
+            legend=True,
+        )
+        axes[4].set_xlabel("time [s]")
+        figure.align_ylabels(axes)
+        return figure
 
 
-def draw_change(runs: Runs, change: str, title: str, path: Path, from_s: float = 70.0) -> Path:
+def draw_change(runs: Runs, change: str, title: str, from_s: float = 70.0) -> Any:
     """Figs. 12 to 14: tracking, network, error around a change; the precise law beside it."""
     made, other = runs[f"{change}, R1"], runs[f"precise, {change}, R1"]
     log, time_s = _tracked(made.run)
     fine, fine_s = _tracked(other.run)
-    figure = _figure(title, 9.5)
-    axes = figure.subplots(4, 1, sharex=True, height_ratios=(2, 2, 2.4, 2))
-    late, fine_late = time_s >= from_s, fine_s >= from_s
-    t = time_s[late]
-    _draw(axes[0], t, log.desired_position_rad[late], "desired", _ORANGE, linewidth=2.2)
-    _draw(axes[0], t, log.position_rad[late], "measured", _BLUE)
-    _tidy(axes[0], "joint angle [rad]", "(a) tracking", legend=True)
-    _draw(axes[1], t, log.network_torque_Nm[late], "paper's law", _RED)
-    _tidy(axes[1], "network [Nm]", "(b) output of the network, subtracted", legend=True)
-    _draw(axes[2], t, log.error_rad[late] * 1e3, "paper's law", _BLUE)
-    _tidy(axes[2], "error [mrad]", "(c) error", legend=True)
-    _draw(axes[3], fine_s[fine_late], fine.error_rad[fine_late] * 1e3, "precise.toml", _GREEN)
-    axes[3].set_ylim(-0.4, 0.4)
-    _tidy(axes[3], "error [mrad]", "not in the paper: configs/precise.toml (note the scale)", legend=True)
-    axes[3].set_xlabel("time [s]")
-    at_s = event_s(made.experiment.scenario)
-    for axis in axes:
-        axis.axvline(at_s, color=_GREY, linewidth=1.0, linestyle=":")
-    figure.align_ylabels(axes)
-    return _save(figure, path)
+    with canvas(9.5, title) as figure:
+        axes = figure.subplots(4, 1, sharex=True, height_ratios=(2, 2, 2.4, 2))
+        late, fine_late = time_s >= from_s, fine_s >= from_s
+        t = time_s[late]
+        _draw(axes[0], t, log.desired_position_rad[late], "desired", ORANGE, linewidth=2.2)
+        _draw(axes[0], t, log.position_rad[late], "measured", BLUE)
+        _tidy(axes[0], "joint angle [rad]", "(a) tracking", legend=True)
+        _draw(axes[1], t, log.network_torque_Nm[late], "paper's law", RED)
+        _tidy(axes[1], "network [Nm]", "(b) output of the network, subtracted", legend=True)
+        _draw(axes[2], t, log.error_rad[late] * 1e3, "paper's law", BLUE)
+        _tidy(axes[2], "error [mrad]", "(c) error", legend=True)
+        _draw(axes[3], fine_s[fine_late], fine.error_rad[fine_late] * 1e3, "precise.toml", GREEN)
+        axes[3].set_ylim(-0.4, 0.4)
+        _tidy(axes[3], "error [mrad]", "not in the paper: configs/precise.toml (note the scale)", legend=True)
+        axes[3].set_xlabel("time [s]")
+        at_s = event_s(made.experiment.scenario)
+        for axis in axes:
+            axis.axvline(at_s, color=GREY, linewidth=1.0, linestyle=":")
+        figure.align_ylabels(axes)
+        return figure
 
 
-def draw_all(runs: Runs, folder: Path) -> list[Path]:
-    """Every figure of the runs; the paths in the paper's order."""
-    return [
-        draw_simulation(runs, folder),
-        draw_friction_model(runs, folder),
-        draw_change(runs, "frequency", "Fig. 12: frequency change at 82.5 s, R1", folder / "fig12_frequency.png"),
-        draw_change(runs, "amplitude", "Fig. 13: amplitude change at 82.5 s, R1", folder / "fig13_amplitude.png"),
-        draw_change(runs, "load", "Fig. 14: load step of 3 Nm at 80 s, R1", folder / "fig14_load.png"),
-    ]
+def draw_all(runs: Runs) -> dict[str, Any]:
+    """Every figure of the runs by the name of its file, in the paper's order."""
+    return {
+        "fig08_simulation": draw_simulation(runs),
+        "fig09_11_friction_model": draw_friction_model(runs),
+        "fig12_frequency": draw_change(runs, "frequency", "Fig. 12: frequency change at 82.5 s, R1"),
+        "fig13_amplitude": draw_change(runs, "amplitude", "Fig. 13: amplitude change at 82.5 s, R1"),
+        "fig14_load": draw_change(runs, "load", "Fig. 14: load step of 3 Nm at 80 s, R1"),
+    }

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
-from tools.identification.figures import fit_png
+from tools.identification.figures import fit_figure
 from tools.identification.friction_data import FrictionData
 from tools.identification.identification import Identification, Options, identify_friction
 
@@ -68,10 +69,10 @@ def identify_paper_friction(options: Options | None = None, seed: int = 1) -> Pa
     )
 
 
-def identification_picture(result: PaperIdentification) -> bytes:
-    """Fig. 7: points, curve and errors, as a PNG."""
+def identification_figure(result: PaperIdentification) -> Any:
+    """Fig. 7: points, curve and errors."""
     found = result.found
     used = {word: direction.index for word, direction in found.directions.items()}
-    return fit_png(
+    return fit_figure(
         found.data, found.branches, used, "Fig. 7: friction identified from a synthetic sweep", identified=found
     )

@@ -2,42 +2,18 @@
 
 from __future__ import annotations
 
-import io
 from typing import Any
 
 import numpy as np
 
 from firmware_py.friction import DEGREE
+from tools.drawing import BLUE, GREY, ORANGE, RED, canvas
 from tools.identification.friction_data import FrictionData
 from tools.identification.identification import DIRECTIONS, Identification
 from tools.identification.models import Branch
 
-_BLUE, _ORANGE, _RED, _GREY = "#1f5fa8", "#d9822b", "#b3282d", "#555555"
 _CURVE_POINTS = 600
 _FLOOR = 1e-5  # [%] drawn at least, on a logarithmic axis
-
-
-def _figure(height: float) -> Any:
-    # slow to import, and only wanted here; no display is needed
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.0, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _png(figure: Any) -> bytes:
-    stream = io.BytesIO()
-    figure.savefig(stream, dpi=110, format="png")
-    return stream.getvalue()
-
-
-def _tidy(axes: Any) -> None:
-    for axis in axes:
-        axis.grid(True, color="#dddddd", linewidth=0.6)
-        axis.spines["top"].set_visible(False)
-        axis.set_axisbelow(True)
 
 
 def _curve_speeds(found: Branch) -> np.ndarray:
@@ -47,7 +23,7 @@ def _curve_speeds(found: Branch) -> np.ndarray:
     return np.sort(np.concatenate([share * found.max_radps, [knee, np.nextafter(knee, np.inf)]]))
 
 
-def fit_png(
+def fit_figure(
     data: FrictionData,
     branches: dict[str, Branch],
     used: dict[str, np.ndarray],
@@ -55,15 +31,28 @@ def fit_png(
     *,
     outliers: np.ndarray | None = None,
     identified: Identification | None = None,
-) -> bytes:
+) -> Any:
     """Data and curve, error, relative error over joint velocity; `used` holds the indices of each direction.
 
     With `identified` the 95 % band is drawn, and the weak parameters are named.
     """
-    figure = _figure(9.0)
+    with canvas(9.6) as figure:
+        _paint_fit(figure, data, branches, used, outliers, identified)
+        figure.axes[0].set_title(title, fontsize=12, fontweight="bold")
+        return figure
+
+
+def _paint_fit(
+    figure: Any,
+    data: FrictionData,
+    branches: dict[str, Branch],
+    used: dict[str, np.ndarray],
+    outliers: np.ndarray | None,
+    identified: Identification | None,
+) -> None:
     axes = figure.subplots(3, 1, sharex=True, height_ratios=(4, 2, 2))
     unsettled = np.flatnonzero(~data.settled)
-    _points(axes[0], data, np.concatenate(list(used.values())), "measured", _BLUE, "o")
+    _points(axes[0], data, np.concatenate(list(used.values())), "measured", BLUE, "o")
     worst = 0.0
     for word, sign in DIRECTIONS:
         if word not in used or not len(used[word]):
@@ -72,13 +61,13 @@ def fit_png(
         speeds = _curve_speeds(found)
         curve = sign * found.torque_Nm(speeds)
         label = "model" if sign > 0 else None
-        axes[0].plot(sign * speeds / DEGREE, curve, color=_ORANGE, linewidth=1.8, label=label, zorder=3)
+        axes[0].plot(sign * speeds / DEGREE, curve, color=ORANGE, linewidth=1.8, label=label, zorder=3)
         if identified is not None:
             direction = identified.directions[word]
             inside = speeds[speeds >= direction.fit.problem.x[0] * found.max_radps]
             half = direction.uncertainty.band_Nm(direction.fit, inside / direction.fit.problem.top_radps)
             axes[1].fill_between(
-                sign * inside / DEGREE, -1e3 * half, 1e3 * half, color=_ORANGE, alpha=0.3, linewidth=0.0,
+                sign * inside / DEGREE, -1e3 * half, 1e3 * half, color=ORANGE, alpha=0.3, linewidth=0.0,
                 label="95 % band of the curve" if sign > 0 else None, zorder=1,
             )  # fmt: skip
         velocity = data.velocity_radps[chosen]
@@ -86,16 +75,16 @@ def fit_png(
         relative = 100.0 * np.abs(error / data.motor_torque_Nm[chosen])
         # one point near zero torque must not flatten all the others
         worst = max(worst, min(float(relative.max()), 2.0 * float(np.percentile(relative, 99))))
-        axes[1].vlines(velocity / DEGREE, 0.0, 1e3 * error, color=_BLUE, linewidth=0.7, alpha=0.5)
-        axes[1].plot(velocity / DEGREE, 1e3 * error, "o", color=_BLUE, markersize=2.6)
-        axes[2].plot(velocity / DEGREE, relative, "o", color=_BLUE, markersize=2.6)
-        axes[2].vlines(velocity / DEGREE, 0.0, relative, color=_BLUE, linewidth=0.7, alpha=0.5)
+        axes[1].vlines(velocity / DEGREE, 0.0, 1e3 * error, color=BLUE, linewidth=0.7, alpha=0.5)
+        axes[1].plot(velocity / DEGREE, 1e3 * error, "o", color=BLUE, markersize=2.6)
+        axes[2].plot(velocity / DEGREE, relative, "o", color=BLUE, markersize=2.6)
+        axes[2].vlines(velocity / DEGREE, 0.0, relative, color=BLUE, linewidth=0.7, alpha=0.5)
     if outliers is not None and len(outliers):
-        _points(axes[0], data, outliers, "outlier, not used", _RED, "x")
+        _points(axes[0], data, outliers, "outlier, not used", RED, "x")
     if len(unsettled):
-        _points(axes[0], data, unsettled, "never settled, not used", _GREY, "^")
+        _points(axes[0], data, unsettled, "never settled, not used", GREY, "^")
     for axis in axes[1:]:
-        axis.axhline(0.0, color=_GREY, linewidth=0.8)
+        axis.axhline(0.0, color=GREY, linewidth=0.8)
     axes[0].set_ylabel("friction at the motor [Nm]")
     axes[1].set_ylabel("measured - model [mNm]")
     axes[2].set_ylabel("relative error [%]")
@@ -104,22 +93,22 @@ def fit_png(
     ratio = data.reduction_ratio
     joint = axes[0].secondary_yaxis("right", functions=(lambda y: y * ratio, lambda y: y / ratio))
     joint.set_ylabel("at the joint [Nm]")
+    joint.grid(False)
+    joint.spines["right"].set_visible(True)
     for axis in axes:
         for word, sign in DIRECTIONS:
             found = branches[word]
             if found.knee_radps < found.max_radps:
-                axis.axvline(sign * found.knee_radps / DEGREE, color=_GREY, linewidth=0.8, linestyle=":", zorder=0)
-    _tidy(axes)
-    axes[0].legend(loc="upper left", frameon=False, fontsize=9)
+                axis.axvline(sign * found.knee_radps / DEGREE, color=GREY, linewidth=0.8, linestyle=":", zorder=0)
+        axis.set_xmargin(0.02)
+    axes[0].legend(loc="upper left")
     if identified is not None:
-        axes[1].legend(loc="upper left", frameon=False, fontsize=8.5, ncols=2, bbox_to_anchor=(0.0, 1.17))
+        axes[1].legend(loc="lower left", bbox_to_anchor=(-0.01, 1.0))
     axes[0].text(
         0.99, 0.04, _summary_text(data, branches, used), transform=axes[0].transAxes, ha="right", va="bottom",
-        fontsize=9, color=_GREY,
+        fontsize=9, color=GREY,
     )  # fmt: skip
-    axes[0].set_title(title, loc="left", fontsize=12, fontweight="bold")
     figure.align_ylabels(axes)
-    return _png(figure)
 
 
 def _points(axis: Any, data: FrictionData, chosen: np.ndarray, label: str, color: str, marker: str) -> None:
@@ -140,34 +129,33 @@ def _summary_text(data: FrictionData, branches: dict[str, Branch], used: dict[st
     return f"RMSE {rmse:.3g} mNm\nmax. error {worst:.3g} mNm"
 
 
-def convergence_png(identified: Identification) -> bytes | None:
+def convergence_figure(identified: Identification) -> Any | None:
     """Excess of the swarm's best RMSE over the least one, over the iterations; None for a model without a swarm."""
     swarms = {word: found for word, found in identified.directions.items() if found.swarm is not None}
     if not swarms:
         return None
-    figure = _figure(4.2)
-    axis = figure.subplots()
-    for (word, found), color in zip(swarms.items(), (_BLUE, _ORANGE), strict=True):
-        assert found.swarm is not None
-        least = found.projected_rmse_Nm
-        excess = 100.0 * (found.swarm.curve_Nm / max(least, 1e-12) - 1.0)
-        label = f"{word} velocity, least possible {1e3 * least:.4g} mNm"
-        axis.plot(np.arange(1, len(excess) + 1), np.maximum(excess, _FLOOR), color=color, linewidth=1.6, label=label)
-    axis.axhline(1.0, color=_GREY, linewidth=0.8, linestyle=":")
-    axis.annotate(
-        "1 %", (1.0, 1.0), xycoords=("axes fraction", "data"), xytext=(-4, 3), textcoords="offset points",
-        ha="right", fontsize=9, color=_GREY,
-    )  # fmt: skip
-    axis.set_xscale("log")
-    axis.set_yscale("log")
-    axis.set_xlabel("iteration")
-    axis.set_ylabel("best RMSE above the least possible [%]")
-    axis.set_ylim(bottom=0.5 * _FLOOR)
-    _tidy([axis])
-    axis.spines["right"].set_visible(False)
-    axis.legend(frameon=False, fontsize=9)
     swarm = identified.options.swarm
-    axis.set_title(
-        f"Particle swarm: {swarm.particles} particles, seed {swarm.seed}", loc="left", fontsize=12, fontweight="bold"
-    )
-    return _png(figure)
+    with canvas(4.4) as figure:
+        axis = figure.subplots()
+        for (word, found), color in zip(swarms.items(), (BLUE, ORANGE), strict=True):
+            assert found.swarm is not None
+            least = found.projected_rmse_Nm
+            excess = 100.0 * (found.swarm.curve_Nm / max(least, 1e-12) - 1.0)
+            label = f"{word} velocity, least possible {1e3 * least:.4g} mNm"
+            axis.plot(
+                np.arange(1, len(excess) + 1), np.maximum(excess, _FLOOR), color=color, linewidth=1.6, label=label
+            )
+        axis.axhline(1.0, color=GREY, linewidth=0.8, linestyle=":")
+        axis.annotate(
+            "1 %", (1.0, 1.0), xycoords=("axes fraction", "data"), xytext=(-4, 3), textcoords="offset points",
+            ha="right", fontsize=9, color=GREY,
+        )  # fmt: skip
+        axis.set_xscale("log")
+        axis.set_yscale("log")
+        axis.set_xlabel("iteration")
+        axis.set_ylabel("best RMSE above the least possible [%]")
+        axis.set_ylim(bottom=0.5 * _FLOOR)
+        axis.legend()
+        title = f"Particle swarm: {swarm.particles} particles, seed {swarm.seed}"
+        axis.set_title(title, fontsize=12, fontweight="bold")
+        return figure

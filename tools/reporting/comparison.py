@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from firmware_py.states import AxisPhase
-from tools.reporting.figure import INK, SERIES, SOFT, draw
+from tools.drawing import INK, SERIES, SOFT
+from tools.reporting.figure import draw
 from tools.reporting.page import Block, Figure, Paragraph
 from tools.reporting.run_figures import binned, friction_points, legend_above, line
 

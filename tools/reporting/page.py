@@ -5,7 +5,6 @@ Everything that is text is escaped; only `Figure.svg` is taken as it is, so it m
 
 from __future__ import annotations
 
-import base64
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -55,18 +54,12 @@ _NUMBER = re.compile(r"[-+]?[0-9][0-9.,]*(e[-+]?[0-9]+)?( ?%)?$")
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture inside the page: `svg` as markup, or `png` bytes; `alt` says in words what is to be seen."""
+    """A picture inside the page, as SVG markup; `alt` says in words what is to be seen."""
 
     alt: str
+    svg: str
     caption: str = ""
-    svg: str = ""
-    png: bytes = b""
     kind: str = field(default="figure", init=False)
-
-    @property
-    def source(self) -> str:
-        """The PNG as a data address."""
-        return "data:image/png;base64," + base64.b64encode(self.png).decode("ascii")
 
 
 @dataclass(frozen=True)

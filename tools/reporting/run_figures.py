@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from firmware_py.states import AxisPhase, Fault
+from tools.drawing import BLUE, COLOURS, GREEN, GREY, INK, MID_BLUE, ORANGE, RED, SOFT, TEAL, VIOLET
 from tools.recording.run_figure import drawn_indices
-from tools.reporting.figure import BLUE, COLOURS, GREEN, GREY, INK, ORANGE, RED, SOFT, VIOLET, draw
+from tools.reporting.figure import draw
 from tools.reporting.page import Figure
 
 POINTS = 1600  # more than the page is wide; least and greatest of each bucket, so that no peak is lost
@@ -23,9 +24,8 @@ _PARTS = (
     ("gravity", "gravity", GREY),
     ("network", "network (subtracted)", RED),
     ("observer", "observer", VIOLET),
-    ("learned", "learned", "#3b8ea5"),
+    ("learned", "learned", TEAL),
 )
-_CLOUD = "#7fa3cc"  # of many points, legible on white and on black
 _CLOUD_POINTS = 20_000
 _LEAST_SPEED_radps = 1e-3
 _BINS = 25  # of speed, in each direction
@@ -222,7 +222,7 @@ def friction_figure(records: Any) -> Figure | None:
         axes = figure.subplots()
         axes.set_xmargin(0.02)
         step = -(-len(velocity) // _CLOUD_POINTS)
-        axes.plot(velocity[::step], torque[::step], ".", color=_CLOUD, markersize=1.5, alpha=0.25, rasterized=True)
+        axes.plot(velocity[::step], torque[::step], ".", color=MID_BLUE, markersize=1.5, alpha=0.25, rasterized=True)
         for i, rows in enumerate(directions):
             label = "median" if i == 0 else None
             axes.plot(rows[:, 0], rows[:, 2], color=BLUE, label=label, linewidth=1.6)

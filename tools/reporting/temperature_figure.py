@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from tools.drawing import RED
 from tools.recording.run_log import RunLog
-from tools.reporting.figure import RED, draw
+from tools.reporting.figure import draw
 from tools.reporting.page import Figure
 
 LEAST_READINGS = 10  # fewer are told by the table

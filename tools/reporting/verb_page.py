@@ -2,34 +2,34 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from rich.table import Table as TerminalTable
-from rich.text import Text
 
+from tools.narrow_table import cell_text
 from tools.output import Output
-from tools.reporting.page import Block, Figure, Paragraph, Section, Table, page, write_page
+from tools.reporting.page import Block, Paragraph, Section, Table, page, write_page
 
+_PAIR = re.compile(r"(?<=\d), (?=-?\d)")
 _RANGE = "\N{NO-BREAK SPACE}..\N{NO-BREAK SPACE}"
 
 
 def from_terminal(table: TerminalTable) -> Table:
     """A table of the terminal as one of the page; without markup and styles."""
-    headings = [_plain(column.header) if table.show_header else "" for column in table.columns]
-    # a range is not broken in its middle
-    columns = [[_plain(cell).replace(" .. ", _RANGE) for cell in column.cells] for column in table.columns]
-    notes = [_plain(part) for part in (table.title, table.caption) if part]
-    return Table(headings, list(zip(*columns, strict=True)), caption=". ".join(notes))
+    named = [(cell_text(column.header) if table.show_header else "", column) for column in table.columns]
+    columns = [(heading, [_unbroken(cell_text(cell)) for cell in column.cells]) for heading, column in named]
+    # a column that says nothing is left out
+    columns = [(heading, cells) for heading, cells in columns if any(cells) or not (heading and cells)]
+    notes = [cell_text(part) for part in (table.title, table.caption) if part]
+    rows = list(zip(*(cells for _, cells in columns), strict=True))
+    return Table([heading for heading, _ in columns], rows, caption=". ".join(notes))
 
 
-def _plain(cell: object) -> str:
-    return cell.plain if isinstance(cell, Text) else Text.from_markup(str(cell)).plain
-
-
-def picture(png: Path | bytes, alt: str, caption: str = "") -> Figure:
-    """A PNG inside the page."""
-    return Figure(alt, caption, png=png if isinstance(png, bytes) else png.read_bytes())
+def _unbroken(text: str) -> str:
+    """A range or a pair of numbers is not broken in its middle."""
+    return _PAIR.sub(",\N{NO-BREAK SPACE}", text.replace(" .. ", _RANGE))
 
 
 def remarks(lines: Sequence[str], tone: str = "warning") -> list[Block]:

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from rich.table import Table as TerminalTable
 
+from tools.drawing import BLUE, ORANGE, RED
 from tools.output import Output
-from tools.reporting.figure import BLUE, ORANGE, RED, draw
+from tools.reporting.figure import draw
 from tools.reporting.page import Block, Details, Figure, Section, Table
 from tools.reporting.verb_page import from_terminal, write_verb_page
 
@@ -66,4 +67,4 @@ def _figure(rows: list[dict[str, Any]]) -> Figure:
         near.set_xscale("log")
         near.set_title("the same, slow speeds spread")
 
-    return draw(4.2, paint, "Motor torque over the speed of the joint, both directions", "each point one plateau")
+    return draw(4.2, paint, "Motor torque over the speed of the joint, both directions", "Each point is one plateau.")

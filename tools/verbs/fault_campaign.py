@@ -7,14 +7,16 @@ from typing import Any
 
 from drivers.errors import ConfigurationError, DataError
 from tools.campaign.judge import Verdict, judge
-from tools.campaign.report import rows_by_kind, table, violations, write_figure, write_json
+from tools.campaign.report import campaign_figure, rows_by_kind, table, violations, write_json
 from tools.campaign.runner import run_campaign
 from tools.campaign.scenario import draw_scenario
 from tools.configuration.config import Config
 from tools.configuration.elmo_settings import refuse_serial
+from tools.drawing import save_png
 from tools.output import Output
+from tools.reporting.figure import svg_figure
 from tools.reporting.page import Details, Paragraph, Section, Table, check_target
-from tools.reporting.verb_page import from_terminal, picture, write_verb_page
+from tools.reporting.verb_page import from_terminal, write_verb_page
 from tools.simulation.lockstep import LockstepJoint
 
 EXIT_VIOLATIONS = 10
@@ -49,16 +51,17 @@ def fault_campaign(
         verdicts, elapsed_s, interrupted = run_campaign(config.path, seed, count, advance, workers)
     rows = rows_by_kind(verdicts)
     found = violations(verdicts, seed)
+    figure = campaign_figure(verdicts, config.limits.velocity_max_radps)
     if verdicts:
         write_json(folder / "campaign.json", seed, verdicts, elapsed_s)
-        write_figure(folder / "campaign.png", verdicts, config.limits.velocity_max_radps)
+        save_png(figure, folder / "campaign.png")
     data = {
         "scenarios": len(verdicts), "violations": len(found), "seed": seed, "elapsed_s": round(elapsed_s, 1),
         "interrupted": interrupted, "report": str(folder / "campaign.json"),
     }  # fmt: skip
     output.result(table(rows), data)
     if report is not None and verdicts:
-        _write_page(report, config, verdicts, found, folder / "campaign.png", seed, output)
+        _write_page(report, config, verdicts, found, figure, seed, output)
     output.note(f"{len(verdicts)} scenarios in {elapsed_s:.0f} s, seed {seed}; report in {folder}")
     for item in found[:SHOWN]:
         output.warning(f"scenario {item['number']} ({item['kind']}): {'; '.join(item['violations'])}")
@@ -72,7 +75,7 @@ def fault_campaign(
 
 
 def _write_page(
-    path: Path, config: Config, verdicts: list[Verdict], found: list[dict[str, Any]], png: Path, seed: int,
+    path: Path, config: Config, verdicts: list[Verdict], found: list[dict[str, Any]], figure: Any, seed: int,
     output: Output,
 ) -> None:  # fmt: skip
     tone = "error" if found else "good"
@@ -81,11 +84,12 @@ def _write_page(
         ["scenario", "kind", "violations"],
         [(item["number"], item["kind"], "; ".join(item["violations"])) for item in found],
     )
+    points = svg_figure(figure, "Greatest speed, and time until off, of each scenario by kind of fault")
     sections = [
         Section("Verdict", [Paragraph(said, tone)]),
         Section("By kind of fault", [from_terminal(table(rows_by_kind(verdicts)))]),
         Section("Violations", [listed] if found else []),
-        Section("Figures", [picture(png, "Greatest speed, and time until off, of each scenario by kind of fault")]),
+        Section("Figures", [points]),
         Section("Configuration", [Details("Configuration", config.text)]),
     ]
     write_verb_page(path, "Fault campaign", sections, output, subtitle=str(config.path))

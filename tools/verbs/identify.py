@@ -7,21 +7,24 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from drivers.errors import ConfigurationError, DataError
 from tools.configuration.conversions import torque_constant_NmpA
 from tools.configuration.load import load_config
-from tools.identification.figures import convergence_png, fit_png
+from tools.drawing import png
+from tools.identification.figures import convergence_figure, fit_figure
 from tools.identification.friction_data import ForeignFormat, read_friction_data
 from tools.identification.friction_section import replace_file, section_values, snippet, write_into
 from tools.identification.identification import Identification, Options, identify_friction
 from tools.identification.plausibility import JointLimits
 from tools.identification.report import error_table, identification_report, model_table, parameter_table
 from tools.output import Output
+from tools.reporting.figure import svg_figure
 from tools.reporting.page import Block, Details, Section, check_target
-from tools.reporting.verb_page import from_terminal, picture, write_verb_page
+from tools.reporting.verb_page import from_terminal, write_verb_page
 from tools.reporting.verb_page import remarks as notes_of
 
 
@@ -109,18 +112,18 @@ def identify(
     stem = out.with_suffix("") if out is not None else data_path.with_suffix(".friction")
     used = {word: direction.index for word, direction in found.directions.items()}
     outliers = np.concatenate([direction.outliers for direction in found.directions.values()])
-    fit_picture = fit_png(
+    fit = fit_figure(
         data, found.branches, used, f"{data_path.name}: {found.model}", outliers=outliers, identified=found
     )
-    convergence = convergence_png(found)
+    convergence = convergence_figure(found)
     values = section_values(found.branches["positive"], found.branches["negative"])
     result = {**found.to_dict(), "friction": values}
     files = {
-        stem.with_name(stem.name + ".png"): fit_picture,
+        stem.with_name(stem.name + ".png"): png(fit),
         stem.with_name(stem.name + ".report.json"): json.dumps(result, indent=1, allow_nan=False).encode("utf-8"),
     }
     if convergence is not None:
-        files[stem.with_name(stem.name + ".convergence.png")] = convergence
+        files[stem.with_name(stem.name + ".convergence.png")] = png(convergence)
     if out is not None:
         files[out] = snippet(values, remarks(found)).encode("utf-8")
     protected = {p.resolve() for p in (data_path, data_path.with_suffix(".json"), into, config) if p is not None}
@@ -139,17 +142,17 @@ def identify(
     if into is not None and _not_compensated(into):
         output.warning(f'{into}: control.feed_forward (="none") leaves the friction to the feedback; "desired" uses it')
     if report is not None:
-        _write_page(report, found, fit_picture, convergence, snippet(values, remarks(found)), output)
+        _write_page(report, found, fit, convergence, snippet(values, remarks(found)), output)
     return 0
 
 
 def _write_page(
-    path: Path, found: Identification, fit: bytes, convergence: bytes | None, section: str, output: Output
+    path: Path, found: Identification, fit: Any, convergence: Any | None, section: str, output: Output
 ) -> None:
     errors = error_table(found.errors_Nm, found.measured_Nm, found.data.reduction_ratio)
-    pictures: list[Block] = [picture(fit, "Measured friction torque and the model, and the error between them")]
+    pictures: list[Block] = [svg_figure(fit, "Measured friction torque and the model, and the error between them")]
     if convergence is not None:
-        pictures.append(picture(convergence, "How the particle swarm converged", "the swarm"))
+        pictures.append(svg_figure(convergence, "How the particle swarm converged"))
     sections = [
         Section("Fit", [*notes_of(found.warnings), from_terminal(model_table(found)), from_terminal(errors)]),
         Section("Parameters", [from_terminal(parameter_table(found))]),

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from typing import Any
 
 from rich.markup import escape
 from rich.table import Table
 
-from drivers.errors import DataError
+from tools.drawing import save_png
 from tools.experiments.error_figures import error_figures
 from tools.experiments.paper_identification import (
     PaperIdentification,
-    identification_picture,
+    identification_figure,
     identify_paper_friction,
 )
 from tools.experiments.paper_rows import PaperRow, PaperRun, paper_rows
 from tools.experiments.paper_runs import AFTER_s, experiments
 from tools.output import Output
+from tools.reporting.figure import svg_figure
 from tools.reporting.page import Section, check_target
-from tools.reporting.verb_page import from_terminal, picture, write_verb_page
+from tools.reporting.verb_page import from_terminal, write_verb_page
 
 PAPER = (
     "Shen, Zhou, Yu, Wang: Design of Adaptive RBFNN and Computed-torque Control for Manipulator Joint "
@@ -47,7 +48,10 @@ def paper(
         if identification:
             identified = identify_paper_friction()
         advance(len(listed) + 1)
-    pictures = _pictures(runs, identified, folder) if folder is not None else []
+    figures = _figures(runs, identified) if folder is not None or report is not None else {}
+    pictures = (
+        [save_png(drawn, folder / f"{name}.png") for name, drawn in figures.items()] if folder is not None else []
+    )
     rows = paper_rows(runs, identified)
     data = {
         "paper": PAPER,
@@ -59,26 +63,18 @@ def paper(
     for path in pictures:
         output.note(f"written: {path}")
     if report is not None:
-        with TemporaryDirectory() as elsewhere:
-            drawn = pictures or _pictures(runs, identified, Path(elsewhere))
-            blocks = [picture(path, path.stem.replace("_", " ")) for path in drawn]
+        blocks = [svg_figure(drawn, name.replace("_", " ")) for name, drawn in figures.items()]
         sections = [Section("In numbers", [from_terminal(_table(rows))]), Section("Figures", blocks)]
         write_verb_page(report, "The paper's experiments", sections, output, subtitle=PAPER)
     return 0
 
 
-def _pictures(runs: dict[str, PaperRun], identified: PaperIdentification | None, folder: Path) -> list[Path]:
+def _figures(runs: dict[str, PaperRun], identified: PaperIdentification | None) -> dict[str, Any]:
+    """By the name of the file, in the paper's order."""
     from tools.experiments.paper_figures import draw_all
 
-    pictures = draw_all(runs, folder)
-    if identified is not None:
-        path = folder / "fig07_identification.png"
-        try:
-            path.write_bytes(identification_picture(identified))
-        except OSError as error:
-            raise DataError(f"{path}: cannot be written: {error.strerror or error}") from None
-        pictures.insert(0, path)
-    return pictures
+    found = {"fig07_identification": identification_figure(identified)} if identified is not None else {}
+    return {**found, **draw_all(runs)}
 
 
 def _table(rows: list[PaperRow]) -> Table:

@@ -11,12 +11,14 @@ from rich.table import Table
 
 from tools.configuration.elmo_settings import refuse_serial
 from tools.configuration.load import load_config, shipped_config
+from tools.drawing import save_png
 from tools.experiments.controllers import controller_config
 from tools.experiments.study_runs import StudyResult, quantile, run_study, write_csv
 from tools.experiments.study_settings import StudySettings, study_controllers
 from tools.output import Output
+from tools.reporting.figure import svg_figure
 from tools.reporting.page import Details, Section, check_target
-from tools.reporting.verb_page import from_terminal, picture, write_verb_page
+from tools.reporting.verb_page import from_terminal, write_verb_page
 
 INTERRUPTED = 130
 _COLUMNS = (
@@ -25,6 +27,9 @@ _COLUMNS = (
     ("true_peak_mrad", "true peak [mrad]"),
     ("true_rmse_mrad", "true RMSE [mrad]"),
     ("settling_s", "settling [s]"),
+)
+_BOXES = (
+    "Box: quartiles, line: median; whiskers: 5 and 95 %; dots: plants beyond them. A run ended by a fault is left out."
 )
 
 
@@ -70,9 +75,7 @@ def study(
         if csv is not None:
             write_csv(result, csv)
         if figure is not None:
-            from tools.experiments.study_figure import save_study_figure
-
-            save_study_figure(result, figure, f"{title}, after {settings.after_s:g} s")
+            save_png(_figure(result, settings, title), figure)
         output.result(_table(result, title, settings.after_s), study_data(result, settings))
         for path in (csv, figure):
             if path is not None:
@@ -82,13 +85,17 @@ def study(
     return INTERRUPTED if result.interrupted else 0
 
 
-def _write_page(path: Path, result: StudyResult, settings: StudySettings, title: str, output: Output) -> None:
-    from tools.experiments.study_figure import study_png
+def _figure(result: StudyResult, settings: StudySettings, title: str) -> Any:
+    from tools.experiments.study_figure import study_figure
 
-    late = f"{title}, after {settings.after_s:g} s"
+    return study_figure(result, f"{title}, after {settings.after_s:g} s")
+
+
+def _write_page(path: Path, result: StudyResult, settings: StudySettings, title: str, output: Output) -> None:
+    boxes = svg_figure(_figure(result, settings, title), "Errors of each controller over all plants, as boxes", _BOXES)
     sections = [
         Section("In numbers", [from_terminal(_table(result, title, settings.after_s))]),
-        Section("Figures", [picture(study_png(result, late), "Errors of each controller over all plants, as boxes")]),
+        Section("Figures", [boxes]),
         Section("Settings", [Details("Settings", settings.model_dump_json(indent=1))]),
     ]
     write_verb_page(path, "Study", sections, output, subtitle=title)
@@ -99,7 +106,7 @@ def _text(values: tuple[float, float, float], digits: int = 3) -> str:
     if not math.isfinite(median):
         return "never" if median > 0 else "-"
     texts = [f"{x:.{digits}g}" if math.isfinite(x) else "never" for x in (median, low, high)]
-    return f"{texts[0]} ({texts[1]} .. {texts[2]})"
+    return f"{texts[0]} ({texts[1]}..{texts[2]})"
 
 
 def _table(result: StudyResult, title: str, after_s: float) -> Table:

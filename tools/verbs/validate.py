@@ -10,7 +10,8 @@ import numpy as np
 from drivers.errors import ConfigurationError, DataError
 from tools.configuration.conversions import friction_constants
 from tools.configuration.load import load_config
-from tools.identification.figures import fit_png
+from tools.drawing import png
+from tools.identification.figures import fit_figure
 from tools.identification.friction_data import ForeignFormat, FrictionData, read_friction_data
 from tools.identification.friction_section import replace_file
 from tools.identification.identification import DIRECTIONS
@@ -65,7 +66,7 @@ def validate(
                 f"({branches[word].max_radps:.4g} rad/s), where its end slope is held"
             )
     used = {word: data.direction(sign) for word, sign in DIRECTIONS}
-    picture = fit_png(data, branches, used, f"{config_path.name} against {data_path.name}")
+    picture = png(fit_figure(data, branches, used, f"{config_path.name} against {data_path.name}"))
     figure = figure or data_path.with_suffix(".validation.png")
     if figure.resolve() in {p.resolve() for p in (data_path, data_path.with_suffix(".json"), config_path)}:
         raise DataError(f"{figure}: is an input of this command and would be overwritten")

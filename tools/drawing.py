@@ -1,0 +1,97 @@
+"""One style for every matplotlib picture: a PNG on white as a file, or SVG whose colours follow the page it stands on.
+
+Draw on a `canvas` with the colours of `COLOURS` (and the default text and axes); `tools.reporting.figure` replaces each
+of them by a variable of the page.  matplotlib is slow to import, and only wanted here.  No display is needed.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from drivers.errors import DataError
+
+# the numbers only mark what to replace; near the page's light colours, so that a plain viewer is right as well
+COLOURS = {
+    "ink": "#1c2431",
+    "soft": "#5b6676",
+    "line": "#d9dee6",
+    "blue": "#1f5fa9",
+    "orange": "#c96f13",
+    "green": "#2f8045",
+    "red": "#b3282e",
+    "violet": "#7a4fa4",
+    "grey": "#6b7281",
+    "wash-1": "#e3edf9",
+    "wash-2": "#f8ecda",
+    "wash-3": "#eceff4",
+}
+INK, SOFT, LINE, BLUE, ORANGE, GREEN, RED, VIOLET, GREY = (
+    COLOURS[name] for name in ("ink", "soft", "line", "blue", "orange", "green", "red", "violet", "grey")
+)
+SERIES = (BLUE, ORANGE, GREEN, VIOLET, RED, GREY)
+# these stay what they are: legible on white and on black, for a seventh line and for rasterised points
+TEAL, MID_BLUE, MID_GREEN, MID_RED = "#3b8ea5", "#7fa3cc", "#4fa866", "#e0524f"
+EITHER_WAY = (TEAL, MID_BLUE, MID_GREEN, MID_RED)
+WIDTH_in = 10.0
+_PNG_DPI = 110
+STYLE: Any = {
+    "svg.fonttype": "none",
+    "font.size": 10,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": SOFT,
+    "xtick.color": SOFT,
+    "ytick.color": SOFT,
+    "axes.grid": True,
+    "grid.color": LINE,
+    "grid.linewidth": 0.7,
+    "axes.axisbelow": True,
+    "axes.xmargin": 0.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 10,
+    "legend.frameon": False,
+    "legend.fontsize": 9,
+    "lines.linewidth": 1.1,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "savefig.facecolor": "none",
+}
+
+
+@contextmanager
+def canvas(height_in: float, title: str = "") -> Iterator[Any]:
+    """A `matplotlib.figure.Figure` of the common width; what is drawn inside the `with` has the style."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH_in, height_in), layout="constrained")
+        if title:
+            figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
+        yield figure
+
+
+def png(figure: Any) -> bytes:
+    """The picture on white, for a file."""
+    import matplotlib
+
+    data = io.BytesIO()
+    with matplotlib.rc_context(STYLE):
+        figure.savefig(data, format="png", dpi=_PNG_DPI, facecolor="white")
+    return data.getvalue()
+
+
+def save_png(figure: Any, path: Path) -> Path:
+    """`png` into a file, whose folder is made; returns the path.  `DataError` if it cannot be written."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(png(figure))
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written: {error.strerror or error}") from None
+    return path
