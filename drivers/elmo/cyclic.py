@@ -59,6 +59,7 @@ def put_command(port: ElmoPort, question: int, value_milli: int, decimals: int) 
     slot = (port.expected_first + port.expected_count) % EXPECTED_MAX
     port.expected_length[slot] = 0
     port.expected_question[slot] = question
+    port.expected_window_ns[slot] = port.window_ns
     port.expected_count += 1
     _put(port, slot, _LETTERS[question, 0])
     _put(port, slot, _LETTERS[question, 1])

@@ -63,6 +63,7 @@ class ElmoDrive(ElmoCommissioning):
         port.target_is_velocity = int(self._speed_mode)
         port.max_velocity_cps = settings.max_velocity_cps
         port.max_current_mA = int(1000.0 * min(settings.max_current_A, settings.peak_current_A))
+        port.period_ns = round(1e9 / settings.rate_Hz)
         port.enable_retry_cycles = max(1, round(ENABLE_RETRY_S * settings.rate_Hz))
         port.dead_man_cycles = max(1, round(settings.dead_man_s * settings.rate_Hz))
         return ports

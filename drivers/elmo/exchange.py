@@ -98,19 +98,21 @@ def _flush(port: ElmoPort, sample: Sample) -> int:
 def receive(ports: Any, data: np.ndarray, scratch: np.ndarray, samples: Any, now_ns: int, deadline_ns: int) -> int:
     """Ask for the position and wait for it until `deadline_ns`; returns the time waited [ns].
 
-    The late replies of the last cycle are taken first.  A cycle that was held up past its window does not look any
-    more: PX may have gone out late as well, and as the position of this slot its answer would be a leap.  The next
-    cycle takes it.
+    The late replies of the last cycle are taken first, older ones are not believed.  A cycle that was held up past its
+    window does not look any more: PX may have gone out late as well, and as the position of this slot its answer would
+    be a leap.  The next cycle takes it.
     """
     port = ports[0]
     sample = samples[0]
+    port.window_ns = deadline_ns
+    port.window_over = now_ns > deadline_ns
     _drain(port, data, sample, now_ns)
     begin_cycle(port, sample)
     _flush(port, sample)
     started_ns = monotonic_ns(scratch)
     arrived_ns = started_ns
     while arrived_ns <= deadline_ns + LOOK_LATE_NS:
-        if _drain(port, data, sample, arrived_ns):
+        if _drain(port, data, sample, arrived_ns) and port.answered_window_ns == deadline_ns:
             return monotonic_ns(scratch) - started_ns
         if arrived_ns >= deadline_ns or port.gone != 0:
             return arrived_ns - started_ns

@@ -46,10 +46,12 @@ class ElmoPort:
     max_velocity_cps: i8  # of JV
     enable_retry_cycles: i8
     dead_man_cycles: i8  # without a sample for so long the torque command is zero
+    period_ns: i8  # of the loop; 0: the age of a reply is not looked at
     # commands that wait for their reply, oldest first in a ring
     expected: Annotated[np.ndarray, array_of(u1, EXPECTED_MAX, TEXT_MAX)]
     expected_length: Annotated[np.ndarray, array_of(i4, EXPECTED_MAX)]
     expected_question: Annotated[np.ndarray, array_of(i4, EXPECTED_MAX)]
+    expected_window_ns: Annotated[np.ndarray, array_of(i8, EXPECTED_MAX)]  # of the cycle that asked; see window_ns
     expected_first: i4
     expected_count: i4
     # the line being received, and the bytes of the next write
@@ -74,6 +76,9 @@ class ElmoPort:
     silent_cycles: i8  # cycles since a reply came although one was due
     quiet: i4  # cycles in which it says nothing until the line is silent: old replies are not taken for new ones
     heard_bytes: i8  # in this cycle
+    window_ns: i8  # when the window of this cycle ends: by it cycles are told apart
+    window_over: i4  # 1: it was over before the cycle began
+    answered_window_ns: i8  # of the cycle that asked for the last position
     gone: i4  # the port has vanished
     # counters
     garbled: i8

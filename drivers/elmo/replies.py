@@ -103,7 +103,17 @@ def _take_status(port: ElmoPort, sample: Sample, status: int) -> None:
 
 
 @kernel
-def _take_value(port: ElmoPort, sample: Sample, question: int, start: int, now_ns: int) -> bool:
+def _too_late(port: ElmoPort, asked_window_ns: int) -> bool:
+    """Whether a position is of a slot too long ago to pass for one of this slot: it would be a leap.
+
+    A drive may answer in the next cycle, each time; more than that was a pause, of the PC or of its serial port.
+    """
+    late_ns = port.window_ns - asked_window_ns
+    return port.period_ns > 0 and late_ns > 0 and (port.window_over != 0 or 2 * late_ns > 3 * port.period_ns)
+
+
+@kernel
+def _take_value(port: ElmoPort, sample: Sample, question: int, start: int, now_ns: int, asked_window_ns: int) -> bool:
     """Take the value of one reply; True if it was a position."""
     if question >= Question.MO or question == Question.TC:
         return False
@@ -116,6 +126,10 @@ def _take_value(port: ElmoPort, sample: Sample, question: int, start: int, now_n
             port.garbled += 1
             return False
         take_counts(port, int(value))
+        if _too_late(port, asked_window_ns):
+            port.lost += 1
+            return False
+        port.answered_window_ns = asked_window_ns
         sample.position_rad = (port.counts - port.zero_counts) * port.position_radpcount
         sample.time_ns = now_ns
         sample.count += 1
@@ -156,7 +170,7 @@ def _take_line(port: ElmoPort, sample: Sample, now_ns: int) -> bool:
         port.refused += 1
         port.last_error = port.line[start] if length == 2 else 0
         return False
-    return _take_value(port, sample, question, start, now_ns)
+    return _take_value(port, sample, question, start, now_ns, port.expected_window_ns[slot])
 
 
 @kernel

@@ -62,6 +62,15 @@ class Line:
         drive.start()
         return drive
 
+    def reply(self, data: bytes) -> None:
+        self.its.send(data)
+
+    def slot(self, window_end_ns: int) -> int:
+        """The same for a window that ends then."""
+        before = int(self.sample[0].count)
+        receive(self.port, self._data, self._scratch, self.sample, time.monotonic_ns(), window_end_ns)
+        return int(self.sample[0].count) - before
+
     def cycle(self, window_ns: int) -> int:
         """How many samples one cycle brings that waits for its own until `window_ns` after its wake-up."""
         before, now_ns = int(self.sample[0].count), time.monotonic_ns()
@@ -80,3 +89,41 @@ def test_a_cycle_held_up_past_its_window_leaves_the_position_to_the_next(window_
         assert line.cycle(1_000_000) == 1 - samples
         assert line.sample[0].position_rad == pytest.approx(0.042)
         assert (line.sample[0].time_ns >= taken_from_ns) == (samples == 0)
+
+
+PERIOD_NS = 100_000_000
+
+
+def asked_once(line: Line, slots_later: float) -> int:
+    """The window's end of a cycle that comes `slots_later` after one whose reply came after it."""
+    line.port[0].period_ns = PERIOD_NS
+    asked_ns = time.monotonic_ns() + 1_000_000
+    assert line.slot(asked_ns) == 0
+    line.reply(REPLY)
+    return asked_ns + int(slots_later * PERIOD_NS)
+
+
+@pytest.mark.parametrize(("slots_later", "samples"), [(1, 1), (2, 0), (13, 0)])
+def test_a_position_asked_for_two_slots_ago_does_not_pass_for_one_of_now(slots_later: int, samples: int) -> None:
+    with Line() as line:
+        window_ns = asked_once(line, slots_later)
+        time.sleep(max(0.0, 1e-9 * (window_ns - time.monotonic_ns()) - 0.02))
+        assert line.slot(window_ns) == samples
+        assert line.port[0].lost == 1 - samples
+
+
+def test_a_late_position_is_none_in_a_cycle_that_is_late_itself() -> None:
+    with Line() as line:
+        window_ns = asked_once(line, 1)
+        time.sleep(1e-9 * (window_ns - time.monotonic_ns()) + 0.01)
+        assert line.slot(window_ns) == 0
+
+
+def test_the_late_position_of_the_last_slot_is_no_reason_not_to_wait_for_the_new_one() -> None:
+    with Line() as line:
+        window_ns = asked_once(line, 1)
+        answer = threading.Timer(0.03, line.reply, [b"PX\r50;"])
+        answer.start()
+        assert line.slot(window_ns) == 2
+        assert line.sample[0].position_rad == pytest.approx(0.05)
+        answer.join()
