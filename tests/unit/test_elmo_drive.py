@@ -215,6 +215,7 @@ class TestSpeedMode:
         assert (m.unit_mode, m.motor_on, port.device.jog_cps) == (2, 0, 0.0)
         assert (m.acceleration_cps2, m.deceleration_cps2, m.stop_deceleration_cps2) == (ramp, ramp, ramp)
         cyclic = drive.port()[0]
+        assert cyclic.period_ns == round(1e9 / SETTINGS.rate_Hz)  # by it late positions are known
         assert (cyclic.target_is_velocity, cyclic.max_velocity_cps) == (1, round(COUNTS / math.tau))
         assert cyclic.max_velocity_cps < m.speed_high_cps
 
