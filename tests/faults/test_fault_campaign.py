@@ -129,6 +129,27 @@ def test_each_invariant_notices(spoil: Any, words: str) -> None:
     assert any(words in line for line in all_checks(run)), all_checks(run)
 
 
+@pytest.mark.parametrize(
+    ("kind", "rises", "allowed"),
+    [
+        (FaultKind.RPDO_CORRUPTED, 254, True),  # asked last in 249; 2 cycles of the bus and 3 of the fault
+        (FaultKind.RPDO_CORRUPTED, 255, False),
+        (FaultKind.RPDO_LOST, 251, True),
+        (FaultKind.RPDO_LOST, 252, False),
+    ],
+)
+def test_only_a_corrupted_frame_may_enable_after_the_loop_has_given_up(
+    kind: FaultKind, rises: int, allowed: bool
+) -> None:
+    """Seed 3, scenario 2834: the frame that should have said "off" said "enable"; the next sound one said "off"."""
+    run = good_run()
+    run.truth[240:rises, TRUE_POWER_STATE] = PowerState.SWITCH_ON_DISABLED
+    run.truth[rises : rises + 2, TRUE_POWER_STATE] = PowerState.OPERATION_ENABLED
+    run.truth[rises + 2 :, TRUE_POWER_STATE] = PowerState.SWITCH_ON_DISABLED
+    scenario = dataclasses.replace(draw_scenario(1, 0), kind=kind, duration_s=0.003)
+    assert (judge_module._enabled_again(run, scenario, 0, 1_000_000) == []) is allowed
+
+
 @pytest.mark.parametrize(("off_row", "late"), [(1299, False), (1302, True)])
 def test_the_time_to_stop_is_checked_at_its_boundary(off_row: int, late: bool) -> None:
     run = good_run(300, 1200)

@@ -99,6 +99,7 @@ HARMLESS: list[tuple[FaultKind, float, float]] = [
     (FaultKind.CONTROLLER_HEARTBEAT_LOST, 0.2, 1.0),  # with its period, a third of drive.heartbeat_s, 0.33 of 0.4 s
     (FaultKind.ENCODER_STUCK, 0.002, 1.0),
     (FaultKind.CURRENT_LOOP_DEAD, 0.002, 1.0),
+    (FaultKind.TORQUE_REVERSED, 0.002, 1.0),
     (FaultKind.RPDO_LOST, 0.005, 1.0),
     (FaultKind.RPDO_DUPLICATED, LONG, 1.0),
     (FaultKind.TPDO_DUPLICATED, LONG, 0.5),

@@ -1,7 +1,9 @@
 """What each kind of fault may do: its sizes, harmful and harmless, and the causes that the loop may then name.
 
-A harmless size is just inside what the limits of `configs/virtual.toml` allow: it must not stop the joint.  Causes are
-those of the fault itself; `LATE_CAUSES` may follow any fault that begins when the joint is already being stopped.
+A harmless size is just inside what the limits of `configs/virtual.toml` allow: it must not stop the joint.  Five
+kinds have none: a drive that restarts or is in fault is off, a corrupted frame may say anything, and a single sample
+counted the wrong way is a leap at any speed worth a trajectory.  Causes are those of the fault itself; `LATE_CAUSES`
+may follow any fault that begins when the joint is already being stopped.
 """
 
 from __future__ import annotations
@@ -130,7 +132,9 @@ _CLASSES = (
         MOTION | NOT_STARTED | {Fault.REFERENCE_LIMIT},
     ),
     FaultClass(FaultKind.ENCODER_REVERSED, Sizes((0.3, LONG_s), (1.0, 1.0)), None, MOTION | NOT_STARTED),
-    FaultClass(FaultKind.TORQUE_REVERSED, Sizes((0.3, LONG_s), (1.0, 1.0)), None, MOTION),
+    FaultClass(
+        FaultKind.TORQUE_REVERSED, Sizes((0.3, LONG_s), (1.0, 1.0)), Sizes((0.001, 0.002), (1.0, 1.0)), MOTION
+    ),
     FaultClass(
         FaultKind.TORQUE_SATURATED, Sizes((0.05, LONG_s), (0.0, 30.0)), Sizes(_ALWAYS, (58.0, 100.0)), MOTION
     ),

@@ -122,7 +122,10 @@ def _ending(run: LockstepRun, allowed: Envelope, fault_row: int, period_s: float
 
 
 def _enabled_again(run: LockstepRun, scenario: Scenario, start_ns: int, period_ns: int) -> list[str]:
-    """The power stage comes on at most once; a frame that was under way when the loop gave up is allowed for."""
+    """The power stage comes on at most once, but for what the wire does by itself.
+
+    A frame may have been under way when the loop gave up; a corrupted one may say "enable", until a sound one comes.
+    """
     enabled = run.truth[:, TRUE_POWER_STATE] == PowerState.OPERATION_ENABLED
     rises = np.flatnonzero(enabled[1:] & ~enabled[:-1]) + 1
     asked = np.flatnonzero(np.asarray(run.log.request) == DriveRequest.ENABLE)
@@ -131,7 +134,8 @@ def _enabled_again(run: LockstepRun, scenario: Scenario, start_ns: int, period_n
     if not len(asked):
         return [f"enabled although the loop never asked ({len(rises)} times)"]
     last_row = (int(run.log.time_ns[asked[-1]]) - start_ns) // period_ns
-    late = 2 + int(scenario.magnitude * 1e9 / period_ns) if scenario.kind is FaultKind.RPDO_DELAYED else 2
+    wire_s = {FaultKind.RPDO_DELAYED: scenario.magnitude, FaultKind.RPDO_CORRUPTED: scenario.duration_s}
+    late = 2 + int(wire_s.get(scenario.kind, 0.0) * 1e9 / period_ns)
     if rises[-1] > last_row + late:
         return [f"enabled again {(rises[-1] - last_row) * period_ns * 1e-6:.0f} ms after the loop had stopped asking"]
     return []
