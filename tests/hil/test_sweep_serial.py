@@ -125,3 +125,17 @@ def test_an_unplugged_port_is_told_and_the_drives_own_position_limit_ends_the_jo
     run.finished().refused(7, "BUS_ERROR")
     serial_bench.until(serial_bench.standing)
     assert device.m.motor_fault == MF_POSITION_LIMIT
+
+
+def test_an_unplugged_port_keeps_the_measured_rows(serial_bench: Any) -> None:
+    points = ("--points", "4", "--grid", "log", "--max-speed", "0.3", "--min-speed", "0.27", "--warm-up", "0", "-y")
+    data = serial_bench.bench.folder / "data.csv"
+    run = serial_bench.bench.start("sweep", serial_bench.config(), "-o", data.name, *points).saw("  tracking")
+    serial_bench.until(lambda: data.read_text().count("\n") > 1, 60.0)
+    serial_bench.device.vanish()
+    ended = run.finished()
+    kept = data.read_text().splitlines()
+    rows = "1 point is" if len(kept) == 2 else f"{len(kept) - 1} points are"
+    ended.refused(7, "BUS_ERROR", f"{rows} in data.csv", "then --resume")
+    assert 2 <= len(kept) <= 4
+    assert len(json.loads(data.with_suffix(".json").read_text())["measured"]) == len(kept) - 1

@@ -235,7 +235,8 @@ class Sweep:
         if text is None:
             return
         done = len(self.file.done) if self.file is not None else 0
-        kept = f"{done} points are in {self.out}" if done else "nothing was measured"
+        points = "1 point is" if done == 1 else f"{done} points are"
+        kept = f"{points} in {self.out}" if done else "nothing was measured"
         raise MotionFault(
             f"{fault.name} ({int(fault)}): {text.happened}; {kept}",
             f"likely cause: {text.cause}; next: {text.next_step}" + ("; then --resume" if done else ""),
