@@ -9,7 +9,7 @@ import pytest
 from firmware_py.records import ENCODER_RESTARTED
 from firmware_py.states import Fault
 from tools.running.events.fault_text import FAULT_TEXTS, TWO_ENCODER_TEXTS, fault_text
-from tools.running.events.serial_fault_text import SERIAL_FAULT_TEXTS
+from tools.running.events.serial_fault_text import SERIAL_FAULT_TEXTS, serial_fault_text
 
 FAULTS = [fault for fault in Fault if fault is not Fault.NONE]
 WITH_STATUSWORD = (
@@ -75,3 +75,10 @@ def test_a_missing_sample_of_two_encoders_may_be_that_of_either(fault: Fault) ->
         assert "encoder" in two.happened
         assert "the joint's encoder" in two.cause
         assert "not believed" in fault_text(fault, 6.0, 0, 0x5000, two_encoders=True).cause
+
+
+@pytest.mark.parametrize(("status", "words"), [(0x8110, "stayed away"), (0x8100, "switched off without being asked")])
+def test_a_status_with_the_servo_on_does_not_pass_for_a_motor_that_was_switched_off(status: int, words: str) -> None:
+    text = serial_fault_text(Fault.DRIVE_NOT_ENABLED, float(status))
+    assert text is not None
+    assert words in text.happened

@@ -22,7 +22,7 @@ from tools.configuration.drive_settings import canopen_settings, cyclic_bus_load
 from tools.configuration.elmo import ElmoSerial
 from tools.configuration.elmo_settings import elmo_settings, serial_line_share
 from tools.running.events.fault_text import FaultText, fault_text
-from tools.running.events.serial_fault_text import SERIAL_FAULT_TEXTS
+from tools.running.events.serial_fault_text import serial_fault_text
 from tools.running.loop.loop_delay import QUANTILE, measured_delay_s, quantile_s
 from tools.running.loop.portable_loop import check_portable_rate
 
@@ -81,7 +81,7 @@ def drive_fault_text(config: Config, fault: Fault, value: float, drive_error: in
     if not isinstance(config.drive, ElmoSerial):
         two_encoders = config.joint_encoder is not None
         return fault_text(fault, value, drive_error, encoder_error, two_encoders=two_encoders)
-    text = SERIAL_FAULT_TEXTS.get(fault) or fault_text(fault, value, 0)
+    text = serial_fault_text(fault, value) or fault_text(fault, value, 0)
     happened = text.happened.format(value=value, word=f"{round(value):X}h") if math.isfinite(value) else text.happened
     if drive_error:
         happened += f"; the drive says {motor_fault_text(drive_error)}"

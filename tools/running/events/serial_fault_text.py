@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from firmware_py.states import Fault
 from tools.running.events.fault_text import FaultText
 
@@ -60,3 +62,18 @@ SERIAL_FAULT_TEXTS: dict[Fault, FaultText] = {
         "use the emergency stop; then check the line",
     ),
 }
+
+SERVO_ON = 1 << 4  # of SR
+# with the servo on in the last SR nothing says that the drive has switched off: the loop has given up believing it
+STATUS_LOST_TEXT = FaultText(
+    "the drive's status stayed away although positions came; the last one said that its motor is on (SR {word})",
+    "replies lost to noise, or a busy computer that hands them over late",
+    "check the cable and its ground, and what else the computer does",
+)
+
+
+def serial_fault_text(fault: Fault, value: float) -> FaultText | None:
+    """The text of a fault on a serial line; None where it is that of a bus.  `value` is SR where there is one."""
+    if fault is Fault.DRIVE_NOT_ENABLED and math.isfinite(value) and round(value) & SERVO_ON:
+        return STATUS_LOST_TEXT
+    return SERIAL_FAULT_TEXTS.get(fault)
