@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import signal
 import struct
 import threading
 from collections.abc import Callable, Iterator
@@ -31,6 +32,12 @@ from tools.simulation.virtual_joint import new_device
 
 PERIOD_s = 1e-3
 INERTIA_kgm2 = 2.1
+
+
+def pytest_configure() -> None:
+    """Ctrl-C reaches what the tests start, although `nohup` or `&` makes a shell start pytest with SIGINT ignored."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def small_axis_constants() -> Any:
