@@ -42,9 +42,26 @@ def fitted(shown: RenderableType, width: int) -> RenderableType:
         return shown
     for column in shown.columns:
         column.overflow = "fold"
-    if width_of(shown) <= width or len(shown.columns) <= _KEY_AND_VALUE or not shown.show_header:
+    if width_of(shown) <= width:
+        _share(shown, width)
         return shown
-    return _listed(shown, width)
+    return shown if len(shown.columns) <= _KEY_AND_VALUE or not shown.show_header else _listed(shown, width)
+
+
+def _share(table: Table, width: int) -> None:
+    """If not every cell finds room on one line: no column gets less than its longest word, as rich would have it."""
+    longest = [_longest(column, table.show_header) for column in table.columns]
+    wanted = [max(len(line) for text in (column.header, *column.cells) for line in (*cell_text(text).split("\n"), ""))
+              for column in table.columns]  # fmt: skip
+    more = [max(full - least, 0) for full, least in zip(wanted, longest, strict=True)]
+    room = width - width_of(table)
+    if sum(more) <= room:
+        return
+    # who wants little is served first, so that a short column is not broken for the sake of a long one
+    for left, i in enumerate(sorted(range(len(more)), key=more.__getitem__)):
+        given = min(more[i], room // (len(more) - left))
+        table.columns[i].width = longest[i] + given
+        room -= given
 
 
 def _listed(table: Table, width: int) -> Group:
@@ -59,7 +76,9 @@ def _listed(table: Table, width: int) -> Group:
         parts.append(first if isinstance(first, Text) else Text.from_markup(str(first), style=style))
         told = [f"{heading} {cell_text(cell)}".strip() for heading, cell in zip(headings[1:], others, strict=True)
                 if cell_text(cell)]  # fmt: skip
-        parts += [Padding(Text(line, style=style), (0, 0, 0, _INDENT)) for line in _lines(told, width - _INDENT)]
+        parts += [
+            Padding(Text(line, style=style), (0, 0, 0, _INDENT), expand=False) for line in _lines(told, width - _INDENT)
+        ]
     if table.caption:
         parts.append(Text(cell_text(table.caption), style="table.caption"))
     return Group(*parts)

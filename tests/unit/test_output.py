@@ -50,6 +50,15 @@ def test_a_wide_terminal_shows_the_table_and_a_narrow_one_a_list_of_its_rows(mon
     ]  # fmt: skip
 
 
+def test_a_long_word_is_whole_as_long_as_there_is_room_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    table = Table("quantity", "value", "note")
+    table.add_row("phase margin", "24.2 deg at so many hertz and more", "at least 15 (margin.min_phase_margin_deg)")
+    table.add_row("P", "12680.357  1.147959  16.091928", "P11 P12 P22")
+    shown = "\n".join(shown_at(60, table, monkeypatch))
+    for word in ("(margin.min_phase_margin_deg)", "12680.357", "quantity"):
+        assert word in shown
+
+
 def test_a_table_of_names_and_values_and_one_in_a_group_lose_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     table = Table("name", "value")
     table.add_row("log", PATH)

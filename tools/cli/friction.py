@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tools.cli.options import FRICTION, Json, Quiet, Report
+from tools.cli.options import FRICTION, Json, Quiet, Report, config_path
 from tools.cli.sweep_command import sweep_command
 from tools.output import Output
 
@@ -111,6 +111,7 @@ def identify(
         swarm=SwarmSettings(particles, iterations, inertia, cognitive, social, seed, stall),
     )
     output = Output(json=json, quiet=quiet)
+    config = None if config is None else config_path(config)
     raise typer.Exit(
         run_identify(data, output, into=into, out=out, config=config, told=told, options=options, report=report)
     )
@@ -141,7 +142,7 @@ def validate(
         velocity_column, torque_column, current_column, velocity_unit, side, torque_side, ratio, torque_constant,
         delimiter,
     )  # fmt: skip
-    raise typer.Exit(run_validate(config, data, Output(json=json, quiet=quiet), told=told, figure=figure))
+    raise typer.Exit(run_validate(config_path(config), data, Output(json=json, quiet=quiet), told=told, figure=figure))
 
 
 def register(app: typer.Typer) -> None:

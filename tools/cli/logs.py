@@ -70,7 +70,7 @@ def scope(
     bitrate: Bitrate = None,
     target: Target = None,
     allow_low_margin: Annotated[
-        bool, typer.Option("--allow-low-margin", help="run a stable loop below margin.min_phase_margin_deg")
+        bool, typer.Option("--allow-low-margin", help="run a stable loop below the wanted phase margin")
     ] = False,
     stop_unwatched: Annotated[
         float | None,

@@ -87,7 +87,7 @@ def run(
         bool, typer.Option("--dry-run", help="commission, show the motion envelope, move nothing")
     ] = False,
     allow_low_margin: Annotated[
-        bool, typer.Option("--allow-low-margin", help="run a stable loop below margin.min_phase_margin_deg")
+        bool, typer.Option("--allow-low-margin", help="run a stable loop below the wanted phase margin")
     ] = False,
     scope: Annotated[bool, typer.Option("--scope", help="live page in the browser (needs the extra scope)")] = False,
     scope_host: Annotated[

@@ -53,7 +53,7 @@ def sweep_command(
     ] = False,
     allow_low_margin: Annotated[
         bool,
-        typer.Option("--allow-low-margin", help="torque mode: run a stable loop below margin.min_phase_margin_deg"),
+        typer.Option("--allow-low-margin", help="torque mode: run a stable loop below the wanted phase margin"),
     ] = False,
     report: Report = None,
     json: Json = False,
