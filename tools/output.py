@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json as json_format
 import math
+import re
 import sys
 import textwrap
 from collections.abc import Iterator
@@ -27,6 +28,7 @@ class Advance(Protocol):
 
 
 FACT_COLUMN = 11  # where the text of a `fact` begins
+_UNIT, _HELD = re.compile(r"(?<=\d) (?=(rad|deg|s|min|ms|us|Nm|A|Hz|mrad|kbit|bit)\b)"), "\N{NO-BREAK SPACE}"
 PIPE_COLUMNS = 140  # of a table that goes to a file or a pipe, or more if it needs them
 
 
@@ -63,10 +65,11 @@ class Output:
     def fact(self, text: str) -> None:
         """A note that begins with a heading of `FACT_COLUMN` characters: what a terminal has to wrap goes below it."""
         if self.stderr.isatty():
+            bound = _UNIT.sub(_HELD, text)  # a number and its unit stay on one line
             text = textwrap.fill(
-                text, self._messages.width, subsequent_indent=" " * FACT_COLUMN, break_long_words=False,
+                bound, self._messages.width, subsequent_indent=" " * FACT_COLUMN, break_long_words=False,
                 break_on_hyphens=False,
-            )  # fmt: skip
+            ).replace(_HELD, " ")  # fmt: skip
         self.note(text)
 
     def warning(self, text: str) -> None:

@@ -85,4 +85,7 @@ def test_what_a_terminal_wraps_of_a_fact_goes_below_its_text(monkeypatch: pytest
     assert terminal.getvalue().splitlines() == [
         "motion     -0.477 .. +0.650 rad, back", "           and forth, about 7 min",
     ]  # fmt: skip
+    terminal.truncate(terminal.seek(0))
+    Output(stdout=io.StringIO(), stderr=terminal).fact("trajectory sine, 0.2200 rad/s, about 11 s long")
+    assert terminal.getvalue().splitlines() == ["trajectory sine, 0.2200 rad/s, about", "           11 s long"]
     assert pipe.getvalue() == text + "\n"  # a line of a file is not broken

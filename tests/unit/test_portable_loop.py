@@ -1,4 +1,4 @@
-"""The plain Python loop against a small drive that is the bus itself: no threads, no second process."""
+"""The plain Python loop against a small drive that is the bus itself: no threads, no second process, no real time."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import json
 import os
 import struct
 import sys
-import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -84,9 +83,35 @@ def warm() -> None:
     portable_loop.warm_up()
 
 
+class Clock:
+    """Time that passes while the loop sleeps, and a little with every look at it: a busy computer changes nothing."""
+
+    def __init__(self) -> None:
+        self.now_ns = 1_000_000_000
+
+    def monotonic_ns(self) -> int:
+        self.now_ns += 1000
+        return self.now_ns
+
+    def sleep(self, duration_s: float) -> None:
+        self.now_ns += round(duration_s * 1e9)
+
+    def sleep_until_ns(self, deadline_ns: int, _: Any) -> None:
+        self.now_ns = max(self.now_ns, deadline_ns)
+
+
 @pytest.fixture
-def block() -> Iterator[SharedBlock]:
-    """Holds position 0 for 50 ms; no limit of the schedule or of the supervisor disturbs a busy computer."""
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """The clock of the loop."""
+    clock = Clock()
+    monkeypatch.setattr(portable_loop, "time", clock)
+    monkeypatch.setattr(portable_loop, "sleep_until_ns", clock.sleep_until_ns)
+    return clock
+
+
+@pytest.fixture
+def block(clock: Clock) -> Iterator[SharedBlock]:
+    """Holds position 0 for 50 ms; no limit of the schedule or of the supervisor is at work."""
     block = SharedBlock.create(1)
     block.constants[:] = axis_constants(load_config(shipped_config("virtual")), start_position_rad=0.0)
     axis = block.constants[0]
@@ -248,12 +273,12 @@ def test_foreign_frames_do_no_harm(block: SharedBlock) -> None:
     assert block.port[0].malformed == executed
 
 
-def test_an_overrun_skips_slots_and_sends_no_burst(block: SharedBlock) -> None:
+def test_an_overrun_skips_slots_and_sends_no_burst(block: SharedBlock, clock: Clock) -> None:
     bus = DriveBus()
 
     def on_send(bus: DriveBus, identifier: int) -> None:
         if identifier == RPDO and bus.syncs == 3:
-            time.sleep(0.012)
+            clock.sleep(0.012)
 
     bus.on_send = on_send
     executed = run(bus, block, max_cycles=6)
@@ -282,14 +307,14 @@ def test_the_stop_word_ends_the_run(block: SharedBlock, request_: StopRequest) -
 
 
 @pytest.mark.parametrize("silent", [True, False])
-def test_a_lost_supervisor_stops_the_joint(block: SharedBlock, silent: bool) -> None:
+def test_a_lost_supervisor_stops_the_joint(block: SharedBlock, clock: Clock, silent: bool) -> None:
     bus = DriveBus()
     block.constants[0].sequence.supervisor_max_cycles = 200
-    block.words[Word.SUPERVISOR_NS] = time.monotonic_ns() - 250 * PERIOD_NS * silent
+    block.words[Word.SUPERVISOR_NS] = clock.monotonic_ns() - 250 * PERIOD_NS * silent
 
     def on_send(bus: DriveBus, identifier: int) -> None:
         if not silent:
-            block.words[Word.SUPERVISOR_NS] = time.monotonic_ns()
+            block.words[Word.SUPERVISOR_NS] = clock.monotonic_ns()
 
     bus.on_send = on_send
     run(bus, block)
