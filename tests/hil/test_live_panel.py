@@ -22,7 +22,10 @@ from firmware_py.schema import new
 from firmware_py.states import AxisPhase, DriveState, Fault
 from tools.output import Output
 from tools.recording.log_facts import missing_records
-from tools.running.display.live_panel import LivePanel, PhaseLines, Snapshot, panel, run_display, time_left
+from tools.running.display.display import Snapshot
+from tools.running.display.live_panel import LivePanel, run_display
+from tools.running.display.panel import panel, time_left
+from tools.running.display.phase_lines import PhaseLines
 
 ESCAPE = "\x1b["
 TERMINAL = {**os.environ, "TERM": "xterm-256color"}

@@ -15,7 +15,7 @@ from tests.unit.test_run_summary import run_records
 from tools.output import Output
 from tools.recording.run_log import ERROR, WARNING, Event
 from tools.recording.run_summary import summarise
-from tools.running.display.live_panel import PhaseLines
+from tools.running.display.phase_lines import PhaseLines
 from tools.running.events.fault_text import fault_text
 from tools.running.result import run_report
 from tools.running.result.run_result import RunResult

@@ -24,7 +24,8 @@ from tools.configuration.load import load_config, shipped_config
 from tools.output import Output
 from tools.recording.run_log import INFO, Event
 from tools.running.changes.viewer_orders import UNWATCHED, ViewerOrders
-from tools.running.display.live_panel import PhaseLines, Snapshot
+from tools.running.display.display import Snapshot
+from tools.running.display.phase_lines import PhaseLines
 from tools.running.display.viewer_request import ViewerRequest
 from tools.scoping import feed as feed_module
 from tools.scoping import order as order_module

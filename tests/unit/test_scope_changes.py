@@ -18,7 +18,7 @@ from firmware_py.states import AxisPhase, StopRequest
 from tools.configuration.records import axis_constants
 from tools.output import Output
 from tools.running.changes.new_motion import new_motion
-from tools.running.display.live_panel import time_left
+from tools.running.display.panel import time_left
 from tools.running.display.viewer_request import ViewerRequest
 from tools.running.supervisor import Supervisor
 from tools.verbs import scope as scope_module

@@ -28,7 +28,8 @@ from tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter
 from tools.recording.run_metadata import run_metadata
 from tools.recording.run_summary import summarise
 from tools.running.changes.viewer_orders import ViewerOrders
-from tools.running.display.live_panel import Display, PhaseLines, Snapshot
+from tools.running.display.display import Display, Snapshot
+from tools.running.display.phase_lines import PhaseLines
 from tools.running.events.event_finder import EventFinder, phase_name
 from tools.running.events.held_up import held_up_text
 from tools.running.guard.guard_handle import GUARD_ENDED, GuardHandle, start_guard

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 from firmware_py.states import StopRequest
 from tools.recording.run_log import Event
-from tools.running.display.live_panel import Display, Snapshot
+from tools.running.display.display import Display, Snapshot
 from tools.running.display.viewer_request import ViewerRequest
 
 

@@ -16,7 +16,7 @@ from typing import Any, Self
 
 from firmware_py.states import StopRequest
 from tools.recording.run_log import Event
-from tools.running.display.live_panel import Snapshot
+from tools.running.display.display import Snapshot
 from tools.running.display.viewer_request import LONGEST_BYTES, ViewerRequest, decoded
 from tools.scoping.order import ScopeOrder
 

@@ -9,7 +9,8 @@ from drivers.drive import CommissioningReport
 from tools.configuration.config import Config
 from tools.output import Output
 from tools.recording.log_folder import log_path
-from tools.running.display.live_panel import Display, run_display
+from tools.running.display.display import Display
+from tools.running.display.live_panel import run_display
 from tools.running.loop.shared_block import SERIAL
 from tools.running.permission.consent import agreed, require_terminal
 from tools.running.permission.envelope import motion_envelope

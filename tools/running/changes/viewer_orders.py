@@ -11,7 +11,7 @@ from drivers.errors import DataError
 from tools.configuration.config import Config
 from tools.recording.run_log import INFO, WARNING, Event, RunLogWriter
 from tools.running.changes.live_changes import LiveChanges, settings_of
-from tools.running.display.live_panel import Display
+from tools.running.display.display import Display
 from tools.running.display.viewer_request import ViewerRequest
 
 SETTINGS_s = 0.5  # how often the page is told how things stand

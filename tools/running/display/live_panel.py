@@ -12,128 +12,21 @@ import io
 import os
 import select
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol, Self
+from collections.abc import Callable
+from typing import Any, Self
 
-import numpy as np
-from rich.console import Console, ConsoleOptions, Group, RenderResult
+from rich.console import Console
 from rich.live import Live
 from rich.panel import Panel
-from rich.table import Table
-from rich.text import Text
 
-from firmware_py.realtime import Histogram
-from firmware_py.states import AxisPhase, Fault, StopRequest
 from tools.output import Output
 from tools.recording.run_log import ERROR, Event
-from tools.running.display.viewer_request import ViewerRequest
-from tools.running.events.event_finder import drive_state_name, phase_name
-from tools.running.loop.loop_delay import quantile_s
+from tools.running.display.display import Display, OnlyShows, Snapshot
+from tools.running.display.panel import NOTES, panel
+from tools.running.display.phase_lines import PhaseLines
 
 REFRESH_s = 0.25
 CLOSE_s = 1.0  # how long the end of a run waits for the last frame
-NOTES = 3  # how many of the newest remarks stay in the panel
-_QUANTILE = 0.99
-_NAME_WIDTH, _LEAST_WIDTH, _RIGHT_WIDTH = 11, 15, 19  # columns of the panel
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """The newest cycle and what has been counted so far; `histograms` is the loop's own memory, read when drawn."""
-
-    record: Any  # LogRecord
-    skipped: int
-    histograms: np.ndarray
-    duration_s: float  # of the trajectory; 0 = until stopped
-    cia402: bool = True
-    records: Any = ()  # all new ones, array of LogRecord (N,)
-    temperature_degC: float | None = None  # None: the drive tells none, or not now
-
-
-class Display(Protocol):
-    """Shows how a run goes; nothing in it may raise or wait."""
-
-    def note(self, text: str) -> None:
-        """A remark that stays."""
-
-    def phase(self, text: str) -> None:
-        """The run has entered a phase."""
-
-    def show(self, snapshot: Snapshot) -> None:
-        """The state of things, called many times a second."""
-
-    def event(self, event: Event) -> None:
-        """Something that went into the log as an event."""
-
-    def stop_request(self) -> StopRequest:
-        """What whoever watches asks for."""
-        ...
-
-    def stop_reason(self) -> str:
-        """Who or what asked for that stop; "" if nobody did."""
-        ...
-
-    def requests(self) -> Sequence[ViewerRequest]:
-        """What else they have asked for since the last call."""
-        ...
-
-    def settings(self, values: Mapping[str, Any]) -> None:
-        """What can be changed in this run, and how it stands."""
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, *_: object) -> None: ...
-
-
-class OnlyShows:
-    """The half of `Display` that a display leaves out when it neither tells events nor takes orders."""
-
-    def event(self, event: Event) -> None:
-        """Events are in the log."""
-
-    def stop_request(self) -> StopRequest:
-        """Nobody can ask for anything here; signals have their own way."""
-        return StopRequest.NONE
-
-    def stop_reason(self) -> str:
-        """As above."""
-        return ""
-
-    def requests(self) -> Sequence[ViewerRequest]:
-        """As above."""
-        return ()
-
-    def settings(self, values: Mapping[str, Any]) -> None:
-        """Nothing can be changed here."""
-
-
-class PhaseLines(OnlyShows):
-    """One line for each phase and remark; for pipes, files and `--json`."""
-
-    def __init__(self, output: Output) -> None:
-        self._output = output
-
-    def note(self, text: str) -> None:
-        """See `Display`."""
-        with contextlib.suppress(OSError):  # the terminal may have been closed: no reason to stop watching
-            self._output.note(f"  {text}")
-
-    phase = note
-
-    def event(self, event: Event) -> None:
-        """A fault is told when it happens, not only at the end of the run; the other events are in the log."""
-        if event.level >= ERROR:
-            self.note(event.text)
-
-    def show(self, snapshot: Snapshot) -> None:
-        """Nothing: lines are for changes."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Nothing to take away."""
 
 
 class _WholeFrames(io.StringIO):
@@ -212,84 +105,6 @@ class LivePanel(OnlyShows):
 
     def _panel(self) -> Panel:
         return panel(self._title, self._phase, self._snapshot, self._notes)
-
-
-def panel(title: str, phase: str, snapshot: Snapshot | None, notes: list[str]) -> Panel:
-    """The picture of one moment; the same number of lines whatever happens, so that nothing jumps."""
-    lines = [Text(f"  {line}", style="dim", no_wrap=True) for line in [*notes, *[""] * (NOTES - len(notes))]]
-    border = "red" if snapshot is not None and int(snapshot.record.fault) else "blue"
-    foot = "Ctrl-C: brake and disable; again: quick stop"
-    return Panel(
-        Group(_Grid(_cells(phase, snapshot)), *lines), title=title, subtitle=foot, title_align="left",
-        subtitle_align="left", border_style=border, width=78,
-    )  # fmt: skip
-
-
-class _Grid:
-    """Two fields a line where they fit, else one."""
-
-    def __init__(self, cells: list[tuple[str, str | Text]]) -> None:
-        self._cells = cells
-
-    def __rich_console__(self, _: Console, options: ConsoleOptions) -> RenderResult:
-        left = min(28, options.max_width - 2 * _NAME_WIDTH - _RIGHT_WIDTH)
-        widths = [_NAME_WIDTH, options.max_width - _NAME_WIDTH]
-        if left >= _LEAST_WIDTH:
-            widths = [_NAME_WIDTH, left, _NAME_WIDTH, _RIGHT_WIDTH]
-        grid, step = Table.grid(), len(widths) // 2
-        for width, style in zip(widths, ("dim", "") * step, strict=True):
-            grid.add_column(style=style, no_wrap=True, width=width)
-        for at in range(0, len(self._cells), step):
-            grid.add_row(*(part for name, value in self._cells[at : at + step] for part in (name, _indented(value))))
-        yield grid
-
-
-def _indented(value: str | Text) -> Text:
-    """A column of space that belongs to the value."""
-    return Text(f" {value}") if isinstance(value, str) else Text(f" {value.plain}", style=value.style)
-
-
-def _cells(phase: str, snapshot: Snapshot | None) -> list[tuple[str, str | Text]]:
-    """(name, value) of each field, in the order of reading."""
-    names = (
-        "phase", "drive", "error", "fault", "angle", "torque", "velocity", "measured", "time left", "temperature",
-        "wake-up p99", "skipped",
-    )  # fmt: skip
-    if snapshot is None:
-        return [(name, Text(phase, style="bold") if name == "phase" else "-") for name in names]
-    record = snapshot.record
-    active = AxisPhase.APPROACH <= int(record.phase) <= AxisPhase.RAMPING
-    fault = int(record.fault)
-    p99_s = quantile_s(snapshot.histograms[Histogram.WAKE], _QUANTILE)
-    values: tuple[str | Text, ...] = (
-        Text(phase_name(int(record.phase)), style="bold"),
-        drive_state_name(int(record.status_word), int(record.drive_state), cia402=snapshot.cia402),
-        f"{float(record.error_rad) * 1e3:+8.3f} mrad" if active else "-",
-        Text(_fault_name(fault), style="bold red") if fault else "none",
-        f"{float(record.position_rad):+8.4f} rad",
-        f"{float(record.command_torque_Nm):+8.2f} Nm",
-        f"{float(record.velocity_radps):+7.3f} rad/s",
-        f"{float(record.measured_torque_Nm):+8.2f} Nm",
-        time_left(float(record.trajectory_s), snapshot.duration_s, int(record.phase)),
-        "-" if snapshot.temperature_degC is None else f"{snapshot.temperature_degC:.1f} °C",
-        f"{p99_s * 1e6:.0f} us" if np.isfinite(p99_s) else "-",
-        f"{snapshot.skipped} cycles",
-    )
-    return list(zip(names, values, strict=True))
-
-
-def _fault_name(code: int) -> str:
-    return Fault(code).name.lower().replace("_", " ") if code in list(Fault) else f"fault {code}"
-
-
-def time_left(trajectory_s: float, duration_s: float, phase: int) -> str:
-    """In words; while the joint approaches, trajectory time is negative and counts as well."""
-    if phase > AxisPhase.TRACKING:
-        return "stopping"
-    if duration_s <= 0.0:
-        return "until stopped"
-    minutes, seconds = divmod(max(0.0, duration_s - trajectory_s), 60.0)
-    return f"{int(minutes)}:{seconds:04.1f} min" if minutes else f"{seconds:.1f} s"
 
 
 def run_display(output: Output, title: str) -> Callable[[], Display]:
