@@ -20,7 +20,9 @@ from tools.output import Output
 from tools.running.changes.new_motion import new_motion
 from tools.running.display.panel import time_left
 from tools.running.display.viewer_request import ViewerRequest
-from tools.running.supervisor import Supervisor
+from tools.running.run_watch import Around, RunParts, RunWatch
+from tools.running.stop_signals import StopSignals
+from tools.running.watch.bus_watch import BusWatch
 from tools.verbs import scope as scope_module
 
 TABLE = np.zeros((1, 5))
@@ -94,17 +96,17 @@ def test_a_motion_without_an_end_says_so(
     assert words.endswith(", until stopped") is not ends
     assert virtual_config.trajectory.duration_s > 0.0
     shown: list[Any] = []
-    supervisor = Supervisor(virtual_config, Output(), tmp_path / "a.mcap", lambda report: True)
-    supervisor._display = SimpleNamespace(show=shown.append)  # type: ignore[assignment]
-    supervisor._events = SimpleNamespace(take=lambda records: [])  # type: ignore[assignment]
     axis = axis_constants(virtual_config, start_position_rad=0.0)
     axis[0].trajectory = constants[0]  # as the loop has taken it
     block = SimpleNamespace(
         constants=axis, words=np.zeros(max(Word) + 1), histograms=np.zeros((3, HISTOGRAM_BINS), np.int64)
     )
-    sink: Any = SimpleNamespace(append=lambda records: None, write_records=lambda records: None)
+    sink: Any = SimpleNamespace(path=tmp_path, append=lambda records: None, write_records=lambda records: None)
+    display: Any = SimpleNamespace(show=shown.append, event=lambda event: None)
+    sink.write_event = lambda *_: None
     loop: Any = SimpleNamespace(block=block, new_records=lambda: new(LogRecord, 1).view(np.recarray))
-    supervisor._take_records(loop, sink, sink)
+    around = Around(StopSignals(), BusWatch(virtual_config, None))
+    RunWatch(virtual_config, RunParts(loop, around, sink, sink, display, {})).take_records()
     assert (time_left(1e4, shown[0].duration_s, AxisPhase.TRACKING) == "until stopped") is not ends
 
 

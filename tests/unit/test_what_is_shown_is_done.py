@@ -19,9 +19,13 @@ from tools.configuration.config import Config
 from tools.configuration.load import load_config, shipped_config
 from tools.configuration.records import trajectory_table
 from tools.output import Output
+from tools.running.display.phase_lines import PhaseLines
 from tools.running.permission.envelope import motion_envelope
 from tools.running.permission.readiness import require_start
+from tools.running.run_watch import Around, RunParts
+from tools.running.stop_signals import StopSignals
 from tools.running.supervisor import Supervisor
+from tools.running.watch.bus_watch import BusWatch
 from tools.simulation.lockstep import LockstepJoint
 from tools.sweeping.carry_out import SweepSupervisor
 from tools.sweeping.checks import require_torque
@@ -154,19 +158,20 @@ def test_a_drive_that_says_nothing_is_told_by_the_loop_and_not_as_a_delay(
     tmp_path: Path, samples: int, velocity: bool
 ) -> None:
     config = config_of(tmp_path)
-    log: Any = SimpleNamespace(write_event=lambda *_: None)
+    log: Any = SimpleNamespace(path=tmp_path / "log.mcap", write_event=lambda *_: None)
     loop: Any = SilentLoop(samples)
-    common: Any = (config, Output(), tmp_path / "log.mcap", lambda _: True)
-    supervisor = Supervisor(*common)
+    nothing: Any = None
+    parts = RunParts(loop, Around(StopSignals(), BusWatch(config, None)), log, nothing, PhaseLines(Output()), {})
+    supervisor: Supervisor = Supervisor(config, Output(), log.path, lambda _: True)
     if velocity:
-        nothing: Any = None
-        supervisor = SweepSupervisor(*common, nothing, nothing, lambda _: None)
+        supervisor = SweepSupervisor(config, Output(), log.path, lambda _: True, nothing, nothing, lambda _: None)
         supervisor._velocity_mode = True
-    supervisor._check_delay(loop, log)
+    with supervisor._make_watch(parts) as watch:
+        watch.check_delay()
     assert loop.may_enable is (samples > 0)
-    assert (supervisor._delay_s is None) is (samples == 0)
+    assert (watch.delay_s is None) is (samples == 0)
     if samples:
-        assert supervisor._delay_s == pytest.approx(1e-3)
+        assert watch.delay_s == pytest.approx(1e-3)
 
 
 @pytest.mark.parametrize(

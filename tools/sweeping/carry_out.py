@@ -17,7 +17,6 @@ import numpy as np
 from drivers.drive import CommissioningReport
 from drivers.elmo.unit_modes import SPEED_MODE
 from drivers.errors import ConfigurationError, DeviceError, UsageError
-from firmware_py.realtime import Histogram
 from firmware_py.records import Reference
 from firmware_py.schema import new
 from firmware_py.states import CommandKind, Fault, TrajectoryKind
@@ -26,12 +25,10 @@ from tools.configuration.config import Config
 from tools.configuration.elmo import ElmoSerial, UnitModeChoice
 from tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_constants
 from tools.output import Output
-from tools.recording.kept_records import KeptRecords
-from tools.recording.run_log import INFO, RunLogWriter
 from tools.recording.thinned_records import ThinnedRecords
 from tools.running.loop.loop_handle import LoopHandle
-from tools.running.open_drive import loop_delay_s
-from tools.running.supervisor import DELAY_CYCLES, Supervisor
+from tools.running.run_watch import RunParts, RunWatch
+from tools.running.supervisor import Supervisor
 from tools.simulation.lockstep import LockstepJoint
 from tools.sweeping.meter import SweepMeter
 from tools.sweeping.plan import SweepMotion, shifted
@@ -113,8 +110,42 @@ def sweep_constants(config: Config, report: CommissioningReport, motion: SweepMo
     return constants
 
 
+class SweepWatch(RunWatch):
+    """Gives the records of a sweep to its meter, and thinned to the run log; `prepare` it first."""
+
+    def prepare(self, meter: SweepMeter, progress: Callable[[float], None], *, velocity_mode: bool) -> None:
+        """`progress` is told the time on the motion [s]."""
+        self._meter, self._progress, self._velocity_mode = meter, progress, velocity_mode
+        self._thinned = ThinnedRecords(LOG_EVERY, round(LOG_WHOLE_S * self.config.loop.rate_Hz))
+
+    def margin_text(self, delay_s: float) -> str:
+        """In a velocity mode the drive closes its loop itself; ours is the slow position correction."""
+        if not self._velocity_mode:
+            return super().margin_text(delay_s)
+        margin_deg = math.degrees(0.5 * math.pi - POSITION_GAIN_ps * delay_s)
+        return f"position correction with {margin_deg:.0f} deg phase margin"
+
+    def take_records(self) -> None:
+        """As for any run; at the end also those that the thinning still holds."""
+        super().take_records()
+        if not self.loop.running():
+            self._write(self._thinned.last())
+
+    def keep(self, records: Any) -> None:
+        """See `RunWatch`."""
+        self._write(self._thinned.take(records))
+        self._meter.temperature_degC = self.temperature.newest_degC
+        self._meter.feed(records)
+        with contextlib.suppress(OSError):  # the terminal may have been closed
+            self._progress(float(records[-1].trajectory_s))
+
+    def _write(self, records: Any) -> None:
+        if len(records):
+            super().keep(records)
+
+
 class SweepSupervisor(Supervisor):
-    """A supervised run along the motion of a sweep; its records go to the meter, and thinned to the run log."""
+    """A supervised run along the motion of a sweep."""
 
     def __init__(
         self,
@@ -133,7 +164,6 @@ class SweepSupervisor(Supervisor):
         self._meter = meter
         self._progress = progress
         self._velocity_mode = False
-        self._thinned = ThinnedRecords(LOG_EVERY, round(LOG_WHOLE_S * config.loop.rate_Hz))
 
     def _table(self) -> np.ndarray:
         return self._motion.table
@@ -146,40 +176,10 @@ class SweepSupervisor(Supervisor):
         loop.block.table[:] = motion.table
         return sweep_constants(self._config, report, motion)
 
-    def _check_delay(self, loop: LoopHandle, log: RunLogWriter) -> None:
-        if not self._velocity_mode:
-            super()._check_delay(loop, log)
-        elif (
-            self._delay_s is None
-            and loop.cycles >= min(DELAY_CYCLES, self._config.loop.rate_Hz)
-            and loop.block.histograms[Histogram.ROUND_TRIP].any()
-        ):
-            # the drive closes its loop itself; ours is the slow position correction
-            self._delay_s = loop_delay_s(self._config, loop.block.histograms)
-            margin_deg = math.degrees(0.5 * math.pi - POSITION_GAIN_ps * self._delay_s)
-            text = f"loop delay {self._delay_s * 1e3:.2f} ms measured, "
-            text += f"position correction with {margin_deg:.0f} deg phase margin"
-            log.write_event(INFO, "supervisor", text)
-            self._display.note(text)
-            loop.allow_enable()
-
-    @staticmethod
-    def _write(records: Any, log: RunLogWriter, kept: KeptRecords) -> None:
-        if len(records):
-            kept.append(records)
-            log.write_records(records)
-
-    def _take_records(self, loop: LoopHandle, log: RunLogWriter, kept: KeptRecords) -> None:
-        super()._take_records(loop, log, kept)
-        if not loop.running():
-            self._write(self._thinned.last(), log, kept)
-
-    def _keep(self, records: Any, log: RunLogWriter, kept: KeptRecords) -> None:
-        self._write(self._thinned.take(records), log, kept)
-        self._meter.temperature_degC = self._temperature.newest_degC
-        self._meter.feed(records)
-        with contextlib.suppress(OSError):  # the terminal may have been closed
-            self._progress(float(records[-1].trajectory_s))
+    def _make_watch(self, parts: RunParts) -> RunWatch:
+        watch = SweepWatch(self._config, parts, allow_low_margin=self._allow_low_margin)
+        watch.prepare(self._meter, self._progress, velocity_mode=self._velocity_mode)
+        return watch
 
 
 def sweep_in_lockstep(

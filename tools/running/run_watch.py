@@ -1,0 +1,163 @@
+"""What the supervisor does 50 times a second while the loop runs: sign of life, stop, records, events, what is watched.
+
+Everything new goes into the log and to the display here; what opens, lets go and makes safe is the supervisor's.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+from firmware_py.realtime import Histogram, Word
+from firmware_py.states import AxisPhase, Fault, StopRequest
+from tools.analysis.margin_gate import require_margin
+from tools.configuration.config import Config
+from tools.recording.can_log import frame_array
+from tools.recording.kept_records import KeptRecords
+from tools.recording.run_log import INFO, WARNING, Event, RunLogWriter
+from tools.running.changes.viewer_orders import ViewerOrders
+from tools.running.display.display import Display, Snapshot
+from tools.running.events.event_finder import EventFinder, phase_name
+from tools.running.guard.guard_handle import GUARD_ENDED, GuardHandle
+from tools.running.loop.loop_handle import LoopHandle
+from tools.running.loop.shared_block import SERIAL
+from tools.running.open_drive import drive_fault_text, loop_delay_s
+from tools.running.stop_signals import StopSignals
+from tools.running.watch.bus_watch import BusWatch
+from tools.running.watch.frame_recorder import FrameRecorder
+from tools.running.watch.temperature_watch import TemperatureWatch
+
+DELAY_CYCLES = 300  # how many cycles with the drive off the loop delay is measured over
+
+
+@dataclass(frozen=True)
+class Around:
+    """Who else has a part in the run, opened before the loop and closed after it."""
+
+    signals: StopSignals
+    bus_watch: BusWatch
+    recorder: FrameRecorder | None = None
+    guard: GuardHandle | None = None
+
+
+@dataclass(frozen=True)
+class RunParts:
+    """What a watch looks at and where it writes; `metadata` is that of the log, for recordings of a stretch."""
+
+    loop: LoopHandle
+    around: Around
+    log: RunLogWriter
+    kept: KeptRecords
+    display: Display
+    metadata: Mapping[str, Mapping[str, str]]
+
+
+class RunWatch:
+    """Watches one run; `poll` it."""
+
+    def __init__(self, config: Config, parts: RunParts, *, allow_low_margin: bool = False) -> None:
+        self.config, self.loop, self.around = config, parts.loop, parts.around
+        self.log, self.kept, self.display = parts.log, parts.kept, parts.display
+        self.temperature = TemperatureWatch()  # until the drive's own thermometer is known
+        self.delay_s: float | None = None  # of the loop, once it is measured
+        self._stopped_by_viewer = ""
+        self._allow_low_margin = allow_low_margin
+        self._phase, self._asked = AxisPhase.WAITING, StopRequest.NONE
+        self._events = EventFinder(cia402=config.bus.interface != SERIAL, fault_words=self._fault_words)
+        self._orders = ViewerOrders(
+            config, self.loop.block, self.log.path, parts.metadata, self._tell_scope, lambda: self.delay_s,
+            allow_low_margin=allow_low_margin,
+        )  # fmt: skip
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Viewers can change nothing any more; a recording of theirs ends."""
+        self._orders.__exit__(*exception)
+
+    @property
+    def stopped_by(self) -> str:
+        """Name of the signal, or of the viewer, that asked for the end of the run; "" if nobody did."""
+        return self.around.signals.name or self._stopped_by_viewer
+
+    def poll(self) -> None:
+        """One look at everything; an exception ends the run."""
+        self.loop.beat()
+        request = max(self.around.signals.request, self.display.stop_request())
+        if request is not StopRequest.NONE:
+            self.loop.request_stop(request)
+        self.take_records()
+        if request is not self._asked:
+            self._asked = request
+            if not self.around.signals.name:
+                self._stopped_by_viewer = self.display.stop_reason()
+            text = f"{request.name.lower().replace('_', ' ')} asked for by {self.stopped_by}"
+            self._tell(Event(time.monotonic_ns(), WARNING, "supervisor", text))
+        self.check_delay()
+        self.temperature.poll()
+        for text in self.around.bus_watch.news():
+            self.log.write_event(WARNING, "bus", text)
+            self.display.note(text)
+        if self.around.guard is not None and self.around.guard.just_ended():
+            self.log.write_event(WARNING, "supervisor", GUARD_ENDED)
+            self.display.note(GUARD_ENDED)
+        self._orders.serve(self.display)
+        if (phase := self.loop.phase) is not self._phase:
+            self._phase = phase
+            self.display.phase(phase_name(phase))
+
+    def take_records(self) -> None:
+        """What the loop has written since the last call: to log, viewers and display, and the events in it."""
+        if self.around.recorder is not None and (frames := self.around.recorder.new_frames()):
+            self.log.write_frames(frame_array(frames))
+        if not len(records := self.loop.new_records()):
+            return
+        self.keep(records)
+        self._orders.keep(records)
+        for event in self._events.take(records):
+            self._tell(event)
+        skipped, histograms = int(self.loop.block.words[Word.SKIPPED]), self.loop.block.histograms
+        duration_s = float(self.loop.block.constants[0].trajectory.duration_s)  # a viewer may have changed the motion
+        cia402 = self.config.bus.interface != SERIAL
+        degC = self.temperature.newest_degC
+        self.display.show(Snapshot(records[-1], skipped, histograms, duration_s, cia402, records, degC))
+
+    def keep(self, records: Any) -> None:
+        """What becomes of new records: the log, and `kept` for the summary at the end."""
+        self.kept.append(records)
+        self.log.write_records(records)
+
+    def check_delay(self) -> None:
+        """Once enough cycles have run with the drive off: refuse the gains, or let the loop enable."""
+        if self.delay_s is not None or self.loop.cycles < min(DELAY_CYCLES, self.config.loop.rate_Hz):
+            return
+        histograms = self.loop.block.histograms
+        if not histograms[Histogram.ROUND_TRIP].any():
+            return  # nothing has been heard: the loop ends that itself, and tells it
+        self.delay_s = loop_delay_s(self.config, histograms)
+        text = f"loop delay {self.delay_s * 1e3:.2f} ms measured, {self.margin_text(self.delay_s)}"
+        self.log.write_event(INFO, "supervisor", text)
+        self.display.note(text)
+        self.loop.allow_enable()
+
+    def margin_text(self, delay_s: float) -> str:
+        """What is left of the stability with that delay, in words; raises if it is too little to enable."""
+        found = require_margin(self.config, delay_s, allow_low_margin=self._allow_low_margin)
+        return f"phase margin {found.phase_margin_deg:.0f} deg"
+
+    def _tell(self, event: Event) -> None:
+        self.log.write_event(event.level, event.source, event.text, event.time_ns)
+        self.display.event(event)
+        self._orders.keep_event(event)
+
+    def _tell_scope(self, level: int, text: str) -> None:
+        self._tell(Event(time.monotonic_ns(), level, "scope", text))
+
+    def _fault_words(self, fault: Fault, drive_error: int) -> str:
+        """In the words that fit the drive, with the value that the loop has latched."""
+        state = self.loop.block.state[0]
+        value, encoder_error = float(state.fault_value), int(state.fault_encoder_error)
+        return drive_fault_text(self.config, fault, value, drive_error, encoder_error).happened
