@@ -9,6 +9,7 @@ import termios
 from typing import Any, Protocol
 
 import serial
+from serial.tools import list_ports
 
 from drivers.errors import BusError
 from drivers.port_users import users_text
@@ -90,6 +91,15 @@ def open_descriptor(path: str) -> int:
         return os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError as error:
         raise _open_error(path, 0, error) from None
+
+
+def usb_serial_number(path: str) -> str | None:
+    """Of the USB adapter behind a port; None where the system tells none: other ports, cheap adapters."""
+    device = os.path.realpath(path)
+    try:
+        return next((found.serial_number or None for found in list_ports.comports() if found.device == device), None)
+    except OSError:  # a device that vanishes while it is read
+        return None
 
 
 def _reason(error: Exception) -> str:

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 
+from drivers.elmo.serial_port import usb_serial_number
 from drivers.errors import JointctlError
 from firmware_py.realtime import WORDS, Word
 from firmware_py.states import StopRequest
@@ -37,6 +38,7 @@ class GuardHandle:
             control_fd=passed[0], block_fd=passed[1], supervisor_pidfd=passed[2], loop_pidfd=passed[3],
             supervisor_pid=os.getpid(), go_word=Word.GO, stop_word=Word.STOP, loop_word=Word.LOOP_NS,
             ended_word=Word.ENDED, held_up_word=Word.HELD_UP_NS, words=WORDS, stop_value=int(StopRequest.OFF),
+            usb_serial_number=usb_serial_number(drive.port),
         )  # fmt: skip
         try:
             self._process = subprocess.Popen(

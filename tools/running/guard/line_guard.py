@@ -5,7 +5,8 @@ third process waits, in a session of its own, and says TC=0, JV=0, ST, MO=0
 
 * when loop and supervisor are both dead, however they died (the kernel tells it: pidfd);
 * when the loop has been silent for `silent_s` and the supervisor has done nothing about it;
-* when the supervisor could not reach the drive at the end of a run: for `REACH_S`, also on a port that comes back;
+* when the supervisor could not reach the drive at the end of a run: for `REACH_S`, also on a port that comes back,
+  unless an adapter with another USB serial number has its name then;
 * when `jointctl stop` asks for it (`guard_call`) and the loop does not obey at once.
 
 It cannot help where the computer loses its power or the cable is cut: only the drive's own limits work then.
@@ -27,9 +28,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from drivers.elmo.dialogue import Dialogue
-from drivers.elmo.serial_port import SerialPort, open_descriptor
+from drivers.elmo.serial_port import SerialPort, open_descriptor, usb_serial_number
 from drivers.elmo.switch_off import SWITCH_OFF, switch_off
-from drivers.errors import JointctlError
+from drivers.errors import BusError, JointctlError
 from tools.running.guard.guard_call import guard_address, heard_line, may_ask
 
 REACH_S = 60.0  # how long a drive that does not answer is tried again: time to plug a cable in
@@ -62,6 +63,7 @@ class GuardOrder:
     held_up_word: int
     words: int
     stop_value: int  # StopRequest.OFF
+    usb_serial_number: str | None = None  # of the port's adapter, where it has one
 
     def argument(self) -> str:
         """As one command line argument."""
@@ -190,6 +192,7 @@ class LineGuard:
         while True:
             port: SerialPort | None = None
             try:
+                self._require_same_device()
                 port = SerialPort(order.port, order.baud_rate_bitps)
                 state = switch_off(port, Dialogue(port, order.reply_timeout_s))
                 self._say(f"line guard: the drive on {order.port} is {state}")
@@ -204,6 +207,12 @@ class LineGuard:
                 self._say(f"line guard: the drive on {order.port} could not be switched off: {reason}")
                 return f"unknown: {reason}"
             time.sleep(REPEAT_S)
+
+    def _require_same_device(self) -> None:
+        """`BusError` where the port's name belongs to another adapter now: what is behind it is none of ours."""
+        known, found = self._order.usb_serial_number, usb_serial_number(self._order.port)
+        if known and found and found != known:
+            raise BusError(f"another adapter has this name now (serial number {found} instead of {known})")
 
     @staticmethod
     def _say(text: str) -> None:
