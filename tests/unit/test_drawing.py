@@ -23,7 +23,7 @@ from tools.reporting.figure import svg_figure
 def verdict(number: int) -> Verdict:
     """Harmful, harmless and a violation in turn, of three kinds."""
     violations = ("late",) if number % 5 == 0 else ()
-    return Verdict(number, f"kind_{number % 3}", number % 2 == 0, "none", "none", violations, 0.1 * number, 0.0, 0.1,
+    return Verdict(number, f"kind_{number % 3}", number % 2 == 0, "NONE", "none", violations, 0.1 * number, 0.0, 0.1,
                    0.01 if number % 4 else None)  # fmt: skip
 
 
@@ -87,3 +87,4 @@ def test_the_heading_of_a_campaigns_table_keeps_its_units() -> None:
     Output(stdout=shown).result(table(rows_by_kind([verdict(1)])))
     for heading in ("speed [rad/s]", "beyond limit [rad]", "allowed [rad]", "off after [s]"):
         assert heading in shown.getvalue()
+    assert "no fault 1" in shown.getvalue()

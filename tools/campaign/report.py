@@ -13,6 +13,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
+from firmware_py.states import Fault
 from tools.campaign.judge import Verdict
 from tools.campaign.scenario import draw_scenario
 from tools.drawing import INK, MID_BLUE, MID_GREEN, MID_RED, canvas
@@ -57,6 +58,11 @@ def rows_by_kind(verdicts: Sequence[Verdict]) -> list[KindRow]:
     return rows
 
 
+def _told(fault: str) -> str:
+    """In words, which a table may wrap."""
+    return "no fault" if fault == Fault.NONE.name else fault.lower().replace("_", " ")
+
+
 def table(rows: Sequence[KindRow]) -> Table:
     """For people."""
     shown = Table(title="fault campaign")
@@ -67,7 +73,7 @@ def table(rows: Sequence[KindRow]) -> Table:
     ):  # fmt: skip
         shown.add_column(escape(name), justify=justify)  # type: ignore[arg-type]
     for row in rows:
-        causes = ", ".join(f"{name.lower()} {count}" for name, count in row.causes.items())
+        causes = ", ".join(f"{_told(name)} {count}" for name, count in row.causes.items())
         shown.add_row(
             row.kind, str(row.scenarios), str(row.harmless), str(row.violations), f"{row.peak_radps:.2f}",
             f"{row.beyond_rad:.3f}", f"{row.allowed_rad:.2f}", f"{row.longest_off_s:.3f}", causes,
