@@ -22,11 +22,6 @@ def _stuffed_bits(length: int, extended: bool) -> int:
     return (_EXTENDED_STUFFED_BITS if extended else _STANDARD_STUFFED_BITS) + 8 * length
 
 
-def minimum_frame_bits(length: int, extended: bool = False) -> int:
-    """Bits of a frame of `length` data bytes if no stuff bit is needed: 47 + 8 n (extended identifier: 67 + 8 n)."""
-    return _stuffed_bits(length, extended) + _TAIL_BITS
-
-
 def worst_frame_bits(length: int, extended: bool = False) -> int:
     """Bits of a frame of `length` data bytes at worst: one stuff bit after the first 5 bits, then after every 4."""
     stuffed = _stuffed_bits(length, extended)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.can.bit_timing import bus_load, highest_rate_Hz, minimum_frame_bits, worst_cycle_bits, worst_frame_bits
+from drivers.can.bit_timing import bus_load, highest_rate_Hz, worst_cycle_bits, worst_frame_bits
 from drivers.errors import ConfigurationError
 from tools.configuration.drive_settings import cyclic_bus_load
 from tools.configuration.load import load_config, shipped_config
@@ -12,20 +12,17 @@ from tools.configuration.load import load_config, shipped_config
 SYNC, POSITION, TORQUE = 0, 8, 4
 
 
-@pytest.mark.parametrize(("length", "least", "worst"), [(0, 47, 55), (4, 79, 95), (8, 111, 135)])
-def test_bits_of_one_frame(length: int, least: int, worst: int) -> None:
-    assert minimum_frame_bits(length) == least
+@pytest.mark.parametrize(("length", "worst"), [(0, 55), (4, 95), (8, 135)])
+def test_bits_of_one_frame(length: int, worst: int) -> None:
     assert worst_frame_bits(length) == worst
 
 
 def test_bits_of_an_extended_frame() -> None:
-    assert minimum_frame_bits(8, extended=True) == 131
     assert worst_frame_bits(8, extended=True) == 160  # Davis et al. (2007)
 
 
 def test_every_length_follows_the_formula() -> None:
     for length in range(9):
-        assert minimum_frame_bits(length) == 47 + 8 * length
         assert worst_frame_bits(length) == 47 + 8 * length + (33 + 8 * length) // 4
 
 

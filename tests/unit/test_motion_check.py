@@ -23,8 +23,7 @@ from tools.configuration.config import Config
 from tools.configuration.load import load_config
 from tools.inspection.drive_scale import judged
 from tools.inspection.findings import NOTE, OK, PROBLEM, Finding
-from tools.motion_check.carry_out import check_in_lockstep
-from tools.motion_check.plan import check_constants, config_of_check, make_plan, motion_table, require_room
+from tools.motion_check.plan import CheckPlan, check_constants, config_of_check, make_plan, motion_table, require_room
 from tools.motion_check.verdict import motion_findings
 from tools.output import Output
 from tools.running.events.fault_text import fault_text
@@ -49,6 +48,16 @@ def config_with(folder: Path, second: dict[str, Any] | None = None, **changes: A
     path = folder / "joint.toml"
     path.write_text(tomlkit.dumps(document))
     return load_config(path)
+
+
+def check_in_lockstep(joint: LockstepJoint, config: Config, plan: CheckPlan, faults: Any = None) -> tuple[Any, Fault]:
+    """The same motion on a virtual joint in simulated time: its records and the fault."""
+    table = motion_table(plan, joint.report.start_position_rad)
+    constants = check_constants(config_of_check(config, plan), plan, joint.report, table)
+    constants[0].sequence.supervisor_max_cycles = 0  # nobody watches in simulated time
+    joint.table = table
+    run = joint.run(constants) if faults is None else joint.run_with_faults(faults, constants)
+    return run.log, run.fault
 
 
 def checked(config: Config, change: Any = None, faults: Any = None) -> tuple[dict[str, Finding], Any, Fault]:

@@ -13,9 +13,12 @@ import pytest
 from drivers.canopen.commissioning import disable
 from drivers.drive import UNTOUCHED, CommissioningReport, DriveIdentity
 from drivers.errors import ConfigurationError, DeviceError, MotionFault
+from firmware_py.friction import branch_torque_Nm
 from firmware_py.realtime import HISTOGRAM_BINS, Histogram
 from firmware_py.states import Fault
+from tools.configuration import checks
 from tools.configuration.config import Config
+from tools.configuration.conversions import RADPS_PER_UNIT, friction_constants
 from tools.configuration.load import load_config, shipped_config
 from tools.configuration.records import trajectory_table
 from tools.output import Output
@@ -273,3 +276,22 @@ def test_no_target_and_no_offset_is_left_from_before(settings_of_virtual_joint: 
     objects: Any = Offsets()
     disable(objects, settings_of_virtual_joint, lambda _: None)
     assert [objects.values[index] for index in (0x6071, 0x60FF, 0x60B1, 0x60B2)] == [0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("velocity_side", ["joint", "motor"])
+def test_the_check_judges_the_curve_that_the_law_computes(velocity_side: str) -> None:
+    """Reading a configuration must not load the compiler, so `checks` has the curve once more, in its own units."""
+    config = load_config(shipped_config("paper"))
+    assert config.friction is not None
+    friction = config.friction.model_copy(update={"velocity_side": velocity_side})
+    ratio = config.joint.reduction_ratio
+    branches = friction_constants(friction, ratio)[0]
+    radps_per_unit = RADPS_PER_UNIT[friction.velocity_unit] / (ratio if velocity_side == "motor" else 1.0)
+    scale = 1.0 / ratio if friction.torque_side == "joint" else 1.0
+    for direction, branch, sign in (
+        (friction.positive, branches.positive, 1.0), (friction.negative, branches.negative, -1.0),
+    ):  # fmt: skip
+        knee, greatest = abs(direction.knee), abs(direction.max)
+        for speed in (0.01 * knee, 0.5 * knee, 0.999 * knee, 1.001 * knee, 0.6 * greatest, greatest, 1.7 * greatest):
+            computed_Nm = branch_torque_Nm(branch, speed * radps_per_unit)
+            assert scale * checks._sliding_Nm(direction, sign, speed) == pytest.approx(computed_Nm, rel=1e-12)

@@ -41,8 +41,7 @@ class Convergence:
 
     worst_factor: float
     worst_Hz: float
-    remaining_1_Hz: float  # share of a disturbance that stays in the end, at 1 Hz and at 5 Hz
-    remaining_5_Hz: float
+    remaining_1_Hz: float  # share of a disturbance at 1 Hz that stays in the end
 
 
 def repetition_factor(settings: LoopSettings, learning: LearningSettings, omega_radps: Array) -> tuple[Array, Array]:
@@ -67,5 +66,5 @@ def learning_convergence(settings: LoopSettings, learning: LearningSettings) -> 
     omega = frequencies_radps(settings.period_s)
     factor, _ = repetition_factor(settings, learning, omega)
     worst = int(np.argmax(factor))
-    _, remaining = repetition_factor(settings, learning, np.array([1.0, 5.0]) * math.tau)
-    return Convergence(float(factor[worst]), float(omega[worst]) / math.tau, float(remaining[0]), float(remaining[1]))
+    _, remaining = repetition_factor(settings, learning, np.array([math.tau]))
+    return Convergence(float(factor[worst]), float(omega[worst]) / math.tau, float(remaining[0]))

@@ -72,7 +72,7 @@ def outcome_table(rows: Sequence[Row]) -> Table:
     """All rows; a ratio below 1 means that ours is faster."""
     table = Table(title="Benchmark: ours / theirs, medians of pairs measured in turn", title_justify="left")
     for column in COLUMNS:
-        table.add_column(column, overflow="fold")
+        table.add_column(column)
     group = None
     for row in rows:
         if row.group != group:

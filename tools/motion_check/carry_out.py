@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 
 from drivers.drive import CommissioningReport
-from firmware_py.states import Fault
 from tools.configuration.config import Config
 from tools.motion_check.plan import CheckPlan, check_constants, config_of_check, motion_table
 from tools.output import Output
 from tools.running.loop.loop_handle import LoopHandle
 from tools.running.supervisor import Supervisor
-from tools.simulation.lockstep import LockstepJoint
 
 
 class CheckSupervisor(Supervisor):
@@ -39,13 +37,3 @@ class CheckSupervisor(Supervisor):
         table = motion_table(self._plan, report.start_position_rad)
         loop.block.table[:] = table
         return check_constants(self._config, self._plan, report, table)
-
-
-def check_in_lockstep(joint: LockstepJoint, config: Config, plan: CheckPlan, faults: Any = None) -> tuple[Any, Fault]:
-    """The same motion on a virtual joint in simulated time: its records and the fault."""
-    table = motion_table(plan, joint.report.start_position_rad)
-    constants = check_constants(config_of_check(config, plan), plan, joint.report, table)
-    constants[0].sequence.supervisor_max_cycles = 0  # nobody watches in simulated time
-    joint.table = table
-    run = joint.run(constants) if faults is None else joint.run_with_faults(faults, constants)
-    return run.log, run.fault

@@ -30,11 +30,6 @@ class KeptRecords:
     def __len__(self) -> int:
         return self._count
 
-    @property
-    def in_file(self) -> bool:
-        """Whether they have been moved to a file."""
-        return self._file is not None
-
     def append(self, records: Any) -> None:
         """Keep `records` (array of LogRecord, shape (N,)); `OSError` if the disk is full."""
         self._count += len(records)

@@ -73,7 +73,7 @@ def _table(
 ) -> Table:
     table = Table(title="Linear loop", title_justify="left")
     for heading in ("quantity", "value", "note"):
-        table.add_column(heading, overflow="fold")  # a narrow terminal must not cut a number or a path
+        table.add_column(heading)
     for a in assumptions:
         table.add_row(a.name, f"{a.value:g} {a.unit}", a.origin)
     table.add_section()

@@ -50,7 +50,7 @@ def report_findings(found: list[Finding], output: Output, title: str) -> int:
     """The table, and 0 or 1 as for `doctor`."""
     table = Table(title=title, title_justify="left")
     for column in ("", "finding", "cure"):
-        table.add_column(column, overflow="fold")
+        table.add_column(column)
     colours = {OK: "green", NOTE: "yellow", PROBLEM: "red"}
     for finding in found:
         topic = f"[{colours[finding.status]}]{finding.status}[/] {finding.topic}"

@@ -33,8 +33,8 @@ def info_table(found: dict[str, Any]) -> Table:
     """One table for all sections; sections are dicts or lists of dicts."""
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
-    table.add_column(overflow="fold")
+    table.add_column()
+    table.add_column()
     for section, content in found.items():
         if not content:
             continue

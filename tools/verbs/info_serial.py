@@ -21,7 +21,7 @@ def info_serial(config: Config, output: Output) -> int:
         facts = drive.facts()
     table = Table(title=f"{identity.name} on {place}", title_justify="left", show_header=False, box=None)
     for column in ("name", "label", "value", "meaning"):
-        table.add_column(column, overflow="fold", justify="right" if column == "value" else "left")
+        table.add_column(column, justify="right" if column == "value" else "left")
     for fact in facts:
         table.add_row(*(text.replace("[", r"\[") for text in (fact.name, fact.label, fact.value, fact.meaning)))
     data = {"port": section.port, "baud_rate_bitps": section.baud_rate_bitps, "version": identity.name}

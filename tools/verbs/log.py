@@ -57,7 +57,7 @@ def log_info(path: Path, output: Output) -> int:
 def _facts_table(facts: dict[str, Any], drive: dict[str, str]) -> Table:
     table = Table(title="Log", show_header=False, title_justify="left")
     table.add_column(style="bold")
-    table.add_column(overflow="fold")
+    table.add_column()
     for name, value in facts.items():
         if value != "":
             text = str(value) if not isinstance(value, bool) else "yes" if value else "no, cut off"
@@ -76,7 +76,7 @@ def _event_table(log: RunLog) -> Table:
     table = Table(title="Events", title_justify="left", caption=f"and {left_out} more" if left_out > 0 else None)
     table.add_column(escape("time [s]"), justify="right")
     for heading in ("level", "source", "text"):
-        table.add_column(heading, overflow="fold")
+        table.add_column(heading)
     for at, level, source, text in rows[:_SHOWN_EVENTS]:
         style = {"error": "red", "warning": "yellow"}.get(level)
         table.add_row(at, level, source, text, style=style)

@@ -86,7 +86,7 @@ def _table(rows: list[PaperRow]) -> Table:
         caption_justify="left",
     )
     for heading in ("experiment", "paper", "reference", "ours", "precise", "note"):
-        table.add_column(heading, overflow="fold")
+        table.add_column(heading)
     for row in rows:
         cells = (row.experiment, row.paper, row.reference, row.ours, row.precise, row.note)
         table.add_row(*(escape(cell) for cell in cells))

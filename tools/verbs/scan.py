@@ -39,7 +39,7 @@ def scan(subject: Subject, output: Output, *, listen_s: float = LISTEN_S, passiv
             raise _nobody(subject, ear.heard)
     table = Table(box=None, pad_edge=False)
     for title in ("node", "NMT state", "device", "name", "vendor", "product", "revision", "serial", "drive state"):
-        table.add_column(title, overflow="fold")
+        table.add_column(title)
     for row in rows:
         device = row["device_type"] or ("" if row["answers_sdo"] else "answers no SDO")
         cells = (row["node"], row["nmt_state"], device, row["name"], row["vendor_id"], row["product_code"],

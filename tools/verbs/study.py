@@ -117,7 +117,7 @@ def _table(result: StudyResult, title: str, after_s: float) -> Table:
         title_justify="left",
         caption_justify="left",
     )
-    table.add_column("controller", overflow="fold")
+    table.add_column("controller")
     for _, heading in _COLUMNS:
         table.add_column(escape(heading), justify="right")
     table.add_column("faults", justify="right")
