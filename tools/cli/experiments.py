@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from tools.cli.options import COMPARE, Json, Quiet, Report, loaded
+from tools.cli.options import COMPARE, Json, Quiet, Report, Workers, loaded
 from tools.output import Output
 
 
@@ -37,7 +37,7 @@ def study(
         list[str] | None, typer.Option("--controller", help="name or configuration file; may be repeated")
     ] = None,
     base: Annotated[str | None, typer.Option("--base", help="configuration of the joint: name or file")] = None,
-    workers: Annotated[int | None, typer.Option("--workers", help="processes; default: one a core")] = None,
+    workers: Workers = None,
     csv: Annotated[Path | None, typer.Option("--csv", help="file for all single results")] = None,
     figure: Annotated[Path | None, typer.Option("--figure", help="PNG with a box plot")] = None,
     report: Report = None,
@@ -69,7 +69,7 @@ def fault_campaign(
     seed: Annotated[int, typer.Option("--seed")] = 1,
     scenario: Annotated[int | None, typer.Option("--scenario", help="replay this one alone")] = None,
     folder: Annotated[Path, typer.Option("--folder", help="for report, JSON and picture")] = Path("fault-campaign"),
-    workers: Annotated[int | None, typer.Option("--workers", help="processes; default: one a core")] = None,
+    workers: Workers = None,
     report: Report = None,
     json: Json = False,
     quiet: Quiet = False,

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tools.cli.options import LOOK, Bitrate, Channel, Interface, Json, Quiet, Target, loaded
+from tools.cli.options import LOOK, AllowLowMargin, Bitrate, Channel, Interface, Json, Quiet, Target, loaded
 from tools.output import Output
 
 LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="run log (MCAP)")]
@@ -69,9 +69,7 @@ def scope(
     channel: Channel = None,
     bitrate: Bitrate = None,
     target: Target = None,
-    allow_low_margin: Annotated[
-        bool, typer.Option("--allow-low-margin", help="run a stable loop below the wanted phase margin")
-    ] = False,
+    allow_low_margin: AllowLowMargin = False,
     stop_unwatched: Annotated[
         float | None,
         typer.Option("--stop-unwatched", metavar="S", min=1.0, help="brake when no page has been open for S seconds"),

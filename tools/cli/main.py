@@ -16,9 +16,11 @@ from tools.cli import logs as cli_log
 from tools.cli.options import (
     BEGIN,
     MOVE,
+    AllowLowMargin,
     Bitrate,
     Channel,
     ConfigPath,
+    DryRun,
     Interface,
     Json,
     Port,
@@ -83,12 +85,8 @@ def run(
     port: Port = None,
     target: Target = None,
     yes: Yes = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="commission, show the motion envelope, move nothing")
-    ] = False,
-    allow_low_margin: Annotated[
-        bool, typer.Option("--allow-low-margin", help="run a stable loop below the wanted phase margin")
-    ] = False,
+    dry_run: DryRun = False,
+    allow_low_margin: AllowLowMargin = False,
     scope: Annotated[bool, typer.Option("--scope", help="live page in the browser (needs the extra scope)")] = False,
     scope_host: Annotated[
         str, typer.Option("--scope-host", help="address of the page; others need a token")

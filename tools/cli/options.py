@@ -26,6 +26,11 @@ ConfigPath = Annotated[
     Path, typer.Argument(metavar="CONFIG", help="configuration file (TOML), or the name of a shipped one")
 ]
 Yes = Annotated[bool, typer.Option("-y", "--yes", help="move without asking")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="commission, show the motion envelope, move nothing")]
+AllowLowMargin = Annotated[
+    bool, typer.Option("--allow-low-margin", help="run a stable loop below the wanted phase margin")
+]
+Workers = Annotated[int | None, typer.Option("--workers", help="processes; default: one a core")]
 
 
 # headings of `jointctl --help`, in this order

@@ -7,7 +7,20 @@ from typing import Annotated
 
 import typer
 
-from tools.cli.options import Bitrate, Channel, ConfigPath, Interface, Json, Port, Quiet, Report, Target, Yes, loaded
+from tools.cli.options import (
+    Bitrate,
+    Channel,
+    ConfigPath,
+    DryRun,
+    Interface,
+    Json,
+    Port,
+    Quiet,
+    Report,
+    Target,
+    Yes,
+    loaded,
+)
 from tools.output import Output
 
 
@@ -48,9 +61,7 @@ def sweep_command(
     port: Port = None,
     target: Target = None,
     yes: Yes = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="commission, show the motion envelope, move nothing")
-    ] = False,
+    dry_run: DryRun = False,
     allow_low_margin: Annotated[
         bool,
         typer.Option("--allow-low-margin", help="torque mode: run a stable loop below the wanted phase margin"),
