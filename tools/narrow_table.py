@@ -18,7 +18,8 @@ def cell_text(cell: object) -> str:
 
 def width_of(table: Table) -> int:
     """Characters that a table needs at least so that no word of it is broken; borders included."""
-    return sum(_longest(column, table.show_header) + 3 for column in table.columns) + 1
+    beside = 3 if table.box else 2  # a space on either side of each column, and the line between two
+    return sum(_longest(column, table.show_header) + beside for column in table.columns) + (1 if table.box else 0)
 
 
 def _longest(column: Column, with_header: bool) -> int:
