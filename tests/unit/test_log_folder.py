@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable
+from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -15,8 +16,9 @@ from drivers.errors import DataError, MotionFault
 from firmware_py.records import LogRecord
 from firmware_py.schema import dtype_of
 from tools.configuration.config import Config
+from tools.output import Output
 from tools.recording.log_folder import log_path, remove_oldest, require_room
-from tools.running.permission.readiness import require_ready
+from tools.running.permission.readiness import prepare_log, require_ready
 
 
 class Usage(NamedTuple):
@@ -61,6 +63,18 @@ def test_a_name_that_is_taken_is_not_given_again(in_folder: Callable[..., Config
         paths.append(log_path(config))
         paths[-1].write_text("")
     assert len(set(paths)) == 3
+
+
+@pytest.mark.parametrize(
+    ("files", "words"), [(0, ""), (1, ": 1 file of older runs removed"), (3, ": 3 files of older")]
+)
+def test_what_is_removed_is_told(in_folder: Callable[..., Config], tmp_path: Path, files: int, words: str) -> None:
+    for end in (".mcap", ".png", ".tail.mcap")[:files]:
+        (tmp_path / f"virtual-20260101-120000{end}").write_text("a log")
+    config, said = in_folder(keep=1), StringIO()
+    prepare_log(config, log_path(config), Output(stdout=StringIO(), stderr=said))
+    assert words in said.getvalue()
+    assert bool(said.getvalue()) == bool(files)
 
 
 @pytest.mark.parametrize(("keep", "left"), [(1, 0), (2, 1), (4, 3), (5, 4), (6, 4), (0, 4)])

@@ -83,10 +83,21 @@ def test_settling_time_is_when_the_error_stays_within_1_mrad() -> None:
     assert summarise(records).settling_s is None
 
 
-def settled_row(records: np.recarray) -> str:
+def shown_row(records: np.recarray, name: str) -> str:
     text = io.StringIO()
     Console(file=text, width=100).print(summary_table(summarise(records)))
-    return next(line for line in text.getvalue().splitlines() if "within 1 mrad for good" in line)
+    return next(line for line in text.getvalue().splitlines() if name in line)
+
+
+def settled_row(records: np.recarray) -> str:
+    return shown_row(records, "within 1 mrad for good")
+
+
+@pytest.mark.parametrize(("age", "words"), [(0, " 0 cycles "), (1, " 1 cycle "), (2, " 2 cycles ")])
+def test_one_cycle_is_no_cycles(age: int, words: str) -> None:
+    records = run_records()
+    records.sample_age_cycles[50] = age
+    assert words in shown_row(records, "oldest sample")
 
 
 def test_an_error_that_was_never_outside_is_told_in_words() -> None:

@@ -210,7 +210,8 @@ def summary_table(summary: RunSummary) -> Table:
         if times is not None:
             table.add_row(f"{name}, p50/p99/p99.9/max", _times_text(times))
     table.add_row("cycles, skipped", f"{summary.cycles}, {summary.skipped_cycles}")
-    table.add_row("oldest sample", f"{summary.oldest_sample_cycles} cycles")
+    oldest = summary.oldest_sample_cycles
+    table.add_row("oldest sample", "1 cycle" if oldest == 1 else f"{oldest} cycles")
     if summary.temperature_degC is not None:
         low_degC, high_degC = summary.temperature_degC.least, summary.temperature_degC.greatest
         table.add_row("temperature", f"{low_degC:.1f} .. {high_degC:.1f} °C")

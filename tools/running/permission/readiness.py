@@ -67,4 +67,5 @@ def prepare_log(config: Config, log_path: Path, output: Output) -> None:
         output.warning(f"{log_path.parent}: an old log cannot be removed: {error.strerror or error}")
         return
     if removed:
-        output.note(f"{log_path.parent}: {len(removed)} files of older runs removed (log.keep = {config.log.keep})")
+        files = "1 file" if len(removed) == 1 else f"{len(removed)} files"
+        output.note(f"{log_path.parent}: {files} of older runs removed (log.keep = {config.log.keep})")
