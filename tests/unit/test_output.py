@@ -13,6 +13,7 @@ from rich.text import Text
 
 from tools.narrow_table import width_of
 from tools.output import Output
+from tools.verbs.info import info_table
 
 NUMBERS = ["0.0949 .. 0.358", "0.00788 .. 0.0162", "0.00762 .. 0.00944"]
 PATH = "runs/a_joint_with_a_long_name-20260101-120000.mcap"
@@ -89,3 +90,15 @@ def test_what_a_terminal_wraps_of_a_fact_goes_below_its_text(monkeypatch: pytest
     Output(stdout=io.StringIO(), stderr=terminal).fact("trajectory sine, 0.2200 rad/s, about 11 s long")
     assert terminal.getvalue().splitlines() == ["trajectory sine, 0.2200 rad/s, about", "           11 s long"]
     assert pipe.getvalue() == text + "\n"  # a line of a file is not broken
+
+
+def test_a_long_name_of_an_object_does_not_squeeze_what_info_tells_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = "profile position, profile velocity"
+    found = {
+        "limits": {"607D:1 Software position limit, Min position limit": -5},
+        "state": {"supported": words},
+        "pdos": {"TPDO1": "6041 Statusword (16 bit); 6064 Position actual value (32 bit); 6077 Torque actual value"},
+    }
+    lines = shown_at(80, info_table(found), monkeypatch)
+    assert any(words in line for line in lines)
+    assert len(lines) <= 9

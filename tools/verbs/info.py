@@ -32,7 +32,7 @@ def info(subject: Subject, output: Output) -> int:
 def info_table(found: dict[str, Any]) -> Table:
     """One table for all sections; sections are dicts or lists of dicts."""
     table = Table(show_header=False, box=None, pad_edge=False)
-    table.add_column(style="bold", no_wrap=True)
+    table.add_column(style="bold")
     table.add_column()
     table.add_column()
     for section, content in found.items():
