@@ -17,6 +17,7 @@ from tools.configuration.plant_settings import plant_settings
 from tools.output import Output
 from tools.sweeping.carry_out import ACCELERATION_SPARE, middle_rad, with_mode, with_tracking_law
 from tools.sweeping.options import QUICK_S, SweepOptions, make_plan
+from tools.sweeping.statistics import LEAST_SAMPLES
 from tools.verbs.sweep import sweep
 
 SWEEP = shipped_config("sweep_virtual")
@@ -49,6 +50,17 @@ def test_quick_stays_below_eight_minutes_with_enough_points(config: Config) -> N
     slow = make_plan(config, SweepOptions(quick=True, min_speed_radps=0.002))
     assert slow.motion(slow.points, 1.0).duration_s <= QUICK_S
     assert len(slow.points) < len(plan.points)
+
+
+@pytest.mark.parametrize("options", [SweepOptions(quick=True), SweepOptions(points=24, dwell_s=0.1)])
+@pytest.mark.parametrize("name", ["elmo_serial", "sweep_virtual"])
+def test_every_plateau_has_room_for_the_samples_that_it_needs(name: str, options: SweepOptions) -> None:
+    config = load_config(shipped_config(name))
+    plan = make_plan(config, options)
+    seconds = dict.fromkeys((p.index for p in plan.points), 0.0)
+    for window in plan.motion(plan.points, 0.0).windows:
+        seconds[window.point.index] += window.end_s - window.start_s
+    assert min(seconds.values()) * config.loop.rate_Hz > 1.1 * LEAST_SAMPLES
 
 
 def test_the_fastest_speed_follows_from_limits_and_travel(config: Config) -> None:

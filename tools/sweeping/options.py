@@ -22,6 +22,7 @@ from tools.sweeping.grid import (
     plan_hash,
 )
 from tools.sweeping.plan import PlanSettings, SweepMotion, fastest_radps, plan_motion
+from tools.sweeping.statistics import LEAST_SAMPLES
 
 SPEED_SHARE = 0.9  # of limits.velocity_max_radps that the fastest plateau may have
 ACCELERATION_SHARE = 0.8  # of sequence.brake_radps2: braking must always be possible
@@ -30,6 +31,7 @@ SETTLE_S = 0.3
 QUICK_S = 450.0
 QUICK_MOST, QUICK_LEAST = 120, 24
 QUICK_DWELL_S = 0.5
+SAMPLES_SPARE = 1.7  # windows are rounded to whole ripple periods, down to two thirds; 0.5 s at 125 Hz were too few
 QUICK_RATIO = 500.0
 
 
@@ -74,7 +76,8 @@ def make_plan(config: Config, options: SweepOptions) -> SweepPlan:
     _check_options(options)
     limits = config.limits
     width = limits.position_max_rad - limits.position_min_rad - 2.0 * position_margin_rad(config)
-    dwell_s = options.dwell_s or (QUICK_DWELL_S if options.quick else 1.0)
+    wanted_s = options.dwell_s or (QUICK_DWELL_S if options.quick else 1.0)
+    dwell_s = max(wanted_s, SAMPLES_SPARE * LEAST_SAMPLES / config.loop.rate_Hz)
     allowed = SPEED_SHARE * limits.velocity_max_radps
 
     def settings(transit_radps: float) -> PlanSettings:
