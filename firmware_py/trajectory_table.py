@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from firmware_py.records import Reference, TrajectoryConstants
 from firmware_py.schema import new
@@ -101,6 +100,8 @@ def table_from_csv(path: str | Path) -> np.ndarray:
     is shifted so that the first row is 0.  The last line must end with a line end, or a file that was cut off inside
     its last number would pass unnoticed.  Returns float64 of shape (points, 5), the last row being the end.
     """
+    from scipy.interpolate import CubicSpline  # here: every start of a run would wait a third of a second for it
+
     path = Path(path)
     time_s, position_rad = _read_points(path)
     time_s = time_s - time_s[0]
