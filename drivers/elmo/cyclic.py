@@ -60,6 +60,7 @@ def put_command(port: ElmoPort, question: int, value_milli: int, decimals: int) 
     port.expected_length[slot] = 0
     port.expected_question[slot] = question
     port.expected_window_ns[slot] = port.window_ns
+    port.expected_asked_ns[slot] = port.asked_ns
     port.expected_count += 1
     _put(port, slot, _LETTERS[question, 0])
     _put(port, slot, _LETTERS[question, 1])

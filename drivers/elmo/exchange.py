@@ -106,13 +106,15 @@ def receive(ports: Any, data: np.ndarray, scratch: np.ndarray, samples: Any, now
     sample = samples[0]
     port.window_ns = deadline_ns
     port.window_over = now_ns > deadline_ns
+    port.asked_ns = now_ns
     _drain(port, data, sample, now_ns)
     begin_cycle(port, sample)
     _flush(port, sample)
     started_ns = monotonic_ns(scratch)
     arrived_ns = started_ns
     while arrived_ns <= deadline_ns + LOOK_LATE_NS:
-        if _drain(port, data, sample, arrived_ns) and port.answered_window_ns == deadline_ns:
+        _drain(port, data, sample, arrived_ns)
+        if port.answered_window_ns == deadline_ns:
             return monotonic_ns(scratch) - started_ns
         if arrived_ns >= deadline_ns or port.gone != 0:
             return arrived_ns - started_ns

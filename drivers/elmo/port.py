@@ -52,6 +52,7 @@ class ElmoPort:
     expected_length: Annotated[np.ndarray, array_of(i4, EXPECTED_MAX)]
     expected_question: Annotated[np.ndarray, array_of(i4, EXPECTED_MAX)]
     expected_window_ns: Annotated[np.ndarray, array_of(i8, EXPECTED_MAX)]  # of the cycle that asked; see window_ns
+    expected_asked_ns: Annotated[np.ndarray, array_of(i8, EXPECTED_MAX)]  # when that cycle began
     expected_first: i4
     expected_count: i4
     # the line being received, and the bytes of the next write
@@ -77,6 +78,9 @@ class ElmoPort:
     quiet: i4  # cycles in which it says nothing until the line is silent: old replies are not taken for new ones
     heard_bytes: i8  # in this cycle
     window_ns: i8  # when the window of this cycle ends: by it cycles are told apart
+    asked_ns: i8  # when this cycle began
+    usual_answer_ns: i8  # from there to the position, its median followed slowly; 0 = none yet
+    left_out: i4  # 1: the last position came unusually late and was left out
     window_over: i4  # 1: it was over before the cycle began
     answered_window_ns: i8  # of the cycle that asked for the last position
     gone: i4  # the port has vanished

@@ -16,6 +16,8 @@ from firmware_py.states import DriveState
 
 NOTHING = -1
 FAULT_CAUSE_CYCLES = 4  # status replies to wait for MF before a fault is told without its cause
+USUAL_STEP_NS = 20_000  # in a cycle
+UNEVEN_SHARE = 16  # a position may come a 16th of a period later than usual
 _DIGITS_MAX = 17
 _CR, _SEMICOLON, _QUESTION_MARK = 0x0D, 0x3B, 0x3F
 _PLUS, _MINUS, _POINT, _ZERO, _NINE, _EQUALS = 0x2B, 0x2D, 0x2E, 0x30, 0x39, 0x3D
@@ -113,7 +115,24 @@ def _too_late(port: ElmoPort, asked_window_ns: int) -> bool:
 
 
 @kernel
-def _take_value(port: ElmoPort, sample: Sample, question: int, start: int, now_ns: int, asked_window_ns: int) -> bool:
+def _uneven(port: ElmoPort, answer_ns: int) -> bool:
+    """Whether a position came so much later than usual that the time at which it was read is not known.
+
+    The drive reads it when its interpreter comes to the question.  1 ms late of 8 ms would be a leap of an eighth of
+    the speed.  One is left out; two in a row are the way of this line, and its usual time follows.
+    """
+    if port.period_ns == 0:
+        return False
+    if port.usual_answer_ns == 0:
+        port.usual_answer_ns = answer_ns
+    late_ns = answer_ns - port.usual_answer_ns
+    port.usual_answer_ns += min(max(late_ns, -USUAL_STEP_NS), USUAL_STEP_NS)
+    port.left_out = 1 if port.left_out == 0 and late_ns * UNEVEN_SHARE > port.period_ns else 0
+    return port.left_out != 0
+
+
+@kernel
+def _take_value(port: ElmoPort, sample: Sample, question: int, start: int, now_ns: int, slot: int) -> bool:
     """Take the value of one reply; True if it was a position."""
     if question >= Question.MO or question == Question.TC:
         return False
@@ -126,10 +145,14 @@ def _take_value(port: ElmoPort, sample: Sample, question: int, start: int, now_n
             port.garbled += 1
             return False
         take_counts(port, int(value))
+        asked_window_ns = port.expected_window_ns[slot]
         if _too_late(port, asked_window_ns):
             port.lost += 1
             return False
         port.answered_window_ns = asked_window_ns
+        if _uneven(port, now_ns - port.expected_asked_ns[slot]):
+            port.lost += 1
+            return False
         sample.position_rad = (port.counts - port.zero_counts) * port.position_radpcount
         sample.time_ns = now_ns
         sample.count += 1
@@ -170,7 +193,7 @@ def _take_line(port: ElmoPort, sample: Sample, now_ns: int) -> bool:
         port.refused += 1
         port.last_error = port.line[start] if length == 2 else 0
         return False
-    return _take_value(port, sample, question, start, now_ns, port.expected_window_ns[slot])
+    return _take_value(port, sample, question, start, now_ns, slot)
 
 
 @kernel

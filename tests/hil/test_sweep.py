@@ -252,6 +252,7 @@ def test_ctrl_c_keeps_the_rows_and_resume_measures_the_rest(joint: Any) -> None:
     kept = out.read_text()
     assert 3 <= len(kept.splitlines()) < 7
     (log,) = (joint.folder / "runs").glob("*.mcap")
+    assert read_run_log(log).metadata["thinning"] == {"every": "20", "whole_s": "2"}
     time_s = read_run_log(log).records.time_ns * 1e-9
     assert np.sum(time_s > time_s[-1] - 2.0) > 1000  # the last seconds are whole, the ones before are not
     assert len(time_s) < 0.5 * 1000 * (time_s[-1] - time_s[0])

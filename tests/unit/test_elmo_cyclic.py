@@ -483,3 +483,30 @@ def test_a_damaged_torque_command_is_bounded_by_the_drives_peak_current(current_
     assert talk.device.m.torque_A == (current_A if current_A < 10.0 else 1.0)
     talk.cycle(torque_Nm=12.1)
     assert talk.device.m.torque_A == 1.0  # the next one, a period later
+
+
+def positions_taken(answers_ms: list[float], period_ns: int = 8_000_000) -> list[bool]:
+    """Which positions count that come so long after their cycle began."""
+    talk = Talk()
+    port, taken = talk.port, []
+    port.period_ns = period_ns
+    for cycle, answer_ms in enumerate(answers_ms, 1):
+        port.asked_ns = cycle * 8_000_000
+        port.window_ns = port.asked_ns + 4_800_000
+        begin_cycle(port, talk.sample)
+        now_ns = int(port.asked_ns) + round(answer_ms * 1e6)
+        taken.append([bool(take_byte(port, byte, talk.sample, now_ns)) for byte in b"PX\r42;"][-1])
+        assert port.answered_window_ns == port.window_ns  # it is not waited for any longer
+    return taken
+
+
+@pytest.mark.parametrize(("late_ms", "counts"), [(0.5, True), (0.52, False), (-0.9, True)])
+def test_a_position_that_comes_unusually_late_is_left_out(late_ms: float, counts: bool) -> None:
+    """Nobody knows when it was read: 1.9 ms late at 0.83 rad/s it looked like 1.03 rad/s."""
+    assert positions_taken([1.0] * 5 + [1.0 + late_ms] + [1.0] * 3) == [True] * 5 + [counts] + [True] * 3
+
+
+def test_two_late_positions_in_a_row_are_the_way_of_the_line() -> None:
+    assert positions_taken([1.0] * 5 + [3.0] * 4) == [True] * 5 + [False, True, False, True]
+    assert all(positions_taken([1.0] * 5 + [3.0] * 400)[-200:])  # it has become usual
+    assert all(positions_taken([1.0, 3.0, 3.0], period_ns=0))

@@ -121,6 +121,7 @@ def test_a_late_position_is_none_in_a_cycle_that_is_late_itself() -> None:
 
 def test_the_late_position_of_the_last_slot_is_no_reason_not_to_wait_for_the_new_one() -> None:
     with Line() as line:
+        line.port[0].usual_answer_ns = PERIOD_NS  # neither of them comes unusually late
         window_ns = asked_once(line, 1)
         answer = threading.Timer(0.03, line.reply, [b"PX\r50;"])
         answer.start()

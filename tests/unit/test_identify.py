@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tomlkit
 
-from drivers.errors import ConfigurationError, DataError
+from drivers.errors import ConfigurationError, DataError, UsageError
 from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
 from tests.page_figures import foreign_colours, svgs
 from tools.configuration.conversions import friction_constants
@@ -292,9 +292,11 @@ def test_validate_needs_friction_and_believable_data(config, tmp_path):
     with pytest.raises(DataError, match="does not oppose the motion"):
         validate(config, write_sweep(tmp_path / "wrong.csv", factor=-1.0), output())
     assert not (tmp_path / "wrong.validation.png").exists()
-    good = write_sweep(tmp_path / "good.csv")
+    good = write_sweep(tmp_path / "data named.png")
     with pytest.raises(DataError, match="is an input"):
         validate(config, good, output(), figure=good)
+    with pytest.raises(UsageError, match=r"x\.jpg\) must end in \.png"):
+        validate(config, good, output(), figure=tmp_path / "x.jpg")
 
 
 def test_validate_takes_data_of_one_direction(config, tmp_path):

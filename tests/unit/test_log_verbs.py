@@ -24,7 +24,7 @@ from tools.output import Output
 from tools.recording.can_log import frame_array, frame_times_ns
 from tools.recording.log_export import FORMATS, columns, parquet_bytes
 from tools.recording.log_facts import missing_records
-from tools.recording.run_log import RunLogWriter, read_run_log
+from tools.recording.run_log import THINNING, RunLogWriter, read_run_log
 from tools.running.events.event_finder import EventFinder
 from tools.running.watch.frame_recorder import FrameRecorder, recording
 from tools.verbs.log import log_export, log_info, log_plot
@@ -99,6 +99,18 @@ def test_info_tells_what_the_log_holds(log_path: Path) -> None:
     assert log_info(log_path, Output(stdout=out, stderr=io.StringIO())) == 0
     for text in ("missing records", "operation enabled", "joint.toml", "RMSE"):
         assert text in out.getvalue()
+
+
+def test_a_log_that_is_thinned_on_purpose_misses_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "sweep.mcap"
+    with RunLogWriter(path, {THINNING: {"every": "20", "whole_s": "2"}}) as log:
+        log.write_records(run_records()[::20])
+    data = spoken(log_info, path)
+    assert (data["records_kept"], data["missing_records"]) == ("every 20th, the last 2 s whole", None)
+    out = io.StringIO()
+    log_info(path, Output(stdout=out, stderr=io.StringIO()))
+    assert "every 20th" in out.getvalue()
+    assert "missing" not in out.getvalue()
 
 
 def test_info_of_a_log_that_was_cut_off_says_so(log_path: Path) -> None:

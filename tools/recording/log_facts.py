@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tools.recording.log_export import calendar_offset_ns
-from tools.recording.run_log import ERROR, WARNING, Event, RunLog
+from tools.recording.run_log import ERROR, THINNING, WARNING, Event, RunLog
 
 _LEVELS = ((ERROR, "error"), (WARNING, "warning"), (20, "information"), (0, "debug"))
 
@@ -19,6 +19,17 @@ def missing_records(records: Any) -> int:
         return 0
     jumps = np.diff(np.asarray(records["cycle"], np.int64)) - 1 - np.asarray(records["skipped"][1:], np.int64)
     return int(np.sum(np.maximum(jumps, 0)))
+
+
+def missing_in(log: RunLog) -> int | None:
+    """`missing_records` of a log; None where records were left out on purpose, so that nobody can tell."""
+    return None if THINNING in log.metadata else missing_records(log.records)
+
+
+def kept_share(log: RunLog) -> str:
+    """Which records a thinned log holds, in words; "" for one that holds all."""
+    thinning = log.metadata.get(THINNING)
+    return f"every {thinning['every']}th, the last {thinning['whole_s']} s whole" if thinning else ""
 
 
 def began_at(log: RunLog) -> str:

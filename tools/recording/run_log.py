@@ -58,6 +58,10 @@ _MESSAGE_HEAD = np.dtype(
 )
 
 
+# metadata of a log from which records are left out on purpose: "every" so many one is kept, the last "whole_s" all
+THINNING = "thinning"
+
+
 @dataclass(frozen=True)
 class Event:
     time_ns: int  # CLOCK_MONOTONIC

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from firmware_py.states import Fault
-from tools.recording.log_facts import began_at, event_rows, missing_records
+from tools.recording.log_facts import began_at, event_rows, missing_in
 from tools.recording.run_log import RunLog
 from tools.recording.run_summary import Range, RunSummary, TimeSummary
 from tools.reporting.page import Table
@@ -98,7 +98,7 @@ def motion_of(summary: RunSummary) -> Figures:
     return rows
 
 
-def deadlines_of(summary: RunSummary, missing: int) -> Figures:
+def deadlines_of(summary: RunSummary, missing: int | None) -> Figures:
     """How well the loop kept its time, in the same form."""
     rows = _times("wake-up late", summary.wake_late)
     rows += _times("round trip", summary.round_trip)
@@ -107,7 +107,7 @@ def deadlines_of(summary: RunSummary, missing: int) -> Figures:
         ("cycles", float(summary.cycles), 0),
         ("cycles skipped", float(summary.skipped_cycles), 0),
         ("oldest sample [cycles]", float(summary.oldest_sample_cycles), 0),
-        ("records missing in the log", float(missing), 0),
+        ("records missing in the log", None if missing is None else float(missing), 0),
     ]
     return rows
 
@@ -116,7 +116,7 @@ def figure_tables(names: Sequence[str], logs: Sequence[RunLog], summaries: Seque
     """Motion and deadlines of each run; of two runs also the second less the first."""
     faults = [s.fault for s in summaries]
     ended = "" if all(fault == Fault.NONE.name for fault in faults) else f"Ended by a fault: {', '.join(faults)}."
-    deadlines = [deadlines_of(s, missing_records(log.records)) for s, log in zip(summaries, logs, strict=True)]
+    deadlines = [deadlines_of(s, missing_in(log)) for s, log in zip(summaries, logs, strict=True)]
     motion = [motion_of(s) for s in summaries]
     return [_side_by_side("motion", names, motion, ended), _side_by_side("deadlines", names, deadlines, "")]
 

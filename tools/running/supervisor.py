@@ -119,12 +119,16 @@ class Supervisor:
         if signals.count:
             raise KeyboardInterrupt
 
+    def _metadata(self, report: CommissioningReport) -> dict[str, dict[str, str]]:
+        """What the log says besides the records."""
+        return run_metadata(self._config, report)
+
     def _make_watch(self, parts: RunParts) -> RunWatch:
         """The watch over the run that is about to begin."""
         return RunWatch(self._config, parts, allow_low_margin=self._allow_low_margin)
 
     def _supervise(self, drive: Drive, loop: LoopHandle, report: CommissioningReport, around: Around) -> RunResult:
-        metadata = run_metadata(self._config, report)
+        metadata = self._metadata(report)
         with (
             RunLogWriter(self._log_path, metadata) as log,
             KeptRecords(self._log_path.parent) as kept,

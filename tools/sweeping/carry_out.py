@@ -25,6 +25,7 @@ from tools.configuration.config import Config
 from tools.configuration.elmo import ElmoSerial, UnitModeChoice
 from tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_constants
 from tools.output import Output
+from tools.recording.run_log import THINNING
 from tools.recording.thinned_records import ThinnedRecords
 from tools.running.loop.loop_handle import LoopHandle
 from tools.running.run_watch import RunParts, RunWatch
@@ -175,6 +176,9 @@ class SweepSupervisor(Supervisor):
         motion = shifted(self._motion, middle_rad(self._config, self._motion, report.start_position_rad))
         loop.block.table[:] = motion.table
         return sweep_constants(self._config, report, motion)
+
+    def _metadata(self, report: CommissioningReport) -> dict[str, dict[str, str]]:
+        return {**super()._metadata(report), THINNING: {"every": str(LOG_EVERY), "whole_s": f"{LOG_WHOLE_S:g}"}}
 
     def _make_watch(self, parts: RunParts) -> RunWatch:
         watch = SweepWatch(self._config, parts, allow_low_margin=self._allow_low_margin)

@@ -13,7 +13,7 @@ from drivers.errors import DataError
 from tools.identification.friction_section import replace_file
 from tools.output import Output
 from tools.recording.log_export import FORMATS
-from tools.recording.log_facts import began_at, event_rows, level_name, missing_records
+from tools.recording.log_facts import began_at, event_rows, kept_share, level_name, missing_in
 from tools.recording.run_figure import save_run_figure
 from tools.recording.run_log import RunLog, read_run_log
 from tools.recording.run_summary import summarise, summary_table
@@ -33,7 +33,8 @@ def log_info(path: Path, output: Output) -> int:
         "began": began_at(log),
         "configuration": log.metadata.get("run", {}).get("path", ""),
         "records": len(log.records),
-        "missing_records": missing_records(log.records),
+        "records_kept": kept_share(log),
+        "missing_records": missing_in(log),
         "events": len(log.events),
         "can_frames": len(log.frames),
     }
@@ -59,7 +60,7 @@ def _facts_table(facts: dict[str, Any], drive: dict[str, str]) -> Table:
     table.add_column(style="bold")
     table.add_column()
     for name, value in facts.items():
-        if value != "":
+        if value not in ("", None):
             text = str(value) if not isinstance(value, bool) else "yes" if value else "no, cut off"
             table.add_row(name.replace("_", " "), text)
     identity = ", ".join(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.errors import ConfigurationError, DataError
+from drivers.errors import ConfigurationError, DataError, UsageError
 from tools.configuration.conversions import friction_constants
 from tools.configuration.load import load_config
 from tools.drawing import png
@@ -45,6 +45,8 @@ def validate(
     config_path: Path, data_path: Path, output: Output, *, told: ForeignFormat | None = None, figure: Path | None = None
 ) -> int:
     """Compare, report, draw (default DATA.validation.png); returns the exit code."""
+    if figure is not None and figure.suffix.lower() != ".png":
+        raise UsageError(f"--figure (={figure}) must end in .png")
     config = load_config(config_path)
     if config.friction is None:
         raise ConfigurationError(
