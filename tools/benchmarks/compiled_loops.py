@@ -38,13 +38,14 @@ PATIENCE_S = 0.25
 
 
 def at_rate(config: Config, rate_Hz: float) -> Config:
-    """The same joint with another loop rate, and limits that let a computer stand still without ending the run."""
-    return config.model_copy(
-        update={
-            "loop": config.loop.model_copy(update={"rate_Hz": rate_Hz}),
-            "limits": config.limits.model_copy(update={"sample_age_max_s": PATIENCE_S, "skipped_max_s": PATIENCE_S}),
-        }
-    )
+    """The same joint with another loop rate."""
+    return config.model_copy(update={"loop": config.loop.model_copy(update={"rate_Hz": rate_Hz})})
+
+
+def patient(config: Config) -> Config:
+    """The same joint with limits that let a computer stand still for a while without ending the run."""
+    limits = config.limits.model_copy(update={"sample_age_max_s": PATIENCE_S, "skipped_max_s": PATIENCE_S})
+    return config.model_copy(update={"limits": limits})
 
 
 @contextmanager

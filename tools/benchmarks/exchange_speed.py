@@ -11,7 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from tools.benchmarks.c_programs import NoCompilerError, exchange_program
-from tools.benchmarks.compiled_loops import at_rate, cyclictest_path, run_c, run_cyclictest, run_ours, run_sleep_only
+from tools.benchmarks.compiled_loops import (
+    at_rate,
+    cyclictest_path,
+    patient,
+    run_c,
+    run_cyclictest,
+    run_ours,
+    run_sleep_only,
+)
 from tools.benchmarks.load import LOADS
 from tools.benchmarks.loop_times import LoopTimes
 from tools.benchmarks.paired import Row, compared, interleaved, skipped
@@ -93,7 +101,7 @@ def exchange_rows(config: Config, folder: Path, *, pairs: int, seconds: float, q
     if cyclictest_path() is None:
         yield skipped(GROUP, "against cyclictest", "not installed (package rt-tests)")
     channel = f"bench{os.getpid()}"
-    config = config.model_copy(
+    config = patient(config).model_copy(
         update={"bus": config.bus.model_copy(update={"interface": "jointctl", "channel": channel})}
     )
     with separate_virtual_joint(config.path, channel):
