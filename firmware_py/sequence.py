@@ -158,8 +158,10 @@ def step_waiting(constants: AxisConstants, state: AxisState, sample: Sample) -> 
             trip(state, Fault.NOT_AT_STANDSTILL, state.velocity.velocity_radps, 0)
         elif state.good_samples >= constants.sequence.settle_cycles:  # all is well, but nobody allows to enable
             trip(state, Fault.SUPERVISOR_LOST, float(state.phase_cycle), 0)
-        else:
+        elif state.sample_age_cycles > limits.sample_age_max_cycles:
             trip(state, Fault.STALE_SAMPLE, float(state.sample_age_cycles), sample.drive_error)
+        else:
+            trip(state, Fault.SAMPLES_MISSING, float(constants.sequence.settle_cycles), sample.drive_error)
 
 
 @kernel

@@ -68,6 +68,7 @@ class Fault(IntEnum):
     DRIVE_SILENT = 23  # the drive's own heartbeat stays away
     POSITION_DISAGREEMENT = 24  # the two encoders of the joint differ by more than they may
     MOVED_BEFORE_START = 25  # the joint is not where it was when the motion was shown
+    SAMPLES_MISSING = 26  # samples came before enabling, but never enough of them in a row
 
 
 class Reaction(IntEnum):

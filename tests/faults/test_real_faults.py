@@ -6,7 +6,9 @@ in tests/hil/test_processes.py.
 
 from __future__ import annotations
 
+import contextlib
 import os
+import threading
 import uuid
 from collections.abc import Callable
 from io import StringIO
@@ -35,6 +37,14 @@ GONE = (Fault.STALE_SAMPLE, Fault.BUS_ERROR)
 RunWith = Callable[..., RunResult]
 
 
+def as_on_a_processor_of_their_own() -> None:
+    """The threads of virtual drive and bus run in time, as `jointctl hil` sees to it for those of its own process."""
+    for thread in threading.enumerate():
+        if thread.name.startswith(("device", "virtual bus")) and thread.native_id is not None:
+            with contextlib.suppress(OSError):  # not permitted here
+                os.sched_setscheduler(thread.native_id, os.SCHED_FIFO, os.sched_param(60))
+
+
 @pytest.fixture
 def run_with(tmp_path: Path) -> RunWith:
     """`run_with(kind, duration_s, magnitude)`: one whole run with this fault in [[virtual.faults]]."""
@@ -60,6 +70,7 @@ def run_with(tmp_path: Path) -> RunWith:
         path.write_text(text)
         config = load_config(path)
         with serve_virtual_joint(config):
+            as_on_a_processor_of_their_own()
             supervisor = Supervisor(
                 config, Output(quiet=True, stderr=StringIO()), tmp_path / "run.mcap", lambda _: True,
                 allow_low_margin=True,

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import signal
 import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 TPDO_ID, EMCY_ID = 0x181, 0x81
 ENABLED, QUICK_STOP_ACTIVE, SWITCH_ON_DISABLED, FAULT = 0x27, 0x07, 0x40, 0x08
 COUNTS_PER_RAD = 524288 / 6.283185307179586
 HEARTBEAT_LOST = 0x8130
+WINDOW_s = 0.05
 
 
 class Witness:
@@ -47,10 +48,14 @@ class Witness:
     def states_since(self, time_s: float) -> set[int]:
         return {status & 0x6F for at, status, _ in self.samples if at >= time_s}
 
-    def largest_step_rad(self, time_s: float) -> float:
-        """Between two samples that are at most 3 ms apart."""
-        kept = [(at, position) for at, _, position in self.samples if at >= time_s]
-        return max((abs(b - a) for (at, a), (bt, b) in itertools.pairwise(kept) if bt - at < 3e-3), default=0.0)
+    def largest_speed_radps(self, time_s: float) -> float:
+        """Over `WINDOW_s` each: from one sample to the next, the loop may have been held up for a while."""
+        kept = np.array([(at, position) for at, _, position in self.samples if at >= time_s])
+        ends = np.searchsorted(kept[:, 0], kept[:, 0] + WINDOW_s)
+        starts = np.flatnonzero(ends < len(kept))
+        assert len(starts) > 100
+        way_s, way_rad = (kept[ends[starts]] - kept[starts]).T
+        return float(np.abs(way_rad / way_s).max())
 
 
 def gone(pid: int, timeout_s: float = 10.0) -> bool:
@@ -103,7 +108,7 @@ def test_supervisor_killed_the_loop_ramps_down_by_itself(moving: Any) -> None:
     states = moving.witness.states_since(moving.since_s)
     assert ENABLED in states  # it braked under control
     assert QUICK_STOP_ACTIVE not in states
-    assert moving.witness.largest_step_rad(moving.since_s) < 1e-3  # 1 rad/s; the trajectory has 0.22
+    assert moving.witness.largest_speed_radps(moving.since_s) < 0.5  # the trajectory has 0.22
     assert moving.bench.disabled()
 
 

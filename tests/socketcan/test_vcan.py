@@ -25,7 +25,7 @@ ON_VCAN = ("-i", "socketcan", "-c", "vcan0")
 # A slow guest may need some periods for a cycle, and now and then stand still: gains that do not mind a late command,
 # and limits that do not mind a pause.  This is about the bus; timing is measured elsewhere.
 GENTLE = {
-    "trajectory.duration_s": 4.0, "control.kp": 64.0, "control.kv": 16.0, "control.q": 20.0,
+    "control.kp": 64.0, "control.kv": 16.0, "control.q": 20.0,
     "limits.sample_age_max_s": 0.5, "limits.skipped_max_s": 0.5, "limits.following_error_max_rad": 0.3,
     # the guest has one processor: an answer that waited while it stood still seems to belong to the next SYNC
     "limits.position_jump_max_rad": 0.1, "limits.velocity_max_radps": 5.0,
@@ -50,9 +50,20 @@ def interface() -> Iterator[None]:
 
 
 @pytest.fixture
-def config(tmp_path: Path) -> str:
+def rate_Hz() -> float:
+    """Half the system calls, so that the other programs of a test get their turn on the only processor."""
+    return 500.0
+
+
+@pytest.fixture
+def duration_s() -> float:
+    return 4.0
+
+
+@pytest.fixture
+def config(tmp_path: Path, rate_Hz: float, duration_s: float) -> str:
     document = tomlkit.parse(CONFIG.read_text())
-    for path, value in GENTLE.items():
+    for path, value in (GENTLE | {"loop.rate_Hz": rate_Hz, "trajectory.duration_s": duration_s}).items():
         section, key = path.split(".")
         document[section][key] = value  # type: ignore[index]
     (tmp_path / "joint.toml").write_text(tomlkit.dumps(document))
@@ -92,6 +103,7 @@ def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return done
 
 
+@pytest.mark.parametrize("rate_Hz", [1000.0])
 @pytest.mark.usefixtures("joint")
 def test_a_run_at_1_khz(tmp_path: Path, config: str) -> None:
     done = run(tmp_path, "run", config, *ON_VCAN, *SLOW_GUEST)
@@ -186,6 +198,7 @@ def test_scan_info_and_monitor(tmp_path: Path) -> None:
     assert (second["kind"], second["text"]) == ("error", ERROR_PASSIVE_TEXT + ", receive errors 0")
 
 
+@pytest.mark.parametrize("duration_s", [10.0])  # time for the program that sends the complaint
 @pytest.mark.usefixtures("joint")
 def test_a_run_beside_foreign_traffic_tells_what_the_controller_complains_about(tmp_path: Path, config: str) -> None:
     with subprocess.Popen(["cangen", "vcan0", "-g", "5", "-I", "500", "-L", "8"]) as foreign:

@@ -707,7 +707,7 @@ def test_samples_with_holes_are_not_enough_to_enable(rig: NewRig) -> None:
     run = rig(0.0)
     for k in range(80):
         run.tick(fresh=k % 4 != 0)
-    assert run.state.fault == Fault.STALE_SAMPLE
+    assert run.state.fault == Fault.SAMPLES_MISSING
     assert set(run.requests) == {DriveRequest.OFF}
 
 

@@ -67,11 +67,15 @@ FAULTS: dict[Fault, tuple[str, str]] = {  # what trips, and its twin
         SEQUENCE + "test_off_timeout | (20, AxisPhase.DISABLING, Fault.NONE)",
     ),
     Fault.NO_SAMPLES: (
-        SEQUENCE + "test_waiting_ends | (0, 0.0, Fault.NO_SAMPLES)",
+        SEQUENCE + "test_waiting_ends | (0, 0.0, 1, Fault.NO_SAMPLES, 0.0)",
         SEQUENCE + "test_waiting_ends | (AxisPhase.WAITING, Fault.NONE)",
     ),
+    Fault.SAMPLES_MISSING: (
+        SEQUENCE + "test_the_wait_for_the_supervisors_word_ends | (5, Fault.SAMPLES_MISSING)",
+        SEQUENCE + "test_the_wait_for_the_supervisors_word_ends | (4, Fault.SUPERVISOR_LOST)",
+    ),
     Fault.NOT_AT_STANDSTILL: (
-        SEQUENCE + "test_waiting_ends | (4, 0.5, Fault.NOT_AT_STANDSTILL)",
+        SEQUENCE + "test_waiting_ends | (4, 0.5, 0, Fault.NOT_AT_STANDSTILL, 0.5)",
         SEQUENCE + "test_enabling_is_only_asked_at_standstill_inside_the_limits | (1.0, 0.02, 4, AxisPhase.ENABLING",
     ),
     Fault.OVERRUN: (AXIS + "test_overrun | (9, True)", AXIS + "test_overrun | (8, False)"),
@@ -131,7 +135,9 @@ CAN: dict[tuple[str, str], tuple[str, str] | tuple[Fault, ...]] = {
     ),
     ("loop", "the drive"): (Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED, Fault.DRIVE_RESTARTED),
     ("loop", "the drive's communication"): (Fault.DRIVE_SILENT,),
-    ("loop", "the samples"): (Fault.STALE_SAMPLE, Fault.NO_SAMPLES, Fault.POSITION_JUMP, Fault.POSITION_FROZEN),
+    ("loop", "the samples"): (
+        Fault.STALE_SAMPLE, Fault.NO_SAMPLES, Fault.SAMPLES_MISSING, Fault.POSITION_JUMP, Fault.POSITION_FROZEN,
+    ),
     ("loop", "that the joint stands where it stood when the motion was shown"): (Fault.MOVED_BEFORE_START,),
     ("loop", "old values"): (
         "faults/test_late_samples.py::test_the_age_counts_on_although_old_frames_come",

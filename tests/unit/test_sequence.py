@@ -228,7 +228,7 @@ def test_the_run_waits_until_it_may_enable(axis: Any, state: Any) -> None:
     assert state.phase == AxisPhase.ENABLING
 
 
-@pytest.mark.parametrize(("settle_cycles", "fault"), [(4, Fault.SUPERVISOR_LOST), (5, Fault.STALE_SAMPLE)])
+@pytest.mark.parametrize(("settle_cycles", "fault"), [(4, Fault.SUPERVISOR_LOST), (5, Fault.SAMPLES_MISSING)])
 def test_the_wait_for_the_supervisors_word_ends(axis: Any, state: Any, settle_cycles: int, fault: Fault) -> None:
     axis.sequence.may_enable, axis.sequence.settle_cycles = 0, settle_cycles
     settled(state)
@@ -238,23 +238,28 @@ def test_the_wait_for_the_supervisors_word_ends(axis: Any, state: Any, settle_cy
     state.phase_cycle = 41
     step_waiting(axis, state, sample_of(DriveState.OFF))
     assert (state.phase, state.fault) == (AxisPhase.DISABLING, fault)
-    assert state.fault_value == (41.0 if fault is Fault.SUPERVISOR_LOST else 0.0)
+    assert state.fault_value == (41.0 if fault is Fault.SUPERVISOR_LOST else settle_cycles)
     assert state.fault_drive_error == (0 if fault is Fault.SUPERVISOR_LOST else 0x3310)
 
 
 @pytest.mark.parametrize(
-    ("samples", "velocity_radps", "fault"),
-    [(0, 0.0, Fault.NO_SAMPLES), (3, 0.0, Fault.STALE_SAMPLE), (4, 0.5, Fault.NOT_AT_STANDSTILL)],
-)
-def test_waiting_ends(axis: Any, state: Any, samples: int, velocity_radps: float, fault: Fault) -> None:
+    ("samples", "velocity_radps", "too_old_cycles", "fault", "value"),
+    [
+        (0, 0.0, 1, Fault.NO_SAMPLES, 0.0), (3, 0.0, 1, Fault.STALE_SAMPLE, 6.0),
+        (3, 0.0, 0, Fault.SAMPLES_MISSING, 4.0), (4, 0.5, 0, Fault.NOT_AT_STANDSTILL, 0.5),
+    ],
+)  # fmt: skip
+def test_waiting_ends(
+    axis: Any, state: Any, samples: int, velocity_radps: float, too_old_cycles: int, fault: Fault, value: float
+) -> None:
     settled(state, 0.0, velocity_radps, samples)
-    state.phase_cycle, state.sample_age_cycles = 40, 2
+    state.phase_cycle, state.sample_age_cycles = 40, axis.limits.sample_age_max_cycles + too_old_cycles
     step_waiting(axis, state, idle_sample())
     assert (state.phase, state.fault) == (AxisPhase.WAITING, Fault.NONE)
     state.phase_cycle = 41
     step_waiting(axis, state, sample_of(DriveState.OFF))
     assert (state.phase, state.fault) == (AxisPhase.DISABLING, fault)
-    assert state.fault_value == {Fault.NO_SAMPLES: 0.0, Fault.STALE_SAMPLE: 2.0, Fault.NOT_AT_STANDSTILL: 0.5}[fault]
+    assert state.fault_value == value
     assert state.fault_drive_error == (0 if fault is Fault.NOT_AT_STANDSTILL else 0x3310)
 
 

@@ -25,8 +25,11 @@ NOT_STARTED = frozenset({Fault.NOT_AT_STANDSTILL, Fault.MOVED_BEFORE_START})
 DRIVE = frozenset({Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED, Fault.DRIVE_RESTARTED})
 # before the joint is enabled, or after it was asked to stop, a fault of the wire shows as one of these
 LATE_CAUSES = frozenset(
-    {Fault.NO_SAMPLES, Fault.STALE_SAMPLE, Fault.ENABLE_TIMEOUT, Fault.STOP_TIMEOUT, Fault.OFF_TIMEOUT}
-)
+    {
+        Fault.NO_SAMPLES, Fault.STALE_SAMPLE, Fault.SAMPLES_MISSING, Fault.ENABLE_TIMEOUT, Fault.STOP_TIMEOUT,
+        Fault.OFF_TIMEOUT,
+    }
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -98,9 +98,7 @@ class RunWatch:
             self._tell(Event(time.monotonic_ns(), WARNING, "supervisor", text))
         self.check_delay()
         self.temperature.poll()
-        for text in self.around.bus_watch.news():
-            self.log.write_event(WARNING, "bus", text)
-            self.display.note(text)
+        self.tell_bus_news()
         if self.around.guard is not None and self.around.guard.just_ended():
             self.log.write_event(WARNING, "supervisor", GUARD_ENDED)
             self.display.note(GUARD_ENDED)
@@ -108,6 +106,12 @@ class RunWatch:
         if (phase := self.loop.phase) is not self._phase:
             self._phase = phase
             self.display.phase(phase_name(phase))
+
+    def tell_bus_news(self) -> None:
+        """What the controller of the bus has complained about since the last call."""
+        for text in self.around.bus_watch.news():
+            self.log.write_event(WARNING, "bus", text)
+            self.display.note(text)
 
     def take_records(self) -> None:
         """What the loop has written since the last call: to log, viewers and display, and the events in it."""

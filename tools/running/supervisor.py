@@ -152,6 +152,7 @@ class Supervisor:
         except MotionFault as error:
             state = drive.make_safe()
             watch.take_records()
+            watch.tell_bus_news()
             watch.log.write_event(ERROR, "supervisor", str(error))
             raise MotionFault(error.message, f"{error.hint}; drive state now: {state}") from None
         except BaseException:
@@ -160,6 +161,7 @@ class Supervisor:
         elapsed_s = (time.monotonic_ns() - started_ns) * 1e-9
         state = drive.make_safe()
         watch.take_records()
+        watch.tell_bus_news()  # it often explains the fault that has ended the run
         watch.log.write_event(INFO, "drive", f"after the run: {state}")
         recorder = watch.around.recorder
         if recorder is not None and recorder.dropped:

@@ -101,6 +101,11 @@ FAULT_TEXTS: dict[Fault, FaultText] = {
         "the drive does not answer SYNC: PDOs disabled, or not operational",
         "look for SYNC (080) and the TPDO (180 + node) with candump",
     ),
+    Fault.SAMPLES_MISSING: FaultText(
+        "positions came, but never {value:.0f} of them in a row, as sequence.settle_s wants it before enabling",
+        "a computer too busy for loop.rate_Hz, or a bus that loses a frame now and then",
+        "run `jointctl doctor`, then `jointctl monitor`; set loop.priority, or lower loop.rate_Hz",
+    ),
     Fault.NOT_AT_STANDSTILL: FaultText(
         "the joint moved at {value:.3f} rad/s before it was enabled",
         "somebody moves it, or the encoder is noisy",

@@ -16,7 +16,7 @@ SHARE_OF_AGE = 0.5  # of the time without a sample that a pause must have taken 
 # a loop that stands still commands its last torque, and hears nothing meanwhile
 FAULTS = frozenset({
     Fault.STALE_SAMPLE, Fault.VELOCITY_LIMIT, Fault.POSITION_LIMIT, Fault.FOLLOWING_ERROR, Fault.POSITION_JUMP,
-    Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED,
+    Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED, Fault.SAMPLES_MISSING,
 })  # fmt: skip
 
 

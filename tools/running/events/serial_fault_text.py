@@ -26,6 +26,11 @@ SERIAL_FAULT_TEXTS: dict[Fault, FaultText] = {
         "the drive went silent after commissioning",
         "check the cable; run again",
     ),
+    Fault.SAMPLES_MISSING: FaultText(
+        "positions came, but never {value:.0f} of them in a row, as sequence.settle_s wants it before enabling",
+        "noise garbles replies, or a busy computer hands them over late",
+        "check the cable and its ground, and what else the computer does; or lower loop.rate_Hz",
+    ),
     Fault.DRIVE_RESTARTED: FaultText(
         "the drive restarted while the loop was running: its unit mode is another one (SR {word})",
         "its supply dropped, or somebody reset it",

@@ -26,7 +26,10 @@ _SOL_CAN_RAW = 101
 _CAN_RAW_FILTER = 1
 _FRAMES_AT_ONCE = 200
 # faults that a sick bus explains
-BUS_FAULTS = frozenset({Fault.BUS_ERROR, Fault.STALE_SAMPLE, Fault.NO_SAMPLES, Fault.DRIVE_FAULT, Fault.ENABLE_TIMEOUT})
+BUS_FAULTS = frozenset({
+    Fault.BUS_ERROR, Fault.STALE_SAMPLE, Fault.NO_SAMPLES, Fault.SAMPLES_MISSING, Fault.DRIVE_FAULT,
+    Fault.ENABLE_TIMEOUT,
+})  # fmt: skip
 _CURES = {
     "bus-off": "a short, missing termination or a wrong bit rate",
     "error passive": "nobody acknowledges, or the bit rate is wrong: power of the drive, wiring, termination",
