@@ -105,7 +105,10 @@ class Bench:
     def config(self, name: str = "joint.toml", base: str = "virtual", **changes: Any) -> str:
         """A shipped configuration with a short trajectory and no way to its start; None removes a key."""
         document = tomlkit.parse((CONFIGS / f"{base}.toml").read_text())
-        short = {"bus__channel": self.channel, "trajectory__duration_s": 1.0, "virtual__initial_position_rad": 0.0}
+        short = {
+            "bus__channel": self.channel, "trajectory__duration_s": 1.0, "virtual__initial_position_rad": 0.0,
+            "log__picture": False,  # test_demo.py looks at one
+        }  # fmt: skip
         for path, value in {**short, **changes}.items():
             *sections, key = path.split("__")
             table: Any = document
@@ -179,6 +182,7 @@ PATIENT: dict[str, Any] = {
     "limits__following_error_max_rad": 0.3,
     "drive__dead_man_s": 0.3,
     "log__folder": "runs",
+    "log__picture": False,
 }
 
 

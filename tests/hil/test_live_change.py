@@ -122,6 +122,7 @@ def test_what_is_not_allowed_is_refused_in_words_and_changes_nothing(bench: Any)
         ("trajectory", {"kind": "table", "file": "x.csv", "duration_s": 1.0}),
         ("trajectory", {"kind": "leap"}),
     )  # fmt: skip
+    assert result.fault.name == "NONE"
     told = [text for text in script.events if text.startswith("parameter change")]
     for text, words in zip(
         told,
@@ -143,7 +144,6 @@ def test_what_is_not_allowed_is_refused_in_words_and_changes_nothing(bench: Any)
         assert text.startswith("parameter change refused: ")
         assert words in text
         assert text.endswith(f"asked for by {WHO}")
-    assert result.fault.name == "NONE"
     rows = result.records[result.records.phase == AxisPhase.TRACKING]
     assert np.min(rows.trajectory_s) >= 0.0  # the motion was never left
     assert {tuple(values["gains"]["kp"])[1] for values in script.seen} == {784.0}

@@ -61,6 +61,13 @@ def test_nothing_heavy_is_imported_for_the_help() -> None:
     assert shown.stdout == "[]\n"
 
 
+def test_what_starts_a_motion_waits_for_no_slow_import() -> None:
+    slow = "{'scipy.optimize', 'scipy.interpolate', 'scipy.stats', 'matplotlib'}"
+    code = f"import sys, tools.verbs.run, tools.verbs.sweep; print(sorted({slow} & set(sys.modules)))"
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert shown.stdout == "[]\n"
+
+
 @pytest.mark.parametrize("shipped", ["virtual", "precise", "elmo_serial.toml"])
 def test_new_copies_a_shipped_configuration_that_loads(tmp_path: Path, shipped: str) -> None:
     assert new(tmp_path / "mine.toml", QUIET, shipped=shipped) == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,16 @@ def test_the_cause_is_told_before_the_picture_is_drawn(
     assert told[0].startswith("error: BUS_ERROR") == (fault is Fault.BUS_ERROR)
     assert ("hint: likely cause" in told[0]) == (fault is Fault.BUS_ERROR)
     assert "picture" in out.getvalue()
+
+
+def test_without_a_picture_none_is_drawn_or_told(tmp_path: Path) -> None:
+    out = io.StringIO()
+    assert run_report.report_run(result(tmp_path, Fault.NONE), Output(stdout=out), "t", picture=False) == 0
+    assert ".png" not in out.getvalue()
+    assert list(tmp_path.iterdir()) == []
+    out = io.StringIO()
+    run_report.report_run(result(tmp_path, Fault.NONE), Output(json=True, stdout=out), "t", picture=False)
+    assert json.loads(out.getvalue())["picture"] is None
 
 
 @pytest.mark.parametrize(("level", "told"), [(ERROR, True), (WARNING, False)])

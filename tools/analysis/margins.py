@@ -11,7 +11,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import brentq, minimize_scalar
 
 from firmware_py.lyapunov import eigenvalues, solve_lyapunov_p, ultimate_bounds
 from firmware_py.states import ControllerKind
@@ -22,6 +21,7 @@ from tools.analysis.linear_loop import (
     linear_loop,
     network_gains,
 )
+from tools.analysis.narrowing import least_between, zero_between
 from tools.analysis.sampled_joint import Array
 
 _POINTS = 3000
@@ -75,11 +75,15 @@ def _at(loop: LinearLoop, log_omega: float) -> complex:
     return complex(loop.open_loop(np.array([math.exp(log_omega)]))[0])
 
 
+def _between(omega: Array, i: int) -> tuple[float, float]:
+    return math.log(omega[i]), math.log(omega[i + 1])
+
+
 def _gain_crossings(loop: LinearLoop, omega: Array, magnitude: Array) -> list[tuple[float, complex]]:
     """(omega [rad/s], L) wherever |L| = 1."""
     found = []
     for i in np.flatnonzero((magnitude[:-1] > 1.0) != (magnitude[1:] > 1.0)):
-        x = brentq(lambda x: abs(_at(loop, x)) - 1.0, math.log(omega[i]), math.log(omega[i + 1]), xtol=1e-12)
+        x = zero_between(lambda x: np.abs(loop.open_loop(np.exp(x))) - 1.0, *_between(omega, int(i)))
         found.append((math.exp(x), _at(loop, x)))
     return found
 
@@ -90,7 +94,7 @@ def _gain_factors(loop: LinearLoop, omega: Array, response: np.ndarray) -> list[
     factors = []
     for i in np.flatnonzero((imaginary[:-1] > 0.0) != (imaginary[1:] > 0.0)):
         if real[i] < 0.0 and real[i + 1] < 0.0:
-            x = brentq(lambda x: _at(loop, x).imag, math.log(omega[i]), math.log(omega[i + 1]), xtol=1e-12)
+            x = zero_between(lambda x: loop.open_loop(np.exp(x)).imag, *_between(omega, int(i)))
             factors.append(1.0 / abs(_at(loop, x)))
     if real[-1] < 0.0:  # at pi / T it is always real
         factors.append(1.0 / abs(real[-1]))
@@ -137,9 +141,9 @@ def _sensitivity_peak(loop: LinearLoop, omega: Array, response: np.ndarray) -> t
     distance = np.abs(1.0 + response)
     i = int(np.argmin(distance))
     low, high = math.log(omega[max(i - 1, 0)]), math.log(omega[min(i + 1, len(omega) - 1)])
-    best = minimize_scalar(lambda x: abs(1.0 + _at(loop, x)), bounds=(low, high), method="bounded")
-    if best.fun < distance[i]:
-        return 1.0 / float(best.fun), math.exp(float(best.x))
+    log_omega, least = least_between(lambda x: np.abs(1.0 + loop.open_loop(np.exp(x))), low, high)
+    if least < distance[i]:
+        return 1.0 / least, math.exp(log_omega)
     return 1.0 / float(distance[i]), float(omega[i])
 
 

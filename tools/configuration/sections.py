@@ -290,3 +290,4 @@ class Log(Section):
     folder: Annotated[str, Field(min_length=1)] = "runs"  # of the run logs, from where jointctl is started
     keep: Annotated[int, between(0, 100_000)] = 0  # newest runs to keep; 0 = all
     frames: bool = False  # record every CAN frame as well
+    picture: bool = True  # of each run, beside its log; takes a second

@@ -65,7 +65,7 @@ def run(
             f"dry run: nothing moved; the drive was commissioned; {left}" if dry_run else f"nothing moved; {left}"
         )
         return 0
-    return report_run(result, output, title)
+    return report_run(result, output, title, picture=config.log.picture)
 
 
 @contextmanager

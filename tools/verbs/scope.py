@@ -113,7 +113,7 @@ class _Runs:
                 why = "stopped before it began" if feed.stop_request() else f"not started within {PREPARED_S:g} s"
                 self._tell("declined", [f"{why}; nothing moved; {words(self.drive_state)}"])
                 return False
-            self.code = report_run(result, output, self._title)
+            self.code = report_run(result, output, self._title, picture=self._config.log.picture)
         except ServerGone:
             raise
         except JointctlError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from drivers.errors import MotionFault
@@ -15,11 +16,11 @@ from tools.running.result.run_result import RunResult
 INTERRUPTED = 130
 
 
-def report_run(result: RunResult, output: Output, title: str) -> int:
-    """Print and save everything; returns the exit code: 0, that of `MotionFault`, or 130 after an interruption.
+def report_run(result: RunResult, output: Output, title: str, *, picture: bool = True) -> int:
+    """Print and save everything, with a `picture` or without; returns the exit code.
 
-    The cause of a fault comes before all else: on a busy computer the picture takes seconds.  `DeviceError` where the
-    drive did not confirm that it is off.
+    That is 0, the one of `MotionFault`, or 130 after an interruption.  The cause of a fault comes before all
+    else: on a busy computer the picture takes seconds.  `DeviceError` where the drive did not confirm that it is off.
     """
     if result.fault_text is not None:
         text = result.fault_text
@@ -27,11 +28,12 @@ def report_run(result: RunResult, output: Output, title: str) -> int:
             f"{result.fault.name} ({int(result.fault)}): {text.happened}",
             f"likely cause: {text.cause}; next: {text.next_step}",
         )
-    picture = result.log_path.with_suffix(".png")
+    drawn = result.log_path.with_suffix(".png") if picture else None
     try:
-        save_run_figure(result.records, picture, title)
+        if drawn is not None:
+            save_run_figure(result.records, drawn, title)
     except OSError as error:
-        output.warning(f"{picture}: cannot be written: {error.strerror or error}")
+        output.warning(f"{drawn}: cannot be written: {error.strerror or error}")
     table = summary_table(result.summary)
     if result.serial:
         table.add_row("line load", f"{result.bus_load:.1%} of the characters from the drive")
@@ -39,8 +41,9 @@ def report_run(result: RunResult, output: Output, title: str) -> int:
         table.add_row("bus load", f"{result.bus_load:.1%} at worst-case stuffing")
     table.add_row("drive afterwards", result.drive_state)
     table.add_row("log", str(result.log_path))
-    table.add_row("picture", str(picture))
-    output.result(table, _data(result, str(picture)))
+    if drawn is not None:
+        table.add_row("picture", str(drawn))
+    output.result(table, _data(result, drawn))
     if result.lost_records:
         output.warning(f"{result.lost_records} log records were lost: the supervisor was too slow")
     if result.fault_text is not None:
@@ -52,7 +55,7 @@ def report_run(result: RunResult, output: Output, title: str) -> int:
     return 0
 
 
-def _data(result: RunResult, picture: str) -> dict[str, Any]:
+def _data(result: RunResult, picture: Path | None) -> dict[str, Any]:
     return {
         **result.summary.to_dict(),
         "bus_load": result.bus_load,
@@ -61,5 +64,5 @@ def _data(result: RunResult, picture: str) -> dict[str, Any]:
         "drive_state": result.drive_state,
         "lost_records": result.lost_records,
         "log": str(result.log_path),
-        "picture": picture,
+        "picture": None if picture is None else str(picture),
     }
