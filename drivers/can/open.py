@@ -13,6 +13,7 @@ from typing import Any
 import can
 
 from drivers.can import serial_adapter, socketcan, virtual_bus
+from drivers.can.foreign_bus import tamed
 from drivers.errors import BusError
 
 CYCLIC_INTERFACES = ("socketcan", "jointctl")
@@ -67,8 +68,8 @@ def open_python_can(
                 bus = can.Bus(channel=channel, interface=interface, ignore_config=True, **settings)
             if exclusive and "://" not in channel:
                 serial_adapter.lock(bus.fileno(), serial_adapter.port_path(channel))
-            return bus
-        return can.Bus(channel=channel, interface=interface, ignore_config=True, **settings)
+            return tamed(bus)
+        return tamed(can.Bus(channel=channel, interface=interface, ignore_config=True, **settings))
     except NotImplementedError as error:  # also CanInterfaceNotImplementedError
         known_interface(interface)
         raise BusError(f"interface {interface} cannot be used here: {error}", "install its driver") from None

@@ -111,7 +111,7 @@ def test_samples_with_holes_prove_standstill_too(joint: LockstepJoint, one_fault
     assert run.state.phase == AxisPhase.FINISHED
 
 
-@pytest.mark.parametrize(("share", "fault"), [(0.05, Fault.NONE), (0.26, Fault.STALE_SAMPLE)])
+@pytest.mark.parametrize(("share", "fault"), [(0.05, Fault.NONE), (0.26, Fault.SAMPLES_MISSING)])
 def test_nothing_is_enabled_on_a_bus_that_mixes_up_every_fourth_sample(
     joint: LockstepJoint, one_fault: MakeFault, share: float, fault: Fault
 ) -> None:

@@ -107,7 +107,7 @@ HARMLESS: list[tuple[FaultKind, float, float]] = [
     (FaultKind.TPDO_LOST, 0.02, 1.0),
     (FaultKind.TPDO_LENGTH, 0.02, 7.0),
     (FaultKind.RPDO_LENGTH, 0.005, 2.0),
-    (FaultKind.CONTROLLER_HEARTBEAT_LOST, 0.2, 1.0),  # with its period, a third of drive.heartbeat_s, 0.33 of 0.4 s
+    (FaultKind.CONTROLLER_HEARTBEAT_LOST, 0.15, 1.0),  # with its period, a third of drive.heartbeat_s, 0.28 of 0.4 s
     (FaultKind.ENCODER_STUCK, 0.002, 1.0),
     (FaultKind.CURRENT_LOOP_DEAD, 0.002, 1.0),
     (FaultKind.TORQUE_REVERSED, 0.002, 1.0),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import gc
 import os
+import re
 import socket
 import tomllib
 import tty
@@ -17,6 +18,7 @@ import pytest
 
 import drivers
 from drivers.can import socketcan, virtual_bus
+from drivers.can.foreign_bus import tamed
 from drivers.can.open import open_cyclic_end, open_python_can
 from drivers.can.virtual_bus import VirtualBus
 from drivers.errors import BusError
@@ -282,6 +284,54 @@ def test_a_serial_adapter_serves_one_program_at_a_time(serial_line: str) -> None
     finally:
         first.shutdown()
     open_python_can("slcan", serial_line, 500_000, sleep_after_open=0.0).shutdown()
+
+
+def test_a_damaged_line_of_an_adapter_is_a_lost_frame() -> None:
+    """Two programs on one adapter cut into each other's lines; ValueError ended whoever made the joint safe."""
+    near, far = os.openpty()
+    tty.setraw(far)
+    bus = open_python_can("slcan", os.ttyname(far), 500_000, sleep_after_open=0.0)
+    try:
+        for line in (b"t1812AAtBB\r", b"t1\r", b"txyz2AABB\r", b"t18129\xff\r"):
+            os.write(near, line)
+            assert bus.recv(0.5) is None
+        os.write(near, b"t1812AABB\r")
+        message = bus.recv(0.5)
+        assert message is not None
+        assert (message.arbitration_id, bytes(message.data)) == (0x181, b"\xaa\xbb")
+    finally:
+        bus.shutdown()
+        os.close(near)
+        os.close(far)
+
+
+class Odd:
+    """A bus whose driver raises what it likes."""
+
+    def __init__(self, error: Exception) -> None:
+        self.error = error
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        raise self.error
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    ("error", "text", "code"),
+    [
+        (OSError(19, "No such device"), "failed: [Errno 19] No such device", 19),
+        (RuntimeError(), "failed: RuntimeError", None),
+        (can.CanOperationError("full", 105), "full", 105),
+    ],
+)
+def test_a_third_party_bus_fails_in_one_way(error: Exception, text: str, code: int | None) -> None:
+    bus = tamed(Odd(error))  # type: ignore[arg-type]
+    for call in (lambda: bus.send(can.Message()), lambda: bus.recv(0.0)):
+        with pytest.raises(can.CanOperationError, match=re.escape(text)) as caught:
+            call()
+        assert caught.value.error_code == code
 
 
 def test_an_adapter_that_is_refused_leaves_the_port_free(serial_line: str) -> None:
