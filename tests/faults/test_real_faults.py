@@ -6,9 +6,7 @@ in tests/hil/test_processes.py.
 
 from __future__ import annotations
 
-import contextlib
 import os
-import threading
 import uuid
 from collections.abc import Callable
 from io import StringIO
@@ -20,13 +18,13 @@ import pytest
 
 from firmware_py.states import AxisPhase, DriveRequest, Fault
 from hil.faults.kinds import LOCKSTEP_ONLY, FaultKind
+from tests.real_time_joint import real_time_joint
 from tools.configuration.config import Config
 from tools.configuration.load import load_config
 from tools.configuration.plant import FAULT_KINDS
 from tools.configuration.plant_settings import fault_constants
 from tools.output import Output
 from tools.running.supervisor import RunResult, Supervisor
-from tools.simulation.virtual_joint import serve_virtual_joint
 
 SHIPPED = (Path(__file__).resolve().parents[2] / "configs" / "virtual.toml").read_text()
 AT_s = 0.7
@@ -35,14 +33,6 @@ MOTION = (Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR, Fault.POSITION_JUMP, Faul
 GONE = (Fault.STALE_SAMPLE, Fault.BUS_ERROR)
 
 RunWith = Callable[..., RunResult]
-
-
-def as_on_a_processor_of_their_own() -> None:
-    """The threads of virtual drive and bus run in time, as `jointctl hil` sees to it for those of its own process."""
-    for thread in threading.enumerate():
-        if thread.name.startswith(("device", "virtual bus")) and thread.native_id is not None:
-            with contextlib.suppress(OSError):  # not permitted here
-                os.sched_setscheduler(thread.native_id, os.SCHED_FIFO, os.sched_param(60))
 
 
 @pytest.fixture
@@ -69,8 +59,7 @@ def run_with(tmp_path: Path) -> RunWith:
         path = tmp_path / "joint.toml"
         path.write_text(text)
         config = load_config(path)
-        with serve_virtual_joint(config):
-            as_on_a_processor_of_their_own()
+        with real_time_joint(config):
             supervisor = Supervisor(
                 config, Output(quiet=True, stderr=StringIO()), tmp_path / "run.mcap", lambda _: True,
                 allow_low_margin=True,

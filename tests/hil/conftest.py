@@ -20,6 +20,7 @@ import pytest
 import tomlkit
 
 from hil.elmo.device import ElmoDevice
+from tests.real_time_joint import real_time_joint
 from tools.configuration.load import load_config
 from tools.recording.run_log import read_run_log
 from tools.verbs.hil_serial import serve_virtual_elmo
@@ -101,6 +102,7 @@ class Bench:
         self.folder = folder
         self.channel = f"test-{os.getpid()}-{uuid.uuid4().hex[:8]}"
         self._started: list[Started] = []
+        self._joints = contextlib.ExitStack()
 
     def config(self, name: str = "joint.toml", base: str = "virtual", **changes: Any) -> str:
         """A shipped configuration with a short trajectory and no way to its start; None removes a key."""
@@ -128,7 +130,11 @@ class Bench:
     def run(self, *arguments: str, timeout_s: float = 180.0, **options: Any) -> Finished:
         return self.start(*arguments, **options).finished(timeout_s)
 
-    def joint(self, config: str) -> Started:
+    def joint(self, config: str) -> None:
+        """The virtual joint in this process, for tests that need one and no more."""
+        self._joints.enter_context(real_time_joint(load_config(self.folder / config)))
+
+    def joint_process(self, config: str) -> Started:
         """`jointctl hil`, ready for others."""
         return self.start("hil", config).saw("Ctrl-C ends it")
 
@@ -157,8 +163,9 @@ class Bench:
         return read_run_log(max(self.folder.glob("runs/*.mcap"), key=lambda path: path.stat().st_mtime_ns))
 
     def end(self) -> None:
-        for started in self._started:
-            started.end()
+        with self._joints:
+            for started in self._started:
+                started.end()
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ SYNC_ID, TPDO_ID, RPDO_ID, HEARTBEAT_ID = 0x80, 0x181, 0x201, 0x701
 
 def test_clients_see_the_run_and_read_objects_meanwhile(bench: Any) -> None:
     config = bench.config(trajectory__duration_s=3.0)
-    bench.joint(config)
+    bench.joint_process(config)
     with can.Bus(interface="jointctl", channel=bench.channel) as onlooker:
         network = bench.network()
         node = network.add_node(1, str(EDS))
@@ -39,7 +39,7 @@ def test_clients_see_the_run_and_read_objects_meanwhile(bench: Any) -> None:
 
 def test_a_cia402_master_of_another_library_enables_and_moves_the_joint(bench: Any) -> None:
     config = bench.config()
-    bench.joint(config)
+    bench.joint_process(config)
     network = bench.network()
     node = BaseNode402(1, str(EDS))
     network.add_node(node)

@@ -78,7 +78,7 @@ def test_what_is_missing_is_told_in_one_line(bench: Any, verb: str) -> None:
 
 
 def test_a_monitor_whose_bus_ends_says_so(bench: Any) -> None:
-    joint = bench.joint(bench.config())
+    joint = bench.joint_process(bench.config())
     monitor = bench.start("monitor", "-i", "jointctl", "-c", bench.channel).saw("listening on")
     joint.signal(signal.SIGTERM)
     monitor.finished(20.0).refused(4, "failed")

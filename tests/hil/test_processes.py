@@ -79,7 +79,7 @@ class Moving:
         self.config = bench.config(
             trajectory__duration_s=60.0, sequence__supervisor_timeout_s=0.8, **changes
         )  # fmt: skip
-        self.hil = bench.joint(self.config)
+        self.hil = bench.joint_process(self.config)
         self.witness = Witness(bench)
         try:
             self.run = bench.start("run", self.config, "-y").saw("  tracking")
