@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numba.core import types
 
+from drivers.answer_window import LOOK_LATE_NS
 from drivers.can.frame_io import receive_frame, send_frame, stamp_frame, stamp_of, wait_readable_ns
 from drivers.can.frames import Frame
 from drivers.canopen.cyclic import accept_frame, answer_owed, begin_cycle, end_cycle
@@ -25,9 +26,6 @@ from firmware_py.kernel import exported, kernel, record_array_type
 from firmware_py.libc import monotonic_ns
 from firmware_py.records import Command, Sample
 from firmware_py.schema import dtype_of, new
-
-# A look at the bus so long after the window's end still counts: a wait may end a little late.
-LOOK_LATE_NS = 200_000
 
 _PORT = record_array_type(dtype_of(CanopenPort))
 _FRAMES = record_array_type(dtype_of(Frame))

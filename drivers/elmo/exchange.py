@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numba.core import types
 
+from drivers.answer_window import LOOK_LATE_NS
 from drivers.elmo.cyclic import begin_cycle, end_cycle, note_written
 from drivers.elmo.port import READ_MAX, SCRATCH_WORDS, ElmoPort
 from drivers.elmo.replies import take_byte
@@ -21,9 +22,6 @@ from firmware_py.schema import dtype_of
 
 _read = external("read", types.intp, types.int32, types.uintp, types.uintp)
 _write = external("write", types.intp, types.int32, types.uintp, types.uintp)
-
-# A look at the line so long after the window's end still counts: a wait may end a little late.
-LOOK_LATE_NS = 200_000
 
 _PORT = record_array_type(dtype_of(ElmoPort))
 _SAMPLE = record_array_type(dtype_of(Sample))

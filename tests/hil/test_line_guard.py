@@ -154,7 +154,9 @@ def test_stop_without_an_answer_of_the_guard(serial_bench: Any) -> None:
 def test_another_program_on_the_port_is_named_and_left_alone(serial_bench: Any) -> None:
     serial_bench.config()
     serial_bench.device.interpreter.execute(b"MO=1")
-    program = "import serial, sys, time; p = serial.Serial(sys.argv[1], exclusive=True); print(); time.sleep(60)"
+    program = (
+        "import serial, sys, time; p = serial.Serial(sys.argv[1], exclusive=True); print(flush=True); time.sleep(60)"
+    )
     other = subprocess.Popen([sys.executable, "-c", program, serial_bench.device.path], stdout=subprocess.PIPE)
     try:
         assert other.stdout is not None

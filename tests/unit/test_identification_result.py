@@ -11,7 +11,7 @@ from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
 from tools.identification.friction_data import FrictionData
 from tools.identification.identification import Options, identify_friction
 from tools.identification.intervals import uncertainty
-from tools.identification.models import FORMS
+from tools.identification.models import FORMS, MIN_PER_STAGE
 from tools.identification.plausibility import JointLimits, check_branches, check_data
 from tools.identification.pso import SwarmSettings
 from tools.identification.selection import choose, find_outliers, fold_numbers, held_out_rss
@@ -212,6 +212,16 @@ def test_auto_takes_a_simple_model_for_simple_friction_and_a_multi_stage_one_for
     auto = Options(model="auto", swarm=QUICK.swarm)
     assert identify_friction(simple, auto).model == "coulomb-viscous"
     assert identify_friction(paper_data(0), auto).model.startswith("multi-stage")
+
+
+@pytest.mark.parametrize(("beyond", "left_out"), [(MIN_PER_STAGE - 1, True), (MIN_PER_STAGE, False)])
+def test_auto_leaves_out_a_model_that_the_data_do_not_reach(beyond, left_out):
+    """A serial drive's quick grid hardly passes the knee: the user had to name another model."""
+    speeds = np.concatenate([np.linspace(2.0, 39.0, 30), np.linspace(41.0, 52.0, beyond)]) * DEGREE
+    data = paper_data(0, np.concatenate([-speeds[::-1], speeds]))
+    found = identify_friction(data, Options(model="auto", folds=4, swarm=QUICK.swarm))
+    assert [f"{beyond} beyond at" in note for note in found.notes] == ([True] if left_out else [])
+    assert ("multi-stage" in found.held_out_by_model_Nm) is not left_out
 
 
 def test_a_searched_knee_is_told_and_not_worse():

@@ -12,7 +12,7 @@ from drivers.errors import DataError
 from firmware_py.friction import DEGREE
 from tools.identification.friction_data import FrictionData
 from tools.identification.intervals import Uncertainty, uncertainty
-from tools.identification.models import FORMS, MIN_PER_STAGE, Branch
+from tools.identification.models import FORMS, MIN_PER_STAGE, Branch, Form
 from tools.identification.plausibility import JointLimits, check_branches, check_data
 from tools.identification.polish import polish
 from tools.identification.pso import SwarmResult, SwarmSettings, run_swarms
@@ -173,8 +173,27 @@ def _stage_check(data: FrictionData, problem: Problem, word: str) -> None:
         raise DataError(
             f"{data.path}: {low} points up to the knee (={problem.knee * problem.top_radps / DEGREE:.4g} deg/s) and "
             f"{len(problem.x) - low} beyond at {word} velocity: at least {MIN_PER_STAGE} are needed on both sides",
-            "set --knee, or --search-knee, or --model stribeck; or the unit or side of the velocity is wrong",
+            "set --knee, or --search-knee, or --model auto; or the unit or side of the velocity is wrong",
         )
+
+
+def _first_form(data: FrictionData, options: Options, notes: list[str]) -> Form:
+    """The richest model that is considered; the chosen one, unless the held-out error is to choose."""
+    if options.model in ("stribeck", "coulomb-viscous"):
+        return FORMS[options.model]
+    form = FORMS["multi-stage-continuous" if options.continuous else "multi-stage"]
+    if options.model != "auto" or options.search_knee:
+        return form
+    for word, sign in DIRECTIONS:
+        speeds = np.abs(data.velocity_radps[data.direction(sign)])
+        low = int(np.count_nonzero(speeds <= options.knee_radps))
+        if min(low, len(speeds) - low) < MIN_PER_STAGE:
+            notes.append(
+                f"{low} points up to the knee and {len(speeds) - low} beyond at {word} velocity: too few for the "
+                f"{form.name} model, which was left out"
+            )
+            return FORMS["stribeck"]
+    return form
 
 
 def identify_friction(
@@ -188,10 +207,8 @@ def identify_friction(
     options.check()
     before = check_data(data, limits)
     _refuse(data, before.problems)
-    first = FORMS[("multi-stage-continuous" if options.continuous else "multi-stage")]
-    if options.model in ("stribeck", "coulomb-viscous"):
-        first = FORMS[options.model]
     notes, warnings = list(data.notes), list(before.warnings)
+    first = _first_form(data, options, notes)
     problems: dict[str, Problem] = {}
     index, outliers = {}, {}
     for word, sign in DIRECTIONS:
