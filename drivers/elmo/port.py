@@ -80,7 +80,7 @@ class ElmoPort:
     window_ns: i8  # when the window of this cycle ends: by it cycles are told apart
     asked_ns: i8  # when this cycle began
     usual_answer_ns: i8  # from there to the position, its median followed slowly; 0 = none yet
-    left_out: i4  # 1: the last position came unusually late and was left out
+    left_out: i4  # how many positions in a row came unusually late and were left out
     window_over: i4  # 1: it was over before the cycle began
     answered_window_ns: i8  # of the cycle that asked for the last position
     gone: i4  # the port has vanished

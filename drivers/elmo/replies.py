@@ -18,6 +18,7 @@ NOTHING = -1
 FAULT_CAUSE_CYCLES = 4  # status replies to wait for MF before a fault is told without its cause
 USUAL_STEP_NS = 20_000  # in a cycle
 UNEVEN_SHARE = 16  # a position may come a 16th of a period later than usual
+LEFT_OUT_MAX = 3  # in a row
 _DIGITS_MAX = 17
 _CR, _SEMICOLON, _QUESTION_MARK = 0x0D, 0x3B, 0x3F
 _PLUS, _MINUS, _POINT, _ZERO, _NINE, _EQUALS = 0x2B, 0x2D, 0x2E, 0x30, 0x39, 0x3D
@@ -119,7 +120,8 @@ def _uneven(port: ElmoPort, answer_ns: int) -> bool:
     """Whether a position came so much later than usual that the time at which it was read is not known.
 
     The drive reads it when its interpreter comes to the question.  1 ms late of 8 ms would be a leap of an eighth of
-    the speed.  One is left out; two in a row are the way of this line, and its usual time follows.
+    the speed.  A few in a row are left out, as a computer held up for three cycles makes them; more are the way of this
+    line, and its usual time follows.
     """
     if port.period_ns == 0:
         return False
@@ -127,7 +129,8 @@ def _uneven(port: ElmoPort, answer_ns: int) -> bool:
         port.usual_answer_ns = answer_ns
     late_ns = answer_ns - port.usual_answer_ns
     port.usual_answer_ns += min(max(late_ns, -USUAL_STEP_NS), USUAL_STEP_NS)
-    port.left_out = 1 if port.left_out == 0 and late_ns * UNEVEN_SHARE > port.period_ns else 0
+    late = late_ns * UNEVEN_SHARE > port.period_ns
+    port.left_out = port.left_out + 1 if late and port.left_out < LEFT_OUT_MAX else 0
     return port.left_out != 0
 
 
