@@ -190,14 +190,15 @@ def rig() -> Callable[..., Rig]:
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 _FRAME = struct.Struct("<IB3x8s")
 _channels = itertools.count()
-IDLE_S = 0.005
 DEVICE_TIME_FACTOR = 4.0
+PASS_TIME, TIME_PASSED = 0x1FFFFFF0, 0x1FFFFFF1  # extended identifiers: no frames of CANopen
 
 
 class DeviceOnBus:
     """The virtual drive on python-can's in-process bus, in a thread.
 
-    Its time moves on 1 ms with every frame, and faster than real time while nothing comes.
+    Its time moves on 1 ms with every frame, and with every wait of the driver by that time, however busy the computer
+    is: the driver's end asks for it with a frame of its own, and goes on when it has heard all that was said meanwhile.
 
     `answers` replaces the value in expedited SDO upload responses, (index, sub) -> value; `mute` lists objects whose
     next requests stay unanswered; `requests` are the frames that came in.  `sequences` are answers used up one by one
@@ -236,12 +237,12 @@ class DeviceOnBus:
 
     def _run(self) -> None:
         while not self._ended.is_set():
-            message = self._bus.recv(IDLE_S)
+            message = self._bus.recv(0.05)
             if message is None:
-                if self.device is not None:
-                    self.now_ns += int(IDLE_S * DEVICE_TIME_FACTOR * 1e9)
-                    for frame in self.device.advance(self.now_ns):
-                        self._reply(frame)
+                continue
+            if message.arbitration_id == PASS_TIME:
+                self._pass_time(struct.unpack("<d", message.data)[0])
+                self._bus.send(can.Message(arbitration_id=TIME_PASSED))
                 continue
             data = bytes(message.data)
             self.requests.append((message.arbitration_id, data))
@@ -263,6 +264,15 @@ class DeviceOnBus:
             for frame in self.device.handle(_FRAME.pack(message.arbitration_id, len(data), data), self.now_ns):
                 self._reply(frame)
 
+    def _pass_time(self, seconds: float) -> None:
+        if self.device is None:
+            return
+        until_ns = self.now_ns + round(seconds * 1e9)
+        while self.now_ns < until_ns:
+            self.now_ns = min(self.now_ns + 10_000_000, until_ns)
+            for frame in self.device.advance(self.now_ns):
+                self._reply(frame)
+
     def _reply(self, frame: bytes) -> None:
         identifier, size, payload = _FRAME.unpack(frame)
         if identifier & 0x780 == 0x580 and payload[0] & 0xE2 == 0x42:
@@ -274,9 +284,26 @@ class DeviceOnBus:
         self._bus.send(can.Message(arbitration_id=identifier, data=payload[:size], is_extended_id=False))
 
     def drive(self, settings: CanopenSettings) -> CanopenDrive:
-        """The real driver on another end of this bus; its waiting is short."""
+        """The real driver on another end of this bus; its waiting is short, but long for the device."""
         bus = can.Bus(interface="virtual", channel=self.channel)
-        return CanopenDrive(bus, settings, sleep=lambda s: threading.Event().wait(s / DEVICE_TIME_FACTOR))
+        passed = threading.Event()
+
+        def hear(message: can.Message) -> None:
+            if message.arbitration_id == TIME_PASSED:
+                passed.set()
+
+        def sleep(seconds: float) -> None:
+            threading.Event().wait(seconds / DEVICE_TIME_FACTOR)
+            if self._ended.is_set() or drive._network.notifier is None:
+                return
+            passed.clear()
+            bus.send(can.Message(arbitration_id=PASS_TIME, data=struct.pack("<d", seconds)))
+            passed.wait(5.0)
+
+        drive = CanopenDrive(bus, settings, sleep=sleep)
+        assert drive._network.notifier is not None
+        drive._network.notifier.add_listener(hear)
+        return drive
 
 
 @pytest.fixture

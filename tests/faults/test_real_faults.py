@@ -39,7 +39,9 @@ RunWith = Callable[..., RunResult]
 def run_with(tmp_path: Path) -> RunWith:
     """`run_with(kind, duration_s, magnitude)`: one whole run with this fault in [[virtual.faults]]."""
 
-    def run(kind: FaultKind, duration_s: float, magnitude: float, tracking_s: float = 1.2) -> RunResult:
+    def run(
+        kind: FaultKind, duration_s: float, magnitude: float, tracking_s: float = 1.2, heartbeat_s: float = 0.4
+    ) -> RunResult:
         text = SHIPPED.replace('channel = "virtual0"', f'channel = "fault-{os.getpid()}-{uuid.uuid4().hex[:8]}"')
         text = text.replace('approach_s = "auto"', "approach_s = 0.3")
         text = text.replace("initial_position_rad = 0.1", "initial_position_rad = 0.0")
@@ -47,7 +49,7 @@ def run_with(tmp_path: Path) -> RunWith:
         # a busy computer must not be the fault that is seen
         for key, value in {
             "sample_age_max_s = 0.05": "sample_age_max_s = 0.25", "skipped_max_s = 0.05": "skipped_max_s = 0.25",
-            "heartbeat_s = 0.2": "heartbeat_s = 0.4", "stop_timeout_s = 3.0": "stop_timeout_s = 1.0",
+            "heartbeat_s = 0.2": f"heartbeat_s = {heartbeat_s}", "stop_timeout_s = 3.0": "stop_timeout_s = 1.0",
             "off_timeout_s = 2.0": "off_timeout_s = 0.7",
         }.items():  # fmt: skip
             assert key in text
@@ -96,7 +98,7 @@ HARMLESS: list[tuple[FaultKind, float, float]] = [
     (FaultKind.TPDO_LOST, 0.02, 1.0),
     (FaultKind.TPDO_LENGTH, 0.02, 7.0),
     (FaultKind.RPDO_LENGTH, 0.005, 2.0),
-    (FaultKind.CONTROLLER_HEARTBEAT_LOST, 0.15, 1.0),  # with its period, a third of drive.heartbeat_s, 0.28 of 0.4 s
+    (FaultKind.CONTROLLER_HEARTBEAT_LOST, 0.3, 1.0),  # with its period, a third of drive.heartbeat_s, 0.63 of 1 s
     (FaultKind.ENCODER_STUCK, 0.002, 1.0),
     (FaultKind.CURRENT_LOOP_DEAD, 0.002, 1.0),
     (FaultKind.TORQUE_REVERSED, 0.002, 1.0),
@@ -139,7 +141,7 @@ def test_the_joint_is_stopped_and_disabled_and_the_user_is_told(
 
 @pytest.mark.parametrize(("kind", "duration_s", "magnitude"), HARMLESS, ids=lambda v: getattr(v, "name", None))
 def test_its_twin_goes_on_to_the_end(run_with: RunWith, kind: FaultKind, duration_s: float, magnitude: float) -> None:
-    result = run_with(kind, duration_s, magnitude)
+    result = run_with(kind, duration_s, magnitude, heartbeat_s=1.0 if kind is FaultKind.CONTROLLER_HEARTBEAT_LOST else 0.4)
     assert result.fault is Fault.NONE, result.fault_text
     assert result.drive_state == "switch on disabled"
     tracked = result.records[result.records.phase == AxisPhase.TRACKING]

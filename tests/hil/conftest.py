@@ -252,10 +252,21 @@ def serial_bench(bench: Any) -> Iterator[SerialBench]:
     (bench.folder / "device.toml").write_text((CONFIGS / "elmo_serial.toml").read_text())
     with serve_virtual_elmo(load_config(bench.folder / "device.toml")) as device, ahead_of_others():
         found.device = device
-        try:
-            yield found
-        finally:
-            end_line_guards(device.path)
+        with name_kept(device.path):
+            try:
+                yield found
+            finally:
+                end_line_guards(device.path)
+
+
+@contextmanager
+def name_kept(port: str) -> Iterator[None]:
+    """No other pseudo-terminal gets this name meanwhile, also when the port has vanished."""
+    descriptor = os.open(port, os.O_RDWR | os.O_NOCTTY)
+    try:
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def end_line_guards(port: str) -> None:

@@ -223,7 +223,7 @@ def test_the_whole_run_over_udp_multicast(multicast_config: Path) -> None:
     result = json.loads(stdout)
     assert result["fault"] is None
     assert result["drive_state"] == "switch on disabled"
-    assert result["tracked_s"] == pytest.approx(1.0, abs=2.0 / RATE_HZ)
+    assert 1.0 - (2 + result["skipped_cycles"]) / RATE_HZ <= result["tracked_s"] <= 1.0 + 2.0 / RATE_HZ
     assert result["error"]["range_rad"]["greatest"] < 0.3
     assert 0.0 < result["bus_load"] < 0.05  # 285 bits at 100 Hz on 1 Mbit/s; own echoes would double it
     assert joint.returncode == 0

@@ -178,7 +178,6 @@ def run(order: LoopOrder) -> int:
 
     with slow_start(tell, "loop") as started, loop(order, block) as ready:
         started()
-        gc.collect()
         gc.freeze()
         gc.disable()
         for line in become_realtime(order.cpu, order.priority):
