@@ -141,7 +141,9 @@ def test_the_joint_is_stopped_and_disabled_and_the_user_is_told(
 
 @pytest.mark.parametrize(("kind", "duration_s", "magnitude"), HARMLESS, ids=lambda v: getattr(v, "name", None))
 def test_its_twin_goes_on_to_the_end(run_with: RunWith, kind: FaultKind, duration_s: float, magnitude: float) -> None:
-    result = run_with(kind, duration_s, magnitude, heartbeat_s=1.0 if kind is FaultKind.CONTROLLER_HEARTBEAT_LOST else 0.4)
+    result = run_with(
+        kind, duration_s, magnitude, heartbeat_s=1.0 if kind is FaultKind.CONTROLLER_HEARTBEAT_LOST else 0.4
+    )
     assert result.fault is Fault.NONE, result.fault_text
     assert result.drive_state == "switch on disabled"
     tracked = result.records[result.records.phase == AxisPhase.TRACKING]
