@@ -102,6 +102,11 @@ def kernel(function: Function) -> Function:
     return cast(Function, numba.njit(**_OPTIONS)(function))
 
 
+def plain(function: Function) -> Function:
+    """The Python function of a kernel: for a few calls outside the loop: loading the compiled one takes longer."""
+    return cast(Function, getattr(function, "py_func", function))
+
+
 def inlined(function: Function) -> Function:
     """Compile a very small function whose body is copied into its callers."""
     return cast(Function, numba.njit(inline="always", **_OPTIONS)(function))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from firmware_py.kernel import kernel
+from firmware_py.kernel import kernel, plain
 from firmware_py.states import DriveRequest, DriveState
 
 
@@ -84,6 +84,14 @@ def decode_state(status_word: int) -> State:
     if bits == 0x07:
         return State.QUICK_STOP_ACTIVE
     return State.UNDEFINED
+
+
+state_of_word = plain(decode_state)
+
+
+def state_text(status_word: int) -> str:
+    """State of a statusword in words, as `operation enabled`."""
+    return state_of_word(status_word).name.lower().replace("_", " ")
 
 
 @kernel

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from drivers.canopen.cia402 import SUPPORTED_MODE_BIT, ControlWord, Mode, State, decode_state
+from drivers.canopen.cia402 import SUPPORTED_MODE_BIT, ControlWord, Mode, State, state_of_word
 from drivers.canopen.connection_loss import arm_reaction, arm_rpdo_deadline
 from drivers.canopen.eds_file import EdsFile
 from drivers.canopen.encoder_node import EncoderFindings, commission_drive_object
@@ -111,7 +111,7 @@ def disable(objects: ObjectAccess, settings: CanopenSettings, pause: Pause) -> N
     for index, what in ((0x60FF, "target velocity"), (0x60B1, "velocity offset"), (0x60B2, "torque offset")):
         objects.write_if_present(index, 0, 0, what=what)
     for _ in range(ATTEMPTS):
-        state = State(decode_state(objects.read(0x6041, what="statusword")))
+        state = state_of_word(objects.read(0x6041, what="statusword"))
         if state is not State.OPERATION_ENABLED and state is not State.QUICK_STOP_ACTIVE:
             break
         pause(PAUSE_S)

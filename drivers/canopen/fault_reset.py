@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.canopen.cia402 import ControlWord, State, decode_state
+from drivers.canopen.cia402 import ControlWord, State, state_of_word
 from drivers.canopen.object_access import ObjectAccess
 from drivers.errors import DeviceError
 
@@ -22,14 +22,14 @@ def reset_fault(objects: ObjectAccess, pause: Callable[[float], None]) -> str:
     for _ in range(ATTEMPTS):
         objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
         pause(SETTLE_S)
-        state = State(decode_state(objects.read(0x6041, what="statusword")))
+        state = state_of_word(objects.read(0x6041, what="statusword"))
         if state not in (State.FAULT, State.FAULT_REACTION_ACTIVE):
             words = state.name.lower().replace("_", " ")
             return f"fault {code:04X}h was reset, the drive is {words}" if code else f"no fault: the drive is {words}"
         code = objects.read(0x603F, what="error code") if objects.has(0x603F) else code
         objects.write(0x6040, 0, ControlWord.FAULT_RESET, what="controlword")
         pause(SETTLE_S)
-    state = State(decode_state(objects.read(0x6041, what="statusword")))
+    state = state_of_word(objects.read(0x6041, what="statusword"))
     if state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
         raise DeviceError(
             f"the drive stays in fault (error code {code:04X}h) after {ATTEMPTS} resets",

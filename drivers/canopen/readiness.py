@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.canopen.cia402 import ControlWord, State, decode_state
+from drivers.canopen.cia402 import ControlWord, State, state_of_word
 from drivers.canopen.object_access import ObjectAccess
 from drivers.errors import DeviceError
 
@@ -20,7 +20,7 @@ def wait_until_ready(objects: ObjectAccess, node: int, timeout_s: float, pause: 
     looks = max(1, round(timeout_s / POLL_S))
     for look in range(looks):
         status_word = objects.read(0x6041, what="statusword")
-        state = State(decode_state(status_word))
+        state = state_of_word(status_word)
         if state not in (State.NOT_READY_TO_SWITCH_ON, State.UNDEFINED):
             if state is State.READY_TO_SWITCH_ON:
                 objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")

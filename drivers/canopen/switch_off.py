@@ -17,7 +17,7 @@ import canopen
 from canopen.objectdictionary import ODArray, ODVariable
 
 from drivers.canopen.bus_watchers import BusFailure
-from drivers.canopen.cia402 import ControlWord, State, decode_state
+from drivers.canopen.cia402 import ControlWord, State, state_of_word
 from drivers.canopen.object_access import ObjectAccess
 from drivers.canopen.standard_objects import standard_type
 from drivers.errors import DeviceError, JointctlError
@@ -35,7 +35,7 @@ _OBJECTS = (0x6040, 0x6041, 0x6071, 0x60FF)
 
 def state_of(objects: ObjectAccess) -> State:
     """By the statusword."""
-    return State(decode_state(objects.read(0x6041, what="statusword")))
+    return state_of_word(objects.read(0x6041, what="statusword"))
 
 
 def brake(objects: ObjectAccess, sleep: Callable[[float], None]) -> bool:

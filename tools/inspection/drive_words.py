@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.canopen.cia402 import SUPPORTED_MODE_BIT, Mode, State, decode_state
-
-_decode: Callable[[int], int] = getattr(decode_state, "py_func", decode_state)  # no kernel is loaded for this
+from drivers.canopen.cia402 import SUPPORTED_MODE_BIT, Mode, state_text
 
 # CiA 402-2, 6041: bits that say more than the state
 _STATUS_BITS = {
@@ -41,7 +39,7 @@ DEVICE_PROFILES = {
 
 def drive_state(status_word: int) -> str:
     """`operation enabled` and so on."""
-    return State(_decode(status_word)).name.lower().replace("_", " ")
+    return state_text(status_word)
 
 
 def status_bits(status_word: int) -> list[str]:

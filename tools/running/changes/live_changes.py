@@ -13,6 +13,7 @@ from typing import Any
 
 from drivers.errors import ConfigurationError, JointctlError
 from firmware_py.change_records import ChangeAnswer, ChangeKind, MotionChange
+from firmware_py.kernel import plain
 from firmware_py.live_change import gains_of
 from firmware_py.records import Gains
 from firmware_py.schema import dtype_of, new
@@ -26,7 +27,7 @@ from tools.running.display.viewer_request import ViewerRequest
 
 NAMES = tuple(dtype_of(Gains).names or ())
 # the plain function: nothing is to be compiled or loaded while the supervisor watches
-_gains_of: Callable[[Any, Any], None] = getattr(gains_of, "py_func", gains_of)
+_gains_of = plain(gains_of)
 _WHY = {
     ChangeAnswer.WRONG_KIND: "the loop does not know this kind of change",
     ChangeAnswer.WRONG_PHASE: "the joint is not under way, or it is being stopped",

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.canopen.cia402 import State, decode_state
+from drivers.canopen.cia402 import State, state_of_word, state_text
 from drivers.elmo.codes import motor_fault_text
 from firmware_py.states import AxisPhase, DriveState, Fault
 from tools.recording.run_log import ERROR, INFO, WARNING, Event
@@ -19,8 +19,6 @@ from tools.running.events.emergency_text import emergency_text
 from tools.running.events.fault_text import FAULT_TEXTS
 
 OVERRUN_CYCLES = 10  # so many skipped slots in one go are worth a line
-# the plain function: a compiled one would be loaded, or compiled, while the supervisor has no time for it
-_decode: Callable[[int], int] = getattr(decode_state, "py_func", decode_state)
 _BAD = (State.FAULT, State.FAULT_REACTION_ACTIVE, State.UNDEFINED)
 
 
@@ -29,7 +27,7 @@ def drive_state_name(status_word: int, drive_state: int, *, cia402: bool = True)
     if drive_state == DriveState.UNKNOWN:
         return "not heard yet"
     if cia402:
-        return State(_decode(status_word)).name.lower().replace("_", " ")
+        return state_text(status_word)
     return DriveState(drive_state).name.lower().replace("_", " ")
 
 
@@ -82,7 +80,7 @@ class EventFinder:
             events.append(self._error_event(time_ns, error))
         if state != state_before:
             bad = drive in (DriveState.FAULT, DriveState.FAULT_BRAKING) or (
-                self._cia402 and drive != DriveState.UNKNOWN and _decode(word) in _BAD
+                self._cia402 and drive != DriveState.UNKNOWN and state_of_word(word) in _BAD
             )
             word_text = f" (statusword {word:04X}h)" if self._cia402 and drive != DriveState.UNKNOWN else ""
             events.append(Event(time_ns, WARNING if bad else INFO, "drive", state + word_text))

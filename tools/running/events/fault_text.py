@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.canopen.cia402 import State, decode_state
+from drivers.canopen.cia402 import state_text
 from firmware_py.records import ENCODER_RESTARTED
 from firmware_py.states import Fault
 from tools.running.events.emergency_text import emergency_text
@@ -168,7 +167,6 @@ TWO_ENCODER_TEXTS: dict[Fault, FaultText] = {
     ),
 }
 _ENCODER_CURE = "check the encoder's supply, cable and mounting; its manual tells the error code"
-_decode: Callable[[int], int] = getattr(decode_state, "py_func", decode_state)  # nothing to compile for one word
 # EMCY classes of CiA 301 with which a drive says that it does not hear this computer as it should
 _COMMUNICATION_ERRORS = (0x8100, 0x8200)
 
@@ -178,7 +176,7 @@ def _word_text(value: float) -> str:
     if not 0.0 <= value <= 65535.0:
         return f"{value}"
     word = round(value)
-    return f"{word:04X}h, {State(_decode(word)).name.lower().replace('_', ' ')}"
+    return f"{word:04X}h, {state_text(word)}"
 
 
 def _encoder_words(encoder_error: int) -> str:
