@@ -17,7 +17,8 @@ from tools.configuration.load import load_config, shipped_config
 from tools.configuration.sections import Friction
 from tools.identification.friction_data import read_friction_data
 from tools.identification.friction_section import section_values
-from tools.identification.identification import Options, identify_friction
+from tools.identification.identification import identify_friction
+from tools.identification.options import Options
 from tools.identification.pso import SwarmSettings
 from tools.output import Output
 from tools.simulation.lockstep import LockstepJoint
@@ -164,5 +165,5 @@ def test_tracking_with_the_identified_model_is_that_with_the_true_one(bench: Con
 
 def test_a_wrong_knee_with_no_points_beyond_is_refused(bench: Config, tmp_path: Path) -> None:
     data = data_of(bench, tmp_path, points=24, max_speed_radps=0.6)
-    with pytest.raises(DataError, match=r"12 points up to the knee \(=40 deg/s\) and 0 beyond"):
+    with pytest.raises(DataError, match=r"knee \(=40 deg/s\) at positive velocity: 12 points up to it and 0 beyond"):
         model_of(data)

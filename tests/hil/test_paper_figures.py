@@ -22,7 +22,7 @@ from tools.experiments.paper_identification import identify_paper_friction
 from tools.experiments.paper_rows import PaperRun, network_difference_mrad, paper_rows
 from tools.experiments.paper_runs import AFTER_s, Experiment, experiments, friction_estimate, hidden_outputs, ideal, law
 from tools.experiments.study_runs import StudyResult, quantile, run_study
-from tools.identification.identification import Options
+from tools.identification.options import Options
 from tools.identification.pso import SwarmSettings
 from tools.output import Output
 from tools.simulation.lockstep import LockstepJoint

@@ -23,7 +23,8 @@ from tools.configuration.load import load_config, shipped_config
 from tools.configuration.sections import Friction
 from tools.identification.friction_data import read_friction_data
 from tools.identification.friction_section import section_values
-from tools.identification.identification import Options, identify_friction
+from tools.identification.identification import identify_friction
+from tools.identification.options import Options
 from tools.identification.pso import SwarmSettings
 from tools.output import Output
 from tools.recording.run_log import read_run_log

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from drivers.errors import DataError
+from drivers.errors import DataError, UsageError
 from tools.identification.friction_data import SWEEP_COLUMNS, ForeignFormat, read_friction_data, sidecar_contents
 
 RATIO, CONSTANT = 121.0, 0.1
@@ -237,7 +237,7 @@ def test_nothing_is_guessed_about_other_peoples_data(tmp_path, change, message):
     text = "speed,torque\n" + "".join(f"{v},{math.copysign(1, v)}\n" for v in SPEEDS)
     path = write_foreign(tmp_path, text)
     read_friction_data(path, FOREIGN)
-    with pytest.raises(DataError, match=message):
+    with pytest.raises(UsageError, match=message):
         read_friction_data(path, ForeignFormat(**{**FOREIGN.__dict__, **change}))
 
 
@@ -248,5 +248,5 @@ def test_a_table_without_mapping_lists_its_columns(tmp_path):
 
 
 def test_unit_flags_do_not_go_with_a_sweep_file(tmp_path):
-    with pytest.raises(DataError, match="a sweep file tells its own units"):
+    with pytest.raises(UsageError, match="a sweep file tells its own units"):
         read_friction_data(write_sweep(tmp_path, rows()), ForeignFormat(velocity_unit="deg/s"))

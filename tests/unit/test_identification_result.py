@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.errors import DataError
+from drivers.errors import DataError, UsageError
 from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
 from tools.identification.friction_data import FrictionData
-from tools.identification.identification import Options, identify_friction
+from tools.identification.identification import identify_friction
 from tools.identification.intervals import uncertainty
 from tools.identification.models import FORMS, MIN_PER_STAGE
+from tools.identification.options import Options
 from tools.identification.plausibility import JointLimits, check_branches, check_data
 from tools.identification.pso import SwarmSettings
 from tools.identification.selection import choose, find_outliers, fold_numbers, held_out_rss
@@ -220,7 +221,7 @@ def test_auto_leaves_out_a_model_that_the_data_do_not_reach(beyond, left_out):
     speeds = np.concatenate([np.linspace(2.0, 39.0, 30), np.linspace(41.0, 52.0, beyond)]) * DEGREE
     data = paper_data(0, np.concatenate([-speeds[::-1], speeds]))
     found = identify_friction(data, Options(model="auto", folds=4, swarm=QUICK.swarm))
-    assert [f"{beyond} beyond at" in note for note in found.notes] == ([True] if left_out else [])
+    assert [f"{beyond} beyond, too few" in note for note in found.notes] == ([True] if left_out else [])
     assert ("multi-stage" in found.held_out_by_model_Nm) is not left_out
 
 
@@ -258,7 +259,7 @@ def test_a_knee_with_too_few_points_on_one_side_is_refused(knee_degps, fits):
     ],
 )
 def test_options_out_of_range_are_refused(change, message):
-    with pytest.raises(DataError, match=message):
+    with pytest.raises(UsageError, match=message):
         identify_friction(paper_data(0), Options(**change))
 
 

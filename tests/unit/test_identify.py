@@ -18,7 +18,7 @@ from tools.configuration.load import load_config, shipped_config
 from tools.identification import identification
 from tools.identification.friction_data import SWEEP_COLUMNS, ForeignFormat, sidecar_contents
 from tools.identification.friction_section import MARK, snippet, with_section
-from tools.identification.identification import Options
+from tools.identification.options import Options
 from tools.identification.pso import SwarmSettings
 from tools.output import Output
 from tools.verbs.identify import identify

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from drivers.errors import DataError
+from drivers.errors import DataError, UsageError
 from firmware_py.realtime import HISTOGRAM_BINS
 from firmware_py.records import LogRecord
 from firmware_py.schema import new
@@ -369,7 +369,7 @@ def test_orders_are_checked_and_beyond_this_computer_get_a_token(monkeypatch: py
     with pytest.raises(DataError, match="needs the package nicegui"):
         scope_order("t", "127.0.0.1", 8642)
     monkeypatch.setattr(order_module, "find_spec", lambda name: object())
-    with pytest.raises(DataError, match=r"--port \(=0\) must be in \[1..65535\]"):
+    with pytest.raises(UsageError, match=r"--port \(=0\) must be in \[1..65535\]"):
         scope_order("t", "127.0.0.1", 0)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

@@ -90,7 +90,7 @@ def identify(
     quiet: Quiet = False,
 ) -> None:
     """Fit the friction model (11) to measured plateaus; writes TOML, figures and a report beside the data."""
-    from tools.identification.identification import Options
+    from tools.identification.options import Options
     from tools.identification.pso import SwarmSettings
     from tools.verbs.identify import identify as run_identify
 

@@ -15,7 +15,9 @@ import numpy as np
 from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
 from tools.identification.figures import fit_figure
 from tools.identification.friction_data import FrictionData
-from tools.identification.identification import Identification, Options, identify_friction
+from tools.identification.identification import identify_friction
+from tools.identification.options import Options
+from tools.identification.result import Identification
 
 POINTS = 225
 NOISE_Nm = 0.0046

@@ -9,8 +9,8 @@ import numpy as np
 from firmware_py.friction import DEGREE
 from tools.drawing import BLUE, GREY, ORANGE, RED, canvas
 from tools.identification.friction_data import FrictionData
-from tools.identification.identification import DIRECTIONS, Identification
 from tools.identification.models import Branch
+from tools.identification.result import DIRECTIONS, Identification
 
 _CURVE_POINTS = 600
 _FLOOR = 1e-5  # [%] drawn at least, on a logarithmic axis

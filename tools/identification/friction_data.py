@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.errors import DataError
+from drivers.errors import DataError, UsageError
 from tools.identification.table_file import TableFile, read_bytes, read_table
 
 SWEEP_COLUMNS = (
@@ -107,15 +107,15 @@ def _check_told(told: ForeignFormat) -> None:
         ("--torque-side", told.torque_side, SIDES),
     ):
         if value is not None and value not in allowed:
-            raise DataError(f"{flag} (={value}) must be one of {', '.join(allowed)}")
+            raise UsageError(f"{flag} (={value}) must be one of {', '.join(allowed)}")
     for flag, number, low, high in (
         ("--ratio", told.ratio, 1.0, 1000.0),
         ("--torque-constant", told.torque_constant_NmpA, 1e-6, 100.0),
     ):
         if number is not None and not low <= number <= high:
-            raise DataError(f"{flag} (={number:g}) must be in [{low:g}..{high:g}]")
+            raise UsageError(f"{flag} (={number:g}) must be in [{low:g}..{high:g}]")
     if told.torque_column and told.current_column:
-        raise DataError("--torque-column and --current-column: give one of them, the friction comes from one")
+        raise UsageError("--torque-column and --current-column: give one of them, the friction comes from one")
 
 
 def _sidecar(path: Path) -> dict[str, Any]:
@@ -153,7 +153,7 @@ def _sweep(table: TableFile, told: ForeignFormat) -> FrictionData:
     for flag, value in (("--velocity-unit", told.velocity_unit), ("--side", told.side), ("--torque-side",
                         told.torque_side), ("--torque-constant", told.torque_constant_NmpA)):  # fmt: skip
         if value is not None:
-            raise DataError(f"{flag} (={value}) is for tables with mapped columns: a sweep file tells its own units")
+            raise UsageError(f"{flag} (={value}) is for tables with mapped columns: a sweep file tells its own units")
     if not table.ended:
         # the sweep ends every line, so this one may have lost digits
         raise DataError(f"{table.path}: the last line has no end: the file is cut off", "remove the last line")
@@ -191,26 +191,26 @@ def _sweep(table: TableFile, told: ForeignFormat) -> FrictionData:
 
 def _foreign(table: TableFile, told: ForeignFormat) -> FrictionData:
     if not told.velocity_column:
-        raise DataError("--velocity-column is missing", f"the file has: {', '.join(table.columns)}")
+        raise UsageError("--velocity-column is missing", f"the file has: {', '.join(table.columns)}")
     if not (told.torque_column or told.current_column):
-        raise DataError("--torque-column or --current-column is missing", f"the file has: {', '.join(table.columns)}")
+        raise UsageError("--torque-column or --current-column is missing", f"the file has: {', '.join(table.columns)}")
     for flag, value in (("--velocity-unit", told.velocity_unit), ("--side", told.side), ("--ratio", told.ratio)):
         if value is None:
-            raise DataError(f"{flag} is missing: a table of numbers does not tell it", "nothing is guessed")
+            raise UsageError(f"{flag} is missing: a table of numbers does not tell it", "nothing is guessed")
     assert told.velocity_unit is not None
     assert told.ratio is not None
     scale = RADPS_PER_UNIT[told.velocity_unit] / (told.ratio if told.side == "motor" else 1.0)
     velocity = _numbers(table, told.velocity_column) * scale
     if told.current_column:
         if told.torque_constant_NmpA is None:
-            raise DataError("--torque-constant is missing: --current-column needs it [Nm/A at the motor]")
+            raise UsageError("--torque-constant is missing: --current-column needs it [Nm/A at the motor]")
         if told.torque_side == "joint":
-            raise DataError("--torque-side (=joint) is for --torque-column: a current gives torque at the motor")
+            raise UsageError("--torque-side (=joint) is for --torque-column: a current gives torque at the motor")
         torque = _numbers(table, told.current_column) * told.torque_constant_NmpA
     else:
         assert told.torque_column is not None
         if told.torque_side is None:
-            raise DataError("--torque-side is missing: a table of numbers does not tell it", "motor or joint")
+            raise UsageError("--torque-side is missing: a table of numbers does not tell it", "motor or joint")
         torque = _numbers(table, told.torque_column) / (told.ratio if told.torque_side == "joint" else 1.0)
     settled = np.ones(len(velocity), bool)
     return _data(table, velocity, torque, settled, told.ratio, told.torque_constant_NmpA)

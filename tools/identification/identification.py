@@ -3,163 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
 from drivers.errors import DataError
 from firmware_py.friction import DEGREE
 from tools.identification.friction_data import FrictionData
-from tools.identification.intervals import Uncertainty, uncertainty
-from tools.identification.models import FORMS, MIN_PER_STAGE, Branch, Form
+from tools.identification.intervals import uncertainty
+from tools.identification.models import FORMS, MIN_PER_STAGE, Form
+from tools.identification.options import Options
 from tools.identification.plausibility import JointLimits, check_branches, check_data
 from tools.identification.polish import polish
-from tools.identification.pso import SwarmResult, SwarmSettings, run_swarms
+from tools.identification.pso import SwarmResult, run_swarms
+from tools.identification.result import DIRECTIONS, Direction, Identification
 from tools.identification.selection import MAX_OUTLIERS, choose, find_outliers, held_out_rss, with_form
 from tools.identification.variable_projection import Fit, Problem, make_problem, project
 
-DIRECTIONS = (("positive", 1), ("negative", -1))
 _BAD_FIT = 0.15  # RMSE over mean friction
 _EXACT = 1e-6  # of the greatest friction: between errors below nothing measured decides
-SLOWEST_degps, FASTEST_degps = 1e-4, 6e4
-STATIC_MAX_Nm = 1e3  # at the motor
-MODELS = ("multi-stage", "stribeck", "coulomb-viscous", "auto")
-
-
-@dataclass(frozen=True)
-class Options:
-    """What to fit and how; speeds in joint rad/s."""
-
-    model: str = "multi-stage"
-    continuous: bool = False
-    search_knee: bool = False
-    knee_radps: float = 40.0 * DEGREE
-    ws_min_radps: float | None = None  # None: a third of the lowest speed
-    ws_max_radps: float = 20.0 * DEGREE
-    static_max_Nm: float | None = None  # None: 1.25 times the greatest friction near zero speed
-    outlier_threshold: float = 5.0
-    folds: int = 10
-    swarm: SwarmSettings = field(default_factory=SwarmSettings)
-
-    def check(self) -> None:
-        """Raise `DataError` for a value out of range."""
-        s = self.swarm
-        for name, value, low, high in (
-            ("--outlier-threshold", self.outlier_threshold, 0.0, 100.0), ("--folds", self.folds, 2, 100),
-            ("--particles", s.particles, 2, 100_000), ("--iterations", s.iterations, 1, 1_000_000),
-            ("--inertia", s.inertia, 0.0, 1.0), ("--cognitive", s.cognitive, 0.0, 4.0),
-            ("--social", s.social, 0.0, 4.0), ("--seed", s.seed, 0, 2**63 - 1), ("--stall", s.stall, 0, 1_000_000),
-        ):  # fmt: skip
-            if not low <= value <= high:
-                raise DataError(f"{name} (={value:g}) must be in [{low:g}..{high:g}]")
-        # as they are given on the command line: in deg/s
-        for name, value_radps in (("--knee", self.knee_radps), ("--ws-max", self.ws_max_radps)):
-            if not SLOWEST_degps <= value_radps / DEGREE <= FASTEST_degps:
-                allowed = f"[{SLOWEST_degps:g}..{FASTEST_degps:g}] deg/s"
-                raise DataError(f"{name} (={value_radps / DEGREE:g} deg/s) must be in {allowed}")
-        if self.ws_min_radps is not None and not 0.0 < self.ws_min_radps < self.ws_max_radps:
-            allowed = f"(0..{self.ws_max_radps / DEGREE:g}) deg/s"
-            raise DataError(f"--ws-min (={self.ws_min_radps / DEGREE:g} deg/s) must be in {allowed}")
-        if self.static_max_Nm is not None and not 0.0 < self.static_max_Nm <= STATIC_MAX_Nm:
-            raise DataError(f"--static-max (={self.static_max_Nm:g} Nm) must be in (0..{STATIC_MAX_Nm:g}]")
-        if self.model not in MODELS:
-            raise DataError(f"--model (={self.model}) must be one of {', '.join(MODELS)}")
-
-
-@dataclass(frozen=True)
-class Direction:
-    """The result of one direction; arrays over the used points are in `fit.problem`, mirrored."""
-
-    fit: Fit
-    swarm: SwarmResult | None
-    projected_rmse_Nm: float
-    source: str  # where the parameters come from: swarm and polish, or variable projection
-    uncertainty: Uncertainty
-    index: np.ndarray  # of the used points in the data
-    outliers: np.ndarray  # indices in the data
-
-
-@dataclass(frozen=True)
-class Identification:
-    """All that there is to tell; `errors_Nm` is measured minus model over the used points of both directions."""
-
-    data: FrictionData
-    options: Options
-    model: str
-    directions: dict[str, Direction]
-    rmse_by_model_Nm: dict[str, float]
-    held_out_by_model_Nm: dict[str, float]
-    notes: tuple[str, ...]
-    warnings: tuple[str, ...]
-
-    @property
-    def branches(self) -> dict[str, Branch]:
-        return {word: found.fit.branch() for word, found in self.directions.items()}
-
-    @property
-    def errors_Nm(self) -> np.ndarray:
-        parts = []
-        for word, sign in DIRECTIONS:
-            fit = self.directions[word].fit
-            parts.append(sign * (fit.problem.y_Nm - fit.torque_Nm(fit.problem.x)))
-        return np.concatenate(parts)
-
-    @property
-    def measured_Nm(self) -> np.ndarray:
-        return np.concatenate([sign * self.directions[word].fit.problem.y_Nm for word, sign in DIRECTIONS])
-
-    @property
-    def rmse_Nm(self) -> float:
-        return float(np.sqrt(np.mean(self.errors_Nm**2)))
-
-    @property
-    def projected_rmse_Nm(self) -> float:
-        """What variable projection reaches: the least possible."""
-        return _pooled({w: d.projected_rmse_Nm for w, d in self.directions.items()}, self.directions)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as numbers, texts, lists and dicts; parameters mirrored, joint rad/s and motor Nm."""
-        errors, swarm = self.errors_Nm, self.options.swarm
-        return {
-            "data": str(self.data.path), "data_sha256": self.data.sha256, "model": self.model,
-            "reduction_ratio": self.data.reduction_ratio, "points": len(errors),
-            "rmse_Nm": self.rmse_Nm, "max_error_Nm": float(np.max(np.abs(errors))),
-            "relative_rmse": float(np.sqrt(np.mean((errors / self.measured_Nm) ** 2))),
-            "relative_max_error": float(np.max(np.abs(errors / self.measured_Nm))),
-            "held_out_rmse_Nm": self.held_out_by_model_Nm[self.model],
-            "projected_rmse_Nm": self.projected_rmse_Nm,
-            "models": {
-                name: {"rmse_Nm": self.rmse_by_model_Nm[name], "held_out_rmse_Nm": self.held_out_by_model_Nm[name]}
-                for name in self.rmse_by_model_Nm
-            },
-            "swarm": {
-                "seed": swarm.seed, "particles": swarm.particles, "iterations": swarm.iterations,
-                "inertia": swarm.inertia, "cognitive": swarm.cognitive, "social": swarm.social,
-            },
-            "directions": {word: _direction_dict(found, self.data) for word, found in self.directions.items()},
-            "notes": list(self.notes), "warnings": list(self.warnings),
-        }  # fmt: skip
-
-
-def _direction_dict(found: Direction, data: FrictionData) -> dict[str, Any]:
-    model = found.fit.branch()
-    return {
-        "parameters": {
-            name: {"value": i.value, "low": i.low, "high": i.high, "weak": i.weak or None}
-            for name, i in found.uncertainty.intervals.items()
-        },
-        "knee_radps": model.knee_radps, "max_radps": model.max_radps, "rmse_Nm": found.fit.rmse_Nm,
-        "swarm_rmse_Nm": found.swarm.fit.rmse_Nm if found.swarm else None,
-        "projected_rmse_Nm": found.projected_rmse_Nm, "source": found.source,
-        "iterations": found.swarm.iterations if found.swarm else 0,
-        "outlier_lines": [int(n) for n in data.line[found.outliers]],
-    }  # fmt: skip
-
-
-def _pooled(rmse: dict[str, float], directions: dict[str, Any]) -> float:
-    count = {word: len(d.fit.problem.x) for word, d in directions.items()}
-    return float(np.sqrt(sum(rmse[w] ** 2 * count[w] for w in rmse) / sum(count.values())))
 
 
 def _refuse(data: FrictionData, problems: list[str]) -> None:
@@ -167,12 +29,19 @@ def _refuse(data: FrictionData, problems: list[str]) -> None:
         raise DataError(f"{data.path}: {'; '.join(problems)}")
 
 
+def _too_few(speeds: np.ndarray, knee: float) -> str:
+    """How many speeds lie on either side of the knee, where one side has too few of them; else nothing."""
+    low = int(np.count_nonzero(speeds <= knee))
+    high = len(speeds) - low
+    return f"{low} points up to it and {high} beyond" if min(low, high) < MIN_PER_STAGE else ""
+
+
 def _stage_check(data: FrictionData, problem: Problem, word: str) -> None:
-    low = int(np.count_nonzero(problem.x <= problem.knee))
-    if problem.form.cubic and min(low, len(problem.x) - low) < MIN_PER_STAGE:
+    few = _too_few(problem.x, problem.knee) if problem.form.cubic else ""
+    if few:
         raise DataError(
-            f"{data.path}: {low} points up to the knee (={problem.knee * problem.top_radps / DEGREE:.4g} deg/s) and "
-            f"{len(problem.x) - low} beyond at {word} velocity: at least {MIN_PER_STAGE} are needed on both sides",
+            f"{data.path}: knee (={problem.knee * problem.top_radps / DEGREE:.4g} deg/s) at {word} velocity: {few}; at "
+            f"least {MIN_PER_STAGE} are needed on both sides",
             "set --knee, or --search-knee, or --model auto; or the unit or side of the velocity is wrong",
         )
 
@@ -185,11 +54,10 @@ def _first_form(data: FrictionData, options: Options, notes: list[str]) -> Form:
     if options.model != "auto" or options.search_knee:
         return form
     for word, sign in DIRECTIONS:
-        speeds = np.abs(data.velocity_radps[data.direction(sign)])
-        low = int(np.count_nonzero(speeds <= options.knee_radps))
-        if min(low, len(speeds) - low) < MIN_PER_STAGE:
+        few = _too_few(np.abs(data.velocity_radps[data.direction(sign)]), options.knee_radps)
+        if few:
             notes.append(
-                f"{low} points up to the knee and {len(speeds) - low} beyond at {word} velocity: too few for the "
+                f"knee (={options.knee_radps / DEGREE:.4g} deg/s) at {word} velocity: {few}, too few for the "
                 f"{form.name} model, which was left out"
             )
             return FORMS["stribeck"]

@@ -8,9 +8,9 @@ from rich.table import Table
 from rich.text import Text
 
 from firmware_py.friction import DEGREE
-from tools.identification.identification import DIRECTIONS, Identification
 from tools.identification.intervals import NAMES
 from tools.identification.models import FORMS
+from tools.identification.result import DIRECTIONS, Identification
 
 _UNITS = {
     "tc": "Nm", "ts": "Nm", "ws": "deg/s", "tv": "Nm s/deg",

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.errors import DataError
+from drivers.errors import DataError, UsageError
 
 DELIMITERS = {"auto": "", "comma": ",", "semicolon": ";", "tab": "\t", "space": " ", ",": ",", ";": ";", "\t": "\t"}
 _MAX_BYTES = 64 * 2**20
@@ -81,7 +81,7 @@ def _text(path: Path, content: bytes) -> str:
 
 def _delimiter(path: Path, header: str, wanted: str) -> str:
     if wanted not in DELIMITERS:
-        raise DataError(f"--delimiter (={wanted}) must be one of auto, comma, semicolon, tab, space")
+        raise UsageError(f"--delimiter (={wanted}) must be one of auto, comma, semicolon, tab, space")
     if wanted != "auto":
         return DELIMITERS[wanted]
     for candidate in (";", "\t", ","):  # a comma may be a decimal one, so it comes last

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
 
-from drivers.errors import DataError
+from drivers.errors import DataError, UsageError
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
@@ -37,7 +37,7 @@ def scope_order(title: str, host: str, port: int, **more: Any) -> ScopeOrder:
     if find_spec("nicegui") is None:
         raise DataError("the scope needs the package nicegui, which is not installed", "install the extra `scope`")
     if not 1 <= port <= 65535:
-        raise DataError(f"--port (={port}) must be in [1..65535]")
+        raise UsageError(f"--port (={port}) must be in [1..65535]")
     try:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

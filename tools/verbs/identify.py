@@ -18,9 +18,11 @@ from tools.drawing import png
 from tools.identification.figures import convergence_figure, fit_figure
 from tools.identification.friction_data import ForeignFormat, read_friction_data
 from tools.identification.friction_section import replace_file, section_values, snippet, write_into
-from tools.identification.identification import Identification, Options, identify_friction
+from tools.identification.identification import identify_friction
+from tools.identification.options import Options
 from tools.identification.plausibility import JointLimits
 from tools.identification.report import error_table, identification_report, model_table, parameter_table
+from tools.identification.result import Identification
 from tools.output import Output
 from tools.reporting.figure import svg_figure
 from tools.reporting.page import Block, Details, Section, check_target

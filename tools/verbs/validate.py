@@ -14,10 +14,10 @@ from tools.drawing import png
 from tools.identification.figures import fit_figure
 from tools.identification.friction_data import ForeignFormat, FrictionData, read_friction_data
 from tools.identification.friction_section import replace_file
-from tools.identification.identification import DIRECTIONS
 from tools.identification.models import Branch
 from tools.identification.plausibility import check_data
 from tools.identification.report import error_table
+from tools.identification.result import DIRECTIONS
 from tools.output import Output
 from tools.verbs.identify import joint_limits
 
