@@ -12,6 +12,8 @@ from drivers.canopen.cia402 import (
     control_word,
     decode_state,
     drive_state,
+    state_of_word,
+    state_text,
 )
 from firmware_py.states import DriveRequest, DriveState
 
@@ -33,6 +35,12 @@ def test_every_statusword_decodes_as_the_table_says() -> None:
         matching = [state for state, (mask, value) in TABLE.items() if word & mask == value]
         assert len(matching) <= 1
         assert decode_state(word) == (matching[0] if matching else State.UNDEFINED), hex(word)
+
+
+def test_the_plain_function_says_the_same_in_words() -> None:
+    assert all(state_of_word(word) is State(decode_state(word)) for word in range(0x80))
+    assert state_text(0x0237) == "operation enabled"
+    assert state_text(0x0250) == "switch on disabled"
 
 
 def test_every_state_is_reached() -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from typing import Any
 
+import can
 import numpy as np
 import pytest
 
@@ -18,7 +20,8 @@ from hil.bus.frames import FrameQueue
 from hil.lockstep import RECEIVED_SLOT, RPDO_SLOT, run_lockstep
 from tools.configuration.load import load_config, shipped_config
 from tools.configuration.records import axis_constants
-from tools.simulation.lockstep import LockstepJoint
+from tools.simulation.lockstep import DirectBus, LockstepJoint
+from tools.simulation.virtual_joint import new_device
 
 PERIOD_ns = 1_000_000
 
@@ -184,3 +187,25 @@ def test_what_the_drive_says_when_an_rpdo_comes_is_heard(lockstep: Lockstep) -> 
     lockstep.start_ns += 2 * PERIOD_ns
     lockstep.run(50)
     assert lockstep.sample[0].drive_error == 0
+
+
+def test_the_direct_bus_waits_for_a_listener_that_is_slow(virtual_config: Any) -> None:
+    """On a busy computer the proof of the watchdog was over before its answer was heard."""
+    bus = DirectBus(new_device(virtual_config))
+    heard: list[int] = []
+
+    def listen(message: can.Message) -> None:
+        time.sleep(0.05)
+        heard.append(message.arbitration_id)
+
+    notifier = can.Notifier(bus, [listen], timeout=0.1)
+    try:
+        bus.sleep(1.0)
+        assert heard[0] == 0x701  # boot-up
+        before = len(heard)
+        bus.send(can.Message(arbitration_id=0x601, data=b"\x40\x41\x60\0\0\0\0\0", is_extended_id=False))
+        bus.sleep(0.0)
+        assert heard[before:] == [0x581]
+    finally:
+        notifier.stop()
+        bus.shutdown()

@@ -7,7 +7,7 @@ is handled at once.  Each run starts from a copy of the device as commissioning 
 from __future__ import annotations
 
 import queue
-import time
+import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,38 +33,55 @@ from tools.configuration.records import axis_constants, trajectory_table
 from tools.simulation.virtual_joint import new_device
 
 _COMMISSIONING_STEP_NS = 1000  # the device's clock goes on a little with every frame
-_LISTENER_S = 0.0005
+_LISTENER_S = 5.0  # at most: it may have gone
 _START_GRID_NS = 5_000_000_000
 NO_STOP = -1
 
 
 class DirectBus(can.BusABC):
-    """A python-can bus whose only other participant is a virtual device in the same process."""
+    """A python-can bus whose only other participant is a virtual device in the same process.
+
+    One thread listens, that of python-can's notifier; it has dealt with a frame when it asks for the next one.
+    """
 
     def __init__(self, device: Cia402Device) -> None:
         super().__init__(channel="direct")
         self._device = device
         self._answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._said = self._taken = self._heard = 0  # frames: of the device, taken by the listener, dealt with
+        self._listener: int | None = None
+        self._all_heard = threading.Condition()
         self.now_ns = 1
+
+    def _say(self, frames: list[bytes]) -> None:
+        self._said += len(frames)
+        for frame in frames:
+            self._answers.put(frame)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """The device handles the frame before this returns."""
         self.now_ns += _COMMISSIONING_STEP_NS
-        for frame in self._device.handle(encode(msg), self.now_ns):
-            self._answers.put(frame)
+        self._say(self._device.handle(encode(msg), self.now_ns))
 
     def sleep(self, seconds: float) -> None:
-        """The device's time goes on; the thread that listens to the bus gets a chance to take what it sent."""
+        """The device's time goes on; returns when what it has said is heard, however busy the computer is."""
         self.now_ns += round(seconds * 1e9)
-        for frame in self._device.advance(self.now_ns):
-            self._answers.put(frame)
-        time.sleep(_LISTENER_S)
+        self._say(self._device.advance(self.now_ns))
+        if self._listener != threading.get_ident():
+            with self._all_heard:
+                self._all_heard.wait_for(lambda: self._heard == self._said, _LISTENER_S)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        self._listener = threading.get_ident()
+        with self._all_heard:
+            self._heard = self._taken
+            self._all_heard.notify_all()
         try:
-            return decode(self._answers.get(timeout=timeout), self.now_ns * 1e-9, self.channel_info), False
+            frame = self._answers.get(timeout=timeout)
         except queue.Empty:
             return None, False
+        self._taken += 1
+        return decode(frame, self.now_ns * 1e-9, self.channel_info), False
 
 
 @dataclass(frozen=True)
