@@ -71,7 +71,10 @@ def identify_friction(
     limits: JointLimits | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Identification:
-    """The whole computation; raises `DataError` where the data or the result are not believable."""
+    """The whole computation.
+
+    Raises `UsageError` for options out of range, `DataError` where the data or the result are not believable.
+    """
     options.check()
     before = check_data(data, limits)
     _refuse(data, before.problems)

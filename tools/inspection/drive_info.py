@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from drivers.canopen.cia402 import state_text
 from tools.inspection import drive_words
 from tools.inspection.objects import Place
 from tools.inspection.pdo_maps import PdoMap, PdoMaps
@@ -56,7 +57,7 @@ def state(reader: SdoReader) -> dict[str, Any]:
     word, modes = reader.value(0x6041), reader.value(0x6502)
     return {
         "status_word": None if word is None else f"{word:04X}h",
-        "drive_state": None if word is None else drive_words.drive_state(word),
+        "drive_state": None if word is None else state_text(word),
         "status_bits": [] if word is None else drive_words.status_bits(word),
         "mode_selected": reader.text(0x6060),
         "mode_shown": reader.text(0x6061),

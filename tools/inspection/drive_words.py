@@ -37,11 +37,6 @@ DEVICE_PROFILES = {
 }  # fmt: skip
 
 
-def drive_state(status_word: int) -> str:
-    """`operation enabled` and so on."""
-    return state_text(status_word)
-
-
 def status_bits(status_word: int) -> list[str]:
     """The bits of a statusword that are set beside the state."""
     return [name for bit, name in _STATUS_BITS.items() if status_word >> bit & 1]
@@ -49,7 +44,7 @@ def status_bits(status_word: int) -> list[str]:
 
 def status_text(status_word: int) -> str:
     """`0237h operation enabled`."""
-    return f"{status_word & 0xFFFF:04X}h {drive_state(status_word)}"
+    return f"{status_word & 0xFFFF:04X}h {state_text(status_word)}"
 
 
 def control_text(word: int) -> str:

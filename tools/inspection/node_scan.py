@@ -18,6 +18,7 @@ from typing import Any
 import can
 import canopen
 
+from drivers.canopen.cia402 import state_text
 from tools.inspection import drive_words
 from tools.inspection.objects import Objects
 from tools.inspection.sdo_reading import SdoReader
@@ -116,5 +117,5 @@ def describe(network: canopen.Network, node: int, answers: bool, nmt: int | None
     row["serial_number"] = reader.value(0x1018, 4)
     row["name"] = reader.value(0x1008)
     word = reader.value(0x6041)
-    row["drive_state"] = None if word is None else drive_words.drive_state(word)
+    row["drive_state"] = None if word is None else state_text(word)
     return row

@@ -33,7 +33,10 @@ class ScopeOrder:
 
 
 def scope_order(title: str, host: str, port: int, **more: Any) -> ScopeOrder:
-    """A checked order; beyond this computer a token is made.  `DataError` if the scope cannot be served."""
+    """A checked order; beyond this computer a token is made.
+
+    Raises `UsageError` for a wrong port, `DataError` if the scope cannot be served.
+    """
     if find_spec("nicegui") is None:
         raise DataError("the scope needs the package nicegui, which is not installed", "install the extra `scope`")
     if not 1 <= port <= 65535:

@@ -9,8 +9,8 @@ from typing import Any
 
 from rich.table import Table
 
+from drivers.canopen.cia402 import state_text
 from drivers.errors import BusError, ConfigurationError, DataError, DeviceError
-from tools.inspection import drive_words
 from tools.inspection.node_scan import Ear
 from tools.inspection.objects import Objects, Place
 from tools.inspection.parameter_file import load_parameters, toml_text, write_dcf
@@ -156,7 +156,7 @@ def _refuse_controller(ear: Ear) -> None:
 
 def _require_off(reader: SdoReader) -> None:
     word = reader.value(0x6041)
-    state = None if word is None else drive_words.drive_state(word)
+    state = None if word is None else state_text(word)
     if state in _MOVING:
         raise DeviceError(
             f"node {reader.node} is in {state}: nothing is written into a drive under power", "jointctl stop CONFIG"
