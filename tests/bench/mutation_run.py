@@ -26,11 +26,11 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 TESTS = {
-    "firmware_py/safety.py": ("test_safety", "test_axis"),
-    "firmware_py/sequence.py": ("test_sequence", "test_axis"),
-    "firmware_py/surroundings.py": ("test_surroundings_edges",),
-    "firmware_py/frozen_reading.py": ("test_surroundings_edges",),
-    "drivers/canopen/cia402.py": ("test_cia402",),
+    "firmware_py/safety.py": ("firmware_py/axis/test_safety", "firmware_py/axis/test_axis"),
+    "firmware_py/sequence.py": ("firmware_py/axis/test_sequence", "firmware_py/axis/test_axis"),
+    "firmware_py/surroundings.py": ("firmware_py/axis/test_surroundings_edges",),
+    "firmware_py/frozen_reading.py": ("firmware_py/axis/test_surroundings_edges",),
+    "drivers/canopen/cia402.py": ("drivers/canopen/test_cia402",),
 }
 LONGEST_S = 120.0  # of processor time: on a busy computer a sound mutant must not count as one that hangs
 COMPARISONS: dict[type, tuple[type, ...]] = {

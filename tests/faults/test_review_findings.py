@@ -22,8 +22,8 @@ from firmware_py.schema import new
 from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, StopRequest
 from hil.canopen.device_core import power_on
 from hil.canopen.device_records import NmtState
-from tests.unit.test_elmo_cyclic import Talk
-from tests.unit.test_realtime import ANSWER_ns, Loop
+from tests.unit.drivers.elmo.test_elmo_cyclic import Talk
+from tests.unit.firmware_py.test_realtime import ANSWER_ns, Loop
 from tools.running.supervisor import Supervisor
 
 ENABLED, DISABLED = 0x0637, 0x0650

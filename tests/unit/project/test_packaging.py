@@ -5,15 +5,14 @@ from __future__ import annotations
 import fnmatch
 import importlib.metadata
 import tomllib
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from drivers.errors import ConfigurationError
+from tests.places import ROOT
 from tools.configuration.load import SHIPPED_FOLDER, load_config
 
-ROOT = Path(__file__).resolve().parents[2]
 TOP = ("firmware_py", "drivers", "hil", "tools", "configs")
 NOT_SHIPPED = ("__pycache__",)
 

@@ -15,8 +15,8 @@ from hil.canopen.device_records import Device
 from hil.canopen.object_dictionary import load_entries
 from hil.canopen.pdo_core import read_object, write_object
 from hil.plant.joint import plant
+from tests.places import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 EDS = ROOT / "configs" / "virtual_joint.eds"
 
 

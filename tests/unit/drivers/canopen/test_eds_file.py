@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from drivers.canopen.eds_file import EdsFile, read_eds
 from drivers.canopen.eds_text import decoded, number_of, parse_sections
 from drivers.errors import ConfigurationError
+from tests.places import EDS
 
-SHIPPED = Path(__file__).resolve().parents[2] / "configs" / "virtual_joint.eds"
-TEXT = SHIPPED.read_text()
+TEXT = EDS.read_text()
 
 
 def eds_of(tmp_path: Path, text: str | bytes) -> EdsFile:
@@ -35,7 +35,7 @@ def edited(section: str, line: str, replacement: str) -> str:
 def test_a_good_file_gets_no_remark_and_is_what_the_library_reads() -> None:
     import canopen
 
-    eds, library = read_eds(SHIPPED, 1), canopen.import_od(str(SHIPPED), 1)
+    eds, library = read_eds(EDS, 1), canopen.import_od(str(EDS), 1)
     assert eds.all_remarks() == []
     assert not eds.unusable
     for index in (i for i in library if i >= 0x1000):

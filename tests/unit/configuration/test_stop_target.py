@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from drivers.errors import ConfigurationError
+from tests.places import CONFIGS
 from tools.configuration.load import load_config
 from tools.configuration.stop_target import CanTarget, GivenTarget, SerialTarget, stop_target
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 NOTHING: dict[str, str] = {}
 
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
-NAMED = re.compile(r"`(\w+/\w+\.py)::(\w+)`")
+from tests.places import ROOT
+
+NAMED = re.compile(r"`((?:\w+/)+\w+\.py)::(\w+)`")
 
 
 def test_every_test_that_the_document_names_exists() -> None:

@@ -16,12 +16,12 @@ from firmware_py.records import LogRecord
 from firmware_py.schema import dtype_of
 from firmware_py.trajectory_table import table_from_csv
 from hil.canopen.object_dictionary import ObjectDictionary
+from tests.places import CONFIGS
 from tools.configuration.config import Config
 from tools.configuration.load import load_config
 from tools.identification.friction_data import read_friction_data
 from tools.recording.run_log import RunLogWriter, read_run_log
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 TOML = (CONFIGS / "virtual.toml").read_text()
 EDS = (CONFIGS / "virtual_joint.eds").read_text()
 quick = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -15,8 +15,8 @@ import pytest
 
 from firmware_py import kernel as kernel_module
 from firmware_py.kernel import kernel, source_hash
+from tests.places import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("firmware_py", "drivers", "hil", "tools")
 
 
@@ -127,9 +127,17 @@ def test_old_caches_are_removed_but_not_those_in_use(tmp_path: Path) -> None:
 # --- without the JIT -------------------------------------------------------------------------------------------
 
 PLAIN = (
-    "test_safety", "test_sequence", "test_friction", "test_lugre", "test_rbfnn", "test_velocity", "test_cia402",
-    "test_live_change", "test_surroundings_edges", "test_sweep_velocity_command",
-)  # fmt: skip
+    "firmware_py/axis/test_safety",
+    "firmware_py/axis/test_sequence",
+    "firmware_py/test_friction",
+    "firmware_py/test_lugre",
+    "firmware_py/test_rbfnn",
+    "firmware_py/test_velocity",
+    "drivers/canopen/test_cia402",
+    "firmware_py/axis/test_live_change",
+    "firmware_py/axis/test_surroundings_edges",
+    "firmware_py/axis/test_sweep_velocity_command",
+)
 FULLY_COVERED = (
     "drivers/canopen/cia402.py",
     *(

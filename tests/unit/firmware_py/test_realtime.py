@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,8 +21,8 @@ from firmware_py.records import AxisState, Command, LogRecord, Sample
 from firmware_py.schema import dtype_of, new
 from firmware_py.sequence import reset_axis
 from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, FeedForward
+from tests.places import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 PERIOD_ns = 1_000_000
 # words of the stub drive's own memory
 CYCLE, BUSY_CYCLE, BUSY_ns, STOP_CYCLE, STOP, REQUEST, SENT, HEARD_AT_ns, LATEST_ns = range(9)
@@ -239,7 +238,7 @@ import socket, sys
 import numpy as np
 from numba.core.runtime import rtsys
 from tests.conftest import small_axis_constants
-from tests.unit import test_realtime as stub
+from tests.unit.firmware_py import test_realtime as stub
 
 loop = stub.Loop(small_axis_constants(), period_ns=10_000)
 sequence = loop.constants[0].sequence

@@ -6,7 +6,6 @@ from __future__ import annotations
 import binascii
 import struct
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import canopen
@@ -15,8 +14,8 @@ import pytest
 from hil.canopen.device import Cia402Device, DeviceSettings
 from hil.canopen.sdo_server import TIMEOUT_NS, SdoServer
 from hil.plant.joint import plant
+from tests.places import EDS
 
-EDS = Path(__file__).resolve().parents[2] / "configs" / "virtual_joint.eds"
 NODE = 5
 NAME = (0x2100, 0)
 TEXT = bytes(range(32, 127)) * 2  # 190 bytes, 28 segments

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from firmware_py.kernel import TOOLS_WITH_KERNELS
+from tests.places import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 TOP_LEVEL = ("firmware_py", "drivers", "hil", "tools", "configs")
 LONGEST_MODULE = 300
 MODULES = sorted(path for package in TOP_LEVEL for path in (ROOT / package).rglob("*.py"))

@@ -17,13 +17,13 @@ from drivers.canopen.switch_off import stop_node
 from drivers.drive import UNTOUCHED, CommissioningReport, DriveIdentity, is_safe
 from drivers.errors import BusError, DeviceError
 from hil.canopen.device_records import PowerState
+from tests.places import CONFIGS
 from tools.output import Output
 from tools.running import supervisor as supervisor_module
 from tools.running.result.drive_end import require_off, words
 from tools.verbs import run as run_module
 from tools.verbs import stop as stop_module
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 ENABLED, SWITCHED_ON = 0x27, 0x23
 NMT_STOP = (0x000, b"\x02\x01")
 

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.places import ROOT
+
 TOP = ("firmware_py", "drivers", "hil", "tools", "configs")
 BUILD = "import sys, setuptools.build_meta as b; b.build_wheel(sys.argv[1])"
 

@@ -19,6 +19,7 @@ from firmware_py.records import LogRecord
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, Fault
 from hil.faults.kinds import FaultConstants, FaultKind
+from tests.places import CONFIGS
 from tools.configuration.config import Config
 from tools.configuration.load import load_config
 from tools.inspection.drive_scale import judged
@@ -30,7 +31,6 @@ from tools.running.events.fault_text import fault_text
 from tools.simulation.lockstep import LockstepJoint
 from tools.verbs import doctor_motion as doctor_motion_module
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 SECOND = {
     "source": "node", "node": 2, "counts_per_turn": 524288, "direction": 1, "zero_counts": 100_000,
     "disagreement_max_rad": 0.005,

@@ -11,6 +11,7 @@ import pytest
 
 from drivers.drive import CommissioningReport, DriveIdentity
 from firmware_py.states import AxisPhase, DriveState, Fault
+from tests.places import CONFIGS
 from tools.configuration.config import Config
 from tools.configuration.load import load_config
 from tools.configuration.records import MOVED_COUNTS, axis_constants
@@ -19,8 +20,6 @@ from tools.simulation.lockstep import LockstepJoint
 from tools.sweeping.carry_out import middle_rad, sweep_constants
 from tools.sweeping.grid import both_directions, ordered_points
 from tools.sweeping.plan import PlanSettings, plan_motion, shifted
-
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 
 def config_with(folder: Path, **changes: str) -> Config:

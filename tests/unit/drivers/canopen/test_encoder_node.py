@@ -23,6 +23,7 @@ from firmware_py.records import ENCODER_RESTARTED, Command, Sample
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, Fault
 from hil.faults.kinds import FaultConstants, FaultKind
+from tests.places import CONFIGS
 from tools.configuration.config import Config
 from tools.configuration.drive_settings import canopen_settings, cyclic_bus_load
 from tools.configuration.load import load_config
@@ -31,7 +32,6 @@ from tools.running.open_drive import drive_fault_text
 from tools.simulation.lockstep import LockstepJoint
 from tools.simulation.virtual_joint import new_device
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 NODE = {
     "source": "node", "node": 2, "counts_per_turn": 524288, "direction": 1, "zero_counts": 100_000,
     "disagreement_max_rad": 0.005,

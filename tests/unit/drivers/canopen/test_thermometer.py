@@ -19,6 +19,7 @@ from drivers.drive import Reading
 from drivers.errors import ConfigurationError, DeviceError
 from firmware_py.records import LogRecord
 from firmware_py.schema import dtype_of
+from tests.places import CONFIGS
 from tools.configuration.drive_settings import temperature_object
 from tools.configuration.load import load_config
 from tools.recording.log_export import csv_bytes, npz_bytes, table_columns
@@ -27,7 +28,6 @@ from tools.recording.run_summary import summarise
 from tools.reporting.temperature_figure import temperature_figure
 from tools.running.watch.temperature_watch import STALE_S, TemperatureWatch
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 INDEX, NODE = 0x2103, 5
 S = 1_000_000_000
 INTEGER16, UNSIGNED8, REAL32, VISIBLE_STRING, INTEGER64 = 3, 5, 8, 9, 21

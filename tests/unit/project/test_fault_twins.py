@@ -10,18 +10,23 @@ from __future__ import annotations
 import ast
 import re
 from functools import cache
-from pathlib import Path
 
 import pytest
 
 from firmware_py.states import Fault
+from tests.places import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
-AXIS, SEQUENCE, SAFETY = "unit/test_axis.py::", "unit/test_sequence.py::", "unit/test_safety.py::"
-EDGES, SURROUNDINGS = "unit/test_surroundings_edges.py::", "unit/test_surroundings.py::"
+AXIS = "unit/firmware_py/axis/test_axis.py::"
+SEQUENCE = "unit/firmware_py/axis/test_sequence.py::"
+SAFETY = "unit/firmware_py/axis/test_safety.py::"
+EDGES = "unit/firmware_py/axis/test_surroundings_edges.py::"
+SURROUNDINGS = "unit/firmware_py/axis/test_surroundings.py::"
+CYCLIC = "unit/drivers/canopen/test_cyclic.py::"
+ELMO_CYCLIC = "unit/drivers/elmo/test_elmo_cyclic.py::"
+HANGS = "unit/running/test_hang_limits.py::"
 EDGE = EDGES + "test_each_limit_at_its_edge_in_each_phase | "
 DENSE = AXIS + "test_velocity_and_following_error_are_dense_at_their_limits | "
-PLACE = re.compile(r"(\w+/\w+\.py)::(\w+)(?: \| (.+))?")
+PLACE = re.compile(r"((?:\w+/)+\w+\.py)::(\w+)(?: \| (.+))?")
 
 FAULTS: dict[Fault, tuple[str, str]] = {  # what trips, and its twin
     Fault.POSITION_LIMIT: (
@@ -112,16 +117,16 @@ FAULTS: dict[Fault, tuple[str, str]] = {  # what trips, and its twin
 # (watcher, watches) of the tables of docs/safety.md; for those that watch for a member of `Fault`, the fault
 CAN: dict[tuple[str, str], tuple[str, str] | tuple[Fault, ...]] = {
     ("drive", "the loop"): (
-        "unit/test_hil_device.py::test_heartbeat_loss_reacts_as_6007_says | rig.run(1)",
-        "unit/test_hil_device.py::test_heartbeat_that_keeps_coming_changes_nothing | rig.run(49)",
+        "unit/hil/canopen/test_hil_device.py::test_heartbeat_loss_reacts_as_6007_says | rig.run(1)",
+        "unit/hil/canopen/test_hil_device.py::test_heartbeat_that_keeps_coming_changes_nothing | rig.run(49)",
     ),
     ("driver", "that watchdog"): (
-        "unit/test_watchdog_proof.py::test_a_watchdog_that_does_nothing_is_refused",
-        "unit/test_watchdog_proof.py::test_a_working_watchdog_is_seen",
+        "unit/drivers/canopen/test_watchdog_proof.py::test_a_watchdog_that_does_nothing_is_refused",
+        "unit/drivers/canopen/test_watchdog_proof.py::test_a_working_watchdog_is_seen",
     ),
     ("driver", "that the drive says how it stops"): (
-        "unit/test_connection_loss.py::test_a_drive_without_any_reaction_to_a_lost_connection_is_refused",
-        "unit/test_connection_loss.py::test_the_twins_that_say_how_they_stop",
+        "unit/drivers/canopen/test_connection_loss.py::test_a_drive_without_any_reaction_to_a_lost_connection_is_refused",
+        "unit/drivers/canopen/test_connection_loss.py::test_the_twins_that_say_how_they_stop",
     ),
     ("drive", "the loop's RPDOs"): (
         "faults/test_fault_regressions.py::test_a_joint_that_holds_while_its_rpdos_stay_away_is_stopped_by_the_deadline"
@@ -130,8 +135,8 @@ CAN: dict[tuple[str, str], tuple[str, str] | tuple[Fault, ...]] = {
         "_of_the_drive | (0.098, False)",
     ),
     ("loop", "that it is heard"): (
-        "unit/test_cyclic.py::test_a_drive_that_stays_enabled_loses_the_heartbeat | (UNHEEDED_MAX_CYCLES + 1, 1)",
-        "unit/test_cyclic.py::test_a_drive_that_stays_enabled_loses_the_heartbeat | (UNHEEDED_MAX_CYCLES, 2)",
+        CYCLIC + "test_a_drive_that_stays_enabled_loses_the_heartbeat | (UNHEEDED_MAX_CYCLES + 1, 1)",
+        CYCLIC + "test_a_drive_that_stays_enabled_loses_the_heartbeat | (UNHEEDED_MAX_CYCLES, 2)",
     ),
     ("loop", "the drive"): (Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED, Fault.DRIVE_RESTARTED),
     ("loop", "the drive's communication"): (Fault.DRIVE_SILENT,),
@@ -154,8 +159,8 @@ CAN: dict[tuple[str, str], tuple[str, str] | tuple[Fault, ...]] = {
     ("loop", "the computer"): (Fault.SUSPENDED,),
     ("loop", "the supervisor"): (Fault.SUPERVISOR_LOST,),
     ("supervisor", "the loop process"): (
-        "unit/test_hang_limits.py::test_the_supervisor_ends_a_loop_that_hangs_and_no_other | (MICROSECOND_ns, True)",
-        "unit/test_hang_limits.py::test_the_supervisor_ends_a_loop_that_hangs_and_no_other | (0, False)",
+        HANGS + "test_the_supervisor_ends_a_loop_that_hangs_and_no_other | (MICROSECOND_ns, True)",
+        HANGS + "test_the_supervisor_ends_a_loop_that_hangs_and_no_other | (0, False)",
     ),
     ("supervisor", "the user"): (
         "hil/test_run_cli.py::test_one_stop_signal_while_tracking_ramps_down",
@@ -168,8 +173,8 @@ CAN: dict[tuple[str, str], tuple[str, str] | tuple[Fault, ...]] = {
 }  # fmt: skip
 SERIAL: dict[tuple[str, str], tuple[str, str] | tuple[Fault, ...]] = {
     ("loop", "that positions come"): (
-        "unit/test_elmo_cyclic.py::test_the_dead_man_commands_a_stop_and_its_twin_does_not | (1, b\"JV=0\\r\")",
-        "unit/test_elmo_cyclic.py::test_the_dead_man_commands_a_stop_and_its_twin_does_not | (0, b\"JV=41722\\r\")",
+        ELMO_CYCLIC + "test_the_dead_man_commands_a_stop_and_its_twin_does_not | (1, b\"JV=0\\r\")",
+        ELMO_CYCLIC + "test_the_dead_man_commands_a_stop_and_its_twin_does_not | (0, b\"JV=41722\\r\")",
     ),
     ("loop", "its own end, however it comes about"): (
         "hil/test_elmo_run.py::test_a_killed_supervisor_is_seen_by_the_loop",
@@ -177,16 +182,16 @@ SERIAL: dict[tuple[str, str], tuple[str, str] | tuple[Fault, ...]] = {
     ),
     ("supervisor", "the loop process"): (
         "hil/test_elmo_run.py::test_a_killed_loop_is_switched_off_by_its_supervisor",
-        "unit/test_hang_limits.py::test_the_supervisor_ends_a_loop_that_hangs_and_no_other | (0, False)",
+        HANGS + "test_the_supervisor_ends_a_loop_that_hangs_and_no_other | (0, False)",
     ),
     ("guard", "loop and supervisor"): (
         "hil/test_line_guard.py::test_loop_and_supervisor_killed_the_guard_switches_off",
         "hil/test_line_guard.py::test_a_run_that_ends_well_leaves_no_guard_behind",
     ),
     ("guard", "a loop that hangs"): (
-        "unit/test_hang_limits.py::test_the_guard_switches_off_behind_a_loop_that_hangs_and_behind_no_other"
+        HANGS + "test_the_guard_switches_off_behind_a_loop_that_hangs_and_behind_no_other"
         " | (MICROSECOND_ns, True)",
-        "unit/test_hang_limits.py::test_the_guard_switches_off_behind_a_loop_that_hangs_and_behind_no_other"
+        HANGS + "test_the_guard_switches_off_behind_a_loop_that_hangs_and_behind_no_other"
         " | (-MICROSECOND_ns, False)",
     ),
     ("guard", "a drive that was not reached at the end of a run"): (
@@ -194,14 +199,14 @@ SERIAL: dict[tuple[str, str], tuple[str, str] | tuple[Fault, ...]] = {
         "hil/test_line_guard.py::test_a_run_that_ends_well_leaves_no_guard_behind",
     ),
     ("user", "everything"): (
-        "unit/test_hang_limits.py::test_a_run_that_does_not_obey_a_stop_is_ended_by_force_and_not_before"
+        HANGS + "test_a_run_that_does_not_obey_a_stop_is_ended_by_force_and_not_before"
         " | (OBEY_S + 0.01, True, True)",
-        "unit/test_hang_limits.py::test_a_run_that_does_not_obey_a_stop_is_ended_by_force_and_not_before"
+        HANGS + "test_a_run_that_does_not_obey_a_stop_is_ended_by_force_and_not_before"
         " | (OBEY_S - 0.01, True, False)",
     ),
     ("drive", "current, speed, position"): (
-        "unit/test_elmo_device.py::test_leaving_the_position_limits_switches_off | (9_999, MF_POSITION_LIMIT)",
-        "unit/test_elmo_device.py::test_leaving_the_position_limits_switches_off | (10_001, 0)",
+        "unit/hil/test_elmo_device.py::test_leaving_the_position_limits_switches_off | (9_999, MF_POSITION_LIMIT)",
+        "unit/hil/test_elmo_device.py::test_leaving_the_position_limits_switches_off | (10_001, 0)",
     ),
 }  # fmt: skip
 

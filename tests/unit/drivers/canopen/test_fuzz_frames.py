@@ -18,6 +18,7 @@ from drivers.canopen.scaling import new_port
 from firmware_py.records import Command, Sample
 from firmware_py.schema import new
 from firmware_py.states import DriveRequest, DriveState
+from tests.places import CONFIGS
 from tools.configuration.load import load_config
 from tools.simulation.virtual_joint import new_device
 
@@ -81,9 +82,8 @@ def test_a_tpdo_is_decoded_or_counted_as_malformed(low: bytes, length: int, sett
 
 @pytest.fixture(scope="module")
 def device() -> Any:
-    from pathlib import Path
 
-    return new_device(load_config(Path(__file__).resolve().parents[2] / "configs" / "virtual.toml"))
+    return new_device(load_config(CONFIGS / "virtual.toml"))
 
 
 @quick

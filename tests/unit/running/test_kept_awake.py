@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.places import ROOT
 from tools.configuration.config import Config
 from tools.configuration.load import load_config, shipped_config
 from tools.output import Output
@@ -88,12 +89,11 @@ def test_without_the_lock_the_run_goes_on_and_the_user_is_told(
 def test_a_run_that_is_killed_releases_it(stand_in: Path) -> None:
     install(stand_in, GRANTS)
     code = (
-        "import sys, time\nfrom tests.unit.test_kept_awake import Output, kept_awake, serial\n"
+        "import sys, time\nfrom tests.unit.running.test_kept_awake import Output, kept_awake, serial\n"
         "with kept_awake(serial(), Output()):\n    print('held', flush=True)\n    time.sleep(60)\n"
     )
-    root = Path(__file__).parents[2]
     with subprocess.Popen(
-        [sys.executable, "-c", code], cwd=root, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+        [sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     ) as run:
         assert run.stdout is not None
         assert run.stdout.readline() == b"held\n"
