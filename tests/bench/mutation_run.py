@@ -25,9 +25,10 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-TESTS = {
-    "firmware_py/safety.py": ("firmware_py/axis/test_safety", "firmware_py/axis/test_axis"),
-    "firmware_py/sequence.py": ("firmware_py/axis/test_sequence", "firmware_py/axis/test_axis"),
+UNIT_TESTS = ROOT / "tests" / "unit"
+TESTS = {  # below UNIT_TESTS
+    "firmware_py/safety.py": ("firmware_py/axis/test_safety", "firmware_py/axis/test_axis_*"),
+    "firmware_py/sequence.py": ("firmware_py/axis/test_sequence_*", "firmware_py/axis/test_axis_*"),
     "firmware_py/surroundings.py": ("firmware_py/axis/test_surroundings_edges",),
     "firmware_py/frozen_reading.py": ("firmware_py/axis/test_surroundings_edges",),
     "drivers/canopen/cia402.py": ("drivers/canopen/test_cia402",),
@@ -224,7 +225,8 @@ def main() -> int:
     survivors: list[dict[str, Any]] = []
     for module in chosen.module or TESTS:
         session = Session(module, part, parts)
-        code = pytest.main([*options, *(f"tests/unit/{name}.py" for name in TESTS[module])], plugins=[session])
+        files = [str(file) for name in TESTS[module] for file in sorted(UNIT_TESTS.glob(f"{name}.py"))]
+        code = pytest.main([*options, *files], plugins=[session])
         if code or session.refused:
             return 1
         survivors += session.survivors

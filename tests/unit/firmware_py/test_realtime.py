@@ -237,7 +237,7 @@ _COUNT_ALLOCATIONS = """
 import socket, sys
 import numpy as np
 from numba.core.runtime import rtsys
-from tests.conftest import small_axis_constants
+from tests.axis_on_stub_joint import small_axis_constants
 from tests.unit.firmware_py import test_realtime as stub
 
 loop = stub.Loop(small_axis_constants(), period_ns=10_000)

@@ -16,22 +16,26 @@ import pytest
 from firmware_py.states import Fault
 from tests.places import ROOT
 
-AXIS = "unit/firmware_py/axis/test_axis.py::"
-SEQUENCE = "unit/firmware_py/axis/test_sequence.py::"
 SAFETY = "unit/firmware_py/axis/test_safety.py::"
 EDGES = "unit/firmware_py/axis/test_surroundings_edges.py::"
 SURROUNDINGS = "unit/firmware_py/axis/test_surroundings.py::"
 CYCLIC = "unit/drivers/canopen/test_cyclic.py::"
 ELMO_CYCLIC = "unit/drivers/elmo/test_elmo_cyclic.py::"
 HANGS = "unit/running/test_hang_limits.py::"
+AXIS_LIMITS = "unit/firmware_py/axis/test_axis_limits.py::"
+AXIS_SAMPLES = "unit/firmware_py/axis/test_axis_samples.py::"
+AXIS_DRIVE_FAULTS = "unit/firmware_py/axis/test_axis_drive_faults.py::"
+AXIS_TIME_LIMITS = "unit/firmware_py/axis/test_axis_time_limits.py::"
+SEQUENCE_START = "unit/firmware_py/axis/test_sequence_start.py::"
+SEQUENCE_END = "unit/firmware_py/axis/test_sequence_end.py::"
 EDGE = EDGES + "test_each_limit_at_its_edge_in_each_phase | "
-DENSE = AXIS + "test_velocity_and_following_error_are_dense_at_their_limits | "
+DENSE = AXIS_LIMITS + "test_velocity_and_following_error_are_dense_at_their_limits | "
 PLACE = re.compile(r"((?:\w+/)+\w+\.py)::(\w+)(?: \| (.+))?")
 
 FAULTS: dict[Fault, tuple[str, str]] = {  # what trips, and its twin
     Fault.POSITION_LIMIT: (
-        AXIS + "test_position_limit | (1.001, Fault.POSITION_LIMIT)",
-        AXIS + "test_position_limit | (0.999, Fault.NONE)",
+        AXIS_LIMITS + "test_position_limit | (1.001, Fault.POSITION_LIMIT)",
+        AXIS_LIMITS + "test_position_limit | (0.999, Fault.NONE)",
     ),
     Fault.VELOCITY_LIMIT: (DENSE + "(1e-9, True)", DENSE + "(0.0, False)"),
     Fault.REFERENCE_LIMIT: (
@@ -39,58 +43,73 @@ FAULTS: dict[Fault, tuple[str, str]] = {  # what trips, and its twin
         SAFETY + "test_a_reference_must_be_able_to_brake_inside_the_limits | (-1e-9, Fault.NONE)",
     ),
     Fault.FOLLOWING_ERROR: (DENSE + "(1e-9, True)", DENSE + "(0.0, False)"),
-    Fault.STALE_SAMPLE: (AXIS + "test_stale_sample | (6, True)", AXIS + "test_stale_sample | (5, False)"),
-    Fault.NOT_FINITE: (
-        AXIS + "test_a_law_that_is_not_finite_sends_zero_and_stops | Fault.NOT_FINITE",
-        AXIS + "test_its_twin_a_law_of_an_enormous_but_finite_torque_is_limited | 1e300",
+    Fault.STALE_SAMPLE: (
+        AXIS_SAMPLES + "test_stale_sample | (6, True)",
+        AXIS_SAMPLES + "test_stale_sample | (5, False)",
     ),
-    Fault.TORQUE_SATURATED: (AXIS + "test_saturation | (21, True)", AXIS + "test_saturation | (20, False)"),
+    Fault.NOT_FINITE: (
+        AXIS_LIMITS + "test_a_law_that_is_not_finite_sends_zero_and_stops | Fault.NOT_FINITE",
+        AXIS_LIMITS + "test_its_twin_a_law_of_an_enormous_but_finite_torque_is_limited | 1e300",
+    ),
+    Fault.TORQUE_SATURATED: (
+        AXIS_LIMITS + "test_saturation | (21, True)",
+        AXIS_LIMITS + "test_saturation | (20, False)",
+    ),
     Fault.DRIVE_FAULT: (
-        AXIS + "test_drive_fault_in_each_phase | Fault.DRIVE_FAULT",
-        AXIS + "test_its_twin_a_warning_of_the_drive_is_no_fault",
+        AXIS_DRIVE_FAULTS + "test_drive_fault_in_each_phase | Fault.DRIVE_FAULT",
+        AXIS_DRIVE_FAULTS + "test_its_twin_a_warning_of_the_drive_is_no_fault",
     ),
     Fault.DRIVE_NOT_ENABLED: (
         EDGE + '("drive_state", DriveState.ENABLED, DriveState.STOPPING, Fault.DRIVE_NOT_ENABLED)',
         EDGE + "((within, False), (beyond, counts))",
     ),
     Fault.DRIVE_RESTARTED: (
-        AXIS + "test_a_restart_before_the_first_cycle_ends_the_run_without_power | Fault.DRIVE_RESTARTED",
-        AXIS + "test_a_restart_before_the_first_cycle_ends_the_run_without_power | twin.until(AxisPhase.TRACKING)",
+        AXIS_DRIVE_FAULTS + "test_a_restart_before_the_first_cycle_ends_the_run_without_power | Fault.DRIVE_RESTARTED",
+        AXIS_DRIVE_FAULTS
+        + "test_a_restart_before_the_first_cycle_ends_the_run_without_power | twin.until(AxisPhase.TRACKING)",
     ),
     Fault.ENABLE_TIMEOUT: (
-        SEQUENCE + "test_enable_timeout | (31, Fault.ENABLE_TIMEOUT)",
-        SEQUENCE + "test_enable_timeout | (30, Fault.NONE)",
+        SEQUENCE_START + "test_enable_timeout | (31, Fault.ENABLE_TIMEOUT)",
+        SEQUENCE_START + "test_enable_timeout | (30, Fault.NONE)",
     ),
-    Fault.SUPERVISOR_LOST: (AXIS + "test_supervisor_lost | (11, True)", AXIS + "test_supervisor_lost | (10, False)"),
-    Fault.BUS_ERROR: (AXIS + "test_bus_errors | (6, True)", AXIS + "test_bus_errors | (5, False)"),
+    Fault.SUPERVISOR_LOST: (
+        AXIS_TIME_LIMITS + "test_supervisor_lost | (11, True)",
+        AXIS_TIME_LIMITS + "test_supervisor_lost | (10, False)",
+    ),
+    Fault.BUS_ERROR: (
+        AXIS_DRIVE_FAULTS + "test_bus_errors | (6, True)",
+        AXIS_DRIVE_FAULTS + "test_bus_errors | (5, False)",
+    ),
     Fault.STOP_TIMEOUT: (
-        AXIS + "test_standstill_is_complete_in_the_last_cycle_or_one_too_late | Fault.STOP_TIMEOUT",
-        AXIS + "test_standstill_is_complete_in_the_last_cycle_or_one_too_late | (AxisPhase.RELEASING, Fault.NONE)",
+        AXIS_TIME_LIMITS + "test_standstill_is_complete_in_the_last_cycle_or_one_too_late | Fault.STOP_TIMEOUT",
+        AXIS_TIME_LIMITS
+        + "test_standstill_is_complete_in_the_last_cycle_or_one_too_late | (AxisPhase.RELEASING, Fault.NONE)",
     ),
     Fault.OFF_TIMEOUT: (
-        SEQUENCE + "test_off_timeout | (21, AxisPhase.FINISHED, Fault.OFF_TIMEOUT)",
-        SEQUENCE + "test_off_timeout | (20, AxisPhase.DISABLING, Fault.NONE)",
+        SEQUENCE_END + "test_off_timeout | (21, AxisPhase.FINISHED, Fault.OFF_TIMEOUT)",
+        SEQUENCE_END + "test_off_timeout | (20, AxisPhase.DISABLING, Fault.NONE)",
     ),
     Fault.NO_SAMPLES: (
-        SEQUENCE + "test_waiting_ends | (0, 0.0, 1, Fault.NO_SAMPLES, 0.0)",
-        SEQUENCE + "test_waiting_ends | (AxisPhase.WAITING, Fault.NONE)",
+        SEQUENCE_START + "test_waiting_ends | (0, 0.0, 1, Fault.NO_SAMPLES, 0.0)",
+        SEQUENCE_START + "test_waiting_ends | (AxisPhase.WAITING, Fault.NONE)",
     ),
     Fault.SAMPLES_MISSING: (
-        SEQUENCE + "test_the_wait_for_the_supervisors_word_ends | (5, Fault.SAMPLES_MISSING)",
-        SEQUENCE + "test_the_wait_for_the_supervisors_word_ends | (4, Fault.SUPERVISOR_LOST)",
+        SEQUENCE_START + "test_the_wait_for_the_supervisors_word_ends | (5, Fault.SAMPLES_MISSING)",
+        SEQUENCE_START + "test_the_wait_for_the_supervisors_word_ends | (4, Fault.SUPERVISOR_LOST)",
     ),
     Fault.NOT_AT_STANDSTILL: (
-        SEQUENCE + "test_waiting_ends | (4, 0.5, 0, Fault.NOT_AT_STANDSTILL, 0.5)",
-        SEQUENCE + "test_enabling_is_only_asked_at_standstill_inside_the_limits | (1.0, 0.02, 4, AxisPhase.ENABLING",
+        SEQUENCE_START + "test_waiting_ends | (4, 0.5, 0, Fault.NOT_AT_STANDSTILL, 0.5)",
+        SEQUENCE_START
+        + "test_enabling_is_only_asked_at_standstill_inside_the_limits | (1.0, 0.02, 4, AxisPhase.ENABLING",
     ),
-    Fault.OVERRUN: (AXIS + "test_overrun | (9, True)", AXIS + "test_overrun | (8, False)"),
+    Fault.OVERRUN: (AXIS_TIME_LIMITS + "test_overrun | (9, True)", AXIS_TIME_LIMITS + "test_overrun | (8, False)"),
     Fault.POSITION_JUMP: (
-        AXIS + "test_position_jump_scales_with_the_gap | 1.001 if trips",
-        AXIS + "test_position_jump_scales_with_the_gap | else 0.999",
+        AXIS_SAMPLES + "test_position_jump_scales_with_the_gap | 1.001 if trips",
+        AXIS_SAMPLES + "test_position_jump_scales_with_the_gap | else 0.999",
     ),
     Fault.DRIVE_STAYS_ENABLED: (
-        SEQUENCE + "test_a_drive_that_is_enabled_already_is_not_taken_over | Fault.DRIVE_STAYS_ENABLED",
-        SEQUENCE + "test_a_drive_that_is_enabled_already_is_not_taken_over | (AxisPhase.WAITING, Fault.NONE)",
+        SEQUENCE_START + "test_a_drive_that_is_enabled_already_is_not_taken_over | Fault.DRIVE_STAYS_ENABLED",
+        SEQUENCE_START + "test_a_drive_that_is_enabled_already_is_not_taken_over | (AxisPhase.WAITING, Fault.NONE)",
     ),
     Fault.POSITION_FROZEN: (
         EDGES + "test_the_way_behind_a_reading_that_stands_still | (0.501, True)",
@@ -105,12 +124,12 @@ FAULTS: dict[Fault, tuple[str, str]] = {  # what trips, and its twin
         SURROUNDINGS + "test_a_drive_whose_heartbeat_stays_away | (600, 600, False)",
     ),
     Fault.POSITION_DISAGREEMENT: (
-        AXIS + "test_the_other_encoder | (0.0101, True)",
-        AXIS + "test_the_other_encoder | (0.0099, False)",
+        AXIS_SAMPLES + "test_the_other_encoder | (0.0101, True)",
+        AXIS_SAMPLES + "test_the_other_encoder | (0.0099, False)",
     ),
     Fault.MOVED_BEFORE_START: (
-        SEQUENCE + "test_a_joint_that_was_moved_since_the_motion_was_shown_is_not_driven | 0.375 + 1e-12, True",
-        SEQUENCE + "test_a_joint_that_was_moved_since_the_motion_was_shown_is_not_driven | 0.375, False",
+        SEQUENCE_START + "test_a_joint_that_was_moved_since_the_motion_was_shown_is_not_driven | 0.375 + 1e-12, True",
+        SEQUENCE_START + "test_a_joint_that_was_moved_since_the_motion_was_shown_is_not_driven | 0.375, False",
     ),
 }
 

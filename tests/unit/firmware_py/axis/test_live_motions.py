@@ -1,161 +1,19 @@
-"""Changes while the joint moves: taken whole and checked, without a jump, by way of rest, never while stopping."""
+"""Set points and trajectories while the joint moves: by way of rest, inside speed and limits, stopped from anywhere."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
 
 from firmware_py.change_records import ChangeAnswer, ChangeKind, MotionChange
-from firmware_py.live_change import gains_allowed, gains_of, move_duration_s, set_gains, trajectory_allowed
-from firmware_py.lyapunov import solve_lyapunov_p
-from firmware_py.records import Gains, TrajectoryConstants
+from firmware_py.live_change import move_duration_s, trajectory_allowed
+from firmware_py.records import TrajectoryConstants
 from firmware_py.schema import new
-from firmware_py.states import AxisPhase, ControllerKind, Fault, StopRequest, TrajectoryKind
-
-NewRig = Callable[..., Any]
-GAINS = ("kp", "kv", "ki", "observer_radps", "learning_rate")
-RAMP_s = 0.05
-
-
-def live(run: Any) -> Any:
-    """The rig with limits for changes: gains by a factor of 2, moves at 2 rad/s."""
-    change, law = run.axis.change, run.axis.law
-    gains_of(law, change.low)
-    gains_of(law, change.high)
-    for name in GAINS:
-        setattr(change.low, name, getattr(change.low, name) / 2.0)
-        setattr(change.high, name, getattr(change.high, name) * 2.0)
-    change.ramp_s, change.q1, change.q2 = RAMP_s, 1800.0, 1800.0
-    change.move_speed_radps, change.move_acceleration_radps2, change.move_min_s = 2.0, 20.0, 0.05
-    return run
-
-
-def post(run: Any, what: int, /, **fields: Any) -> int:
-    """What the supervisor does: the request first, its number last."""
-    change = run.axis.change
-    number = int(change.order[0]) + 1
-    request = change.request
-    request.first = request.last = number
-    request.kind = what
-    gains_of(run.axis.law, request.gains)
-    target = request.gains if what == ChangeKind.GAINS else request.trajectory
-    for name, value in fields.items():
-        setattr(target, name, value)
-    change.order[0] = number
-    return number
-
-
-def answered(run: Any, number: int) -> ChangeAnswer:
-    run.tick()
-    assert run.state.change.answered == number
-    return ChangeAnswer(int(run.state.change.answer))
-
-
-def hold(run: Any, at_rad: float) -> int:
-    run.axis.change.request.trajectory = new(TrajectoryConstants)[0]
-    return post(run, ChangeKind.MOTION, kind=TrajectoryKind.HOLD, start_rad=at_rad, target_rad=at_rad)
-
-
-def test_gains_change_along_a_line_and_nothing_jumps(rig: NewRig) -> None:
-    run = live(rig(0.0)).until(AxisPhase.TRACKING).run(100)
-    number = post(run, ChangeKind.GAINS, kp=1200.0, kv=70.0, learning_rate=40.0)
-    assert answered(run, number) is ChangeAnswer.TAKEN
-    seen = [float(run.axis.law.kp)]
-    while run.state.change.ramping:
-        run.tick()
-        seen.append(float(run.axis.law.kp))
-        _, p12, p22 = solve_lyapunov_p(seen[-1], float(run.axis.law.kv), 1800.0, 1800.0)
-        np.testing.assert_allclose(run.axis.law.network.p_b, [p12 / 2.1, p22 / 2.1], rtol=1e-12)
-    assert len(seen) == pytest.approx(RAMP_s / 1e-3, abs=2)
-    np.testing.assert_allclose(np.diff(seen), (1200.0 - 784.0) / 50.0, rtol=1e-6)
-    assert (run.axis.law.kp, run.axis.law.kv, run.axis.law.network.learning_rate) == (1200.0, 70.0, 40.0)
-    assert np.max(np.abs(np.diff(run.torques_Nm[-60:]))) < 0.2
-    run.run(200)
-    assert run.phase is AxisPhase.TRACKING
-    assert run.state.fault == Fault.NONE
-
-
-@pytest.mark.parametrize("name", GAINS)
-def test_gain_limits_are_dense_at_their_boundary(name: str) -> None:
-    low, high, gains = new(Gains)[0], new(Gains)[0], new(Gains)[0]
-    for field in GAINS:
-        setattr(low, field, 1.0)
-        setattr(high, field, 3.0)
-        setattr(gains, field, 2.0)
-    for value, allowed in (
-        (1.0, True), (3.0, True), (math.nextafter(1.0, 0.0), False), (math.nextafter(3.0, 4.0), False),
-        (math.nan, False), (math.inf, False), (-math.inf, False), (0.0, False),
-    ):  # fmt: skip
-        setattr(gains, name, value)
-        assert bool(gains_allowed(low, high, gains)) is allowed
-
-
-@pytest.mark.parametrize("value", [784.0 * 2.0001, 784.0 * 0.4999, math.nan, math.inf, -784.0, 0.0])
-def test_gains_outside_of_the_limits_change_nothing(rig: NewRig, value: float) -> None:
-    run = live(rig(0.0)).until(AxisPhase.TRACKING)
-    before = run.axis.law.copy()
-    assert answered(run, post(run, ChangeKind.GAINS, kp=value, kv=60.0)) is ChangeAnswer.GAIN_LIMIT
-    run.run(60)
-    assert (run.axis.law.kp, run.axis.law.kv) == (before.kp, before.kv)
-    assert run.phase is AxisPhase.TRACKING
-
-
-def test_a_change_is_taken_whole_or_not_yet(rig: NewRig) -> None:
-    run = live(rig(0.0)).until(AxisPhase.TRACKING)
-    number = post(run, ChangeKind.GAINS, kp=900.0)
-    for first, last in ((number - 1, number), (number, number - 1), (number + 1, number + 1)):
-        run.axis.change.request.first, run.axis.change.request.last = first, last
-        run.run(5)
-        assert run.state.change.answered == number - 1
-        assert run.axis.law.kp == 784.0
-    run.axis.change.request.first = run.axis.change.request.last = number
-    assert answered(run, number) is ChangeAnswer.TAKEN
-
-
-def test_one_request_is_carried_out_once(rig: NewRig) -> None:
-    run = live(rig(0.0)).until(AxisPhase.TRACKING)
-    answered(run, post(run, ChangeKind.GAINS, kp=900.0))
-    run.run(100)
-    run.axis.change.request.gains.kp = 1500.0  # without a new number: nobody looks
-    run.run(100)
-    assert run.axis.law.kp == 900.0
-
-
-@pytest.mark.parametrize("kind", [0, 3, -1])
-def test_a_kind_that_is_not_known_is_refused(rig: NewRig, kind: int) -> None:
-    run = live(rig(0.0)).until(AxisPhase.TRACKING)
-    assert answered(run, post(run, kind)) is ChangeAnswer.WRONG_KIND
-
-
-@pytest.mark.parametrize("phase", [AxisPhase.WAITING, AxisPhase.ENABLING, AxisPhase.APPROACH, AxisPhase.TRACKING])
-def test_gains_change_while_the_law_follows_and_motions_while_it_tracks(rig: NewRig, phase: AxisPhase) -> None:
-    run = live(rig(0.1))
-    if phase is not AxisPhase.WAITING:
-        run.until(phase)
-    gains = answered(run, post(run, ChangeKind.GAINS, kp=900.0))
-    motion = answered(run, hold(run, 0.1))
-    assert run.phase is phase
-    assert (gains is ChangeAnswer.TAKEN) is (phase >= AxisPhase.APPROACH)
-    assert (motion is ChangeAnswer.TAKEN) is (phase is AxisPhase.TRACKING)
-
-
-@pytest.mark.parametrize("stop", [StopRequest.RAMP, StopRequest.QUICK_STOP, StopRequest.OFF])
-def test_nothing_changes_any_more_once_the_joint_is_being_stopped(rig: NewRig, stop: StopRequest) -> None:
-    run = live(rig(0.0)).until(AxisPhase.TRACKING).run(50)
-    post(run, ChangeKind.GAINS, kp=1200.0)
-    run.run(20)
-    halfway = float(run.axis.law.kp)
-    assert 784.0 < halfway < 1200.0
-    run.stop = stop
-    number = post(run, ChangeKind.GAINS, kp=1000.0)
-    assert answered(run, number) is ChangeAnswer.WRONG_PHASE
-    assert answered(run, hold(run, 0.0)) is ChangeAnswer.WRONG_PHASE
-    run.until(AxisPhase.FINISHED)
-    assert run.axis.law.kp == pytest.approx(halfway, rel=1e-12)
+from firmware_py.states import AxisPhase, Fault, StopRequest, TrajectoryKind
+from tests.axis_on_stub_joint import NewRig
+from tests.unit.firmware_py.axis.live_axis import answered, hold, live, post
 
 
 def test_a_set_point_is_reached_from_rest_inside_the_speed_of_moves(rig: NewRig) -> None:
@@ -299,15 +157,3 @@ def test_the_time_of_a_move_keeps_both_limits(rig: NewRig) -> None:
         assert abs(distance) * speed.max() / duration <= 2.0 * (1 + 1e-6)
         assert abs(distance) * np.abs(acceleration).max() / duration**2 <= 20.0 * (1 + 1e-6)
         assert duration >= 0.05
-
-
-def test_what_was_integrated_keeps_its_torque(rig: NewRig) -> None:
-    run = live(rig(0.0))
-    law, state, gains = run.axis.law, run.state.law, new(Gains)[0]
-    law.kind, law.ki, law.observer.bandwidth_radps = ControllerKind.PID, 1000.0, 50.0
-    state.integral_rads, state.observer.disturbance_Nm, state.observer.integral_Nms = 0.01, 7.0, 7.0 / 50.0 + 0.3
-    gains_of(law, gains)
-    gains.ki, gains.observer_radps = 2000.0, 80.0
-    set_gains(run.axis.change, law, state, gains)
-    assert law.ki * state.integral_rads == pytest.approx(10.0)
-    assert law.observer.bandwidth_radps * (state.observer.integral_Nms - 0.3) == pytest.approx(7.0)

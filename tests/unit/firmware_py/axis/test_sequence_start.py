@@ -1,143 +1,19 @@
-"""The phases of a run as pure functions: forward only, and the stronger reaction wins."""
+"""When a run enables the drive and when torque begins: at standstill, inside the limits, where it was shown."""
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
-from firmware_py.records import LINE_GONE, AxisState, Command, Sample
+from firmware_py.records import Sample
 from firmware_py.schema import new
-from firmware_py.sequence import (
-    ANSWER_CYCLES,
-    compare_encoders,
-    enter,
-    powered,
-    react,
-    released_torque_Nm,
-    request_stop,
-    reset_axis,
-    step_enabling,
-    step_stopping,
-    step_waiting,
-    trip,
-    write_command,
-)
-from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction, StopRequest
+from firmware_py.sequence import compare_encoders, step_enabling, step_waiting
+from firmware_py.states import AxisPhase, DriveState, Fault
 from firmware_py.trajectory import approach_at
-
-GOAL = {
-    Reaction.RAMP: AxisPhase.RAMPING,
-    Reaction.QUICK_STOP: AxisPhase.QUICK_STOPPING,
-    Reaction.OFF: AxisPhase.DISABLING,
-}
-
-
-@pytest.fixture
-def axis(axis_constants: Any) -> Any:
-    return axis_constants[0]
-
-
-@pytest.fixture
-def state(axis: Any) -> Any:
-    state = new(AxisState)[0]
-    reset_axis(axis, state)
-    return state
-
-
-def sample_of(drive_state: DriveState) -> Any:
-    sample = new(Sample)[0]
-    sample.drive_state, sample.status_word, sample.drive_error = drive_state, 0x1237, 0x3310
-    return sample
-
-
-def test_reset_forgets_the_run_before(axis: Any, state: Any) -> None:
-    state.phase, state.fault, state.reaction, state.cycle = AxisPhase.FINISHED, Fault.OVERRUN, Reaction.OFF, 99
-    state.command_torque_Nm, state.saturated_cycles = 7.0, 8
-    state.velocity.primed, state.law.lugre_deflection_rad = 1, 0.1
-    state.law.network.weights[:] = 5.0
-    reset_axis(axis, state)
-    assert (state.phase, state.fault, state.reaction, state.cycle) == (AxisPhase.WAITING, 0, 0, 0)
-    assert (state.command_torque_Nm, state.saturated_cycles) == (0.0, 0)
-    assert (state.velocity.primed, state.law.lugre_deflection_rad) == (0, 0.0)
-    assert list(state.law.network.weights) == [0.01] * 15
-
-
-# written in a cycle before they are read in it
-WRITTEN_FIRST = {
-    "frozen_way_rad",
-    "frozen_reference_rad",
-    "frozen_at_rad",
-    "sample_late_s",
-    "measured_position_rad",
-    "measured_torque_Nm",
-}
-
-
-def test_reset_leaves_nothing_of_the_run_before_behind(axis: Any, state: Any) -> None:
-    used = new(AxisState)[0]
-    plain = [name for name in used.dtype.names if used.dtype[name].kind in "if"]
-    for name in plain:
-        used[name] = 3
-    changed = ("answered", "answer", "ramping", "ramp_s", "motion")
-    for name in changed:
-        used.change[name] = 3
-    reset_axis(axis, used)
-    assert [name for name in plain if name not in WRITTEN_FIRST and used[name] != 0] == []
-    assert [name for name in changed if used.change[name] != 0] == []
-
-
-@pytest.mark.parametrize("phase", AxisPhase)
-def test_torque_is_only_commanded_between_enabled_and_released(phase: AxisPhase) -> None:
-    assert powered(int(phase)) is (phase.name in ("APPROACH", "TRACKING", "RAMPING", "RELEASING"))
-
-
-@pytest.mark.parametrize("phase", AxisPhase)
-@pytest.mark.parametrize("in_force", Reaction)
-@pytest.mark.parametrize("reaction", Reaction)
-def test_react_goes_forward_or_stays(state: Any, phase: AxisPhase, in_force: Reaction, reaction: Reaction) -> None:
-    state.phase, state.reaction, state.phase_cycle = phase, in_force, 7
-    react(state, int(reaction))
-    if reaction <= in_force or phase is AxisPhase.FINISHED:
-        assert (state.phase, state.reaction, state.phase_cycle) == (phase, in_force, 7)
-    else:
-        assert state.reaction == reaction
-        assert state.phase == max(phase, GOAL[reaction])
-        assert state.phase_cycle == (7 if state.phase == phase else 0)
-
-
-@pytest.mark.parametrize("phase", [AxisPhase.ENABLING, AxisPhase.TRACKING, AxisPhase.RELEASING])
-def test_the_first_fault_is_latched_and_the_reaction_never_weakens(axis: Any, state: Any, phase: AxisPhase) -> None:
-    for first, second in itertools.product(Fault, Fault):
-        reset_axis(axis, state)
-        state.phase = phase
-        trip(state, int(first), 1.0, 11)
-        reaction, after_first = int(state.reaction), int(state.phase)
-        trip(state, int(second), 2.0, 22)
-        latched = first if first is not Fault.NONE else second
-        expected = (0.0, 0) if latched is Fault.NONE else (1.0, 11) if first is not Fault.NONE else (2.0, 22)
-        assert (state.fault, state.fault_value, state.fault_drive_error) == (latched, *expected)
-        assert state.reaction >= reaction
-        assert state.phase >= after_first
-
-
-@pytest.mark.parametrize("phase", AxisPhase)
-@pytest.mark.parametrize("stop", StopRequest)
-def test_stop_request_in_every_phase(state: Any, phase: AxisPhase, stop: StopRequest) -> None:
-    state.phase = phase
-    request_stop(state, int(stop))
-    assert state.fault == Fault.NONE
-    if stop is StopRequest.NONE:
-        goal = phase
-    elif phase <= AxisPhase.ENABLING or stop is StopRequest.OFF:
-        goal = AxisPhase.DISABLING
-    else:
-        goal = GOAL[Reaction(int(stop))]
-    assert state.phase == max(phase, goal)
+from tests.unit.firmware_py.axis.sequence_records import sample_of
 
 
 def idle_sample(drive_state: DriveState = DriveState.OFF) -> Any:
@@ -300,22 +176,6 @@ def test_the_approach_leads_from_where_the_joint_stands_into_the_trajectory(axis
         assert state.reference.velocity_radps == pytest.approx(velocity_radps, abs=1e-12)
 
 
-@pytest.mark.parametrize("elapsed_cycles", [1, 3])
-@pytest.mark.parametrize(
-    ("release_cycles", "phase_cycle"), [(10.0, 1), (10.0, 5), (10.0, 9), (9.5, 9), (10.0, 10), (10.0, 11)]
-)
-def test_the_torque_is_released_along_a_straight_line(
-    axis: Any, state: Any, release_cycles: float, phase_cycle: int, elapsed_cycles: int
-) -> None:
-    """In proportion to the time that is left, from what it was `elapsed_cycles` before."""
-    axis.sequence.release_s = release_cycles * axis.law.period_s
-    state.phase, state.phase_cycle, state.command_torque_Nm = AxisPhase.RELEASING, phase_cycle, 12.0
-    torque_Nm = released_torque_Nm(axis, state, elapsed_cycles)
-    left = max(release_cycles - phase_cycle, 0.0)
-    assert torque_Nm == pytest.approx(12.0 * left / (left + elapsed_cycles), abs=1e-9)
-    assert state.phase == (AxisPhase.RELEASING if left else AxisPhase.DISABLING)
-
-
 def test_without_an_approach_the_trajectory_begins_at_once(axis: Any, state: Any) -> None:
     axis.sequence.approach_s = 0.0
     state.phase = AxisPhase.ENABLING
@@ -331,87 +191,6 @@ def test_enable_timeout(axis: Any, state: Any, phase_cycle: int, fault: Fault) -
     assert state.fault == fault
     assert state.phase == (AxisPhase.DISABLING if fault else AxisPhase.ENABLING)
     assert (state.fault_value, state.fault_drive_error) == ((0x1237, 0x3310) if fault else (0.0, 0))
-
-
-@pytest.mark.parametrize("drive_state", DriveState)
-@pytest.mark.parametrize("age_cycles", [0, 1])
-@pytest.mark.parametrize("phase_cycle", [ANSWER_CYCLES, ANSWER_CYCLES + 1])
-@pytest.mark.parametrize(
-    ("phase", "following"),
-    [(AxisPhase.QUICK_STOPPING, AxisPhase.DISABLING), (AxisPhase.DISABLING, AxisPhase.FINISHED)],
-)
-def test_only_a_fresh_answer_of_the_drive_ends_the_stop(
-    axis: Any, state: Any, drive_state: DriveState, age_cycles: int, phase_cycle: int, phase: int, following: int
-) -> None:
-    state.phase, state.phase_cycle, state.sample_age_cycles = phase, phase_cycle, age_cycles
-    step_stopping(axis, state, sample_of(drive_state))
-    confirmed = drive_state in (DriveState.OFF, DriveState.FAULT) and age_cycles == 0 and phase_cycle > ANSWER_CYCLES
-    assert state.phase == (following if confirmed else phase)
-    assert state.fault == Fault.NONE
-
-
-@pytest.mark.parametrize("bus_errors", [LINE_GONE - 1, LINE_GONE])
-@pytest.mark.parametrize("phase", [AxisPhase.QUICK_STOPPING, AxisPhase.DISABLING])
-def test_on_a_line_that_is_gone_there_is_nothing_to_wait_for(
-    axis: Any, state: Any, phase: AxisPhase, bus_errors: int
-) -> None:
-    enter(state, int(phase))
-    sample = sample_of(DriveState.ENABLED)
-    sample.bus_errors = bus_errors
-    step_stopping(axis, state, sample)
-    assert state.phase == (AxisPhase.FINISHED if bus_errors == LINE_GONE else phase)
-
-
-@pytest.mark.parametrize("phase", [p for p in AxisPhase if p not in (AxisPhase.QUICK_STOPPING, AxisPhase.DISABLING)])
-def test_the_stop_concerns_no_other_phase(axis: Any, state: Any, phase: AxisPhase) -> None:
-    state.phase, state.phase_cycle = phase, 1000
-    step_stopping(axis, state, sample_of(DriveState.OFF))
-    assert state.phase == phase
-
-
-@pytest.mark.parametrize(("phase_cycle", "phase"), [(100, AxisPhase.QUICK_STOPPING), (101, AxisPhase.DISABLING)])
-def test_a_quick_stop_that_does_not_end_is_cut_off(axis: Any, state: Any, phase_cycle: int, phase: AxisPhase) -> None:
-    state.phase, state.phase_cycle, state.reaction = AxisPhase.QUICK_STOPPING, phase_cycle, Reaction.QUICK_STOP
-    step_stopping(axis, state, sample_of(DriveState.STOPPING))
-    assert state.phase == phase
-
-
-@pytest.mark.parametrize(
-    ("phase_cycle", "phase", "fault"),
-    [(20, AxisPhase.DISABLING, Fault.NONE), (21, AxisPhase.FINISHED, Fault.OFF_TIMEOUT)],
-)
-def test_off_timeout(axis: Any, state: Any, phase_cycle: int, phase: AxisPhase, fault: Fault) -> None:
-    state.phase, state.phase_cycle = AxisPhase.DISABLING, phase_cycle
-    step_stopping(axis, state, sample_of(DriveState.ENABLED))
-    assert (state.phase, state.fault) == (phase, fault)
-    assert (state.fault_value, state.fault_drive_error) == ((0x1237, 0x3310) if fault else (0.0, 0))
-
-
-@pytest.mark.parametrize("phase", AxisPhase)
-def test_request_of_every_phase(state: Any, phase: AxisPhase) -> None:
-    state.phase_cycle = state.good_samples = 7
-    enter(state, int(phase))
-    assert (state.phase, state.phase_cycle, state.good_samples) == (phase, 0, 0)
-    command = new(Command)[0]
-    command.request = -1  # each phase says what it wants
-    state.command_torque_Nm, state.command_velocity_radps = 1.5, 0.25
-    write_command(state, command)
-    assert (command.torque_Nm, command.velocity_radps) == (1.5, 0.25)
-    if phase is AxisPhase.QUICK_STOPPING:
-        assert command.request == DriveRequest.QUICK_STOP
-    elif AxisPhase.ENABLING <= phase <= AxisPhase.RELEASING:
-        assert command.request == DriveRequest.ENABLE
-    else:
-        assert command.request == DriveRequest.OFF
-
-
-def test_phases_follow_each_other_in_a_whole_run(rig: Callable[..., Any]) -> None:
-    run = rig(0.1)
-    run.until(AxisPhase.TRACKING).run(20)
-    run.stop = StopRequest.RAMP
-    run.until(AxisPhase.FINISHED)
-    order = [phase for phase, _ in itertools.groupby(run.phases)]
-    assert order == [p for p in AxisPhase if p is not AxisPhase.QUICK_STOPPING]
 
 
 @pytest.mark.parametrize("phase", AxisPhase)

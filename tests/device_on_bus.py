@@ -1,0 +1,130 @@
+"""The virtual drive on a bus in the process of a test, as fast as it is asked."""
+
+from __future__ import annotations
+
+import itertools
+import struct
+import threading
+
+import can
+
+from drivers.canopen.drive import CanopenDrive
+from drivers.canopen.settings import CanopenSettings
+from hil.canopen.device import Cia402Device
+
+_FRAME = struct.Struct("<IB3x8s")
+_channels = itertools.count()
+DEVICE_TIME_FACTOR = 4.0
+PASS_TIME, TIME_PASSED = 0x1FFFFFF0, 0x1FFFFFF1  # extended identifiers: no frames of CANopen
+
+
+class DeviceOnBus:
+    """The virtual drive on python-can's in-process bus, in a thread.
+
+    Its time moves on 1 ms with every frame, and with every wait of the driver by that time, however busy the computer
+    is: the driver's end asks for it with a frame of its own, and goes on when it has heard all that was said meanwhile.
+
+    `answers` replaces the value in expedited SDO upload responses, (index, sub) -> value; `mute` lists objects whose
+    next requests stay unanswered; `requests` are the frames that came in.  `sequences` are answers used up one by one
+    before the true ones; `refused` are downloads answered with that SDO abort code; `deaf_frames` frames are lost.
+    """
+
+    def __init__(self, device: Cia402Device | None) -> None:
+        self.device = device
+        self.channel = f"device {next(_channels)}"
+        self.now_ns = 1_000_000
+        self.answers: dict[tuple[int, int], int] = {}
+        self.mute: list[tuple[int, int]] = []
+        self.refused: dict[tuple[int, int], int] = {}
+        self.sequences: dict[tuple[int, int], list[int]] = {}
+        self.deaf_frames = 0
+        self.requests: list[tuple[int, bytes]] = []
+        self._bus = can.Bus(interface="virtual", channel=self.channel)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> DeviceOnBus:
+        if self.device is not None:
+            # nobody's frame: everything is compiled before a master counts the time of its first request
+            self.device.handle(_FRAME.pack(0x7E5, 0, b""), self.now_ns)
+        self._thread.start()
+        return self
+
+    def stop(self) -> None:
+        """From here on the device only moves when the test moves it."""
+        self._ended.set()
+        self._thread.join()
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+        self._bus.shutdown()
+
+    def _run(self) -> None:
+        while not self._ended.is_set():
+            message = self._bus.recv(0.05)
+            if message is None:
+                continue
+            if message.arbitration_id == PASS_TIME:
+                self._pass_time(struct.unpack("<d", message.data)[0])
+                self._bus.send(can.Message(arbitration_id=TIME_PASSED))
+                continue
+            data = bytes(message.data)
+            self.requests.append((message.arbitration_id, data))
+            if self.device is None:
+                continue
+            if self.deaf_frames:
+                self.deaf_frames -= 1
+                continue
+            if message.arbitration_id == 0x600 + self.device.settings.node_id:
+                place = struct.unpack_from("<HB", data, 1)
+                if place in self.mute:
+                    self.mute.remove(place)
+                    continue
+                if data[0] & 0xE0 == 0x20 and place in self.refused:
+                    abort = struct.pack("<BHBI", 0x80, *place, self.refused[place])
+                    self._reply(_FRAME.pack(0x580 + self.device.settings.node_id, 8, abort))
+                    continue
+            self.now_ns += 1_000_000
+            for frame in self.device.handle(_FRAME.pack(message.arbitration_id, len(data), data), self.now_ns):
+                self._reply(frame)
+
+    def _pass_time(self, seconds: float) -> None:
+        if self.device is None:
+            return
+        until_ns = self.now_ns + round(seconds * 1e9)
+        while self.now_ns < until_ns:
+            self.now_ns = min(self.now_ns + 10_000_000, until_ns)
+            for frame in self.device.advance(self.now_ns):
+                self._reply(frame)
+
+    def _reply(self, frame: bytes) -> None:
+        identifier, size, payload = _FRAME.unpack(frame)
+        if identifier & 0x780 == 0x580 and payload[0] & 0xE2 == 0x42:
+            place = struct.unpack_from("<HB", payload, 1)
+            if self.sequences.get(place) or place in self.answers:
+                value = self.sequences[place].pop(0) if self.sequences.get(place) else self.answers[place]
+                value &= 0xFFFFFFFF
+                payload = payload[:4] + struct.pack("<I", value)
+        self._bus.send(can.Message(arbitration_id=identifier, data=payload[:size], is_extended_id=False))
+
+    def drive(self, settings: CanopenSettings) -> CanopenDrive:
+        """The real driver on another end of this bus; its waiting is short, but long for the device."""
+        bus = can.Bus(interface="virtual", channel=self.channel)
+        passed = threading.Event()
+
+        def hear(message: can.Message) -> None:
+            if message.arbitration_id == TIME_PASSED:
+                passed.set()
+
+        def sleep(seconds: float) -> None:
+            threading.Event().wait(seconds / DEVICE_TIME_FACTOR)
+            if self._ended.is_set() or drive._network.notifier is None:
+                return
+            passed.clear()
+            bus.send(can.Message(arbitration_id=PASS_TIME, data=struct.pack("<d", seconds)))
+            passed.wait(5.0)
+
+        drive = CanopenDrive(bus, settings, sleep=sleep)
+        assert drive._network.notifier is not None
+        drive._network.notifier.add_listener(hear)
+        return drive

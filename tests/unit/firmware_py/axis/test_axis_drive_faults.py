@@ -1,0 +1,142 @@
+"""A drive that faults, brakes, restarts or leaves Operation Enabled by itself, and a bus that fails."""
+
+from __future__ import annotations
+
+import pytest
+
+from firmware_py.records import LINE_GONE
+from firmware_py.sequence import reset_axis
+from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction, StopRequest
+from tests.axis_on_stub_joint import NewRig, assert_fault, assert_well
+
+
+@pytest.mark.parametrize("drive_state", [DriveState.FAULT, DriveState.FAULT_BRAKING])
+@pytest.mark.parametrize("phase", [p for p in AxisPhase if p < AxisPhase.DISABLING and p != AxisPhase.QUICK_STOPPING])
+def test_drive_fault_in_each_phase(rig: NewRig, phase: AxisPhase, drive_state: DriveState) -> None:
+    run = rig(0.05)
+    if phase in (AxisPhase.RAMPING, AxisPhase.RELEASING):
+        run.until(AxisPhase.TRACKING).run(5)
+        run.stop = StopRequest.RAMP
+    run.until(phase)
+    run.joint.drive_state = drive_state
+    run.sample.drive_error, run.sample.status_word = 0x8311, 0x0218
+    run.tick()
+    assert run.phase == AxisPhase.DISABLING
+    assert run.state.fault_drive_error == 0x8311
+    run.joint.drive_state = DriveState.FAULT
+    assert_fault(run, Fault.DRIVE_FAULT, Reaction.OFF)
+
+
+def test_its_twin_a_warning_of_the_drive_is_no_fault(rig: NewRig) -> None:
+    """An EMCY code and the warning bit (7) of the statusword, while the drive stays enabled."""
+    run = rig(0.05).until(AxisPhase.TRACKING)
+    run.sample.drive_error, run.sample.status_word = 0x4210, 0x12B7
+    run.run(20)
+    assert_well(run)
+    assert run.state.fault_drive_error == 0
+
+
+@pytest.mark.parametrize("cleared_before", [False, True])
+def test_the_encoders_error_of_the_first_fault_is_kept(rig: NewRig, cleared_before: bool) -> None:
+    run = rig(0.05).until(AxisPhase.TRACKING)
+    run.sample.encoder_error = 0x5000
+    run.tick()
+    if cleared_before:
+        run.sample.encoder_error = 0
+    run.joint.drive_state = DriveState.FAULT
+    run.tick()
+    assert run.state.fault == Fault.DRIVE_FAULT
+    run.sample.encoder_error = 0x7300
+    run.tick()
+    assert run.state.fault_encoder_error == (0 if cleared_before else 0x5000)
+    reset_axis(run.axis, run.state)
+    assert run.state.fault_encoder_error == 0
+
+
+def test_a_restart_before_the_first_cycle_ends_the_run_without_power(rig: NewRig) -> None:
+    """It was taken for one from before the run: a drive without its limits would have been enabled."""
+    run, twin = rig(0.0), rig(0.0)
+    run.sample.restarts = 1
+    run.tick()
+    assert_fault(run, Fault.DRIVE_RESTARTED, Reaction.OFF)
+    assert set(run.requests) == {DriveRequest.OFF}
+    twin.tick()
+    assert twin.until(AxisPhase.TRACKING).state.fault == Fault.NONE
+
+
+@pytest.mark.parametrize("phase", [AxisPhase.APPROACH, AxisPhase.TRACKING, AxisPhase.RAMPING, AxisPhase.RELEASING])
+def test_a_drive_that_brakes_by_itself_is_left_braking(rig: NewRig, phase: AxisPhase) -> None:
+    """Power off would make it coast; at standstill, or after the time for a stop, it is switched off."""
+    run = rig(0.05)
+    if phase >= AxisPhase.RAMPING:
+        run.until(AxisPhase.TRACKING).run(5)
+        run.stop = StopRequest.RAMP
+    run.until(phase)
+    before = len(run.requests)
+    run.joint.drive_state, run.joint.delay_cycles = DriveState.STOPPING, 50
+    run.run(40)
+    assert run.phase == AxisPhase.QUICK_STOPPING
+    assert set(run.requests[before:]) == {DriveRequest.QUICK_STOP}
+    assert set(run.torques_Nm[before:]) == {0.0}
+    run.joint.drive_state = DriveState.OFF
+    assert_fault(run, Fault.DRIVE_NOT_ENABLED, Reaction.QUICK_STOP)
+
+
+def test_a_drive_that_brakes_for_ever_is_switched_off(rig: NewRig) -> None:
+    run = rig(0.0).until(AxisPhase.TRACKING).run(5)
+    run.joint.drive_state, run.joint.delay_cycles = DriveState.STOPPING, 1000
+    run.run(int(run.axis.sequence.stop_max_cycles) + 2)
+    assert run.requests[-1] == DriveRequest.OFF
+    run.joint.drive_state = DriveState.OFF
+    assert_fault(run, Fault.DRIVE_NOT_ENABLED, Reaction.OFF)
+
+
+@pytest.mark.parametrize("drive_state", [DriveState.OFF, DriveState.STARTING, DriveState.UNKNOWN])
+def test_a_drive_that_leaves_enabled_unasked_is_switched_off_and_not_enabled_again(
+    rig: NewRig, drive_state: DriveState
+) -> None:
+    run = rig(0.0).until(AxisPhase.TRACKING).run(5)
+    run.joint.drive_state = drive_state
+    run.joint.delay_cycles = 100  # it stays there for a while
+    run.tick()
+    assert run.phase == AxisPhase.DISABLING
+    assert (run.requests[-1], run.torques_Nm[-1]) == (DriveRequest.OFF, 0.0)
+    run.joint.drive_state = DriveState.OFF
+    assert_fault(run, Fault.DRIVE_NOT_ENABLED, Reaction.OFF)
+
+
+@pytest.mark.parametrize("phase", [AxisPhase.WAITING, AxisPhase.ENABLING, AxisPhase.APPROACH, AxisPhase.TRACKING])
+def test_drive_restart(rig: NewRig, phase: AxisPhase) -> None:
+    run = rig(0.0)
+    run.tick()
+    run.until(phase)
+    assert run.state.fault == Fault.NONE
+    run.sample.restarts = 1
+    run.tick()
+    assert_fault(run, Fault.DRIVE_RESTARTED, Reaction.OFF)
+
+
+@pytest.mark.parametrize(("errors", "trips"), [(5, False), (6, True)])
+def test_bus_errors(rig: NewRig, errors: int, trips: bool) -> None:
+    run = rig(0.0).until(AxisPhase.TRACKING)
+    run.sample.bus_errors = errors
+    run.tick()
+    if trips:
+        assert_fault(run, Fault.BUS_ERROR, Reaction.QUICK_STOP)
+    else:
+        assert_well(run)
+
+
+def test_without_a_line_the_run_ends_at_once(rig: NewRig) -> None:
+    run = rig(0.0).until(AxisPhase.TRACKING)
+    run.sample.bus_errors = LINE_GONE
+    run.tick()
+    assert_fault(run, Fault.BUS_ERROR, Reaction.QUICK_STOP)
+    assert run.state.phase == AxisPhase.FINISHED
+
+
+def test_with_a_line_that_only_fails_it_goes_on_stopping(rig: NewRig) -> None:
+    run = rig(0.0).until(AxisPhase.TRACKING)
+    run.sample.bus_errors = LINE_GONE - 1
+    run.tick()
+    assert run.state.phase == AxisPhase.QUICK_STOPPING

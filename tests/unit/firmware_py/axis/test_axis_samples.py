@@ -1,0 +1,136 @@
+"""Samples that an axis cannot believe or does not get: late, lost, jumping, at odds with the other encoder."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from firmware_py.states import AxisPhase, DriveRequest, Fault, Reaction
+from tests.axis_on_stub_joint import NewRig, assert_fault, assert_well
+
+
+@pytest.mark.parametrize(("missing", "trips"), [(1, False), (5, False), (6, True)])
+def test_stale_sample(rig: NewRig, missing: int, trips: bool) -> None:
+    run = rig(0.0).until(AxisPhase.TRACKING).run(20)
+    for _ in range(missing):
+        run.tick(fresh=False)
+    if trips:
+        assert run.phase == AxisPhase.QUICK_STOPPING
+        assert run.state.fault_value == 6.0
+        assert_fault(run, Fault.STALE_SAMPLE, Reaction.QUICK_STOP)
+    else:
+        run.run(20)
+        assert_well(run)
+
+
+def test_missing_samples_are_bridged_by_the_velocity(rig: NewRig) -> None:
+    run = rig(0.0).until(AxisPhase.TRACKING).run(100)
+    for _ in range(5):
+        run.tick(fresh=False)
+        assert run.state.measured_position_rad == pytest.approx(run.joint.position_rad, abs=5e-6)
+    torque_before = run.torques_Nm[-6]
+    run.run(10)
+    assert np.max(np.abs(np.array(run.torques_Nm[-15:]) - torque_before)) < 0.5
+    assert_well(run)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("gap_cycles", [1, 2, 4])
+@pytest.mark.parametrize("trips", [False, True])
+def test_position_jump_scales_with_the_gap(rig: NewRig, sign: float, gap_cycles: int, trips: bool) -> None:
+    run = rig(0.0)
+    run.axis.trajectory.amplitude_rad = 0.0
+    run.axis.limits.velocity_max_radps = 1e3  # only the jump is looked at
+    run.until(AxisPhase.TRACKING).run(20)
+    for _ in range(gap_cycles - 1):
+        run.tick(fresh=False)
+    moved_rad = 0.02 * gap_cycles * (1.001 if trips else 0.999)
+    run.tick(offset_rad=run.state.velocity.last_position_rad - run.joint.position_rad + sign * moved_rad)
+    if trips:
+        assert run.state.fault_value == pytest.approx(moved_rad)
+        assert_fault(run, Fault.POSITION_JUMP, Reaction.QUICK_STOP)
+    else:
+        assert run.state.fault == Fault.NONE
+
+
+def test_a_jump_after_an_overrun_is_measured_per_period_too(rig: NewRig) -> None:
+    run = rig(0.0)
+    run.axis.trajectory.amplitude_rad = 0.0
+    run.axis.limits.velocity_max_radps = 1e3
+    run.until(AxisPhase.TRACKING).run(20)
+    run.tick(4, offset_rad=0.079)
+    assert run.state.fault == Fault.NONE
+
+
+@pytest.mark.parametrize(("apart_rad", "trips"), [(0.0101, True), (-0.0101, True), (0.0099, False), (-0.0099, False)])
+@pytest.mark.parametrize("phase", [AxisPhase.WAITING, AxisPhase.APPROACH, AxisPhase.TRACKING])
+def test_the_other_encoder(rig: NewRig, phase: AxisPhase, apart_rad: float, trips: bool) -> None:
+    run = rig(0.05)
+    run.axis.limits.disagreement_max_rad = 0.01
+    run.until(phase).run(2)
+    assert run.state.fault == Fault.NONE
+    run.twin_rad = apart_rad
+    run.run(5)
+    if trips:
+        assert run.state.fault_value == pytest.approx(apart_rad)
+        assert_fault(
+            run, Fault.POSITION_DISAGREEMENT, Reaction.OFF if phase is AxisPhase.WAITING else Reaction.QUICK_STOP
+        )
+    else:
+        assert run.state.fault == Fault.NONE
+
+
+@pytest.mark.parametrize(("source", "fault"), [(0, Fault.NONE), (1, Fault.POSITION_LIMIT), (2, Fault.POSITION_LIMIT)])
+def test_the_limits_see_the_encoder_that_they_are_told(rig: NewRig, source: int, fault: Fault) -> None:
+    run = rig(0.05)
+    run.axis.limits.disagreement_max_rad = 0.9
+    run.axis.limits.limit_source = source
+    run.until(AxisPhase.TRACKING).run(5)
+    run.twin_rad = 0.899  # of limits -1 .. 1; the joint is between 0 and 0.1
+    run.run(5)
+    assert_well(run)
+    run.axis.limits.position_max_rad = 0.8
+    run.tick()
+    if fault is Fault.NONE:
+        assert_well(run)
+    else:
+        assert run.state.fault_value > 0.8
+        assert_fault(run, fault, Reaction.QUICK_STOP)
+
+
+@pytest.mark.parametrize("phase", [AxisPhase.WAITING, AxisPhase.TRACKING])
+def test_a_position_that_is_not_a_number_stops(rig: NewRig, phase: AxisPhase) -> None:
+    run = rig(0.0)
+    run.tick()
+    run.until(phase)
+    run.tick(offset_rad=math.nan)
+    assert run.torques_Nm[-1] == 0.0
+    assert run.state.fault == Fault.POSITION_JUMP
+    assert run.phase >= AxisPhase.QUICK_STOPPING
+
+
+def test_no_samples_at_all(rig: NewRig) -> None:
+    run = rig(0.0)
+    for _ in range(80):
+        run.tick(fresh=False)
+    assert run.phase == AxisPhase.FINISHED
+    assert run.state.fault == Fault.NO_SAMPLES
+    assert set(run.requests) == {DriveRequest.OFF}
+
+
+def test_a_moving_joint_is_not_enabled(rig: NewRig) -> None:
+    run = rig(0.0)
+    for k in range(80):
+        run.tick(offset_rad=0.0005 * k)
+    assert run.state.fault == Fault.NOT_AT_STANDSTILL
+    assert set(run.requests) == {DriveRequest.OFF}
+
+
+def test_samples_with_holes_are_not_enough_to_enable(rig: NewRig) -> None:
+    run = rig(0.0)
+    for k in range(80):
+        run.tick(fresh=k % 4 != 0)
+    assert run.state.fault == Fault.SAMPLES_MISSING
+    assert set(run.requests) == {DriveRequest.OFF}

@@ -1,0 +1,82 @@
+"""How a run ends: the torque is released along a line, the drive is asked to be off, and each wait has its end."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from firmware_py.records import LINE_GONE
+from firmware_py.sequence import ANSWER_CYCLES, enter, released_torque_Nm, step_stopping
+from firmware_py.states import AxisPhase, DriveState, Fault, Reaction
+from tests.unit.firmware_py.axis.sequence_records import sample_of
+
+
+@pytest.mark.parametrize("elapsed_cycles", [1, 3])
+@pytest.mark.parametrize(
+    ("release_cycles", "phase_cycle"), [(10.0, 1), (10.0, 5), (10.0, 9), (9.5, 9), (10.0, 10), (10.0, 11)]
+)
+def test_the_torque_is_released_along_a_straight_line(
+    axis: Any, state: Any, release_cycles: float, phase_cycle: int, elapsed_cycles: int
+) -> None:
+    """In proportion to the time that is left, from what it was `elapsed_cycles` before."""
+    axis.sequence.release_s = release_cycles * axis.law.period_s
+    state.phase, state.phase_cycle, state.command_torque_Nm = AxisPhase.RELEASING, phase_cycle, 12.0
+    torque_Nm = released_torque_Nm(axis, state, elapsed_cycles)
+    left = max(release_cycles - phase_cycle, 0.0)
+    assert torque_Nm == pytest.approx(12.0 * left / (left + elapsed_cycles), abs=1e-9)
+    assert state.phase == (AxisPhase.RELEASING if left else AxisPhase.DISABLING)
+
+
+@pytest.mark.parametrize("drive_state", DriveState)
+@pytest.mark.parametrize("age_cycles", [0, 1])
+@pytest.mark.parametrize("phase_cycle", [ANSWER_CYCLES, ANSWER_CYCLES + 1])
+@pytest.mark.parametrize(
+    ("phase", "following"),
+    [(AxisPhase.QUICK_STOPPING, AxisPhase.DISABLING), (AxisPhase.DISABLING, AxisPhase.FINISHED)],
+)
+def test_only_a_fresh_answer_of_the_drive_ends_the_stop(
+    axis: Any, state: Any, drive_state: DriveState, age_cycles: int, phase_cycle: int, phase: int, following: int
+) -> None:
+    state.phase, state.phase_cycle, state.sample_age_cycles = phase, phase_cycle, age_cycles
+    step_stopping(axis, state, sample_of(drive_state))
+    confirmed = drive_state in (DriveState.OFF, DriveState.FAULT) and age_cycles == 0 and phase_cycle > ANSWER_CYCLES
+    assert state.phase == (following if confirmed else phase)
+    assert state.fault == Fault.NONE
+
+
+@pytest.mark.parametrize("bus_errors", [LINE_GONE - 1, LINE_GONE])
+@pytest.mark.parametrize("phase", [AxisPhase.QUICK_STOPPING, AxisPhase.DISABLING])
+def test_on_a_line_that_is_gone_there_is_nothing_to_wait_for(
+    axis: Any, state: Any, phase: AxisPhase, bus_errors: int
+) -> None:
+    enter(state, int(phase))
+    sample = sample_of(DriveState.ENABLED)
+    sample.bus_errors = bus_errors
+    step_stopping(axis, state, sample)
+    assert state.phase == (AxisPhase.FINISHED if bus_errors == LINE_GONE else phase)
+
+
+@pytest.mark.parametrize("phase", [p for p in AxisPhase if p not in (AxisPhase.QUICK_STOPPING, AxisPhase.DISABLING)])
+def test_the_stop_concerns_no_other_phase(axis: Any, state: Any, phase: AxisPhase) -> None:
+    state.phase, state.phase_cycle = phase, 1000
+    step_stopping(axis, state, sample_of(DriveState.OFF))
+    assert state.phase == phase
+
+
+@pytest.mark.parametrize(("phase_cycle", "phase"), [(100, AxisPhase.QUICK_STOPPING), (101, AxisPhase.DISABLING)])
+def test_a_quick_stop_that_does_not_end_is_cut_off(axis: Any, state: Any, phase_cycle: int, phase: AxisPhase) -> None:
+    state.phase, state.phase_cycle, state.reaction = AxisPhase.QUICK_STOPPING, phase_cycle, Reaction.QUICK_STOP
+    step_stopping(axis, state, sample_of(DriveState.STOPPING))
+    assert state.phase == phase
+
+
+@pytest.mark.parametrize(
+    ("phase_cycle", "phase", "fault"),
+    [(20, AxisPhase.DISABLING, Fault.NONE), (21, AxisPhase.FINISHED, Fault.OFF_TIMEOUT)],
+)
+def test_off_timeout(axis: Any, state: Any, phase_cycle: int, phase: AxisPhase, fault: Fault) -> None:
+    state.phase, state.phase_cycle = AxisPhase.DISABLING, phase_cycle
+    step_stopping(axis, state, sample_of(DriveState.ENABLED))
+    assert (state.phase, state.fault) == (phase, fault)
+    assert (state.fault_value, state.fault_drive_error) == ((0x1237, 0x3310) if fault else (0.0, 0))
