@@ -22,7 +22,7 @@ from firmware_py.schema import new
 from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, StopRequest
 from hil.canopen.device_core import power_on
 from hil.canopen.device_records import NmtState
-from tests.unit.drivers.elmo.test_elmo_cyclic import Talk
+from tests.unit.drivers.elmo.talk import Talk
 from tests.unit.firmware_py.test_realtime import ANSWER_ns, Loop
 from tools.running.supervisor import Supervisor
 

@@ -19,7 +19,6 @@ from tests.places import ROOT
 SAFETY = "unit/firmware_py/axis/test_safety.py::"
 EDGES = "unit/firmware_py/axis/test_surroundings_edges.py::"
 SURROUNDINGS = "unit/firmware_py/axis/test_surroundings.py::"
-CYCLIC = "unit/drivers/canopen/test_cyclic.py::"
 ELMO_CYCLIC = "unit/drivers/elmo/test_elmo_cyclic.py::"
 HANGS = "unit/running/test_hang_limits.py::"
 AXIS_LIMITS = "unit/firmware_py/axis/test_axis_limits.py::"
@@ -28,6 +27,7 @@ AXIS_DRIVE_FAULTS = "unit/firmware_py/axis/test_axis_drive_faults.py::"
 AXIS_TIME_LIMITS = "unit/firmware_py/axis/test_axis_time_limits.py::"
 SEQUENCE_START = "unit/firmware_py/axis/test_sequence_start.py::"
 SEQUENCE_END = "unit/firmware_py/axis/test_sequence_end.py::"
+CYCLIC_SENT = "unit/drivers/canopen/test_cyclic_sent.py::"
 EDGE = EDGES + "test_each_limit_at_its_edge_in_each_phase | "
 DENSE = AXIS_LIMITS + "test_velocity_and_following_error_are_dense_at_their_limits | "
 PLACE = re.compile(r"((?:\w+/)+\w+\.py)::(\w+)(?: \| (.+))?")
@@ -154,8 +154,8 @@ CAN: dict[tuple[str, str], tuple[str, str] | tuple[Fault, ...]] = {
         "_of_the_drive | (0.098, False)",
     ),
     ("loop", "that it is heard"): (
-        CYCLIC + "test_a_drive_that_stays_enabled_loses_the_heartbeat | (UNHEEDED_MAX_CYCLES + 1, 1)",
-        CYCLIC + "test_a_drive_that_stays_enabled_loses_the_heartbeat | (UNHEEDED_MAX_CYCLES, 2)",
+        CYCLIC_SENT + "test_a_drive_that_stays_enabled_loses_the_heartbeat | (UNHEEDED_MAX_CYCLES + 1, 1)",
+        CYCLIC_SENT + "test_a_drive_that_stays_enabled_loses_the_heartbeat | (UNHEEDED_MAX_CYCLES, 2)",
     ),
     ("loop", "the drive"): (Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED, Fault.DRIVE_RESTARTED),
     ("loop", "the drive's communication"): (Fault.DRIVE_SILENT,),

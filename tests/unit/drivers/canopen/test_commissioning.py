@@ -20,11 +20,6 @@ from drivers.errors import ConfigurationError, DeviceError, JointctlError, NoDev
 pytestmark = pytest.mark.usefixtures("short_timeout")
 
 
-@pytest.fixture
-def short_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers.canopen.drive.SDO_TIMEOUT_S", 0.15)
-
-
 @contextmanager
 def opened(bus: Any, settings: CanopenSettings) -> Iterator[CanopenDrive]:
     drive = bus.drive(settings)

@@ -1,0 +1,64 @@
+"""The virtual joint with a second encoder: its configuration, and the frames of both positions."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+
+from drivers.can.frames import Frame
+from drivers.canopen.cyclic import accept_frame, begin_cycle
+from firmware_py.schema import new
+from tests.places import CONFIGS
+from tools.configuration.config import Config
+from tools.configuration.drive_settings import canopen_settings
+from tools.configuration.load import load_config
+
+NODE = {
+    "source": "node", "node": 2, "counts_per_turn": 524288, "direction": 1, "zero_counts": 100_000,
+    "disagreement_max_rad": 0.005,
+}  # fmt: skip
+
+
+def config_with(folder: Path, encoder: dict[str, Any], **changes: Any) -> Config:
+    """configs/virtual.toml with its own encoder on the motor and this [joint_encoder]."""
+    document = tomlkit.parse((CONFIGS / "virtual.toml").read_text())
+    document["joint_encoder"] = encoder
+    short: dict[str, Any] = {
+        "encoder__side": "motor", "encoder__counts_per_turn": 65536, "trajectory__duration_s": 1.0,
+        "virtual__initial_position_rad": 0.0,
+    }  # fmt: skip
+    for path, value in {**short, **changes}.items():
+        section, key = path.split("__")
+        document[section][key] = value  # type: ignore[index]
+    path = folder / "joint.toml"
+    path.write_text(tomlkit.dumps(document))
+    return load_config(path)
+
+
+def port_of(folder: Path, encoder: dict[str, Any], **changes: Any) -> Any:
+    from drivers.canopen.scaling import new_port
+
+    return new_port(canopen_settings(config_with(folder, encoder, **changes)), 0.06, 1000, second_range_counts=1 << 20)
+
+
+def cycle(port: Any, sample: Any, first: int | None, second: int | None) -> None:
+    """One SYNC, and the TPDOs that answer it."""
+    begin_cycle(port[0], new(Frame, 4))
+    tell(port, sample, first, second)
+
+
+def tell(port: Any, sample: Any, first: int | None, second: int | None) -> None:
+    """The TPDOs of drive and encoder."""
+    frames = new(Frame, 4)
+    for identifier, data in (
+        (0x181, None if first is None else struct.pack("<HiH", 0x1237, first, 0)),
+        (0x182, None if second is None else struct.pack("<I", second)),
+    ):
+        if data is not None:
+            frames[3].can_id, frames[3].length = identifier, len(data)
+            for at, byte in enumerate(data):
+                frames[3].payload[at] = byte
+            accept_frame(port[0], frames[3], sample, 1)

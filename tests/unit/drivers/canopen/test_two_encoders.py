@@ -1,0 +1,223 @@
+"""A run with two encoders: configuration, commissioning, and the loop that finds the one that is wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.can.frames import Frame
+from drivers.canopen.cyclic import accept_frame
+from drivers.errors import ConfigurationError, DeviceError
+from firmware_py.records import Sample
+from firmware_py.schema import new
+from firmware_py.states import AxisPhase, Fault
+from hil.faults.kinds import FaultConstants, FaultKind
+from tests.places import CONFIGS
+from tests.two_encoders import NODE, config_with, cycle, port_of
+from tools.configuration.drive_settings import canopen_settings, cyclic_bus_load
+from tools.configuration.load import load_config
+from tools.inspection.bus_health import bus_budget
+from tools.running.open_drive import drive_fault_text
+from tools.simulation.lockstep import LockstepJoint
+from tools.simulation.virtual_joint import new_device
+
+DRIVE = {**{k: v for k, v in NODE.items() if k != "node"}, "source": "drive"}
+
+
+# --- commissioning and runs in lockstep ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("encoder", [NODE, DRIVE, {**NODE, "law": "encoder"}, {**NODE, "kind": "incremental"}])
+def test_a_run_with_two_encoders(tmp_path: Path, encoder: dict[str, Any]) -> None:
+    joint = LockstepJoint(config_with(tmp_path, encoder, virtual__initial_position_rad=0.1))
+    assert joint.report.start_position_rad == pytest.approx(0.1, abs=1e-4)
+    run = joint.run()
+    assert run.fault is Fault.NONE
+    tracked = run.log[run.tracking]
+    assert np.abs(tracked.position_rad - tracked.second_position_rad).max() < 1e-4
+    assert np.abs(run.true_error_rad[run.tracking]).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"counts_per_turn": 4096}, ""),
+        ({"eds": "virtual_joint.eds"}, "EDS virtual_joint.eds has no object 6001"),
+    ],
+)
+def test_commissioning_refuses(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    good = config_with(tmp_path, NODE)
+    device = new_device(good)
+    from drivers.canopen.drive import CanopenDrive
+    from tools.simulation.lockstep import DirectBus
+
+    bus = DirectBus(device)
+    settings = canopen_settings(config_with(tmp_path, {**NODE, **change}))
+    drive = CanopenDrive(bus, settings, sleep=bus.sleep)
+    message = message or r"joint_encoder.counts_per_turn (=4096) differs from the encoder's 6001, 524288"
+    with pytest.raises(DeviceError, match=re.escape(message)):
+        drive.commission()
+    drive.close()
+    assert device.device[0].state == 1
+
+
+def test_an_encoder_with_an_alarm_is_refused(tmp_path: Path) -> None:
+    from drivers.canopen.drive import CanopenDrive
+    from tools.simulation.lockstep import DirectBus
+
+    config = config_with(tmp_path, NODE)
+    device = new_device(config)
+    device.device[0].encoder.error_code = 0x5000
+    bus = DirectBus(device)
+    drive = CanopenDrive(bus, canopen_settings(config), sleep=bus.sleep)
+    with pytest.raises(DeviceError, match="node 2: the encoder reports alarms"):
+        drive.commission()
+    drive.close()
+
+
+@pytest.mark.parametrize("alarm", [True, False])
+def test_an_alarm_that_comes_while_the_question_is_open_is_refused(tmp_path: Path, alarm: bool) -> None:
+    """Its EMCY comes while nobody listens."""
+    from drivers.canopen.drive import CanopenDrive
+    from tools.simulation.lockstep import DirectBus
+
+    config = config_with(tmp_path, NODE)
+    device = new_device(config)
+    bus = DirectBus(device)
+    drive = CanopenDrive(bus, canopen_settings(config), sleep=bus.sleep)
+    drive.commission()
+    if alarm:
+        device.device[0].encoder.error_code = 0x5000
+        bus.sleep(0.05)
+        with pytest.raises(DeviceError, match=re.escape("node 2: the encoder reports alarms (6503 = 0001h)")):
+            drive.start_cyclic()
+    else:
+        drive.start_cyclic()
+    drive.close()
+
+
+def drift(rate_radps: float) -> Any:
+    faults = new(FaultConstants, 1)
+    faults[0].kind, faults[0].start_s, faults[0].duration_s = FaultKind.ENCODER_DRIFT, 1.5, 100.0
+    faults[0].magnitude = rate_radps
+    return faults
+
+
+@pytest.mark.parametrize(("rate_radps", "fault"), [(0.02, Fault.POSITION_DISAGREEMENT), (0.002, Fault.NONE)])
+def test_an_encoder_that_drifts_is_found_by_the_other_one(tmp_path: Path, rate_radps: float, fault: Fault) -> None:
+    """The drive's encoder drifts for 1.5 s or so: by 30 mrad, or by 3 of the 5 that are allowed."""
+    joint = LockstepJoint(config_with(tmp_path, NODE, trajectory__duration_s=2.0))
+    run = joint.run_with_faults(drift(rate_radps), tail_s=0.1)
+    assert run.fault is fault
+    if fault is not Fault.NONE:
+        assert abs(run.state.fault_value) == pytest.approx(0.005, abs=1e-3)
+        assert AxisPhase.QUICK_STOPPING in run.log.phase
+        assert run.device.state in (1, 7)
+
+
+@pytest.mark.parametrize(("key", "value"), [("encoder__direction", -1), ("encoder__counts_per_turn", 32768)])
+def test_a_configuration_that_is_wrong_about_one_encoder(tmp_path: Path, key: str, value: int) -> None:
+    """The joint is what the file says; the controller is told otherwise."""
+    good = LockstepJoint(config_with(tmp_path, NODE, virtual__initial_position_rad=0.1))
+    wrong = canopen_settings(config_with(tmp_path, NODE, virtual__initial_position_rad=0.1, **{key: value}))
+    from drivers.canopen.scaling import joint_angle_per_count_rad
+
+    good._port[0].position_radpcount = joint_angle_per_count_rad(wrong) * wrong.encoder_direction
+    run = good.run()
+    assert run.fault is Fault.POSITION_DISAGREEMENT
+    assert not (run.log.drive_state == 3).any()  # found before the drive was enabled
+
+
+def test_losing_the_encoder_node_ends_the_run(tmp_path: Path) -> None:
+    joint = LockstepJoint(config_with(tmp_path, NODE))
+    joint._virtual.device[0].encoder.node_id = 0
+    assert joint.run().fault is Fault.NO_SAMPLES
+
+
+def emergency(port: Any, sample: Any, code: int) -> None:
+    received = new(Frame)[0]
+    received.can_id, received.length = 0x82, 8
+    received.payload[0], received.payload[1] = code & 0xFF, code >> 8
+    accept_frame(port[0], received, sample, 1)
+
+
+@pytest.mark.parametrize("cleared", [False, True])
+def test_an_error_of_the_encoder_is_not_the_drives_and_ends_when_it_is_cleared(tmp_path: Path, cleared: bool) -> None:
+    """It was taken for the drive's, even 200 cycles after it had been cleared."""
+    port, sample = port_of(tmp_path, NODE), new(Sample)[0]
+    cycle(port, sample, 0, 100_000)
+    emergency(port, sample, 0x5000)
+    if cleared:
+        emergency(port, sample, 0)
+    cycle(port, sample, 0, 100_000)
+    assert (sample.count, sample.encoder_error) == ((2, 0) if cleared else (1, 0x5000))
+    assert sample.drive_error == 0
+
+
+@pytest.mark.parametrize("code", [0x5000, 0])
+def test_a_run_that_the_encoder_ends_says_so(tmp_path: Path, code: int) -> None:
+    config = config_with(tmp_path, NODE)
+    joint = LockstepJoint(config)
+    joint._virtual.device[0].encoder.error_code = code
+    run = joint.run()
+    assert run.fault is (Fault.NO_SAMPLES if code else Fault.NONE)
+    errors = int(run.state.fault_drive_error), int(run.state.fault_encoder_error)
+    assert errors == (0, code)
+    if code:
+        told = drive_fault_text(config, run.fault, float(run.state.fault_value), *errors)
+        assert "from both encoders of the joint; the encoder node's error code is 5000h" in told.happened
+        assert "not believed" in told.cause
+
+
+# --- configuration ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"node": 1}, "joint_encoder.node (=1) must differ from drive.node"),
+        ({"source": "drive"}, 'joint_encoder.node must be given with source = "node", and only then'),
+        ({"eds": "missing.eds"}, "joint_encoder.eds (=missing.eds) must name a file"),
+        ({"object": "60E"}, "joint_encoder.object"),
+        ({"disagreement_max_rad": 0.0}, "joint_encoder.disagreement_max_rad (=0) must be in (0..1]"),
+        ({"disagreement_max_rad": 0.9}, "must be less than ten times"),
+    ],
+)
+def test_problems(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigurationError, match=re.escape(message)):
+        config_with(tmp_path, {**NODE, **change})
+
+
+def test_two_incremental_encoders_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="both incremental"):
+        config_with(tmp_path, {**NODE, "kind": "incremental"}, encoder__kind="incremental")
+
+
+def test_the_bus_load_counts_the_second_position(tmp_path: Path) -> None:
+    with_one = cyclic_bus_load(load_config(CONFIGS / "virtual.toml"))
+    assert cyclic_bus_load(config_with(tmp_path, NODE)) == pytest.approx(with_one + 95e3 / 1e6)
+
+
+@pytest.mark.parametrize(("rate_Hz", "refused"), [(2105.0, False), (2106.0, True)])
+def test_the_arithmetic_names_the_second_position(tmp_path: Path, rate_Hz: float, refused: bool) -> None:
+    """SYNC 55, TPDO 135, RPDO 95 and 95 bits; `doctor` reckons alike."""
+    config = config_with(tmp_path, NODE)
+    config = config.model_copy(update={"loop": config.loop.model_copy(update={"rate_Hz": rate_Hz})})
+    assert bus_budget(config).status == ("problem" if refused else "ok")
+    if refused:
+        with pytest.raises(ConfigurationError, match=re.escape("TPDO(8) + RPDO(4) + second encoder(4) = 380 bits")):
+            cyclic_bus_load(config)
+    else:
+        assert cyclic_bus_load(config) == pytest.approx(380 * rate_Hz / 1e6)
+
+
+def test_settings_of_the_driver(tmp_path: Path) -> None:
+    settings = canopen_settings(config_with(tmp_path, {**DRIVE, "object": "2ABC:3"}))
+    assert settings.joint_encoder is not None
+    assert (settings.joint_encoder.index, settings.joint_encoder.sub) == (0x2ABC, 3)
+    assert dataclasses.replace(settings, joint_encoder=None).joint_encoder is None
