@@ -22,15 +22,13 @@ NODE = {
 }  # fmt: skip
 
 
-def config_with(folder: Path, encoder: dict[str, Any], **changes: Any) -> Config:
-    """configs/virtual.toml with its own encoder on the motor and this [joint_encoder]."""
+def config_with(folder: Path, encoder: dict[str, Any] | None = None, **changes: Any) -> Config:
+    """configs/virtual.toml changed; with `encoder` as its [joint_encoder], its own one is on the motor."""
     document = tomlkit.parse((CONFIGS / "virtual.toml").read_text())
-    document["joint_encoder"] = encoder
-    short: dict[str, Any] = {
-        "encoder__side": "motor", "encoder__counts_per_turn": 65536, "trajectory__duration_s": 1.0,
-        "virtual__initial_position_rad": 0.0,
-    }  # fmt: skip
-    for path, value in {**short, **changes}.items():
+    if encoder is not None:
+        document["joint_encoder"] = encoder
+        changes = {"encoder__side": "motor", "encoder__counts_per_turn": 65536, **changes}
+    for path, value in changes.items():
         section, key = path.split("__")
         document[section][key] = value  # type: ignore[index]
     path = folder / "joint.toml"
@@ -38,10 +36,16 @@ def config_with(folder: Path, encoder: dict[str, Any], **changes: Any) -> Config
     return load_config(path)
 
 
+def short_run(folder: Path, encoder: dict[str, Any], **changes: Any) -> Config:
+    """A second of the trajectory, from position zero."""
+    short = {"trajectory__duration_s": 1.0, "virtual__initial_position_rad": 0.0}
+    return config_with(folder, encoder, **{**short, **changes})
+
+
 def port_of(folder: Path, encoder: dict[str, Any], **changes: Any) -> Any:
     from drivers.canopen.scaling import new_port
 
-    return new_port(canopen_settings(config_with(folder, encoder, **changes)), 0.06, 1000, second_range_counts=1 << 20)
+    return new_port(canopen_settings(short_run(folder, encoder, **changes)), 0.06, 1000, second_range_counts=1 << 20)
 
 
 def cycle(port: Any, sample: Any, first: int | None, second: int | None) -> None:

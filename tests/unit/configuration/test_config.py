@@ -1,49 +1,17 @@
-"""Configuration files: what is shipped loads, what is wrong is named in one line, units are converted once."""
+"""Configuration files: what is shipped loads, what is wrong is named in one line."""
 
 from __future__ import annotations
 
-import math
 import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from drivers.errors import ConfigurationError
-from firmware_py import friction as friction_model
-from firmware_py.states import ControllerKind, FeedForward, TrajectoryKind
-from firmware_py.trajectory_table import approach_peak, approach_start, peak_of
-from tools.configuration.checks import trajectory_extremes
-from tools.configuration.config import Config
-from tools.configuration.conversions import friction_constants, joint_rad_per_count, torque_constant_NmpA
+from tests.unit.configuration.edited_config import VIRTUAL, load, problems, replaced
 from tools.configuration.load import load_config, shipped_config, with_bus_overrides
-from tools.configuration.plant_settings import plant_settings
-from tools.configuration.records import approach_s, axis_constants, trajectory_table
 
-VIRTUAL = shipped_config("virtual").read_text()
 UNIT = " (the unit is part of the key)"
-
-
-def replaced(text: str, pattern: str, line: str) -> str:
-    changed, count = re.subn(rf"^{pattern}", lambda _: line, text, count=1, flags=re.M)
-    assert count == 1, pattern
-    return changed
-
-
-def load(tmp_path: Path, pattern: str = "", line: str = "", text: str = VIRTUAL) -> Config:
-    path = tmp_path / "joint.toml"
-    path.write_text(replaced(text, pattern, line) if pattern else text)
-    return load_config(path)
-
-
-def problems(tmp_path: Path, pattern: str, line: str, text: str = VIRTUAL) -> list[str]:
-    with pytest.raises(ConfigurationError) as caught:
-        load(tmp_path, pattern, line, text)
-    assert caught.value.exit_code == 3
-    lines = caught.value.message.splitlines()
-    prefix = f"{tmp_path / 'joint.toml'}: "
-    assert all(x.startswith(prefix) for x in lines)
-    return [x.removeprefix(prefix) for x in lines]
 
 
 @pytest.mark.parametrize("name", ["virtual", "paper"])
@@ -198,131 +166,6 @@ def test_a_configuration_cannot_be_changed() -> None:
     config = load_config(shipped_config("virtual"))
     with pytest.raises(ValueError, match="frozen"):
         config.limits.torque_max_Nm = 1000.0  # type: ignore[misc]
-
-
-def test_records_of_the_paper() -> None:
-    axis = axis_constants(load_config(shipped_config("paper")))[0]
-    law = axis.law
-    assert law.kind == ControllerKind.COMPUTED_TORQUE_RBF
-    assert law.feed_forward == FeedForward.MEASURED
-    # spec, section 3: P for Q = 1800 I, divided by M0 = 2.1
-    np.testing.assert_allclose(law.network.p_b, [1.147959 / 2.1, 16.091928 / 2.1], rtol=1e-6)
-    assert law.network.inverse_width[14] == pytest.approx(1.0 / 50.0)
-    half = 1e-2 * np.array([-5, -3, -1, -0.8, -0.4, -0.1, -0.05])
-    np.testing.assert_allclose(law.network.centres[:, 1], [*half, 0.0, *-half])
-    np.testing.assert_array_equal(law.network.centres[:, 0], law.network.centres[:, 1])
-    assert axis.trajectory.kind == TrajectoryKind.SINE
-    assert axis.trajectory.omega_radps == pytest.approx(0.2 * math.pi)
-    assert axis.trajectory.duration_s == 100.0
-    assert axis.limits.torque_max_Nm == 60.0
-    assert axis.limits.sample_age_max_cycles == 50
-    assert axis.velocity.period_gain == pytest.approx(1.0 - math.exp(-0.2 * math.pi))
-
-
-@pytest.mark.parametrize("name", ["virtual", "paper"])
-def test_friction_of_the_files_is_table_3(name: str) -> None:
-    law = axis_constants(load_config(shipped_config(name)))[0].law
-    velocity = np.radians([12.6, -12.6, 40.0, 40.01, -40.0, -40.01, 100.0, 200.0, -200.0])
-    torque = [friction_model.friction_motor_torque_Nm(law.friction, v) for v in velocity]
-    np.testing.assert_allclose(
-        torque, [0.15326, -0.13814, 0.22592, 0.22761, -0.20530, -0.20402, 0.28871, 0.33823, -0.35398], atol=2e-5
-    )
-
-
-def test_friction_units_and_sides_describe_the_same_curve() -> None:
-    friction = load_config(shipped_config("virtual")).friction
-    assert friction is not None
-    n = 121.0
-    own = friction_constants(friction, n)
-    # the same table as r/min of the motor, torque at the joint
-    unit = n / 6.0  # deg/s of the joint in r/min of the motor
-
-    def converted(d):  # type: ignore[no-untyped-def]
-        values = {"tc_Nm": d.tc_Nm * n, "ts_Nm": d.ts_Nm * n, "ws": d.ws * unit, "tv": d.tv * n / unit}
-        values |= {f"a{i}": getattr(d, f"a{i}") * n / unit**i for i in range(4)}
-        return d.model_copy(update={**values, "knee": d.knee * unit, "max": d.max * unit})
-
-    other = friction.model_copy(
-        update={
-            "velocity_unit": "r/min", "velocity_side": "motor", "torque_side": "joint",
-            "positive": converted(friction.positive), "negative": converted(friction.negative),
-        }
-    )  # fmt: skip
-    velocity = np.radians([-250.0, -100.0, -39.0, -1.0, 1.0, 39.0, 100.0, 250.0])
-    np.testing.assert_allclose(
-        friction_model.friction_curve_Nm(friction_constants(other, n), velocity),
-        friction_model.friction_curve_Nm(own, velocity),
-        rtol=1e-12,
-    )
-
-
-def test_ampere_conventions_and_encoder_sides(tmp_path: Path) -> None:
-    assert torque_constant_NmpA(load(tmp_path)) == 0.1
-    config = load(tmp_path, "torque_constant_NmpA", 'torque_constant_ampere = "rms"\ntorque_constant_NmpA')
-    # 1 A rms is 1.414 A amplitude: the drive, which counts amplitude, gets less torque per ampere
-    assert torque_constant_NmpA(config) == pytest.approx(0.1 / math.sqrt(2.0))
-    assert joint_rad_per_count(load(tmp_path)) == pytest.approx(math.tau / 2**19)
-    config = load(tmp_path, "side = .*\ndirection = 1", 'side = "motor"\ndirection = -1')
-    assert joint_rad_per_count(config) == pytest.approx(-math.tau / 2**19 / 121.0)
-
-
-def test_the_automatic_approach_keeps_to_its_speed_and_is_no_longer_than_needed(tmp_path: Path) -> None:
-    config = load(tmp_path)
-    assert approach_s(config, 0.0) == 1.0
-    start = approach_start(axis_constants(config, start_position_rad=0.0)[0].trajectory)
-    allowed = 1.2 * 0.35 * 0.2 * math.pi  # of the sine's own speed at its start, above a quarter of the limit
-    duration = approach_s(config, -0.6)
-    assert approach_peak(-0.6, start, duration).velocity_radps <= allowed * (1.0 + 1e-6)
-    assert approach_peak(-0.6, start, 0.99 * duration).velocity_radps > allowed
-    # an unknown place is taken as the farther end of the range
-    assert approach_s(config) == max(approach_s(config, -0.7), approach_s(config, 0.7))
-    assert approach_s(load(tmp_path, "approach_s = .*", "approach_s = 0"), 0.6) == 0.0
-
-
-def test_shipped_checks_agree_with_the_trajectory_itself(tmp_path: Path) -> None:
-    start = VIRTUAL.index("[trajectory]")
-    end = VIRTUAL.index("[virtual]")
-    for keys in (
-        'kind = "sine"\namplitude_rad = -0.3\nfrequency_Hz = 0.2\noffset_rad = 0.1',
-        'kind = "min_jerk"\nstart_rad = 0.2\ntarget_rad = -0.4\nmove_s = 2.0',
-        'kind = "trapezoid"\nstart_rad = 0.2\ntarget_rad = -0.4\nspeed_radps = 0.5\nacceleration_radps2 = 0.1',
-        'kind = "trapezoid"\nstart_rad = 0.2\ntarget_rad = -0.4\nspeed_radps = 0.2\nacceleration_radps2 = 1.0',
-        'kind = "hold"\nposition_rad = 0.3',
-    ):
-        text = VIRTUAL[:start] + f"[trajectory]\nduration_s = 0.0\n{keys}\n\n" + VIRTUAL[end:]
-        config = load(tmp_path, text=text)
-        peak = peak_of(axis_constants(config)[0].trajectory)
-        assert trajectory_extremes(config.trajectory) == pytest.approx(peak[:3]), keys
-
-
-def test_plant_settings_are_accepted_by_the_plant() -> None:
-    from hil.plant.joint import plant
-
-    settings = plant_settings(load_config(shipped_config("virtual")))
-    constants, state = plant(**settings)
-    assert constants[0].positive_factor == pytest.approx(121.0 * 1.1)
-    assert state[0].joint_position_rad == 0.1
-    assert settings["current_lag_s"] == 0.5e-3
-
-
-def test_a_table_trajectory_is_read_and_checked(tmp_path: Path) -> None:
-    start = VIRTUAL.index("[trajectory]")
-    end = VIRTUAL.index("[virtual]")
-    text = VIRTUAL[:start] + '[trajectory]\nkind = "table"\nduration_s = 2.0\nfile = "way.csv"\n\n' + VIRTUAL[end:]
-    assert problems(tmp_path, "#", "#", text)[0].startswith("trajectory.file (=way.csv) must name a file")
-    way = tmp_path / "way.csv"
-    way.write_text("time_s,position_rad\n0,0\n1,0.1\n2,0.2\n3,0.2\n")
-    config = load(tmp_path, text=text)
-    assert trajectory_table(config).shape[1] == 5
-    assert axis_constants(config)[0].trajectory.table_rows == len(trajectory_table(config))
-    with pytest.raises(ConfigurationError, match="needs a table that ends where it begins"):
-        trajectory_table(load(tmp_path, "file = ", "repeat = true\nfile = ", text))
-    way.write_text("time_s,position_rad\n0,0\n1,0.1\n2,0.8\n3,0.8\n")
-    with pytest.raises(ConfigurationError, match=r"trajectory: highest position \(=0\.8"):
-        trajectory_table(load(tmp_path, text=text))
-    way.write_text("time_s,position_rad\n0,0\n1,zero\n")
-    with pytest.raises(ConfigurationError, match=r"trajectory\.file: .*way\.csv"):
-        trajectory_table(load(tmp_path, text=text))
 
 
 @pytest.mark.parametrize(

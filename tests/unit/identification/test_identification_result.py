@@ -1,135 +1,17 @@
-"""Outliers, selection, intervals, plausibility and the whole identification on synthetic Table 3 data."""
+"""The whole identification on synthetic data of Table 3: what comes out, what is told, which options it takes."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from drivers.errors import DataError, UsageError
 from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
-from tools.identification.friction_data import FrictionData
+from tests.unit.identification.synthetic_friction import LIMITS, QUICK, DENSE_radps, NOISE_Nm, UNIFORM_radps, paper_data
 from tools.identification.identification import identify_friction
-from tools.identification.intervals import uncertainty
 from tools.identification.models import FORMS, MIN_PER_STAGE
 from tools.identification.options import Options
-from tools.identification.plausibility import JointLimits, check_branches, check_data
 from tools.identification.pso import SwarmSettings
-from tools.identification.selection import choose, find_outliers, fold_numbers, held_out_rss
-from tools.identification.variable_projection import make_problem, project
-
-NOISE_Nm = 0.0046
-UNIFORM_radps = np.linspace(-200.0, 200.0, 225) * DEGREE
-DENSE_radps = np.concatenate([-np.geomspace(0.2, 200.0, 112)[::-1], np.geomspace(0.2, 200.0, 112)]) * DEGREE
-QUICK = Options(folds=4, swarm=SwarmSettings(particles=150, iterations=300))
-LIMITS = JointLimits(torque_max_Nm=60.0, velocity_max_radps=3.5, reduction_ratio=121.0, torque_constant_NmpA=0.1)
-
-
-def paper_data(seed=0, velocity_radps=UNIFORM_radps, noise_Nm=NOISE_Nm, torque_factor=1.0, speed_factor=1.0,
-               ratio=121.0, offset_Nm=0.0):  # fmt: skip
-    velocity_radps = velocity_radps[velocity_radps != 0.0]
-    noise = np.random.default_rng(seed).normal(0.0, noise_Nm, len(velocity_radps))
-    torque = (friction_curve_Nm(paper_friction(), velocity_radps) + noise + offset_Nm) * torque_factor
-    velocity_radps = velocity_radps * speed_factor
-    order = np.argsort(velocity_radps)
-    count = len(order)
-    return FrictionData(
-        Path("sweep.csv"), "0" * 64, velocity_radps[order], torque[order], np.arange(2, count + 2),
-        np.ones(count, bool), ratio, 0.1,
-    )  # fmt: skip
-
-
-def one_direction(seed, form="multi-stage", velocity_radps=UNIFORM_radps, **settings):
-    data = paper_data(seed, velocity_radps, **settings)
-    chosen = data.direction(1)
-    return make_problem(FORMS[form], data.velocity_radps[chosen], data.motor_torque_Nm[chosen], 40.0 * DEGREE,
-                        (None, 20.0 * DEGREE))  # fmt: skip
-
-
-def moved(problem, at, by_Nm):
-    y = problem.y_Nm.copy()
-    y[at] += by_Nm
-    return make_problem(problem.form, problem.x * problem.top_radps, y, problem.knee * problem.top_radps,
-                        (None, 20.0 * DEGREE))  # fmt: skip
-
-
-@pytest.mark.parametrize("at", [5, 21, 22, 60, 110])
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_point_ten_deviations_off_is_found_and_no_other(at, sign):
-    out, score = find_outliers(moved(one_direction(1), at, sign * 10.0 * NOISE_Nm), 5.0)
-    assert np.flatnonzero(out).tolist() == [at]
-    assert abs(score[at]) > 5.0
-
-
-def test_outliers_do_not_hide_each_other_and_clean_data_have_none():
-    out, _ = find_outliers(moved(one_direction(2), [30, 31, 32, 70, 90], 0.1), 5.0)
-    assert np.flatnonzero(out).tolist() == [30, 31, 32, 70, 90]
-    assert sum(find_outliers(one_direction(seed), 5.0)[0].sum() for seed in range(20)) <= 1
-    assert not find_outliers(one_direction(0, noise_Nm=0.0), 5.0)[0].any()
-
-
-def test_the_outlier_test_can_be_switched_off():
-    assert not find_outliers(moved(one_direction(1), 60, 1.0), 0.0)[0].any()
-
-
-def test_folds_are_seeded_balanced_and_keep_repeats_together():
-    problem = make_problem(FORMS["stribeck"], np.repeat(np.arange(1.0, 31.0), 2), np.ones(60), 10.0, (None, 1.0))
-    number = fold_numbers(problem, 5, seed=3)
-    assert np.array_equal(number[::2], number[1::2])
-    assert np.bincount(number).tolist() == [12] * 5
-    assert np.array_equal(number, fold_numbers(problem, 5, seed=3))
-    assert not np.array_equal(number, fold_numbers(problem, 5, seed=4))
-
-
-def test_held_out_error_is_larger_than_the_fitted_one_and_near_the_noise():
-    problem = one_direction(0)
-    held_out = np.sqrt(held_out_rss(problem, 10, 1) / len(problem.x))
-    assert project(problem).rmse_Nm < held_out < 1.25 * NOISE_Nm
-
-
-def test_among_equals_the_model_with_fewer_parameters_is_chosen():
-    assert choose({"multi-stage": 1.0, "multi-stage-continuous": 1.005, "stribeck": 1.02}) == "multi-stage-continuous"
-    assert choose({"multi-stage": 1.0, "multi-stage-continuous": 1.011, "stribeck": 4.0}) == "multi-stage"
-
-
-def test_intervals_cover_the_truth_about_as_often_as_they_say():
-    inside = {"tc": 0, "tv": 0, "a1": 0, "a3": 0}
-    truth = {"tc": 0.11985, "tv": 0.0026518 / DEGREE, "a1": 0.0012298 / DEGREE, "a3": -7.6969e-9 / DEGREE**3}
-    for seed in range(60):
-        found = uncertainty(project(one_direction(seed, velocity_radps=DENSE_radps))).intervals
-        for name in inside:
-            inside[name] += found[name].low <= truth[name] <= found[name].high
-    # 57 expected, standard deviation 1.7
-    assert all(count >= 51 for count in inside.values()), inside
-
-
-def test_the_band_covers_the_true_curve_about_as_often_as_it_says():
-    covered = []
-    for seed in range(40):
-        problem = one_direction(seed)
-        fit = project(problem)
-        half = uncertainty(fit).band_Nm(fit, problem.x)
-        truth = friction_curve_Nm(paper_friction(), problem.x * problem.top_radps)
-        covered.append(np.mean(np.abs(fit.torque_Nm(problem.x) - truth) <= half))
-    assert 0.88 < np.mean(covered) < 0.985
-
-
-def test_the_profile_says_that_a_uniform_grid_does_not_determine_ws_and_a_dense_one_does():
-    weak = [uncertainty(project(one_direction(seed))).intervals["ws"].weak for seed in range(8)]
-    assert sum(bool(w) for w in weak) >= 7
-    dense = [uncertainty(project(one_direction(seed, velocity_radps=DENSE_radps, noise_Nm=0.001))) for seed in range(8)]
-    intervals = [u.intervals["ws"] for u in dense]
-    assert not any(i.weak for i in intervals)
-    assert sum(i.low <= 1.2301 * DEGREE <= i.high for i in intervals) >= 6
-
-
-def test_no_stribeck_effect_is_told_and_not_made_up():
-    u = np.linspace(0.05, 3.0, 80)
-    y = 0.1 + 0.02 * u - 0.02 * np.exp(-u / 0.3)
-    found = uncertainty(project(make_problem(FORMS["stribeck"], u, y, 1.0, (None, 0.5)))).intervals
-    assert found["ts"].value == pytest.approx(found["tc"].value, rel=1e-6)
-    assert found["ts"].weak == "no Stribeck effect found (ts = tc)"
-    assert found["ws"].weak
 
 
 @pytest.mark.parametrize("velocity_radps", [UNIFORM_radps, DENSE_radps])
@@ -274,79 +156,3 @@ def test_friction_without_speed_and_noise_is_compared_with_rounding_by_nobody():
     found = identify_friction(data, QUICK)
     assert found.rmse_Nm < 1e-6
     assert not [w for w in found.warnings if "held-out" in w or "the least RMSE" in w]
-
-
-# --- plausibility: K_m, ratio, unit, side, sign wrong on purpose ---
-
-
-def test_one_point_far_off_on_the_wrong_side_is_told_as_such():
-    data = paper_data(0)
-    torque = data.motor_torque_Nm.copy()
-    torque[0] = 1e300
-    problems = check_data(replace(data, motor_torque_Nm=torque), None).problems
-    assert "mean torque at negative velocity drives the motion" in problems[0]
-    assert not any("a factor of" in problem for problem in problems)
-
-
-def test_right_data_raise_nothing():
-    verdict = check_data(paper_data(0), LIMITS)
-    assert verdict.problems == []
-    assert verdict.warnings == []
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"torque_factor": -1.0}, "torque does not oppose the motion at positive velocity: right sign at 0%"),
-        ({"speed_factor": -1.0}, "torque does not oppose the motion"),
-        ({"offset_Nm": 0.4}, "does not oppose the motion at negative velocity"),
-        ({"torque_factor": 121.0}, "times limits.torque_max_Nm"),  # joint torque taken for motor torque
-        ({"torque_factor": 10.0}, r"6\.9\d times limits.torque_max_Nm"),  # torque constant ten times too large
-        ({"speed_factor": 180.0 / np.pi}, "times limits.velocity_max_radps"),  # deg/s taken for rad/s
-        ({"speed_factor": 121.0}, "times limits.velocity_max_radps"),  # motor speed taken for joint speed
-        ({"ratio": 100.0}, r"reduction ratio of the data \(=100\) differs from joint.reduction_ratio \(=121\)"),
-    ],
-)
-def test_what_is_wrong_on_purpose_is_refused(wrong, message):
-    with pytest.raises(DataError, match=message):
-        identify_friction(paper_data(0, **wrong), QUICK, limits=LIMITS)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"torque_factor": 1.0 / 121.0}, "times limits.torque_max_Nm"),  # motor torque divided by the ratio again
-        ({"speed_factor": 1.0 / 121.0}, "or a unit or a side is wrong"),  # joint speed divided by the ratio again
-        ({"speed_factor": np.pi / 180.0}, "or a unit or a side is wrong"),
-        ({"offset_Nm": 0.14}, "a load"),
-        ({"torque_factor": 1.3}, "times limits.torque_max_Nm"),
-    ],
-)
-def test_what_may_be_wrong_is_warned_about(wrong, message):
-    verdict = check_data(paper_data(0, **wrong), LIMITS)
-    assert verdict.problems == []
-    assert any(message in warning for warning in verdict.warnings)
-
-
-@pytest.mark.parametrize(("constant", "refused"), [(0.1, False), (0.10009, False), (0.10011, True), (0.1414, True)])
-def test_another_torque_constant_than_configured_is_refused(constant, refused):
-    limits = JointLimits(60.0, 3.5, 121.0, constant)
-    assert bool(check_data(paper_data(0), limits).problems) is refused
-
-
-@pytest.mark.parametrize(("share", "refused"), [(1.19, False), (1.21, True)])
-def test_friction_above_what_the_joint_can_drive_is_refused_at_the_limit(share, refused):
-    data = paper_data(0)
-    reach_Nm = 121.0 * np.percentile(np.abs(data.motor_torque_Nm), 95)
-    limits = JointLimits(reach_Nm / share, 3.5, 121.0, 0.1)
-    assert bool(check_data(data, limits).problems) is refused
-
-
-def test_negative_viscous_friction_and_a_falling_end_are_told_with_their_numbers():
-    u = np.linspace(0.05, 3.0, 80)
-    found = project(make_problem(FORMS["coulomb-viscous"], u, 0.2 - 0.03 * u, 1.0, (None, 0.5))).branch()
-    verdict = check_branches({"positive": found})
-    assert any("tv = -0.03" in w for w in verdict.warnings)
-    assert any("falls with speed" in w for w in verdict.warnings)
-    steep = project(make_problem(FORMS["coulomb-viscous"], u, 0.2 - 0.08 * u, 1.0, (None, 0.5))).branch()
-    assert "drives the motion" in check_branches({"positive": steep}).problems[0]

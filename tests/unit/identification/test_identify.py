@@ -1,28 +1,25 @@
-"""The verbs identify and validate: what they write, what they leave alone, what they say."""
+"""The verb identify: what it writes, what it leaves alone, what it says."""
 
-import io
 import json
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tomlkit
 
-from drivers.errors import ConfigurationError, DataError, UsageError
+from drivers.errors import ConfigurationError, DataError
 from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
 from tests.page_figures import foreign_colours, svgs
+from tests.unit.identification.sweep_files import output, write_sweep
 from tools.configuration.conversions import friction_constants
-from tools.configuration.load import load_config, shipped_config
+from tools.configuration.load import load_config
 from tools.identification import identification
-from tools.identification.friction_data import SWEEP_COLUMNS, ForeignFormat, sidecar_contents
+from tools.identification.friction_data import ForeignFormat
 from tools.identification.friction_section import MARK, snippet, with_section
 from tools.identification.options import Options
 from tools.identification.pso import SwarmSettings
-from tools.output import Output
 from tools.verbs.identify import identify
-from tools.verbs.validate import validate
 
 QUICK = Options(folds=3, swarm=SwarmSettings(particles=80, iterations=120))
 VALUES = {
@@ -34,32 +31,9 @@ VALUES = {
 }  # fmt: skip
 
 
-def write_sweep(path, seed=0, factor=1.0, noise_Nm=0.0046):
-    velocity = np.linspace(-200.0, 200.0, 224) * DEGREE
-    noise = np.random.default_rng(seed).normal(0.0, noise_Nm, len(velocity))
-    torque = factor * (friction_curve_Nm(paper_friction(), velocity) + noise)
-    lines = [",".join(SWEEP_COLUMNS)]
-    for v, t in zip(velocity, torque, strict=True):
-        lines.append(f"{v:.9g},{t / 0.1:.9g},{t:.9g},0.01,0.05,500,1,-0.5,0.5,1.0,,{1 if v > 0 else -1},0")
-    path.write_text("\n".join(lines) + "\n")
-    path.with_suffix(".json").write_text(json.dumps(sidecar_contents(121.0, 0.1)))
-    return path
-
-
 @pytest.fixture
 def sweep(tmp_path):
     return write_sweep(tmp_path / "sweep.csv")
-
-
-@pytest.fixture
-def config(tmp_path):
-    path = tmp_path / "joint.toml"
-    shutil.copy(shipped_config("virtual"), path)
-    return path
-
-
-def output(**options):
-    return Output(stdout=io.StringIO(), stderr=io.StringIO(), **options)
 
 
 def contents(folder):
@@ -268,41 +242,3 @@ def test_other_peoples_table_gives_the_same_model_as_our_own(sweep, tmp_path):
     identify(theirs, output(), out=tmp_path / "theirs.toml", told=told, options=QUICK)
     ours, other = (tomlkit.parse((tmp_path / f"{n}.toml").read_text()).unwrap()["friction"] for n in ("ours", "theirs"))
     assert other["positive"] == pytest.approx(ours["positive"], rel=1e-3, abs=1e-10)
-
-
-def test_validate_reports_the_error_on_other_data(config, tmp_path):
-    other = write_sweep(tmp_path / "other.csv", seed=9)
-    out = output(json=True)
-    assert validate(config, other, out) == 0
-    result = json.loads(out.stdout.getvalue())
-    assert result["rmse_Nm"] == pytest.approx(0.0046, rel=0.12)
-    assert result["points"] == 224
-    assert Path(result["picture"]).read_bytes().startswith(b"\x89PNG")
-
-
-def test_validate_shows_a_joint_whose_friction_has_grown(config, tmp_path):
-    out = output(json=True)
-    validate(config, write_sweep(tmp_path / "other.csv", factor=1.1, noise_Nm=0.0), out)
-    result = json.loads(out.stdout.getvalue())
-    assert result["relative_rmse"] == pytest.approx(0.1 / 1.1, rel=1e-3)
-    assert result["max_error_Nm"] == pytest.approx(0.035398, rel=1e-3)
-
-
-def test_validate_needs_friction_and_believable_data(config, tmp_path):
-    with pytest.raises(DataError, match="does not oppose the motion"):
-        validate(config, write_sweep(tmp_path / "wrong.csv", factor=-1.0), output())
-    assert not (tmp_path / "wrong.validation.png").exists()
-    good = write_sweep(tmp_path / "data named.png")
-    with pytest.raises(DataError, match="is an input"):
-        validate(config, good, output(), figure=good)
-    with pytest.raises(UsageError, match=r"x\.jpg\) must end in \.png"):
-        validate(config, good, output(), figure=tmp_path / "x.jpg")
-
-
-def test_validate_takes_data_of_one_direction(config, tmp_path):
-    path = write_sweep(tmp_path / "half.csv")
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join([lines[0], *lines[113:]]) + "\n")
-    out = output(json=True)
-    assert validate(config, path, out) == 0
-    assert json.loads(out.stdout.getvalue())["points"] == 112

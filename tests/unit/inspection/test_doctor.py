@@ -1,12 +1,10 @@
-"""`jointctl doctor`: what it finds, what it says about it, and that it only ever reads."""
+"""`jointctl doctor` on a bus: what it finds, what it says about it, and that it only ever reads."""
 
 from __future__ import annotations
 
 import io
 import json
-import os
 import struct
-import subprocess
 from collections import deque
 from pathlib import Path
 from typing import Any
@@ -17,7 +15,7 @@ import pytest
 
 from drivers.can.link_state import parse_link
 from drivers.errors import BusError
-from tools.analysis.wake_up import fifo, wake_up_lateness_ns
+from tests.unit.inspection.system_files import write
 from tools.configuration.config import Config
 from tools.configuration.load import load_config, shipped_config
 from tools.inspection import bus_health, computer
@@ -29,10 +27,8 @@ from tools.inspection.bus_health import (
     interface_state,
     sdo_round_trips_us,
 )
-from tools.inspection.computer import kernel_cache, kernel_findings, wake_up
 from tools.inspection.findings import NOTE, OK, PROBLEM, Finding
 from tools.output import Output
-from tools.running.loop import start_time
 from tools.verbs import doctor as doctor_module
 from tools.verbs.doctor import doctor, findings
 
@@ -49,12 +45,6 @@ def changed(config: Config, **values: Any) -> Config:
     return config.model_copy(
         update={"bus": config.bus.model_copy(update=bus), "loop": config.loop.model_copy(update=loop)}
     )
-
-
-def write(root: Path, name: str, text: str) -> None:
-    path = root / name
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
 
 
 class SdoBus:
@@ -86,107 +76,6 @@ class SdoBus:
 @pytest.fixture
 def short_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bus_health, "_SDO_TIMEOUT_S", 0.01)
-
-
-class TestComputer:
-    @pytest.mark.parametrize(("text", "status"), [("1\n", OK), ("0\n", NOTE), (None, NOTE)])
-    def test_preempt_rt(self, tmp_path: Path, text: str | None, status: str, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(computer.platform, "version", lambda: "#1 SMP PREEMPT_DYNAMIC")
-        if text is not None:
-            write(tmp_path, "sys/kernel/realtime", text)
-        kernel = next(kernel_findings(tmp_path))
-        assert kernel.status == status
-        assert ("not PREEMPT_RT" in kernel.text) == (status == NOTE)
-        assert bool(kernel.cure) == (status == NOTE)
-
-    @pytest.mark.parametrize(("clock", "status"), [("tsc", OK), ("hpet", NOTE), ("acpi_pm", NOTE)])
-    def test_clock_source(self, tmp_path: Path, clock: str, status: str) -> None:
-        write(tmp_path, "sys/devices/system/clocksource/clocksource0/current_clocksource", clock + "\n")
-        found = {f.topic: f for f in kernel_findings(tmp_path)}["clock source"]
-        assert (found.status, found.text, bool(found.cure)) == (status, clock, status == NOTE)
-
-    @pytest.mark.parametrize(
-        ("governors", "status"), [([], OK), (["performance"] * 2, OK), (["performance", "powersave"], NOTE)]
-    )
-    def test_governor(self, tmp_path: Path, governors: list[str], status: str) -> None:
-        for core, governor in enumerate(governors):
-            write(tmp_path, f"sys/devices/system/cpu/cpu{core}/cpufreq/scaling_governor", governor)
-        found = {f.topic: f for f in kernel_findings(tmp_path)}["CPU governor"]
-        assert found.status == status
-        assert ("cpupower" in found.cure) == (status == NOTE)
-
-    def test_fifo_is_left_again(self) -> None:
-        before = os.sched_getscheduler(0)
-        with fifo(1) as refused:
-            assert refused or os.sched_getscheduler(0) == os.SCHED_FIFO
-        assert os.sched_getscheduler(0) == before
-
-    def test_a_refused_priority_is_told_and_not_raised(self) -> None:
-        with fifo(1000) as refused:
-            assert refused
-
-
-class TestWakeUp:
-    def test_one_value_a_cycle_and_none_early(self) -> None:
-        late_ns = wake_up_lateness_ns(1000.0, 20)
-        assert late_ns.shape == (20,)
-        assert (late_ns >= 0).all()
-
-    @pytest.mark.parametrize(("rate_Hz", "cycles"), [(0.0, 1), (-1.0, 1), (float("nan"), 1), (1000.0, 0)])
-    def test_bad_input(self, rate_Hz: float, cycles: int) -> None:
-        with pytest.raises(ValueError, match=r"\(=.*\) must be"):
-            wake_up_lateness_ns(rate_Hz, cycles)
-
-    @pytest.mark.parametrize(("worst_us", "status"), [(499, OK), (500, OK), (501, NOTE), (3000, NOTE)])
-    def test_the_worst_decides(
-        self, config: Config, worst_us: int, status: str, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        late = np.array([10_000] * 99 + [worst_us * 1000])
-        monkeypatch.setattr(computer, "wake_up_lateness_ns", lambda rate, cycles: late)
-        found = next(wake_up(config, 100))
-        assert found.status == status
-        assert (found.numbers["p50_us"], found.numbers["max_us"]) == (10.0, worst_us)
-        assert bool(found.cure) == (status == NOTE)
-
-
-class TestCache:
-    def test_no_folder(self) -> None:
-        (found,) = kernel_cache(None, False)
-        assert found.status == PROBLEM
-        assert "JOINTCTL_CACHE_DIR" in found.cure
-
-    def test_cold_is_not_started_unless_asked(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        started: list[Path | None] = []
-        monkeypatch.setattr(computer, "start_time_s", lambda cache: float(not started.append(cache)))
-        (found,) = kernel_cache(tmp_path, False)
-        assert (found.status, found.numbers["warm"], started) == (NOTE, False, [])
-        write(tmp_path, "firmware_py_1/realtime.run_loop-86.py311.1.nbc", "12345678")
-        found, warm = kernel_cache(tmp_path, False)
-        assert (found.status, found.numbers) == (OK, {"files": 1, "bytes": 8, "warm": True})
-        assert (warm.topic, warm.numbers, started) == ("warm start", {"start_s": 1.0}, [None])
-        assert [f.topic for f in kernel_cache(tmp_path, True)] == ["kernel cache", "warm start", "cold start"]
-        assert isinstance(started[-1], Path)
-        assert started[-1] != tmp_path
-        found = list(kernel_cache(tmp_path / "firmware_py_2", True))
-        assert [f.topic for f in found] == ["kernel cache", "cold start", "warm start"]
-        assert started[-1] == started[-2]  # warm, because the cold start has just filled it
-
-    def test_a_start_that_fails_is_a_problem(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        def failing(cache: Path | None) -> float:
-            raise subprocess.CalledProcessError(1, "python", stderr=b"Traceback\nImportError: no numba\n")
-
-        monkeypatch.setattr(computer, "start_time_s", failing)
-        write(tmp_path, "x/realtime.run_loop-86.py311.1.nbc", "1")
-        assert list(kernel_cache(tmp_path, False))[1].text == "the loop cannot be started: ImportError: no numba"
-
-    def test_the_probe_gets_the_other_cache(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        calls: list[dict[str, Any]] = []
-        monkeypatch.setattr(start_time.subprocess, "run", lambda command, **rest: calls.append(rest))
-        monkeypatch.setenv("JOINTCTL_CACHE_DIR", "unchanged")
-        assert start_time.start_time_s() >= 0.0
-        assert start_time.start_time_s(tmp_path) >= 0.0
-        assert [call["env"]["JOINTCTL_CACHE_DIR"] for call in calls] == ["unchanged", str(tmp_path)]
-        assert calls[0]["check"]
 
 
 class TestBus:

@@ -2,73 +2,23 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
-import re
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-import tomlkit
 
-from drivers.drive import CommissioningReport, DriveIdentity
-from drivers.errors import ConfigurationError
-from firmware_py.records import LogRecord
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, Fault
 from hil.faults.kinds import FaultConstants, FaultKind
-from tests.places import CONFIGS
+from tests.two_encoders import NODE, config_with
+from tests.unit.inspection.checked_joint import checked
 from tools.configuration.config import Config
-from tools.configuration.load import load_config
-from tools.inspection.drive_scale import judged
-from tools.inspection.findings import NOTE, OK, PROBLEM, Finding
-from tools.motion_check.plan import CheckPlan, check_constants, config_of_check, make_plan, motion_table, require_room
+from tools.inspection.findings import OK, PROBLEM
+from tools.motion_check.plan import check_constants, config_of_check, make_plan, motion_table
 from tools.motion_check.verdict import motion_findings
-from tools.output import Output
 from tools.running.events.fault_text import fault_text
 from tools.simulation.lockstep import LockstepJoint
-from tools.verbs import doctor_motion as doctor_motion_module
-
-SECOND = {
-    "source": "node", "node": 2, "counts_per_turn": 524288, "direction": 1, "zero_counts": 100_000,
-    "disagreement_max_rad": 0.005,
-}  # fmt: skip
-
-
-def config_with(folder: Path, second: dict[str, Any] | None = None, **changes: Any) -> Config:
-    document = tomlkit.parse((CONFIGS / "virtual.toml").read_text())
-    if second is not None:
-        document["joint_encoder"] = second
-        changes = {"encoder__side": "motor", "encoder__counts_per_turn": 65536, **changes}
-    for path, value in changes.items():
-        section, key = path.split("__")
-        document[section][key] = value  # type: ignore[index]
-    path = folder / "joint.toml"
-    path.write_text(tomlkit.dumps(document))
-    return load_config(path)
-
-
-def check_in_lockstep(joint: LockstepJoint, config: Config, plan: CheckPlan, faults: Any = None) -> tuple[Any, Fault]:
-    """The same motion on a virtual joint in simulated time: its records and the fault."""
-    table = motion_table(plan, joint.report.start_position_rad)
-    constants = check_constants(config_of_check(config, plan), plan, joint.report, table)
-    constants[0].sequence.supervisor_max_cycles = 0  # nobody watches in simulated time
-    joint.table = table
-    run = joint.run(constants) if faults is None else joint.run_with_faults(faults, constants)
-    return run.log, run.fault
-
-
-def checked(config: Config, change: Any = None, faults: Any = None) -> tuple[dict[str, Finding], Any, Fault]:
-    """Findings by topic, records and fault; `change` may spoil the joint."""
-    plan = make_plan(config, None)
-    joint = LockstepJoint(config)
-    if change is not None:
-        change(joint)
-    records, fault = check_in_lockstep(joint, config, plan, faults)
-    text = fault_text(fault, 0.0, 0) if fault is not Fault.NONE else None
-    return {f.topic: f for f in motion_findings(config, plan, records, fault, text)}, records, fault
 
 
 def assert_gentle(config: Config, records: Any) -> None:
@@ -79,7 +29,7 @@ def assert_gentle(config: Config, records: Any) -> None:
     assert records.phase[-1] >= AxisPhase.DISABLING
 
 
-@pytest.mark.parametrize("second", [None, SECOND, {**SECOND, "law": "encoder"}])
+@pytest.mark.parametrize("second", [None, NODE, {**NODE, "law": "encoder"}])
 @pytest.mark.parametrize("scale", [0.5, 1.1])
 def test_a_joint_that_is_right(tmp_path: Path, second: dict[str, Any] | None, scale: float) -> None:
     friction = {"virtual__friction_positive_scale": scale, "virtual__friction_negative_scale": scale}
@@ -115,7 +65,7 @@ def test_a_wrong_sign(tmp_path: Path, change: Any) -> None:
 
 @pytest.mark.parametrize(("law", "wrong"), [("encoder", "encoder"), ("joint_encoder", "encoder")])
 def test_with_two_encoders_the_wrong_one_is_named(tmp_path: Path, law: str, wrong: str) -> None:
-    config = config_with(tmp_path, {**SECOND, "law": law}, virtual__initial_position_rad=0.0)
+    config = config_with(tmp_path, {**NODE, "law": law}, virtual__initial_position_rad=0.0)
     found, records, _ = checked(config, reverse_encoder)
     assert found["two encoders"].status == PROBLEM
     assert found["two encoders"].cure.startswith(f"{wrong}.direction")
@@ -123,7 +73,7 @@ def test_with_two_encoders_the_wrong_one_is_named(tmp_path: Path, law: str, wron
 
 
 def test_with_two_encoders_a_wrong_torque_sign_is_told_from_a_wrong_encoder(tmp_path: Path) -> None:
-    found, _, _ = checked(config_with(tmp_path, SECOND), reverse_torque)
+    found, _, _ = checked(config_with(tmp_path, NODE), reverse_torque)
     assert found["two encoders"].status == OK
     assert found["direction"].status == PROBLEM
 
@@ -133,7 +83,7 @@ def test_counts_wrong_by_a_factor(tmp_path: Path, factor: float) -> None:
     def change(joint: Any) -> None:
         joint._port[0].position_radpcount *= factor
 
-    config = config_with(tmp_path, SECOND, virtual__initial_position_rad=0.0)
+    config = config_with(tmp_path, NODE, virtual__initial_position_rad=0.0)
     found, records, _ = checked(config, change)
     assert found["scale"].status == PROBLEM
     assert f"[encoder] moves {factor:.3g}" in found["scale"].text.replace("1.99", "2").replace("2.01", "2")
@@ -149,7 +99,7 @@ def test_a_joint_that_is_stuck(tmp_path: Path) -> None:
     assert_gentle(config, records)
 
 
-@pytest.mark.parametrize("second", [None, SECOND])
+@pytest.mark.parametrize("second", [None, NODE])
 def test_a_dead_encoder_is_found_before_the_joint_has_gone_far(tmp_path: Path, second: dict[str, Any] | None) -> None:
     config = config_with(tmp_path, second)
     faults = new(FaultConstants, 1)
@@ -166,7 +116,7 @@ def test_a_dead_encoder_is_found_before_the_joint_has_gone_far(tmp_path: Path, s
 
 
 def test_the_records_name_the_encoder_that_stood(tmp_path: Path) -> None:
-    config = config_with(tmp_path, {**SECOND, "law": "encoder"})
+    config = config_with(tmp_path, {**NODE, "law": "encoder"})
     _, records, _ = checked(config)
     still = records.copy()
     still.position_rad[:] = still.position_rad[0]
@@ -185,159 +135,3 @@ def test_a_check_that_was_never_enabled_tells_the_fault(tmp_path: Path) -> None:
     text = fault_text(Fault.POSITION_DISAGREEMENT, 0.3, 0)
     (found,) = motion_findings(config, make_plan(config, None), waiting, Fault.POSITION_DISAGREEMENT, text)
     assert found.text.startswith("ended before the drive was enabled: POSITION_DISAGREEMENT: the two encoders")
-
-
-WAY_FAULTS = (Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR, Fault.POSITION_LIMIT, Fault.POSITION_DISAGREEMENT)
-
-
-def sound_records(config: Config) -> Any:
-    """Of a joint that moves with the torque, by both encoders nearly alike, until a fault stops it."""
-    records = new(LogRecord, 400)
-    records.phase[:380], records.phase[380:] = AxisPhase.TRACKING, AxisPhase.QUICK_STOPPING
-    records.position_rad[:] = np.linspace(0.0, 0.04, 400)
-    records.second_position_rad[:] = 0.86 * records.position_rad
-    records.command_torque_Nm[:] = make_plan(config, None).static_friction_Nm
-    return records
-
-
-def judged_records(config: Config, records: Any, fault: Fault) -> tuple[set[str], str]:
-    """Topics of the problems, and all that is said of the check as a whole."""
-    text = fault_text(fault, 0.1, 0) if fault is not Fault.NONE else None
-    found = list(motion_findings(config, make_plan(config, None), records, fault, text))
-    said = " ".join(finding.text for finding in found if finding.topic == "check")
-    return {finding.topic for finding in found if finding.status == PROBLEM}, said
-
-
-@pytest.mark.parametrize("second", [None, SECOND])
-@pytest.mark.parametrize("fault", [*WAY_FAULTS, Fault.NONE])
-def test_a_fault_that_no_finding_explains_is_told(tmp_path: Path, second: dict[str, Any] | None, fault: Fault) -> None:
-    """With a second encoder these were dropped: everything was right, exit code 0."""
-    config = config_with(tmp_path, second)
-    problems, said = judged_records(config, sound_records(config), fault)
-    assert problems == (set() if fault is Fault.NONE else {"check"})
-    assert (f"ended while the joint moved: {fault.name}" in said) is (fault is not Fault.NONE)
-
-
-@pytest.mark.parametrize("fault", [*WAY_FAULTS, Fault.DRIVE_FAULT])
-def test_a_fault_that_another_problem_explains_is_not_told_twice(tmp_path: Path, fault: Fault) -> None:
-    config = config_with(tmp_path, SECOND)
-    against = sound_records(config)
-    against.command_torque_Nm *= -1.0
-    problems, _ = judged_records(config, against, fault)
-    assert problems == ({"direction"} if fault in WAY_FAULTS else {"direction", "check"})
-    scaled = sound_records(config)
-    scaled.second_position_rad[:] = 0.5 * scaled.position_rad
-    problems, _ = judged_records(config, scaled, fault)
-    assert problems == ({"scale"} if fault is Fault.POSITION_DISAGREEMENT else {"scale", "check"})
-
-
-@pytest.mark.parametrize("fault", [Fault.POSITION_FROZEN, Fault.TORQUE_SATURATED, Fault.DRIVE_FAULT])
-def test_what_stopped_a_standing_joint_is_told_unless_standing_explains_it(tmp_path: Path, fault: Fault) -> None:
-    config = config_with(tmp_path)
-    still = sound_records(config)
-    still.position_rad[:] = 0.0
-    problems, _ = judged_records(config, still, fault)
-    assert problems == ({"motion", "check"} if fault is Fault.DRIVE_FAULT else {"motion"})
-
-
-@pytest.mark.parametrize("second", [None, SECOND])
-@pytest.mark.parametrize("load_Nm", [-45.0, -1.0])
-def test_a_push_from_outside(tmp_path: Path, second: dict[str, Any] | None, load_Nm: float) -> None:
-    faults = new(FaultConstants, 1)
-    faults[0].kind, faults[0].start_s, faults[0].duration_s = FaultKind.LOAD_JUMP, 1.5, 10.0
-    faults[0].magnitude = load_Nm
-    found, _, fault = checked(config_with(tmp_path, second), None, faults)
-    pushed = load_Nm == -45.0
-    assert fault is (Fault.VELOCITY_LIMIT if pushed else Fault.NONE)
-    assert ("check" in found) is pushed
-    assert any(finding.status == PROBLEM for finding in found.values()) is pushed
-
-
-@pytest.mark.parametrize("fault", [Fault.VELOCITY_LIMIT, Fault.NONE])
-def test_an_interruption_does_not_hide_the_fault(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], fault: Fault
-) -> None:
-    config = config_with(tmp_path, log__folder=str(tmp_path))
-    text = fault_text(fault, 0.6, 0) if fault is not Fault.NONE else None
-    result = SimpleNamespace(
-        stopped_by="SIGINT", drive_state="switch on disabled", records=sound_records(config), fault=fault,
-        fault_text=text, log_path=tmp_path / "run.mcap",
-    )  # fmt: skip
-    stub = lambda *_: SimpleNamespace(run=lambda: result)  # noqa: E731
-    monkeypatch.setattr(doctor_motion_module, "CheckSupervisor", stub)
-    code = doctor_motion_module.doctor_motion(config, Output(), assume_yes=True)
-    told = capsys.readouterr()
-    assert code == (130 if fault is Fault.NONE else 1)
-    assert "stopped by SIGINT" in told.err
-    assert ("VELOCITY_LIMIT" in told.out) is (fault is not Fault.NONE)
-
-
-# --- the plan --------------------------------------------------------------------------------------------------
-
-
-def test_the_torque_is_that_of_friction_and_gravity_and_never_above_the_limit(tmp_path: Path) -> None:
-    static_Nm = 0.1575 * 121.0
-    assert make_plan(config_with(tmp_path), None).torque_Nm == pytest.approx(2.0 * static_Nm)
-    assert make_plan(config_with(tmp_path, joint__gravity_Nm=5.0), None).torque_Nm == pytest.approx(2.0 * static_Nm + 5)
-    assert make_plan(config_with(tmp_path, limits__torque_max_Nm=25.0), None).torque_Nm == 25.0
-    assert make_plan(config_with(tmp_path), 12.0).torque_Nm == 12.0
-    with pytest.raises(ConfigurationError, match=re.escape("--torque (=60.1) must be in (0..60]")):
-        make_plan(config_with(tmp_path), 60.1)
-
-
-def test_the_check_only_narrows_torque_speed_and_travel(tmp_path: Path) -> None:
-    config = config_with(tmp_path)
-    plan = make_plan(config, None)
-    report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.1, 0.06, 1e-5)
-    made = check_constants(config_of_check(config, plan), plan, report, motion_table(plan, 0.1))[0].limits
-    assert made.torque_max_Nm == plan.torque_Nm < config.limits.torque_max_Nm
-    assert made.velocity_max_radps == 0.5 < config.limits.velocity_max_radps
-    assert (made.position_min_rad, made.position_max_rad) == pytest.approx((0.0, 0.2))
-    assert made.sample_age_max_cycles == round(config.limits.sample_age_max_s * config.loop.rate_Hz)
-    assert config_of_check(config, plan).canopen.max_torque_permille is None
-
-
-def test_the_motion_is_smooth_and_ends_where_it_begins(tmp_path: Path) -> None:
-    plan = make_plan(config_with(tmp_path), None)
-    table = motion_table(plan, 0.3)
-    assert table[0, 1] == table[-1, 1] == pytest.approx(0.3)
-    assert np.ptp(table[:, 1]) == pytest.approx(2.0 * plan.travel_rad)
-    assert np.abs(table[:, 2]).max() < plan.velocity_radps / 2.0
-    assert np.all(np.diff(table[:, 0]) > 0.0)
-
-
-@pytest.mark.parametrize(("start_rad", "refused"), [(0.659, False), (0.661, True), (-0.659, False), (-0.661, True)])
-def test_room_on_both_sides_is_needed(tmp_path: Path, start_rad: float, refused: bool) -> None:
-    config = config_with(tmp_path)
-    plan = make_plan(config, None)
-    if not refused:
-        require_room(config, plan, start_rad)
-        return
-    with pytest.raises(ConfigurationError, match=r"needs \[-0\.66\.\.0\.66\]"):
-        require_room(config, plan, start_rad)
-
-
-def test_a_coarse_encoder_takes_more_travel(tmp_path: Path) -> None:
-    config = config_with(tmp_path, encoder__counts_per_turn=4096)
-    assert make_plan(config, None).travel_rad == pytest.approx(60.0 * math.tau / 4096)
-    assert make_plan(config_with(tmp_path, encoder__counts_per_turn=512), None).travel_rad == 0.3
-
-
-@pytest.mark.parametrize(
-    ("side", "own", "per_motor_turn", "status"),
-    [
-        ("motor", 65536, 65536.0, OK), ("motor", 131072, 65536.0, NOTE), ("joint", 524288, 524288.0, OK),
-        ("joint", 524288, 524288.0 / 121.0, OK), ("joint", 262144, 524288.0, NOTE),
-    ],
-)  # fmt: skip
-def test_the_drives_own_counts(tmp_path: Path, side: str, own: int, per_motor_turn: float, status: str) -> None:
-    config = config_with(tmp_path, encoder__side=side, encoder__counts_per_turn=own)
-    found = judged(config, per_motor_turn)
-    assert found.status == status
-    assert (found.cure == "") is (status == OK)
-
-
-def test_figures_of_a_finding_are_plain_numbers(tmp_path: Path) -> None:
-    found, _, _ = checked(config_with(tmp_path))
-    for finding in found.values():
-        assert all(isinstance(value, float) for value in dataclasses.asdict(finding)["numbers"].values())

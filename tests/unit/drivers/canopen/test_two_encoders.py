@@ -18,7 +18,7 @@ from firmware_py.schema import new
 from firmware_py.states import AxisPhase, Fault
 from hil.faults.kinds import FaultConstants, FaultKind
 from tests.places import CONFIGS
-from tests.two_encoders import NODE, config_with, cycle, port_of
+from tests.two_encoders import NODE, cycle, port_of, short_run
 from tools.configuration.drive_settings import canopen_settings, cyclic_bus_load
 from tools.configuration.load import load_config
 from tools.inspection.bus_health import bus_budget
@@ -34,7 +34,7 @@ DRIVE = {**{k: v for k, v in NODE.items() if k != "node"}, "source": "drive"}
 
 @pytest.mark.parametrize("encoder", [NODE, DRIVE, {**NODE, "law": "encoder"}, {**NODE, "kind": "incremental"}])
 def test_a_run_with_two_encoders(tmp_path: Path, encoder: dict[str, Any]) -> None:
-    joint = LockstepJoint(config_with(tmp_path, encoder, virtual__initial_position_rad=0.1))
+    joint = LockstepJoint(short_run(tmp_path, encoder, virtual__initial_position_rad=0.1))
     assert joint.report.start_position_rad == pytest.approx(0.1, abs=1e-4)
     run = joint.run()
     assert run.fault is Fault.NONE
@@ -51,13 +51,13 @@ def test_a_run_with_two_encoders(tmp_path: Path, encoder: dict[str, Any]) -> Non
     ],
 )
 def test_commissioning_refuses(tmp_path: Path, change: dict[str, Any], message: str) -> None:
-    good = config_with(tmp_path, NODE)
+    good = short_run(tmp_path, NODE)
     device = new_device(good)
     from drivers.canopen.drive import CanopenDrive
     from tools.simulation.lockstep import DirectBus
 
     bus = DirectBus(device)
-    settings = canopen_settings(config_with(tmp_path, {**NODE, **change}))
+    settings = canopen_settings(short_run(tmp_path, {**NODE, **change}))
     drive = CanopenDrive(bus, settings, sleep=bus.sleep)
     message = message or r"joint_encoder.counts_per_turn (=4096) differs from the encoder's 6001, 524288"
     with pytest.raises(DeviceError, match=re.escape(message)):
@@ -70,7 +70,7 @@ def test_an_encoder_with_an_alarm_is_refused(tmp_path: Path) -> None:
     from drivers.canopen.drive import CanopenDrive
     from tools.simulation.lockstep import DirectBus
 
-    config = config_with(tmp_path, NODE)
+    config = short_run(tmp_path, NODE)
     device = new_device(config)
     device.device[0].encoder.error_code = 0x5000
     bus = DirectBus(device)
@@ -86,7 +86,7 @@ def test_an_alarm_that_comes_while_the_question_is_open_is_refused(tmp_path: Pat
     from drivers.canopen.drive import CanopenDrive
     from tools.simulation.lockstep import DirectBus
 
-    config = config_with(tmp_path, NODE)
+    config = short_run(tmp_path, NODE)
     device = new_device(config)
     bus = DirectBus(device)
     drive = CanopenDrive(bus, canopen_settings(config), sleep=bus.sleep)
@@ -111,7 +111,7 @@ def drift(rate_radps: float) -> Any:
 @pytest.mark.parametrize(("rate_radps", "fault"), [(0.02, Fault.POSITION_DISAGREEMENT), (0.002, Fault.NONE)])
 def test_an_encoder_that_drifts_is_found_by_the_other_one(tmp_path: Path, rate_radps: float, fault: Fault) -> None:
     """The drive's encoder drifts for 1.5 s or so: by 30 mrad, or by 3 of the 5 that are allowed."""
-    joint = LockstepJoint(config_with(tmp_path, NODE, trajectory__duration_s=2.0))
+    joint = LockstepJoint(short_run(tmp_path, NODE, trajectory__duration_s=2.0))
     run = joint.run_with_faults(drift(rate_radps), tail_s=0.1)
     assert run.fault is fault
     if fault is not Fault.NONE:
@@ -123,8 +123,8 @@ def test_an_encoder_that_drifts_is_found_by_the_other_one(tmp_path: Path, rate_r
 @pytest.mark.parametrize(("key", "value"), [("encoder__direction", -1), ("encoder__counts_per_turn", 32768)])
 def test_a_configuration_that_is_wrong_about_one_encoder(tmp_path: Path, key: str, value: int) -> None:
     """The joint is what the file says; the controller is told otherwise."""
-    good = LockstepJoint(config_with(tmp_path, NODE, virtual__initial_position_rad=0.1))
-    wrong = canopen_settings(config_with(tmp_path, NODE, virtual__initial_position_rad=0.1, **{key: value}))
+    good = LockstepJoint(short_run(tmp_path, NODE, virtual__initial_position_rad=0.1))
+    wrong = canopen_settings(short_run(tmp_path, NODE, virtual__initial_position_rad=0.1, **{key: value}))
     from drivers.canopen.scaling import joint_angle_per_count_rad
 
     good._port[0].position_radpcount = joint_angle_per_count_rad(wrong) * wrong.encoder_direction
@@ -134,7 +134,7 @@ def test_a_configuration_that_is_wrong_about_one_encoder(tmp_path: Path, key: st
 
 
 def test_losing_the_encoder_node_ends_the_run(tmp_path: Path) -> None:
-    joint = LockstepJoint(config_with(tmp_path, NODE))
+    joint = LockstepJoint(short_run(tmp_path, NODE))
     joint._virtual.device[0].encoder.node_id = 0
     assert joint.run().fault is Fault.NO_SAMPLES
 
@@ -161,7 +161,7 @@ def test_an_error_of_the_encoder_is_not_the_drives_and_ends_when_it_is_cleared(t
 
 @pytest.mark.parametrize("code", [0x5000, 0])
 def test_a_run_that_the_encoder_ends_says_so(tmp_path: Path, code: int) -> None:
-    config = config_with(tmp_path, NODE)
+    config = short_run(tmp_path, NODE)
     joint = LockstepJoint(config)
     joint._virtual.device[0].encoder.error_code = code
     run = joint.run()
@@ -190,23 +190,23 @@ def test_a_run_that_the_encoder_ends_says_so(tmp_path: Path, code: int) -> None:
 )
 def test_problems(tmp_path: Path, change: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigurationError, match=re.escape(message)):
-        config_with(tmp_path, {**NODE, **change})
+        short_run(tmp_path, {**NODE, **change})
 
 
 def test_two_incremental_encoders_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="both incremental"):
-        config_with(tmp_path, {**NODE, "kind": "incremental"}, encoder__kind="incremental")
+        short_run(tmp_path, {**NODE, "kind": "incremental"}, encoder__kind="incremental")
 
 
 def test_the_bus_load_counts_the_second_position(tmp_path: Path) -> None:
     with_one = cyclic_bus_load(load_config(CONFIGS / "virtual.toml"))
-    assert cyclic_bus_load(config_with(tmp_path, NODE)) == pytest.approx(with_one + 95e3 / 1e6)
+    assert cyclic_bus_load(short_run(tmp_path, NODE)) == pytest.approx(with_one + 95e3 / 1e6)
 
 
 @pytest.mark.parametrize(("rate_Hz", "refused"), [(2105.0, False), (2106.0, True)])
 def test_the_arithmetic_names_the_second_position(tmp_path: Path, rate_Hz: float, refused: bool) -> None:
     """SYNC 55, TPDO 135, RPDO 95 and 95 bits; `doctor` reckons alike."""
-    config = config_with(tmp_path, NODE)
+    config = short_run(tmp_path, NODE)
     config = config.model_copy(update={"loop": config.loop.model_copy(update={"rate_Hz": rate_Hz})})
     assert bus_budget(config).status == ("problem" if refused else "ok")
     if refused:
@@ -217,7 +217,7 @@ def test_the_arithmetic_names_the_second_position(tmp_path: Path, rate_Hz: float
 
 
 def test_settings_of_the_driver(tmp_path: Path) -> None:
-    settings = canopen_settings(config_with(tmp_path, {**DRIVE, "object": "2ABC:3"}))
+    settings = canopen_settings(short_run(tmp_path, {**DRIVE, "object": "2ABC:3"}))
     assert settings.joint_encoder is not None
     assert (settings.joint_encoder.index, settings.joint_encoder.sub) == (0x2ABC, 3)
     assert dataclasses.replace(settings, joint_encoder=None).joint_encoder is None

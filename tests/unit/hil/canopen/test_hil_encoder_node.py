@@ -12,7 +12,7 @@ import pytest
 
 from drivers.canopen.eds_file import read_eds
 from tests.places import CONFIGS
-from tests.two_encoders import NODE, config_with
+from tests.two_encoders import NODE, short_run
 from tools.simulation.virtual_joint import new_device
 
 
@@ -26,7 +26,7 @@ def words(frames: list[bytes]) -> list[tuple[int, bytes]]:
 
 @pytest.fixture
 def device(tmp_path: Path) -> Any:
-    return new_device(config_with(tmp_path, NODE, virtual__initial_position_rad=0.25))
+    return new_device(short_run(tmp_path, NODE, virtual__initial_position_rad=0.25))
 
 
 def test_the_eds_is_read_by_the_library_and_is_that_of_an_encoder() -> None:

@@ -1,4 +1,4 @@
-"""The scope's feed, memory and door: nothing waits, nothing grows, nobody else comes in."""
+"""The scope's feed: nothing waits for a page, and the run knows who watches."""
 
 from __future__ import annotations
 
@@ -15,11 +15,9 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from drivers.errors import DataError, UsageError
 from firmware_py.realtime import HISTOGRAM_BINS
-from firmware_py.records import LogRecord
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase, StopRequest
+from firmware_py.states import StopRequest
+from tests.unit.scoping.scope_records import records
 from tools.configuration.load import load_config, shipped_config
 from tools.output import Output
 from tools.recording.run_log import INFO, Event
@@ -28,22 +26,10 @@ from tools.running.display.display import Snapshot
 from tools.running.display.phase_lines import PhaseLines
 from tools.running.display.viewer_request import ViewerRequest
 from tools.scoping import feed as feed_module
-from tools.scoping import order as order_module
 from tools.scoping import server as server_module
-from tools.scoping.access import COOKIE, allowed
 from tools.scoping.displays import Displays
 from tools.scoping.feed import EVENT, PIECE, RECORDS, SETTINGS, ScopeFeed
-from tools.scoping.history import EVENTS, POINTS, SIGNALS, History, crossing_s, percentiles_us
-from tools.scoping.order import ScopeOrder, scope_order
-
-
-def records(count: int, first: int = 0) -> Any:
-    found = new(LogRecord, count)
-    found.cycle = np.arange(first, first + count)
-    found.time_ns = 10**12 + found.cycle * 1_000_000
-    found.error_rad = np.sin(found.cycle / 100.0) * 1e-3
-    found.phase = AxisPhase.TRACKING
-    return found
+from tools.scoping.history import History
 
 
 def snapshot(rows: Any) -> Snapshot:
@@ -237,150 +223,3 @@ def test_several_displays_are_one(ends: tuple[socket.socket, socket.socket]) -> 
         assert display.stop_reason() == "the scope's STOP, a viewer"
     assert err.getvalue() == "  tracking\n  delay\n"
     assert [ends[1].recv(1 << 20)[:1] for _ in range(3)] == [SETTINGS, RECORDS, EVENT]
-
-
-def test_the_memory_is_a_ring() -> None:
-    history = History(1000)
-    assert len(history.newest(1.0)) == 0
-    for first in range(0, 10_000, 30):
-        history.take(records(30, first))
-    history.take(records(2500, 10_020))
-    kept = history.newest(1e9)
-    np.testing.assert_array_equal(kept.cycle, np.arange(11_520, 12_520))
-    for number in range(3 * EVENTS):
-        history.events.append(Event(number, INFO, "a", "b"))
-    assert len(history.events) == EVENTS
-    assert history.events[-1].time_ns == 3 * EVENTS - 1
-
-
-@pytest.mark.parametrize(("span_s", "before_s", "first", "last"), [(0.1, None, 900, 999), (0.1, 0.5, 401, 500)])
-def test_the_picture_is_the_last_stretch_or_the_held_one(
-    span_s: float, before_s: float | None, first: int, last: int
-) -> None:
-    history = History()
-    history.take(records(1000))
-    rows = history.newest(span_s, before_s)
-    assert abs(int(rows.cycle[0]) - first) <= 1
-    assert int(rows.cycle[-1]) == last
-
-
-def test_a_series_keeps_its_peaks_and_leaves_out_what_is_no_number() -> None:
-    history, rows = History(), records(20_000)
-    rows.error_rad[7777] = 0.5
-    rows.error_rad[100] = np.nan
-    history.take(rows)
-    points = np.array(history.series(history.newest(1e9), "error [mrad]"))
-    assert len(points) <= POINTS + 2
-    assert points[:, 1].max() == 500.0
-    assert points[np.argmax(points[:, 1]), 0] == pytest.approx(7.777)
-    assert np.all(np.isfinite(points))
-    assert np.all(np.diff(points[:, 0]) > 0)
-    for signal in SIGNALS:
-        assert history.series(history.newest(0.1), signal)
-
-
-@pytest.mark.parametrize(("missing", "gap"), [(99, False), (100, True)])
-def test_records_that_did_not_come_are_a_gap_in_the_line(missing: int, gap: bool) -> None:
-    history = History()
-    history.take(records(200))
-    history.take(records(200, 200 + missing))
-    found = history.series(history.newest(1e9), "angle [rad]")
-    empty = [i for i, (_, value) in enumerate(found) if value is None]
-    assert len(empty) == gap
-    if gap:
-        assert found[empty[0]][0] == pytest.approx(0.199)
-        assert found[empty[0] + 1][0] == pytest.approx(0.3)
-    times = [time_s for time_s, _ in found if time_s is not None]
-    assert times == sorted(times)
-
-
-def test_the_error_is_only_drawn_while_the_law_is_at_work() -> None:
-    history, rows = History(), records(300)
-    rows.phase[:100], rows.phase[200:] = AxisPhase.WAITING, AxisPhase.DISABLING
-    history.take(rows)
-    found = history.newest(1e9)
-    assert len(history.series(found, "error [mrad]")) == 100
-    assert len(history.series(found, "angle [rad]")) == 300
-
-
-def test_the_trigger_is_the_last_crossing_in_its_direction() -> None:
-    time_s = np.arange(6) * 1.0
-    values = np.array([0.0, 2.0, 0.0, 2.0, 2.0, 0.0])
-    assert crossing_s(time_s, values, 1.0, rising=True) == 3.0
-    assert crossing_s(time_s, values, 1.0, rising=False) == 5.0
-    assert crossing_s(time_s, values, 2.0, rising=True) is None
-    assert crossing_s(time_s[:1], values[:1], 1.0, rising=True) is None
-
-
-def test_deadline_statistics_leave_out_cycles_without_a_sample() -> None:
-    rows = records(100)
-    rows.wake_late_ns, rows.work_ns = 20_000, 10_000
-    rows.round_trip_ns[:50] = 90_000
-    assert percentiles_us(rows) == {
-        "wake-up late": "20 / 20 / 20 us", "round trip": "90 / 90 / 90 us", "work": "10 / 10 / 10 us",
-    }  # fmt: skip
-    rows.round_trip_ns = 0
-    assert "round trip" not in percentiles_us(rows)
-
-
-def request(host: str, query: str = "", **headers: str) -> dict[str, Any]:
-    listed = [(b"host", host.encode())] + [(name.encode(), value.encode()) for name, value in headers.items()]
-    return {"type": "http", "headers": listed, "query_string": query.encode()}
-
-
-@pytest.mark.parametrize(
-    ("host", "origin", "passes"),
-    [
-        ("127.0.0.1:8642", "", True),
-        ("localhost:8642", "http://localhost:8642", True),
-        ("[::1]:8642", "", True),
-        ("evil.example:8642", "", False),
-        ("127.0.0.1.evil.example", "", False),
-        ("127.0.0.1:8642", "http://evil.example", False),
-        ("127.0.0.1:8642", "null", False),
-        ("", "", False),
-    ],
-)
-def test_without_a_token_only_this_computer_comes_in(host: str, origin: str, passes: bool) -> None:
-    assert allowed(request(host, **({"origin": origin} if origin else {})), "") is passes
-
-
-@pytest.mark.parametrize(
-    ("query", "cookie", "passes"),
-    [
-        ("", "", False),
-        ("token=secret", "", True),
-        ("token=secreT", "", False),
-        ("token=", "", False),
-        ("", f"{COOKIE}=secret", True),
-        ("", f"{COOKIE}=other", False),
-        ("", "other=secret", False),
-        ("token=wrong", f"{COOKIE}=secret", True),
-    ],
-)
-def test_beyond_this_computer_the_token_is_asked_for(query: str, cookie: str, passes: bool) -> None:
-    headers = {"cookie": cookie} if cookie else {}
-    assert allowed(request("192.168.0.5:8642", query, **headers), "secret") is passes
-    assert allowed(request("127.0.0.1:8642", query, **headers), "secret") is passes
-
-
-def test_orders_are_checked_and_beyond_this_computer_get_a_token(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(order_module, "find_spec", lambda name: None)
-    with pytest.raises(DataError, match="needs the package nicegui"):
-        scope_order("t", "127.0.0.1", 8642)
-    monkeypatch.setattr(order_module, "find_spec", lambda name: object())
-    with pytest.raises(UsageError, match=r"--port \(=0\) must be in \[1..65535\]"):
-        scope_order("t", "127.0.0.1", 0)
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        with pytest.raises(DataError, match=f"cannot be served at 127.0.0.1:{port}"):
-            scope_order("t", "127.0.0.1", port)
-    near, far = scope_order("t", "127.0.0.1", port), scope_order("t", "0.0.0.0", port)
-    assert near.token == ""
-    assert near.url == f"http://127.0.0.1:{port}/"
-    assert len(far.token) >= 20
-    assert far.url.endswith(f"?token={far.token}")
-    assert far.token != scope_order("t", "0.0.0.0", port).token
-    assert ScopeOrder("t", "::1", 1, "").url == "http://[::1]:1/"

@@ -1,0 +1,121 @@
+"""States and modes of the virtual drive (CiA 402), frame by frame: transitions, quick stop, torque, speed, position."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.virtual_drive import Rig
+
+
+@pytest.mark.parametrize(
+    ("words", "status"),
+    [
+        ((0x07,), 0x40),
+        ((0x0F,), 0x40),
+        ((0x06,), 0x21),
+        ((0x06, 0x00), 0x40),
+        ((0x06, 0x02), 0x40),
+        ((0x06, 0x07), 0x23),
+        ((0x06, 0x07, 0x06), 0x21),
+        ((0x06, 0x07, 0x00), 0x40),
+        ((0x06, 0x07, 0x0F), 0x27),
+        ((0x06, 0x0F), 0x27),
+        ((0x06, 0x07, 0x0F, 0x07), 0x23),
+        ((0x06, 0x07, 0x0F, 0x06), 0x21),
+        ((0x06, 0x07, 0x0F, 0x00), 0x40),
+        ((0x06, 0x07, 0x8F), 0x23),
+    ],
+)
+def test_transitions(rig: Rig, words: tuple[int, ...], status: int) -> None:
+    rig.control(*words)
+    rig.run(2)
+    mask = 0x4F if status == 0x40 else 0x6F
+    assert rig.get(0x6041) & mask == status
+
+
+@pytest.mark.parametrize(("option", "status"), [(0, 0x40), (1, 0x40), (2, 0x40), (5, 0x07), (6, 0x07)])
+def test_quick_stop_brakes_and_ends_as_605a_says(rig: Rig, option: int, status: int) -> None:
+    rig.set(0x605A, 0, option, 2)
+    rig.enable(10)
+    rig.set(0x6071, 0, 500, 2)
+    rig.run(100)
+    before = rig.speed_radps
+    assert before > 1.0
+    rig.control(0x02)
+    rig.run(1500)
+    assert rig.get(0x6041) & 0x4F == status
+    assert (abs(rig.speed_radps) < 0.02) is (option != 0)
+    if option >= 5:
+        rig.set(0x6071, 0, 0, 2)
+        rig.control(0x0F)
+        assert rig.get(0x6041) & 0x6F == 0x27
+
+
+def test_cyclic_torque_scales_by_rated_torque_and_moves_the_plant(rig: Rig) -> None:
+    rig.enable(10)
+    rig.set(0x6071, 0, 100, 2)
+    rig.set(0x60B2, 0, 20, 2)
+    rig.run(50)
+    joint_Nm = 0.120 * 0.5 * 121.0
+    assert rig.get(0x6077) == 120
+    assert rig.device.plant_state[0].actuator_torque_Nm == pytest.approx(joint_Nm, rel=1e-9)
+    assert rig.speed_radps == pytest.approx(joint_Nm / 2.1 * 0.05, rel=0.05)
+
+
+def test_the_reported_torque_is_that_of_the_current_without_the_ripple(rig: Rig) -> None:
+    rig.enable(10)
+    plant = rig.device.plant_constants[0]
+    plant.torque_ripples = 1
+    plant.torque_ripple_Nm[0] = 6.0
+    plant.torque_ripple_phase_turns[0] = 0.25  # its crest, at any angle
+    rig.set(0x6071, 0, 100, 2)
+    rig.run(50)
+    assert rig.get(0x6077) == 100
+    assert rig.get(0x6078) == 100  # rated current yields rated torque
+    joint_Nm = 0.100 * 0.5 * 121.0
+    assert rig.device.plant_state[0].actuator_torque_Nm == pytest.approx(joint_Nm + 6.0, rel=1e-9)
+
+
+@pytest.mark.parametrize(("target", "limit", "limited"), [(299, 300, 0), (300, 300, 0), (301, 300, 1), (-301, 300, 1)])
+@pytest.mark.parametrize("index", [0x6072, 0x6073])
+def test_torque_limits_set_bit_11_only_beyond(rig: Rig, index: int, target: int, limit: int, limited: int) -> None:
+    rig.set(index, 0, limit, 2)
+    rig.enable(10)
+    rig.set(0x6071, 0, target, 2)
+    rig.run(2)
+    assert abs(rig.get(0x6074)) == min(abs(target), limit)
+    assert rig.get(0x6041) >> 11 & 1 == limited
+
+
+def test_torque_mode_follows_the_slope(rig: Rig) -> None:
+    rig.enable(4)
+    rig.set(0x6071, 0, 200, 2)
+    rig.run(100)
+    assert rig.get(0x6074) == pytest.approx(100, abs=3)
+    rig.run(150)
+    assert rig.get(0x6074) == 200
+    assert rig.get(0x6041) & 0x400
+
+
+@pytest.mark.parametrize("mode", [3, 9])
+def test_velocity_modes_reach_the_target(rig: Rig, mode: int) -> None:
+    rig.enable(mode)
+    rig.set(0x60FF, 0, -50_000, 4)
+    rig.run(1000)
+    assert rig.get(0x606C) == pytest.approx(-50_000, abs=500)
+
+
+@pytest.mark.parametrize("mode", [1, 8])
+def test_position_modes_reach_the_target(rig: Rig, mode: int) -> None:
+    rig.enable(mode)
+    for target in range(0, 20_001, 50) if mode == 8 else [20_000]:
+        rig.set(0x607A, 0, target, 4)
+        rig.run(1)
+    if mode == 1:
+        rig.control(0x1F)
+        assert rig.get(0x6041) & 0x1000
+        rig.control(0x0F)
+        assert not rig.get(0x6041) & 0x1000
+    rig.run(1500)
+    assert rig.get(0x6064) == pytest.approx(20_000, abs=100)
+    assert mode == 8 or rig.get(0x6041) & 0x400
