@@ -1,4 +1,7 @@
-"""What a wheel holds is what the tree holds, and it works from an empty folder without the tree."""
+"""What the archives hold is what the tree holds: wheel by way of the sdist, as an index would build it.
+
+The wheel works from an empty folder, without the tree.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,10 @@ import os
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
+from email.message import Message
+from email.parser import Parser
 from importlib.metadata import version
 from pathlib import Path
 
@@ -15,48 +21,92 @@ import pytest
 from tests.places import ROOT
 
 TOP = ("firmware_py", "drivers", "hil", "tools", "configs")
-BUILD = "import sys, setuptools.build_meta as b; b.build_wheel(sys.argv[1])"
+READ = (
+    "docs",
+    "tests",
+    "pyproject.toml",
+    "README.md",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "LICENSE",
+    "MANIFEST.in",
+    "check",
+)
+BUILD = "import sys, setuptools.build_meta as b; getattr(b, 'build_' + sys.argv[1])(sys.argv[2])"
+
+
+def build(kind: str, tree: Path, out: Path) -> Path:
+    """The archive that the build back end makes of a tree."""
+    subprocess.run(
+        [sys.executable, "-c", BUILD, kind, str(out)], cwd=tree, check=True, capture_output=True, timeout=120.0
+    )
+    (archive,) = out.iterdir()
+    return archive
+
+
+def files(root: Path, *tops: str) -> set[str]:
+    found = (file for top in tops for file in ([root / top] if (root / top).is_file() else (root / top).rglob("*")))
+    return {str(f.relative_to(root)) for f in found if f.is_file() and "__pycache__" not in f.parts}
 
 
 @pytest.fixture(scope="module")
-def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel of a copy of the tree, unpacked."""
+def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The sdist of a copy of the tree, unpacked."""
     if int(version("setuptools").split(".")[0]) < 77:
         pytest.skip("the build needs setuptools 77 or newer")
-    tree, out = tmp_path_factory.mktemp("tree"), tmp_path_factory.mktemp("wheel")
-    for name in TOP:
-        shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE", "MANIFEST.in"):
+    tree, out = tmp_path_factory.mktemp("tree"), tmp_path_factory.mktemp("sdist")
+    for name in files(ROOT, *TOP, *READ):
+        (tree / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, tree / name)
-    subprocess.run([sys.executable, "-c", BUILD, str(out)], cwd=tree, check=True, capture_output=True, timeout=120.0)
-    (wheel,) = out.glob("*.whl")
-    zipfile.ZipFile(wheel).extractall(out / "unpacked")
-    return out / "unpacked"
+    with tarfile.open(build("sdist", tree, out)) as archive:
+        archive.extractall(out, filter="data")
+    return next(folder for folder in out.iterdir() if folder.is_dir())
 
 
-def test_a_wheel_holds_every_file_of_the_tree_and_the_licence(unpacked: Path) -> None:
-    def files(root: Path) -> set[str]:
-        found = (file for top in TOP for file in (root / top).rglob("*"))
-        return {str(f.relative_to(root)) for f in found if f.is_file() and "__pycache__" not in f.parts}
+@pytest.fixture(scope="module")
+def unpacked(sources: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel of that, unpacked."""
+    folder = tmp_path_factory.mktemp("unpacked")
+    zipfile.ZipFile(build("wheel", sources, tmp_path_factory.mktemp("wheel"))).extractall(folder)
+    return folder
 
-    assert files(unpacked) == files(ROOT)
-    (metadata,) = unpacked.glob("*.dist-info/METADATA")
-    assert "\nLicense-Expression: Apache-2.0\n" in metadata.read_text()
+
+@pytest.fixture(scope="module")
+def metadata(unpacked: Path) -> Message:
+    (file,) = unpacked.glob("*.dist-info/METADATA")
+    return Parser().parsestr(file.read_text())
+
+
+def test_the_sdist_holds_every_file_to_build_test_and_read(sources: Path) -> None:
+    assert files(sources, *TOP, *READ) == files(ROOT, *TOP, *READ)
+
+
+def test_a_wheel_holds_every_file_of_the_tree_and_nothing_else(unpacked: Path) -> None:
+    assert files(unpacked, *TOP) == files(ROOT, *TOP)
+    assert {folder.name for folder in unpacked.iterdir() if folder.suffix != ".dist-info"} == set(TOP)
+
+
+def test_what_the_metadata_say(unpacked: Path, metadata: Message) -> None:
+    assert metadata["License-Expression"] == "Apache-2.0"
     assert list(unpacked.glob("*.dist-info/licenses/LICENSE"))
+    assert metadata["Requires-Python"] == ">=3.11"
+    assert metadata["Description-Content-Type"] == "text/markdown"
+    classifiers = metadata.get_all("Classifier")
+    assert classifiers is not None
+    assert not [name for name in classifiers if name.startswith("License ::")], "the SPDX expression stands alone"
+    assert {f"Programming Language :: Python :: 3.{minor}" for minor in (11, 12, 13)} <= set(classifiers)
 
 
 def test_it_works_from_an_empty_folder(unpacked: Path, tmp_path: Path) -> None:
-    def jointctl(*words: str) -> str:
+    environment = {**os.environ, "PYTHONPATH": str(unpacked)}
+
+    def python(*words: str) -> str:
         return subprocess.run(
-            [sys.executable, "-P", "-m", "tools.cli", *words], cwd=tmp_path, check=True, capture_output=True, text=True,
-            env={**os.environ, "PYTHONPATH": str(unpacked)}, timeout=120.0,
+            [sys.executable, "-P", *words], cwd=tmp_path, check=True, capture_output=True, text=True, env=environment,
+            timeout=120.0,
         ).stdout  # fmt: skip
 
-    place = "import tools, configs; print(tools.__file__, configs.__file__)"
-    environment = {**os.environ, "PYTHONPATH": str(unpacked)}
-    shown = subprocess.run(
-        [sys.executable, "-P", "-c", place], cwd=tmp_path, env=environment, check=True, capture_output=True, text=True
-    )
-    assert shown.stdout.count(str(unpacked)) == 2
-    jointctl("new", "joint.toml", "--from", "virtual")
+    shown = python("-c", "import tools, configs; print(tools.__file__, configs.__file__)")
+    assert shown.count(str(unpacked)) == 2
+    python("-m", "tools.cli", "new", "joint.toml", "--from", "virtual")
     assert (tmp_path / "joint.toml").read_text() == (ROOT / "configs" / "virtual.toml").read_text()
