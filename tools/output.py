@@ -7,17 +7,19 @@ from __future__ import annotations
 
 import json as json_format
 import math
+import os
 import re
 import sys
 import textwrap
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import IO, Any, Protocol
 
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from drivers.errors import DataError
 from tools.narrow_table import fitted, widest
 
 
@@ -32,9 +34,28 @@ _UNIT, _HELD = re.compile(r"(?<=\d) (?=(rad|deg|s|min|ms|us|Nm|A|Hz|mrad|kbit|bi
 PIPE_COLUMNS = 140  # of a table that goes to a file or a pipe, or more if it needs them
 
 
+class _Console(Console):
+    """Rich's own ends the program where nobody reads any more, in the middle of a motion as well."""
+
+    def on_broken_pipe(self) -> None:
+        raise
+
+
+def _abandon(stream: IO[str]) -> None:
+    """Let what is still to be written to it vanish; else the interpreter would complain when it ends."""
+    with suppress(OSError, ValueError):
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, stream.fileno())
+        os.close(null)
+
+
 @dataclass
 class Output:
-    """The two streams of a command; `stdout` and `stderr` are replaced in tests."""
+    """The two streams of a command; `stdout` and `stderr` are replaced in tests.
+
+    Nobody reads stdout any more (`| head`): the result is thrown away, the verb goes on to its end.  It cannot be
+    written (disk full): `DataError`.  What stderr does not take is lost: never a reason to end a motion.
+    """
 
     json: bool = False
     quiet: bool = False
@@ -44,23 +65,46 @@ class Output:
     def __post_init__(self) -> None:
         # rich wraps at 80 columns where there is no terminal; a line of a log file or of a pipe is not to be broken
         width = None if self.stdout.isatty() else PIPE_COLUMNS
-        self._results = Console(file=self.stdout, highlight=False, soft_wrap=not self.stdout.isatty(), width=width)
-        self._messages = Console(file=self.stderr, highlight=False, soft_wrap=not self.stderr.isatty())
+        self._results = _Console(file=self.stdout, highlight=False, soft_wrap=not self.stdout.isatty(), width=width)
+        self._messages = _Console(file=self.stderr, highlight=False, soft_wrap=not self.stderr.isatty())
 
     def result(self, shown: RenderableType, data: Any = None) -> None:
         """A result: `shown` for people, `data` (numbers, texts, lists, dicts) with `--json`."""
         if self.json:
             if data is not None:
-                print(json_format.dumps(_plain(data), allow_nan=False), file=self.stdout, flush=True)
-        else:
-            if not self.stdout.isatty():
-                self._results.width = max(PIPE_COLUMNS, widest(shown))
-            self._results.print(fitted(shown, self._results.width))
+                self.line(json_format.dumps(_plain(data), allow_nan=False))
+            return
+        if not self.stdout.isatty():
+            self._results.width = max(PIPE_COLUMNS, widest(shown))
+        self._write(lambda: self._results.print(fitted(shown, self._results.width)))
 
-    def note(self, text: str) -> None:
-        """Progress in words; not with `--quiet`."""
+    def line(self, text: str) -> bool:
+        """One line of a result that comes bit by bit; False if nobody reads it any more."""
+        return self._write(lambda: print(text, file=self.stdout, flush=True))
+
+    def _write(self, write: Callable[[], None]) -> bool:
+        try:
+            write()
+        except BrokenPipeError:
+            _abandon(self.stdout)
+            self._results.quiet = True
+            return False
+        except OSError as error:
+            _abandon(self.stdout)
+            raise DataError(f"standard output: cannot be written: {error.strerror or error}") from None
+        return True
+
+    def _say(self, text: RenderableType, style: str | None = None) -> None:
+        try:
+            self._messages.print(text, style=style, markup=False)
+        except OSError:
+            _abandon(self.stderr)
+            self._messages.quiet = True
+
+    def note(self, text: RenderableType) -> None:
+        """Progress in words, or as a table; not with `--quiet`."""
         if not self.quiet:
-            self._messages.print(text, markup=False)
+            self._say(text)
 
     def fact(self, text: str) -> None:
         """A note that begins with a heading of `FACT_COLUMN` characters: what a terminal has to wrap goes below it."""
@@ -73,14 +117,14 @@ class Output:
         self.note(text)
 
     def warning(self, text: str) -> None:
-        self._messages.print(f"warning: {text}", style="yellow", markup=False)
+        self._say(f"warning: {text}", "yellow")
 
     def error(self, text: str, hint: str = "") -> None:
         """One line for each line of `text`, and what to do about it."""
         for line in text.splitlines():
-            self._messages.print(f"error: {line}", style="red", markup=False)
+            self._say(f"error: {line}", "red")
         if hint:
-            self._messages.print(f"hint: {hint}", markup=False)
+            self._say(f"hint: {hint}")
 
     @contextmanager
     def progress(self, title: str, total: float) -> Iterator[Advance]:

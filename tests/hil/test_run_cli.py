@@ -197,6 +197,20 @@ def test_a_terminal_that_is_closed_while_tracking_ramps_down(bench: Any) -> None
     assert largest_velocity_step(records) < LARGEST_STEP_radps
 
 
+def test_a_run_whose_output_nobody_reads_any_more_goes_on_to_its_end(bench: Any) -> None:
+    config = bench.config()
+    bench.joint(config)
+    reading, writing = os.pipe()
+    with os.fdopen(reading) as reader:
+        started = bench.start("run", config, "-y", stderr=writing)
+        os.close(writing)
+        while "tracking" not in reader.readline():
+            pass
+    assert started.finished(60.0).code == 0
+    assert bench.disabled()
+    assert entered(bench.log().records)[-1] is AxisPhase.FINISHED
+
+
 def test_dry_run_commissions_and_moves_nothing(bench: Any) -> None:
     config = bench.config(virtual__initial_position_rad=0.1)
     bench.joint(config)

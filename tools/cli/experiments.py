@@ -10,6 +10,8 @@ import typer
 from tools.cli.options import COMPARE, Json, Quiet, Report, Workers, loaded
 from tools.output import Output
 
+LARGEST = 2**31 - 1  # of a seed or of a scenario's number
+
 
 def paper(
     figures: Annotated[Path | None, typer.Option("--figures", help="folder for the figures; without it none")] = None,
@@ -65,9 +67,11 @@ def study(
 
 def fault_campaign(
     config: Annotated[Path, typer.Argument(metavar="CONFIG")] = Path("virtual"),
-    count: Annotated[int, typer.Option("--count", help="how many random scenarios", min=1)] = 10_000,
-    seed: Annotated[int, typer.Option("--seed")] = 1,
-    scenario: Annotated[int | None, typer.Option("--scenario", help="replay this one alone")] = None,
+    count: Annotated[int, typer.Option("--count", help="how many random scenarios", min=1, max=LARGEST)] = 10_000,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=LARGEST)] = 1,
+    scenario: Annotated[
+        int | None, typer.Option("--scenario", help="replay this one alone", min=0, max=LARGEST)
+    ] = None,
     folder: Annotated[Path, typer.Option("--folder", help="for report, JSON and picture")] = Path("fault-campaign"),
     workers: Workers = None,
     report: Report = None,

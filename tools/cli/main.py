@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from drivers.errors import JointctlError
+from drivers.errors import DataError, JointctlError, UsageError
 from tools.cli import experiments as cli_experiments
 from tools.cli import friction as cli_friction
 from tools.cli import inspection as cli_inspection
@@ -32,6 +33,7 @@ from tools.cli.options import (
     config_path,
     loaded,
 )
+from tools.cli.standard_streams import occupy_standard_streams
 from tools.output import Output
 
 EPILOG = (
@@ -252,14 +254,37 @@ def _start_quickly() -> None:
     gc.set_threshold(100_000, 50, 100)
 
 
+# typer's own parser or click, as the version has it
+_USAGE: type[Exception] = typer.BadParameter.__mro__[1]
+INTERRUPTED = 130
+
+
+def _refuse_usage(error: Any) -> None:
+    """One line for what the parser did not understand; without any argument it has shown the help instead."""
+    text = " ".join(error.format_message().split())
+    if not text:
+        return
+    command = error.ctx.command_path if error.ctx is not None else "jointctl"
+    Output().error(text[0].lower() + text[1:], f"`{command} --help` shows what there is")
+
+
 def main() -> None:
     """Run a verb; every known error is one line and its own exit code."""
+    occupy_standard_streams()
     _start_quickly()
     try:
-        app()
+        sys.exit(app(standalone_mode=False))
     except JointctlError as error:
         Output().error(error.message, error.hint)
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
+    except _USAGE as error:
+        _refuse_usage(error)
+        sys.exit(UsageError.exit_code)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        Output().error(f"{error.filename or 'a file or the output'}: cannot be written: {error.strerror}")
+        sys.exit(DataError.exit_code)
+    except (KeyboardInterrupt, typer.Abort):
         Output().note("interrupted")
-        sys.exit(130)
+        sys.exit(INTERRUPTED)

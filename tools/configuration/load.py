@@ -25,10 +25,13 @@ def shipped_config(name: str) -> Path:
 
 
 def read_text(path: Path) -> str:
-    """Text of a configuration file; `ConfigurationError` if it cannot be read as such."""
+    """Text of a configuration file, without the mark that some editors begin it with.
+
+    `ConfigurationError` if it cannot be read as such.
+    """
     known = ", ".join(sorted(p.stem for p in SHIPPED_FOLDER.glob("*.toml")))
     try:
-        return path.read_bytes().decode("utf-8")
+        return path.read_bytes().decode("utf-8-sig")
     except FileNotFoundError:
         raise ConfigurationError(f"{path}: no such file", f"shipped configurations: {known}") from None
     except IsADirectoryError:

@@ -105,7 +105,7 @@ def stop_target(
     """Flag beats environment (CAN_INTERFACE, _CHANNEL, _BITRATE) beats file; `ConfigurationError`: what is missing."""
     given, environ = given or GivenTarget(), os.environ if environ is None else environ
     try:
-        sections = readable_keys(path.read_bytes().decode("utf-8", "replace"))
+        sections = readable_keys(path.read_bytes().decode("utf-8-sig", "replace"))
     except OSError as error:
         sections = {}
         unread = f"{path}: cannot be read: {error.strerror or error}; "

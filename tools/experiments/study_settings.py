@@ -49,7 +49,7 @@ class StudySettings(Section):
 def load_study(path: Path) -> StudySettings:
     """Read and check a study file; names of files in it are relative to the working folder."""
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise ConfigurationError(f"{path}: cannot be read as TOML: {reason}") from None

@@ -118,7 +118,7 @@ def replace_file(path: Path, content: bytes, check: Callable[[Path], None] | Non
 def write_into(config_path: Path, values: dict[str, Any], remarks: list[str]) -> None:
     """Put the section into a configuration; if the result is not valid, `ConfigurationError`, and the file stays."""
     try:
-        text = config_path.read_bytes().decode("utf-8")
+        text = config_path.read_bytes().decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{config_path}: cannot be read: {error}") from None
     try:

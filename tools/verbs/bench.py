@@ -18,6 +18,7 @@ from tools.configuration.config import Config
 from tools.configuration.load import load_config, shipped_config
 from tools.configuration.records import axis_constants
 from tools.output import Output
+from tools.target_folder import prepare_folder
 
 PARTS = ("law", "loop", "lockstep", "swarm", "start")
 
@@ -53,6 +54,8 @@ def bench(
     for name in only:
         if name not in PARTS:
             raise UsageError(f"only (={name}) must be one of {', '.join(PARTS)}")
+    if out is not None:
+        prepare_folder(out)
     # under load the library tells of every SDO that it repeats; a failure comes as an exception anyway
     logging.getLogger("canopen").setLevel(logging.CRITICAL)
     config = load_config(config_path or shipped_config("virtual"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from drivers.errors import ConfigurationError, DataError
+from drivers.errors import ConfigurationError
 from tools.campaign.judge import Verdict, judge
 from tools.campaign.report import campaign_figure, rows_by_kind, table, violations, write_json
 from tools.campaign.runner import run_campaign
@@ -18,6 +18,7 @@ from tools.reporting.figure import svg_figure
 from tools.reporting.page import Details, Paragraph, Section, Table, check_target
 from tools.reporting.verb_page import from_terminal, write_verb_page
 from tools.simulation.lockstep import LockstepJoint
+from tools.target_folder import prepare_folder
 
 EXIT_VIOLATIONS = 10
 EXIT_INTERRUPTED = 130
@@ -46,7 +47,7 @@ def fault_campaign(
         return _replay(config, output, seed, scenario)
     if report is not None:
         check_target(report)
-    _prepare(folder)
+    prepare_folder(folder)
     with output.progress("fault campaign", float(count)) as advance:
         verdicts, elapsed_s, interrupted = run_campaign(config.path, seed, count, advance, workers)
     rows = rows_by_kind(verdicts)
@@ -93,13 +94,6 @@ def _write_page(
         Section("Configuration", [Details("Configuration", config.text)]),
     ]
     write_verb_page(path, "Fault campaign", sections, output, subtitle=str(config.path))
-
-
-def _prepare(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"{folder}: cannot be created: {error.strerror or error}") from None
 
 
 def _replay(config: Config, output: Output, seed: int, number: int) -> int:

@@ -13,7 +13,7 @@ import numpy as np
 
 from drivers.errors import ConfigurationError, DataError
 from tools.configuration.conversions import torque_constant_NmpA
-from tools.configuration.load import load_config
+from tools.configuration.load import load_config, shipped_config
 from tools.drawing import png
 from tools.identification.figures import convergence_figure, fit_figure
 from tools.identification.friction_data import ForeignFormat, read_friction_data
@@ -94,6 +94,9 @@ def identify(
         raise DataError(f"{out}: the name of the section's file (-o) must end in .toml")
     if report is not None:
         check_target(report, [path for path in (data_path, into, config) if path is not None])
+    if into is not None and not into.exists() and shipped_config(into.name).exists():
+        hint = f"`jointctl new FILE --from {into.stem}` makes one of your own"
+        raise DataError(f"--into {into}: a shipped configuration is not written into", hint)
     limits = _limits(into, config, output)
     data = read_friction_data(data_path, told)
     if limits is None and data.recorded_limits is None:

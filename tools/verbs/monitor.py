@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import sys
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -91,8 +89,6 @@ def monitor(subject: Subject, output: Output, selection: Selection, *, ask: bool
             _show(bus, decoder, output, selection, lambda: bool(signals.count))
     except can.CanError as error:
         raise BusError(f"{subject.place} failed: {error}", "wiring, bit rate, and whether it is up") from None
-    except BrokenPipeError:  # `jointctl monitor | head`
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115  (the interpreter would complain when it flushes)
     finally:
         bus.shutdown()
     return 0
@@ -119,8 +115,8 @@ def _show(bus: can.BusABC, decoder: FrameDecoder, output: Output, selection: Sel
             continue
         last[message.arbitration_id] = bytes(message.data)
         shown += 1
-        print(json_line(message, decoded) if output.json else text_line(message, decoded), file=output.stdout,
-              flush=True)  # fmt: skip
+        if not output.line(json_line(message, decoded) if output.json else text_line(message, decoded)):
+            break
     elapsed_s = time.monotonic() - started_s
     told = ", ".join(f"{kind} {number}" for kind, number in kinds.most_common())
     output.note(f"{sum(kinds.values())} frames in {elapsed_s:.1f} s{': ' + told if told else ''}")

@@ -7,8 +7,6 @@ input, look at a fault.  Nothing is written to the drive.
 from __future__ import annotations
 
 import json
-import os
-import sys
 import time
 from dataclasses import dataclass
 
@@ -77,20 +75,18 @@ def monitor_serial(
     with inspected_drive(config) as (drive, identity), stop_signals() as signals:
         output.note(f"{identity.name} on {section.port}: asked every {INTERVAL_S:g} s; Ctrl-C ends it")
         next_s = started_s = time.monotonic()
-        try:
-            while not signals.count and (count is None or shown < count):
-                if until_s is not None and time.monotonic() >= until_s:
+        while not signals.count and (count is None or shown < count):
+            if until_s is not None and time.monotonic() >= until_s:
+                break
+            reading = read_once(drive)
+            asked += 1
+            now = (reading.position_rad, reading.status, reading.motor_fault)
+            if not (changes and now == last):
+                shown += 1
+                if not output.line(reading.json() if output.json else reading.line()):
                     break
-                reading = read_once(drive)
-                asked += 1
-                now = (reading.position_rad, reading.status, reading.motor_fault)
-                if not (changes and now == last):
-                    shown += 1
-                    print(reading.json() if output.json else reading.line(), file=output.stdout, flush=True)
-                last = now
-                next_s = max(next_s + INTERVAL_S, time.monotonic())
-                time.sleep(max(0.0, next_s - time.monotonic()))
-        except BrokenPipeError:  # `jointctl monitor | head`
-            sys.stdout = open(os.devnull, "w")  # noqa: SIM115  (the interpreter would complain when it flushes)
+            last = now
+            next_s = max(next_s + INTERVAL_S, time.monotonic())
+            time.sleep(max(0.0, next_s - time.monotonic()))
         output.note(f"asked {asked} times in {time.monotonic() - started_s:.1f} s")
     return 0

@@ -72,7 +72,7 @@ def dump(subject: Subject, output: Output, out: Path | None = None) -> int:
     if output.json:
         output.result("", _as_data(found))
     elif out is None:
-        print(toml_text(found, objects), end="", file=output.stdout)
+        output.line(toml_text(found, objects).removesuffix("\n"))
     return 0
 
 
@@ -129,8 +129,7 @@ def restore_file(
             output.result("nothing to restore: the drive has these values", {"restored": [], "failed": []})
             return 0
         output.note(f"{len(changes)} parameters differ; the drive as it is, and {path.name}:")
-        if not output.quiet:
-            output._messages.print(_table(objects, changes, "drive", "file"))
+        output.note(_table(objects, changes, "drive", "file"))
         if not assume_yes:
             require_terminal("this writes into the drive and there is no terminal to ask on", "give -y to write")
         if not (assume_yes or agreed(output, "Write these into the drive?")):

@@ -19,6 +19,7 @@ from tools.output import Output
 from tools.reporting.figure import svg_figure
 from tools.reporting.page import Details, Section, check_target
 from tools.reporting.verb_page import from_terminal, write_verb_page
+from tools.target_folder import prepare_target
 
 INTERRUPTED = 130
 _COLUMNS = (
@@ -51,6 +52,8 @@ def study(
     refuse_serial(base, "study")
     if report is not None:
         check_target(report)
+    for file in (csv, figure):
+        prepare_target(file)
     controllers = study_controllers(settings)
     for controller in controllers:
         controller_config(base, controller)  # a contradiction is to be told before an hour of simulation
@@ -72,14 +75,14 @@ def study(
         title = f"INTERRUPTED: {done} of {title}"
         output.warning(f"interrupted: only {done} of {settings.plants} plants are in the result")
     if done:
+        # first of all: a file that cannot be written does not cost the result
+        output.result(_table(result, title, settings.after_s), study_data(result, settings))
         if csv is not None:
             write_csv(result, csv)
+            output.note(f"written: {csv}")
         if figure is not None:
             save_png(_figure(result, settings, title), figure)
-        output.result(_table(result, title, settings.after_s), study_data(result, settings))
-        for path in (csv, figure):
-            if path is not None:
-                output.note(f"written: {path}")
+            output.note(f"written: {figure}")
         if report is not None:
             _write_page(report, result, settings, title, output)
     return INTERRUPTED if result.interrupted else 0

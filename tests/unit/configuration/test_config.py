@@ -127,6 +127,13 @@ def test_values_just_inside_are_accepted(tmp_path: Path, pattern: str, line: str
     load(tmp_path, pattern, line)
 
 
+def test_a_file_may_begin_with_the_mark_of_an_editor_and_end_its_lines_with_two_characters(tmp_path: Path) -> None:
+    shipped = shipped_config("virtual")
+    path = tmp_path / "joint.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + shipped.read_text().replace("\n", "\r\n").encode())
+    assert load_config(path).limits == load_config(shipped).limits
+
+
 def test_files_that_are_no_configuration_give_one_line(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"none\.toml: no such file .*virtual"):
         load_config(tmp_path / "none.toml")

@@ -25,6 +25,13 @@ def changed(folder: Path, base: str, *changes: tuple[str, str]) -> Path:
     return path
 
 
+def test_the_mark_that_an_editor_begins_a_file_with_does_not_matter(tmp_path: Path) -> None:
+    path = changed(tmp_path, "virtual", ("[control]", "[contr"))
+    text = path.read_text()
+    path.write_text("\ufeff" + text[text.index("[bus]") :], encoding="utf-8")
+    assert stop_target(path, environ=NOTHING) == stop_target(CONFIGS / "virtual.toml", environ=NOTHING)
+
+
 @pytest.mark.parametrize(
     "changes",
     [

@@ -205,6 +205,13 @@ def test_an_interruption_writes_nothing(sweep, config, monkeypatch):
     assert contents(sweep.parent) == before
 
 
+def test_a_shipped_configuration_is_not_written_into(sweep, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("precise", "precise.toml"):
+        with pytest.raises(DataError, match=r"not written into \(`jointctl new FILE --from precise`"):
+            identify(sweep, output(), into=Path(name), options=QUICK)
+
+
 @pytest.mark.parametrize("name", ["sweep.csv", "sweep.json", "section"])
 def test_the_section_goes_into_a_toml_file_only(sweep, name):
     before = contents(sweep.parent)

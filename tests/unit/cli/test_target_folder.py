@@ -1,0 +1,42 @@
+"""Where results go is tried before the work that makes them."""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+
+import pytest
+
+from drivers.errors import DataError
+from tools.experiments.study_settings import StudySettings
+from tools.output import Output
+from tools.target_folder import prepare_folder, prepare_target
+from tools.verbs import study as study_module
+
+
+def test_a_folder_is_made_and_one_that_is_there_stays(tmp_path: Path) -> None:
+    prepare_folder(tmp_path / "a" / "b")
+    prepare_folder(tmp_path / "a" / "b")
+    prepare_target(tmp_path / "c" / "file.csv")
+    prepare_target(None)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "c"]
+
+
+def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match="file: cannot be made: File exists"):
+        prepare_folder(tmp_path / "file")
+    with pytest.raises(DataError, match="is a folder, not a file to write"):
+        prepare_target(tmp_path)
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everywhere
+    with pytest.raises(DataError, match="no permission"):
+        prepare_folder(tmp_path)
+
+
+@pytest.mark.parametrize("key", ["csv", "figure"])
+def test_a_study_is_not_begun(key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(study_module, "run_study", lambda *_, **__: pytest.fail("hours of simulation"))
+    output = Output(stdout=io.StringIO(), stderr=io.StringIO())
+    with pytest.raises(DataError, match="is a folder"):
+        study_module.study(StudySettings(), output, **{key: tmp_path})
