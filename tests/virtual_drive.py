@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import struct
-from pathlib import Path
 from typing import Any
 
 import canopen
 
 from hil.canopen.device import Cia402Device, DeviceSettings
 from hil.plant.joint import plant
+from tests.places import EDS
 
-EDS = Path(__file__).resolve().parents[1] / "configs" / "virtual_joint.eds"
 NODE = 5
 MS = 1_000_000
 REMOTE = 0x40000000

@@ -8,7 +8,6 @@ import struct
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,8 +25,8 @@ from hil.frame_stamps import OLDEST_STAMP_NS, sent_ns_of
 from hil.plant.joint import plant
 from hil.plant.records import FrictionKind
 from hil.realtime_device import RealtimeDevice
+from tests.places import EDS
 
-EDS = Path(__file__).resolve().parents[2] / "configs" / "virtual_joint.eds"
 NODE = 5
 WRAP_NS = (1 << 24) * 1000
 

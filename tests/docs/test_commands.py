@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 import pytest
 import typer
 
+from tests.places import ROOT
 from tools.cli.main import app
 
-ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *(ROOT / name for name in ("CHANGELOG.md", "CONTRIBUTING.md")), *ROOT.glob("docs/**/*.md")]
 FENCE = re.compile(r"^```(?P<info>[^\n`]*)\n(?P<body>.*?)^```$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`(jointctl [^`\n]+)`")

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import tomllib
-from pathlib import Path
 
+from tests.places import ROOT
 from tools.configuration.config import Config
 from tools.configuration.reference import reference, rows_of
 from tools.configuration.sections import Limits
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_the_page_is_up_to_date() -> None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 from drivers.errors import JointctlError
+from tests.places import ROOT
 from tools.configuration.config import Config
 from tools.identification.friction_data import SWEEP_COLUMNS
 from tools.recording.can_log import CAN_TOPIC
@@ -13,7 +13,7 @@ from tools.recording.run_log import EVENT_TOPIC, RECORD_TOPIC
 from tools.verbs.fault_campaign import EXIT_VIOLATIONS
 from tools.verbs.params import DIFFERENT
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
+DOCS = ROOT / "docs"
 NO_CLASS = {0, EXIT_VIOLATIONS, DIFFERENT, 130}
 
 

@@ -21,6 +21,7 @@ from hil.canopen.device_records import PowerState
 from hil.faults.kinds import FaultKind
 from hil.lockstep import TRUE_POWER_STATE, TRUTHS
 from tests.page_figures import foreign_colours, svgs
+from tests.places import CONFIGS
 from tools.campaign import judge as judge_module
 from tools.campaign import runner
 from tools.campaign.envelope import Envelope, envelope, reaction_s
@@ -35,7 +36,7 @@ from tools.output import Output
 from tools.simulation.lockstep import LockstepJoint, LockstepRun
 from tools.verbs.fault_campaign import fault_campaign
 
-CONFIG = Path(__file__).resolve().parents[2] / "configs" / "virtual.toml"
+CONFIG = CONFIGS / "virtual.toml"
 KINDS = len(FAULT_CLASSES)
 WIDE = Envelope(-9.0, 9.0, 9.0, 60.0, 20.0, 1.0, 2.0)
 

@@ -14,6 +14,7 @@ from firmware_py.realtime import Word
 from firmware_py.records import LogRecord
 from firmware_py.schema import dtype_of
 from firmware_py.states import AxisPhase, Fault, StopRequest
+from tests.hil.moving_run import Moving, gone
 from tools.configuration.load import load_config
 from tools.configuration.records import axis_constants, trajectory_table
 from tools.recording.run_log import RunLogWriter, read_run_log
@@ -23,8 +24,8 @@ from tools.running.open_drive import open_drive
 
 
 @pytest.fixture
-def moving(bench: Any, processes: Any) -> Any:
-    moving = processes.Moving(bench)
+def moving(bench: Any) -> Any:
+    moving = Moving(bench)
     time.sleep(2.2)  # two seconds to keep
     yield moving
     moving.close()
@@ -34,10 +35,10 @@ def covered_s(records: Any) -> float:
     return float(records.time_ns[-1] - records.time_ns[0]) * 1e-9
 
 
-def test_supervisor_killed_the_loop_saves_what_it_has(moving: Any, processes: Any) -> None:
+def test_supervisor_killed_the_loop_saves_what_it_has(moving: Any) -> None:
     killed_ns = time.monotonic_ns()
     moving.run.signal(signal.SIGKILL)
-    assert processes.gone(moving.loop, 20.0)
+    assert gone(moving.loop, 20.0)
     (path,) = moving.bench.folder.glob("runs/*.tail.mcap")
     tail = read_run_log(path)
     assert tail.complete

@@ -18,6 +18,7 @@ import pytest
 
 from firmware_py.states import AxisPhase, DriveRequest, Fault
 from hil.faults.kinds import LOCKSTEP_ONLY, FaultKind
+from tests.places import CONFIGS
 from tests.real_time_joint import real_time_joint
 from tools.configuration.config import Config
 from tools.configuration.load import load_config
@@ -26,7 +27,7 @@ from tools.configuration.plant_settings import fault_constants
 from tools.output import Output
 from tools.running.supervisor import RunResult, Supervisor
 
-SHIPPED = (Path(__file__).resolve().parents[2] / "configs" / "virtual.toml").read_text()
+SHIPPED = (CONFIGS / "virtual.toml").read_text()
 AT_s = 0.7
 OFF = ("switch on disabled", "fault")
 MOTION = (Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR, Fault.POSITION_JUMP, Fault.POSITION_FROZEN)
@@ -167,7 +168,7 @@ def test_faults_come_from_the_configuration(tmp_path: Path) -> None:
     assert (first.kind, first.start_s, first.magnitude) == (FaultKind.ENCODER_JUMP, 2.0, -0.1)
     assert (second.kind, second.start_s, second.duration_s) == (FaultKind.TPDO_LOST, 1.0, 0.5)
     assert (second.magnitude, second.seed) == (0.25, 7)
-    assert len(fault_constants(load_config(Path(__file__).resolve().parents[2] / "configs" / "virtual.toml"))) == 0
+    assert len(fault_constants(load_config(CONFIGS / "virtual.toml"))) == 0
 
 
 @pytest.mark.parametrize(

@@ -1,173 +1,18 @@
-"""`jointctl` as its users start it: processes in a folder of their own, on a virtual bus of a name of its own."""
+"""The benches: a folder and a bus, and a serial line."""
 
 from __future__ import annotations
 
-import contextlib
-import os
-import signal
-import subprocess
-import sys
-import time
-import uuid
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import canopen
 import pytest
-import tomlkit
 
-from hil.elmo.device import ElmoDevice
-from tests.real_time_joint import real_time_joint
+from tests.hil.bench import Bench
+from tests.hil.serial_bench import SerialBench, end_line_guards, name_kept
+from tests.places import CONFIGS
+from tests.real_time_joint import real_time_serial_joint
 from tools.configuration.load import load_config
-from tools.recording.run_log import read_run_log
-from tools.verbs.hil_serial import serve_virtual_elmo
-
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-
-
-@dataclass(frozen=True)
-class Finished:
-    """What a command left: exit code and its two streams."""
-
-    code: int
-    out: str
-    err: str
-
-    def refused(self, code: int, *words: str) -> None:
-        """It ended with this exit code and one line of error that holds the words, and no traceback."""
-        errors = [line for line in self.err.splitlines() if line.startswith("error: ")]
-        assert (self.code, len(errors)) == (code, 1), self.err
-        assert "Traceback" not in self.err
-        assert "Traceback" not in self.out
-        for word in words:
-            assert word in self.err, self.err
-
-
-class Started:
-    """A `jointctl` process in a session of its own, its streams in files."""
-
-    def __init__(self, folder: Path, arguments: tuple[str, ...], **options: Any) -> None:
-        number = len(list(folder.glob("*.stderr")))
-        self._files = [folder / f"{number}.stdout", folder / f"{number}.stderr"]
-        command = [sys.executable, "-P", "-m", "tools.cli", *arguments]
-        with self._files[0].open("wb") as out, self._files[1].open("wb") as err:
-            options = {"stdin": subprocess.DEVNULL, "stdout": out, "stderr": err, **options}
-            self.process = subprocess.Popen(command, cwd=folder, start_new_session=True, **options)
-
-    @property
-    def err(self) -> str:
-        return self._files[1].read_text()
-
-    def saw(self, text: str, timeout_s: float = 180.0) -> Started:
-        """Wait until stderr holds the text; the first start may have to compile."""
-        give_up_s = time.monotonic() + timeout_s
-        while text not in self.err:
-            assert self.process.poll() is None, f"ended with {self.process.returncode} before {text!r}: {self.err}"
-            assert time.monotonic() < give_up_s, f"no {text!r} in: {self.err}"
-            time.sleep(0.01)
-        return self
-
-    def signal(self, number: int, *, group: bool = False) -> None:
-        """To the process, or to its group as the keys of a terminal do."""
-        (os.killpg if group else os.kill)(self.process.pid, number)
-
-    def finished(self, timeout_s: float = 180.0) -> Finished:
-        code = self.process.wait(timeout_s)
-        return Finished(code, self._files[0].read_text(), self.err)
-
-    def children(self) -> list[int]:
-        """Process ids of the direct children."""
-        return [
-            int(pid) for pid in Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
-        ]
-
-    def child(self, module: str) -> int:
-        """The direct child that runs this module."""
-        (pid,) = [pid for pid in self.children() if module in Path(f"/proc/{pid}/cmdline").read_text()]
-        return pid
-
-    def end(self) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-        self.process.wait()
-
-
-class Bench:
-    """A folder, a bus of its own name, and `jointctl` as a user types it there."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.channel = f"test-{os.getpid()}-{uuid.uuid4().hex[:8]}"
-        self._started: list[Started] = []
-        self._joints = contextlib.ExitStack()
-
-    def config(self, name: str = "joint.toml", base: str = "virtual", **changes: Any) -> str:
-        """A shipped configuration with a short trajectory and no way to its start; None removes a key."""
-        document = tomlkit.parse((CONFIGS / f"{base}.toml").read_text())
-        short = {
-            "bus__channel": self.channel, "trajectory__duration_s": 1.0, "virtual__initial_position_rad": 0.0,
-            "log__picture": False,  # test_demo.py looks at one
-            # a busy computer must not be the fault that is seen
-            "limits__sample_age_max_s": 0.15, "limits__skipped_max_s": 0.15,
-        }  # fmt: skip
-        for path, value in {**short, **changes}.items():
-            *sections, key = path.split("__")
-            table: Any = document
-            for section in sections:
-                table = table[section]
-            if value is None:
-                del table[key]
-            else:
-                table[key] = value
-        (self.folder / name).write_text(tomlkit.dumps(document))
-        return name
-
-    def start(self, *arguments: str, **options: Any) -> Started:
-        self._started.append(Started(self.folder, arguments, **options))
-        return self._started[-1]
-
-    def run(self, *arguments: str, timeout_s: float = 180.0, **options: Any) -> Finished:
-        return self.start(*arguments, **options).finished(timeout_s)
-
-    def joint(self, config: str) -> None:
-        """The virtual joint in this process, for tests that need one and no more."""
-        self._joints.enter_context(real_time_joint(load_config(self.folder / config)))
-
-    def joint_process(self, config: str) -> Started:
-        """`jointctl hil`, ready for others."""
-        return self.start("hil", config).saw("Ctrl-C ends it")
-
-    def network(self) -> Any:
-        """An independent CANopen client on the bus."""
-        network = canopen.Network()
-        network.NOTIFIER_CYCLE = 0.02
-        network.connect(interface="jointctl", channel=self.channel)
-        return network
-
-    def status_word(self, node: int = 1) -> int:
-        """6041 as an independent client reads it; NMT first, since a stopped node answers no SDO."""
-        network = self.network()
-        try:
-            network.send_message(0, [128, node])
-            return int.from_bytes(network.add_node(node).sdo.upload(0x6041, 0), "little")
-        finally:
-            network.disconnect()
-
-    def disabled(self, node: int = 1) -> bool:
-        """Switch On Disabled or Fault: the power stage is off."""
-        return self.status_word(node) & 0x4F in (0x40, 0x08)
-
-    def log(self) -> Any:
-        """The newest run log."""
-        return read_run_log(max(self.folder.glob("runs/*.mcap"), key=lambda path: path.stat().st_mtime_ns))
-
-    def end(self) -> None:
-        with self._joints:
-            for started in self._started:
-                started.end()
 
 
 @pytest.fixture
@@ -178,101 +23,14 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
     bench.end()
 
 
-# a busy computer may stop this process, and with it the virtual drive, for tens of milliseconds
-# and 100 Hz leaves room for what it adds to the measured delay
-PATIENT: dict[str, Any] = {
-    "loop__rate_Hz": 100.0,
-    "control__kp": 64.0,
-    "control__kv": 16.0,
-    "control__q": 20.0,
-    "control__velocity_cutoff_Hz": 40.0,
-    "limits__sample_age_max_s": 0.5,
-    "limits__skipped_max_s": 0.5,
-    "limits__following_error_max_rad": 0.3,
-    "drive__dead_man_s": 0.3,
-    "log__folder": "runs",
-    "log__picture": False,
-}
-
-
-class SerialBench:
-    """A configuration with the port of a running virtual drive in it; the drive is a thread of this process."""
-
-    def __init__(self, bench: Any) -> None:
-        self.bench = bench
-        self.device: ElmoDevice
-
-    def config(self, name: str = "serial.toml", **changes: Any) -> str:
-        values = {**PATIENT, "trajectory__duration_s": 20.0, "drive__port": self.device.path, **changes}
-        return serial_config(self.bench.folder, name, values)
-
-    def until(self, condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
-        give_up_s = time.monotonic() + timeout_s
-        while not condition():
-            assert time.monotonic() < give_up_s
-            time.sleep(0.02)
-
-    def standing(self) -> bool:
-        """Motor off and the joint at rest."""
-        device = self.device.interpreter
-        return not device.m.motor_on and abs(float(device.state[0].joint_velocity_radps)) < 1e-3
-
-
-def serial_config(folder: Path, name: str, values: dict[str, Any]) -> str:
-    document: Any = tomlkit.parse((CONFIGS / "elmo_serial.toml").read_text())
-    for path, value in values.items():
-        section, key = path.split("__")
-        document[section][key] = value
-    (folder / name).write_text(tomlkit.dumps(document))
-    return name
-
-
-@contextmanager
-def ahead_of_others() -> Iterator[None]:
-    """Every thread of this process before ordinary programs, below a loop, where the system allows it.
-
-    The virtual drive is one of them, and a real one answers in time whatever a computer is busy with.
-    """
-
-    def schedule(policy: int, priority: int) -> None:
-        for thread in os.listdir("/proc/self/task"):
-            with contextlib.suppress(PermissionError, ProcessLookupError):
-                os.sched_setscheduler(int(thread), policy, os.sched_param(priority))
-
-    schedule(os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 20)
-    try:
-        yield
-    finally:
-        schedule(os.SCHED_OTHER, 0)
-
-
 @pytest.fixture
 def serial_bench(bench: Any) -> Iterator[SerialBench]:
     found = SerialBench(bench)
     (bench.folder / "device.toml").write_text((CONFIGS / "elmo_serial.toml").read_text())
-    with serve_virtual_elmo(load_config(bench.folder / "device.toml")) as device, ahead_of_others():
+    with real_time_serial_joint(load_config(bench.folder / "device.toml")) as device:
         found.device = device
         with name_kept(device.path):
             try:
                 yield found
             finally:
                 end_line_guards(device.path)
-
-
-@contextmanager
-def name_kept(port: str) -> Iterator[None]:
-    """No other pseudo-terminal gets this name meanwhile, also when the port has vanished."""
-    descriptor = os.open(port, os.O_RDWR | os.O_NOCTTY)
-    try:
-        yield
-    finally:
-        os.close(descriptor)
-
-
-def end_line_guards(port: str) -> None:
-    """A guard tries for a minute to reach a drive on a port that vanished; another test's line may get its name."""
-    for process in Path("/proc").glob("[0-9]*/cmdline"):
-        with contextlib.suppress(OSError):
-            arguments = process.read_text().split("\0")
-            if "tools.running.guard.line_guard" in arguments and any(f'"port": "{port}"' in text for text in arguments):
-                os.kill(int(process.parent.name), signal.SIGKILL)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any
 
 import can
 from canopen.profiles.p402 import BaseNode402
 
-EDS = Path(__file__).resolve().parents[2] / "configs" / "virtual_joint.eds"
+from tests.places import EDS
+
 SYNC_ID, TPDO_ID, RPDO_ID, HEARTBEAT_ID = 0x80, 0x181, 0x201, 0x701
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from hil.bus.virtual_bus import VirtualBusHub, default_socket_path
+from tests.places import EDS
 
-EDS = Path(__file__).resolve().parents[2] / "configs" / "virtual_joint.eds"
 CONTROL_WORD_ID = 0x201  # RPDO1 of node 1: only the loop sends it
 TPDO_ID = 0x181
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from firmware_py.states import AxisPhase, DriveState
+from tests.places import CONFIGS
 
 ROWS = (
     "tracking error",
@@ -88,7 +89,7 @@ def test_a_duration_that_is_none_is_refused(bench: Any, duration: str) -> None:
 
 
 def test_configuration_without_a_virtual_joint_is_refused(bench: Any) -> None:
-    document = (Path(__file__).resolve().parents[2] / "configs" / "virtual.toml").read_text()
+    document = (CONFIGS / "virtual.toml").read_text()
     text = re.sub(r"(?ms)^\[virtual\].*?(?=^\[log\])", "", document)
     (bench.folder / "real.toml").write_text(text)
     bench.run("demo", "--config", "real.toml").refused(3, "[virtual]")

@@ -30,6 +30,7 @@ from drivers.canopen.drive import CanopenDrive
 from firmware_py.realtime import Word
 from firmware_py.sequence import reset_axis
 from firmware_py.states import AxisPhase, Fault
+from tests.places import ROOT
 from tools.configuration.config import Config
 from tools.configuration.drive_settings import canopen_settings
 from tools.configuration.load import load_config, shipped_config
@@ -41,7 +42,6 @@ from tools.simulation.virtual_joint import new_device, serve_virtual_joint
 
 RATE_HZ = 100.0
 PERIOD_NS = round(1e9 / RATE_HZ)
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def written_config(folder: Path, interface: str, channel: str) -> Path:

@@ -9,15 +9,14 @@ import re
 import resource
 import signal
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from firmware_py.states import AxisPhase, DriveRequest, DriveState
+from tests.places import CONFIGS
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 LARGEST_STEP_radps = 0.02  # of the desired velocity in one cycle; braking at 2 rad/s2 is a tenth of it
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import can
 import pytest
 
-from tests.hil.conftest import end_line_guards
+from tests.hil.serial_bench import end_line_guards
 
 RATE_HZ = 100.0
 

@@ -1,13 +1,9 @@
-"""Sweeps of the virtual joint: the curve that comes out, in lockstep; stopping and resuming, in real time."""
+"""Sweeps of the virtual joint in lockstep: the curve that comes out, and what is kept after a fault."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import signal
-import subprocess
-import sys
-import time
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -17,6 +13,7 @@ import pytest
 
 from drivers.errors import DeviceError, MotionFault
 from firmware_py.friction import friction_curve_Nm
+from tests.hil.sweep_rows import rows, truth_Nm
 from tools.configuration.config import Config
 from tools.configuration.conversions import friction_constants
 from tools.configuration.load import load_config, shipped_config
@@ -27,7 +24,6 @@ from tools.identification.identification import identify_friction
 from tools.identification.options import Options
 from tools.identification.pso import SwarmSettings
 from tools.output import Output
-from tools.recording.run_log import read_run_log
 from tools.sweeping.options import SweepOptions
 from tools.verbs.sweep import sweep
 
@@ -44,16 +40,6 @@ def swept(config: Config, out: Path, **options: Any) -> Any:
     output = Output(stdout=StringIO(), stderr=StringIO())
     assert sweep(config, output, out, SweepOptions(lockstep=True, **options)) == 0
     return rows(out)
-
-
-def rows(out: Path) -> Any:
-    return np.genfromtxt(out, delimiter=",", names=True)
-
-
-def truth_Nm(config: Config, velocity_radps: np.ndarray) -> np.ndarray:
-    assert config.virtual is not None
-    assert config.virtual.friction is not None
-    return friction_curve_Nm(friction_constants(config.virtual.friction, 121.0), velocity_radps)
 
 
 @pytest.mark.parametrize(("mode", "tolerance_Nm"), [("csv", 0.001), ("pv", 0.001), ("torque", 0.003)])
@@ -200,85 +186,6 @@ def test_a_dry_run_in_lockstep_writes_nothing(config: Config, tmp_path: Path) ->
 
 
 # --- in real time, as processes ---
-
-SHORT = ("--max-speed", "1.0", "--min-speed", "0.5", "--points", "6", "--dwell", "0.3", "--warm-up", "0")
-
-
-class SweepProcess:
-    """`jointctl sweep` in the folder of the bench."""
-
-    def __init__(self, bench: Any, *arguments: str) -> None:
-        self._err = bench.folder / f"sweep-{len(list(bench.folder.glob('sweep-*')))}.stderr"
-        with self._err.open("wb") as err:
-            self.process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "tools.cli", "sweep", *arguments], cwd=bench.folder,
-                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=err, start_new_session=True,
-            )  # fmt: skip
-
-    @property
-    def err(self) -> str:
-        return self._err.read_text()
-
-    def finished(self) -> tuple[int, str]:
-        try:
-            return self.process.wait(120.0), self.err
-        finally:
-            self.process.kill()
-
-
-@pytest.fixture
-def joint(bench: Any) -> Any:
-    """The bench with the joint of sweep_virtual running; limits for a busy computer."""
-    bench.config(base="sweep_virtual", limits__sample_age_max_s=0.5, limits__skipped_max_s=0.5,
-                 drive__heartbeat_s=1.0)  # fmt: skip
-    bench.joint("joint.toml")
-    return bench
-
-
-def test_ctrl_c_keeps_the_rows_and_resume_measures_the_rest(joint: Any) -> None:
-    out = joint.folder / "data.csv"
-    started = SweepProcess(joint, "joint.toml", "-o", "data.csv", "-y", *SHORT)
-    give_up_s = time.monotonic() + 120.0
-    while not (out.exists() and len(out.read_text().splitlines()) >= 3):
-        assert started.process.poll() is None, started.err
-        assert time.monotonic() < give_up_s, started.err
-        time.sleep(0.05)
-    started.process.send_signal(signal.SIGINT)
-    code, err = started.finished()
-    assert code == 130, err
-    assert "Traceback" not in err
-    assert "ramping" in err
-    assert "--resume goes on" in err
-    assert joint.disabled()
-    kept = out.read_text()
-    assert 3 <= len(kept.splitlines()) < 7
-    (log,) = (joint.folder / "runs").glob("*.mcap")
-    assert read_run_log(log).metadata["thinning"] == {"every": "20", "whole_s": "2"}
-    time_s = read_run_log(log).records.time_ns * 1e-9
-    assert np.sum(time_s > time_s[-1] - 2.0) > 1000  # the last seconds are whole, the ones before are not
-    assert len(time_s) < 0.5 * 1000 * (time_s[-1] - time_s[0])
-    code, err = SweepProcess(joint, "joint.toml", "-o", "data.csv", "-y", "--resume", *SHORT).finished()
-    assert code == 0, err
-    assert joint.disabled()
-    found = rows(out)
-    assert out.read_text().startswith(kept)
-    once = {(round(v, 1), d) for v, d in zip(found["velocity_radps"], found["direction"], strict=True)}
-    assert len(once) == 6
-    error_Nm = found["motor_torque_Nm"] - truth_Nm(
-        load_config(shipped_config("sweep_virtual")), found["velocity_radps"]
-    )
-    assert np.max(np.abs(error_Nm)) < 0.005
-
-
-def test_a_dry_run_and_a_missing_y_move_nothing(joint: Any) -> None:
-    code, err = SweepProcess(joint, "joint.toml", "-o", "data.csv", "--dry-run", *SHORT).finished()
-    assert code == 0, err
-    assert "dry run: nothing moved; the drive is disabled" in err
-    code, err = SweepProcess(joint, "joint.toml", "-o", "data.csv", *SHORT).finished()
-    assert code == 2, err
-    assert "no terminal to ask on" in err
-    assert joint.disabled()
-    assert not (joint.folder / "data.csv").exists()
 
 
 def test_options_type_matches_the_command(config: Config) -> None:

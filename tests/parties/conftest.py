@@ -15,8 +15,8 @@ from hil.canopen.device import Cia402Device, DeviceSettings
 from hil.plant.joint import plant
 from hil.realtime_device import RealtimeDevice
 from tests.hil.conftest import bench as bench
+from tests.places import EDS
 
-EDS = Path(__file__).resolve().parents[2] / "configs" / "virtual_joint.eds"
 NODE = 5
 
 

@@ -16,7 +16,7 @@ from tests.places import ROOT
 
 TOP_LEVEL = ("firmware_py", "drivers", "hil", "tools", "configs")
 LONGEST_MODULE = 300
-MODULES = sorted(path for package in TOP_LEVEL for path in (ROOT / package).rglob("*.py"))
+MODULES = sorted(path for folder in (*TOP_LEVEL, "tests") for path in (ROOT / folder).rglob("*.py"))
 
 
 def imported(path: Path) -> set[str]:
@@ -82,7 +82,27 @@ def test_kernels_do_not_depend_on_what_the_cache_key_leaves_out(name: str) -> No
             assert not wrong, f"{path.relative_to(ROOT)} has kernels and imports {wrong}"
 
 
+def too_long(path: Path) -> bool:
+    return len(path.read_text().splitlines()) > LONGEST_MODULE
+
+
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_modules_are_short(path: Path) -> None:
-    lines = len(path.read_text().splitlines())
-    assert lines <= LONGEST_MODULE, f"{path.relative_to(ROOT)} has {lines} lines: split it"
+    assert not too_long(path), f"{path.relative_to(ROOT)} has more than {LONGEST_MODULE} lines: split it"
+
+
+@pytest.mark.parametrize(("lines", "refused"), [(LONGEST_MODULE, False), (LONGEST_MODULE + 1, True)])
+def test_one_line_too_many_is_refused(tmp_path: Path, lines: int, refused: bool) -> None:
+    path = tmp_path / "module.py"
+    path.write_text("pass\n" * lines)
+    assert too_long(path) == refused
+
+
+def test_tests_are_among_those_that_must_be_short() -> None:
+    assert {Path(__file__).resolve(), ROOT / "tests" / "conftest.py"} <= set(MODULES)
+
+
+def test_unit_tests_have_names_of_their_own() -> None:
+    """`pytest -k` and a look at a list of failures tell which module it is."""
+    names = [path.name for path in (ROOT / "tests" / "unit").rglob("test_*.py")]
+    assert sorted(set(names)) == sorted(names)

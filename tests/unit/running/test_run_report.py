@@ -12,7 +12,7 @@ import pytest
 
 from firmware_py.realtime import HISTOGRAM_BINS, Histogram
 from firmware_py.states import Fault
-from tests.unit.recording.test_run_summary import run_records
+from tests.run_records import run_records
 from tools.output import Output
 from tools.recording.run_log import ERROR, WARNING, Event
 from tools.recording.run_summary import summarise

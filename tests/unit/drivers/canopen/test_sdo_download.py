@@ -12,7 +12,8 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 from drivers.canopen.sdo_download import download
 from hil.canopen.device import Cia402Device, DeviceSettings
 from hil.plant.joint import plant
-from tests.virtual_drive import EDS, NODE, Network
+from tests.places import EDS
+from tests.virtual_drive import NODE, Network
 
 NAME = 0x2100  # a text of the virtual drive that can be written
 REFUSED = 0x06010002

@@ -16,7 +16,7 @@ from firmware_py.schema import new
 from firmware_py.sequence import reset_axis
 from firmware_py.states import AxisPhase, CommandKind, DriveRequest, DriveState, Fault, Reaction, StopRequest
 from firmware_py.surroundings import check_suspension
-from tests.unit.firmware_py.test_realtime import Loop
+from tests.unit.firmware_py.stub_loop import Loop
 
 NewRig = Callable[..., Any]
 

@@ -14,7 +14,8 @@ from hil.canopen.device import Cia402Device, DeviceSettings
 from hil.device_loop import SEND_ERRORS_WORD
 from hil.plant.joint import plant
 from hil.realtime_device import RealtimeDevice
-from tests.virtual_drive import EDS, NODE, Network
+from tests.places import EDS
+from tests.virtual_drive import NODE, Network
 
 
 @pytest.fixture

@@ -12,7 +12,8 @@ from canopen.objectdictionary import ODVariable
 from drivers.canopen.sdo_download import download
 from hil.canopen.device import Cia402Device, DeviceSettings
 from hil.plant.joint import plant
-from tests.virtual_drive import EDS, NODE, Network
+from tests.places import EDS
+from tests.virtual_drive import NODE, Network
 
 FORMATS = {1: "<B", 2: "<b", 3: "<h", 4: "<i", 5: "<B", 6: "<H", 7: "<I"}
 TEXT = 9

@@ -1,4 +1,4 @@
-"""Ways in which torque could have been applied with nobody watching, each closed; every one with its twin."""
+"""Ways in which a drive could have had power with nobody watching, each closed; every one with its twin."""
 
 from __future__ import annotations
 
@@ -16,15 +16,11 @@ from drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES, accept_frame, end_cycle,
 from drivers.canopen.port import FRAME_SLOTS, SCRATCH_WORDS, SLOT_RPDO, CanopenPort
 from drivers.drive import is_safe
 from drivers.errors import DeviceError
-from firmware_py.realtime import Histogram
 from firmware_py.records import Command, Sample
 from firmware_py.schema import new
-from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, StopRequest
+from firmware_py.states import DriveRequest
 from hil.canopen.device_core import power_on
 from hil.canopen.device_records import NmtState
-from tests.unit.drivers.elmo.talk import Talk
-from tests.unit.firmware_py.test_realtime import ANSWER_ns, Loop
-from tools.running.supervisor import Supervisor
 
 ENABLED, DISABLED = 0x0637, 0x0650
 WATCHDOG = 126 << 16 | 200  # 1016:1 as configs/virtual.toml arms it
@@ -209,108 +205,3 @@ def test_an_rpdo_that_is_never_sent_counts_although_sync_is(lost: bool) -> None:
 )
 def test_states_in_which_the_power_stage_is_off(state: str, safe: bool) -> None:
     assert is_safe(state) is safe
-
-
-# --- serial drive: a status that is old ----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("echo", [True, False])
-def test_a_stop_right_after_motor_on_is_said_although_the_status_is_still_off(echo: bool) -> None:
-    talk = Talk(echo)
-    talk.cycle(DriveRequest.OFF, count=4)
-    assert b"MO=0" not in talk.said  # twin: off and never asked for more
-    talk.command.request = DriveRequest.ENABLE
-    while b"MO=1" not in talk.cycle(DriveRequest.ENABLE):
-        pass
-    talk.sample.drive_state, talk.port.status = DriveState.OFF, 0  # what was read before the motor was on
-    assert b"MO=0" in talk.cycle(DriveRequest.OFF)
-    talk.cycle(DriveRequest.OFF)
-    assert talk.device.m.motor_on == 0
-
-
-@pytest.mark.parametrize("answers", [True, False])
-def test_a_drive_that_tells_positions_but_no_status_is_not_taken_for_enabled(answers: bool) -> None:
-    talk = Talk().enabled()
-    talk.spoil = lambda reply: reply if answers or not reply.startswith(b"SR") else b""
-    count = int(talk.sample.count)
-    talk.cycle(torque_Nm=12.1, count=40)
-    assert talk.sample.count > count + 20  # positions keep coming
-    assert talk.sample.drive_state == (DriveState.ENABLED if answers else DriveState.UNKNOWN)
-
-
-# --- the measured delay, where every sample answers the SYNC before -------------------------------------------------
-
-
-@pytest.mark.parametrize(("after_wake_ns", "bin_us"), [(-1, 1001), (1, 1)])
-def test_a_sample_that_came_between_the_cycles_is_a_period_old(
-    axis_constants: Any, after_wake_ns: int, bin_us: int
-) -> None:
-    loop = Loop(axis_constants)
-    loop.stub[ANSWER_ns] = after_wake_ns
-    loop.run(20)
-    row = loop.histograms[Histogram.ROUND_TRIP]
-    assert row.sum() == 20
-    assert row[:bin_us].sum() == 0
-    assert bin_us > 1000 or row[bin_us] == 20
-
-
-# --- the supervisor brakes, the user asks for more ------------------------------------------------------------------
-
-
-class _BrakingLoop:
-    def __init__(self) -> None:
-        self.asked: list[StopRequest] = []
-        self.polls = 3
-
-    def request_stop(self, request: StopRequest) -> None:
-        self.asked.append(request)
-
-    def beat(self) -> None:
-        pass
-
-    def running(self) -> bool:
-        self.polls -= 1
-        return self.polls > 0
-
-
-@pytest.mark.parametrize("request_", [StopRequest.NONE, StopRequest.OFF])
-def test_a_stop_signal_is_heard_while_a_failed_supervisor_brakes(virtual_config: Any, request_: StopRequest) -> None:
-    class Signals:
-        request = request_
-
-    supervisor = Supervisor.__new__(Supervisor)
-    supervisor._config = virtual_config
-    loop: Any = _BrakingLoop()
-    signals: Any = Signals()
-    supervisor._brake(loop, signals)
-    assert max(loop.asked) == max(StopRequest.RAMP, request_)
-
-
-# --- the loop stood still (SIGSTOP, a suspended machine) and goes on -------------------------------------------------
-
-
-@pytest.mark.parametrize("elapsed_cycles", [9, 150, 1_500])
-def test_a_loop_that_stood_still_gives_no_torque_to_a_drive_that_was_stopped_meanwhile(
-    rig: Any, elapsed_cycles: int
-) -> None:
-    run = rig(0.1).until(AxisPhase.TRACKING).run(20)
-    run.command.request = DriveRequest.OFF  # the watchdog in the drive: power off, whatever the last command was
-    run.joint.drive_state, run.joint.velocity_radps = DriveState.OFF, 0.0
-    before = len(run.requests)
-    run.tick(elapsed_cycles)
-    for _ in range(40):
-        if run.phase == AxisPhase.FINISHED:
-            break
-        run.joint.drive_state = DriveState.ENABLED  # somebody switches it on again
-        run.tick()
-    assert run.phase == AxisPhase.FINISHED
-    assert run.state.fault == Fault.DRIVE_NOT_ENABLED
-    assert set(run.requests[before:]) == {DriveRequest.OFF}
-    assert set(run.torques_Nm[before:]) == {0.0}
-
-
-def test_a_loop_that_missed_a_few_cycles_goes_on(rig: Any) -> None:
-    run = rig(0.1).until(AxisPhase.TRACKING).run(20)
-    run.tick(int(run.axis.limits.skipped_max_cycles) + 1)
-    run.run(50)
-    assert (run.phase, run.state.fault) == (AxisPhase.TRACKING, Fault.NONE)

@@ -1,0 +1,84 @@
+"""A virtual serial drive in the process of a test, and configurations with its port."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+
+from hil.elmo.device import ElmoDevice
+from tests.places import CONFIGS
+
+# a busy computer may stop this process, and with it the virtual drive, for tens of milliseconds
+# and 100 Hz leaves room for what it adds to the measured delay
+PATIENT: dict[str, Any] = {
+    "loop__rate_Hz": 100.0,
+    "control__kp": 64.0,
+    "control__kv": 16.0,
+    "control__q": 20.0,
+    "control__velocity_cutoff_Hz": 40.0,
+    "limits__sample_age_max_s": 0.5,
+    "limits__skipped_max_s": 0.5,
+    "limits__following_error_max_rad": 0.3,
+    "drive__dead_man_s": 0.3,
+    "log__folder": "runs",
+    "log__picture": False,
+}
+
+
+class SerialBench:
+    """A configuration with the port of a running virtual drive in it; the drive is a thread of this process."""
+
+    def __init__(self, bench: Any) -> None:
+        self.bench = bench
+        self.device: ElmoDevice
+
+    def config(self, name: str = "serial.toml", **changes: Any) -> str:
+        values = {**PATIENT, "trajectory__duration_s": 20.0, "drive__port": self.device.path, **changes}
+        return serial_config(self.bench.folder, name, values)
+
+    def until(self, condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
+        give_up_s = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < give_up_s
+            time.sleep(0.02)
+
+    def standing(self) -> bool:
+        """Motor off and the joint at rest."""
+        device = self.device.interpreter
+        return not device.m.motor_on and abs(float(device.state[0].joint_velocity_radps)) < 1e-3
+
+
+def serial_config(folder: Path, name: str, values: dict[str, Any]) -> str:
+    document: Any = tomlkit.parse((CONFIGS / "elmo_serial.toml").read_text())
+    for path, value in values.items():
+        section, key = path.split("__")
+        document[section][key] = value
+    (folder / name).write_text(tomlkit.dumps(document))
+    return name
+
+
+@contextmanager
+def name_kept(port: str) -> Iterator[None]:
+    """No other pseudo-terminal gets this name meanwhile, also when the port has vanished."""
+    descriptor = os.open(port, os.O_RDWR | os.O_NOCTTY)
+    try:
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def end_line_guards(port: str) -> None:
+    """A guard tries for a minute to reach a drive on a port that vanished; another test's line may get its name."""
+    for process in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            arguments = process.read_text().split("\0")
+            if "tools.running.guard.line_guard" in arguments and any(f'"port": "{port}"' in text for text in arguments):
+                os.kill(int(process.parent.name), signal.SIGKILL)

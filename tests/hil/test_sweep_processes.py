@@ -1,0 +1,95 @@
+"""Sweeps as processes in real time: stopped by Ctrl-C, resumed, and dry."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.hil.sweep_rows import rows, truth_Nm
+from tools.configuration.load import load_config, shipped_config
+from tools.recording.run_log import read_run_log
+
+SHORT = ("--max-speed", "1.0", "--min-speed", "0.5", "--points", "6", "--dwell", "0.3", "--warm-up", "0")
+
+
+class SweepProcess:
+    """`jointctl sweep` in the folder of the bench."""
+
+    def __init__(self, bench: Any, *arguments: str) -> None:
+        self._err = bench.folder / f"sweep-{len(list(bench.folder.glob('sweep-*')))}.stderr"
+        with self._err.open("wb") as err:
+            self.process = subprocess.Popen(
+                [sys.executable, "-P", "-m", "tools.cli", "sweep", *arguments], cwd=bench.folder,
+                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=err, start_new_session=True,
+            )  # fmt: skip
+
+    @property
+    def err(self) -> str:
+        return self._err.read_text()
+
+    def finished(self) -> tuple[int, str]:
+        try:
+            return self.process.wait(120.0), self.err
+        finally:
+            self.process.kill()
+
+
+@pytest.fixture
+def joint(bench: Any) -> Any:
+    """The bench with the joint of sweep_virtual running; limits for a busy computer."""
+    bench.config(base="sweep_virtual", limits__sample_age_max_s=0.5, limits__skipped_max_s=0.5,
+                 drive__heartbeat_s=1.0)  # fmt: skip
+    bench.joint("joint.toml")
+    return bench
+
+
+def test_ctrl_c_keeps_the_rows_and_resume_measures_the_rest(joint: Any) -> None:
+    out = joint.folder / "data.csv"
+    started = SweepProcess(joint, "joint.toml", "-o", "data.csv", "-y", *SHORT)
+    give_up_s = time.monotonic() + 120.0
+    while not (out.exists() and len(out.read_text().splitlines()) >= 3):
+        assert started.process.poll() is None, started.err
+        assert time.monotonic() < give_up_s, started.err
+        time.sleep(0.05)
+    started.process.send_signal(signal.SIGINT)
+    code, err = started.finished()
+    assert code == 130, err
+    assert "Traceback" not in err
+    assert "ramping" in err
+    assert "--resume goes on" in err
+    assert joint.disabled()
+    kept = out.read_text()
+    assert 3 <= len(kept.splitlines()) < 7
+    (log,) = (joint.folder / "runs").glob("*.mcap")
+    assert read_run_log(log).metadata["thinning"] == {"every": "20", "whole_s": "2"}
+    time_s = read_run_log(log).records.time_ns * 1e-9
+    assert np.sum(time_s > time_s[-1] - 2.0) > 1000  # the last seconds are whole, the ones before are not
+    assert len(time_s) < 0.5 * 1000 * (time_s[-1] - time_s[0])
+    code, err = SweepProcess(joint, "joint.toml", "-o", "data.csv", "-y", "--resume", *SHORT).finished()
+    assert code == 0, err
+    assert joint.disabled()
+    found = rows(out)
+    assert out.read_text().startswith(kept)
+    once = {(round(v, 1), d) for v, d in zip(found["velocity_radps"], found["direction"], strict=True)}
+    assert len(once) == 6
+    error_Nm = found["motor_torque_Nm"] - truth_Nm(
+        load_config(shipped_config("sweep_virtual")), found["velocity_radps"]
+    )
+    assert np.max(np.abs(error_Nm)) < 0.005
+
+
+def test_a_dry_run_and_a_missing_y_move_nothing(joint: Any) -> None:
+    code, err = SweepProcess(joint, "joint.toml", "-o", "data.csv", "--dry-run", *SHORT).finished()
+    assert code == 0, err
+    assert "dry run: nothing moved; the drive is disabled" in err
+    code, err = SweepProcess(joint, "joint.toml", "-o", "data.csv", *SHORT).finished()
+    assert code == 2, err
+    assert "no terminal to ask on" in err
+    assert joint.disabled()
+    assert not (joint.folder / "data.csv").exists()

@@ -1,0 +1,27 @@
+"""Records of a run whose summary is known in advance."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from firmware_py.records import LogRecord
+from firmware_py.schema import new
+from firmware_py.states import AxisPhase
+
+
+def run_records(tracking: int = 1000) -> np.recarray:
+    """100 cycles of approach with a great error, then tracking: e = 2 mrad in the first tenth, then +-0.5 mrad."""
+    records = new(LogRecord, 100 + tracking)
+    records.time_ns = 10**15 + np.arange(len(records)) * 1_000_000
+    records.phase = AxisPhase.TRACKING
+    records.phase[:100] = AxisPhase.APPROACH
+    records.trajectory_s = (np.arange(len(records)) - 100) * 1e-3
+    records.error_rad[:100] = 0.1
+    records.error_rad[100:] = 0.5e-3 * (-1.0) ** np.arange(tracking)
+    records.error_rad[100 : 100 + tracking // 10] = 2e-3
+    records.command_torque_Nm[100:] = np.linspace(-10.0, 20.0, tracking)
+    records.command_torque_Nm[50] = 55.0
+    records.network_torque_Nm[100:] = 1.5
+    records.wake_late_ns = np.arange(len(records)) * 1000
+    records.round_trip_ns[::2] = 300_000
+    return records
