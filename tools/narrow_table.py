@@ -12,8 +12,8 @@ _INDENT = 2
 
 
 def cell_text(cell: object) -> str:
-    """A cell, heading or title of a table without its markup."""
-    return cell.plain if isinstance(cell, Text) else Text.from_markup(str(cell)).plain
+    """A cell, heading or title of a table: plain text, or a `Text` without its style."""
+    return cell.plain if isinstance(cell, Text) else str(cell)
 
 
 def width_of(table: Table) -> int:
@@ -74,7 +74,7 @@ def _listed(table: Table, width: int) -> Group:
     cells = zip(*(column.cells for column in table.columns), strict=True)
     for row, (first, *others) in zip(table.rows, cells, strict=True):
         style = row.style or ""
-        parts.append(first if isinstance(first, Text) else Text.from_markup(str(first), style=style))
+        parts.append(first if isinstance(first, Text) else Text(str(first), style=style))
         told = [f"{heading} {cell_text(cell)}".strip() for heading, cell in zip(headings[1:], others, strict=True)
                 if cell_text(cell)]  # fmt: skip
         parts += [

@@ -65,8 +65,9 @@ class Output:
     def __post_init__(self) -> None:
         # rich wraps at 80 columns where there is no terminal; a line of a log file or of a pipe is not to be broken
         width = None if self.stdout.isatty() else PIPE_COLUMNS
-        self._results = _Console(file=self.stdout, highlight=False, soft_wrap=not self.stdout.isatty(), width=width)
-        self._messages = _Console(file=self.stderr, highlight=False, soft_wrap=not self.stderr.isatty())
+        as_it_is: Any = {"highlight": False, "markup": False, "emoji": False}
+        self._results = _Console(file=self.stdout, soft_wrap=not self.stdout.isatty(), width=width, **as_it_is)
+        self._messages = _Console(file=self.stderr, soft_wrap=not self.stderr.isatty(), **as_it_is)
 
     def result(self, shown: RenderableType, data: Any = None) -> None:
         """A result: `shown` for people, `data` (numbers, texts, lists, dicts) with `--json`."""
@@ -74,9 +75,7 @@ class Output:
             if data is not None:
                 self.line(json_format.dumps(_plain(data), allow_nan=False))
             return
-        if not self.stdout.isatty():
-            self._results.width = max(PIPE_COLUMNS, widest(shown))
-        self._write(lambda: self._results.print(fitted(shown, self._results.width)))
+        self._write(lambda: _print_whole(self._results, shown))
 
     def line(self, text: str) -> bool:
         """One line of a result that comes bit by bit; False if nobody reads it any more."""
@@ -96,7 +95,10 @@ class Output:
 
     def _say(self, text: RenderableType, style: str | None = None) -> None:
         try:
-            self._messages.print(text, style=style, markup=False)
+            if isinstance(text, str):
+                self._messages.print(text, style=style)
+            else:
+                _print_whole(self._messages, text)
         except OSError:
             _abandon(self.stderr)
             self._messages.quiet = True
@@ -132,7 +134,7 @@ class Output:
         if self.quiet or not self.stderr.isatty():
             yield lambda completed: None
             return
-        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"))
+        columns = (TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.percentage:>3.0f} %"))
         with Progress(*columns, TimeRemainingColumn(), console=self._messages, transient=True) as bar:
             task = bar.add_task(title, total=total)
 
@@ -140,6 +142,13 @@ class Output:
                 bar.update(task, completed=completed)
 
             yield advance
+
+
+def _print_whole(console: Console, shown: RenderableType) -> None:
+    """As wide as the terminal; on a pipe as wide as the widest table needs."""
+    if not console.file.isatty():
+        console.width = max(PIPE_COLUMNS, widest(shown))
+    console.print(fitted(shown, console.width))
 
 
 def _plain(value: Any) -> Any:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.table import Table
+from rich.text import Text
 
 from drivers.errors import DataError
 from tools.benchmarks.paired import Row
@@ -77,9 +78,9 @@ def outcome_table(rows: Sequence[Row]) -> Table:
     for row in rows:
         if row.group != group:
             table.add_section()
-            table.add_row(f"[bold]{row.group}[/]")
+            table.add_row(Text(row.group, "bold"))
             group = row.group
-        table.add_row(*(cell.replace("[", r"\[") for cell in cells(row)))
+        table.add_row(*cells(row))
     return table
 
 

@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.markup import escape
 from rich.table import Table
 
 from firmware_py.states import Fault
@@ -71,7 +70,7 @@ def table(rows: Sequence[KindRow]) -> Table:
         ("speed [rad/s]", "right"), ("beyond limit [rad]", "right"), ("allowed [rad]", "right"),
         ("off after [s]", "right"), ("told as", "left"),
     ):  # fmt: skip
-        shown.add_column(escape(name), justify=justify)  # type: ignore[arg-type]
+        shown.add_column(name, justify=justify)  # type: ignore[arg-type]
     for row in rows:
         causes = ", ".join(f"{_told(name)} {count}" for name, count in row.causes.items())
         shown.add_row(

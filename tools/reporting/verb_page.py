@@ -17,7 +17,7 @@ _RANGE = "\N{NO-BREAK SPACE}..\N{NO-BREAK SPACE}"
 
 
 def from_terminal(table: TerminalTable) -> Table:
-    """A table of the terminal as one of the page; without markup and styles."""
+    """A table of the terminal as one of the page; without styles."""
     named = [(cell_text(column.header) if table.show_header else "", column) for column in table.columns]
     columns = [(heading, [_unbroken(cell_text(cell)) for cell in column.cells]) for heading, column in named]
     # a column that says nothing is left out

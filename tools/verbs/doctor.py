@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 
 from rich.table import Table
+from rich.text import Text
 
 from firmware_py.kernel import cache_folder
 from tools.configuration.config import Config
@@ -53,8 +54,8 @@ def report_findings(found: list[Finding], output: Output, title: str) -> int:
         table.add_column(column)
     colours = {OK: "green", NOTE: "yellow", PROBLEM: "red"}
     for finding in found:
-        topic = f"[{colours[finding.status]}]{finding.status}[/] {finding.topic}"
-        table.add_row(topic, finding.text.replace("[", r"\["), finding.cure.replace("[", r"\["))
+        topic = Text.assemble((finding.status, colours[finding.status]), " ", finding.topic)
+        table.add_row(topic, finding.text, finding.cure)
     bad = any(finding.status == PROBLEM for finding in found)
     output.result(table, {"healthy": not bad, "findings": [asdict(finding) for finding in found]})
     return 1 if bad else 0

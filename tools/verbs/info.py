@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from rich.table import Table
+from rich.text import Text
 
 from tools.inspection.drive_info import drive_info
 from tools.inspection.sdo_reading import SdoReader
@@ -38,10 +39,10 @@ def info_table(found: dict[str, Any]) -> Table:
     for section, content in found.items():
         if not content:
             continue
-        table.add_row(f"[cyan]{_TITLES.get(section, section)}[/]", "", "")
+        table.add_row(Text(_TITLES.get(section, section), "cyan"), "", "")
         rows = _dict_rows(content) if isinstance(content, dict) else _list_rows(content)
         for cells in rows:
-            table.add_row(*(str(cell).replace("[", r"\[") for cell in cells))
+            table.add_row(*cells)
     return table
 
 

@@ -23,7 +23,7 @@ def info_serial(config: Config, output: Output) -> int:
     for column in ("name", "label", "value", "meaning"):
         table.add_column(column, justify="right" if column == "value" else "left")
     for fact in facts:
-        table.add_row(*(text.replace("[", r"\[") for text in (fact.name, fact.label, fact.value, fact.meaning)))
+        table.add_row(fact.name, fact.label, fact.value, fact.meaning)
     data = {"port": section.port, "baud_rate_bitps": section.baud_rate_bitps, "version": identity.name}
     output.result(table, {**data, "facts": [asdict(fact) for fact in facts]})
     return 0

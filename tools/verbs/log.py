@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Group
-from rich.markup import escape
 from rich.table import Table
 
 from drivers.errors import DataError
@@ -75,7 +74,7 @@ def _event_table(log: RunLog) -> Table:
     rows = event_rows(log)
     left_out = len(rows) - _SHOWN_EVENTS
     table = Table(title="Events", title_justify="left", caption=f"and {left_out} more" if left_out > 0 else None)
-    table.add_column(escape("time [s]"), justify="right")
+    table.add_column("time [s]", justify="right")
     for heading in ("level", "source", "text"):
         table.add_column(heading)
     for at, level, source, text in rows[:_SHOWN_EVENTS]:

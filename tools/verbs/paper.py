@@ -6,7 +6,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rich.markup import escape
 from rich.table import Table
 
 from tools.drawing import save_png
@@ -91,6 +90,5 @@ def _table(rows: list[PaperRow]) -> Table:
     for heading in ("experiment", "paper", "reference", "ours", "precise", "note"):
         table.add_column(heading)
     for row in rows:
-        cells = (row.experiment, row.paper, row.reference, row.ours, row.precise, row.note)
-        table.add_row(*(escape(cell) for cell in cells))
+        table.add_row(row.experiment, row.paper, row.reference, row.ours, row.precise, row.note)
     return table

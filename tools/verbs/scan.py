@@ -44,7 +44,7 @@ def scan(subject: Subject, output: Output, *, listen_s: float = LISTEN_S, passiv
         device = row["device_type"] or ("" if row["answers_sdo"] else "answers no SDO")
         cells = (row["node"], row["nmt_state"], device, row["name"], row["vendor_id"], row["product_code"],
                  row["revision"], row["serial_number"], row["drive_state"])  # fmt: skip
-        table.add_row(*("" if cell is None else str(cell).replace("[", r"\[") for cell in cells))
+        table.add_row(*("" if cell is None else str(cell) for cell in cells))
     output.result(table, {"bus": subject.place, "controller_active": active, "nodes": rows})
     return 0
 

@@ -6,7 +6,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-from rich.markup import escape
 from rich.table import Table
 
 from tools.configuration.elmo_settings import refuse_serial
@@ -114,7 +113,7 @@ def _text(values: tuple[float, float, float], digits: int = 3) -> str:
 
 def _table(result: StudyResult, title: str, after_s: float) -> Table:
     table = Table(
-        title=escape(f"{title}: errors after {after_s:g} s [mrad], median (5..95 %)"),
+        title=f"{title}: errors after {after_s:g} s [mrad], median (5..95 %)",
         caption="peak and RMSE as the encoder shows them; true: of the joint itself; "
         "settling: until the error stays within 1 mrad",
         title_justify="left",
@@ -122,11 +121,11 @@ def _table(result: StudyResult, title: str, after_s: float) -> Table:
     )
     table.add_column("controller")
     for _, heading in _COLUMNS:
-        table.add_column(escape(heading), justify="right")
+        table.add_column(heading, justify="right")
     table.add_column("faults", justify="right")
     for name in result.controllers:
         cells = [_text(spread(result, name, key)) for key, _ in _COLUMNS]
-        table.add_row(escape(name), *cells, str(result.faults(name)))
+        table.add_row(name, *cells, str(result.faults(name)))
     return table
 
 

@@ -7,7 +7,6 @@ import re
 
 import pytest
 from rich.console import Group, RenderableType
-from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -35,9 +34,9 @@ def shown_at(columns: int, table: RenderableType, monkeypatch: pytest.MonkeyPatc
 
 
 def wide() -> Table:
-    table = Table("file", "peak", escape("RMSE [mrad]"), "true RMSE", title="T", caption="C")
+    table = Table("file", "peak", "RMSE [mrad]", "true RMSE", title="T", caption="C")
     table.add_row(PATH, *NUMBERS)
-    table.add_row("[bold]two[/]", "1", "", Text("[2]"))
+    table.add_row("[bold]two[/]", "1", "", Text("[2]", "red"))
     return table
 
 
@@ -47,7 +46,7 @@ def test_a_wide_terminal_shows_the_table_and_a_narrow_one_a_list_of_its_rows(mon
     assert any(line.startswith("│") for line in shown_at(needed, wide(), monkeypatch))
     assert shown_at(needed - 1, wide(), monkeypatch) == [
         "T", PATH, f"  peak {NUMBERS[0]}, RMSE [mrad] {NUMBERS[1]}", f"  true RMSE {NUMBERS[2]}",
-        "two", "  peak 1, true RMSE [2]", "C",
+        "[bold]two[/]", "  peak 1, true RMSE [2]", "C",
     ]  # fmt: skip
 
 
@@ -102,3 +101,18 @@ def test_a_long_name_of_an_object_does_not_squeeze_what_info_tells_of_it(monkeyp
     lines = shown_at(80, info_table(found), monkeypatch)
     assert any(words in line for line in lines)
     assert len(lines) <= 9
+
+
+@pytest.mark.parametrize("path", ["runs/[old]/a.mcap", "runs/[/old]/a.mcap", "runs/:warning:.mcap"])
+def test_what_rich_would_take_for_markup_is_shown_as_it_is(path: str) -> None:
+    table = Table("log", title=path)
+    table.add_row(path)
+    out, err = io.StringIO(), io.StringIO()
+    output = Output(stdout=out, stderr=err)
+    output.result(path)
+    output.result(table)
+    output.note(table)
+    output.note(path)
+    assert out.getvalue().startswith(path)
+    assert out.getvalue().count(path) == 3
+    assert err.getvalue().count(path) == 3

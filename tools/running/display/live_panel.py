@@ -63,7 +63,7 @@ class LivePanel(OnlyShows):
         self._phase = "starting"
         self._notes: list[str] = []
         self._ended = threading.Event()
-        self._console = Console(file=_WholeFrames(fd), highlight=False)
+        self._console = Console(file=_WholeFrames(fd), highlight=False, markup=False, emoji=False)
         self._thread = threading.Thread(target=self._draw_until_ended, name="live panel", daemon=True)
 
     def note(self, text: str) -> None:
