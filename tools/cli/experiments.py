@@ -62,7 +62,7 @@ def study(
     settings = load_study(file) if file is not None else StudySettings()
     settings = checked({**settings.model_dump(), **flags}, "command line")
     output = Output(json=json, quiet=quiet)
-    raise typer.Exit(run_study(settings, output, workers=workers, csv=csv, figure=figure, report=report))
+    raise typer.Exit(run_study(settings, output, file=file, workers=workers, csv=csv, figure=figure, report=report))
 
 
 def fault_campaign(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from tools.cli.option_group import grouped
 from tools.cli.options import FRICTION, Json, Quiet, Report, config_path
 from tools.cli.sweep_command import sweep_command
 from tools.output import Output
@@ -16,55 +18,43 @@ if TYPE_CHECKING:
     from tools.identification.friction_data import ForeignFormat
 
 Data = Annotated[Path, typer.Argument(metavar="DATA", help="CSV of velocity plateaus, from sweep or elsewhere")]
-VelocityColumn = Annotated[str | None, typer.Option("--velocity-column", help="name of the velocity column")]
-TorqueColumn = Annotated[str | None, typer.Option("--torque-column", help="name of the torque column (Nm)")]
-CurrentColumn = Annotated[str | None, typer.Option("--current-column", help="name of the current column (A)")]
-VelocityUnit = Annotated[str | None, typer.Option("--velocity-unit", help="deg/s, rad/s or r/min")]
-Side = Annotated[str | None, typer.Option("--side", help="of the velocity: joint or motor")]
-TorqueSide = Annotated[str | None, typer.Option("--torque-side", help="motor or joint")]
-Ratio = Annotated[float | None, typer.Option("--ratio", help="reduction ratio")]
-TorqueConstant = Annotated[float | None, typer.Option("--torque-constant", help="of the motor (Nm/A)")]
-Delimiter = Annotated[str, typer.Option("--delimiter", help="between columns: auto, or the character")]
 Model = Annotated[str, typer.Option("--model", help="multi-stage, stribeck, coulomb-viscous, or auto (held-out error)")]
 
 
-def _told(
-    velocity_column: str | None,
-    torque_column: str | None,
-    current_column: str | None,
-    velocity_unit: str | None,
-    side: str | None,
-    torque_side: str | None,
-    ratio: float | None,
-    torque_constant: float | None,
-    delimiter: str,
-) -> ForeignFormat:
-    from tools.identification.friction_data import ForeignFormat
+@dataclass(frozen=True)
+class TableOptions:
+    """How to read a table that is not ours; a field of `ForeignFormat` each."""
 
-    return ForeignFormat(
-        velocity_column, torque_column, current_column, velocity_unit, side, torque_side, ratio, torque_constant,
-        delimiter,
-    )  # fmt: skip
+    velocity_column: Annotated[str | None, typer.Option("--velocity-column", help="name of the velocity column")] = None
+    torque_column: Annotated[str | None, typer.Option("--torque-column", help="name of the torque column (Nm)")] = None
+    current_column: Annotated[str | None, typer.Option("--current-column", help="name of the current column (A)")] = (
+        None
+    )
+    velocity_unit: Annotated[str | None, typer.Option("--velocity-unit", help="deg/s, rad/s or r/min")] = None
+    side: Annotated[str | None, typer.Option("--side", help="of the velocity: joint or motor")] = None
+    torque_side: Annotated[str | None, typer.Option("--torque-side", help="motor or joint")] = None
+    ratio: Annotated[float | None, typer.Option("--ratio", help="reduction ratio")] = None
+    torque_constant_NmpA: Annotated[float | None, typer.Option("--torque-constant", help="of the motor (Nm/A)")] = None
+    delimiter: Annotated[str, typer.Option("--delimiter", help="between columns: auto, or the character")] = "auto"
+
+    def told(self) -> ForeignFormat:
+        from tools.identification.friction_data import ForeignFormat
+
+        return ForeignFormat(**asdict(self))
 
 
 def _radps(speed_degps: float | None) -> float | None:
     return None if speed_degps is None else math.radians(speed_degps)
 
 
+@grouped
 def identify(
+    *,
     data: Data,
     into: Annotated[Path | None, typer.Option("--into", help="configuration whose friction section to replace")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="TOML file to write instead")] = None,
     config: Annotated[Path | None, typer.Option("--config", help="configuration to check plausibility against")] = None,
-    velocity_column: VelocityColumn = None,
-    torque_column: TorqueColumn = None,
-    current_column: CurrentColumn = None,
-    velocity_unit: VelocityUnit = None,
-    side: Side = None,
-    torque_side: TorqueSide = None,
-    ratio: Ratio = None,
-    torque_constant: TorqueConstant = None,
-    delimiter: Delimiter = "auto",
+    table: TableOptions,
     model: Model = "multi-stage",
     continuous: Annotated[bool, typer.Option("--continuous", help="let the two stages meet at the knees")] = False,
     search_knee: Annotated[bool, typer.Option("--search-knee", help="search the knees as well")] = False,
@@ -94,10 +84,6 @@ def identify(
     from tools.identification.pso import SwarmSettings
     from tools.verbs.identify import identify as run_identify
 
-    told = _told(
-        velocity_column, torque_column, current_column, velocity_unit, side, torque_side, ratio, torque_constant,
-        delimiter,
-    )  # fmt: skip
     options = Options(
         model=model,
         continuous=continuous,
@@ -113,36 +99,28 @@ def identify(
     output = Output(json=json, quiet=quiet)
     config = None if config is None else config_path(config)
     raise typer.Exit(
-        run_identify(data, output, into=into, out=out, config=config, told=told, options=options, report=report)
+        run_identify(data, output, into=into, out=out, config=config, told=table.told(), options=options, report=report)
     )
 
 
+@grouped
 def validate(
+    *,
     config: Annotated[
         Path, typer.Argument(metavar="CONFIG", help="configuration with the identified friction section")
     ],
     data: Data,
     figure: Annotated[Path | None, typer.Option("--figure", help="PNG to write")] = None,
-    velocity_column: VelocityColumn = None,
-    torque_column: TorqueColumn = None,
-    current_column: CurrentColumn = None,
-    velocity_unit: VelocityUnit = None,
-    side: Side = None,
-    torque_side: TorqueSide = None,
-    ratio: Ratio = None,
-    torque_constant: TorqueConstant = None,
-    delimiter: Delimiter = "auto",
+    table: TableOptions,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """An identified friction model against other data of the same joint."""
     from tools.verbs.validate import validate as run_validate
 
-    told = _told(
-        velocity_column, torque_column, current_column, velocity_unit, side, torque_side, ratio, torque_constant,
-        delimiter,
-    )  # fmt: skip
-    raise typer.Exit(run_validate(config_path(config), data, Output(json=json, quiet=quiet), told=told, figure=figure))
+    raise typer.Exit(
+        run_validate(config_path(config), data, Output(json=json, quiet=quiet), told=table.told(), figure=figure)
+    )
 
 
 def register(app: typer.Typer) -> None:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from drivers.errors import ConfigurationError
-from tools.cli.options import INSPECT, Bitrate, Channel, Interface, Json, Port, Quiet, Target, loaded
+from tools.cli.option_group import grouped
+from tools.cli.options import INSPECT, BusOptions, CanOptions, Json, Quiet, loaded
 from tools.output import Output
 
 if TYPE_CHECKING:
@@ -23,55 +24,32 @@ MaybeConfig = Annotated[
 Eds = Annotated[Path | None, typer.Option("--eds", help="EDS or DCF file of the node; default: the configuration's")]
 
 
-def config_of(
-    path: Path | None,
-    interface: str | None,
-    channel: str | None,
-    bitrate: int | None,
-    port: str | None,
-    target: int | None,
-) -> Config | None:
-    """The configuration if one is named.  Its `drive.kind` tells which branch of a verb is meant."""
-    if path is None and port is not None:
+def config_of(path: Path | None, bus: CanOptions) -> Config | None:
+    """The configuration if one is named.  Whether it `is_serial` tells which branch of a verb is meant."""
+    if path is None and isinstance(bus, BusOptions) and bus.port is not None:
         raise ConfigurationError("-p needs a configuration: it tells the baud rate", "for example elmo_serial")
-    return None if path is None else loaded(path, interface, channel, bitrate, port, target)
+    return None if path is None else loaded(path, bus)
 
 
-def canopen_subject(
-    config: Config | None,
-    interface: str | None,
-    channel: str | None,
-    bitrate: int | None,
-    target: int | None,
-    eds: Path | None,
-) -> Subject:
+def canopen_subject(config: Config | None, bus: CanOptions, eds: Path | None) -> Subject:
     """What a CANopen branch looks at."""
     from tools.inspection.subject import subject_of_config, subject_of_flags
 
     if config is None:
-        return subject_of_flags(interface, channel, bitrate, target, eds)
+        return subject_of_flags(bus.interface, bus.channel, bus.bitrate, bus.target, eds)
     return subject_of_config(config, eds)
 
 
-def subject_of(
-    path: Path | None,
-    interface: str | None,
-    channel: str | None,
-    bitrate: int | None,
-    target: int | None,
-    eds: Path | None = None,
-) -> Subject:
+def subject_of(path: Path | None, bus: CanOptions, eds: Path | None = None) -> Subject:
     """For a verb that has a CANopen branch only."""
-    config = config_of(path, interface, channel, bitrate, None, target)
-    return canopen_subject(config, interface, channel, bitrate, target, eds)
+    return canopen_subject(config_of(path, bus), bus, eds)
 
 
+@grouped
 def scan(
+    *,
     config: MaybeConfig = None,
-    interface: Interface = None,
-    channel: Channel = None,
-    bitrate: Bitrate = None,
-    target: Target = None,
+    bus: CanOptions,
     listen: Annotated[float, typer.Option("--listen", help="seconds to listen before asking", min=0.0)] = 1.2,
     passive: Annotated[bool, typer.Option("--passive", help="only listen, ask nobody")] = False,
     json: Json = False,
@@ -80,40 +58,36 @@ def scan(
     """Which CANopen nodes are on the bus: identity, device type, NMT state, drive state.  Reads only."""
     from tools.verbs.scan import scan as run_scan
 
-    subject = subject_of(config, interface, channel, bitrate, target)
+    subject = subject_of(config, bus)
     raise typer.Exit(run_scan(subject, Output(json=json, quiet=quiet), listen_s=listen, passive=passive))
 
 
+@grouped
 def info(
+    *,
     config: MaybeConfig = None,
-    interface: Interface = None,
-    channel: Channel = None,
-    bitrate: Bitrate = None,
-    port: Port = None,
-    target: Target = None,
+    bus: BusOptions,
     eds: Eds = None,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """What a drive tells about itself: identity, state, errors by name, limits, ratings, PDO mapping.  Reads only."""
-    joint = config_of(config, interface, channel, bitrate, port, target)
+    joint = config_of(config, bus)
     output = Output(json=json, quiet=quiet)
-    if joint is not None and joint.drive.kind == "elmo_serial":
+    if joint is not None and joint.is_serial:
         from tools.verbs.info_serial import info_serial
 
         raise typer.Exit(info_serial(joint, output))
     from tools.verbs.info import info as run_info
 
-    raise typer.Exit(run_info(canopen_subject(joint, interface, channel, bitrate, target, eds), output))
+    raise typer.Exit(run_info(canopen_subject(joint, bus, eds), output))
 
 
+@grouped
 def monitor(
+    *,
     config: MaybeConfig = None,
-    interface: Interface = None,
-    channel: Channel = None,
-    bitrate: Bitrate = None,
-    port: Port = None,
-    target: Target = None,
+    bus: BusOptions,
     eds: Eds = None,
     cob_id: Annotated[list[str] | None, typer.Option("--cob-id", help="identifier (hex); may be repeated")] = None,
     kind: Annotated[
@@ -128,9 +102,9 @@ def monitor(
     quiet: Quiet = False,
 ) -> None:
     """The traffic of a bus in words: NMT, SYNC, heartbeats, EMCY, SDO, PDO by their mapping.  Listens only."""
-    joint = config_of(config, interface, channel, bitrate, port, target)
+    joint = config_of(config, bus)
     output = Output(json=json, quiet=quiet)
-    if joint is not None and joint.drive.kind == "elmo_serial":
+    if joint is not None and joint.is_serial:
         from tools.verbs.monitor_serial import monitor_serial
 
         raise typer.Exit(monitor_serial(joint, output, count=count, duration_s=duration, changes=changes))
@@ -138,7 +112,7 @@ def monitor(
     from tools.verbs.monitor import selection_of
 
     selection = selection_of(cob_id or [], kind or [], node or [], count, duration, changes)
-    subject = canopen_subject(joint, interface, channel, bitrate, target, eds)
+    subject = canopen_subject(joint, bus, eds)
     os.nice(_NICENESS)
     raise typer.Exit(run_monitor(subject, output, selection, ask=ask))
 
@@ -147,15 +121,14 @@ params_app = typer.Typer(help="All objects of a drive to a file and back.", no_a
 
 
 @params_app.command("dump")
+@grouped
 def params_dump(
+    *,
     config: MaybeConfig = None,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="file to write (.toml, .dcf); default: TOML on stdout")
     ] = None,
-    interface: Interface = None,
-    channel: Channel = None,
-    bitrate: Bitrate = None,
-    target: Target = None,
+    bus: CanOptions,
     eds: Eds = None,
     json: Json = False,
     quiet: Quiet = False,
@@ -163,18 +136,17 @@ def params_dump(
     """Read every readable object of the EDS.  Reads only."""
     from tools.verbs.params import dump
 
-    subject = subject_of(config, interface, channel, bitrate, target, eds)
+    subject = subject_of(config, bus, eds)
     raise typer.Exit(dump(subject, Output(json=json, quiet=quiet), out))
 
 
 @params_app.command("restore")
+@grouped
 def params_restore(
+    *,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="a dump, or a DCF")],
     config: MaybeConfig = None,
-    interface: Interface = None,
-    channel: Channel = None,
-    bitrate: Bitrate = None,
-    target: Target = None,
+    bus: CanOptions,
     eds: Eds = None,
     yes: Annotated[bool, typer.Option("-y", "--yes", help="write without asking")] = False,
     other_device: Annotated[
@@ -187,20 +159,19 @@ def params_restore(
     """Write the parameters that differ, read each back, tell what was refused.  The drive must be off."""
     from tools.verbs.params import place_index, restore_file
 
-    subject = subject_of(config, interface, channel, bitrate, target, eds)
+    subject = subject_of(config, bus, eds)
     indices = [place_index(text) for text in skip or []]
     output = Output(json=json, quiet=quiet)
     raise typer.Exit(restore_file(subject, file, output, assume_yes=yes, other_device=other_device, skip=indices))
 
 
 @params_app.command("diff")
+@grouped
 def params_diff(
+    *,
     first: Annotated[Path, typer.Argument(metavar="FIRST", help="dump, DCF, EDS; or configuration: its drive now")],
     second: Annotated[Path, typer.Argument(metavar="SECOND", help="the same")],
-    interface: Interface = None,
-    channel: Channel = None,
-    bitrate: Bitrate = None,
-    target: Target = None,
+    bus: CanOptions,
     readings: Annotated[bool, typer.Option("--readings", help="what is no parameter as well")] = False,
     json: Json = False,
     quiet: Quiet = False,
@@ -214,9 +185,9 @@ def params_diff(
     objects, sides = Objects(), []
     for path in (first, second):
         if is_parameter_file(path):
-            sides.append(load_parameters(path, target or 1))
+            sides.append(load_parameters(path, bus.target or 1))
         else:
-            subject = subject_of(path, interface, channel, bitrate, target)
+            subject = subject_of(path, bus)
             found, objects = parameters_of_drive(subject, output)
             sides.append(found)
     raise typer.Exit(diff(sides[0], sides[1], objects, output, readings=readings))

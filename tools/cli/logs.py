@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from tools.cli.options import LOOK, AllowLowMargin, Bitrate, Channel, Interface, Json, Quiet, Target, loaded
+from tools.cli.option_group import grouped
+from tools.cli.options import LOOK, AllowLowMargin, CanOptions, Json, Quiet, loaded
 from tools.output import Output
 
 LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="run log (MCAP)")]
@@ -59,16 +60,15 @@ def report(
     raise typer.Exit(run_report(logs, Output(json=json), out))
 
 
+@grouped
 def scope(
+    *,
     path: Annotated[Path, typer.Argument(metavar="LOG|CONFIG", help="run log (MCAP), or configuration of a joint")],
     host: Annotated[
         str, typer.Option("--host", help="address to serve at; beyond this computer with a token")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", help="of the page")] = 8642,
-    interface: Interface = None,
-    channel: Channel = None,
-    bitrate: Bitrate = None,
-    target: Target = None,
+    bus: CanOptions,
     allow_low_margin: AllowLowMargin = False,
     stop_unwatched: Annotated[
         float | None,
@@ -83,7 +83,7 @@ def scope(
     output = Output(quiet=quiet)
     if path.suffix == ".mcap":
         raise typer.Exit(run_scope(path, output, host=host, port=port))
-    joint = loaded(path, interface, channel, bitrate, None, target)
+    joint = loaded(path, bus)
     code = live_scope(
         joint, output, host=host, port=port, allow_low_margin=allow_low_margin, unwatched_s=stop_unwatched
     )

@@ -11,24 +11,21 @@ from typing import Annotated, Any
 
 import typer
 
-from drivers.errors import DataError, JointctlError, UsageError
+from drivers.errors import DataError, INTERRUPTED, JointctlError, UsageError
 from tools.cli import experiments as cli_experiments
 from tools.cli import friction as cli_friction
 from tools.cli import inspection as cli_inspection
 from tools.cli import logs as cli_log
+from tools.cli.option_group import grouped
 from tools.cli.options import (
     BEGIN,
     MOVE,
     AllowLowMargin,
-    Bitrate,
-    Channel,
+    BusOptions,
     ConfigPath,
     DryRun,
-    Interface,
     Json,
-    Port,
     Quiet,
-    Target,
     Yes,
     config_path,
     loaded,
@@ -81,13 +78,11 @@ def demo(
 
 
 @app.command(rich_help_panel=MOVE)
+@grouped
 def run(
+    *,
     config: ConfigPath,
-    interface: Interface = None,
-    channel: Channel = None,
-    bitrate: Bitrate = None,
-    port: Port = None,
-    target: Target = None,
+    bus: BusOptions,
     yes: Yes = False,
     dry_run: DryRun = False,
     allow_low_margin: AllowLowMargin = False,
@@ -102,7 +97,7 @@ def run(
     """Track the configured trajectory on a real or virtual joint."""
     from tools.verbs.run import run as run_run
 
-    joint = loaded(config, interface, channel, bitrate, port, target)
+    joint = loaded(config, bus)
     raise typer.Exit(
         run_run(
             joint,
@@ -128,13 +123,11 @@ def new(
 
 
 @app.command(rich_help_panel=BEGIN)
+@grouped
 def hil(
+    *,
     config: ConfigPath = Path("virtual"),
-    interface: Interface = None,
-    channel: Channel = None,
-    bitrate: Bitrate = None,
-    port: Port = None,
-    target: Target = None,
+    bus: BusOptions,
     serial: Annotated[bool, typer.Option("--serial", help="the virtual serial drive instead of the CAN bus")] = False,
     link: Annotated[str | None, typer.Option("--link", help="serial drive: path of a link to its port")] = None,
     timing: Annotated[bool, typer.Option("--timing", help="model bit times and arbitration")] = False,
@@ -146,58 +139,52 @@ def hil(
 
     if serial and config == Path("virtual"):
         config = Path("elmo_serial")
-    joint = loaded(config, interface, channel, bitrate, port, target)
-    if serial or link is not None or joint.drive.kind == "elmo_serial":
+    joint = loaded(config, bus)
+    if serial or link is not None or joint.is_serial:
         from tools.verbs.hil_serial import hil_serial, refuse_options
 
-        refuse_options(joint, port=port, timing=timing)
+        refuse_options(joint, port=bus.port, timing=timing)
         raise typer.Exit(hil_serial(joint, Output(quiet=quiet), link=link, ready_fd=ready_fd))
     raise typer.Exit(run_hil(joint, Output(quiet=quiet), timing=timing, ready_fd=ready_fd))
 
 
 @app.command(rich_help_panel=MOVE)
+@grouped
 def stop(
+    *,
     config: ConfigPath,
-    interface: Interface = None,
-    channel: Channel = None,
-    bitrate: Bitrate = None,
-    port: Port = None,
-    target: Target = None,
+    bus: BusOptions,
     json: Json = False,
 ) -> None:
     """Stop and disable the drive now, also while another program controls it."""
     from tools.configuration.stop_target import GivenTarget
     from tools.verbs.stop import stop as run_stop
 
-    given = GivenTarget(interface, channel, bitrate, port, target)
+    given = GivenTarget(bus.interface, bus.channel, bus.bitrate, bus.port, bus.target)
     raise typer.Exit(run_stop(config_path(config), Output(json=json), given))
 
 
 @app.command("clear-fault", rich_help_panel=MOVE)
+@grouped
 def clear_fault(
+    *,
     config: ConfigPath,
-    interface: Interface = None,
-    channel: Channel = None,
-    bitrate: Bitrate = None,
-    port: Port = None,
-    target: Target = None,
+    bus: BusOptions,
     json: Json = False,
 ) -> None:
     """Reset the drive's fault; it stays disabled."""
     from tools.verbs.stop import clear_fault as run_clear_fault
 
-    joint = loaded(config, interface, channel, bitrate, port, target)
+    joint = loaded(config, bus)
     raise typer.Exit(run_clear_fault(joint, Output(json=json)))
 
 
 @app.command(rich_help_panel=BEGIN)
+@grouped
 def doctor(
+    *,
     config: ConfigPath = Path("virtual"),
-    interface: Interface = None,
-    channel: Channel = None,
-    bitrate: Bitrate = None,
-    port: Port = None,
-    target: Target = None,
+    bus: BusOptions,
     cold: Annotated[bool, typer.Option("--cold", help="measure the cold start as well (about a minute)")] = False,
     motion: Annotated[
         bool, typer.Option("--motion", help="instead: pull the joint a little; are torque and encoders right?")
@@ -213,7 +200,7 @@ def doctor(
 
     Moves nothing; with --motion it asks first, then checks the directions of torque and encoders and their counts.
     """
-    joint = loaded(config, interface, channel, bitrate, port, target)
+    joint = loaded(config, bus)
     if motion:
         from tools.verbs.doctor_motion import doctor_motion
 

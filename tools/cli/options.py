@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,6 +18,25 @@ Port = Annotated[str | None, typer.Option("-p", "--port", help="serial port of a
 Target = Annotated[
     int | None, typer.Option("-t", "--target", help="CANopen node instead of drive.node", min=1, max=127)
 ]
+
+
+@dataclass(frozen=True)
+class CanOptions:
+    """Which CAN bus and node; None = as configured."""
+
+    interface: Interface = None
+    channel: Channel = None
+    bitrate: Bitrate = None
+    target: Target = None
+
+
+@dataclass(frozen=True)
+class BusOptions(CanOptions):
+    """Which bus or port, and which node; None = as configured."""
+
+    port: Port = None
+
+
 Json = Annotated[bool, typer.Option("--json", help="result as one JSON document on stdout")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="no progress on stderr")]
 Report = Annotated[
@@ -46,19 +66,14 @@ def config_path(path: Path) -> Path:
     return shipped if not path.exists() and shipped.exists() else path
 
 
-def loaded(
-    path: Path,
-    interface: str | None = None,
-    channel: str | None = None,
-    bitrate: int | None = None,
-    port: str | None = None,
-    target: int | None = None,
-) -> Config:
+def loaded(path: Path, bus: CanOptions | None = None) -> Config:
     """The configuration with what the command line and the environment say about bus, port and node."""
     from tools.configuration.elmo_settings import with_port_override
     from tools.configuration.load import load_config, with_bus_overrides
 
-    config = with_bus_overrides(with_port_override(load_config(config_path(path)), port), interface, channel, bitrate)
-    if target is None:
+    bus = BusOptions() if bus is None else bus
+    config = with_port_override(load_config(config_path(path)), bus.port if isinstance(bus, BusOptions) else None)
+    config = with_bus_overrides(config, bus.interface, bus.channel, bus.bitrate)
+    if bus.target is None:
         return config
-    return config.model_copy(update={"drive": config.canopen.model_copy(update={"node": target})})
+    return config.model_copy(update={"drive": config.canopen.model_copy(update={"node": bus.target})})

@@ -7,24 +7,23 @@ from typing import Annotated
 
 import typer
 
+from tools.cli.option_group import grouped
 from tools.cli.options import (
-    Bitrate,
-    Channel,
+    BusOptions,
     ConfigPath,
     DryRun,
-    Interface,
     Json,
-    Port,
     Quiet,
     Report,
-    Target,
     Yes,
     loaded,
 )
 from tools.output import Output
 
 
+@grouped
 def sweep_command(
+    *,
     config: ConfigPath,
     out: Annotated[
         Path, typer.Option("-o", "--out", help="CSV file to write; its sidecar is the same name with .json")
@@ -55,11 +54,7 @@ def sweep_command(
     ] = "auto",
     resume: Annotated[bool, typer.Option("--resume", help="measure what is missing in an interrupted sweep")] = False,
     lockstep: Annotated[bool, typer.Option("--lockstep", help="virtual joint in simulated time: seconds")] = False,
-    interface: Interface = None,
-    channel: Channel = None,
-    bitrate: Bitrate = None,
-    port: Port = None,
-    target: Target = None,
+    bus: BusOptions,
     yes: Yes = False,
     dry_run: DryRun = False,
     allow_low_margin: Annotated[
@@ -74,7 +69,7 @@ def sweep_command(
     from tools.sweeping.options import SweepOptions
     from tools.verbs.sweep import sweep
 
-    configuration = loaded(config, interface, channel, bitrate, port, target)
+    configuration = loaded(config, bus)
     options = SweepOptions(
         points=points, grid=grid, speeds=speeds, max_speed_radps=max_speed, min_speed_radps=min_speed, quick=quick,
         warm_up_turns=warm_up, shuffle_seed=shuffle, passes=passes, dwell_s=dwell, mode=mode, resume=resume,
