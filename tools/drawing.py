@@ -7,12 +7,13 @@ of them by a variable of the page.  matplotlib is slow to import, and only wante
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from drivers.errors import DataError
+from drivers.errors import UsageError
+from tools.written_file import refuse_overwriting, writing
 
 # the numbers only mark what to replace; near the page's light colours, so that a plain viewer is right as well
 COLOURS = {
@@ -87,11 +88,16 @@ def png(figure: Any) -> bytes:
     return data.getvalue()
 
 
+def require_png(path: Path, inputs: Iterable[Path]) -> None:
+    """For `--figure`, before the work: `UsageError` without .png; `DataError` if it would overwrite an input."""
+    if path.suffix.lower() != ".png":
+        raise UsageError(f"--figure (={path}) must end in .png")
+    refuse_overwriting(path, inputs)
+
+
 def save_png(figure: Any, path: Path) -> Path:
     """`png` into a file, whose folder is made; returns the path.  `DataError` if it cannot be written."""
-    try:
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(png(figure))
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written: {error.strerror or error}") from None
     return path

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.errors import ConfigurationError
+from drivers.errors import INTERRUPTED, ConfigurationError, DataError
 from tests.page_figures import foreign_colours, svgs
 from tools.configuration.config import Config
 from tools.configuration.load import load_config, shipped_config
@@ -25,7 +25,7 @@ from tools.experiments.study_runs import PlantResult, StudyResult, quantile, run
 from tools.experiments.study_settings import StudySettings, checked, load_study, study_controllers
 from tools.output import Output
 from tools.simulation.lockstep import DirectBus
-from tools.verbs.study import INTERRUPTED, study
+from tools.verbs.study import study
 
 
 @pytest.fixture
@@ -148,6 +148,18 @@ def test_csv_has_a_line_for_each_run_and_the_figure_is_drawn(base: Config, tmp_p
 
 
 # --- the verb ---
+
+
+def test_the_results_never_replace_the_settings_or_a_controller(base: Config, tmp_path: Path) -> None:
+    file, law = tmp_path / "study.toml", tmp_path / "law.toml"
+    file.write_text("plants = 1\n")
+    law.write_text(shipped_config("paper").read_text())
+    settings = checked({"plants": 1, "controllers": [str(law)]}, "test")
+    before = file.read_bytes(), law.read_bytes()
+    for target in (file, law):
+        with pytest.raises(DataError, match=rf"{target.name}: is an input of this command"):
+            study(settings, Output(stdout=io.StringIO()), file=file, csv=target)
+    assert (file.read_bytes(), law.read_bytes()) == before
 
 
 def test_the_verb_prints_json_and_says_when_it_was_interrupted(

@@ -8,28 +8,24 @@ from typing import Any
 
 import numpy as np
 
-from drivers.errors import DataError
 from tools.analysis.linear_loop import LoopSettings, linear_loop
 from tools.analysis.margins import Margins, frequencies_radps, margins
+from tools.drawing import BLUE, GREY, ORANGE, RED, SOFT, canvas, save_png
 
-_BLUE, _ORANGE, _RED, _GREY = "#1f5fa8", "#d9822b", "#b3282d", "#555555"
 _LOWEST_HZ = 0.1
 _DAMPING_LINES = (0.1, 0.3, 0.5, 0.7)
 
 
-def save_loop_figure(
-    settings: LoopSettings, path: str | Path, title: str = "", minimum_deg: float | None = None
-) -> Path:
+def save_loop_figure(settings: LoopSettings, path: Path, title: str, minimum_deg: float) -> Path:
     """Draw the loop into a PNG at `path`; an unstable one is drawn too, without margins."""
-    path = Path(path)
-    # slow to import, and only wanted here; no display is needed
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, 7.5), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(2, 2, width_ratios=(1.15, 1.0))
     found = margins(settings)
+    with canvas(6.8, f"{title}: {'stable' if found.stable else 'UNSTABLE'}") as figure:
+        _draw(figure, settings, found, minimum_deg)
+    return save_png(figure, path)
+
+
+def _draw(figure: Any, settings: LoopSettings, found: Margins, minimum_deg: float) -> None:
+    axes = figure.subplots(2, 2, width_ratios=(1.15, 1.0))
     omega = frequencies_radps(settings.period_s)
     omega = omega[omega >= math.tau * _LOWEST_HZ]
     response = linear_loop(settings).open_loop(omega)
@@ -38,18 +34,6 @@ def save_loop_figure(
     _phase(axes[1, 0], frequency_Hz, np.degrees(np.unwrap(np.angle(response))), found, minimum_deg)
     _sensitivity(axes[0, 1], frequency_Hz, 1.0 / np.abs(1.0 + response), found)
     _poles(axes[1, 1], found, settings.period_s)
-    for axis in axes.flat:
-        axis.grid(True, color="#dddddd", linewidth=0.6)
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.set_axisbelow(True)
-    state = "stable" if found.stable else "UNSTABLE"
-    figure.suptitle(f"{title or 'Linear loop'}: {state}", x=0.01, ha="left", fontweight="bold")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=110, format="png")
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written: {error.strerror or error}") from None
-    return path
 
 
 def _frequency_axis(axis: Any, frequency_Hz: Any) -> None:
@@ -59,31 +43,30 @@ def _frequency_axis(axis: Any, frequency_Hz: Any) -> None:
 
 
 def _magnitude(axis: Any, frequency_Hz: Any, magnitude: Any, found: Margins) -> None:
-    axis.loglog(frequency_Hz, magnitude, color=_BLUE)
-    axis.axhline(1.0, color=_GREY, linewidth=0.8)
+    axis.loglog(frequency_Hz, magnitude, color=BLUE)
+    axis.axhline(1.0, color=GREY, linewidth=0.8)
     if found.stable and math.isfinite(found.crossover_Hz):
-        axis.plot([found.crossover_Hz], [1.0], "o", color=_RED)
+        axis.plot([found.crossover_Hz], [1.0], "o", color=RED)
         up = "any factor up" if math.isinf(found.gain_margin_up) else f"x {found.gain_margin_up:.3g} up"
         down = "any down" if found.gain_margin_down == 0.0 else f"x {found.gain_margin_down:.2g} down"
         text = f"gain margins {up}, {down}\ncrossover {found.crossover_Hz:.3g} Hz"
-        axis.text(0.97, 0.95, text, transform=axis.transAxes, ha="right", va="top", color=_RED, fontsize=9)
+        axis.text(0.97, 0.95, text, transform=axis.transAxes, ha="right", va="top", color=RED, fontsize=9)
     axis.set_ylabel("open loop |L|")
     _frequency_axis(axis, frequency_Hz)
 
 
-def _phase(axis: Any, frequency_Hz: Any, phase_deg: Any, found: Margins, minimum_deg: float | None) -> None:
+def _phase(axis: Any, frequency_Hz: Any, phase_deg: Any, found: Margins, minimum_deg: float) -> None:
     # counted so that the crossover lies in the turn around -180 deg
     near = np.argmin(np.abs(frequency_Hz - (found.crossover_Hz if found.stable else 10.0)))
     phase_deg = phase_deg - 360.0 * round((phase_deg[near] + 180.0) / 360.0)
-    axis.plot(frequency_Hz, phase_deg, color=_BLUE)
-    axis.axhline(-180.0, color=_GREY, linewidth=0.8)
+    axis.plot(frequency_Hz, phase_deg, color=BLUE)
+    axis.axhline(-180.0, color=GREY, linewidth=0.8)
     if found.stable and math.isfinite(found.crossover_Hz):
         at_crossover = float(np.interp(found.crossover_Hz, frequency_Hz, phase_deg))
-        axis.plot([found.crossover_Hz] * 2, [-180.0, at_crossover], color=_RED, linewidth=2.0)
-        wanted = "" if minimum_deg is None else f", at least {minimum_deg:g} wanted"
-        text = f"phase margin {found.phase_margin_deg:.1f} deg{wanted}\n"
+        axis.plot([found.crossover_Hz] * 2, [-180.0, at_crossover], color=RED, linewidth=2.0)
+        text = f"phase margin {found.phase_margin_deg:.1f} deg, at least {minimum_deg:g} wanted\n"
         text += f"delay margin {found.delay_margin_s * 1e3:.2f} ms more"
-        axis.text(0.03, 0.05, text, transform=axis.transAxes, va="bottom", color=_RED, fontsize=9)
+        axis.text(0.03, 0.05, text, transform=axis.transAxes, va="bottom", color=RED, fontsize=9)
     axis.set_ylim(-370.0, max(-80.0, min(float(phase_deg.max()), 100.0) + 10.0))
     axis.set_yticks(range(-360, -60, 45))
     axis.set_ylabel("phase of L [deg]")
@@ -91,12 +74,12 @@ def _phase(axis: Any, frequency_Hz: Any, phase_deg: Any, found: Margins, minimum
 
 
 def _sensitivity(axis: Any, frequency_Hz: Any, sensitivity: Any, found: Margins) -> None:
-    axis.semilogy(frequency_Hz, sensitivity, color=_BLUE)
-    axis.axhline(1.0, color=_GREY, linewidth=0.8)
+    axis.semilogy(frequency_Hz, sensitivity, color=BLUE)
+    axis.axhline(1.0, color=GREY, linewidth=0.8)
     if found.stable:
-        axis.plot([found.sensitivity_peak_Hz], [found.sensitivity_peak], "o", color=_RED)
+        axis.plot([found.sensitivity_peak_Hz], [found.sensitivity_peak], "o", color=RED)
         text = f"Ms {found.sensitivity_peak:.3g} at {found.sensitivity_peak_Hz:.3g} Hz"
-        axis.text(0.03, 0.95, text, transform=axis.transAxes, va="top", color=_RED, fontsize=9)
+        axis.text(0.03, 0.95, text, transform=axis.transAxes, va="top", color=RED, fontsize=9)
     axis.set_ylim(bottom=max(float(sensitivity.min()), 1e-4))
     axis.set_ylabel("sensitivity |1 / (1 + L)|")
     _frequency_axis(axis, frequency_Hz)
@@ -111,19 +94,19 @@ def _poles(axis: Any, found: Margins, period_s: float) -> None:
     widest = max((abs(x) for x in shown), default=1.0) * 1.15
     for damping in _DAMPING_LINES:
         x, y = -widest * damping, widest * math.sqrt(1.0 - damping**2)
-        axis.plot([x, 0.0, x], [y, 0.0, -y], color="#cccccc", linewidth=0.8, linestyle=":")
-        axis.annotate(f"{damping:g}", (x, y), fontsize=8, color=_GREY, ha="center", va="bottom")
-    axis.axvline(0.0, color=_GREY, linewidth=0.8)
+        axis.plot([x, 0.0, x], [y, 0.0, -y], color=SOFT, linewidth=0.8, linestyle=":")
+        axis.annotate(f"{damping:g}", (x, y), fontsize=8, color=GREY, ha="center", va="bottom")
+    axis.axvline(0.0, color=GREY, linewidth=0.8)
     for pole in shown:
-        color = _RED if pole.real >= 0.0 else _ORANGE
+        color = RED if pole.real >= 0.0 else ORANGE
         axis.plot([pole.real], [pole.imag], "x", color=color, markersize=8, markeredgewidth=2)
     if found.stable:
         text = f"slowest {found.slowest_time_constant_s:.3g} s"
         if math.isfinite(found.oscillation_Hz):
             text += f"\noscillation {found.oscillation_Hz:.3g} Hz, damping {found.oscillation_damping:.2f}"
-        axis.text(0.03, 0.04, text, transform=axis.transAxes, fontsize=9, color=_RED)
+        axis.text(0.03, 0.04, text, transform=axis.transAxes, fontsize=9, color=RED)
     hidden = len(found.poles) - len(shown)
-    axis.set_title(f"closed-loop poles; dotted: damping ratio; {hidden} fast ones not shown", fontsize=9, color=_GREY)
+    axis.set_title(f"closed-loop poles; dotted: damping ratio; {hidden} fast ones not shown", fontsize=9, color=GREY)
     axis.set_xlim(-widest, max(0.15 * widest, *(1.2 * pole.real for pole in shown)))
     axis.set_xlabel("real part [1/s]")
     axis.set_ylabel("imaginary part [rad/s]")

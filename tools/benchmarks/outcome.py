@@ -16,8 +16,9 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from drivers.errors import DataError
 from tools.benchmarks.paired import Row
+from tools.drawing import GREEN, GREY, INK, RED, canvas, save_png
+from tools.written_file import writing
 
 
 def conditions() -> dict[str, Any]:
@@ -96,31 +97,25 @@ def outcome_data(rows: Sequence[Row], found: dict[str, Any]) -> dict[str, Any]:
 
 def write_outcome(folder: Path, rows: Sequence[Row], data: dict[str, Any]) -> tuple[Path, Path]:
     """bench.json and bench.png in `folder`, which is made if it is not there."""
-    try:
+    path = folder / "bench.json"
+    with writing(path):
         folder.mkdir(parents=True, exist_ok=True)
-        path = folder / "bench.json"
         path.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n")
-        return path, draw_ratios(folder / "bench.png", rows)
-    except OSError as error:
-        raise DataError(f"{folder}: cannot be written: {error.strerror or error}") from None
-
-
-def draw_ratios(path: Path, rows: Sequence[Row]) -> Path:
-    """Every ratio with its quartiles on a logarithmic axis, the goals as marks."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     shown = [row for row in rows if row.ratio > 0.0][::-1]
-    figure = Figure(figsize=(9.0, 1.5 + 0.24 * len(shown)), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    axes.axvline(1.0, color="#1c2431", linewidth=1.0)
+    with canvas(1.5 + 0.24 * len(shown)) as figure:
+        _draw_ratios(figure.add_subplot(), shown)
+    return path, save_png(figure, folder / "bench.png")
+
+
+def _draw_ratios(axes: Any, shown: Sequence[Row]) -> None:
+    """Every ratio with its quartiles on a logarithmic axis, the goals as marks."""
+    axes.axvline(1.0, color=INK, linewidth=1.0)
     for place, row in enumerate(shown):
-        colour = {None: "#6b7281", True: "#2f8045", False: "#b3282e"}[row.reached]
+        colour = {None: GREY, True: GREEN, False: RED}[row.reached]
         axes.plot([row.low, row.high], [place, place], color=colour, linewidth=3.0, alpha=0.4)
         axes.plot([row.ratio], [place], "o", color=colour, markersize=5.0)
         if row.goal is not None and not row.goal_is_value:
-            axes.plot([row.goal], [place], "|", color="#1c2431", markersize=9.0)
+            axes.plot([row.goal], [place], "|", color=INK, markersize=9.0)
     if shown:
         axes.set_xscale("log")
     axes.set_yticks(range(len(shown)), [f"{row.what} / {row.other_name}" for row in shown], fontsize=8)
@@ -128,6 +123,4 @@ def draw_ratios(path: Path, rows: Sequence[Row]) -> Path:
     axes.set_xlabel(
         "ours / theirs, left of 1 is faster\nbar: quartiles of the pairs; |: goal (green: met, red: missed)"
     )
-    axes.grid(axis="x", color="#d9dee6", linewidth=0.7)
-    figure.savefig(path, dpi=120)
-    return path
+    axes.grid(visible=False, axis="y")

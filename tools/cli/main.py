@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from drivers.errors import DataError, INTERRUPTED, JointctlError, UsageError
+from drivers.errors import INTERRUPTED, DataError, JointctlError, UsageError
 from tools.cli import experiments as cli_experiments
 from tools.cli import friction as cli_friction
 from tools.cli import inspection as cli_inspection
@@ -243,7 +243,6 @@ def _start_quickly() -> None:
 
 # typer's own parser or click, as the version has it
 _USAGE: type[Exception] = typer.BadParameter.__mro__[1]
-INTERRUPTED = 130
 
 
 def _refuse_usage(error: Any) -> None:

@@ -18,13 +18,14 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.errors import ConfigurationError, DataError
+from drivers.errors import ConfigurationError
 from tools.configuration.config import Config
 from tools.experiments.controllers import Controller, controller_constants
 from tools.experiments.ensemble import EnsembleSettings, random_plant
 from tools.experiments.error_figures import ErrorFigures, error_figures
 from tools.experiments.scenarios import Scenario, run_scenario
 from tools.simulation.lockstep import LockstepJoint
+from tools.written_file import writing
 
 Progress = Callable[[float], None]
 
@@ -160,7 +161,7 @@ def _run_in_processes(tasks: list[PlantTask], workers: int, take: Callable[[Plan
 def write_csv(result: StudyResult, path: Path) -> None:
     """One line for each run."""
     names = [field.name for field in fields(ErrorFigures)]
-    try:
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
@@ -170,5 +171,3 @@ def write_csv(result: StudyResult, path: Path) -> None:
                     writer.writerow(
                         [plant.index, plant.friction_kind, plant.encoder_bits, name, *asdict(figures).values()]
                     )
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written: {error.strerror or error}") from None

@@ -6,22 +6,18 @@ checked as a whole configuration before it replaces the file in one step; on any
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
-from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
 
-from drivers.errors import ConfigurationError, DataError
+from drivers.errors import ConfigurationError
 from firmware_py.friction import DEGREE
 from tools.configuration.load import load_config
 from tools.configuration.problems import ConfigurationProblems
 from tools.identification.models import Branch
+from tools.written_file import replace_file
 
 MARK = "# identified by jointctl: "
 
@@ -84,35 +80,6 @@ def with_section(text: str, values: dict[str, Any], remarks: list[str]) -> str:
     lines = tomlkit.dumps(document).splitlines(keepends=True)
     at = next((k for k, line in enumerate(lines) if line.replace(" ", "").startswith("[friction")), len(lines))
     return "".join(lines[:at] + [MARK + line + newline for line in remarks] + lines[at:])
-
-
-def replace_file(path: Path, content: bytes, check: Callable[[Path], None] | None = None) -> None:
-    """Write a new file beside `path`, let `check` read it, then put it in place in one step."""
-    path = path.resolve()
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written: {error.strerror or error}") from None
-    temporary = Path(name)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        if check is not None:
-            check(temporary)
-        if path.exists():
-            shutil.copymode(path, temporary)
-        else:
-            mask = os.umask(0)
-            os.umask(mask)
-            temporary.chmod(0o666 & ~mask)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written: {error.strerror or error}") from None
-    finally:
-        with suppress(FileNotFoundError):
-            temporary.unlink()
 
 
 def write_into(config_path: Path, values: dict[str, Any], remarks: list[str]) -> None:

@@ -12,6 +12,7 @@ from firmware_py.records import LogRecord
 from firmware_py.schema import dtype_of
 from tools.configuration.config import Config
 from tools.recording.kept_records import IN_MEMORY
+from tools.written_file import writing
 
 MESSAGE_BYTES = dtype_of(LogRecord).itemsize + 40  # of the log file for a record
 UNKNOWN_S = 60.0  # room for a run until it is stopped
@@ -33,7 +34,7 @@ def require_room(config: Config, path: Path) -> None:
     """`DataError` if the log of a run of this configuration could not be written to `path`; leaves nothing behind."""
     records = (config.trajectory.duration_s or UNKNOWN_S) * config.loop.rate_Hz
     needed = records * (MESSAGE_BYTES + (dtype_of(LogRecord).itemsize if records > IN_MEMORY else 0))
-    try:
+    with writing(path):
         new = [folder for folder in (path.parent, *path.parent.parents) if not folder.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(path.parent).free
@@ -41,8 +42,6 @@ def require_room(config: Config, path: Path) -> None:
         path.unlink()
         for folder in new:
             folder.rmdir()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written: {error.strerror or error}") from None
     if free < needed:
         raise DataError(
             f"{path.parent}: {free / 1e6:.0f} MB are free, the log of this run takes about {needed / 1e6:.0f} MB",

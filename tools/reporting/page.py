@@ -16,7 +16,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from drivers.errors import DataError
-from tools.identification.friction_section import replace_file
+from tools.written_file import replace_file, require_target
 
 _TEMPLATE = "page.html.j2"
 
@@ -110,10 +110,7 @@ def check_target(path: Path, inputs: Sequence[Path] = ()) -> None:
     """`DataError` if a page cannot go there, or would overwrite one of its `inputs`; ask before the work is done."""
     if path.suffix.lower() not in (".html", ".htm"):
         raise DataError(f"{path}: the name of a report must end in .html")
-    if path.resolve() in {other.resolve() for other in inputs}:
-        raise DataError(f"{path}: is an input of this command and would be overwritten", "choose another name")
-    if not path.parent.is_dir():
-        raise DataError(f"{path}: cannot be written: no folder {path.parent}")
+    require_target(path, inputs)
 
 
 def write_page(path: str | Path, html: str, inputs: Sequence[Path] = ()) -> Path:

@@ -20,6 +20,7 @@ from typing import Any
 from drivers.errors import DataError
 from tools.identification.friction_data import SWEEP_COLUMNS, sidecar_contents
 from tools.sweeping.meter import MeasuredPoint
+from tools.written_file import writing
 
 HEADING = ",".join(SWEEP_COLUMNS) + "\n"
 
@@ -71,11 +72,9 @@ class SweepFile:
         sidecar = sidecar_contents(
             reduction_ratio, torque_constant_NmpA, plan=plan, measured=[], elapsed_s=0.0, unsettled={}, **more
         )
-        try:
+        with writing(path):
             _replace(path.with_suffix(".json"), json.dumps(sidecar, indent=1))
             path.write_text(HEADING, encoding="ascii")
-        except OSError as error:
-            raise DataError(f"{path}: cannot be written: {error.strerror or error}") from None
         return cls(path, sidecar, torque_constant_NmpA)
 
     @classmethod
@@ -125,11 +124,9 @@ class SweepFile:
         )  # fmt: skip
         line = io.StringIO()
         csv.writer(line, lineterminator="\n").writerow(values)
-        try:
+        with writing(self.path):
             self._stream.write(line.getvalue())
             self._stream.flush()
-        except OSError as error:
-            raise self._failure(error) from None
         self._sidecar["measured"].append(point.index)
         self._sidecar["elapsed_s"] = round(measured.time_s, 3)
         if result.problem:
@@ -142,14 +139,9 @@ class SweepFile:
         os.fsync(self._stream.fileno())
         _replace(self.path.with_suffix(".json"), sidecar)
 
-    def _failure(self, error: OSError) -> DataError:
-        return DataError(f"{self.path}: cannot be written: {error.strerror or error}")
-
     def _settle(self, kept: Future[None]) -> None:
-        try:
+        with writing(self.path):
             kept.result()
-        except OSError as error:
-            raise self._failure(error) from None
 
     def close(self) -> None:
         """Files without one row are removed: nothing was measured, and they would be in the way of the next try."""

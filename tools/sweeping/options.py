@@ -23,6 +23,7 @@ from tools.sweeping.grid import (
 )
 from tools.sweeping.plan import PlanSettings, SweepMotion, fastest_radps, plan_motion
 from tools.sweeping.statistics import LEAST_SAMPLES
+from tools.written_file import require_target
 
 SPEED_SHARE = 0.9  # of limits.velocity_max_radps that the fastest plateau may have
 ACCELERATION_SHARE = 0.8  # of sequence.brake_radps2: braking must always be possible
@@ -140,8 +141,7 @@ def _check_fastest(name: str, fastest: float, reachable: float, allowed: float) 
 def check_files(out: Path, resume: bool) -> None:
     if out.suffix != ".csv":
         raise UsageError(f"-o (={out}) must end in .csv; its sidecar gets the same name with .json")
-    if not out.parent.is_dir():
-        raise DataError(f"{out}: cannot be written: no folder {out.parent}")
+    require_target(out)
     for file in (out, out.with_suffix(".json")):
         if file.exists() and not resume:
             raise DataError(f"{file}: exists already", "--resume goes on with it, -o gives another name")

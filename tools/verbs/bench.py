@@ -18,7 +18,7 @@ from tools.configuration.config import Config
 from tools.configuration.load import load_config, shipped_config
 from tools.configuration.records import axis_constants
 from tools.output import Output
-from tools.target_folder import prepare_folder
+from tools.written_file import prepare_folder
 
 PARTS = ("law", "loop", "lockstep", "swarm", "start")
 

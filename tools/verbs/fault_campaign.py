@@ -18,7 +18,7 @@ from tools.reporting.figure import svg_figure
 from tools.reporting.page import Details, Paragraph, Section, Table, check_target
 from tools.reporting.verb_page import from_terminal, write_verb_page
 from tools.simulation.lockstep import LockstepJoint
-from tools.target_folder import prepare_folder
+from tools.written_file import prepare_folder
 
 EXIT_VIOLATIONS = 10
 EXIT_INTERRUPTED = 130

@@ -17,7 +17,7 @@ from tools.configuration.load import load_config, shipped_config
 from tools.drawing import png
 from tools.identification.figures import convergence_figure, fit_figure
 from tools.identification.friction_data import ForeignFormat, read_friction_data
-from tools.identification.friction_section import replace_file, section_values, snippet, write_into
+from tools.identification.friction_section import section_values, snippet, write_into
 from tools.identification.identification import identify_friction
 from tools.identification.options import Options
 from tools.identification.plausibility import JointLimits
@@ -28,6 +28,7 @@ from tools.reporting.figure import svg_figure
 from tools.reporting.page import Block, Details, Section, check_target
 from tools.reporting.verb_page import from_terminal, write_verb_page
 from tools.reporting.verb_page import remarks as notes_of
+from tools.written_file import replace_file, require_target
 
 
 def joint_limits(config_path: Path) -> JointLimits:
@@ -131,12 +132,9 @@ def identify(
         files[stem.with_name(stem.name + ".convergence.png")] = png(convergence)
     if out is not None:
         files[out] = snippet(values, remarks(found)).encode("utf-8")
-    protected = {p.resolve() for p in (data_path, data_path.with_suffix(".json"), into, config) if p is not None}
+    protected = [p for p in (data_path, data_path.with_suffix(".json"), into, config) if p is not None]
     for path in files:
-        if path.resolve() in protected:
-            raise DataError(f"{path}: is an input of this command and would be overwritten", "choose another -o")
-        if not path.parent.is_dir():
-            raise DataError(f"{path}: cannot be written: no folder {path.parent}")
+        require_target(path, protected)
     if into is not None:  # first, because it is the one that may be refused
         write_into(into, values, remarks(found))
     for path, content in files.items():

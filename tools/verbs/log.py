@@ -9,13 +9,13 @@ from rich.console import Group
 from rich.table import Table
 
 from drivers.errors import DataError
-from tools.identification.friction_section import replace_file
 from tools.output import Output
 from tools.recording.log_export import FORMATS
 from tools.recording.log_facts import began_at, event_rows, kept_share, level_name, missing_in
 from tools.recording.run_figure import save_run_figure
 from tools.recording.run_log import RunLog, read_run_log
 from tools.recording.run_summary import summarise, summary_table
+from tools.written_file import replace_file, require_target
 
 _SHOWN_EVENTS = 100
 
@@ -111,8 +111,5 @@ def log_export(path: Path, output: Output, format: str, out: Path | None = None)
 
 def _target(path: Path, out: Path | None, ending: str) -> Path:
     target = out if out is not None else path.with_suffix(ending)
-    if target.resolve() == path.resolve():
-        raise DataError(f"{target}: is the log itself and would be overwritten", "choose another -o")
-    if not target.parent.is_dir():
-        raise DataError(f"{target}: cannot be written: no folder {target.parent}")
+    require_target(target, (path,))
     return target

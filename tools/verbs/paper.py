@@ -21,7 +21,7 @@ from tools.output import Output
 from tools.reporting.figure import svg_figure
 from tools.reporting.page import Section, check_target
 from tools.reporting.verb_page import from_terminal, write_verb_page
-from tools.target_folder import prepare_folder
+from tools.written_file import prepare_folder
 
 PAPER = (
     "Shen, Zhou, Yu, Wang: Design of Adaptive RBFNN and Computed-torque Control for Manipulator Joint "

@@ -8,9 +8,10 @@ from typing import Any
 
 from rich.table import Table
 
+from drivers.errors import INTERRUPTED
 from tools.configuration.elmo_settings import refuse_serial
 from tools.configuration.load import load_config, shipped_config
-from tools.drawing import save_png
+from tools.drawing import require_png, save_png
 from tools.experiments.controllers import controller_config
 from tools.experiments.study_runs import StudyResult, quantile, run_study, write_csv
 from tools.experiments.study_settings import StudySettings, study_controllers
@@ -18,9 +19,8 @@ from tools.output import Output
 from tools.reporting.figure import svg_figure
 from tools.reporting.page import Details, Section, check_target
 from tools.reporting.verb_page import from_terminal, write_verb_page
-from tools.target_folder import prepare_target
+from tools.written_file import prepare_target, refuse_overwriting
 
-INTERRUPTED = 130
 _COLUMNS = (
     ("peak_mrad", "peak [mrad]"),
     ("rmse_mrad", "RMSE [mrad]"),
@@ -37,6 +37,7 @@ def study(
     settings: StudySettings,
     output: Output,
     *,
+    file: Path | None = None,
     workers: int | None = None,
     csv: Path | None = None,
     figure: Path | None = None,
@@ -44,15 +45,21 @@ def study(
 ) -> int:
     """Run the study and print medians with 5-95 % ranges; `csv`, `figure` and `report` are files to write.
 
+    `file` is where the settings came from; like the configurations that they name, it is never overwritten.
     Ctrl-C keeps the plants that are done, says so, and gives exit code 130.
     """
     base_path = Path(settings.base)
     base = load_config(base_path if base_path.exists() else shipped_config(settings.base))
     refuse_serial(base, "study")
+    inputs = [Path(name) for name in (settings.base, *settings.controllers)] + ([file] if file is not None else [])
+    if csv is not None:
+        refuse_overwriting(csv, inputs)
+    if figure is not None:
+        require_png(figure, inputs)
     if report is not None:
-        check_target(report)
-    for file in (csv, figure):
-        prepare_target(file)
+        check_target(report, inputs)
+    for target in (csv, figure):
+        prepare_target(target)
     controllers = study_controllers(settings)
     for controller in controllers:
         controller_config(base, controller)  # a contradiction is to be told before an hour of simulation

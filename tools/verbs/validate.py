@@ -7,19 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from drivers.errors import ConfigurationError, DataError, UsageError
+from drivers.errors import ConfigurationError, DataError
 from tools.configuration.conversions import friction_constants
 from tools.configuration.load import load_config
-from tools.drawing import png
+from tools.drawing import png, require_png
 from tools.identification.figures import fit_figure
 from tools.identification.friction_data import ForeignFormat, FrictionData, read_friction_data
-from tools.identification.friction_section import replace_file
 from tools.identification.models import Branch
 from tools.identification.plausibility import check_data
 from tools.identification.report import error_table
 from tools.identification.result import DIRECTIONS
 from tools.output import Output
 from tools.verbs.identify import joint_limits
+from tools.written_file import replace_file
 
 
 def _branch(record: Any) -> Branch:
@@ -45,8 +45,8 @@ def validate(
     config_path: Path, data_path: Path, output: Output, *, told: ForeignFormat | None = None, figure: Path | None = None
 ) -> int:
     """Compare, report, draw (default DATA.validation.png); returns the exit code."""
-    if figure is not None and figure.suffix.lower() != ".png":
-        raise UsageError(f"--figure (={figure}) must end in .png")
+    figure = figure or data_path.with_suffix(".validation.png")
+    require_png(figure, (data_path, data_path.with_suffix(".json"), config_path))
     config = load_config(config_path)
     if config.friction is None:
         raise ConfigurationError(
@@ -69,9 +69,6 @@ def validate(
             )
     used = {word: data.direction(sign) for word, sign in DIRECTIONS}
     picture = png(fit_figure(data, branches, used, f"{config_path.name} against {data_path.name}"))
-    figure = figure or data_path.with_suffix(".validation.png")
-    if figure.resolve() in {p.resolve() for p in (data_path, data_path.with_suffix(".json"), config_path)}:
-        raise DataError(f"{figure}: is an input of this command and would be overwritten")
     replace_file(figure, picture)
     for note in data.notes:
         output.note(f"{data_path}: {note}")

@@ -211,11 +211,11 @@ def test_a_format_that_is_none_is_refused(log_path: Path, format: str) -> None:
 @pytest.mark.parametrize("format", ["csv", "npz", "candump"])
 def test_the_log_itself_is_never_overwritten(log_path: Path, format: str) -> None:
     before = log_path.read_bytes()
-    with pytest.raises(DataError, match="log itself"):
+    with pytest.raises(DataError, match="is an input of this command"):
         log_export(log_path, Output(), format, log_path.parent / "." / "run.mcap")
     with pytest.raises(DataError, match="no folder"):
         log_export(log_path, Output(), format, log_path.parent / "none" / "x")
-    with pytest.raises(DataError, match="log itself"):
+    with pytest.raises(DataError, match="is an input of this command"):
         log_plot(log_path, Output(), log_path)
     assert log_path.read_bytes() == before
     assert format in FORMATS

@@ -175,7 +175,7 @@ def test_the_figure_is_a_png_and_marks_the_fault(tmp_path: Path) -> None:
     assert plain.startswith(b"\x89PNG\r\n")
     assert plain != fault
     with pytest.raises(DataError, match="nothing to draw, the run has 0 records"):
-        save_run_figure(records[:0], tmp_path / "none.png")
+        save_run_figure(records[:0], tmp_path / "none.png", "none")
 
 
 def height_of(png: Path) -> int:
@@ -184,10 +184,10 @@ def height_of(png: Path) -> int:
 
 def test_a_law_without_network_has_neither_its_panel_nor_its_row(tmp_path: Path) -> None:
     records = run_records()
-    high = height_of(save_run_figure(records, tmp_path / "with.png"))
+    high = height_of(save_run_figure(records, tmp_path / "with.png", "with"))
     records.network_torque_Nm = 0.0
     records.observer_torque_Nm[100:] = 2.0
-    assert height_of(save_run_figure(records, tmp_path / "without.png")) < 0.9 * high
+    assert height_of(save_run_figure(records, tmp_path / "without.png", "without")) < 0.9 * high
     text = io.StringIO()
     Console(file=text, width=100).print(summary_table(summarise(records)))
     assert "command torque" in text.getvalue()

@@ -46,6 +46,17 @@ def test_the_cause_is_told_before_the_picture_is_drawn(
     assert "picture" in out.getvalue()
 
 
+@pytest.mark.parametrize("fault", [Fault.NONE, Fault.BUS_ERROR])
+def test_a_picture_that_cannot_be_written_does_not_hide_the_result(tmp_path: Path, fault: Fault) -> None:
+    (tmp_path / "run.png").mkdir()
+    out, err = io.StringIO(), io.StringIO()
+    code = run_report.report_run(result(tmp_path, fault), Output(stdout=out, stderr=err), "t")
+    assert code == (0 if fault is Fault.NONE else 7)
+    assert "run.png: cannot be written: Is a directory" in err.getvalue().replace("\n", " ")
+    assert "run.mcap" in out.getvalue()
+    assert "│ picture" not in out.getvalue()
+
+
 def test_without_a_picture_none_is_drawn_or_told(tmp_path: Path) -> None:
     out = io.StringIO()
     assert run_report.report_run(result(tmp_path, Fault.NONE), Output(stdout=out), "t", picture=False) == 0

@@ -5,15 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from drivers.errors import MotionFault
+from drivers.errors import INTERRUPTED, DataError, MotionFault
 from firmware_py.states import Fault
 from tools.output import Output
 from tools.recording.run_figure import save_run_figure
 from tools.recording.run_summary import summary_table
 from tools.running.result.drive_end import require_off
 from tools.running.result.run_result import RunResult
-
-INTERRUPTED = 130
 
 
 def report_run(result: RunResult, output: Output, title: str, *, picture: bool = True) -> int:
@@ -29,11 +27,12 @@ def report_run(result: RunResult, output: Output, title: str, *, picture: bool =
             f"likely cause: {text.cause}; next: {text.next_step}",
         )
     drawn = result.log_path.with_suffix(".png") if picture else None
-    try:
-        if drawn is not None:
+    if drawn is not None:
+        try:
             save_run_figure(result.records, drawn, title)
-    except OSError as error:
-        output.warning(f"{drawn}: cannot be written: {error.strerror or error}")
+        except DataError as error:
+            output.warning(error.message)
+            drawn = None
     table = summary_table(result.summary)
     if result.serial:
         table.add_row("line load", f"{result.bus_load:.1%} of the characters from the drive")

@@ -11,8 +11,8 @@ import pytest
 from drivers.errors import DataError
 from tools.experiments.study_settings import StudySettings
 from tools.output import Output
-from tools.target_folder import prepare_folder, prepare_target
 from tools.verbs import study as study_module
+from tools.written_file import prepare_folder, prepare_target
 
 
 def test_a_folder_is_made_and_one_that_is_there_stays(tmp_path: Path) -> None:

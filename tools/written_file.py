@@ -1,0 +1,79 @@
+"""Files that a command writes: refused before the work begins, and put in place in one step."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from drivers.errors import DataError
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """An `OSError` inside the `with` becomes the `DataError` that `path` cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+def refuse_overwriting(path: Path, inputs: Iterable[Path]) -> None:
+    """`DataError` if `path` is one of the files that the command reads; ask before the work is done."""
+    if path.resolve() in {other.resolve() for other in inputs}:
+        raise DataError(f"{path}: is an input of this command and would be overwritten", "choose another name")
+
+
+def require_target(path: Path, inputs: Iterable[Path] = ()) -> None:
+    """As `refuse_overwriting`; `DataError` too if its folder is not there."""
+    refuse_overwriting(path, inputs)
+    if not path.parent.is_dir():
+        raise DataError(f"{path}: cannot be written: no folder {path.parent}")
+
+
+def prepare_folder(folder: Path) -> None:
+    """Make it where it is not there; `DataError` if nothing could be written into it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{folder}: cannot be made: {error.strerror or error}") from None
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise DataError(f"{folder}: cannot be written: no permission")
+
+
+def prepare_target(file: Path | None) -> None:
+    """As `prepare_folder` for the folder of a file; `DataError` if the name is that of a folder.  None: nothing."""
+    if file is None:
+        return
+    prepare_folder(file.parent)
+    if file.is_dir():
+        raise DataError(f"{file}: is a folder, not a file to write")
+
+
+def replace_file(path: Path, content: bytes, check: Callable[[Path], None] | None = None) -> None:
+    """Write a new file beside `path`, let `check` read it, then put it in place in one step."""
+    path = path.resolve()
+    with writing(path):
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+    temporary = Path(name)
+    try:
+        with writing(path):
+            with os.fdopen(handle, "wb") as stream:
+                stream.write(content)
+                stream.flush()
+                os.fsync(stream.fileno())
+            if check is not None:
+                check(temporary)
+            if path.exists():
+                shutil.copymode(path, temporary)
+            else:
+                mask = os.umask(0)
+                os.umask(mask)
+                temporary.chmod(0o666 & ~mask)
+            os.replace(temporary, path)
+    finally:
+        with suppress(FileNotFoundError):
+            temporary.unlink()
