@@ -17,6 +17,7 @@ from firmware_py.records import NEURONS
 from firmware_py.states import ControllerKind
 from firmware_py.velocity import low_pass_gain
 from tools.analysis.linear_loop import LoopSettings
+from tools.configuration.conversions import joint_rad_per_count
 from tools.configuration.elmo import ElmoSerial
 from tools.configuration.records import PAPER_CENTRES
 
@@ -25,15 +26,6 @@ if TYPE_CHECKING:
 
 LAST_SYNCHRONOUS_TYPE = 240
 STEP_SHARE = 0.2  # of the torque limit; `precise` with 17 bit is below, with 16 bit, where it chatters, above
-
-
-@dataclass(frozen=True, kw_only=True)
-class MarginSettings:
-    """The section [margin]; these are its defaults."""
-
-    min_phase_margin_deg: float = 20.0
-    loop_delay_s: float | None = None  # None = from drive.rpdo_transmission_type
-    current_lag_s: float = 0.0005
 
 
 @dataclass(frozen=True)
@@ -46,21 +38,11 @@ class Assumption:
     origin: str
 
 
-def margin_settings(config: Config) -> MarginSettings:
-    """The section [margin]."""
-    section = config.margin
-    return MarginSettings(
-        min_phase_margin_deg=section.min_phase_margin_deg,
-        loop_delay_s=section.loop_delay_s,
-        current_lag_s=section.current_lag_s,
-    )
-
-
-def _delay(config: Config, margin: MarginSettings, measured_s: float | None) -> tuple[float, str]:
+def _delay(config: Config, measured_s: float | None) -> tuple[float, str]:
     if measured_s is not None:
         return measured_s, "measured"
-    if margin.loop_delay_s is not None:
-        return margin.loop_delay_s, "margin.loop_delay_s"
+    if config.margin.loop_delay_s is not None:
+        return config.margin.loop_delay_s, "margin.loop_delay_s"
     if isinstance(config.drive, ElmoSerial):
         return 1.0 / config.loop.rate_Hz, "assumed: at most one period (serial line)"
     period_s, kind = 1.0 / config.loop.rate_Hz, config.canopen.rpdo_transmission_type
@@ -71,13 +53,10 @@ def _delay(config: Config, margin: MarginSettings, measured_s: float | None) -> 
     return periods * period_s, f"assumed: {count} (drive.rpdo_transmission_type = {kind}, synchronous)"
 
 
-def loop_settings(
-    config: Config, delay_s: float | None = None, margin: MarginSettings | None = None
-) -> tuple[LoopSettings, tuple[Assumption, ...]]:
+def loop_settings(config: Config, delay_s: float | None = None) -> tuple[LoopSettings, tuple[Assumption, ...]]:
     """The loop of this configuration; `delay_s` is a measured loop delay, which beats the configured one."""
-    margin = margin_settings(config) if margin is None else margin
-    control = config.control
-    delay_s, delay_origin = _delay(config, margin, delay_s)
+    control, current_lag_s = config.control, config.margin.current_lag_s
+    delay_s, delay_origin = _delay(config, delay_s)
     centres = control.centres or tuple((c, c) for c in PAPER_CENTRES)
     widths = control.widths if len(control.widths) > 1 else control.widths * NEURONS
     try:
@@ -85,7 +64,7 @@ def loop_settings(
             kind=ControllerKind[control.kind.upper()],
             period_s=1.0 / config.loop.rate_Hz,
             delay_s=delay_s,
-            lag_s=margin.current_lag_s,
+            lag_s=current_lag_s,
             inertia_kgm2=config.joint.inertia_kgm2,
             kp=control.kp,
             kv=control.kv,
@@ -105,7 +84,7 @@ def loop_settings(
     assumptions = (
         Assumption("loop rate", config.loop.rate_Hz, "Hz", "loop.rate_Hz"),
         Assumption("loop delay", delay_s, "s", delay_origin),
-        Assumption("current lag", margin.current_lag_s, "s", "margin.current_lag_s"),
+        Assumption("current lag", current_lag_s, "s", "margin.current_lag_s"),
         Assumption("velocity filter", control.velocity_cutoff_Hz, "Hz", "control.velocity_cutoff_Hz (0 = none)"),
         Assumption("joint inertia", config.joint.inertia_kgm2, "kg m^2", "joint.inertia_kgm2"),
     )
@@ -147,7 +126,6 @@ def not_modelled(config: Config) -> list[str]:
 
 def encoder_step_Nm(config: Config) -> float:
     """By how much kp and kv move the torque when the reading changes by one count."""
-    turn_rad = math.tau / (config.joint.reduction_ratio if config.encoder.side == "motor" else 1.0)
     control, rate_Hz = config.control, config.loop.rate_Hz
     slope_1ps = low_pass_gain(control.velocity_cutoff_Hz, 1.0 / rate_Hz) * rate_Hz
-    return config.joint.inertia_kgm2 * (control.kp + control.kv * slope_1ps) * turn_rad / config.encoder.counts_per_turn
+    return config.joint.inertia_kgm2 * (control.kp + control.kv * slope_1ps) * abs(joint_rad_per_count(config))

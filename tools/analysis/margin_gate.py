@@ -6,7 +6,7 @@ from drivers.errors import MarginError
 from tools.analysis.advice import Remedy, longest_delay_s, remedies
 from tools.analysis.learning_loop import Convergence, LearningSettings, learning_convergence
 from tools.analysis.linear_loop import LoopSettings
-from tools.analysis.loop_settings import loop_settings, margin_settings
+from tools.analysis.loop_settings import loop_settings
 from tools.analysis.margins import Margins, margins
 from tools.configuration.config import Config
 
@@ -16,7 +16,7 @@ def require_margin(config: Config, delay_s: float | None = None, *, allow_low_ma
 
     `allow_low_margin` is the user's explicit override; it never lets an unstable loop pass.
     """
-    minimum_deg = margin_settings(config).min_phase_margin_deg
+    minimum_deg = config.margin.min_phase_margin_deg
     settings, _ = loop_settings(config, delay_s)
     found = margins(settings)
     refuse_diverging_learning(learning_of(config, settings))

@@ -43,3 +43,12 @@ def friction_constants(friction: Friction, reduction_ratio: float) -> Any:
         )  # fmt: skip
 
     return friction_model.friction_constants(branch(friction.positive, False), branch(friction.negative, True))
+
+
+def static_friction_Nm(config: Config) -> float | None:
+    """The larger one of both directions, at the joint; None where no friction is configured."""
+    friction = config.friction
+    if friction is None:
+        return None
+    ratio = config.joint.reduction_ratio if friction.torque_side == "motor" else 1.0
+    return max(abs(friction.positive.ts_Nm), abs(friction.negative.ts_Nm)) * ratio

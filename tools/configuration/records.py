@@ -10,14 +10,15 @@ import numpy as np
 from drivers.errors import ConfigurationError
 from firmware_py.live_change import gains_of
 from firmware_py.lyapunov import solve_lyapunov_p
+from firmware_py.motion_peak import approach_duration_s, approach_start, peak_of
 from firmware_py.records import NEURONS, AxisConstants, Gains, TrajectoryConstants
 from firmware_py.schema import dtype_of, new
 from firmware_py.states import ControllerKind, FeedForward, LimitSource, TrajectoryKind, ZeroSpeedRule
-from firmware_py.trajectory_table import approach_duration_s, approach_start, ends_meet, peak_of, table_from_csv
+from firmware_py.trajectory_table import ends_meet, table_from_csv
 from firmware_py.velocity import low_pass_gain
 from tools.configuration.checks import extremes_problems
 from tools.configuration.config import Config
-from tools.configuration.conversions import friction_constants, joint_rad_per_count, period_s
+from tools.configuration.conversions import friction_constants, joint_rad_per_count, period_s, static_friction_Nm
 from tools.configuration.elmo import ElmoSerial
 from tools.configuration.problems import ConfigurationProblems
 
@@ -183,11 +184,8 @@ def _fill_limits(record: Any, config: Config) -> None:
     ):  # fmt: skip
         setattr(record, key, getattr(limits, key))
     share = FROZEN_SHARE_WITHOUT_MODEL if config.control.feed_forward == "none" else FROZEN_SHARE
-    if config.friction is not None:
-        static_Nm = max(
-            abs(branch.ts_Nm) * (config.joint.reduction_ratio if config.friction.torque_side == "motor" else 1.0)
-            for branch in (config.friction.positive, config.friction.negative)
-        )
+    static_Nm = static_friction_Nm(config)
+    if static_Nm is not None:
         record.frozen_torque_Nm = FROZEN_FRICTION * static_Nm + abs(config.joint.gravity_Nm)
     second = config.joint_encoder
     if second is not None:

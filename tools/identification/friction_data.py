@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from drivers.errors import DataError, UsageError
+from tools.configuration.conversions import RADPS_PER_UNIT
 from tools.identification.table_file import TableFile, read_bytes, read_table
 
 SWEEP_COLUMNS = (
@@ -34,7 +35,6 @@ SWEEP_COLUMNS = (
     "position_min_rad", "position_max_rad", "time_s", "temperature_degC", "direction", "pass",
 )  # fmt: skip
 SIDECAR_FORMAT = "jointctl friction sweep 1"
-RADPS_PER_UNIT = {"rad/s": 1.0, "deg/s": math.pi / 180.0, "r/min": math.tau / 60.0}
 SIDES = ("joint", "motor")
 MIN_PER_DIRECTION = 12
 _SAME_CONSTANT = 0.02  # motor_torque_Nm against current_A times the torque constant, median

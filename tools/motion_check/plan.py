@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from drivers.drive import CommissioningReport
 from drivers.errors import ConfigurationError
 from firmware_py.states import TrajectoryKind
+from firmware_py.trajectory_table import spline_table
 from tools.configuration.config import Config
-from tools.configuration.conversions import joint_rad_per_count
+from tools.configuration.conversions import joint_rad_per_count, static_friction_Nm
 from tools.configuration.elmo import ElmoSerial
 from tools.configuration.records import APPROACH_MIN_S, axis_constants
 
@@ -48,15 +48,6 @@ class CheckPlan:
     @property
     def duration_s(self) -> float:
         return APPROACH_MIN_S + len(STOPS) * (RAMP_s + REST_s)
-
-
-def static_friction_Nm(config: Config) -> float | None:
-    """The larger one of both directions, at the joint; None where no friction is configured."""
-    friction = config.friction
-    if friction is None:
-        return None
-    ratio = config.joint.reduction_ratio if friction.torque_side == "motor" else 1.0
-    return max(abs(friction.positive.ts_Nm), abs(friction.negative.ts_Nm)) * ratio
 
 
 def make_plan(config: Config, torque_Nm: float | None) -> CheckPlan:
@@ -121,11 +112,7 @@ def motion_table(plan: CheckPlan, start_rad: float) -> np.ndarray:
             places.append(stop)
         end_s, place = times_s[-1], stop
     position_rad = start_rad + plan.travel_rad * np.array(places)
-    table = np.zeros((len(times_s), 5))
-    table[:, 0] = times_s
-    table[:-1, 1:] = CubicSpline(times_s, position_rad, bc_type="clamped").c[::-1].T
-    table[-1, 1] = position_rad[-1]
-    return table
+    return spline_table(np.array(times_s), position_rad)
 
 
 def check_constants(config: Config, plan: CheckPlan, report: CommissioningReport, table: np.ndarray) -> Any:

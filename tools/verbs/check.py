@@ -10,11 +10,11 @@ from rich.table import Table
 
 from tools.analysis.advice import Remedy, remedies
 from tools.analysis.linear_loop import LoopSettings
-from tools.analysis.loop_settings import Assumption, loop_settings, margin_settings, not_modelled
+from tools.analysis.loop_settings import Assumption, loop_settings, not_modelled
 from tools.analysis.margin_gate import learning_of, meets, refusal, refuse_diverging_learning
 from tools.analysis.margins import Margins, Theory, margins, theory
 from tools.configuration.config import Config
-from tools.configuration.elmo import ElmoSerial
+from tools.drawing import require_png
 from tools.output import Output
 from tools.verbs.check_serial import line_text, refuse_rate
 
@@ -32,10 +32,12 @@ def check(
     `delay_s` is a measured loop delay (sample to torque command taking effect); `figure` a PNG to write;
     `allow_low_margin` accepts a stable loop below the minimum.
     """
-    serial = isinstance(config.drive, ElmoSerial)
+    if figure is not None:
+        require_png(figure, (config.path,))
+    serial = config.is_serial
     if serial:
         refuse_rate(config)
-    minimum_deg = margin_settings(config).min_phase_margin_deg
+    minimum_deg = config.margin.min_phase_margin_deg
     settings, assumptions = loop_settings(config, delay_s)
     found, ideal = margins(settings), theory(settings)
     enough = meets(found, minimum_deg)

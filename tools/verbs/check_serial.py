@@ -9,7 +9,7 @@ from drivers.elmo.line_budget import LARGEST_SHARE, highest_rate_Hz
 from drivers.errors import ConfigurationError
 from tools.analysis.advice import remedies
 from tools.analysis.linear_loop import LoopSettings
-from tools.analysis.loop_settings import loop_settings, margin_settings
+from tools.analysis.loop_settings import loop_settings
 from tools.analysis.margin_gate import meets
 from tools.analysis.margins import margins
 from tools.configuration.config import Config
@@ -37,7 +37,7 @@ def _advice(config: Config) -> str:
     """The rate with the reserve that is kept for the measured line, the cut-off that it allows, and gains."""
     drive = elmo_section(config)
     rate_Hz = math.floor(LARGEST_SHARE * highest_rate_Hz(drive.baud_rate_bitps, drive.echo))
-    minimum_deg = margin_settings(config).min_phase_margin_deg
+    minimum_deg = config.margin.min_phase_margin_deg
     settings, _ = loop_settings(config, 1.0 / rate_Hz)
     cutoff_Hz = min(settings.cutoff_Hz, float(f"{HIGHEST_CUTOFF * rate_Hz:.2g}"))
     settings = replace(settings, period_s=1.0 / rate_Hz, cutoff_Hz=cutoff_Hz)

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import io
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from drivers.errors import ConfigurationError, MarginError
+from drivers.errors import ConfigurationError, DataError, JointctlError, MarginError, UsageError
 from firmware_py.states import ControllerKind
 from tools.analysis import loop_settings as mapping
 from tools.analysis.linear_loop import CONTROLLERS
-from tools.analysis.loop_settings import MarginSettings, loop_settings, margin_settings, not_modelled
+from tools.analysis.loop_settings import loop_settings, not_modelled
 from tools.analysis.margin_gate import require_margin
 from tools.analysis.margins import phase_margin_deg
 from tools.configuration.config import Config
@@ -81,17 +80,16 @@ def test_an_unstable_loop_is_called_so() -> None:
     assert "the control loop is unstable" in messages
 
 
-def test_the_limit_is_met_exactly_at_the_boundary(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_limit_is_met_exactly_at_the_boundary() -> None:
     config = load_config(shipped_config("paper"))
     margin_deg = require_margin(config).phase_margin_deg
     for above_deg, refused in ((-1e-9, False), (0.0, False), (1e-9, True), (0.1, True)):
-        wanted = MarginSettings(min_phase_margin_deg=margin_deg + above_deg)
-        monkeypatch.setattr("tools.analysis.margin_gate.margin_settings", lambda _, wanted=wanted: wanted)
+        wanted = changed("margin", min_phase_margin_deg=margin_deg + above_deg)
         if refused:
             with pytest.raises(MarginError):
-                require_margin(config)
+                require_margin(wanted)
         else:
-            require_margin(config)
+            require_margin(wanted)
 
 
 def test_the_override_accepts_a_small_margin_but_never_an_unstable_loop() -> None:
@@ -135,6 +133,20 @@ def test_json_of_an_unstable_loop_is_valid() -> None:
     assert data["margins"]["sensitivity_peak"] is None  # infinite
 
 
+@pytest.mark.parametrize(("name", "error", "text"), [
+    ("virtual.toml", UsageError, "must end in .png"), ("virtual.png", DataError, "is an input of this command"),
+])  # fmt: skip
+def test_a_picture_never_replaces_the_configuration(
+    tmp_path: Path, name: str, error: type[JointctlError], text: str
+) -> None:
+    path = tmp_path / name
+    content = shipped_config("virtual").read_bytes()
+    path.write_bytes(content)
+    with pytest.raises(error, match=text):
+        check(load_config(path), Output(stdout=io.StringIO()), figure=path)
+    assert path.read_bytes() == content
+
+
 @pytest.mark.parametrize("delay_s", [None, 8e-3])
 def test_a_picture_is_written_for_stable_and_unstable_loops(tmp_path: Path, delay_s: float | None) -> None:
     path = tmp_path / "folder" / "loop.png"
@@ -156,22 +168,19 @@ def test_the_assumed_delay_follows_the_rpdo(transmission_type: int, periods: flo
 
 
 def test_measured_beats_configured_beats_assumed() -> None:
-    config = load_config(shipped_config("paper"))
-    configured = MarginSettings(loop_delay_s=1.7e-3, current_lag_s=0.9e-3)
-    settings, assumptions = loop_settings(config, None, configured)
+    config = changed("margin", loop_delay_s=1.7e-3, current_lag_s=0.9e-3)
+    settings, assumptions = loop_settings(config)
     assert (settings.delay_s, settings.lag_s) == (1.7e-3, 0.9e-3)
     assert assumptions[1].origin == "margin.loop_delay_s"
-    settings, assumptions = loop_settings(config, 2.5e-3, configured)
+    settings, assumptions = loop_settings(config, 2.5e-3)
     assert settings.delay_s == 2.5e-3
     assert assumptions[1].origin == "measured"
 
 
 def test_the_section_of_the_configuration_is_used() -> None:
-    assert asdict(margin_settings(load_config(shipped_config("paper")))) == asdict(MarginSettings())
-    config = changed("margin", min_phase_margin_deg=25.0, loop_delay_s=0.0, current_lag_s=0.001)
+    config = changed("margin", loop_delay_s=0.0, current_lag_s=0.001)
     settings, _ = loop_settings(config)
     assert (settings.delay_s, settings.lag_s) == (0.0, 0.001)  # a delay of 0 is a value, not "unknown"
-    assert margin_settings(config).min_phase_margin_deg == 25.0
 
 
 def test_a_negative_measured_delay_is_named() -> None:

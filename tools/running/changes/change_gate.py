@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from drivers.errors import ConfigurationError, MarginError
-from tools.analysis.loop_settings import loop_settings, margin_settings
+from tools.analysis.loop_settings import loop_settings
 from tools.analysis.margin_gate import require_margin
 from tools.analysis.margins import phase_margin_deg
 from tools.configuration.checks import problems_between_sections
@@ -33,7 +33,7 @@ def require_change(
     if problems:
         raise ConfigurationError(problems[0])
     found = require_margin(end, delay_s, allow_low_margin=allow_low_margin)
-    least_deg = 1e-6 if allow_low_margin else margin_settings(config).min_phase_margin_deg
+    least_deg = 1e-6 if allow_low_margin else config.margin.min_phase_margin_deg
     for step in range(1, STEPS):
         share = step / STEPS
         between = {name: value + share * (after[name] - value) for name, value in before.items()}
