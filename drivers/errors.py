@@ -1,13 +1,14 @@
 """Every error that a user can meet, as one tree; the class decides the exit code of the command line.
 
 The message is one line that names the thing, its value and what is allowed.  The hint is one line that tells what
-to do about it (often a command to type), or empty.  Exit code 130 is an interruption: it has no
-class here.
+to do about it (often a command to type), or empty.
 """
 
 from __future__ import annotations
 
 from typing import ClassVar
+
+INTERRUPTED = 130  # exit code after Ctrl-C and its like, which are no error
 
 
 class JointctlError(Exception):

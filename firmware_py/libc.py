@@ -55,6 +55,7 @@ EAGAIN = errno_codes.EAGAIN
 EINTR = errno_codes.EINTR
 ENOBUFS = errno_codes.ENOBUFS
 NANOSECONDS = 1_000_000_000
+WAIT_SCRATCH_WORDS = 3  # of `wait_readable_ns`
 
 
 if JIT_DISABLED:
@@ -132,3 +133,26 @@ def sleep_until_ns(deadline_ns: int, timespec: np.ndarray) -> None:
     address = np.uintp(timespec.ctypes.data)
     while clock_nanosleep(np.int32(CLOCK_MONOTONIC), np.int32(TIMER_ABSTIME), address, np.uintp(0)) == EINTR:
         pass
+
+
+@kernel
+def wait_readable_ns(fd: int, timeout_ns: int, scratch: np.ndarray) -> bool:
+    """Sleep until something can be read from `fd`, or `timeout_ns` is over; True if a read has something to say.
+
+    True also when the other end has gone: the next read then tells the error, and so does `poll_events`.  A negative
+    time-out is taken as 0.  A signal ends the wait early with False, so a caller that must wait the whole time
+    compares its own clock.  `scratch` is int64[WAIT_SCRATCH_WORDS] owned by the caller: `struct pollfd`, packed as on
+    little-endian machines, and `struct timespec`.
+    """
+    limited_ns = max(timeout_ns, 0)
+    scratch[0] = (POLLIN << 32) | np.int64(fd)
+    scratch[1] = limited_ns // NANOSECONDS
+    scratch[2] = limited_ns % NANOSECONDS
+    address = scratch.ctypes.data
+    return bool(ppoll(np.uintp(address), np.uintp(1), np.uintp(address + 8), np.uintp(0)) > 0)
+
+
+@kernel
+def poll_events(scratch: np.ndarray) -> int:
+    """What the last `wait_readable_ns` with this scratch has seen (`revents` of poll(2))."""
+    return int(scratch[0] >> 48)

@@ -29,14 +29,21 @@ from firmware_py.change_records import (
 from firmware_py.iterative_learning import reset_learning
 from firmware_py.kernel import kernel
 from firmware_py.libc import load_acquire
+from firmware_py.lyapunov import right_column_of_p
 from firmware_py.records import AxisConstants, AxisState, LawConstants, LawState, LimitConstants, TrajectoryConstants
 from firmware_py.safety import within
 from firmware_py.states import AxisPhase, ControllerKind, TrajectoryKind
-from firmware_py.trajectory import approach_at, brake_step, plan_approach, reference_at, trapezoid_times_s
+from firmware_py.trajectory import (
+    QUINTIC_PEAK_ACCELERATION,
+    QUINTIC_PEAK_SPEED,
+    approach_at,
+    brake_step,
+    plan_approach,
+    reference_at,
+    trapezoid_times_s,
+)
 
 REST_radps = 1e-9  # what rounding leaves of the velocity at a crest
-_PEAK_SPEED = 1.875  # of a quintic of least jerk, in distance / duration
-_PEAK_ACCELERATION = 10.0 / math.sqrt(3.0)  # in distance / duration^2
 _LONGEST_s = 1e9
 
 
@@ -85,7 +92,7 @@ def trajectory_allowed(limits: LimitConstants, c: TrajectoryConstants, table_row
         return False
     distance = abs(c.target_rad - c.start_rad)
     if c.kind == TrajectoryKind.MIN_JERK:
-        return within(c.move_s, 0.0, _LONGEST_s) and within(_PEAK_SPEED * distance, 0.0, top * c.move_s)
+        return within(c.move_s, 0.0, _LONGEST_s) and within(QUINTIC_PEAK_SPEED * distance, 0.0, top * c.move_s)
     if c.kind == TrajectoryKind.TRAPEZOID:
         if not (within(c.speed_radps, 0.0, 1e9) and within(c.acceleration_radps2, 0.0, 1e9)):
             return False
@@ -99,8 +106,8 @@ def trajectory_allowed(limits: LimitConstants, c: TrajectoryConstants, table_row
 @kernel
 def move_duration_s(constants: ChangeConstants, distance_rad: float) -> float:
     """Of a move from rest to rest within the speed and acceleration of moves."""
-    by_speed_s = _PEAK_SPEED * abs(distance_rad) / constants.move_speed_radps
-    by_acceleration_s = math.sqrt(_PEAK_ACCELERATION * abs(distance_rad) / constants.move_acceleration_radps2)
+    by_speed_s = QUINTIC_PEAK_SPEED * abs(distance_rad) / constants.move_speed_radps
+    by_acceleration_s = math.sqrt(QUINTIC_PEAK_ACCELERATION * abs(distance_rad) / constants.move_acceleration_radps2)
     return max(by_speed_s, by_acceleration_s, constants.move_min_s)
 
 
@@ -128,9 +135,9 @@ def set_gains(constants: ChangeConstants, law: LawConstants, state: LawState, ga
     law.kp, law.kv, law.ki = gains.kp, gains.kv, gains.ki
     law.observer.bandwidth_radps = now
     law.network.learning_rate = gains.learning_rate
-    p12 = constants.q1 / (2.0 * gains.kp)  # as `lyapunov.solve_lyapunov_p`
+    p12, p22 = right_column_of_p(gains.kp, gains.kv, constants.q1, constants.q2)
     law.network.p_b[0] = p12 / law.inertia_kgm2
-    law.network.p_b[1] = (constants.q2 + 2.0 * p12) / (2.0 * gains.kv) / law.inertia_kgm2
+    law.network.p_b[1] = p22 / law.inertia_kgm2
 
 
 @kernel

@@ -4,6 +4,18 @@ from __future__ import annotations
 
 import math
 
+from firmware_py.kernel import kernel, plain
+
+
+@kernel
+def right_column_of_p(kp: float, kv: float, q1: float, q2: float) -> tuple[float, float]:
+    """(P12, P22), all that the adaptation law needs of P; nothing is checked."""
+    p12 = q1 / (2.0 * kp)
+    return p12, (q2 + 2.0 * p12) / (2.0 * kv)
+
+
+_right_column_of_p = plain(right_column_of_p)
+
 
 def solve_lyapunov_p(kp: float, kv: float, q1: float, q2: float) -> tuple[float, float, float]:
     """(P11, P12, P22) for Q = diag(q1, q2), in closed form; kp, kv > 0.
@@ -15,8 +27,7 @@ def solve_lyapunov_p(kp: float, kv: float, q1: float, q2: float) -> tuple[float,
         raise ValueError(f"kp (={kp:g}) and kv (={kv:g}) must be > 0: the error dynamics would not be stable")
     if not (q1 > 0.0 and q2 > 0.0):
         raise ValueError(f"Q (=diag({q1:g}, {q2:g})) must be positive definite")
-    p12 = q1 / (2.0 * kp)
-    p22 = (q2 + 2.0 * p12) / (2.0 * kv)
+    p12, p22 = _right_column_of_p(kp, kv, q1, q2)
     return kp * p22 + kv * p12, p12, p22
 
 

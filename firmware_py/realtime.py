@@ -17,6 +17,7 @@ from firmware_py.axis import step_axis
 from firmware_py.kernel import kernel
 from firmware_py.libc import boottime_ns, load_acquire, monotonic_ns, sleep_until_ns, store_release
 from firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
+from firmware_py.schema import INT32_MAX
 from firmware_py.states import AxisPhase
 from firmware_py.surroundings import check_suspension
 
@@ -170,10 +171,10 @@ def run_loop(
         record = ring[head % len(ring)]
         write_log(record, now_state, sample[0], command[0])
         record.time_ns = deadline_ns
-        record.wake_late_ns = min(late_ns, 2147483647)
-        record.round_trip_ns = min(round_trip_ns, 2147483647) if now_state.sample_age_cycles == 0 else 0
-        record.work_ns = min(end_ns - wake_ns - waited_ns, 2147483647)
-        record.skipped = min(elapsed_cycles - 1, 2147483647)
+        record.wake_late_ns = min(late_ns, INT32_MAX)
+        record.round_trip_ns = min(round_trip_ns, INT32_MAX) if now_state.sample_age_cycles == 0 else 0
+        record.work_ns = min(end_ns - wake_ns - waited_ns, INT32_MAX)
+        record.skipped = min(elapsed_cycles - 1, INT32_MAX)
         count(histograms, Histogram.WAKE, late_ns)
         if now_state.sample_age_cycles == 0:
             count(histograms, Histogram.ROUND_TRIP, round_trip_ns)

@@ -23,6 +23,7 @@ i2 = Annotated[int, np.dtype("<i2")]
 u2 = Annotated[int, np.dtype("<u2")]
 i1 = Annotated[int, np.dtype("i1")]
 u1 = Annotated[int, np.dtype("u1")]
+INT32_MAX = 2_147_483_647  # what an i4 holds at most: saturate before writing to it
 
 _DTYPES: dict[type, np.dtype[Any]] = {}
 Class = TypeVar("Class", bound=type)

@@ -5,6 +5,16 @@ from __future__ import annotations
 from enum import IntEnum
 
 
+def in_words(member: IntEnum) -> str:
+    """`quick stopping` of QUICK_STOPPING."""
+    return member.name.lower().replace("_", " ")
+
+
+def fault_name(code: int) -> str:
+    """`POSITION_LIMIT`; `FAULT_99` for a number that this version does not know, as a log of a newer one may hold."""
+    return Fault(code).name if code in list(Fault) else f"FAULT_{code}"
+
+
 class DriveState(IntEnum):
     """What a drive of any make is doing (a driver maps its own states onto these)."""
 

@@ -21,6 +21,9 @@ from firmware_py.records import Reference, TrajectoryConstants
 from firmware_py.states import TrajectoryKind
 
 ENDS_MEET_rad = 1e-9  # a table whose ends differ by more is not repeated: it would jump
+# of a quintic of least jerk from rest to rest, in distance / duration and in distance / duration^2
+QUINTIC_PEAK_SPEED = 1.875
+QUINTIC_PEAK_ACCELERATION = 10.0 / math.sqrt(3.0)
 _STEPS_BEFORE_SEARCH = 4
 
 

@@ -130,6 +130,58 @@ def _take_frames(
 
 
 @kernel
+def _wait_for_frames(fd: int, service_fd: int, wait_ns: int, polls: np.ndarray, timespec: np.ndarray) -> None:
+    """Sleep until a frame of the bus or an SDO answer waits, `wait_ns` at most; scratch as in `run_device`."""
+    polls[0] = fd
+    polls[1] = POLLIN
+    polls[2] = service_fd
+    polls[3] = POLLIN
+    timespec[0] = 0
+    timespec[1] = wait_ns
+    ppoll(np.uintp(polls.ctypes.data), np.uintp(2), np.uintp(timespec.ctypes.data), np.uintp(0))
+
+
+@kernel
+def _take_from_bus(
+    device: Device,
+    plant_c: PlantConstants,
+    plant_s: PlantState,
+    faults: Any,
+    memory: FaultMemory,
+    frame: np.ndarray,
+    service_fd: int,
+    now_ns: int,
+    queue: FrameQueue,
+) -> bool:
+    """One frame of the controller, through the wire's faults, as of the time it was sent; whether it told that time."""
+    sent_ns = sent_ns_of(frame, now_ns)
+    if len(faults) == 0:
+        _take_frame(device, plant_c, plant_s, frame, service_fd, sent_ns, queue)
+    else:
+        step_faults(faults, memory, device, plant_c, plant_s, sent_ns)
+        pass_frame(faults, memory, frame, True, int64(device.node_id), sent_ns, memory.ready)
+        _take_frames(device, plant_c, plant_s, memory.ready, service_fd, sent_ns, queue)
+    if sent_ns == now_ns:
+        return False
+    if _is_sync(device, frame):
+        stamp_answers(queue, frame)
+    return True
+
+
+@kernel
+def _take_sdo_answer(
+    device: Device, plant_c: PlantConstants, plant_s: PlantState, frame: np.ndarray, now_ns: int, queue: FrameQueue
+) -> None:
+    """An answer of the Python thread: the core first acts on what was written, then the frame goes out."""
+    device.next_due_ns = 0
+    advance(device, plant_c, plant_s, now_ns, queue)
+    slot = queue.count
+    if slot < len(queue.frames):
+        queue.frames[slot] = frame
+        queue.count = slot + 1
+
+
+@kernel
 def run_device(
     fd: int,
     devices: Any,
@@ -166,13 +218,7 @@ def run_device(
             take_due(memory, True, plant_ns, False, memory.ready)
             _take_frames(device, plant_c, plant_s, memory.ready, service_fd, plant_ns, queue)
         wait_ns = max(0, min(device.next_due_ns + lag_ns - now_ns, _LONGEST_WAIT_NS))
-        polls[0] = fd
-        polls[1] = POLLIN
-        polls[2] = service_fd
-        polls[3] = POLLIN
-        timespec[0] = 0
-        timespec[1] = wait_ns
-        ppoll(np.uintp(polls.ctypes.data), np.uintp(2), np.uintp(timespec.ctypes.data), np.uintp(0))
+        _wait_for_frames(fd, service_fd, wait_ns, polls, timespec)
         woken_ns = monotonic_ns(timespec)
         drained = False
         for _ in range(_FRAMES_AT_ONCE):
@@ -185,25 +231,11 @@ def run_device(
             if got != FRAME_SIZE:
                 continue
             now_ns = monotonic_ns(timespec)
-            sent_ns = sent_ns_of(frame, now_ns)
-            if len(faults) == 0:
-                _take_frame(device, plant_c, plant_s, frame, service_fd, sent_ns, queue)
-            else:
-                step_faults(faults, memory, device, plant_c, plant_s, sent_ns)
-                pass_frame(faults, memory, frame, True, node_id, sent_ns, memory.ready)
-                _take_frames(device, plant_c, plant_s, memory.ready, service_fd, sent_ns, queue)
-            if sent_ns != now_ns:
+            if _take_from_bus(device, plant_c, plant_s, faults, memory, frame, service_fd, now_ns, queue):
                 stamped_ns = now_ns
-                if _is_sync(device, frame):
-                    stamp_answers(queue, frame)
             _flush_through_faults(fd, faults, memory, node_id, now_ns, queue, words)
         while _receive(service_fd, frame) == FRAME_SIZE:
-            device.next_due_ns = 0
-            advance(device, plant_c, plant_s, monotonic_ns(timespec), queue)
-            slot = queue.count
-            if slot < len(queue.frames):
-                queue.frames[slot] = frame
-                queue.count = slot + 1
+            _take_sdo_answer(device, plant_c, plant_s, frame, monotonic_ns(timespec), queue)
             _flush_through_faults(fd, faults, memory, node_id, monotonic_ns(timespec), queue, words)
         # after the frames, which may be older: the plant does not go back
         if drained or lag_ns == 0:

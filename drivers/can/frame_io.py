@@ -1,11 +1,8 @@
-"""Send, receive and wait for 16-byte CAN frames on a file descriptor, from inside the control loop.
+"""Send and receive 16-byte CAN frames on a file descriptor, from inside the control loop.
 
 The same code serves an AF_CAN raw socket and an AF_UNIX SEQPACKET socket of the virtual bus: on both, one datagram
-is one `struct can_frame`.  Nothing here allocates, blocks (except `wait_readable_ns`, which is asked to) or raises.
-The frames live in an array of `Frame` records owned by the caller.  Not for CAN FD (72-byte frames).
-
-Byte order: the wait packs `struct pollfd` into one 64-bit word, which is right on little-endian machines only,
-as the rest of the project.
+is one `struct can_frame`.  Nothing here allocates, blocks or raises.  The frames live in an array of `Frame` records
+owned by the caller.  Not for CAN FD (72-byte frames).
 """
 
 from __future__ import annotations
@@ -17,18 +14,12 @@ import numpy as np
 
 from drivers.can.frames import FRAME_BYTES, Frame
 from firmware_py.kernel import kernel
-from firmware_py.libc import EINTR, MSG_DONTWAIT, MSG_NOSIGNAL, NANOSECONDS, POLLIN, errno, ppoll, recv, send
+from firmware_py.libc import EINTR, MSG_DONTWAIT, MSG_NOSIGNAL, errno, recv, send
 
 # On AF_UNIX, the length of the whole datagram is returned even where it is longer than the buffer.
 MSG_TRUNC = 0x20
-WAIT_SCRATCH_WORDS = 3
 _CLOSED = errno_codes.ECONNRESET
 _WRONG_SIZE = errno_codes.EBADMSG
-
-
-def new_wait_scratch() -> np.ndarray[Any, Any]:
-    """The memory that `wait_readable_ns` needs: int64[3] (struct pollfd, struct timespec), one per thread."""
-    return np.zeros(WAIT_SCRATCH_WORDS, np.int64)
 
 
 @kernel
@@ -90,19 +81,3 @@ def receive_frame(fd: int, frames: Any, index: int) -> int:
             return 0
         if code != EINTR:
             return -int(code)
-
-
-@kernel
-def wait_readable_ns(fd: int, timeout_ns: int, scratch: Any) -> bool:
-    """Sleep until a frame is waiting or `timeout_ns` is over; True if `receive_frame` has something to say.
-
-    True also when the bus ended: the next `receive_frame` then tells the error.  A negative time-out is taken as
-    0.  A signal ends the wait early with False, so a caller that must wait the whole time compares its own clock.
-    `scratch` is int64[3] of `new_wait_scratch`.
-    """
-    limited_ns = max(timeout_ns, 0)
-    scratch[0] = (POLLIN << 32) | np.int64(fd)
-    scratch[1] = limited_ns // NANOSECONDS
-    scratch[2] = limited_ns % NANOSECONDS
-    address = scratch.ctypes.data
-    return bool(ppoll(np.uintp(address), np.uintp(1), np.uintp(address + 8), np.uintp(0)) > 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Annotated
 
 import numpy as np
@@ -12,6 +13,7 @@ EXTENDED_FLAG = 0x80000000
 REMOTE_FLAG = 0x40000000
 ERROR_FLAG = 0x20000000
 FRAME_BYTES = 16
+FRAME_STRUCT = struct.Struct("<IB3x8s")  # identifier with its flags, length, data
 
 
 @record

@@ -32,7 +32,6 @@ class LinkState:
     transmit_errors: int | None
     receive_errors: int | None
     bitrate_bitps: int | None
-    restart_ms: int | None
     queue_frames: int | None
     counts: dict[str, int]  # bus_error, error_passive, bus_off, restarts, ...
 
@@ -60,7 +59,6 @@ def parse_link(link: dict[str, Any]) -> LinkState:
         transmit_errors=counters.get("tx"),
         receive_errors=counters.get("rx"),
         bitrate_bitps=data.get("bittiming", {}).get("bitrate"),
-        restart_ms=data.get("restart_ms"),
         queue_frames=link.get("txqlen"),
         counts={key: value for key, value in info.get("info_xstats", {}).items() if isinstance(value, int)},
     )

@@ -15,17 +15,15 @@ import re
 import select
 import socket
 import stat
-import struct
 import time
 from pathlib import Path
 from typing import Any
 
 import can
 
-from drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, FRAME_BYTES, REMOTE_FLAG
+from drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, FRAME_BYTES, FRAME_STRUCT, REMOTE_FLAG
 from drivers.errors import BusError
 
-_FRAME = struct.Struct("<IB3x8s")
 _EXTENDED_MASK = 0x1FFFFFFF
 _STANDARD_MASK = 0x7FF
 _LONGEST_DATA = 8
@@ -89,14 +87,14 @@ def encode(message: can.Message) -> bytes:
     if not 0 <= message.dlc <= _LONGEST_DATA:
         raise ValueError(f"data length (={message.dlc}) must be in [0..{_LONGEST_DATA}] bytes")
     flags = (EXTENDED_FLAG if message.is_extended_id else 0) | (REMOTE_FLAG if message.is_remote_frame else 0)
-    return _FRAME.pack(message.arbitration_id | flags, message.dlc, bytes(message.data or b""))
+    return FRAME_STRUCT.pack(message.arbitration_id | flags, message.dlc, bytes(message.data or b""))
 
 
 def decode(datagram: bytes, timestamp_s: float, channel: str) -> can.Message | None:
     """The message in a datagram; None if it is no frame."""
     if len(datagram) != FRAME_BYTES:
         return None
-    can_id, length, data = _FRAME.unpack(datagram)
+    can_id, length, data = FRAME_STRUCT.unpack(datagram)
     if length > _LONGEST_DATA:
         return None
     extended, remote = bool(can_id & EXTENDED_FLAG), bool(can_id & REMOTE_FLAG)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import can
 import canopen
 
-from drivers.canopen.synchronisation import SYNC_ID
+from drivers.canopen.identifiers import SYNC_ID
 from drivers.errors import BusError
 
 LISTEN_S = 0.05  # five SYNC periods of the slowest loop

@@ -10,7 +10,7 @@ from __future__ import annotations
 from enum import IntEnum
 
 from firmware_py.kernel import kernel, plain
-from firmware_py.states import DriveRequest, DriveState
+from firmware_py.states import DriveRequest, DriveState, in_words
 
 
 class State(IntEnum):
@@ -91,7 +91,7 @@ state_of_word = plain(decode_state)
 
 def state_text(status_word: int) -> str:
     """State of a statusword in words, as `operation enabled`."""
-    return state_of_word(status_word).name.lower().replace("_", " ")
+    return in_words(state_of_word(status_word))
 
 
 @kernel

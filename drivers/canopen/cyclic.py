@@ -16,14 +16,15 @@ import numpy as np
 from drivers.can.bit_timing import worst_frame_bits
 from drivers.can.frames import ERROR_FLAG, Frame
 from drivers.canopen.cia402 import State, control_word, decode_state, drive_state
+from drivers.canopen.identifiers import NmtState
 from drivers.canopen.port import SLOT_HEARTBEAT, SLOT_RPDO, SLOT_SYNC, CanopenPort
 from drivers.canopen.second_position import SEEN_FIRST, SEEN_SECOND, publish_sample, take_second_counts, watch_second
 from drivers.position_counts import HALF_WRAP, WRAP, take_counts
 from firmware_py.kernel import kernel
 from firmware_py.records import Command, Sample
+from firmware_py.schema import INT32_MAX
 from firmware_py.states import DriveRequest
 
-NMT_OPERATIONAL = 5
 # A drive that was told to stop and still says that it is enabled, or says nothing, does not hear us (SYNC or RPDO
 # lost).  Its watchdog is what is left: after so many cycles the heartbeat is withheld for the rest of the run.
 UNHEEDED_MAX_CYCLES = 20
@@ -75,7 +76,7 @@ def begin_cycle(port: CanopenPort, frames: np.ndarray) -> int:
         return 1
     frames[SLOT_HEARTBEAT].can_id = port.own_heartbeat_id
     frames[SLOT_HEARTBEAT].length = 1
-    frames[SLOT_HEARTBEAT].payload[0] = NMT_OPERATIONAL
+    frames[SLOT_HEARTBEAT].payload[0] = NmtState.OPERATIONAL
     port.bits_sent += _WORST_BITS[1]
     return 2
 
@@ -160,7 +161,7 @@ def accept_frame(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -
         if frame.length >= 1:
             port.nmt_state = frame.payload[0] & 0x7F
             port.heartbeat_heard_cycle = port.cycle
-            if port.nmt_state == 0:
+            if port.nmt_state == NmtState.BOOT_UP:
                 sample.restarts += 1
     return False
 
@@ -181,7 +182,7 @@ def velocity_units(port: CanopenPort, velocity_radps: float) -> int:
     value = velocity_radps / port.velocity_radpspunit
     if not math.isfinite(value):
         return 0
-    return round(min(max(value, -2147483647.0), 2147483647.0))
+    return round(min(max(value, -float(INT32_MAX)), float(INT32_MAX)))
 
 
 @kernel
@@ -192,7 +193,7 @@ def end_cycle(port: CanopenPort, frames: np.ndarray, sample: Sample, command: Co
     """
     port.in_cycle = 0
     if port.heartbeat_watched != 0:
-        sample.heartbeat_age_cycles = min(port.cycle - port.heartbeat_heard_cycle, 2147483647)
+        sample.heartbeat_age_cycles = min(port.cycle - port.heartbeat_heard_cycle, INT32_MAX)
     request = np.int64(command.request)
     if request == DriveRequest.ENABLE and port.unheeded_cycles > UNHEEDED_MAX_CYCLES:
         request = np.int64(DriveRequest.OFF)

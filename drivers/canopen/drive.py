@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import time
 from collections.abc import Callable
 from typing import Any
 
 import can
-import canopen
 
-from drivers.canopen.bus_watchers import BusFailure, refuse_second_controller
+from drivers.canopen.bus_watchers import refuse_second_controller
 from drivers.canopen.cia402 import State
 from drivers.canopen.commissioning import VELOCITY_MODES, Findings, commission
 from drivers.canopen.connection_loss import clear_rpdo_deadlines
@@ -19,18 +17,19 @@ from drivers.canopen.eds_file import read_eds
 from drivers.canopen.encoder_end import EncoderEnd
 from drivers.canopen.encoder_settings import DRIVE_RANGE_COUNTS
 from drivers.canopen.fault_reset import reset_fault
+from drivers.canopen.identifiers import NmtCommand
+from drivers.canopen.network import new_network
 from drivers.canopen.object_access import ATTEMPTS as SDO_ATTEMPTS
 from drivers.canopen.object_access import ObjectAccess
 from drivers.canopen.scaling import joint_angle_per_count_rad, new_port, start_position_rad
 from drivers.canopen.settings import CanopenSettings
-from drivers.canopen.switch_off import NMT_PRE_OPERATIONAL, SDO_TIMEOUT_S, SwitchOff, state_of
+from drivers.canopen.switch_off import SDO_TIMEOUT_S, SwitchOff, state_of
 from drivers.canopen.thermometer import Thermometer
 from drivers.canopen.watchdog_proof import prove_watchdog
 from drivers.drive import UNTOUCHED, CommissioningReport
 from drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
 
 SEARCH_S = 0.3
-NMT_OPERATIONAL = 1
 REOPEN_ATTEMPTS = 10
 REOPEN_PAUSE_S = 0.3  # an adapter that was plugged in again needs a second or two
 
@@ -59,26 +58,18 @@ class CanopenDrive:
         self._reopen = reopen
         self._lent = False
         self._thermometer: Thermometer | None = None
-        # the library warns about every heartbeat state and unknown frame; what matters is told by this driver
-        logging.getLogger("canopen").setLevel(logging.CRITICAL)
-        self._network = canopen.Network(bus)
-        self._network.NOTIFIER_CYCLE = 0.05
-        on_failure: Any = BusFailure(sleep)  # the library knows only its own kind of listener
-        self._network.listeners.append(on_failure)
+        self._network = new_network(bus, sleep)
         self._network.connect()
+        sdo_timeout_s = settings.sdo_timeout_s or SDO_TIMEOUT_S
         try:
             self._eds = read_eds(settings.eds_path, settings.node)
+            self._encoder = EncoderEnd(self._network, settings, sdo_timeout_s)
         except ConfigurationError:
             self.close()
             raise
         self._node = self._network.add_node(settings.node, self._eds.dictionary)
-        self._node.sdo.RESPONSE_TIMEOUT = settings.sdo_timeout_s or SDO_TIMEOUT_S
+        self._node.sdo.RESPONSE_TIMEOUT = sdo_timeout_s
         self._objects = ObjectAccess(self._node, self._eds.name, self._eds.unusable)
-        try:
-            self._encoder = EncoderEnd(self._network, settings, self._node.sdo.RESPONSE_TIMEOUT)
-        except ConfigurationError:
-            self.close()
-            raise
         encoder = settings.joint_encoder.node if settings.joint_encoder is not None else None
         self._switch_off = SwitchOff(self._network, settings.node, self._objects, encoder, sleep)
 
@@ -92,7 +83,7 @@ class CanopenDrive:
             with contextlib.suppress(NoDeviceError):
                 self._objects.read(0x1000, what="device type")
                 break
-            self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
+            self._node.nmt.send_command(NmtCommand.ENTER_PRE_OPERATIONAL)
         try:
             self._objects.read(0x1000, what="device type")
         except NoDeviceError as error:
@@ -112,7 +103,7 @@ class CanopenDrive:
         """See `prove_watchdog`; afterwards the node is brought back to pre-operational."""
         settings = self._settings
         seen = prove_watchdog(self._network, settings.node, settings.master_node, settings.heartbeat_s, self._sleep)
-        self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
+        self._node.nmt.send_command(NmtCommand.ENTER_PRE_OPERATIONAL)
         return seen
 
     def commission(self) -> CommissioningReport:
@@ -121,7 +112,7 @@ class CanopenDrive:
             refuse_second_controller(self._network, self._sleep)
             self._taken, self._started = True, False
             # first: a node that its watchdog or an earlier run left in "stopped" does not answer SDO
-            self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
+            self._node.nmt.send_command(NmtCommand.ENTER_PRE_OPERATIONAL)
             self._find()
             if self._thermometer is None and self._settings.temperature is not None:
                 wanted = self._settings.temperature
@@ -175,8 +166,8 @@ class CanopenDrive:
             # whoever came after our commissioning has the drive: its load must not be dropped by our controlword
             refuse_second_controller(self._network, self._sleep)
             self._started = True
-            self._encoder.tell(NMT_OPERATIONAL)
-            self._node.nmt.send_command(NMT_OPERATIONAL)
+            self._encoder.tell(NmtCommand.START)
+            self._node.nmt.send_command(NmtCommand.START)
         except can.CanError as error:
             raise BusError(f"the bus failed before the run: {error}") from None
         if self._reopen is not None:
@@ -259,7 +250,7 @@ class CanopenDrive:
                     hint="`jointctl stop` switches it off",
                 )
         self._taken = True
-        self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
+        self._node.nmt.send_command(NmtCommand.ENTER_PRE_OPERATIONAL)
         self._find()
         # nobody sends a heartbeat now: a watchdog that is still armed would keep its fault alive
         self._objects.write_if_present(0x1016, 1, 0, what="consumer heartbeat time")

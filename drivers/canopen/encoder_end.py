@@ -6,10 +6,10 @@ import canopen
 
 from drivers.canopen.eds_file import read_eds
 from drivers.canopen.encoder_node import EncoderFindings, commission_encoder, require_no_alarm
+from drivers.canopen.identifiers import NmtCommand
+from drivers.canopen.network import send_nmt
 from drivers.canopen.object_access import ObjectAccess
 from drivers.canopen.settings import CanopenSettings
-
-NMT_PRE_OPERATIONAL = 128
 
 
 class EncoderEnd:
@@ -28,17 +28,17 @@ class EncoderEnd:
             self._eds_remarks = eds.all_remarks()
             self._objects = ObjectAccess(node, eds.name, eds.unusable)
 
-    def tell(self, command: int) -> None:
+    def tell(self, command: NmtCommand) -> None:
         """An NMT command."""
         if self._node is not None:
-            self._network.send_message(0, bytes([command, self._node]))
+            send_nmt(self._network, command, self._node)
 
     def commission(self) -> tuple[EncoderFindings, list[str]] | None:
         """Identify, check and map; findings and remarks."""
         encoder = self._settings.joint_encoder
         if self._objects is None or encoder is None:
             return None
-        self.tell(NMT_PRE_OPERATIONAL)
+        self.tell(NmtCommand.ENTER_PRE_OPERATIONAL)
         self._objects.forget_verified()
         self._objects.remarks.clear()
         found = commission_encoder(self._objects, encoder, self._settings.rate_Hz, self._settings.heartbeat_s)

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.canopen.encoder_settings import JointEncoderSettings
+from drivers.canopen.encoder_settings import DRIVE_RANGE_COUNTS, JointEncoderSettings
+from drivers.canopen.identifiers import TPDO1_ID, TPDO2_ID
 from drivers.canopen.object_access import ObjectAccess
 from drivers.canopen.pdo_layout import COMMUNICATION_TPDO, MappedObject
-from drivers.canopen.pdo_map import configure_pdo, disable_pdo, pdos_of
+from drivers.canopen.pdo_map import EVERY_SYNC, configure_pdo, disable_pdo, pdos_of
 from drivers.canopen.synchronisation import listen_to_our_sync
 from drivers.errors import DeviceError
 
 CIA406_PROFILE = 406
 POSITION_VALUE = MappedObject(0x6004, 0, 32, "position value")
-EVERY_SYNC = 1
 CYCLIC_TIMER = 0x6200
 ALARMS = 0x6503
 
@@ -54,7 +54,7 @@ def commission_encoder(
         objects.remarks.append(f"node {node}: no object 1017: a restart is seen by its boot-up message")
     if objects.has(CYCLIC_TIMER) and objects.read(CYCLIC_TIMER, what="cyclic timer") != 0:
         objects.write_verified(CYCLIC_TIMER, 0, 0, what="cyclic timer")
-    configure_pdo(objects, COMMUNICATION_TPDO, 0x180 + node, EVERY_SYNC, (POSITION_VALUE,))
+    configure_pdo(objects, COMMUNICATION_TPDO, TPDO1_ID + node, EVERY_SYNC, (POSITION_VALUE,))
     for base in pdos_of(objects, COMMUNICATION_TPDO):
         if base != COMMUNICATION_TPDO:
             disable_pdo(objects, base)
@@ -76,6 +76,6 @@ def commission_drive_object(objects: ObjectAccess, settings: JointEncoderSetting
     base = COMMUNICATION_TPDO + 1
     objects.require(mapped.index, mapped.sub, what=mapped.name)
     objects.require(base, 1, what="PDO communication parameter")
-    configure_pdo(objects, base, 0x280 + node, EVERY_SYNC, (mapped,))
+    configure_pdo(objects, base, TPDO2_ID + node, EVERY_SYNC, (mapped,))
     start = objects.read(mapped.index, mapped.sub, what=mapped.name)
-    return EncoderFindings(1 << 32, start, f"object {settings.index:04X}:{settings.sub} of the drive")
+    return EncoderFindings(DRIVE_RANGE_COUNTS, start, f"object {settings.index:04X}:{settings.sub} of the drive")

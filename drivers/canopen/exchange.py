@@ -11,7 +11,7 @@ import numpy as np
 from numba.core import types
 
 from drivers.answer_window import LOOK_LATE_NS
-from drivers.can.frame_io import receive_frame, send_frame, stamp_frame, stamp_of, wait_readable_ns
+from drivers.can.frame_io import receive_frame, send_frame, stamp_frame, stamp_of
 from drivers.can.frames import Frame
 from drivers.canopen.cyclic import accept_frame, answer_owed, begin_cycle, end_cycle
 from drivers.canopen.port import (
@@ -23,7 +23,7 @@ from drivers.canopen.port import (
     CanopenPort,
 )
 from firmware_py.kernel import exported, kernel, record_array_type
-from firmware_py.libc import monotonic_ns
+from firmware_py.libc import monotonic_ns, wait_readable_ns
 from firmware_py.records import Command, Sample
 from firmware_py.schema import dtype_of, new
 

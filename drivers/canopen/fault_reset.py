@@ -11,6 +11,7 @@ from collections.abc import Callable
 from drivers.canopen.cia402 import ControlWord, State, state_of_word
 from drivers.canopen.object_access import ObjectAccess
 from drivers.errors import DeviceError
+from firmware_py.states import in_words
 
 ATTEMPTS = 3
 SETTLE_S = 0.1  # for the fault to come back if its cause is still there
@@ -24,7 +25,7 @@ def reset_fault(objects: ObjectAccess, pause: Callable[[float], None]) -> str:
         pause(SETTLE_S)
         state = state_of_word(objects.read(0x6041, what="statusword"))
         if state not in (State.FAULT, State.FAULT_REACTION_ACTIVE):
-            words = state.name.lower().replace("_", " ")
+            words = in_words(state)
             return f"fault {code:04X}h was reset, the drive is {words}" if code else f"no fault: the drive is {words}"
         code = objects.read(0x603F, what="error code") if objects.has(0x603F) else code
         objects.write(0x6040, 0, ControlWord.FAULT_RESET, what="controlword")
@@ -35,4 +36,4 @@ def reset_fault(objects: ObjectAccess, pause: Callable[[float], None]) -> str:
             f"the drive stays in fault (error code {code:04X}h) after {ATTEMPTS} resets",
             "its cause is still there: supply, temperature, encoder, heartbeat; see the drive's manual for the code",
         )
-    return f"fault {code:04X}h was reset, the drive is {state.name.lower().replace('_', ' ')}"
+    return f"fault {code:04X}h was reset, the drive is {in_words(state)}"

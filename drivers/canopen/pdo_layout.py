@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from drivers.canopen.identifiers import RPDO1_ID, TPDO1_ID
 from drivers.canopen.object_access import ObjectAccess, object_name
 from drivers.errors import DeviceError
 
@@ -70,8 +71,8 @@ class PdoLayout:
 def own_layout(node: int, *, velocity: bool = False, torque: bool = True) -> PdoLayout:
     """Statusword, position, torque; controlword and target torque (or target velocity)."""
     return PdoLayout(
-        tpdo_id=0x180 + node,
-        rpdo_id=0x200 + node,
+        tpdo_id=TPDO1_ID + node,
+        rpdo_id=RPDO1_ID + node,
         tpdo_length=8 if torque else 6,
         rpdo_length=6 if velocity else 4,
         status_at=0,

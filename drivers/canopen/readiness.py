@@ -7,6 +7,7 @@ from collections.abc import Callable
 from drivers.canopen.cia402 import ControlWord, State, state_of_word
 from drivers.canopen.object_access import ObjectAccess
 from drivers.errors import DeviceError
+from firmware_py.states import in_words
 
 POLL_S = 0.05
 
@@ -31,6 +32,6 @@ def wait_until_ready(objects: ObjectAccess, node: int, timeout_s: float, pause: 
         objects.write(0x6040, 0, word, what="controlword")
         pause(POLL_S)
     raise DeviceError(
-        f"node {node} is {state.name.lower().replace('_', ' ')} (statusword {status_word:04X}h) after {timeout_s:g} s",
+        f"node {node} is {in_words(state)} (statusword {status_word:04X}h) after {timeout_s:g} s",
         hint="motor supply, safe torque off (STO) and enable inputs; a drive that takes longer: drive.boot_timeout_s",
     )

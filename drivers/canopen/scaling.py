@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from drivers.canopen.cia402 import State
 from drivers.canopen.encoder_settings import DRIVE_RANGE_COUNTS, JointEncoderSettings
+from drivers.canopen.identifiers import EMERGENCY_ID, HEARTBEAT_ID, SYNC_ID, TPDO1_ID, TPDO2_ID
 from drivers.canopen.pdo_layout import PdoLayout, own_layout
 from drivers.canopen.port import AlignTo, CanopenPort
 from drivers.canopen.second_position import centred
@@ -60,10 +62,10 @@ def new_port(
     port = ports[0]
     port.fd = -1
     port.node = settings.node
-    port.sync_id = 0x80
-    port.emergency_id = 0x80 + settings.node
-    port.heartbeat_id = 0x700 + settings.node
-    port.own_heartbeat_id = 0x700 + settings.master_node
+    port.sync_id = SYNC_ID
+    port.emergency_id = EMERGENCY_ID + settings.node
+    port.heartbeat_id = HEARTBEAT_ID + settings.node
+    port.own_heartbeat_id = HEARTBEAT_ID + settings.master_node
     # three heartbeats within the drive's time-out, so that one or two lost ones do not stop the joint
     port.heartbeat_cycles = max(1, int(settings.heartbeat_s * settings.rate_Hz / 3.0))
     port.heartbeat_watched = int(heartbeat_watched)
@@ -81,7 +83,7 @@ def new_port(
     port.zero_counts = settings.zero_counts
     port.torque_Nmppermille = torque_per_permille_Nm * settings.torque_direction
     port.max_permille = max_permille
-    port.state = 8
+    port.state = State.UNDEFINED
     if settings.joint_encoder is not None:
         _fill_second(port.second, settings, settings.joint_encoder, second_range_counts)
     return ports
@@ -90,11 +92,11 @@ def new_port(
 def _fill_second(second: Any, settings: CanopenSettings, encoder: JointEncoderSettings, range_counts: int) -> None:
     """The second encoder of the joint."""
     if encoder.node is None:
-        second.tpdo_id = 0x280 + settings.node
+        second.tpdo_id = TPDO2_ID + settings.node
     else:
-        second.tpdo_id = 0x180 + encoder.node
-        second.emergency_id = 0x80 + encoder.node
-        second.heartbeat_id = 0x700 + encoder.node
+        second.tpdo_id = TPDO1_ID + encoder.node
+        second.emergency_id = EMERGENCY_ID + encoder.node
+        second.heartbeat_id = HEARTBEAT_ID + encoder.node
     second.tpdo_length = 4
     second.position_at = 0
     second.range_counts = range_counts

@@ -7,7 +7,6 @@ give them.
 from __future__ import annotations
 
 import contextlib
-import logging
 import time
 from collections.abc import Callable
 from typing import Any
@@ -16,15 +15,15 @@ import can
 import canopen
 from canopen.objectdictionary import ODArray, ODVariable
 
-from drivers.canopen.bus_watchers import BusFailure
 from drivers.canopen.cia402 import ControlWord, State, state_of_word
+from drivers.canopen.identifiers import NmtCommand
+from drivers.canopen.network import new_network, send_nmt
 from drivers.canopen.object_access import ObjectAccess
 from drivers.canopen.standard_objects import standard_type
 from drivers.errors import DeviceError, JointctlError
+from firmware_py.states import in_words
 
 SDO_TIMEOUT_S = 0.3
-NMT_PRE_OPERATIONAL = 128
-NMT_STOPPED = 2
 QUICK_STOP_S = 1.0  # how long a moving joint may brake before its power is taken
 OFF_S = 1.0  # how long a drive may take to be off; some run through a brake delay of their own first
 POLL_S = 0.02
@@ -60,9 +59,9 @@ class SwitchOff:
         self._network, self._node, self._objects, self._encoder_node = network, node, objects, encoder_node
         self._sleep = sleep
 
-    def _tell(self, command: int, node: int | None) -> None:
+    def _tell(self, command: NmtCommand, node: int | None) -> None:
         if node is not None:
-            self._network.send_message(0, bytes([command, node]))
+            send_nmt(self._network, command, node)
 
     def make_safe(self) -> str:
         """Pre-operational, quick stop if it is enabled, then controlword 0 until the statusword says disabled.
@@ -81,7 +80,7 @@ class SwitchOff:
             return self._attempt()
         except JointctlError as error:
             try:
-                self._tell(NMT_STOPPED, self._node)
+                self._tell(NmtCommand.STOP, self._node)
             except can.CanError:
                 return f"unknown: {error}; the bus does not take frames any more"
             return f"unknown: {error}; NMT stop was sent"
@@ -90,8 +89,8 @@ class SwitchOff:
 
     def _attempt(self) -> str:
         state = State.UNDEFINED
-        self._tell(NMT_PRE_OPERATIONAL, self._encoder_node)
-        self._tell(NMT_PRE_OPERATIONAL, self._node)
+        self._tell(NmtCommand.ENTER_PRE_OPERATIONAL, self._encoder_node)
+        self._tell(NmtCommand.ENTER_PRE_OPERATIONAL, self._node)
         brake(self._objects, self._sleep)
         for _ in range(round(OFF_S / POLL_S)):
             self._objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
@@ -102,14 +101,14 @@ class SwitchOff:
         for index, what in ((0x6071, "target torque"), (0x60FF, "target velocity")):
             with contextlib.suppress(DeviceError):  # a drive that has no such target refuses it
                 self._objects.write_if_present(index, 0, 0, what=what)
-        words = state.name.lower().replace("_", " ")
+        words = in_words(state)
         if state in OFF_STATES:
             # our heartbeat has ended with the loop; disabled, the drive need not watch it any more.  A drive that
             # did not obey keeps its watchdog: little else is left to stop it.
             with contextlib.suppress(DeviceError):
                 self._objects.write_if_present(0x1016, 1, 0, what="consumer heartbeat time")
         elif state in POWERED_STATES:
-            self._tell(NMT_STOPPED, self._node)
+            self._tell(NmtCommand.STOP, self._node)
             return f"{words}, it did not obey; NMT stop was sent"
         return words
 
@@ -143,11 +142,7 @@ def stop_node(
     sleep: Callable[[float], None] = time.sleep,
 ) -> str:
     """Stop and disable the drive at `node` whoever controls it; closes `bus`.  See `SwitchOff.make_safe`."""
-    logging.getLogger("canopen").setLevel(logging.CRITICAL)
-    network = canopen.Network(bus)
-    network.NOTIFIER_CYCLE = 0.05
-    on_failure: Any = BusFailure(sleep)
-    network.listeners.append(on_failure)
+    network = new_network(bus, sleep)
     network.connect()
     try:
         remote = network.add_node(node, _standard_objects(node))

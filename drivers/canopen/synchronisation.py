@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from drivers.canopen.identifiers import SYNC_ID
 from drivers.canopen.object_access import ObjectAccess
 from drivers.errors import DeviceError
 
-SYNC_ID = 0x80
 PRODUCES_SYNC = 0x40000000
 LONGEST_PERIOD = 255
 

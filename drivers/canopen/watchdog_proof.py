@@ -11,11 +11,10 @@ from collections.abc import Callable
 
 import canopen
 
+from drivers.canopen.identifiers import EMERGENCY_ID, HEARTBEAT_ID, NmtState
 from drivers.errors import DeviceError
 
 HEARTBEAT_LOST = 0x8130  # EMCY error code of CiA 301
-NMT_OPERATIONAL = 5
-NMT_BOOT_UP = 0
 BEATS = 6
 BEATS_PER_TIMEOUT = 3
 POLLS_PER_TIMEOUT = 20
@@ -36,7 +35,7 @@ class _Witness:
 
     def on_heartbeat(self, _: int, data: bytearray, __: float) -> None:
         """Heartbeat of the drive."""
-        state = data[0] & 0x7F if data else NMT_BOOT_UP
+        state = data[0] & 0x7F if data else NmtState.BOOT_UP
         if self._nmt_state is not None and state != self._nmt_state:
             self.seen = self.seen or f"NMT state {state}"
         self._nmt_state = state
@@ -50,11 +49,11 @@ def prove_watchdog(
     Takes about three times `heartbeat_s`.  The drive must be disabled; it may end in another NMT state.
     """
     witness = _Witness()
-    network.subscribe(0x80 + node, witness.on_emergency)
-    network.subscribe(0x700 + node, witness.on_heartbeat)
+    network.subscribe(EMERGENCY_ID + node, witness.on_emergency)
+    network.subscribe(HEARTBEAT_ID + node, witness.on_heartbeat)
     try:
         for _ in range(BEATS):
-            network.send_message(0x700 + master_node, bytes([NMT_OPERATIONAL]))
+            network.send_message(HEARTBEAT_ID + master_node, bytes([NmtState.OPERATIONAL]))
             sleep(heartbeat_s / BEATS_PER_TIMEOUT)
         if witness.seen:
             raise DeviceError(
@@ -66,8 +65,8 @@ def prove_watchdog(
             if witness.seen:
                 return witness.seen
     finally:
-        network.unsubscribe(0x80 + node, witness.on_emergency)
-        network.unsubscribe(0x700 + node, witness.on_heartbeat)
+        network.unsubscribe(EMERGENCY_ID + node, witness.on_emergency)
+        network.unsubscribe(HEARTBEAT_ID + node, witness.on_heartbeat)
     raise DeviceError(
         f"node {node}: the heartbeat was stopped for {LONGEST_TIMEOUTS * heartbeat_s:g} s and the drive did not react",
         "its watchdog (object 1016) would not stop the joint if this computer died; jointctl does not enable it",

@@ -42,17 +42,10 @@ class ElmoCommissioning:
         self._commissioned = False
         self._speed_mode = False
 
-    # --- commissioning ---
-
     def commission(self) -> CommissioningReport:
         """See `Drive.commission`.  The motor is off and the drive in torque or speed mode when this returns."""
         settings, line = self._settings, self._line
-        budget_Hz = highest_rate_Hz(settings.baud_rate_bitps, settings.echo)
-        if settings.rate_Hz > budget_Hz:
-            raise ConfigurationError(
-                f"loop.rate_Hz (={settings.rate_Hz:g}) must be at most {budget_Hz:.0f} at drive.baud_rate_bitps "
-                f"(={settings.baud_rate_bitps}) with drive.echo (={str(settings.echo).lower()})"
-            )
+        self._budget_Hz()
         found: dict[str, str] = {}
         remarks: list[str] = []
         identity = self._identify()
@@ -141,12 +134,7 @@ class ElmoCommissioning:
         settings, line = self._settings, self._line
         line.forget_verified()
         digits = settings.velocity_digits if speed else 0
-        budget_Hz = highest_rate_Hz(settings.baud_rate_bitps, settings.echo, digits)
-        if settings.rate_Hz > budget_Hz:
-            raise ConfigurationError(
-                f"loop.rate_Hz (={settings.rate_Hz:g}) must be at most {budget_Hz:.0f} at drive.baud_rate_bitps "
-                f"(={settings.baud_rate_bitps}) for JV and BG in every cycle"
-            )
+        budget_Hz = self._budget_Hz(digits)
         set_here = set_torque_mode(line)  # in either case: the limits are written, and TC is known to be zero
         missing = write_limits(line, settings, set_here, speed_mode=speed)
         if speed:
@@ -163,6 +151,18 @@ class ElmoCommissioning:
         remarks.extend(missing)
         self._speed_mode = speed
         return measured
+
+    def _budget_Hz(self, velocity_digits: int = 0) -> float:
+        """The rate that the baud rate allows (`velocity_digits` > 0: in speed mode); a faster loop is refused."""
+        settings = self._settings
+        budget_Hz = highest_rate_Hz(settings.baud_rate_bitps, settings.echo, velocity_digits)
+        if settings.rate_Hz > budget_Hz:
+            targets = ", for JV and BG in every cycle" if velocity_digits else ""
+            raise ConfigurationError(
+                f"loop.rate_Hz (={settings.rate_Hz:g}) must be at most {budget_Hz:.0f} at drive.baud_rate_bitps "
+                f"(={settings.baud_rate_bitps}) with drive.echo (={str(settings.echo).lower()}){targets}"
+            )
+        return budget_Hz
 
     def _refuse_fault(self) -> None:
         """A drive that could not be enabled anyway; nothing is reset here."""
@@ -206,5 +206,3 @@ class ElmoCommissioning:
                 f"{measured.cycle_s * 1e3:.2f} ms on this line, at most {LARGEST_SHARE:.0%} of a period may be used",
                 "lower loop.rate_Hz, raise drive.baud_rate_bitps, or reduce the adapter's latency timer",
             )
-
-    # --- the run ---

@@ -21,6 +21,8 @@ import math
 
 import numpy as np
 
+from drivers.elmo.characters import CR, EQUALS, MINUS, POINT, ZERO
+from drivers.elmo.codes import SERVO_ON, UnitMode
 from drivers.elmo.port import EXPECTED_MAX, OUT_MAX, TEXT_MAX, ElmoPort, Question
 from firmware_py.kernel import kernel
 from firmware_py.records import LINE_GONE, Command, Sample
@@ -29,10 +31,6 @@ from firmware_py.states import DriveRequest, DriveState
 SILENT_CYCLES = 3
 STATUS_SPARE_CYCLES = 8  # SR is asked every other cycle, and a lost reply must not stop the joint
 _LETTERS = np.array([[ord(c) for c in q.name] for q in Question], np.uint8)
-_CR, _SEMICOLON, _QUESTION_MARK = 0x0D, 0x3B, 0x3F
-_PLUS, _MINUS, _POINT, _ZERO, _NINE, _EQUALS = 0x2B, 0x2D, 0x2E, 0x30, 0x39, 0x3D
-_AMPLIFIER, _SERVO_ON, _FAULT = 0xF, 1 << 4, 1 << 6
-_SPEED_MODE = 2
 
 
 # --- commands ---
@@ -65,23 +63,23 @@ def put_command(port: ElmoPort, question: int, value_milli: int, decimals: int) 
     _put(port, slot, _LETTERS[question, 0])
     _put(port, slot, _LETTERS[question, 1])
     if decimals >= 0:
-        _put(port, slot, _EQUALS)
+        _put(port, slot, EQUALS)
         if value_milli < 0:
-            _put(port, slot, _MINUS)
+            _put(port, slot, MINUS)
         size = abs(value_milli)
         whole = size // 1000
         divisor = 1
         while whole // divisor >= 10:
             divisor *= 10
         while divisor > 0:
-            _put(port, slot, _ZERO + whole // divisor % 10)
+            _put(port, slot, ZERO + whole // divisor % 10)
             divisor //= 10
         if decimals > 0:
-            _put(port, slot, _POINT)
-            _put(port, slot, _ZERO + size // 100 % 10)
-            _put(port, slot, _ZERO + size // 10 % 10)
-            _put(port, slot, _ZERO + size % 10)
-    _put(port, slot, _CR)
+            _put(port, slot, POINT)
+            _put(port, slot, ZERO + size // 100 % 10)
+            _put(port, slot, ZERO + size // 10 % 10)
+            _put(port, slot, ZERO + size % 10)
+    _put(port, slot, CR)
     return True
 
 
@@ -110,7 +108,7 @@ def _put_target(port: ElmoPort, command: Command, live: bool) -> None:
     """Torque or velocity of this cycle, zero unless `live`.  No BG in another unit mode: it begins another motion."""
     if port.target_is_velocity != 0:
         put_command(port, Question.JV, 1000 * velocity_cps(port, command.velocity_radps) if live else 0, 0)
-        if port.unit_mode == _SPEED_MODE:
+        if port.unit_mode == UnitMode.SPEED:
             put_command(port, Question.BG, 0, -1)
     else:
         put_command(port, Question.TC, current_mA(port, command.torque_Nm) if live else 0, 3)
@@ -164,7 +162,7 @@ def _put_stop(port: ElmoPort, command: Command) -> None:
     if port.expected_count > EXPECTED_MAX - 4 or port.quiet != 0:
         _forget_expected(port)
         port.quiet = 0
-    if port.status & _SERVO_ON != 0:
+    if port.status & SERVO_ON != 0:
         _put_target(port, command, False)
         put_command(port, Question.ST, 0, -1)
     put_command(port, Question.MO, 0, 0)
@@ -176,7 +174,7 @@ def _put_dead_man(port: ElmoPort, command: Command) -> None:
 
     In every other cycle of a disorder that lasts: the replies must not keep the line from becoming silent.
     """
-    if port.status & _SERVO_ON == 0:
+    if port.status & SERVO_ON == 0:
         return
     if port.quiet == 0 and port.expected_count > EXPECTED_MAX - 2:
         _become_quiet(port)
@@ -194,7 +192,7 @@ def end_cycle(port: ElmoPort, sample: Sample, command: Command) -> None:
             _put_dead_man(port, command)
         if port.quiet != 0:
             return
-        if port.status & _SERVO_ON != 0:
+        if port.status & SERVO_ON != 0:
             heard = port.no_sample_cycles <= port.dead_man_cycles
             _put_target(port, command, heard and sample.drive_state == DriveState.ENABLED)
         elif port.has_been_on != 0 or port.fault_seen > 0:

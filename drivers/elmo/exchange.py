@@ -16,7 +16,7 @@ from drivers.elmo.cyclic import begin_cycle, end_cycle, note_written
 from drivers.elmo.port import READ_MAX, SCRATCH_WORDS, ElmoPort
 from drivers.elmo.replies import take_byte
 from firmware_py.kernel import exported, kernel, record_array_type
-from firmware_py.libc import EAGAIN, EINTR, NANOSECONDS, POLLIN, errno, external, monotonic_ns, ppoll
+from firmware_py.libc import EAGAIN, EINTR, errno, external, monotonic_ns, poll_events, wait_readable_ns
 from firmware_py.records import Command, Sample
 from firmware_py.schema import dtype_of
 
@@ -41,15 +41,9 @@ def _lose_port(port: ElmoPort, code: int) -> None:
 
 @kernel
 def _wait_ns(port: ElmoPort, timeout_ns: int, scratch: np.ndarray) -> None:
-    """Sleep until bytes came, the port has gone, or the time is over; `scratch` int64[3]: pollfd, timespec."""
-    limited_ns = max(timeout_ns, 0)
-    scratch[0] = (POLLIN << 32) | port.fd
-    scratch[1] = limited_ns // NANOSECONDS
-    scratch[2] = limited_ns % NANOSECONDS
-    address = scratch.ctypes.data
-    if ppoll(np.uintp(address), np.uintp(1), np.uintp(address + 8), np.uintp(0)) > 0:
-        if (scratch[0] >> 48) & _GONE_EVENTS != 0:
-            _lose_port(port, _EIO)
+    """Sleep until bytes came, the port has gone, or the time is over; `scratch` as in `wait_readable_ns`."""
+    if wait_readable_ns(port.fd, timeout_ns, scratch) and poll_events(scratch) & _GONE_EVENTS != 0:
+        _lose_port(port, _EIO)
 
 
 @kernel

@@ -15,6 +15,7 @@ LINE_MAX = 64  # longest cyclic reply, echo included
 OUT_MAX = 64  # bytes of one write
 READ_MAX = 256
 SCRATCH_WORDS = 8
+SERIAL = "serial"  # stands for such a line where a CAN bus has the name of its python-can interface
 
 
 class Question(IntEnum):

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from drivers.elmo.characters import CR, MINUS, NINE, PLUS, POINT, QUESTION_MARK, SEMICOLON, ZERO
+from drivers.elmo.codes import AMPLIFIER_MASK, FAULT_LATCHED, SERVO_ON, UNIT_MODE_MASK, UNIT_MODE_SHIFT, UnitMode
 from drivers.elmo.line_budget import BITS_PER_CHARACTER
 from drivers.elmo.port import EXPECTED_MAX, LINE_MAX, ElmoPort, Question
 from drivers.position_counts import WRAP, take_counts
@@ -20,10 +22,6 @@ USUAL_STEP_NS = 20_000  # in a cycle
 UNEVEN_SHARE = 16  # a position may come a 16th of a period later than usual
 LEFT_OUT_MAX = 3  # in a row
 _DIGITS_MAX = 17
-_CR, _SEMICOLON, _QUESTION_MARK = 0x0D, 0x3B, 0x3F
-_PLUS, _MINUS, _POINT, _ZERO, _NINE, _EQUALS = 0x2B, 0x2D, 0x2E, 0x30, 0x39, 0x3D
-_AMPLIFIER, _SERVO_ON, _FAULT = 0xF, 1 << 4, 1 << 6
-_TORQUE_MODE, _SPEED_MODE = 1, 2
 
 
 @kernel
@@ -43,7 +41,7 @@ def _match(port: ElmoPort) -> int:
     if port.echo == 0:
         for i in range(port.line_length):
             # a CR may only be an error byte (code 13); elsewhere it is an echo that must not be there
-            if port.line[i] == _CR and port.line_length != 2:
+            if port.line[i] == CR and port.line_length != 2:
                 return NOTHING
         return 0 if port.expected_count > 0 else NOTHING
     for place in range(port.expected_count):
@@ -57,17 +55,17 @@ def parse_number(line: np.ndarray, start: int, end: int) -> tuple[bool, float, b
     """(is a number, its value, has no point) of the characters from `start` to `end`; plain decimal notation only."""
     at = start
     negative = False
-    if at < end and (line[at] == _MINUS or line[at] == _PLUS):
-        negative = line[at] == _MINUS
+    if at < end and (line[at] == MINUS or line[at] == PLUS):
+        negative = line[at] == MINUS
         at += 1
     digits, scale, value, whole = 0, 1.0, 0.0, True
     while at < end:
         byte = line[at]
-        if byte == _POINT and whole:
+        if byte == POINT and whole:
             whole = False
-        elif byte >= _ZERO and byte <= _NINE and digits < _DIGITS_MAX:
+        elif byte >= ZERO and byte <= NINE and digits < _DIGITS_MAX:
             digits += 1
-            value = value * 10.0 + (byte - _ZERO)
+            value = value * 10.0 + (byte - ZERO)
             if not whole:
                 scale *= 10.0
         else:
@@ -86,12 +84,12 @@ def _take_status(port: ElmoPort, sample: Sample, status: int) -> None:
     port.status = status
     port.no_status_cycles = 0
     sample.status_word = status & 0x7FFFFFFF
-    mode = status >> 7 & 7
-    run_mode = _SPEED_MODE if port.target_is_velocity != 0 else _TORQUE_MODE
+    mode = status >> UNIT_MODE_SHIFT & UNIT_MODE_MASK
+    run_mode = UnitMode.SPEED if port.target_is_velocity != 0 else UnitMode.TORQUE
     if mode != run_mode and (port.unit_mode == run_mode or port.unit_mode == 0):
         sample.restarts += 1
     port.unit_mode = mode
-    if status & (_FAULT | _AMPLIFIER) != 0:
+    if status & (FAULT_LATCHED | AMPLIFIER_MASK) != 0:
         # the cause (MF) is asked for before the fault is told; the power stage is off already
         port.fault_seen += 1
         if port.motor_fault != 0 or port.fault_seen > FAULT_CAUSE_CYCLES:
@@ -100,9 +98,9 @@ def _take_status(port: ElmoPort, sample: Sample, status: int) -> None:
         return
     port.fault_seen = 0
     port.motor_fault = 0
-    if status & _SERVO_ON != 0:
+    if status & SERVO_ON != 0:
         port.has_been_on = 1
-    sample.drive_state = DriveState.ENABLED if status & _SERVO_ON != 0 else DriveState.OFF
+    sample.drive_state = DriveState.ENABLED if status & SERVO_ON != 0 else DriveState.OFF
 
 
 @kernel
@@ -192,7 +190,7 @@ def _take_line(port: ElmoPort, sample: Sample, now_ns: int) -> bool:
     port.expected_count -= place + 1
     port.silent_cycles = 0
     length = port.line_length - start
-    if length >= 1 and length <= 2 and port.line[port.line_length - 1] == _QUESTION_MARK:
+    if length >= 1 and length <= 2 and port.line[port.line_length - 1] == QUESTION_MARK:
         port.refused += 1
         port.last_error = port.line[start] if length == 2 else 0
         return False
@@ -204,7 +202,7 @@ def take_byte(port: ElmoPort, byte: int, sample: Sample, now_ns: int) -> bool:
     """Take one received character; True if it completed a new position."""
     port.heard_bytes += 1
     port.bits_sent += BITS_PER_CHARACTER
-    if byte == _SEMICOLON:
+    if byte == SEMICOLON:
         got = False
         if port.quiet == 0:
             got = _take_line(port, sample, now_ns)

@@ -234,7 +234,7 @@ def _target_reached(device: Device) -> bool:
         return False
     mode = drive.mode_display
     moving = abs(int64(drive.velocity)) > int64(drive.velocity_window)
-    if drive.controlword & _HALT and (mode == 1 or mode == 3):
+    if drive.controlword & _HALT and (mode == Mode.PROFILE_POSITION or mode == Mode.PROFILE_VELOCITY):
         return not moving
     if mode == Mode.PROFILE_POSITION:
         error = int64(drive.position) - int64(round(device.setpoint_position_rad * device.counts_per_rad))

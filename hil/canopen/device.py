@@ -77,6 +77,11 @@ class DeviceSettings:
         return self.motor_torque_constant_NmpA or self.rated_torque_mNm / self.rated_current_mA
 
 
+def _sdo_frames(node_id: int, responses: list[bytes]) -> list[bytes]:
+    """The answers of an SDO server as frames of 16 bytes."""
+    return [struct.pack("<IB3x8s", 0x580 + node_id, 8, data) for data in responses]
+
+
 class Cia402Device:
     """One drive with its plant.  `device`, `plant_constants`, `plant_state`, `queue` are record arrays for kernels.
 
@@ -142,9 +147,9 @@ class Cia402Device:
     def is_sdo_request(self, frame: bytes) -> bool:
         """True for a frame that `answer_sdo` is for, in a state in which SDO is alive."""
         identifier = struct.unpack_from("<I", frame)[0]
-        alive = self.device[0].nmt not in (NmtState.BOOT_UP, NmtState.STOPPED)
         if self._is_for_encoder(frame):
             return True
+        alive = self.device[0].nmt not in (NmtState.BOOT_UP, NmtState.STOPPED)
         return bool(identifier == 0x600 + self.settings.node_id and alive)
 
     def _is_for_encoder(self, frame: bytes) -> bool:
@@ -157,21 +162,18 @@ class Cia402Device:
             if not self.encoder.answers_sdo:
                 return []
             answers = self.encoder.sdo.handle(frame[8 : 8 + min(frame[4], 8)], now_ns)
-            return [struct.pack("<IB3x8s", 0x580 + self.encoder.settings.node_id, 8, data) for data in answers]
+            return _sdo_frames(self.encoder.settings.node_id, answers)
         resets = int(self.device[0].application_resets)
         if resets != self._resets:
             self._resets = resets
             self.objects.restore_strings()
             self.sdo = SdoServer(self.objects, self._write)
         size = min(frame[4], 8)
-        return self._sdo_frames(self.sdo.handle(frame[8 : 8 + size], now_ns))
+        return _sdo_frames(self.settings.node_id, self.sdo.handle(frame[8 : 8 + size], now_ns))
 
     def expire_sdo(self, now_ns: int) -> list[bytes]:
         """The abort frame of an SDO transfer whose client has fallen silent, if there is one."""
-        return self._sdo_frames(self.sdo.expire(now_ns))
-
-    def _sdo_frames(self, responses: list[bytes]) -> list[bytes]:
-        return [struct.pack("<IB3x8s", 0x580 + self.settings.node_id, 8, data) for data in responses]
+        return _sdo_frames(self.settings.node_id, self.sdo.expire(now_ns))
 
     def _take_queue(self) -> list[bytes]:
         queue = self.queue[0]

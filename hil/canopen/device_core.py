@@ -29,14 +29,13 @@ from hil.canopen.device_errors import (
     error_register,
     send_emergency,
 )
-from hil.canopen.device_records import CONSUMERS, Device, HomingState, NmtState, PowerState, int64
+from hil.canopen.device_records import CONSUMERS, Device, HomingState, Mode, NmtState, PowerState, int64
 from hil.canopen.device_timers import SYNC_ERROR, answer_node_guard, connection_back, enter_nmt, run_timers
 from hil.canopen.encoder_core import accept_encoder_frame, step_encoder
 from hil.canopen.pdo_core import mark_events, receive_rpdo, receive_sync
 from hil.plant.joint import encoder_counts, step_plant
 from hil.plant.records import PlantConstants, PlantState
 
-_FAR_NS = 1_000_000_000
 _MS = 1_000_000
 
 
@@ -118,7 +117,11 @@ def sample_objects(device: Device, plant_c: PlantConstants, plant_s: PlantState)
     drive.motor_temperature_ddegC = _int16(10.0 * plant_s.motor_temperature_degC)
     drive.demand_torque = _int16(device.torque_sign * device.demand)
     mode = drive.mode_display
-    if (mode == 1 or mode == 8) and device.state == PowerState.OPERATION_ENABLED and not device.resync:
+    if (
+        (mode == Mode.PROFILE_POSITION or mode == Mode.CYCLIC_POSITION)
+        and device.state == PowerState.OPERATION_ENABLED
+        and not device.resync
+    ):
         reference = device.reference_position_rad * device.counts_per_rad
         drive.demand_position = _int32(reference)
         drive.following_error = _int32(reference - drive.position)
@@ -133,7 +136,7 @@ def _substep(device: Device, plant_c: PlantConstants, plant_s: PlantState, dt_s:
     limits = device.drive.position_limit
     mode = device.drive.mode_display
     counts = int64(device.drive.position)
-    positioning = mode == 1 or mode == 8 or mode == 6
+    positioning = mode == Mode.PROFILE_POSITION or mode == Mode.CYCLIC_POSITION or mode == Mode.HOMING
     if limits[0] != 0 or limits[1] != 0 or positioning or device.resync:  # the encoder costs time
         counts = _position_counts(device, plant_c, plant_s)
     if device.fault_code == 0:

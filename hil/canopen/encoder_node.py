@@ -7,14 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from firmware_py.schema import dtype_of
-from hil.canopen.device_records import Device, NmtState
+from hil.canopen.device_records import NmtState
 from hil.canopen.device_write_rules import check_write
 from hil.canopen.encoder_core import restart_encoder
-from hil.canopen.encoder_records import FIELDS, EncoderNode, EncoderObjects
-from hil.canopen.object_dictionary import ObjectDictionary, load_entries, split_field
+from hil.canopen.encoder_records import FIELDS
+from hil.canopen.object_dictionary import ObjectDictionary, field_view, load_entries
 from hil.canopen.sdo_server import SdoServer
 
 
@@ -42,16 +39,6 @@ class EncoderSettings:
             raise ValueError(f"direction (={self.direction}) must be 1 or -1")
 
 
-def _view(memory: Any, group: str, field: str) -> np.ndarray:
-    """A one-element view of a field of the node inside the first `Device` of `memory`."""
-    name, element = split_field(field)
-    dtype, offset = dtype_of(EncoderObjects).fields[name][:2]  # type: ignore[index]
-    dtype = dtype.subdtype[0] if dtype.subdtype else dtype
-    offset += element * dtype.itemsize + dtype_of(EncoderNode).fields[group][1]  # type: ignore[index]
-    offset += dtype_of(Device).fields["encoder"][1]  # type: ignore[index]
-    return np.ndarray((1,), dtype, buffer=memory.view(np.ndarray).view(np.uint8).data, offset=offset)
-
-
 class EncoderDictionary(ObjectDictionary):
     """Values of the encoder node's objects."""
 
@@ -60,8 +47,8 @@ class EncoderDictionary(ObjectDictionary):
         for key, field in FIELDS.items():
             if key not in self.entries:
                 raise ValueError(f"{eds_path.name}: object {key[0]:04X}:{key[1]} must be there, the encoder uses it")
-            self._live[key] = _view(memory, "objects", field)
-            self._initial[key] = _view(memory, "default_objects", field)
+            self._live[key] = field_view(memory, ("encoder", "objects"), field)
+            self._initial[key] = field_view(memory, ("encoder", "default_objects"), field)
             self.set_default(*key, int(self.entries[key].default))
         self.restore_strings()
 

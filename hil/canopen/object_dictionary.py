@@ -19,7 +19,7 @@ from canopen.objectdictionary import ODVariable
 
 from firmware_py.schema import dtype_of
 from hil.canopen.device_fields import FIELDS
-from hil.canopen.device_records import CommunicationObjects, Device, DriveObjects
+from hil.canopen.device_records import Device
 
 _TYPES = {1: "u1", 2: "i1", 3: "<i2", 4: "<i4", 5: "u1", 6: "<u2", 7: "<u4"}
 _VISIBLE_STRING = 9
@@ -112,14 +112,16 @@ def split_field(field: str) -> tuple[str, int]:
     return match[1], int(match[2] or 0)
 
 
-def _field_view(memory: np.ndarray, group: str, field: str) -> np.ndarray:
-    """A one-element view of `field` ("name" or "name[flat element]") inside the first record of `memory`."""
-    name, number = split_field(field)
-    record = dtype_of(CommunicationObjects if group.endswith("communication") else DriveObjects)
-    element, offset = record.fields[name][:2]  # type: ignore[index]
-    dtype = element.subdtype[0] if element.subdtype else element
-    offset += number * dtype.itemsize + dtype_of(Device).fields[group][1]  # type: ignore[index]
-    return np.ndarray((1,), dtype, buffer=memory.view(np.ndarray).view(np.uint8).data, offset=offset)
+def field_view(memory: Any, path: tuple[str, ...], field: str) -> np.ndarray:
+    """A one-element view into the first `Device` of `memory`: of `field` in the record that `path` leads to."""
+    name, element = split_field(field)
+    record, offset = dtype_of(Device), 0
+    for part in (*path, name):
+        record, start = record.fields[part][:2]  # type: ignore[index]
+        offset += start
+    dtype = record.subdtype[0] if record.subdtype else record
+    bytes_of_memory = memory.view(np.ndarray).view(np.uint8).data
+    return np.ndarray((1,), dtype, buffer=bytes_of_memory, offset=offset + element * dtype.itemsize)
 
 
 class ObjectDictionary:
@@ -131,8 +133,8 @@ class ObjectDictionary:
             if key not in self.entries:
                 raise ValueError(f"{eds_path.name}: object {key[0]:04X}:{key[1]} must be there, the drive uses it")
             group = "communication" if key[0] < 0x2000 else "drive"
-            self._live[key] = _field_view(memory, group, field)
-            self._initial[key] = _field_view(memory, f"default_{group}", field)
+            self._live[key] = field_view(memory, (group,), field)
+            self._initial[key] = field_view(memory, (f"default_{group}",), field)
             if self._live[key].dtype != self.entries[key].dtype:
                 raise ValueError(
                     f"{eds_path.name}: type of {key[0]:04X}:{key[1]} (={self.entries[key].dtype}) "

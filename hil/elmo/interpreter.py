@@ -49,7 +49,7 @@ SUBSTEPS_AT_ONCE_S = 2.0  # after a longer sleep of this process, time is lost r
 
 
 class ElmoInterpreter:
-    """`execute(line)` one command without its end; `advance_s(time)` moves drive and joint on."""
+    """`execute(line)` one command without its end; `advance_to(time)` moves drive and joint on."""
 
     def __init__(self, settings: ElmoDeviceSettings, plant_constants: Any, plant_state: Any) -> None:
         self.settings = settings

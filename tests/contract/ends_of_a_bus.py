@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Protocol
 
 import can
+import numpy as np
 
-from drivers.can.frame_io import new_wait_scratch, receive_frame, send_frame, wait_readable_ns
+from drivers.can.frame_io import receive_frame, send_frame
 from drivers.can.frames import Frame
 from drivers.can.open import open_cyclic_end
+from firmware_py.libc import WAIT_SCRATCH_WORDS, wait_readable_ns
 from firmware_py.schema import new
 
 LONG_S = 10.0  # far more than is ever needed: a limit against hanging, not a measure of speed
@@ -31,7 +33,7 @@ class RawEnd:
 
     def __init__(self, path: Path) -> None:
         self.socket = open_cyclic_end("jointctl", str(path))
-        self.frames, self.scratch = new(Frame, 2), new_wait_scratch()
+        self.frames, self.scratch = new(Frame, 2), np.zeros(WAIT_SCRATCH_WORDS, np.int64)
 
     def send(self, identifier: int, data: bytes = b"") -> bool:
         self.frames["can_id"][0] = identifier

@@ -14,6 +14,7 @@ import canopen
 import numpy as np
 
 from drivers.can.virtual_bus import VirtualBus
+from drivers.canopen.identifiers import RPDO1_ID, SYNC_ID, TPDO1_ID
 from tools.benchmarks.compiled_loops import commissioned
 from tools.benchmarks.load import load
 from tools.benchmarks.loop_times import NO_VALUES, LoopTimes, times_from_ns
@@ -29,7 +30,7 @@ def run_python_can(config: Config, seconds: float, load_name: str) -> LoopTimes:
     """Absolute deadlines, SYNC, wait for the TPDO, RPDO, with python-can's send and recv; no law is computed."""
     period_ns = round(1e9 / config.loop.rate_Hz)
     node = config.canopen.node
-    sync, rpdo = _frame(0x80), _frame(0x200 + node, bytes(4))
+    sync, rpdo = _frame(SYNC_ID), _frame(RPDO1_ID + node, bytes(4))
     cycles = round(seconds * config.loop.rate_Hz)
     rows, done = np.zeros((cycles, 3), np.int64), 0
     with commissioned(config) as (drive, _), VirtualBus(config.bus.channel) as bus, ExitStack() as stack:
@@ -49,7 +50,7 @@ def run_python_can(config: Config, seconds: float, load_name: str) -> LoopTimes:
             answer = None
             while (left_ns := end_ns - time.monotonic_ns()) > 0:
                 answer = bus.recv(left_ns * 1e-9)
-                if answer is None or answer.arbitration_id == 0x180 + node:
+                if answer is None or answer.arbitration_id == TPDO1_ID + node:
                     break
             waited_ns = time.monotonic_ns() - started_ns
             bus.send(rpdo)

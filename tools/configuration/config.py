@@ -1,7 +1,6 @@
-"""Read and check a TOML configuration: `load_config(path)` gives a frozen `Config` or one line for each problem.
+"""A configuration as one frozen object: its sections, and the files beside it that it names.
 
-A line reads `FILE: section.key (=value) must be in [a..b]`; an unknown key names the one that was meant, also when
-only the unit is wrong or missing (`loop.rate_kHz` -> `rate_Hz`).
+It is read and checked by `load.load_config`.
 """
 
 from __future__ import annotations
@@ -75,6 +74,11 @@ class Config(Section):
         return self.drive
 
     @property
+    def is_serial(self) -> bool:
+        """Whether the drive is on a serial line: its statuswords are not those of CiA 402, it heeds no heartbeat."""
+        return isinstance(self.drive, ElmoSerial)
+
+    @property
     def eds_path(self) -> Path:
         """The EDS file: beside the configuration, else a shipped one."""
         return _beside(self._path, self.canopen.eds)
@@ -95,6 +99,3 @@ def _beside(config_path: Path, name: str) -> Path:
     own = config_path.parent / name
     shipped = SHIPPED_FOLDER / name
     return shipped if not own.exists() and shipped.exists() else own
-
-
-# --- from pydantic's error list to our one line ---

@@ -12,11 +12,11 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, PrivateAttr
 from pydantic_core import PydanticCustomError
 
+from drivers.elmo.port import SERIAL
 from drivers.errors import ConfigurationError
 from tools.configuration.sections import Ampere, Direction, Rule, Section, between
 
 KIND = "elmo_serial"
-INTERFACE = "serial"  # `Config.bus.interface` of a serial drive
 BAUD_RATES_bitps = (9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600)
 
 
@@ -86,5 +86,5 @@ def with_serial_bus(data: Any) -> Any:
     port, baud_rate = drive.get("port"), drive.get("baud_rate_bitps")
     good = isinstance(port, str) and port and baud_rate in BAUD_RATES_bitps
     # where port or rate are wrong, the section itself says so
-    bus = {"interface": INTERFACE, "channel": port if good else "-", "bitrate_bitps": baud_rate if good else 19_200}
+    bus = {"interface": SERIAL, "channel": port if good else "-", "bitrate_bitps": baud_rate if good else 19_200}
     return {**data, "bus": bus}

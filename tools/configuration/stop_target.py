@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from drivers.can.open import SHARED_INTERFACES
+from drivers.canopen.identifiers import HIGHEST_NODE
 from drivers.errors import ConfigurationError
 from tools.configuration.elmo import BAUD_RATES_TEXT, KIND, BAUD_RATES_bitps
 
 REPLY_TIMEOUT_S = 0.2
-HIGHEST_NODE = 127
 _HEADING = re.compile(r"\s*\[\s*(\w+)\s*\]\s*(#.*)?")
 _HINT = "it can be given on the command line: -i, -c, -b and -t, or -p for a serial port"
 

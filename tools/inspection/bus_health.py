@@ -19,6 +19,7 @@ from drivers.can.bit_timing import bus_load, highest_rate_Hz
 from drivers.can.link_state import SHORT_QUEUE, link_problem, link_state
 from drivers.can.open import CYCLIC_INTERFACES, open_python_can
 from drivers.can.socketcan import up_command
+from drivers.canopen.identifiers import SDO_ANSWER_ID, SDO_REQUEST_ID
 from drivers.errors import BusError
 from tools.configuration.config import Config
 from tools.configuration.drive_settings import HIGHEST_LOAD, cycle_bytes
@@ -113,7 +114,7 @@ def bus_budget(config: Config) -> Finding:
 def sdo_round_trips_us(bus: Any, node: int, reads: int = SDO_READS) -> list[float]:
     """Times [us] to read 1000h of `node`, fewer than `reads` where answers stay away; writes nothing."""
     request = can.Message(
-        arbitration_id=0x600 + node, is_extended_id=False, data=struct.pack("<BHB4x", 0x40, 0x1000, 0)
+        arbitration_id=SDO_REQUEST_ID + node, is_extended_id=False, data=struct.pack("<BHB4x", 0x40, 0x1000, 0)
     )
     times: list[float] = []
     for _ in range(reads):
@@ -121,7 +122,11 @@ def sdo_round_trips_us(bus: Any, node: int, reads: int = SDO_READS) -> list[floa
         bus.send(request, _SDO_TIMEOUT_S)
         while (left_s := started_s + _SDO_TIMEOUT_S - time.monotonic()) > 0.0:
             answer = bus.recv(left_s)
-            if answer is not None and answer.arbitration_id == 0x580 + node and answer.data[1:4] == request.data[1:4]:
+            if (
+                answer is not None
+                and answer.arbitration_id == SDO_ANSWER_ID + node
+                and answer.data[1:4] == request.data[1:4]
+            ):
                 times.append((time.monotonic() - started_s) * 1e6)
                 break
         else:

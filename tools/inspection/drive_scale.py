@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import can
-import canopen
-
-from drivers.can.open import open_python_can
 from drivers.errors import JointctlError
 from tools.configuration.config import Config
-from tools.configuration.elmo import ElmoSerial
 from tools.inspection.findings import NOTE, OK, Finding
 from tools.inspection.sdo_reading import Refusal, SdoReader
+from tools.inspection.subject import canopen_network, subject_of_config
 
 TOLERANCE = 0.001
 _CURE = "encoder.counts_per_turn, encoder.side, joint.reduction_ratio; or the drive scales 6064 by 6091 and 6092: "
@@ -19,21 +15,14 @@ _CURE += "then turn the joint by hand by 90 deg with the power off and compare"
 
 def scale_finding(config: Config) -> Finding | None:
     """None where the drive does not tell; CiA 402-2: 608F:1 increments in 608F:2 motor revolutions.  Reads only."""
-    if isinstance(config.drive, ElmoSerial):
+    if config.is_serial:
         return None
     try:
-        bus = open_python_can(config.bus.interface, config.bus.channel, config.bus.bitrate_bitps)
+        with canopen_network(subject_of_config(config)) as network:
+            reader = SdoReader(network, config.canopen.node)
+            values = [reader.upload(0x608F, sub) for sub in (1, 2)]
     except JointctlError:
         return None  # commissioning says it better
-    network = canopen.Network(bus)
-    network.connect()
-    try:
-        reader = SdoReader(network, config.canopen.node)
-        values = [reader.upload(0x608F, sub) for sub in (1, 2)]
-    except can.CanError:
-        return None
-    finally:
-        network.disconnect()
     increments, turns = (0 if isinstance(value, Refusal) else int.from_bytes(value, "little") for value in values)
     if not increments or not turns:
         return None

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from drivers.canopen.cia402 import SUPPORTED_MODE_BIT, Mode, state_text
+from drivers.canopen.identifiers import NmtCommand, NmtState
 
 # CiA 402-2, 6041: bits that say more than the state
 _STATUS_BITS = {
@@ -15,9 +16,14 @@ _STATUS_BITS = {
 _ERROR_BITS = (
     "generic", "current", "voltage", "temperature", "communication", "device profile", "reserved", "manufacturer",
 )  # fmt: skip
-NMT_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
-NMT_COMMANDS = {
-    1: "start (operational)", 2: "stop", 128: "enter pre-operational", 129: "reset node", 130: "reset communication",
+NMT_STATES: Mapping[int, str] = {
+    NmtState.BOOT_UP: "boot-up", NmtState.STOPPED: "stopped", NmtState.OPERATIONAL: "operational",
+    NmtState.PRE_OPERATIONAL: "pre-operational",
+}  # fmt: skip
+NMT_COMMANDS: Mapping[int, str] = {
+    NmtCommand.START: "start (operational)", NmtCommand.STOP: "stop",
+    NmtCommand.ENTER_PRE_OPERATIONAL: "enter pre-operational", NmtCommand.RESET_NODE: "reset node",
+    NmtCommand.RESET_COMMUNICATION: "reset communication",
 }  # fmt: skip
 MODES = {
     -1: "manufacturer specific", 0: "no mode", 1: "profile position (PP)", 2: "velocity (VL)",

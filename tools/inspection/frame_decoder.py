@@ -10,6 +10,17 @@ from typing import Any
 import can
 
 from drivers.can.error_frames import error_frame_text
+from drivers.canopen.identifiers import (
+    EMERGENCY_ID,
+    FUNCTION_MASK,
+    HEARTBEAT_ID,
+    NMT_ID,
+    NODE_MASK,
+    SDO_ANSWER_ID,
+    SDO_REQUEST_ID,
+    SYNC_ID,
+    TPDO1_ID,
+)
 from tools.inspection import drive_words
 from tools.inspection.objects import Objects, Place
 from tools.inspection.pdo_maps import PdoMaps
@@ -50,31 +61,31 @@ class FrameDecoder:
         if message.is_extended_id or message.is_fd:
             return Decoded("other", 0, "extended identifier" if message.is_extended_id else "CAN FD")
         if message.is_remote_frame:
-            guard = cob_id & 0x780 == 0x700
+            guard = cob_id & FUNCTION_MASK == HEARTBEAT_ID
             return Decoded(
-                "heartbeat" if guard else "other", cob_id & 0x7F, "node guarding request" if guard else "RTR"
+                "heartbeat" if guard else "other", cob_id & NODE_MASK, "node guarding request" if guard else "RTR"
             )
-        if cob_id == 0:
+        if cob_id == NMT_ID:
             return _nmt(data)
-        if cob_id == 0x80:
+        if cob_id == SYNC_ID:
             return Decoded("sync", 0, f"SYNC {data[0]}" if data else "SYNC")
         if cob_id == 0x100:
             return Decoded("time", 0, "TIME")
         if cob_id in (0x7E4, 0x7E5):
             return Decoded("lss", 0, f"LSS {'answer' if cob_id == 0x7E4 else 'request'} {data[0] if data else 0:02X}h")
-        function, node = cob_id & 0x780, cob_id & 0x7F
+        function, node = cob_id & FUNCTION_MASK, cob_id & NODE_MASK
         pdo = self.maps.at(cob_id)
-        if pdo is not None and (pdo.enabled or 0x180 <= cob_id < 0x580):
+        if pdo is not None and (pdo.enabled or TPDO1_ID <= cob_id < SDO_ANSWER_ID):
             return self._pdo(pdo, data)
-        if function == 0x80:
+        if function == EMERGENCY_ID:
             return _emergency(node, data)
-        if function == 0x580:
+        if function == SDO_ANSWER_ID:
             text, fields = self._sdo.response(node, data)
             return Decoded("sdo", node, f"< {text}", fields)
-        if function == 0x600:
+        if function == SDO_REQUEST_ID:
             text, fields = self._sdo.request(node, data)
             return Decoded("sdo", node, f"> {text}", fields)
-        if function == 0x700:
+        if function == HEARTBEAT_ID:
             return _heartbeat(node, data)
         return Decoded("other", 0, "")
 

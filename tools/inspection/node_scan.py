@@ -19,6 +19,15 @@ import can
 import canopen
 
 from drivers.canopen.cia402 import state_text
+from drivers.canopen.identifiers import (
+    EMERGENCY_ID,
+    FUNCTION_MASK,
+    HEARTBEAT_ID,
+    NODE_MASK,
+    SDO_ANSWER_ID,
+    SDO_REQUEST_ID,
+    SYNC_ID,
+)
 from tools.inspection import drive_words
 from tools.inspection.objects import Objects
 from tools.inspection.sdo_reading import SdoReader
@@ -27,9 +36,7 @@ LISTEN_S = 1.2  # a little more than the usual heartbeat period of one second
 PACE_S = 0.002  # between two questions; 127 of them take a quarter of a second
 ANSWER_S = 0.3
 ROUNDS = 2
-HIGHEST_NODE = 127
 _READ_DEVICE_TYPE = struct.pack("<BHB4x", 0x40, 0x1000, 0)
-_SYNC = 0x80
 
 
 @dataclass
@@ -64,14 +71,14 @@ class Ear(can.Listener):
         heard.frames += 1
         if msg.is_extended_id or msg.is_remote_frame:
             return
-        function, node = msg.arbitration_id & 0x780, msg.arbitration_id & 0x7F
-        if msg.arbitration_id == _SYNC:
+        function, node = msg.arbitration_id & FUNCTION_MASK, msg.arbitration_id & NODE_MASK
+        if msg.arbitration_id == SYNC_ID:
             heard.syncs += 1
-        elif node and function == 0x700 and len(msg.data) == 1:
+        elif node and function == HEARTBEAT_ID and len(msg.data) == 1:
             heard.heartbeats[node] = msg.data[0] & 0x7F
-        elif node and function == 0x580:
+        elif node and function == SDO_ANSWER_ID:
             heard.answers[node] = time.monotonic()
-        elif node and function == 0x80:
+        elif node and function == EMERGENCY_ID:
             heard.others.add(node)
 
     def nodes(self) -> set[int]:
@@ -89,7 +96,7 @@ def ask_everybody(
         ear.heard.answers.clear()  # those were answers to somebody else
     for _ in range(ROUNDS):
         for node in sorted(silent):
-            network.send_message(0x600 + node, _READ_DEVICE_TYPE)
+            network.send_message(SDO_REQUEST_ID + node, _READ_DEVICE_TYPE)
             sleep(PACE_S)
         sleep(ANSWER_S)
         with ear.lock:

@@ -12,13 +12,14 @@ from typing import Any
 
 import canopen
 
+from drivers.canopen.identifiers import NODE_MASK, RPDO1_ID, SDO_ANSWER_ID, TPDO1_ID
 from drivers.canopen.pdo_layout import CONTROL, DISABLED, POSITION, STATUS, TARGET_TORQUE, TARGET_VELOCITY, TORQUE
 from tools.inspection.objects import SIGNED, Objects
 
 PREDEFINED = 4  # PDOs of each direction in the predefined connection set
 _SPAN = 0x200
 _RPDO, _RPDO_MAP, _TPDO, _TPDO_MAP = 0x1400, 0x1600, 0x1800, 0x1A00
-_BASES = {True: (_TPDO, _TPDO_MAP, 0x180), False: (_RPDO, _RPDO_MAP, 0x200)}
+_BASES = {True: (_TPDO, _TPDO_MAP, TPDO1_ID), False: (_RPDO, _RPDO_MAP, RPDO1_ID)}
 _FIRST_REAL_OBJECT = 0x20  # below are the data types, mapped to leave a gap
 COB_MASK = 0x1FFFFFFF
 
@@ -92,11 +93,11 @@ class PdoMaps:
     def at(self, cob_id: int) -> PdoMap | None:
         """Whose frame this is; by the predefined connection set where nothing better is known."""
         found = self._by_cob.get(cob_id)
-        if found is not None or not 0x180 <= cob_id < 0x580 or not cob_id & 0x7F:
+        if found is not None or not TPDO1_ID <= cob_id < SDO_ANSWER_ID or not cob_id & NODE_MASK:
             return found
         transmit = bool(cob_id & 0x80)
-        number = (cob_id - (0x180 if transmit else 0x200)) // 0x100 + 1
-        return self.of(cob_id & 0x7F, transmit, number)
+        number = (cob_id - (TPDO1_ID if transmit else RPDO1_ID)) // 0x100 + 1
+        return self.of(cob_id & NODE_MASK, transmit, number)
 
     def learn(self, node: int, index: int, sub: int, value: int) -> None:
         """Take the value of a PDO parameter of the drive; anything else is none of our business."""

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import can
 import canopen
 
 from drivers.can.link_state import interface_blamed
 from drivers.can.open import open_python_can
-from drivers.canopen.bus_watchers import BusFailure
+from drivers.canopen.network import new_network
 from drivers.errors import BusError, ConfigurationError
 from tools.configuration.config import Config
 from tools.inspection.objects import Objects, read_dictionary
@@ -90,11 +88,7 @@ def subject_of_flags(
 @contextmanager
 def canopen_network(subject: Subject, *listeners: can.Listener) -> Iterator[canopen.Network]:
     """The `canopen` library on an end of the bus of its own; it sends nothing by itself."""
-    logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what matters is told by whoever asks
-    network = canopen.Network(subject.open_bus())
-    network.NOTIFIER_CYCLE = 0.05
-    added: list[Any] = [BusFailure(time.sleep), *listeners]  # the library knows only its own kind of listener
-    network.listeners.extend(added)
+    network = new_network(subject.open_bus(), time.sleep, *listeners)
     with interface_blamed(subject.interface, subject.channel, subject.bitrate_bitps):
         try:
             network.connect()

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from firmware_py.states import AxisPhase, Fault
+from firmware_py.states import AxisPhase, Fault, fault_name
 
 SETTLED_RAD = 1e-3
 _TIMES = ("wake_late", "round_trip", "work")  # rows of the loop's histograms, and LogRecord fields with _ns
@@ -101,7 +101,7 @@ def summarise(
         cycles=len(records),
         duration_s=duration_ns * 1e-9,
         tracked_s=float(time_s[-1] - time_s[0]) if len(time_s) else 0.0,
-        fault=_fault_name(int(faults[0])) if len(faults) else Fault.NONE.name,
+        fault=fault_name(int(faults[0])) if len(faults) else Fault.NONE.name,
         error=_error(tracking, time_s),
         late_error=_error(tracking[time_s >= late_from_s], time_s[time_s >= late_from_s]),
         settling_s=_settling_s(tracking),
@@ -123,10 +123,6 @@ def tracking_time_s(tracking: Any) -> np.ndarray:
         return time_s
     since: np.ndarray = (tracking["time_ns"] - tracking["time_ns"][0]) * 1e-9
     return since + time_s[0]
-
-
-def _fault_name(code: int) -> str:
-    return Fault(code).name if code in list(Fault) else f"FAULT_{code}"
 
 
 def _range(values: Any) -> Range | None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.states import AxisPhase, Fault
+from firmware_py.states import AxisPhase, fault_name
 from tools.drawing import BLUE, COLOURS, GREEN, GREY, INK, MID_BLUE, ORANGE, RED, SOFT, TEAL, VIOLET
 from tools.recording.run_figure import drawn_indices
 from tools.reporting.figure import draw
@@ -100,9 +100,7 @@ def _fault_words(records: Any) -> str:
     found = np.flatnonzero(records["fault"])
     if not len(found):
         return ""
-    code = int(records["fault"][found[0]])
-    name = Fault(code).name if code in list(Fault) else f"fault {code}"
-    return f" {name} at {float(seconds(records)[found[0]]):.3f} s."
+    return f" {fault_name(int(records['fault'][found[0]]))} at {float(seconds(records)[found[0]]):.3f} s."
 
 
 def error_figure(records: Any) -> Figure:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 from firmware_py.realtime import Histogram, Word
-from firmware_py.states import AxisPhase, Fault, StopRequest
+from firmware_py.states import AxisPhase, Fault, StopRequest, in_words
 from tools.analysis.margin_gate import require_margin
 from tools.configuration.config import Config
 from tools.recording.can_log import frame_array
@@ -22,7 +22,6 @@ from tools.running.display.display import Display, Snapshot
 from tools.running.events.event_finder import EventFinder, phase_name
 from tools.running.guard.guard_handle import GUARD_ENDED, GuardHandle
 from tools.running.loop.loop_handle import LoopHandle
-from tools.running.loop.shared_block import SERIAL
 from tools.running.open_drive import drive_fault_text, loop_delay_s
 from tools.running.stop_signals import StopSignals
 from tools.running.watch.bus_watch import BusWatch
@@ -65,7 +64,7 @@ class RunWatch:
         self._stopped_by_viewer = ""
         self._allow_low_margin = allow_low_margin
         self._phase, self._asked = AxisPhase.WAITING, StopRequest.NONE
-        self._events = EventFinder(cia402=config.bus.interface != SERIAL, fault_words=self._fault_words)
+        self._events = EventFinder(cia402=not config.is_serial, fault_words=self._fault_words)
         self._orders = ViewerOrders(
             config, self.loop.block, self.log.path, parts.metadata, self._tell_scope, lambda: self.delay_s,
             allow_low_margin=allow_low_margin,
@@ -94,7 +93,7 @@ class RunWatch:
             self._asked = request
             if not self.around.signals.name:
                 self._stopped_by_viewer = self.display.stop_reason()
-            text = f"{request.name.lower().replace('_', ' ')} asked for by {self.stopped_by}"
+            text = f"{in_words(request)} asked for by {self.stopped_by}"
             self._tell(Event(time.monotonic_ns(), WARNING, "supervisor", text))
         self.check_delay()
         self.temperature.poll()
@@ -125,7 +124,7 @@ class RunWatch:
             self._tell(event)
         skipped, histograms = int(self.loop.block.words[Word.SKIPPED]), self.loop.block.histograms
         duration_s = float(self.loop.block.constants[0].trajectory.duration_s)  # a viewer may have changed the motion
-        cia402 = self.config.bus.interface != SERIAL
+        cia402 = not self.config.is_serial
         degC = self.temperature.newest_degC
         self.display.show(Snapshot(records[-1], skipped, histograms, duration_s, cia402, records, degC))
 

@@ -30,7 +30,6 @@ from tools.running.events.held_up import held_up_text
 from tools.running.guard.guard_handle import GuardHandle, start_guard
 from tools.running.guard.kept_awake import kept_awake
 from tools.running.loop.loop_handle import LoopHandle
-from tools.running.loop.shared_block import SERIAL
 from tools.running.open_drive import check_cyclic_rate, commission, drive_fault_text, open_drive
 from tools.running.permission.readiness import require_same_motion
 from tools.running.result.drive_end import warn_unless_off
@@ -204,7 +203,7 @@ class Supervisor:
             stopped_by=watch.stopped_by or ("jointctl stop" if loop.stop_requested else ""),
             drive_state=drive_state,
             bus_load=float(loop.block.port[0].bits_sent) / (self._config.bus.bitrate_bitps * elapsed_s),
-            serial=self._config.bus.interface == SERIAL,
+            serial=self._config.is_serial,
             lost_records=loop.lost_records,
             log_path=self._log_path,
         )

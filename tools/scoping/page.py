@@ -7,10 +7,9 @@ from typing import Any, Protocol
 
 from nicegui import ui
 
-from firmware_py.states import Fault
 from tools.recording.run_log import Event
 from tools.running.display.viewer_request import ViewerRequest, viewer
-from tools.running.events.event_finder import drive_state_name, phase_name
+from tools.running.events.event_finder import drive_state_name, fault_words, phase_name
 from tools.scoping.change_panels import ChangePanels
 from tools.scoping.chart import Chart
 from tools.scoping.history import History, percentiles_us
@@ -135,8 +134,7 @@ class ScopePage:
             words.append(f"{temperature_degC:.1f} °C")
         fault = int(last["fault"])
         if fault:
-            name = Fault(fault).name.lower().replace("_", " ") if fault in list(Fault) else str(fault)
-            words.append(f"FAULT: {name}")
+            words.append(f"FAULT: {fault_words(fault)}")
         if self._history.ended or stage == "ended":
             words.append("the run has ended")
         elif motion := self._history.settings.get("motion"):

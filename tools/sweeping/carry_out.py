@@ -17,10 +17,10 @@ import numpy as np
 from drivers.drive import CommissioningReport
 from drivers.elmo.unit_modes import SPEED_MODE
 from drivers.errors import ConfigurationError, DeviceError, UsageError
+from firmware_py.motion_peak import approach_duration_s
 from firmware_py.records import Reference
 from firmware_py.schema import new
 from firmware_py.states import CommandKind, Fault, TrajectoryKind
-from firmware_py.trajectory_table import approach_duration_s
 from tools.configuration.config import Config
 from tools.configuration.elmo import ElmoSerial, UnitModeChoice
 from tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_constants

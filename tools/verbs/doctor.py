@@ -14,7 +14,6 @@ from rich.text import Text
 
 from firmware_py.kernel import cache_folder
 from tools.configuration.config import Config
-from tools.configuration.elmo import ElmoSerial
 from tools.inspection.bus_health import adapters, bus_budget, drive_finding, interface_state
 from tools.inspection.computer import kernel_cache, kernel_findings, scheduling, software, wake_up
 from tools.inspection.findings import NOTE, OK, PROBLEM, Finding
@@ -29,7 +28,7 @@ def findings(config: Config, *, cold: bool = False, wake_cycles: int | None = No
     yield from scheduling()
     yield from wake_up(config, wake_cycles or max(1, round(config.loop.rate_Hz)))
     yield from kernel_cache(cache_folder, cold)
-    if isinstance(config.drive, ElmoSerial):
+    if config.is_serial:
         yield from serial_findings(config)
         return
     yield from adapters(config)

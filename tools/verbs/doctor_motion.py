@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from drivers.drive import CommissioningReport
+from drivers.errors import INTERRUPTED
 from firmware_py.states import Fault
 from tools.configuration.config import Config
 from tools.inspection.drive_scale import scale_finding
@@ -15,7 +16,6 @@ from tools.running.permission.consent import agreed, require_terminal
 from tools.running.permission.readiness import prepare_log, require_ready
 from tools.running.result import drive_end
 from tools.running.result.drive_end import require_off
-from tools.running.result.run_report import INTERRUPTED
 from tools.verbs.doctor import report_findings
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from drivers.errors import ConfigurationError
+from drivers.errors import INTERRUPTED, ConfigurationError
 from tools.campaign.judge import Verdict, judge
 from tools.campaign.report import campaign_figure, rows_by_kind, table, violations, write_json
 from tools.campaign.runner import run_campaign
@@ -21,7 +21,6 @@ from tools.simulation.lockstep import LockstepJoint
 from tools.written_file import prepare_folder
 
 EXIT_VIOLATIONS = 10
-EXIT_INTERRUPTED = 130
 SHOWN = 20
 
 
@@ -72,7 +71,7 @@ def fault_campaign(
             f"replay one with: jointctl fault-campaign {config.path} --seed {seed} --scenario {found[0]['number']}",
         )
         return EXIT_VIOLATIONS
-    return EXIT_INTERRUPTED if interrupted else 0
+    return INTERRUPTED if interrupted else 0
 
 
 def _write_page(

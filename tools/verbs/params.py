@@ -9,7 +9,9 @@ from typing import Any
 
 from rich.table import Table
 
-from drivers.canopen.cia402 import state_text
+from drivers.canopen.cia402 import State, state_of_word, state_text
+from drivers.canopen.identifiers import NmtCommand
+from drivers.canopen.network import send_nmt
 from drivers.errors import BusError, ConfigurationError, DataError, DeviceError
 from tools.inspection.node_scan import Ear
 from tools.inspection.objects import Objects, Place
@@ -30,11 +32,12 @@ from tools.inspection.sdo_reading import Refusal, SdoReader
 from tools.inspection.subject import Subject, canopen_network
 from tools.output import Output
 from tools.running.permission.consent import agreed, require_terminal
+from tools.written_file import writing
 
 LISTEN_S = 0.1  # for the SYNC of another controller
 DIFFERENT = 11  # exit code of diff
 _SETTLE_S = 0.02
-_MOVING = ("operation enabled", "quick stop active", "fault reaction active")
+_UNDER_POWER = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
 
 
 def _known_objects(subject: Subject) -> Objects:
@@ -58,13 +61,11 @@ def dump(subject: Subject, output: Output, out: Path | None = None) -> int:
     if out is not None:
         if out.exists():
             raise DataError(f"{out}: exists already", "give another name; a dump is never overwritten")
-        try:
+        with writing(out):
             if out.suffix.lower() == ".dcf":
                 write_dcf(found, objects.required(), out)
             else:
                 out.write_text(toml_text(found, objects))
-        except OSError as error:
-            raise DataError(f"{out}: cannot be written: {error.strerror or error}") from None
         output.note(
             f"{out}: {len(found.parameters)} parameters, {len(found.readings)} readings, "
             f"{len(found.unreadable)} objects could not be read"
@@ -138,7 +139,7 @@ def restore_file(
         # the answer may have taken minutes: a joint that moves by now must not lose its controller
         _refuse_controller(ear)
         _require_off(reader)
-        network.send_message(0, bytes([0x80, node]))  # pre-operational: PDOs can only be changed there
+        send_nmt(network, NmtCommand.ENTER_PRE_OPERATIONAL, node)  # PDOs can only be changed there
         time.sleep(_SETTLE_S)
         _require_off(reader)
         values = {change.place: change.second for change in changes if change.second is not None}
@@ -155,10 +156,10 @@ def _refuse_controller(ear: Ear) -> None:
 
 def _require_off(reader: SdoReader) -> None:
     word = reader.value(0x6041)
-    state = None if word is None else state_text(word)
-    if state in _MOVING:
+    if word is not None and state_of_word(word) in _UNDER_POWER:
         raise DeviceError(
-            f"node {reader.node} is in {state}: nothing is written into a drive under power", "jointctl stop CONFIG"
+            f"node {reader.node} is in {state_text(word)}: nothing is written into a drive under power",
+            "jointctl stop CONFIG",
         )
 
 

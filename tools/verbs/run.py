@@ -6,18 +6,18 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from drivers.drive import CommissioningReport
+from drivers.errors import INTERRUPTED
 from tools.configuration.config import Config
 from tools.output import Output
 from tools.recording.log_folder import log_path
 from tools.running.display.display import Display
 from tools.running.display.live_panel import run_display
-from tools.running.loop.shared_block import SERIAL
 from tools.running.permission.consent import agreed, require_terminal
 from tools.running.permission.envelope import motion_envelope
 from tools.running.permission.readiness import prepare_log, require_ready, require_start
 from tools.running.result import drive_end
 from tools.running.result.drive_end import require_off
-from tools.running.result.run_report import INTERRUPTED, report_run
+from tools.running.result.run_report import report_run
 from tools.running.supervisor import Supervisor
 
 
@@ -81,7 +81,7 @@ def _displays(
     from tools.scoping.feed import scope_server
     from tools.scoping.order import scope_order
 
-    order = scope_order(title, *scope, cia402=config.bus.interface != SERIAL)
+    order = scope_order(title, *scope, cia402=not config.is_serial)
     output.note(f"scope: {order.url}")
     with scope_server(order) as feed:
         feed.settings({"stage": "terminal"})

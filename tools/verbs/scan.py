@@ -6,8 +6,9 @@ import time
 
 from rich.table import Table
 
+from drivers.canopen.identifiers import HIGHEST_NODE
 from drivers.errors import NoDeviceError
-from tools.inspection.node_scan import HIGHEST_NODE, LISTEN_S, Ear, Heard, ask_everybody, describe
+from tools.inspection.node_scan import LISTEN_S, Ear, Heard, ask_everybody, describe
 from tools.inspection.subject import Subject, canopen_network
 from tools.output import Output
 

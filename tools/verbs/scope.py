@@ -14,7 +14,6 @@ from tools.output import Output
 from tools.recording.log_folder import log_path
 from tools.recording.run_log import read_run_log
 from tools.running.display.live_panel import run_display
-from tools.running.loop.shared_block import SERIAL
 from tools.running.permission.envelope import motion_envelope
 from tools.running.permission.readiness import prepare_log, require_ready, require_start
 from tools.running.result.drive_end import words
@@ -54,7 +53,7 @@ def live_scope(
     page has been open for so long; None = go on.
     """
     title = f"{config.path.stem}: {config.trajectory.kind}"
-    order = scope_order(title, host, port, cia402=config.bus.interface != SERIAL)
+    order = scope_order(title, host, port, cia402=not config.is_serial)
     output.note(f"scope: {order.url}  (Ctrl-C ends it; nothing moves before Start on the page)")
     with scope_server(order, in_charge=True, unwatched_s=unwatched_s) as feed:
         runs = _Runs(config, output, feed, title, allow_low_margin=allow_low_margin)

@@ -14,7 +14,7 @@ from typing import Any
 from rich.table import Table
 
 from drivers.drive import CommissioningReport
-from drivers.errors import MotionFault
+from drivers.errors import INTERRUPTED, MotionFault
 from firmware_py.states import Fault
 from tools.configuration.config import Config
 from tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
@@ -25,7 +25,6 @@ from tools.running.events.fault_text import FaultText, fault_text
 from tools.running.permission.consent import agreed, require_terminal
 from tools.running.permission.readiness import require_ready
 from tools.running.result import drive_end
-from tools.running.result.run_report import INTERRUPTED
 from tools.sweeping.carry_out import SweepSupervisor, approach_time_s, middle_rad, sweep_in_lockstep, with_mode
 from tools.sweeping.checks import constant_remarks, recorded_limits, refuse_constants, require_torque, torque_source
 from tools.sweeping.data_file import SweepFile

@@ -11,11 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from firmware_py.motion_peak import approach_duration_s, approach_peak, peak_of
 from firmware_py.records import Reference, TrajectoryConstants
 from firmware_py.schema import new
 from firmware_py.states import TrajectoryKind
 from firmware_py.trajectory import reference_at
-from firmware_py.trajectory_table import approach_duration_s, approach_peak, ends_meet, peak_of, table_from_csv
+from firmware_py.trajectory_table import ends_meet, table_from_csv
 
 POINTS = "time_s,position_rad\n10,0.0\n11,0.5\n12.5,-0.25\n13,0.0\n"
 

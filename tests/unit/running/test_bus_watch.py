@@ -61,7 +61,7 @@ def test_each_trouble_is_told_once(config: Config, ends: Any) -> None:
 def link(**changes: Any) -> LinkState:
     values = {
         "name": "can0", "kind": "can", "up": True, "state": "ERROR-ACTIVE", "transmit_errors": 0, "receive_errors": 0,
-        "bitrate_bitps": 1_000_000, "restart_ms": 0, "queue_frames": 10, "counts": {},
+        "bitrate_bitps": 1_000_000, "queue_frames": 10, "counts": {},
     }  # fmt: skip
     return LinkState(**{**values, **changes})
 

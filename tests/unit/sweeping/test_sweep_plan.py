@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.errors import DataError, UsageError
+from firmware_py.motion_peak import peak_of
 from firmware_py.records import Reference, TrajectoryConstants
 from firmware_py.schema import new
 from firmware_py.states import TrajectoryKind
 from firmware_py.trajectory import reference_at
-from firmware_py.trajectory_table import peak_of
 from tools.sweeping.grid import (
     SweepPoint,
     both_directions,

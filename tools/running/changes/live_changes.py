@@ -15,14 +15,14 @@ from drivers.errors import ConfigurationError, JointctlError
 from firmware_py.change_records import ChangeAnswer, ChangeKind, MotionChange
 from firmware_py.kernel import plain
 from firmware_py.live_change import gains_of
+from firmware_py.motion_peak import peak_of
 from firmware_py.records import Gains
 from firmware_py.schema import dtype_of, new
 from firmware_py.states import AxisPhase, CommandKind
-from firmware_py.trajectory_table import peak_of
 from tools.configuration.config import Config
 from tools.recording.run_log import INFO, WARNING
 from tools.running.changes.change_gate import checked_gains, require_change
-from tools.running.changes.new_motion import in_words, new_motion
+from tools.running.changes.new_motion import motion_in_words, new_motion
 from tools.running.display.viewer_request import ViewerRequest
 
 NAMES = tuple(dtype_of(Gains).names or ())
@@ -85,7 +85,7 @@ class LiveChanges:
         """The motion in force, in words."""
         trajectory = self._axis.trajectory
         speed = peak_of(trajectory, self._block.table).velocity_radps
-        return in_words(trajectory, speed)
+        return motion_in_words(trajectory, speed)
 
     @property
     def reference_rad(self) -> float:

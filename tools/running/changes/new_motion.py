@@ -9,10 +9,10 @@ from typing import Any
 from pydantic import ValidationError
 
 from drivers.errors import ConfigurationError
+from firmware_py.motion_peak import peak_of
 from firmware_py.records import TrajectoryConstants
 from firmware_py.schema import new
-from firmware_py.states import TrajectoryKind
-from firmware_py.trajectory_table import peak_of
+from firmware_py.states import TrajectoryKind, in_words
 from tools.configuration.checks import extremes_problems
 from tools.configuration.config import Config
 from tools.configuration.problems import problem_line
@@ -49,7 +49,7 @@ def new_motion(config: Config, table: Any, values: Mapping[str, Any]) -> tuple[A
         )
     if problems:
         raise ConfigurationError(problems[0])
-    return constants, in_words(record, peak.velocity_radps)
+    return constants, motion_in_words(record, peak.velocity_radps)
 
 
 def _trajectory(config: Config, values: Mapping[str, Any]) -> Any:
@@ -65,7 +65,7 @@ def _trajectory(config: Config, values: Mapping[str, Any]) -> Any:
         raise ConfigurationError(problem_line(error.errors(include_url=False)[0], data, ())) from None
 
 
-def in_words(record: Any, speed_radps: float) -> str:
+def motion_in_words(record: Any, speed_radps: float) -> str:
     """`sine -0.350 .. +0.350 rad, up to 0.22 rad/s`; without a duration `, until stopped`."""
     return _what(record, speed_radps) + ("" if record.duration_s > 0.0 else ", until stopped")
 
@@ -74,7 +74,7 @@ def _what(record: Any, speed_radps: float) -> str:
     kind = TrajectoryKind(int(record.kind))
     if kind is TrajectoryKind.HOLD:
         return f"set-point {record.start_rad:+.4f} rad"
-    name = kind.name.lower().replace("_", " ")
+    name = in_words(kind)
     if kind is TrajectoryKind.SINE:
         ends = record.offset_rad - abs(record.amplitude_rad), record.offset_rad + abs(record.amplitude_rad)
     elif kind is TrajectoryKind.TABLE:

@@ -9,9 +9,9 @@ from rich.table import Table
 from rich.text import Text
 
 from firmware_py.realtime import Histogram
-from firmware_py.states import AxisPhase, Fault
+from firmware_py.states import AxisPhase
 from tools.running.display.display import Snapshot
-from tools.running.events.event_finder import drive_state_name, phase_name
+from tools.running.events.event_finder import drive_state_name, fault_words, phase_name
 from tools.running.loop.loop_delay import quantile_s
 
 NOTES = 3  # how many of the newest remarks stay in the panel
@@ -70,7 +70,7 @@ def _cells(phase: str, snapshot: Snapshot | None) -> list[tuple[str, str | Text]
         Text(phase_name(int(record.phase)), style="bold"),
         drive_state_name(int(record.status_word), int(record.drive_state), cia402=snapshot.cia402),
         f"{float(record.error_rad) * 1e3:+8.3f} mrad" if active else "-",
-        Text(_fault_name(fault), style="bold red") if fault else "none",
+        Text(fault_words(fault), style="bold red") if fault else "none",
         f"{float(record.position_rad):+8.4f} rad",
         f"{float(record.command_torque_Nm):+8.2f} Nm",
         f"{float(record.velocity_radps):+7.3f} rad/s",
@@ -81,10 +81,6 @@ def _cells(phase: str, snapshot: Snapshot | None) -> list[tuple[str, str | Text]
         f"{snapshot.skipped} cycles",
     )
     return list(zip(names, values, strict=True))
-
-
-def _fault_name(code: int) -> str:
-    return Fault(code).name.lower().replace("_", " ") if code in list(Fault) else f"fault {code}"
 
 
 def time_left(trajectory_s: float, duration_s: float, phase: int) -> str:

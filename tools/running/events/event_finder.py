@@ -13,7 +13,7 @@ import numpy as np
 
 from drivers.canopen.cia402 import State, state_of_word, state_text
 from drivers.elmo.codes import motor_fault_text
-from firmware_py.states import AxisPhase, DriveState, Fault
+from firmware_py.states import AxisPhase, DriveState, Fault, fault_name, in_words
 from tools.recording.run_log import ERROR, INFO, WARNING, Event
 from tools.running.events.emergency_text import emergency_text
 from tools.running.events.fault_text import FAULT_TEXTS
@@ -28,15 +28,20 @@ def drive_state_name(status_word: int, drive_state: int, *, cia402: bool = True)
         return "not heard yet"
     if cia402:
         return state_text(status_word)
-    return DriveState(drive_state).name.lower().replace("_", " ")
+    return in_words(DriveState(drive_state))
 
 
 def phase_name(phase: int) -> str:
     """`quick stopping` and so on."""
-    return AxisPhase(phase).name.lower().replace("_", " ")
+    return in_words(AxisPhase(phase))
 
 
-def _fault_words(fault: Fault, _drive_error: int) -> str:
+def fault_words(code: int) -> str:
+    """`position limit` and so on; `fault 99` for a number that this version does not know."""
+    return fault_name(code).replace("_", " ").lower()
+
+
+def _likely_cause(fault: Fault, _drive_error: int) -> str:
     """Without the value that tripped it, which is not in the records."""
     return f"likely cause: {FAULT_TEXTS[fault].cause}" if fault in FAULT_TEXTS else ""
 
@@ -48,7 +53,7 @@ class EventFinder:
     about a fault than its name.
     """
 
-    def __init__(self, *, cia402: bool = True, fault_words: Callable[[Fault, int], str] = _fault_words) -> None:
+    def __init__(self, *, cia402: bool = True, fault_words: Callable[[Fault, int], str] = _likely_cause) -> None:
         self._cia402 = cia402
         self._fault_words = fault_words
         self._last: tuple[int, ...] | None = None

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
+from drivers.elmo.codes import SERVO_ON
 from firmware_py.states import Fault
-from tools.running.events.fault_text import FaultText
+from tools.running.events.fault_text import FAULT_TEXTS, FaultText
 
 # {value}: the number that tripped the limit; {word}: the same as a hexadecimal status register (SR)
 SERIAL_FAULT_TEXTS: dict[Fault, FaultText] = {
@@ -26,10 +28,10 @@ SERIAL_FAULT_TEXTS: dict[Fault, FaultText] = {
         "the drive went silent after commissioning",
         "check the cable; run again",
     ),
-    Fault.SAMPLES_MISSING: FaultText(
-        "positions came, but never {value:.0f} of them in a row, as sequence.settle_s wants it before enabling",
-        "noise garbles replies, or a busy computer hands them over late",
-        "check the cable and its ground, and what else the computer does; or lower loop.rate_Hz",
+    Fault.SAMPLES_MISSING: replace(
+        FAULT_TEXTS[Fault.SAMPLES_MISSING],
+        cause="noise garbles replies, or a busy computer hands them over late",
+        next_step="check the cable and its ground, and what else the computer does; or lower loop.rate_Hz",
     ),
     Fault.DRIVE_RESTARTED: FaultText(
         "the drive restarted while the loop was running: its unit mode is another one (SR {word})",
@@ -68,7 +70,6 @@ SERIAL_FAULT_TEXTS: dict[Fault, FaultText] = {
     ),
 }
 
-SERVO_ON = 1 << 4  # of SR
 # with the servo on in the last SR nothing says that the drive has switched off: the loop has given up believing it
 STATUS_LOST_TEXT = FaultText(
     "the drive's status stayed away although positions came; the last one said that its motor is on (SR {word})",

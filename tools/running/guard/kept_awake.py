@@ -13,7 +13,6 @@ import subprocess
 from collections.abc import Iterator
 
 from tools.configuration.config import Config
-from tools.configuration.elmo import ElmoSerial
 from tools.output import Output
 
 WHAT = "sleep:handle-lid-switch"
@@ -55,7 +54,7 @@ def _end(child: subprocess.Popen[bytes]) -> None:
 @contextlib.contextmanager
 def kept_awake(config: Config, output: Output) -> Iterator[bool]:
     """Whether the computer is kept awake; nothing is done where the drive has a watchdog of its own."""
-    if not isinstance(config.drive, ElmoSerial):
+    if not config.is_serial:
         yield False
         return
     child = _start()

@@ -18,7 +18,7 @@ from firmware_py.sequence import reset_axis
 from firmware_py.states import AxisPhase, Fault, StopRequest
 from tools.configuration.config import Config
 from tools.running.loop.loop_process import LoopOrder
-from tools.running.loop.shared_block import SERIAL, SharedBlock
+from tools.running.loop.shared_block import SharedBlock
 from tools.simulation.starting import Starting
 
 KILL_S = 1.0  # how long a killed process may take to go
@@ -42,7 +42,7 @@ class LoopHandle:
         self.block.table[:] = table
         self._tail = 0
         self.lost_records = 0
-        self._after_end = _ON_SERIAL if config.bus.interface == SERIAL else _ON_CAN
+        self._after_end = _ON_SERIAL if config.is_serial else _ON_CAN
         self._period_ns = period_ns = round(NANOSECONDS / config.loop.rate_Hz)
         order = LoopOrder(
             supervisor_pid=os.getpid(),

@@ -163,7 +163,8 @@ def portable_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
 def run(order: LoopOrder) -> int:
     """Warm up, wait for GO, run the loop; returns the exit code."""
     from drivers.can.open import CYCLIC_INTERFACES
-    from tools.running.loop.shared_block import SERIAL, SharedBlock
+    from drivers.elmo.port import SERIAL
+    from tools.running.loop.shared_block import SharedBlock
 
     block = SharedBlock(order.block_fd, order.table_rows, order.interface)
     if order.interface == SERIAL:

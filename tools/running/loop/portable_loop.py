@@ -36,7 +36,7 @@ from drivers.errors import ConfigurationError
 from firmware_py.axis import step_axis
 from firmware_py.libc import NANOSECONDS, sleep_until_ns
 from firmware_py.realtime import Histogram, Word, count, note_suspension, write_log
-from firmware_py.schema import new
+from firmware_py.schema import INT32_MAX, new
 from firmware_py.states import AxisPhase, DriveRequest
 from tools.running.loop.loop_delay import QUANTILE, quantile_s
 from tools.running.loop.shared_block import SharedBlock
@@ -45,7 +45,6 @@ HIGHEST_RATE_HZ = 500.0
 FOREVER = 1 << 62
 PROBE_PERIOD_NS, PROBE_CYCLES = 2_000_000, 100
 _FRAMES_AT_ONCE = 256  # a flooded bus must not keep a cycle from its end
-_INT32_MAX = 2_147_483_647
 _UNKNOWN_ERROR = 5  # EIO
 
 
@@ -106,7 +105,7 @@ class PortableExchange:
 
     def _fail(self, error: Exception) -> None:
         code = getattr(error, "error_code", None) or getattr(error, "errno", None)
-        self._port.last_errno = code if isinstance(code, int) and abs(code) <= _INT32_MAX else _UNKNOWN_ERROR
+        self._port.last_errno = code if isinstance(code, int) and abs(code) <= INT32_MAX else _UNKNOWN_ERROR
         self._failed = True
 
     def _send(self, slot: int) -> None:
@@ -239,10 +238,10 @@ def _cycles(exchange: PortableExchange, block: SharedBlock, period_ns: int, rece
         record = ring[head % len(ring)]
         write_log(record, state, sample, command)
         record.time_ns = deadline_ns
-        record.wake_late_ns = min(late_ns, _INT32_MAX)
-        record.round_trip_ns = min(round_trip_ns, _INT32_MAX) if fresh else 0
-        record.work_ns = min(work_ns, _INT32_MAX)
-        record.skipped = min(elapsed_cycles - 1, _INT32_MAX)
+        record.wake_late_ns = min(late_ns, INT32_MAX)
+        record.round_trip_ns = min(round_trip_ns, INT32_MAX) if fresh else 0
+        record.work_ns = min(work_ns, INT32_MAX)
+        record.skipped = min(elapsed_cycles - 1, INT32_MAX)
         count(histograms, Histogram.WAKE, late_ns)
         if fresh:
             count(histograms, Histogram.ROUND_TRIP, round_trip_ns)

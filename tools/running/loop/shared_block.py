@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 
 from drivers.canopen.port import CanopenPort
-from drivers.elmo.port import ElmoPort
+from drivers.elmo.port import SERIAL, ElmoPort
 from firmware_py.realtime import HISTOGRAM_BINS, WORDS, Histogram, Word
 from firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
 from firmware_py.schema import dtype_of
 
 RING_RECORDS = 1 << 14  # 16 s at 1 kHz
-SERIAL = "serial"  # the interface of a serial drive
 _LINE = 64  # bytes; nothing of one array shares a cache line with another
 
 

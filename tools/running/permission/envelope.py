@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from drivers.drive import CommissioningReport
+from firmware_py.motion_peak import peak_of
 from firmware_py.records import Reference
 from firmware_py.schema import new
 from firmware_py.trajectory import reference_at
-from firmware_py.trajectory_table import peak_of
 from tools.configuration.config import Config
 from tools.configuration.records import axis_constants, trajectory_table
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from drivers.drive import CommissioningReport
 from drivers.errors import ConfigurationError, MotionFault
+from firmware_py.motion_peak import approach_start
 from firmware_py.records import TrajectoryConstants
 from firmware_py.schema import new
 from firmware_py.states import Fault
-from firmware_py.trajectory_table import approach_start
 from tools.configuration.config import Config
 from tools.configuration.records import fill_trajectory, trajectory_table
 from tools.output import Output

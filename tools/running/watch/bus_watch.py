@@ -15,13 +15,13 @@ from dataclasses import replace
 
 from drivers.can import socketcan
 from drivers.can.error_frames import error_frame_text, trouble
+from drivers.can.frames import FRAME_STRUCT
 from drivers.can.link_state import link_problem, link_state, send_problem
 from drivers.errors import BusError
 from firmware_py.states import Fault
 from tools.configuration.config import Config
 from tools.running.events.fault_text import FaultText
 
-_FRAME = struct.Struct("<IB3x8s")
 _SOL_CAN_RAW = 101
 _CAN_RAW_FILTER = 1
 _FRAMES_AT_ONCE = 200
@@ -56,7 +56,7 @@ class BusWatch:
         news = []
         for _ in range(_FRAMES_AT_ONCE):
             try:
-                identifier, _, data = _FRAME.unpack(self._end.recv(_FRAME.size))
+                identifier, _, data = FRAME_STRUCT.unpack(self._end.recv(FRAME_STRUCT.size))
             except (OSError, struct.error):  # nothing waits, or the interface has gone, which the loop sees as well
                 break
             kind = trouble(identifier, data)

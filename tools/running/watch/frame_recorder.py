@@ -21,7 +21,6 @@ import can
 from drivers.can.open import SHARED_INTERFACES, open_python_can
 from drivers.errors import ConfigurationError
 from tools.configuration.config import Config
-from tools.running.loop.shared_block import SERIAL
 
 QUEUE_FRAMES = 1 << 16  # more than 20 s at 1 kHz
 RECEIVE_S = 0.1  # how long the thread waits before it looks whether it is to end
@@ -81,7 +80,7 @@ def recording(config: Config) -> Iterator[FrameRecorder | None]:
         yield None
         return
     bus = config.bus
-    if bus.interface == SERIAL:
+    if config.is_serial:
         raise ConfigurationError(f"{config.path}: log.frames (=true) must be false on a serial line, it has no frames")
     if bus.interface not in SHARED_INTERFACES:
         raise ConfigurationError(

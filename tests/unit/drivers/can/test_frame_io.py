@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 import drivers
-from drivers.can.frame_io import new_wait_scratch, receive_frame, send_frame, wait_readable_ns
+from drivers.can.frame_io import receive_frame, send_frame
 from drivers.can.frames import FRAME_BYTES, Frame
+from firmware_py.libc import WAIT_SCRATCH_WORDS, wait_readable_ns
 from firmware_py.schema import dtype_of, new
 
 Pair = tuple[socket.socket, socket.socket]
@@ -23,11 +24,13 @@ Pair = tuple[socket.socket, socket.socket]
 ALLOCATION_COUNT = """
 import socket, sys, threading
 import numba
+import numpy as np
 from numba.core.runtime import rtsys
-from drivers.can.frame_io import new_wait_scratch, receive_frame, send_frame, wait_readable_ns
+from drivers.can.frame_io import receive_frame, send_frame
 from drivers.can.frames import Frame
 from drivers.can.virtual_bus import connect
 from firmware_py.kernel import kernel
+from firmware_py.libc import WAIT_SCRATCH_WORDS, wait_readable_ns
 from firmware_py.schema import new
 from hil.bus.virtual_bus import VirtualBusHub
 
@@ -44,7 +47,7 @@ def allocations():
     counts = rtsys.get_allocation_stats()
     return counts.alloc, counts.mi_alloc
 
-frames, scratch = new(Frame, 2), new_wait_scratch()
+frames, scratch = new(Frame, 2), np.zeros(WAIT_SCRATCH_WORDS, np.int64)
 left, right = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
 exchange(left.fileno(), right.fileno(), frames, scratch, 1)
 counts = []
@@ -138,7 +141,7 @@ def test_a_bad_descriptor() -> None:
 
 
 def test_waiting(pair: Pair) -> None:
-    scratch = new_wait_scratch()
+    scratch = np.zeros(WAIT_SCRATCH_WORDS, np.int64)
     fd = pair[1].fileno()
     assert not wait_readable_ns(fd, 0, scratch)
     assert not wait_readable_ns(fd, -5, scratch)
