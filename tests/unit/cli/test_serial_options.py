@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from drivers.errors import ConfigurationError
 from tools.cli.main import app
-from tools.cli.options import loaded
+from tools.cli.options import BusOptions, CanOptions, loaded
 from tools.configuration.elmo_settings import elmo_section
 
 SERIAL, CAN = Path("elmo_serial"), Path("virtual")
@@ -24,8 +24,8 @@ def test_these_verbs_take_a_port(verb: str) -> None:
 
 
 def test_the_port_replaces_the_one_of_the_file() -> None:
-    assert elmo_section(loaded(SERIAL, port="/dev/ttyUSB7")).port == "/dev/ttyUSB7"
-    assert loaded(CAN, target=9).canopen.node == 9
+    assert elmo_section(loaded(SERIAL, BusOptions(port="/dev/ttyUSB7"))).port == "/dev/ttyUSB7"
+    assert loaded(CAN, CanOptions(target=9)).canopen.node == 9
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,7 @@ def test_the_port_replaces_the_one_of_the_file() -> None:
 )
 def test_options_of_the_other_kind_are_refused(path: Path, options: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
-        loaded(path, **options)
+        loaded(path, BusOptions(**options))
     assert words in caught.value.message
 
 

@@ -218,7 +218,7 @@ def test_current_becomes_torque(tmp_path):
     ("change", "message"),
     [
         ({"velocity_unit": None}, "--velocity-unit is missing"),
-        ({"velocity_unit": "rpm"}, r"--velocity-unit \(=rpm\) must be one of rad/s, deg/s, r/min"),
+        ({"velocity_unit": "rpm"}, r"--velocity-unit \(=rpm\) must be one of deg/s, rad/s, r/min"),
         ({"side": None}, "--side is missing"),
         ({"side": "both"}, r"--side \(=both\) must be one of joint, motor"),
         ({"torque_side": None}, "--torque-side is missing"),

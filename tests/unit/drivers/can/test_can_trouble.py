@@ -62,7 +62,7 @@ def real_interface(**data: Any) -> dict[str, Any]:
 
 def test_a_healthy_interface() -> None:
     link = parse_link(real_interface())
-    assert link == LinkState("can0", "can", True, "ERROR-ACTIVE", 0, 0, 1_000_000, 0, 10, link.counts)
+    assert link == LinkState("can0", "can", True, "ERROR-ACTIVE", 0, 0, 1_000_000, 10, link.counts)
     assert link.counts["bus_error"] == 3
     assert link_problem(link) is None
     assert link_problem(link, 1_000_000) is None
