@@ -13,13 +13,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from drivers.errors import ConfigurationError
-from firmware_py.records import NEURONS
 from firmware_py.states import ControllerKind
 from firmware_py.velocity import low_pass_gain
 from tools.analysis.linear_loop import LoopSettings
 from tools.configuration.conversions import joint_rad_per_count
 from tools.configuration.elmo import ElmoSerial
-from tools.configuration.records import PAPER_CENTRES
+from tools.configuration.records import hidden_layer
 
 if TYPE_CHECKING:
     from tools.configuration.config import Config
@@ -57,8 +56,7 @@ def loop_settings(config: Config, delay_s: float | None = None) -> tuple[LoopSet
     """The loop of this configuration; `delay_s` is a measured loop delay, which beats the configured one."""
     control, current_lag_s = config.control, config.margin.current_lag_s
     delay_s, delay_origin = _delay(config, delay_s)
-    centres = control.centres or tuple((c, c) for c in PAPER_CENTRES)
-    widths = control.widths if len(control.widths) > 1 else control.widths * NEURONS
+    centres, widths = hidden_layer(control)
     try:
         settings = LoopSettings(
             kind=ControllerKind[control.kind.upper()],

@@ -21,6 +21,7 @@ from tools.configuration.config import Config
 from tools.configuration.conversions import friction_constants, joint_rad_per_count, period_s, static_friction_Nm
 from tools.configuration.elmo import ElmoSerial
 from tools.configuration.problems import ConfigurationProblems
+from tools.configuration.sections import Control
 
 # the paper's centres, in rad and in rad/s: -c_p, 0, c_p with c_p = 1e-2 [-5 -3 -1 -0.8 -0.4 -0.1 -0.05]
 _PAPER_HALF = (0.05, 0.03, 0.01, 0.008, 0.004, 0.001, 0.0005)
@@ -108,16 +109,21 @@ def _fill_law(law: Any, config: Config) -> None:
     _, p12, p22 = solve_lyapunov_p(control.kp, control.kv, control.q[0], control.q[-1])
     network.p_b[0] = p12 / joint.inertia_kgm2
     network.p_b[1] = p22 / joint.inertia_kgm2
-    centres = control.centres or tuple((c, c) for c in PAPER_CENTRES)
+    centres, widths = hidden_layer(control)
     for i in range(NEURONS):
         network.centres[i, 0], network.centres[i, 1] = centres[i]
-        width = control.widths[i if len(control.widths) > 1 else 0]
-        network.inverse_width[i] = 0.5 / width**2
+        network.inverse_width[i] = 0.5 / widths[i] ** 2
     network.learning_rate = control.learning_rate
     network.initial_weight = control.initial_weight_Nm
     network.leakage = control.leakage_1ps
     network.weight_limit = control.weight_limit_Nm
     network.dead_zone_rad = control.dead_zone_rad
+
+
+def hidden_layer(control: Control) -> tuple[tuple[tuple[float, float], ...], tuple[float, ...]]:
+    """Centres and widths of all neurons; without centres those of the paper, one width is that of all."""
+    centres = control.centres or tuple((c, c) for c in PAPER_CENTRES)
+    return centres, control.widths if len(control.widths) > 1 else control.widths * NEURONS
 
 
 def fill_change(record: Any, law: Any, config: Config) -> None:

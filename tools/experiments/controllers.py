@@ -63,10 +63,14 @@ def changed(control: Control, changes: Mapping[str, Any], name: str) -> Control:
     try:
         return Control.model_validate(values)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in first["loc"])
-        message = str(first["msg"])
-        raise ConfigurationError(f"{name}: {key} (={first['input']}): {message[0].lower()}{message[1:]}") from None
+        raise ConfigurationError(one_line(error, name)) from None
+
+
+def one_line(error: ValidationError, origin: str) -> str:
+    """Its first problem: where, which key, its value, what is wrong."""
+    first = error.errors(include_url=False)[0]
+    key, message = ".".join(str(part) for part in first["loc"]), str(first["msg"])
+    return f"{origin}: {key} (={first['input']}): {message[0].lower()}{message[1:]}"
 
 
 def named(names: tuple[str, ...] = DEFAULT) -> list[Controller]:

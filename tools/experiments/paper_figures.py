@@ -36,6 +36,27 @@ def _scale_to_later(axis: Any, *curves: tuple[np.ndarray, np.ndarray]) -> None:
     axis.set_ylim(low - room, high + room)
 
 
+def _draw_nodes(
+    axis: Any, time_s: np.ndarray, values: np.ndarray, letter: str, widths: tuple[float, ...] = (1.0, 1.0, 1.0)
+) -> None:
+    """Three of the network's nodes, (N, nodes): the first, the middle, the last."""
+    for index, color, width in zip((0, 7, 14), (BLUE, ORANGE, GREEN), widths, strict=True):
+        _draw(axis, time_s, values[:, index], f"{letter}{index + 1}", color, linewidth=width)
+    _scale_to_later(axis, *((time_s, values[:, index]) for index in (0, 7, 14)))
+
+
+def _draw_precise(axis: Any, time_s: np.ndarray, error_rad: np.ndarray, on: str = "") -> None:
+    _draw(axis, time_s, error_rad * 1e3, "precise.toml", GREEN)
+    axis.set_ylim(-0.4, 0.4)
+    _tidy(axis, "error [mrad]", f"not in the paper: configs/precise.toml{on} (note the scale)", legend=True)
+
+
+def _over_time(figure: Any, axes: Any) -> Any:
+    axes[-1].set_xlabel("time [s]")
+    figure.align_ylabels(axes)
+    return figure
+
+
 def _tracked(run: LockstepRun) -> tuple[Any, np.ndarray]:
     log = run.log[run.tracking]
     return log, log.trajectory_s
@@ -64,20 +85,14 @@ def draw_simulation(runs: Runs) -> Any:
         text = f"(b) estimated and true model error; after 75 s correlation {estimate.correlation:.3f}"
         _scale_to_later(axes[2], (time_s, estimate.true_Nm), (time_s, estimate.estimate_Nm))
         _tidy(axes[2], "[Nm]", text, legend=True)
-        # all weights move as one (b = 5): drawing one in three is drawing them all
-        for index, color in zip((0, 7, 14), (BLUE, ORANGE, GREEN), strict=True):
-            _draw(axes[3], time_s, log.weights[:, index], f"w{index + 1}", color, linewidth=2.6 - 0.09 * index)
-        _scale_to_later(axes[3], (time_s, log.weights[:, 0]))
+        # all weights move as one (b = 5), so that only lines of different widths are seen
+        _draw_nodes(axes[3], time_s, log.weights, "w", (2.6, 1.97, 1.34))
         _tidy(axes[3], "[Nm]", "(c) weights: they differ by less than a line's width", legend=True)
         hidden = hidden_outputs(run, experiment.plant, experiment.controller)
-        for index, color in zip((0, 7, 14), (BLUE, ORANGE, GREEN), strict=True):
-            _draw(axes[4], time_s, hidden[:, index], f"h{index + 1}", color)
+        _draw_nodes(axes[4], time_s, hidden, "h")
         axes[4].ticklabel_format(axis="y", useOffset=False)
-        _scale_to_later(axes[4], (time_s, hidden[:, 0]), (time_s, hidden[:, 7]), (time_s, hidden[:, 14]))
         _tidy(axes[4], "", "(d) outputs of the hidden layer: near 1 throughout", legend=True)
-        axes[4].set_xlabel("time [s]")
-        figure.align_ylabels(axes)
-        return figure
+        return _over_time(figure, axes)
 
 
 def draw_friction_model(runs: Runs) -> Any:
@@ -104,17 +119,8 @@ def draw_friction_model(runs: Runs) -> Any:
         _draw(axes[3], bare_s, bare.command_torque_Nm, "without", GREY)
         _scale_to_later(axes[3], (bare_s, bare.command_torque_Nm), (time_s, log.command_torque_Nm))
         _tidy(axes[3], "torque [Nm]", "torque at the joint", legend=True)
-        _draw(axes[4], fine_s, fine.error_rad * 1e3, "precise.toml", GREEN)
-        axes[4].set_ylim(-0.4, 0.4)
-        _tidy(
-            axes[4],
-            "error [mrad]",
-            "not in the paper: configs/precise.toml on the same joint (note the scale)",
-            legend=True,
-        )
-        axes[4].set_xlabel("time [s]")
-        figure.align_ylabels(axes)
-        return figure
+        _draw_precise(axes[4], fine_s, fine.error_rad, " on the same joint")
+        return _over_time(figure, axes)
 
 
 def draw_change(runs: Runs, change: str, title: str, from_s: float = 70.0) -> Any:
@@ -133,15 +139,11 @@ def draw_change(runs: Runs, change: str, title: str, from_s: float = 70.0) -> An
         _tidy(axes[1], "network [Nm]", "(b) output of the network, subtracted", legend=True)
         _draw(axes[2], t, log.error_rad[late] * 1e3, "paper's law", BLUE)
         _tidy(axes[2], "error [mrad]", "(c) error", legend=True)
-        _draw(axes[3], fine_s[fine_late], fine.error_rad[fine_late] * 1e3, "precise.toml", GREEN)
-        axes[3].set_ylim(-0.4, 0.4)
-        _tidy(axes[3], "error [mrad]", "not in the paper: configs/precise.toml (note the scale)", legend=True)
-        axes[3].set_xlabel("time [s]")
+        _draw_precise(axes[3], fine_s[fine_late], fine.error_rad[fine_late])
         at_s = event_s(made.experiment.scenario)
         for axis in axes:
             axis.axvline(at_s, color=GREY, linewidth=1.0, linestyle=":")
-        figure.align_ylabels(axes)
-        return figure
+        return _over_time(figure, axes)
 
 
 def draw_all(runs: Runs) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from pydantic import BeforeValidator, Field, ValidationError
 from drivers.errors import ConfigurationError
 from tools.configuration.problems import suggestion
 from tools.configuration.sections import Section, between
-from tools.experiments.controllers import DEFAULT, Controller, changed, named
+from tools.experiments.controllers import DEFAULT, Controller, changed, named, one_line
 from tools.experiments.ensemble import EnsembleSettings
 from tools.experiments.scenarios import Scenario
 
@@ -62,14 +62,13 @@ def checked(data: dict[str, Any], origin: str) -> StudySettings:
         return StudySettings.model_validate(data)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
             model = EnsembleSettings if first["loc"][0] == "plant" else StudySettings
             known = list(model.model_fields)
             hint = suggestion(str(first["loc"][-1]), known)
+            key = ".".join(str(part) for part in first["loc"])
             raise ConfigurationError(f"{origin}: {key} is not a known key{hint}") from None
-        message = str(first["msg"])
-        raise ConfigurationError(f"{origin}: {key} (={first['input']}): {message[0].lower()}{message[1:]}") from None
+        raise ConfigurationError(one_line(error, origin)) from None
 
 
 def study_controllers(settings: StudySettings) -> list[Controller]:

@@ -13,6 +13,7 @@ from tools.motion_check.verdict import ended_finding, motion_findings
 from tools.output import Output
 from tools.recording.log_folder import log_path
 from tools.running.permission.consent import agreed, require_terminal
+from tools.running.permission.envelope import remark_lines, where_lines
 from tools.running.permission.readiness import prepare_log, require_ready
 from tools.running.result import drive_end
 from tools.running.result.drive_end import require_off
@@ -23,15 +24,14 @@ def check_envelope(config: Config, plan: CheckPlan, report: CommissioningReport)
     """What is about to happen, in lines."""
     start = report.start_position_rad
     lines = [
-        f"drive      {report.identity.name or 'unnamed'}, vendor {report.identity.vendor}, {report.mode}",
-        f"now at     {start:+.4f} rad",
+        *where_lines(report),
         f"motion     a soft spring pulls the joint towards {start + plan.travel_rad:+.3f}, then "
         f"{start - plan.travel_rad:+.3f} rad, {plan.duration_s:.0f} s",
         f"limits     {plan.torque_Nm:.1f} Nm, {plan.velocity_radps:.2f} rad/s; it is braked beyond 0.1 rad or so: "
         "keep it free and unloaded, a hand on the emergency stop",
         "watch      which way it turns first: it must be the one that you call positive",
     ]
-    return lines + [f"remark     {remark}" for remark in report.remarks]
+    return lines + remark_lines(report.remarks)
 
 
 def doctor_motion(config: Config, output: Output, *, assume_yes: bool, torque_Nm: float | None = None) -> int:

@@ -6,13 +6,15 @@ import contextlib
 import os
 import select
 import time
+from collections.abc import Callable
 
 from hil.bus.virtual_bus import default_socket_path
+from hil.device_loop import ENDED_WORD
 from tools.configuration.config import Config
 from tools.output import Output
 from tools.running.loop.loop_process import become_realtime
 from tools.running.loop.slow_start import slow_start
-from tools.running.stop_signals import stop_signals
+from tools.running.stop_signals import StopSignals, stop_signals
 from tools.simulation.virtual_joint import serve_virtual_joint
 
 _POLL_S = 0.05
@@ -26,9 +28,7 @@ def hil(config: Config, output: Output, *, timing: bool = False, ready_fd: int |
         serve_virtual_joint(config, timing) as joint,
     ):
         started()
-        # only now, and every thread: bus, drive and SDO server are compiled and run
-        for line in become_realtime(None, config.loop.priority, [int(name) for name in os.listdir("/proc/self/task")]):
-            output.note(f"virtual joint: {line}")
+        make_realtime(config, output)
         bus = config.bus
         place = f"{bus.interface}:{bus.channel}"
         if bus.interface == "jointctl":
@@ -36,16 +36,27 @@ def hil(config: Config, output: Output, *, timing: bool = False, ready_fd: int |
         output.note(f"virtual joint: node {config.canopen.node} on {place}; Ctrl-C ends it")
         if bus.interface == "jointctl":
             output.note(f'attach with python-can: can.Bus(interface="jointctl", channel="{bus.channel}")')
-        if ready_fd is not None:
-            os.set_blocking(ready_fd, False)
-            with contextlib.suppress(BrokenPipeError):
-                os.write(ready_fd, b"+")
-        while not signals.count and not joint.words[2] and not reader_gone(ready_fd):
-            time.sleep(_POLL_S)
+        wait_for_end(signals, ready_fd, lambda: bool(joint.words[ENDED_WORD]))
     return 0
 
 
-def reader_gone(ready_fd: int | None) -> bool:
+def make_realtime(config: Config, output: Output) -> None:
+    """Every thread of this process, once bus, drive and SDO server are compiled and run."""
+    for line in become_realtime(None, config.loop.priority, [int(name) for name in os.listdir("/proc/self/task")]):
+        output.note(f"virtual joint: {line}")
+
+
+def wait_for_end(signals: StopSignals, ready_fd: int | None, ended: Callable[[], bool] = lambda: False) -> None:
+    """Tell `ready_fd` with one byte that we are up; until a stop signal, its reader's end, or `ended`."""
+    if ready_fd is not None:
+        os.set_blocking(ready_fd, False)
+        with contextlib.suppress(BrokenPipeError):
+            os.write(ready_fd, b"+")
+    while not signals.count and not ended() and not _reader_gone(ready_fd):
+        time.sleep(_POLL_S)
+
+
+def _reader_gone(ready_fd: int | None) -> bool:
     """Whether whoever started us and waited on `ready_fd` has gone."""
     if ready_fd is None:
         return False

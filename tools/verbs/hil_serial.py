@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -16,11 +15,8 @@ from tools.configuration.config import Config
 from tools.configuration.elmo_settings import elmo_device_settings, elmo_section
 from tools.configuration.plant_settings import plant_settings
 from tools.output import Output
-from tools.running.loop.loop_process import become_realtime
 from tools.running.stop_signals import stop_signals
-from tools.verbs.hil import reader_gone
-
-_POLL_S = 0.05
+from tools.verbs.hil import make_realtime, wait_for_end
 
 
 def new_elmo_device(config: Config) -> ElmoDevice:
@@ -61,16 +57,9 @@ def refuse_options(config: Config, *, port: str | None, timing: bool) -> None:
 def hil_serial(config: Config, output: Output, *, link: str | None = None, ready_fd: int | None = None) -> int:
     """Serve until a stop signal; prints the port on stdout.  `ready_fd` as in `tools.verbs.hil.hil`."""
     with stop_signals() as signals, serve_virtual_elmo(config, link) as device:
-        # only now, and every thread: bus, drive and SDO server are compiled and run
-        for line in become_realtime(None, config.loop.priority, [int(name) for name in os.listdir("/proc/self/task")]):
-            output.note(f"virtual joint: {line}")
+        make_realtime(config, output)
         path = link or device.path
         output.result(path, {"port": path, "baud_rate_bitps": device.baud_rate_bitps})
         output.note(f"virtual drive: {path} at {device.baud_rate_bitps} baud; Ctrl-C ends it")
-        if ready_fd is not None:
-            os.set_blocking(ready_fd, False)
-            with contextlib.suppress(BrokenPipeError):
-                os.write(ready_fd, b"+")
-        while not signals.count and not reader_gone(ready_fd):
-            time.sleep(_POLL_S)
+        wait_for_end(signals, ready_fd)
     return 0

@@ -17,7 +17,7 @@ from tools.running.permission.envelope import motion_envelope
 from tools.running.permission.readiness import prepare_log, require_ready, require_start
 from tools.running.result import drive_end
 from tools.running.result.drive_end import require_off
-from tools.running.result.run_report import report_run
+from tools.running.result.run_report import report_run, run_title
 from tools.running.supervisor import Supervisor
 
 
@@ -50,7 +50,7 @@ def run(
         return True
 
     path = log_path(config)
-    title = f"{config.path.stem}: {config.trajectory.kind}"
+    title = run_title(config)
     with _displays(config, output, title, scope) as display:
         supervisor = Supervisor(config, output, path, confirm, allow_low_margin=allow_low_margin, display=display)
         try:
@@ -65,7 +65,7 @@ def run(
             f"dry run: nothing moved; the drive was commissioned; {left}" if dry_run else f"nothing moved; {left}"
         )
         return 0
-    return report_run(result, output, title, picture=config.log.picture)
+    return report_run(result, output, config)
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from tools.running.display.live_panel import run_display
 from tools.running.permission.envelope import motion_envelope
 from tools.running.permission.readiness import prepare_log, require_ready, require_start
 from tools.running.result.drive_end import words
-from tools.running.result.run_report import report_run
+from tools.running.result.run_report import report_run, run_title
 from tools.running.supervisor import Supervisor
 from tools.scoping.displays import Displays
 from tools.scoping.feed import ScopeFeed, scope_server
@@ -52,7 +52,7 @@ def live_scope(
     Nothing moves before a viewer has confirmed the motion envelope that the page shows.  `unwatched_s`: brake when no
     page has been open for so long; None = go on.
     """
-    title = f"{config.path.stem}: {config.trajectory.kind}"
+    title = run_title(config)
     order = scope_order(title, host, port, cia402=not config.is_serial)
     output.note(f"scope: {order.url}  (Ctrl-C ends it; nothing moves before Start on the page)")
     with scope_server(order, in_charge=True, unwatched_s=unwatched_s) as feed:
@@ -112,7 +112,7 @@ class _Runs:
                 why = "stopped before it began" if feed.stop_request() else f"not started within {PREPARED_S:g} s"
                 self._tell("declined", [f"{why}; nothing moved; {words(self.drive_state)}"])
                 return False
-            self.code = report_run(result, output, self._title, picture=self._config.log.picture)
+            self.code = report_run(result, output, self._config)
         except ServerGone:
             raise
         except JointctlError as error:
@@ -125,7 +125,7 @@ class _Runs:
             lines.insert(0, f"error    RMSE {result.summary.error.rmse_rad * 1e3:.3f} mrad")
         if result.fault_text is not None:
             text = result.fault_text
-            lines.insert(0, f"{result.fault.name}: {text.happened}; likely cause: {text.cause}; next: {text.next_step}")
+            lines.insert(0, f"{result.fault.name}: {text.happened}; {text.advice}")
         self._tell("ended", lines)
         return result.stopped_by.startswith("SIG")
 

@@ -23,6 +23,7 @@ from tools.recording.log_folder import log_path
 from tools.reporting.page import check_target
 from tools.running.events.fault_text import FaultText, fault_text
 from tools.running.permission.consent import agreed, require_terminal
+from tools.running.permission.envelope import remark_lines, where_lines
 from tools.running.permission.readiness import require_ready
 from tools.running.result import drive_end
 from tools.sweeping.carry_out import SweepSupervisor, approach_time_s, middle_rad, sweep_in_lockstep, with_mode
@@ -65,9 +66,7 @@ def envelope(config: Config, report: CommissioningReport, motion: SweepMotion, p
     speeds = sorted(abs(p.velocity_radps) for p in points)
     total_s = motion.duration_s + approach_s + OVERHEAD_S
     lines = [
-        f"drive      {report.identity.name or 'unnamed'}, vendor {report.identity.vendor}, serial "
-        f"{report.identity.serial or 'unknown'}, {report.mode}",
-        f"now at     {start:+.4f} rad",
+        *where_lines(report),
         f"approach   to {middle:+.4f} rad in {approach_s:.1f} s",
         f"sweep      {len(points)} points from {speeds[0]:.4g} to {speeds[-1]:.4g} rad/s, both directions together",
         f"motion     {middle + motion.low_rad:+.3f} .. {middle + motion.high_rad:+.3f} rad, back and forth, "
@@ -75,9 +74,9 @@ def envelope(config: Config, report: CommissioningReport, motion: SweepMotion, p
         f"limits     {limits.position_min_rad:+.3f} .. {limits.position_max_rad:+.3f} rad, "
         f"{limits.velocity_max_radps:.2f} rad/s, {limits.torque_max_Nm:.1f} Nm",
     ]
-    if config.joint.gravity_Nm:
-        lines.append(f"remark     joint.gravity_Nm (={config.joint.gravity_Nm:g}) is subtracted from what is measured")
-    return lines + [f"remark     {remark}" for remark in (*constant_remarks(config), *report.remarks)]
+    gravity_Nm = config.joint.gravity_Nm
+    own = [f"joint.gravity_Nm (={gravity_Nm:g}) is subtracted from what is measured"] if gravity_Nm else []
+    return lines + remark_lines((*own, *constant_remarks(config), *report.remarks))
 
 
 class Sweep:
@@ -238,7 +237,7 @@ class Sweep:
         kept = f"{points} in {self.out}" if done else "nothing was measured"
         raise MotionFault(
             f"{fault.name} ({int(fault)}): {text.happened}; {kept}",
-            f"likely cause: {text.cause}; next: {text.next_step}" + ("; then --resume" if done else ""),
+            text.advice + ("; then --resume" if done else ""),
         )
 
     def _report(self, stopped: str | None) -> int:

@@ -13,6 +13,7 @@ import pytest
 from firmware_py.realtime import HISTOGRAM_BINS, Histogram
 from firmware_py.states import Fault
 from tests.run_records import run_records
+from tools.configuration.load import load_config, shipped_config
 from tools.output import Output
 from tools.recording.run_log import ERROR, WARNING, Event
 from tools.recording.run_summary import summarise
@@ -20,6 +21,9 @@ from tools.running.display.phase_lines import PhaseLines
 from tools.running.events.fault_text import fault_text
 from tools.running.result import run_report
 from tools.running.result.run_result import RunResult
+
+CONFIG = load_config(shipped_config("virtual"))
+WITHOUT_PICTURE = CONFIG.model_copy(update={"log": CONFIG.log.model_copy(update={"picture": False})})
 
 
 def result(folder: Path, fault: Fault) -> RunResult:
@@ -39,7 +43,7 @@ def test_the_cause_is_told_before_the_picture_is_drawn(
     out, err = io.StringIO(), io.StringIO()
     told: list[str] = []
     monkeypatch.setattr(run_report, "save_run_figure", lambda *_: told.append(err.getvalue()))
-    assert run_report.report_run(result(tmp_path, fault), Output(stdout=out, stderr=err), "t") == code
+    assert run_report.report_run(result(tmp_path, fault), Output(stdout=out, stderr=err), CONFIG) == code
     assert err.getvalue() == told[0]  # nothing more comes after it
     assert told[0].startswith("error: BUS_ERROR") == (fault is Fault.BUS_ERROR)
     assert ("hint: likely cause" in told[0]) == (fault is Fault.BUS_ERROR)
@@ -50,7 +54,7 @@ def test_the_cause_is_told_before_the_picture_is_drawn(
 def test_a_picture_that_cannot_be_written_does_not_hide_the_result(tmp_path: Path, fault: Fault) -> None:
     (tmp_path / "run.png").mkdir()
     out, err = io.StringIO(), io.StringIO()
-    code = run_report.report_run(result(tmp_path, fault), Output(stdout=out, stderr=err), "t")
+    code = run_report.report_run(result(tmp_path, fault), Output(stdout=out, stderr=err), CONFIG)
     assert code == (0 if fault is Fault.NONE else 7)
     assert "run.png: cannot be written: Is a directory" in err.getvalue().replace("\n", " ")
     assert "run.mcap" in out.getvalue()
@@ -59,11 +63,11 @@ def test_a_picture_that_cannot_be_written_does_not_hide_the_result(tmp_path: Pat
 
 def test_without_a_picture_none_is_drawn_or_told(tmp_path: Path) -> None:
     out = io.StringIO()
-    assert run_report.report_run(result(tmp_path, Fault.NONE), Output(stdout=out), "t", picture=False) == 0
+    assert run_report.report_run(result(tmp_path, Fault.NONE), Output(stdout=out), WITHOUT_PICTURE) == 0
     assert ".png" not in out.getvalue()
     assert list(tmp_path.iterdir()) == []
     out = io.StringIO()
-    run_report.report_run(result(tmp_path, Fault.NONE), Output(json=True, stdout=out), "t", picture=False)
+    run_report.report_run(result(tmp_path, Fault.NONE), Output(json=True, stdout=out), WITHOUT_PICTURE)
     assert json.loads(out.getvalue())["picture"] is None
 
 

@@ -18,6 +18,11 @@ class FaultText:
     cause: str
     next_step: str
 
+    @property
+    def advice(self) -> str:
+        """For the line below what happened."""
+        return f"likely cause: {self.cause}; next: {self.next_step}"
+
 
 FAULT_TEXTS: dict[Fault, FaultText] = {
     Fault.POSITION_LIMIT: FaultText(

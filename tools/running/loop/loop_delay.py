@@ -9,8 +9,10 @@ import math
 
 import numpy as np
 
+from drivers.can.bit_timing import worst_frame_bits
 from firmware_py.realtime import Histogram
 
+RPDO_BYTES = 4
 AT_ONCE = 254  # RPDO transmission types from here on act on receipt, the lower ones at a SYNC
 QUANTILE = 0.99
 MICROSECOND = 1e-6
@@ -31,7 +33,7 @@ def measured_delay_s(histograms: np.ndarray, rpdo_transmission_type: int, period
     Round trip and work at their 99th percentile, and the RPDO on the wire.  A synchronous RPDO waits for the next
     SYNC (transmission type n > 1: for the n-th), so that its delay is a whole number of periods.
     """
-    rpdo_s = 95 * bit_s  # 4 data bytes at worst-case stuffing
+    rpdo_s = worst_frame_bits(RPDO_BYTES) * bit_s
     path_s = (
         quantile_s(histograms[Histogram.ROUND_TRIP], QUANTILE)
         + quantile_s(histograms[Histogram.WORK], QUANTILE)

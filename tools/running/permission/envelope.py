@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from drivers.drive import CommissioningReport
 from firmware_py.motion_peak import peak_of
 from firmware_py.records import Reference
@@ -23,9 +25,7 @@ def motion_envelope(config: Config, report: CommissioningReport) -> list[str]:
     duration = config.trajectory.duration_s
     time_text = f"{approach + duration:.0f} s" if duration else "until stopped"
     lines = [
-        f"drive      {report.identity.name or 'unnamed'}, vendor {report.identity.vendor}, serial "
-        f"{report.identity.serial or 'unknown'}, {report.mode}",
-        f"now at     {report.start_position_rad:+.4f} rad",
+        *where_lines(report),
         f"approach   to {first.position_rad:+.4f} rad in {approach:.1f} s"
         if approach
         else f"approach   none: at once to {first.position_rad:+.4f} rad",
@@ -35,4 +35,18 @@ def motion_envelope(config: Config, report: CommissioningReport) -> list[str]:
         f"{limits.velocity_max_radps:.2f} rad/s, {limits.torque_max_Nm:.1f} Nm, "
         f"following error {limits.following_error_max_rad:.3f} rad",
     ]
-    return lines + [f"remark     {remark}" for remark in report.remarks]
+    return lines + remark_lines(report.remarks)
+
+
+def where_lines(report: CommissioningReport) -> list[str]:
+    """Which drive it is, and where the joint stands."""
+    identity = report.identity
+    return [
+        f"drive      {identity.name or 'unnamed'}, vendor {identity.vendor}, serial {identity.serial or 'unknown'}, "
+        f"{report.mode}",
+        f"now at     {report.start_position_rad:+.4f} rad",
+    ]
+
+
+def remark_lines(remarks: Iterable[str]) -> list[str]:
+    return [f"remark     {remark}" for remark in remarks]

@@ -29,7 +29,7 @@ def require_ready(config: Config, report: CommissioningReport, log_path: Path) -
         raise MotionFault(
             f"{Fault.POSITION_LIMIT.name} ({int(Fault.POSITION_LIMIT)}): the joint stands at {start_rad:.4f} rad, "
             f"which must be in [{limits.position_min_rad:g}..{limits.position_max_rad:g}], the limits.position_*",
-            f"likely cause: {text.cause}; next: {text.next_step}",
+            text.advice,
         )
     require_room(config, log_path)
 

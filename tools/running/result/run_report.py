@@ -7,6 +7,7 @@ from typing import Any
 
 from drivers.errors import INTERRUPTED, DataError, MotionFault
 from firmware_py.states import Fault
+from tools.configuration.config import Config
 from tools.output import Output
 from tools.recording.run_figure import save_run_figure
 from tools.recording.run_summary import summary_table
@@ -14,22 +15,24 @@ from tools.running.result.drive_end import require_off
 from tools.running.result.run_result import RunResult
 
 
-def report_run(result: RunResult, output: Output, title: str, *, picture: bool = True) -> int:
-    """Print and save everything, with a `picture` or without; returns the exit code.
+def run_title(config: Config) -> str:
+    """What a run is called on its displays and its picture."""
+    return f"{config.path.stem}: {config.trajectory.kind}"
+
+
+def report_run(result: RunResult, output: Output, config: Config) -> int:
+    """Print and save everything, and a picture unless log.picture forbids it; returns the exit code.
 
     That is 0, the one of `MotionFault`, or 130 after an interruption.  The cause of a fault comes before all
     else: on a busy computer the picture takes seconds.  `DeviceError` where the drive did not confirm that it is off.
     """
     if result.fault_text is not None:
         text = result.fault_text
-        output.error(
-            f"{result.fault.name} ({int(result.fault)}): {text.happened}",
-            f"likely cause: {text.cause}; next: {text.next_step}",
-        )
-    drawn = result.log_path.with_suffix(".png") if picture else None
+        output.error(f"{result.fault.name} ({int(result.fault)}): {text.happened}", text.advice)
+    drawn = result.log_path.with_suffix(".png") if config.log.picture else None
     if drawn is not None:
         try:
-            save_run_figure(result.records, drawn, title)
+            save_run_figure(result.records, drawn, run_title(config))
         except DataError as error:
             output.warning(error.message)
             drawn = None
