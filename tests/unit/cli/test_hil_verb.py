@@ -39,8 +39,8 @@ def test_only_what_is_compiled_and_runs_becomes_realtime(monkeypatch: pytest.Mon
         return []
 
     monkeypatch.setattr(module, "serve_virtual_elmo" if serial else "serve_virtual_joint", serve)
-    monkeypatch.setattr(module, "become_realtime", realtime)
-    monkeypatch.setattr(module, "reader_gone", lambda _: True)
+    monkeypatch.setattr(hil, "become_realtime", realtime)
+    monkeypatch.setattr(hil, "_reader_gone", lambda _: True)
     config = load_config(shipped_config("elmo_serial" if serial else "virtual"))
     assert (hil_serial.hil_serial if serial else hil.hil)(config, Output(quiet=True)) == 0
     assert happened == ["compiled and started", "realtime"]
