@@ -10,8 +10,8 @@ import pytest
 
 from drivers.errors import ConfigurationError
 from firmware_py import friction as friction_model
+from firmware_py.motion_peak import approach_peak, approach_start, peak_of
 from firmware_py.states import ControllerKind, FeedForward, TrajectoryKind
-from firmware_py.trajectory_table import approach_peak, approach_start, peak_of
 from tests.unit.configuration.edited_config import VIRTUAL, load, problems
 from tools.configuration.checks import trajectory_extremes
 from tools.configuration.conversions import friction_constants, joint_rad_per_count, torque_constant_NmpA
