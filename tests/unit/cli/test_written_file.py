@@ -38,5 +38,7 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.M
 def test_a_study_is_not_begun(key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(study_module, "run_study", lambda *_, **__: pytest.fail("hours of simulation"))
     output = Output(stdout=io.StringIO(), stderr=io.StringIO())
+    folder = tmp_path / "folder.png"
+    folder.mkdir()
     with pytest.raises(DataError, match="is a folder"):
-        study_module.study(StudySettings(), output, **{key: tmp_path})
+        study_module.study(StudySettings(), output, **{key: folder})
