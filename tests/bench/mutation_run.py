@@ -206,6 +206,15 @@ class Session:
         return int(last[0]) if last[2] == "0" else -1
 
 
+def files_of_tests(module: str) -> list[Path]:
+    """The files of the tests of a module; ValueError if one of `TESTS` is not there."""
+    found = {name: sorted(UNIT_TESTS.glob(f"{name}.py")) for name in TESTS[module]}
+    for name, files in found.items():
+        if not files:
+            raise ValueError(f"{module}: tests/unit/{name}.py does not exist")
+    return [file for files in found.values() for file in files]
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--module", choices=list(TESTS), action="append")
@@ -225,8 +234,7 @@ def main() -> int:
     survivors: list[dict[str, Any]] = []
     for module in chosen.module or TESTS:
         session = Session(module, part, parts)
-        files = [str(file) for name in TESTS[module] for file in sorted(UNIT_TESTS.glob(f"{name}.py"))]
-        code = pytest.main([*options, *files], plugins=[session])
+        code = pytest.main([*options, *map(str, files_of_tests(module))], plugins=[session])
         if code or session.refused:
             return 1
         survivors += session.survivors

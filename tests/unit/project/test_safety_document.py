@@ -1,9 +1,12 @@
-"""docs/safety.md names a test behind each statement; every one of them exists."""
+"""docs/safety.md names a test behind each statement, the mutation run those of a module; every one of them exists."""
 
 from __future__ import annotations
 
 import re
 
+import pytest
+
+from tests.bench import mutation_run
 from tests.places import ROOT
 
 NAMED = re.compile(r"`((?:\w+/)+\w+\.py)::(\w+)`")
@@ -23,3 +26,11 @@ def test_every_row_of_the_watchers_names_one() -> None:
     assert len(rows) >= 12
     for row in rows:
         assert NAMED.search(row), row
+
+
+@pytest.mark.parametrize("module", mutation_run.TESTS)
+def test_the_mutation_run_finds_its_tests(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert len(mutation_run.files_of_tests(module)) >= len(mutation_run.TESTS[module])
+    monkeypatch.setitem(mutation_run.TESTS, module, ("firmware_py/test_that_was_moved_*",))
+    with pytest.raises(ValueError, match="test_that_was_moved"):
+        mutation_run.files_of_tests(module)

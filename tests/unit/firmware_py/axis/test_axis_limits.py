@@ -1,4 +1,4 @@
-"""Limits of position, velocity, reference, following error and torque in the loop of one axis."""
+"""Limits of position, velocity, reference, following error and torque, each with a twin just inside."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What may last how long: the supervisor's silence, skipped cycles, enabling, stopping, coming to rest."""
+"""What may last how long: the supervisor's silence, skipped cycles, enabling, stopping, rest; with twins."""
 
 from __future__ import annotations
 
