@@ -11,7 +11,7 @@ import numpy as np
 
 from firmware_py.states import AxisPhase, Fault
 from tools.configuration.config import Config
-from tools.configuration.conversions import joint_rad_per_count
+from tools.configuration.records import law_resolution_rad
 from tools.inspection.findings import NOTE, OK, PROBLEM, Finding
 from tools.motion_check.plan import CheckPlan
 from tools.running.events.fault_text import FaultText
@@ -74,13 +74,11 @@ def motion_findings(
     config: Config, plan: CheckPlan, records: Any, fault: Fault, text: FaultText | None
 ) -> Iterator[Finding]:
     """Every finding of one check; `config` is the user's own."""
-    resolution_rad = abs(joint_rad_per_count(config))
     second = config.joint_encoder
     law, other = "encoder", "joint_encoder"
     if second is not None and second.law == "joint_encoder":
         law, other = other, law
-        resolution_rad = math.tau / second.counts_per_turn
-    threshold_rad = max(MOVED_SHARE * plan.travel_rad, MOVED_COUNTS * resolution_rad)
+    threshold_rad = max(MOVED_SHARE * plan.travel_rad, MOVED_COUNTS * law_resolution_rad(config))
     motion = motion_of(records, threshold_rad)
     if motion is None:
         yield ended_finding(records, fault, text)

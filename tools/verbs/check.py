@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -39,12 +39,13 @@ def check(
         refuse_rate(config)
     minimum_deg = config.margin.min_phase_margin_deg
     settings, assumptions = loop_settings(config, delay_s)
-    found, ideal = margins(settings), theory(settings)
+    found = margins(settings)
     enough = meets(found, minimum_deg)
     changes = [] if enough else remedies(settings, minimum_deg)
     accepted = enough or (found.stable and allow_low_margin)
     verdict = "ok" if enough else "below the minimum, accepted" if accepted else "too small"
-    table = _table(settings, found, ideal, assumptions, minimum_deg, verdict)
+    analysis = _Analysis(settings, assumptions, found, theory(settings), minimum_deg, verdict, changes)
+    table = _table(analysis)
     if serial:
         table.add_row("serial line", line_text(config), "characters of a cycle; measured before a run enables")
     learning = learning_of(config, settings)
@@ -56,7 +57,7 @@ def check(
 
         save_loop_figure(settings, figure, config.path.name, minimum_deg)
         table.add_row("picture", str(figure), "")
-    output.result(table, _data(settings, found, ideal, assumptions, minimum_deg, verdict, changes, figure))
+    output.result(table, _data(analysis, figure))
     for text in not_modelled(config):
         output.note(f"not in this analysis: {text}")
     if not accepted:
@@ -65,23 +66,30 @@ def check(
     return 0
 
 
-def _table(
-    settings: LoopSettings,
-    found: Margins,
-    ideal: Theory,
-    assumptions: tuple[Assumption, ...],
-    minimum_deg: float,
-    verdict: str,
-) -> Table:
+@dataclass(frozen=True)
+class _Analysis:
+    """What is printed, as a table or as JSON."""
+
+    settings: LoopSettings
+    assumptions: tuple[Assumption, ...]
+    found: Margins
+    ideal: Theory
+    minimum_deg: float
+    verdict: str
+    changes: list[Remedy]
+
+
+def _table(analysis: _Analysis) -> Table:
+    found, ideal = analysis.found, analysis.ideal
     table = Table(title="Linear loop", title_justify="left")
     for heading in ("quantity", "value", "note"):
         table.add_column(heading)
-    for a in assumptions:
+    for a in analysis.assumptions:
         table.add_row(a.name, f"{a.value:g} {a.unit}", a.origin)
     table.add_section()
     if ideal.p is not None and ideal.p_eigenvalues is not None:
         p11, p12, p22 = ideal.p
-        table.add_row("P", f"{p11:.3f}  {p12:.6f}  {p22:.6f}", f"P11 P12 P22 for Q = diag{settings.q}")
+        table.add_row("P", f"{p11:.3f}  {p12:.6f}  {p22:.6f}", f"P11 P12 P22 for Q = diag{analysis.settings.q}")
         table.add_row("eigenvalues of P", "{:.3f}  {:.3f}".format(*ideal.p_eigenvalues), "")
         table.add_row("bound (30)", f"{ideal.bound_per_Nm:.4g}", "|x| for 1 Nm that the network cannot represent")
         table.add_row("bound with |P B|", f"{ideal.tight_bound_per_Nm:.4g}", "the same, tighter")
@@ -98,7 +106,8 @@ def _table(
         oscillation = f"{found.oscillation_Hz:.2f} Hz, damping {found.oscillation_damping:.3f}"
         table.add_row("oscillation", oscillation, "pair of the sampled loop that decays slowest")
     table.add_section()
-    table.add_row("verdict", verdict, f"at least {minimum_deg:g} deg wanted (margin.min_phase_margin_deg)")
+    wanted = f"at least {analysis.minimum_deg:g} deg wanted (margin.min_phase_margin_deg)"
+    table.add_row("verdict", analysis.verdict, wanted)
     return table
 
 
@@ -113,26 +122,17 @@ def _add_margins(table: Table, found: Margins) -> None:
     table.add_row("slowest mode", f"{found.slowest_time_constant_s:.3g} s", "time constant")
 
 
-def _data(
-    settings: LoopSettings,
-    found: Margins,
-    ideal: Theory,
-    assumptions: tuple[Assumption, ...],
-    minimum_deg: float,
-    verdict: str,
-    changes: list[Remedy],
-    figure: Path | None,
-) -> dict[str, Any]:
+def _data(analysis: _Analysis, figure: Path | None) -> dict[str, Any]:
     """For --json; a complex pole is a pair [real, imaginary]."""
-    measured = asdict(found)
-    measured["poles"] = [[pole.real, pole.imag] for pole in found.poles]
+    measured = asdict(analysis.found)
+    measured["poles"] = [[pole.real, pole.imag] for pole in analysis.found.poles]
     return {
-        "verdict": verdict,
-        "min_phase_margin_deg": minimum_deg,
-        "kind": settings.kind.name.lower(),
-        "assumptions": [asdict(a) for a in assumptions],
-        "theory": asdict(ideal),
+        "verdict": analysis.verdict,
+        "min_phase_margin_deg": analysis.minimum_deg,
+        "kind": analysis.settings.kind.name.lower(),
+        "assumptions": [asdict(a) for a in analysis.assumptions],
+        "theory": asdict(analysis.ideal),
         "margins": measured,
-        "remedies": [{"change": r.text, "phase_margin_deg": r.phase_margin_deg} for r in changes],
+        "remedies": [{"change": r.text, "phase_margin_deg": r.phase_margin_deg} for r in analysis.changes],
         "picture": None if figure is None else str(figure),
     }
