@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,14 +13,14 @@ from tools.campaign.scenario import draw_scenario
 from tools.configuration.config import Config
 from tools.configuration.load import load_config
 from tools.simulation.lockstep import LockstepJoint
+from tools.simulation.workers import interrupts_left_to_the_parent
 
 AT_ONCE = 16  # scenarios that a worker takes at a time
 _worker: dict[str, object] = {}
 
 
 def _begin(path: str, seed: int) -> None:
-    """In each worker: commission a joint of its own.  Ctrl-C is for the parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """In each worker: commission a joint of its own."""
     config = load_config(path)
     _worker.update(config=config, joint=LockstepJoint(config), seed=seed)
 
@@ -42,7 +41,9 @@ def _verdicts(path: Path, seed: int, count: int, workers: int) -> Iterator[Verdi
             yield judge(config, joint, draw_scenario(seed, number))
         return
     context = multiprocessing.get_context("spawn")
-    with context.Pool(workers, _begin, (str(path), seed)) as pool:
+    with interrupts_left_to_the_parent():
+        started = context.Pool(workers, _begin, (str(path), seed))
+    with started as pool:
         yield from pool.imap_unordered(_work, range(count), AT_ONCE)
 
 

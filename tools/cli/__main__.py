@@ -1,5 +1,5 @@
 """`python -m tools.cli`: the command line without the installed script."""
 
-from tools.cli.main import main
+from tools.cli.start import main
 
 main()

@@ -10,7 +10,6 @@ import csv
 import math
 import multiprocessing
 import os
-import signal
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, fields
@@ -25,6 +24,7 @@ from tools.experiments.ensemble import EnsembleSettings, random_plant
 from tools.experiments.error_figures import ErrorFigures, error_figures
 from tools.experiments.scenarios import Scenario, run_scenario
 from tools.simulation.lockstep import LockstepJoint
+from tools.simulation.workers import interrupts_left_to_the_parent
 from tools.written_file import writing
 
 Progress = Callable[[float], None]
@@ -90,10 +90,6 @@ def run_plant(task: PlantTask) -> PlantResult:
     return PlantResult(task.index, config.virtual.friction_kind, bits, tuple(figures))
 
 
-def _leave_interrupts_to_the_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
 def run_study(
     base: Config,
     controllers: list[Controller],
@@ -139,12 +135,11 @@ def run_study(
 def _run_in_processes(tasks: list[PlantTask], workers: int, take: Callable[[PlantResult], None]) -> None:
     """Spawned, not forked: nothing of this process (threads, open buses) is to be inherited."""
     before = set(multiprocessing.active_children())
-    executor = ProcessPoolExecutor(
-        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_leave_interrupts_to_the_parent
-    )
+    executor = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
     ended = False
     try:
-        pending: set[Future[PlantResult]] = {executor.submit(run_plant, task) for task in tasks}
+        with interrupts_left_to_the_parent():
+            pending: set[Future[PlantResult]] = {executor.submit(run_plant, task) for task in tasks}
         while pending:
             finished, pending = wait(pending, return_when=FIRST_COMPLETED)
             for future in finished:
