@@ -67,6 +67,8 @@ def prepare_cache() -> Path | None:
         _prune(base, folder)
     except OSError:
         return None
+    if not os.access(folder, os.W_OK):  # numba would refuse to compile at all
+        return None
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
     return folder
 
@@ -74,13 +76,26 @@ def prepare_cache() -> Path | None:
 cache_folder = prepare_cache()
 
 import numba  # noqa: E402  (NUMBA_CACHE_DIR is read while numba is imported)
-from numba.core import types  # noqa: E402
+from numba.core import caching, types  # noqa: E402
 
 _numba_config: Any = numba.config
 if cache_folder is not None:
     _numba_config.CACHE_DIR = str(cache_folder)
 
 JIT_DISABLED = bool(_numba_config.DISABLE_JIT)
+
+
+_cache_file: Any = caching.IndexDataCacheFile
+_save_compiled = _cache_file.save
+
+
+def _save_where_there_is_room(file: Any, key: Any, data: Any) -> None:
+    """A disk that takes no more costs the next start some time, not this run."""
+    with contextlib.suppress(OSError):
+        _save_compiled(file, key, data)
+
+
+_cache_file.save = _save_where_there_is_room
 
 
 def _no_blas() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -12,6 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
+from numba.core import caching
 
 from firmware_py import kernel as kernel_module
 from firmware_py.kernel import kernel, source_hash
@@ -44,6 +46,30 @@ def test_options() -> None:
     assert kernel_module._OPTIONS["nogil"] is True
     assert kernel_module._OPTIONS["error_model"] == "numpy"
     assert "fastmath" not in kernel_module._OPTIONS
+
+
+def test_a_cache_that_takes_nothing_more_does_not_cost_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(caching.IndexDataCacheFile, "_save_index", full)
+
+    @kernel
+    def twice(a: float) -> float:
+        return 2.0 * a
+
+    assert twice(3.0) == 6.0
+
+
+def test_a_folder_that_cannot_be_written_is_no_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("JOINTCTL_CACHE_DIR", str(tmp_path))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "as before")
+    assert (folder := kernel_module.prepare_cache()) is not None
+    assert os.environ["NUMBA_CACHE_DIR"] == str(folder)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "as before")
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everywhere
+    assert kernel_module.prepare_cache() is None
+    assert os.environ["NUMBA_CACHE_DIR"] == "as before"
 
 
 # --- the cache must never run stale ----------------------------------------------------------------------------
