@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.kernel import kernel
+from firmware_py.kernel import inlined, kernel
 from firmware_py.records import FrictionBranch, FrictionConstants
 from firmware_py.schema import new
 from firmware_py.states import ZeroSpeedRule
@@ -28,7 +28,7 @@ from firmware_py.states import ZeroSpeedRule
 DEGREE = math.pi / 180.0
 
 
-@kernel
+@inlined
 def branch_torque_Nm(branch: FrictionBranch, speed_radps: float) -> float:
     """Friction of one direction at the motor [Nm] for a speed >= 0; at 0 it is the static friction."""
     if speed_radps <= branch.knee_radps:
@@ -42,7 +42,7 @@ def branch_torque_Nm(branch: FrictionBranch, speed_radps: float) -> float:
     return torque
 
 
-@kernel
+@inlined
 def friction_motor_torque_Nm(friction: FrictionConstants, velocity_radps: float) -> float:
     """Friction at the motor [Nm], opposing the motion and counted positive for positive velocity; 0 at v = 0."""
     if velocity_radps > 0.0:

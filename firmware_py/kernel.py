@@ -6,6 +6,8 @@ decides the options:
 * ``nogil``: the loop must not wait for other Python threads;
 * ``error_model="numpy"``: a division by zero gives inf, which the finite check catches; an exception would
   unwind the loop with torque applied;
+* no reference counting: a kernel that would allocate does not compile, and no atomic count is touched in the loop
+  (docs/adr/0005).  Arrays belong to the caller, who keeps them for as long as the call lasts;
 * no ``fastmath``: it lets the compiler assume that NaN does not exist, and then `isfinite` is always true;
 * ``cache``: on disk, in a folder named after a hash of *all* our sources.  Numba looks only at the file of the
   function itself, so that an edited callee in another file would run stale.
@@ -107,13 +109,14 @@ with contextlib.suppress(ImportError):
     import numba.np.linalg as _numba_linalg
 
     _numba_linalg.ensure_blas = _no_blas
-_OPTIONS: dict[str, Any] = {"nogil": True, "cache": cache_folder is not None, "error_model": "numpy"}
+_NO_COUNTS: dict[str, Any] = {"_nrt": False, "cache": cache_folder is not None}
+_OPTIONS: dict[str, Any] = {**_NO_COUNTS, "nogil": True, "error_model": "numpy"}
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def kernel(function: Function) -> Function:
-    """Compile `function` for the control loop (nopython, nogil, cached, no exceptions from arithmetic)."""
+    """Compile `function` for the control loop (nogil, cached, no allocation, no exceptions from arithmetic)."""
     return cast(Function, numba.njit(**_OPTIONS)(function))
 
 
@@ -123,8 +126,8 @@ def plain(function: Function) -> Function:
 
 
 def inlined(function: Function) -> Function:
-    """Compile a very small function whose body is copied into its callers."""
-    return cast(Function, numba.njit(inline="always", **_OPTIONS)(function))
+    """Compile a function whose machine code is copied into its callers: what it returns stays in registers."""
+    return cast(Function, numba.njit(forceinline=True, **_OPTIONS)(function))
 
 
 def exported(signature: Any) -> Callable[[Function], Any]:
@@ -137,7 +140,7 @@ def exported(signature: Any) -> Callable[[Function], Any]:
         if JIT_DISABLED:
             return function
         compile_c: Any = numba.cfunc
-        return compile_c(signature, nopython=True, cache=cache_folder is not None)(function)
+        return compile_c(signature, nopython=True, **_NO_COUNTS)(function)
 
     return wrap
 

@@ -127,6 +127,7 @@ def run_loop(
     words: np.ndarray,
     ring: np.ndarray,
     histograms: np.ndarray,
+    timespec: np.ndarray,
     period_ns: int,
     receive_ns: int,
     max_cycles: int,
@@ -137,10 +138,10 @@ def run_loop(
     `send(port, frames, sample, command) -> int32` are the driver's, as C function types; `port`, `frames` and
     `scratch` are its memory and are only passed through.  Arrays of one record: `constants` AxisConstants, `state`
     AxisState (reset), `sample`, `command`.  `ring` LogRecord[N]; record k is at k % N once HEAD > k.
+    `timespec` int64[2] is scratch of the clock calls.
     `receive_ns` is how long a cycle may wait for its sample, counted from the deadline.
     With max_cycles = 0 nothing is sent: that call compiles.
     """
-    timespec = np.zeros(2, np.int64)
     axis: AxisConstants = constants[0]
     now_state: AxisState = state[0]
     executed = 0

@@ -177,7 +177,8 @@ def _take_sdo_answer(
     advance(device, plant_c, plant_s, now_ns, queue)
     slot = queue.count
     if slot < len(queue.frames):
-        queue.frames[slot] = frame
+        for byte in range(FRAME_SIZE):
+            queue.frames[slot, byte] = frame[byte]
         queue.count = slot + 1
 
 

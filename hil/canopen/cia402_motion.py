@@ -196,6 +196,15 @@ def following_error_tripped(device: Device, position: int, dt_s: float) -> bool:
 
 
 @kernel
+def demand_is_held(device: Device) -> bool:
+    """Whether the demand depends on nothing but the objects: with the power stage off, and in CST while enabled."""
+    state = device.state
+    if state == PowerState.OPERATION_ENABLED:
+        return device.drive.mode_display == Mode.CYCLIC_TORQUE and device.braking == 0
+    return state != PowerState.QUICK_STOP_ACTIVE and state != PowerState.FAULT_REACTION_ACTIVE
+
+
+@kernel
 def demand_torque_Nm(device: Device, position: int, velocity_radps: float, dt_s: float) -> float:
     """Limited joint torque [Nm] for the next substep; `position` [counts] and velocity at the joint; 0 when off."""
     state = device.state

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from firmware_py.kernel import kernel
+from firmware_py.kernel import inlined, kernel
 from hil.bus.frames import FrameQueue
 from hil.canopen.cia402_core import (
     apply_controlword,
@@ -21,7 +21,7 @@ from hil.canopen.cia402_core import (
     raise_fault,
     status_word,
 )
-from hil.canopen.cia402_motion import demand_torque_Nm, following_error_tripped
+from hil.canopen.cia402_motion import demand_is_held, demand_torque_Nm, following_error_tripped
 from hil.canopen.device_errors import (
     FOLLOWING_ERROR,
     POSITION_LIMIT,
@@ -131,13 +131,17 @@ def sample_objects(device: Device, plant_c: PlantConstants, plant_s: PlantState)
     drive.statusword = status_word(device)
 
 
-@kernel
-def _substep(device: Device, plant_c: PlantConstants, plant_s: PlantState, dt_s: float, queue: FrameQueue) -> None:
+@inlined
+def _torque_Nm(
+    device: Device, plant_c: PlantConstants, plant_s: PlantState, dt_s: float, queue: FrameQueue
+) -> tuple[float, bool]:
+    """Joint torque [Nm] of the next substep, and whether it stays so until a frame, a timer or a fault changes it."""
     limits = device.drive.position_limit
     mode = device.drive.mode_display
     counts = int64(device.drive.position)
     positioning = mode == Mode.PROFILE_POSITION or mode == Mode.CYCLIC_POSITION or mode == Mode.HOMING
-    if limits[0] != 0 or limits[1] != 0 or positioning or device.resync:  # the encoder costs time
+    sampled = limits[0] != 0 or limits[1] != 0 or positioning or device.resync != 0  # the encoder costs time
+    if sampled:
         counts = _position_counts(device, plant_c, plant_s)
     if device.fault_code == 0:
         code = int64(device.inject_fault_code)
@@ -147,8 +151,8 @@ def _substep(device: Device, plant_c: PlantConstants, plant_s: PlantState, dt_s:
             raise_fault(device, POSITION_LIMIT, queue)
         elif following_error_tripped(device, counts, dt_s):
             raise_fault(device, FOLLOWING_ERROR, queue)
-    torque_Nm = demand_torque_Nm(device, counts, plant_s.joint_velocity_radps, dt_s)
-    step_plant(plant_c, plant_s, torque_Nm)
+    held = not sampled and demand_is_held(device)
+    return demand_torque_Nm(device, counts, plant_s.joint_velocity_radps, dt_s), held
 
 
 @kernel
@@ -170,14 +174,18 @@ def advance(device: Device, plant_c: PlantConstants, plant_s: PlantState, until_
         device.primed = 1
         device.time_ns = until_ns
     apply_controlword(device, queue)  # SDO may have written 6040 or 6060
+    torque_Nm, held = 0.0, False
     while device.time_ns + step_ns <= until_ns:
-        _substep(device, plant_c, plant_s, plant_c.step_s, queue)
+        if not held:
+            torque_Nm, held = _torque_Nm(device, plant_c, plant_s, plant_c.step_s, queue)
+        step_plant(plant_c, plant_s, torque_Nm)
         device.time_ns += step_ns
         before = int64(device.event_status) >> 16
         if int64(device.state) != before & 0xFF or device.time_ns >= device.next_due_ns:
             sample_objects(device, plant_c, plant_s)
             _notice_status(device)
             run_timers(device, device.time_ns, queue)
+            held = False
     sample_objects(device, plant_c, plant_s)
     _notice_status(device)
     if until_ns >= device.next_due_ns:

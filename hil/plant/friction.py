@@ -20,14 +20,14 @@ Not modelled: dwell-time dependence of the static friction, dependence on load t
 from __future__ import annotations
 
 from firmware_py.friction import friction_motor_torque_Nm
-from firmware_py.kernel import kernel
+from firmware_py.kernel import inlined, kernel
 from hil.plant.actuator import sine_of_turns
 from hil.plant.records import FrictionKind, PlantConstants, PlantState
 
 _LEAST_FRICTION_Nm = 1e-9  # a curve that touches zero must not divide by it
 
 
-@kernel
+@inlined
 def modulation(c: PlantConstants, s: PlantState, position_rad: float) -> float:
     """Factor on friction: ``1 + a sin(k q)`` times the temperature's ``1 + b (T - ambient)`` (at least 0.05)."""
     factor = 1.0
@@ -39,14 +39,14 @@ def modulation(c: PlantConstants, s: PlantState, position_rad: float) -> float:
     return factor
 
 
-@kernel
+@inlined
 def sliding_torque_Nm(c: PlantConstants, velocity_radps: float) -> float:
     """(11) at the joint for velocity != 0, with its sign; ripple and temperature are not in it."""
     factor = c.positive_factor if velocity_radps > 0.0 else c.negative_factor
     return factor * friction_motor_torque_Nm(c.friction, velocity_radps)
 
 
-@kernel
+@inlined
 def lugre_torque_Nm(c: PlantConstants, s: PlantState, velocity_radps: float, factor: float) -> float:
     """LuGre friction at the joint; advances the bristle deflection by one substep."""
     z = s.bristle_deflection_rad
@@ -74,7 +74,7 @@ def _from_rest(c: PlantConstants, net_torque_Nm: float, time_s: float, factor: f
     return velocity, 0.5 * velocity * time_s, friction
 
 
-@kernel
+@inlined
 def advance(
     c: PlantConstants, s: PlantState, velocity_radps: float, position_rad: float, net_torque_Nm: float
 ) -> tuple[float, float, float]:

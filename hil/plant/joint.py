@@ -16,7 +16,7 @@ import math
 from typing import Any
 
 from firmware_py.friction import paper_friction
-from firmware_py.kernel import kernel
+from firmware_py.kernel import inlined, kernel
 from firmware_py.schema import new
 from hil.plant.actuator import step_current, torque_ripple_Nm
 from hil.plant.encoder import encoder_counts
@@ -53,7 +53,7 @@ def _end_stop_torque_Nm(c: PlantConstants, position_rad: float, velocity_radps: 
     return 0.0
 
 
-@kernel
+@inlined
 def step_plant(c: PlantConstants, s: PlantState, target_joint_torque_Nm: float) -> None:
     """Advance the plant by one substep of `c.step_s`.
 

@@ -226,7 +226,9 @@ def advance_swarm(
     """
     dimensions, particles = position.shape
     inertia, cognitive, social = weights
-    least = np.min(best_error)
+    least = best_error[0]
+    for i in range(1, particles):
+        least = min(least, best_error[i])
     for step in range(len(curve)):
         first = -1
         for d in range(dimensions):

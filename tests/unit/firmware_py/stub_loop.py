@@ -84,7 +84,7 @@ class Loop:
         return int(
             run_loop(
                 stub_receive, stub_send, self.stub, self.words, np.zeros(2, np.int64), self.constants, self.state,
-                np.zeros((1, 5)), self.sample, self.command, self.words, self.ring, self.histograms, self.period_ns,
-                receive_ns, cycles,
+                np.zeros((1, 5)), self.sample, self.command, self.words, self.ring, self.histograms,
+                np.zeros(2, np.int64), self.period_ns, receive_ns, cycles,
             )
         )  # fmt: skip

@@ -12,8 +12,10 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from numba.core import caching
+from numba.core.errors import NumbaError
 
 from firmware_py import kernel as kernel_module
 from firmware_py.kernel import kernel, source_hash
@@ -70,6 +72,16 @@ def test_a_folder_that_cannot_be_written_is_no_cache(tmp_path: Path, monkeypatch
     monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everywhere
     assert kernel_module.prepare_cache() is None
     assert os.environ["NUMBA_CACHE_DIR"] == "as before"
+
+
+@pytest.mark.skipif(kernel_module.JIT_DISABLED, reason="plain Python allocates")
+def test_what_allocates_does_not_compile() -> None:
+    @kernel
+    def allocating(count: int) -> float:
+        return float(np.zeros(count)[0])
+
+    with pytest.raises(NumbaError, match="zeros"):
+        allocating(3)
 
 
 # --- the cache must never run stale ----------------------------------------------------------------------------

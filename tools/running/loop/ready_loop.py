@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 FOREVER = 1 << 62
 
 
@@ -29,13 +31,14 @@ def loop_call(exchange: Any, block: Any, period_ns: int, receive_ns: int) -> Cal
     from firmware_py.realtime import run_loop
 
     frames, scratch = exchange.exchange_memory()
+    timespec = np.zeros(2, np.int64)
 
     def call(max_cycles: int) -> int:
         return int(
             run_loop(
                 exchange.receive, exchange.send, block.port, frames, scratch, block.constants, block.state, block.table,
-                block.sample, block.command, block.words, block.ring, block.histograms, period_ns, receive_ns,
-                max_cycles,
+                block.sample, block.command, block.words, block.ring, block.histograms, timespec, period_ns,
+                receive_ns, max_cycles,
             )
         )  # fmt: skip
 
