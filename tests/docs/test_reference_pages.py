@@ -7,7 +7,7 @@ import re
 from drivers.errors import JointctlError
 from tests.places import ROOT
 from tools.configuration.config import Config
-from tools.identification.friction_data import SWEEP_COLUMNS
+from tools.identification.sweep_file import SWEEP_COLUMNS
 from tools.recording.can_log import CAN_TOPIC
 from tools.recording.run_log import EVENT_TOPIC, RECORD_TOPIC
 from tools.verbs.fault_campaign import EXIT_VIOLATIONS

@@ -18,7 +18,7 @@ from tools.configuration.config import Config
 from tools.configuration.conversions import friction_constants
 from tools.configuration.load import load_config, shipped_config
 from tools.configuration.sections import Friction
-from tools.identification.friction_data import read_friction_data
+from tools.identification.friction_file import read_friction_data
 from tools.identification.friction_section import section_values
 from tools.identification.identification import identify_friction
 from tools.identification.options import Options

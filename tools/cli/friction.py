@@ -15,7 +15,7 @@ from tools.cli.sweep_command import sweep_command
 from tools.output import Output
 
 if TYPE_CHECKING:
-    from tools.identification.friction_data import ForeignFormat
+    from tools.identification.foreign_table import ForeignFormat
 
 Data = Annotated[Path, typer.Argument(metavar="DATA", help="CSV of velocity plateaus, from sweep or elsewhere")]
 Model = Annotated[str, typer.Option("--model", help="multi-stage, stribeck, coulomb-viscous, or auto (held-out error)")]
@@ -38,7 +38,7 @@ class TableOptions:
     delimiter: Annotated[str, typer.Option("--delimiter", help="between columns: auto, or the character")] = "auto"
 
     def told(self) -> ForeignFormat:
-        from tools.identification.friction_data import ForeignFormat
+        from tools.identification.foreign_table import ForeignFormat
 
         return ForeignFormat(**asdict(self))
 

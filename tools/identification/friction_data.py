@@ -1,62 +1,22 @@
-"""Friction measurements: our own sweep file, or other people's tables with column mapping and units.
+"""Friction data: one point for each speed at which friction was measured, and which of them are used.
 
-The sweep file is a CSV with these columns (joint speed, motor torque), one plateau a line, in the order measured:
-
-    velocity_radps,current_A,motor_torque_Nm,velocity_std_radps,current_std_A,samples,settled,position_min_rad,
-    position_max_rad,time_s,temperature_degC,direction,pass
-
-settled is 1 if the mean's confidence interval was met before the time limit, direction is 1 or -1, pass counts repeats
-from 0, temperature_degC may be empty.  Beside it lies a JSON file of the same stem with at least reduction_ratio and
-torque_constant_NmpA, and, if known, limits (torque_max_Nm, velocity_max_radps of the joint); both signs are such that
-friction opposes motion (torque and velocity have the same sign).
-
-What is done with the points: they are sorted by speed, so the order of the file does not matter; repeats of a
-speed are all kept, each a measurement of its own (averaging would hide their spread); a line that is an exact copy
-of another one is a mistake of copying and counts once; a point at zero speed says nothing, since friction is
-set-valued there; points that never settled are left out.  All of this is told in `notes`.
+Points are sorted by speed, so the order of the file does not matter; repeats of a speed are all kept, each a
+measurement of its own (averaging would hide their spread); a line that is an exact copy of another one is a mistake of
+copying and counts once; a point at zero speed says nothing, since friction is set-valued there; points that never
+settled are left out.  All of this is told in `notes`.
 """
 
 from __future__ import annotations
 
-import json
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from drivers.errors import DataError, UsageError
-from tools.configuration.conversions import RADPS_PER_UNIT
-from tools.identification.table_file import TableFile, read_bytes, read_table
+from drivers.errors import DataError
+from tools.identification.table_file import TableFile
 
-SWEEP_COLUMNS = (
-    "velocity_radps", "current_A", "motor_torque_Nm", "velocity_std_radps", "current_std_A", "samples", "settled",
-    "position_min_rad", "position_max_rad", "time_s", "temperature_degC", "direction", "pass",
-)  # fmt: skip
-SIDECAR_FORMAT = "jointctl friction sweep 1"
-SIDES = ("joint", "motor")
 MIN_PER_DIRECTION = 12
-_SAME_CONSTANT = 0.02  # motor_torque_Nm against current_A times the torque constant, median
-
-
-@dataclass(frozen=True)
-class ForeignFormat:
-    """How to read a table that is not ours; None = not told."""
-
-    velocity_column: str | None = None
-    torque_column: str | None = None
-    current_column: str | None = None
-    velocity_unit: str | None = None
-    side: str | None = None  # of the velocity
-    torque_side: str | None = None
-    ratio: float | None = None
-    torque_constant_NmpA: float | None = None
-    delimiter: str = "auto"
-
-    @property
-    def mapped(self) -> bool:
-        return bool(self.velocity_column or self.torque_column or self.current_column)
 
 
 @dataclass(frozen=True)
@@ -79,149 +39,13 @@ class FrictionData:
         return np.flatnonzero(self.settled & (sign * self.velocity_radps > 0.0))
 
 
-def read_friction_data(path: str | Path, told: ForeignFormat | None = None, *, both: bool = True) -> FrictionData:
-    """Read and check; `both` asks for enough points in both directions, else one is enough to go on with."""
-    path, told = Path(path), told or ForeignFormat()
-    _check_told(told)
-    table = read_table(path, told.delimiter)
-    ours = not told.mapped and "velocity_radps" in table.columns and "motor_torque_Nm" in table.columns
-    if ours:
-        data = _sweep(table, told)
-    elif told.mapped:
-        data = _foreign(table, told)
-    else:
-        raise DataError(
-            f"{path}: not a sweep of ours: columns velocity_radps and motor_torque_Nm are missing; "
-            f"it has {', '.join(table.columns)}",
-            "tell --velocity-column and --torque-column or --current-column",
-        )
-    data = _tidy(data, ordered=not ours)
-    _check_directions(data, both)
-    return data
-
-
-def _check_told(told: ForeignFormat) -> None:
-    for flag, value, allowed in (
-        ("--velocity-unit", told.velocity_unit, tuple(RADPS_PER_UNIT)),
-        ("--side", told.side, SIDES),
-        ("--torque-side", told.torque_side, SIDES),
-    ):
-        if value is not None and value not in allowed:
-            raise UsageError(f"{flag} (={value}) must be one of {', '.join(allowed)}")
-    for flag, number, low, high in (
-        ("--ratio", told.ratio, 1.0, 1000.0),
-        ("--torque-constant", told.torque_constant_NmpA, 1e-6, 100.0),
-    ):
-        if number is not None and not low <= number <= high:
-            raise UsageError(f"{flag} (={number:g}) must be in [{low:g}..{high:g}]")
-    if told.torque_column and told.current_column:
-        raise UsageError("--torque-column and --current-column: give one of them, the friction comes from one")
-
-
-def _sidecar(path: Path) -> dict[str, Any]:
-    beside = path.with_suffix(".json")
-    if not beside.exists():
-        raise DataError(f"{beside}: missing: the sidecar of the sweep holds the ratio", "or give --ratio")
-    try:
-        content = json.loads(read_bytes(beside).decode("utf-8"))
-    except (ValueError, UnicodeDecodeError) as error:
-        raise DataError(f"{beside}: not valid JSON: {error}") from None
-    if not isinstance(content, dict):
-        raise DataError(f"{beside}: must be a JSON object with reduction_ratio and torque_constant_NmpA")
-    for key, low, high in (("reduction_ratio", 1.0, 1000.0), ("torque_constant_NmpA", 1e-6, 100.0)):
-        value = content.get(key)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-            raise DataError(f"{beside}: {key} (={value}) must be a number in [{low:g}..{high:g}]")
-    return content
-
-
-def _recorded_limits(beside: Path, sidecar: dict[str, Any]) -> tuple[float, float] | None:
-    """Greatest torque and speed of the joint that the sweep was allowed; sidecars of others need not have them."""
-    limits = sidecar.get("limits")
-    if limits is None:
-        return None
-    found = []
-    for key in ("torque_max_Nm", "velocity_max_radps"):
-        value = limits.get(key) if isinstance(limits, dict) else None
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < 1e6:
-            raise DataError(f"{beside}: limits.{key} (={value}) must be a number in (0..1e+06)")
-        found.append(float(value))
-    return found[0], found[1]
-
-
-def _sweep(table: TableFile, told: ForeignFormat) -> FrictionData:
-    for flag, value in (("--velocity-unit", told.velocity_unit), ("--side", told.side), ("--torque-side",
-                        told.torque_side), ("--torque-constant", told.torque_constant_NmpA)):  # fmt: skip
-        if value is not None:
-            raise UsageError(f"{flag} (={value}) is for tables with mapped columns: a sweep file tells its own units")
-    if not table.ended:
-        # the sweep ends every line, so this one may have lost digits
-        raise DataError(f"{table.path}: the last line has no end: the file is cut off", "remove the last line")
-    ratio, constant, limits = told.ratio or math.nan, math.nan, None
-    if told.ratio is None or table.path.with_suffix(".json").exists():
-        sidecar = _sidecar(table.path)
-        ratio, constant = float(sidecar["reduction_ratio"]), float(sidecar["torque_constant_NmpA"])
-        limits = _recorded_limits(table.path.with_suffix(".json"), sidecar)
-        if told.ratio is not None and abs(told.ratio / ratio - 1.0) > 1e-6:
-            raise DataError(
-                f"--ratio (={told.ratio:g}) differs from reduction_ratio (={ratio:g}) in the sidecar of {table.path}"
-            )
-    velocity = _numbers(table, "velocity_radps")
-    torque = _numbers(table, "motor_torque_Nm")
-    settled = np.ones(len(velocity), bool)
-    if "settled" in table.columns:
-        values = _numbers(table, "settled")
-        for (line, _), value in zip(table.rows, values, strict=True):
-            if value not in (0.0, 1.0):
-                raise DataError(f"{table.path}: line {line}: settled (={value:g}) must be 0 or 1")
-        settled = values == 1.0
-    if "current_A" in table.columns and math.isfinite(constant):
-        current = _numbers(table, "current_A")
-        moving = np.abs(current) > 0.2 * np.max(np.abs(current), initial=0.0)
-        if np.any(moving):
-            found = float(np.median(torque[moving] / current[moving]))
-            if not abs(found / constant - 1.0) <= _SAME_CONSTANT:
-                raise DataError(
-                    f"{table.path}: motor_torque_Nm is {found:.4g} times current_A, but torque_constant_NmpA "
-                    f"(={constant:g}) in the sidecar: one of them is wrong"
-                )
-    data = _data(table, velocity, torque, settled, ratio, constant if math.isfinite(constant) else None)
-    return replace(data, recorded_limits=limits)
-
-
-def _foreign(table: TableFile, told: ForeignFormat) -> FrictionData:
-    if not told.velocity_column:
-        raise UsageError("--velocity-column is missing", f"the file has: {', '.join(table.columns)}")
-    if not (told.torque_column or told.current_column):
-        raise UsageError("--torque-column or --current-column is missing", f"the file has: {', '.join(table.columns)}")
-    for flag, value in (("--velocity-unit", told.velocity_unit), ("--side", told.side), ("--ratio", told.ratio)):
-        if value is None:
-            raise UsageError(f"{flag} is missing: a table of numbers does not tell it", "nothing is guessed")
-    assert told.velocity_unit is not None
-    assert told.ratio is not None
-    scale = RADPS_PER_UNIT[told.velocity_unit] / (told.ratio if told.side == "motor" else 1.0)
-    velocity = _numbers(table, told.velocity_column) * scale
-    if told.current_column:
-        if told.torque_constant_NmpA is None:
-            raise UsageError("--torque-constant is missing: --current-column needs it [Nm/A at the motor]")
-        if told.torque_side == "joint":
-            raise UsageError("--torque-side (=joint) is for --torque-column: a current gives torque at the motor")
-        torque = _numbers(table, told.current_column) * told.torque_constant_NmpA
-    else:
-        assert told.torque_column is not None
-        if told.torque_side is None:
-            raise UsageError("--torque-side is missing: a table of numbers does not tell it", "motor or joint")
-        torque = _numbers(table, told.torque_column) / (told.ratio if told.torque_side == "joint" else 1.0)
-    settled = np.ones(len(velocity), bool)
-    return _data(table, velocity, torque, settled, told.ratio, told.torque_constant_NmpA)
-
-
-def _numbers(table: TableFile, column: str) -> np.ndarray:
+def numbers(table: TableFile, column: str) -> np.ndarray:
+    """A column (N,) of finite numbers; `DataError` names the line of anything else."""
     index = table.column(column)
     return np.array([table.number(row, index) for row in table.rows])
 
 
-def _data(
+def from_table(
     table: TableFile,
     velocity: np.ndarray,
     torque: np.ndarray,
@@ -229,12 +53,16 @@ def _data(
     ratio: float,
     constant: float | None,
 ) -> FrictionData:
+    """Points as the file has them, with their lines: rad/s of the joint, Nm at the motor."""
     line = np.array([n for n, _ in table.rows])
     return FrictionData(table.path, table.sha256, velocity, torque, line, settled, ratio, constant)
 
 
-def _tidy(data: FrictionData, *, ordered: bool) -> FrictionData:
-    """`ordered`: the file is expected to be in order of velocity, so that it is told where it is not."""
+def tidied(data: FrictionData, *, ordered: bool) -> FrictionData:
+    """The points that are used, sorted, with notes on what was done.
+
+    `ordered`: the file is expected to be in order of velocity, so that it is told where it is not.
+    """
     notes = []
     cells = np.column_stack([data.velocity_radps, data.motor_torque_Nm])
     _, first = np.unique(cells, axis=0, return_index=True)
@@ -268,7 +96,8 @@ def _lines(numbers: np.ndarray) -> str:
     return f"line{'s' if len(numbers) > 1 else ''} {shown}"
 
 
-def _check_directions(data: FrictionData, both: bool) -> None:
+def check_directions(data: FrictionData, both: bool) -> None:
+    """`DataError` where too few points are left: in either direction, or in all."""
     counts = {sign: len(data.direction(sign)) for sign in (1, -1)}
     text = f"{counts[1]} usable points at positive and {counts[-1]} at negative velocity"
     if both and min(counts.values()) == 0:
@@ -277,18 +106,3 @@ def _check_directions(data: FrictionData, both: bool) -> None:
         raise DataError(f"{data.path}: {text}: at least {MIN_PER_DIRECTION} are needed in each direction")
     if max(counts.values()) == 0:
         raise DataError(f"{data.path}: {text}")
-
-
-def sidecar_contents(reduction_ratio: float, torque_constant_NmpA: float, **more: Any) -> dict[str, Any]:
-    """What the sweep writes beside its CSV; `more` is recorded as it is (configuration, drive, versions, time)."""
-    return {
-        "format": SIDECAR_FORMAT,
-        "reduction_ratio": reduction_ratio,
-        "torque_constant_NmpA": torque_constant_NmpA,
-        "units": {
-            "velocity_radps": "joint",
-            "motor_torque_Nm": "motor, with the sign of the velocity where it opposes motion",
-            "current_A": "of the drive, times torque_constant_NmpA gives motor_torque_Nm",
-        },
-        **more,
-    }

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -71,7 +71,7 @@ def identify_friction(
     limits: JointLimits | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Identification:
-    """The whole computation.
+    """The whole computation: points that are used, model, fit of each direction, what is believable of it.
 
     Raises `UsageError` for options out of range, `DataError` where the data or the result are not believable.
     """
@@ -80,71 +80,102 @@ def identify_friction(
     _refuse(data, before.problems)
     notes, warnings = list(data.notes), list(before.warnings)
     first = _first_form(data, options, notes)
-    problems: dict[str, Problem] = {}
-    index, outliers = {}, {}
-    for word, sign in DIRECTIONS:
-        chosen = data.direction(sign)
-        chosen = chosen[np.argsort(sign * data.velocity_radps[chosen], kind="stable")]
-        problem = make_problem(
-            first, sign * data.velocity_radps[chosen], sign * data.motor_torque_Nm[chosen], options.knee_radps,
-            (options.ws_min_radps, options.ws_max_radps), options.static_max_Nm,
-        )  # fmt: skip
-        if not options.search_knee:
-            _stage_check(data, problem, word)
-        elif first.cubic:
-            problem = replace(problem, knee=project(problem, search_knee=True).knee)
-        out, score = find_outliers(problem, options.outlier_threshold)
-        if np.count_nonzero(out) > MAX_OUTLIERS * len(out):
-            warnings.append(
-                f"{np.count_nonzero(out)} of {len(out)} points at {word} velocity are far from the curve: the model "
-                "does not describe these data; none was left out"
-            )
-            out = np.zeros_like(out)
-        for line, value in zip(data.line[chosen[out]], score[out], strict=True):
-            notes.append(f"line {line}: outlier at {word} velocity, {abs(value):.1f} standard deviations: not used")
-        problem = problem.part(~out)
-        if options.search_knee and first.cubic and out.any():
-            problem = replace(problem, knee=project(problem, search_knee=True).knee)
-        _stage_check(data, problem, word)
-        problems[word], index[word] = problem, chosen[~out]
-        outliers[word] = chosen[out]
-
-    total = sum(len(p.x) for p in problems.values())
-    rmse, held_out = {}, {}
-    names = [n for n in FORMS if FORMS[n].cubic <= first.cubic]
-    for name in names:
-        parts = [with_form(p, FORMS[name]) for p in problems.values()]
-        rmse[name] = float(np.sqrt(sum(project(p).rss for p in parts) / total))
-        squared = sum(held_out_rss(p, options.folds, options.swarm.seed) for p in parts)
-        held_out[name] = float(np.sqrt(squared / total))
-    model = choose(held_out) if options.model == "auto" else first.name
-    best = choose(held_out)
-    rounding_Nm = _EXACT * max(float(np.max(np.abs(p.y_Nm))) for p in problems.values())
-    if model != best and held_out[best] < held_out[model] / 1.02 and held_out[model] > rounding_Nm:
-        warnings.append(
-            f"the model {best} predicts held-out points better: {held_out[best]:.4g} against {held_out[model]:.4g} Nm"
-        )
-    problems = {word: with_form(p, FORMS[model]) for word, p in problems.items()}
-    swarms: list[SwarmResult | None] = [None] * len(problems)
-    if FORMS[model].stribeck:
-        swarms = list(
-            run_swarms(list(problems.values()), options.swarm, search_knee=options.search_knee, progress=progress)
-        )
-    directions = {}
-    for (word, problem), swarm in zip(problems.items(), swarms, strict=True):
-        fit, projected, source = _best_fit(problem, swarm, warnings, word)
-        directions[word] = Direction(fit, swarm, projected, source, uncertainty(fit), index[word], outliers[word])
-    for word, found in directions.items():
-        share = found.fit.rmse_Nm / float(np.mean(np.abs(found.fit.problem.y_Nm)))
-        if share > _BAD_FIT:
-            warnings.append(
-                f"the model describes the data at {word} velocity badly: RMSE is {share:.0%} of the friction"
-            )
+    points = {word: _points(data, options, first, word, sign, notes, warnings) for word, sign in DIRECTIONS}
+    rmse, held_out = _compared([found.problem for found in points.values()], first, options)
+    greatest_Nm = max(float(np.max(np.abs(found.problem.y_Nm))) for found in points.values())
+    model = _model(held_out, options, first, _EXACT * greatest_Nm, warnings)
+    directions = _fitted(points, FORMS[model], options, progress, warnings)
     after = check_branches({word: found.fit.branch() for word, found in directions.items()})
     _refuse(data, after.problems)
     return Identification(
         data, options, model, directions, rmse, held_out, tuple(notes), tuple(warnings + after.warnings)
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Points:
+    """The points of one direction that are used, as a problem, and which they are of all."""
+
+    problem: Problem
+    index: np.ndarray
+    outliers: np.ndarray
+
+
+def _points(
+    data: FrictionData, options: Options, first: Form, word: str, sign: int, notes: list[str], warnings: list[str]
+) -> _Points:
+    """Those of one direction without outliers, with the knee where the data have it if it is searched."""
+    chosen = data.direction(sign)
+    chosen = chosen[np.argsort(sign * data.velocity_radps[chosen], kind="stable")]
+    problem = make_problem(
+        first, sign * data.velocity_radps[chosen], sign * data.motor_torque_Nm[chosen], options.knee_radps,
+        (options.ws_min_radps, options.ws_max_radps), options.static_max_Nm,
+    )  # fmt: skip
+    if not options.search_knee:
+        _stage_check(data, problem, word)
+    elif first.cubic:
+        problem = replace(problem, knee=project(problem, search_knee=True).knee)
+    out, score = find_outliers(problem, options.outlier_threshold)
+    if np.count_nonzero(out) > MAX_OUTLIERS * len(out):
+        warnings.append(
+            f"{np.count_nonzero(out)} of {len(out)} points at {word} velocity are far from the curve: the model "
+            "does not describe these data; none was left out"
+        )
+        out = np.zeros_like(out)
+    for line, value in zip(data.line[chosen[out]], score[out], strict=True):
+        notes.append(f"line {line}: outlier at {word} velocity, {abs(value):.1f} standard deviations: not used")
+    problem = problem.part(~out)
+    if options.search_knee and first.cubic and out.any():
+        problem = replace(problem, knee=project(problem, search_knee=True).knee)
+    _stage_check(data, problem, word)
+    return _Points(problem, chosen[~out], chosen[out])
+
+
+def _compared(problems: Sequence[Problem], first: Form, options: Options) -> tuple[dict[str, float], dict[str, float]]:
+    """RMSE [Nm] of each model that the data allow: of all points, and of points held out of the fit."""
+    total = sum(len(problem.x) for problem in problems)
+    rmse, held_out = {}, {}
+    for name in [n for n in FORMS if FORMS[n].cubic <= first.cubic]:
+        parts = [with_form(problem, FORMS[name]) for problem in problems]
+        rmse[name] = float(np.sqrt(sum(project(part).rss for part in parts) / total))
+        squared = sum(held_out_rss(part, options.folds, options.swarm.seed) for part in parts)
+        held_out[name] = float(np.sqrt(squared / total))
+    return rmse, held_out
+
+
+def _model(held_out: dict[str, float], options: Options, first: Form, rounding_Nm: float, warnings: list[str]) -> str:
+    """The model asked for, or the one that predicts best; a warning where the former predicts worse."""
+    best = choose(held_out)
+    model = best if options.model == "auto" else first.name
+    if model != best and held_out[best] < held_out[model] / 1.02 and held_out[model] > rounding_Nm:
+        warnings.append(
+            f"the model {best} predicts held-out points better: {held_out[best]:.4g} against {held_out[model]:.4g} Nm"
+        )
+    return model
+
+
+def _fitted(
+    points: dict[str, _Points],
+    form: Form,
+    options: Options,
+    progress: Callable[[int], None] | None,
+    warnings: list[str],
+) -> dict[str, Direction]:
+    """The fit of each direction: swarm and polish where the model has a Stribeck stage, else the exact minimum."""
+    problems = [with_form(found.problem, form) for found in points.values()]
+    swarms: list[SwarmResult | None] = [None] * len(problems)
+    if form.stribeck:
+        swarms = list(run_swarms(problems, options.swarm, search_knee=options.search_knee, progress=progress))
+    directions = {}
+    for (word, used), problem, swarm in zip(points.items(), problems, swarms, strict=True):
+        fit, projected, source = _best_fit(problem, swarm, warnings, word)
+        directions[word] = Direction(fit, swarm, projected, source, uncertainty(fit), used.index, used.outliers)
+        share = fit.rmse_Nm / float(np.mean(np.abs(fit.problem.y_Nm)))
+        if share > _BAD_FIT:
+            warnings.append(
+                f"the model describes the data at {word} velocity badly: RMSE is {share:.0%} of the friction"
+            )
+    return directions
 
 
 def _best_fit(problem: Problem, swarm: SwarmResult | None, warnings: list[str], word: str) -> tuple[Fit, float, str]:

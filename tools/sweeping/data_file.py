@@ -1,6 +1,6 @@
 """The files of a sweep: rows are written as they are measured, so that an interrupted sweep keeps them.
 
-Beside the CSV (format: `tools.identification.friction_data`) lies its JSON sidecar; it also holds the plan's hash and
+Beside the CSV (format: `tools.identification.sweep_file`) lies its JSON sidecar; it also holds the plan's hash and
 which of the plan's points the rows are, so that a sweep can be resumed.  The row is written first: rows beyond the
 sidecar's list were cut off by a crash, and are measured again.  A busy disk can take longer to confirm a row than the
 loop goes without its supervisor, so a thread waits for it.
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.errors import DataError
-from tools.identification.friction_data import SWEEP_COLUMNS, sidecar_contents
+from tools.identification.sweep_file import SWEEP_COLUMNS, sidecar_contents
 from tools.sweeping.meter import MeasuredPoint
 from tools.written_file import writing
 

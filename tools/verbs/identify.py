@@ -16,7 +16,8 @@ from tools.configuration.conversions import torque_constant_NmpA
 from tools.configuration.load import load_config, shipped_config
 from tools.drawing import png
 from tools.identification.figures import convergence_figure, fit_figure
-from tools.identification.friction_data import ForeignFormat, read_friction_data
+from tools.identification.foreign_table import ForeignFormat
+from tools.identification.friction_file import read_friction_data
 from tools.identification.friction_section import section_values, snippet, write_into
 from tools.identification.identification import identify_friction
 from tools.identification.options import Options

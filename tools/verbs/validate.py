@@ -12,7 +12,9 @@ from tools.configuration.conversions import friction_constants
 from tools.configuration.load import load_config
 from tools.drawing import png, require_png
 from tools.identification.figures import fit_figure
-from tools.identification.friction_data import ForeignFormat, FrictionData, read_friction_data
+from tools.identification.foreign_table import ForeignFormat
+from tools.identification.friction_data import FrictionData
+from tools.identification.friction_file import read_friction_data
 from tools.identification.models import Branch
 from tools.identification.plausibility import check_data
 from tools.identification.report import error_table

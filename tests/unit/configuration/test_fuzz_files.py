@@ -19,7 +19,7 @@ from hil.canopen.object_dictionary import ObjectDictionary
 from tests.places import CONFIGS
 from tools.configuration.config import Config
 from tools.configuration.load import load_config
-from tools.identification.friction_data import read_friction_data
+from tools.identification.friction_file import read_friction_data
 from tools.recording.run_log import RunLogWriter, read_run_log
 
 TOML = (CONFIGS / "virtual.toml").read_text()

@@ -15,9 +15,10 @@ from drivers.errors import ConfigurationError, DataError
 from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
 from tools.configuration.config import Config
 from tools.configuration.load import load_config, shipped_config
-from tools.identification.friction_data import SWEEP_COLUMNS, ForeignFormat, sidecar_contents
+from tools.identification.foreign_table import ForeignFormat
 from tools.identification.options import Options
 from tools.identification.pso import SwarmSettings
+from tools.identification.sweep_file import SWEEP_COLUMNS, sidecar_contents
 from tools.output import Output
 from tools.sweeping.checks import constant_remarks, recorded_limits, refuse_constants
 from tools.sweeping.options import SweepOptions

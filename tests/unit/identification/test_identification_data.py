@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from drivers.errors import DataError, UsageError
-from tools.identification.friction_data import SWEEP_COLUMNS, ForeignFormat, read_friction_data, sidecar_contents
+from tools.identification.foreign_table import ForeignFormat
+from tools.identification.friction_file import read_friction_data
+from tools.identification.sweep_file import SWEEP_COLUMNS, sidecar_contents
 
 RATIO, CONSTANT = 121.0, 0.1
 SPEEDS = np.concatenate([-np.arange(1, 14)[::-1], np.arange(1, 14)]) * 0.2

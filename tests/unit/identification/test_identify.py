@@ -15,7 +15,7 @@ from tests.unit.identification.sweep_files import output, write_sweep
 from tools.configuration.conversions import friction_constants
 from tools.configuration.load import load_config
 from tools.identification import identification
-from tools.identification.friction_data import ForeignFormat
+from tools.identification.foreign_table import ForeignFormat
 from tools.identification.friction_section import MARK, snippet, with_section
 from tools.identification.options import Options
 from tools.identification.pso import SwarmSettings

@@ -17,7 +17,8 @@ from drivers.errors import DataError
 from firmware_py.records import LogRecord
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase
-from tools.identification.friction_data import SWEEP_COLUMNS, read_friction_data
+from tools.identification.friction_file import read_friction_data
+from tools.identification.sweep_file import SWEEP_COLUMNS
 from tools.sweeping.data_file import HEADING, SweepFile
 from tools.sweeping.grid import SweepPoint
 from tools.sweeping.meter import JointModel, MeasuredPoint, SweepMeter
