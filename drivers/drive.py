@@ -86,10 +86,6 @@ class Drive(Protocol):
         """Disable the drive whatever its state and confirm it; returns the state in words.  Never raises."""
         ...
 
-    def stop_now(self) -> str:
-        """Stop and disable the drive whoever controls it; returns the state in words.  Never raises."""
-        ...
-
     def clear_fault(self) -> str:
         """Reset the drive's own fault; it stays disabled.  Returns what was done, in words.
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import itertools
 import struct
 import threading
+import time
 
 import can
 
 from drivers.canopen.drive import CanopenDrive
 from drivers.canopen.settings import CanopenSettings
+from drivers.canopen.switch_off import stop_node
 from hil.canopen.device import Cia402Device
 
 _FRAME = struct.Struct("<IB3x8s")
@@ -106,6 +108,11 @@ class DeviceOnBus:
                 value &= 0xFFFFFFFF
                 payload = payload[:4] + struct.pack("<I", value)
         self._bus.send(can.Message(arbitration_id=identifier, data=payload[:size], is_extended_id=False))
+
+    def stop_drive(self) -> str:
+        """What `jointctl stop` does, from another end of this bus; the state in words."""
+        bus = can.Bus(interface="virtual", channel=self.channel)
+        return stop_node(bus, 1, sdo_timeout_s=0.15, sleep=lambda s: time.sleep(s / DEVICE_TIME_FACTOR))
 
     def drive(self, settings: CanopenSettings) -> CanopenDrive:
         """The real driver on another end of this bus; its waiting is short, but long for the device."""

@@ -54,7 +54,6 @@ class CanopenDrive:
         self._findings: Findings | None = None
         self._taken = False  # whether the drive has heard anything from us
         self._started = False  # whether the loop may send SYNC
-        self._stopping = False  # on the user's word, whoever controls it
         self._reopen = reopen
         self._lent = False
         self._thermometer: Thermometer | None = None
@@ -218,7 +217,7 @@ class CanopenDrive:
         """
         if not self._taken:
             return UNTOUCHED
-        if not self._started and not self._stopping:
+        if not self._started:
             try:
                 refuse_second_controller(self._network, self._sleep)
             except BusError:
@@ -231,11 +230,6 @@ class CanopenDrive:
                 f"the drive's own watchdog stops the joint within {self._settings.heartbeat_s:g} s"
             )
         return self._switch_off.make_safe()
-
-    def stop_now(self) -> str:
-        """Stop and disable the drive whoever controls it: leaving operational takes it from another controller."""
-        self._taken = self._stopping = True
-        return self.make_safe()
 
     def clear_fault(self) -> str:
         """Reset the drive's fault on the user's word; refuses while another controller is active, or it is enabled.

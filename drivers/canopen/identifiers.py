@@ -19,6 +19,8 @@ HEARTBEAT_ID = 0x700
 # of an identifier of 11 bits
 FUNCTION_MASK, NODE_MASK = 0x780, 0x07F
 HIGHEST_NODE = 127
+# transmission types of PDOs (7.5.2.35): up to the first at SYNC, from the second on at an event or on receipt
+LAST_SYNCHRONOUS, EVENT_DRIVEN = 240, 254
 
 
 class NmtCommand(IntEnum):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 from dataclasses import replace
 
+from drivers.canopen.identifiers import LAST_SYNCHRONOUS
 from drivers.canopen.object_access import ObjectAccess, was_refused
 from drivers.canopen.pdo_layout import (
     COMMUNICATION_RPDO,
@@ -35,7 +36,6 @@ from drivers.errors import DeviceError
 
 EVERY_SYNC = 1
 FIRST_IDENTIFIER, LAST_IDENTIFIER = 0x181, 0x57F
-LAST_SYNCHRONOUS = 240
 INHIBIT_TIME, EVENT_TIMER = 3, 5
 FIXED_HINT = "change the map with the drive maker's software, or use a drive whose PDOs can be mapped"
 

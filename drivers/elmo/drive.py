@@ -99,11 +99,6 @@ class ElmoDrive(ElmoCommissioning):
         except JointctlError as error:
             return f"unknown: {error.message}; only the drive's own limits stop it now, use the emergency stop"
 
-    def stop_now(self) -> str:
-        """See `Drive.stop_now`.  The line has one user at a time: a port in use has been refused at its opening."""
-        self._taken = True
-        return self.make_safe()
-
     def clear_fault(self) -> str:
         """See `Drive.clear_fault`.  MF and the latch in SR are cleared by MO=1 alone: in torque mode, with TC at zero.
 

@@ -22,6 +22,8 @@ from hil.canopen.encoder_records import EncoderNode
 int64: Callable[[Any], int] = np.int64  # type: ignore[assignment]
 
 PDOS = 4
+# transmission types (CiA 301, 7.5.2.35): up to the first at SYNC, from the second on at an event or on receipt
+LAST_SYNCHRONOUS, EVENT_DRIVEN = 240, 254
 MAPPED = 8
 HISTORY = 8
 CONSUMERS = 2

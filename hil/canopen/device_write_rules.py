@@ -6,7 +6,7 @@ inhibit time of a valid PDO are fixed.  A COB-ID must be an 11-bit identifier ou
 
 from __future__ import annotations
 
-from hil.canopen.device_records import MAPPED, PowerState
+from hil.canopen.device_records import EVENT_DRIVEN, LAST_SYNCHRONOUS, MAPPED, PowerState
 from hil.canopen.object_dictionary import DEVICE_STATE, INVALID_VALUE, ObjectDictionary, SdoAbort
 
 NOT_MAPPABLE = 0x06040041
@@ -83,7 +83,7 @@ def check_write(objects: ObjectDictionary, index: int, sub: int, value: int, pow
     if pdo_parameter and sub == 1:
         _check_cob_id(objects.value(index, 1), value)
     elif pdo_parameter and sub == 2:
-        if 240 < value < 254:
+        if LAST_SYNCHRONOUS < value < EVENT_DRIVEN:
             raise SdoAbort(INVALID_VALUE)
     elif pdo_parameter and sub in (3, 6):
         if not objects.value(index, 1) & _INVALID:

@@ -13,13 +13,11 @@ import numpy as np
 from firmware_py.kernel import kernel
 from hil.bus.frames import FrameQueue
 from hil.canopen.device_errors import COB_ID_INVALID, push_frame
-from hil.canopen.device_records import NmtState, int64
+from hil.canopen.device_records import EVENT_DRIVEN, LAST_SYNCHRONOUS, NmtState, int64
 from hil.canopen.encoder_records import MAPPED, EncoderNode
 from hil.plant.records import PlantState
 
 _MS = 1_000_000
-LAST_SYNCHRONOUS = 240
-EVENT_DRIVEN = 254
 POSITION_ALARM = 1  # bit of 6503
 
 

@@ -16,9 +16,15 @@ from firmware_py.kernel import kernel
 from hil.bus.frames import FrameQueue
 from hil.canopen.cia402_core import apply_controlword
 from hil.canopen.device_errors import COB_ID_INVALID, RPDO_TOO_SHORT, push_frame, report_cleared, send_emergency
-from hil.canopen.device_records import PDOS, CommunicationObjects, Device, DriveObjects, int64
-
-EVENT_DRIVEN = 254
+from hil.canopen.device_records import (
+    EVENT_DRIVEN,
+    LAST_SYNCHRONOUS,
+    PDOS,
+    CommunicationObjects,
+    Device,
+    DriveObjects,
+    int64,
+)
 
 
 @kernel
@@ -167,7 +173,7 @@ def receive_sync(device: Device, now_ns: int, counter: int, queue: FrameQueue) -
     group = device.communication
     for pdo in range(PDOS):
         kind = int64(group.tpdo_type[pdo])
-        if int64(group.tpdo_cob_id[pdo]) & COB_ID_INVALID or group.tpdo_count[pdo] == 0 or kind > 240:
+        if int64(group.tpdo_cob_id[pdo]) & COB_ID_INVALID or group.tpdo_count[pdo] == 0 or kind > LAST_SYNCHRONOUS:
             continue
         if counter and kind and not device.tpdo_started[pdo]:
             start = int64(group.tpdo_sync_start[pdo])

@@ -81,11 +81,6 @@ class DriveContract:
         assert bench.drive.make_safe() == "untouched"
         assert bench.powered()
 
-    def test_stop_now_takes_the_power_off_whoever_switched_it_on(self, bench: Bench) -> None:
-        bench.power_up()
-        assert bench.drive.stop_now() == self.off
-        assert not bench.powered()
-
     def test_clearing_a_fault_enables_nothing(self, bench: Bench) -> None:
         bench.drive.clear_fault()
         assert not bench.powered()

@@ -75,11 +75,7 @@ def test_make_safe_reaches_a_drive_that_its_watchdog_stops_meanwhile(
 
 
 def another_program_stops_it(bus: Any, settings: Any) -> None:
-    other = bus.drive(settings)
-    try:
-        assert other.stop_now() == "switch on disabled"
-    finally:
-        other.close()
+    assert bus.stop_drive() == "switch on disabled"
 
 
 def its_supply_is_switched_off_and_on(bus: Any, settings: Any) -> None:

@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from drivers.canopen.identifiers import LAST_SYNCHRONOUS
 from drivers.errors import ConfigurationError
 from firmware_py.states import ControllerKind
 from firmware_py.velocity import low_pass_gain
@@ -23,7 +24,6 @@ from tools.configuration.records import hidden_layer
 if TYPE_CHECKING:
     from tools.configuration.config import Config
 
-LAST_SYNCHRONOUS_TYPE = 240
 STEP_SHARE = 0.2  # of the torque limit; `precise` with 17 bit is below, with 16 bit, where it chatters, above
 
 
@@ -45,7 +45,7 @@ def _delay(config: Config, measured_s: float | None) -> tuple[float, str]:
     if isinstance(config.drive, ElmoSerial):
         return 1.0 / config.loop.rate_Hz, "assumed: at most one period (serial line)"
     period_s, kind = 1.0 / config.loop.rate_Hz, config.canopen.rpdo_transmission_type
-    if kind > LAST_SYNCHRONOUS_TYPE:
+    if kind > LAST_SYNCHRONOUS:
         return period_s, f"assumed: at most one period (drive.rpdo_transmission_type = {kind}, asynchronous)"
     periods = max(kind, 1)
     count = "one period" if periods == 1 else f"at most {periods} periods"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from drivers.canopen.identifiers import EVENT_DRIVEN, LAST_SYNCHRONOUS
 from tools.configuration.config import Config
 from tools.configuration.conversions import RADPS_PER_UNIT
 from tools.configuration.elmo import ElmoSerial
@@ -260,9 +261,11 @@ def _canopen_problems(config: Config) -> list[str]:
         found.append(f"loop.rate_Hz (={config.loop.rate_Hz:g}) must be in [{CAN_RATE_HZ[0]:g}..{CAN_RATE_HZ[1]:g}]")
     if drive.node == drive.master_node:
         found.append(f"drive.master_node (={drive.master_node}) must differ from drive.node")
-    if 240 < drive.rpdo_transmission_type < 254:
+    if LAST_SYNCHRONOUS < drive.rpdo_transmission_type < EVENT_DRIVEN:
         kind = drive.rpdo_transmission_type
-        found.append(f"drive.rpdo_transmission_type (={kind}) must be in [0..240] or in [254..255]")
+        found.append(
+            f"drive.rpdo_transmission_type (={kind}) must be in [0..{LAST_SYNCHRONOUS}] or in [{EVENT_DRIVEN}..255]"
+        )
     if drive.rated_torque_Nm is not None and drive.max_torque_permille is not None:
         if drive.torque_reference == "rated_torque":
             reach = drive.rated_torque_Nm * config.joint.reduction_ratio * drive.max_torque_permille / 1000.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from drivers.canopen.cia402 import SUPPORTED_MODE_BIT, Mode, state_text
-from drivers.canopen.identifiers import NmtCommand, NmtState
+from drivers.canopen.identifiers import LAST_SYNCHRONOUS, NmtCommand, NmtState
 
 # CiA 402-2, 6041: bits that say more than the state
 _STATUS_BITS = {
@@ -103,7 +103,7 @@ def transmission_text(kind: int) -> str:
     """Of a PDO (CiA 301, 7.5.2.35)."""
     if kind == 0:
         return "synchronous, on an event"
-    if kind <= 240:
+    if kind <= LAST_SYNCHRONOUS:
         return "every SYNC" if kind == 1 else f"every {kind} SYNC"
     return {252: "on request, sampled at SYNC", 253: "on request", 254: "event (manufacturer)", 255: "event"}.get(
         kind, f"reserved ({kind})"

@@ -10,10 +10,10 @@ import math
 import numpy as np
 
 from drivers.can.bit_timing import worst_frame_bits
+from drivers.canopen.identifiers import EVENT_DRIVEN
 from firmware_py.realtime import Histogram
 
 RPDO_BYTES = 4
-AT_ONCE = 254  # RPDO transmission types from here on act on receipt, the lower ones at a SYNC
 QUANTILE = 0.99
 MICROSECOND = 1e-6
 
@@ -39,7 +39,7 @@ def measured_delay_s(histograms: np.ndarray, rpdo_transmission_type: int, period
         + quantile_s(histograms[Histogram.WORK], QUANTILE)
         + rpdo_s
     )
-    if rpdo_transmission_type >= AT_ONCE:
+    if rpdo_transmission_type >= EVENT_DRIVEN:
         return path_s
     periods = math.ceil(path_s / period_s)
     return period_s * max(periods, rpdo_transmission_type, 1)

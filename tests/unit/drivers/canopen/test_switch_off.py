@@ -13,7 +13,6 @@ from typing import Any
 import can
 import pytest
 
-from drivers.canopen.switch_off import stop_node
 from drivers.drive import UNTOUCHED, CommissioningReport, DriveIdentity, is_safe
 from drivers.errors import BusError, DeviceError
 from hil.canopen.device_records import PowerState
@@ -32,10 +31,6 @@ def bus_of(device_on_bus: Any) -> can.BusABC:
     return can.Bus(interface="virtual", channel=device_on_bus.channel)
 
 
-def stopped(device_on_bus: Any) -> str:
-    return stop_node(bus_of(device_on_bus), 1, sdo_timeout_s=0.15, sleep=lambda s: time.sleep(s / 4.0))
-
-
 def power_up(device_on_bus: Any) -> None:
     with bus_of(device_on_bus) as bus:
         for control in (0x06, 0x07, 0x0F, 0x0F):
@@ -51,7 +46,7 @@ def powered(device_on_bus: Any) -> bool:
 
 def test_no_eds_is_needed(device_on_bus: Any) -> None:
     power_up(device_on_bus)
-    assert stopped(device_on_bus) == "switch on disabled"
+    assert device_on_bus.stop_drive() == "switch on disabled"
     assert not powered(device_on_bus)
     words_ = [data[4] for cob, data in device_on_bus.requests if cob == 0x601 and data[:3] == b"\x2b\x40\x60"]
     assert (words_[4], words_[-1]) == (2, 0)  # after the four of power_up: quick stop, then disable voltage
@@ -60,7 +55,7 @@ def test_no_eds_is_needed(device_on_bus: Any) -> None:
 
 def test_a_drive_that_stays_enabled_is_told_so_and_gets_nmt_stop(device_on_bus: Any) -> None:
     device_on_bus.answers[0x6041, 0] = ENABLED
-    state = stopped(device_on_bus)
+    state = device_on_bus.stop_drive()
     assert state.startswith("operation enabled,")
     assert "NMT stop was sent" in state
     assert not is_safe(state)
@@ -69,12 +64,12 @@ def test_a_drive_that_stays_enabled_is_told_so_and_gets_nmt_stop(device_on_bus: 
 
 def test_a_drive_that_takes_its_time_is_waited_for(device_on_bus: Any) -> None:
     device_on_bus.sequences[0x6041, 0] = [SWITCHED_ON] * 20
-    assert stopped(device_on_bus) == "switch on disabled"
+    assert device_on_bus.stop_drive() == "switch on disabled"
     assert NMT_STOP not in device_on_bus.requests
 
 
 def test_nobody_answers(empty_bus: Any) -> None:
-    state = stopped(empty_bus)
+    state = empty_bus.stop_drive()
     assert state.startswith("unknown: ")
     assert NMT_STOP in empty_bus.requests
 
@@ -150,7 +145,7 @@ def test_a_yes_that_comes_after_another_controller_is_refused(device_on_bus: Any
             waiting.start_cyclic()
         assert waiting.make_safe() == UNTOUCHED  # its motion is not ours to end
         assert commands(device_on_bus) == []
-        assert waiting.stop_now() == "switch on disabled"  # the user's own word is another matter
+        assert device_on_bus.stop_drive() == "switch on disabled"  # the user's own word is another matter
 
 
 def test_its_twin_starts_and_is_made_safe_beside_its_own_loop(device_on_bus: Any, waiting: Any) -> None:
@@ -277,7 +272,7 @@ def test_clear_fault_leaves_an_enabled_drive_alone(device_on_bus: Any, settings_
             drive.clear_fault()
         assert powered(device_on_bus)
         assert commands(device_on_bus) == []
-        drive.stop_now()
+        assert device_on_bus.stop_drive() == "switch on disabled"
         assert drive.clear_fault() == "no fault: the drive is switch on disabled"  # the twin
     finally:
         drive.close()
