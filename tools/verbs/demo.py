@@ -26,7 +26,7 @@ def demo(config_path: Path, output: Output, *, duration_s: float | None = None) 
     config = with_bus_overrides(config, interface="jointctl", channel=channel, environ={})
     if duration_s is not None:
         config = _with_duration(config, duration_s)
-    output.note("starting the virtual joint (the first start compiles, about a minute)")
+    output.note("starting the virtual joint")
     with separate_virtual_joint(config_path, channel, output.note):
         return run(config, output, assume_yes=True)
 
