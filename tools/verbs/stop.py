@@ -24,9 +24,11 @@ def stop(path: Path, output: Output, given: GivenTarget | None = None) -> int:
     """
     target = stop_target(path, given)
     state = stop_serial(target, output) if isinstance(target, SerialTarget) else _stop_canopen(target)
-    output.result(f"the drive is {state}", {"drive_state": state})
-    _warn_of(path, output)
-    require_off(state)
+    try:
+        output.result(f"the drive is {state}", {"drive_state": state})
+    finally:  # a result that cannot be written must not hide that the drive is not off
+        _warn_of(path, output)
+        require_off(state)
     return 0
 
 

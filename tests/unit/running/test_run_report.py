@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from drivers.errors import DataError, DeviceError
 from firmware_py.realtime import HISTOGRAM_BINS, Histogram
 from firmware_py.states import Fault
 from tests.run_records import run_records
@@ -59,6 +61,25 @@ def test_a_picture_that_cannot_be_written_does_not_hide_the_result(tmp_path: Pat
     assert "run.png: cannot be written: Is a directory" in err.getvalue().replace("\n", " ")
     assert "run.mcap" in out.getvalue()
     assert "│ picture" not in out.getvalue()
+
+
+def reported_to_a_full_disk(found: RunResult) -> int:
+    with Path("/dev/full").open("w") as full:
+        return run_report.report_run(found, Output(stdout=full, stderr=io.StringIO()), WITHOUT_PICTURE)
+
+
+def test_a_fault_outweighs_a_result_that_cannot_be_written(tmp_path: Path) -> None:
+    assert reported_to_a_full_disk(result(tmp_path, Fault.BUS_ERROR)) == 7
+
+
+def test_so_does_a_drive_that_is_not_off(tmp_path: Path) -> None:
+    with pytest.raises(DeviceError, match="did not confirm"):
+        reported_to_a_full_disk(replace(result(tmp_path, Fault.NONE), drive_state="operation enabled"))
+
+
+def test_without_them_it_is_the_error(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="standard output"):
+        reported_to_a_full_disk(result(tmp_path, Fault.NONE))
 
 
 def test_without_a_picture_none_is_drawn_or_told(tmp_path: Path) -> None:

@@ -24,7 +24,8 @@ def report_run(result: RunResult, output: Output, config: Config) -> int:
     """Print and save everything, and a picture unless log.picture forbids it; returns the exit code.
 
     That is 0, the one of `MotionFault`, or 130 after an interruption.  The cause of a fault comes before all
-    else: on a busy computer the picture takes seconds.  `DeviceError` where the drive did not confirm that it is off.
+    else: on a busy computer the picture takes seconds.  `DeviceError` where the drive did not confirm that it is off;
+    both outweigh the `DataError` of a result that cannot be written.
     """
     if result.fault_text is not None:
         text = result.fault_text
@@ -45,7 +46,13 @@ def report_run(result: RunResult, output: Output, config: Config) -> int:
     table.add_row("log", str(result.log_path))
     if drawn is not None:
         table.add_row("picture", str(drawn))
-    output.result(table, _data(result, drawn))
+    try:
+        output.result(table, _data(result, drawn))
+    except DataError as error:
+        if result.fault_text is None:
+            require_off(result.drive_state)
+            raise
+        output.warning(error.message)
     if result.lost_records:
         output.warning(f"{result.lost_records} log records were lost: the supervisor was too slow")
     if result.fault_text is not None:

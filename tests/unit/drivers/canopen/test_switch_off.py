@@ -14,7 +14,7 @@ import can
 import pytest
 
 from drivers.drive import UNTOUCHED, CommissioningReport, DriveIdentity, is_safe
-from drivers.errors import BusError, DeviceError
+from drivers.errors import BusError, DataError, DeviceError
 from hil.canopen.device_records import PowerState
 from tests.places import CONFIGS
 from tools.output import Output
@@ -101,6 +101,15 @@ def test_a_stop_that_is_not_confirmed_is_an_error(
     with pytest.raises(DeviceError, match="use the emergency stop"):
         stop_module.stop(CONFIGS / "virtual.toml", Output())
     assert "operation enabled" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("state", "error"), [("operation enabled", DeviceError), ("switch on disabled", DataError)])
+def test_a_full_disk_behind_its_output_does_not_hide_it(
+    monkeypatch: pytest.MonkeyPatch, state: str, error: type[Exception]
+) -> None:
+    monkeypatch.setattr(stop_module, "_stop_canopen", lambda _: state)
+    with Path("/dev/full").open("w") as full, pytest.raises(error):
+        stop_module.stop(CONFIGS / "virtual.toml", Output(stdout=full))
 
 
 # --- another controller, after ours has commissioned ---------------------------------------------------------------
