@@ -41,7 +41,7 @@ class _Console(Console):
         raise
 
 
-def _abandon(stream: IO[str]) -> None:
+def abandon(stream: IO[str]) -> None:
     """Let what is still to be written to it vanish; else the interpreter would complain when it ends."""
     with suppress(OSError, ValueError):
         null = os.open(os.devnull, os.O_WRONLY)
@@ -85,11 +85,11 @@ class Output:
         try:
             write()
         except BrokenPipeError:
-            _abandon(self.stdout)
+            abandon(self.stdout)
             self._results.quiet = True
             return False
         except OSError as error:
-            _abandon(self.stdout)
+            abandon(self.stdout)
             raise DataError(f"standard output: cannot be written: {error.strerror or error}") from None
         return True
 
@@ -100,7 +100,7 @@ class Output:
             else:
                 _print_whole(self._messages, text)
         except OSError:
-            _abandon(self.stderr)
+            abandon(self.stderr)
             self._messages.quiet = True
 
     def note(self, text: RenderableType) -> None:

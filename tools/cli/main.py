@@ -31,7 +31,7 @@ from tools.cli.options import (
     loaded,
 )
 from tools.cli.standard_streams import occupy_standard_streams
-from tools.output import Output
+from tools.output import Output, abandon
 
 EPILOG = (
     "First steps: `jointctl demo` shows all of it on a virtual joint; `jointctl doctor` tells what this computer can "
@@ -270,6 +270,8 @@ def main() -> None:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
         Output().error(f"{error.filename or 'a file or the output'}: cannot be written: {error.strerror}")
+        if error.filename is None:
+            abandon(sys.stdout)
         sys.exit(DataError.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         Output().note("interrupted")

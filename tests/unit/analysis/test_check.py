@@ -11,7 +11,6 @@ import pytest
 
 from drivers.errors import ConfigurationError, DataError, JointctlError, MarginError, UsageError
 from firmware_py.states import ControllerKind
-from tools.analysis import loop_settings as mapping
 from tools.analysis.linear_loop import CONTROLLERS
 from tools.analysis.loop_settings import loop_settings, not_modelled
 from tools.analysis.margin_gate import require_margin
@@ -224,7 +223,6 @@ def test_what_the_model_leaves_out_is_said() -> None:
         "control.feed_forward", "joint.gravity_Nm", "joint.coriolis_Nmspr", "control.dead_zone_rad",
     ]  # fmt: skip
     assert not_modelled(changed("control", feed_forward="desired")) == []
-    assert mapping.LAST_SYNCHRONOUS_TYPE == 240
 
 
 def precise_with(bits: int, side: str = "joint") -> Config:

@@ -61,8 +61,9 @@ def test_a_result_that_does_not_fit_is_an_error(json: bool) -> None:
         Output(json=json, stdout=full, stderr=io.StringIO()).result("a table", {"a": 1})
 
 
-def test_a_disk_without_room_is_one_line_of_any_verb() -> None:
-    done = shell(f"{JOINTCTL} --version >/dev/full")
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_disk_without_room_is_one_line_of_any_verb(unbuffered: str) -> None:
+    done = shell(f"PYTHONUNBUFFERED={unbuffered} {JOINTCTL} --version >/dev/full")
     assert (done.returncode, done.stderr.count("\n")) == (8, 1)
     assert done.stderr.startswith("error: ")
 
