@@ -142,7 +142,7 @@ def test_cyclic_position_by_pdo_and_sync(joint: Any, node: Any) -> None:
 def test_the_program_in_the_documentation(joint: Any) -> None:
     page = (joint.eds.parents[1] / "docs" / "virtual-joint.md").read_text()
     program = page.split("```text\n")[1].split("```")[0]
-    for shown, here in (('"vcan"', repr(joint.channel)), ("(1,", f"({joint.node_id},"), ('"configs/', '"')):
+    for shown, here in (('"virtual0"', repr(joint.channel)), ("(1,", f"({joint.node_id},"), ('"configs/', '"')):
         assert shown in program
         program = program.replace(shown, here, 1)
     names: dict[str, Any] = {}
