@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.virtual_drive import Rig
+from tests.virtual_drive import MS, Rig
 
 
 @pytest.mark.parametrize(
@@ -119,3 +119,29 @@ def test_position_modes_reach_the_target(rig: Rig, mode: int) -> None:
     rig.run(1500)
     assert rig.get(0x6064) == pytest.approx(20_000, abs=100)
     assert mode == 8 or rig.get(0x6041) & 0x400
+
+
+def _pushed_until_unheard(reaction: int, mode: int, calls: int) -> Rig:
+    """Pushed in this mode for 300 ms, in so many calls; the controller's heartbeat is lost after 50 ms."""
+    rig = Rig()
+    rig.set(0x1016, 1, 0x7F << 16 | 50, 4)
+    rig.set(0x6007, 0, reaction, 2)
+    rig.operational()
+    rig.enable(mode)
+    rig.set(0x6071, 0, 300, 2)
+    rig.send(0x77F, b"\x05")
+    for _ in range(calls):
+        rig.now_ns += 300 * MS // calls
+        rig.device.advance(rig.now_ns)
+    return rig
+
+
+@pytest.mark.parametrize("mode", [10, 4])
+@pytest.mark.parametrize(("reaction", "state"), [(0, 4), (1, 7), (2, 1), (3, 1)])
+def test_a_torque_is_not_held_beyond_what_ends_it(reaction: int, state: int, mode: int) -> None:
+    """In cyclic torque mode it is worked out once a frame: as if it were in each substep, also where a stop begins."""
+    whole, stepped = (_pushed_until_unheard(reaction, mode, calls) for calls in (1, 3000))
+    assert whole.device.plant_state[0].joint_position_rad > 0.001
+    assert whole.device.plant_state.tobytes() == stepped.device.plant_state.tobytes()
+    assert whole.device.device[0].demand == stepped.device.device[0].demand
+    assert whole.state() == stepped.state() == state
