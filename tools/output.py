@@ -41,6 +41,11 @@ class _Console(Console):
         raise
 
 
+def _console(stream: IO[str], width: int | None = None) -> _Console:
+    soft_wrap = not stream.isatty()
+    return _Console(file=stream, soft_wrap=soft_wrap, width=width, highlight=False, markup=False, emoji=False)
+
+
 def abandon(stream: IO[str]) -> None:
     """Let what is still to be written to it vanish; else the interpreter would complain when it ends."""
     with suppress(OSError, ValueError):
@@ -49,12 +54,21 @@ def abandon(stream: IO[str]) -> None:
         os.close(null)
 
 
+def let_go(stream: IO[str]) -> None:
+    """At the end: what a slow reader has not taken is lost; the interpreter would make another exit code of it."""
+    try:
+        stream.flush()
+    except OSError:
+        abandon(stream)
+
+
 @dataclass
 class Output:
     """The two streams of a command; `stdout` and `stderr` are replaced in tests.
 
     Nobody reads stdout any more (`| head`): the result is thrown away, the verb goes on to its end.  It cannot be
-    written (disk full): `DataError`.  What stderr does not take is lost: never a reason to end a motion.
+    written (disk full): `DataError`.  What stderr does not take is lost: never a reason to end a motion; where its
+    reader is only slow, what is said later is not lost with it.
     """
 
     json: bool = False
@@ -65,9 +79,8 @@ class Output:
     def __post_init__(self) -> None:
         # rich wraps at 80 columns where there is no terminal; a line of a log file or of a pipe is not to be broken
         width = None if self.stdout.isatty() else PIPE_COLUMNS
-        as_it_is: Any = {"highlight": False, "markup": False, "emoji": False}
-        self._results = _Console(file=self.stdout, soft_wrap=not self.stdout.isatty(), width=width, **as_it_is)
-        self._messages = _Console(file=self.stderr, soft_wrap=not self.stderr.isatty(), **as_it_is)
+        self._results = _console(self.stdout, width)
+        self._messages = _console(self.stderr)
 
     def result(self, shown: RenderableType, data: Any = None) -> None:
         """A result: `shown` for people, `data` (numbers, texts, lists, dicts) with `--json`."""
@@ -99,6 +112,8 @@ class Output:
                 self._messages.print(text, style=style)
             else:
                 _print_whole(self._messages, text)
+        except BlockingIOError:
+            self._messages = _console(self.stderr)  # the old one would say it again
         except OSError:
             abandon(self.stderr)
             self._messages.quiet = True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import errno
 import gc
 import os
@@ -31,7 +32,7 @@ from tools.cli.options import (
     loaded,
 )
 from tools.cli.standard_streams import occupy_standard_streams
-from tools.output import Output, abandon
+from tools.output import Output, abandon, let_go
 
 EPILOG = (
     "First steps: `jointctl demo` shows all of it on a virtual joint; `jointctl doctor` tells what this computer can "
@@ -257,6 +258,7 @@ def _refuse_usage(error: Any) -> None:
 def main() -> None:
     """Run a verb; every known error is one line and its own exit code."""
     occupy_standard_streams()
+    atexit.register(let_go, sys.stderr)
     _start_quickly()
     try:
         sys.exit(app(standalone_mode=False))

@@ -55,6 +55,35 @@ def test_what_stderr_does_not_take_is_no_reason_to_end(unread: IO[str]) -> None:
     output.error("four", "five")
 
 
+def test_a_slow_reader_of_stderr_hears_what_is_said_when_it_has_caught_up() -> None:
+    reading, writing = os.pipe()
+    os.set_blocking(reading, False)
+    os.set_blocking(writing, False)
+    with os.fdopen(reading, "rb", buffering=0) as reader, os.fdopen(writing, "w") as stream:
+        output = Output(stdout=io.StringIO(), stderr=stream)
+        for number in range(3000):
+            output.note(f"note {number:050d}")
+        while reader.read(1 << 16):
+            pass
+        output.error("the drive did not confirm that it is off")
+        assert (reader.read(1 << 16) or b"").endswith(b"error: the drive did not confirm that it is off\n")
+
+
+def test_one_that_never_catches_up_does_not_change_the_exit_code() -> None:
+    code = (
+        "import os, sys; os.set_blocking(2, False); sys.argv = ['jointctl', 'check', 'absent.toml']\n"
+        "try:\n    os.write(2, bytes(1 << 20))\nexcept BlockingIOError:\n    pass\n"
+        "import tools.cli.start as start; start.main()"
+    )
+    reading, writing = os.pipe()
+    try:
+        done = subprocess.run([sys.executable, "-c", code], stderr=writing, timeout=60.0)
+    finally:
+        os.close(reading)
+        os.close(writing)
+    assert done.returncode == 3
+
+
 @pytest.mark.parametrize("json", [False, True])
 def test_a_result_that_does_not_fit_is_an_error(json: bool) -> None:
     with Path("/dev/full").open("w") as full, pytest.raises(DataError, match="standard output: cannot be written: No"):
