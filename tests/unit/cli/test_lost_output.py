@@ -69,7 +69,8 @@ def test_a_slow_reader_of_stderr_hears_what_is_said_when_it_has_caught_up() -> N
         assert (reader.read(1 << 16) or b"").endswith(b"error: the drive did not confirm that it is off\n")
 
 
-def test_one_that_never_catches_up_does_not_change_the_exit_code() -> None:
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_one_that_never_catches_up_does_not_change_the_exit_code(unbuffered: str) -> None:
     code = (
         "import os, sys; os.set_blocking(2, False); sys.argv = ['jointctl', 'check', 'absent.toml']\n"
         "try:\n    os.write(2, bytes(1 << 20))\nexcept BlockingIOError:\n    pass\n"
@@ -77,7 +78,8 @@ def test_one_that_never_catches_up_does_not_change_the_exit_code() -> None:
     )
     reading, writing = os.pipe()
     try:
-        done = subprocess.run([sys.executable, "-c", code], stderr=writing, timeout=60.0)
+        environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+        done = subprocess.run([sys.executable, "-c", code], stderr=writing, env=environment, timeout=60.0)
     finally:
         os.close(reading)
         os.close(writing)
