@@ -31,7 +31,7 @@ from firmware_py.libc import (
 from hil.bus.frames import FRAME_SIZE, FrameQueue
 from hil.canopen.device_core import accept_frame, advance
 from hil.canopen.device_records import Device, NmtState, int64
-from hil.faults.frame_faults import pass_frame, take_due
+from hil.faults.frame_faults import append_frame, pass_frame, take_due
 from hil.faults.kinds import FaultMemory
 from hil.faults.plant_faults import step_faults
 from hil.frame_stamps import OLDEST_STAMP_NS, STAMPED_LAG_NS, sent_ns_of, stamp_answers
@@ -175,11 +175,7 @@ def _take_sdo_answer(
     """An answer of the Python thread: the core first acts on what was written, then the frame goes out."""
     device.next_due_ns = 0
     advance(device, plant_c, plant_s, now_ns, queue)
-    slot = queue.count
-    if slot < len(queue.frames):
-        for byte in range(FRAME_SIZE):
-            queue.frames[slot, byte] = frame[byte]
-        queue.count = slot + 1
+    append_frame(queue, frame)
 
 
 @kernel

@@ -7,30 +7,16 @@ import math
 import re
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from drivers.canopen.drive import CanopenDrive
 from drivers.canopen.settings import CanopenSettings
 from drivers.errors import ConfigurationError, DeviceError, JointctlError, NoDeviceError
+from tests.unit.drivers.canopen.odd_drive import opened, value
 
 pytestmark = pytest.mark.usefixtures("short_timeout")
-
-
-@contextmanager
-def opened(bus: Any, settings: CanopenSettings) -> Iterator[CanopenDrive]:
-    drive = bus.drive(settings)
-    try:
-        yield drive
-    finally:
-        drive.close()
-
-
-def value(bus: Any, index: int, sub: int = 0) -> int:
-    return int(bus.device.objects.value(index, sub))
 
 
 def refusal(bus: Any, settings: CanopenSettings, kind: type[JointctlError]) -> str:
