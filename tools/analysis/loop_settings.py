@@ -18,7 +18,6 @@ from firmware_py.states import ControllerKind
 from firmware_py.velocity import low_pass_gain
 from tools.analysis.linear_loop import LoopSettings
 from tools.configuration.conversions import joint_rad_per_count
-from tools.configuration.elmo import ElmoSerial
 from tools.configuration.records import hidden_layer
 
 if TYPE_CHECKING:
@@ -42,7 +41,7 @@ def _delay(config: Config, measured_s: float | None) -> tuple[float, str]:
         return measured_s, "measured"
     if config.margin.loop_delay_s is not None:
         return config.margin.loop_delay_s, "margin.loop_delay_s"
-    if isinstance(config.drive, ElmoSerial):
+    if config.is_serial:
         return 1.0 / config.loop.rate_Hz, "assumed: at most one period (serial line)"
     period_s, kind = 1.0 / config.loop.rate_Hz, config.canopen.rpdo_transmission_type
     if kind > LAST_SYNCHRONOUS:

@@ -8,7 +8,6 @@ from typing import Any
 from drivers.canopen.identifiers import EVENT_DRIVEN, LAST_SYNCHRONOUS
 from tools.configuration.config import Config
 from tools.configuration.conversions import RADPS_PER_UNIT
-from tools.configuration.elmo import ElmoSerial
 from tools.configuration.elmo_settings import serial_problems
 from tools.configuration.sections import Friction, FrictionDirection
 
@@ -230,7 +229,7 @@ def _drive_problems(config: Config) -> list[str]:
     else:
         weak = []
     weak += _joint_encoder_problems(config)
-    if isinstance(config.drive, ElmoSerial):
+    if config.is_serial:
         return weak + serial_problems(config)
     return weak + _canopen_problems(config)
 
@@ -239,7 +238,7 @@ def _joint_encoder_problems(config: Config) -> list[str]:
     encoder, found = config.joint_encoder, []
     if encoder is None:
         return []
-    if isinstance(config.drive, ElmoSerial):
+    if config.is_serial:
         return ['[joint_encoder] needs a CANopen drive: drive.kind must be "canopen"']
     if (encoder.source == "node") != (encoder.node is not None):
         found.append('joint_encoder.node must be given with source = "node", and only then')

@@ -22,7 +22,7 @@ def elmo_section(config: Config) -> ElmoSerial:
 
 def refuse_serial(config: Config, what: str) -> None:
     """`ConfigurationError` for a serial drive: its joint is simulated in real time only, behind a pseudo-terminal."""
-    if isinstance(config.drive, ElmoSerial):
+    if config.is_serial:
         raise ConfigurationError(
             f'{config.path}: drive.kind (={KIND}) must be "canopen" for {what}',
             "the serial joint runs in real time only: `jointctl hil --serial`, then `jointctl run CONFIG -p PORT`",

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from drivers.errors import ConfigurationError
 from tools.configuration.checks import problems_between_sections
 from tools.configuration.config import SHIPPED_FOLDER, Config
-from tools.configuration.elmo import ElmoSerial, with_serial_bus
+from tools.configuration.elmo import with_serial_bus
 from tools.configuration.plant_settings import plant_problems
 from tools.configuration.problems import ConfigurationProblems, problem_line, problem_lines, raise_if
 from tools.configuration.sections import Bus, Drive
@@ -72,7 +72,7 @@ def with_bus_overrides(
     environ: Mapping[str, str] | None = None,
 ) -> Config:
     """The configuration on another bus: flag beats environment (CAN_INTERFACE, _CHANNEL, _BITRATE) beats file."""
-    if isinstance(config.drive, ElmoSerial):
+    if config.is_serial:
         given = next((value for value in (interface, channel, bitrate) if value is not None), None)
         if given is not None:
             raise ConfigurationError(f"command line: {given} names a CAN bus, the drive is on a serial port: use -p")

@@ -78,7 +78,7 @@ def loop_delay_s(config: Config, histograms: Any) -> float:
 
 def drive_fault_text(config: Config, fault: Fault, value: float, drive_error: int, encoder_error: int = 0) -> FaultText:
     """A fault in the words that fit the drive, its line and the joint's encoders."""
-    if not isinstance(config.drive, ElmoSerial):
+    if not config.is_serial:
         two_encoders = config.joint_encoder is not None
         return fault_text(fault, value, drive_error, encoder_error, two_encoders=two_encoders)
     text = serial_fault_text(fault, value) or fault_text(fault, value, 0)

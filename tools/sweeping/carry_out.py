@@ -190,7 +190,7 @@ def sweep_in_lockstep(
     config: Config, motion: SweepMotion, meter: SweepMeter, confirm: Callable[[CommissioningReport], bool]
 ) -> tuple[Fault, float] | None:
     """The whole motion on the virtual joint in simulated time; the fault and its value, None if `confirm` declined."""
-    if isinstance(config.drive, ElmoSerial):
+    if config.is_serial:
         raise UsageError('--lockstep is for drive.kind = "canopen": the serial joint runs in real time only')
     joint = LockstepJoint(config)
     if not confirm(joint.report):

@@ -85,6 +85,6 @@ def measuring_constants(config: Config) -> dict[str, float]:
 
 def torque_source(config: Config) -> str:
     """For the sidecar: which reading of the drive the torque comes from."""
-    if isinstance(config.drive, ElmoSerial):
+    if config.is_serial:
         return "current IQ as the drive measures it; motor_torque_Nm = current_A * torque_constant_NmpA"
     return "object 6077 as the drive measures it; current_A = motor_torque_Nm / torque_constant_NmpA"
