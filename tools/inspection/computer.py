@@ -29,6 +29,7 @@ _PR_GET_TIMERSLACK = 30
 _MCL_CURRENT = 1
 _MUCH_SLACK_NS = 50_000
 _LATE_US = 500.0
+_FULL = "preempt=full"  # an option of kernels built with PREEMPT_DYNAMIC
 _RIGHTS = "in /etc/security/limits.d/jointctl.conf: '{user} - rtprio 90' and '{user} - memlock unlimited'; log in again"
 _LATENCY_RIGHT = (
     """a udev rule gives the right: KERNEL=="cpu_dma_latency", GROUP="realtime", MODE="0660", and you in that group"""
@@ -50,14 +51,22 @@ def software() -> Iterator[Finding]:
     yield Finding("cores", OK if cores >= 2 else NOTE, str(cores), "" if cores >= 2 else few, {"cores": cores})
 
 
+def _preemption(root: Path) -> Finding:
+    """How long the kernel itself may hold a woken loop up: without preemption, to the end of what it is doing."""
+    kernel, version = platform.release(), platform.version()
+    if file_text(root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in version:
+        return Finding("kernel", OK, f"{kernel}, PREEMPT_RT")
+    cure = "a real-time kernel bounds the worst wake-up; install one if the measured max is too late"
+    if _FULL in (file_text(root / "proc/cmdline") or "").split():
+        return Finding("kernel", NOTE, f"{kernel}, not PREEMPT_RT, {_FULL}", cure)
+    if "PREEMPT_DYNAMIC" in version:
+        cure += f"; the kernel option {_FULL} goes half the way"
+    return Finding("kernel", NOTE, f"{kernel}, not PREEMPT_RT", cure)
+
+
 def kernel_findings(root: Path = Path("/")) -> Iterator[Finding]:
     """Kernel, clock, governor, timer slack; `root` is replaced in tests."""
-    realtime = file_text(root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in platform.version()
-    kind = "PREEMPT_RT" if realtime else "not PREEMPT_RT"
-    cure = (
-        "" if realtime else "a real-time kernel bounds the worst wake-up; install one if the measured max is too late"
-    )
-    yield Finding("kernel", OK if realtime else NOTE, f"{platform.release()}, {kind}", cure)
+    yield _preemption(root)
     clock = file_text(root / "sys/devices/system/clocksource/clocksource0/current_clocksource")
     good = clock in _GOOD_CLOCKS
     cure = "" if good else "a slow clock costs microseconds a reading: try the kernel option clocksource=tsc"

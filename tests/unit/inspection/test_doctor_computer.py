@@ -30,6 +30,23 @@ class TestComputer:
         assert ("not PREEMPT_RT" in kernel.text) == (status == NOTE)
         assert bool(kernel.cure) == (status == NOTE)
 
+    @pytest.mark.parametrize(
+        ("version", "options", "advised"),
+        [
+            ("#1 SMP PREEMPT_DYNAMIC Debian", "quiet preempt=voluntary", True),
+            ("#1 SMP PREEMPT_DYNAMIC Debian", "quiet preempt=full", False),
+            ("#1 SMP Debian", "quiet", False),  # could not
+        ],
+    )
+    def test_full_preemption_is_advised_where_the_kernel_can(
+        self, tmp_path: Path, version: str, options: str, advised: bool, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(computer.platform, "version", lambda: version)
+        write(tmp_path, "proc/cmdline", options + "\n")
+        kernel = next(kernel_findings(tmp_path))
+        assert ("preempt=full" in kernel.cure) is advised
+        assert ("preempt=full" in kernel.text) is ("preempt=full" in options)
+
     @pytest.mark.parametrize(("clock", "status"), [("tsc", OK), ("hpet", NOTE), ("acpi_pm", NOTE)])
     def test_clock_source(self, tmp_path: Path, clock: str, status: str) -> None:
         write(tmp_path, "sys/devices/system/clocksource/clocksource0/current_clocksource", clock + "\n")
