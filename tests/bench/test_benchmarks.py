@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import json
 import math
+import os
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +19,10 @@ from drivers.errors import ConfigurationError, UsageError
 from firmware_py.states import ControllerKind
 from tools.benchmarks import c_programs
 from tools.benchmarks.c_programs import NoCompilerError, compiler
-from tools.benchmarks.compiled_loops import at_rate, run_cyclictest
+from tools.benchmarks.compiled_loops import at_rate, on_the_core, run_cyclictest
 from tools.benchmarks.law_memory import FIRST_WEIGHT, law_doubles, state_doubles
 from tools.benchmarks.law_speed import SAME_NUMBERS, difference, kernel_ticks, law_rows, sine_inputs
-from tools.benchmarks.load import LOADS, load
+from tools.benchmarks.load import LOADS, busy_core, cores, load, on_core
 from tools.benchmarks.loop_times import times_from_ns
 from tools.benchmarks.numpy_law import NumpyLaw
 from tools.benchmarks.outcome import outcome_data, outcome_table, write_outcome
@@ -153,9 +155,29 @@ def test_every_load_ends_with_its_block():
         pass
 
 
-def test_another_rate_changes_nothing_else():
+@pytest.mark.skipif(len(cores()) < 2, reason="needs two cores")
+def test_a_load_keeps_to_the_first_core_and_nothing_else_does():
+    before = os.sched_getaffinity(0)
+    with load("Python thread"):
+        thread = next(thread for thread in threading.enumerate() if thread.name == "load")
+        while len(os.sched_getaffinity(thread.native_id)) > 1:
+            time.sleep(0.001)
+        assert os.sched_getaffinity(thread.native_id) == {min(before)}
+        assert os.sched_getaffinity(0) == before
+    with busy_core() as pid:
+        assert os.sched_getaffinity(pid) == {min(before)}
+        assert os.sched_getaffinity(0) == before
+    with on_core(max(before)):
+        assert os.sched_getaffinity(0) == {max(before)}
+    with on_core(None):
+        assert os.sched_getaffinity(0) == before
+    assert os.sched_getaffinity(0) == before
+
+
+def test_another_rate_or_core_changes_nothing_else():
     config = load_config(shipped_config("virtual"))
-    faster = at_rate(config, 2000.0)
+    faster = on_the_core(at_rate(config, 2000.0), 1)
+    assert faster.loop.cpu == 1
     assert faster.loop.rate_Hz == 2000.0
     assert faster.limits == config.limits
     assert config.loop.rate_Hz == 1000.0

@@ -24,7 +24,7 @@ from firmware_py.states import StopRequest
 from tools.analysis.idle_states import cores_awake
 from tools.analysis.wake_up import fifo, wake_up_lateness_ns
 from tools.benchmarks.law_memory import setting_doubles
-from tools.benchmarks.load import load
+from tools.benchmarks.load import load, on_core
 from tools.benchmarks.loop_times import NO_VALUES, LoopTimes, times_from_ns
 from tools.configuration.config import Config
 from tools.configuration.records import axis_constants, trajectory_table
@@ -40,6 +40,11 @@ PATIENCE_S = 0.25
 def at_rate(config: Config, rate_Hz: float) -> Config:
     """The same joint with another loop rate."""
     return config.model_copy(update={"loop": config.loop.model_copy(update={"rate_Hz": rate_Hz})})
+
+
+def on_the_core(config: Config, core: int) -> Config:
+    """The same joint with its loop on that core."""
+    return config.model_copy(update={"loop": config.loop.model_copy(update={"cpu": core})})
 
 
 def patient(config: Config) -> Config:
@@ -99,7 +104,7 @@ def run_c(program: Path, config: Config, seconds: float, load_name: str) -> Loop
         drive.start_cyclic()
         fd = end.fileno()
         numbers = (fd, config.loop.priority or 0, period_ns, int(RECEIVE_SHARE * period_ns), cycles)
-        with load(load_name), cores_awake():  # as ours and cyclictest do
+        with load(load_name), cores_awake(), on_core(config.loop.cpu):  # as ours, and awake as cyclictest as well
             result = subprocess.run(
                 [str(program), *map(str, numbers)],
                 input=setting.tobytes(),

@@ -27,7 +27,12 @@ def _part(name: str, config: Config, folder: Path, quick: bool, verbs: Sequence[
     parts: dict[str, Callable[[], Iterator[Row]]] = {
         "law": lambda: law_rows(axis_constants(config), folder, pairs=15 if quick else 61),
         "loop": lambda: exchange_rows(
-            config, folder, pairs=1 if quick else 3, seconds=1.0 if quick else 2.0, quick=quick
+            config,
+            folder,
+            pairs=1 if quick else 3,
+            pairs_in_c=2 if quick else 24,
+            seconds=1.0 if quick else 2.0,
+            quick=quick,
         ),
         "lockstep": lambda: lockstep_rows(config, runs=3 if quick else 15),
         "swarm": lambda: swarm_rows(pairs=1 if quick else 3, pyswarms_iterations=20 if quick else 100),
@@ -48,7 +53,7 @@ def bench(
     """Measure and report; always 0, since a goal that is missed on a busy computer is no error.
 
     `only`: names of `PARTS`, all if empty.  `verbs`: whose start is timed.  `out`: folder for bench.json and bench.png.
-    `quick` takes a minute or two instead of about ten, with few pairs and without the verbs: no basis for a claim.
+    `quick` takes two minutes instead of half an hour, with few pairs and without the verbs: no basis for a claim.
     A virtual joint is started; no other is touched.
     """
     for name in only:
