@@ -134,7 +134,7 @@ def run_cyclictest(path: str, config: Config, seconds: float, load_name: str) ->
     options = ["-q", "-m", "-t1", f"-i{period_us}", f"-l{round(seconds * config.loop.rate_Hz)}", "-h20000"]
     if config.loop.priority:
         options.append(f"-p{config.loop.priority}")
-    with load(load_name):
+    with load(load_name), on_core(config.loop.cpu):
         result = subprocess.run(
             [path, *options], capture_output=True, text=True, check=False, timeout=10.0 * seconds + 10.0
         )
@@ -147,6 +147,6 @@ def run_cyclictest(path: str, config: Config, seconds: float, load_name: str) ->
 
 def run_sleep_only(config: Config, seconds: float, load_name: str) -> LoopTimes:
     """Our compiled sleep without any exchange, in this process: what cyclictest does."""
-    with load(load_name), fifo(config.loop.priority or 1), cores_awake():
+    with load(load_name), on_core(config.loop.cpu), fifo(config.loop.priority or 1), cores_awake():
         late_ns = wake_up_lateness_ns(config.loop.rate_Hz, round(seconds * config.loop.rate_Hz))
     return LoopTimes(late_ns * 1e-3, NO_VALUES, NO_VALUES)

@@ -1,14 +1,14 @@
 """The loop on the virtual joint against the same exchange in C, cyclictest and Python loops; idle and under load.
 
-The two that are close, ours and C, both keep to the last core, and the load to the first.
+Ours, C and cyclictest all keep to the last core, and the load to the first.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +43,37 @@ _AGAINST_C = (
     ("round trip p50", "round_trip", MEDIAN, None),
     ("round trip p99", "round_trip", HIGH, None),
 )
+_AGAINST_CYCLICTEST = (("wake-up p50", "wake", MEDIAN, GOAL), ("wake-up p99", "wake", HIGH, None))
+_BARE = (("sleep alone, p50", "wake", MEDIAN, None), ("sleep alone, p99", "wake", HIGH, None))
 _AGAINST_PYTHON = (("wake-up p50", "wake", MEDIAN, None), ("wake-up p99", "wake", HIGH, None))
+_INTERVALS = (("SYNC interval off by, p99", "wake", HIGH, None),)
+
+
+@dataclass(frozen=True)
+class Rounds:
+    """How often each comparison is measured: what is close, more often, for the p99 of some seconds is noisy."""
+
+    in_c: int
+    cyclictest: int
+    in_python: int
+
+
+@dataclass(frozen=True)
+class Case:
+    """One rate and one load; a segment lasts `seconds`."""
+
+    config: Config
+    load_name: str
+    seconds: float
+
+    @property
+    def name(self) -> str:
+        """As the table has it."""
+        return f"{self.config.loop.rate_Hz / 1000.0:g} kHz, {self.load_name}"
+
+    def ours(self) -> LoopTimes:
+        """One segment of the control loop."""
+        return run_ours(self.config, self.seconds, self.load_name)
 
 
 def _rows(
@@ -61,59 +91,43 @@ def _rows(
             yield compared(GROUP, f"{case}: {what}", one, two, "us", name, goal=goal, note=note)
 
 
-def _case_rows(
-    config: Config, program: Path | None, load_name: str, pairs: int, pairs_in_c: int, seconds: float
-) -> Iterator[Row]:
-    """All loops in turn, `pairs` times, under one load at one rate; `pairs_in_c` against the C loop."""
-    cyclictest = cyclictest_path()
-    found: dict[str, list[LoopTimes]] = {}
-    order: list[tuple[str, Callable[[], LoopTimes]]] = [
-        ("ours", lambda: run_ours(config, seconds, load_name)),
-        ("cyclictest", lambda: run_cyclictest(str(cyclictest), config, seconds, load_name)),
-        ("sleep only", lambda: run_sleep_only(config, seconds, load_name)),
-        ("python-can", lambda: run_python_can(config, seconds, load_name)),
-        ("canopen", lambda: run_canopen_sync(config, seconds, load_name)),
-    ]
-    missing = {"cyclictest", "sleep only"} if cyclictest is None else set()
-    for pair in range(pairs):
-        for name, measure in order if pair % 2 == 0 else reversed(order):
-            if name not in missing:
-                found.setdefault(name, []).append(measure())
-    case = f"{config.loop.rate_Hz / 1000.0:g} kHz, {load_name}"
-    ours = found["ours"]
-    if program is not None:
-        placed = on_the_core(config, cores()[-1])
-        beside_c, in_c = interleaved(
-            pairs_in_c,
-            partial(run_ours, placed, seconds, load_name),
-            partial(run_c, program, placed, seconds, load_name),
-        )
-        yield from _rows(case, beside_c, in_c, "C loop", _AGAINST_C)
-    if "cyclictest" in found:
-        goals = (("wake-up p50", "wake", MEDIAN, GOAL), ("wake-up p99", "wake", HIGH, None))
-        yield from _rows(case, ours, found["cyclictest"], "cyclictest", goals)
-        bare = (("sleep alone, p50", "wake", MEDIAN, None), ("sleep alone, p99", "wake", HIGH, None))
-        yield from _rows(case, found["sleep only"], found["cyclictest"], "cyclictest", bare)
-    yield from _rows(case, ours, found["python-can"], "python-can loop", _AGAINST_PYTHON)
+def _against_c(case: Case, program: Path, rounds: int) -> Iterator[Row]:
+    ours, theirs = interleaved(rounds, case.ours, lambda: run_c(program, case.config, case.seconds, case.load_name))
+    yield from _rows(case.name, ours, theirs, "C loop", _AGAINST_C)
+
+
+def _against_cyclictest(case: Case, path: str, rounds: int) -> Iterator[Row]:
+    ours, theirs, bare = interleaved(
+        rounds,
+        case.ours,
+        lambda: run_cyclictest(path, case.config, case.seconds, case.load_name),
+        lambda: run_sleep_only(case.config, case.seconds, case.load_name),
+    )
+    yield from _rows(case.name, ours, theirs, "cyclictest", _AGAINST_CYCLICTEST)
+    yield from _rows(case.name, bare, theirs, "cyclictest", _BARE)
+
+
+def _against_python(case: Case, rounds: int) -> Iterator[Row]:
+    ours, python_can, canopen = interleaved(
+        rounds,
+        case.ours,
+        lambda: run_python_can(case.config, case.seconds, case.load_name),
+        lambda: run_canopen_sync(case.config, case.seconds, case.load_name),
+    )
+    yield from _rows(case.name, ours, python_can, "python-can loop", _AGAINST_PYTHON)
     intervals = [LoopTimes(np.abs(np.diff(times.wake_us)), times.work_us, times.work_us) for times in ours]
-    quantities = (("SYNC interval off by, p99", "wake", HIGH, None),)
-    yield from _rows(case, intervals, found["canopen"], "canopen SYNC", quantities)
+    yield from _rows(case.name, intervals, canopen, "canopen SYNC", _INTERVALS)
 
 
-def exchange_rows(
-    config: Config, folder: Path, *, pairs: int, pairs_in_c: int, seconds: float, quick: bool
-) -> Iterator[Row]:
-    """Starts a virtual joint of its own on a bus of its own; `quick`: one rate, idle and the Python thread only.
-
-    `pairs` of what is far apart, `pairs_in_c` against the C loop, which is not: on a guest whose host takes the
-    processor away a p99 of some seconds is noisy.
-    """
+def exchange_rows(config: Config, folder: Path, *, rounds: Rounds, seconds: float, quick: bool) -> Iterator[Row]:
+    """Starts a virtual joint of its own on a bus of its own; `quick`: one rate, idle and the Python thread only."""
     program: Path | None = None
     try:
         program = exchange_program(folder)
     except NoCompilerError as error:
         yield skipped(GROUP, "against a C loop", error.message)
-    if cyclictest_path() is None:
+    cyclictest = cyclictest_path()
+    if cyclictest is None:
         yield skipped(GROUP, "against cyclictest", "not installed (package rt-tests)")
     channel = f"bench{os.getpid()}"
     config = patient(config).model_copy(
@@ -122,4 +136,9 @@ def exchange_rows(
     with separate_virtual_joint(config.path, channel):
         for rate_Hz in RATES_Hz[:1] if quick else RATES_Hz:
             for name in LOADS[:2] if quick else LOADS:
-                yield from _case_rows(at_rate(config, rate_Hz), program, name, pairs, pairs_in_c, seconds)
+                case = Case(on_the_core(at_rate(config, rate_Hz), cores()[-1]), name, seconds)
+                if program is not None:
+                    yield from _against_c(case, program, rounds.in_c)
+                if cyclictest is not None:
+                    yield from _against_cyclictest(case, cyclictest, rounds.cyclictest)
+                yield from _against_python(case, rounds.in_python)

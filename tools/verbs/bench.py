@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from drivers.errors import JointctlError, UsageError
-from tools.benchmarks.exchange_speed import exchange_rows
+from tools.benchmarks.exchange_speed import Rounds, exchange_rows
 from tools.benchmarks.law_speed import law_rows
 from tools.benchmarks.outcome import conditions, outcome_data, outcome_table, write_outcome
 from tools.benchmarks.paired import Row, skipped
@@ -29,8 +29,7 @@ def _part(name: str, config: Config, folder: Path, quick: bool, verbs: Sequence[
         "loop": lambda: exchange_rows(
             config,
             folder,
-            pairs=1 if quick else 3,
-            pairs_in_c=2 if quick else 24,
+            rounds=Rounds(in_c=2, cyclictest=1, in_python=1) if quick else Rounds(in_c=16, cyclictest=8, in_python=3),
             seconds=1.0 if quick else 2.0,
             quick=quick,
         ),
