@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ from tools.benchmarks.python_loops import run_canopen_sync, run_python_can
 from tools.configuration.config import Config
 from tools.simulation.virtual_joint import separate_virtual_joint
 
+Loop = Callable[[Config, float, str], LoopTimes]  # one segment: joint, seconds, name of the load
 GROUP = "loop"
 RATES_Hz = (1000.0, 2000.0)
 GOAL = 1.2
@@ -71,10 +73,6 @@ class Case:
         """As the table has it."""
         return f"{self.config.loop.rate_Hz / 1000.0:g} kHz, {self.load_name}"
 
-    def ours(self) -> LoopTimes:
-        """One segment of the control loop."""
-        return run_ours(self.config, self.seconds, self.load_name)
-
 
 def _rows(
     case: str,
@@ -82,38 +80,31 @@ def _rows(
     other: list[LoopTimes],
     name: str,
     quantities: tuple[tuple[str, str, float, float | None], ...],
-    note: str = "",
 ) -> Iterator[Row]:
     for what, field, share, goal in quantities:
         one = [times.quantile(field, share) for times in ours]
         two = [times.quantile(field, share) for times in other]
         if not any(math.isnan(value) for value in two):
-            yield compared(GROUP, f"{case}: {what}", one, two, "us", name, goal=goal, note=note)
+            yield compared(GROUP, f"{case}: {what}", one, two, "us", name, goal=goal)
+
+
+def _in_turn(case: Case, rounds: int, *loops: Loop) -> list[list[LoopTimes]]:
+    return interleaved(rounds, *(partial(loop, case.config, case.seconds, case.load_name) for loop in loops))
 
 
 def _against_c(case: Case, program: Path, rounds: int) -> Iterator[Row]:
-    ours, theirs = interleaved(rounds, case.ours, lambda: run_c(program, case.config, case.seconds, case.load_name))
+    ours, theirs = _in_turn(case, rounds, run_ours, partial(run_c, program))
     yield from _rows(case.name, ours, theirs, "C loop", _AGAINST_C)
 
 
 def _against_cyclictest(case: Case, path: str, rounds: int) -> Iterator[Row]:
-    ours, theirs, bare = interleaved(
-        rounds,
-        case.ours,
-        lambda: run_cyclictest(path, case.config, case.seconds, case.load_name),
-        lambda: run_sleep_only(case.config, case.seconds, case.load_name),
-    )
+    ours, theirs, bare = _in_turn(case, rounds, run_ours, partial(run_cyclictest, path), run_sleep_only)
     yield from _rows(case.name, ours, theirs, "cyclictest", _AGAINST_CYCLICTEST)
     yield from _rows(case.name, bare, theirs, "cyclictest", _BARE)
 
 
 def _against_python(case: Case, rounds: int) -> Iterator[Row]:
-    ours, python_can, canopen = interleaved(
-        rounds,
-        case.ours,
-        lambda: run_python_can(case.config, case.seconds, case.load_name),
-        lambda: run_canopen_sync(case.config, case.seconds, case.load_name),
-    )
+    ours, python_can, canopen = _in_turn(case, rounds, run_ours, run_python_can, run_canopen_sync)
     yield from _rows(case.name, ours, python_can, "python-can loop", _AGAINST_PYTHON)
     intervals = [LoopTimes(np.abs(np.diff(times.wake_us)), times.work_us, times.work_us) for times in ours]
     yield from _rows(case.name, intervals, canopen, "canopen SYNC", _INTERVALS)
