@@ -36,6 +36,7 @@ from firmware_py.records import LogRecord
 from firmware_py.schema import dtype_of
 from tools.recording.can_log import CAN_DEFINITION, CAN_FRAME, CAN_SCHEMA, CAN_TOPIC, frame_times_ns
 from tools.recording.cdr import CDR_HEADER, event_body, event_from_body, message_definition
+from tools.recording.chunk_indexes import ChunkIndexes
 
 RECORD_TOPIC, RECORD_SCHEMA = "/joint", "jointctl_msgs/msg/LogRecord"
 EVENT_TOPIC, EVENT_SCHEMA = "/events", "jointctl_msgs/msg/Event"
@@ -107,6 +108,8 @@ class RunLogWriter:
             raise DataError(f"{self.path}: cannot be created: {error.strerror or error}") from None
         # Any: some of the library's methods carry no types
         self._writer: Any = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.NONE)
+        self._indexes = ChunkIndexes(self.path.parent)
+        self._indexes.take_the_place_in(self._writer)
         self._writer.start(profile="ros2", library="jointctl")
         for name, values in {"clock": _clock_metadata(), **metadata}.items():
             self._writer.add_metadata(name, {key: str(value) for key, value in values.items()})
@@ -169,6 +172,7 @@ class RunLogWriter:
             try:
                 self._writer.finish()
             finally:
+                self._indexes.close()
                 self._file.close()
 
     def __enter__(self) -> Self:
