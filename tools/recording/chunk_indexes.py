@@ -6,7 +6,9 @@ flushed twice a second has 7200 chunks an hour.
 
 from __future__ import annotations
 
+import errno
 import os
+import struct
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
@@ -16,10 +18,11 @@ from pathlib import Path
 from typing import IO, Any
 
 from mcap.data_stream import RecordBuilder
+from mcap.exceptions import McapError
 from mcap.records import ChunkIndex
 from mcap.stream_reader import StreamReader
 
-IN_MEMORY = 256  # chunks: two minutes of a run
+IN_MEMORY = 64  # chunks: half a minute of a run
 _LIBRARY_S_LIST = "_Writer__chunk_indices"  # private in mcap.writer.Writer, which knows no other way
 
 
@@ -66,9 +69,10 @@ class ChunkIndexes:
         return chain(islice(StreamReader(BytesIO(data), skip_magic=True).records, self._put_away), self._newest)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Let go of the file; nobody needs it any more, so nothing that goes wrong matters."""
         if self._file is not None:
-            self._file.close()
+            with suppress(OSError):
+                self._file.close()
 
     def take_the_place_in(self, writer: object) -> bool:
         """Let `writer`, an MCAP writer that has no chunk yet, keep its index here.
@@ -79,3 +83,13 @@ class ChunkIndexes:
             return False
         setattr(writer, _LIBRARY_S_LIST, self)
         return True
+
+    def give_back_to(self, writer: object) -> None:
+        """A list of all of them for the end of the file, which is what the library expects; `OSError` if unreadable."""
+        if getattr(writer, _LIBRARY_S_LIST, None) is not self:
+            return
+        try:
+            indexes = list(self)
+        except (McapError, struct.error, ValueError) as error:
+            raise OSError(errno.EIO, f"the index of its chunks cannot be read back ({error})") from None
+        setattr(writer, _LIBRARY_S_LIST, indexes)

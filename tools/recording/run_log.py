@@ -170,6 +170,8 @@ class RunLogWriter:
         """Finish the file (index and summary); may be called twice."""
         if not self._file.closed:
             try:
+                self._writer.flush()
+                self._indexes.give_back_to(self._writer)
                 self._writer.finish()
             finally:
                 self._indexes.close()

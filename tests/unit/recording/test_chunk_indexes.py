@@ -16,7 +16,7 @@ from firmware_py.records import LogRecord
 from firmware_py.schema import new
 from tools.recording import chunk_indexes, run_log
 from tools.recording.chunk_indexes import ChunkIndexes
-from tools.recording.run_log import INFO, RunLogWriter
+from tools.recording.run_log import INFO, RunLogWriter, read_run_log
 
 FIRST = ChunkIndex(
     chunk_length=170_000,
@@ -79,6 +79,22 @@ def test_a_folder_that_takes_no_file_costs_memory_only(tmp_path: Path) -> None:
     indexes.close()
 
 
+def test_an_index_that_cannot_be_read_back_is_an_error_of_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "pread", lambda _handle, count, _at: bytes(count))
+    log = RunLogWriter(tmp_path / "log.mcap", {}, flush_s=0.0, clock=lambda: 0.0)
+    for cycle in range(200):
+        records = new(LogRecord, 1)
+        records.time_ns = cycle
+        log.write_records(records)
+    with pytest.raises(OSError, match="index of its chunks cannot be read back"):
+        log.close()
+    log.close()
+    read = read_run_log(tmp_path / "log.mcap")
+    assert (len(read.records), read.complete) == (200, False)  # nothing but the index is lost
+
+
 def a_log(path: Path, chunks: int) -> bytes:
     """Bytes of a log of `chunks` chunks, ten records each, without the clock of its metadata."""
     with RunLogWriter(path, {}, flush_s=0.0, clock=lambda: 0.0) as log:
@@ -93,7 +109,7 @@ def a_log(path: Path, chunks: int) -> bytes:
 def test_a_log_is_the_same_with_and_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_log, "_clock_metadata", lambda: {"monotonic_ns": "0"})
     ours = a_log(tmp_path / "ours.mcap", 700)
-    monkeypatch.setattr(chunk_indexes, "_LIBRARY_S_LIST", "no_such_list")
+    monkeypatch.setattr(chunk_indexes, "_LIBRARY_S_LIST", "no_such_list")  # as in another version of the library
     assert ours == a_log(tmp_path / "library.mcap", 700)
     with (tmp_path / "ours.mcap").open("rb") as file:
         summary = make_reader(file).get_summary()
@@ -115,5 +131,10 @@ def test_the_library_keeps_its_index_where_we_put_ours(tmp_path: Path) -> None:
             writer.flush()
         assert len(indexes) == 600
         assert indexes.in_memory() < chunk_indexes.IN_MEMORY
+        indexes.give_back_to(writer)
         writer.finish()
         indexes.close()
+    with (tmp_path / "log.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert [index.message_start_time for index in summary.chunk_indexes] == list(range(600))
