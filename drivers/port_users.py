@@ -1,4 +1,4 @@
-"""Who has a serial port open: asked of the system, so that nobody has to guess a process."""
+"""Who has a serial port open, and what a process is called: asked of the system, so that nobody has to guess."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ def port_users(path: str, proc: Path = Path("/proc")) -> list[PortUser]:
         try:
             opened = {os.readlink(link) for link in (folder / "fd").iterdir()}
             if real in opened and not opened & _TERMINAL_MAKERS:
-                found.append(PortUser(pid, _name(folder)))
+                found.append(PortUser(pid, program_name(pid, proc)))
         except OSError:  # gone, or another user's
             continue
     return sorted(found, key=lambda user: user.pid)
 
 
-def _name(folder: Path) -> str:
-    """The program as its command line tells it."""
-    words = [Path(word).name for word in (folder / "cmdline").read_text(errors="replace").split("\0") if word]
+def program_name(pid: int, proc: Path = Path("/proc")) -> str:
+    """The program as its command line tells it; `OSError` where there is no such process."""
+    words = [Path(word).name for word in (proc / str(pid) / "cmdline").read_text(errors="replace").split("\0") if word]
     for at, word in enumerate(words):
         if word == "-m" and at + 1 < len(words):
             return words[at + 1]

@@ -43,7 +43,7 @@ def default_socket_path(channel: str) -> Path:
     return folder / f"{channel}.sock"
 
 
-def _socket_path(channel: str) -> Path:
+def socket_path(channel: str) -> Path:
     """A channel with a '/' is a path, else a name in this user's own folder, which nobody else may have made."""
     if "/" in channel:
         return Path(channel)
@@ -59,7 +59,7 @@ def _socket_path(channel: str) -> Path:
 
 def connect(channel: str) -> socket.socket:
     """A non-blocking end of the virtual bus, as the control loop uses it; BusError if no bus listens there."""
-    path = _socket_path(channel)
+    path = socket_path(channel)
     end = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
         end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)

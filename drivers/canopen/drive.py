@@ -9,6 +9,7 @@ from typing import Any
 
 import can
 
+from drivers.can.bus_claim import BusClaim
 from drivers.canopen.bus_watchers import refuse_second_controller
 from drivers.canopen.cia402 import State
 from drivers.canopen.commissioning import VELOCITY_MODES, Findings, commission
@@ -35,7 +36,7 @@ REOPEN_PAUSE_S = 0.3  # an adapter that was plugged in again needs a second or t
 
 
 class CanopenDrive:
-    """Implements `drivers.drive.Drive`.  `bus` is a python-can bus of its own, closed by `close`.
+    """Implements `drivers.drive.Drive`.  `bus` is a python-can bus of its own, closed by `close`, as `claim` is.
 
     Where an adapter serves one program at a time, `reopen` is given: `start_cyclic` closes the bus for the loop, and
     `make_safe` opens it again.  In between nobody but the loop talks to the drive; it is disabled until the loop
@@ -48,13 +49,14 @@ class CanopenDrive:
         settings: CanopenSettings,
         sleep: Callable[[float], None] = time.sleep,
         reopen: Callable[[], can.BusABC] | None = None,
+        claim: BusClaim | None = None,
     ) -> None:
         self._settings = settings
         self._sleep = sleep
         self._findings: Findings | None = None
         self._taken = False  # whether the drive has heard anything from us
         self._started = False  # whether the loop may send SYNC
-        self._reopen = reopen
+        self._reopen, self._claim = reopen, claim
         self._lent = False
         self._thermometer: Thermometer | None = None
         self._network = new_network(bus, sleep)
@@ -255,3 +257,5 @@ class CanopenDrive:
         """Leave the bus; what went wrong on it has been told before."""
         with contextlib.suppress(Exception):
             self._network.disconnect()
+        if self._claim is not None:
+            self._claim.close()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import pty
 import re
 import resource
 import signal
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 
 from firmware_py.states import AxisPhase, DriveRequest, DriveState
+from tests.hil.terminal import Terminal
 from tests.places import CONFIGS
 
 LARGEST_STEP_radps = 0.02  # of the desired velocity in one cycle; braking at 2 rad/s2 is a tenth of it
@@ -138,29 +138,6 @@ def test_ctrl_c_before_motion_moves_nothing(bench: Any, delay_s: float) -> None:
         assert DriveState.ENABLED not in bench.log().records.drive_state
 
 
-class Terminal:
-    """`jointctl` with a terminal as its standard input and error."""
-
-    def __init__(self, bench: Any, *arguments: str) -> None:
-        self.master, slave = pty.openpty()
-        self.started = bench.start(*arguments, stdin=slave, stderr=slave)
-        os.close(slave)
-        os.set_blocking(self.master, False)
-        self.text = ""
-
-    def saw(self, text: str, timeout_s: float = 180.0) -> Terminal:
-        give_up = time.monotonic() + timeout_s
-        while text not in self.text and text not in " ".join(self.text.split()):  # a terminal breaks long lines
-            assert time.monotonic() < give_up, self.text
-            try:
-                self.text += os.read(self.master, 4096).decode()
-            except BlockingIOError:
-                time.sleep(0.01)
-            except OSError as error:  # EIO: it has ended
-                raise AssertionError(f"ended before {text!r}: {self.text}") from error
-        return self
-
-
 def test_answering_no_moves_nothing(bench: Any) -> None:
     config = bench.config()
     bench.joint(config)
@@ -239,14 +216,4 @@ def test_a_disk_that_is_full_before_motion_moves_nothing(bench: Any) -> None:
     terminal.saw("cannot be written")
     assert terminal.started.finished(20.0).code == 8
     assert "Traceback" not in terminal.text
-    assert bench.disabled()
-
-
-def test_a_second_run_on_a_moving_joint_is_refused_and_the_first_goes_on(bench: Any) -> None:
-    config = bench.config(trajectory__duration_s=5.0)
-    bench.joint(config)
-    first = bench.start("run", config, "-y").saw("  tracking")
-    bench.run("run", config, "-y").refused(4, "another controller", "SYNC")
-    done = first.finished(30.0)
-    assert done.code == 0, done.err
     assert bench.disabled()

@@ -71,12 +71,3 @@ def test_clear_fault_resets_and_leaves_the_drive_off(bench: Any) -> None:
     assert bench.status_word() & 0x6F == 0x40
     again = bench.run("clear-fault", config)
     assert (again.code, "no fault" in again.out) == (0, True)
-
-
-def test_clear_fault_is_refused_while_a_run_is_active(bench: Any) -> None:
-    config = bench.config(trajectory__duration_s=30.0)
-    bench.joint(config)
-    run = bench.start("run", config, "-y").saw("tracking")
-    bench.run("clear-fault", config).refused(4, "another controller")
-    run.signal(2)
-    assert run.finished(20.0).code == 130

@@ -7,6 +7,7 @@ from typing import Any
 
 import can
 
+from drivers.can.bus_claim import BusClaim
 from drivers.can.link_state import interface_blamed
 from drivers.can.open import CYCLIC_INTERFACES, SHARED_INTERFACES, open_python_can
 from drivers.canopen.drive import CanopenDrive
@@ -38,20 +39,25 @@ def check_cyclic_rate(config: Config) -> None:
         check_portable_rate(config.bus.interface, config.loop.rate_Hz)
 
 
-def open_drive(config: Config, *, exclusive: bool = True) -> Drive:
-    """The drive of the configuration, its bus or port open; nothing has been said to it.
+def open_drive(config: Config) -> Drive:
+    """The drive of the configuration, its bus or port open and ours; nothing has been said to it.
 
-    `exclusive` False opens a serial CAN adapter that another program has: see `open_python_can`.
+    `BusError` names the program that has it, if another has.
     """
     if isinstance(config.drive, ElmoSerial):
         return ElmoDrive(elmo_settings(config, torque_constant_NmpA(config)))
 
     def open_bus() -> can.BusABC:
         bus = config.bus
-        return open_python_can(bus.interface, bus.channel, bus.bitrate_bitps, exclusive=exclusive)
+        return open_python_can(bus.interface, bus.channel, bus.bitrate_bitps)
 
     reopen = None if config.bus.interface in SHARED_INTERFACES else open_bus
-    return CanopenDrive(open_bus(), canopen_settings(config), reopen=reopen)
+    claim = BusClaim(config.bus.interface, config.bus.channel)
+    try:
+        return CanopenDrive(open_bus(), canopen_settings(config), reopen=reopen, claim=claim)
+    except BaseException:
+        claim.close()
+        raise
 
 
 def commission(config: Config, drive: Drive) -> CommissioningReport:

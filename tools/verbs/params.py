@@ -9,6 +9,7 @@ from typing import Any
 
 from rich.table import Table
 
+from drivers.can.bus_claim import BusClaim
 from drivers.canopen.cia402 import State, state_of_word, state_text
 from drivers.canopen.identifiers import NmtCommand
 from drivers.canopen.network import send_nmt
@@ -119,7 +120,7 @@ def restore_file(
     node, objects = subject.required_node(), _known_objects(subject)
     wanted = load_parameters(path, node)
     ear = Ear()
-    with canopen_network(subject, ear) as network:
+    with BusClaim(subject.interface, subject.channel), canopen_network(subject, ear) as network:
         _refuse_controller(ear)
         reader = SdoReader(network, node, objects)
         reader.require_answer()

@@ -1,0 +1,65 @@
+"""Two programs that want the same joint: the second is told who has it, and the first goes on undisturbed."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import can
+
+from drivers.canopen.identifiers import SYNC_ID
+from tests.hil.terminal import Terminal
+
+
+def test_whoever_comes_while_the_joint_moves_is_refused(bench: Any) -> None:
+    config = bench.config(trajectory__duration_s=8.0)
+    bench.joint(config)
+    first = bench.start("run", config, "-y").saw("  tracking")
+    for verb in (("run", "-y"), ("clear-fault",)):
+        bench.run(*verb, config).refused(4, "another program controls", f"pid {first.process.pid}")
+    done = first.finished(30.0)
+    assert done.code == 0, done.err
+    assert bench.disabled()
+
+
+def test_whoever_comes_while_the_first_is_asked_is_refused(bench: Any) -> None:
+    config = bench.config()
+    bench.joint(config)
+    first = Terminal(bench, "run", config).saw("[y/N]")
+    for verb in (("run", "-y"), ("clear-fault",)):
+        bench.run(*verb, config).refused(4, "another program controls", f"pid {first.started.process.pid}")
+    os.write(first.master, b"y\n")
+    assert first.finished().code == 0, first.text
+    assert bench.disabled()
+
+
+def test_of_two_that_start_at_once_one_runs(bench: Any) -> None:
+    config = bench.config()
+    bench.joint(config)
+    started = [bench.start("run", config, "-y") for _ in range(2)]
+    finished = sorted((one.finished() for one in started), key=lambda done: done.code)
+    assert finished[0].code == 0, finished[0].err
+    finished[1].refused(4, "another program controls", "pid ")
+    assert bench.disabled()
+
+
+def test_stop_reaches_the_drive_whoever_controls_it(bench: Any) -> None:
+    config = bench.config()
+    bench.joint(config)
+    first = Terminal(bench, "run", config).saw("[y/N]")
+    assert bench.run("stop", config).code == 0
+    os.write(first.master, b"y\n")
+    assert first.finished().code == 6, first.text  # the drive has lost its watchdog
+    assert "has changed since it was commissioned" in first.text
+    assert bench.disabled()
+
+
+def test_a_foreign_controller_is_known_by_its_sync(bench: Any) -> None:
+    config = bench.config()
+    bench.joint(config)
+    with can.Bus(interface="jointctl", channel=bench.channel) as foreign:
+        sender = foreign.send_periodic(can.Message(arbitration_id=SYNC_ID, is_extended_id=False), 0.01)
+        for verb in (("run", "-y"), ("clear-fault",)):
+            bench.run(*verb, config).refused(4, "another controller", "SYNC")
+        sender.stop()
+    assert bench.disabled()
