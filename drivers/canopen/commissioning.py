@@ -167,19 +167,26 @@ def limit_velocity(objects: ObjectAccess, settings: CanopenSettings, findings: F
         findings.remarks.append("profile velocity mode (PV) instead of cyclic synchronous velocity")
 
 
-def _compare_rated(name: str, found: float, expected: float | None, tolerance: float, unit: str) -> None:
-    if expected is not None and found == 0.0:
+def _compare_rated(name: str, found: float, expected: float | None, tolerance: float, unit: str) -> list[str]:
+    """What to tell the user; `DeviceError` where they do not agree."""
+    if expected is None:
+        return [f"drive.{name} is not given: nothing to compare the drive's {found:g} {unit} with"] if found else []
+    if found == 0.0:
         raise DeviceError(f"drive.{name} (={expected:g}) cannot be compared: the drive does not tell its rated value")
-    if expected is not None and abs(found - expected) > tolerance * expected:
+    if abs(found - expected) > tolerance * expected:
         raise DeviceError(f"drive.{name} (={expected:g}) does not agree with the drive's {found:g} {unit}")
+    return []
 
 
 def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
     """Scaling from the rated values, then the drive's own torque limit 6072 from the joint's."""
     rated_mNm = objects.read(0x6076, what="motor rated torque") if objects.has(0x6076) else 0
     rated_mA = objects.read(0x6075, what="motor rated current") if objects.has(0x6075) else 0
-    _compare_rated("rated_torque_Nm", rated_mNm * 1e-3, settings.rated_torque_Nm, settings.rated_tolerance, "Nm")
-    _compare_rated("rated_current_A", rated_mA * 1e-3, settings.rated_current_A, settings.rated_tolerance, "A")
+    tolerance = settings.rated_tolerance
+    findings.remarks += [
+        *_compare_rated("rated_torque_Nm", rated_mNm * 1e-3, settings.rated_torque_Nm, tolerance, "Nm"),
+        *_compare_rated("rated_current_A", rated_mA * 1e-3, settings.rated_current_A, tolerance, "A"),
+    ]
     scale = joint_torque_per_permille_Nm(settings, rated_mNm, rated_mA)
     if scale <= 0.0:
         index = "6076" if settings.torque_reference == "rated_torque" else "6075"

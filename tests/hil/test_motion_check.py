@@ -23,6 +23,19 @@ def test_a_joint_that_is_right_and_one_whose_file_is_wrong_about_its_torque(benc
     assert bench.disabled()
 
 
+def test_a_joint_with_a_coarse_encoder_is_judged_as_well(bench: Any) -> None:
+    right = bench.config(encoder__counts_per_turn=4096)
+    bench.joint(right)
+    done = bench.start("doctor", right, "--motion", "-y").finished()
+    assert done.code == 0, done.err + done.out
+    assert "the joint moved with the torque" in " ".join(done.out.replace("│", " ").split())
+    wrong = bench.config("wrong.toml", encoder__counts_per_turn=4096, drive__torque_direction=-1)
+    done = bench.start("doctor", wrong, "--motion", "-y", "--json").finished()
+    assert done.code == 1, done.err
+    assert "moved against the torque" in done.out
+    assert bench.disabled()
+
+
 def test_it_asks_and_ctrl_c_and_the_loss_of_the_watcher_end_it_safely(bench: Any) -> None:
     config = bench.config()
     bench.joint(config)

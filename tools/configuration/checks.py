@@ -7,7 +7,7 @@ from typing import Any
 
 from drivers.canopen.identifiers import EVENT_DRIVEN, LAST_SYNCHRONOUS
 from tools.configuration.config import Config
-from tools.configuration.conversions import RADPS_PER_UNIT
+from tools.configuration.conversions import RADPS_PER_UNIT, velocity_of_a_count_radps
 from tools.configuration.elmo_settings import serial_problems
 from tools.configuration.sections import Friction, FrictionDirection
 
@@ -103,6 +103,12 @@ def _limit_problems(config: Config) -> list[str]:
         found.append(
             f"limits.standstill_radps (={limits.standstill_radps:g}) must be less than "
             f"limits.velocity_max_radps (={limits.velocity_max_radps:g})"
+        )
+    of_a_count = velocity_of_a_count_radps(config)
+    if limits.velocity_max_radps <= of_a_count:
+        found.append(
+            f"limits.velocity_max_radps (={limits.velocity_max_radps:g}) must be more than {of_a_count:.3g}, what one "
+            f"count of the encoder reads behind control.velocity_cutoff_Hz (={config.control.velocity_cutoff_Hz:g})"
         )
     step = limits.velocity_max_radps / loop.rate_Hz
     if limits.position_jump_max_rad < step:

@@ -30,6 +30,21 @@ def joint_rad_per_count(config: Config) -> float:
     return config.encoder.direction * math.tau / turns
 
 
+def law_resolution_rad(config: Config) -> float:
+    """One count of the encoder that feeds the law, at the joint."""
+    second = config.joint_encoder
+    if second is not None and second.law == "joint_encoder":
+        return math.tau / second.counts_per_turn
+    return abs(joint_rad_per_count(config))
+
+
+def velocity_of_a_count_radps(config: Config) -> float:
+    """What the filter of the velocity (`firmware_py.velocity`) gives when the encoder counts one on."""
+    cutoff_Hz, rate_Hz = config.control.velocity_cutoff_Hz, config.loop.rate_Hz
+    gain = -math.expm1(-math.tau * cutoff_Hz / rate_Hz) if cutoff_Hz else 1.0
+    return gain * law_resolution_rad(config) * rate_Hz
+
+
 def friction_constants(friction: Friction, reduction_ratio: float) -> Any:
     """`FrictionConstants` (joint rad/s, motor Nm) from the table as the user gave it."""
     speed = RADPS_PER_UNIT[friction.velocity_unit] / (reduction_ratio if friction.velocity_side == "motor" else 1.0)

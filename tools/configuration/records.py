@@ -18,7 +18,7 @@ from firmware_py.trajectory_table import ends_meet, table_from_csv
 from firmware_py.velocity import low_pass_gain
 from tools.configuration.checks import extremes_problems
 from tools.configuration.config import Config
-from tools.configuration.conversions import friction_constants, joint_rad_per_count, period_s, static_friction_Nm
+from tools.configuration.conversions import friction_constants, law_resolution_rad, period_s, static_friction_Nm
 from tools.configuration.elmo import ElmoSerial
 from tools.configuration.problems import ConfigurationProblems
 from tools.configuration.sections import Control
@@ -172,14 +172,6 @@ def fill_trajectory(record: Any, config: Config) -> None:
 
 def _cycles(config: Config, time_s: float) -> int:
     return max(1, round(time_s * config.loop.rate_Hz))
-
-
-def law_resolution_rad(config: Config) -> float:
-    """One count of the encoder that feeds the law, at the joint."""
-    second = config.joint_encoder
-    if second is not None and second.law == "joint_encoder":
-        return math.tau / second.counts_per_turn
-    return abs(joint_rad_per_count(config))
 
 
 def _fill_limits(record: Any, config: Config) -> None:

@@ -19,7 +19,7 @@ from drivers.errors import ConfigurationError
 from firmware_py.states import TrajectoryKind
 from firmware_py.trajectory_table import spline_table
 from tools.configuration.config import Config
-from tools.configuration.conversions import joint_rad_per_count, static_friction_Nm
+from tools.configuration.conversions import joint_rad_per_count, static_friction_Nm, velocity_of_a_count_radps
 from tools.configuration.elmo import ElmoSerial
 from tools.configuration.records import APPROACH_MIN_S, axis_constants
 
@@ -27,11 +27,13 @@ TRAVEL_rad, TRAVEL_MAX_rad = 0.04, 0.3  # of the reference, to each side
 TRAVEL_COUNTS = 60.0  # so coarse an encoder takes more travel
 REACH = 2.5  # times the travel: where the position limits of the check are
 VELOCITY_MAX_radps = 0.5
+COUNTS_IN_VELOCITY = 2.0  # what a coarse encoder may add to it, in steps of its reading
+PEAK = 1.875  # of the velocity over its mean, in a minimum-jerk ramp
 STATIC_FRICTIONS = 2.0  # torque limit of the check, over the static friction that is configured
 TORQUE_SHARE = 0.1  # of limits.torque_max_Nm, where no friction is configured
 SPRING_SHARE = 0.7  # of the torque limit, at full travel; the rest is for damping and gravity
 DAMPING = 0.5
-RAMP_s, REST_s = 0.4, 0.4
+RAMP_s, REST_s = 0.4, 0.4  # a longer travel takes a longer ramp
 STOPS = (1.0, 0.0, -1.0, 0.0)  # where the reference goes, in travels
 _ROWS_PER_RAMP = 16
 
@@ -46,8 +48,23 @@ class CheckPlan:
     static_friction_Nm: float | None  # that is configured
 
     @property
+    def coarse(self) -> bool:
+        """Whether an encoder has so few counts that it takes more travel to see a motion."""
+        return self.travel_rad > TRAVEL_rad
+
+    @property
+    def ramp_s(self) -> float:
+        """Of one ramp: longer travel is no faster."""
+        return RAMP_s * max(1.0, self.travel_rad / TRAVEL_rad)
+
+    @property
+    def reach_rad(self) -> float:
+        """How far to each side the joint may come before it is braked."""
+        return REACH * self.travel_rad
+
+    @property
     def duration_s(self) -> float:
-        return APPROACH_MIN_S + len(STOPS) * (RAMP_s + REST_s)
+        return APPROACH_MIN_S + len(STOPS) * (self.ramp_s + REST_s)
 
 
 def make_plan(config: Config, torque_Nm: float | None) -> CheckPlan:
@@ -64,7 +81,9 @@ def make_plan(config: Config, torque_Nm: float | None) -> CheckPlan:
     if config.joint_encoder is not None:
         resolutions.append(math.tau / config.joint_encoder.counts_per_turn)
     travel = min(max(TRAVEL_rad, TRAVEL_COUNTS * max(resolutions)), TRAVEL_MAX_rad)
-    return CheckPlan(torque_Nm, travel, min(VELOCITY_MAX_radps, limits.velocity_max_radps), static_Nm)
+    steps_radps = COUNTS_IN_VELOCITY * velocity_of_a_count_radps(config)
+    velocity = min(max(VELOCITY_MAX_radps, steps_radps + PEAK * TRAVEL_rad / RAMP_s), limits.velocity_max_radps)
+    return CheckPlan(torque_Nm, travel, velocity, static_Nm)
 
 
 def config_of_check(config: Config, plan: CheckPlan) -> Config:
@@ -105,10 +124,10 @@ def motion_table(plan: CheckPlan, start_rad: float) -> np.ndarray:
     times_s, places, end_s, place = [0.0], [0.0], 0.0, 0.0
     for stop in STOPS:
         for share in np.linspace(0.0, 1.0, _ROWS_PER_RAMP + 1)[1:]:
-            times_s.append(end_s + share * RAMP_s)
+            times_s.append(end_s + share * plan.ramp_s)
             places.append(place + (stop - place) * share**3 * (10.0 - 15.0 * share + 6.0 * share**2))
         for share in (0.5, 1.0):
-            times_s.append(end_s + RAMP_s + share * REST_s)
+            times_s.append(end_s + plan.ramp_s + share * REST_s)
             places.append(stop)
         end_s, place = times_s[-1], stop
     position_rad = start_rad + plan.travel_rad * np.array(places)
@@ -123,9 +142,8 @@ def check_constants(config: Config, plan: CheckPlan, report: CommissioningReport
     axis = constants[0]
     axis.trajectory.kind, axis.trajectory.repeats = TrajectoryKind.TABLE, 0
     axis.trajectory.table_rows, axis.trajectory.duration_s = len(table), float(table[-1, 0])
-    reach_rad = REACH * plan.travel_rad
-    axis.limits.position_min_rad = max(axis.limits.position_min_rad, start_rad - reach_rad)
-    axis.limits.position_max_rad = min(axis.limits.position_max_rad, start_rad + reach_rad)
+    axis.limits.position_min_rad = max(axis.limits.position_min_rad, start_rad - plan.reach_rad)
+    axis.limits.position_max_rad = min(axis.limits.position_max_rad, start_rad + plan.reach_rad)
     # the spring must be able to reach its torque before a standing reading is held against the joint
     axis.limits.frozen_max_rad = 0.95 * plan.travel_rad
     return constants

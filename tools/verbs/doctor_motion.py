@@ -27,8 +27,8 @@ def check_envelope(config: Config, plan: CheckPlan, report: CommissioningReport)
         *where_lines(report),
         f"motion     a soft spring pulls the joint towards {start + plan.travel_rad:+.3f}, then "
         f"{start - plan.travel_rad:+.3f} rad, {plan.duration_s:.0f} s",
-        f"limits     {plan.torque_Nm:.1f} Nm, {plan.velocity_radps:.2f} rad/s; it is braked beyond 0.1 rad or so: "
-        "keep it free and unloaded, a hand on the emergency stop",
+        f"limits     {plan.torque_Nm:.1f} Nm, {plan.velocity_radps:.2f} rad/s; it is braked beyond "
+        f"{plan.reach_rad:.2g} rad to either side: keep it free and unloaded, a hand on the emergency stop",
         "watch      which way it turns first: it must be the one that you call positive",
     ]
     return lines + remark_lines(report.remarks)

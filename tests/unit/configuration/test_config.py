@@ -25,10 +25,7 @@ def test_the_elmo_configuration_refuses_to_load_until_it_is_filled_in(tmp_path: 
     text = shipped_config("elmo_gold_can").read_text()
     marked = set(re.findall(r"^# (\w+) = .*# FILL IN(?! if)", text, re.M))
     lines = problems(tmp_path, "#", "#", text)
-    assert {x.removesuffix(" is missing").split(".")[1] for x in lines} == marked - {
-        "rated_current_A",
-        "rated_torque_Nm",
-    }
+    assert {x.removesuffix(" is missing").split(".")[1] for x in lines} == marked
     (tmp_path / "elmo_gold.eds").write_text("")
     filled = re.sub(r"^# (\w+ = .*# FILL IN)", r"\1", text, flags=re.M)
     config = load(tmp_path, text=filled)
@@ -91,6 +88,7 @@ def test_several_problems_are_told_at_once(tmp_path: Path) -> None:
         ("position_min_rad = .*", "position_min_rad = -0.3499", "trajectory: lowest position (=-0.35 rad)"),
         ("velocity_max_radps = .*", "velocity_max_radps = 0.2199", "trajectory: peak speed (=0.219911 rad/s)"),
         ("position_jump_max_rad = .*", "position_jump_max_rad = 0.0009", "limits.position_jump_max_rad (=0.0009)"),
+        ("counts_per_turn = .*", "counts_per_turn = 2931", "limits.velocity_max_radps (=1) must be more than 1, what"),
         ("sample_age_max_s = .*", "sample_age_max_s = 0.0009", "limits.sample_age_max_s (=0.0009)"),
         ("velocity_cutoff_Hz = .*", "velocity_cutoff_Hz = 500.0", "control.velocity_cutoff_Hz (=500)"),
         ("zero_rule = .*", 'zero_rule = "linear"', "control.zero_band_radps (=0)"),
@@ -114,6 +112,7 @@ def test_contradictions_between_values_are_named(tmp_path: Path, pattern: str, l
         ("position_min_rad = .*", "position_min_rad = -0.35"),
         ("velocity_max_radps = .*", "velocity_max_radps = 0.21992"),
         ("position_jump_max_rad = .*", "position_jump_max_rad = 0.001"),
+        ("counts_per_turn = .*", "counts_per_turn = 2932"),
         ("sample_age_max_s = .*", "sample_age_max_s = 0.001"),
         ("velocity_cutoff_Hz = .*", "velocity_cutoff_Hz = 499.9"),
         ("knee = 40.0", "knee = 200.0"),

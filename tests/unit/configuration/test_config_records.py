@@ -11,10 +11,18 @@ import pytest
 from drivers.errors import ConfigurationError
 from firmware_py import friction as friction_model
 from firmware_py.motion_peak import approach_peak, approach_start, peak_of
+from firmware_py.records import VelocityState
+from firmware_py.schema import new
 from firmware_py.states import ControllerKind, FeedForward, TrajectoryKind
+from firmware_py.velocity import step_velocity
 from tests.unit.configuration.edited_config import VIRTUAL, load, problems
 from tools.configuration.checks import trajectory_extremes
-from tools.configuration.conversions import friction_constants, joint_rad_per_count, torque_constant_NmpA
+from tools.configuration.conversions import (
+    friction_constants,
+    joint_rad_per_count,
+    torque_constant_NmpA,
+    velocity_of_a_count_radps,
+)
 from tools.configuration.load import load_config, shipped_config
 from tools.configuration.plant_settings import plant_settings
 from tools.configuration.records import approach_s, axis_constants, trajectory_table
@@ -143,3 +151,16 @@ def test_a_table_trajectory_is_read_and_checked(tmp_path: Path) -> None:
     way.write_text("time_s,position_rad\n0,0\n1,zero\n")
     with pytest.raises(ConfigurationError, match=r"trajectory\.file: .*way\.csv"):
         trajectory_table(load(tmp_path, text=text))
+
+
+@pytest.mark.parametrize("cutoff_Hz", [0.0, 20.0, 400.0])
+@pytest.mark.parametrize("rate_Hz", [1000, 2000])
+def test_the_velocity_of_one_count_is_what_the_filter_makes_of_it(
+    tmp_path: Path, cutoff_Hz: float, rate_Hz: int
+) -> None:
+    text = VIRTUAL.replace("velocity_cutoff_Hz = 100.0", f"velocity_cutoff_Hz = {cutoff_Hz}")
+    config = load(tmp_path, "rate_Hz = .*", f"rate_Hz = {rate_Hz}", text)
+    state = new(VelocityState)[0]
+    for position_rad in (0.0, abs(joint_rad_per_count(config))):
+        step_velocity(axis_constants(config)[0].velocity, state, position_rad, 0.0, 1)
+    assert velocity_of_a_count_radps(config) == pytest.approx(state.velocity_radps)

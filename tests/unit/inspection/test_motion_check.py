@@ -14,7 +14,7 @@ from hil.faults.kinds import FaultConstants, FaultKind
 from tests.two_encoders import NODE, config_with
 from tests.unit.inspection.checked_joint import checked
 from tools.configuration.config import Config
-from tools.inspection.findings import OK, PROBLEM
+from tools.inspection.findings import NOTE, OK, PROBLEM
 from tools.motion_check.plan import check_constants, config_of_check, make_plan, motion_table
 from tools.motion_check.verdict import motion_findings
 from tools.running.events.fault_text import fault_text
@@ -97,6 +97,23 @@ def test_a_joint_that_is_stuck(tmp_path: Path) -> None:
     assert found["motion"].status == PROBLEM
     assert "stood still" in found["motion"].text
     assert_gentle(config, records)
+
+
+@pytest.mark.parametrize("counts", [4096, 8192])
+def test_a_coarse_encoder_that_is_right_or_dead(tmp_path: Path, counts: int) -> None:
+    config = config_with(tmp_path, encoder__counts_per_turn=counts)
+    found, records, _ = checked(config)
+    assert {f.status for f in found.values()} <= {OK, NOTE}, found
+    assert found["direction"].status == OK
+    plan = make_plan(config, None)
+    assert np.abs(records.position_rad - records.position_rad[0]).max() < plan.travel_rad
+    still = records.copy()
+    still.position_rad[:] = still.position_rad[0]
+    (dead,) = motion_findings(config, plan, still, Fault.POSITION_FROZEN, None)
+    assert (dead.topic, dead.status) == ("motion", PROBLEM)
+    text = fault_text(Fault.VELOCITY_LIMIT, 1.2, 0)
+    (fast,) = motion_findings(config, plan, still, Fault.VELOCITY_LIMIT, text)
+    assert "VELOCITY_LIMIT" in fast.text  # of a reading that stands there is none
 
 
 @pytest.mark.parametrize("second", [None, NODE])

@@ -12,9 +12,12 @@ import pytest
 from drivers.drive import CommissioningReport, DriveIdentity
 from drivers.errors import ConfigurationError
 from tests.two_encoders import config_with
+from tools.configuration.conversions import velocity_of_a_count_radps
+from tools.configuration.records import APPROACH_MIN_S
 from tools.inspection.drive_scale import judged
 from tools.inspection.findings import NOTE, OK
 from tools.motion_check.plan import check_constants, config_of_check, make_plan, motion_table, require_room
+from tools.verbs.doctor_motion import check_envelope
 
 
 def test_the_torque_is_that_of_friction_and_gravity_and_never_above_the_limit(tmp_path: Path) -> None:
@@ -59,10 +62,20 @@ def test_room_on_both_sides_is_needed(tmp_path: Path, start_rad: float, refused:
         require_room(config, plan, start_rad)
 
 
-def test_a_coarse_encoder_takes_more_travel(tmp_path: Path) -> None:
+def test_a_coarse_encoder_takes_more_travel_and_time_and_is_told_so(tmp_path: Path) -> None:
+    fine = make_plan(config_with(tmp_path), None)
     config = config_with(tmp_path, encoder__counts_per_turn=4096)
-    assert make_plan(config, None).travel_rad == pytest.approx(60.0 * math.tau / 4096)
-    assert make_plan(config_with(tmp_path, encoder__counts_per_turn=512), None).travel_rad == 0.3
+    plan = make_plan(config, None)
+    assert plan.travel_rad == pytest.approx(60.0 * math.tau / 4096)
+    assert np.abs(motion_table(plan, 0.1)[:, 2]).max() == pytest.approx(np.abs(motion_table(fine, 0.1)[:, 2]).max())
+    assert plan.duration_s == pytest.approx(motion_table(plan, 0.1)[-1, 0] + APPROACH_MIN_S)
+    assert plan.velocity_radps == config.limits.velocity_max_radps == 1.0  # never more than the user's
+    config = config_with(tmp_path, encoder__counts_per_turn=8192)
+    assert make_plan(config, None).velocity_radps > 2.0 * velocity_of_a_count_radps(config) > fine.velocity_radps
+    report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.1, 0.06, 1e-5)
+    assert "braked beyond 0.23 rad to either side" in " ".join(check_envelope(config, plan, report))
+    coarsest = config_with(tmp_path, encoder__counts_per_turn=512, control__velocity_cutoff_Hz=10.0)
+    assert make_plan(coarsest, None).travel_rad == 0.3
 
 
 @pytest.mark.parametrize(

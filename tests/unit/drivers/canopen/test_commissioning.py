@@ -199,6 +199,16 @@ def test_a_drive_that_does_not_do_what_it_must(
     assert re.search(pattern, refusal(device_on_bus, settings_of_virtual_joint, DeviceError))
 
 
+@pytest.mark.parametrize(("name", "drives"), [("rated_torque_Nm", "0.5 Nm"), ("rated_current_A", "5 A")])
+def test_a_rated_value_that_is_not_compared_is_told(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, name: str, drives: str
+) -> None:
+    remark = f"drive.{name} is not given: nothing to compare the drive's {drives} with"
+    for settings in (settings_of_virtual_joint, dataclasses.replace(settings_of_virtual_joint, **{name: None})):
+        with opened(device_on_bus, settings) as drive:
+            assert (remark in drive.commission().remarks) is (settings is not settings_of_virtual_joint)
+
+
 @pytest.mark.parametrize(("reference", "index"), [("rated_torque", 0x6076), ("rated_current", 0x6075)])
 def test_no_scale_without_a_rated_value(
     device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, reference: str, index: int
