@@ -20,7 +20,7 @@ import numpy as np
 from drivers.can.open import open_cyclic_end
 from drivers.drive import Drive
 from drivers.errors import JointctlError
-from firmware_py.states import StopRequest
+from firmware_py.states import DriveState, StopRequest
 from tools.analysis.idle_states import cores_awake
 from tools.analysis.wake_up import fifo, wake_up_lateness_ns
 from tools.benchmarks.law_memory import setting_doubles
@@ -35,6 +35,7 @@ SETTLE_S = 0.5  # from the start of the loop until the drive is enabled, and a l
 POLL_S = 0.02
 END_S = 3.0
 PATIENCE_S = 0.25
+ENABLED_SHARE = 0.9
 
 
 def at_rate(config: Config, rate_Hz: float) -> Config:
@@ -87,8 +88,16 @@ def run_ours(config: Config, seconds: float, load_name: str) -> LoopTimes:
     if ended_early:
         raise JointctlError(f"the control loop stopped by itself while it was measured: {fault.name} ({value:g})")
     records = np.concatenate(chunks)[round(SETTLE_S * config.loop.rate_Hz) :]
+    _require_enabled("our", records["drive_state"] == DriveState.ENABLED)
     rows = np.column_stack([records["wake_late_ns"], records["round_trip_ns"], records["work_ns"]])
     return times_from_ns(rows.astype(np.int64))
+
+
+def _require_enabled(whose: str, enabled: np.ndarray) -> None:
+    """`JointctlError` unless the drive was enabled most of the time: cycles that command nothing are no measurement."""
+    share = float(np.mean(enabled)) if len(enabled) else 0.0
+    if share < ENABLED_SHARE:
+        raise JointctlError(f"{whose} loop had the drive enabled in {share:.0%} of its cycles only")
 
 
 def run_c(program: Path, config: Config, seconds: float, load_name: str) -> LoopTimes:
@@ -118,8 +127,7 @@ def run_c(program: Path, config: Config, seconds: float, load_name: str) -> Loop
         raise JointctlError(f"the C loop ended with code {result.returncode} after {len(rows) // 4} of {cycles} cycles")
     rows = rows.reshape(cycles, 4)[round(SETTLE_S * rate_Hz) : -round(0.1 * rate_Hz)]
     enabled = rows[:, 3] == 1
-    if enabled.mean() < 0.9:
-        raise JointctlError(f"the C loop had the drive enabled in {enabled.mean():.0%} of its cycles only")
+    _require_enabled("the C", enabled)
     return times_from_ns(rows[enabled])
 
 

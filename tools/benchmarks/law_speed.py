@@ -138,6 +138,10 @@ def _timer(ticks: Ticks, inputs: np.ndarray) -> Callable[[], float]:
     return measure
 
 
+def _apart_text(apart: float) -> str:
+    return f"torques differ by {apart:.1e}" + ("" if apart <= SAME_NUMBERS else ": MORE THAN ALLOWED")
+
+
 def _versus_c(constants: Any, folder: Path, pairs: int) -> Iterator[Row]:
     inputs = sine_inputs(constants[0], CHUNK_TICKS)
     ours = _timer(kernel_ticks(constants), inputs)
@@ -145,9 +149,8 @@ def _versus_c(constants: Any, folder: Path, pairs: int) -> Iterator[Row]:
         name = f"gcc {' '.join(options)}"
         library = law_library(folder, options)
         apart = difference(kernel_ticks(constants), c_function(library, "run_ticks", constants), inputs)
-        note = f"torques differ by {apart:.1e}" + ("" if apart <= SAME_NUMBERS else ": MORE THAN ALLOWED")
         values = interleaved(pairs, ours, _timer(c_function(library, "run_ticks", constants), inputs))
-        yield compared(GROUP, "tick", values[0], values[1], "ns", name, goal=goal, note=note)
+        yield compared(GROUP, "tick", values[0], values[1], "ns", name, goal=goal, note=_apart_text(apart))
         state = new(AxisState)
         hidden = _timer(lambda i, t, state=state: run_hidden(constants, state, i, t), inputs)  # type: ignore[misc]
         values = interleaved(pairs, hidden, _timer(c_function(library, "run_hidden", constants), inputs))
@@ -168,4 +171,4 @@ def law_rows(constants: Any, folder: Path, *, pairs: int) -> Iterator[Row]:
     values = interleaved(
         max(3, pairs // 3), _timer(kernel_ticks(constants), inputs), _timer(NumpyLaw(constants[0]).ticks, inputs)
     )
-    yield compared(GROUP, "tick", values[0], values[1], "ns", "numpy", note=f"torques differ by {apart:.1e}")
+    yield compared(GROUP, "tick", values[0], values[1], "ns", "numpy", note=_apart_text(apart))
