@@ -27,7 +27,7 @@ sys.path.insert(0, str(ROOT))
 
 from tools.configuration.load import shipped_config  # noqa: E402
 from tools.recording.log_facts import missing_records  # noqa: E402
-from tools.recording.run_log import read_run_log  # noqa: E402
+from tools.recording.run_log_reader import read_run_log  # noqa: E402
 from tools.simulation.virtual_joint import separate_virtual_joint  # noqa: E402
 
 SETTLED_S = 60.0  # memory of the first minute is start-up

@@ -17,7 +17,8 @@ from firmware_py.states import AxisPhase, Fault, StopRequest
 from tests.hil.moving_run import Moving, gone
 from tools.configuration.load import load_config
 from tools.configuration.records import axis_constants, trajectory_table
-from tools.recording.run_log import RunLogWriter, read_run_log
+from tools.recording.run_log import RunLogWriter
+from tools.recording.run_log_reader import read_run_log
 from tools.running.loop.loop_handle import LoopHandle
 from tools.running.loop.shared_block import RING_RECORDS, SharedBlock
 from tools.running.open_drive import open_drive

@@ -18,7 +18,7 @@ import tomlkit
 from tests.places import CONFIGS
 from tests.real_time_joint import real_time_joint
 from tools.configuration.load import load_config
-from tools.recording.run_log import read_run_log
+from tools.recording.run_log_reader import read_run_log
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ import pytest
 from firmware_py.states import AxisPhase, StopRequest
 from tools.configuration.load import load_config
 from tools.output import Output
-from tools.recording.run_log import Event, read_run_log
+from tools.recording.run_log import Event
+from tools.recording.run_log_reader import read_run_log
 from tools.running.display.display import OnlyShows, Snapshot
 from tools.running.display.viewer_request import ViewerRequest
 from tools.running.supervisor import RunResult, Supervisor

@@ -13,7 +13,7 @@ import pytest
 
 from tests.hil.sweep_rows import rows, truth_Nm
 from tools.configuration.load import load_config, shipped_config
-from tools.recording.run_log import read_run_log
+from tools.recording.run_log_reader import read_run_log
 
 SHORT = ("--max-speed", "1.0", "--min-speed", "0.5", "--points", "6", "--dwell", "0.3", "--warm-up", "0")
 

@@ -18,7 +18,7 @@ import tomlkit
 
 from drivers.can.open import open_cyclic_end
 from drivers.errors import BusError
-from tools.recording.run_log import read_run_log
+from tools.recording.run_log_reader import read_run_log
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "virtual.toml"
 ON_VCAN = ("-i", "socketcan", "-c", "vcan0")

@@ -17,7 +17,7 @@ import numpy as np
 
 from drivers.errors import DataError
 from tools.recording.can_log import candump_lines
-from tools.recording.run_log import RunLog
+from tools.recording.run_log_reader import RunLog
 
 _ROWS = 10_000  # turned into Python numbers at once
 

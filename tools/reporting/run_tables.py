@@ -8,7 +8,7 @@ from typing import Any
 
 from firmware_py.states import Fault
 from tools.recording.log_facts import began_at, event_rows, missing_in
-from tools.recording.run_log import RunLog
+from tools.recording.run_log_reader import RunLog
 from tools.recording.run_summary import Range, RunSummary, TimeSummary
 from tools.reporting.page import Table
 

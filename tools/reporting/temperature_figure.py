@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from tools.drawing import RED
-from tools.recording.run_log import RunLog
+from tools.recording.run_log_reader import RunLog
 from tools.reporting.figure import draw
 from tools.reporting.page import Figure
 

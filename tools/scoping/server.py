@@ -12,7 +12,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from tools.recording.run_log import Event, read_run_log
+from tools.recording.run_log import Event
+from tools.recording.run_log_reader import read_run_log
 from tools.running.display.viewer_request import ViewerRequest, viewer
 from tools.scoping.access import AccessControl
 from tools.scoping.feed import COUNT_AGAIN_S, EVENT, RECORDS, SETTINGS

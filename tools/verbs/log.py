@@ -13,7 +13,7 @@ from tools.output import Output
 from tools.recording.log_export import FORMATS
 from tools.recording.log_facts import began_at, event_rows, kept_share, level_name, missing_in
 from tools.recording.run_figure import save_run_figure
-from tools.recording.run_log import RunLog, read_run_log
+from tools.recording.run_log_reader import RunLog, read_run_log
 from tools.recording.run_summary import summarise, summary_table
 from tools.written_file import replace_file, require_target
 

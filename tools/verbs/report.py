@@ -8,7 +8,7 @@ from pathlib import Path
 from drivers.errors import DataError
 from firmware_py.states import Fault
 from tools.output import Output
-from tools.recording.run_log import RunLog, read_run_log
+from tools.recording.run_log_reader import RunLog, read_run_log
 from tools.recording.run_summary import RunSummary, summarise
 from tools.reporting.comparison import comparison
 from tools.reporting.page import Block, Details, Paragraph, Section, check_target, page, write_page

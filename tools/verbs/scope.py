@@ -12,7 +12,7 @@ from drivers.errors import JointctlError
 from firmware_py.states import StopRequest
 from tools.output import Output
 from tools.recording.log_folder import log_path
-from tools.recording.run_log import read_run_log
+from tools.recording.run_log_reader import read_run_log
 from tools.running.display.live_panel import run_display
 from tools.running.permission.envelope import motion_envelope
 from tools.running.permission.readiness import prepare_log, require_ready, require_start

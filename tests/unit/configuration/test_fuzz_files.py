@@ -20,7 +20,8 @@ from tests.places import CONFIGS
 from tools.configuration.config import Config
 from tools.configuration.load import load_config
 from tools.identification.friction_file import read_friction_data
-from tools.recording.run_log import RunLogWriter, read_run_log
+from tools.recording.run_log import RunLogWriter
+from tools.recording.run_log_reader import read_run_log
 
 TOML = (CONFIGS / "virtual.toml").read_text()
 EDS = (CONFIGS / "virtual_joint.eds").read_text()

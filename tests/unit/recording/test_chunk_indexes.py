@@ -16,7 +16,8 @@ from firmware_py.records import LogRecord
 from firmware_py.schema import new
 from tools.recording import chunk_indexes, run_log
 from tools.recording.chunk_indexes import ChunkIndexes
-from tools.recording.run_log import INFO, RunLogWriter, read_run_log
+from tools.recording.run_log import INFO, RunLogWriter
+from tools.recording.run_log_reader import read_run_log
 
 FIRST = ChunkIndex(
     chunk_length=170_000,

@@ -24,7 +24,8 @@ from tools.output import Output
 from tools.recording.can_log import frame_array, frame_times_ns
 from tools.recording.log_export import FORMATS, columns, parquet_bytes
 from tools.recording.log_facts import missing_records
-from tools.recording.run_log import THINNING, RunLogWriter, read_run_log
+from tools.recording.run_log import THINNING, RunLogWriter
+from tools.recording.run_log_reader import read_run_log
 from tools.running.events.event_finder import EventFinder
 from tools.running.watch.frame_recorder import FrameRecorder, recording
 from tools.verbs.log import log_export, log_info, log_plot

@@ -16,7 +16,8 @@ from drivers.errors import DataError
 from firmware_py.records import LogRecord
 from firmware_py.schema import dtype_of, new
 from tools.recording.cdr import event_body, event_from_body, message_definition
-from tools.recording.run_log import ERROR, INFO, RunLogWriter, read_run_log
+from tools.recording.run_log import ERROR, INFO, RunLogWriter
+from tools.recording.run_log_reader import read_run_log
 
 
 def sample_records(count: int, first: int = 0) -> np.recarray:

@@ -19,7 +19,8 @@ from tests.places import CONFIGS
 from tools.configuration.drive_settings import temperature_object
 from tools.configuration.load import load_config
 from tools.recording.log_export import csv_bytes, npz_bytes, table_columns
-from tools.recording.run_log import RunLogWriter, read_run_log
+from tools.recording.run_log import RunLogWriter
+from tools.recording.run_log_reader import read_run_log
 from tools.recording.run_summary import summarise
 from tools.reporting.temperature_figure import temperature_figure
 from tools.running.watch.temperature_watch import STALE_S, TemperatureWatch
