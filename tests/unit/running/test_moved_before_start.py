@@ -63,7 +63,7 @@ def test_the_tolerance(tmp_path: Path) -> None:
     sequence = axis_constants(config, start_position_rad=0.25)[0].sequence
     assert (sequence.start_rad, sequence.moved_max_rad) == (0.25, config.limits.following_error_max_rad)
     assert axis_constants(config)[0].sequence.moved_max_rad == 0.0  # not known where it stands: not checked
-    coarse = config_with(tmp_path, counts_per_turn="256", following_error_max_rad="0.05")
+    coarse = config_with(tmp_path, counts_per_turn="256", following_error_max_rad="0.05", velocity_cutoff_Hz="5.0")
     sequence = axis_constants(coarse, start_position_rad=0.25)[0].sequence
     assert sequence.moved_max_rad == pytest.approx(MOVED_COUNTS * math.tau / 256)
 
