@@ -31,7 +31,11 @@ COUNTS_IN_VELOCITY = 2.0  # what a coarse encoder may add to it, in steps of its
 PEAK = 1.875  # of the velocity over its mean, in a minimum-jerk ramp
 STATIC_FRICTIONS = 2.0  # torque limit of the check, over the static friction that is configured
 TORQUE_SHARE = 0.1  # of limits.torque_max_Nm, where no friction is configured
-SPRING_SHARE = 0.7  # of the torque limit, at full travel; the rest is for damping and gravity
+# The spring reaches the limit at 0.7 of the travel.  Friction that takes half of the limit lets go at 0.36; on the way
+# back the spring has to turn round first, and it takes twice that, with friction as strong as the push 1.07 travels.
+SPRING_SHARE = 1.4  # of the torque limit that gravity leaves, at full travel
+PUSH_SHARE = 0.75  # of it: a joint that stands still under that is stuck, or its reading is
+STANDING_WAY = 1.2  # travels of the reference past a reading that stands still
 DAMPING = 0.5
 RAMP_s, REST_s = 0.4, 0.4  # a longer travel takes a longer ramp
 STOPS = (1.0, 0.0, -1.0, 0.0)  # where the reference goes, in travels
@@ -46,11 +50,12 @@ class CheckPlan:
     travel_rad: float
     velocity_radps: float
     static_friction_Nm: float | None  # that is configured
+    gravity_Nm: float  # that the law holds, at most
 
     @property
-    def coarse(self) -> bool:
-        """Whether an encoder has so few counts that it takes more travel to see a motion."""
-        return self.travel_rad > TRAVEL_rad
+    def spring_Nm(self) -> float:
+        """What gravity leaves of the torque."""
+        return max(self.torque_Nm - self.gravity_Nm, 0.2 * self.torque_Nm)
 
     @property
     def ramp_s(self) -> float:
@@ -83,7 +88,7 @@ def make_plan(config: Config, torque_Nm: float | None) -> CheckPlan:
     travel = min(max(TRAVEL_rad, TRAVEL_COUNTS * max(resolutions)), TRAVEL_MAX_rad)
     steps_radps = COUNTS_IN_VELOCITY * velocity_of_a_count_radps(config)
     velocity = min(max(VELOCITY_MAX_radps, steps_radps + PEAK * TRAVEL_rad / RAMP_s), limits.velocity_max_radps)
-    return CheckPlan(torque_Nm, travel, velocity, static_Nm)
+    return CheckPlan(torque_Nm, travel, velocity, static_Nm, abs(config.joint.gravity_Nm))
 
 
 def config_of_check(config: Config, plan: CheckPlan) -> Config:
@@ -95,8 +100,7 @@ def config_of_check(config: Config, plan: CheckPlan) -> Config:
             "following_error_max_rad": 1.25 * plan.travel_rad,
         }
     )
-    spring_Nm = max(plan.torque_Nm - abs(config.joint.gravity_Nm), 0.2 * plan.torque_Nm)
-    kp = SPRING_SHARE * spring_Nm / plan.travel_rad / config.joint.inertia_kgm2
+    kp = SPRING_SHARE * plan.spring_Nm / plan.travel_rad / config.joint.inertia_kgm2
     law = {
         "kind": "computed_torque", "kp": kp, "kv": 2.0 * DAMPING * math.sqrt(kp), "feed_forward": "none",
         "learning": None,
@@ -144,6 +148,6 @@ def check_constants(config: Config, plan: CheckPlan, report: CommissioningReport
     axis.trajectory.table_rows, axis.trajectory.duration_s = len(table), float(table[-1, 0])
     axis.limits.position_min_rad = max(axis.limits.position_min_rad, start_rad - plan.reach_rad)
     axis.limits.position_max_rad = min(axis.limits.position_max_rad, start_rad + plan.reach_rad)
-    # the spring must be able to reach its torque before a standing reading is held against the joint
-    axis.limits.frozen_max_rad = 0.95 * plan.travel_rad
+    axis.limits.frozen_max_rad = STANDING_WAY * plan.travel_rad
+    axis.limits.frozen_torque_Nm = plan.gravity_Nm + PUSH_SHARE * plan.spring_Nm
     return constants

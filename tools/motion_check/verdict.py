@@ -17,8 +17,10 @@ from tools.motion_check.plan import CheckPlan
 from tools.running.events.fault_text import FaultText
 
 MOVED_SHARE = 0.03  # of the travel: less is no motion
-MOVED_COUNTS = 10.0
+MOVED_COUNTS = 6.0
+SMOOTHED_CYCLES = 20  # torques are compared over so many: a coarse encoder makes them jump, and the measured one lags
 SAME_SCALE = 0.2  # by which two encoders may differ over the small way: backlash, twist
+LITTLE_WORK = 0.05  # of the largest torque times the farthest way
 FRICTION_FACTOR = 2.5  # measured over configured static friction, either way
 TORQUE_FACTOR = 2.0  # measured over commanded torque, either way
 _POWERED = (AxisPhase.APPROACH, AxisPhase.TRACKING, AxisPhase.RAMPING)
@@ -33,11 +35,25 @@ class Motion:
 
     moved_rad: float  # farthest from the start, with its sign
     work_J: float  # of the commanded torque without gravity: negative if the joint moved against it
+    accelerating: float  # torque times change of speed, summed: negative if the joint sped up against the torque
     break_away_Nm: float  # commanded when the joint began to move
     torque_max_Nm: float
     torque_ratio: float | None  # measured over commanded; None where the drive measures none
     other_ratio: float | None  # way of the other encoder over that of this one
     other_moved_rad: float
+
+    @property
+    def along(self) -> bool:
+        """Whether the joint moved with the torque.  One without friction gives all of the work back."""
+        if abs(self.work_J) < LITTLE_WORK * self.torque_max_Nm * abs(self.moved_rad):
+            return self.accelerating > 0.0
+        return self.work_J > 0.0
+
+
+def _smoothed(values: np.ndarray) -> np.ndarray:
+    """Moving mean."""
+    cycles = min(SMOOTHED_CYCLES, len(values))
+    return np.convolve(values, np.ones(cycles) / cycles, "valid")
 
 
 def motion_of(records: Any, threshold_rad: float) -> Motion | None:
@@ -53,15 +69,16 @@ def motion_of(records: Any, threshold_rad: float) -> Motion | None:
     work = float(np.sum(pushed[:-1] * np.diff(way)))
     moved = np.nonzero(np.abs(way) >= threshold_rad)[0]
     first = int(moved[0]) if len(moved) else -1
-    strong = np.abs(torque) > 0.5 * np.abs(torque).max()
-    measured = np.asarray(rows.measured_torque_Nm)
+    smooth, measured = _smoothed(torque), _smoothed(np.asarray(rows.measured_torque_Nm))
+    strong = np.abs(smooth) > 0.5 * np.abs(smooth).max()
     ratio = None
     if measured.any() and strong.any():
-        ratio = float(np.sum(measured[strong] * torque[strong]) / np.sum(torque[strong] ** 2))
+        ratio = float(np.sum(measured[strong] * smooth[strong]) / np.sum(smooth[strong] ** 2))
     square = float(np.sum(way**2))
     return Motion(
         moved_rad=float(way[np.argmax(np.abs(way))]),
         work_J=work,
+        accelerating=float(np.sum(_smoothed(pushed[1:-1]) * _smoothed(np.diff(way, 2)))) if len(way) > 2 else 0.0,
         break_away_Nm=float(np.abs(torque[: first + 1 or None]).max()),
         torque_max_Nm=float(np.abs(torque).max()),
         torque_ratio=ratio,
@@ -98,19 +115,12 @@ def motion_findings(
     yield direction
     if motion.torque_ratio is not None:
         yield _measured_torque(motion.torque_ratio)
-    if motion.work_J > 0.0:
+    if motion.along:
         yield from _friction(motion, plan)
     explained = direction.status == PROBLEM and fault in _WAY_FAULTS
     if fault is Fault.POSITION_DISAGREEMENT:
         explained = explained or any(finding.status == PROBLEM for finding in encoders)
-    if fault is Fault.POSITION_FROZEN and direction.status == OK and plan.coarse:
-        yield Finding(
-            "check",
-            NOTE,
-            "ended early, on the way back: friction held the joint, and an encoder of so few counts sees no twist",
-            "none if it ends so each time: what stands above was judged; else the encoder's cable",
-        )
-    elif fault is not Fault.NONE and not explained:
+    if fault is not Fault.NONE and not explained:
         yield ended_finding(records, fault, text)
 
 
@@ -150,7 +160,7 @@ def _encoders(motion: Motion, law: str, other: str) -> Iterator[Finding]:
             numbers,
         )
     elif ratio < 0.0:
-        wrong = other if motion.work_J > 0.0 else law
+        wrong = other if motion.along else law
         text = f"[{law}] and [{other}] count against each other"
         cure = f"{wrong}.direction: [{law if wrong == other else other}] agrees with the torque"
         yield Finding("two encoders", PROBLEM, text, cure, numbers)
@@ -164,7 +174,7 @@ def _encoders(motion: Motion, law: str, other: str) -> Iterator[Finding]:
 
 def _direction(motion: Motion, law: str, other: str, numbers: dict[str, Any]) -> Finding:
     way = f"by up to {abs(motion.moved_rad) * 1e3:.1f} mrad ({math.degrees(abs(motion.moved_rad)):.2f} deg)"
-    if motion.work_J <= 0.0:
+    if not motion.along:
         cure = (
             f"if the joint turned the way that you call positive at first: {law}.direction; else drive.torque_direction"
         )

@@ -14,11 +14,13 @@ from hil.faults.kinds import FaultConstants, FaultKind
 from tests.two_encoders import NODE, config_with
 from tests.unit.inspection.checked_joint import checked
 from tools.configuration.config import Config
-from tools.inspection.findings import NOTE, OK, PROBLEM
+from tools.inspection.findings import OK, PROBLEM
 from tools.motion_check.plan import check_constants, config_of_check, make_plan, motion_table
 from tools.motion_check.verdict import motion_findings
 from tools.running.events.fault_text import fault_text
 from tools.simulation.lockstep import LockstepJoint
+
+WAYS = ("positive", "negative")
 
 
 def assert_gentle(config: Config, records: Any) -> None:
@@ -99,21 +101,40 @@ def test_a_joint_that_is_stuck(tmp_path: Path) -> None:
     assert_gentle(config, records)
 
 
-@pytest.mark.parametrize("counts", [4096, 8192])
-def test_a_coarse_encoder_that_is_right_or_dead(tmp_path: Path, counts: int) -> None:
-    config = config_with(tmp_path, encoder__counts_per_turn=counts)
-    found, records, _ = checked(config)
-    assert {f.status for f in found.values()} <= {OK, NOTE}, found
-    assert found["direction"].status == OK
-    plan = make_plan(config, None)
-    assert np.abs(records.position_rad - records.position_rad[0]).max() < plan.travel_rad
-    still = records.copy()
+@pytest.mark.parametrize("kind", ["lugre", "stick_slip"])
+@pytest.mark.parametrize(("counts", "cutoff_Hz"), [(1024, 20.0), (8192, 100.0), (16384, 100.0), (524288, 100.0)])
+def test_the_way_back_is_no_standing_reading(tmp_path: Path, kind: str, counts: int, cutoff_Hz: float) -> None:
+    """Friction holds the joint while the spring turns round; few counts, or pure Coulomb friction, show no twist."""
+    friction = {"virtual__friction_kind": kind} | {f"virtual__friction_{way}_scale": 1.3 for way in WAYS}
+    config = config_with(tmp_path, encoder__counts_per_turn=counts, control__velocity_cutoff_Hz=cutoff_Hz, **friction)
+    found, records, fault = checked(config)
+    assert fault is Fault.NONE
+    assert {f.status for f in found.values()} == {OK}, found
+    way = (records.position_rad - records.position_rad[0]) / make_plan(config, None).travel_rad
+    assert -1.0 < way.min() < -0.4
+    assert 0.4 < way.max() < 1.0
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.001, 0.05])
+@pytest.mark.parametrize("wrong", [False, True])
+def test_a_joint_with_hardly_any_friction(tmp_path: Path, scale: float, wrong: bool) -> None:
+    """It gives back all of the work that is put into it."""
+    friction = (
+        {f"virtual__friction_{way}_scale": scale for way in WAYS} if scale else {"virtual__friction_kind": "none"}
+    )
+    found, _, _ = checked(config_with(tmp_path, **friction), reverse_torque if wrong else None)
+    assert found["direction"].status == (PROBLEM if wrong else OK)
+
+
+def test_a_reading_that_stands_has_no_velocity(tmp_path: Path) -> None:
+    config = config_with(tmp_path, encoder__counts_per_turn=4096)
+    still = checked(config)[1].copy()
     still.position_rad[:] = still.position_rad[0]
+    plan = make_plan(config, None)
     (dead,) = motion_findings(config, plan, still, Fault.POSITION_FROZEN, None)
     assert (dead.topic, dead.status) == ("motion", PROBLEM)
-    text = fault_text(Fault.VELOCITY_LIMIT, 1.2, 0)
-    (fast,) = motion_findings(config, plan, still, Fault.VELOCITY_LIMIT, text)
-    assert "VELOCITY_LIMIT" in fast.text  # of a reading that stands there is none
+    (fast,) = motion_findings(config, plan, still, Fault.VELOCITY_LIMIT, fault_text(Fault.VELOCITY_LIMIT, 1.2, 0))
+    assert "VELOCITY_LIMIT" in fast.text
 
 
 @pytest.mark.parametrize("second", [None, NODE])

@@ -78,13 +78,13 @@ def test_what_stopped_a_standing_joint_is_told_unless_standing_explains_it(tmp_p
 
 
 @pytest.mark.parametrize("second", [None, NODE])
-@pytest.mark.parametrize("load_Nm", [-45.0, -1.0])
+@pytest.mark.parametrize("load_Nm", [-60.0, -1.0])
 def test_a_push_from_outside(tmp_path: Path, second: dict[str, Any] | None, load_Nm: float) -> None:
     faults = new(FaultConstants, 1)
     faults[0].kind, faults[0].start_s, faults[0].duration_s = FaultKind.LOAD_JUMP, 1.5, 10.0
     faults[0].magnitude = load_Nm
     found, _, fault = checked(config_with(tmp_path, second), None, faults)
-    pushed = load_Nm == -45.0
+    pushed = load_Nm == -60.0
     assert fault is (Fault.VELOCITY_LIMIT if pushed else Fault.NONE)
     assert ("check" in found) is pushed
     assert any(finding.status == PROBLEM for finding in found.values()) is pushed
