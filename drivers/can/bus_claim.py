@@ -16,6 +16,7 @@ import os
 import socket
 import struct
 import sys
+import time
 from typing import Self
 
 from drivers.can.serial_adapter import port_path
@@ -23,6 +24,7 @@ from drivers.can.virtual_bus import socket_path
 from drivers.errors import BusError
 from drivers.port_users import program_name
 
+_RELEASE_S = 0.05  # a process that was just started holds a copy until it has become another program
 _IN_PROCESS = "virtual"  # python-can's bus of this name ends with the process: nobody else can be on it
 
 
@@ -34,19 +36,19 @@ class BusClaim:
         if sys.platform != "linux" or interface == _IN_PROCESS:
             return
         address = bus_address(interface, channel)
-        claim = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        with contextlib.suppress(OSError):
+            self._socket = _bound(address)
+            return
+        time.sleep(_RELEASE_S)
         try:
-            claim.bind(address)
-            claim.listen()
+            self._socket = _bound(address)
         except OSError as error:
-            claim.close()
             if error.errno != errno.EADDRINUSE:
                 return
             raise BusError(
                 f"another program controls {interface}:{channel}{_holder_text(address)}",
                 "only one controller may use a bus: end it first; `jointctl stop` switches its drive off",
             ) from None
-        self._socket = claim
 
     def close(self) -> None:
         """Leave the bus to others; may be called twice."""
@@ -61,19 +63,40 @@ class BusClaim:
 
 
 def bus_address(interface: str, channel: str) -> bytes:
-    """Of the bus itself, whatever links lead to it."""
+    """Of the bus itself, whatever links lead to it, and whatever else has its name in another mount namespace."""
+    place = f"{interface}:{channel}"
     if interface == "jointctl":
-        channel = os.path.realpath(socket_path(channel))
-    elif interface == "slcan":
-        channel = os.path.realpath(port_path(channel))
-    return b"\0jointctl-bus-" + hashlib.sha256(f"{interface}:{channel}".encode()).hexdigest()[:32].encode()
+        path = socket_path(channel)
+        place = f"{interface}:{path}"
+        with contextlib.suppress(OSError):
+            found = os.stat(path)
+            place = f"{interface}:{found.st_dev:x}:{found.st_ino:x}"
+    elif port_path(channel).startswith("/"):
+        place = f"{interface}:{os.path.realpath(port_path(channel))}"
+    return b"\0jointctl-bus-" + hashlib.sha256(place.encode()).hexdigest()[:32].encode()
+
+
+def _bound(address: bytes) -> socket.socket:
+    claim = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        claim.bind(address)
+        claim.listen()
+    except OSError:
+        claim.close()
+        raise
+    return claim
 
 
 def _holder_text(address: bytes) -> str:
     """` (jointctl, pid 1234)`; empty where it has just gone."""
-    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as peer:
-        peer.settimeout(1.0)
-        peer.connect(address)
-        pid, _, _ = struct.unpack("3i", peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as peer:
+            peer.settimeout(1.0)
+            peer.connect(address)
+            pid, _, _ = struct.unpack("3i", peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+    except OSError:
+        return ""
+    try:
         return f" ({program_name(pid)}, pid {pid})"
-    return ""
+    except OSError:
+        return f" (pid {pid})"

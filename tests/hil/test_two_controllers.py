@@ -10,12 +10,15 @@ import can
 from drivers.canopen.identifiers import SYNC_ID
 from tests.hil.terminal import Terminal
 
+SDO_REQUEST = 0x601  # to node 1
+OTHERS = (("run", "-y"), ("clear-fault",), ("doctor", "--motion", "-y"))
+
 
 def test_whoever_comes_while_the_joint_moves_is_refused(bench: Any) -> None:
-    config = bench.config(trajectory__duration_s=8.0)
+    config = bench.config(trajectory__duration_s=15.0)
     bench.joint(config)
     first = bench.start("run", config, "-y").saw("  tracking")
-    for verb in (("run", "-y"), ("clear-fault",)):
+    for verb in OTHERS:
         bench.run(*verb, config).refused(4, "another program controls", f"pid {first.process.pid}")
     done = first.finished(30.0)
     assert done.code == 0, done.err
@@ -25,9 +28,13 @@ def test_whoever_comes_while_the_joint_moves_is_refused(bench: Any) -> None:
 def test_whoever_comes_while_the_first_is_asked_is_refused(bench: Any) -> None:
     config = bench.config()
     bench.joint(config)
+    assert bench.run("params", "dump", config, "-o", "kept.toml").code == 0
     first = Terminal(bench, "run", config).saw("[y/N]")
-    for verb in (("run", "-y"), ("clear-fault",)):
-        bench.run(*verb, config).refused(4, "another program controls", f"pid {first.started.process.pid}")
+    with can.Bus(interface="jointctl", channel=bench.channel) as ear:
+        for arguments in (*((*verb, config) for verb in OTHERS), ("params", "restore", "kept.toml", config, "-y")):
+            bench.run(*arguments).refused(4, "another program controls", f"pid {first.started.process.pid}")
+        requests = [message for message in iter(lambda: ear.recv(0.0), None) if message.arbitration_id == SDO_REQUEST]
+    assert not requests
     os.write(first.master, b"y\n")
     assert first.finished().code == 0, first.text
     assert bench.disabled()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from drivers.can.bus_claim import BusClaim
 from drivers.drive import CommissioningReport
 from drivers.errors import INTERRUPTED
 from firmware_py.states import Fault
 from tools.configuration.config import Config
 from tools.inspection.drive_scale import scale_finding
+from tools.inspection.findings import Finding
 from tools.motion_check.carry_out import CheckSupervisor
 from tools.motion_check.plan import CheckPlan, make_plan, require_room
 from tools.motion_check.verdict import ended_finding, motion_findings
@@ -34,13 +36,22 @@ def check_envelope(config: Config, plan: CheckPlan, report: CommissioningReport)
     return lines + remark_lines(report.remarks)
 
 
+def _scale_of_the_drive(config: Config) -> list[Finding]:
+    """Asked before the run has the bus; `BusError` where another program has it: its transfers are not disturbed."""
+    if config.is_serial:
+        return []
+    with BusClaim(config.bus.interface, config.bus.channel):
+        finding = scale_finding(config)
+    return [] if finding is None else [finding]
+
+
 def doctor_motion(config: Config, output: Output, *, assume_yes: bool, torque_Nm: float | None = None) -> int:
     """Commission, tell, ask, pull, judge; 0, or 1 if something is wrong, 130 after an interruption."""
     if not assume_yes:
         require_terminal()
     plan = make_plan(config, torque_Nm)
     path = log_path(config)
-    found = [finding for finding in (scale_finding(config),) if finding is not None]
+    found = _scale_of_the_drive(config)
 
     def confirm(report: CommissioningReport) -> bool:
         for line in check_envelope(config, plan, report):

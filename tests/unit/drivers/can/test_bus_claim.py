@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -66,7 +68,34 @@ def test_links_lead_to_the_same_bus(tmp_path: Path) -> None:
     device, link = str(tmp_path / "ttyACM0"), str(tmp_path / "adapter")
     assert bus_address("slcan", f"{link}@115200") == bus_address("slcan", device)
     assert bus_address("jointctl", link) == bus_address("jointctl", device)
-    assert bus_address("socketcan", link) != bus_address("socketcan", device)
+    assert bus_address("seeedstudio", link) == bus_address("seeedstudio", device) != bus_address("slcan", device)
+
+
+def test_a_bus_of_the_same_name_behind_another_mount_is_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    socket_file = tmp_path / "bus.sock"
+    first = socket.socket(socket.AF_UNIX)
+    first.bind(str(socket_file))
+    address = bus_address("jointctl", str(socket_file))
+    assert bus_address("jointctl", str(socket_file)) == address
+    socket_file.rename(tmp_path / "other.sock")
+    with socket.socket(socket.AF_UNIX) as second:
+        second.bind(str(socket_file))
+        assert bus_address("jointctl", str(socket_file)) != address
+    first.close()
+    monkeypatch.chdir(tmp_path)
+    url = bus_address("slcan", "socket://host:1234")
+    monkeypatch.chdir("/")
+    assert bus_address("slcan", "socket://host:1234") == url
+
+
+def test_where_such_sockets_are_forbidden_there_is_no_claim(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(*_: object) -> None:
+        raise OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol")
+
+    monkeypatch.setattr(socket, "socket", forbidden)
+    BusClaim("socketcan", channel).close()
 
 
 def test_a_bus_inside_a_process_needs_no_claim(channel: str) -> None:
@@ -76,7 +105,10 @@ def test_a_bus_inside_a_process_needs_no_claim(channel: str) -> None:
 
 def test_no_process_that_was_started_keeps_the_claim(channel: str) -> None:
     claim = BusClaim("socketcan", channel)
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE, close_fds=False) as child:
+    command = [sys.executable, "-c", "print(flush=True); input()"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, close_fds=False) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline()
         claim.close()
         BusClaim("socketcan", channel).close()
         child.communicate(b"\n")

@@ -1,0 +1,25 @@
+"""Opening the drive of a configuration: what fails leaves the bus to whoever tries next."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from drivers.can.bus_claim import BusClaim
+from drivers.errors import BusError
+from tests.places import CONFIGS
+from tools.configuration.load import load_config
+from tools.running.open_drive import open_drive
+
+
+def test_a_bus_that_cannot_be_opened_can_be_tried_again(tmp_path: Path) -> None:
+    text = (CONFIGS / "virtual.toml").read_text().replace('"virtual0"', f'"{tmp_path}/none.sock"')
+    (tmp_path / "joint.toml").write_text(text)
+    config = load_config(tmp_path / "joint.toml")
+    for _ in range(2):
+        with pytest.raises(BusError, match="no virtual bus at"):
+            open_drive(config)
+    with BusClaim("jointctl", f"{tmp_path}/none.sock"), pytest.raises(BusError, match=f"pid {os.getpid()}"):
+        open_drive(config)
