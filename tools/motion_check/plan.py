@@ -3,7 +3,7 @@
 The spring is the loop's own law with gains that are made for it, so every limit, watchdog and stop of a run is in
 force.  Its torque grows with the distance of the reference and is limited to a small share; a joint that is free
 follows as soon as the torque exceeds its friction, one that is stuck does not, and one with a wrong sign runs into
-the velocity limit or the following error of the check, which are narrow.
+the velocity limit or the following error of the check, which are as narrow as the encoder's counts allow.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ TORQUE_SHARE = 0.1  # of limits.torque_max_Nm, where no friction is configured
 # back the spring has to turn round first, and it takes twice that, with friction as strong as the push 1.07 travels.
 SPRING_SHARE = 1.4  # of the torque limit that gravity leaves, at full travel
 PUSH_SHARE = 0.75  # of it: a joint that stands still under that is stuck, or its reading is
+MOST_PUSH = 0.95  # of the torque limit, where gravity takes nearly all of it
 STANDING_WAY = 1.2  # travels of the reference past a reading that stands still
 DAMPING = 0.5
 RAMP_s, REST_s = 0.4, 0.4  # a longer travel takes a longer ramp
@@ -149,5 +150,5 @@ def check_constants(config: Config, plan: CheckPlan, report: CommissioningReport
     axis.limits.position_min_rad = max(axis.limits.position_min_rad, start_rad - plan.reach_rad)
     axis.limits.position_max_rad = min(axis.limits.position_max_rad, start_rad + plan.reach_rad)
     axis.limits.frozen_max_rad = STANDING_WAY * plan.travel_rad
-    axis.limits.frozen_torque_Nm = plan.gravity_Nm + PUSH_SHARE * plan.spring_Nm
+    axis.limits.frozen_torque_Nm = min(plan.gravity_Nm + PUSH_SHARE * plan.spring_Nm, MOST_PUSH * plan.torque_Nm)
     return constants

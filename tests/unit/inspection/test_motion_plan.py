@@ -42,6 +42,18 @@ def test_the_check_only_narrows_torque_speed_and_travel(tmp_path: Path) -> None:
     assert config_of_check(config, plan).canopen.max_torque_permille is None
 
 
+@pytest.mark.parametrize(("torque_Nm", "watched_Nm"), [(None, 0.75 * 38.115), (5.0, 4.75)])
+def test_a_standing_joint_is_never_pushed_unwatched(tmp_path: Path, torque_Nm: float | None, watched_Nm: float) -> None:
+    """Also where gravity takes more than the torque that is allowed."""
+    gravity_Nm = 0.0 if torque_Nm is None else 10.0
+    config = config_with(tmp_path, joint__gravity_Nm=gravity_Nm, virtual__gravity_Nm=gravity_Nm)
+    plan = make_plan(config, torque_Nm)
+    report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.1, 0.06, 1e-5)
+    made = check_constants(config_of_check(config, plan), plan, report, motion_table(plan, 0.1))[0].limits
+    assert made.frozen_torque_Nm == pytest.approx(watched_Nm)
+    assert made.frozen_torque_Nm < plan.torque_Nm
+
+
 def test_the_motion_is_smooth_and_ends_where_it_begins(tmp_path: Path) -> None:
     plan = make_plan(config_with(tmp_path), None)
     table = motion_table(plan, 0.3)
