@@ -33,4 +33,5 @@ def serial_bench(bench: Any) -> Iterator[SerialBench]:
             try:
                 yield found
             finally:
+                bench.end()  # a run that is killed after its port has gone leaves a guard behind
                 end_line_guards(device.path)

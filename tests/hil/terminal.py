@@ -9,6 +9,7 @@ import time
 from typing import Any
 
 from tests.hil.bench import Finished
+from tests.hil.serial_bench import end_line_guards
 
 
 class Terminal:
@@ -16,6 +17,7 @@ class Terminal:
 
     def __init__(self, bench: Any, *arguments: str) -> None:
         self.master, slave = pty.openpty()
+        end_line_guards(os.ttyname(slave))  # of a test that had a terminal of this name before
         self.started = bench.start(*arguments, stdin=slave, stderr=slave)
         os.close(slave)
         os.set_blocking(self.master, False)

@@ -128,7 +128,9 @@ def test_ctrl_c_before_motion_moves_nothing(bench: Any, delay_s: float) -> None:
     time.sleep(delay_s)
     started.signal(signal.SIGINT, group=True)
     done = started.finished(20.0)
-    assert done.code in (130, -signal.SIGINT), done.err  # the latter while Python itself starts
+    python_itself = done.err.startswith("Fatal Python error: init_")  # met before the first line of ours
+    assert done.code in ((1,) if python_itself else (130, -signal.SIGINT)), done.err
+    assert not python_itself or delay_s < 0.7
     assert "tracking" not in done.err
     if delay_s >= 0.7:
         assert "Traceback" not in done.err
