@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import time
@@ -78,7 +79,9 @@ def name_kept(port: str) -> Iterator[None]:
 def end_line_guards(port: str) -> None:
     """A guard tries for a minute to reach a drive on a port that vanished; another test's line may get its name."""
     for process in Path("/proc").glob("[0-9]*/cmdline"):
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, ValueError):
             arguments = process.read_text().split("\0")
-            if "tools.running.guard.line_guard" in arguments and any(f'"port": "{port}"' in text for text in arguments):
-                os.kill(int(process.parent.name), signal.SIGKILL)
+            if "tools.running.guard.line_guard" in arguments:
+                guarded = json.loads(next(text for text in arguments if text.startswith("{")))["port"]
+                if os.path.realpath(guarded) == os.path.realpath(port):  # it may be a link to it
+                    os.kill(int(process.parent.name), signal.SIGKILL)
