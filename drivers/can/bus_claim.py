@@ -14,7 +14,6 @@ import errno
 import hashlib
 import os
 import socket
-import struct
 import sys
 import time
 from typing import Self
@@ -22,6 +21,7 @@ from typing import Self
 from drivers.can.serial_adapter import port_path
 from drivers.can.virtual_bus import socket_path
 from drivers.errors import BusError
+from drivers.local_socket import listener, process_behind
 from drivers.port_users import program_name
 
 _RELEASE_S = 0.05  # a process that was just started holds a copy until it has become another program
@@ -37,11 +37,11 @@ class BusClaim:
             return
         address = bus_address(interface, channel)
         with contextlib.suppress(OSError):
-            self._socket = _bound(address)
+            self._socket = listener(address)
             return
         time.sleep(_RELEASE_S)
         try:
-            self._socket = _bound(address)
+            self._socket = listener(address)
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
                 return
@@ -76,24 +76,13 @@ def bus_address(interface: str, channel: str) -> bytes:
     return b"\0jointctl-bus-" + hashlib.sha256(place.encode()).hexdigest()[:32].encode()
 
 
-def _bound(address: bytes) -> socket.socket:
-    claim = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    try:
-        claim.bind(address)
-        claim.listen()
-    except OSError:
-        claim.close()
-        raise
-    return claim
-
-
 def _holder_text(address: bytes) -> str:
     """` (jointctl, pid 1234)`; empty where it has just gone."""
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as peer:
             peer.settimeout(1.0)
             peer.connect(address)
-            pid, _, _ = struct.unpack("3i", peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+            pid, _ = process_behind(peer)
     except OSError:
         return ""
     try:

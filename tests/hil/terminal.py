@@ -28,20 +28,21 @@ class Terminal:
         while text not in self.text and text not in " ".join(self.text.split()):  # a terminal breaks long lines
             assert time.monotonic() < give_up, self.text
             try:
-                self.text += os.read(self.master, 4096).decode()
-            except BlockingIOError:
-                time.sleep(0.01)
+                self._read()
             except OSError as error:  # EIO: it has ended
                 raise AssertionError(f"ended before {text!r}: {self.text}") from error
         return self
+
+    def _read(self) -> None:
+        try:
+            self.text += os.read(self.master, 4096).decode(errors="replace")
+        except BlockingIOError:
+            time.sleep(0.01)
 
     def finished(self, timeout_s: float = 30.0) -> Finished:
         """Read to the end, as a terminal does."""
         give_up = time.monotonic() + timeout_s
         with contextlib.suppress(OSError):  # EIO: it has ended
             while time.monotonic() < give_up:
-                try:
-                    self.text += os.read(self.master, 4096).decode(errors="replace")
-                except BlockingIOError:
-                    time.sleep(0.01)
+                self._read()
         return self.started.finished(timeout_s)

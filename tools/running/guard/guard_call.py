@@ -13,8 +13,9 @@ from __future__ import annotations
 import json
 import os
 import socket
-import struct
 from typing import Any
+
+from drivers.local_socket import process_behind
 
 HEARD_S = 1.0  # a guard that lives answers at once
 ENDED_S = 25.0  # for a run to end, and a drive that is silent to be tried again
@@ -29,7 +30,7 @@ def guard_address(port: str) -> bytes:
 
 def may_ask(peer: socket.socket) -> bool:
     """Whether the process at the other end is of this user or root."""
-    _, user, _ = struct.unpack("3i", peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+    _, user = process_behind(peer)
     return user in (os.geteuid(), 0)
 
 

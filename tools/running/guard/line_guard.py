@@ -31,6 +31,7 @@ from drivers.elmo.dialogue import Dialogue
 from drivers.elmo.serial_port import SerialPort, open_descriptor, usb_serial_number
 from drivers.elmo.switch_off import SWITCH_OFF, switch_off
 from drivers.errors import BusError, JointctlError
+from drivers.local_socket import listener
 from tools.running.guard.guard_call import guard_address, heard_line, may_ask
 
 REACH_S = 60.0  # how long a drive that does not answer is tried again: time to plug a cable in
@@ -88,14 +89,10 @@ class LineGuard:
     @staticmethod
     def _bound(address: bytes) -> socket.socket | None:
         """None where another guard has the name: that of a run that ended just now."""
-        server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            server.bind(address)
-            server.listen(4)
+            return listener(address, 4)
         except OSError:
-            server.close()
             return None
-        return server
 
     def run(self) -> int:
         """Watch until the supervisor says that the drive is off, or until both are dead and it has been told."""
