@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 UNTOUCHED = "untouched"  # of `Drive.make_safe`: this program has not taken the drive over
+Approval = Callable[[str], bool]  # of a question, by the user
 SAFE_STATES = ("switch on disabled", "fault", "off")
 
 
 def is_safe(state: str) -> bool:
     """Whether the drive's words for its state mean that its power stage is off ("fault reaction active" does not)."""
     return state.partition(",")[0] in SAFE_STATES
+
+
+class Declined(Exception):
+    """The user does not want the drive to be touched."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +43,7 @@ class CommissioningReport:
     settings: dict[str, str] = field(default_factory=dict)  # name -> value read back
     remarks: tuple[str, ...] = ()
     loop_delay_s: float | None = None  # measured, position sample to torque command; None = not measured
+    counts_per_motor_turn: float = 0.0  # of the encoder, by the drive's own word; 0 = it does not report it
     measures_torque: bool = True  # False: the drive does not tell its torque in the cyclic exchange, it reads as zero
 
 
@@ -57,13 +64,28 @@ class Thermometer(Protocol):
         ...
 
 
+class SettingsGuard(Protocol):
+    """Sees that what stops the drive when this computer dies stays as commissioning has set it."""
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether all of it was read back since `start_cyclic`: nothing may be enabled before."""
+        ...
+
+    def poll(self) -> list[str]:
+        """What is to be warned of; never waits.  `DeviceError` where something was changed: the run is over."""
+        ...
+
+
 class Drive(Protocol):
     """A drive on the way from unknown to commissioned, and back to safe."""
 
-    def commission(self) -> CommissioningReport:
+    def commission(self, approve: Approval | None = None) -> CommissioningReport:
         """Identify the drive, write and read back limits, arm its watchdog; leaves it disabled.
 
-        Raises `NoDeviceError` if nobody answers, `DeviceError` if it refuses or differs from the configuration.
+        A drive that is found enabled is braked only if `approve` agrees to the question that it gets; None: never.
+        Raises `NoDeviceError` if no one answers, `DeviceError` if it refuses, differs from the configuration or must be
+        left alone, `BusError` where another controller is active, `Declined`.
         """
         ...
 
@@ -82,8 +104,16 @@ class Drive(Protocol):
         """
         ...
 
-    def make_safe(self) -> str:
-        """Disable the drive whatever its state and confirm it; returns the state in words.  Never raises."""
+    def settings_guard(self) -> SettingsGuard | None:
+        """None where nothing can be read beside the loop: it was read back before.  Valid as `thermometer` is."""
+        ...
+
+    def make_safe(self, *, asked: bool = False) -> str:
+        """Disable the drive whatever its state and confirm it; returns the state in words.  Never raises.
+
+        A drive that another controller has taken before the loop began is left alone, unless `asked`: by the user,
+        with `jointctl stop`.
+        """
         ...
 
     def clear_fault(self) -> str:

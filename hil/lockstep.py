@@ -98,6 +98,10 @@ def _run(
     stop_cycle: int,
     tail_cycles: int,
     ideal_velocity: bool,
+    stop_request: int,
+    silent_cycles: int,
+    lost_to_drive: bool,
+    lost_from_drive: bool,
 ) -> tuple[int, int]:
     """See `run_lockstep`; (log records, rows of `truth`) written.
 
@@ -143,13 +147,17 @@ def _run(
             if faulty:
                 to_drive(faults, memory, frame_bytes[slot], drive, joint_c, joint, outgoing, now_ns)
                 sample[0].bus_errors = sample[0].bus_errors + 1 if off_bus else 0
-            else:
+            elif not lost_to_drive:
                 accept_frame(drive, joint_c, joint, frame_bytes[slot], now_ns, outgoing)
+        if lost_from_drive:
+            outgoing.count = 0
+        if silent_cycles >= 0:
+            silent = silent_cycles + cycle
         if faulty:
             _empty_mailbox(memory.to_controller, accept, port, frames, frame_bytes, sample, now_ns)
         else:
             _empty_mailbox(outgoing, accept, port, frames, frame_bytes, sample, now_ns)
-        stop = StopRequest.RAMP if 0 <= stop_cycle <= cycle else StopRequest.NONE
+        stop = stop_request if 0 <= stop_cycle <= cycle else StopRequest.NONE
         if ideal_velocity and state[0].velocity.primed != 0:
             _perfect_measurement(state[0], sample[0], joint, constants[0].law.period_s)
         step_axis(constants[0], state[0], table, sample[0], command[0], elapsed, stop, silent)
@@ -157,7 +165,7 @@ def _run(
         if faulty:
             to_drive(faults, memory, frame_bytes[RPDO_SLOT], drive, joint_c, joint, outgoing, now_ns)
             sample[0].bus_errors = sample[0].bus_errors + 1 if off_bus else 0
-        else:
+        elif not lost_to_drive:
             accept_frame(drive, joint_c, joint, frame_bytes[RPDO_SLOT], now_ns, outgoing)
         if logged and written < len(log):
             write_log(log[written], state[0], sample[0], command[0])
@@ -196,6 +204,10 @@ def run_lockstep(
     faults: Any = None,
     memories: Any = None,
     tail_cycles: int = 0,
+    stop_request: int = StopRequest.RAMP,
+    silent_cycles: int = -1,
+    lost_to_drive: bool = False,
+    lost_from_drive: bool = False,
 ) -> tuple[int, int]:
     """Run until the axis is FINISHED, `cycles` at most, then `tail_cycles` without a controller.
 
@@ -204,7 +216,8 @@ def run_lockstep(
     `begin(port, frames) -> n`, `accept(port, frames, slot, sample, now_ns) -> bool` and
     `end(port, frames, sample, command)` are the driver's codec; `frame_bytes` uint8[slots, 16] is the memory of
     `frames`.  The device has been commissioned and is operational.  Every `log_every`-th cycle goes to `log` while
-    there is room (0: none).  A controlled stop is requested at `stop_cycle` (negative: never).
+    there is room (0: none).  `stop_request` is made at `stop_cycle` (negative: never).  `silent_cycles`: the age of the
+    supervisor's sign of life at the beginning (negative: not watched).  `lost_*`: no frame arrives there.
     `truth` float64[N, TRUTHS], or None, takes what the joint truly did in the same periods (columns TRUE_*), and in
     those in which the controller was held up or silent.  `ideal_velocity` bypasses encoder and velocity filter: for
     textbook experiments only.  `faults` FaultConstants[N], `memories` FaultMemory[1].
@@ -216,6 +229,6 @@ def run_lockstep(
         begin, accept, end, port, frames, frame_bytes, constants, state, table, sample, command, device,
         plant_constants, plant, queue, log, log_every, truth, faults,
         fault_memory(faults) if memories is None else memories, start_ns, period_ns, cycles, stop_cycle, tail_cycles,
-        ideal_velocity,
+        ideal_velocity, int(stop_request), silent_cycles, lost_to_drive, lost_from_drive,
     )  # fmt: skip
     return int(written), int(rows)

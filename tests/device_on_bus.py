@@ -9,6 +9,7 @@ import time
 
 import can
 
+from drivers.canopen.bus_watchers import LISTEN_S
 from drivers.canopen.drive import CanopenDrive
 from drivers.canopen.settings import CanopenSettings
 from drivers.canopen.switch_off import stop_node
@@ -109,13 +110,26 @@ class DeviceOnBus:
                 payload = payload[:4] + struct.pack("<I", value)
         self._bus.send(can.Message(arbitration_id=identifier, data=payload[:size], is_extended_id=False))
 
+    def send(self, identifier: int, data: bytes) -> None:
+        """A frame of someone else, which the drive takes as well."""
+        with can.Bus(interface="virtual", channel=self.channel) as bus:
+            bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+        self.settle()
+
+    def settle(self, seconds: float = 0.02) -> None:
+        """Until what was sent has been taken and answered."""
+        threading.Event().wait(seconds)
+
     def stop_drive(self) -> str:
         """What `jointctl stop` does, from another end of this bus; the state in words."""
         bus = can.Bus(interface="virtual", channel=self.channel)
         return stop_node(bus, 1, sdo_timeout_s=0.15, sleep=lambda s: time.sleep(s / DEVICE_TIME_FACTOR))
 
-    def drive(self, settings: CanopenSettings) -> CanopenDrive:
-        """The real driver on another end of this bus; its waiting is short, but long for the device."""
+    def drive(self, settings: CanopenSettings, *, listened: bool = True) -> CanopenDrive:
+        """The real driver on another end of this bus; its waiting is short, but long for the device.
+
+        `listened`: it has listened to the bus for long enough already.
+        """
         bus = can.Bus(interface="virtual", channel=self.channel)
         passed = threading.Event()
 
@@ -132,6 +146,8 @@ class DeviceOnBus:
             passed.wait(5.0)
 
         drive = CanopenDrive(bus, settings, sleep=sleep)
+        if listened:
+            drive._others._started_s -= LISTEN_S
         assert drive._network.notifier is not None
         drive._network.notifier.add_listener(hear)
         return drive

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable
 
 import can
-import canopen
 
-from drivers.canopen.identifiers import SYNC_ID
+from drivers.canopen.identifiers import HEARTBEAT_ID, NMT_ID, RPDO_IDS, SDO_REQUEST_ID, SYNC_ID, NmtCommand
 from drivers.errors import BusError
 
-LISTEN_S = 0.05  # five SYNC periods of the slowest loop
+LISTEN_S = 1.0  # a controller whose SYNC is slower than this is not found by listening alone
 FAILURE_PAUSE_S = 0.05
+_ALL_NODES = 0
+_NAMED_FRAMES = 4  # kinds of frames that a message names
+_MASKED_NODE = 0x7F
+_DOWNLOADS = (1, 6)  # client command specifiers: initiate download, block download
+_CRITICAL = {0x1016, 0x6007, 0x6040, 0x605A, 0x6060}  # they decide whether the drive has power, and when it loses it
+_RPDO_RECORDS = range(0x1400, 0x1600)
 
 
 class BusFailure(can.Listener):
-    """Keeps a bus that fails from ending the receiving thread with a traceback; whoever sends next is told."""
+    """Keeps a bus that fails from ending the receiving thread with a traceback; the next sender gets the error."""
 
     def __init__(self, sleep: Callable[[float], None]) -> None:
         self._sleep = sleep
@@ -28,18 +36,92 @@ class BusFailure(can.Listener):
         self._sleep(FAILURE_PAUSE_S)
 
 
-def refuse_second_controller(network: canopen.Network, sleep: Callable[[float], None]) -> None:
-    """Who sends SYNC controls a joint on this bus: two of them would fight over the same drive (`BusError`)."""
-    seen: list[float] = []
+class OtherControllers(can.Listener):
+    """Notices what only a controller sends: SYNC, NMT commands, SDO requests and RPDOs to `nodes`, our heartbeat.
 
-    def on_sync(_: int, data: bytearray, timestamp_s: float) -> None:
-        seen.append(timestamp_s)
+    A bus does not hand us the frames that we send ourselves.  It listens from its making on.
+    """
 
-    network.subscribe(SYNC_ID, on_sync)
-    sleep(LISTEN_S)
-    network.unsubscribe(SYNC_ID, on_sync)
-    if seen:
-        raise BusError(
-            f"another controller is active on this bus: {len(seen)} SYNC frames (080h) in {LISTEN_S:g} s",
-            hint="end it first; only one controller may use the bus",
-        )
+    def __init__(self, nodes: Collection[int], master_node: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._started_s = clock()
+        self._nodes, self._master_node = frozenset(nodes), master_node
+        self._rpdo_ids = {base + node: f"RPDO to node {node}" for node in nodes for base in RPDO_IDS}
+        self._lock = threading.Lock()
+        self._beside_own_loop = False
+        self._seen: Counter[str] = Counter()
+        self._identifiers: Counter[int] = Counter()
+        self.heartbeats: set[int] = set()  # nodes that send one, ours and the drive's not among them
+
+    def on_message_received(self, msg: can.Message) -> None:
+        """In the receiving thread."""
+        if msg.is_error_frame or msg.is_extended_id:
+            return
+        identifier, data = msg.arbitration_id, bytes(msg.data)
+        with self._lock:
+            self._identifiers[identifier] += 1
+            if words := self._words(identifier, data):
+                self._seen[words] += 1
+            elif HEARTBEAT_ID < identifier <= HEARTBEAT_ID + _MASKED_NODE:
+                if (node := identifier - HEARTBEAT_ID) not in self._nodes:
+                    self.heartbeats.add(node)
+
+    def _words(self, identifier: int, data: bytes) -> str:
+        """What a frame is, if only a controller sends it; beside our own loop, what the loop does not send either."""
+        if self._beside_own_loop and identifier != NMT_ID:
+            index = self._written(identifier, data)
+            critical = index is not None and (index in _CRITICAL or index in _RPDO_RECORDS)
+            return f"SDO request that writes object {index:04X}" if critical else ""
+        if identifier == SYNC_ID:
+            return f"SYNC ({SYNC_ID:03X}h)"
+        if identifier == NMT_ID and len(data) >= 2 and (data[1] == _ALL_NODES or data[1] in self._nodes):
+            command = NmtCommand(data[0]).name.lower().replace("_", " ") if data[0] in set(NmtCommand) else "unknown"
+            return f"NMT {command!r} to {f'node {data[1]}' if data[1] else 'all nodes'}"
+        if identifier - SDO_REQUEST_ID in self._nodes:
+            return f"SDO request ({identifier:03X}h)"
+        if identifier == HEARTBEAT_ID + self._master_node:
+            return f"heartbeat of node {self._master_node}, which is our own (drive.master_node)"
+        if identifier in self._rpdo_ids:
+            return f"{self._rpdo_ids[identifier]} ({identifier:03X}h)"
+        return ""
+
+    def _written(self, identifier: int, data: bytes) -> int | None:
+        """The object that an SDO request writes (CiA 301, 7.2.4.3.3 and 7.2.4.3.9); None where it writes none."""
+        if identifier - SDO_REQUEST_ID not in self._nodes or len(data) < 4 or data[0] >> 5 not in _DOWNLOADS:
+            return None
+        return int.from_bytes(data[1:3], "little")
+
+    def own_loop_begins(self) -> None:
+        """SYNC, RPDOs and heartbeats may be our own from here on, and reading an object disturbs no one."""
+        with self._lock:
+            self._beside_own_loop = True
+
+    @property
+    def to_listen_s(self) -> float:
+        """How long it has still to listen until silence means something."""
+        return max(0.0, LISTEN_S - (self._clock() - self._started_s))
+
+    def add_rpdos(self, identifiers: Iterable[int]) -> None:
+        """The RPDOs that the drive has by its own word; what has come of them counts."""
+        with self._lock:
+            for identifier in identifiers:
+                if identifier in self._rpdo_ids:
+                    continue
+                words = self._rpdo_ids[identifier] = "RPDO of the drive"
+                if count := self._identifiers[identifier]:
+                    self._seen[f"{words} ({identifier:03X}h)"] += count
+
+    def found(self) -> str:
+        """What has come, in words; "" for nothing."""
+        with self._lock:
+            kinds = [f"{count} x {words}" for words, count in self._seen.most_common(_NAMED_FRAMES)]
+            more = len(self._seen) - len(kinds)
+        return ", ".join(kinds) + (f" and {more} other kinds" if more else "")
+
+    def refuse(self) -> None:
+        """`BusError` where another controller has the drive: two of them would fight over it."""
+        if found := self.found():
+            raise BusError(
+                f"another controller is active on this bus: {found}",
+                hint="end it first; only one controller may use the bus",
+            )

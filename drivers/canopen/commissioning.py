@@ -20,11 +20,12 @@ from drivers.canopen.pdo_map import configure_loop_pdos
 from drivers.canopen.readiness import wait_until_ready
 from drivers.canopen.scaling import joint_torque_per_permille_Nm, joint_velocity_per_unit_radps
 from drivers.canopen.settings import CanopenSettings
-from drivers.canopen.switch_off import brake
+from drivers.canopen.switch_off import POWERED_STATES, state_of
 from drivers.canopen.synchronisation import set_sync
 from drivers.canopen.torque_slope import set_torque_slope
 from drivers.drive import DriveIdentity
 from drivers.errors import DeviceError
+from firmware_py.states import in_words
 
 CIA402_PROFILE = 402
 MODES = {
@@ -59,6 +60,7 @@ class Findings:
     layout: PdoLayout | None = None  # of the loop's PDOs
     heartbeat_watched: bool = True  # the drive sends its own
     second: EncoderFindings | None = None
+    counts_per_motor_turn: float = 0.0  # by 608F; 0 = the drive does not report it
     settings: dict[str, str] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
 
@@ -102,10 +104,13 @@ def _compare_with_eds(settings: CanopenSettings, eds: EdsFile, vendor: int, prod
 def disable(objects: ObjectAccess, settings: CanopenSettings, pause: Pause) -> None:
     """Zero every target that could move the motor at enable, take the power stage off, refuse a drive in fault.
 
-    A drive that is found enabled brakes by its quick stop first: a joint that moves would coast, and a load fall.
+    It was off before commissioning began (`found_enabled`): one that has power now has got it from another controller.
     """
-    if brake(objects, pause):
-        objects.remarks.append("the drive was enabled: it has been braked by its quick stop and switched off")
+    if (state := state_of(objects)) in POWERED_STATES:
+        raise DeviceError(
+            f"node {settings.node} is {in_words(state)}, and was off a moment ago: another controller has enabled it",
+            hint="find that program; `jointctl stop` brakes the drive and switches it off",
+        )
     objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
     objects.write_verified(0x6071, 0, 0, what="target torque")
     for index, what in ((0x60FF, "target velocity"), (0x60B1, "velocity offset"), (0x60B2, "torque offset")):
@@ -210,6 +215,18 @@ def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
     findings.settings["max torque"] = f"{findings.max_permille} permille = {findings.max_permille * scale:.1f} Nm"
 
 
+def counts_per_motor_turn(objects: ObjectAccess) -> float:
+    """608F: increments (sub 1) in motor revolutions (sub 2); 0 where the drive does not report them (CiA 402-2)."""
+    try:
+        increments, turns = (
+            objects.read(0x608F, sub, what="position encoder resolution") if objects.has(0x608F, sub) else 0
+            for sub in (1, 2)
+        )
+    except DeviceError:
+        return 0.0
+    return increments / turns if turns else 0.0
+
+
 def arm_watchdog(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
     """The drive watches our heartbeat and stops by itself when it stays away; it sends its own as well."""
     milliseconds = round(settings.heartbeat_s * 1000.0)
@@ -221,6 +238,9 @@ def arm_watchdog(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
             hint="use the EDS file that belongs to this drive and firmware; a drive without a heartbeat consumer is "
             "not enabled",
         )
+    if objects.read(0x1016, 1, what="consumer heartbeat time"):
+        # left armed by a controller that was ended: its error ends with the entry, and does not pass for ours
+        objects.write(0x1016, 1, 0, what="consumer heartbeat time")
     objects.write_verified(0x1016, 1, consumer, what="consumer heartbeat time")
     findings.heartbeat_watched = objects.write_if_present(0x1017, 0, milliseconds, what="producer heartbeat time")
     if not findings.heartbeat_watched:
@@ -267,5 +287,6 @@ def commission(
         findings.second = commission_drive_object(objects, second, settings.node)
         findings.settings["joint encoder"] = findings.second.words
     findings.start_counts = objects.read(0x6064, what="position actual value")
+    findings.counts_per_motor_turn = counts_per_motor_turn(objects)
     findings.remarks += objects.remarks
     return findings

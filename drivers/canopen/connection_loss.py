@@ -7,6 +7,8 @@ brake, at zero torque as well.  What can be had without that is the drive's own 
 
 from __future__ import annotations
 
+import contextlib
+
 from drivers.canopen.object_access import ObjectAccess
 from drivers.canopen.pdo_layout import COMMUNICATION_RPDO, DISABLED, IDENTIFIER
 from drivers.canopen.pdo_map import EVENT_TIMER, pdos_of
@@ -18,6 +20,7 @@ STOPPED = 2  # object 1029:1
 RPDO_DEADLINE_SHARE = 0.5  # of drive.heartbeat_s
 RPDO_DEADLINE_MIN_PERIODS = 5
 LARGEST_MS = 0xFFFF
+LARGEST_SUB = 0x80
 _ALONE = "RPDOs that get lost while our heartbeat does not stop the joint only when the loop withholds its heartbeat"
 
 
@@ -92,3 +95,27 @@ def clear_rpdo_deadlines(objects: ObjectAccess) -> None:
             error = _write_event_timer(objects, base, cob_id, 0)
             if error is not None:
                 raise error
+
+
+def rpdo_identifiers(objects: ObjectAccess) -> list[int]:
+    """COB-IDs of the drive's enabled RPDOs, as it has them now; those that cannot be read are left out."""
+    found = []
+    for base in pdos_of(objects, COMMUNICATION_RPDO):
+        with contextlib.suppress(DeviceError):
+            cob_id = objects.read(base, 1, what=f"PDO {base:04X} COB-ID") & 0xFFFFFFFF
+            if not cob_id & DISABLED:
+                found.append(cob_id & IDENTIFIER)
+    return found
+
+
+def watched_nodes(objects: ObjectAccess) -> set[int]:
+    """Nodes whose heartbeat the drive watches now (1016)."""
+    found = set()
+    for sub in range(1, LARGEST_SUB):
+        if not objects.has(0x1016, sub):
+            break
+        with contextlib.suppress(DeviceError):
+            entry = objects.read(0x1016, sub, what="consumer heartbeat time")
+            if entry & 0xFFFF:
+                found.add(entry >> 16 & 0xFF)
+    return found

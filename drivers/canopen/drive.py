@@ -9,35 +9,40 @@ from typing import Any
 
 import can
 
-from drivers.can.bus_claim import BusClaim
-from drivers.canopen.bus_watchers import refuse_second_controller
-from drivers.canopen.cia402 import State
+from drivers.canopen.bus_watchers import OtherControllers
 from drivers.canopen.commissioning import VELOCITY_MODES, Findings, commission
-from drivers.canopen.connection_loss import clear_rpdo_deadlines
+from drivers.canopen.connection_loss import clear_rpdo_deadlines, rpdo_identifiers, watched_nodes
 from drivers.canopen.eds_file import read_eds
 from drivers.canopen.encoder_end import EncoderEnd
 from drivers.canopen.encoder_settings import DRIVE_RANGE_COUNTS
 from drivers.canopen.fault_reset import reset_fault
+from drivers.canopen.found_enabled import brake_if_enabled
 from drivers.canopen.identifiers import NmtCommand
 from drivers.canopen.network import new_network
 from drivers.canopen.object_access import ATTEMPTS as SDO_ATTEMPTS
 from drivers.canopen.object_access import ObjectAccess
 from drivers.canopen.scaling import joint_angle_per_count_rad, new_port, start_position_rad
+from drivers.canopen.sdo_reads import SdoReads
 from drivers.canopen.settings import CanopenSettings
-from drivers.canopen.switch_off import SDO_TIMEOUT_S, SwitchOff, state_of
+from drivers.canopen.switch_off import POWERED_STATES, SDO_TIMEOUT_S, SwitchOff, state_of
 from drivers.canopen.thermometer import Thermometer
+from drivers.canopen.watchdog_guard import WatchdogGuard, is_kept
 from drivers.canopen.watchdog_proof import prove_watchdog
-from drivers.drive import UNTOUCHED, CommissioningReport
+from drivers.drive import UNTOUCHED, Approval, CommissioningReport, is_safe
 from drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
+from firmware_py.states import in_words
 
 SEARCH_S = 0.3
+GATE_S = 0.05  # a wait is interrupted after so long at most
 REOPEN_ATTEMPTS = 10
 REOPEN_PAUSE_S = 0.3  # an adapter that was plugged in again needs a second or two
 
 
 class CanopenDrive:
-    """Implements `drivers.drive.Drive`.  `bus` is a python-can bus of its own, closed by `close`, as `claim` is.
+    """Implements `drivers.drive.Drive`.  `bus` is a python-can bus of its own, closed by `close`.
 
+    It listens for other controllers from its making on.  `gate` is called between any two steps before the loop runs,
+    and raises once the user has asked for a stop: no step follows then but those of `make_safe`.
     Where an adapter serves one program at a time, `reopen` is given: `start_cyclic` closes the bus for the loop, and
     `make_safe` opens it again.  In between nobody but the loop talks to the drive; it is disabled until the loop
     enables it, and from the loop's first heartbeat on its own watchdog stops it when the loop ends.
@@ -49,17 +54,23 @@ class CanopenDrive:
         settings: CanopenSettings,
         sleep: Callable[[float], None] = time.sleep,
         reopen: Callable[[], can.BusABC] | None = None,
-        claim: BusClaim | None = None,
+        gate: Callable[[], None] = lambda: None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._settings = settings
-        self._sleep = sleep
+        self._sleep, self._gate, self._clock = sleep, gate, clock
         self._findings: Findings | None = None
         self._taken = False  # whether the drive has heard anything from us
         self._started = False  # whether the loop may send SYNC
-        self._reopen, self._claim = reopen, claim
+        self._reopen = reopen
         self._lent = False
         self._thermometer: Thermometer | None = None
-        self._network = new_network(bus, sleep)
+        self._reads: SdoReads | None = None
+        self._guard: WatchdogGuard | None = None
+        encoder = settings.joint_encoder.node if settings.joint_encoder is not None else None
+        nodes = [settings.node] if encoder is None else [settings.node, encoder]
+        self._others = OtherControllers(nodes, settings.master_node, clock)
+        self._network = new_network(bus, sleep, self._others)
         self._network.connect()
         sdo_timeout_s = settings.sdo_timeout_s or SDO_TIMEOUT_S
         try:
@@ -71,26 +82,47 @@ class CanopenDrive:
         self._node = self._network.add_node(settings.node, self._eds.dictionary)
         self._node.sdo.RESPONSE_TIMEOUT = sdo_timeout_s
         self._objects = ObjectAccess(self._node, self._eds.name, self._eds.unusable)
-        encoder = settings.joint_encoder.node if settings.joint_encoder is not None else None
+        self._objects.gate = gate
         self._switch_off = SwitchOff(self._network, settings.node, self._objects, encoder, sleep)
 
-    def _find(self) -> None:
-        """Make sure that the node answers, also one that is still booting; else say who does.
+    def _pause(self, seconds: float) -> None:
+        """Sleep, and leave as soon as the user has asked for a stop."""
+        while seconds > 0.0:
+            self._gate()
+            self._sleep(min(seconds, GATE_S))
+            seconds -= GATE_S
+        self._gate()
 
-        "Pre-operational" is said again each time: a node that boots in the meantime has not heard it, and some go
-        to operational by themselves.
+    def _listen(self) -> None:
+        """Nothing is sent to a bus that was not listened to; `BusError` names what another controller has sent."""
+        self._pause(self._others.to_listen_s)
+        self._others.refuse()
+
+    def _answers(self) -> bool:
+        """Whether the node answers SDO in the NMT state that it has."""
+        try:
+            self._objects.read(0x1000, what="device type")
+        except NoDeviceError:
+            return False
+        return True
+
+    def _find(self) -> None:
+        """Make sure that the node answers, also one that is still booting; else say which nodes do.
+
+        Only a node that does not answer is sent "pre-operational", again each time: one that boots in the meantime
+        has not received it, and some go to operational by themselves.
         """
         for _ in range(round(self._settings.boot_timeout_s / (self._node.sdo.RESPONSE_TIMEOUT * SDO_ATTEMPTS))):
-            with contextlib.suppress(NoDeviceError):
-                self._objects.read(0x1000, what="device type")
+            if self._answers():
                 break
+            self._others.refuse()
             self._node.nmt.send_command(NmtCommand.ENTER_PRE_OPERATIONAL)
         try:
             self._objects.read(0x1000, what="device type")
         except NoDeviceError as error:
             self._network.scanner.nodes.clear()
             self._network.scanner.search()
-            self._sleep(SEARCH_S)
+            self._pause(SEARCH_S)
             others = sorted(set(self._network.scanner.nodes) - {self._settings.node})
             if others:
                 message = f"node {self._settings.node} does not answer; these do: {', '.join(map(str, others))}"
@@ -100,26 +132,55 @@ class CanopenDrive:
                 hint="power, wiring, termination, and the bit rate of the drive",
             ) from error
 
+    def _refuse_by_the_drives_word(self) -> list[str]:
+        """What the drive's own objects say of another controller (`BusError`); remarks."""
+        self._others.add_rpdos(rpdo_identifiers(self._objects))
+        self._others.refuse()
+        heartbeats = self._others.heartbeats
+        for watched in watched_nodes(self._objects):
+            if watched in heartbeats:
+                raise BusError(
+                    f"node {self._settings.node} watches the heartbeat of node {watched} (1016), which is on this bus: "
+                    "another controller has the drive",
+                    "end it first; only one controller may use the bus",
+                )
+        if not heartbeats:
+            return []
+        numbers = ", ".join(map(str, sorted(heartbeats)))
+        return [f"other nodes are on the bus: heartbeats of {numbers}"]
+
     def _prove_watchdog(self) -> str:
         """See `prove_watchdog`; afterwards the node is brought back to pre-operational."""
         settings = self._settings
-        seen = prove_watchdog(self._network, settings.node, settings.master_node, settings.heartbeat_s, self._sleep)
+        seen = prove_watchdog(self._network, settings.node, settings.master_node, settings.heartbeat_s, self._pause)
         self._node.nmt.send_command(NmtCommand.ENTER_PRE_OPERATIONAL)
         return seen
 
-    def commission(self) -> CommissioningReport:
-        """See `Drive.commission`; the node is left in pre-operational."""
+    def commission(self, approve: Approval | None = None) -> CommissioningReport:
+        """See `Drive.commission`; the node is left in pre-operational.
+
+        Nothing is sent before the bus was silent for LISTEN_S, no NMT command before the drive is known to be off.
+        """
         try:
-            refuse_second_controller(self._network, self._sleep)
-            self._taken, self._started = True, False
-            # first: a node that its watchdog or an earlier run left in "stopped" does not answer SDO
-            self._node.nmt.send_command(NmtCommand.ENTER_PRE_OPERATIONAL)
+            self._started = False
+            self._objects.remarks.clear()
+            self._listen()
             self._find()
+            remarks = self._refuse_by_the_drives_word()
+            angle_rad = joint_angle_per_count_rad(self._settings)
+            braked = brake_if_enabled(
+                self._objects, self._settings.node, angle_rad, approve, self._pause, self._others.refuse
+            )
+            self._others.refuse()
+            self._taken = True
+            self._node.nmt.send_command(NmtCommand.ENTER_PRE_OPERATIONAL)
+            if self._reads is None:
+                self._reads = SdoReads(self._network, self._node, lambda: round(self._clock() * 1e9))
             if self._thermometer is None and self._settings.temperature is not None:
                 wanted = self._settings.temperature
-                self._thermometer = Thermometer(self._network, self._node, wanted, self._eds.name)
+                self._thermometer = Thermometer(self._network, self._node, wanted, self._eds.name, reads=self._reads)
             self._objects.forget_verified()
-            findings = commission(self._objects, self._settings, self._eds, self._sleep, self._prove_watchdog)
+            findings = commission(self._objects, self._settings, self._eds, self._pause, self._prove_watchdog)
             encoder = self._encoder.commission()
             if encoder is not None:
                 findings.second = encoder[0]
@@ -127,8 +188,11 @@ class CanopenDrive:
                 findings.remarks += encoder[1]
         except can.CanError as error:
             raise BusError(f"the bus failed during commissioning: {error}") from None
+        except (DeviceError, NoDeviceError):
+            self._others.refuse()  # explains it
+            raise
+        findings.remarks += [*([braked] if braked else []), *remarks]
         self._findings = findings
-        angle_rad = joint_angle_per_count_rad(self._settings)
         second = findings.second
         start_rad = start_position_rad(
             self._settings,
@@ -144,6 +208,7 @@ class CanopenDrive:
             position_resolution_rad=angle_rad,
             settings=findings.settings,
             remarks=tuple(findings.remarks),
+            counts_per_motor_turn=findings.counts_per_motor_turn,
             measures_torque=findings.layout is None or findings.layout.torque_at >= 0,
         )
 
@@ -152,29 +217,48 @@ class CanopenDrive:
 
         The user may have taken minutes to confirm.  A drive that was switched off meanwhile, or that another program
         has made safe, has lost its watchdog or its limits: everything is read back once more.  `BusError` if another
-        controller is active by now.
+        controller was on the bus since commissioning began.
         """
-        if self._findings is None:
+        if self._findings is None or self._reads is None:
             raise DeviceError("the drive has not been commissioned")
         try:
             self._objects.verify_again()
-            shown = self._objects.read(0x6061, what="modes of operation display")
-            if shown != self._findings.mode:
-                raise DeviceError(
-                    f"node {self._settings.node}: 6061 shows mode {shown}, it was {self._findings.mode:d}"
-                )
+            self._require_mode(self._findings.mode)
             self._encoder.verify_again()
-            # whoever came after our commissioning has the drive: its load must not be dropped by our controlword
-            refuse_second_controller(self._network, self._sleep)
+            # another controller that came after our commissioning has the drive: its load must not be dropped by us
+            self._others.refuse()
+            self._gate()
             self._started = True
             self._encoder.tell(NmtCommand.START)
             self._node.nmt.send_command(NmtCommand.START)
+            self._others.own_loop_begins()
+            if self._reopen is not None:
+                self._objects.verify_again(is_kept)
+                self._require_mode(self._findings.mode)
+                self._others.refuse()
+                self._gate()
+            else:
+                self._guard = WatchdogGuard(
+                    self._objects, self._reads, self._settings.node, self._findings.mode, self._others.refuse
+                )
         except can.CanError as error:
             raise BusError(f"the bus failed before the run: {error}") from None
+        except (DeviceError, NoDeviceError):
+            self._others.refuse()
+            raise
         if self._reopen is not None:
             self._lent = True
-            with contextlib.suppress(Exception):  # whoever opens it next is told
+            with contextlib.suppress(Exception):  # the next one to open it gets the error
                 self._network.disconnect()
+
+    def _require_mode(self, mode: int) -> None:
+        shown = self._objects.read(0x6061, what="modes of operation display")
+        if shown != mode:
+            raise DeviceError(f"node {self._settings.node}: 6061 shows mode {shown}, it was {mode:d}")
+
+    def settings_guard(self) -> WatchdogGuard | None:
+        """See `Drive.settings_guard`; an adapter that the loop has for itself carries no SDO of ours."""
+        return self._guard
 
     def _take_back(self) -> None:
         """Open the bus again if the loop has had it; `BusError` if it cannot be opened."""
@@ -211,19 +295,18 @@ class CanopenDrive:
         """See `Drive.thermometer`; a bus that the loop has for itself carries no SDO of ours."""
         return None if self._lent else self._thermometer
 
-    def make_safe(self) -> str:
+    def make_safe(self, *, asked: bool = False) -> str:
         """See `SwitchOff.make_safe`.
 
         A drive that `commission` has not taken over is left alone, and so is one that another controller has taken
-        before our loop was started: its motion is not ours to end.
+        before our loop was started: its motion is not ours to end.  `asked`: the user wants a stop, whose frames look
+        like another controller's.  The watchdog that we have armed is taken away when the drive is off.
         """
+        self._gate = self._objects.gate = lambda: None
         if not self._taken:
             return UNTOUCHED
-        if not self._started:
-            try:
-                refuse_second_controller(self._network, self._sleep)
-            except BusError:
-                return UNTOUCHED
+        if not self._started and not asked and self._others.found():
+            return UNTOUCHED
         try:
             self._take_back()
         except JointctlError as error:
@@ -231,31 +314,44 @@ class CanopenDrive:
                 f"unknown: the bus cannot be opened again ({error.message}); the loop's heartbeat has ended, "
                 f"the drive's own watchdog stops the joint within {self._settings.heartbeat_s:g} s"
             )
-        return self._switch_off.make_safe()
+        state = self._switch_off.make_safe()
+        if is_safe(state):
+            with contextlib.suppress(JointctlError, can.CanError):
+                self._take_watchdog_away()
+        return state
+
+    def _take_watchdog_away(self) -> None:
+        """Our heartbeat has ended with the loop; a drive that is off need not watch it any more.
+
+        Another program may have armed it for itself meanwhile: then it stays.
+        """
+        armed, _ = self._objects.verified().get((0x1016, 1), (0, ""))
+        what = "consumer heartbeat time"
+        if armed and self._objects.read(0x1016, 1, what=what) == armed:
+            self._objects.write_verified(0x1016, 1, 0, what=what)
 
     def clear_fault(self) -> str:
-        """Reset the drive's fault on the user's word; refuses while another controller is active, or it is enabled.
+        """Reset the drive's fault on the user's word; refuses while another controller is active, or it has power.
 
-        An enabled drive has no fault, and somebody needs it so, perhaps without SYNC: its watchdog and power stay.
+        A drive with power has no fault, and its controller needs it so, perhaps without SYNC: it is left as it is.
         """
-        refuse_second_controller(self._network, self._sleep)
-        with contextlib.suppress(NoDeviceError):  # one that was stopped does not answer yet
-            if state_of(self._objects) is State.OPERATION_ENABLED:
-                raise DeviceError(
-                    f"node {self._settings.node} is in operation enabled: there is no fault, and it was left as it is",
-                    hint="`jointctl stop` switches it off",
-                )
+        self._listen()
+        self._find()
+        self._refuse_by_the_drives_word()
+        if (state := state_of(self._objects)) in POWERED_STATES:
+            raise DeviceError(
+                f"node {self._settings.node} is in {in_words(state)}: there is no fault, and it was left as it is",
+                hint="`jointctl stop` switches it off",
+            )
+        self._others.refuse()
         self._taken = True
         self._node.nmt.send_command(NmtCommand.ENTER_PRE_OPERATIONAL)
-        self._find()
-        # nobody sends a heartbeat now: a watchdog that is still armed would keep its fault alive
+        # no one sends a heartbeat now: a watchdog that is still armed would keep its fault alive
         self._objects.write_if_present(0x1016, 1, 0, what="consumer heartbeat time")
         clear_rpdo_deadlines(self._objects)
-        return reset_fault(self._objects, self._sleep)
+        return reset_fault(self._objects, self._pause)
 
     def close(self) -> None:
-        """Leave the bus; what went wrong on it has been told before."""
+        """Leave the bus; what went wrong on it has been reported before."""
         with contextlib.suppress(Exception):
             self._network.disconnect()
-        if self._claim is not None:
-            self._claim.close()

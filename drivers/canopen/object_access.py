@@ -5,9 +5,11 @@ Time-outs are retried (drives leave SDOs unanswered now and then); an abort is a
 
 from __future__ import annotations
 
+import random
 import struct
-from collections.abc import Iterator, Mapping
-from typing import Any
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, TypeVar
 
 import canopen
 from canopen.objectdictionary import ObjectDictionaryError
@@ -17,6 +19,10 @@ from drivers.canopen.sdo_download import download
 from drivers.errors import DeviceError, NoDeviceError
 
 ATTEMPTS = 3
+COLLISIONS = 10  # with the transfers of another master on the one SDO channel, such as those of `jointctl stop`
+COLLISION_PAUSE_S = 0.01
+NO_ANSWER = "No SDO response received"  # by the library, in contrast to an answer that does not fit
+Result = TypeVar("Result")
 ABORT_TEXT = {
     0x06090030: "value out of range",
     0x06090031: "value too high",
@@ -52,6 +58,7 @@ class ObjectAccess:
         self._eds_name = self.eds_name = eds_name
         self._unusable = unusable or {}
         self.remarks: list[str] = []  # what was tolerated
+        self.gate: Callable[[], None] = lambda: None  # raises where no more is to be said to the drive
         self._verified: dict[tuple[int, int], tuple[int, str]] = {}  # what `write_verified` has set, and its name
 
     def has(self, index: int, sub: int = 0) -> bool:
@@ -119,24 +126,31 @@ class ObjectAccess:
     def read(self, index: int, sub: int = 0, *, what: str) -> int:
         """Integer value of an object; `what` names it in messages."""
         variable = self._required(index, sub, what)
-        for attempt in range(ATTEMPTS):
-            try:
-                return self._number(variable, self._node.sdo.upload(index, sub), what)
-            except (SdoAbortedError, SdoCommunicationError, struct.error) as error:
-                if isinstance(error, SdoAbortedError) or attempt == ATTEMPTS - 1:
-                    raise self._failure(error, "reading", index, sub, what) from error
-        raise AssertionError("unreachable")
+        return self._transfer(
+            lambda: self._number(variable, self._node.sdo.upload(index, sub), what), "reading", index, sub, what
+        )
 
     def write(self, index: int, sub: int, value: int, *, what: str) -> None:
         """Write an integer object; the type and so the length come from the EDS."""
         data = self._encoded(self._required(index, sub, what), value, what)
-        for attempt in range(ATTEMPTS):
+        self._transfer(lambda: download(self._node.sdo, index, sub, data), f"writing {value} to", index, sub, what)
+
+    def _transfer(self, transfer: Callable[[], Result], action: str, index: int, sub: int, what: str) -> Result:
+        """ATTEMPTS for an answer that does not come; more where the answer was to another master's request."""
+        attempts = collisions = 0
+        while True:
+            self.gate()
             try:
-                download(self._node.sdo, index, sub, data)
-                return
+                return transfer()
             except (SdoAbortedError, SdoCommunicationError, struct.error) as error:
-                if isinstance(error, SdoAbortedError) or attempt == ATTEMPTS - 1:
-                    raise self._failure(error, f"writing {value} to", index, sub, what) from error
+                collided = isinstance(error, SdoCommunicationError) and str(error) != NO_ANSWER
+                if collided and collisions < COLLISIONS:
+                    collisions += 1
+                    time.sleep(random.uniform(0.0, COLLISION_PAUSE_S))
+                    continue
+                attempts += 1
+                if isinstance(error, SdoAbortedError) or attempts == ATTEMPTS:
+                    raise self._failure(error, action, index, sub, what) from error
 
     def write_verified(self, index: int, sub: int, value: int, *, what: str) -> int:
         """Write, read back and compare.  A refused write is none where the object already holds the value."""
@@ -153,13 +167,23 @@ class ObjectAccess:
         self._verified[index, sub] = value, what
         return found
 
+    def verified(self) -> dict[tuple[int, int], tuple[int, str]]:
+        """What was written and read back since commissioning began: (index, sub) -> value and name."""
+        return dict(self._verified)
+
+    def encoded(self, index: int, sub: int, value: int, *, what: str) -> bytes:
+        """A value as the object holds it on the wire."""
+        return self._encoded(self._required(index, sub, what), value, what)
+
     def forget_verified(self) -> None:
         """Commissioning begins anew."""
         self._verified.clear()
 
-    def verify_again(self) -> None:
+    def verify_again(self, wanted: Callable[[int, int], bool] = lambda *_: True) -> None:
         """Read everything that was verified once more; `DeviceError` if the drive has changed in the meantime."""
         for (index, sub), (value, what) in self._verified.items():
+            if not wanted(index, sub):
+                continue
             found = self.read(index, sub, what=what)
             if found != value:
                 raise DeviceError(

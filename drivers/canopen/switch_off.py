@@ -13,7 +13,7 @@ from typing import Any
 
 import can
 import canopen
-from canopen.objectdictionary import ODArray, ODVariable
+from canopen.objectdictionary import ODVariable
 
 from drivers.canopen.cia402 import ControlWord, State, state_of_word
 from drivers.canopen.identifiers import NmtCommand
@@ -50,7 +50,10 @@ def brake(objects: ObjectAccess, sleep: Callable[[float], None]) -> bool:
 
 
 class SwitchOff:
-    """Takes the power from one drive; `encoder_node` is brought to pre-operational with it."""
+    """Takes the power from one drive; `encoder_node` is brought to pre-operational with it.
+
+    It never changes what watches the drive's controller (1016, 1400:5): another program may be about to enable it.
+    """
 
     def __init__(
         self, network: canopen.Network, node: int, objects: ObjectAccess, encoder_node: int | None,
@@ -63,12 +66,17 @@ class SwitchOff:
         if node is not None:
             send_nmt(self._network, command, node)
 
-    def make_safe(self) -> str:
+    def make_safe(self, *, brake_first: bool = False) -> str:
         """Pre-operational, quick stop if it is enabled, then controlword 0 until the statusword says disabled.
 
         NMT stop if SDO does not answer, or if the drive stays enabled.  The controlword is also in an RPDO, so leave
         operational first: two writers would fight over it.  The state in words, "unknown: ..." if there is none.
+        `brake_first`: of a drive that is another's, which may take its power when it leaves operational (6007): first
+        the quick stop over SDO, for as long as no one enables it again.
         """
+        if brake_first:
+            with contextlib.suppress(JointctlError, can.CanError):
+                self._brake_undisturbed()
         try:
             return self._attempt()
         except JointctlError:
@@ -87,6 +95,16 @@ class SwitchOff:
         except can.CanError as error:
             return f"unknown: the bus does not take frames any more ({error})"
 
+    def _brake_undisturbed(self) -> None:
+        """The quick stop, in the NMT state that the node has; not longer than it is obeyed."""
+        if state_of(self._objects) is not State.OPERATION_ENABLED:
+            return
+        self._objects.write(0x6040, 0, ControlWord.QUICK_STOP, what="controlword")
+        for _ in range(round(QUICK_STOP_S / POLL_S)):
+            if state_of(self._objects) is not State.QUICK_STOP_ACTIVE:
+                return
+            self._sleep(POLL_S)
+
     def _attempt(self) -> str:
         state = State.UNDEFINED
         self._tell(NmtCommand.ENTER_PRE_OPERATIONAL, self._encoder_node)
@@ -102,12 +120,7 @@ class SwitchOff:
             with contextlib.suppress(DeviceError):  # a drive that has no such target refuses it
                 self._objects.write_if_present(index, 0, 0, what=what)
         words = in_words(state)
-        if state in OFF_STATES:
-            # our heartbeat has ended with the loop; disabled, the drive need not watch it any more.  A drive that
-            # did not obey keeps its watchdog: little else is left to stop it.
-            with contextlib.suppress(DeviceError):
-                self._objects.write_if_present(0x1016, 1, 0, what="consumer heartbeat time")
-        elif state in POWERED_STATES:
+        if state in POWERED_STATES:
             self._tell(NmtCommand.STOP, self._node)
             return f"{words}, it did not obey; NMT stop was sent"
         return words
@@ -126,10 +139,6 @@ def _standard_objects(node: int) -> canopen.ObjectDictionary:
 
     for index in _OBJECTS:
         dictionary.add_object(variable(index, 0))
-    heartbeats: Any = ODArray("1016", 0x1016)
-    heartbeats.add_member(variable(0x1016, 0))
-    heartbeats.add_member(variable(0x1016, 1))
-    dictionary.add_object(heartbeats)
     return dictionary
 
 
@@ -147,7 +156,8 @@ def stop_node(
     try:
         remote = network.add_node(node, _standard_objects(node))
         remote.sdo.RESPONSE_TIMEOUT = sdo_timeout_s or SDO_TIMEOUT_S
-        return SwitchOff(network, node, ObjectAccess(remote, "CiA 402"), encoder_node, sleep).make_safe()
+        switch_off = SwitchOff(network, node, ObjectAccess(remote, "CiA 402"), encoder_node, sleep)
+        return switch_off.make_safe(brake_first=True)
     finally:
         with contextlib.suppress(Exception):  # what went wrong on it has been told
             network.disconnect()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from drivers.drive import CommissioningReport, DriveIdentity
+from drivers.drive import Approval, CommissioningReport, Declined, DriveIdentity
 from drivers.elmo.codes import (
     AMPLIFIER_MASK,
     FAULT_LATCHED,
@@ -18,11 +18,15 @@ from drivers.elmo.limits import write_limits
 from drivers.elmo.line_budget import LARGEST_SHARE, MeasuredExchange, highest_rate_Hz, measured_exchange
 from drivers.elmo.serial_port import BytePort, SerialPort
 from drivers.elmo.settings import ElmoSettings
+from drivers.elmo.switch_off import switch_off
 from drivers.elmo.unit_modes import SPEED_MODE, TORQUE_MODE, set_speed_mode, set_torque_mode
 from drivers.errors import BusError, ConfigurationError, DeviceError, NoDeviceError
 
 MEASURED_CYCLES = 20
 TC_STEP_A = 1e-3
+WATCH_S = 0.5  # how long a motor that is found on is watched
+REST_COUNTS, REST_rad = 2, 1e-4  # one at rest may move by so much, whichever is more
+QUESTION = "The motor is on, and at rest. Stop it and switch it off?"
 
 
 class ElmoCommissioning:
@@ -33,26 +37,32 @@ class ElmoCommissioning:
         settings: ElmoSettings,
         open_port: Callable[[str, int], BytePort] = SerialPort,
         clock: Callable[[], float] = time.monotonic,
+        gate: Callable[[], None] = lambda: None,
     ) -> None:
+        """`gate` is called before each command until the loop runs, and raises once the user has asked for a stop."""
         self._settings = settings
         self._byte_port = open_port(settings.port, settings.baud_rate_bitps)
         self._line = Dialogue(self._byte_port, settings.reply_timeout_s, clock)
+        self._line.gate = gate
         self._clock = clock
         self._taken = False  # whether a drive has been found and told anything
         self._commissioned = False
         self._speed_mode = False
 
-    def commission(self) -> CommissioningReport:
+    def commission(self, approve: Approval | None = None) -> CommissioningReport:
         """See `Drive.commission`.  The motor is off and the drive in torque or speed mode when this returns."""
         settings, line = self._settings, self._line
         self._budget_Hz()
         found: dict[str, str] = {}
         remarks: list[str] = []
         identity = self._identify()
+        if line.integer("MO") != 0:
+            self._refuse_unless_agreed(approve)
+            self._taken = True
+            switch_off(self._byte_port, line)
+            remarks.append("the motor was on, at rest: it has been stopped and switched off")
         self._taken = True
         self._set_echo()
-        if line.integer("MO") != 0:
-            remarks.append("the motor was on: it has been switched off")
         self._motor_off()
         self._refuse_fault()
         self._compare_counts(found)
@@ -72,6 +82,30 @@ class ElmoCommissioning:
             ),
             loop_delay_s=measured.loop_delay_s,
         )
+
+    def _refuse_unless_agreed(self, approve: Approval | None) -> None:
+        """The motor was found on: it is left as it is where it turns, or must not be touched."""
+        place = f"the motor on {self._settings.port} is on (MO=1)"
+        hint = "`jointctl stop` stops it and switches it off"
+
+        def refuse_unless_at_rest() -> None:
+            readings = [self._line.integer("PX")]
+            until_s = self._clock() + WATCH_S
+            while self._clock() < until_s:
+                readings.append(self._line.integer("PX"))
+            turned = max(readings) - min(readings)
+            if turned > max(REST_COUNTS, REST_rad / abs(self._settings.rad_per_count)):
+                raise DeviceError(
+                    f"{place} and turns ({turned} counts in {WATCH_S:g} s): another controller may have it; it was "
+                    "left as it is", hint,
+                )  # fmt: skip
+
+        refuse_unless_at_rest()
+        if approve is None:
+            raise DeviceError(f"{place}: another controller may have it; it was left as it is", hint)
+        if not approve(QUESTION):
+            raise Declined
+        refuse_unless_at_rest()  # the answer may have taken minutes
 
     def _identify(self) -> DriveIdentity:
         settings, line = self._settings, self._line

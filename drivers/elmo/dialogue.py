@@ -34,6 +34,7 @@ class Dialogue:
         self._clock = clock
         self.interpreter = Interpreter()
         self.retries = 0
+        self.gate: Callable[[], None] = lambda: None  # raises where no more is to be sent to the drive
         self._verified: dict[tuple[str, int | None], float] = {}  # what `assign_verified` read back last
 
     def resynchronise(self) -> None:
@@ -65,6 +66,7 @@ class Dialogue:
         shown = command.decode("ascii").strip()
         reply = Reply(ReplyKind.TIMEOUT)
         for attempt in range(attempts):
+            self.gate()
             if attempt:
                 self.retries += 1
                 self.resynchronise()

@@ -29,6 +29,9 @@ class ElmoDrive(ElmoCommissioning):
     def thermometer(self) -> None:
         """The loop has the line for itself; see `Drive.thermometer`."""
 
+    def settings_guard(self) -> None:
+        """The loop has the line for itself; see `Drive.settings_guard`."""
+
     def start_cyclic(self) -> None:
         """From here on the loop has the line; this object is silent until `make_safe`.
 
@@ -90,8 +93,9 @@ class ElmoDrive(ElmoCommissioning):
 
     # --- the end ---
 
-    def make_safe(self) -> str:
+    def make_safe(self, *, asked: bool = False) -> str:
         """TC=0, JV=0, ST, MO=0 until MO reads 0.  Never raises; a drive that was never found is left alone."""
+        self._line.gate = lambda: None
         if not self._taken:
             return "untouched"
         try:

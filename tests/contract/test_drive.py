@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, Protocol
 import pytest
 
 from drivers.canopen.settings import CanopenSettings
-from drivers.drive import Drive
+from drivers.drive import Declined, Drive
 from drivers.elmo.drive import ElmoDrive
 from drivers.errors import DeviceError, NoDeviceError
 from hil.canopen.device_records import PowerState
@@ -64,8 +64,14 @@ class DriveContract:
         bench.drive.commission()
         bench.power_up()
         assert bench.powered()
-        bench.drive.commission()
+        with pytest.raises(DeviceError, match="left as it is"):
+            bench.drive.commission()  # no one was asked
+        with pytest.raises(Declined):
+            bench.drive.commission(lambda question: False)
+        assert bench.powered()
+        report = bench.drive.commission(lambda question: "switch it off?" in question)
         assert not bench.powered()
+        assert any("at rest" in remark for remark in report.remarks)
 
     def test_make_safe_takes_the_power_off_and_says_so(self, bench: Bench) -> None:
         bench.drive.commission()

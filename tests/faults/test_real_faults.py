@@ -25,6 +25,8 @@ from tools.configuration.load import load_config
 from tools.configuration.plant import FAULT_KINDS
 from tools.configuration.plant_settings import fault_constants
 from tools.output import Output
+from tools.running.control import Control
+from tools.running.stop_signals import StopSignals
 from tools.running.supervisor import RunResult, Supervisor
 
 SHIPPED = (CONFIGS / "virtual.toml").read_text()
@@ -65,7 +67,7 @@ def run_with(tmp_path: Path) -> RunWith:
         with real_time_joint(config):
             supervisor = Supervisor(
                 config, Output(quiet=True, stderr=StringIO()), tmp_path / "run.mcap", lambda _: True,
-                allow_low_margin=True,
+                Control(StopSignals()), allow_low_margin=True,
             )  # fmt: skip
             result = supervisor.run()
         assert result is not None

@@ -16,8 +16,10 @@ from tools.configuration.load import load_config
 from tools.output import Output
 from tools.recording.run_log import Event
 from tools.recording.run_log_reader import read_run_log
+from tools.running.control import Control
 from tools.running.display.display import OnlyShows, Snapshot
 from tools.running.display.viewer_request import ViewerRequest
+from tools.running.stop_signals import StopSignals
 from tools.running.supervisor import RunResult, Supervisor
 
 WHO = "a test"
@@ -75,7 +77,9 @@ def carried_out(bench: Any, *requests: tuple[str, dict[str, Any]], **changes: An
     config = load_config(bench.folder / name)
     script = Script([ViewerRequest(kind, WHO, values) for kind, values in requests])
     path = Path(bench.folder) / "runs" / "live.mcap"
-    result = Supervisor(config, Output(quiet=True), path, lambda report: True, display=lambda: script).run()
+    result = Supervisor(
+        config, Output(quiet=True), path, lambda report: True, Control(StopSignals()), display=lambda: script
+    ).run()
     assert result is not None
     return script, result
 
@@ -174,6 +178,8 @@ def test_before_the_joint_is_under_way_nothing_is_taken(bench: Any, kind: str) -
     script = Early([ViewerRequest(kind, WHO, {"kp": 700.0, "position_rad": 0.1})])
     config = load_config(bench.folder / name)
     path = Path(bench.folder) / "runs" / "early.mcap"
-    Supervisor(config, Output(quiet=True), path, lambda report: True, display=lambda: script).run()
+    Supervisor(
+        config, Output(quiet=True), path, lambda report: True, Control(StopSignals()), display=lambda: script
+    ).run()
     told = [text for text in script.events if text.startswith("parameter change")]
     assert told == ["parameter change refused: the joint is not under way, or it is being stopped; asked for by a test"]

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import signal
+import time
 from typing import Any
 
 import can
+import pytest
 
 from drivers.canopen.identifiers import SYNC_ID
 from tests.hil.terminal import Terminal
@@ -51,15 +54,41 @@ def test_of_two_that_start_at_once_one_runs(bench: Any) -> None:
     assert bench.disabled()
 
 
-def test_stop_reaches_the_drive_whoever_controls_it(bench: Any) -> None:
+def test_stop_ends_a_program_that_waits_for_its_user(bench: Any) -> None:
     config = bench.config()
     bench.joint(config)
     first = Terminal(bench, "run", config).saw("[y/N]")
     assert bench.run("stop", config).code == 0
-    os.write(first.master, b"y\n")
-    assert first.finished().code == 6, first.text  # the drive has lost its watchdog
-    assert "has changed since it was commissioned" in first.text
+    ended = first.finished()
+    assert ended.code == 130, first.text
+    assert "interrupted by jointctl stop; nothing moved" in first.text
     assert bench.disabled()
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.3, 0.6, 0.9, 1.2, 1.5, 1.8, 2.1, 2.5])
+def test_a_stop_latches_wherever_the_run_is(bench: Any, delay_s: float) -> None:
+    """From the first moment of its process on: it ends with the code of an interruption, and the drive is off."""
+    config = bench.config()
+    bench.joint(config)
+    run = bench.start("run", config, "-y")
+    time.sleep(delay_s)
+    stopped = bench.run("stop", config)
+    assert (stopped.code, "switch on disabled" in stopped.out) == (0, True), stopped
+    ended = run.finished(20.0)
+    assert ended.code == 130, ended.err
+    assert bench.disabled()
+
+
+def test_a_run_that_hangs_is_ended_with_its_loop(bench: Any) -> None:
+    config = bench.config(trajectory__duration_s=30.0, sequence__supervisor_timeout_s=30.0)
+    bench.joint(config)
+    run = bench.start("run", config, "-y").saw("  tracking")
+    run.process.send_signal(signal.SIGSTOP)
+    stopped = bench.run("stop", config)
+    assert (stopped.code, "ending process" in stopped.err) == (0, True), stopped
+    assert run.process.wait(5.0) == -signal.SIGKILL
+    assert bench.disabled()
+    assert bench.run("run", bench.config(), "-y").code == 0  # the next run takes the armed watchdog over
 
 
 def test_a_foreign_controller_is_known_by_its_sync(bench: Any) -> None:

@@ -174,7 +174,7 @@ def clear_fault(
     json: Json = False,
 ) -> None:
     """Reset the drive's fault; it stays disabled."""
-    from tools.verbs.stop import clear_fault as run_clear_fault
+    from tools.verbs.clear_fault import clear_fault as run_clear_fault
 
     joint = loaded(config, bus)
     raise typer.Exit(run_clear_fault(joint, Output(json=json)))

@@ -2,11 +2,31 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import signal
+import sys
+
+STARTING = "jointctl-starting"  # as in `drivers.bus_lock`, whose imports take their time
+_CONTROLLING = {"run", "sweep", "clear-fault", "scope", "demo"}  # verbs
+_CONTROLLING_WITH = {("doctor", "--motion"), ("params", "restore")}
+
+
+def _mark_as_starting() -> None:
+    """`jointctl stop` waits for a program that was started before it, and ends it when it has the lock of its bus.
+
+    A memory file with that name, which the kernel lists; it is closed when the lock is held, or with the process.
+    """
+    words = set(sys.argv[1:])
+    controlling = bool(words & _CONTROLLING) or any(words.issuperset(both) for both in _CONTROLLING_WITH)
+    if controlling and "--lockstep" not in words and hasattr(os, "memfd_create"):
+        with contextlib.suppress(OSError):  # a system without it has no lock either
+            os.memfd_create(STARTING)
 
 
 def main() -> None:
     """Nothing is open yet that would have to be closed: the signal may simply end the process (130 in a shell)."""
+    _mark_as_starting()
     ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # a script's background job ignores it
     if ours:
         signal.signal(signal.SIGINT, signal.SIG_DFL)

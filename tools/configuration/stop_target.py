@@ -17,6 +17,7 @@ from typing import Any
 
 from drivers.can.open import SHARED_INTERFACES
 from drivers.canopen.identifiers import HIGHEST_NODE
+from drivers.elmo.port import SERIAL
 from drivers.errors import ConfigurationError
 from tools.configuration.elmo import BAUD_RATES_TEXT, KIND, BAUD_RATES_bitps
 
@@ -36,6 +37,11 @@ class CanTarget:
     encoder_node: int | None = None
     sdo_timeout_s: float | None = None
 
+    @property
+    def place(self) -> tuple[str, str]:
+        """Interface and channel, as the lock of the bus has them."""
+        return self.interface, self.channel
+
 
 @dataclass(frozen=True)
 class SerialTarget:
@@ -44,6 +50,11 @@ class SerialTarget:
     port: str
     baud_rate_bitps: int
     reply_timeout_s: float = REPLY_TIMEOUT_S
+
+    @property
+    def place(self) -> tuple[str, str]:
+        """See `CanTarget.place`."""
+        return SERIAL, self.port
 
 
 @dataclass(frozen=True)

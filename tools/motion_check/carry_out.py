@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from drivers.drive import CommissioningReport
+from drivers.drive import Approval, CommissioningReport
 from tools.configuration.config import Config
 from tools.motion_check.plan import CheckPlan, check_constants, config_of_check, motion_table
 from tools.output import Output
+from tools.running.control import Control
 from tools.running.loop.loop_handle import LoopHandle
 from tools.running.supervisor import Supervisor
 
@@ -26,8 +27,10 @@ class CheckSupervisor(Supervisor):
         log_path: Path,
         confirm: Callable[[CommissioningReport], bool],
         plan: CheckPlan,
+        control: Control,
+        approve: Approval | None,
     ) -> None:
-        super().__init__(config_of_check(config, plan), output, log_path, confirm)
+        super().__init__(config_of_check(config, plan), output, log_path, confirm, control, approve=approve)
         self._plan = plan
 
     def _table(self) -> np.ndarray:

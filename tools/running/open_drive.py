@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import can
 
-from drivers.can.bus_claim import BusClaim
 from drivers.can.link_state import interface_blamed
 from drivers.can.open import CYCLIC_INTERFACES, SHARED_INTERFACES, open_python_can
 from drivers.canopen.drive import CanopenDrive
-from drivers.drive import CommissioningReport, Drive
+from drivers.drive import Approval, CommissioningReport, Drive
 from drivers.elmo.codes import motor_fault_text
 from drivers.elmo.drive import ElmoDrive
 from drivers.elmo.line_budget import command_time_s
@@ -39,31 +39,26 @@ def check_cyclic_rate(config: Config) -> None:
         check_portable_rate(config.bus.interface, config.loop.rate_Hz)
 
 
-def open_drive(config: Config) -> Drive:
-    """The drive of the configuration, its bus or port open and ours; nothing has been said to it.
+def open_drive(config: Config, gate: Callable[[], None] = lambda: None) -> Drive:
+    """The drive of the configuration, its bus or port open; nothing has been sent to it.
 
-    `BusError` names the program that has it, if another has.
+    `gate` is called before each step until the loop runs, and raises where none may follow.  The caller holds the lock.
     """
     if isinstance(config.drive, ElmoSerial):
-        return ElmoDrive(elmo_settings(config, torque_constant_NmpA(config)))
+        return ElmoDrive(elmo_settings(config, torque_constant_NmpA(config)), gate=gate)
 
     def open_bus() -> can.BusABC:
         bus = config.bus
         return open_python_can(bus.interface, bus.channel, bus.bitrate_bitps)
 
     reopen = None if config.bus.interface in SHARED_INTERFACES else open_bus
-    claim = BusClaim(config.bus.interface, config.bus.channel)
-    try:
-        return CanopenDrive(open_bus(), canopen_settings(config), reopen=reopen, claim=claim)
-    except BaseException:
-        claim.close()
-        raise
+    return CanopenDrive(open_bus(), canopen_settings(config), reopen=reopen, gate=gate)
 
 
-def commission(config: Config, drive: Drive) -> CommissioningReport:
-    """`Drive.commission`; a failure also tells what is wrong with the interface, if something is."""
+def commission(config: Config, drive: Drive, approve: Approval | None = None) -> CommissioningReport:
+    """`Drive.commission`; a failure also names what is wrong with the interface, if something is."""
     with interface_blamed(config.bus.interface, config.bus.channel, config.bus.bitrate_bitps):
-        return drive.commission()
+        return drive.commission(approve)
 
 
 def loop_delay_s(config: Config, histograms: Any) -> float:

@@ -10,13 +10,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
+from drivers.drive import SettingsGuard
 from firmware_py.realtime import Histogram, Word
 from firmware_py.states import AxisPhase, Fault, StopRequest, in_words
 from tools.analysis.margin_gate import require_margin
 from tools.configuration.config import Config
 from tools.recording.can_log import frame_array
 from tools.recording.kept_records import KeptRecords
-from tools.recording.run_log import INFO, WARNING, Event, RunLogWriter
+from tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter
 from tools.running.changes.viewer_orders import ViewerOrders
 from tools.running.display.display import Display, Snapshot
 from tools.running.events.event_finder import EventFinder, phase_name
@@ -60,6 +61,7 @@ class RunWatch:
         self.config, self.loop, self.around = config, parts.loop, parts.around
         self.log, self.kept, self.display = parts.log, parts.kept, parts.display
         self.temperature = TemperatureWatch()  # until the drive's own thermometer is known
+        self.settings_guard: SettingsGuard | None = None
         self.delay_s: float | None = None  # of the loop, once it is measured
         self._stopped_by_viewer = ""
         self._allow_low_margin = allow_low_margin
@@ -95,6 +97,7 @@ class RunWatch:
                 self._stopped_by_viewer = self.display.stop_reason()
             text = f"{in_words(request)} asked for by {self.stopped_by}"
             self._tell(Event(time.monotonic_ns(), WARNING, "supervisor", text))
+        self._guard_settings()
         self.check_delay()
         self.temperature.poll()
         self.tell_bus_news()
@@ -105,6 +108,14 @@ class RunWatch:
         if (phase := self.loop.phase) is not self._phase:
             self._phase = phase
             self.display.phase(phase_name(phase))
+
+    def _guard_settings(self) -> None:
+        """`DeviceError` where what stops the drive without us has been changed."""
+        if self.settings_guard is None:
+            return
+        for text in self.settings_guard.poll():
+            self.log.write_event(WARNING, "drive", text)
+            self.display.note(text)
 
     def tell_bus_news(self) -> None:
         """What the controller of the bus has complained about since the last call."""
@@ -120,8 +131,9 @@ class RunWatch:
             return
         self.keep(records)
         self._orders.keep(records)
+        commanded = self.around.signals.commanded_ns != 0  # the drive is off then, and the loop cannot know why
         for event in self._events.take(records):
-            self._tell(event)
+            self._tell(event, shown=not (commanded and event.level == ERROR))
         skipped, histograms = int(self.loop.block.words[Word.SKIPPED]), self.loop.block.histograms
         duration_s = float(self.loop.block.constants[0].trajectory.duration_s)  # a viewer may have changed the motion
         cia402 = not self.config.is_serial
@@ -137,6 +149,8 @@ class RunWatch:
         """Once enough cycles have run with the drive off: refuse the gains, or let the loop enable."""
         if self.delay_s is not None or self.loop.cycles < min(DELAY_CYCLES, self.config.loop.rate_Hz):
             return
+        if self.settings_guard is not None and not self.settings_guard.confirmed:
+            return
         histograms = self.loop.block.histograms
         if not histograms[Histogram.ROUND_TRIP].any():
             return  # nothing has been heard: the loop ends that itself, and tells it
@@ -151,9 +165,10 @@ class RunWatch:
         found = require_margin(self.config, delay_s, allow_low_margin=self._allow_low_margin)
         return f"phase margin {found.phase_margin_deg:.0f} deg"
 
-    def _tell(self, event: Event) -> None:
+    def _tell(self, event: Event, *, shown: bool = True) -> None:
         self.log.write_event(event.level, event.source, event.text, event.time_ns)
-        self.display.event(event)
+        if shown:
+            self.display.event(event)
         self._orders.keep_event(event)
 
     def _tell_scope(self, level: int, text: str) -> None:

@@ -1,45 +1,77 @@
-"""Ctrl-C, SIGTERM and a closed terminal as stop requests; asking again asks for more."""
+"""Ctrl-C, SIGTERM, a closed terminal and `jointctl stop` as stop requests; asking again asks for more."""
 
 from __future__ import annotations
 
+import contextlib
 import signal
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
 from firmware_py.states import StopRequest
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+STOP_COMMAND = "jointctl stop"
 _ESCALATION = (StopRequest.RAMP, StopRequest.QUICK_STOP, StopRequest.OFF)
 
 
 class StopSignals:
-    """Counts stop signals; `request` is what they ask for by now."""
+    """Counts stop signals; `request` is what they ask for by now.  Nothing takes a stop back.
 
-    def __init__(self) -> None:
+    While `raising`, a signal also raises KeyboardInterrupt: it does so wherever nothing has to come to its end first.
+    """
+
+    def __init__(self, *, raising: bool = False) -> None:
         self.count = 0
-        self.name = ""
-        self.raising = False  # a signal also raises KeyboardInterrupt, as a question to the user needs it
+        self.name = ""  # of the first signal, or STOP_COMMAND
+        self.raising = raising
+        self.commanded_ns = 0  # CLOCK_MONOTONIC of `jointctl stop`; 0 = it has not come
+        self.on_command: Callable[[StopRequest], None] = lambda _: None  # reaches a loop that runs, at once
 
     @property
     def request(self) -> StopRequest:
-        """NONE, then RAMP, QUICK_STOP and OFF with each further signal."""
-        if self.count == 0:
-            return StopRequest.NONE
-        return _ESCALATION[min(self.count, len(_ESCALATION)) - 1]
+        """NONE, then RAMP, QUICK_STOP and OFF with each further signal; `jointctl stop` is a quick stop at least."""
+        asked = _ESCALATION[min(self.count, len(_ESCALATION)) - 1] if self.count else StopRequest.NONE
+        return max(asked, StopRequest.QUICK_STOP) if self.commanded_ns else asked
 
     def on_signal(self, number: int, _: FrameType | None) -> None:
         """Signal handler."""
         self.count += 1
-        self.name = signal.Signals(number).name
+        self.name = self.name or signal.Signals(number).name
         if self.raising:
             raise KeyboardInterrupt
 
+    def on_stop_command(self) -> None:
+        """`jointctl stop` has come; in another thread than the run."""
+        self.commanded_ns = time.monotonic_ns()
+        self.name = STOP_COMMAND
+        self.on_command(self.request)
+        main = threading.main_thread().ident
+        if main is not None:  # wakes whatever the run waits for
+            with contextlib.suppress(ProcessLookupError):
+                signal.pthread_kill(main, signal.SIGTERM)
+
+    def leave_if_asked(self) -> None:
+        """`KeyboardInterrupt` once a stop was asked for: between two steps before the joint may move."""
+        if self.count or self.commanded_ns:
+            raise KeyboardInterrupt
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """A signal raises nothing inside: what is begun there must come to its end."""
+        before, self.raising = self.raising, False
+        try:
+            yield
+        finally:
+            self.raising = before
+
 
 @contextmanager
-def stop_signals() -> Iterator[StopSignals]:
+def stop_signals(*, raising: bool = False) -> Iterator[StopSignals]:
     """Collect stop signals while the block runs instead of ending the program."""
-    signals = StopSignals()
+    signals = StopSignals(raising=raising)
     before = {number: signal.signal(number, signals.on_signal) for number in STOP_SIGNALS}
     try:
         yield signals

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from drivers.drive import CommissioningReport, Drive
-from drivers.errors import DataError, JointctlError, MotionFault
+from drivers.drive import Approval, CommissioningReport, Declined, Drive
+from drivers.errors import BusError, DataError, DeviceError, JointctlError, MotionFault
 from firmware_py.states import Fault, StopRequest
 from tools.configuration.config import Config
 from tools.configuration.records import axis_constants, trajectory_table
@@ -24,6 +24,7 @@ from tools.recording.kept_records import KeptRecords
 from tools.recording.run_log import ERROR, INFO, WARNING, RunLogWriter
 from tools.recording.run_metadata import run_metadata
 from tools.recording.run_summary import summarise
+from tools.running.control import Control
 from tools.running.display.display import Display
 from tools.running.display.phase_lines import PhaseLines
 from tools.running.events.held_up import held_up_text
@@ -35,12 +36,18 @@ from tools.running.permission.readiness import require_same_motion
 from tools.running.result.drive_end import warn_unless_off
 from tools.running.result.run_result import RunResult as RunResult
 from tools.running.run_watch import Around, RunParts, RunWatch
-from tools.running.stop_signals import StopSignals, stop_signals
+from tools.running.stop_signals import StopSignals
 from tools.running.watch.bus_watch import bus_watch
 from tools.running.watch.frame_recorder import recording
 from tools.running.watch.temperature_watch import TemperatureWatch
 
 POLL_S = 0.02
+
+
+def came_before(fault: Fault, records: Any, time_ns: int) -> bool:
+    """Whether the loop had latched its fault by then."""
+    faulty = records[records.fault != Fault.NONE]
+    return fault is not Fault.NONE and len(faulty) > 0 and int(faulty[0].time_ns) <= time_ns
 
 
 class Supervisor:
@@ -55,53 +62,67 @@ class Supervisor:
         output: Output,
         log_path: Path,
         confirm: Callable[[CommissioningReport], bool],
+        control: Control,
         *,
+        approve: Approval | None = None,
         allow_low_margin: bool = False,
         display: Callable[[], Display] | None = None,
     ) -> None:
+        """`approve` is asked before a drive that is found enabled is braked; None: it is left as it is."""
         self._config, self._output, self._log_path, self._confirm = config, output, log_path, confirm
+        self._control, self._approve = control, approve
+        self.signals = control.signals
         self._allow_low_margin = allow_low_margin
         self._make_display = display or (lambda: PhaseLines(output))
-        self.signals = StopSignals()  # that came during the run
         self.drive_state = ""  # in words, after the run
 
     def run(self) -> RunResult | None:
         """The whole run; None if the user declined.  Afterwards the drive is off, or `drive_state` says otherwise."""
-        config = self._config
+        config, signals = self._config, self.signals
         check_cyclic_rate(config)
         tail_path = self._log_path.with_suffix(".tail.mcap")
         with (
-            stop_signals() as self.signals,
-            LoopHandle(config, self._table(), tail_path) as loop,
+            signals.held(),
+            LoopHandle(config, self._table(), tail_path, self._control.marker_fd) as loop,
             recording(config) as recorder,
             bus_watch(config) as bus_news,
             kept_awake(config, self._output),
         ):
-            signals, drive = self.signals, open_drive(config)
+            drive = open_drive(config, signals.leave_if_asked)
             guard: GuardHandle | None = None
             try:
                 guard = start_guard(config, loop)
-                report = commission(config, drive)
-                self._leave_if_asked(signals)
-                signals.raising = True
-                confirmed = self._confirm(report)
-                signals.raising = False
-                if not confirmed:
+                try:
+                    report = commission(config, drive, self._asking(self._approve))
+                except Declined:
                     return None
-                loop.wait_ready(lambda: self._leave_if_asked(signals), self._output.note)
-                self._leave_if_asked(signals)
+                signals.leave_if_asked()
+                if not self._ask(lambda: self._confirm(report)):
+                    return None
+                loop.wait_ready(signals.leave_if_asked, self._output.note)
+                signals.leave_if_asked()
                 if guard is not None:
                     guard.wait_ready()
                 return self._supervise(drive, loop, report, Around(signals, bus_news, recorder, guard))
             except OSError as error:
                 raise DataError(f"{self._log_path}: cannot be written: {error.strerror or error}") from None
             finally:
-                signals.raising = False
-                self.drive_state = drive.make_safe()
+                self.drive_state = drive.make_safe(asked=bool(signals.commanded_ns))
                 drive.close()
                 if guard is not None:
                     guard.release(self.drive_state)
                 warn_unless_off(self.drive_state, self._output)
+
+    def _ask(self, question: Callable[[], bool]) -> bool:
+        """The answer of the user, whom a stop may interrupt."""
+        self.signals.raising = True
+        try:
+            return question()
+        finally:
+            self.signals.raising = False
+
+    def _asking(self, approve: Approval | None) -> Approval | None:
+        return None if approve is None else lambda text: self._ask(lambda: approve(text))
 
     def _table(self) -> np.ndarray:
         """Rows of the motion, (N, 5); their number is fixed before the drive is known."""
@@ -112,11 +133,6 @@ class Supervisor:
         constants = axis_constants(self._config, start_position_rad=report.start_position_rad)
         require_same_motion(self._config, loop.block.table)
         return constants
-
-    @staticmethod
-    def _leave_if_asked(signals: StopSignals) -> None:
-        if signals.count:
-            raise KeyboardInterrupt
 
     def _metadata(self, report: CommissioningReport) -> dict[str, dict[str, str]]:
         """What the log says besides the records."""
@@ -139,9 +155,14 @@ class Supervisor:
                 return self._carry_out(drive, loop, constants, watch)
 
     def _carry_out(self, drive: Drive, loop: LoopHandle, constants: Any, watch: RunWatch) -> RunResult:
+        signals = watch.around.signals
         loop.listen()
+        signals.on_command = loop.request_stop
+        if signals.commanded_ns:  # just before: the loop is told all the same, and never enables
+            loop.request_stop(signals.request)
         drive.start_cyclic()
         watch.temperature = TemperatureWatch(drive.thermometer(), watch.log)
+        watch.settings_guard = drive.settings_guard()
         started_ns = time.monotonic_ns()
         loop.go(constants, drive.port())
         try:
@@ -154,11 +175,19 @@ class Supervisor:
             watch.tell_bus_news()
             watch.log.write_event(ERROR, "supervisor", str(error))
             raise MotionFault(error.message, f"{error.hint}; drive state now: {state}") from None
+        except (DeviceError, BusError) as error:  # another program has the drive, or has changed what stops it
+            self._brake(loop, signals, StopRequest.QUICK_STOP)
+            watch.take_records()
+            if not signals.commanded_ns:  # `jointctl stop` sends such frames as well
+                watch.log.write_event(ERROR, "supervisor", str(error))
+                raise
         except BaseException:
-            self._brake(loop, watch.around.signals)
+            self._brake(loop, signals)
             raise
         elapsed_s = (time.monotonic_ns() - started_ns) * 1e-9
-        state = drive.make_safe()
+        watch.take_records()
+        self._raise_what_others_did(watch, loop)
+        state = drive.make_safe(asked=bool(signals.commanded_ns))
         watch.take_records()
         watch.tell_bus_news()  # it often explains the fault that has ended the run
         watch.log.write_event(INFO, "drive", f"after the run: {state}")
@@ -167,13 +196,24 @@ class Supervisor:
             watch.log.write_event(WARNING, "log", f"{recorder.dropped} CAN frames were not recorded: too slow")
         return self._result(watch, state, elapsed_s)
 
-    def _brake(self, loop: LoopHandle, signals: StopSignals) -> None:
+    @staticmethod
+    def _raise_what_others_did(watch: RunWatch, loop: LoopHandle) -> None:
+        """A fault of the loop is explained by another controller's frames, if some came: `BusError`."""
+        if watch.settings_guard is None or watch.around.signals.commanded_ns or loop.verdict()[0] is Fault.NONE:
+            return
+        try:
+            watch.settings_guard.poll()
+        except (DeviceError, BusError) as error:
+            watch.log.write_event(ERROR, "supervisor", str(error))
+            raise
+
+    def _brake(self, loop: LoopHandle, signals: StopSignals, how: StopRequest = StopRequest.RAMP) -> None:
         """The supervisor cannot go on (disk full, say), but the joint moves: brake it under control, unlogged.
 
         The user may still ask for more than a ramp.
         """
         sequence = self._config.sequence
-        loop.request_stop(StopRequest.RAMP)
+        loop.request_stop(how)
         give_up_s = time.monotonic() + sequence.stop_timeout_s + sequence.release_s + sequence.off_timeout_s
         with contextlib.suppress(MotionFault):
             while loop.running() and time.monotonic() < give_up_s:
@@ -188,6 +228,8 @@ class Supervisor:
         records = watch.kept.records()
         state = loop.block.state[0]
         fault, value = loop.verdict()
+        if watch.around.signals.commanded_ns and not came_before(fault, records, watch.around.signals.commanded_ns):
+            fault = Fault.NONE  # `jointctl stop` has switched the drive off under the loop
         text = None
         if fault is not Fault.NONE:
             errors = int(state.fault_drive_error), int(state.fault_encoder_error)

@@ -113,7 +113,7 @@ class LockstepJoint:
         self.config = config
         virtual = new_device(config)
         bus = DirectBus(virtual)
-        drive = CanopenDrive(bus, canopen_settings(config), sleep=bus.sleep)
+        drive = CanopenDrive(bus, canopen_settings(config), sleep=bus.sleep, clock=lambda: bus.now_ns * 1e-9)
         try:
             self.report: CommissioningReport = drive.commission()
             drive.start_cyclic()

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.drive import CommissioningReport
+from drivers.drive import Approval, CommissioningReport
 from drivers.elmo.unit_modes import SPEED_MODE
 from drivers.errors import ConfigurationError, DeviceError, UsageError
 from firmware_py.motion_peak import approach_duration_s
@@ -27,6 +27,7 @@ from tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_con
 from tools.output import Output
 from tools.recording.run_log import THINNING
 from tools.recording.thinned_records import ThinnedRecords
+from tools.running.control import Control
 from tools.running.loop.loop_handle import LoopHandle
 from tools.running.run_watch import RunParts, RunWatch
 from tools.running.supervisor import Supervisor
@@ -157,10 +158,12 @@ class SweepSupervisor(Supervisor):
         motion: SweepMotion,
         meter: SweepMeter,
         progress: Callable[[float], None],
+        control: Control,
+        approve: Approval | None = None,
         *,
         allow_low_margin: bool = False,
     ) -> None:
-        super().__init__(config, output, log_path, confirm, allow_low_margin=allow_low_margin)
+        super().__init__(config, output, log_path, confirm, control, approve=approve, allow_low_margin=allow_low_margin)
         self._motion = motion
         self._meter = meter
         self._progress = progress

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from drivers.can.bus_claim import BusClaim
 from drivers.drive import CommissioningReport
 from drivers.errors import INTERRUPTED
 from firmware_py.states import Fault
 from tools.configuration.config import Config
-from tools.inspection.drive_scale import scale_finding
+from tools.inspection.drive_scale import judged
 from tools.inspection.findings import Finding
 from tools.motion_check.carry_out import CheckSupervisor
 from tools.motion_check.plan import CheckPlan, make_plan, require_room
 from tools.motion_check.verdict import ended_finding, motion_findings
 from tools.output import Output
 from tools.recording.log_folder import log_path
-from tools.running.permission.consent import agreed, require_terminal
+from tools.running.control import Control, in_control
+from tools.running.permission.consent import agreed, approval, require_terminal
 from tools.running.permission.envelope import remark_lines, where_lines
 from tools.running.permission.readiness import prepare_log, require_ready
 from tools.running.result import drive_end
@@ -36,24 +36,26 @@ def check_envelope(config: Config, plan: CheckPlan, report: CommissioningReport)
     return lines + remark_lines(report.remarks)
 
 
-def _scale_of_the_drive(config: Config) -> list[Finding]:
-    """Asked before the run has the bus; `BusError` where another program has it: its transfers are not disturbed."""
-    if config.is_serial:
-        return []
-    with BusClaim(config.bus.interface, config.bus.channel):
-        finding = scale_finding(config)
-    return [] if finding is None else [finding]
-
-
 def doctor_motion(config: Config, output: Output, *, assume_yes: bool, torque_Nm: float | None = None) -> int:
     """Commission, tell, ask, pull, judge; 0, or 1 if something is wrong, 130 after an interruption."""
     if not assume_yes:
         require_terminal()
+    with in_control(config, output) as control:
+        try:
+            return _check(config, output, control, assume_yes=assume_yes, torque_Nm=torque_Nm)
+        except KeyboardInterrupt:
+            output.note(f"interrupted by {control.signals.name}; nothing moved")
+            return INTERRUPTED
+
+
+def _check(config: Config, output: Output, control: Control, *, assume_yes: bool, torque_Nm: float | None) -> int:
     plan = make_plan(config, torque_Nm)
     path = log_path(config)
-    found = _scale_of_the_drive(config)
+    found: list[Finding] = []
 
     def confirm(report: CommissioningReport) -> bool:
+        if report.counts_per_motor_turn:
+            found.append(judged(config, report.counts_per_motor_turn))
         for line in check_envelope(config, plan, report):
             output.fact(line)
         require_ready(config, report, path)
@@ -63,13 +65,13 @@ def doctor_motion(config: Config, output: Output, *, assume_yes: bool, torque_Nm
         prepare_log(config, path, output)
         return True
 
-    supervisor = CheckSupervisor(config, output, path, confirm, plan)
+    approve = approval(output, assume_yes=assume_yes)
+    supervisor = CheckSupervisor(config, output, path, confirm, plan, control, approve)
     try:
         result = supervisor.run()
     except KeyboardInterrupt:
-        output.note("interrupted; nothing moved")
         require_off(supervisor.drive_state)
-        return INTERRUPTED
+        raise
     if result is None:
         output.note(f"nothing moved; {drive_end.words(supervisor.drive_state)}")
         return 0

@@ -9,12 +9,11 @@ from typing import Any
 
 from rich.table import Table
 
-from drivers.can.bus_claim import BusClaim
+from drivers.canopen.bus_watchers import OtherControllers
 from drivers.canopen.cia402 import State, state_of_word, state_text
 from drivers.canopen.identifiers import NmtCommand
 from drivers.canopen.network import send_nmt
-from drivers.errors import BusError, ConfigurationError, DataError, DeviceError
-from tools.inspection.node_scan import Ear
+from drivers.errors import ConfigurationError, DataError, DeviceError
 from tools.inspection.objects import Objects, Place
 from tools.inspection.parameter_file import load_parameters, toml_text, write_dcf
 from tools.inspection.parameter_restore import Written, restore
@@ -32,11 +31,12 @@ from tools.inspection.parameters import (
 from tools.inspection.sdo_reading import Refusal, SdoReader
 from tools.inspection.subject import Subject, canopen_network
 from tools.output import Output
+from tools.running.control import control_of
 from tools.running.permission.consent import agreed, require_terminal
 from tools.written_file import writing
 
-LISTEN_S = 0.1  # for the SYNC of another controller
 DIFFERENT = 11  # exit code of diff
+MASTER_NODE = 126  # of jointctl, unless a configuration has another one
 _SETTLE_S = 0.02
 _UNDER_POWER = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
 
@@ -119,9 +119,10 @@ def restore_file(
     """Show what would change, ask, write, read back, report; `DeviceError` if something was not taken."""
     node, objects = subject.required_node(), _known_objects(subject)
     wanted = load_parameters(path, node)
-    ear = Ear()
-    with BusClaim(subject.interface, subject.channel), canopen_network(subject, ear) as network:
-        _refuse_controller(ear)
+    others = OtherControllers([node], MASTER_NODE if subject.config is None else subject.config.canopen.master_node)
+    with control_of(subject.interface, subject.channel, output), canopen_network(subject, others) as network:
+        time.sleep(others.to_listen_s)
+        others.refuse()
         reader = SdoReader(network, node, objects)
         reader.require_answer()
         _require_same_device(reader, wanted, path, other_device)
@@ -138,21 +139,14 @@ def restore_file(
             output.note("nothing was written")
             return 0
         # the answer may have taken minutes: a joint that moves by now must not lose its controller
-        _refuse_controller(ear)
         _require_off(reader)
+        others.refuse()  # after an answer: what came before it has been received by then
         send_nmt(network, NmtCommand.ENTER_PRE_OPERATIONAL, node)  # PDOs can only be changed there
         time.sleep(_SETTLE_S)
         _require_off(reader)
         values = {change.place: change.second for change in changes if change.second is not None}
         done = restore(reader, values, wanted.parameters)
     return _report(done, objects, output)
-
-
-def _refuse_controller(ear: Ear) -> None:
-    """`BusError` if SYNC comes, or has come since `ear` was opened."""
-    time.sleep(LISTEN_S)
-    if ear.heard.syncs:
-        raise BusError("another controller is active on this bus (SYNC)", "end it first")
 
 
 def _require_off(reader: SdoReader) -> None:

@@ -10,9 +10,10 @@ from drivers.errors import INTERRUPTED
 from tools.configuration.config import Config
 from tools.output import Output
 from tools.recording.log_folder import log_path
+from tools.running.control import in_control
 from tools.running.display.display import Display
 from tools.running.display.live_panel import run_display
-from tools.running.permission.consent import agreed, require_terminal
+from tools.running.permission.consent import agreed, approval, require_terminal
 from tools.running.permission.envelope import motion_envelope
 from tools.running.permission.readiness import prepare_log, require_ready, require_start
 from tools.running.result import drive_end
@@ -51,12 +52,15 @@ def run(
 
     path = log_path(config)
     title = run_title(config)
-    with _displays(config, output, title, scope) as display:
-        supervisor = Supervisor(config, output, path, confirm, allow_low_margin=allow_low_margin, display=display)
+    approve = None if dry_run else approval(output, assume_yes=assume_yes)
+    with _displays(config, output, title, scope) as display, in_control(config, output) as control:
+        supervisor = Supervisor(
+            config, output, path, confirm, control, approve=approve, allow_low_margin=allow_low_margin, display=display
+        )
         try:
             result = supervisor.run()
         except KeyboardInterrupt:
-            output.note("interrupted; nothing moved")
+            output.note(f"interrupted by {control.signals.name}; nothing moved")
             require_off(supervisor.drive_state)
             return INTERRUPTED
     if result is None:

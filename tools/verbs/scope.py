@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drivers.drive import CommissioningReport
-from drivers.errors import JointctlError
+from drivers.errors import INTERRUPTED, JointctlError
 from firmware_py.states import StopRequest
 from tools.output import Output
 from tools.recording.log_folder import log_path
 from tools.recording.run_log_reader import read_run_log
+from tools.running.control import in_control
 from tools.running.display.live_panel import run_display
 from tools.running.permission.envelope import motion_envelope
 from tools.running.permission.readiness import prepare_log, require_ready, require_start
@@ -74,6 +75,7 @@ class _Runs:
         self._allow_low_margin = allow_low_margin
         self.code = 0  # exit code of the last one
         self.drive_state = ""  # after the last one
+        self._ended = False  # whether a signal or `jointctl stop` has ended the program as well
         self.told: dict[str, Any] = {}  # to the page, of how the last one ended
 
     def _tell(self, stage: str, lines: list[str]) -> None:
@@ -98,15 +100,20 @@ class _Runs:
             return agreed
 
         terminal = run_display(output, self._title)
-        supervisor = Supervisor(
-            self._config, output, path, confirm, allow_low_margin=self._allow_low_margin,
-            display=lambda: Displays([terminal(), feed]),
-        )  # fmt: skip
         try:
-            try:
-                result = supervisor.run()
-            finally:
-                self.drive_state = supervisor.drive_state
+            with in_control(self._config, output) as control:
+                supervisor = Supervisor(
+                    self._config, output, path, confirm, control, allow_low_margin=self._allow_low_margin,
+                    display=lambda: Displays([terminal(), feed]),
+                )  # fmt: skip
+                try:
+                    result = supervisor.run()
+                except KeyboardInterrupt:
+                    if control.signals.commanded_ns:
+                        self.code = INTERRUPTED
+                    raise
+                finally:
+                    self.drive_state, self._ended = supervisor.drive_state, control.signals.count > 0
             if result is None:
                 self.code = 0
                 why = "stopped before it began" if feed.stop_request() else f"not started within {PREPARED_S:g} s"
@@ -119,7 +126,7 @@ class _Runs:
             output.error(error.message, error.hint)
             self.code = error.exit_code
             self._tell("ended", [error.message, error.hint])
-            return supervisor.signals.count > 0
+            return self._ended
         lines = [f"log      {result.log_path}", f"drive    {result.drive_state}"]
         if result.summary.error is not None:
             lines.insert(0, f"error    RMSE {result.summary.error.rmse_rad * 1e3:.3f} mrad")
@@ -127,7 +134,7 @@ class _Runs:
             text = result.fault_text
             lines.insert(0, f"{result.fault.name}: {text.happened}; {text.advice}")
         self._tell("ended", lines)
-        return result.stopped_by.startswith("SIG")
+        return self._ended
 
 
 def confirmed(feed: ScopeFeed, lines: list[str], patience_s: float = PREPARED_S) -> bool:

@@ -21,8 +21,9 @@ from tools.configuration.conversions import joint_rad_per_count, torque_constant
 from tools.output import Advance, Output
 from tools.recording.log_folder import log_path
 from tools.reporting.page import check_target
+from tools.running.control import Control, in_control
 from tools.running.events.fault_text import FaultText, fault_text
-from tools.running.permission.consent import agreed, require_terminal
+from tools.running.permission.consent import agreed, approval, require_terminal
 from tools.running.permission.envelope import remark_lines, where_lines
 from tools.running.permission.readiness import require_ready
 from tools.running.result import drive_end
@@ -88,6 +89,7 @@ class Sweep:
         self.output = output
         self.out = out
         self.options = options
+        self.control: Control | None = None  # of the joint; in lockstep there is none
         self.plan = make_plan(config, options)
         self.file: SweepFile | None = None
         self.drive_state = ""
@@ -163,8 +165,10 @@ class Sweep:
                     bars.append(stack.enter_context(self.output.progress(title, motion.duration_s)))
                 bars[0](max(0.0, done_s))
 
+            assert self.control is not None
+            approve = None if options.dry_run else approval(self.output, assume_yes=options.assume_yes)
             supervisor = SweepSupervisor(
-                config, self.output, log_path(config), confirm, motion, meter, progress,
+                config, self.output, log_path(config), confirm, motion, meter, progress, self.control, approve,
                 allow_low_margin=options.allow_low_margin,
             )  # fmt: skip
             try:
@@ -284,9 +288,12 @@ def sweep(config: Config, output: Output, out: Path, options: SweepOptions | Non
     if not (options.assume_yes or options.dry_run or options.lockstep):
         require_terminal()
     command = Sweep(config, output, out, options)
-    try:
-        return command.run()
-    except KeyboardInterrupt:
-        output.note("interrupted; nothing moved" + ("" if command.file is None else " any more"))
-        drive_end.require_off(command.drive_state)
-        return INTERRUPTED
+    with contextlib.ExitStack() as stack:
+        try:
+            if not options.lockstep:
+                command.control = stack.enter_context(in_control(command.config, output))
+            return command.run()
+        except KeyboardInterrupt:
+            output.note("interrupted; nothing moved" + ("" if command.file is None else " any more"))
+            drive_end.require_off(command.drive_state)
+            return INTERRUPTED

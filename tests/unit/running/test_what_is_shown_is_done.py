@@ -22,6 +22,7 @@ from tools.configuration.conversions import RADPS_PER_UNIT, friction_constants
 from tools.configuration.load import load_config, shipped_config
 from tools.configuration.records import trajectory_table
 from tools.output import Output
+from tools.running.control import Control
 from tools.running.display.phase_lines import PhaseLines
 from tools.running.permission.envelope import motion_envelope
 from tools.running.permission.readiness import require_start
@@ -127,7 +128,7 @@ def with_table(tmp_path: Path) -> tuple[Config, Path]:
 )
 def test_a_table_that_was_edited_meanwhile_is_not_carried_out(tmp_path: Path, text: str, same: bool) -> None:
     config, way = with_table(tmp_path)
-    supervisor = Supervisor(config, Output(), tmp_path / "log.mcap", lambda _: True)
+    supervisor = Supervisor(config, Output(), tmp_path / "log.mcap", lambda _: True, Control(StopSignals()))
     loop: Any = SimpleNamespace(block=SimpleNamespace(table=trajectory_table(config)))
     way.write_text(text)
     if same:
@@ -165,9 +166,12 @@ def test_a_drive_that_says_nothing_is_told_by_the_loop_and_not_as_a_delay(
     loop: Any = SilentLoop(samples)
     nothing: Any = None
     parts = RunParts(loop, Around(StopSignals(), BusWatch(config, None)), log, nothing, PhaseLines(Output()), {})
-    supervisor: Supervisor = Supervisor(config, Output(), log.path, lambda _: True)
+    control = Control(StopSignals())
+    supervisor: Supervisor = Supervisor(config, Output(), log.path, lambda _: True, control)
     if velocity:
-        supervisor = SweepSupervisor(config, Output(), log.path, lambda _: True, nothing, nothing, lambda _: None)
+        supervisor = SweepSupervisor(
+            config, Output(), log.path, lambda _: True, nothing, nothing, lambda _: None, control
+        )
         supervisor._velocity_mode = True
     with supervisor._make_watch(parts) as watch:
         watch.check_delay()

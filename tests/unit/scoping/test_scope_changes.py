@@ -151,9 +151,8 @@ def test_what_run_checks_is_checked_before_start(
         """A supervisor that asks and does not run."""
 
         drive_state = "switch on disabled"
-        signals = SimpleNamespace(count=0)
 
-        def __init__(self, config: Any, output: Any, path: Any, confirm: Any, **_: Any) -> None:
+        def __init__(self, config: Any, output: Any, path: Any, confirm: Any, control: Any, **_: Any) -> None:
             self._confirm = confirm
 
         def run(self) -> None:

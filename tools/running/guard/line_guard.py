@@ -31,8 +31,8 @@ from drivers.elmo.dialogue import Dialogue
 from drivers.elmo.serial_port import SerialPort, open_descriptor, usb_serial_number
 from drivers.elmo.switch_off import SWITCH_OFF, switch_off
 from drivers.errors import BusError, JointctlError
-from drivers.local_socket import listener
-from tools.running.guard.guard_call import guard_address, heard_line, may_ask
+from drivers.local_socket import listener, may_ask, received_line, send_line
+from tools.running.guard.guard_call import guard_address
 
 REACH_S = 60.0  # how long a drive that does not answer is tried again: time to plug a cable in
 OBEY_S = 5.0  # how long a run may take to end after `jointctl stop`
@@ -220,14 +220,14 @@ class LineGuard:
 
     def _take_word(self) -> None:
         """The end of the connection without a word is the supervisor's end, which its pidfd tells as well."""
-        message = heard_line(self._control, HEARD_S)
+        message = received_line(self._control, HEARD_S)
         if message is not None:
             self._state = str(message.get("state", "unknown: no word"))
 
     def _take_caller(self) -> None:
         assert self._server is not None
         caller, _ = self._server.accept()
-        message = heard_line(caller, HEARD_S) if may_ask(caller) else None
+        message = received_line(caller, HEARD_S) if may_ask(caller) else None
         if message is None:
             caller.close()
             return
@@ -251,7 +251,7 @@ class LineGuard:
     @staticmethod
     def _send(caller: socket.socket, message: dict[str, Any]) -> None:
         with contextlib.suppress(OSError):
-            caller.sendall(json.dumps(message).encode() + b"\n")
+            send_line(caller, message)
 
 
 def main() -> int:

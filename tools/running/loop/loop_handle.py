@@ -34,10 +34,11 @@ _ON_SERIAL = "a serial drive does not notice that: it has been told to switch of
 class LoopHandle:
     """Owns the process and the shared memory; a context manager that never leaves the process behind.
 
-    `tail_path` is where the loop itself saves the ring if this process has gone when it ends.
+    `tail_path` is where the loop itself saves the ring if this process has gone when it ends; `marker_fd` shows whose
+    loop it is (`drivers.bus_lock`).
     """
 
-    def __init__(self, config: Config, table: Any, tail_path: Path | None = None) -> None:
+    def __init__(self, config: Config, table: Any, tail_path: Path | None = None, marker_fd: int | None = None) -> None:
         self.block = SharedBlock.create(len(table), config.bus.interface)
         self.block.table[:] = table
         self._tail = 0
@@ -59,7 +60,7 @@ class LoopHandle:
         )
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "tools.running.loop.loop_process", order.argument()],
-            pass_fds=(self.block.fd,),
+            pass_fds=(self.block.fd,) if marker_fd is None else (self.block.fd, marker_fd),
             stdin=subprocess.DEVNULL,
             start_new_session=True,  # keys that a terminal turns into signals are not for the loop
         )

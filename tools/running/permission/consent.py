@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 
+from drivers.drive import Approval
 from drivers.errors import UsageError
 from tools.output import Output
 
@@ -22,3 +23,14 @@ def agreed(output: Output, question: str = MOVE) -> bool:
     """Whether the user says yes; everything else is no."""
     output.note(f"{question} [y/N] ")
     return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+
+def approval(output: Output, *, assume_yes: bool) -> Approval:
+    """Asks the user, or says yes."""
+
+    def approve(question: str) -> bool:
+        if assume_yes:
+            output.note(f"{question} yes (-y)")
+        return assume_yes or agreed(output, question)
+
+    return approve

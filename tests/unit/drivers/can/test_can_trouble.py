@@ -23,9 +23,9 @@ from drivers.errors import BusError, JointctlError, NoDeviceError
 from tools.inspection.subject import Subject
 from tools.output import Output
 from tools.running.open_drive import commission
+from tools.verbs.clear_fault import clear_fault
 from tools.verbs.info import info
 from tools.verbs.scan import scan
-from tools.verbs.stop import clear_fault
 
 
 @pytest.mark.parametrize(
@@ -147,7 +147,9 @@ def test_who_hears_nobody_on_an_interface_of_another_bit_rate_says_so(
     monkeypatch.setattr(
         "tools.inspection.subject.open_python_can", lambda *_: can.Bus(interface="virtual", channel=empty_bus.channel)
     )
-    monkeypatch.setattr("tools.verbs.stop.open_drive", lambda config: empty_bus.drive(settings_of_virtual_joint))
+    monkeypatch.setattr(
+        "tools.verbs.clear_fault.open_drive", lambda config, gate: empty_bus.drive(settings_of_virtual_joint)
+    )
     bus = virtual_config.bus.model_copy(update={"interface": "socketcan", "channel": "can0"})
     config, output = virtual_config.model_copy(update={"bus": bus}), Output(quiet=True)
     subject = Subject("socketcan", "can0", 1_000_000, 1)

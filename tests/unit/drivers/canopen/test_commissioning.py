@@ -184,7 +184,6 @@ def test_the_twins_that_agree(
         ((0x1A00, 2), 0x606C0020, r"object 1A00:2 \(PDO 1800 mapping of position actual value\) reads back"),
         ((0x6041, 0), 0x0218, r"node 1 is in fault \(error code 0000h\) .*never resets one by itself"),
         ((0x6041, 0), 0x021F, r"node 1 is in fault"),
-        ((0x6041, 0), 0x1637, r"node 1 stays enabled although controlword 0 was written"),
         ((0x6071, 0), 5, r"object 6071 \(target torque\) reads back 5, 0 was written"),
     ],
 )
@@ -196,6 +195,18 @@ def test_a_drive_that_does_not_do_what_it_must(
     pattern: str,
 ) -> None:
     device_on_bus.answers[place] = answer
+    assert re.search(pattern, refusal(device_on_bus, settings_of_virtual_joint, DeviceError))
+
+
+@pytest.mark.parametrize(
+    ("off_for", "pattern"),
+    [(1, "node 1 is operation enabled, and was off a moment ago"), (2, "node 1 stays enabled although controlword 0")],
+)
+def test_a_drive_that_gets_power_while_it_is_commissioned(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, off_for: int, pattern: str
+) -> None:
+    device_on_bus.sequences[0x6041, 0] = [0x1250] * off_for
+    device_on_bus.answers[0x6041, 0] = 0x1637
     assert re.search(pattern, refusal(device_on_bus, settings_of_virtual_joint, DeviceError))
 
 

@@ -124,7 +124,7 @@ def test_not_ready_to_switch_on_for_too_long(commission: Any, device_on_bus: Any
 
 
 def test_no_statusword_until_the_first_controlword_that_is_not_zero(commission: Any, device_on_bus: Any) -> None:
-    device_on_bus.sequences[(0x6041, 0)] = [0, 0, 0]
+    device_on_bus.sequences[(0x6041, 0)] = [0, 0, 0, 0]
     commission(boot_timeout_s=1.0)
     words = [data[4] for cob, data in device_on_bus.requests if cob == 0x601 and data[:3] == b"\x2b\x40\x60"]
     assert words[:2] == [0x00, 0x06]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from typing import Any
 import can
 import pytest
 
-from drivers.drive import UNTOUCHED, CommissioningReport, DriveIdentity, is_safe
+from drivers.drive import UNTOUCHED, CommissioningReport, Declined, DriveIdentity, is_safe
 from drivers.errors import BusError, DataError, DeviceError
 from hil.canopen.device_records import PowerState
 from tests.places import CONFIGS
@@ -112,6 +113,35 @@ def test_a_full_disk_behind_its_output_does_not_hide_it(
         stop_module.stop(CONFIGS / "virtual.toml", Output(stdout=full))
 
 
+# --- the watchdog ----------------------------------------------------------------------------------------------------
+
+
+def consumer(device_on_bus: Any) -> int:
+    return int(device_on_bus.device.objects.value(0x1016, 1))
+
+
+def test_stop_leaves_the_watchdog_as_it_is(device_on_bus: Any, settings_of_virtual_joint: Any) -> None:
+    drive = device_on_bus.drive(settings_of_virtual_joint)
+    drive.commission()
+    armed, deadline = consumer(device_on_bus), int(device_on_bus.device.objects.value(0x1400, 5))
+    assert (armed & 0xFFFF, deadline) > (0, 0)
+    assert device_on_bus.stop_drive() == "switch on disabled"
+    assert (consumer(device_on_bus), int(device_on_bus.device.objects.value(0x1400, 5))) == (armed, deadline)
+    drive.make_safe(asked=True)
+    assert consumer(device_on_bus) == 0  # the one that armed it takes it away
+    drive.close()
+
+
+def test_only_its_own_watchdog_is_taken_away(device_on_bus: Any, settings_of_virtual_joint: Any) -> None:
+    drive = device_on_bus.drive(settings_of_virtual_joint)
+    drive.commission()
+    other = 42 << 16 | 500
+    drive._objects.write(0x1016, 1, other, what="another program's consumer heartbeat time")
+    assert drive.make_safe() == "switch on disabled"
+    assert consumer(device_on_bus) == other
+    drive.close()
+
+
 # --- another controller, after ours has commissioned ---------------------------------------------------------------
 
 
@@ -166,9 +196,16 @@ def test_its_twin_starts_and_is_made_safe_beside_its_own_loop(device_on_bus: Any
 
 def test_a_no_leaves_the_drive_to_the_other_controller(device_on_bus: Any, waiting: Any) -> None:
     with another_controller(device_on_bus):
-        assert waiting.make_safe() == UNTOUCHED
-        assert commands(device_on_bus) == []
-    assert waiting.make_safe() == "switch on disabled"  # the twin: nobody else is there
+        waiting._pause(0.1)
+    assert waiting.make_safe() == UNTOUCHED
+    assert commands(device_on_bus) == []
+
+
+def test_its_twins_where_no_one_came_or_the_user_has_asked_for_a_stop(device_on_bus: Any, waiting: Any) -> None:
+    assert waiting.make_safe() == "switch on disabled"
+    with another_controller(device_on_bus):
+        waiting._pause(0.1)
+    assert waiting.make_safe(asked=True) == "switch on disabled"  # the frames may have been those of that stop
 
 
 # --- clear-fault ---------------------------------------------------------------------------------------------------
@@ -207,9 +244,9 @@ class NoLoop:
 
 def left_by_a_dry_run(monkeypatch: pytest.MonkeyPatch, config: Any, state: str) -> int:
     report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.0, 0.1, 1e-5)
-    drive = SimpleNamespace(commission=lambda: report, make_safe=lambda: state, close=lambda: None)
+    drive = SimpleNamespace(commission=lambda _: report, make_safe=lambda *, asked: state, close=lambda: None)
     monkeypatch.setattr(supervisor_module, "LoopHandle", NoLoop)
-    monkeypatch.setattr(supervisor_module, "open_drive", lambda _: drive)
+    monkeypatch.setattr(supervisor_module, "open_drive", lambda *_: drive)
     monkeypatch.setattr(supervisor_module, "start_guard", lambda *_: None)
     return run_module.run(config, Output(), assume_yes=True, dry_run=True)
 
@@ -255,11 +292,51 @@ def test_a_drive_that_is_found_enabled_brakes_before_its_power_goes_off(
     device_on_bus.requests.clear()
     drive = device_on_bus.drive(settings_of_virtual_joint)
     try:
-        report = drive.commission()
+        report = drive.commission(lambda _: True)
     finally:
         drive.close()
     assert control_words(device_on_bus)[:2] == [2, 0]  # quick stop, then disable voltage
+    first_nmt = next(at for at, (cob, _) in enumerate(device_on_bus.requests) if cob == 0)
+    quick_stop = next(
+        at for at, (cob, data) in enumerate(device_on_bus.requests) if data[:5] == b"\x2b\x40\x60\x00\x02"
+    )
+    assert quick_stop < first_nmt
     assert any("the drive was enabled" in remark for remark in report.remarks)
+
+
+@pytest.mark.parametrize("approve", [None, lambda _: False])
+def test_without_the_users_word_it_is_left_as_it_is(
+    device_on_bus: Any, settings_of_virtual_joint: Any, approve: Any
+) -> None:
+    power_up(device_on_bus)
+    device_on_bus.requests.clear()
+    drive = device_on_bus.drive(settings_of_virtual_joint)
+    try:
+        with pytest.raises(DeviceError if approve is None else Declined):
+            drive.commission(approve)
+        assert drive.make_safe() == UNTOUCHED
+    finally:
+        drive.close()
+    assert powered(device_on_bus)
+    assert commands(device_on_bus) == []
+
+
+@pytest.mark.parametrize(("step", "turns"), [(0, False), (2, False), (40, True), (-40, True)])
+def test_an_enabled_drive_that_turns_is_left_alone(
+    device_on_bus: Any, settings_of_virtual_joint: Any, step: int, turns: bool
+) -> None:
+    power_up(device_on_bus)
+    device_on_bus.requests.clear()
+    device_on_bus.sequences[0x6064, 0] = [1000 + step * (at % 2 if step == 2 else at) for at in range(40)]
+    drive = device_on_bus.drive(settings_of_virtual_joint)
+    asked: list[str] = []
+    try:
+        with pytest.raises(DeviceError, match="turns") if turns else contextlib.nullcontext():
+            drive.commission(lambda question: asked.append(question) is None)
+        assert (drive.make_safe() == UNTOUCHED) is turns
+    finally:
+        drive.close()
+    assert (powered(device_on_bus), len(asked)) == ((True, 0) if turns else (False, 1))
 
 
 def test_its_twin_that_is_off_is_not_braked(device_on_bus: Any, settings_of_virtual_joint: Any) -> None:
@@ -282,6 +359,12 @@ def test_clear_fault_leaves_an_enabled_drive_alone(device_on_bus: Any, settings_
         assert powered(device_on_bus)
         assert commands(device_on_bus) == []
         assert device_on_bus.stop_drive() == "switch on disabled"
-        assert drive.clear_fault() == "no fault: the drive is switch on disabled"  # the twin
+        with pytest.raises(BusError, match="another controller"):  # it has received the frames of that stop
+            drive.clear_fault()
     finally:
         drive.close()
+    later = device_on_bus.drive(settings_of_virtual_joint)
+    try:
+        assert later.clear_fault() == "no fault: the drive is switch on disabled"  # the twin
+    finally:
+        later.close()

@@ -112,7 +112,7 @@ def test_without_an_answer_it_is_unknown_and_asked_again() -> None:
         (struct.pack("<BHBI", 0x80, INDEX, 0, 0x06020000), "object does not exist (SDO abort 06020000h)"),
         (struct.pack("<BHBI", 0x80, INDEX, 0, 0x08000000), "refused (SDO abort 08000000h)"),
         (upload(b"\x01"), "16 bits are expected"),
-        (struct.pack("<BHBI", 0x41, INDEX, 0, 20), "16 bits are expected"),  # a segmented transfer: not a number
+        (struct.pack("<BHBI", 0x41, INDEX, 0, 20), "is no expedited answer"),  # a segmented transfer: not a number
     ],
 )
 def test_an_abort_and_nonsense_make_it_unknown(answer: bytes, words: str) -> None:

@@ -36,9 +36,24 @@ class TestCommissioning:
 
     def test_a_motor_that_was_on_is_switched_off_and_told(self, port: MemoryPort) -> None:
         port.device.execute(b"MO=1")
-        report = port.drive().commission()
+        report = port.drive().commission(lambda _: True)
         assert port.device.m.motor_on == 0
         assert any("was on" in remark for remark in report.remarks)
+
+    @pytest.mark.parametrize("step", [100, -100, 0])
+    def test_a_motor_that_is_on_and_turns_is_left_alone(self, port: MemoryPort, step: int) -> None:
+        port.device.execute(b"MO=1")
+        counts = iter(range(0, 1_000_000 * (step or 1), step)) if step else None
+        port.answer = lambda line, reply: b"PX\r%d;" % next(counts) if counts is not None and line == b"PX" else reply
+        asked: list[str] = []
+        approve = lambda question: bool(asked.append(question)) or True  # noqa: E731
+        if step == 0:
+            port.drive().commission(approve)
+            assert (port.device.m.motor_on, len(asked)) == (0, 1)
+            return
+        with pytest.raises(DeviceError, match=r"turns .* left as it is"):
+            port.drive().commission(approve)
+        assert (port.device.m.motor_on, asked) == (1, [])
 
     def test_a_real_drive_without_position_limits_is_a_remark(self, port: MemoryPort) -> None:
         port.answer = lambda line, reply: line + b"\r\x03?;" if line.startswith((b"HL[3]", b"LL[3]")) else reply
@@ -74,7 +89,7 @@ class TestCommissioning:
             (lambda line, reply: b"", NoDeviceError, "no drive answers on memory at 115200 baud"),
             (lambda line, reply: b"\xf8\x80\xfe", NoDeviceError, "baud rate"),
             (lambda line, reply: b"\xf8;\x80;", NoDeviceError, "baud rate"),
-            (lambda line, reply: b"MO\r1;" if line == b"MO" else reply, DeviceError, "cannot be switched off"),
+            (lambda line, reply: b"MO\r1;" if line == b"MO" else reply, DeviceError, "left as it is"),
             (lambda line, reply: b"CL[1]\r4.9;" if line == b"CL[1]" else reply, DeviceError, "does not read back"),
             (lambda line, reply: b"HL[2]\r1;" if line == b"HL[2]" else reply, DeviceError, "HL[2]"),
             (lambda line, reply: b"UM=1\r\x02?;" if line == b"UM=1" else reply, DeviceError, "bad command"),

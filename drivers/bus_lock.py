@@ -1,0 +1,358 @@
+"""One controller for each bus or serial line of a computer, and the way by which `jointctl stop` reaches it.
+
+A program that controls a bus holds its lock before it sends anything to the drive, until it ends: SYNC gives a
+controller away only while its loop runs, not at commissioning nor while the user is asked.
+
+The lock is an abstract Unix socket.  The kernel takes it back however the program ends, and it belongs to the network
+namespace, as SocketCAN's interfaces do.  A thread answers on it, in single lines of JSON:
+
+    {"ask": "who"}   ->  {"controls": NAME, "pid": 123}
+    {"ask": "stop"}  ->  {"controls": NAME, "pid": 123, "within_s": 8.0}   at once, after `on_stop` was called
+                         and the connection is closed when the lock is given back
+                         {"controls": NAME, "pid": 123, "refused": "..."}  to another user, root excepted
+
+A name proves nothing: who holds it without that answer keeps no one off the bus, the lock then takes the next of its
+names.  Each process of a controller also has a descriptor with the lock's name (`marker_fd`, a memory file), which the
+kernel lists: so the processes are found though they hang, and though the one that answers has died.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import os
+import selectors
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, Self
+
+from drivers.can.serial_adapter import port_path
+from drivers.can.virtual_bus import socket_path
+from drivers.errors import BusError
+from drivers.local_socket import ANSWER_S, listener, may_ask, parsed_line, process_behind, send_line
+from drivers.port_users import program_name
+
+STARTING = "jointctl-starting"  # marks a program that is about to control a bus, until it has its lock
+NAMES = 8  # of one lock: as many programs would have to hold the others
+_RELEASE_S = 0.05  # a process that was just started holds a copy until it has become another program
+_IN_PROCESS = "virtual"  # python-can's bus of this name ends with the process: no one else can be on it
+_LONGEST = 256  # bytes of a request
+_CALLERS = 64  # that are served at once; the oldest gives way
+STOP_WITHIN_S = 8.0  # how long a program may take to end after a stop, unless it says otherwise
+
+
+class BusLock:
+    """Held until `close`; `BusError` names the program that has it.  No lock where the system has no such sockets.
+
+    `on_stop` is called in a thread of the lock when the user asks for a stop, once.  `remarks`: what was found and
+    does not keep this program off the bus.
+    """
+
+    def __init__(
+        self, interface: str, channel: str, on_stop: Callable[[], None] | None = None,
+        within_s: float = STOP_WITHIN_S,
+    ) -> None:  # fmt: skip
+        self.marker_fd: int | None = None  # to be handed to every process that acts for this program
+        self.remarks: list[str] = []
+        self._place = f"{interface}:{channel}"
+        self._on_stop, self._within_s = on_stop, within_s
+        self._server: socket.socket | None = None
+        self._number = -1  # of the name that this lock has
+        self._thread: threading.Thread | None = None
+        if sys.platform != "linux" or interface == _IN_PROCESS:
+            return
+        self._name = lock_name(interface, channel)
+        try:
+            self._take_free_name()
+            self._wake, self._woken = socket.socketpair()
+        except OSError:  # no such sockets here
+            return
+        self._thread = threading.Thread(target=self._serve, name="bus lock", daemon=True)
+        self._thread.start()
+        try:
+            self._refuse_others()
+            self.marker_fd = os.memfd_create(self._name)
+            _no_longer_starting()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Leave the bus to others; may be called twice."""
+        if self._thread is not None:
+            self._woken.send(b"x")
+            self._thread.join()
+            self._thread = None
+            self._wake.close()
+            self._woken.close()
+        if self.marker_fd is not None:
+            os.close(self.marker_fd)
+            self.marker_fd = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _take_free_name(self) -> None:
+        """The first name that no one has; others may have all of them."""
+        for number in range(NAMES):
+            try:
+                self._server, self._number = listener(_address(self._name, number)), number
+                return
+            except OSError as error:
+                if error.errno != errno.EADDRINUSE:
+                    raise
+
+    def _refuse_others(self) -> None:
+        """`BusError` where another controller has the bus, or processes of one that has died."""
+        holders = _holders(self._name, but=self._number)
+        with contextlib.ExitStack() as stack:
+            for holder in holders:
+                stack.callback(holder.close)
+                holder.send("who")
+            wait_for_answers(holders)
+            for holder in holders:
+                if holder.is_controller:
+                    raise self._refusal(holder.pid, "controls")
+        if marked_processes(self._name):
+            time.sleep(_RELEASE_S)
+        if marked := marked_processes(self._name):
+            raise self._refusal(marked[0], "that does not answer still controls")
+        self.remarks += [
+            f"{_program(holder.pid)} has the name of the lock of {self._place} and is no controller: it is ignored"
+            for holder in holders
+        ]
+        if self._server is None:
+            self.remarks.append(f"{self._place} cannot be locked: a second controller of another user is not kept off")
+
+    def _refusal(self, pid: int, what: str) -> BusError:
+        return BusError(
+            f"another program {what} {self._place} ({_program(pid)})",
+            "only one controller may use a bus: end it first; `jointctl stop` switches its drive off and ends it",
+        )
+
+    # --- the thread ---
+
+    def _serve(self) -> None:
+        """Answer whoever asks; returns when `close` wakes it."""
+        signal.pthread_sigmask(signal.SIG_BLOCK, set(signal.valid_signals()) - {signal.SIGKILL, signal.SIGSTOP})
+        callers: dict[socket.socket, bytes] = {}
+        with selectors.DefaultSelector() as selector:
+            selector.register(self._wake, selectors.EVENT_READ)
+            if self._server is not None:
+                self._server.setblocking(False)
+                selector.register(self._server, selectors.EVENT_READ)
+            while True:
+                ready = [key.fileobj for key, _ in selector.select()]
+                if self._wake in ready:
+                    break
+                for end in ready:
+                    if end is self._server:
+                        self._take_caller(callers, selector)
+                    elif isinstance(end, socket.socket) and not self._listen_to(end, callers):
+                        selector.unregister(end)
+                        del callers[end]
+                        end.close()
+        if self._server is not None:  # first, so that no one is accepted and then not answered
+            self._server.close()
+        for caller in callers:
+            caller.close()
+
+    def _take_caller(self, callers: dict[socket.socket, bytes], selector: selectors.BaseSelector) -> None:
+        assert self._server is not None
+        with contextlib.suppress(OSError):
+            caller, _ = self._server.accept()
+            caller.setblocking(False)
+            if len(callers) >= _CALLERS:
+                oldest = next(iter(callers))
+                selector.unregister(oldest)
+                del callers[oldest]
+                oldest.close()
+            callers[caller] = b""
+            selector.register(caller, selectors.EVENT_READ)
+
+    def _listen_to(self, caller: socket.socket, callers: dict[socket.socket, bytes]) -> bool:
+        """What one caller has sent; False where it has gone, or sends what is no request."""
+        try:
+            part = caller.recv(_LONGEST)
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False
+        data = callers[caller] + part
+        callers[caller] = data
+        if not part or len(data) > _LONGEST:
+            return False
+        if not data.endswith(b"\n"):
+            return True
+        callers[caller] = b""
+        message = parsed_line(data)
+        if message is None:
+            return False
+        answer: dict[str, Any] = {"controls": self._name, "pid": os.getpid()}
+        with contextlib.suppress(OSError):  # it has gone; its stop counts all the same
+            if message.get("ask") == "stop":
+                if not may_ask(caller):
+                    answer["refused"] = "this program belongs to another user"
+                else:
+                    answer["within_s"] = self._within_s
+                    if self._on_stop is not None:
+                        self._on_stop()
+                        self._on_stop = None
+            send_line(caller, answer)
+        return True
+
+
+class Holder:
+    """A program that holds one of the names of a lock, asked without waiting."""
+
+    def __init__(self, name: str, number: int) -> None:
+        """`OSError` where no one has the name."""
+        self._name = name
+        self._answer: dict[str, Any] | None = None
+        self._data = b""
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            self.socket.setblocking(False)
+            self.socket.connect(_address(name, number))
+            self.pid, _ = process_behind(self.socket)
+        except OSError:
+            self.socket.close()
+            raise
+
+    def close(self) -> None:
+        self.socket.close()
+
+    def send(self, ask: str) -> None:
+        """Never waits."""
+        with contextlib.suppress(OSError):
+            send_line(self.socket, {"ask": ask})
+
+    def poll(self) -> bool:
+        """Whether there is nothing more to come: it has answered, or left."""
+        try:
+            part = self.socket.recv(_LONGEST)
+        except BlockingIOError:
+            return self._answer is not None
+        except OSError:
+            part = b""
+        self._data += part
+        if self._answer is None and self._data.endswith(b"\n"):
+            self._answer = parsed_line(self._data)
+        return self._answer is not None or not part
+
+    @property
+    def is_controller(self) -> bool:
+        """Whether it has answered as the holder of this lock does, about itself."""
+        answer = self._answer or {}
+        return answer.get("controls") == self._name and answer.get("pid") == self.pid
+
+    @property
+    def within_s(self) -> float | None:
+        """How long it may take to stop, by its own word; None where it has not acknowledged."""
+        within = (self._answer or {}).get("within_s")
+        return float(within) if self.is_controller and isinstance(within, (int, float)) else None
+
+    @property
+    def refused(self) -> str:
+        """Why it does not stop; "" where it has not refused."""
+        return str((self._answer or {}).get("refused", "")) if self.is_controller else ""
+
+    @property
+    def left(self) -> bool:
+        """Whether it has given the lock back, or has died."""
+        try:
+            return not self.socket.recv(_LONGEST)
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+
+
+def _holders(name: str, but: int = -1) -> list[Holder]:
+    """All programs that hold a name of this lock, without that of the number `but`."""
+    found = []
+    for number in range(NAMES):
+        with contextlib.suppress(OSError):
+            if number != but:
+                found.append(Holder(name, number))
+    return found
+
+
+def lock_holders(interface: str, channel: str) -> list[Holder]:
+    """The programs that hold a name of this bus's lock; to be closed."""
+    return _holders(lock_name(interface, channel)) if sys.platform == "linux" and interface != _IN_PROCESS else []
+
+
+def wait_for_answers(holders: Iterable[Holder], timeout_s: float = ANSWER_S) -> None:
+    """Until each has answered or left, `timeout_s` at most."""
+    waiting = list(holders)
+    give_up_s = time.monotonic() + timeout_s
+    with selectors.DefaultSelector() as selector:
+        for holder in waiting:
+            selector.register(holder.socket, selectors.EVENT_READ, holder)
+        while selector.get_map() and (left_s := give_up_s - time.monotonic()) > 0.0:
+            for key, _ in selector.select(left_s):
+                if key.data.poll():
+                    selector.unregister(key.fileobj)
+
+
+def marked_processes(name: str, proc: Path = Path("/proc")) -> list[int]:
+    """Processes that act for the holder of this lock, ourselves not among them; of this user, or all for root."""
+    return [
+        int(folder.name)
+        for folder in proc.glob("[0-9]*")
+        if int(folder.name) != os.getpid() and is_marked(int(folder.name), name, proc)
+    ]
+
+
+def is_marked(pid: int, name: str, proc: Path = Path("/proc")) -> bool:
+    """Whether the process has the marker of this lock; False where this user may not look."""
+    with contextlib.suppress(OSError):
+        for link in (proc / str(pid) / "fd").iterdir():
+            with contextlib.suppress(OSError):
+                if os.readlink(link).startswith(f"/memfd:{name} "):
+                    return True
+    return False
+
+
+def _no_longer_starting() -> None:
+    """Take the mark away that the program gave itself when it was started (`STARTING`)."""
+    for link in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):
+            if os.readlink(link).startswith(f"/memfd:{STARTING} "):
+                os.close(int(link.name))
+
+
+def lock_name(interface: str, channel: str) -> str:
+    """Of the bus itself, whatever links lead to it, and whatever else has its name in another mount namespace."""
+    place = f"{interface}:{channel}"
+    if interface == "jointctl":
+        path = socket_path(channel)
+        place = f"{interface}:{path}"
+        with contextlib.suppress(OSError):
+            found = os.stat(path)
+            place = f"{interface}:{found.st_dev:x}:{found.st_ino:x}"
+    elif interface == "serial" or port_path(channel).startswith("/"):
+        place = f"{interface}:{os.path.realpath(port_path(channel))}"
+    return "jointctl-bus-" + hashlib.sha256(place.encode()).hexdigest()[:32]
+
+
+def _address(name: str, number: int) -> bytes:
+    return b"\0" + (name if number == 0 else f"{name}-{number}").encode()
+
+
+def _program(pid: int) -> str:
+    """`jointctl, pid 1234`; without a name where it has just gone."""
+    try:
+        return f"{program_name(pid)}, pid {pid}"
+    except OSError:
+        return f"pid {pid}"

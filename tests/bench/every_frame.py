@@ -1,0 +1,429 @@
+"""A stop, a death, another controller or a loss after EVERY frame of a run: is the joint off in time, and off for good?
+
+    python tests/bench/every_frame.py [--kind run|sweep] [--deadline yes|no] [--every 1] [--rest 20] [--workers 2]
+
+The run is simulated (`tests/simulated_programs.py`): supervisor, loop, `jointctl stop` and virtual drive at simulated
+time, frame by frame.  Right after frame k the process is forked for each injection; the child carries the run on to
+its end and judges it, the parent goes on as if nothing had been.  `--rest N`: every Nth frame where nothing changes:
+while the loop waits with the drive off, and from 100 ms after enabling until the stop.  Exit code 1 on a violation.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import os
+import re
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+from drivers.errors import JointctlError  # noqa: E402
+from firmware_py.realtime import Word  # noqa: E402
+from firmware_py.states import Fault  # noqa: E402
+from tests.simulated_programs import (  # noqa: E402
+    World,
+    quiet_output,
+    simulated,
+    stop_of_another_computer,
+    stop_of_this_computer,
+)
+from tools.configuration.config import Config  # noqa: E402
+from tools.configuration.load import load_config, shipped_config  # noqa: E402
+from tools.running.control import Control  # noqa: E402
+from tools.running.display.phase_lines import PhaseLines  # noqa: E402
+from tools.running.stop_signals import STOP_COMMAND, StopSignals  # noqa: E402
+from tools.running.supervisor import Supervisor  # noqa: E402
+
+VERBOSE = False
+CLOCK = time.monotonic  # the computer's own
+FIRST_MOTION_CYCLES = 100  # of the approach, in which every frame is tried
+ENABLING_s = 0.05  # a write while the loop enables is seen at the supervisor's next look
+QUIET_s = 0.2  # for so long after the end the drive must stay off
+LONGEST_s = 30.0
+CYCLE_FRAMES = 4
+
+
+@dataclass
+class Session:
+    """One run, and what became of it."""
+
+    world: World
+    config: Config
+    signals: StopSignals
+    supervisor: Supervisor
+    outcome: str = ""  # how the supervisor ended: "" while it runs
+    text: str = ""
+    waiting_frames: int = 0
+
+    @property
+    def node(self) -> int:
+        return self.config.canopen.node
+
+    @property
+    def loop(self) -> Any:
+        return SEEN[-1] if SEEN else None
+
+    @property
+    def phase(self) -> str:
+        """Of the run: commissioning, the loop's phases, or switching off."""
+        loop = self.loop
+        if loop is None or not loop.block.words[Word.GO]:
+            return "commissioning"
+        return "switching off" if loop.block.words[Word.ENDED] else loop.phase.name.lower().replace("_", " ")
+
+    def carry_out(self) -> None:
+        """The supervisor's program."""
+        try:
+            result = self.supervisor.run()
+        except KeyboardInterrupt:
+            self.outcome, self.text = "interrupted", self.signals.name
+        except JointctlError as error:
+            self.outcome, self.text = type(error).__name__, str(error)
+        else:
+            self.outcome = "done" if result is not None else "declined"
+            if result is not None and result.stopped_by:
+                self.outcome, self.text = "interrupted", result.stopped_by
+            elif result is not None and result.fault is not Fault.NONE:
+                self.outcome = "fault"
+                self.text = f"{result.fault.name}: {result.fault_text}"
+
+
+SEEN: list[Any] = []  # loops of this process
+
+
+def write_object(index: int, sub: int, value: int, size: int) -> Callable[[Session], None]:
+    """An expedited SDO download of another master."""
+
+    def inject(session: Session) -> None:
+        data = struct.pack("<BHB", 0x23 | (4 - size) << 2, index, sub) + value.to_bytes(4, "little")
+        session.world.send(None, 0x600 + session.node, data)
+
+    return inject
+
+
+def nmt(command: int) -> Callable[[Session], None]:
+    return lambda session: session.world.send(None, 0, bytes([command, session.node]))
+
+
+def die(*names: str) -> Callable[[Session], None]:
+    def inject(session: Session) -> None:
+        loop = session.loop
+        if "loop" in names and loop is not None:
+            loop._process.kill()
+        session.world.kill(*names)
+
+    return inject
+
+
+def lose(direction: str) -> Callable[[Session], None]:
+    return lambda session: setattr(session.world, direction, True)
+
+
+@dataclass(frozen=True)
+class Injection:
+    """`reaction_s`: until the joint is being stopped, at most (docs/safety.md); `causes`: one must be in the message.
+
+    `may_enable`: the program that would enable cannot know of it yet.
+    """
+
+    act: Callable[[Session], None]
+    reaction_s: Callable[[Config], float]
+    causes: tuple[str, ...] = ()
+    may_enable: bool = False
+    ends: bool = True  # whether the run must end by it, wherever it comes before the loop's end
+
+
+def at_once(_: Config) -> float:
+    return 0.1
+
+
+def by_heartbeat(config: Config) -> float:
+    return 20.0 / config.loop.rate_Hz + config.canopen.heartbeat_s + config.limits.sample_age_max_s
+
+
+def by_ramp(config: Config) -> float:
+    return config.sequence.supervisor_timeout_s + config.sequence.stop_timeout_s + config.sequence.release_s
+
+
+OTHERS = ("another controller", "another program", "DRIVE_", "STALE", "NO_SAMPLES", "SAMPLES_MISSING", "ENABLE_TIMEOUT",
+          "OFF_TIMEOUT", "does not answer", "got no answer", "changed", "was set", "refused", "mode")  # fmt: skip
+SILENCE = ("no answer", "does not answer", "STALE", "NO_SAMPLES", "SAMPLES_MISSING", "DRIVE_", "did not react",
+           "ENABLE_TIMEOUT", "OFF_TIMEOUT", "did not confirm", "watchdog tripped", "cannot be read")  # fmt: skip
+INJECTIONS = {
+    "stop": Injection(lambda s: stop_of_this_computer(s.world, s.signals, s.node), at_once, (STOP_COMMAND,)),
+    "stop of another computer": Injection(lambda s: stop_of_another_computer(s.world, s.node), at_once, OTHERS),
+    "loop dies": Injection(die("loop"), by_heartbeat, ("loop process",), may_enable=True),
+    "supervisor dies": Injection(die("supervisor"), by_ramp, may_enable=True),
+    "both die": Injection(die("loop", "supervisor"), by_heartbeat, may_enable=True),
+    "NMT pre-operational": Injection(nmt(128), at_once, OTHERS),
+    "NMT stop": Injection(nmt(2), at_once, OTHERS),
+    "NMT reset node": Injection(nmt(129), at_once, OTHERS),
+    "NMT reset communication": Injection(nmt(130), at_once, OTHERS),
+    "SDO 1016:1 = 0": Injection(write_object(0x1016, 1, 0, 4), at_once, OTHERS, may_enable=True),
+    "SDO 1400:5 = 0": Injection(write_object(0x1400, 5, 0, 2), at_once, OTHERS, may_enable=True),
+    "SDO 6007 = 0": Injection(write_object(0x6007, 0, 0, 2), at_once, OTHERS, may_enable=True),
+    "SDO 6060 = 1": Injection(write_object(0x6060, 0, 1, 1), at_once, OTHERS, may_enable=True),
+    "SDO 6040 = 0": Injection(write_object(0x6040, 0, 0, 2), at_once, OTHERS, may_enable=True),
+    "SDO 6040 = 0Fh": Injection(write_object(0x6040, 0, 0x0F, 2), at_once, OTHERS, may_enable=True),
+    "frames to the drive lost": Injection(lose("lost_to_drive"), by_heartbeat, SILENCE),
+    "frames of the drive lost": Injection(lose("lost_from_drive"), by_heartbeat, SILENCE, may_enable=True),
+}
+
+
+@dataclass
+class Verdict:
+    """Of one injection."""
+
+    frame: int
+    phase: str
+    injection: str
+    off_after_s: float
+    outcome: str
+    text: str
+    problems: list[str] = field(default_factory=list)
+
+
+def judge(session: Session, name: str, frame: int, phase: str, injected_ns: int, powered: bool) -> Verdict:
+    """After the run has ended."""
+    world, config, injection = session.world, session.config, INJECTIONS[name]
+    sequence = config.sequence
+    allowed_s = injection.reaction_s(config) + sequence.stop_timeout_s + sequence.off_timeout_s
+    changes = [(time_ns, on) for time_ns, on in world.power_changes if time_ns >= injected_ns]
+    off_ns = max((time_ns for time_ns, on in changes if not on), default=injected_ns)
+    verdict = Verdict(frame, phase, name, (off_ns - injected_ns) * 1e-9, session.outcome, session.text[:300])
+    problems = verdict.problems
+    if world.powered:
+        problems.append("the drive has power at the end")
+    if verdict.off_after_s > allowed_s:
+        problems.append(f"off after {verdict.off_after_s:.2f} s, allowed are {allowed_s:.2f} s")
+    ons = [time_ns for time_ns, on in changes if on]
+    late = [time_ns for time_ns in ons if (time_ns - injected_ns) * 1e-9 > ENABLING_s]
+    if ons and not injection.may_enable:
+        problems.append(f"enabled {(ons[0] - injected_ns) * 1e-6:.1f} ms after it")
+    elif (
+        len(ons) > 1 or (ons and powered) or (late and name != "supervisor dies" and name != "frames of the drive lost")
+    ):
+        problems.append(f"enabled again {(ons[-1] - injected_ns) * 1e-6:.1f} ms after it")
+    if world.enabled_unproven:
+        problems.append("enabled without a proven watchdog")
+    if injection.causes and session.outcome not in ("",) and phase != "switching off":
+        if session.outcome == "done" and phase not in ("disabling", "finished"):
+            problems.append("the run went on as if nothing had been")
+        elif session.outcome != "done" and not any(cause in session.text for cause in injection.causes):
+            problems.append(f"the message does not name the cause: {session.outcome}: {session.text[:200]}")
+    return verdict
+
+
+def prepared(kind: str, deadline: bool, folder: Path) -> Config:
+    """The configuration of a short run."""
+    text = shipped_config("virtual").read_text()
+    text = re.sub(r"(?m)^duration_s = .*$", "duration_s = 0.3", text)
+    text = re.sub(r"(?m)^release_s = \S+", "release_s = 0.02", text)
+    text = re.sub(r"(?m)^heartbeat_s = \S+", "heartbeat_s = 0.1", text)
+    eds = (ROOT / "configs" / "virtual_joint.eds").read_text()
+    if not deadline:
+        eds, count = re.subn(r"(?ims)^\[1400sub5\].*?(?=^\[|\Z)", "", eds)
+        assert count == 1
+    (folder / "joint.eds").write_text(eds)
+    text = text.replace('"virtual_joint.eds"', '"joint.eds"')
+    path = folder / f"{kind}.toml"
+    path.write_text(text)
+    return load_config(path)
+
+
+def new_supervisor(kind: str, config: Config, control: Control, folder: Path) -> Supervisor:
+    output, log = quiet_output(), folder / "log.mcap"
+    if kind == "run":
+        return Supervisor(config, output, log, lambda _: True, control, display=lambda: PhaseLines(output))
+    from tools.sweeping.carry_out import SweepSupervisor, with_mode
+    from tools.sweeping.meter import SweepMeter
+    from tools.sweeping.options import SweepOptions, make_plan
+    from tools.sweeping.statistics import Tolerance
+    from tools.verbs.sweep import joint_model
+
+    config = with_mode(config, "auto")
+    options = SweepOptions(points=2, min_speed_radps=0.1, max_speed_radps=0.2, dwell_s=0.3, warm_up_turns=0.0)
+    plan = make_plan(config, options)
+    motion = plan.motion(plan.points, 0.0, 1.0)
+    meter = SweepMeter(motion.windows, joint_model(config, plan.settings), lambda _: None)
+    meter.tolerance = Tolerance(0.01, 0.001)
+    return SweepSupervisor(config, output, log, lambda _: True, motion, meter, lambda _: None, control)
+
+
+class Exhaustion:
+    """Runs once and forks after its frames."""
+
+    def __init__(self, kind: str, deadline: bool, every: int, rest: int, part: tuple[int, int], out: Any) -> None:
+        self.kind, self.deadline, self.every, self.rest, self.part, self.out = kind, deadline, every, rest, part, out
+        self.child = False
+        self.chosen = self.in_rest = 0
+        self.why: tuple[str, int, str, int, bool] | None = None
+
+    def run(self) -> int:
+        """The number of frames of the undisturbed run."""
+        with tempfile.TemporaryDirectory() as name:
+            config = prepared(self.kind, self.deadline, Path(name))
+            with simulated(config) as world:
+                self.session = self._start(config, world, Path(name))
+                self.motion_cycle = -1
+                world.on_frame = self._after_frame
+                gc.collect()
+                gc.freeze()
+                gc.disable()  # a child would copy what it looks through
+                world.run(lambda: world.now_ns > LONGEST_s * 1e9 + 1e9)
+                if self.child:
+                    self._finish()
+                assert self.session.outcome == "done", (self.session.outcome, self.session.text)
+                assert not world.powered
+                return world.frames
+
+    def _start(self, config: Config, world: World, folder: Path) -> Session:
+        from tools.running import supervisor as supervisor_module
+
+        made = supervisor_module.LoopHandle
+
+        def make(*arguments: Any, **more: Any) -> Any:
+            SEEN.append(made(*arguments, **more))
+            return SEEN[-1]
+
+        supervisor_module.LoopHandle = make  # type: ignore[misc, assignment]
+        signals = StopSignals()
+        supervisor = new_supervisor(self.kind, config, Control(signals), folder)
+        session = Session(world, supervisor._config, signals, supervisor)
+        world.start("supervisor", session.carry_out)
+        return session
+
+    def _wanted(self, phase: str) -> bool:
+        """Whether injections follow this frame."""
+        loop = self.session.loop
+        resting = phase == "waiting"
+        if phase in ("approach", "tracking"):
+            if self.motion_cycle < 0:
+                self.motion_cycle = loop.cycles
+            resting = loop.cycles - self.motion_cycle > FIRST_MOTION_CYCLES
+        if resting:
+            self.in_rest += 1
+            if self.in_rest % self.rest:
+                return False
+        self.chosen += 1
+        return (self.chosen % self.every) == 0 and (self.chosen // self.every) % self.part[1] == self.part[0]
+
+    def _after_frame(self, number: int, identifier: int) -> None:
+        if self.child:
+            return
+        phase = self.session.phase
+        if not self._wanted(phase):
+            return
+        for name in INJECTIONS:
+            if os.fork():
+                _, status = os.wait()
+                if status:
+                    problem = f"the simulation ended with status {status}"
+                    row = {"frame": number, "phase": phase, "injection": name, "problems": [problem]}
+                    self.out.write(json.dumps(row) + "\n")
+                    self.out.flush()
+                continue
+            self.child = True
+            world = self.session.world
+            world.fast = True
+            self.why = (name, number, phase, world.now_ns, world.powered)
+            INJECTIONS[name].act(self.session)
+            return
+
+    def _finish(self) -> None:
+        """The end of a child."""
+        assert self.why is not None
+        world = self.session.world
+        world.pass_time(10.0, lambda: not world.powered)
+        world.pass_time(QUIET_s)
+        name, number, phase, injected_ns, powered = self.why
+        verdict = judge(self.session, name, number, phase, injected_ns, powered)
+        if VERBOSE:
+            print(name, phase, injected_ns, powered, world.power_changes, verdict, file=sys.stderr)
+        self.out.write(json.dumps(vars(verdict)) + "\n")
+        self.out.flush()
+        os._exit(0)
+
+
+def report(rows: list[dict[str, Any]], frames: dict[str, int], elapsed_s: float) -> int:
+    """Table and violations; the number of these."""
+    times: dict[str, list[float]] = defaultdict(list)
+    bad = [row for row in rows if row["problems"]]
+    for row in rows:
+        if "off_after_s" in row:
+            times[row["injection"]].append(row["off_after_s"])
+    print(f"{len(rows)} injections after the frames of {', '.join(f'{k} ({n} frames)' for k, n in frames.items())}; "
+          f"{elapsed_s:.0f} s; simulated")  # fmt: skip
+    print(f"{'injection':28} {'number':>7} {'with power':>10} {'off after, median':>18} {'99 %':>8} {'longest':>8}")
+    for name in INJECTIONS:
+        all_s = times[name]
+        off = sorted(value for value in all_s if value > 0.0)
+        shown = [off[len(off) // 2], off[int(0.99 * len(off))], off[-1]] if off else []
+        print(f"{name:28} {len(all_s):7d} {len(off):10d} " + "".join(f"{v * 1e3:12.0f} ms" for v in shown))
+    print(f"{len(bad)} violations")
+    shown_kinds: Counter[tuple[str, str, str]] = Counter()
+    for row in bad:
+        kind = (row["injection"], row["phase"], re.sub(r"[\d.]+", "#", row["problems"][0]))
+        shown_kinds[kind] += 1
+        if shown_kinds[kind] == 1:
+            print(json.dumps(row))
+    for kind, count in shown_kinds.most_common():
+        print(count, *kind)
+    return len(bad)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kind", choices=("run", "sweep"), action="append")
+    parser.add_argument("--deadline", choices=("yes", "no"), action="append", help="whether the drive has 1400:5")
+    parser.add_argument("--every", type=int, default=1, help="every Nth of the frames that would be tried")
+    parser.add_argument("--rest", type=int, default=20, help="every Nth frame where nothing changes")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--part", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    kinds, deadlines = given.kind or ["run", "sweep"], given.deadline or ["yes", "no"]
+    if given.part:
+        number, count = map(int, given.part.split("/"))
+        one = Exhaustion(kinds[0], deadlines[0] == "yes", given.every, given.rest, (number, count), sys.stdout)
+        sys.stdout.write(json.dumps({"frames": one.run()}) + "\n")
+        return 0
+    rows: list[dict[str, Any]] = []
+    frames: dict[str, int] = {}
+    started_s = CLOCK()
+    for kind in kinds:
+        for deadline in deadlines:
+            command = [sys.executable, __file__, "--kind", kind, "--deadline", deadline, "--every", str(given.every)]
+            command += ["--rest", str(given.rest)]
+            parts = [
+                subprocess.Popen([*command, "--part", f"{k}/{given.workers}"], stdout=subprocess.PIPE, text=True)
+                for k in range(given.workers)
+            ]
+            for part in parts:
+                for line in part.communicate()[0].splitlines():
+                    row = json.loads(line)
+                    if "frames" in row:
+                        frames[f"{kind}, {'with' if deadline == 'yes' else 'without'} 1400:5"] = row["frames"]
+                    else:
+                        rows.append(row)
+                if part.returncode:
+                    raise SystemExit(f"a part ended with code {part.returncode}")
+            print(f"{kind}, 1400:5 {deadline}: {len(rows)} injections so far, "
+                  f"{sum(bool(row['problems']) for row in rows)} violations, {CLOCK() - started_s:.0f} s",
+                  file=sys.stderr, flush=True)  # fmt: skip
+    return 1 if report(rows, frames, CLOCK() - started_s) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,426 @@
+"""Supervisor, loop, `jointctl stop` and the virtual drive at simulated time, in one process that can be forked.
+
+Each program is a greenlet that runs the code that ships: the real `Supervisor`, the real driver, the portable loop on
+the kernels of the compiled one, the real `stop_node`.  Only what waits is replaced: sleeping lets the drive and the
+other programs go on, and an SDO answer is there or does not come.  A frame is delivered in the instant in which it is
+sent; every frame is counted, and a hook runs after it.  Nothing depends on the computer's clock.
+
+Importing this replaces the clock of the whole process: for programs of their own only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import mmap
+import struct
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from io import StringIO
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import can
+import canopen
+import greenlet
+import numpy as np
+from canopen.sdo.client import SdoClient
+from canopen.sdo.exceptions import SdoCommunicationError
+
+from drivers.canopen import drive as drive_module
+from drivers.canopen import switch_off as switch_off_module
+from drivers.canopen.drive import CanopenDrive
+from drivers.canopen.exchange import accept, begin, end, exchange_memory
+from drivers.canopen.switch_off import stop_node
+from firmware_py.libc import NANOSECONDS
+from firmware_py.realtime import Word
+from firmware_py.records import LogRecord
+from firmware_py.schema import new
+from firmware_py.states import AxisPhase
+from hil.bus.frames import FRAME_SIZE
+from hil.canopen.device_records import PowerState
+from hil.lockstep import TRUE_POWER_STATE, TRUTHS, run_lockstep
+from tools.configuration.config import Config
+from tools.configuration.drive_settings import canopen_settings
+from tools.output import Output
+from tools.running import supervisor as supervisor_module
+from tools.running.loop import loop_handle as loop_module
+from tools.running.loop import portable_loop, shared_block
+from tools.running.loop.loop_handle import LoopHandle
+from tools.running.stop_signals import STOP_COMMAND, StopSignals
+from tools.simulation.virtual_joint import new_device
+
+STEP_NS = 1_000_000
+FAST_STEPS = 5
+LONGEST_CHUNK = 50  # cycles of the loop in one compiled call
+FRAME_NS = 1_000
+_FRAME = struct.Struct("<IB3x8s")
+POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
+
+
+class World:
+    """One virtual drive, the bus, and the programs on it.  `on_frame` runs after each frame."""
+
+    def __init__(self, config: Config) -> None:
+        self.device = new_device(config)
+        self.now_ns = 1_000_000_000
+        self.frames = 0
+        self.on_frame: Callable[[int, int], None] = lambda number, identifier: None
+        self.lost_to_drive = self.lost_from_drive = False
+        self.fast = False  # frame by frame no more: whole cycles of the loop in one compiled call
+        self.ears: list[Any] = []
+        self.programs: dict[str, Program] = {}
+        self.dead: list[Program] = []
+        self.current: Program | None = None
+        self.hub = greenlet.getcurrent()
+        self.powered = False
+        self.power_changes: list[tuple[int, bool]] = []
+        self.enabled_unproven = False
+        self.watchdog_proven = lambda: True
+        for frame in self.device.advance(self.now_ns):
+            del frame  # the boot-up message: no one is there yet
+
+    # --- time ---
+
+    def sleep(self, seconds: float) -> None:
+        """The calling program waits; the drive and the others go on."""
+        self.sleep_until_ns(self.now_ns + max(0, round(seconds * NANOSECONDS)))
+
+    def sleep_until_ns(self, until_ns: int, *_: Any) -> None:
+        program = self.current
+        assert program is not None, "only a program may wait"
+        program.wake_ns = until_ns
+        self.hub.switch()
+
+    def next_wake_ns(self) -> int:
+        """Of the other programs."""
+        others = [one.wake_ns for one in self.programs.values() if one is not self.current]
+        return min(others, default=self.now_ns + LONGEST_CHUNK * STEP_NS)
+
+    def run(self, until: Callable[[], bool]) -> None:
+        """Until that holds, or no program is left."""
+        while self.programs and not until():
+            program = min(self.programs.values(), key=lambda one: one.wake_ns)
+            if program.wake_ns > self.now_ns:
+                self._advance(min(program.wake_ns, self.now_ns + self.step_ns))
+                continue
+            self.current = program
+            program.greenlet.switch()
+            self.current = None
+            if program.greenlet.dead:
+                self.programs.pop(program.name, None)
+
+    def pass_time(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
+        """The drive alone."""
+        end_ns = self.now_ns + round(seconds * NANOSECONDS)
+        while self.now_ns < end_ns and not until():
+            self._advance(self.now_ns + self.step_ns)
+
+    @property
+    def step_ns(self) -> int:
+        """The drive's timers are looked at so often."""
+        return FAST_STEPS * STEP_NS if self.fast else STEP_NS
+
+    def _advance(self, to_ns: int) -> None:
+        self.now_ns = to_ns
+        for frame in self.device.advance(to_ns):
+            self._from_drive(frame)
+        self.look()
+
+    def look(self) -> None:
+        self.note_power(int(self.device.device[0].state), self.now_ns)
+
+    def note_power(self, state: int, time_ns: int) -> None:
+        """The drive's state at that time."""
+        powered = state in POWERED
+        if powered != self.powered:
+            self.powered = powered
+            self.power_changes.append((time_ns, powered))
+            if powered and not self.watchdog_proven():
+                self.enabled_unproven = True
+
+    # --- programs ---
+
+    def start(self, name: str, function: Callable[[], Any]) -> None:
+        self.programs[name] = Program(name, function, self.now_ns, self.hub)
+
+    def kill(self, *names: str) -> None:
+        """They execute nothing more; one that is executing now ends here."""
+        for name in names:
+            if (program := self.programs.pop(name, None)) is not None:
+                self.dead.append(program)  # what is forgotten would be unwound, and so act once more
+        if self.current is not None and self.current.name in names:
+            self.hub.switch()
+            raise AssertionError("a dead program was woken")
+
+    # --- frames ---
+
+    def send(self, sender: Any, identifier: int, data: bytes) -> None:
+        """A frame of a program: to every other one, and to the drive, which answers at once."""
+        self.now_ns += FRAME_NS
+        frame = _FRAME.pack(identifier, len(data), data)
+        answers = [] if self.lost_to_drive else self.device.handle(frame, self.now_ns)
+        for ear in list(self.ears):
+            if ear is not sender:
+                ear.deliver(identifier, data)
+        self.look()
+        self._count(identifier)
+        for answer in answers:
+            self._from_drive(answer)
+
+    def _from_drive(self, frame: bytes) -> None:
+        identifier, size, data = _FRAME.unpack(frame)
+        if not self.lost_from_drive:
+            for ear in list(self.ears):
+                ear.deliver(identifier, data[:size])
+        self._count(identifier)
+
+    def _count(self, identifier: int) -> None:
+        self.frames += 1
+        self.on_frame(self.frames, identifier)
+
+
+class Program:
+    """A greenlet that is woken at `wake_ns`."""
+
+    def __init__(self, name: str, function: Callable[[], Any], wake_ns: int, hub: greenlet.greenlet) -> None:
+        self.name, self.wake_ns = name, wake_ns
+        self.greenlet = greenlet.greenlet(function, hub)
+
+
+class SimulatedNetwork(canopen.Network):
+    """The `canopen` library on the simulated bus."""
+
+    def __init__(self, world: World, listeners: tuple[can.Listener, ...]) -> None:
+        super().__init__()
+        self._world, self._ears = world, listeners
+
+    def connect(self, *_: Any, **__: Any) -> SimulatedNetwork:
+        self._world.ears.append(self)
+        return self
+
+    def disconnect(self) -> None:
+        if self in self._world.ears:
+            self._world.ears.remove(self)
+
+    def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
+        self._world.send(self, can_id, bytes(data))
+
+    def deliver(self, identifier: int, data: bytes) -> None:
+        self.notify(identifier, bytearray(data), self._world.now_ns * 1e-9)
+        if self._ears:
+            message = can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
+            for ear in self._ears:
+                ear.on_message_received(message)
+
+
+class SimulatedBus:
+    """A python-can bus for the portable loop."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._waiting: deque[can.Message] = deque()
+        world.ears.append(self)
+
+    def deliver(self, identifier: int, data: bytes) -> None:
+        self._waiting.append(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+
+    def send(self, message: can.Message, timeout: float | None = None) -> None:
+        self._world.send(self, message.arbitration_id, bytes(message.data))
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        if not self._waiting and timeout:
+            self._world.sleep(timeout)
+        return self._waiting.popleft() if self._waiting else None
+
+
+class SimulatedProcess:
+    """What the supervisor sees of the loop process."""
+
+    def __init__(self) -> None:
+        self.code: int | None = None
+
+    def poll(self) -> int | None:
+        return self.code
+
+    def kill(self) -> None:
+        self.code = -9 if self.code is None else self.code
+
+    def wait(self, timeout: float | None = None) -> int:
+        return self.code or 0
+
+
+class SimulatedLoop(LoopHandle):
+    """The handle of a loop that is a program of the world."""
+
+    world: World
+
+    def __init__(self, config: Config, table: Any, tail_path: Path | None = None, marker_fd: int | None = None) -> None:
+        self.block = shared_block.SharedBlock.create(len(table), config.bus.interface)
+        self.block.table[:] = table
+        self._tail = self.lost_records = 0
+        self._after_end = loop_module._ON_CAN
+        self._period_ns = round(NANOSECONDS / config.loop.rate_Hz)
+        self._process: Any = SimulatedProcess()
+        self._bus = SimulatedBus(self.world)
+        self._frames, _ = exchange_memory()
+        self._frame_bytes = self._frames.view(np.ndarray).view(np.uint8).reshape(len(self._frames), FRAME_SIZE)
+        self._cycles(0, 0)  # loads what is compiled, before anything is forked
+        self.block.words[Word.READY] = 1
+
+    def __exit__(self, *_: object) -> None:
+        self.world.programs.pop("loop", None)
+
+    def wait_ready(self, alive: Any = lambda: None, tell: Any = None) -> None:
+        alive()
+        self.running()
+
+    def go(self, constants: Any, port: Any) -> None:
+        super().go(constants, port)
+        if self._process.code is None:
+            self.world.start("loop", self._cycle)
+
+    def wait_for_cycle(self, deadline_ns: int, *_: Any) -> None:
+        """In the loop: until its next deadline, or, where nothing is counted any more, until its end."""
+        world = self.world
+        world.sleep_until_ns(deadline_ns)
+        if not world.fast:
+            return
+        while self.block.state[0].phase != AxisPhase.FINISHED:
+            cycles = max(1, min(LONGEST_CHUNK, (world.next_wake_ns() - deadline_ns) // self._period_ns))
+            deadline_ns += self._cycles(deadline_ns, cycles) * self._period_ns
+            world.sleep_until_ns(deadline_ns)
+        self._ended()
+        world.kill("loop")
+
+    def _cycles(self, first_ns: int, cycles: int) -> int:
+        """So many whole cycles in one call; how many there were until FINISHED."""
+        block, world, period_ns = self.block, self.world, self._period_ns
+        device, log, truth = world.device, new(LogRecord, max(1, cycles)), np.zeros((cycles, TRUTHS))
+        stop = int(block.words[Word.STOP])
+        written, rows = run_lockstep(
+            begin, accept, end, block.port, self._frames, self._frame_bytes, block.constants, block.state, block.table,
+            block.sample, block.command, device.device, device.plant_constants, device.plant_state, device.queue,
+            log, 1, first_ns, period_ns, cycles, 0 if stop else -1, truth, stop_request=stop,
+            silent_cycles=max(0, first_ns - int(block.words[Word.SUPERVISOR_NS])) // period_ns,
+            lost_to_drive=world.lost_to_drive, lost_from_drive=world.lost_from_drive,
+        )  # fmt: skip
+        device.queue[0].count = 0
+        for row in range(rows):
+            world.note_power(int(truth[row, TRUE_POWER_STATE]), first_ns + row * period_ns)
+        head = int(block.words[Word.HEAD])
+        block.ring[(head + np.arange(written)) % len(block.ring)] = log[:written]
+        block.histograms[:, 1] += written  # the watch over the delay asks whether there is something
+        block.words[Word.HEAD] = head + written
+        if written:
+            world.now_ns = max(world.now_ns, first_ns + (written - 1) * period_ns)
+            block.words[Word.LOOP_NS] = world.now_ns
+            world.look()
+        return int(written)
+
+    def _ended(self) -> None:
+        self.block.words[Word.ENDED] = 1
+        self._process.code = 0
+
+    def _cycle(self) -> None:
+        portable_loop.run_portable_loop(
+            self._bus, self.block, self._period_ns, int(loop_module.RECEIVE_SHARE * self._period_ns)
+        )
+        self._ended()
+
+    def die(self) -> None:
+        """SIGKILL."""
+        self._process.kill()
+        self.world.kill("loop")
+
+
+class SilentLog:
+    """Keeps the texts of events."""
+
+    def __init__(self, path: Path, *_: Any) -> None:
+        self.path = path
+
+    def __enter__(self) -> SilentLog:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+    def write_event(self, level: int, source: str, text: str, time_ns: int = 0) -> None: ...
+    def write_records(self, records: Any) -> None: ...
+    def write_frames(self, frames: Any) -> None: ...
+    def write_temperature(self, time_ns: int, degC: float | None) -> None: ...
+
+
+def stop_of_this_computer(world: World, signals: StopSignals, node: int) -> None:
+    """`jointctl stop`: the request through the lock of the bus, and the frames."""
+    stop_of_another_computer(world, node)
+    signals.commanded_ns = world.now_ns
+    signals.name = STOP_COMMAND
+    signals.on_command(signals.request)
+    signals.on_signal(15, None)
+
+
+def stop_of_another_computer(world: World, node: int) -> None:
+    """The frames alone."""
+    world.start("stop", lambda: stop_node(None, node, sleep=world.sleep))  # type: ignore[arg-type]
+
+
+@contextlib.contextmanager
+def simulated(config: Config) -> Iterator[World]:
+    """The world of one run; supervisors that are made inside run in it."""
+    logging.getLogger("canopen").setLevel(logging.CRITICAL)
+    world = World(config)
+
+    def read_response(client: Any) -> Any:
+        if client.responses.empty():
+            world.sleep(client.RESPONSE_TIMEOUT)
+        if client.responses.empty():
+            raise SdoCommunicationError("No SDO response received")
+        response = client.responses.get_nowait()
+        if response[0] == 0x80:
+            raise canopen.SdoAbortedError(struct.unpack_from("<L", response, 4)[0])
+        return response
+
+    def new_network(_: Any, __: Any, *listeners: can.Listener) -> SimulatedNetwork:
+        return SimulatedNetwork(world, listeners)
+
+    def open_simulated(wanted: Config, gate: Callable[[], None] = lambda: None) -> CanopenDrive:
+        bus: Any = None
+        return CanopenDrive(
+            bus, canopen_settings(wanted), sleep=world.sleep, gate=gate, clock=lambda: world.now_ns * 1e-9
+        )
+
+    loops: list[SimulatedLoop] = []
+
+    def new_loop(*arguments: Any, **more: Any) -> SimulatedLoop:
+        loops.append(made(*arguments, **more))
+        return loops[-1]
+
+    made = type("Loop", (SimulatedLoop,), {"world": world})
+    private = SimpleNamespace(mmap=lambda fd, size: mmap.mmap(fd, size, flags=mmap.MAP_PRIVATE))
+    with contextlib.ExitStack() as stack:
+        for place, name, value in (
+            (time, "sleep", world.sleep),
+            (time, "monotonic", lambda: world.now_ns * 1e-9),
+            (time, "monotonic_ns", lambda: world.now_ns),
+            (SdoClient, "read_response", read_response),
+            (drive_module, "new_network", new_network),
+            (switch_off_module, "new_network", new_network),
+            (portable_loop, "sleep_until_ns", lambda *when: loops[-1].wait_for_cycle(*when)),
+            (portable_loop, "note_suspension", lambda *_: None),
+            (shared_block, "mmap", private),
+            (supervisor_module, "LoopHandle", new_loop),
+            (supervisor_module, "open_drive", open_simulated),
+            (supervisor_module, "recording", lambda _: contextlib.nullcontext()),
+            (supervisor_module, "kept_awake", lambda *_: contextlib.nullcontext()),
+            (supervisor_module, "RunLogWriter", SilentLog),
+        ):
+            stack.callback(setattr, place, name, getattr(place, name))
+            setattr(place, name, value)
+        yield world
+
+
+def quiet_output() -> Output:
+    """Prints nothing."""
+    return Output(quiet=True, stdout=StringIO(), stderr=StringIO())

@@ -1,0 +1,101 @@
+"""What another controller sends is noticed, before anything is sent to the drive and until the end of a run."""
+
+from __future__ import annotations
+
+import can
+import pytest
+
+from drivers.canopen.bus_watchers import LISTEN_S, OtherControllers
+from drivers.errors import BusError
+
+NODE, MASTER = 5, 126
+
+
+def listening(own_loop: bool = False) -> OtherControllers:
+    others = OtherControllers([NODE, 9], MASTER, lambda: 0.0)
+    if own_loop:
+        others.own_loop_begins()
+    return others
+
+
+def heard(others: OtherControllers, identifier: int, data: bytes = b"", *, extended: bool = False) -> str:
+    others.on_message_received(can.Message(arbitration_id=identifier, data=data, is_extended_id=extended))
+    return others.found()
+
+
+CONTROLLER = [
+    (0x080, b"", "1 x SYNC (080h)"),
+    (0x000, bytes([128, NODE]), "1 x NMT 'enter pre operational' to node 5"),
+    (0x000, bytes([1, 0]), "1 x NMT 'start' to all nodes"),
+    (0x000, bytes([77, 9]), "1 x NMT 'unknown' to node 9"),
+    (0x600 + NODE, bytes(8), "1 x SDO request (605h)"),
+    (0x200 + NODE, bytes(4), "1 x RPDO to node 5 (205h)"),
+    (0x500 + 9, bytes(4), "1 x RPDO to node 9 (509h)"),
+    (0x700 + MASTER, b"\x05", "1 x heartbeat of node 126, which is our own (drive.master_node)"),
+]
+
+
+@pytest.mark.parametrize(("identifier", "data", "words"), CONTROLLER)
+def test_what_only_a_controller_sends_refuses_the_run(identifier: int, data: bytes, words: str) -> None:
+    others = listening()
+    assert heard(others, identifier, data) == words
+    with pytest.raises(BusError, match="another controller is active on this bus"):
+        others.refuse()
+
+
+@pytest.mark.parametrize(
+    ("identifier", "data"),
+    [
+        (0x580 + NODE, bytes(8)), (0x180 + NODE, bytes(8)), (0x080 + NODE, bytes(8)), (0x700 + NODE, b"\x05"),
+        (0x000, bytes([1, 7])), (0x000, b"\x01"), (0x600 + 7, bytes(8)), (0x200 + 7, bytes(8)), (0x100, bytes(6)),
+    ],
+)  # fmt: skip
+def test_its_twins_are_the_drives_own_and_those_of_other_nodes(identifier: int, data: bytes) -> None:
+    others = listening()
+    assert heard(others, identifier, data) == ""
+    others.refuse()
+
+
+def test_frames_with_long_identifiers_are_no_frames_of_canopen() -> None:
+    assert heard(listening(), 0x080, extended=True) == ""
+
+
+def test_heartbeats_of_other_nodes_are_kept_as_such() -> None:
+    others = listening()
+    for node in (7, 3, 7, NODE):
+        assert heard(others, 0x700 + node, b"\x05") == ""
+    assert others.heartbeats == {3, 7}
+
+
+@pytest.mark.parametrize(
+    ("identifier", "data", "words"),
+    [
+        (0x000, bytes([2, NODE]), "1 x NMT 'stop' to node 5"),
+        (0x600 + NODE, b"\x23\x16\x10\x01\0\0\0\0", "1 x SDO request that writes object 1016"),
+        (0x600 + NODE, b"\x2b\x40\x60\x00\x0f\0\0\0", "1 x SDO request that writes object 6040"),
+        (0x600 + NODE, b"\xc2\x00\x14\x05\0\0\0\0", "1 x SDO request that writes object 1400"),
+        (0x600 + NODE, b"\x2b\x72\x60\x00\x0f\0\0\0", ""),  # 6072: it does not decide whether there is power
+        (0x600 + NODE, b"\x40\x16\x10\x01\0\0\0\0", ""),  # a reading
+        (0x080, b"", ""), (0x200 + NODE, bytes(4), ""), (0x700 + MASTER, b"\x05", ""),  # our own loop sends them
+    ],
+)  # fmt: skip
+def test_beside_our_own_loop_commands_and_writes_that_matter_count(identifier: int, data: bytes, words: str) -> None:
+    assert heard(listening(own_loop=True), identifier, data) == words
+
+
+def test_rpdos_by_the_drives_own_word_count_from_the_beginning() -> None:
+    others = listening()
+    for _ in range(3):
+        assert heard(others, 0x333, bytes(8)) == ""
+    others.add_rpdos([0x333, 0x334])
+    assert others.found() == "3 x RPDO of the drive (333h)"
+    heard(others, 0x334, bytes(8))
+    assert "1 x RPDO of the drive (334h)" in others.found()
+
+
+@pytest.mark.parametrize(("passed_s", "left_s"), [(0.0, LISTEN_S), (0.4, LISTEN_S - 0.4), (LISTEN_S, 0.0), (9.0, 0.0)])
+def test_it_listens_for_a_second_from_its_making_on(passed_s: float, left_s: float) -> None:
+    now = [100.0]
+    others = OtherControllers([NODE], MASTER, lambda: now[0])
+    now[0] += passed_s
+    assert others.to_listen_s == pytest.approx(left_s)

@@ -1,0 +1,224 @@
+"""One controller for each bus of this computer: the second is told who the first is, and a dead one leaves nothing."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import IO
+
+import pytest
+
+from drivers.bus_lock import NAMES, BusLock, Holder, lock_name, wait_for_answers
+from drivers.errors import BusError
+from tools.running.stop_call import StopCall
+
+LOCK = """
+import sys, time
+from drivers.bus_lock import BusLock
+lock = BusLock(*sys.argv[1:])
+print("mine", flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.fixture
+def channel() -> str:
+    """A name that no other test has."""
+    return f"locked-{os.getpid()}"
+
+
+def test_the_second_is_told_who_has_the_bus(channel: str) -> None:
+    command = [sys.executable, "-c", LOCK, "socketcan", channel]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as first:
+        try:
+            said: IO[str] | None = first.stdout
+            assert said is not None
+            assert said.readline() == "mine\n"
+            for _ in range(3):
+                with pytest.raises(BusError, match=rf"controls socketcan:{channel} \(.*, pid {first.pid}\)"):
+                    BusLock("socketcan", channel)
+            first.send_signal(signal.SIGKILL)
+            first.wait()
+            BusLock("socketcan", channel).close()
+        finally:
+            first.kill()
+
+
+def test_a_bus_is_free_again_after_its_controller(channel: str) -> None:
+    lock = BusLock("socketcan", channel)
+    lock.close()
+    lock.close()
+    with BusLock("socketcan", channel), pytest.raises(BusError):
+        BusLock("socketcan", channel)
+    BusLock("socketcan", channel).close()
+
+
+def test_other_buses_are_others(channel: str) -> None:
+    with BusLock("socketcan", channel), BusLock("socketcan", f"{channel}2"), BusLock("pcan", channel):
+        pass
+
+
+def test_links_lead_to_the_same_bus(tmp_path: Path) -> None:
+    (tmp_path / "ttyACM0").touch()
+    (tmp_path / "adapter").symlink_to("ttyACM0")
+    device, link = str(tmp_path / "ttyACM0"), str(tmp_path / "adapter")
+    assert lock_name("slcan", f"{link}@115200") == lock_name("slcan", device)
+    assert lock_name("jointctl", link) == lock_name("jointctl", device)
+    assert lock_name("seeedstudio", link) == lock_name("seeedstudio", device) != lock_name("slcan", device)
+
+
+def test_a_bus_of_the_same_name_behind_another_mount_is_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    socket_file = tmp_path / "bus.sock"
+    first = socket.socket(socket.AF_UNIX)
+    first.bind(str(socket_file))
+    address = lock_name("jointctl", str(socket_file))
+    assert lock_name("jointctl", str(socket_file)) == address
+    socket_file.rename(tmp_path / "other.sock")
+    with socket.socket(socket.AF_UNIX) as second:
+        second.bind(str(socket_file))
+        assert lock_name("jointctl", str(socket_file)) != address
+    first.close()
+    monkeypatch.chdir(tmp_path)
+    url = lock_name("slcan", "socket://host:1234")
+    monkeypatch.chdir("/")
+    assert lock_name("slcan", "socket://host:1234") == url
+
+
+def test_where_such_sockets_are_forbidden_there_is_no_lock(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(*_: object) -> None:
+        raise OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol")
+
+    monkeypatch.setattr(socket, "socket", forbidden)
+    BusLock("socketcan", channel).close()
+
+
+def test_a_bus_inside_a_process_needs_no_lock(channel: str) -> None:
+    with BusLock("virtual", channel), BusLock("virtual", channel):
+        pass
+
+
+def test_no_process_that_was_started_keeps_the_lock(channel: str) -> None:
+    lock = BusLock("socketcan", channel)
+    command = [sys.executable, "-c", "print(flush=True); input()"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, close_fds=False) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline()
+        lock.close()
+        BusLock("socketcan", channel).close()
+        child.communicate(b"\n")
+
+
+# --- who is a controller, and how a stop reaches it ------------------------------------------------------------------
+
+HOLD = """
+import signal, sys, time
+from drivers.bus_lock import BusLock
+stopped = []
+lock = BusLock(*sys.argv[1:], on_stop=lambda: stopped.append(1))
+print("mine", flush=True)
+while not stopped:
+    time.sleep(0.01)
+print("stopped", flush=True)
+"""
+
+
+@contextmanager
+def controller(channel: str, code: str = HOLD) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-c", code, "socketcan", channel]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "mine\n"
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize("held", [1, NAMES])
+def test_a_mere_holder_of_the_name_is_a_remark(channel: str, held: int) -> None:
+    name = lock_name("socketcan", channel)
+    with ExitStack() as stack:
+        for number in range(held):
+            squatter = stack.enter_context(socket.socket(socket.AF_UNIX))
+            squatter.bind(b"\0" + (name if number == 0 else f"{name}-{number}").encode())
+            squatter.listen()
+        with BusLock("socketcan", channel) as lock:
+            assert len(lock.remarks) == held + (held == NAMES)
+            assert "is no controller: it is ignored" in lock.remarks[0]
+            if held < NAMES:
+                with pytest.raises(BusError, match="another program controls"):
+                    BusLock("socketcan", channel)
+        called = StopCall("socketcan", channel)
+        with called:
+            assert called.end(lambda _: None) is False
+
+
+def test_a_controller_that_is_stopped_still_refuses_the_second(channel: str) -> None:
+    with controller(channel) as process:
+        process.send_signal(signal.SIGSTOP)
+        with pytest.raises(BusError, match=rf"does not answer still controls .*pid {process.pid}"):
+            BusLock("socketcan", channel)
+        process.send_signal(signal.SIGCONT)
+        with pytest.raises(BusError, match=rf"another program controls .*pid {process.pid}"):
+            BusLock("socketcan", channel)
+
+
+def test_a_stop_is_acknowledged_and_waited_for(channel: str) -> None:
+    notes: list[str] = []
+    with controller(channel) as process:
+        with StopCall("socketcan", channel) as call:
+            assert call.end(notes.append)
+        assert process.stdout is not None
+        assert process.stdout.read() == "stopped\n"
+        assert process.wait(5.0) == 0
+    assert notes == [f"stopping the program that controls the bus (pid {process.pid})"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGSTOP, None])
+def test_one_that_does_not_end_is_ended(channel: str, number: signal.Signals | None) -> None:
+    notes: list[str] = []
+    deaf = HOLD.replace("while not stopped:", "signal.signal(signal.SIGTERM, signal.SIG_IGN)\nwhile True:")
+    with controller(
+        channel, deaf.replace("lock = BusLock(*sys.argv[1:],", "lock = BusLock(*sys.argv[1:], within_s=0.2,")
+    ) as process:
+        if number is not None:
+            process.send_signal(number)
+        with StopCall("socketcan", channel) as call:
+            assert call.end(notes.append)
+        assert process.wait(5.0) == -signal.SIGKILL
+    assert f"ending process {process.pid}" in notes[-1]
+
+
+@pytest.mark.parametrize("data", [b"", b"garbage\n", b"[" * 300, b'{"ask": 7}\n', b"x" * 10_000])
+def test_garbage_and_silence_keep_no_one_from_stopping(channel: str, data: bytes) -> None:
+    stopped: list[int] = []
+    with BusLock("socketcan", channel, lambda: stopped.append(1)), ExitStack() as stack:
+        for _ in range(100):
+            caller = stack.enter_context(socket.socket(socket.AF_UNIX))
+            caller.connect(b"\0" + lock_name("socketcan", channel).encode())
+            with suppress(OSError):
+                caller.sendall(data)
+        holder = Holder(lock_name("socketcan", channel), 0)
+        holder.send("stop")
+        wait_for_answers([holder])
+        assert holder.within_s is not None
+        assert stopped == [1]
+        holder.close()
+
+
+def test_a_program_that_starts_is_waited_for(channel: str) -> None:
+    late = "import os, time\nmark = os.memfd_create('jointctl-starting')\nprint('mine', flush=True)\ntime.sleep(0.7)\n"
+    notes: list[str] = []
+    with controller(channel, late + HOLD.replace('print("mine", flush=True)', "")) as process:
+        with StopCall("socketcan", channel) as call:
+            assert call.end(notes.append)
+        assert process.wait(5.0) == 0

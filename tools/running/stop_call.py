@@ -1,0 +1,115 @@
+"""What `jointctl stop` does about the program that controls a bus or line: it ends, by itself or by force.
+
+The request is sent at once, and no one waits for an answer before the drive is stopped.  A program that acknowledges it
+has its own time to brake and to switch off; one that does not, or takes longer, is ended by signal with all its
+processes.  After `end` nothing of it can enable the drive.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import time
+from collections.abc import Callable
+
+from drivers.bus_lock import STARTING, is_marked, lock_holders, lock_name, marked_processes, wait_for_answers
+
+LONGEST_S = 180.0  # that a program may ask for: two time-outs of a stop are at most 60 s each
+STARTING_S = 10.0  # how long a program that was just started may take until it controls its bus
+TERM_S = 1.0  # between SIGTERM and SIGKILL
+KILL_S = 2.0
+POLL_S = 0.02
+ARMED = (
+    "its drive keeps its watchdog, and may report a lost heartbeat (8130h): the next run takes it over; a fault that "
+    "remains is reset by `jointctl clear-fault`"
+)
+
+
+class StopCall:
+    """Asks the program that controls the bus to stop, at once; then `end` it.  To be used in a `with` block."""
+
+    def __init__(self, interface: str, channel: str) -> None:
+        self._place, self._name = (interface, channel), lock_name(interface, channel)
+        self._ask()
+
+    def _ask(self) -> None:
+        self._holders = lock_holders(*self._place)
+        for holder in self._holders:
+            holder.send("stop")
+
+    def __enter__(self) -> StopCall:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for holder in self._holders:
+            holder.close()
+
+    def end(self, note: Callable[[str], None]) -> bool:
+        """Whether there was a controller; its processes have ended when this returns, or `note` got why not.
+
+        A program that was started before this call, and does not control the bus yet, is waited for and then ended.
+        """
+        starting = marked_processes(STARTING)
+        found = self._end_controllers(note)
+        give_up_s = time.monotonic() + STARTING_S
+        while any(is_marked(pid, STARTING) for pid in starting) and time.monotonic() < give_up_s:
+            time.sleep(POLL_S)
+        self.__exit__()
+        self._ask()
+        return self._end_controllers(note) or found
+
+    def _end_controllers(self, note: Callable[[str], None]) -> bool:
+        wait_for_answers(self._holders)
+        marked = marked_processes(self._name)
+        if marked and not any(holder.is_controller for holder in self._holders):  # it may have come after the request
+            self.__exit__()
+            self._ask()
+            wait_for_answers(self._holders)
+        controllers = [holder for holder in self._holders if holder.is_controller]
+        for holder in controllers:
+            if holder.refused:
+                note(f"the program that controls the bus (pid {holder.pid}) cannot be ended: {holder.refused}")
+            elif holder.within_s is not None:
+                note(f"stopping the program that controls the bus (pid {holder.pid})")
+        waited_for = [holder for holder in controllers if holder.within_s is not None]
+        if waited_for:
+            within_s = min(max(holder.within_s or 0.0 for holder in waited_for), LONGEST_S)
+            give_up_s = time.monotonic() + within_s
+            while time.monotonic() < give_up_s:
+                waited_for = [holder for holder in waited_for if not holder.left]
+                if not waited_for and not any(is_marked(pid, self._name) for pid in marked):
+                    break
+                time.sleep(POLL_S)
+        self._end_by_force(note)
+        return bool(controllers or marked)
+
+    def _end_by_force(self, note: Callable[[str], None]) -> None:
+        """SIGTERM, then SIGKILL, to every process that still acts for the controller."""
+        pids = marked_processes(self._name)
+        if not pids:
+            return
+        note(f"it does not end by itself: ending process {', '.join(map(str, pids))}; {ARMED}")
+        for number, wait_s in ((signal.SIGTERM, TERM_S), (signal.SIGKILL, KILL_S)):
+            pids = _signalled(marked_processes(self._name), self._name, number, wait_s)
+        if pids:
+            note(f"process {', '.join(map(str, pids))} cannot be ended; the drive may be enabled again")
+
+
+def _signalled(pids: list[int], name: str, number: signal.Signals, wait_s: float) -> list[int]:
+    """Those that still live `wait_s` after the signal.  A descriptor of a process cannot come to mean another one."""
+    with contextlib.ExitStack() as stack:
+        ends: dict[int, int] = {}
+        for pid in pids:
+            with contextlib.suppress(OSError):
+                end = os.pidfd_open(pid)
+                stack.callback(os.close, end)
+                if is_marked(pid, name):  # it is still the one that was found
+                    ends[end] = pid
+                    signal.pidfd_send_signal(end, number)
+        give_up_s = time.monotonic() + wait_s
+        while ends and (left_s := give_up_s - time.monotonic()) > 0.0:
+            for end in select.select(list(ends), [], [], left_s)[0]:
+                del ends[end]
+        return list(ends.values())

@@ -1,0 +1,34 @@
+"""`jointctl clear-fault`: reset the drive's own fault; nothing else of jointctl ever does."""
+
+from __future__ import annotations
+
+from drivers.can.link_state import interface_blamed
+from drivers.errors import INTERRUPTED
+from tools.configuration.config import Config
+from tools.configuration.elmo import ElmoSerial
+from tools.output import Output
+from tools.running.control import in_control
+from tools.running.open_drive import open_drive
+from tools.running.result import drive_end
+from tools.running.result.drive_end import warn_unless_off
+from tools.verbs.stop_serial import refuse_while_running
+
+
+def clear_fault(config: Config, output: Output) -> int:
+    """Reset the drive's fault; it stays disabled."""
+    if isinstance(config.drive, ElmoSerial):
+        refuse_while_running(config.drive)
+    with in_control(config, output) as control, control.signals.held():
+        drive = open_drive(config, control.signals.leave_if_asked)
+        try:
+            with interface_blamed(config.bus.interface, config.bus.channel, config.bus.bitrate_bitps):
+                done = drive.clear_fault()
+        except KeyboardInterrupt:
+            state = drive.make_safe(asked=bool(control.signals.commanded_ns))
+            warn_unless_off(state, output)
+            output.note(f"interrupted by {control.signals.name}; {drive_end.words(state)}")
+            return INTERRUPTED
+        finally:
+            drive.close()
+    output.result(done, {"result": done})
+    return 0
