@@ -15,8 +15,8 @@ from firmware_py.kernel import TOOLS_WITH_KERNELS
 from tests.places import ROOT
 
 TOP_LEVEL = ("firmware_py", "drivers", "hil", "tools", "configs")
-LONGEST_MODULE = 300
-MODULES = sorted(path for folder in (*TOP_LEVEL, "tests") for path in (ROOT / folder).rglob("*.py"))
+LONGEST_MODULE = 600  # where a reader asks whether it is one concept; tests may be longer
+MODULES = sorted(path for folder in TOP_LEVEL for path in (ROOT / folder).rglob("*.py"))
 
 
 def imported(path: Path) -> set[str]:
@@ -96,10 +96,6 @@ def test_one_line_too_many_is_refused(tmp_path: Path, lines: int, refused: bool)
     path = tmp_path / "module.py"
     path.write_text("pass\n" * lines)
     assert too_long(path) == refused
-
-
-def test_tests_are_among_those_that_must_be_short() -> None:
-    assert {Path(__file__).resolve(), ROOT / "tests" / "conftest.py"} <= set(MODULES)
 
 
 def test_unit_tests_have_names_of_their_own() -> None:
