@@ -2,7 +2,8 @@
 
 Transitions 0 and 1 (power on to Switch On Disabled) need no time here.  Commands with bit 7 set are ignored except
 for its rising edge in Fault.  Stop ramps are carried out by `cia402_motion`; here they are only started.
-Not modelled: halt option 605D (halt ramps down in modes 1, 3, 4), a missing power supply (bit 4 is always set),
+Halt (bit 8) acts in modes 1, 3, 4 and 6, along the ramp that 605D names; in torque mode that is always 6087.
+Not modelled: a missing power supply (bit 4 is always set, 6079 is constant);
 bit 9 follows the NMT state (0 while stopped).
 """
 
@@ -11,7 +12,7 @@ from __future__ import annotations
 from firmware_py.kernel import kernel
 from hil.bus.frames import FrameQueue
 from hil.canopen.cia402_homing import begin_homing, interrupt_homing
-from hil.canopen.device_errors import report_cleared, report_error
+from hil.canopen.device_errors import LENGTH_ERRORS, report_cleared, report_error
 from hil.canopen.device_records import Device, DriveObjects, HomingState, Mode, NmtState, PowerState, int64
 
 _HALT = 0x0100
@@ -66,10 +67,10 @@ def power_off(device: Device) -> None:
 
 
 @kernel
-def latch_fault(device: Device, code: int) -> None:
-    """Transition 13 with the reaction of 605E (14 follows at its end); the first fault is the one that stays."""
+def latch_fault(device: Device, code: int) -> bool:
+    """Transition 13 with the reaction of 605E (14 follows at its end); False while an earlier fault is latched."""
     if device.fault_code != 0:
-        return
+        return False
     device.fault_code = code
     if device.state == PowerState.OPERATION_ENABLED or device.state == PowerState.QUICK_STOP_ACTIVE:
         device.state = PowerState.FAULT_REACTION_ACTIVE
@@ -77,29 +78,33 @@ def latch_fault(device: Device, code: int) -> None:
     else:
         device.braking = 0
         device.state = PowerState.FAULT
+    return True
 
 
 @kernel
 def raise_fault(device: Device, code: int, queue: FrameQueue) -> None:
     """A drive fault: latch, react, report.  Nothing while an earlier fault is latched."""
-    if device.fault_code == 0:
-        latch_fault(device, code)
+    if latch_fault(device, code):
         report_error(device, code, queue)
 
 
 @kernel
-def abort_connection(device: Device, code: int) -> None:
-    """Reaction 6007 to a lost connection, power stage on: 0 none, 1 fault, 2 disable voltage, 3 quick stop."""
+def abort_connection(device: Device, code: int) -> bool:
+    """Reaction 6007 to a lost connection, power stage on: 0 none, 1 fault, 2 disable voltage, 3 quick stop.
+
+    True if it has latched a fault, which the caller reports.
+    """
     option = device.drive.abort_option
     enabled = device.state == PowerState.OPERATION_ENABLED
     if not (enabled or device.state == PowerState.QUICK_STOP_ACTIVE):
-        return
+        return False
     if option == 1:
-        latch_fault(device, code)
-    elif option == 2:
+        return latch_fault(device, code)
+    if option == 2:
         power_off(device)
     elif option == 3 and enabled:
         quick_stop(device)
+    return False
 
 
 @kernel
@@ -107,7 +112,7 @@ def fault_cause_present(device: Device) -> bool:
     """True while a fault reset must be refused."""
     return (
         device.inject_fault_code != 0
-        or device.communication_errors != 0
+        or device.communication_errors & ~LENGTH_ERRORS != 0
         or outside_position_limit(device.drive, device.drive.position)
     )
 

@@ -59,11 +59,19 @@ def _velocity_loop(device: Device, velocity_radps: float, dt_s: float) -> float:
 
 
 @kernel
+def halted_quickly(drive: DriveObjects) -> bool:
+    """Halt with the ramp of the quick stop (605D = 2) instead of the mode's own."""
+    return drive.controlword & _HALT != 0 and drive.halt_option == 2
+
+
+@kernel
 def _ramp_velocity(device: Device, target_radps: float, dt_s: float) -> None:
-    """Move the reference velocity towards the target with 6083 away from zero and 6084 towards it."""
+    """Move the reference velocity towards the target with 6083 away from zero and 6084 towards it; halt: 605D."""
     reference = device.reference_velocity_radps
     rate = int64(device.drive.profile_acceleration)
-    if abs(target_radps) < abs(reference) or target_radps * reference < 0.0:
+    if halted_quickly(device.drive):
+        rate = int64(device.drive.quick_stop_deceleration)
+    elif abs(target_radps) < abs(reference) or target_radps * reference < 0.0:
         rate = int64(device.drive.profile_deceleration)
     step = rate / abs(device.counts_per_rad) * dt_s
     device.reference_velocity_radps = reference + _limit(target_radps - reference, step)
@@ -152,7 +160,8 @@ def _mode_demand(device: Device, position: int, velocity_radps: float, dt_s: flo
         return _profile_position(device, position_rad, velocity_radps, dt_s)
     if mode == Mode.HOMING:
         target_radps = _limit(homing_target_radps(device, position, dt_s), _max_speed_radps(device))
-        step_radps = int64(drive.homing_acceleration) / abs(device.counts_per_rad) * dt_s
+        rate = int64(drive.quick_stop_deceleration if halted_quickly(drive) else drive.homing_acceleration)
+        step_radps = rate / abs(device.counts_per_rad) * dt_s
         device.reference_velocity_radps += _limit(target_radps - device.reference_velocity_radps, step_radps)
         return _velocity_loop(device, velocity_radps, dt_s)
     return 0.0
@@ -193,6 +202,17 @@ def following_error_tripped(device: Device, position: int, dt_s: float) -> bool:
         return False
     device.following_time_s += dt_s
     return device.following_time_s > 1e-3 * int64(drive.following_timeout_ms)
+
+
+@kernel
+def follows_velocity(device: Device) -> bool:
+    """Whether the velocity loop sets the torque: in its modes and in those above it, and in a stop ramp of any mode."""
+    if device.resync != 0 or device.braking == 2:  # not before its next substep
+        return False
+    if device.state == PowerState.OPERATION_ENABLED and device.braking == 0:
+        mode = device.drive.mode_display
+        return mode != Mode.NONE and mode != Mode.TORQUE and mode != Mode.CYCLIC_TORQUE
+    return device.braking == 1 or device.state == PowerState.QUICK_STOP_ACTIVE
 
 
 @kernel

@@ -21,16 +21,20 @@ from hil.canopen.cia402_core import (
     raise_fault,
     status_word,
 )
-from hil.canopen.cia402_motion import demand_is_held, demand_torque_Nm, following_error_tripped
+from hil.canopen.cia402_motion import demand_is_held, demand_torque_Nm, following_error_tripped, follows_velocity
 from hil.canopen.device_errors import (
     FOLLOWING_ERROR,
     POSITION_LIMIT,
+    SYNC_ERROR,
     SYNC_LENGTH,
+    SYNC_LENGTH_ERROR,
+    clear_error,
     error_register,
+    raise_error,
     send_emergency,
 )
 from hil.canopen.device_records import CONSUMERS, Device, HomingState, Mode, NmtState, PowerState, int64
-from hil.canopen.device_timers import SYNC_ERROR, answer_node_guard, connection_back, enter_nmt, run_timers
+from hil.canopen.device_timers import answer_node_guard, enter_nmt, run_timers
 from hil.canopen.encoder_core import accept_encoder_frame, step_encoder
 from hil.canopen.pdo_core import mark_events, receive_rpdo, receive_sync
 from hil.plant.joint import encoder_counts, step_plant
@@ -128,6 +132,8 @@ def sample_objects(device: Device, plant_c: PlantConstants, plant_s: PlantState)
     else:
         drive.demand_position = drive.position
         drive.following_error = 0
+    demand_radps = device.reference_velocity_radps if follows_velocity(device) else 0.0
+    drive.demand_velocity = _int32(demand_radps * device.counts_per_rad)
     drive.statusword = status_word(device)
 
 
@@ -194,13 +200,16 @@ def advance(device: Device, plant_c: PlantConstants, plant_s: PlantState, until_
 
 
 @kernel
-def _command_nmt(device: Device, command: int) -> None:
+def _command_nmt(device: Device, command: int, queue: FrameQueue) -> None:
+    errors = device.communication_errors
     if command == 0x01:
-        enter_nmt(device, NmtState.OPERATIONAL)
+        enter_nmt(device, NmtState.OPERATIONAL, queue)
     elif command == 0x02:
-        enter_nmt(device, NmtState.STOPPED)
+        enter_nmt(device, NmtState.STOPPED, queue)
     elif command == 0x80:
-        enter_nmt(device, NmtState.PRE_OPERATIONAL)
+        enter_nmt(device, NmtState.PRE_OPERATIONAL, queue)
+        if errors != 0 and device.communication.error_register == 0:
+            send_emergency(device, 0, queue)  # what is watched in operational only has gone
     elif command == 0x81:
         restart(device, True)
     elif command == 0x82:
@@ -212,16 +221,13 @@ def _accept_sync(device: Device, frame: np.ndarray, now_ns: int, queue: FrameQue
     """SYNC in NMT operational; one without its counter byte, or with one too many, is reported once and ignored."""
     counted = device.communication.sync_overflow != 0
     if int64(frame[4]) != (1 if counted else 0):
-        if not device.sync_length_wrong:
-            device.sync_length_wrong = 1
-            send_emergency(device, SYNC_LENGTH, queue)
+        raise_error(device, SYNC_LENGTH_ERROR, SYNC_LENGTH, queue)
         return
-    device.sync_length_wrong = 0
     device.sync_heard_ns = now_ns
     timeout_ns = int64(device.drive.sync_timeout_ms) * _MS
     if timeout_ns:
         device.next_due_ns = min(device.next_due_ns, now_ns + timeout_ns)
-    connection_back(device, SYNC_ERROR, queue)
+    clear_error(device, SYNC_ERROR | SYNC_LENGTH_ERROR, queue)
     receive_sync(device, now_ns, int64(frame[8]) if counted else 0, queue)
 
 
@@ -247,7 +253,7 @@ def accept_frame(
             answer_node_guard(device, now_ns, queue)
     elif identifier == 0:
         if size == 2 and (frame[9] == 0 or frame[9] == device.node_id):
-            _command_nmt(device, int64(frame[8]))
+            _command_nmt(device, int64(frame[8]), queue)
             device.next_due_ns = 0
     elif 0x700 < identifier <= 0x77F:
         for i in range(CONSUMERS):
@@ -255,7 +261,7 @@ def accept_frame(
             if entry & 0xFFFF and entry >> 16 == identifier - 0x700:
                 device.consumer_entry[i] = entry
                 device.consumer_heard_ns[i] = now_ns
-                connection_back(device, 1 << i, queue)
+                clear_error(device, 1 << i, queue)
                 device.next_due_ns = 0
     elif device.nmt == NmtState.OPERATIONAL:
         if identifier == int64(device.communication.sync_cob_id) & 0x7FF:

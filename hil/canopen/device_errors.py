@@ -21,6 +21,15 @@ NMT_LEFT = 0x8100
 FOLLOWING_ERROR = 0x8611
 POSITION_LIMIT = 0x8680
 
+# bits of `Device.communication_errors`: causes that are present; those of SYNC and RPDOs in NMT operational only
+HEARTBEAT_ERRORS = 0x03  # one a consumer
+SYNC_ERROR = 0x04
+LIFE_GUARD_ERROR = 0x08
+RPDO_ERROR = 0x10  # shifted by the number of the PDO, 0 to 3; so is the next
+RPDO_LENGTH_ERROR = 0x100
+SYNC_LENGTH_ERROR = 0x1000
+LENGTH_ERRORS = 0x1F00  # reported, but no reason to keep a fault
+
 
 @kernel
 def push_frame(queue: FrameQueue, identifier: int, size: int) -> int:
@@ -130,6 +139,14 @@ def report_error(device: Device, code: int, queue: FrameQueue) -> None:
 
 
 @kernel
+def raise_error(device: Device, cause: int, code: int, queue: FrameQueue) -> None:
+    """A communication error: reported when it begins, not again with every frame that shows it."""
+    if not device.communication_errors & cause:
+        device.communication_errors |= cause
+        report_error(device, code, queue)
+
+
+@kernel
 def report_cleared(device: Device, queue: FrameQueue) -> None:
     """After a cause has gone: update 1001, and send 0000 when it was the last one."""
     register = error_register(device)
@@ -137,3 +154,11 @@ def report_cleared(device: Device, queue: FrameQueue) -> None:
     if register == 0:
         device.drive.error_code = 0
         send_emergency(device, 0, queue)
+
+
+@kernel
+def clear_error(device: Device, cause: int, queue: FrameQueue) -> None:
+    """What `raise_error` reported, or a lost connection, has gone."""
+    if device.communication_errors & cause:
+        device.communication_errors &= ~cause
+        report_cleared(device, queue)

@@ -114,6 +114,7 @@ class DriveObjects:
     quick_stop_option: i2
     shutdown_option: i2
     disable_option: i2
+    halt_option: i2
     fault_reaction_option: i2
     mode: i1
     mode_display: i1
@@ -123,6 +124,7 @@ class DriveObjects:
     following_window: u4
     following_timeout_ms: u2
     position_window: u4
+    demand_velocity: i4
     velocity: i4
     velocity_window: u2
     target_torque: i2
@@ -133,6 +135,7 @@ class DriveObjects:
     rated_torque_mNm: u4
     torque: i2
     current: i2
+    dc_link_mV: u4
     target_position: i4
     home_offset: i4
     position_limit: Annotated[np.ndarray, array_of(i4, 2)]
@@ -142,7 +145,9 @@ class DriveObjects:
     profile_acceleration: u4
     profile_deceleration: u4
     quick_stop_deceleration: u4
+    motion_profile: i2
     torque_slope: u4
+    torque_profile: i2
     encoder_resolution: Annotated[np.ndarray, array_of(u4, 2)]
     homing_method: i1
     homing_speed: Annotated[np.ndarray, array_of(u4, 2)]
@@ -190,7 +195,6 @@ class Device:
     consumer_entry: Annotated[np.ndarray, array_of(u4, CONSUMERS)]
     consumer_heard_ns: Annotated[np.ndarray, array_of(i8, CONSUMERS)]  # 0 = not yet heard
     sync_heard_ns: i8  # 0 = not yet heard
-    sync_length_wrong: i4  # reported already
     guard_heard_ns: i8  # 0 = not yet asked by a node-guarding master
     guard_toggle: i4
     emcy_sent_ns: i8  # 0 = none yet

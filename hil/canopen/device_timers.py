@@ -7,17 +7,19 @@ from __future__ import annotations
 
 from firmware_py.kernel import kernel
 from hil.bus.frames import FrameQueue
-from hil.canopen.cia402_core import (
-    abort_connection,
-)
+from hil.canopen.cia402_core import abort_connection
 from hil.canopen.device_errors import (
+    HEARTBEAT_ERRORS,
     HEARTBEAT_LOST,
+    LIFE_GUARD_ERROR,
     NMT_LEFT,
+    RPDO_ERROR,
     RPDO_TIMEOUT,
+    SYNC_ERROR,
     SYNC_LOST,
+    clear_error,
     error_register,
     push_frame,
-    report_cleared,
     report_error,
     send_waiting_emergencies,
 )
@@ -26,17 +28,17 @@ from hil.canopen.pdo_core import send_due_tpdos, start_pdos
 
 _FAR_NS = 1_000_000_000
 _MS = 1_000_000
-SYNC_ERROR = 0x04
-LIFE_GUARD_ERROR = 0x08
-RPDO_ERROR = 0x10
-HEARTBEAT_ERRORS = 0x03
 
 
 @kernel
-def enter_nmt(device: Device, state: int) -> None:
-    """Change the NMT state; leaving operational while the power stage is on is a lost connection (6007)."""
+def enter_nmt(device: Device, state: int, queue: FrameQueue) -> None:
+    """Change the NMT state; leaving operational while the power stage is on is a lost connection (6007).
+
+    Its fault is reported before the state changes: a node that is stopped sends no emergency.
+    """
     if device.nmt == NmtState.OPERATIONAL and state != NmtState.OPERATIONAL:
-        abort_connection(device, NMT_LEFT)
+        if abort_connection(device, NMT_LEFT):
+            report_error(device, NMT_LEFT, queue)
         device.communication_errors &= HEARTBEAT_ERRORS | LIFE_GUARD_ERROR  # SYNC and RPDOs: in operational only
         device.communication.error_register = error_register(device)
     if state == NmtState.OPERATIONAL and device.nmt != NmtState.OPERATIONAL:
@@ -52,16 +54,9 @@ def _connection_lost(device: Device, code: int, cause: int, whole: bool, queue: 
     report_error(device, code, queue)
     behaviour = device.communication.error_behaviour
     if whole and behaviour == 2:
-        enter_nmt(device, NmtState.STOPPED)
+        enter_nmt(device, NmtState.STOPPED, queue)
     elif whole and behaviour == 0 and device.nmt == NmtState.OPERATIONAL:
-        enter_nmt(device, NmtState.PRE_OPERATIONAL)
-
-
-@kernel
-def connection_back(device: Device, cause: int, queue: FrameQueue) -> None:
-    if device.communication_errors & cause:
-        device.communication_errors &= ~cause
-        report_cleared(device, queue)
+        enter_nmt(device, NmtState.PRE_OPERATIONAL, queue)
 
 
 @kernel
@@ -73,7 +68,7 @@ def _producer_heartbeat(device: Device, now_ns: int, next_ns: int, queue: FrameQ
     if period_ms == 0:
         return next_ns
     device.guard_heard_ns = 0  # heartbeat and node guarding exclude each other; heartbeat has precedence
-    connection_back(device, LIFE_GUARD_ERROR, queue)
+    clear_error(device, LIFE_GUARD_ERROR, queue)
     if now_ns >= device.heartbeat_due_ns:
         slot = push_frame(queue, 0x700 + device.node_id, 1)
         if slot >= 0:
@@ -95,7 +90,7 @@ def answer_node_guard(device: Device, now_ns: int, queue: FrameQueue) -> None:
     device.guard_toggle ^= 1
     device.guard_heard_ns = now_ns
     device.next_due_ns = 0
-    connection_back(device, LIFE_GUARD_ERROR, queue)
+    clear_error(device, LIFE_GUARD_ERROR, queue)
 
 
 @kernel
@@ -122,7 +117,7 @@ def _watch(device: Device, now_ns: int, next_ns: int, queue: FrameQueue) -> int:
         if entry != device.consumer_entry[i]:
             device.consumer_entry[i] = entry
             device.consumer_heard_ns[i] = 0
-            connection_back(device, 1 << i, queue)
+            clear_error(device, 1 << i, queue)
             continue
         time_ns = (entry & 0xFFFF) * _MS
         heard_ns = device.consumer_heard_ns[i]

@@ -1,16 +1,26 @@
 """What CiA 301 and CiA 402 demand of an SDO write beyond type and range: PDO set-up, COB-IDs, sets of values.
 
 A PDO's mapping changes only while its COB-ID has bit 31 set and, for the entries, while sub 0 is 0; identifier and
-inhibit time of a valid PDO are fixed.  A COB-ID must be an 11-bit identifier outside the restricted ones.
+inhibit time of a valid PDO are fixed.  A COB-ID must be an 11-bit identifier outside the restricted ones.  Abort codes
+of a mapping are those of CiA 301, 7.5.2.36 and 7.5.2.38: an object that is not there, whole or its sub-index, is
+0602 0000, one that cannot be mapped 0604 0041, more than there is room for 0604 0042.
 """
 
 from __future__ import annotations
 
-from hil.canopen.device_records import EVENT_DRIVEN, LAST_SYNCHRONOUS, MAPPED, PowerState
-from hil.canopen.object_dictionary import DEVICE_STATE, INVALID_VALUE, ObjectDictionary, SdoAbort
+from hil.canopen.device_records import EVENT_DRIVEN, LAST_SYNCHRONOUS, PowerState
+from hil.canopen.object_dictionary import (
+    DEVICE_STATE,
+    INVALID_VALUE,
+    NO_OBJECT,
+    PDO_LENGTH,
+    UNSUPPORTED_ACCESS,
+    ObjectDictionary,
+    SdoAbort,
+    is_mapping,
+)
 
 NOT_MAPPABLE = 0x06040041
-PDO_LENGTH = 0x06040042
 PARAMETER_CONFLICT = 0x06040043
 
 _INVALID = 0x80000000
@@ -18,7 +28,15 @@ _EXTENDED = 0x20000000
 _QUICK_STOP_OPTIONS = (0, 1, 2, 5, 6)
 _MODES = (0, 1, 3, 4, 6, 8, 9, 10)
 _HOMING_METHODS = (0, 33, 34, 35, 37)
-_VALUES = {0x605A: _QUICK_STOP_OPTIONS, 0x6060: _MODES, 0x6098: _HOMING_METHODS, 0x1003: (0,)}
+_LINEAR_RAMP = (0,)  # of 6086 and 6088: the only profile there is
+_VALUES = {
+    0x605A: _QUICK_STOP_OPTIONS,
+    0x6060: _MODES,
+    0x6086: _LINEAR_RAMP,
+    0x6088: _LINEAR_RAMP,
+    0x6098: _HOMING_METHODS,
+    0x1003: (0,),
+}
 
 
 def _restricted(identifier: int) -> bool:
@@ -45,7 +63,9 @@ def _check_cob_id(old: int, new: int) -> None:
 
 def _check_entry(objects: ObjectDictionary, value: int, received: bool) -> int:
     """A mapping entry must name a mappable object with its own length; its length in bits."""
-    entry = objects.entry(value >> 16, value >> 8 & 0xFF)
+    entry = objects.entries.get((value >> 16, value >> 8 & 0xFF))
+    if entry is None:
+        raise SdoAbort(NO_OBJECT)
     if not entry.mappable or (received and not entry.writable) or value & 0xFF != 8 * entry.size:
         raise SdoAbort(NOT_MAPPABLE)
     return value & 0xFF
@@ -54,27 +74,26 @@ def _check_entry(objects: ObjectDictionary, value: int, received: bool) -> int:
 def _check_mapping(objects: ObjectDictionary, index: int, sub: int, value: int) -> None:
     received = index < 0x1800
     if not objects.value(index - 0x200, 1) & _INVALID:
-        raise SdoAbort(DEVICE_STATE)
+        raise SdoAbort(UNSUPPORTED_ACCESS)
     if sub == 0:
-        if value > MAPPED:
+        if (index, value) not in objects.entries:
             raise SdoAbort(PDO_LENGTH)
         bits = sum(_check_entry(objects, objects.value(index, i + 1), received) for i in range(value))
         if bits > 64:
             raise SdoAbort(PDO_LENGTH)
         return
     if objects.value(index, 0) != 0:
-        raise SdoAbort(DEVICE_STATE)
+        raise SdoAbort(UNSUPPORTED_ACCESS)
     if value != 0:
         _check_entry(objects, value, received)
 
 
 def _check_heartbeat(objects: ObjectDictionary, sub: int, value: int) -> None:
-    """A producer may be watched once only."""
+    """A producer may be watched once only; an entry without a time, or without a node that there can be, is unused."""
     others = [objects.value(0x1016, other) for other in (1, 2) if other != sub]
-    if value & 0xFFFF and any(other >> 16 == value >> 16 and other & 0xFFFF for other in others):
+    used = value & 0xFFFF and 1 <= value >> 16 <= 127
+    if used and any(other >> 16 == value >> 16 and other & 0xFFFF for other in others):
         raise SdoAbort(PARAMETER_CONFLICT)
-    if value & 0xFFFF and not 1 <= value >> 16 <= 127:
-        raise SdoAbort(INVALID_VALUE)
 
 
 def check_write(objects: ObjectDictionary, index: int, sub: int, value: int, power_state: int) -> None:
@@ -88,7 +107,7 @@ def check_write(objects: ObjectDictionary, index: int, sub: int, value: int, pow
     elif pdo_parameter and sub in (3, 6):
         if not objects.value(index, 1) & _INVALID:
             raise SdoAbort(DEVICE_STATE)
-    elif 0x1600 <= index < 0x1800 or 0x1A00 <= index < 0x1C00:
+    elif is_mapping(index):
         _check_mapping(objects, index, sub, value)
     elif index == 0x1014:
         _check_cob_id(objects.value(0x1014, 0), value)

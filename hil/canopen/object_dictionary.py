@@ -30,10 +30,12 @@ UNKNOWN_COMMAND = 0x05040001
 BLOCK_SIZE = 0x05040002
 SEQUENCE_NUMBER = 0x05040003
 CRC_ERROR = 0x05040004
+UNSUPPORTED_ACCESS = 0x06010000
 NO_OBJECT = 0x06020000
 NO_SUB_INDEX = 0x06090011
 WRITE_ONLY = 0x06010001
 READ_ONLY = 0x06010002
+PDO_LENGTH = 0x06040042
 LENGTH_MISMATCH = 0x06070010
 TOO_LONG = 0x06070012
 TOO_SHORT = 0x06070013
@@ -44,6 +46,11 @@ HARDWARE = 0x06060000
 CANNOT_STORE = 0x08000020
 DEVICE_STATE = 0x08000022
 NO_DATA = 0x08000024
+
+
+def is_mapping(index: int) -> bool:
+    """Whether the object maps a PDO."""
+    return 0x1600 <= index < 0x1800 or 0x1A00 <= index < 0x1C00
 
 
 class SdoAbort(Exception):
@@ -209,7 +216,7 @@ class ObjectDictionary:
             raise SdoAbort(TOO_LONG if len(data) > entry.size else TOO_SHORT)
         value = int(np.frombuffer(data, entry.dtype)[0])
         if entry.high is not None and value > entry.high:
-            raise SdoAbort(TOO_HIGH)
+            raise SdoAbort(PDO_LENGTH if sub == 0 and is_mapping(index) else TOO_HIGH)
         if entry.low is not None and value < entry.low:
             raise SdoAbort(TOO_LOW)
         return value

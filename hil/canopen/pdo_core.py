@@ -15,7 +15,15 @@ import numpy as np
 from firmware_py.kernel import kernel
 from hil.bus.frames import FrameQueue
 from hil.canopen.cia402_core import apply_controlword
-from hil.canopen.device_errors import COB_ID_INVALID, RPDO_TOO_SHORT, push_frame, report_cleared, send_emergency
+from hil.canopen.device_errors import (
+    COB_ID_INVALID,
+    RPDO_ERROR,
+    RPDO_LENGTH_ERROR,
+    RPDO_TOO_SHORT,
+    clear_error,
+    push_frame,
+    raise_error,
+)
 from hil.canopen.device_records import (
     EVENT_DRIVEN,
     LAST_SYNCHRONOUS,
@@ -42,6 +50,10 @@ def read_object(drive: DriveObjects, entry: int) -> int:
         value = int64(drive.torque)
     elif key == 0x606C00:
         value = int64(drive.velocity)
+    elif key == 0x606B00:
+        value = int64(drive.demand_velocity)
+    elif key == 0x607900:
+        value = int64(drive.dc_link_mV)
     elif key == 0x607800:
         value = int64(drive.current)
     elif key == 0x606100:
@@ -147,15 +159,13 @@ def receive_rpdo(device: Device, identifier: int, frame: np.ndarray, now_ns: int
         if cob_id & COB_ID_INVALID or cob_id & 0x7FF != identifier or group.rpdo_count[pdo] == 0:
             continue
         if int64(frame[4]) < _mapped_bytes(group, pdo):
-            send_emergency(device, RPDO_TOO_SHORT, queue)
+            raise_error(device, RPDO_LENGTH_ERROR << pdo, RPDO_TOO_SHORT, queue)
             continue
         device.rpdo_heard_ns[pdo] = now_ns
         timer_ns = int64(group.rpdo_timer_ms[pdo]) * 1_000_000
         if timer_ns:
             device.next_due_ns = min(device.next_due_ns, now_ns + timer_ns)
-        if device.communication_errors & (0x10 << pdo):
-            device.communication_errors &= ~(0x10 << pdo)
-            report_cleared(device, queue)
+        clear_error(device, (RPDO_ERROR | RPDO_LENGTH_ERROR) << pdo, queue)
         for i in range(8):
             device.rpdo_data[pdo, i] = frame[8 + i]
         if group.rpdo_type[pdo] >= EVENT_DRIVEN:
@@ -210,7 +220,6 @@ def start_pdos(device: Device) -> None:
         device.tpdo_syncs[pdo] = 0
         device.tpdo_started[pdo] = 0
         device.tpdo_event[pdo] = 1
-    device.sync_length_wrong = 0
     device.sync_heard_ns = 0
 
 

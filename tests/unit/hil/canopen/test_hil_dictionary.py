@@ -26,10 +26,12 @@ CHOICES: dict[int, tuple[int, ...]] = {
     0x1019: (0, *range(2, 241)),
     0x605A: (0, 1, 2, 5, 6),
     0x6060: (0, 1, 3, 4, 6, 8, 9, 10),
+    0x6086: (0,),
+    0x6088: (0,),
     0x6098: (0, 33, 34, 35, 37),
 }
 IDENTIFIERS = (0x1005, 0x1014, *range(0x1400, 0x1404), *range(0x1800, 0x1804))
-# Fixed while the PDO is valid, as the first ones are at the start: 0800 0022.
+# Fixed while the PDO is valid, as the first ones are at the start: a mapping 0601 0000, others 0800 0022.
 WITH_PDO = (
     *range(0x1600, 0x1604),
     *range(0x1A00, 0x1A04),
@@ -111,7 +113,8 @@ def test_writing_respects_length_limits_and_sets(node: Any, variable: ODVariable
     assert code_of(node, variable, before + b"\0") == 0x06070012
     if size > 1:
         assert code_of(node, variable, before[:-1]) == 0x06070013
-    for value, code in ((low - 1, 0x06090032), (high + 1, 0x06090031)):
+    too_high = 0x06040042 if sub == 0 and index in WITH_PDO else 0x06090031
+    for value, code in ((low - 1, 0x06090032), (high + 1, too_high)):
         try:
             data = struct.pack(kind, value)
         except struct.error:
@@ -127,10 +130,8 @@ def test_writing_respects_length_limits_and_sets(node: Any, variable: ODVariable
             assert code in (0, 0x06090030, 0x08000022)
         elif index in IDENTIFIERS and sub == 2:
             assert code == (0x06090030 if 240 < value < 254 else 0)
-        elif index == 0x1016:
-            assert code == (0 if value & 0xFFFF == 0 or 1 <= value >> 16 <= 127 else 0x06090030), value
         elif state:  # mapping and its checks: test_hil_sdo_server.py
-            assert code in (0, 0x08000022, 0x06020000, 0x06040041, 0x06040042)
+            assert code in (0, 0x06010000, 0x08000022, 0x06020000, 0x06040041, 0x06040042)
         else:
             assert code == 0, value
         if code == 0 and index not in (0x1010, 0x1011):

@@ -7,6 +7,7 @@ import struct
 
 import pytest
 
+from hil.canopen.device_records import PowerState
 from tests.virtual_drive import NODE, REMOTE, Rig
 
 GUARD = REMOTE | 0x700 + NODE
@@ -192,7 +193,67 @@ def test_a_sync_of_the_wrong_length_is_reported_once_and_ignored(rig: Rig, overf
     for _ in range(3):
         assert 0x285 not in [i for i, _ in rig.send(0x80, data)]
     assert rig.emergencies() == [0x8240]
-    assert [i for i, _ in rig.send(0x80, right)] == [0x285]
+    assert (rig.get(0x1001), rig.get(0x1003), rig.get(0x1003, 1)) == (0x11, 1, 0x8240)
+    assert 0x285 in [i for i, _ in rig.send(0x80, right)]
+    assert rig.emergencies() == [0x8240, 0]
+    assert (rig.get(0x1001), rig.get(0x1003)) == (0, 1)
+    rig.send(0x80, data)  # another event
+    assert rig.emergencies() == [0x8240, 0, 0x8240]
+    assert rig.get(0x1003) == 2
+
+
+def test_a_pdo_that_is_too_short_is_reported_once_each_time_it_begins(rig: Rig) -> None:
+    """Each RPDO for itself; the right length ends it, and so does leaving operational."""
+    rig.set(0x1401, 1, 0x80000305, 4)
+    rig.set(0x1401, 2, 255, 1)
+    rig.set(0x1401, 1, 0x305, 4)
+    rig.operational()
+    for _ in range(5):
+        rig.send(0x200 + NODE, b"\x06")
+    assert rig.emergencies() == [0x8210]
+    assert (rig.get(0x1001), rig.get(0x1003), rig.get(0x1003, 1)) == (0x11, 1, 0x8210)
+    rig.send(0x300 + NODE, b"\x06")
+    assert rig.emergencies() == [0x8210, 0x8210]
+    rig.send(0x200 + NODE, b"\x06\x00")
+    assert rig.emergencies() == [0x8210, 0x8210]  # the other one is still wrong
+    assert rig.get(0x1001) == 0x11
+    rig.send(0, bytes([0x80, NODE]))
+    assert rig.emergencies() == [0x8210, 0x8210, 0]
+    assert (rig.get(0x1001), rig.get(0x1003)) == (0, 2)
+
+
+def test_a_pdo_of_the_wrong_length_keeps_no_fault(rig: Rig) -> None:
+    rig.operational()
+    rig.send(0x200 + NODE, b"\x06")
+    rig.device.device[0].inject_fault_code = 0x2310
+    rig.run(1)
+    rig.device.device[0].inject_fault_code = 0
+    rig.control(0x00, 0x80)
+    assert rig.get(0x6041) & 0x4F == 0x40
+    assert rig.get(0x1001) == 0x11  # of the PDO
+    assert rig.emergencies() == [0x8210, 0x2310]
+
+
+@pytest.mark.parametrize("command", [0x80, 0x02])
+@pytest.mark.parametrize(("option", "enabled", "code"), [(1, True, 0x8100), (1, False, 0), (2, True, 0), (3, True, 0)])
+def test_leaving_operational_with_the_power_on_is_a_fault_that_is_reported(
+    rig: Rig, command: int, option: int, enabled: bool, code: int
+) -> None:
+    """6007 = 1: with error code, history and emergency, which a stopped node could not send any more."""
+    rig.set(0x6007, 0, option, 2)
+    rig.operational()
+    if enabled:
+        rig.enable(9)
+    rig.send(0, bytes([command, NODE]))
+    rig.run(1200)
+    assert rig.emergencies() == ([code] if code else [])
+    assert (rig.get(0x603F), rig.get(0x1001), rig.get(0x1003)) == ((code, 0x11, 1) if code else (0, 0, 0))
+    assert rig.state() == (PowerState.FAULT if code else PowerState.SWITCH_ON_DISABLED)
+    rig.send(0, bytes([0x80, NODE]))
+    if code:
+        rig.control(0x00, 0x80)
+        assert rig.emergencies() == [code, 0]
+        assert rig.state() == PowerState.SWITCH_ON_DISABLED
 
 
 @pytest.mark.parametrize(

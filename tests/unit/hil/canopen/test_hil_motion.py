@@ -105,6 +105,80 @@ def test_velocity_modes_reach_the_target(rig: Rig, mode: int) -> None:
     assert rig.get(0x606C) == pytest.approx(-50_000, abs=500)
 
 
+def _braking_ms(rig: Rig, word: int) -> int:
+    """How long the joint needs to come to rest once this controlword has come."""
+    rig.control(word)
+    return next(ms for ms in range(5000) if abs(rig.speed_radps) < 0.01 or rig.run(1) is None)
+
+
+@pytest.mark.parametrize("mode", [1, 3])
+@pytest.mark.parametrize(("option", "rate"), [(1, 200_000), (2, 1_000_000)])
+def test_halt_brakes_along_the_ramp_that_605d_names(rig: Rig, mode: int, option: int, rate: int) -> None:
+    """6084 or 6085, and the drive stays enabled; without halt the motion goes on."""
+    rig.set(0x6084, 0, 200_000, 4)
+    rig.set(0x605D, 0, option, 2)
+    rig.enable(mode)
+    rig.set(0x60FF, 0, 100_000, 4)
+    rig.set(0x607A, 0, 1_000_000, 4)
+    rig.control(0x1F)
+    rig.run(1000)
+    assert rig.get(0x606C) == pytest.approx(100_000, rel=0.02)
+    assert _braking_ms(rig, 0x11F) == pytest.approx(1e3 * 100_000 / rate, rel=0.1, abs=15)
+    assert rig.get(0x6041) & 0x6F == 0x27
+    rig.control(0x1F)
+    rig.run(1000)
+    assert rig.get(0x606C) == pytest.approx(100_000, rel=0.02)
+
+
+def test_halt_in_torque_mode_takes_the_torque_slope(rig: Rig) -> None:
+    rig.set(0x605D, 0, 2, 2)
+    rig.enable(4)
+    rig.set(0x6071, 0, 50, 2)
+    rig.run(100)
+    assert rig.get(0x6074) == 50
+    rig.control(0x10F)
+    rig.run(24)
+    assert rig.get(0x6074) == pytest.approx(25, abs=3)
+
+
+def test_the_velocity_demand_is_that_of_the_velocity_loop(rig: Rig) -> None:
+    """606B: the ramp in the velocity modes, zero where no velocity is controlled, the stop ramp of any mode."""
+    rig.set(0x6083, 0, 100_000, 4)
+    assert rig.get(0x606B) == 0
+    rig.enable(3)
+    rig.set(0x60FF, 0, -50_000, 4)
+    rig.run(250)
+    assert rig.get(0x606B) == pytest.approx(-25_000, abs=300)
+    rig.run(500)
+    assert rig.get(0x606B) == -50_000
+    rig.set(0x605A, 0, 2, 2)
+    rig.control(0x02)
+    rig.run(20)
+    assert -40_000 < rig.get(0x606B) < -20_000
+    rig.run(200)
+    assert rig.get(0x606B) == 0
+    rig.control(0x00)
+    rig.enable(10)
+    rig.set(0x6071, 0, 300, 2)
+    rig.run(100)
+    assert abs(rig.get(0x606C)) > 10_000
+    assert rig.get(0x606B) == 0
+    rig.control(0x02)
+    rig.run(1)
+    assert rig.get(0x606B) == pytest.approx(rig.get(0x606C), rel=0.2)
+
+
+def test_the_supply_is_there_and_can_be_mapped(rig: Rig) -> None:
+    assert rig.get(0x6079) == 48_000  # mV
+    rig.set(0x1A02, 0, 0, 1)
+    rig.set(0x1A02, 1, 0x60790020, 4)
+    rig.set(0x1A02, 2, 0x606B0020, 4)
+    rig.set(0x1A02, 0, 2, 1)
+    rig.set(0x1802, 1, 0x40000385, 4)
+    rig.operational()
+    assert (0x385, (48_000).to_bytes(4, "little") + bytes(4)) in rig.send(0x80, b"")
+
+
 @pytest.mark.parametrize("mode", [1, 8])
 def test_position_modes_reach_the_target(rig: Rig, mode: int) -> None:
     rig.enable(mode)

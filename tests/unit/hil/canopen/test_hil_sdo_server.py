@@ -60,11 +60,26 @@ def write(device: Cia402Device, index: int, sub: int, data: bytes) -> int:
         (0x1400, 1, "06020000", 0x08000022),  # another identifier of a valid PDO
         (0x1401, 1, "05060080", 0),  # any identifier while it stays invalid
         (0x1401, 1, "05060000", 0x06090030),  # restricted
-        (0x1600, 0, "00", 0x08000022),  # remap of a valid PDO
-        (0x1601, 1, "10004060", 0x08000022),  # sub 0 is not 0
+        (0x1600, 0, "00", 0x06010000),  # remap of a valid PDO
+        (0x1A00, 1, "10007760", 0x06010000),
+        (0x1601, 1, "10004060", 0x06010000),  # sub 0 is not 0
+        (0x1600, 0, "09", 0x06040042),  # more than there is room for, whatever else
+        (0x1601, 0, "09", 0x06040042),
+        (0x1A01, 0, "ff", 0x06040042),
+        (0x1601, 0, "08", 0x06020000),  # entry 4 names object 0000
         (0x1003, 0, "01", 0x06090030),
         (0x1003, 0, "00", 0),
         (0x1016, 1, "32007f00", 0),
+        (0x1016, 1, "32000000", 0),  # unused: node 0
+        (0x1016, 2, "32008000", 0),  # unused: no such node
+        (0x1016, 2, "ffffffff", 0),
+        (0x605D, 0, "0200", 0),
+        (0x605D, 0, "0000", 0x06090032),
+        (0x605D, 0, "0300", 0x06090031),
+        (0x6086, 0, "0100", 0x06090030),
+        (0x6088, 0, "0100", 0x06090030),
+        (0x6079, 0, "00000000", 0x06010002),
+        (0x606B, 0, "00000000", 0x06010002),
     ],
 )
 def test_download(device: Cia402Device, index: int, sub: int, data: str, code: int) -> None:
@@ -78,7 +93,7 @@ def test_download(device: Cia402Device, index: int, sub: int, data: str, code: i
         (0x60730010, 0x06040041),
         (0x60400020, 0x06040041),  # wrong length
         (0x23450010, 0x06020000),
-        (0x607D0910, 0x06090011),
+        (0x607D0910, 0x06020000),  # by CiA 301, 7.5.2.36: what is to be mapped does not exist
         (0x60FF0020, 0),
     ],
 )
@@ -99,6 +114,12 @@ def test_one_producer_is_watched_once(device: Cia402Device) -> None:
     assert write(device, 0x1016, 1, struct.pack("<I", 7 << 16 | 100)) == 0
     assert write(device, 0x1016, 2, struct.pack("<I", 7 << 16 | 50)) == 0x06040043
     assert write(device, 0x1016, 2, struct.pack("<I", 8 << 16 | 50)) == 0
+
+
+@pytest.mark.parametrize("node", [0, 128, 255])
+def test_an_entry_for_no_node_is_unused_and_so_no_second_one(device: Cia402Device, node: int) -> None:
+    for sub in (1, 2):
+        assert write(device, 0x1016, sub, struct.pack("<I", node << 16 | 50)) == 0
 
 
 def test_the_page_lists_every_abort_code_and_each_has_a_test() -> None:
