@@ -71,7 +71,7 @@ def identify(objects: ObjectAccess, settings: CanopenSettings, eds: EdsFile, fin
     if profile != CIA402_PROFILE:
         raise DeviceError(f"node {settings.node} has device profile {profile}, a drive has {CIA402_PROFILE} (CiA 402)")
     vendor, product, revision, serial = (
-        objects.read(0x1018, sub, what=what) if objects.has(0x1018, sub) else 0
+        objects.read_if_present(0x1018, sub, what=what) or 0
         for sub, what in ((1, "vendor ID"), (2, "product code"), (3, "revision"), (4, "serial number"))
     )
     for name, expected, found in (
@@ -121,7 +121,7 @@ def disable(objects: ObjectAccess, settings: CanopenSettings, pause: Pause) -> N
             break
         pause(PAUSE_S)
     if state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
-        code = objects.read(0x603F, what="error code") if objects.has(0x603F) else 0
+        code = objects.read_if_present(0x603F, what="error code") or 0
         raise DeviceError(
             f"node {settings.node} is in fault (error code {code:04X}h)",
             hint="find the cause, then reset the fault; jointctl never resets one by itself",
@@ -134,8 +134,8 @@ def disable(objects: ObjectAccess, settings: CanopenSettings, pause: Pause) -> N
 def choose_mode(objects: ObjectAccess, settings: CanopenSettings, findings: Findings, pause: Pause) -> None:
     """Select the first wanted mode that the drive has, and wait until 6061 confirms it."""
     wanted = MODES[settings.mode]
-    if objects.has(0x6502):
-        supported = objects.read(0x6502, what="supported drive modes")
+    supported = objects.read_if_present(0x6502, what="supported drive modes")
+    if supported is not None:
         usable = [mode for mode in wanted if supported >> SUPPORTED_MODE_BIT[mode] & 1]
     else:
         findings.remarks.append("the drive does not tell its supported modes (no object 6502)")
@@ -185,8 +185,8 @@ def _compare_rated(name: str, found: float, expected: float | None, tolerance: f
 
 def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
     """Scaling from the rated values, then the drive's own torque limit 6072 from the joint's."""
-    rated_mNm = objects.read(0x6076, what="motor rated torque") if objects.has(0x6076) else 0
-    rated_mA = objects.read(0x6075, what="motor rated current") if objects.has(0x6075) else 0
+    rated_mNm = objects.read_if_present(0x6076, what="motor rated torque") or 0
+    rated_mA = objects.read_if_present(0x6075, what="motor rated current") or 0
     tolerance = settings.rated_tolerance
     findings.remarks += [
         *_compare_rated("rated_torque_Nm", rated_mNm * 1e-3, settings.rated_torque_Nm, tolerance, "Nm"),
@@ -231,9 +231,10 @@ def arm_watchdog(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
     """The drive watches our heartbeat and stops by itself when it stays away; it sends its own as well."""
     milliseconds = round(settings.heartbeat_s * 1000.0)
     consumer = settings.master_node << 16 | milliseconds
-    if not objects.has(0x1016, 1):
+    lack = objects.lack(0x1016, 1)
+    if lack:
         raise DeviceError(
-            f"EDS {objects.eds_name} has no object 1016:1 (consumer heartbeat time), which jointctl needs: "
+            f"{lack} object 1016:1 (consumer heartbeat time), which jointctl needs: "
             "without it the drive cannot notice that this computer has died",
             hint="use the EDS file that belongs to this drive and firmware; a drive without a heartbeat consumer is "
             "not enabled",

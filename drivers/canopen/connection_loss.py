@@ -90,7 +90,7 @@ def _write_event_timer(objects: ObjectAccess, base: int, cob_id: int, millisecon
 def clear_rpdo_deadlines(objects: ObjectAccess) -> None:
     """Event timers of all RPDOs to zero: which one an earlier run has armed is not known."""
     for base in pdos_of(objects, COMMUNICATION_RPDO):
-        if objects.has(base, EVENT_TIMER) and objects.read(base, EVENT_TIMER, what="RPDO event timer"):
+        if objects.read_if_present(base, EVENT_TIMER, what="RPDO event timer"):
             cob_id = objects.read(base, 1, what=f"PDO {base:04X} COB-ID") & 0xFFFFFFFF
             error = _write_event_timer(objects, base, cob_id, 0)
             if error is not None:
@@ -112,10 +112,9 @@ def watched_nodes(objects: ObjectAccess) -> set[int]:
     """Nodes whose heartbeat the drive watches now (1016)."""
     found = set()
     for sub in range(1, LARGEST_SUB):
-        if not objects.has(0x1016, sub):
+        entry = objects.read_if_present(0x1016, sub, what="consumer heartbeat time")
+        if entry is None:
             break
-        with contextlib.suppress(DeviceError):
-            entry = objects.read(0x1016, sub, what="consumer heartbeat time")
-            if entry & 0xFFFF:
-                found.add(entry >> 16 & 0xFF)
+        if entry & 0xFFFF:
+            found.add(entry >> 16 & 0xFF)
     return found

@@ -52,7 +52,7 @@ def commission_encoder(
     listen_to_our_sync(objects, rate_Hz)
     if not objects.write_if_present(0x1017, 0, round(heartbeat_s * 1000.0), what="producer heartbeat time"):
         objects.remarks.append(f"node {node}: no object 1017: a restart is seen by its boot-up message")
-    if objects.has(CYCLIC_TIMER) and objects.read(CYCLIC_TIMER, what="cyclic timer") != 0:
+    if objects.read_if_present(CYCLIC_TIMER, what="cyclic timer"):
         objects.write_verified(CYCLIC_TIMER, 0, 0, what="cyclic timer")
     configure_pdo(objects, COMMUNICATION_TPDO, TPDO1_ID + node, EVERY_SYNC, (POSITION_VALUE,))
     for base in pdos_of(objects, COMMUNICATION_TPDO):
@@ -65,7 +65,7 @@ def commission_encoder(
 
 def require_no_alarm(objects: ObjectAccess, node: int) -> None:
     """`DeviceError` if the encoder says that its position is not valid (6503, CiA 406)."""
-    alarms = objects.read(ALARMS, what="alarms") if objects.has(ALARMS) else 0
+    alarms = objects.read_if_present(ALARMS, what="alarms")
     if alarms:
         raise DeviceError(f"node {node}: the encoder reports alarms (6503 = {alarms:04X}h): its position is not valid")
 

@@ -1,4 +1,7 @@
-"""Reading and writing the drive's objects over SDO, with the EDS as the judge of what exists.
+"""Reading and writing the drive's objects over SDO, with EDS and drive as the judges of what exists.
+
+An EDS often describes more than the drive at hand has (other firmware, an option that was not bought).  What may be
+absent counts as absent when the drive itself says so; what must be there is refused with that reason.
 
 Time-outs are retried (drives leave SDOs unanswered now and then); an abort is an answer and is not.
 """
@@ -23,7 +26,9 @@ COLLISIONS = 10  # with the transfers of another master on the one SDO channel, 
 COLLISION_PAUSE_S = 0.01
 NO_ANSWER = "No SDO response received"  # by the library, in contrast to an answer that does not fit
 Result = TypeVar("Result")
+ABSENT = (0x06020000, 0x06090011)  # no such object, no such sub-index
 ABORT_TEXT = {
+    0x06010000: "access is not supported",
     0x06090030: "value out of range",
     0x06090031: "value too high",
     0x06090032: "value too low",
@@ -55,15 +60,31 @@ class ObjectAccess:
     ) -> None:
         """`unusable`: objects that the EDS describes wrongly, and how."""
         self._node = node
-        self._eds_name = self.eds_name = eds_name
+        self._eds_name = eds_name
         self._unusable = unusable or {}
         self.remarks: list[str] = []  # what was tolerated
         self.gate: Callable[[], None] = lambda: None  # raises where no more is to be said to the drive
         self._verified: dict[tuple[int, int], tuple[int, str]] = {}  # what `write_verified` has set, and its name
+        self._answered: dict[tuple[int, int], bool] = {}  # whether the drive has what the EDS lists
 
     def has(self, index: int, sub: int = 0) -> bool:
-        """Whether the EDS lists the object."""
-        return self._variable(index, sub) is not None
+        """Whether the EDS lists the object and the drive, which is asked once, does not say that it lacks it."""
+        return self.lack(index, sub) == ""
+
+    def lack(self, index: int, sub: int = 0) -> str:
+        """Who lacks the object, in words that end where its name is to follow; empty where it is there."""
+        if self._variable(index, sub) is None:
+            return f"EDS {self._eds_name} has no"
+        if (index, sub) not in self._answered:
+            self.gate()
+            try:
+                self._node.sdo.upload(index, sub)
+                self._answered[index, sub] = True
+            except SdoAbortedError as error:  # any other refusal is one of this moment, or of reading
+                self._answered[index, sub] = error.code not in ABSENT
+            except (SdoCommunicationError, struct.error):
+                return ""  # whoever needs the object will see
+        return "" if self._answered[index, sub] else f"node {self._node.id}, unlike EDS {self._eds_name}, has no"
 
     def require(self, index: int, sub: int = 0, *, what: str) -> None:
         """`DeviceError` unless the EDS lists the object."""
@@ -91,7 +112,10 @@ class ObjectAccess:
         place = f"node {self._node.id}: {action} object {object_name(index, sub)} ({what})"
         if isinstance(error, SdoAbortedError):
             reason = ABORT_TEXT.get(error.code, "refused")
-            return DeviceError(f"{place} was refused: {reason} (SDO abort {error.code:08X}h)")
+            hint = f"EDS {self._eds_name} lists it: use the EDS file that belongs to this drive and firmware"
+            return DeviceError(
+                f"{place} was refused: {reason} (SDO abort {error.code:08X}h)", hint if error.code in ABSENT else ""
+            )
         return NoDeviceError(f"{place} got no answer in {ATTEMPTS} attempts")
 
     def _number(self, variable: Any, data: bytes, what: str) -> int:
@@ -129,6 +153,24 @@ class ObjectAccess:
         return self._transfer(
             lambda: self._number(variable, self._node.sdo.upload(index, sub), what), "reading", index, sub, what
         )
+
+    def read_if_present(self, index: int, sub: int = 0, *, what: str) -> int | None:
+        """`read` where EDS and drive have the object; None where one has not."""
+        if self._variable(index, sub) is None or not self._answered.get((index, sub), True):
+            return None
+        try:
+            return self.read(index, sub, what=what)
+        except DeviceError as error:
+            if self._says_absent(error, index, sub):
+                return None
+            raise
+
+    def _says_absent(self, error: DeviceError, index: int, sub: int) -> bool:
+        """Whether the drive has refused because it lacks the object; that is kept."""
+        absent = isinstance(error.__cause__, SdoAbortedError) and error.__cause__.code in ABSENT
+        if absent:
+            self._answered[index, sub] = False
+        return absent
 
     def write(self, index: int, sub: int, value: int, *, what: str) -> None:
         """Write an integer object; the type and so the length come from the EDS."""
@@ -178,6 +220,7 @@ class ObjectAccess:
     def forget_verified(self) -> None:
         """Commissioning begins anew."""
         self._verified.clear()
+        self._answered.clear()
 
     def verify_again(self, wanted: Callable[[int, int], bool] = lambda *_: True) -> None:
         """Read everything that was verified once more; `DeviceError` if the drive has changed in the meantime."""
@@ -193,15 +236,20 @@ class ObjectAccess:
                 )
 
     def write_if_present(self, index: int, sub: int, value: int, *, what: str) -> bool:
-        """`write_verified` where the EDS has the object; False where it has not."""
-        if not self.has(index, sub):
+        """`write_verified` where EDS and drive have the object; False where one has not."""
+        if self._variable(index, sub) is None or not self._answered.get((index, sub), True):
             return False
-        self.write_verified(index, sub, value, what=what)
+        try:
+            self.write_verified(index, sub, value, what=what)
+        except DeviceError as error:
+            if self._says_absent(error, index, sub):
+                return False
+            raise
         return True
 
     def text(self, index: int) -> str:
         """A visible string such as 1008 (device name); empty if there is none."""
-        if not self.has(index):
+        if self._variable(index, 0) is None:
             return ""
         try:
             return bytes(self._node.sdo.upload(index, 0)).rstrip(b"\0").decode("latin-1").strip()

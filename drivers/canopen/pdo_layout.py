@@ -117,7 +117,7 @@ def read_map(objects: ObjectAccess, base: int) -> PdoMap:
     """What the drive tells about the PDO whose communication record is at `base`."""
     what = f"PDO {base:04X}"
     mapping = base + MAPPING_OFFSET
-    count = objects.read(mapping, 0, what=f"{what} number of mapped objects") if objects.has(mapping) else 0
+    count = objects.read_if_present(mapping, 0, what=f"{what} number of mapped objects") or 0
     entries = []
     for position in range(1, min(count, 64) + 1):
         raw = objects.read(mapping, position, what=f"{what} mapping entry {position}") & 0xFFFFFFFF

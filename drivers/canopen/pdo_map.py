@@ -70,7 +70,7 @@ def configure_pdo(
 def quiet_timers(objects: ObjectAccess, base: int) -> None:
     """No inhibit time and no event timer: a TPDO answers each SYNC, neither less often nor more."""
     for sub, what in ((INHIBIT_TIME, "inhibit time"), (EVENT_TIMER, "event timer")):
-        if objects.has(base, sub) and objects.read(base, sub, what=f"PDO {base:04X} {what}") != 0:
+        if objects.read_if_present(base, sub, what=f"PDO {base:04X} {what}"):
             try:
                 objects.write_verified(base, sub, 0, what=f"PDO {base:04X} {what}")
             except DeviceError as error:
@@ -79,12 +79,11 @@ def quiet_timers(objects: ObjectAccess, base: int) -> None:
 
 def disable_pdo(objects: ObjectAccess, base: int) -> None:
     """Set bit 31 of a PDO that is not used; its other bits stay.  One that stays enabled is told."""
-    if not objects.has(base, 1):
-        return
     what = f"PDO {base:04X} COB-ID"
-    cob_id = objects.read(base, 1, what=what) & 0xFFFFFFFF
-    if cob_id & DISABLED:
+    cob_id = objects.read_if_present(base, 1, what=what)
+    if cob_id is None or cob_id & DISABLED:
         return
+    cob_id &= 0xFFFFFFFF
     try:
         objects.write_verified(base, 1, cob_id | DISABLED, what=what)
     except DeviceError as error:

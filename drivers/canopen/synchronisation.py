@@ -23,15 +23,14 @@ def interpolation_period(rate_Hz: float) -> tuple[int, int]:
 
 def listen_to_our_sync(objects: ObjectAccess, rate_Hz: float) -> None:
     """1005 = 80h without production, 1006 our period if it is used at all, 1019 = 0: our SYNC carries no counter."""
-    if objects.has(0x1005):
-        found = objects.read(0x1005, what="COB-ID SYNC") & 0xFFFFFFFF
-        if found & (PRODUCES_SYNC | 0x7FF) != SYNC_ID:
-            objects.write_verified(0x1005, 0, SYNC_ID, what="COB-ID SYNC")
-            objects.remarks.append(f"1005 was {found:08X}h, it is now {SYNC_ID:08X}h")
+    found = objects.read_if_present(0x1005, what="COB-ID SYNC")
+    if found is not None and found & (PRODUCES_SYNC | 0x7FF) != SYNC_ID:
+        objects.write_verified(0x1005, 0, SYNC_ID, what="COB-ID SYNC")
+        objects.remarks.append(f"1005 was {found & 0xFFFFFFFF:08X}h, it is now {SYNC_ID:08X}h")
     period_us = round(1e6 / rate_Hz)
-    if objects.has(0x1006) and objects.read(0x1006, what="communication cycle period") not in (0, period_us):
+    if objects.read_if_present(0x1006, what="communication cycle period") not in (None, 0, period_us):
         objects.write_verified(0x1006, 0, period_us, what="communication cycle period")
-    if objects.has(0x1019) and objects.read(0x1019, what="synchronous counter overflow value") != 0:
+    if objects.read_if_present(0x1019, what="synchronous counter overflow value"):
         objects.write_verified(0x1019, 0, 0, what="synchronous counter overflow value")
 
 
