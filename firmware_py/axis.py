@@ -236,6 +236,8 @@ def step_axis(
     """
     state.cycle += elapsed_cycles
     state.phase_cycle += elapsed_cycles
+    if elapsed_cycles - 1 > constants.limits.skipped_max_cycles:
+        state.held_up_cycles += elapsed_cycles - 1
     if state.fault == Fault.NONE:
         state.fault_encoder_error = sample.encoder_error
     gap_cycles = _take_position(constants, state, sample, elapsed_cycles)

@@ -149,6 +149,7 @@ class AxisState:
     fault_encoder_error: i4  # `Sample.encoder_error` in the cycle of the fault, or of the last cycle if there is none
     cycle: i8
     phase_cycle: i8  # cycles since the phase began
+    held_up_cycles: i8  # of them those that the loop skipped in overruns beyond skipped_max_cycles
     good_samples: i8
     sample_count: i8
     sample_age_cycles: i8

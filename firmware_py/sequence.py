@@ -33,6 +33,7 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.fault_value = 0.0
     state.cycle = 0
     state.phase_cycle = 0
+    state.held_up_cycles = 0
     state.good_samples = 0
     state.sample_count = 0
     state.sample_age_cycles = 0
@@ -56,6 +57,7 @@ def enter(state: AxisState, phase: int) -> None:
     """Begin a phase."""
     state.phase = phase
     state.phase_cycle = 0
+    state.held_up_cycles = 0
     state.good_samples = 0
 
 
@@ -97,6 +99,20 @@ def trip(state: AxisState, fault: int, value: float, drive_error: int) -> None:
         return
     latch_fault(state, fault, value, drive_error)
     react(state, reaction_to(fault, state.phase))
+
+
+@kernel
+def waited_too_long(state: AxisState, longest_cycles: int) -> bool:
+    """Whether the phase's time is over.
+
+    Over only because the loop itself was held up: nobody has looked for an answer meanwhile, so that is the cause, and
+    what is missing is not.
+    """
+    if state.phase_cycle <= longest_cycles:
+        return False
+    if state.phase_cycle - state.held_up_cycles <= longest_cycles:
+        trip(state, Fault.OVERRUN, float(state.held_up_cycles), 0)
+    return True
 
 
 @kernel
@@ -149,7 +165,7 @@ def step_waiting(constants: AxisConstants, state: AxisState, sample: Sample) -> 
         if not moving and not enabled and constants.sequence.may_enable != 0:
             enter(state, AxisPhase.ENABLING)
             return
-    if state.phase_cycle > constants.sequence.wait_max_cycles:
+    if waited_too_long(state, constants.sequence.wait_max_cycles):
         if state.sample_count == 0:
             trip(state, Fault.NO_SAMPLES, 0.0, sample.drive_error)
         elif sample.drive_state == DriveState.ENABLED:
@@ -185,7 +201,7 @@ def step_enabling(constants: AxisConstants, state: AxisState, sample: Sample, ta
         reset_law(constants.law, state.law)
         state.frozen_way_rad = 0.0
         state.frozen_reference_rad = state.reference.position_rad
-    elif state.phase_cycle > constants.sequence.enable_max_cycles:
+    elif waited_too_long(state, constants.sequence.enable_max_cycles):
         trip(state, Fault.ENABLE_TIMEOUT, float(sample.status_word), sample.drive_error)
 
 
@@ -218,7 +234,7 @@ def step_stopping(constants: AxisConstants, state: AxisState, sample: Sample) ->
     elif state.phase == AxisPhase.DISABLING:
         if off:
             enter(state, AxisPhase.FINISHED)
-        elif state.phase_cycle > constants.sequence.off_max_cycles:
+        elif waited_too_long(state, constants.sequence.off_max_cycles):
             trip(state, Fault.OFF_TIMEOUT, float(sample.status_word), sample.drive_error)
             enter(state, AxisPhase.FINISHED)
 

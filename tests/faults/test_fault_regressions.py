@@ -128,3 +128,27 @@ def test_a_watchdog_that_trips_is_told_by_its_error_code(joint: LockstepJoint, o
     assert seconds_until(run, PowerState.QUICK_STOP_ACTIVE) <= HEARTBEAT_s
     twin = joint.run_with_faults(one_fault(FaultKind.CONTROLLER_HEARTBEAT_LOST, AT_s, 0.06))
     assert twin.fault is Fault.NONE
+
+
+@pytest.mark.parametrize(
+    ("at_s", "step_s", "fault"),
+    [
+        (0.025, 5.6, Fault.OVERRUN),  # seed 915311, scenarios 1269 and 4927: told as SAMPLES_MISSING
+        (0.025, 4.97, Fault.OVERRUN),  # the wait ends some cycles after the step
+        (0.0, 5.6, Fault.OVERRUN),  # before the first sample: told as NO_SAMPLES
+        (0.0525, 5.6, Fault.OVERRUN),  # while the drive is asked to enable: told as ENABLE_TIMEOUT
+        (0.025, 4.9, Fault.NONE),  # the twins: the power is off, and there is time left to wait
+        (0.0525, 2.9, Fault.NONE),
+    ],
+)
+def test_a_clock_that_leaps_before_enabling_is_told_as_that(
+    joint: LockstepJoint, one_fault: MakeFault, at_s: float, step_s: float, fault: Fault
+) -> None:
+    """The wait was over at once, and what had not come in the few cycles that there were was told as the cause."""
+    run = joint.run_with_faults(one_fault(FaultKind.CLOCK_STEP, at_s, 0.01, step_s), epoch_at_start=True)
+    assert run.fault is fault
+    if fault is Fault.OVERRUN:
+        assert run.state.fault_value == pytest.approx(1e3 * step_s, abs=1.0)
+        assert PowerState.OPERATION_ENABLED not in run.truth[:, TRUE_POWER_STATE]
+    else:
+        assert run.state.phase == AxisPhase.FINISHED

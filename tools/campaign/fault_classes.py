@@ -154,8 +154,7 @@ _CLASSES = (
     ),
     FaultClass(
         FaultKind.CLOCK_STEP, Sizes((0.01, 0.01), (0.06, 100.0)), Sizes((0.01, 0.01), (0.001, 0.045)),
-        frozenset({Fault.OVERRUN, Fault.NOT_AT_STANDSTILL, Fault.STALE_SAMPLE, Fault.ENABLE_TIMEOUT, Fault.OFF_TIMEOUT,
-                   Fault.STOP_TIMEOUT}), True,
+        frozenset({Fault.OVERRUN}), True,
     ),
     FaultClass(
         FaultKind.SUPERVISOR_SILENT, Sizes((1.05, LONG_s), (1.0, 1.0)), Sizes((0.01, 0.95), (1.0, 1.0)),

@@ -11,7 +11,7 @@ import pytest
 from firmware_py.records import Sample
 from firmware_py.schema import new
 from firmware_py.sequence import compare_encoders, step_enabling, step_waiting
-from firmware_py.states import AxisPhase, DriveState, Fault
+from firmware_py.states import AxisPhase, DriveState, Fault, Reaction
 from firmware_py.trajectory import approach_at
 from tests.unit.firmware_py.axis.sequence_records import sample_of
 
@@ -137,6 +137,26 @@ def test_waiting_ends(
     assert (state.phase, state.fault) == (AxisPhase.DISABLING, fault)
     assert state.fault_value == value
     assert state.fault_drive_error == (0 if fault is Fault.NOT_AT_STANDSTILL else 0x3310)
+
+
+@pytest.mark.parametrize(("phase", "wait_cycles"), [(AxisPhase.WAITING, 40), (AxisPhase.ENABLING, 30)])
+@pytest.mark.parametrize("samples", [0, 3])
+def test_a_wait_that_is_over_only_because_the_loop_was_held_up_says_so(
+    axis: Any, state: Any, phase: AxisPhase, wait_cycles: int, samples: int
+) -> None:
+    """Campaign 915311, scenarios 1269 and 4927: told as SAMPLES_MISSING, for which the bus was then searched."""
+    axis.sequence.wait_max_cycles, axis.sequence.enable_max_cycles = 40, 30
+    for held_up_cycles, fault in ((wait_cycles, Fault.OVERRUN), (1, Fault.OVERRUN), (0, None)):
+        settled(state, good_samples=samples)
+        state.phase, state.fault, state.reaction = phase, Fault.NONE, Reaction.NONE
+        state.phase_cycle, state.held_up_cycles = wait_cycles + 1, held_up_cycles
+        if phase is AxisPhase.WAITING:
+            step_waiting(axis, state, sample_of(DriveState.OFF))
+        else:
+            step_enabling(axis, state, sample_of(DriveState.OFF), axis_table())
+        assert state.phase == AxisPhase.DISABLING
+        assert bool(state.fault == Fault.OVERRUN) is (fault is Fault.OVERRUN)
+        assert fault is None or state.fault_value == held_up_cycles
 
 
 @pytest.mark.parametrize("drive_state", DriveState)
