@@ -3,18 +3,20 @@
 The loop reacts when a measured value passes its limit.  Until the reaction has begun, `t` later, the motor may push
 with all that the drive allows in the worst direction, and friction is not counted on:
 
-    a = (torque limit of the drive + ripple + added load) / J
+    a = (torque limit of the drive + ripple + loads) / J
     v1 = v_max + a t                     the greatest speed
     x1 = v_max t + a t^2 / 2             the way until then
 
 From then on the joint is braked by at least its own Coulomb friction F, the weakest of the reactions (power off), less
-the ripple, or, under an added load, by the drive's quick stop with what the load leaves of it:
+the ripple and the load L of the configuration (gravity with its whole lever), or, under an added load, by the drive's
+quick stop with what the load leaves of it:
 
-    d = (F - ripple) / J,   x2 = v1^2 / (2 d)
+    d = (F - ripple - L) / J,   x2 = v1^2 / (2 d)
 
-`t` is `REACTION_s` where the loop measures and is heard: one period each for sample and command, the velocity filter
-(three time constants, 5 ms) and the motor's delay and lag.  Where the drive does not hear the loop it holds the last
-torque until its own watchdog acts: age limit of the samples + UNHEEDED_MAX_CYCLES + drive.heartbeat_s.
+`t` is `REACTION_s` where the loop measures and is heard, or more where these take longer: one period each for sample
+and command, the velocity filter (three time constants, 5 ms at 100 Hz) and the motor's delay and lag.  Where the drive
+does not hear the loop it holds the last torque, or in a sweep the last velocity, until its own watchdog acts: age limit
+of the samples + UNHEEDED_MAX_CYCLES + drive.heartbeat_s.
 
 A reading that is wrong by w (jump, drift) shifts the true position by w.  Behind a stuck encoder the joint is blind
 until POSITION_FROZEN: it is pushed with at most frozen_torque_Nm for longer than PUSHED_CYCLES, 16 Nm more than the
@@ -26,6 +28,7 @@ for good (it needs a brake).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,6 +38,8 @@ from tools.campaign.scenario import Scenario
 from tools.configuration.config import Config
 
 REACTION_s = 0.010
+FILTER_CONSTANTS = 3.0
+MOTOR_s = 0.0013  # the longest delay and lag that a scenario draws
 BLIND_RADPS = 1.8
 BLIND_RAD = 1.0
 BRAKE_SPARE_s = 1.0  # a quick stop of the virtual drive may end so much late
@@ -59,24 +64,41 @@ class Envelope:
     command_step_Nm: float
     stop_s: float  # from the latched fault to power off and standstill, by quick stop or power off
     ramp_s: float  # the same by a controlled ramp
+    command_max_radps: float = math.inf  # of the velocity command, where there is one
+    command_step_radps: float = math.inf  # in one period
+
+
+def _measuring_s(config: Config) -> float:
+    """Longest time from passing a limit to a reaction, with samples and a drive that hears."""
+    cutoff_Hz = config.control.velocity_cutoff_Hz
+    filter_s = FILTER_CONSTANTS / (math.tau * cutoff_Hz) if cutoff_Hz else 0.0
+    return max(REACTION_s, 2.0 / config.loop.rate_Hz + filter_s + MOTOR_s)
 
 
 def reaction_s(config: Config, kind: FaultKind) -> float:
     """Longest time from passing a limit to the beginning of the reaction."""
-    age_s = config.limits.sample_age_max_s
+    age_s, measuring_s = config.limits.sample_age_max_s, _measuring_s(config)
     if kind in _UNHEARD:
         unheeded_s = UNHEEDED_MAX_CYCLES / config.loop.rate_Hz
-        return REACTION_s + age_s + unheeded_s + config.canopen.heartbeat_s
+        return measuring_s + age_s + unheeded_s + config.canopen.heartbeat_s
     if kind in _BLIND_FOR_A_WHILE:
-        return REACTION_s + age_s
-    return REACTION_s
+        return measuring_s + age_s
+    return measuring_s
+
+
+def load_Nm(config: Config) -> float:
+    """The greatest load at the joint that is there without a fault."""
+    virtual = config.virtual
+    assert virtual is not None
+    return abs(virtual.gravity_Nm) + abs(virtual.load_torque_Nm) + abs(virtual.load_step_Nm)
 
 
 def _friction_floor_Nm(config: Config, scenario: Scenario) -> float:
     """The least Coulomb friction at the joint, of the slower direction and with its ripple."""
-    friction, virtual = config.friction, config.virtual
-    assert friction is not None
+    virtual = config.virtual
     assert virtual is not None
+    friction = virtual.friction or config.friction
+    assert friction is not None
     curves = (
         abs(friction.positive.tc_Nm) * scenario.plant["friction_positive_scale"],
         abs(friction.negative.tc_Nm) * scenario.plant["friction_negative_scale"],
@@ -92,9 +114,10 @@ def envelope(config: Config, scenario: Scenario, constants: Any) -> Envelope:
     load = abs(scenario.magnitude) if kind is FaultKind.LOAD_JUMP else 0.0
     share = 1e-3 * (config.canopen.max_torque_permille or 1000)
     drive_Nm = share * (config.canopen.rated_torque_Nm or 0.0) * config.joint.reduction_ratio
-    floor = _friction_floor_Nm(config, scenario) - ripple
+    constant_Nm = load_Nm(config)
+    floor = _friction_floor_Nm(config, scenario) - ripple - constant_Nm
     wait_s = reaction_s(config, kind)
-    push = (drive_Nm + ripple + load) / inertia
+    push = (drive_Nm + ripple + load + constant_Nm) / inertia
     speed = limits.velocity_max_radps + push * wait_s
     brake = (min(floor, drive_Nm + floor - load) if load else floor) / inertia
     way = limits.velocity_max_radps * wait_s + 0.5 * push * wait_s**2 + speed**2 / (2.0 * brake)
@@ -124,4 +147,6 @@ def envelope(config: Config, scenario: Scenario, constants: Any) -> Envelope:
         command_step_Nm=limits.torque_rate_max_Nmps * constants.law.period_s,
         stop_s=stop_s,
         ramp_s=config.sequence.stop_timeout_s + config.sequence.release_s + stop_s,
+        command_max_radps=limits.velocity_max_radps,
+        command_step_radps=constants.velocity_command.acceleration_max_radps2 * constants.law.period_s,
     )

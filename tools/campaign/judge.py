@@ -16,13 +16,14 @@ from hil.faults.kinds import FaultKind
 from hil.lockstep import TRUE_POWER_STATE, TRUE_POSITION_rad, TRUE_VELOCITY_radps
 from tools.campaign.envelope import STANDSTILL_RADPS, Envelope, envelope
 from tools.campaign.fault_classes import FAULT_CLASSES, LATE_CAUSES
-from tools.campaign.scenario import Scenario, plant_of
+from tools.campaign.scenario import Scenario, fitted, plant_of
+from tools.campaign.sweep_motion import SweepStrokes, placed_sweep
 from tools.configuration.config import Config
 from tools.configuration.records import axis_constants
 from tools.simulation.lockstep import LockstepJoint, LockstepRun
 
-SUPERVISOR_CYCLES = 1000
 APPROACH_s = 1.0
+SPARE_s = 14.0  # for waiting, enabling and stopping
 TAIL_s = 2.5  # watched after the controller has ended
 NOTICED_s = 0.35  # a certain fault that begins so long before the end of the trajectory must be noticed
 POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
@@ -45,7 +46,11 @@ class Verdict:
 
 
 def run_scenario(config: Config, joint: LockstepJoint, scenario: Scenario) -> tuple[LockstepRun, Any]:
-    """The run, and the AxisConstants record array that it used."""
+    """The run, and the AxisConstants record array that it used; the joint's table is the scenario's afterwards."""
+    if isinstance(scenario.trajectory, SweepStrokes):
+        placed = placed_sweep(config, joint, scenario.trajectory, scenario.start_offset_rad)
+        joint.table = placed.table
+        return _carry_out(config, joint, scenario, placed.constants, placed.start_rad, placed.duration_s)
     sequence = config.sequence.model_copy(update={"approach_s": APPROACH_s})
     shown = config.model_copy(update={"trajectory": scenario.trajectory, "sequence": sequence})
     first = new(Reference)
@@ -54,11 +59,17 @@ def run_scenario(config: Config, joint: LockstepJoint, scenario: Scenario) -> tu
     start = float(first[0].position_rad) + scenario.start_offset_rad
     start = min(max(start, limits.position_min_rad + 0.05), limits.position_max_rad - 0.05)
     constants = axis_constants(shown, start_position_rad=start)
-    constants[0].sequence.supervisor_max_cycles = SUPERVISOR_CYCLES
-    plant_constants, plant_state = plant_of(shown, scenario, start)
+    return _carry_out(shown, joint, scenario, constants, start, scenario.trajectory.duration_s)
+
+
+def _carry_out(
+    config: Config, joint: LockstepJoint, scenario: Scenario, constants: Any, start_rad: float, duration_s: float
+) -> tuple[LockstepRun, Any]:
+    plant_constants, plant_state = plant_of(config, scenario, start_rad)
     run = joint.run_with_faults(
-        scenario.fault(), constants, plant_constants=plant_constants, plant_state=plant_state, epoch_at_start=True,
-        longest_s=float(constants[0].sequence.approach_s) + scenario.trajectory.duration_s + 14.0, tail_s=TAIL_s,
+        fitted(config, scenario).fault(), constants,
+        plant_constants=plant_constants, plant_state=plant_state, epoch_at_start=True,
+        longest_s=float(constants[0].sequence.approach_s) + duration_s + SPARE_s, tail_s=TAIL_s,
     )  # fmt: skip
     return run, constants
 
@@ -74,6 +85,14 @@ def _commands(run: LockstepRun, allowed: Envelope) -> list[str]:
         found.append(f"torque command steps by {steps.max():.2f} Nm, allowed {allowed.command_step_Nm:g}")
     if torque[~powered].any():
         found.append("torque commanded in a phase without power")
+    speed = np.asarray(log.command_velocity_radps)
+    if not np.isfinite(speed).all() or np.abs(speed).max() > allowed.command_max_radps:
+        found.append(f"velocity command {np.abs(speed).max():.3f} rad/s exceeds {allowed.command_max_radps:g}")
+    steps = (np.abs(np.diff(speed)) / (1.0 + np.asarray(log.skipped)[1:]))[powered[1:]]
+    if len(steps) and steps.max() > allowed.command_step_radps * (1.0 + 1e-9):
+        found.append(f"velocity command steps by {steps.max():.4f} rad/s, allowed {allowed.command_step_radps:g}")
+    if speed[~powered].any():
+        found.append("a velocity commanded in a phase without power")
     return found
 
 

@@ -80,23 +80,24 @@ def table(rows: Sequence[KindRow]) -> Table:
     return shown
 
 
-def violations(verdicts: Sequence[Verdict], seed: int) -> list[dict[str, Any]]:
+def violations(verdicts: Sequence[Verdict], seed: int, *, sweep: bool = False) -> list[dict[str, Any]]:
     """Everything that is needed to look at each violation again."""
     return [
-        {**asdict(verdict), "scenario": draw_scenario(seed, verdict.number).describe()}
+        {**asdict(verdict), "scenario": draw_scenario(seed, verdict.number, sweep=sweep).describe()}
         for verdict in verdicts
         if verdict.violations
     ]
 
 
-def write_json(path: Path, seed: int, verdicts: Sequence[Verdict], elapsed_s: float) -> None:
+def write_json(path: Path, seed: int, verdicts: Sequence[Verdict], elapsed_s: float, *, sweep: bool = False) -> None:
     """Rows and violations."""
     content = {
         "seed": seed,
+        "sweep": sweep,
         "scenarios": len(verdicts),
         "elapsed_s": round(elapsed_s, 1),
         "kinds": [asdict(row) for row in rows_by_kind(verdicts)],
-        "violations": violations(verdicts, seed),
+        "violations": violations(verdicts, seed, sweep=sweep),
     }
     text = json.dumps(content, indent=1, allow_nan=False)
     path.write_text(text + "\n")

@@ -14,15 +14,22 @@ from tools.configuration.config import Config
 from tools.configuration.load import load_config
 from tools.simulation.lockstep import LockstepJoint
 from tools.simulation.workers import interrupts_left_to_the_parent
+from tools.sweeping.carry_out import with_mode
 
 AT_ONCE = 16  # scenarios that a worker takes at a time
 _worker: dict[str, object] = {}
 
 
-def _begin(path: str, seed: int) -> None:
+def campaign_joint(config: Config, *, sweep: bool) -> tuple[Config, LockstepJoint]:
+    """The configuration in the mode of the drive that a run, or a sweep, uses, and its joint, commissioned."""
+    config = with_mode(config, "auto") if sweep else config
+    return config, LockstepJoint(config)
+
+
+def _begin(path: str, seed: int, sweep: bool) -> None:
     """In each worker: commission a joint of its own."""
-    config = load_config(path)
-    _worker.update(config=config, joint=LockstepJoint(config), seed=seed)
+    config, joint = campaign_joint(load_config(path), sweep=sweep)
+    _worker.update(config=config, joint=joint, seed=seed, sweep=sweep)
 
 
 def _work(number: int) -> Verdict:
@@ -30,32 +37,37 @@ def _work(number: int) -> Verdict:
     assert isinstance(config, Config)
     assert isinstance(joint, LockstepJoint)
     assert isinstance(seed, int)
-    return judge(config, joint, draw_scenario(seed, number))
+    return judge(config, joint, draw_scenario(seed, number, sweep=bool(_worker["sweep"])))
 
 
-def _verdicts(path: Path, seed: int, count: int, workers: int) -> Iterator[Verdict]:
+def _verdicts(path: Path, seed: int, count: int, workers: int, sweep: bool) -> Iterator[Verdict]:
     if workers == 1:
-        config = load_config(path)
-        joint = LockstepJoint(config)
+        config, joint = campaign_joint(load_config(path), sweep=sweep)
         for number in range(count):
-            yield judge(config, joint, draw_scenario(seed, number))
+            yield judge(config, joint, draw_scenario(seed, number, sweep=sweep))
         return
     context = multiprocessing.get_context("spawn")
     with interrupts_left_to_the_parent():
-        started = context.Pool(workers, _begin, (str(path), seed))
+        started = context.Pool(workers, _begin, (str(path), seed, sweep))
     with started as pool:
         yield from pool.imap_unordered(_work, range(count), AT_ONCE)
 
 
 def run_campaign(
-    path: Path, seed: int, count: int, advance: Callable[[float], None], workers: int | None = None
+    path: Path,
+    seed: int,
+    count: int,
+    advance: Callable[[float], None],
+    workers: int | None = None,
+    *,
+    sweep: bool = False,
 ) -> tuple[list[Verdict], float, bool]:
     """(verdicts in order of their numbers, time taken [s], whether Ctrl-C ended it early)."""
     started_s = time.monotonic()
     found: list[Verdict] = []
     interrupted = False
     try:
-        for verdict in _verdicts(path, seed, count, workers or os.cpu_count() or 1):
+        for verdict in _verdicts(path, seed, count, workers or os.cpu_count() or 1, sweep):
             found.append(verdict)
             advance(float(len(found)))
     except KeyboardInterrupt:

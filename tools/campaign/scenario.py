@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from firmware_py.schema import new
+from firmware_py.velocity import low_pass_gain
 from hil.faults.kinds import FaultConstants, FaultKind
 from hil.plant.joint import plant
 from hil.plant.records import FrictionKind
 from tools.campaign.fault_classes import EMERGENCY_CODES, FAULT_CLASSES, SIGNED, Sizes
+from tools.campaign.sweep_motion import LONGEST_s, SweepStrokes, draw_strokes
 from tools.configuration.config import Config
 from tools.configuration.plant_settings import plant_settings
 from tools.configuration.trajectory import Hold, MinJerk, Sine, Trapezoid
@@ -20,6 +22,8 @@ from tools.configuration.trajectory import Hold, MinJerk, Sine, Trapezoid
 HARMLESS_SHARE = 0.35
 REACH_RAD = 0.4  # of the trajectories; the limits are at 0.7
 TOP_SPEED_RADPS = 0.6  # of the trajectories; the limit is 1
+FILTER_OF_SWAPS = (100.0, 0.001)  # cutoff [Hz] and period [s] with which every reordering of a twin is harmless
+BEFORE_s = 1.8  # until the trajectory begins, at most
 
 
 @dataclass(frozen=True)
@@ -47,10 +51,12 @@ class Scenario:
 
     def describe(self) -> dict[str, Any]:
         """For the report."""
+        trajectory = self.trajectory
+        strokes = isinstance(trajectory, SweepStrokes)
         return {
             **{k: v for k, v in asdict(self).items() if k != "trajectory"},
             "kind": self.kind.name.lower(),
-            "trajectory": self.trajectory.model_dump(exclude_none=True),
+            "trajectory": asdict(trajectory) if strokes else trajectory.model_dump(exclude_none=True),
             "plant": {k: (v.name.lower() if isinstance(v, FrictionKind) else v) for k, v in self.plant.items()},
         }
 
@@ -105,8 +111,8 @@ def _size(random: np.random.Generator, sizes: Sizes) -> tuple[float, float]:
     return float(duration), float(random.uniform(*sizes.magnitude))
 
 
-def draw_scenario(seed: int, number: int) -> Scenario:
-    """Scenario `number` of the campaign with this seed."""
+def draw_scenario(seed: int, number: int, *, sweep: bool = False) -> Scenario:
+    """Scenario `number` of the campaign with this seed; `sweep`: during a sweep instead of a run."""
     random = np.random.default_rng([seed, number])
     kinds = list(FAULT_CLASSES)
     chosen = FAULT_CLASSES[kinds[number % len(kinds)]]  # in turn: every kind gets its share
@@ -121,13 +127,28 @@ def draw_scenario(seed: int, number: int) -> Scenario:
     tracking_s = float(random.uniform(0.5, 2.5))
     return Scenario(
         number, seed, chosen.kind, harmless,
-        at_s=float(random.uniform(0.0, 1.8 + tracking_s)),
+        at_s=float(random.uniform(0.0, BEFORE_s + (LONGEST_s if sweep else tracking_s))),
         duration_s=duration,
         magnitude=magnitude,
-        trajectory=_trajectory(random, tracking_s),
+        trajectory=draw_strokes(random) if sweep else _trajectory(random, tracking_s),
         start_offset_rad=float(random.uniform(-0.1, 0.1)),
         plant=_plant(random),
     )  # fmt: skip
+
+
+def fitted(config: Config, scenario: Scenario) -> Scenario:
+    """The scenario with a harmless size that is harmless with this configuration's velocity filter.
+
+    A swapped sample reads as half the speed and the next one as twice that.  The filter of configs/virtual.toml lets
+    any number of swaps pass for harmless; one that passes more reads two in a row as 1.8 times the speed, and 0.6 rad/s
+    as more than the limit: there a harmless reordering is one swap.
+    """
+    if scenario.kind is not FaultKind.TPDO_REORDERED or not scenario.harmless:
+        return scenario
+    period_s = 1.0 / config.loop.rate_Hz
+    if low_pass_gain(config.control.velocity_cutoff_Hz, period_s) <= low_pass_gain(*FILTER_OF_SWAPS):
+        return scenario
+    return replace(scenario, duration_s=1.5 * period_s, magnitude=1.0)
 
 
 def plant_of(config: Config, scenario: Scenario, position_rad: float) -> tuple[Any, Any]:

@@ -72,6 +72,7 @@ def fault_campaign(
     scenario: Annotated[
         int | None, typer.Option("--scenario", help="replay this one alone", min=0, max=LARGEST)
     ] = None,
+    sweep: Annotated[bool, typer.Option("--sweep", help="during a sweep, in its mode, instead of a run")] = False,
     folder: Annotated[Path, typer.Option("--folder", help="for report, JSON and picture")] = Path("fault-campaign"),
     workers: Workers = None,
     report: Report = None,
@@ -89,6 +90,7 @@ def fault_campaign(
             count=count,
             seed=seed,
             scenario=scenario,
+            sweep=sweep,
             folder=folder,
             workers=workers,
             report=report,

@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from drivers.errors import INTERRUPTED, ConfigurationError
+from drivers.errors import INTERRUPTED
+from tools.campaign.fitness import require_fit
 from tools.campaign.judge import Verdict, judge
 from tools.campaign.report import campaign_figure, rows_by_kind, table, violations, write_json
-from tools.campaign.runner import run_campaign
+from tools.campaign.runner import campaign_joint, run_campaign
 from tools.campaign.scenario import draw_scenario
 from tools.configuration.config import Config
 from tools.configuration.elmo_settings import refuse_serial
@@ -17,7 +18,6 @@ from tools.output import Output
 from tools.reporting.figure import svg_figure
 from tools.reporting.page import Details, Paragraph, Section, Table, check_target
 from tools.reporting.verb_page import from_terminal, write_verb_page
-from tools.simulation.lockstep import LockstepJoint
 from tools.written_file import prepare_folder
 
 EXIT_VIOLATIONS = 10
@@ -34,26 +34,26 @@ def fault_campaign(
     folder: Path = Path("fault-campaign"),
     workers: int | None = None,
     report: Path | None = None,
+    sweep: bool = False,
 ) -> int:
-    """Run `count` scenarios, or replay one; 0 if nothing was violated, 10 if something was, 130 after Ctrl-C."""
+    """Run `count` scenarios, or replay one, of a run or of a `sweep`.
+
+    0 if nothing was violated, 10 if something was, 130 after Ctrl-C.
+    """
     refuse_serial(config, "fault-campaign")
-    if config.virtual is None or config.friction is None:
-        missing = "[virtual]" if config.virtual is None else "[friction]"
-        raise ConfigurationError(f"{config.path}: {missing} is missing: the campaign needs a virtual joint")
-    if config.virtual.faults:
-        raise ConfigurationError(f"{config.path}: [[virtual.faults]] must be empty: the campaign brings its own")
+    require_fit(config)
     if scenario is not None:
-        return _replay(config, output, seed, scenario)
+        return _replay(config, output, seed, scenario, sweep)
     if report is not None:
         check_target(report)
     prepare_folder(folder)
     with output.progress("fault campaign", float(count)) as advance:
-        verdicts, elapsed_s, interrupted = run_campaign(config.path, seed, count, advance, workers)
+        verdicts, elapsed_s, interrupted = run_campaign(config.path, seed, count, advance, workers, sweep=sweep)
     rows = rows_by_kind(verdicts)
-    found = violations(verdicts, seed)
+    found = violations(verdicts, seed, sweep=sweep)
     figure = campaign_figure(verdicts, config.limits.velocity_max_radps)
     if verdicts:
-        write_json(folder / "campaign.json", seed, verdicts, elapsed_s)
+        write_json(folder / "campaign.json", seed, verdicts, elapsed_s, sweep=sweep)
         save_png(figure, folder / "campaign.png")
     data = {
         "scenarios": len(verdicts), "violations": len(found), "seed": seed, "elapsed_s": round(elapsed_s, 1),
@@ -68,7 +68,8 @@ def fault_campaign(
     if found:
         output.error(
             f"{len(found)} of {len(verdicts)} scenarios violate an invariant",
-            f"replay one with: jointctl fault-campaign {config.path} --seed {seed} --scenario {found[0]['number']}",
+            f"replay one with: jointctl fault-campaign {config.path}{' --sweep' if sweep else ''} --seed {seed} "
+            f"--scenario {found[0]['number']}",
         )
         return EXIT_VIOLATIONS
     return INTERRUPTED if interrupted else 0
@@ -95,10 +96,10 @@ def _write_page(
     write_verb_page(path, "Fault campaign", sections, output, subtitle=str(config.path))
 
 
-def _replay(config: Config, output: Output, seed: int, number: int) -> int:
+def _replay(config: Config, output: Output, seed: int, number: int, sweep: bool) -> int:
     """One scenario, with all that it consists of."""
-    chosen = draw_scenario(seed, number)
-    verdict = judge(config, LockstepJoint(config), chosen)
+    chosen = draw_scenario(seed, number, sweep=sweep)
+    verdict = judge(*campaign_joint(config, sweep=sweep), chosen)
     described = chosen.describe()
     lines = [f"{key}: {value}" for key, value in described.items()]
     lines += [f"told as {verdict.fault}, reaction {verdict.reaction}, greatest speed {verdict.peak_radps:.3f} rad/s"]

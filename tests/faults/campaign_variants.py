@@ -1,0 +1,41 @@
+"""Configurations that a campaign is run with beside the shipped ones: one line changed each, or two.
+
+`python -m tests.faults.campaign_variants FOLDER` writes them, for `jointctl fault-campaign FOLDER/NAME.toml`.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+from tests.places import CONFIGS
+
+VARIANTS: dict[str, tuple[tuple[str, str], ...]] = {
+    "gravity": (  # known to the law; about half of what friction holds
+        (r"^torque_constant_NmpA", "gravity_Nm = 6.0\ntorque_constant_NmpA"),
+        (r"^initial_position_rad", "gravity_Nm = 6.0\ninitial_position_rad"),
+    ),
+    "counts_4096": (  # on the motor: at the joint the count would be 1.5 mrad, 1.5 rad/s in one period
+        (r"^counts_per_turn = \d+", "counts_per_turn = 4096"),
+        (r'^side = "joint"', 'side = "motor"'),
+    ),
+    "rate_500_Hz": ((r"^rate_Hz = [\d.]+", "rate_Hz = 500.0"),),
+    "rate_2_kHz": ((r"^rate_Hz = [\d.]+", "rate_Hz = 2000.0"),),
+}
+
+
+def write_variant(name: str, folder: Path) -> Path:
+    """configs/virtual.toml with the changes of `name`, as a file of its own."""
+    text = (CONFIGS / "virtual.toml").read_text()
+    for pattern, changed in VARIANTS[name]:
+        text, count = re.subn(pattern, changed, text, count=1, flags=re.MULTILINE)
+        assert count == 1, pattern
+    path = folder / f"{name}.toml"
+    path.write_text(text)
+    return path
+
+
+if __name__ == "__main__":
+    for name in VARIANTS:
+        print(write_variant(name, Path(sys.argv[1])))

@@ -1,0 +1,216 @@
+"""Campaigns on other configurations than configs/virtual.toml, during a sweep, and which ones cannot be judged."""
+
+from __future__ import annotations
+
+import dataclasses
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.errors import ConfigurationError
+from firmware_py.states import AxisPhase, CommandKind
+from hil.faults.kinds import FaultKind
+from tests.faults.campaign_variants import VARIANTS, write_variant
+from tests.faults.test_fault_campaign import WIDE, good_run
+from tests.places import CONFIGS
+from tools.campaign import judge as judge_module
+from tools.campaign.envelope import envelope, reaction_s
+from tools.campaign.fault_classes import FAULT_CLASSES
+from tools.campaign.fitness import require_fit
+from tools.campaign.judge import judge, run_scenario
+from tools.campaign.runner import campaign_joint, run_campaign
+from tools.campaign.scenario import draw_scenario, fitted
+from tools.campaign.sweep_motion import SweepStrokes, placed_sweep
+from tools.configuration.config import Config
+from tools.configuration.load import load_config
+from tools.output import Output
+from tools.simulation.lockstep import LockstepJoint
+from tools.verbs.fault_campaign import fault_campaign
+
+KINDS = len(FAULT_CLASSES)
+
+
+@pytest.mark.parametrize("name", ["precise", *VARIANTS])
+def test_no_scenario_violates_an_invariant_with_other_configurations(tmp_path: Path, name: str) -> None:
+    path = write_variant(name, tmp_path) if name in VARIANTS else CONFIGS / f"{name}.toml"
+    config, joint = campaign_joint(load_config(path), sweep=False)
+    require_fit(config)
+    found = [judge(config, joint, draw_scenario(13, number)) for number in range(2 * KINDS)]
+    assert [(v.number, v.kind, v.violations) for v in found if v.violations] == []
+    assert sum(v.fault != "NONE" for v in found) > len(found) // 4
+
+
+# --- during a sweep --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def sweep() -> tuple[Config, LockstepJoint]:
+    return campaign_joint(load_config(CONFIGS / "sweep_virtual.toml"), sweep=True)
+
+
+def test_no_scenario_violates_an_invariant_during_a_sweep(sweep: tuple[Config, LockstepJoint]) -> None:
+    found = [judge(*sweep, draw_scenario(13, number, sweep=True)) for number in range(2 * KINDS)]
+    assert [(v.number, v.kind, v.violations) for v in found if v.violations] == []
+    assert sum(v.fault != "NONE" for v in found) > len(found) // 4
+
+
+def test_a_sweep_is_carried_out_in_its_own_mode_to_its_end(sweep: tuple[Config, LockstepJoint]) -> None:
+    config, joint = sweep
+    scenario = dataclasses.replace(draw_scenario(13, 0, sweep=True), at_s=1e6)
+    assert isinstance(scenario.trajectory, SweepStrokes)
+    run, constants = run_scenario(config, joint, scenario)
+    assert constants[0].command_kind == CommandKind.VELOCITY
+    assert run.state.phase == AxisPhase.FINISHED
+    shares = {round(s, 3) for s in run.log.desired_velocity_radps[run.tracking] / config.limits.velocity_max_radps}
+    assert {round(share, 3) for share in scenario.trajectory.shares} <= shares
+    assert np.ptp(run.log.command_velocity_radps) > 0.0
+    assert judge(config, joint, scenario).violations == ()
+
+
+def test_without_a_velocity_mode_the_law_of_a_sweep_closes_the_loop() -> None:
+    config, joint = campaign_joint(load_config(CONFIGS / "virtual.toml"), sweep=False)
+    placed = placed_sweep(config, joint, SweepStrokes((0.1, -0.1), 0.1), 0.05)
+    assert placed.constants[0].command_kind == CommandKind.TORQUE
+    assert placed.constants[0].law.observer.bandwidth_radps > 0.0
+    assert placed.start_rad == pytest.approx(0.05)
+
+
+def test_workers_sweep_as_well(sweep: tuple[Config, LockstepJoint]) -> None:
+    found, _, _ = run_campaign(CONFIGS / "sweep_virtual.toml", 9, 20, lambda _: None, workers=2, sweep=True)
+    alone = [judge(*sweep, draw_scenario(9, number, sweep=True)) for number in range(20)]
+    assert [dataclasses.astuple(v)[:8] for v in found] == [dataclasses.astuple(v)[:8] for v in alone]
+
+
+def test_the_command_that_replays_a_violation_names_the_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(judge_module, "_motion", lambda run, allowed: ["made up"])
+    err = StringIO()
+    shown = Output(json=True, stdout=StringIO(), stderr=err)
+    config = load_config(CONFIGS / "sweep_virtual.toml")
+    assert fault_campaign(config, shown, count=1, seed=5, folder=tmp_path, workers=1, sweep=True) == 10
+    assert "sweep_virtual.toml --sweep --seed 5 --scenario 0" in err.getvalue()
+    assert fault_campaign(config, shown, seed=5, scenario=0, sweep=True) == 10
+
+
+@pytest.mark.parametrize(
+    ("rows", "value", "words"),
+    [
+        (100, 1.01, "velocity command 1.010 rad/s exceeds 1"),
+        (100, float("nan"), "velocity command"),
+        (slice(100, 110), 0.011, "velocity command steps by 0.0110"),
+        (20, 0.001, "a velocity commanded in a phase without power"),
+        (slice(100, 110), 0.01, ""),
+    ],
+)
+def test_the_invariants_of_a_velocity_command_notice(rows: Any, value: float, words: str) -> None:
+    allowed = dataclasses.replace(WIDE, command_max_radps=1.0, command_step_radps=0.01)
+    run = good_run()
+    run.log.command_velocity_radps[rows] = value
+    lines = judge_module._commands(run, allowed)
+    assert any(words in line for line in lines) if words else lines == []
+
+
+# --- the envelope and what it takes for granted ----------------------------------------------------------------
+
+
+def with_load(config: Config, load_Nm: float) -> Config:
+    assert config.virtual is not None
+    return config.model_copy(update={"virtual": config.virtual.model_copy(update={"gravity_Nm": load_Nm})})
+
+
+def test_a_load_pushes_before_the_reaction_and_is_held_by_less_friction_after_it(virtual_config: Config) -> None:
+    joint = LockstepJoint(virtual_config)
+    plain = dataclasses.replace(
+        draw_scenario(1, 0),
+        kind=FaultKind.TORQUE_REVERSED,
+        plant={"inertia_kgm2": 2.0, "torque_ripple_Nm": (0.0, 0.0), "friction_positive_scale": 1.0,
+               "friction_negative_scale": 1.0},
+    )  # fmt: skip
+    allowed = envelope(with_load(virtual_config, 6.0), plain, joint.constants()[0])
+    speed = 1.0 + (60.5 + 6.0) / 2.0 * 0.01
+    brake = (121.0 * 0.1063 * 0.95 - 6.0) / 2.0
+    assert allowed.velocity_max_radps == pytest.approx(speed)
+    assert allowed.stop_s == pytest.approx(0.01 + speed / brake + 1.0)
+    assert allowed.command_max_radps == 1.0
+
+
+@pytest.mark.parametrize(
+    ("rate_Hz", "cutoff_Hz", "measuring_s"),
+    [(1000.0, 100.0, 0.010), (2000.0, 0.0, 0.010), (250.0, 100.0, 0.008 + 0.00477 + 0.0013),
+     (1000.0, 20.0, 0.002 + 0.02387 + 0.0013)],
+)  # fmt: skip
+def test_a_slow_loop_or_filter_reacts_later(
+    virtual_config: Config, rate_Hz: float, cutoff_Hz: float, measuring_s: float
+) -> None:
+    changed = virtual_config.model_copy(
+        update={
+            "loop": virtual_config.loop.model_copy(update={"rate_Hz": rate_Hz}),
+            "control": virtual_config.control.model_copy(update={"velocity_cutoff_Hz": cutoff_Hz}),
+        }
+    )
+    assert reaction_s(changed, FaultKind.TORQUE_REVERSED) == pytest.approx(measuring_s, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("rate_Hz", "cutoff_Hz", "one"),
+    [(1000.0, 100.0, False), (2000.0, 200.0, False), (1000.0, 101.0, True), (500.0, 100.0, True), (1000.0, 0.0, True)],
+)
+def test_where_the_velocity_filter_passes_more_a_harmless_reordering_is_one_swap(
+    virtual_config: Config, rate_Hz: float, cutoff_Hz: float, one: bool
+) -> None:
+    """`precise`, seed 13, scenario 12: two swaps within three cycles read as 1.01 rad/s, at a true 0.59 rad/s."""
+    changed = virtual_config.model_copy(
+        update={
+            "loop": virtual_config.loop.model_copy(update={"rate_Hz": rate_Hz}),
+            "control": virtual_config.control.model_copy(update={"velocity_cutoff_Hz": cutoff_Hz}),
+        }
+    )
+    twin = draw_scenario(13, 12)
+    assert (twin.kind, twin.harmless) == (FaultKind.TPDO_REORDERED, True)
+    seen = fitted(changed, twin)
+    assert (seen == twin) is not one
+    assert not one or (seen.duration_s, seen.magnitude) == (1.5 / rate_Hz, 1.0)
+    for other in (dataclasses.replace(twin, harmless=False), draw_scenario(13, 10)):
+        assert fitted(changed, other) == other
+
+
+@pytest.mark.parametrize(("load_Nm", "fits"), [(9.59, True), (9.6, False)])
+def test_a_load_that_friction_does_not_hold_has_no_envelope(virtual_config: Config, load_Nm: float, fits: bool) -> None:
+    """0.9 x 121 x 0.1063 Nm x 0.95 - 1.4 Nm of ripple."""
+    if fits:
+        require_fit(with_load(virtual_config, load_Nm))
+        return
+    with pytest.raises(ConfigurationError, match=r"\[virtual\] \(=9\.6 Nm\) must be less than 9\.60 Nm.* a brake"):
+        require_fit(with_load(virtual_config, load_Nm))
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value"),
+    [
+        ("limits", "position_max_rad", 0.69),
+        ("limits", "position_min_rad", -0.69),
+        ("limits", "velocity_max_radps", 0.99),
+        ("limits", "sample_age_max_s", 0.049),
+        ("limits", "skipped_max_s", 0.049),
+        ("sequence", "supervisor_timeout_s", 0.9),
+        ("drive", "heartbeat_s", 0.19),
+    ],
+)
+def test_tighter_limits_than_the_harmless_faults_are_made_for_are_refused(
+    virtual_config: Config, section: str, key: str, value: float
+) -> None:
+    require_fit(virtual_config)
+    changed = virtual_config.model_copy(
+        update={section: getattr(virtual_config, section).model_copy(update={key: value})}
+    )
+    with pytest.raises(ConfigurationError, match=rf"{section}\.{key} \(=.*\) must be at least"):
+        require_fit(changed)
+
+
+def test_without_any_friction_there_is_no_campaign(virtual_config: Config) -> None:
+    with pytest.raises(ConfigurationError, match=r"\[friction\] is missing, and so is \[virtual\.friction\]"):
+        require_fit(virtual_config.model_copy(update={"friction": None}))
+    with pytest.raises(ConfigurationError, match=r"\[virtual\] is missing"):
+        require_fit(virtual_config.model_copy(update={"virtual": None}))
