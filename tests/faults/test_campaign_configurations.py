@@ -20,10 +20,10 @@ from tools.campaign import judge as judge_module
 from tools.campaign.envelope import envelope, reaction_s
 from tools.campaign.fault_classes import FAULT_CLASSES
 from tools.campaign.fitness import require_fit
-from tools.campaign.judge import judge, run_scenario
+from tools.campaign.judge import in_time, judge, run_scenario
 from tools.campaign.runner import campaign_joint, run_campaign
-from tools.campaign.scenario import draw_scenario, fitted
-from tools.campaign.sweep_motion import SweepStrokes, placed_sweep
+from tools.campaign.scenario import BEFORE_s, draw_scenario, fitted
+from tools.campaign.sweep_motion import LONGEST_s, SweepStrokes, placed_sweep
 from tools.configuration.config import Config
 from tools.configuration.load import load_config
 from tools.output import Output
@@ -68,6 +68,21 @@ def test_a_sweep_is_carried_out_in_its_own_mode_to_its_end(sweep: tuple[Config, 
     assert {round(share, 3) for share in scenario.trajectory.shares} <= shares
     assert np.ptp(run.log.command_velocity_radps) > 0.0
     assert judge(config, joint, scenario).violations == ()
+
+
+def test_the_fault_of_a_sweep_begins_before_its_end(sweep: tuple[Config, LockstepJoint]) -> None:
+    """Seed 915311, scenario 1949: a push in the last 5 ms of the watch, long after the run; not at rest in the end."""
+    for number in (1949, *range(20)):
+        drawn = draw_scenario(915311, number, sweep=True)
+        assert isinstance(drawn.trajectory, SweepStrokes)
+        seen = in_time(*sweep, drawn)
+        assert seen == dataclasses.replace(drawn, at_s=seen.at_s)
+        placed = placed_sweep(*sweep, drawn.trajectory, 0.0)
+        assert 0.0 <= seen.at_s / drawn.at_s == pytest.approx((BEFORE_s + placed.duration_s) / (BEFORE_s + LONGEST_s))
+        assert seen.at_s <= BEFORE_s + placed.duration_s
+    assert judge(*sweep, draw_scenario(915311, 1949, sweep=True)).violations == ()
+    run = draw_scenario(915311, 1949)
+    assert in_time(*sweep, run) == run
 
 
 def test_without_a_velocity_mode_the_law_of_a_sweep_closes_the_loop() -> None:
