@@ -33,6 +33,7 @@ from firmware_py.sequence import (
 )
 from firmware_py.states import AxisPhase, CommandKind, Fault, Reaction
 from firmware_py.surroundings import check_surroundings
+from firmware_py.swing_check import check_swing, take_notice, watch_rest
 from firmware_py.trajectory import approach_at, brake_step, reference_at, repetition
 from firmware_py.velocity import step_velocity
 from firmware_py.velocity_command import limited_velocity_radps, velocity_command_radps
@@ -180,7 +181,9 @@ def _command_torque(constants: AxisConstants, state: AxisState, table: np.ndarra
     )
     if not finite:
         trip(state, Fault.NOT_FINITE, state.unlimited_torque_Nm, 0)
+    check_swing(constants, state, torque_Nm)
     _check_saturation(limits, state, torque_Nm, elapsed_cycles)
+    take_notice(constants, state, torque_Nm)
     state.command_torque_Nm = torque_Nm if powered(state.phase) else 0.0
 
 
@@ -213,6 +216,7 @@ def _command_velocity(constants: AxisConstants, state: AxisState, elapsed_cycles
     )
     if not finite:
         trip(state, Fault.NOT_FINITE, unlimited_radps, 0)
+    check_swing(constants, state, state.measured_torque_Nm)
     _check_saturation(limits, state, state.measured_torque_Nm, elapsed_cycles)
     state.command_velocity_radps = velocity_radps if powered(state.phase) else 0.0
 
@@ -251,6 +255,7 @@ def step_axis(
     if state.phase >= AxisPhase.APPROACH and state.phase <= AxisPhase.RAMPING:
         _move_reference(constants, state, table, elapsed_cycles)
     if gap_cycles > 0:
+        watch_rest(constants, state, sample)
         # The drive samples when SYNC comes, and SYNC goes out when the loop wakes up.  Until then the joint moved on
         # with about the desired velocity: without this, 0.1 ms at 0.2 rad/s would look like 20 urad of error.
         state.measured_position_rad -= state.reference.velocity_radps * state.sample_late_s

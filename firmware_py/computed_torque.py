@@ -15,7 +15,7 @@ import math
 
 from firmware_py.disturbance_observer import add_to_disturbance, reset_observer, step_observer
 from firmware_py.friction import compensation_motor_torque_Nm
-from firmware_py.iterative_learning import learning_torque_Nm, record_correction, reset_learning
+from firmware_py.iterative_learning import learning_torque_Nm, record_correction, reset_learning, watch_learning
 from firmware_py.kernel import kernel
 from firmware_py.lugre import step_lugre
 from firmware_py.pid import integrate_error
@@ -30,6 +30,7 @@ def reset_law(constants: LawConstants, state: LawState) -> None:
     reset_network(constants.network, state.network)
     reset_observer(state.observer, 0.0)
     reset_learning(state.learning)
+    state.learning.stopped = 0
     state.lugre_deflection_rad = 0.0
     state.integral_rads = 0.0
     state.inertia_torque_Nm = 0.0
@@ -67,12 +68,19 @@ def friction_feed_forward_Nm(
 
 @kernel
 def _learn(
-    constants: LawConstants, state: LawState, epoch: int, repeat_s: float, local_s: float, correction_Nm: float
+    constants: LawConstants,
+    state: LawState,
+    epoch: int,
+    repeat_s: float,
+    local_s: float,
+    correction_Nm: float,
+    error: float,
 ) -> float:
     """Torque from iterative learning [Nm]; what it stops adding at a change is handed to the observer."""
     before_Nm = state.learned_torque_Nm
     epoch_before = state.learning.epoch
     torque = learning_torque_Nm(constants.learning, state.learning, epoch, repeat_s, local_s, constants.period_s)
+    watch_learning(constants.learning, state.learning, error)
     record_correction(constants.learning, state.learning, correction_Nm)
     if epoch_before != state.learning.epoch or repeat_s == 0.0:
         add_to_disturbance(constants.observer, state.observer, before_Nm)
@@ -141,7 +149,7 @@ def step_law(
     )
     rest_Nm = _rest_torque_Nm(constants, state, error, error_rate, velocity.velocity_radps, sent_torque_Nm)
     correction_Nm = proportional_Nm + rest_Nm - constants.inertia_kgm2 * constants.learning.error_gain_ps2 * error
-    state.learned_torque_Nm = _learn(constants, state, epoch, repeat_s, local_s, correction_Nm)
+    state.learned_torque_Nm = _learn(constants, state, epoch, repeat_s, local_s, correction_Nm, error)
     if constants.kind == ControllerKind.COMPUTED_TORQUE_OBSERVER:
         rest_Nm = state.observer_torque_Nm
     return (

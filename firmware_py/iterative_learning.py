@@ -8,17 +8,24 @@ where `correction` is what feedback and observer added in this period, plus a te
 error that decays at kp / kv would go unnoticed, because its parts cancel in the feedback.  The lead makes up for the
 delay from command to measured effect.  The smoothing over neighbouring bins has no phase shift: that stretch is over.
 What was learned belongs to the positions of one trajectory: a change of trajectory starts anew.
+
+A loop that learning makes worse gets worse by and by: where the error grows in GROWN repetitions in a row, learning
+fades out over `blend_s` and stays off for the rest of the run.
 """
 
 from __future__ import annotations
 
+import math
+
 from firmware_py.kernel import kernel
 from firmware_py.records import LEARNING_BINS, LearningConstants, LearningState
+
+GROWN = 3  # repetitions in a row with a greater error than before end the learning
 
 
 @kernel
 def reset_learning(state: LearningState) -> None:
-    """Forget everything; the next call begins a new epoch."""
+    """Forget what was learned; the next call begins a new epoch.  What was switched off stays off."""
     state.epoch = -1
     state.bins = 0
     state.torque_Nm = 0.0
@@ -31,6 +38,10 @@ def _begin_epoch(state: LearningState, epoch: int, bins: int) -> None:
     state.filled = 0
     state.last_bin = -1
     state.weight = 0.0
+    state.squares_rad2 = 0.0
+    state.samples = 0
+    state.error_rad = 0.0
+    state.grown = 0
 
 
 @kernel
@@ -49,10 +60,30 @@ def learning_torque_Nm(
     if epoch != state.epoch:
         _begin_epoch(state, epoch, int(min(period_s / cycle_s + 0.5, float(LEARNING_BINS))))
     state.present_bin = min(int(local_s / period_s * state.bins), state.bins - 1)
-    if state.filled > state.bins + 2 * constants.half_width + constants.lead_cycles:
+    if state.stopped != 0:
+        state.weight = max(0.0, state.weight - cycle_s / constants.blend_s)
+    elif state.filled > state.bins + 2 * constants.half_width + constants.lead_cycles:
         state.weight = min(1.0, state.weight + cycle_s / constants.blend_s)
     state.torque_Nm = state.weight * state.learned_Nm[state.present_bin]
     return state.torque_Nm
+
+
+@kernel
+def watch_learning(constants: LearningConstants, state: LearningState, error_rad: float) -> None:
+    """Compare the error of each repetition with that of the one before; call it after `learning_torque_Nm`."""
+    if constants.growth <= 0.0 or state.bins == 0 or state.stopped != 0:
+        return
+    if state.present_bin < state.last_bin:  # a repetition is over
+        mean_rad = math.sqrt(state.squares_rad2 / state.samples)
+        grows = state.error_rad > 0.0 and state.error_rad * constants.growth < mean_rad
+        state.grown = state.grown + 1 if grows else 0
+        state.error_rad = mean_rad
+        state.squares_rad2 = 0.0
+        state.samples = 0
+        if state.grown >= GROWN:
+            state.stopped = 1
+    state.squares_rad2 += error_rad * error_rad
+    state.samples += 1
 
 
 @kernel
@@ -69,7 +100,7 @@ def record_correction(constants: LearningConstants, state: LearningState, correc
     """Note what feedback and observer added in this cycle; call it after `learning_torque_Nm`."""
     bins = state.bins
     half_width = constants.half_width
-    if bins <= 2 * half_width + constants.lead_cycles + 2:
+    if state.stopped != 0 or bins <= 2 * half_width + constants.lead_cycles + 2:
         return
     index = state.present_bin if state.last_bin < 0 else (state.last_bin + 1) % bins
     state.last_bin = state.present_bin

@@ -92,6 +92,7 @@ class LearningConstants:
     lead_cycles: i8
     half_width: i8  # of the smoothing, in bins
     blend_s: f8
+    growth: f8  # of the error from one repetition to the next that counts as growing; 0 = not watched
 
 
 @record
@@ -103,6 +104,11 @@ class LearningState:
     last_bin: i8
     weight: f8
     torque_Nm: f8  # what is fed forward now
+    squares_rad2: f8  # sum of the squared errors of this repetition
+    samples: i8  # in that sum
+    error_rad: f8  # root mean square of the repetition before; 0 = there was none
+    grown: i4  # repetitions in a row whose error was greater than that of the one before
+    stopped: i4  # switched off for the rest of the run, because the error grew
     learned_Nm: Annotated[np.ndarray, array_of(f8, LEARNING_BINS)]
     recorded_Nm: Annotated[np.ndarray, array_of(f8, LEARNING_BINS)]
 

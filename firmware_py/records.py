@@ -49,6 +49,43 @@ class VelocityState:
 
 
 @record
+class SwingConstants:
+    """See `safety.swing_fault`; amplitudes are peak to peak."""
+
+    torque_Nm: f8  # of the torque beyond the reference's inertia torque; 0 = not watched
+    error_rad: f8  # of the tracking error; 0 = not watched
+    slowest_cycles: i8  # that half a swing may take; what is slower is a motion
+    noise_Nm: f8  # mean change of the command from cycle to cycle that is worth a warning; 0 = not watched
+    noise_gain: f8  # weight of a new change in that mean
+
+
+@record
+class Swing:
+    """One quantity that may swing: where it last turned, and how often in a row."""
+
+    direction: i4  # +1 after it has risen, -1 after it has fallen, 0 at the beginning
+    low: f8  # since it last turned
+    high: f8
+    amplitude: f8  # of the last half swing, peak to peak
+    count: i8  # half swings in a row
+    growing: i8  # of them in a row greater than the one before
+    last_cycle: i8  # when it last turned
+    half_cycles: i8  # that the last half swing took
+
+
+@record
+class SwingState:
+    torque: Swing
+    error: Swing
+    faint_error: Swing  # the same error, half as large swings counted: do they grow?
+    reference_direction: i4  # of the last desired motion that was no standstill
+    rest_rad: f8  # greatest step of the position from sample to sample before the power was on
+    rest_position_rad: f8
+    noise_Nm: f8  # mean change of the command from cycle to cycle
+    noise_told_Nm: f8  # the same when it was reported
+
+
+@record
 class LimitConstants:
     """What the loop allows; every one is at the joint."""
 
@@ -71,6 +108,7 @@ class LimitConstants:
     disagreement_max_rad: f8
     twist_radpNm: f8  # by how much they may differ more for each Nm of torque: the reducer's compliance
     limit_source: i4  # LimitSource
+    swing: SwingConstants
 
 
 @record
@@ -146,6 +184,7 @@ class AxisState:
     fault: i4  # Fault, the first one
     reaction: i4  # Reaction in force
     fault_drive_error: i4
+    notices: i4  # bits of `Notice`
     fault_encoder_error: i4  # `Sample.encoder_error` in the cycle of the fault, or of the last cycle if there is none
     cycle: i8
     phase_cycle: i8  # cycles since the phase began
@@ -175,6 +214,7 @@ class AxisState:
     velocity: VelocityState
     law: LawState
     change: ChangeState
+    swing: SwingState
 
 
 @record

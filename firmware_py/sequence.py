@@ -14,7 +14,7 @@ from firmware_py.computed_torque import reset_law
 from firmware_py.kernel import kernel
 from firmware_py.live_change import reset_change
 from firmware_py.records import LINE_GONE, AxisConstants, AxisState, Command, LimitConstants, Sample
-from firmware_py.safety import encoders_disagree, limit_position_rad, motion_fault, reaction_to
+from firmware_py.safety import encoders_disagree, limit_position_rad, motion_fault, reaction_to, reset_swing
 from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction, StopRequest
 from firmware_py.trajectory import plan_approach, reference_at
 
@@ -50,6 +50,8 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.velocity.primed = 0
     reset_law(constants.law, state.law)
     reset_change(state.change)
+    state.notices = 0
+    reset_swing(state.swing)
 
 
 @kernel

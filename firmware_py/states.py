@@ -79,6 +79,14 @@ class Fault(IntEnum):
     POSITION_DISAGREEMENT = 24  # the two encoders of the joint differ by more than they may
     MOVED_BEFORE_START = 25  # the joint is not where it was when the motion was shown
     SAMPLES_MISSING = 26  # samples came before enabling, but never enough of them in a row
+    LIMIT_CYCLE = 27  # torque or error swing back and forth instead of settling
+
+
+class Notice(IntEnum):
+    """What the loop reports without ending the run; each is one bit of `AxisState.notices`, set once in a run."""
+
+    TORQUE_NOISE = 1  # the command changes too much from cycle to cycle
+    LEARNING_OFF = 2  # iterative learning made the error grow and was switched off
 
 
 class Reaction(IntEnum):

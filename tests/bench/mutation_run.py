@@ -31,6 +31,7 @@ TESTS = {  # below UNIT_TESTS
     "firmware_py/sequence.py": ("firmware_py/axis/test_sequence_*", "firmware_py/axis/test_axis_*"),
     "firmware_py/surroundings.py": ("firmware_py/axis/test_surroundings_edges",),
     "firmware_py/frozen_reading.py": ("firmware_py/axis/test_surroundings_edges",),
+    "firmware_py/swing_check.py": ("firmware_py/axis/test_axis_swing*",),
     "drivers/canopen/cia402.py": ("drivers/canopen/test_cia402",),
 }
 LONGEST_S = 120.0  # of processor time: on a busy computer a sound mutant must not count as one that hangs
@@ -49,6 +50,7 @@ ENUMERATIONS = (
     "ControlWord",
     "StopRequest",
     "CommandKind",
+    "Notice",
 )
 
 

@@ -17,7 +17,7 @@ LONG_s = 30.0  # longer than any scenario
 MOTION = frozenset(
     {
         Fault.POSITION_LIMIT, Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR, Fault.POSITION_JUMP, Fault.POSITION_FROZEN,
-        Fault.TORQUE_SATURATED, Fault.STOP_TIMEOUT,
+        Fault.TORQUE_SATURATED, Fault.LIMIT_CYCLE, Fault.STOP_TIMEOUT,
     }
 )  # fmt: skip
 # what a joint that seems to move, or does, shows before it is enabled

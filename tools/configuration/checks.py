@@ -12,6 +12,7 @@ from tools.configuration.elmo_settings import serial_problems
 from tools.configuration.sections import Friction, FrictionDirection
 
 CAN_RATE_HZ = (100.0, 4000.0)
+SWING_PERIODS = 4.0  # that half a swing takes at least: a faster one no sampled loop can follow
 CURVE_POINTS = 200  # at which a friction curve is looked at
 SWITCH_rad, SWITCH_radps = 1e-3, 1e-2  # what rounding of the numbers in a file may leave at a switch
 
@@ -120,6 +121,11 @@ def _limit_problems(config: Config) -> list[str]:
         value = getattr(limits, key)
         if value * loop.rate_Hz < 1.0:
             found.append(f"limits.{key} (={value:g}) must be at least one period, {1.0 / loop.rate_Hz:g} s")
+    if limits.swing_slowest_s * loop.rate_Hz < SWING_PERIODS:
+        found.append(
+            f"limits.swing_slowest_s (={limits.swing_slowest_s:g}) must be at least {SWING_PERIODS:g} periods, "
+            f"{SWING_PERIODS / loop.rate_Hz:g} s"
+        )
     extremes = trajectory_extremes(config.trajectory)
     if extremes is not None:
         found += extremes_problems(config, *extremes)

@@ -35,6 +35,10 @@ FROZEN_FRICTION = 1.5  # times the static friction: what a sound joint does not 
 HEARTBEATS_MISSED = 3  # periods of the drive's own heartbeat until it counts as silent
 MOVED_COUNTS = 4  # encoder counts by which a joint that nobody has moved may seem to have moved
 FROZEN_COUNTS = 4  # encoder counts by which a standing reading may flicker
+NOISE_S = 0.25  # that the mean change of the torque command is taken over
+NOISE_OF_RATE = (
+    0.6  # share of the rate limit that is noise too, where the limit is lower than the noise that is allowed
+)
 APPROACH_SPEED = 0.25  # share of limits.velocity_max_radps that an automatic approach may use
 
 
@@ -98,6 +102,7 @@ def _fill_law(law: Any, config: Config) -> None:
         law.learning.lead_cycles = control.learning.lead_cycles
         law.learning.half_width = control.learning.half_width_cycles
         law.learning.blend_s = control.learning.blend_s
+        law.learning.growth = config.limits.learning_growth
     law.reduction_ratio = joint.reduction_ratio
     law.zero_band_radps = control.zero_band_radps
     if config.friction is not None:
@@ -197,8 +202,19 @@ def _fill_limits(record: Any, config: Config) -> None:
     record.sample_age_max_cycles = _cycles(config, limits.sample_age_max_s)
     record.saturation_max_cycles = _cycles(config, limits.saturation_max_s)
     record.skipped_max_cycles = _cycles(config, limits.skipped_max_s)
+    _fill_swing(record.swing, config)
     if not isinstance(config.drive, ElmoSerial):  # a serial drive answers in every cycle and sends nothing by itself
         record.heartbeat_age_max_cycles = _cycles(config, HEARTBEATS_MISSED * config.drive.heartbeat_s)
+
+
+def _fill_swing(record: Any, config: Config) -> None:
+    limits = config.limits
+    record.torque_Nm = 2.0 * limits.swing_torque_share * limits.torque_max_Nm
+    record.error_rad = limits.swing_error_share * limits.following_error_max_rad
+    record.slowest_cycles = _cycles(config, limits.swing_slowest_s)
+    rate_Nm = limits.torque_rate_max_Nmps * period_s(config)  # a command cannot change by more
+    record.noise_Nm = min(limits.torque_noise_share * limits.torque_max_Nm, NOISE_OF_RATE * rate_Nm)
+    record.noise_gain = 1.0 / _cycles(config, NOISE_S)
 
 
 def _fill_sequence(record: Any, config: Config, start_position_rad: float | None) -> None:

@@ -176,6 +176,13 @@ class Limits(Section):
     saturation_max_s: Annotated[float, between(0.0, 60.0, open_low=True)]
     skipped_max_s: Annotated[float, between(0.0, 1.0, open_low=True)]  # periods lost in one overrun: more is a fault
     standstill_radps: Annotated[float, between(0.0, 10.0, open_low=True)]  # slower counts as standing
+    # of the range from -torque_max_Nm to torque_max_Nm: a torque that reverses by more, four times in a row, is a fault
+    swing_torque_share: Annotated[float, between(0.2, 1.0)] = 0.5
+    # of following_error_max_rad, from peak to peak: an error that swings by more, six times in a row, is the same fault
+    swing_error_share: Annotated[float, between(0.01, 1.0)] = 0.05
+    swing_slowest_s: Annotated[float, between(0.01, 2.0)] = 0.3  # that half a swing takes; what is slower is a motion
+    torque_noise_share: Annotated[float, between(0.01, 1.0)] = 0.2  # of torque_max_Nm; more change a cycle is a warning
+    learning_growth: Annotated[float, between(1.0, 10.0)] = 1.05  # of the error, three repetitions long: learning ends
 
 
 class Sequence(Section):

@@ -21,6 +21,7 @@ from tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter
 from tools.running.changes.viewer_orders import ViewerOrders
 from tools.running.display.display import Display, Snapshot
 from tools.running.events.event_finder import EventFinder, phase_name
+from tools.running.events.notice_text import NoticeFinder
 from tools.running.guard.guard_handle import GUARD_ENDED, GuardHandle
 from tools.running.loop.loop_handle import LoopHandle
 from tools.running.open_drive import drive_fault_text, loop_delay_s
@@ -67,6 +68,7 @@ class RunWatch:
         self._allow_low_margin = allow_low_margin
         self._phase, self._asked = AxisPhase.WAITING, StopRequest.NONE
         self._events = EventFinder(cia402=not config.is_serial, fault_words=self._fault_words)
+        self._notices = NoticeFinder()
         self._orders = ViewerOrders(
             config, self.loop.block, self.log.path, parts.metadata, self._tell_scope, lambda: self.delay_s,
             allow_low_margin=allow_low_margin,
@@ -132,6 +134,9 @@ class RunWatch:
         self.keep(records)
         self._orders.keep(records)
         commanded = self.around.signals.commanded_ns != 0  # the drive is off then, and the loop cannot know why
+        # first: what has been reported may explain the fault that follows
+        for event in self._notices.take(self.loop.block.state[0], int(records[-1].time_ns)):
+            self._tell(event)
         for event in self._events.take(records):
             self._tell(event, shown=not (commanded and event.level == ERROR))
         skipped, histograms = int(self.loop.block.words[Word.SKIPPED]), self.loop.block.histograms

@@ -166,6 +166,7 @@ def test_old_caches_are_removed_but_not_those_in_use(tmp_path: Path) -> None:
 
 PLAIN = (
     "firmware_py/axis/test_safety",
+    "firmware_py/axis/test_axis_swing*",
     "firmware_py/axis/test_sequence_*",
     "firmware_py/test_friction",
     "firmware_py/test_lugre",
@@ -180,7 +181,15 @@ FULLY_COVERED = (
     "drivers/canopen/cia402.py",
     *(
         f"firmware_py/{name}.py"
-        for name in ("safety", "sequence", "surroundings", "frozen_reading", "live_change", "velocity_command")
+        for name in (
+            "safety",
+            "sequence",
+            "surroundings",
+            "frozen_reading",
+            "swing_check",
+            "live_change",
+            "velocity_command",
+        )
     ),
 )
 

@@ -14,6 +14,7 @@ SURROUNDINGS = "unit/firmware_py/axis/test_surroundings.py::"
 ELMO_CYCLIC = "unit/drivers/elmo/test_elmo_cyclic.py::"
 HANGS = "unit/running/test_hang_limits.py::"
 AXIS_LIMITS = "unit/firmware_py/axis/test_axis_limits.py::"
+AXIS_SWING = "unit/firmware_py/axis/test_axis_swing.py::"
 AXIS_SAMPLES = "unit/firmware_py/axis/test_axis_samples.py::"
 AXIS_DRIVE_FAULTS = "unit/firmware_py/axis/test_axis_drive_faults.py::"
 AXIS_TIME_LIMITS = "unit/firmware_py/axis/test_axis_time_limits.py::"
@@ -45,6 +46,10 @@ FAULTS: dict[Fault, tuple[str, str]] = {  # what trips, and its twin
     Fault.TORQUE_SATURATED: (
         AXIS_LIMITS + "test_saturation | (21, True)",
         AXIS_LIMITS + "test_saturation | (20, False)",
+    ),
+    Fault.LIMIT_CYCLE: (
+        AXIS_SWING + "test_torque_that_reverses_between_its_shares | (30.0 + 1e-9, Fault.LIMIT_CYCLE)",
+        AXIS_SWING + "test_torque_that_reverses_between_its_shares | (30.0, Fault.NONE)",
     ),
     Fault.DRIVE_FAULT: (
         AXIS_DRIVE_FAULTS + "test_drive_fault_in_each_phase | Fault.DRIVE_FAULT",
@@ -164,6 +169,17 @@ CAN: dict[tuple[str, str], tuple[str, str] | tuple[Fault, ...]] = {
         Fault.TORQUE_SATURATED, Fault.NOT_AT_STANDSTILL,
     ),
     ("loop", "its own law"): (Fault.NOT_FINITE,),
+    ("loop", "that the joint settles"): (Fault.LIMIT_CYCLE,),
+    ("loop", "what it learns"): (
+        "unit/firmware_py/test_learning_growth.py::test_an_error_that_grows_in_three_repetitions_switches_learning_off"
+        " | (1.05 + 1e-9, True)",
+        "unit/firmware_py/test_learning_growth.py::test_an_error_that_grows_in_three_repetitions_switches_learning_off"
+        " | (1.05 - 1e-9, False)",
+    ),
+    ("loop", "the noise of its command"): (
+        "faults/test_limit_cycle.py::test_a_coarse_encoder_is_reported_as_torque_noise | (16, True)",
+        "faults/test_limit_cycle.py::test_a_coarse_encoder_is_reported_as_torque_noise | (17, False)",
+    ),
     ("loop", "the bus"): (Fault.BUS_ERROR,),
     ("loop", "the schedule"): (Fault.OVERRUN,),
     ("loop", "the computer"): (Fault.SUSPENDED,),

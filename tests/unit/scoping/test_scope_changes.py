@@ -12,7 +12,7 @@ import pytest
 from drivers.drive import CommissioningReport, DriveIdentity
 from drivers.errors import MotionFault
 from firmware_py.realtime import HISTOGRAM_BINS, Word
-from firmware_py.records import LogRecord
+from firmware_py.records import AxisState, LogRecord
 from firmware_py.schema import new
 from firmware_py.states import AxisPhase, StopRequest
 from tools.configuration.records import axis_constants
@@ -99,7 +99,10 @@ def test_a_motion_without_an_end_says_so(
     axis = axis_constants(virtual_config, start_position_rad=0.0)
     axis[0].trajectory = constants[0]  # as the loop has taken it
     block = SimpleNamespace(
-        constants=axis, words=np.zeros(max(Word) + 1), histograms=np.zeros((3, HISTOGRAM_BINS), np.int64)
+        constants=axis,
+        state=new(AxisState),
+        words=np.zeros(max(Word) + 1),
+        histograms=np.zeros((3, HISTOGRAM_BINS), np.int64),
     )
     sink: Any = SimpleNamespace(path=tmp_path, append=lambda records: None, write_records=lambda records: None)
     display: Any = SimpleNamespace(show=shown.append, event=lambda event: None)

@@ -60,6 +60,13 @@ FAULT_TEXTS: dict[Fault, FaultText] = {
         "the joint is blocked, or limits.torque_max_Nm is too low for load and friction",
         "turn the joint by hand with the power off, then look at the friction values",
     ),
+    Fault.LIMIT_CYCLE: FaultText(
+        "torque or error swung back and forth at about {value:.1f} Hz instead of settling",
+        "more loop delay than the gains allow, gains too high for a heavy or soft joint, learning that diverges, "
+        "or an encoder of too little resolution",
+        "run `jointctl check`; then lower the gains (kp, kv, observer_radps), switch learning off, "
+        "or measure with more counts",
+    ),
     Fault.DRIVE_FAULT: FaultText(
         "the drive reported a fault (statusword {word})",
         "see the drive's error code",
