@@ -48,6 +48,13 @@ def test_a_turn_is_a_way_back_by_more_than_the_least(top: float, counts: int, si
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("back", "counts"), [(0.25, 0), (0.5, 1)])
+def test_before_the_first_turn_both_sides_are_followed(sign: float, back: float, counts: int) -> None:
+    swing = swung([sign * 0.75, -sign * back])
+    assert (swing.count, swing.direction) == (counts, -sign * counts)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_amplitude_is_the_way_between_two_turns(sign: float) -> None:
     values = [sign * x for x in (2.0, 3.0, 2.5, -4.0, -4.5, -4.25)]
     swing = swung(values)
@@ -136,6 +143,15 @@ def test_torque_that_reverses_between_its_shares(peak_Nm: float, fault: Fault) -
     else:
         assert first is None
         assert fault is Fault.NONE
+
+
+def test_a_small_joint_is_watched_too() -> None:
+    found = limits()
+    found.swing.torque_Nm = 0.5
+    _, faults = run_swing(found, [0.3 * (-1.0) ** i for i in range(9)])
+    assert max(faults) is Fault.LIMIT_CYCLE
+    _, faults = run_swing(found, [0.25 * (-1.0) ** i for i in range(9)])
+    assert set(faults) == {Fault.NONE}
 
 
 @pytest.mark.parametrize(("turns", "fault"), [(TORQUE_SWINGS - 1, Fault.NONE), (TORQUE_SWINGS, Fault.LIMIT_CYCLE)])

@@ -75,7 +75,7 @@ def test_a_swing_counts_while_the_law_is_active(axis: Any, state: Any, phase: Ax
         state.cycle += 25
         check_swing(axis, state, 21.0 + 60.5 * (i % 2 == 0))
     if active:
-        assert (state.fault, state.fault_value) == (Fault.LIMIT_CYCLE, 20.0)
+        assert (state.fault, state.fault_value, state.fault_drive_error) == (Fault.LIMIT_CYCLE, 20.0, 0)
         assert (state.phase, state.reaction) == (AxisPhase.QUICK_STOPPING, Reaction.QUICK_STOP)
     else:
         assert (state.fault, state.phase, state.swing.torque.count) == (Fault.NONE, phase, 0)
