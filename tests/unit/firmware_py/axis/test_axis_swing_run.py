@@ -40,6 +40,8 @@ def test_the_mean_change_of_the_command(past: float, noisy: bool) -> None:
     assert state.noise_Nm == 2.5
     assert torque_noise(constants, state, -10.0) == noisy
     assert state.noise_Nm == 4.375
+    constants.noise_Nm = 0.5
+    assert torque_noise(constants, state, 0.0)  # that of a small joint
     constants.noise_Nm = 0.0
     assert not torque_noise(constants, state, 100.0)  # not watched
 
