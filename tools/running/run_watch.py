@@ -137,6 +137,7 @@ class RunWatch:
         # first: what has been reported may explain the fault that follows
         for event in self._notices.take(self.loop.block.state[0], int(records[-1].time_ns)):
             self._tell(event)
+            self.display.note(event.text)  # of events, a display shows the errors by itself
         for event in self._events.take(records):
             self._tell(event, shown=not (commanded and event.level == ERROR))
         skipped, histograms = int(self.loop.block.words[Word.SKIPPED]), self.loop.block.histograms

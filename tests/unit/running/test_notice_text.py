@@ -50,14 +50,14 @@ def test_both_at_once_are_two_events() -> None:
 def test_a_run_tells_them_to_log_display_and_viewers_before_the_fault() -> None:
     """They may explain it."""
     told: list[Any] = []
-    records: Any = SimpleNamespace(__len__=lambda: 1)
+    noted: list[str] = []
     fault = SimpleNamespace(text="LIMIT_CYCLE", time_ns=1)
     watch: Any = RunWatch.__new__(RunWatch)
 
     class Records(list[Any]):
         pass
 
-    records = Records([SimpleNamespace(time_ns=41)])
+    records: Any = Records([SimpleNamespace(time_ns=41)])
     block = SimpleNamespace(
         state=[state_with(Notice.LEARNING_OFF)], words=[0] * 64, histograms=None,
         constants=[SimpleNamespace(trajectory=SimpleNamespace(duration_s=1.0))],
@@ -69,10 +69,11 @@ def test_a_run_tells_them_to_log_display_and_viewers_before_the_fault() -> None:
     watch._notices, watch._events = NoticeFinder(), SimpleNamespace(take=lambda _: [fault])
     watch._tell = told.append
     watch.config, watch.temperature = SimpleNamespace(is_serial=False), SimpleNamespace(newest_degC=None)
-    watch.display = SimpleNamespace(show=lambda _: None)
+    watch.display = SimpleNamespace(show=lambda _: None, note=noted.append)
     watch.take_records()
     assert [event.text.split()[0] for event in told] == ["iterative", "LIMIT_CYCLE"]
     assert told[0].time_ns == 41
+    assert noted == [told[0].text]
 
 
 def test_the_advice_of_a_limit_cycle_names_delay_gains_learning_and_resolution() -> None:
