@@ -1,14 +1,17 @@
 """Every error that a user can meet, as one tree; the class decides the exit code of the command line.
 
-The message is one line that names the thing, its value and what is allowed.  The hint is one line that tells what
-to do about it (often a command to type), or empty.
+The message is one printable line that names the thing, its value and what is allowed.  The hint is one line that tells
+what to do about it (often a command to type), or empty.
 """
 
 from __future__ import annotations
 
 from typing import ClassVar
 
+from drivers.printable import one_line
+
 INTERRUPTED = 130  # exit code after Ctrl-C and its like, which are no error
+DECLINED = 12  # exit code where the user did not agree to what was asked: nothing was done
 
 
 class JointctlError(Exception):
@@ -18,8 +21,8 @@ class JointctlError(Exception):
 
     def __init__(self, message: str, hint: str = "") -> None:
         super().__init__(message, hint)
-        self.message = " ".join(message.split())
-        self.hint = " ".join(hint.split())
+        self.message = one_line(message)
+        self.hint = one_line(hint)
 
     def __str__(self) -> str:
         return f"{self.message} ({self.hint})" if self.hint else self.message

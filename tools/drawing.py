@@ -7,12 +7,14 @@ of them by a variable of the page.  matplotlib is slow to import, and only wante
 from __future__ import annotations
 
 import io
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from drivers.errors import UsageError
+from drivers.printable import printable
 from tools.written_file import refuse_overwriting, writing
 
 # the numbers only mark what to replace; near the page's light colours, so that a plain viewer is right as well
@@ -41,6 +43,7 @@ WIDTH_in = 10.0
 _PNG_DPI = 110
 STYLE: Any = {
     "svg.fonttype": "none",
+    "text.parse_math": False,  # a name may hold dollar signs
     "font.size": 10,
     "text.color": INK,
     "axes.labelcolor": INK,
@@ -78,13 +81,22 @@ def canvas(height_in: float, title: str = "") -> Iterator[Any]:
         yield figure
 
 
+def save_figure(figure: Any, target: Any, **how: Any) -> None:
+    """matplotlib's `savefig` in the common style; names in titles and legends are shown as they may be."""
+    import matplotlib
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        text.set_text(printable(text.get_text(), keep="\n"))
+    with matplotlib.rc_context({**STYLE, "svg.hashsalt": how.pop("hashsalt", None)}), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from")  # drawn as a box
+        figure.savefig(target, **how)
+
+
 def png(figure: Any) -> bytes:
     """The picture on white, for a file."""
-    import matplotlib
-
     data = io.BytesIO()
-    with matplotlib.rc_context(STYLE):
-        figure.savefig(data, format="png", dpi=_PNG_DPI, facecolor="white")
+    save_figure(figure, data, format="png", dpi=_PNG_DPI, facecolor="white")
     return data.getvalue()
 
 

@@ -1,6 +1,7 @@
 """Where output goes: results on stdout, everything else on stderr; colour and progress only on a terminal.
 
 With `json` the result is one JSON document on stdout and nothing else is printed there; NO_COLOR is honoured by rich.
+Whatever a text holds, a terminal shows it and obeys none of it (`drivers.printable`); a result is not cut.
 """
 
 from __future__ import annotations
@@ -16,10 +17,14 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import IO, Any, Protocol
 
-from rich.console import Console, RenderableType
+from rich.console import Console, Group, RenderableType
+from rich.padding import Padding
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
 
 from drivers.errors import DataError
+from drivers.printable import message_line, printable
 from tools.narrow_table import fitted, widest
 
 
@@ -92,7 +97,8 @@ class Output:
 
     def line(self, text: str) -> bool:
         """One line of a result that comes bit by bit; False if nobody reads it any more."""
-        return self._write(lambda: print(text, file=self.stdout, flush=True))
+        # the escapes are those of JSON and TOML, so that both stay what they are
+        return self._write(lambda: print(printable(text, keep="\n"), file=self.stdout, flush=True))
 
     def _write(self, write: Callable[[], None]) -> bool:
         try:
@@ -121,27 +127,33 @@ class Output:
     def note(self, text: RenderableType) -> None:
         """Progress in words, or as a table; not with `--quiet`."""
         if not self.quiet:
-            self._say(text)
+            self._say(message_line(text) if isinstance(text, str) else text)
+
+    def address(self, text: str) -> None:
+        """What the user cannot do without, such as where a page is served: also with `--quiet`."""
+        self._say(message_line(text))
 
     def fact(self, text: str) -> None:
         """A note that begins with a heading of `FACT_COLUMN` characters: what a terminal has to wrap goes below it."""
+        text = message_line(text)
         if self.stderr.isatty():
             bound = _UNIT.sub(_HELD, text)  # a number and its unit stay on one line
             text = textwrap.fill(
                 bound, self._messages.width, subsequent_indent=" " * FACT_COLUMN, break_long_words=False,
                 break_on_hyphens=False,
             ).replace(_HELD, " ")  # fmt: skip
-        self.note(text)
+        if not self.quiet:
+            self._say(text)
 
     def warning(self, text: str) -> None:
-        self._say(f"warning: {text}", "yellow")
+        self._say(f"warning: {message_line(text)}", "yellow")
 
     def error(self, text: str, hint: str = "") -> None:
         """One line for each line of `text`, and what to do about it."""
-        for line in text.splitlines():
-            self._say(f"error: {line}", "red")
+        for line in text.strip("\n").split("\n"):
+            self._say(f"error: {message_line(line)}", "red")
         if hint:
-            self._say(f"hint: {hint}")
+            self._say(f"hint: {message_line(hint)}")
 
     @contextmanager
     def progress(self, title: str, total: float) -> Iterator[Advance]:
@@ -161,9 +173,33 @@ class Output:
 
 def _print_whole(console: Console, shown: RenderableType) -> None:
     """As wide as the terminal; on a pipe as wide as the widest table needs."""
+    shown = _printable(shown)
     if not console.file.isatty():
         console.width = max(PIPE_COLUMNS, widest(shown))
     console.print(fitted(shown, console.width))
+
+
+def _printable(shown: RenderableType) -> RenderableType:
+    """The same with every text in it escaped; only what is no cell may have several lines."""
+    if isinstance(shown, str):
+        return printable(shown, keep="\n")
+    if isinstance(shown, Text):
+        if (text := printable(shown.plain, keep="\n")) != shown.plain:
+            shown.plain = text
+    elif isinstance(shown, Group):
+        return Group(*(_printable(part) for part in shown.renderables))
+    elif isinstance(shown, Padding):
+        shown.renderable = _printable(shown.renderable)
+    elif isinstance(shown, Table):
+        shown.title, shown.caption = _cell(shown.title), _cell(shown.caption)
+        for column in shown.columns:
+            column.header, column.footer = _cell(column.header), _cell(column.footer)
+            column._cells = [_cell(cell) for cell in column._cells]
+    return shown
+
+
+def _cell(cell: Any) -> Any:
+    return printable(cell) if isinstance(cell, str) else _printable(cell)
 
 
 def _plain(value: Any) -> Any:

@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from drivers.errors import INTERRUPTED, DataError, JointctlError, UsageError
+from drivers.printable import one_line
 from tools.cli import experiments as cli_experiments
 from tools.cli import friction as cli_friction
 from tools.cli import inspection as cli_inspection
@@ -88,9 +89,7 @@ def run(
     dry_run: DryRun = False,
     allow_low_margin: AllowLowMargin = False,
     scope: Annotated[bool, typer.Option("--scope", help="live page in the browser (needs the extra scope)")] = False,
-    scope_host: Annotated[
-        str, typer.Option("--scope-host", help="address of the page; others need a token")
-    ] = "127.0.0.1",
+    scope_host: Annotated[str, typer.Option("--scope-host", help="address to serve the page at")] = "127.0.0.1",
     scope_port: Annotated[int, typer.Option("--scope-port", min=1, max=65535)] = 8642,
     json: Json = False,
     quiet: Quiet = False,
@@ -248,7 +247,7 @@ _USAGE: type[Exception] = typer.BadParameter.__mro__[1]
 
 def _refuse_usage(error: Any) -> None:
     """One line for what the parser did not understand; without any argument it has shown the help instead."""
-    text = " ".join(error.format_message().split())
+    text = one_line(error.format_message())
     if not text:
         return
     command = error.ctx.command_path if error.ctx is not None else "jointctl"

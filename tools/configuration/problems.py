@@ -12,6 +12,7 @@ from typing import Any, get_args
 from pydantic import BaseModel
 
 from drivers.errors import ConfigurationError
+from drivers.printable import one_line
 from tools.configuration.config import Config
 
 
@@ -20,8 +21,8 @@ class ConfigurationProblems(ConfigurationError):
 
     def __init__(self, problems: list[str]) -> None:
         super().__init__(problems[0])
-        self.problems = tuple(problems)
-        self.message = "\n".join(problems)
+        self.problems = tuple(one_line(problem) for problem in problems)
+        self.message = "\n".join(self.problems)
 
 
 _UNITS = frozenset(

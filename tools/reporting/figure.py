@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from tools.drawing import COLOURS, STYLE, canvas
+from tools.drawing import COLOURS, canvas, save_figure
 from tools.reporting.page import Figure
 
 
@@ -25,11 +25,8 @@ def draw(height_in: float, paint: Callable[[Any], None], alt: str, caption: str 
 
 def svg_figure(figure: Any, alt: str, caption: str = "") -> Figure:
     """A matplotlib figure, drawn on a `canvas`, as a figure of the page."""
-    import matplotlib
-
     data = io.StringIO()
-    with matplotlib.rc_context({**STYLE, "svg.hashsalt": alt}):
-        figure.savefig(data, format="svg", dpi=150, metadata={"Date": None, "Creator": None})
+    save_figure(figure, data, format="svg", dpi=150, metadata={"Date": None, "Creator": None}, hashsalt=alt)
     return Figure(alt, _inline(data.getvalue(), alt), caption)
 
 

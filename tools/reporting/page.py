@@ -16,6 +16,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from drivers.errors import DataError
+from drivers.printable import printable
 from tools.written_file import replace_file, require_target
 
 _TEMPLATE = "page.html.j2"
@@ -87,12 +88,18 @@ class Section:
         return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-") or "section"
 
 
+def _shown(value: Any) -> Any:
+    """What is text on the page, without what a browser would obey; markup (`Figure.svg`) is left as it is."""
+    return printable(value, keep="\n\t") if isinstance(value, str) and not hasattr(value, "__html__") else value
+
+
 @cache
 def _environment() -> Environment:
     return Environment(
         loader=PackageLoader("tools.reporting", "."),
         autoescape=select_autoescape(default=True, default_for_string=True),
         undefined=StrictUndefined,
+        finalize=_shown,
         trim_blocks=True,
         lstrip_blocks=True,
     )

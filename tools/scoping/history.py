@@ -5,10 +5,13 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from drivers.printable import printable
 from firmware_py.records import LogRecord
 from firmware_py.schema import dtype_of, new
 from tools.recording.run_figure import drawn_indices
@@ -40,6 +43,15 @@ SIGNALS: dict[str, tuple[str, float]] = {
 _OF_THE_LAW = ("error_rad", "desired_position_rad", "desired_velocity_radps")
 
 
+def _printable(value: Any) -> Any:
+    """Every text in a message of the supervisor as it may be shown."""
+    if isinstance(value, str):
+        return printable(value)
+    if isinstance(value, Mapping):
+        return {printable(key): _printable(item) for key, item in value.items()}
+    return [_printable(item) for item in value] if isinstance(value, list) else value
+
+
 class History:
     """Filled by one thread, read by others; its memory never grows."""
 
@@ -53,6 +65,14 @@ class History:
         self.settings: dict[str, Any] = {}  # what the supervisor tells: gains, motion, stage, ...
         self.ended = False
         self.heard_s = time.monotonic()  # of the last message of the supervisor
+
+    def take_event(self, event: Event) -> None:
+        """One more event; a page shows whatever is in it and obeys none of it."""
+        self.events.append(replace(event, source=printable(event.source), text=printable(event.text)))
+
+    def take_settings(self, found: Mapping[str, Any]) -> None:
+        """What the supervisor tells besides, likewise."""
+        self.settings.update(_printable(found))
 
     def take(self, records: Any) -> None:
         """Append records, shape (N,), in order of time."""

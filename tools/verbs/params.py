@@ -13,7 +13,7 @@ from drivers.canopen.bus_watchers import OtherControllers
 from drivers.canopen.cia402 import State, state_of_word, state_text
 from drivers.canopen.identifiers import NmtCommand
 from drivers.canopen.network import send_nmt
-from drivers.errors import ConfigurationError, DataError, DeviceError
+from drivers.errors import DECLINED, ConfigurationError, DataError, DeviceError
 from tools.inspection.objects import Objects, Place
 from tools.inspection.parameter_file import load_parameters, toml_text, write_dcf
 from tools.inspection.parameter_restore import Written, restore
@@ -97,9 +97,10 @@ def _table(objects: Objects, found: Iterable[Difference], first: str, second: st
         table.add_column(title, overflow="fold")
     for item in found:
         place = item.place
-        cells = (str(place), objects.name(place.index, place.sub), shown(objects, place, item.first),
-                 shown(objects, place, item.second))  # fmt: skip
-        table.add_row(*(cell.replace("[", r"\[") for cell in cells))
+        table.add_row(
+            str(place), objects.name(place.index, place.sub), shown(objects, place, item.first),
+            shown(objects, place, item.second),
+        )  # fmt: skip
     return table
 
 
@@ -137,7 +138,7 @@ def restore_file(
             require_terminal("this writes into the drive and there is no terminal to ask on", "give -y to write")
         if not (assume_yes or agreed(output, "Write these into the drive?")):
             output.note("nothing was written")
-            return 0
+            return DECLINED
         # the answer may have taken minutes: a joint that moves by now must not lose its controller
         _require_off(reader)
         others.refuse()  # after an answer: what came before it has been received by then

@@ -11,7 +11,7 @@ from typing import Any
 import can
 import pytest
 
-from drivers.errors import BusError, ConfigurationError, DeviceError, UsageError
+from drivers.errors import DECLINED, BusError, ConfigurationError, DeviceError, UsageError
 from tests.unit.inspection.parameter_verbs import change, output, read, subject, writes
 from tools.inspection.objects import Place
 from tools.verbs.params import place_index, restore_file
@@ -100,7 +100,7 @@ class TestRestore:
 
         change(file, o6072="700")
         monkeypatch.setattr(sys, "stdin", Terminal(answer))
-        assert restored(device_on_bus, file, assume_yes=False) == 0
+        assert restored(device_on_bus, file, assume_yes=False) == (0 if written else DECLINED)
         assert bool(writes(device_on_bus)) == written
 
     @pytest.mark.parametrize("what", ["SYNC", "under power", "nothing"])

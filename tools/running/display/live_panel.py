@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.panel import Panel
 
+from drivers.printable import message_line, printable
 from tools.output import Output
 from tools.recording.run_log import ERROR, Event
 from tools.running.display.display import Display, OnlyShows, Snapshot
@@ -57,7 +58,7 @@ class LivePanel(OnlyShows):
     """The panel on the terminal behind file descriptor `fd`."""
 
     def __init__(self, fd: int, title: str, refresh_s: float = REFRESH_s) -> None:
-        self._title = title
+        self._title = printable(title)
         self._refresh_s = refresh_s
         self._snapshot: Snapshot | None = None
         self._phase = "starting"
@@ -68,7 +69,7 @@ class LivePanel(OnlyShows):
 
     def note(self, text: str) -> None:
         """See `Display`."""
-        self._notes = [*self._notes, text][-NOTES:]
+        self._notes = [*self._notes, message_line(text)][-NOTES:]
 
     def event(self, event: Event) -> None:
         """As in `PhaseLines`."""

@@ -25,7 +25,8 @@ def panel(title: str, phase: str, snapshot: Snapshot | None, notes: list[str]) -
     border = "red" if snapshot is not None and int(snapshot.record.fault) else "blue"
     foot = "Ctrl-C: brake and disable; again: quick stop"
     return Panel(
-        Group(_Grid(_cells(phase, snapshot)), *lines), title=title, subtitle=foot, title_align="left",
+        # a str would be read as markup
+        Group(_Grid(_cells(phase, snapshot)), *lines), title=Text(title), subtitle=foot, title_align="left",
         subtitle_align="left", border_style=border, width=78,
     )  # fmt: skip
 
