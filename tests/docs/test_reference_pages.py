@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from drivers.errors import JointctlError
+from drivers.errors import DECLINED, INTERRUPTED, JointctlError
 from tests.places import ROOT
 from tools.configuration.config import Config
 from tools.identification.sweep_file import SWEEP_COLUMNS
@@ -14,7 +14,7 @@ from tools.verbs.fault_campaign import EXIT_VIOLATIONS
 from tools.verbs.params import DIFFERENT
 
 DOCS = ROOT / "docs"
-NO_CLASS = {0, EXIT_VIOLATIONS, DIFFERENT, 130}
+NO_CLASS = {0, EXIT_VIOLATIONS, DIFFERENT, DECLINED, INTERRUPTED}
 
 
 def classes_of(root: type[JointctlError]) -> set[type[JointctlError]]:

@@ -146,7 +146,7 @@ def test_answering_no_moves_nothing(bench: Any) -> None:
     terminal = Terminal(bench, "run", config).saw("[y/N]")
     os.write(terminal.master, b"\n")
     terminal.saw("nothing moved")
-    assert terminal.started.finished(20.0).code == 0
+    assert terminal.started.finished(20.0).code == 12
     assert bench.disabled()
     assert not (bench.folder / "runs").exists()
 

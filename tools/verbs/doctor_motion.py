@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drivers.drive import CommissioningReport
-from drivers.errors import INTERRUPTED
+from drivers.errors import DECLINED, INTERRUPTED
 from firmware_py.states import Fault
 from tools.configuration.config import Config
 from tools.inspection.drive_scale import judged
@@ -37,7 +37,7 @@ def check_envelope(config: Config, plan: CheckPlan, report: CommissioningReport)
 
 
 def doctor_motion(config: Config, output: Output, *, assume_yes: bool, torque_Nm: float | None = None) -> int:
-    """Commission, tell, ask, pull, judge; 0, or 1 if something is wrong, 130 after an interruption."""
+    """Commission, tell, ask, pull, judge; 0, 1 if something is wrong, 12 if declined, 130 after an interruption."""
     if not assume_yes:
         require_terminal()
     with in_control(config, output) as control:
@@ -74,7 +74,7 @@ def _check(config: Config, output: Output, control: Control, *, assume_yes: bool
         raise
     if result is None:
         output.note(f"nothing moved; {drive_end.words(supervisor.drive_state)}")
-        return 0
+        return DECLINED
     require_off(result.drive_state)
     if result.stopped_by:
         output.note(f"stopped by {result.stopped_by}; the joint is {result.drive_state}; nothing was judged")

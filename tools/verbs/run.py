@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from drivers.drive import CommissioningReport
-from drivers.errors import INTERRUPTED
+from drivers.errors import DECLINED, INTERRUPTED
 from tools.configuration.config import Config
 from tools.output import Output
 from tools.recording.log_folder import log_path
@@ -68,7 +68,7 @@ def run(
         output.note(
             f"dry run: nothing moved; the drive was commissioned; {left}" if dry_run else f"nothing moved; {left}"
         )
-        return 0
+        return 0 if dry_run else DECLINED
     return report_run(result, output, config)
 
 
@@ -86,7 +86,7 @@ def _displays(
     from tools.scoping.order import scope_order
 
     order = scope_order(title, *scope, cia402=not config.is_serial)
-    output.note(f"scope: {order.url}")
+    output.address(f"scope: {order.url}")
     with scope_server(order) as feed:
         feed.settings({"stage": "terminal"})
         yield lambda: Displays([terminal(), feed])

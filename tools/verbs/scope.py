@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drivers.drive import CommissioningReport
-from drivers.errors import INTERRUPTED, JointctlError
+from drivers.errors import DECLINED, INTERRUPTED, JointctlError
 from firmware_py.states import StopRequest
 from tools.output import Output
 from tools.recording.log_folder import log_path
@@ -37,7 +37,7 @@ def scope(path: Path, output: Output, *, host: str = HOST, port: int = PORT) -> 
     """Serve a run log; the page can zoom, but there is nothing to stop.  Returns the exit code."""
     read_run_log(path)  # what is wrong with it is to be told here
     order = scope_order(path.stem, host, port, log=str(path))
-    output.note(f"scope: {order.url}  (Ctrl-C ends it)")
+    output.address(f"scope: {order.url}  (Ctrl-C ends it)")
     from tools.scoping.server import serve
 
     serve(order)
@@ -55,7 +55,7 @@ def live_scope(
     """
     title = run_title(config)
     order = scope_order(title, host, port, cia402=not config.is_serial)
-    output.note(f"scope: {order.url}  (Ctrl-C ends it; nothing moves before Start on the page)")
+    output.address(f"scope: {order.url}  (Ctrl-C ends it; nothing moves before Start on the page)")
     with scope_server(order, in_charge=True, unwatched_s=unwatched_s) as feed:
         runs = _Runs(config, output, feed, title, allow_low_margin=allow_low_margin)
         try:
@@ -97,6 +97,7 @@ class _Runs:
             agreed = confirmed(feed, lines)
             if agreed:
                 prepare_log(self._config, path, output)
+            self.code = 0 if agreed else DECLINED
             return agreed
 
         terminal = run_display(output, self._title)
@@ -115,7 +116,6 @@ class _Runs:
                 finally:
                     self.drive_state, self._ended = supervisor.drive_state, control.signals.count > 0
             if result is None:
-                self.code = 0
                 why = "stopped before it began" if feed.stop_request() else f"not started within {PREPARED_S:g} s"
                 self._tell("declined", [f"{why}; nothing moved; {words(self.drive_state)}"])
                 return False

@@ -14,7 +14,7 @@ from typing import Any
 from rich.table import Table
 
 from drivers.drive import CommissioningReport
-from drivers.errors import INTERRUPTED, MotionFault
+from drivers.errors import DECLINED, INTERRUPTED, MotionFault
 from firmware_py.states import Fault
 from tools.configuration.config import Config
 from tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
@@ -95,10 +95,10 @@ class Sweep:
         self.drive_state = ""
         self._time_offset_s = 0.0
         self._unsettled: dict[int, SweepPoint] = {}
-        self._confirmed = False
+        self._confirmed = self._declined = False
 
     def run(self) -> int:
-        """Returns the exit code: 0, or 130 after an interruption; raises `MotionFault` and the other errors."""
+        """The exit code: 0, 12 if declined, 130 after an interruption; raises `MotionFault` and the other errors."""
         options = self.options
         check_files(self.out, options.resume)
         if options.report is not None:
@@ -194,6 +194,7 @@ class Sweep:
             if not self.options.lockstep:
                 require_ready(self.config, report, log_path(self.config))
             if not (self.options.assume_yes or self.options.lockstep or agreed(self.output)):
+                self._declined = True
                 return False
             self._confirmed = True
         if self.file is None:
@@ -248,7 +249,7 @@ class Sweep:
         if stopped is None:
             left = "nothing moved; " + drive_end.words(self.drive_state)
             self.output.note(f"dry run: {left}" if self.options.dry_run else left)
-            return 0
+            return DECLINED if self._declined else 0
         drive_end.require_off(self.drive_state)
         assert self.file is not None
         done = len(self.file.done)
