@@ -56,8 +56,8 @@ def opened(bench: Any, browser: Browser, *options: str, **changes: Any) -> tuple
     config = bench.config(trajectory__duration_s=0.0, limits__velocity_max_radps=3.0, **changes)
     bench.joint(config)
     port = free_port()
-    scope = bench.start("scope", config, "--port", str(port), *options, env=environment()).saw("scope: http")
-    url = f"http://127.0.0.1:{port}/"
+    scope = bench.start("scope", config, "--port", str(port), *options, env=environment()).saw("token=")
+    url = printed_address(scope)
     give_up = time.monotonic() + 60.0
     while True:
         try:
@@ -69,6 +69,13 @@ def opened(bench: Any, browser: Browser, *options: str, **changes: Any) -> tuple
     tab = browser.open(url)
     state_is(tab, "ready; nothing moves")
     return scope, tab, url
+
+
+def printed_address(scope: Any) -> str:
+    """With its token, as a user copies it from the terminal."""
+    found = re.search(r"scope: (http://\S+)", scope.err)
+    assert found is not None, scope.err
+    return found[1]
 
 
 def start(tab: Tab) -> None:

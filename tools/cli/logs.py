@@ -64,9 +64,7 @@ def report(
 def scope(
     *,
     path: Annotated[Path, typer.Argument(metavar="LOG|CONFIG", help="run log (MCAP), or configuration of a joint")],
-    host: Annotated[
-        str, typer.Option("--host", help="address to serve at; beyond this computer with a token")
-    ] = "127.0.0.1",
+    host: Annotated[str, typer.Option("--host", help="address to serve at")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", help="of the page")] = 8642,
     bus: CanOptions,
     allow_low_margin: AllowLowMargin = False,

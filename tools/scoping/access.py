@@ -1,38 +1,50 @@
-"""Who may see the scope: pages from this computer, or whoever has the token.
+"""Who may see the scope: whoever has the token that jointctl printed, on this computer as elsewhere.
 
-As a plain ASGI layer it sees web sockets as well.  Against pages of other sites in the same browser, the Host must be
-the one that is served and an Origin must be the scope's own.
+As a plain ASGI layer it sees web sockets as well.  Against pages of other sites in the same browser, an Origin must be
+the scope's own; such a page has no cookie of ours either.
 """
 
 from __future__ import annotations
 
+import hashlib
 import secrets
-from collections.abc import Awaitable, Callable, MutableMapping
-from http.cookies import SimpleCookie
+from collections.abc import Awaitable, Callable, Iterator, MutableMapping
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from tools.scoping.order import LOOPBACK
-
-COOKIE = "jointctl_scope"
+COOKIE = "jointctl_scope"  # how their names begin
 Scope = MutableMapping[str, Any]
 Application = Callable[[Scope, Any, Any], Awaitable[None]]
+# the address holds the token: it goes to no other site, and into no cache
+_PRIVATE = ((b"referrer-policy", b"no-referrer"), (b"cache-control", b"no-store"))
 
 
 def allowed(scope: Scope, token: str) -> bool:
-    """Whether a request may pass; `token` "" means that only this computer is served."""
+    """Whether a request may pass: it has the token, in its address or in a cookie."""
     headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope.get("headers", [])}
-    host = headers.get("host", "")
     origin = headers.get("origin", "")
-    if origin and urlsplit(origin).netloc != host:
+    try:
+        if origin and urlsplit(origin).netloc != headers.get("host", ""):
+            return False
+    except ValueError:  # no address at all
         return False
-    if not token:
-        return (urlsplit(f"//{host}").hostname or "") in LOOPBACK
-    given = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [""])[0]
-    cookie = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
-    return any(
-        secrets.compare_digest(word.encode(), token.encode()) for word in (given, cookie.value if cookie else "")
-    )
+    given = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [])
+    words = [*given, *_cookies(headers.get("cookie", ""))]
+    return bool(token) and any(secrets.compare_digest(word.encode(), token.encode()) for word in words)
+
+
+def cookie_name(token: str) -> str:
+    """A name of its own for each server: cookies are for all ports of a computer, and a page must not lose its STOP
+    because another scope was opened in the same browser."""
+    return f"{COOKIE}_{hashlib.sha256(token.encode()).hexdigest()[:8]}"
+
+
+def _cookies(header: str) -> Iterator[str]:
+    """Our values; what other pages of this computer have left beside them does no harm."""
+    for part in header.split(";"):
+        name, _, value = part.strip().partition("=")
+        if name.startswith(COOKIE):
+            yield value
 
 
 class AccessControl:
@@ -51,9 +63,10 @@ class AccessControl:
             return
 
         async def with_cookie(message: MutableMapping[str, Any]) -> None:
-            if message["type"] == "http.response.start" and self._token:
-                value = f"{COOKIE}={self._token}; HttpOnly; SameSite=Strict; Path=/"
-                message["headers"] = [*message.get("headers", []), (b"set-cookie", value.encode())]
+            if message["type"] == "http.response.start":
+                value = f"{cookie_name(self._token)}={self._token}; HttpOnly; SameSite=Strict; Path=/"
+                kept = [(key, found) for key, found in message.get("headers", []) if key.lower() != b"cache-control"]
+                message["headers"] = [*kept, *_PRIVATE, (b"set-cookie", value.encode())]
             await send(message)
 
         await self._app(scope, receive, with_cookie)

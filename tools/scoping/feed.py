@@ -180,13 +180,16 @@ def scope_server(
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     fed = ScopeOrder(**{**asdict(order), "feed_fd": theirs.fileno()})
     process = subprocess.Popen(
-        [sys.executable, "-P", "-m", "tools.scoping.server", json.dumps(asdict(fed))],
+        [sys.executable, "-P", "-m", "tools.scoping.server"],
         pass_fds=(theirs.fileno(),),
-        stdin=subprocess.DEVNULL,
+        stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         start_new_session=True,  # keys that a terminal turns into signals are for the supervisor
     )
     theirs.close()
+    assert process.stdin is not None
+    with contextlib.suppress(OSError), process.stdin:  # a server that ends at once is noticed as any that has ended
+        process.stdin.write(json.dumps(asdict(fed)).encode())  # far less than a pipe holds
     try:
         yield ScopeFeed(ours, in_charge=in_charge, unwatched_s=unwatched_s)
     finally:

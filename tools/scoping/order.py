@@ -9,8 +9,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from drivers.errors import DataError, UsageError
-
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
+from drivers.printable import printable
 
 
 @dataclass(frozen=True)
@@ -20,7 +19,7 @@ class ScopeOrder:
     title: str
     host: str
     port: int
-    token: str  # "" = none is asked for
+    token: str  # without it nothing is shown or taken
     cia402: bool = True
     feed_fd: int = -1  # -1: show `log` instead
     log: str = ""
@@ -29,11 +28,11 @@ class ScopeOrder:
     def url(self) -> str:
         """What to open."""
         host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"http://{host}:{self.port}/" + (f"?token={self.token}" if self.token else "")
+        return f"http://{host}:{self.port}/?token={self.token}"
 
 
 def scope_order(title: str, host: str, port: int, **more: Any) -> ScopeOrder:
-    """A checked order; beyond this computer a token is made.
+    """A checked order with a new token: other users of this computer, too, would reach a page without one.
 
     Raises `UsageError` for a wrong port, `DataError` if the scope cannot be served.
     """
@@ -49,5 +48,4 @@ def scope_order(title: str, host: str, port: int, **more: Any) -> ScopeOrder:
         raise DataError(
             f"the scope cannot be served at {host}:{port}: {error.strerror or error}", "choose another --port"
         ) from None
-    token = "" if host in LOOPBACK else secrets.token_urlsafe(16)
-    return ScopeOrder(title, host, port, token, **more)
+    return ScopeOrder(printable(title), host, port, secrets.token_urlsafe(16), **more)

@@ -1,4 +1,8 @@
-"""The scope's web server: `python -m tools.scoping.server JSON`, started by `run --scope` and by `scope LOG`."""
+"""The scope's web server: `python -m tools.scoping.server`, started by `run --scope` and by `scope CONFIG`.
+
+What it is to serve, and the token that it asks for, come as JSON on its standard input: what stands among the arguments
+or in the environment of a process can be read by others.
+"""
 
 from __future__ import annotations
 
@@ -50,14 +54,14 @@ class Feed(threading.Thread):
             if message[:1] == RECORDS:
                 self._history.take_bytes(message[1:])
             elif message[:1] == EVENT:
-                self._history.events.append(Event(**json.loads(message[1:])))
+                self._history.take_event(Event(**json.loads(message[1:])))
             elif message[:1] == SETTINGS:
                 found = json.loads(message[1:])
                 if found.get("stage") == "running" != self._history.settings.get("stage"):
                     self._history.begin()
                 if found.get("stage", self._history.settings.get("stage")) != self._history.settings.get("stage"):
                     self._stops = 0
-                self._history.settings.update(found)
+                self._history.take_settings(found)
             self._history.heard_s = time.monotonic()
         self._history.ended = True
         time.sleep(_AFTER_END_S)
@@ -85,7 +89,8 @@ def history_of_log(path: str) -> History:
     log = read_run_log(Path(path))
     history = History(max(len(log.records), 1))
     history.take(log.records)
-    history.events.extend(log.events[-EVENTS:])
+    for event in log.events[-EVENTS:]:
+        history.take_event(event)
     history.ended = True
     return history
 
@@ -155,7 +160,7 @@ def serve(order: ScopeOrder) -> None:
 def main() -> int:
     """Entry point of the process."""
     os.nice(NICE)
-    serve(ScopeOrder(**json.loads(sys.argv[1])))
+    serve(ScopeOrder(**json.loads(sys.stdin.buffer.read())))
     return 0
 
 
