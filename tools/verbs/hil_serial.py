@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from drivers.errors import ConfigurationError
+from drivers.errors import ConfigurationError, DataError
 from hil.elmo.device import ElmoDevice
 from hil.elmo.interpreter import ElmoInterpreter
 from hil.plant.joint import plant
@@ -31,15 +33,59 @@ def serve_virtual_elmo(config: Config, link: str | None = None) -> Iterator[Elmo
     """Drive and plant in a thread of this process; `link` is a path that shall point to the port."""
     with new_elmo_device(config) as device:
         if link is not None:
-            with contextlib.suppress(FileNotFoundError):
-                os.unlink(link)
-            os.symlink(device.path, link)
+            _make_link(link, device.path)
         try:
             yield device
         finally:
-            if link is not None:
-                with contextlib.suppress(FileNotFoundError):
+            # by now it may be that of another program
+            if link is not None and _target(link) == device.path:
+                with contextlib.suppress(OSError):
                     os.unlink(link)
+
+
+def _target(link: str) -> str:
+    """Where a link points; empty if there is none."""
+    try:
+        return os.readlink(link)
+    except OSError:
+        return ""
+
+
+def _make_link(link: str, port: str) -> None:
+    """`DataError` where anything but the link of an earlier `hil` of this user has the name: it is left alone."""
+    try:
+        with contextlib.suppress(FileNotFoundError):
+            _require_own_link(link)
+            os.unlink(link)
+        os.symlink(port, link)  # never follows or replaces anything
+    except (OSError, ValueError) as error:  # ValueError: a zero in its name
+        raise DataError(f"--link (={link}): cannot be made: {getattr(error, 'strerror', None) or error}") from None
+
+
+def _require_own_link(link: str) -> None:
+    """A link to a pseudo-terminal, which ended with its `hil` or belongs to this user."""
+    hint = "give a name that is free, or remove what is there by hand"
+    found = os.lstat(link)
+    kind = next((words for is_it, words in _KINDS if is_it(found.st_mode)), "a file")
+    if not stat.S_ISLNK(found.st_mode):
+        raise DataError(f"--link (={link}): is {kind}, and only the link of an earlier hil is replaced", hint)
+    target = os.readlink(link)
+    if found.st_uid != os.getuid() or not _PORT.fullmatch(target):
+        raise DataError(f"--link (={link}): is a link to {target} which no hil of yours has made: left as it is", hint)
+    with contextlib.suppress(FileNotFoundError):
+        if os.stat(target).st_uid != os.getuid():
+            raise DataError(f"--link (={link}): is a link to {target}, the terminal of another user", hint)
+
+
+_PORT = re.compile(r"/dev/pts/[0-9]+")
+_KINDS = (
+    (stat.S_ISREG, "a regular file"),
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+    (stat.S_ISFIFO, "a FIFO"),
+    (stat.S_ISSOCK, "a socket"),
+)
 
 
 def refuse_options(config: Config, *, port: str | None, timing: bool) -> None:
