@@ -82,7 +82,13 @@ def open_python_can(
         if error.errno in (errno.ENODEV, errno.ENOENT, errno.ENXIO):
             raise BusError(f"no such device: {place}", "plug in the adapter") from None
         raise BusError(f"cannot open {place}: {error.strerror or error}") from None
-    except (can.CanError, ValueError, TypeError) as error:
+    except BusError:
+        raise
+    except Exception as error:  # without its maker's library an interface raises NameError, AttributeError, ctypes' own
         if isinstance(error.__cause__, BusError):
             raise error.__cause__ from None
-        raise BusError(f"cannot open {place}: {error}") from None
+        if isinstance(error, (can.CanError, ValueError, TypeError)):
+            raise BusError(f"cannot open {place}: {error}") from None
+        raise BusError(
+            f"cannot open {place}: {type(error).__name__}: {error}", f"is the driver of {interface} installed?"
+        ) from None
