@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from firmware_py.input_file import LARGEST_TABLE_BYTES, number_from, read_input
 from firmware_py.trajectory import ENDS_MEET_rad
 
 COLUMNS = ("time_s", "position_rad")
@@ -19,7 +20,7 @@ COLUMNS = ("time_s", "position_rad")
 
 def _read_text(path: Path) -> str:
     try:
-        content = path.read_bytes()
+        content = read_input(path, LARGEST_TABLE_BYTES)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
     try:
@@ -38,7 +39,7 @@ def _read_text(path: Path) -> str:
 
 def _number(path: Path, row: int, name: str, text: str) -> float:
     try:
-        value = float(text)
+        value = number_from(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):

@@ -15,7 +15,7 @@ from typing import Any
 
 from drivers.errors import UsageError
 from drivers.printable import printable
-from tools.written_file import refuse_overwriting, writing
+from tools.written_file import refuse_overwriting, refuse_special, writing
 
 # the numbers only mark what to replace; near the page's light colours, so that a plain viewer is right as well
 COLOURS = {
@@ -105,11 +105,13 @@ def require_png(path: Path, inputs: Iterable[Path]) -> None:
     if path.suffix.lower() != ".png":
         raise UsageError(f"--figure (={path}) must end in .png")
     refuse_overwriting(path, inputs)
+    refuse_special(path)
 
 
 def save_png(figure: Any, path: Path) -> Path:
     """`png` into a file, whose folder is made; returns the path.  `DataError` if it cannot be written."""
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
+        refuse_special(path)
         path.write_bytes(png(figure))
     return path

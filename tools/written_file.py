@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -27,10 +28,22 @@ def refuse_overwriting(path: Path, inputs: Iterable[Path]) -> None:
         raise DataError(f"{path}: is an input of this command and would be overwritten", "choose another name")
 
 
+def refuse_special(path: Path) -> None:
+    """`DataError` where there is something that is no file: a new file in its place would take its name away."""
+    with writing(path):
+        try:
+            mode = os.stat(path).st_mode
+        except FileNotFoundError:
+            return
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # a folder is refused by what writes
+            raise DataError(f"{path}: is a device, a FIFO or a socket, and only files are written")
+
+
 def require_target(path: Path, inputs: Iterable[Path] = ()) -> None:
-    """As `refuse_overwriting`; `DataError` too if its folder is not there."""
+    """As `refuse_overwriting` and `refuse_special`; `DataError` too if its folder is not there."""
     refuse_overwriting(path, inputs)
-    if not path.parent.is_dir():
+    refuse_special(path)
+    if not os.path.isdir(path.parent):
         raise DataError(f"{path}: cannot be written: no folder {path.parent}")
 
 
@@ -49,13 +62,15 @@ def prepare_target(file: Path | None) -> None:
     if file is None:
         return
     prepare_folder(file.parent)
-    if file.is_dir():
+    if os.path.isdir(file):
         raise DataError(f"{file}: is a folder, not a file to write")
+    refuse_special(file)
 
 
 def replace_file(path: Path, content: bytes, check: Callable[[Path], None] | None = None) -> None:
     """Write a new file beside `path`, let `check` read it, then put it in place in one step."""
     path = path.resolve()
+    refuse_special(path)
     with writing(path):
         handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
     temporary = Path(name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -63,7 +64,7 @@ def config_path(path: Path) -> Path:
     from tools.configuration.load import shipped_config
 
     shipped = shipped_config(str(path))
-    return shipped if not path.exists() and shipped.exists() else path
+    return shipped if not os.path.exists(path) and os.path.exists(shipped) else path
 
 
 def loaded(path: Path, bus: CanOptions | None = None) -> Config:

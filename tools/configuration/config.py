@@ -5,6 +5,7 @@ It is read and checked by `load.load_config`.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -98,4 +99,4 @@ class Config(Section):
 def _beside(config_path: Path, name: str) -> Path:
     own = config_path.parent / name
     shipped = SHIPPED_FOLDER / name
-    return shipped if not own.exists() and shipped.exists() else own
+    return shipped if not os.path.exists(own) and os.path.exists(shipped) else own

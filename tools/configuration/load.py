@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from drivers.errors import ConfigurationError
+from firmware_py.input_file import LARGEST_TABLE_BYTES, LARGEST_TEXT_BYTES, parse_toml, read_input, require_input
 from tools.configuration.checks import problems_between_sections
 from tools.configuration.config import SHIPPED_FOLDER, Config
 from tools.configuration.elmo import with_serial_bus
@@ -31,7 +32,7 @@ def read_text(path: Path) -> str:
     """
     known = ", ".join(sorted(p.stem for p in SHIPPED_FOLDER.glob("*.toml")))
     try:
-        return path.read_bytes().decode("utf-8-sig")
+        return read_input(path).decode("utf-8-sig")
     except FileNotFoundError:
         raise ConfigurationError(f"{path}: no such file", f"shipped configurations: {known}") from None
     except IsADirectoryError:
@@ -47,7 +48,7 @@ def load_config(path: str | Path) -> Config:
     path = Path(path)
     text = read_text(path)
     try:
-        data = tomllib.loads(text)
+        data = parse_toml(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigurationError(f"{path}: not valid TOML: {error}") from None
     config = _validated(data, str(path))
@@ -59,8 +60,14 @@ def load_config(path: str | Path) -> Config:
         ("joint_encoder.eds", config.encoder_eds_path),
         ("trajectory.file", config.table_path),
     ):
-        if file is not None and not file.is_file():
+        if file is None:
+            continue
+        if not os.path.isfile(file):
             raise_if([f"{path}: {key} (={file.name}) must name a file beside the configuration or a shipped one"])
+        try:
+            require_input(file, LARGEST_TABLE_BYTES if key == "trajectory.file" else LARGEST_TEXT_BYTES)
+        except OSError as error:
+            raise_if([f"{path}: {key} (={file.name}): cannot be read: {error.strerror or error}"])
     return config
 
 

@@ -19,6 +19,7 @@ from drivers.can.open import SHARED_INTERFACES
 from drivers.canopen.identifiers import HIGHEST_NODE
 from drivers.elmo.port import SERIAL
 from drivers.errors import ConfigurationError
+from firmware_py.input_file import parse_toml, read_input
 from tools.configuration.elmo import BAUD_RATES_TEXT, KIND, BAUD_RATES_bitps
 
 REPLY_TIMEOUT_S = 0.2
@@ -71,7 +72,7 @@ class GivenTarget:
 def readable_keys(text: str) -> dict[str, dict[str, Any]]:
     """Sections and keys of a TOML file; where it is none as a whole, every line that is a key of its own."""
     try:
-        data = tomllib.loads(text)
+        data = parse_toml(text)
     except tomllib.TOMLDecodeError:
         data = {}
         section: dict[str, Any] = {}
@@ -81,7 +82,7 @@ def readable_keys(text: str) -> dict[str, dict[str, Any]]:
                 section = data.setdefault(heading[1], {})
                 continue
             with contextlib.suppress(tomllib.TOMLDecodeError):
-                section.update(tomllib.loads(line))
+                section.update(parse_toml(line))
     return {name: found for name, found in data.items() if isinstance(found, dict)}
 
 
@@ -116,7 +117,7 @@ def stop_target(
     """Flag beats environment (CAN_INTERFACE, _CHANNEL, _BITRATE) beats file; `ConfigurationError`: what is missing."""
     given, environ = given or GivenTarget(), os.environ if environ is None else environ
     try:
-        sections = readable_keys(path.read_bytes().decode("utf-8-sig", "replace"))
+        sections = readable_keys(read_input(path).decode("utf-8-sig", "replace"))
     except OSError as error:
         sections = {}
         unread = f"{path}: cannot be read: {error.strerror or error}; "

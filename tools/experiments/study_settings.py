@@ -22,6 +22,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field, ValidationError
 
 from drivers.errors import ConfigurationError
+from firmware_py.input_file import parse_toml, read_input
 from tools.configuration.problems import suggestion
 from tools.configuration.sections import Section, between
 from tools.experiments.controllers import DEFAULT, Controller, changed, named, one_line
@@ -49,7 +50,7 @@ class StudySettings(Section):
 def load_study(path: Path) -> StudySettings:
     """Read and check a study file; names of files in it are relative to the working folder."""
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        data = parse_toml(read_input(path).decode("utf-8-sig"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise ConfigurationError(f"{path}: cannot be read as TOML: {reason}") from None

@@ -8,7 +8,7 @@ import numpy as np
 
 from firmware_py.friction import DEGREE
 from tools.drawing import BLUE, GREY, ORANGE, RED, canvas
-from tools.identification.friction_data import FrictionData
+from tools.identification.friction_data import FrictionData, relative_errors
 from tools.identification.models import Branch
 from tools.identification.result import DIRECTIONS, Identification
 
@@ -72,9 +72,11 @@ def _paint_fit(
             )  # fmt: skip
         velocity = data.velocity_radps[chosen]
         error = data.motor_torque_Nm[chosen] - sign * found.torque_Nm(np.abs(velocity))
-        relative = 100.0 * np.abs(error / data.motor_torque_Nm[chosen])
+        relative = 100.0 * np.abs(relative_errors(error, data.motor_torque_Nm[chosen]))
+        there = relative[np.isfinite(relative)]
         # one point near zero torque must not flatten all the others
-        worst = max(worst, min(float(relative.max()), 2.0 * float(np.percentile(relative, 99))))
+        if len(there):
+            worst = max(worst, min(float(there.max()), 2.0 * float(np.percentile(there, 99))))
         axes[1].vlines(velocity / DEGREE, 0.0, 1e3 * error, color=BLUE, linewidth=0.7, alpha=0.5)
         axes[1].plot(velocity / DEGREE, 1e3 * error, "o", color=BLUE, markersize=2.6)
         axes[2].plot(velocity / DEGREE, relative, "o", color=BLUE, markersize=2.6)

@@ -8,6 +8,7 @@ settled are left out.  All of this is told in `notes`.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from drivers.errors import DataError
 from tools.identification.table_file import TableFile
 
 MIN_PER_DIRECTION = 12
+LEAST_TORQUE_Nm, LEAST_SHARE = 1e-12, 1e-6  # of a point, absolute and of the greatest, that has a relative error
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,23 @@ def tidied(data: FrictionData, *, ordered: bool) -> FrictionData:
         data, velocity_radps=speeds, motor_torque_Nm=data.motor_torque_Nm[index], line=data.line[index],
         settled=data.settled[index], notes=tuple(notes),
     )  # fmt: skip
+
+
+def relative_errors(errors_Nm: np.ndarray, measured_Nm: np.ndarray) -> np.ndarray:
+    """errors / measured, shape (N,); nan where next to nothing was measured, of which no error is a share."""
+    least_Nm = max(LEAST_TORQUE_Nm, LEAST_SHARE * float(np.max(np.abs(measured_Nm), initial=0.0)))
+    found = np.full(len(errors_Nm), np.nan)
+    np.divide(errors_Nm, measured_Nm, out=found, where=np.abs(measured_Nm) >= least_Nm)
+    return found
+
+
+def relative_figures(errors_Nm: np.ndarray, measured_Nm: np.ndarray) -> tuple[float, float, float]:
+    """RMS, greatest and mean of the relative errors that there are; nan without any."""
+    relative = relative_errors(errors_Nm, measured_Nm)
+    relative = relative[np.isfinite(relative)]
+    if not len(relative):
+        return math.nan, math.nan, math.nan
+    return float(np.sqrt(np.mean(relative**2))), float(np.max(np.abs(relative))), float(np.mean(relative))
 
 
 def _lines(numbers: np.ndarray) -> str:

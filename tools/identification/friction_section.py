@@ -14,6 +14,7 @@ from tomlkit.exceptions import TOMLKitError
 
 from drivers.errors import ConfigurationError
 from firmware_py.friction import DEGREE
+from firmware_py.input_file import read_input
 from tools.configuration.load import load_config
 from tools.configuration.problems import ConfigurationProblems
 from tools.identification.models import Branch
@@ -85,9 +86,11 @@ def with_section(text: str, values: dict[str, Any], remarks: list[str]) -> str:
 def write_into(config_path: Path, values: dict[str, Any], remarks: list[str]) -> None:
     """Put the section into a configuration; if the result is not valid, `ConfigurationError`, and the file stays."""
     try:
-        text = config_path.read_bytes().decode("utf-8-sig")
+        text = read_input(config_path).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{config_path}: cannot be read: {error}") from None
+        raise ConfigurationError(
+            f"{config_path}: cannot be read: {getattr(error, 'strerror', None) or error}"
+        ) from None
     try:
         changed = with_section(text, values, remarks)
     except ConfigurationError as error:

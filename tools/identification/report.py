@@ -8,6 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from firmware_py.friction import DEGREE
+from tools.identification.friction_data import relative_figures
 from tools.identification.intervals import NAMES
 from tools.identification.models import FORMS
 from tools.identification.result import DIRECTIONS, Identification
@@ -72,11 +73,11 @@ def error_table(errors_Nm: np.ndarray, measured_Nm: np.ndarray, ratio: float) ->
     table = Table(title="Error", title_justify="left")
     for title in ("", "motor, mNm", "joint, Nm", "relative"):
         table.add_column(title, justify="right" if title else "left")
-    relative = errors_Nm / measured_Nm
+    rms, greatest, mean = relative_figures(errors_Nm, measured_Nm)
     for word, value, share in (
-        ("RMSE", np.sqrt(np.mean(errors_Nm**2)), np.sqrt(np.mean(relative**2))),
-        ("greatest", np.max(np.abs(errors_Nm)), np.max(np.abs(relative))),
-        ("mean", np.mean(errors_Nm), np.mean(relative)),
+        ("RMSE", np.sqrt(np.mean(errors_Nm**2)), rms),
+        ("greatest", np.max(np.abs(errors_Nm)), greatest),
+        ("mean", np.mean(errors_Nm), mean),
     ):
         # a fit's mean error is rounding noise: zero, in the digits that mean something
         motor_mNm, joint_Nm = round(1e3 * value, 9), round(ratio * value, 9)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tools.identification.friction_data import FrictionData
+from tools.identification.friction_data import FrictionData, relative_figures
 from tools.identification.intervals import Uncertainty
 from tools.identification.models import Branch
 from tools.identification.options import Options
@@ -71,12 +71,13 @@ class Identification:
     def to_dict(self) -> dict[str, Any]:
         """Everything as numbers, texts, lists and dicts; parameters mirrored, joint rad/s and motor Nm."""
         errors, swarm = self.errors_Nm, self.options.swarm
+        relative = relative_figures(errors, self.measured_Nm)
         return {
             "data": str(self.data.path), "data_sha256": self.data.sha256, "model": self.model,
             "reduction_ratio": self.data.reduction_ratio, "points": len(errors),
             "rmse_Nm": self.rmse_Nm, "max_error_Nm": float(np.max(np.abs(errors))),
-            "relative_rmse": float(np.sqrt(np.mean((errors / self.measured_Nm) ** 2))),
-            "relative_max_error": float(np.max(np.abs(errors / self.measured_Nm))),
+            "relative_rmse": relative[0],
+            "relative_max_error": relative[1],
             "held_out_rmse_Nm": self.held_out_by_model_Nm[self.model],
             "projected_rmse_Nm": self.projected_rmse_Nm,
             "models": {

@@ -13,7 +13,6 @@ friction opposes motion (torque and velocity have the same sign).
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from drivers.errors import DataError, UsageError
+from firmware_py.input_file import parse_json
 from tools.identification.foreign_table import ForeignFormat
 from tools.identification.friction_data import FrictionData, from_table, numbers
 from tools.identification.table_file import TableFile, read_bytes
@@ -54,7 +54,7 @@ def _sidecar(path: Path) -> dict[str, Any]:
     if not beside.exists():
         raise DataError(f"{beside}: missing: the sidecar of the sweep holds the ratio", "or give --ratio")
     try:
-        content = json.loads(read_bytes(beside).decode("utf-8"))
+        content = parse_json(read_bytes(beside).decode("utf-8"))
     except (ValueError, UnicodeDecodeError) as error:
         raise DataError(f"{beside}: not valid JSON: {error}") from None
     if not isinstance(content, dict):

@@ -12,9 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.errors import DataError, UsageError
+from firmware_py.input_file import LARGEST_TABLE_BYTES, number_from, read_input
 
 DELIMITERS = {"auto": "", "comma": ",", "semicolon": ";", "tab": "\t", "space": " ", ",": ",", ";": ";", "\t": "\t"}
-_MAX_BYTES = 64 * 2**20
+
+
+LARGEST_NUMBER = 1e100  # whatever it means, its squares are numbers as well
 
 
 @dataclass(frozen=True)
@@ -46,22 +49,20 @@ class TableFile:
         if not text and empty is not None:
             return empty
         try:
-            value = float(text.replace(",", ".") if self.decimal_comma else text)
+            value = number_from(text.replace(",", ".") if self.decimal_comma else text)
         except ValueError:
             value = math.nan
-        if not math.isfinite(value):
+        if not abs(value) <= LARGEST_NUMBER:
             raise DataError(
                 f"{self.path}: line {line}: {self.columns[index]} (={text[:40] or 'empty'}) must be a finite number"
+                + (f", at most {LARGEST_NUMBER:g}" if math.isfinite(value) else "")
             )
         return value
 
 
 def read_bytes(path: Path) -> bytes:
     try:
-        size = path.stat().st_size
-        if size > _MAX_BYTES:
-            raise DataError(f"{path}: {size} bytes must be at most {_MAX_BYTES}: not a table of a friction sweep")
-        return path.read_bytes()
+        return read_input(path, LARGEST_TABLE_BYTES)
     except FileNotFoundError:
         raise DataError(f"{path}: no such file") from None
     except IsADirectoryError:
@@ -126,7 +127,7 @@ def read_table(path: Path, delimiter: str = "auto") -> TableFile:
 
 def _is_number(text: str) -> bool:
     try:
-        float(text)
+        number_from(text)
     except ValueError:
         return False
     return True

@@ -13,6 +13,7 @@ from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 from drivers.canopen.eds_file import read_eds
 from drivers.canopen.object_access import object_name
 from drivers.errors import ConfigurationError
+from firmware_py.input_file import require_input
 from tools.inspection import drive_words
 from tools.inspection.standard_objects import standard_variable
 from tools.running.events.emergency_text import emergency_text
@@ -25,6 +26,10 @@ _LONGEST_SHOWN = 32  # bytes of a domain
 
 def read_dictionary(path: Path, node: int) -> canopen.ObjectDictionary:
     """The objects of an EDS or DCF; `ConfigurationError` if it cannot be read."""
+    try:
+        require_input(path)
+    except OSError as error:
+        raise ConfigurationError(f"{path}: is not a readable EDS file: {error.strerror or error}") from None
     return read_eds(path, node).dictionary
 
 

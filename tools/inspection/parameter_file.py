@@ -17,6 +17,7 @@ import canopen
 import tomlkit
 
 from drivers.errors import DataError
+from firmware_py.input_file import parse_toml, read_input
 from tools.inspection.objects import Objects, Place, read_dictionary
 from tools.inspection.parameters import ParameterSet, Value, shown, variables
 
@@ -30,7 +31,8 @@ def is_parameter_file(path: Path) -> bool:
     if path.suffix.lower() in _DICTIONARIES:
         return True
     try:
-        return path.is_file() and str(tomllib.loads(path.read_text("utf-8")).get("format", "")).startswith(FORMAT[:-2])
+        data = parse_toml(read_input(path).decode("utf-8"))
+        return str(data.get("format", "")).startswith(FORMAT[:-2])
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
         return False
 
@@ -59,13 +61,15 @@ def _from_toml(raw: Any, key: str, path: Path) -> Value:
 
 def load_parameters(path: Path, node: int = 1) -> ParameterSet:
     """A TOML, DCF or EDS file; `DataError` if it is none.  `node` is put where a DCF says $NODEID."""
-    if not path.is_file():
-        raise DataError(f"{path}: no such file")
     if path.suffix.lower() in _DICTIONARIES:
         return _load_dictionary(path, node)
     try:
-        data = tomllib.loads(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        data = parse_toml(read_input(path).decode("utf-8"))
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file") from None
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise DataError(f"{path}: cannot be read: {error}") from None
     if data.get("format") != FORMAT:
         raise DataError(f'{path}: format (={data.get("format")}) must be "{FORMAT}"')

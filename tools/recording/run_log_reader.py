@@ -15,6 +15,7 @@ from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 
 from drivers.errors import DataError
+from firmware_py.input_file import LARGEST_LOG_BYTES, open_input
 from firmware_py.records import LogRecord
 from firmware_py.schema import dtype_of
 from tools.recording.can_log import CAN_FRAME, CAN_TOPIC
@@ -56,7 +57,7 @@ def read_run_log(path: str | Path) -> RunLog:
     """Everything in a run log; `DataError` if it is not one. A cut-off tail is left out (`complete` is False)."""
     path = Path(path)
     try:
-        with path.open("rb") as file:
+        with open_input(path, LARGEST_LOG_BYTES) as file:
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise DataError(f"{path}: is not an MCAP file")
             file.seek(0)

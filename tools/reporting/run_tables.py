@@ -6,6 +6,7 @@ import tomllib
 from collections.abc import Sequence
 from typing import Any
 
+from firmware_py.input_file import parse_toml
 from firmware_py.states import Fault
 from tools.recording.log_facts import began_at, event_rows, missing_in
 from tools.recording.run_log_reader import RunLog
@@ -18,7 +19,7 @@ _EVENTS_SHOWN = 300
 
 def _configuration(log: RunLog) -> dict[str, Any]:
     try:
-        return tomllib.loads(log.metadata.get("run", {}).get("configuration", ""))
+        return parse_toml(log.metadata.get("run", {}).get("configuration", ""))
     except tomllib.TOMLDecodeError:
         return {}
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.errors import DataError
+from firmware_py.input_file import LARGEST_TABLE_BYTES, parse_json, read_input
 from tools.identification.sweep_file import SWEEP_COLUMNS, sidecar_contents
 from tools.sweeping.meter import MeasuredPoint
 from tools.written_file import writing
@@ -82,8 +83,8 @@ class SweepFile:
         """The files of an interrupted sweep of the same plan."""
         beside = path.with_suffix(".json")
         try:
-            sidecar = json.loads(beside.read_text(encoding="utf-8"))
-            lines = path.read_text(encoding="ascii").splitlines(keepends=True)
+            sidecar = parse_json(read_input(beside).decode("utf-8"))
+            lines = read_input(path, LARGEST_TABLE_BYTES).decode("ascii").splitlines(keepends=True)
         except OSError as error:
             raise DataError(
                 f"{error.filename}: cannot be read: {error.strerror or error}", "--resume needs it"

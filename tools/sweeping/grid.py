@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.errors import DataError, UsageError
+from firmware_py.input_file import number_from, read_input
 
 GRIDS = ("near-zero", "linear", "log", "list")
 DEFAULT_POINTS = 225
@@ -59,7 +60,7 @@ def grid_speeds(grid: str, count: int, slowest_radps: float, fastest_radps: floa
 def listed_velocities(path: Path) -> list[float]:
     """Velocities [rad/s] of a file, one a line; `#` comments and the heading velocity_radps are allowed."""
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        text = read_input(path).decode("utf-8-sig")
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
     except UnicodeDecodeError as error:
@@ -70,7 +71,7 @@ def listed_velocities(path: Path) -> list[float]:
         if not word or word == "velocity_radps":
             continue
         try:
-            value = float(word)
+            value = number_from(word)
         except ValueError:
             value = math.nan
         if not math.isfinite(value) or value == 0.0:

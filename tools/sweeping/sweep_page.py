@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import csv
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.table import Table as TerminalTable
 
+from firmware_py.input_file import LARGEST_TABLE_BYTES, parse_json, read_input
 from tools.drawing import BLUE, ORANGE, RED
 from tools.output import Output
 from tools.reporting.figure import draw
@@ -19,10 +19,9 @@ from tools.reporting.verb_page import from_terminal, write_verb_page
 
 def write_sweep_page(path: Path, data: Path, summary: TerminalTable, output: Output) -> None:
     """`summary` is the table that the terminal shows; the points come from the CSV file `data`, its JSON beside it."""
-    with data.open(encoding="ascii", newline="") as stream:
-        rows = list(csv.DictReader(stream))
+    rows = list(csv.DictReader(read_input(data, LARGEST_TABLE_BYTES).decode("ascii").splitlines()))
     beside = data.with_suffix(".json")
-    about = json.loads(beside.read_text(encoding="utf-8"))
+    about = parse_json(read_input(beside).decode("utf-8"))
     blocks: list[Block] = [_figure(rows)] if rows else []
     tones = {i: "warning" for i, row in enumerate(rows) if row["settled"] == "0"}
     warm = any(row["temperature_degC"] for row in rows)

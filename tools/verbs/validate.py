@@ -13,7 +13,7 @@ from tools.configuration.load import load_config
 from tools.drawing import png, require_png
 from tools.identification.figures import fit_figure
 from tools.identification.foreign_table import ForeignFormat
-from tools.identification.friction_data import FrictionData
+from tools.identification.friction_data import FrictionData, relative_figures
 from tools.identification.friction_file import read_friction_data
 from tools.identification.models import Branch
 from tools.identification.plausibility import check_data
@@ -76,14 +76,14 @@ def validate(
         output.note(f"{data_path}: {note}")
     for warning in warnings:
         output.warning(warning)
-    relative = errors / measured
+    relative_rmse, relative_worst, _ = relative_figures(errors, measured)
     output.result(
         error_table(errors, measured, data.reduction_ratio),
         {
             "config": str(config_path), "data": str(data_path), "data_sha256": data.sha256, "points": len(errors),
             "rmse_Nm": float(np.sqrt(np.mean(errors**2))), "max_error_Nm": float(np.max(np.abs(errors))),
-            "mean_error_Nm": float(np.mean(errors)), "relative_rmse": float(np.sqrt(np.mean(relative**2))),
-            "relative_max_error": float(np.max(np.abs(relative))), "warnings": warnings, "notes": list(data.notes),
+            "mean_error_Nm": float(np.mean(errors)), "relative_rmse": relative_rmse,
+            "relative_max_error": relative_worst, "warnings": warnings, "notes": list(data.notes),
             "picture": str(figure),
         },
     )  # fmt: skip

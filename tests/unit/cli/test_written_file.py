@@ -12,7 +12,7 @@ from drivers.errors import DataError
 from tools.experiments.study_settings import StudySettings
 from tools.output import Output
 from tools.verbs import study as study_module
-from tools.written_file import prepare_folder, prepare_target
+from tools.written_file import prepare_folder, prepare_target, replace_file, require_target
 
 
 def test_a_folder_is_made_and_one_that_is_there_stays(tmp_path: Path) -> None:
@@ -42,3 +42,19 @@ def test_a_study_is_not_begun(key: str, tmp_path: Path, monkeypatch: pytest.Monk
     folder.mkdir()
     with pytest.raises(DataError, match="is a folder"):
         study_module.study(StudySettings(), output, **{key: folder})
+
+
+@pytest.mark.parametrize("kind", ["fifo", "device"])
+def test_what_is_no_file_is_not_replaced_by_one(tmp_path: Path, kind: str) -> None:
+    """As root, a new /dev/null would be an ordinary file."""
+    path = tmp_path / "out.png"
+    if kind == "fifo":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/null")
+    before = os.stat(path)
+    for refused in (require_target, prepare_target, lambda target: replace_file(target, b"x")):
+        with pytest.raises(DataError, match="is a device, a FIFO or a socket, and only files are written"):
+            refused(path)
+    after = os.stat(path)
+    assert (after.st_ino, after.st_mode) == (before.st_ino, before.st_mode)
