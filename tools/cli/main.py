@@ -32,7 +32,8 @@ from tools.cli.options import (
     config_path,
     loaded,
 )
-from tools.cli.standard_streams import occupy_standard_streams
+from tools.cli.standard_streams import never_refuse_a_character, occupy_standard_streams
+from tools.cli.unexpected_end import end_unexpected
 from tools.output import Output, abandon, let_go
 
 EPILOG = (
@@ -257,6 +258,7 @@ def _refuse_usage(error: Any) -> None:
 def main() -> None:
     """Run a verb; every known error is one line and its own exit code."""
     occupy_standard_streams()
+    never_refuse_a_character()
     atexit.register(let_go, sys.stderr)
     _start_quickly()
     try:
@@ -269,7 +271,7 @@ def main() -> None:
         sys.exit(UsageError.exit_code)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise
+            end_unexpected(error)
         Output().error(f"{error.filename or 'a file or the output'}: cannot be written: {error.strerror}")
         if error.filename is None:
             abandon(sys.stdout)
@@ -277,3 +279,5 @@ def main() -> None:
     except (KeyboardInterrupt, typer.Abort):
         Output().note("interrupted")
         sys.exit(INTERRUPTED)
+    except Exception as error:
+        end_unexpected(error)

@@ -6,8 +6,16 @@ lands in it: in a CAN socket or a log.
 
 from __future__ import annotations
 
+import io
 import os
 import sys
+
+
+def never_refuse_a_character() -> None:
+    """What the encoding of a terminal lacks (`LANG=C`) is escaped instead of ending the program."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def occupy_standard_streams() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import signal
 import sys
@@ -22,6 +23,7 @@ def _mark_as_starting() -> None:
     if controlling and "--lockstep" not in words and hasattr(os, "memfd_create"):
         with contextlib.suppress(OSError):  # a system without it has no lock either
             os.memfd_create(STARTING)
+FREE_DESCRIPTORS = 32  # that must be left: a run takes about 20, a library that gets none fails or hangs where it likes
 
 
 def main() -> None:
@@ -30,8 +32,29 @@ def main() -> None:
     ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # a script's background job ignores it
     if ours:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+    _require_descriptors()
     from tools.cli.main import main as run
 
     if ours:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     run()
+
+
+def _require_descriptors() -> None:
+    """Ends the program where too few files can be opened; a stop is tried all the same."""
+    if sys.argv[1:2] == ["stop"]:
+        return
+    opened: list[int] = []
+    try:
+        while len(opened) < FREE_DESCRIPTORS:
+            opened.append(os.open("/dev/null", os.O_RDONLY | os.O_CLOEXEC))
+    except OSError as error:
+        if error.errno in (errno.EMFILE, errno.ENFILE):
+            sys.stderr.write(
+                f"error: open files: {len(opened)} more may be opened, at least {FREE_DESCRIPTORS} are needed\n"
+                "hint: raise the limit, such as `ulimit -n 1024`\n"
+            )
+            sys.exit(1)
+    finally:
+        for descriptor in opened:
+            os.close(descriptor)
