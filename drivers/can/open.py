@@ -13,6 +13,7 @@ from typing import Any
 import can
 
 from drivers.can import serial_adapter, socketcan, virtual_bus
+from drivers.can.channel import check_options, split_channel
 from drivers.can.foreign_bus import tamed
 from drivers.errors import BusError
 
@@ -48,16 +49,19 @@ def open_python_can(
 ) -> can.BusABC:
     """A python-can bus; everything that can go wrong while opening it becomes a BusError.
 
-    `bitrate` [bit/s] is passed on where given; SocketCAN and the virtual bus ignore it.  `settings` go to the
-    interface unchanged.  The interface "jointctl" works even where the package is not installed.  `exclusive` False
-    is for whoever has to switch the drive off whoever has the serial adapter.
+    `bitrate` [bit/s] is passed on where given; SocketCAN and the virtual bus ignore it.  `settings`, and the options in
+    `channel` (`drivers.can.channel`), go to the interface.  The interface "jointctl" works even where the package is
+    not installed.  `exclusive` False is for whoever has to switch the drive off whoever has the serial adapter.
     """
+    place = f"{interface}:{channel}"
+    channel, options = split_channel(channel)
     if bitrate is not None:
         settings["bitrate"] = bitrate
     if interface == "slcan":
         settings.setdefault("sleep_after_open", SLCAN_SETTLE_S)
-    place = f"{interface}:{channel}"
     try:
+        check_options(interface, options)
+        settings |= options
         if interface == "jointctl":
             return virtual_bus.VirtualBus(channel, **settings)
         if interface == "socketcan":

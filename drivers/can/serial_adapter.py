@@ -7,13 +7,14 @@ import fcntl
 import os
 from collections.abc import Iterator
 
+from drivers.can.channel import split_channel
 from drivers.errors import BusError
 from drivers.port_users import users_text
 
 
 def port_path(channel: str) -> str:
     """The device file of `/dev/ttyACM0@115200`, as python-can writes port and baud rate."""
-    return channel.partition("@")[0]
+    return split_channel(channel)[0].partition("@")[0]
 
 
 @contextlib.contextmanager

@@ -13,7 +13,10 @@ if TYPE_CHECKING:
     from tools.configuration.config import Config
 
 Interface = Annotated[str | None, typer.Option("-i", "--interface", help="python-can interface (env CAN_INTERFACE)")]
-Channel = Annotated[str | None, typer.Option("-c", "--channel", help="bus channel (env CAN_CHANNEL)")]
+Channel = Annotated[
+    str | None,
+    typer.Option("-c", "--channel", help="bus channel, with options: can0,host=...,port=... (env CAN_CHANNEL)"),
+]
 Bitrate = Annotated[int | None, typer.Option("-b", "--bitrate", help="bit/s (env CAN_BITRATE)")]
 Port = Annotated[str | None, typer.Option("-p", "--port", help="serial port of an elmo_serial drive")]
 Target = Annotated[

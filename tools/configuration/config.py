@@ -9,9 +9,10 @@ import os
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, PrivateAttr
+from pydantic import AfterValidator, Field, PrivateAttr
 
 from drivers.errors import ConfigurationError
+from tools.configuration.bus_options import whole_channel
 from tools.configuration.elmo import ElmoSerial
 from tools.configuration.joint_encoder import JointEncoder
 from tools.configuration.plant import Virtual
@@ -38,7 +39,7 @@ SHIPPED_FOLDER = Path(__file__).resolve().parents[2] / "configs"
 class Config(Section):
     """One joint, its drive and what it shall do; [virtual] only matters on the virtual bus."""
 
-    bus: Bus
+    bus: Annotated[Bus, AfterValidator(whole_channel)]
     drive: Annotated[Drive | ElmoSerial, Field(discriminator="kind")]
     encoder: Encoder
     joint: Joint

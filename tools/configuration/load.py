@@ -9,9 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
+from pydantic_core import PydanticCustomError
 
+from drivers.can.channel import split_channel
 from drivers.errors import ConfigurationError
 from firmware_py.input_file import LARGEST_TABLE_BYTES, LARGEST_TEXT_BYTES, parse_toml, read_input, require_input
+from tools.configuration.bus_options import whole_channel
 from tools.configuration.checks import problems_between_sections
 from tools.configuration.config import SHIPPED_FOLDER, Config
 from tools.configuration.elmo import with_serial_bus
@@ -94,11 +97,16 @@ def with_bus_overrides(
         except ValueError:
             value = environ["CAN_BITRATE"]
             raise ConfigurationError(f"environment: CAN_BITRATE (={value}) must be a whole number of bit/s") from None
-    bus["interface"] = interface or environ.get("CAN_INTERFACE") or bus["interface"]
+    own = bus["interface"]
+    bus["interface"] = interface or environ.get("CAN_INTERFACE") or own
+    if bus["interface"] != own:  # what the file says besides is for the interface of the file
+        bus["channel"], bus["options"] = split_channel(bus["channel"])[0], None
     bus["channel"] = channel or environ.get("CAN_CHANNEL") or bus["channel"]
     bus["bitrate_bitps"] = bus["bitrate_bitps"] if bitrate is None else bitrate
     try:
-        return config.model_copy(update={"bus": Bus.model_validate(bus)})
+        return config.model_copy(update={"bus": whole_channel(Bus.model_validate(bus))})
+    except PydanticCustomError as error:
+        raise ConfigurationProblems([f"{origin}: bus.{error.message()}"]) from None
     except ValidationError as error:
         lines = [problem_line(e, bus, ("bus",)) for e in error.errors(include_url=False)]
         raise ConfigurationProblems([f"{origin}: {line}" for line in lines]) from None

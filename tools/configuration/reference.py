@@ -89,6 +89,8 @@ def type_and_range(annotation: Any, metadata: tuple[Any, ...] = ()) -> tuple[str
     if origin is Literal:
         return "text", ", ".join(f"`{value}`" for value in get_args(annotation))
     allowed = ", ".join(rule.allowed for rule in rules)
+    if origin is dict:
+        return "table", allowed
     if origin is tuple:
         return "list", allowed
     return TYPES[annotation], allowed

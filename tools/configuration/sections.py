@@ -15,6 +15,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from pydantic_core import PydanticCustomError
 
 from firmware_py.records import NEURONS
+from tools.configuration.bus_options import ALLOWED, checked_options
 from tools.configuration.object_place import ObjectPlace
 
 
@@ -112,6 +113,8 @@ class Bus(Section):
     # as the interface names it: can0, PCAN_USBBUS1; the virtual bus' own name
     channel: Annotated[str, Field(min_length=1)]
     bitrate_bitps: Annotated[int, between(10_000, 1_000_000)]  # must be the drive's; 1 kHz needs 500 kbit/s or more
+    # what the interface needs besides, such as `{ host = "192.168.1.5", port = 29536 }` for socketcand
+    options: Annotated[dict[str, Any], BeforeValidator(Rule(ALLOWED, checked_options))] | None = None
 
 
 class Drive(Section):

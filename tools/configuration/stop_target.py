@@ -15,11 +15,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drivers.can.open import SHARED_INTERFACES
+from pydantic_core import PydanticCustomError
+
+from drivers.can.channel import split_channel, with_options
+from drivers.can.open import CYCLIC_INTERFACES, SHARED_INTERFACES
 from drivers.canopen.identifiers import HIGHEST_NODE
 from drivers.elmo.port import SERIAL
 from drivers.errors import ConfigurationError
 from firmware_py.input_file import parse_toml, read_input
+from tools.configuration.bus_options import checked_options
 from tools.configuration.elmo import BAUD_RATES_TEXT, KIND, BAUD_RATES_bitps
 
 REPLY_TIMEOUT_S = 0.2
@@ -143,6 +147,10 @@ def stop_target(
     interface = _required(f"{unread}bus.interface", interfaces, _text, "a text in quotes")
     channels = [given.channel, environ.get("CAN_CHANNEL") or None, bus.get("channel")]
     channel = _required(f"{unread}bus.channel", channels, _text, "a text in quotes")
+    if interface == bus.get("interface") and interface not in CYCLIC_INTERFACES:
+        channel, inline = split_channel(channel)
+        with contextlib.suppress(PydanticCustomError):  # without them rather than not at all
+            channel = with_options(channel, {**(checked_options(bus.get("options")) or {}), **inline})
     node = _required(
         f"{unread}drive.node", [given.node, drive.get("node")], lambda n: _whole(n, 1, HIGHEST_NODE), "in [1..127]"
     )
