@@ -6,8 +6,11 @@ interface of python-can serves for commissioning and for the plain Python loop.
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import logging
 import socket
+from collections.abc import Iterator
 from typing import Any
 
 import can
@@ -44,6 +47,19 @@ def known_interface(interface: str) -> None:
         raise BusError(f"interface (={interface!r}) must be one of {', '.join(sorted(names))}")
 
 
+@contextlib.contextmanager
+def _without_its_log() -> Iterator[None]:
+    """What python-can and its interfaces log while they open comes as an exception as well: one line is enough."""
+    log = logging.getLogger("can")
+    level = log.level
+    log.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
+
+
+@_without_its_log()
 def open_python_can(
     interface: str, channel: str, bitrate: int | None = None, *, exclusive: bool = True, **settings: Any
 ) -> can.BusABC:

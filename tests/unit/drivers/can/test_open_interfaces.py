@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import logging
 from typing import Any
 
 import can
@@ -15,6 +16,21 @@ from drivers.errors import BusError
 
 # these open something on any computer
 WORKING = {"virtual", "udp_multicast", "jointctl"}
+
+
+def test_what_an_interface_logs_is_told_once(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = logging.getLogger("can.somewhere")
+
+    def fail(*_: Any, **__: Any) -> None:
+        log.warning("Failed to connect")
+        raise can.CanInitializationError("Failed to connect")
+
+    monkeypatch.setattr(open_module.can, "Bus", fail)
+    with pytest.raises(BusError, match="Failed to connect"):
+        open_python_can("kvaser", "0")
+    assert not caplog.records
+    log.warning("afterwards")
+    assert len(caplog.records) == 1
 
 
 @pytest.mark.filterwarnings("ignore")  # of the libraries, about themselves
