@@ -23,6 +23,8 @@ def _mark_as_starting() -> None:
     if controlling and "--lockstep" not in words and hasattr(os, "memfd_create"):
         with contextlib.suppress(OSError):  # a system without it has no lock either
             os.memfd_create(STARTING)
+
+
 FREE_DESCRIPTORS = 32  # that must be left: a run takes about 20, a library that gets none fails or hangs where it likes
 
 

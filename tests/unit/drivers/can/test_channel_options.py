@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.can.bus_claim import bus_address
+from drivers.bus_lock import lock_name
 from drivers.can.channel import NAME, split_channel, with_options
 from drivers.can.open import open_python_can
 from drivers.can.serial_adapter import port_path
@@ -137,7 +137,7 @@ def test_the_configuration_names_the_bus_completely(tmp_path: Path) -> None:
     assert stop_target(path, GivenTarget(interface="jointctl"), environ={}).channel == "can0"  # type: ignore[union-attr]
     # two servers with a can0 each are two buses
     other = load_config(configured(tmp_path, 'options = { port = 29536, host = "10.0.0.6" }'))
-    assert bus_address("socketcand", config.bus.channel) != bus_address("socketcand", other.bus.channel)
+    assert lock_name("socketcand", config.bus.channel) != lock_name("socketcand", other.bus.channel)
 
 
 @pytest.mark.parametrize(
