@@ -367,10 +367,10 @@ def stop_of_another_computer(world: World, node: int) -> None:
 
 
 @contextlib.contextmanager
-def simulated(config: Config) -> Iterator[World]:
-    """The world of one run; supervisors that are made inside run in it."""
+def simulated(joint: Config) -> Iterator[World]:
+    """The world of one run, with the drive of `joint`; supervisors that are made inside run in it."""
     logging.getLogger("canopen").setLevel(logging.CRITICAL)
-    world = World(config)
+    world = World(joint)
 
     def read_response(client: Any) -> Any:
         if client.responses.empty():

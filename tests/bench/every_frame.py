@@ -226,8 +226,8 @@ def judge(session: Session, name: str, frame: int, phase: str, injected_ns: int,
     return verdict
 
 
-def prepared(kind: str, deadline: bool, folder: Path) -> Config:
-    """The configuration of a short run."""
+def prepared(kind: str, deadline: bool, folder: Path) -> tuple[Config, Config]:
+    """The configuration of a short run, and that of its virtual drive, which has all objects."""
     text = shipped_config("virtual").read_text()
     text = re.sub(r"(?m)^duration_s = .*$", "duration_s = 0.3", text)
     text = re.sub(r"(?m)^release_s = \S+", "release_s = 0.02", text)
@@ -237,10 +237,9 @@ def prepared(kind: str, deadline: bool, folder: Path) -> Config:
         eds, count = re.subn(r"(?ims)^\[1400sub5\].*?(?=^\[|\Z)", "", eds)
         assert count == 1
     (folder / "joint.eds").write_text(eds)
-    text = text.replace('"virtual_joint.eds"', '"joint.eds"')
-    path = folder / f"{kind}.toml"
-    path.write_text(text)
-    return load_config(path)
+    (folder / "drive.toml").write_text(text)
+    (folder / f"{kind}.toml").write_text(text.replace('"virtual_joint.eds"', '"joint.eds"'))
+    return load_config(folder / f"{kind}.toml"), load_config(folder / "drive.toml")
 
 
 def new_supervisor(kind: str, config: Config, control: Control, folder: Path) -> Supervisor:
@@ -274,8 +273,8 @@ class Exhaustion:
     def run(self) -> int:
         """The number of frames of the undisturbed run."""
         with tempfile.TemporaryDirectory() as name:
-            config = prepared(self.kind, self.deadline, Path(name))
-            with simulated(config) as world:
+            config, joint = prepared(self.kind, self.deadline, Path(name))
+            with simulated(joint) as world:
                 self.session = self._start(config, world, Path(name))
                 self.motion_cycle = -1
                 world.on_frame = self._after_frame

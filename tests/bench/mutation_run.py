@@ -1,6 +1,7 @@
 """Mutation run of the safety code: change one thing at a time, and see whether a test notices.
 
     NUMBA_DISABLE_JIT=1 python tests/bench/mutation_run.py [--module firmware_py/safety.py] [--part 1/2]
+    python tests/bench/mutation_run.py                     the modules without kernels, against the compiled drive
 
 Mutants: another comparison, `and` for `or`, the operands' sign or operation, a constant one off, a condition negated,
 another member of an enumeration, a statement left out.  Each runs in a child process whose functions have the changed
@@ -33,7 +34,23 @@ TESTS = {  # below UNIT_TESTS
     "firmware_py/frozen_reading.py": ("firmware_py/axis/test_surroundings_edges",),
     "firmware_py/swing_check.py": ("firmware_py/axis/test_axis_swing*",),
     "drivers/canopen/cia402.py": ("drivers/canopen/test_cia402",),
-}
+    "drivers/canopen/bus_watchers.py": ("drivers/canopen/test_other_controllers", "drivers/canopen/test_switch_off"),
+    "drivers/canopen/found_enabled.py": ("drivers/canopen/test_switch_off",),
+    "drivers/canopen/switch_off.py": ("drivers/canopen/test_switch_off",),
+    "drivers/canopen/watchdog_guard.py": ("drivers/canopen/test_watchdog_guard",),
+    "drivers/canopen/watchdog_proof.py": ("drivers/canopen/test_watchdog_proof",),
+    "drivers/canopen/connection_loss.py": ("drivers/canopen/test_connection_loss", "drivers/canopen/test_switch_off"),
+    "drivers/canopen/commissioning.py": (
+        "drivers/canopen/test_commissioning", "drivers/canopen/test_odd_drives", "drivers/canopen/test_connection_loss",
+    ),
+    "drivers/canopen/drive.py": (
+        "drivers/canopen/test_switch_off", "drivers/canopen/test_commissioning", "drivers/canopen/test_watchdog_guard",
+        "drivers/canopen/test_two_encoders",
+    ),
+    "drivers/bus_lock.py": ("drivers/test_bus_lock",),
+    "tools/running/stop_call.py": ("drivers/test_bus_lock",),
+}  # fmt: skip
+KERNELS = (*(module for module in TESTS if module.startswith("firmware_py")), "drivers/canopen/cia402.py")
 LONGEST_S = 120.0  # of processor time: on a busy computer a sound mutant must not count as one that hangs
 COMPARISONS: dict[type, tuple[type, ...]] = {
     ast.Lt: (ast.LtE, ast.GtE), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.LtE), ast.GtE: (ast.Gt, ast.Lt),
@@ -51,7 +68,13 @@ ENUMERATIONS = (
     "StopRequest",
     "CommandKind",
     "Notice",
+    "NmtCommand",
+    "NmtState",
 )
+HOMES = {  # of enumerations that are not in firmware_py/states.py
+    "State": "drivers/canopen/cia402.py", "ControlWord": "drivers/canopen/cia402.py",
+    "NmtCommand": "drivers/canopen/identifiers.py", "NmtState": "drivers/canopen/identifiers.py",
+}  # fmt: skip
 
 
 def _variants(node: ast.AST) -> Iterator[tuple[str, Any]]:
@@ -88,7 +111,7 @@ def mutants(source: str, module: str) -> list[tuple[int, str, ast.Module]]:
     Each is made in a copy of its own: a change must neither be lost nor be left behind in the next mutant.
     """
     tree = ast.parse(source)
-    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
+    functions = _functions(tree)
     inside = {id(node) for function in functions for node in ast.walk(function)}
     skipped = {id(n) for f in functions for d in (*f.decorator_list, f.args) for n in ast.walk(d)}
     found = []
@@ -99,7 +122,7 @@ def mutants(source: str, module: str) -> list[tuple[int, str, ast.Module]]:
             changed = copy.deepcopy(tree)
             node: Any = list(ast.walk(changed))[place_in_tree]
             if field == "next":
-                members = _members(module, node.value.id)
+                members = _members(node.value.id)
                 node.attr = members[(members.index(node.attr) + 1) % len(members)]
             elif field == "pass":
                 line, end = node.lineno, node.end_lineno
@@ -116,21 +139,42 @@ def mutants(source: str, module: str) -> list[tuple[int, str, ast.Module]]:
     return found
 
 
-def _members(module: str, enumeration: str) -> list[str]:
-    source = ROOT / (module if enumeration in ("State", "ControlWord") else "firmware_py/states.py")
+def _functions(tree: ast.Module) -> list[ast.FunctionDef]:
+    """Those of the module and the methods of its classes."""
+    bodies = [tree.body, *(node.body for node in tree.body if isinstance(node, ast.ClassDef))]
+    return [node for body in bodies for node in body if isinstance(node, ast.FunctionDef)]
+
+
+def _members(enumeration: str) -> list[str]:
+    source = ROOT / HOMES.get(enumeration, "firmware_py/states.py")
     for node in ast.parse(source.read_text()).body:
         if isinstance(node, ast.ClassDef) and node.name == enumeration:
             return [item.targets[0].id for item in node.body if isinstance(item, ast.Assign)]  # type: ignore[attr-defined]
-    raise ValueError(f"enumeration (={enumeration}) must be in firmware_py/states.py or {module}")
+    raise ValueError(f"enumeration (={enumeration}) must be in {source.name}")
 
 
 def changed_code(module: str, tree: ast.Module) -> dict[str, Any]:
     """Function name -> the code object that the changed module gives it; module-level values are as they were."""
     loaded = importlib.import_module(module[:-3].replace("/", "."))
     space = dict(vars(loaded))
-    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
-    exec(compile(ast.Module([*functions], []), str(ROOT / module), "exec"), space)
-    return {node.name: (getattr(loaded, node.name), space[node.name].__code__) for node in functions}
+    defined = [node for node in tree.body if isinstance(node, (ast.FunctionDef, ast.ClassDef))]
+    exec(compile(ast.Module([*defined], []), str(ROOT / module), "exec"), space)
+    found = {}
+    for node in defined:
+        if isinstance(node, ast.FunctionDef):
+            found[node.name] = _bare(getattr(loaded, node.name)), _bare(space[node.name]).__code__
+            continue
+        before, after = vars(getattr(loaded, node.name)), vars(space[node.name])
+        for method in node.body:
+            if isinstance(method, ast.FunctionDef):
+                found[f"{node.name}.{method.name}"] = _bare(before[method.name]), _bare(after[method.name]).__code__
+    return found
+
+
+def _bare(function: Any) -> Any:
+    """The function itself, without property, staticmethod, or a decorator that wraps it."""
+    function = getattr(function, "fget", None) or getattr(function, "__func__", function)
+    return getattr(function, "__wrapped__", function)
 
 
 class Session:
@@ -223,8 +267,10 @@ def main() -> int:
     parser.add_argument("--json", type=Path, default=None)
     parser.add_argument("--part", default="1/1", help="k/n: every n-th mutant, from the k-th on")
     chosen = parser.parse_args()
-    if os.environ.get("NUMBA_DISABLE_JIT") != "1":
-        print("NUMBA_DISABLE_JIT (=unset) must be 1: the mutants run as plain Python", file=sys.stderr)
+    plain = os.environ.get("NUMBA_DISABLE_JIT") == "1"
+    modules = chosen.module or [module for module in TESTS if (module in KERNELS) == plain]
+    if any((module in KERNELS) != plain for module in modules):
+        print(f"NUMBA_DISABLE_JIT must be 1 for {', '.join(KERNELS)}, and unset for the others", file=sys.stderr)
         return 2
     sys.path.insert(0, str(ROOT))
     os.chdir(ROOT)
@@ -234,7 +280,7 @@ def main() -> int:
     part, parts = (int(text) for text in chosen.part.split("/"))
     options = ["-s", "-qq", "-p", "no:cacheprovider", "-p", "no:randomly", "-p", "no:xdist", "--hypothesis-seed=0"]
     survivors: list[dict[str, Any]] = []
-    for module in chosen.module or TESTS:
+    for module in modules:
         session = Session(module, part, parts)
         code = pytest.main([*options, *map(str, files_of_tests(module))], plugins=[session])
         if code or session.refused:

@@ -166,7 +166,7 @@ class Sweep:
                 bars[0](max(0.0, done_s))
 
             assert self.control is not None
-            approve = None if options.dry_run else approval(self.output, assume_yes=options.assume_yes)
+            approve = None if options.dry_run else self._approve
             supervisor = SweepSupervisor(
                 config, self.output, log_path(config), confirm, motion, meter, progress, self.control, approve,
                 allow_low_margin=options.allow_low_margin,
@@ -184,6 +184,11 @@ class Sweep:
             self.output.warning(f"{result.lost_records} log records were lost: the supervisor was too slow")
         self._raise_fault(result.fault, result.fault_text)
         return result.stopped_by
+
+    def _approve(self, question: str) -> bool:
+        agreed_to = approval(self.output, assume_yes=self.options.assume_yes)(question)
+        self._declined = self._declined or not agreed_to
+        return agreed_to
 
     def _confirm(self, report: CommissioningReport, motion: SweepMotion, points: list[SweepPoint]) -> bool:
         if not self._confirmed:
