@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from drivers.drive import Approval, CommissioningReport, Declined, Drive
-from drivers.errors import BusError, DataError, DeviceError, JointctlError, MotionFault
+from drivers.errors import BusError, DataError, DeviceError, JointctlError, MotionFault, NoDeviceError
 from firmware_py.states import Fault, StopRequest
 from tools.configuration.config import Config
 from tools.configuration.records import axis_constants, trajectory_table
@@ -104,6 +104,10 @@ class Supervisor:
                 if guard is not None:
                     guard.wait_ready()
                 return self._supervise(drive, loop, report, Around(signals, bus_news, recorder, guard))
+            except (BusError, DeviceError, NoDeviceError):
+                if signals.commanded_ns:  # the frames of that stop look like another controller's
+                    raise KeyboardInterrupt from None
+                raise
             except OSError as error:
                 raise DataError(f"{self._log_path}: cannot be written: {error.strerror or error}") from None
             finally:

@@ -44,7 +44,6 @@ def test_no_is_a_code_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(run, "Supervisor", Asking)
     monkeypatch.setattr(sweep, "SweepSupervisor", Asking)
     monkeypatch.setattr(doctor_motion, "CheckSupervisor", Asking)
-    monkeypatch.setattr(doctor_motion, "_scale_of_the_drive", lambda _: [])
     output = Output(stdout=io.StringIO(), stderr=io.StringIO())
     if verb == "run":
         code = run.run(load_config(shipped_config("virtual")), output, assume_yes=False)

@@ -10,10 +10,11 @@ import pytest
 from firmware_py.records import AxisState
 from firmware_py.schema import new
 from firmware_py.states import Fault, Notice
-from tools.recording.run_log import WARNING
+from tools.recording.run_log import ERROR, WARNING
 from tools.running.events.fault_text import FAULT_TEXTS, fault_text
 from tools.running.events.notice_text import NoticeFinder
 from tools.running.run_watch import RunWatch
+from tools.running.stop_signals import StopSignals
 
 
 def state_with(notices: int) -> Any:
@@ -51,7 +52,7 @@ def test_a_run_tells_them_to_log_display_and_viewers_before_the_fault() -> None:
     """They may explain it."""
     told: list[Any] = []
     noted: list[str] = []
-    fault = SimpleNamespace(text="LIMIT_CYCLE", time_ns=1)
+    fault = SimpleNamespace(text="LIMIT_CYCLE", time_ns=1, level=ERROR)
     watch: Any = RunWatch.__new__(RunWatch)
 
     class Records(list[Any]):
@@ -63,11 +64,11 @@ def test_a_run_tells_them_to_log_display_and_viewers_before_the_fault() -> None:
         constants=[SimpleNamespace(trajectory=SimpleNamespace(duration_s=1.0))],
     )  # fmt: skip
     watch.loop = SimpleNamespace(block=block, new_records=lambda: records)
-    watch.around = SimpleNamespace(recorder=None)
+    watch.around = SimpleNamespace(recorder=None, signals=StopSignals())
     watch.keep = lambda _: None
     watch._orders = SimpleNamespace(keep=lambda _: None)
     watch._notices, watch._events = NoticeFinder(), SimpleNamespace(take=lambda _: [fault])
-    watch._tell = told.append
+    watch._tell = lambda event, shown=True: told.append(event)
     watch.config, watch.temperature = SimpleNamespace(is_serial=False), SimpleNamespace(newest_degC=None)
     watch.display = SimpleNamespace(show=lambda _: None, note=noted.append)
     watch.take_records()
