@@ -340,7 +340,8 @@ def lock_name(interface: str, channel: str) -> str:
         place = f"{interface}:{path}"
         with contextlib.suppress(OSError):
             found = os.stat(path)
-            place = f"{interface}:{found.st_dev:x}:{found.st_ino:x}"
+            # with its time: the number of a socket file that is gone is given to the next one
+            place = f"{interface}:{found.st_dev:x}:{found.st_ino:x}:{found.st_ctime_ns:x}"
     elif interface == "serial" or port_path(channel).startswith("/"):
         place = f"{interface}:{os.path.realpath(port_path(channel))}"
     return "jointctl-bus-" + hashlib.sha256(place.encode()).hexdigest()[:32]

@@ -39,7 +39,8 @@ class BusFailure(can.Listener):
 class OtherControllers(can.Listener):
     """Notices what only a controller sends: SYNC, NMT commands, SDO requests and RPDOs to `nodes`, our heartbeat.
 
-    A bus does not hand us the frames that we send ourselves.  It listens from its making on.
+    It listens from its making on.  Some interfaces hand us the frames that we send ourselves: the first of them that
+    `sent` is told of shows it, and from then on each counts once.
     """
 
     def __init__(self, nodes: Collection[int], master_node: int, clock: Callable[[], float] = time.monotonic) -> None:
@@ -49,6 +50,8 @@ class OtherControllers(can.Listener):
         self._rpdo_ids = {base + node: f"RPDO to node {node}" for node in nodes for base in RPDO_IDS}
         self._lock = threading.Lock()
         self._beside_own_loop = False
+        self._echoes: bool | None = None  # whether our own frames come back; None = not known yet
+        self._own: Counter[tuple[int, bytes]] = Counter()  # that have not come back yet
         self._seen: Counter[str] = Counter()
         self._identifiers: Counter[int] = Counter()
         self.heartbeats: set[int] = set()  # nodes that send one, ours and the drive's not among them
@@ -59,12 +62,25 @@ class OtherControllers(can.Listener):
             return
         identifier, data = msg.arbitration_id, bytes(msg.data)
         with self._lock:
+            if self._own[identifier, data] > 0:
+                self._own[identifier, data] -= 1
+                self._echoes = True
+                return
             self._identifiers[identifier] += 1
             if words := self._words(identifier, data):
                 self._seen[words] += 1
             elif HEARTBEAT_ID < identifier <= HEARTBEAT_ID + _MASKED_NODE:
                 if (node := identifier - HEARTBEAT_ID) not in self._nodes:
                     self.heartbeats.add(node)
+
+    def sent(self, identifier: int, data: bytes) -> None:
+        """This program is about to send a frame."""
+        with self._lock:
+            if self._echoes is None and self._own:  # the first one has not come back
+                self._echoes = False
+                self._own.clear()
+            if self._echoes is not False:
+                self._own[identifier, data] += 1
 
     def _words(self, identifier: int, data: bytes) -> str:
         """What a frame is, if only a controller sends it; beside our own loop, what the loop does not send either."""

@@ -18,7 +18,7 @@ from drivers.canopen.encoder_settings import DRIVE_RANGE_COUNTS
 from drivers.canopen.fault_reset import reset_fault
 from drivers.canopen.found_enabled import brake_if_enabled
 from drivers.canopen.identifiers import NmtCommand
-from drivers.canopen.network import new_network
+from drivers.canopen.network import new_network, report_own_frames
 from drivers.canopen.object_access import ATTEMPTS as SDO_ATTEMPTS
 from drivers.canopen.object_access import ObjectAccess
 from drivers.canopen.scaling import joint_angle_per_count_rad, new_port, start_position_rad
@@ -71,6 +71,7 @@ class CanopenDrive:
         nodes = [settings.node] if encoder is None else [settings.node, encoder]
         self._others = OtherControllers(nodes, settings.master_node, clock)
         self._network = new_network(bus, sleep, self._others)
+        report_own_frames(self._network, self._others)
         self._network.connect()
         sdo_timeout_s = settings.sdo_timeout_s or SDO_TIMEOUT_S
         try:

@@ -9,7 +9,7 @@ from typing import Any
 import can
 import canopen
 
-from drivers.canopen.bus_watchers import BusFailure
+from drivers.canopen.bus_watchers import BusFailure, OtherControllers
 from drivers.canopen.identifiers import NMT_ID, NmtCommand
 
 NOTIFIER_S = 0.05  # how long the receiving thread waits before it looks whether it is to end
@@ -29,3 +29,14 @@ def new_network(bus: can.BusABC, sleep: Callable[[float], None], *listeners: can
 def send_nmt(network: canopen.Network, command: NmtCommand, node: int) -> None:
     """An NMT command to one node."""
     network.send_message(NMT_ID, bytes([command, node]))
+
+
+def report_own_frames(network: canopen.Network, others: OtherControllers) -> None:
+    """`others` learns what this end sends, so that an interface which hands it back does not make it another's."""
+    send: Any = network.send_message
+
+    def send_message(can_id: int, data: Any, remote: bool = False) -> None:
+        others.sent(can_id, bytes(data))
+        send(can_id, data, remote)
+
+    network.send_message = send_message  # type: ignore[method-assign]

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import can
 import canopen
 import tomlkit
 
@@ -141,7 +142,10 @@ class Bench:
         return network
 
     def status_word(self, node: int = 1) -> int:
-        """6041 as an independent client reads it; NMT first, since a stopped node answers no SDO."""
+        """6041 as an independent client reads it; NMT first, since a stopped node answers no SDO.
+
+        Not while a program of ours has the drive and no loop runs: it would take these frames for another controller's.
+        """
         network = self.network()
         try:
             network.send_message(0, [128, node])
@@ -152,6 +156,16 @@ class Bench:
     def disabled(self, node: int = 1) -> bool:
         """Switch On Disabled or Fault: the power stage is off."""
         return self.status_word(node) & 0x4F in (0x40, 0x08)
+
+    def is_pre_operational(self, node: int = 1) -> bool:
+        """By the drive's own heartbeat; nothing is sent."""
+        with can.Bus(interface="jointctl", channel=self.channel) as bus:
+            for _ in range(1000):
+                message = bus.recv(1.0)
+                assert message is not None
+                if message.arbitration_id == 0x700 + node:
+                    return bool(message.data[0] == 127)
+        return False
 
     def log(self) -> Any:
         """The newest run log."""

@@ -64,7 +64,9 @@ def test_a_missing_port_is_a_bus_error(serial_bench: Any) -> None:
 
 def test_a_second_controller_is_kept_out(serial_bench: Any) -> None:
     first = serial_bench.bench.start("run", serial_bench.config(), "-y").saw("  tracking")
-    serial_bench.bench.run("run", serial_bench.config(), "-y").refused(4, "in use by another program")
+    serial_bench.bench.run("run", serial_bench.config(), "-y").refused(
+        4, "another program controls", f"pid {first.process.pid}"
+    )
     first.signal(signal.SIGINT)
     assert first.finished().code == 130
     assert serial_bench.standing()

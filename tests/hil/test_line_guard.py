@@ -5,6 +5,7 @@ The virtual drive is a thread of this process, as in test_elmo_run.py.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -147,8 +148,10 @@ def test_stop_without_an_answer_of_the_guard(serial_bench: Any) -> None:
     assert (stopped.code, "the drive is off" in stopped.out) == (0, True), stopped
     assert "telling the drive on the same line" in stopped.err
     assert serial_bench.standing()
+    assert "ending process" in stopped.err
     for pid in (run.process.pid, loop, guard):
-        os.kill(pid, signal.SIGKILL)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
 
 
 def test_another_program_on_the_port_is_named_and_left_alone(serial_bench: Any) -> None:

@@ -108,7 +108,7 @@ def test_nothing_moves_before_start_and_stop_stops(bench: Any, browser: Browser)
     tab.click("start")  # without the word that the way is clear
     time.sleep(1.0)
     state_is(tab, "ready; nothing moves")
-    assert bench.disabled()
+    assert bench.is_pre_operational()
     start(tab)
     moves(tab)
     tab.enter("set-point", "-0.2")

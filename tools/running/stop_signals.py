@@ -36,6 +36,11 @@ class StopSignals:
         asked = _ESCALATION[min(self.count, len(_ESCALATION)) - 1] if self.count else StopRequest.NONE
         return max(asked, StopRequest.QUICK_STOP) if self.commanded_ns else asked
 
+    @property
+    def by_command(self) -> str:
+        """` by jointctl stop` where that has ended it, for messages."""
+        return f" by {STOP_COMMAND}" if self.commanded_ns else ""
+
     def on_signal(self, number: int, _: FrameType | None) -> None:
         """Signal handler."""
         self.count += 1

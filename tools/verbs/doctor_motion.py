@@ -44,7 +44,7 @@ def doctor_motion(config: Config, output: Output, *, assume_yes: bool, torque_Nm
         try:
             return _check(config, output, control, assume_yes=assume_yes, torque_Nm=torque_Nm)
         except KeyboardInterrupt:
-            output.note(f"interrupted by {control.signals.name}; nothing moved")
+            output.note(f"interrupted{control.signals.by_command}; nothing moved")
             return INTERRUPTED
 
 

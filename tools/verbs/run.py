@@ -60,7 +60,7 @@ def run(
         try:
             result = supervisor.run()
         except KeyboardInterrupt:
-            output.note(f"interrupted by {control.signals.name}; nothing moved")
+            output.note(f"interrupted{control.signals.by_command}; nothing moved")
             require_off(supervisor.drive_state)
             return INTERRUPTED
     if result is None:

@@ -99,3 +99,15 @@ def test_it_listens_for_a_second_from_its_making_on(passed_s: float, left_s: flo
     others = OtherControllers([NODE], MASTER, lambda: now[0])
     now[0] += passed_s
     assert others.to_listen_s == pytest.approx(left_s)
+
+
+@pytest.mark.parametrize("echoes", [True, False])
+def test_our_own_frames_are_not_anothers_where_the_interface_hands_them_back(echoes: bool) -> None:
+    others = listening()
+    request = 0x600 + NODE, b"\x40\x00\x10\x00\0\0\0\0"
+    for _ in range(3):
+        others.sent(*request)
+        if echoes:
+            assert heard(others, *request) == ""
+        heard(others, 0x580 + NODE, bytes(8))
+    assert heard(others, *request) == "1 x SDO request (605h)"  # the twin: the same frame once more is another's
