@@ -50,6 +50,7 @@ class OtherControllers(can.Listener):
         self._rpdo_ids = {base + node: f"RPDO to node {node}" for node in nodes for base in RPDO_IDS}
         self._lock = threading.Lock()
         self._beside_own_loop = False
+        self._commands = {NMT_ID, *(SDO_REQUEST_ID + node for node in nodes)}
         self._echoes: bool | None = None  # whether our own frames come back; None = not known yet
         self._own: Counter[tuple[int, bytes]] = Counter()  # that have not come back yet
         self._seen: Counter[str] = Counter()
@@ -60,7 +61,10 @@ class OtherControllers(can.Listener):
         """In the receiving thread."""
         if msg.is_error_frame or msg.is_extended_id:
             return
-        identifier, data = msg.arbitration_id, bytes(msg.data)
+        identifier = msg.arbitration_id
+        if self._beside_own_loop and identifier not in self._commands:  # most frames of a run: at no cost
+            return
+        data = bytes(msg.data)
         with self._lock:
             if self._own[identifier, data] > 0:
                 self._own[identifier, data] -= 1

@@ -184,7 +184,7 @@ class Supervisor:
             watch.take_records()
             if not signals.commanded_ns:  # `jointctl stop` sends such frames as well
                 watch.log.write_event(ERROR, "supervisor", str(error))
-                raise
+                raise MotionFault(error.message, error.hint) from None
         except BaseException:
             self._brake(loop, signals)
             raise
@@ -202,14 +202,14 @@ class Supervisor:
 
     @staticmethod
     def _raise_what_others_did(watch: RunWatch, loop: LoopHandle) -> None:
-        """A fault of the loop is explained by another controller's frames, if some came: `BusError`."""
+        """A fault of the loop is explained by another controller's frames, if some came: `MotionFault`."""
         if watch.settings_guard is None or watch.around.signals.commanded_ns or loop.verdict()[0] is Fault.NONE:
             return
         try:
             watch.settings_guard.poll()
         except (DeviceError, BusError) as error:
             watch.log.write_event(ERROR, "supervisor", str(error))
-            raise
+            raise MotionFault(error.message, error.hint) from None
 
     def _brake(self, loop: LoopHandle, signals: StopSignals, how: StopRequest = StopRequest.RAMP) -> None:
         """The supervisor cannot go on (disk full, say), but the joint moves: brake it under control, unlogged.
