@@ -63,6 +63,7 @@ class RunWatch:
         self.log, self.kept, self.display = parts.log, parts.kept, parts.display
         self.temperature = TemperatureWatch()  # until the drive's own thermometer is known
         self.settings_guard: SettingsGuard | None = None
+        self._allowed = False  # whether the loop may enable
         self.delay_s: float | None = None  # of the loop, once it is measured
         self._stopped_by_viewer = ""
         self._allow_low_margin = allow_low_margin
@@ -101,6 +102,7 @@ class RunWatch:
             self._tell(Event(time.monotonic_ns(), WARNING, "supervisor", text))
         self._guard_settings()
         self.check_delay()
+        self._may_enable()
         self.temperature.poll()
         self.tell_bus_news()
         if self.around.guard is not None and self.around.guard.just_ended():
@@ -113,7 +115,7 @@ class RunWatch:
 
     def _guard_settings(self) -> None:
         """`DeviceError` where what stops the drive without us has been changed."""
-        if self.settings_guard is None:
+        if self.settings_guard is None or self.delay_s is None:  # its reads would lengthen the delay that is measured
             return
         for text in self.settings_guard.poll():
             self.log.write_event(WARNING, "drive", text)
@@ -155,8 +157,6 @@ class RunWatch:
         """Once enough cycles have run with the drive off: refuse the gains, or let the loop enable."""
         if self.delay_s is not None or self.loop.cycles < min(DELAY_CYCLES, self.config.loop.rate_Hz):
             return
-        if self.settings_guard is not None and not self.settings_guard.confirmed:
-            return
         histograms = self.loop.block.histograms
         if not histograms[Histogram.ROUND_TRIP].any():
             return  # nothing has been heard: the loop ends that itself, and tells it
@@ -164,7 +164,14 @@ class RunWatch:
         text = f"loop delay {self.delay_s * 1e3:.2f} ms measured, {self.margin_text(self.delay_s)}"
         self.log.write_event(INFO, "supervisor", text)
         self.display.note(text)
-        self.loop.allow_enable()
+        self._may_enable()
+
+    def _may_enable(self) -> None:
+        """Once the delay allows the gains, and what stops the drive without us was read back."""
+        guard = self.settings_guard
+        if not self._allowed and self.delay_s is not None and (guard is None or guard.confirmed):
+            self._allowed = True
+            self.loop.allow_enable()
 
     def margin_text(self, delay_s: float) -> str:
         """What is left of the stability with that delay, in words; raises if it is too little to enable."""
