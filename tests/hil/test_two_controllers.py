@@ -88,7 +88,8 @@ def test_a_run_that_hangs_is_ended_with_its_loop(bench: Any) -> None:
     assert (stopped.code, "ending process" in stopped.err) == (0, True), stopped
     assert run.process.wait(5.0) == -signal.SIGKILL
     assert bench.disabled()
-    assert bench.run("run", bench.config(), "-y").code == 0  # the next run takes the armed watchdog over
+    again = bench.run("run", bench.config(), "-y", "--allow-low-margin")  # takes the armed watchdog over
+    assert again.code == 0, again.err
 
 
 def test_a_foreign_controller_is_known_by_its_sync(bench: Any) -> None:
