@@ -52,7 +52,6 @@ FIRST_MOTION_CYCLES = 100  # of the approach, in which every frame is tried
 ENABLING_s = 0.05  # a write while the loop enables is seen at the supervisor's next look
 QUIET_s = 0.2  # for so long after the end the drive must stay off
 LONGEST_s = 30.0
-CYCLE_FRAMES = 4
 
 
 @dataclass
@@ -65,7 +64,6 @@ class Session:
     supervisor: Supervisor
     outcome: str = ""  # how the supervisor ended: "" while it runs
     text: str = ""
-    waiting_frames: int = 0
 
     @property
     def node(self) -> int:
@@ -142,7 +140,6 @@ class Injection:
     reaction_s: Callable[[Config], float]
     causes: tuple[str, ...] = ()
     may_enable: bool = False
-    ends: bool = True  # whether the run must end by it, wherever it comes before the loop's end
 
 
 def at_once(_: Config) -> float:
