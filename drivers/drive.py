@@ -72,8 +72,10 @@ class SettingsGuard(Protocol):
         """Whether all of it was read back since `start_cyclic`: nothing may be enabled before."""
         ...
 
-    def poll(self) -> list[str]:
-        """What is to be warned of; never waits.  `DeviceError` where something was changed: the run is over."""
+    def poll(self, *, may_ask: bool = True) -> list[str]:
+        """What is to be warned of; never waits.  `DeviceError` or `BusError` where something was changed, or another
+        controller has sent what matters: the run is over.  Without `may_ask` nothing is sent.
+        """
         ...
 
 

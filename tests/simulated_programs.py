@@ -54,6 +54,7 @@ from tools.simulation.virtual_joint import new_device
 
 STEP_NS = 1_000_000
 FAST_STEPS = 5
+OFF_STEPS = 100  # without power, where nothing is timed
 LONGEST_CHUNK = 50  # cycles of the loop in one compiled call
 FRAME_NS = 1_000
 _FRAME = struct.Struct("<IB3x8s")
@@ -121,7 +122,9 @@ class World:
     @property
     def step_ns(self) -> int:
         """The drive's timers are looked at so often."""
-        return FAST_STEPS * STEP_NS if self.fast else STEP_NS
+        if not self.fast:
+            return STEP_NS
+        return (FAST_STEPS if self.powered else OFF_STEPS) * STEP_NS
 
     def _advance(self, to_ns: int) -> None:
         self.now_ns = to_ns

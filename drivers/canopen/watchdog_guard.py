@@ -63,10 +63,14 @@ class WatchdogGuard:
         """Whether everything has been read back in NMT operational: before that nothing may be enabled."""
         return not self._unread
 
-    def poll(self) -> list[str]:
-        """What is to be warned of; `DeviceError` where something was changed, or cannot be read before enabling."""
+    def poll(self, *, may_ask: bool = True) -> list[str]:
+        """What is to be warned of; `DeviceError` where something was changed, or cannot be read before enabling.
+
+        Without `may_ask` it only listens.
+        """
         self._refuse_others()
-        self._reads.poll()
+        if may_ask:
+            self._reads.poll()
         if self._changed:
             raise DeviceError(self._changed, _HINT)
         warnings = []

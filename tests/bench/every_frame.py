@@ -52,6 +52,9 @@ FIRST_MOTION_CYCLES = 100  # of the approach, in which every frame is tried
 ENABLING_s = 0.05  # a write while the loop enables is seen at the supervisor's next look
 QUIET_s = 0.2  # for so long after the end the drive must stay off
 LONGEST_s = 30.0
+# What is waited for, shorter than on a joint: the time that is allowed follows.
+SHORT = {"duration_s": 0.3, "release_s": 0.02, "heartbeat_s": 0.1, "wait_timeout_s": 1.0, "enable_timeout_s": 1.0,
+         "stop_timeout_s": 1.0, "off_timeout_s": 0.5}  # fmt: skip
 
 
 @dataclass
@@ -226,9 +229,8 @@ def judge(session: Session, name: str, frame: int, phase: str, injected_ns: int,
 def prepared(kind: str, deadline: bool, folder: Path) -> tuple[Config, Config]:
     """The configuration of a short run, and that of its virtual drive, which has all objects."""
     text = shipped_config("virtual").read_text()
-    text = re.sub(r"(?m)^duration_s = .*$", "duration_s = 0.3", text)
-    text = re.sub(r"(?m)^release_s = \S+", "release_s = 0.02", text)
-    text = re.sub(r"(?m)^heartbeat_s = \S+", "heartbeat_s = 0.1", text)
+    for key, value in SHORT.items():
+        text = re.sub(rf"(?m)^{key} = \S+", f"{key} = {value}", text)
     eds = (ROOT / "configs" / "virtual_joint.eds").read_text()
     if not deadline:
         eds, count = re.subn(r"(?ims)^\[1400sub5\].*?(?=^\[|\Z)", "", eds)

@@ -114,10 +114,13 @@ class RunWatch:
             self.display.phase(phase_name(phase))
 
     def _guard_settings(self) -> None:
-        """`DeviceError` where what stops the drive without us has been changed."""
-        if self.settings_guard is None or self.delay_s is None:  # its reads would lengthen the delay that is measured
+        """`DeviceError` or `BusError` where what stops the drive without us has been changed, or someone else commands.
+
+        Its reads would lengthen the delay that is measured.
+        """
+        if self.settings_guard is None:
             return
-        for text in self.settings_guard.poll():
+        for text in self.settings_guard.poll(may_ask=self.delay_s is not None):
             self.log.write_event(WARNING, "drive", text)
             self.display.note(text)
 

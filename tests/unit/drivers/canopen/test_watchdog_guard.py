@@ -92,3 +92,14 @@ def test_it_costs_four_uploads_a_second(run: Run) -> None:
     run.polled(100, 0.05)
     uploads = [struct.unpack_from("<H", data, 1)[0] for cob, data in run.bus.requests if cob == 0x601]
     assert {index: uploads.count(index) for index in WATCHED} == dict.fromkeys(WATCHED, 5)
+
+
+def test_while_the_delay_is_measured_it_reads_nothing_and_listens(run: Run) -> None:
+    for _ in range(20):
+        assert run.guard.poll(may_ask=False) == []
+        run.bus.settle()
+        run.now_s += 0.06
+    assert not run.guard.confirmed
+    run.bus.send(0x601, struct.pack("<BHBI", 0x2B, 0x6007, 0, 0))
+    with pytest.raises(BusError, match="writes object 6007"):
+        run.guard.poll(may_ask=False)
