@@ -121,11 +121,12 @@ class BusLock:
             wait_for_answers(holders)
             for holder in holders:
                 if holder.is_controller:
-                    raise self._refusal(holder.pid, "controls")
+                    raise self._refusal(holder.pid, f"another program controls {self._place}")
         if marked_processes(self._name):
             time.sleep(_RELEASE_S)
         if marked := marked_processes(self._name):
-            raise self._refusal(marked[0], "that does not answer still controls")
+            text = f"another program that does not answer still controls {self._place}"
+            raise self._refusal(marked[0], text)
         self.remarks += [
             f"{_program(holder.pid)} has the name of the lock of {self._place} and is no controller: it is ignored"
             for holder in holders
@@ -133,9 +134,9 @@ class BusLock:
         if self._server is None:
             self.remarks.append(f"{self._place} cannot be locked: a second controller of another user is not kept off")
 
-    def _refusal(self, pid: int, what: str) -> BusError:
+    def _refusal(self, pid: int, text: str) -> BusError:
         return BusError(
-            f"another program {what} {self._place} ({_program(pid)})",
+            f"{text} ({_program(pid)})",
             "only one controller may use a bus: end it first; `jointctl stop` switches its drive off and ends it",
         )
 

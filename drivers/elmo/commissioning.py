@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from drivers.drive import Approval, CommissioningReport, Declined, DriveIdentity
+from drivers.at_rest import refuse_unless_at_rest
+from drivers.drive import Approval, CommissioningReport, DriveIdentity
 from drivers.elmo.codes import (
     AMPLIFIER_MASK,
     FAULT_LATCHED,
@@ -24,8 +25,6 @@ from drivers.errors import BusError, ConfigurationError, DeviceError, NoDeviceEr
 
 MEASURED_CYCLES = 20
 TC_STEP_A = 1e-3
-WATCH_S = 0.5  # how long a motor that is found on is watched
-REST_COUNTS, REST_rad = 2, 1e-4  # one at rest may move by so much, whichever is more
 QUESTION = "The motor is on, and at rest. Stop it and switch it off?"
 
 
@@ -38,13 +37,14 @@ class ElmoCommissioning:
         open_port: Callable[[str, int], BytePort] = SerialPort,
         clock: Callable[[], float] = time.monotonic,
         gate: Callable[[], None] = lambda: None,
+        sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         """`gate` is called before each command until the loop runs, and raises once the user has asked for a stop."""
         self._settings = settings
         self._byte_port = open_port(settings.port, settings.baud_rate_bitps)
         self._line = Dialogue(self._byte_port, settings.reply_timeout_s, clock)
         self._line.gate = gate
-        self._clock = clock
+        self._clock, self._sleep = clock, sleep
         self._taken = False  # whether a drive has been found and told anything
         self._commissioned = False
         self._speed_mode = False
@@ -57,7 +57,10 @@ class ElmoCommissioning:
         remarks: list[str] = []
         identity = self._identify()
         if line.integer("MO") != 0:
-            self._refuse_unless_agreed(approve)
+            refuse_unless_at_rest(
+                f"the motor on {settings.port} is on (MO=1)", lambda: line.integer("PX"), settings.rad_per_count,
+                approve, QUESTION, self._sleep,
+            )  # fmt: skip
             self._taken = True
             switch_off(self._byte_port, line)
             remarks.append("the motor was on, at rest: it has been stopped and switched off")
@@ -82,30 +85,6 @@ class ElmoCommissioning:
             ),
             loop_delay_s=measured.loop_delay_s,
         )
-
-    def _refuse_unless_agreed(self, approve: Approval | None) -> None:
-        """The motor was found on: it is left as it is where it turns, or must not be touched."""
-        place = f"the motor on {self._settings.port} is on (MO=1)"
-        hint = "`jointctl stop` stops it and switches it off"
-
-        def refuse_unless_at_rest() -> None:
-            readings = [self._line.integer("PX")]
-            until_s = self._clock() + WATCH_S
-            while self._clock() < until_s:
-                readings.append(self._line.integer("PX"))
-            turned = max(readings) - min(readings)
-            if turned > max(REST_COUNTS, REST_rad / abs(self._settings.rad_per_count)):
-                raise DeviceError(
-                    f"{place} and turns ({turned} counts in {WATCH_S:g} s): another controller may have it; it was "
-                    "left as it is", hint,
-                )  # fmt: skip
-
-        refuse_unless_at_rest()
-        if approve is None:
-            raise DeviceError(f"{place}: another controller may have it; it was left as it is", hint)
-        if not approve(QUESTION):
-            raise Declined
-        refuse_unless_at_rest()  # the answer may have taken minutes
 
     def _identify(self) -> DriveIdentity:
         settings, line = self._settings, self._line
