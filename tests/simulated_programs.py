@@ -55,6 +55,7 @@ from tools.simulation.virtual_joint import new_device
 STEP_NS = 1_000_000
 FAST_STEPS = 5
 OFF_STEPS = 100  # without power, where nothing is timed
+SHORT_NAP_s, OFF_NAP_s = 0.05, 0.1  # a supervisor that looks often does so less often without power
 LONGEST_CHUNK = 50  # cycles of the loop in one compiled call
 FRAME_NS = 1_000
 _FRAME = struct.Struct("<IB3x8s")
@@ -71,6 +72,7 @@ class World:
         self.on_frame: Callable[[int, int], None] = lambda number, identifier: None
         self.lost_to_drive = self.lost_from_drive = False
         self.fast = False  # frame by frame no more: whole cycles of the loop in one compiled call
+        self.long_naps = False  # once the loop runs
         self.ears: list[Any] = []
         self.programs: dict[str, Program] = {}
         self.dead: list[Program] = []
@@ -87,6 +89,8 @@ class World:
 
     def sleep(self, seconds: float) -> None:
         """The calling program waits; the drive and the others go on."""
+        if self.long_naps and not self.powered and seconds < SHORT_NAP_s:
+            seconds = OFF_NAP_s
         self.sleep_until_ns(self.now_ns + max(0, round(seconds * NANOSECONDS)))
 
     def sleep_until_ns(self, until_ns: int, *_: Any) -> None:

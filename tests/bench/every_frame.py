@@ -335,7 +335,7 @@ class Exhaustion:
                 continue
             self.child = True
             world = self.session.world
-            world.fast = True
+            world.fast, world.long_naps = True, phase != "commissioning"
             self.why = (name, number, phase, world.now_ns, world.powered)
             INJECTIONS[name].act(self.session)
             return
