@@ -55,8 +55,8 @@ from tools.simulation.virtual_joint import new_device
 STEP_NS = 1_000_000
 FAST_STEPS = 5
 OFF_STEPS = 100  # without power, where nothing is timed
-SHORT_NAP_s, OFF_NAP_s = 0.05, 0.1  # a supervisor that looks often does so less often without power
-LONGEST_CHUNK = 50  # cycles of the loop in one compiled call
+SHORT_NAP_s, OFF_NAP_s = 0.05, 0.25  # a supervisor that looks often does so less often without power
+LONGEST_CHUNK = 250  # cycles of the loop in one compiled call
 FRAME_NS = 1_000
 _FRAME = struct.Struct("<IB3x8s")
 POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
