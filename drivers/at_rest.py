@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.drive import Approval, Declined
-from drivers.errors import DeviceError
+from jointctl.drivers.drive import Approval, Declined
+from jointctl.drivers.errors import DeviceError
 
 WATCH_S = 0.5
 WATCH_EACH_S = 0.05

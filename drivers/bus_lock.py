@@ -32,11 +32,11 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Self
 
-from drivers.can.serial_adapter import port_path
-from drivers.can.virtual_bus import socket_path
-from drivers.errors import BusError
-from drivers.local_socket import ANSWER_S, listener, may_ask, parsed_line, process_behind, send_line
-from drivers.port_users import program_name
+from jointctl.drivers.can.serial_adapter import port_path
+from jointctl.drivers.can.virtual_bus import socket_path
+from jointctl.drivers.errors import BusError
+from jointctl.drivers.local_socket import ANSWER_S, listener, may_ask, parsed_line, process_behind, send_line
+from jointctl.drivers.port_users import program_name
 
 STARTING = "jointctl-starting"  # marks a program that is about to control a bus, until it has its lock
 NAMES = 8  # of one lock: as many programs would have to hold the others

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from drivers.printable import one_line
+from jointctl.drivers.printable import one_line
 
 INTERRUPTED = 130  # exit code after Ctrl-C and its like, which are no error
 DECLINED = 12  # exit code where the user did not agree to what was asked: nothing was done

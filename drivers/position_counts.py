@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from firmware_py.kernel import kernel
+from jointctl.firmware_py.kernel import kernel
 
 WRAP = 1 << 32
 HALF_WRAP = 1 << 31

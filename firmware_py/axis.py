@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from firmware_py.change_records import MotionChange
-from firmware_py.computed_torque import step_law
-from firmware_py.frozen_reading import check_reading
-from firmware_py.kernel import kernel
-from firmware_py.live_change import step_change, step_new_motion
-from firmware_py.records import AxisConstants, AxisState, Command, LimitConstants, Sample
-from firmware_py.safety import limit_position_rad, limited_torque_Nm, motion_fault, reference_fault
-from firmware_py.sequence import (
+from jointctl.firmware_py.change_records import MotionChange
+from jointctl.firmware_py.computed_torque import step_law
+from jointctl.firmware_py.frozen_reading import check_reading
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.live_change import step_change, step_new_motion
+from jointctl.firmware_py.records import AxisConstants, AxisState, Command, LimitConstants, Sample
+from jointctl.firmware_py.safety import limit_position_rad, limited_torque_Nm, motion_fault, reference_fault
+from jointctl.firmware_py.sequence import (
     compare_encoders,
     enter,
     powered,
@@ -31,12 +31,12 @@ from firmware_py.sequence import (
     trip,
     write_command,
 )
-from firmware_py.states import AxisPhase, CommandKind, Fault, Reaction
-from firmware_py.surroundings import check_surroundings
-from firmware_py.swing_check import check_swing, take_notice, watch_rest
-from firmware_py.trajectory import approach_at, brake_step, reference_at, repetition
-from firmware_py.velocity import step_velocity
-from firmware_py.velocity_command import limited_velocity_radps, velocity_command_radps
+from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, Reaction
+from jointctl.firmware_py.surroundings import check_surroundings
+from jointctl.firmware_py.swing_check import check_swing, take_notice, watch_rest
+from jointctl.firmware_py.trajectory import approach_at, brake_step, reference_at, repetition
+from jointctl.firmware_py.velocity import step_velocity
+from jointctl.firmware_py.velocity_command import limited_velocity_radps, velocity_command_radps
 
 REACTION_CYCLES = 2  # between seeing that the reference leaves its limits and the first braked cycle
 

@@ -10,8 +10,8 @@ from typing import Annotated
 
 import numpy as np
 
-from firmware_py.motion_records import Reference, TrajectoryConstants
-from firmware_py.schema import array_of, f8, i4, i8, record
+from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
+from jointctl.firmware_py.schema import array_of, f8, i4, i8, record
 
 
 class ChangeKind(IntEnum):

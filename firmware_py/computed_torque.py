@@ -13,15 +13,20 @@ from __future__ import annotations
 
 import math
 
-from firmware_py.disturbance_observer import add_to_disturbance, reset_observer, step_observer
-from firmware_py.friction import compensation_motor_torque_Nm
-from firmware_py.iterative_learning import learning_torque_Nm, record_correction, reset_learning, watch_learning
-from firmware_py.kernel import kernel
-from firmware_py.lugre import step_lugre
-from firmware_py.pid import integrate_error
-from firmware_py.rbfnn import adapt_network, network_torque_Nm, reset_network
-from firmware_py.records import LawConstants, LawState, Reference, VelocityState
-from firmware_py.states import ControllerKind, FeedForward
+from jointctl.firmware_py.disturbance_observer import add_to_disturbance, reset_observer, step_observer
+from jointctl.firmware_py.friction import compensation_motor_torque_Nm
+from jointctl.firmware_py.iterative_learning import (
+    learning_torque_Nm,
+    record_correction,
+    reset_learning,
+    watch_learning,
+)
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.lugre import step_lugre
+from jointctl.firmware_py.pid import integrate_error
+from jointctl.firmware_py.rbfnn import adapt_network, network_torque_Nm, reset_network
+from jointctl.firmware_py.records import LawConstants, LawState, Reference, VelocityState
+from jointctl.firmware_py.states import ControllerKind, FeedForward
 
 
 @kernel

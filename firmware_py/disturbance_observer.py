@@ -9,8 +9,8 @@ as a command needs to become torque, so that saturation does not wind the observ
 
 from __future__ import annotations
 
-from firmware_py.kernel import kernel
-from firmware_py.records import TORQUE_HISTORY, ObserverConstants, ObserverState
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.records import TORQUE_HISTORY, ObserverConstants, ObserverState
 
 
 @kernel

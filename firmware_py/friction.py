@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.kernel import inlined, kernel
-from firmware_py.records import FrictionBranch, FrictionConstants
-from firmware_py.schema import new
-from firmware_py.states import ZeroSpeedRule
+from jointctl.firmware_py.kernel import inlined, kernel
+from jointctl.firmware_py.records import FrictionBranch, FrictionConstants
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import ZeroSpeedRule
 
 DEGREE = math.pi / 180.0
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from firmware_py.kernel import kernel
-from firmware_py.records import AxisConstants, AxisState
-from firmware_py.sequence import trip
-from firmware_py.states import CommandKind, Fault
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.records import AxisConstants, AxisState
+from jointctl.firmware_py.sequence import trip
+from jointctl.firmware_py.states import CommandKind, Fault
 
 # at a torque that a sound joint gives way to: it moves by a milliradian in that time
 PUSHED_CYCLES = 20

@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import math
 
-from firmware_py.kernel import kernel
-from firmware_py.records import LEARNING_BINS, LearningConstants, LearningState
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.records import LEARNING_BINS, LearningConstants, LearningState
 
 GROWN = 3  # repetitions in a row with a greater error than before end the learning
 

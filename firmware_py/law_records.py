@@ -10,7 +10,7 @@ from typing import Annotated
 
 import numpy as np
 
-from firmware_py.schema import array_of, f8, i4, i8, record
+from jointctl.firmware_py.schema import array_of, f8, i4, i8, record
 
 NEURONS = 15
 TORQUE_HISTORY = 16  # cycles that an observer can look back

@@ -15,7 +15,7 @@ import numpy as np
 from numba.core import types
 from numba.extending import intrinsic
 
-from firmware_py.kernel import JIT_DISABLED, kernel
+from jointctl.firmware_py.kernel import JIT_DISABLED, kernel
 
 _CTYPES = {
     types.int32: ctypes.c_int32,

@@ -17,7 +17,7 @@ import math
 
 import numpy as np
 
-from firmware_py.change_records import (
+from jointctl.firmware_py.change_records import (
     ChangeAnswer,
     ChangeConstants,
     ChangeKind,
@@ -26,14 +26,21 @@ from firmware_py.change_records import (
     Gains,
     MotionChange,
 )
-from firmware_py.iterative_learning import reset_learning
-from firmware_py.kernel import kernel
-from firmware_py.libc import load_acquire
-from firmware_py.lyapunov import right_column_of_p
-from firmware_py.records import AxisConstants, AxisState, LawConstants, LawState, LimitConstants, TrajectoryConstants
-from firmware_py.safety import within
-from firmware_py.states import AxisPhase, ControllerKind, TrajectoryKind
-from firmware_py.trajectory import (
+from jointctl.firmware_py.iterative_learning import reset_learning
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.libc import load_acquire
+from jointctl.firmware_py.lyapunov import right_column_of_p
+from jointctl.firmware_py.records import (
+    AxisConstants,
+    AxisState,
+    LawConstants,
+    LawState,
+    LimitConstants,
+    TrajectoryConstants,
+)
+from jointctl.firmware_py.safety import within
+from jointctl.firmware_py.states import AxisPhase, ControllerKind, TrajectoryKind
+from jointctl.firmware_py.trajectory import (
     QUINTIC_PEAK_ACCELERATION,
     QUINTIC_PEAK_SPEED,
     approach_at,

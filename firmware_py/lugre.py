@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import math
 
-from firmware_py.friction import branch_torque_Nm
-from firmware_py.kernel import kernel
-from firmware_py.records import FrictionConstants, LuGreConstants
+from jointctl.firmware_py.friction import branch_torque_Nm
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.records import FrictionConstants, LuGreConstants
 
 
 @kernel

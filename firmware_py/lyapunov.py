@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from firmware_py.kernel import kernel, plain
+from jointctl.firmware_py.kernel import kernel, plain
 
 
 @kernel

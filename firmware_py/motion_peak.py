@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from firmware_py.records import Reference, TrajectoryConstants
-from firmware_py.schema import new
-from firmware_py.states import TrajectoryKind
-from firmware_py.trajectory import (
+from jointctl.firmware_py.records import Reference, TrajectoryConstants
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import TrajectoryKind
+from jointctl.firmware_py.trajectory import (
     QUINTIC_PEAK_ACCELERATION,
     QUINTIC_PEAK_SPEED,
     plan_approach,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from firmware_py.schema import f8, i4, record
+from jointctl.firmware_py.schema import f8, i4, record
 
 
 @record

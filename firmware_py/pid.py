@@ -7,7 +7,7 @@ A triple pole p needs kd = 3 p, kp = 3 p^2, ki = p^3.
 
 from __future__ import annotations
 
-from firmware_py.kernel import kernel
+from jointctl.firmware_py.kernel import kernel
 
 
 @kernel

@@ -9,27 +9,27 @@ from typing import Annotated
 
 import numpy as np
 
-from firmware_py.change_records import ChangeConstants as ChangeConstants
-from firmware_py.change_records import ChangeRequest as ChangeRequest
-from firmware_py.change_records import ChangeState as ChangeState
-from firmware_py.change_records import Gains as Gains
-from firmware_py.law_records import LEARNING_BINS as LEARNING_BINS
-from firmware_py.law_records import NEURONS as NEURONS
-from firmware_py.law_records import TORQUE_HISTORY as TORQUE_HISTORY
-from firmware_py.law_records import FrictionBranch as FrictionBranch
-from firmware_py.law_records import FrictionConstants as FrictionConstants
-from firmware_py.law_records import LawConstants as LawConstants
-from firmware_py.law_records import LawState as LawState
-from firmware_py.law_records import LearningConstants as LearningConstants
-from firmware_py.law_records import LearningState as LearningState
-from firmware_py.law_records import LuGreConstants as LuGreConstants
-from firmware_py.law_records import NetworkConstants as NetworkConstants
-from firmware_py.law_records import NetworkState as NetworkState
-from firmware_py.law_records import ObserverConstants as ObserverConstants
-from firmware_py.law_records import ObserverState as ObserverState
-from firmware_py.motion_records import Reference as Reference
-from firmware_py.motion_records import TrajectoryConstants as TrajectoryConstants
-from firmware_py.schema import array_of, f8, i4, i8, record, u4
+from jointctl.firmware_py.change_records import ChangeConstants as ChangeConstants
+from jointctl.firmware_py.change_records import ChangeRequest as ChangeRequest
+from jointctl.firmware_py.change_records import ChangeState as ChangeState
+from jointctl.firmware_py.change_records import Gains as Gains
+from jointctl.firmware_py.law_records import LEARNING_BINS as LEARNING_BINS
+from jointctl.firmware_py.law_records import NEURONS as NEURONS
+from jointctl.firmware_py.law_records import TORQUE_HISTORY as TORQUE_HISTORY
+from jointctl.firmware_py.law_records import FrictionBranch as FrictionBranch
+from jointctl.firmware_py.law_records import FrictionConstants as FrictionConstants
+from jointctl.firmware_py.law_records import LawConstants as LawConstants
+from jointctl.firmware_py.law_records import LawState as LawState
+from jointctl.firmware_py.law_records import LearningConstants as LearningConstants
+from jointctl.firmware_py.law_records import LearningState as LearningState
+from jointctl.firmware_py.law_records import LuGreConstants as LuGreConstants
+from jointctl.firmware_py.law_records import NetworkConstants as NetworkConstants
+from jointctl.firmware_py.law_records import NetworkState as NetworkState
+from jointctl.firmware_py.law_records import ObserverConstants as ObserverConstants
+from jointctl.firmware_py.law_records import ObserverState as ObserverState
+from jointctl.firmware_py.motion_records import Reference as Reference
+from jointctl.firmware_py.motion_records import TrajectoryConstants as TrajectoryConstants
+from jointctl.firmware_py.schema import array_of, f8, i4, i8, record, u4
 
 
 @record

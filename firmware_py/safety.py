@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 
-from firmware_py.kernel import kernel
-from firmware_py.records import LimitConstants, Swing, SwingConstants, SwingState
-from firmware_py.states import AxisPhase, DriveState, Fault, LimitSource, Reaction
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.records import LimitConstants, Swing, SwingConstants, SwingState
+from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, LimitSource, Reaction
 
 # Half swings in a row that are a limit cycle.  On 480 runs of joints that are well there were 2 at most of either kind,
 # and 6 that grew.

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from firmware_py.computed_torque import reset_law
-from firmware_py.kernel import kernel
-from firmware_py.live_change import reset_change
-from firmware_py.records import LINE_GONE, AxisConstants, AxisState, Command, LimitConstants, Sample
-from firmware_py.safety import encoders_disagree, limit_position_rad, motion_fault, reaction_to, reset_swing
-from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction, StopRequest
-from firmware_py.trajectory import plan_approach, reference_at
+from jointctl.firmware_py.computed_torque import reset_law
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.live_change import reset_change
+from jointctl.firmware_py.records import LINE_GONE, AxisConstants, AxisState, Command, LimitConstants, Sample
+from jointctl.firmware_py.safety import encoders_disagree, limit_position_rad, motion_fault, reaction_to, reset_swing
+from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction, StopRequest
+from jointctl.firmware_py.trajectory import plan_approach, reference_at
 
 # The drive answers a request one cycle later at the earliest; a state older than this is not its answer.
 ANSWER_CYCLES = 2

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from firmware_py.kernel import kernel
-from firmware_py.records import AxisConstants, AxisState, Sample
-from firmware_py.safety import drive_fault
-from firmware_py.sequence import latch_fault, powered, react, trip
-from firmware_py.states import AxisPhase, DriveState, Fault, Reaction
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.records import AxisConstants, AxisState, Sample
+from jointctl.firmware_py.safety import drive_fault
+from jointctl.firmware_py.sequence import latch_fault, powered, react, trip
+from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, Reaction
 
 
 @kernel

@@ -5,11 +5,11 @@ What counts as a swing is in `safety`.
 
 from __future__ import annotations
 
-from firmware_py.kernel import kernel
-from firmware_py.records import AxisConstants, AxisState, Sample
-from firmware_py.safety import note_rest, swing_fault, swing_Hz, torque_noise
-from firmware_py.sequence import powered, trip
-from firmware_py.states import AxisPhase, Fault, Notice
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.records import AxisConstants, AxisState, Sample
+from jointctl.firmware_py.safety import note_rest, swing_fault, swing_Hz, torque_noise
+from jointctl.firmware_py.sequence import powered, trip
+from jointctl.firmware_py.states import AxisPhase, Fault, Notice
 
 
 @kernel

@@ -16,9 +16,9 @@ import math
 
 import numpy as np
 
-from firmware_py.kernel import kernel
-from firmware_py.records import Reference, TrajectoryConstants
-from firmware_py.states import TrajectoryKind
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.records import Reference, TrajectoryConstants
+from jointctl.firmware_py.states import TrajectoryKind
 
 ENDS_MEET_rad = 1e-9  # a table whose ends differ by more is not repeated: it would jump
 # of a quintic of least jerk from rest to rest, in distance / duration and in distance / duration^2

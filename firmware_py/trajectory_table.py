@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_py.input_file import LARGEST_TABLE_BYTES, number_from, read_input
-from firmware_py.trajectory import ENDS_MEET_rad
+from jointctl.firmware_py.input_file import LARGEST_TABLE_BYTES, number_from, read_input
+from jointctl.firmware_py.trajectory import ENDS_MEET_rad
 
 COLUMNS = ("time_s", "position_rad")
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 
-from firmware_py.kernel import kernel
-from firmware_py.records import VelocityConstants, VelocityState
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.records import VelocityConstants, VelocityState
 
 
 @kernel

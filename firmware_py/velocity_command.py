@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import math
 
-from firmware_py.kernel import kernel
-from firmware_py.records import LimitConstants, Reference, VelocityCommandConstants
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.records import LimitConstants, Reference, VelocityCommandConstants
 
 
 @kernel

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.kernel import kernel
-from firmware_py.libc import (
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.libc import (
     EAGAIN,
     EINTR,
     MSG_DONTWAIT,
@@ -28,14 +28,14 @@ from firmware_py.libc import (
     send,
     store_release,
 )
-from hil.bus.frames import FRAME_SIZE, FrameQueue
-from hil.canopen.device_core import accept_frame, advance
-from hil.canopen.device_records import Device, NmtState, int64
-from hil.faults.frame_faults import append_frame, pass_frame, take_due
-from hil.faults.kinds import FaultMemory
-from hil.faults.plant_faults import step_faults
-from hil.frame_stamps import OLDEST_STAMP_NS, STAMPED_LAG_NS, sent_ns_of, stamp_answers
-from hil.plant.records import PlantConstants, PlantState
+from jointctl.hil.bus.frames import FRAME_SIZE, FrameQueue
+from jointctl.hil.canopen.device_core import accept_frame, advance
+from jointctl.hil.canopen.device_records import Device, NmtState, int64
+from jointctl.hil.faults.frame_faults import append_frame, pass_frame, take_due
+from jointctl.hil.faults.kinds import FaultMemory
+from jointctl.hil.faults.plant_faults import step_faults
+from jointctl.hil.frame_stamps import OLDEST_STAMP_NS, STAMPED_LAG_NS, sent_ns_of, stamp_answers
+from jointctl.hil.plant.records import PlantConstants, PlantState
 
 ENETDOWN = errno_codes.ENETDOWN
 STOP_WORD = 0  # not zero: leave the loop

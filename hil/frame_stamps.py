@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from firmware_py.kernel import kernel
-from hil.bus.frames import FrameQueue
-from hil.canopen.device_records import int64
+from jointctl.firmware_py.kernel import kernel
+from jointctl.hil.bus.frames import FrameQueue
+from jointctl.hil.canopen.device_records import int64
 
 OLDEST_STAMP_NS = 100_000_000  # an older one is not believed
 STAMPED_LAG_NS = 3_000_000  # how far drive and plant stay behind while frames are stamped

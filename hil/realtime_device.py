@@ -8,11 +8,11 @@ import time
 
 import numpy as np
 
-from firmware_py.schema import new
-from hil.bus.frames import FRAME_SIZE, FrameQueue
-from hil.canopen.device import Cia402Device
-from hil.device_loop import STOP_WORD, WORDS, run_device, store_release_word
-from hil.faults.kinds import fault_memory, no_faults
+from jointctl.firmware_py.schema import new
+from jointctl.hil.bus.frames import FRAME_SIZE, FrameQueue
+from jointctl.hil.canopen.device import Cia402Device
+from jointctl.hil.device_loop import STOP_WORD, WORDS, run_device, store_release_word
+from jointctl.hil.faults.kinds import fault_memory, no_faults
 
 _SDO_LOOK_S = 0.1
 

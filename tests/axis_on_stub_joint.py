@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.axis import step_axis
-from firmware_py.friction import paper_friction
-from firmware_py.lyapunov import solve_lyapunov_p
-from firmware_py.records import NEURONS, AxisConstants, AxisState, Command, Sample
-from firmware_py.schema import new
-from firmware_py.sequence import reset_axis
-from firmware_py.states import (
+from jointctl.firmware_py.axis import step_axis
+from jointctl.firmware_py.friction import paper_friction
+from jointctl.firmware_py.lyapunov import solve_lyapunov_p
+from jointctl.firmware_py.records import NEURONS, AxisConstants, AxisState, Command, Sample
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.sequence import reset_axis
+from jointctl.firmware_py.states import (
     AxisPhase,
     ControllerKind,
     DriveRequest,
@@ -23,7 +23,7 @@ from firmware_py.states import (
     StopRequest,
     TrajectoryKind,
 )
-from firmware_py.velocity import low_pass_gain
+from jointctl.firmware_py.velocity import low_pass_gain
 
 PERIOD_s = 1e-3
 INERTIA_kgm2 = 2.1

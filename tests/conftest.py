@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
-from drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.tools.configuration.drive_settings import canopen_settings
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.simulation.virtual_joint import new_device
 from tests.axis_on_stub_joint import Rig, small_axis_constants
 from tests.device_on_bus import DeviceOnBus
 from tests.places import CONFIGS
-from tools.configuration.drive_settings import canopen_settings
-from tools.configuration.load import load_config
-from tools.simulation.virtual_joint import new_device
 
 
 def pytest_configure() -> None:

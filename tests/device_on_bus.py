@@ -9,11 +9,11 @@ import time
 
 import can
 
-from drivers.canopen.bus_watchers import LISTEN_S
-from drivers.canopen.drive import CanopenDrive
-from drivers.canopen.settings import CanopenSettings
-from drivers.canopen.switch_off import stop_node
-from hil.canopen.device import Cia402Device
+from jointctl.drivers.canopen.bus_watchers import LISTEN_S
+from jointctl.drivers.canopen.drive import CanopenDrive
+from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.canopen.switch_off import stop_node
+from jointctl.hil.canopen.device import Cia402Device
 
 _FRAME = struct.Struct("<IB3x8s")
 _channels = itertools.count()

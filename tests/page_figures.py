@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from tools.drawing import EITHER_WAY
+from jointctl.tools.drawing import EITHER_WAY
 
 
 def svgs(html: str) -> list[str]:

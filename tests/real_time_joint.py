@@ -12,10 +12,10 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from hil.elmo.device import ElmoDevice
-from tools.configuration.config import Config
-from tools.simulation.virtual_joint import serve_virtual_joint
-from tools.verbs.hil_serial import serve_virtual_elmo
+from jointctl.hil.elmo.device import ElmoDevice
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.simulation.virtual_joint import serve_virtual_joint
+from jointctl.tools.verbs.hil_serial import serve_virtual_elmo
 
 BEFORE_A_LOOP, BELOW_A_LOOP = 60, 20  # priorities
 COMPILED = ("device", "virtual bus")  # the threads that never hold the interpreter's lock for long

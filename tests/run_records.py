@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from firmware_py.records import LogRecord
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase
 
 
 def run_records(tracking: int = 1000) -> np.recarray:

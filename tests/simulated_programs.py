@@ -29,28 +29,28 @@ import numpy as np
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoCommunicationError
 
-from drivers.canopen import drive as drive_module
-from drivers.canopen import switch_off as switch_off_module
-from drivers.canopen.drive import CanopenDrive
-from drivers.canopen.exchange import accept, begin, end, exchange_memory
-from drivers.canopen.switch_off import stop_node
-from firmware_py.libc import NANOSECONDS
-from firmware_py.realtime import Word
-from firmware_py.records import LogRecord
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase
-from hil.bus.frames import FRAME_SIZE
-from hil.canopen.device_records import PowerState
-from hil.lockstep import TRUE_POWER_STATE, TRUTHS, run_lockstep
-from tools.configuration.config import Config
-from tools.configuration.drive_settings import canopen_settings
-from tools.output import Output
-from tools.running import supervisor as supervisor_module
-from tools.running.loop import loop_handle as loop_module
-from tools.running.loop import portable_loop, shared_block
-from tools.running.loop.loop_handle import LoopHandle
-from tools.running.stop_signals import STOP_COMMAND, StopSignals
-from tools.simulation.virtual_joint import new_device
+from jointctl.drivers.canopen import drive as drive_module
+from jointctl.drivers.canopen import switch_off as switch_off_module
+from jointctl.drivers.canopen.drive import CanopenDrive
+from jointctl.drivers.canopen.exchange import accept, begin, end, exchange_memory
+from jointctl.drivers.canopen.switch_off import stop_node
+from jointctl.firmware_py.libc import NANOSECONDS
+from jointctl.firmware_py.realtime import Word
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase
+from jointctl.hil.bus.frames import FRAME_SIZE
+from jointctl.hil.canopen.device_records import PowerState
+from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUTHS, run_lockstep
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.drive_settings import canopen_settings
+from jointctl.tools.output import Output
+from jointctl.tools.running import supervisor as supervisor_module
+from jointctl.tools.running.loop import loop_handle as loop_module
+from jointctl.tools.running.loop import portable_loop, shared_block
+from jointctl.tools.running.loop.loop_handle import LoopHandle
+from jointctl.tools.running.stop_signals import STOP_COMMAND, StopSignals
+from jointctl.tools.simulation.virtual_joint import new_device
 
 STEP_NS = 1_000_000
 FAST_STEPS = 5

@@ -8,13 +8,13 @@ from typing import Any
 
 import tomlkit
 
-from drivers.can.frames import Frame
-from drivers.canopen.cyclic import accept_frame, begin_cycle
-from firmware_py.schema import new
+from jointctl.drivers.can.frames import Frame
+from jointctl.drivers.canopen.cyclic import accept_frame, begin_cycle
+from jointctl.firmware_py.schema import new
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.drive_settings import canopen_settings
+from jointctl.tools.configuration.load import load_config
 from tests.places import CONFIGS
-from tools.configuration.config import Config
-from tools.configuration.drive_settings import canopen_settings
-from tools.configuration.load import load_config
 
 NODE = {
     "source": "node", "node": 2, "counts_per_turn": 524288, "direction": 1, "zero_counts": 100_000,
@@ -43,7 +43,7 @@ def short_run(folder: Path, encoder: dict[str, Any], **changes: Any) -> Config:
 
 
 def port_of(folder: Path, encoder: dict[str, Any], **changes: Any) -> Any:
-    from drivers.canopen.scaling import new_port
+    from jointctl.drivers.canopen.scaling import new_port
 
     return new_port(canopen_settings(short_run(folder, encoder, **changes)), 0.06, 1000, second_range_counts=1 << 20)
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import canopen
 
-from hil.canopen.device import Cia402Device, DeviceSettings
-from hil.plant.joint import plant
+from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
+from jointctl.hil.plant.joint import plant
 from tests.places import EDS
 
 NODE = 5

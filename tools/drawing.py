@@ -13,9 +13,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from drivers.errors import UsageError
-from drivers.printable import printable
-from tools.written_file import refuse_overwriting, refuse_special, writing
+from jointctl.drivers.errors import UsageError
+from jointctl.drivers.printable import printable
+from jointctl.tools.written_file import refuse_overwriting, refuse_special, writing
 
 # the numbers only mark what to replace; near the page's light colours, so that a plain viewer is right as well
 COLOURS = {

@@ -23,9 +23,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-from drivers.errors import DataError
-from drivers.printable import message_line, printable
-from tools.narrow_table import fitted, widest
+from jointctl.drivers.errors import DataError
+from jointctl.drivers.printable import message_line, printable
+from jointctl.tools.narrow_table import fitted, widest
 
 
 class Advance(Protocol):

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from drivers.errors import DataError
+from jointctl.drivers.errors import DataError
 
 
 @contextmanager

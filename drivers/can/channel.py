@@ -16,7 +16,7 @@ from urllib.parse import quote, unquote
 
 import can
 
-from drivers.errors import BusError
+from jointctl.drivers.errors import BusError
 
 Option = str | int | float | bool
 RESERVED = frozenset(("interface", "channel", "bitrate", "can_filters", "ignore_config", "config_context", "context"))

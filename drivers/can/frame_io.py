@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from drivers.can.frames import FRAME_BYTES, Frame
-from firmware_py.kernel import kernel
-from firmware_py.libc import EINTR, MSG_DONTWAIT, MSG_NOSIGNAL, errno, recv, send
+from jointctl.drivers.can.frames import FRAME_BYTES, Frame
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.libc import EINTR, MSG_DONTWAIT, MSG_NOSIGNAL, errno, recv, send
 
 # On AF_UNIX, the length of the whole datagram is returned even where it is longer than the buffer.
 MSG_TRUNC = 0x20

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
-from firmware_py.schema import array_of, record, u1, u4
+from jointctl.firmware_py.schema import array_of, record, u1, u4
 
 EXTENDED_FLAG = 0x80000000
 REMOTE_FLAG = 0x40000000

@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.can.socketcan import up_command
-from drivers.errors import BusError, NoDeviceError
+from jointctl.drivers.can.socketcan import up_command
+from jointctl.drivers.errors import BusError, NoDeviceError
 
 _TIMEOUT_S = 2.0
 SHORT_QUEUE = 50  # frames; Linux' default of 10 overflows when two programs send

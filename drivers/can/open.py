@@ -15,10 +15,10 @@ from typing import Any
 
 import can
 
-from drivers.can import serial_adapter, socketcan, virtual_bus
-from drivers.can.channel import check_options, split_channel
-from drivers.can.foreign_bus import tamed
-from drivers.errors import BusError
+from jointctl.drivers.can import serial_adapter, socketcan, virtual_bus
+from jointctl.drivers.can.channel import check_options, split_channel
+from jointctl.drivers.can.foreign_bus import tamed
+from jointctl.drivers.errors import BusError
 
 CYCLIC_INTERFACES = ("socketcan", "jointctl")
 # several programs can open them at once; any other may serve one at a time

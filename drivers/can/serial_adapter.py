@@ -7,9 +7,9 @@ import fcntl
 import os
 from collections.abc import Iterator
 
-from drivers.can.channel import split_channel
-from drivers.errors import BusError
-from drivers.port_users import users_text
+from jointctl.drivers.can.channel import split_channel
+from jointctl.drivers.errors import BusError
+from jointctl.drivers.port_users import users_text
 
 
 def port_path(channel: str) -> str:

@@ -10,7 +10,7 @@ import errno
 import socket
 import struct
 
-from drivers.errors import BusError
+from jointctl.drivers.errors import BusError
 
 _RECEIVE_BUFFER_BYTES = 1 << 20
 _ALL_ERRORS = 0x1FFFFFFF  # CAN_ERR_MASK

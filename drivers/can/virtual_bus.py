@@ -21,8 +21,8 @@ from typing import Any
 
 import can
 
-from drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, FRAME_BYTES, FRAME_STRUCT, REMOTE_FLAG
-from drivers.errors import BusError
+from jointctl.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, FRAME_BYTES, FRAME_STRUCT, REMOTE_FLAG
+from jointctl.drivers.errors import BusError
 
 _EXTENDED_MASK = 0x1FFFFFFF
 _STANDARD_MASK = 0x7FF

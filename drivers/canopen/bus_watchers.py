@@ -9,8 +9,8 @@ from collections.abc import Callable, Collection, Iterable
 
 import can
 
-from drivers.canopen.identifiers import HEARTBEAT_ID, NMT_ID, RPDO_IDS, SDO_REQUEST_ID, SYNC_ID, NmtCommand
-from drivers.errors import BusError
+from jointctl.drivers.canopen.identifiers import HEARTBEAT_ID, NMT_ID, RPDO_IDS, SDO_REQUEST_ID, SYNC_ID, NmtCommand
+from jointctl.drivers.errors import BusError
 
 LISTEN_S = 1.0  # a controller whose SYNC is slower than this is not found by listening alone
 FAILURE_PAUSE_S = 0.05

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from firmware_py.kernel import kernel, plain
-from firmware_py.states import DriveRequest, DriveState, in_words
+from jointctl.firmware_py.kernel import kernel, plain
+from jointctl.firmware_py.states import DriveRequest, DriveState, in_words
 
 
 class State(IntEnum):

@@ -10,22 +10,22 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from drivers.canopen.cia402 import SUPPORTED_MODE_BIT, ControlWord, Mode, State, state_of_word
-from drivers.canopen.connection_loss import arm_reaction, arm_rpdo_deadline
-from drivers.canopen.eds_file import EdsFile
-from drivers.canopen.encoder_node import EncoderFindings, commission_drive_object
-from drivers.canopen.object_access import ObjectAccess
-from drivers.canopen.pdo_layout import TARGET_TORQUE, TARGET_VELOCITY, PdoLayout
-from drivers.canopen.pdo_map import configure_loop_pdos
-from drivers.canopen.readiness import wait_until_ready
-from drivers.canopen.scaling import joint_torque_per_permille_Nm, joint_velocity_per_unit_radps
-from drivers.canopen.settings import CanopenSettings
-from drivers.canopen.switch_off import POWERED_STATES, state_of
-from drivers.canopen.synchronisation import set_sync
-from drivers.canopen.torque_slope import set_torque_slope
-from drivers.drive import DriveIdentity
-from drivers.errors import DeviceError
-from firmware_py.states import in_words
+from jointctl.drivers.canopen.cia402 import SUPPORTED_MODE_BIT, ControlWord, Mode, State, state_of_word
+from jointctl.drivers.canopen.connection_loss import arm_reaction, arm_rpdo_deadline
+from jointctl.drivers.canopen.eds_file import EdsFile
+from jointctl.drivers.canopen.encoder_node import EncoderFindings, commission_drive_object
+from jointctl.drivers.canopen.object_access import ObjectAccess
+from jointctl.drivers.canopen.pdo_layout import TARGET_TORQUE, TARGET_VELOCITY, PdoLayout
+from jointctl.drivers.canopen.pdo_map import configure_loop_pdos
+from jointctl.drivers.canopen.readiness import wait_until_ready
+from jointctl.drivers.canopen.scaling import joint_torque_per_permille_Nm, joint_velocity_per_unit_radps
+from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.canopen.switch_off import POWERED_STATES, state_of
+from jointctl.drivers.canopen.synchronisation import set_sync
+from jointctl.drivers.canopen.torque_slope import set_torque_slope
+from jointctl.drivers.drive import DriveIdentity
+from jointctl.drivers.errors import DeviceError
+from jointctl.firmware_py.states import in_words
 
 CIA402_PROFILE = 402
 MODES = {

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import contextlib
 
-from drivers.canopen.object_access import ObjectAccess
-from drivers.canopen.pdo_layout import COMMUNICATION_RPDO, DISABLED, IDENTIFIER
-from drivers.canopen.pdo_map import EVENT_TIMER, pdos_of
-from drivers.canopen.settings import CanopenSettings
-from drivers.errors import DeviceError
+from jointctl.drivers.canopen.object_access import ObjectAccess
+from jointctl.drivers.canopen.pdo_layout import COMMUNICATION_RPDO, DISABLED, IDENTIFIER
+from jointctl.drivers.canopen.pdo_map import EVENT_TIMER, pdos_of
+from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.errors import DeviceError
 
 ABORT_QUICK_STOP = 3  # object 6007
 STOPPED = 2  # object 1029:1

@@ -13,17 +13,23 @@ import math
 
 import numpy as np
 
-from drivers.can.bit_timing import worst_frame_bits
-from drivers.can.frames import ERROR_FLAG, Frame
-from drivers.canopen.cia402 import State, control_word, decode_state, drive_state
-from drivers.canopen.identifiers import NmtState
-from drivers.canopen.port import SLOT_HEARTBEAT, SLOT_RPDO, SLOT_SYNC, CanopenPort
-from drivers.canopen.second_position import SEEN_FIRST, SEEN_SECOND, publish_sample, take_second_counts, watch_second
-from drivers.position_counts import HALF_WRAP, WRAP, take_counts
-from firmware_py.kernel import kernel
-from firmware_py.records import Command, Sample
-from firmware_py.schema import INT32_MAX
-from firmware_py.states import DriveRequest
+from jointctl.drivers.can.bit_timing import worst_frame_bits
+from jointctl.drivers.can.frames import ERROR_FLAG, Frame
+from jointctl.drivers.canopen.cia402 import State, control_word, decode_state, drive_state
+from jointctl.drivers.canopen.identifiers import NmtState
+from jointctl.drivers.canopen.port import SLOT_HEARTBEAT, SLOT_RPDO, SLOT_SYNC, CanopenPort
+from jointctl.drivers.canopen.second_position import (
+    SEEN_FIRST,
+    SEEN_SECOND,
+    publish_sample,
+    take_second_counts,
+    watch_second,
+)
+from jointctl.drivers.position_counts import HALF_WRAP, WRAP, take_counts
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.records import Command, Sample
+from jointctl.firmware_py.schema import INT32_MAX
+from jointctl.firmware_py.states import DriveRequest
 
 # A drive that was told to stop and still says that it is enabled, or says nothing, does not hear us (SYNC or RPDO
 # lost).  Its watchdog is what is left: after so many cycles the heartbeat is withheld for the rest of the run.

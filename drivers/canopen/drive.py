@@ -9,28 +9,28 @@ from typing import Any
 
 import can
 
-from drivers.canopen.bus_watchers import OtherControllers
-from drivers.canopen.commissioning import VELOCITY_MODES, Findings, commission
-from drivers.canopen.connection_loss import clear_rpdo_deadlines, rpdo_identifiers, watched_nodes
-from drivers.canopen.eds_file import read_eds
-from drivers.canopen.encoder_end import EncoderEnd
-from drivers.canopen.encoder_settings import DRIVE_RANGE_COUNTS
-from drivers.canopen.fault_reset import reset_fault
-from drivers.canopen.found_enabled import brake_if_enabled
-from drivers.canopen.identifiers import NmtCommand
-from drivers.canopen.network import new_network, report_own_frames
-from drivers.canopen.object_access import ATTEMPTS as SDO_ATTEMPTS
-from drivers.canopen.object_access import ObjectAccess
-from drivers.canopen.scaling import joint_angle_per_count_rad, new_port, start_position_rad
-from drivers.canopen.sdo_reads import SdoReads
-from drivers.canopen.settings import CanopenSettings
-from drivers.canopen.switch_off import POWERED_STATES, SDO_TIMEOUT_S, SwitchOff, state_of
-from drivers.canopen.thermometer import Thermometer
-from drivers.canopen.watchdog_guard import WatchdogGuard, is_kept
-from drivers.canopen.watchdog_proof import prove_watchdog
-from drivers.drive import UNTOUCHED, Approval, CommissioningReport, is_safe
-from drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
-from firmware_py.states import in_words
+from jointctl.drivers.canopen.bus_watchers import OtherControllers
+from jointctl.drivers.canopen.commissioning import VELOCITY_MODES, Findings, commission
+from jointctl.drivers.canopen.connection_loss import clear_rpdo_deadlines, rpdo_identifiers, watched_nodes
+from jointctl.drivers.canopen.eds_file import read_eds
+from jointctl.drivers.canopen.encoder_end import EncoderEnd
+from jointctl.drivers.canopen.encoder_settings import DRIVE_RANGE_COUNTS
+from jointctl.drivers.canopen.fault_reset import reset_fault
+from jointctl.drivers.canopen.found_enabled import brake_if_enabled
+from jointctl.drivers.canopen.identifiers import NmtCommand
+from jointctl.drivers.canopen.network import new_network, report_own_frames
+from jointctl.drivers.canopen.object_access import ATTEMPTS as SDO_ATTEMPTS
+from jointctl.drivers.canopen.object_access import ObjectAccess
+from jointctl.drivers.canopen.scaling import joint_angle_per_count_rad, new_port, start_position_rad
+from jointctl.drivers.canopen.sdo_reads import SdoReads
+from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.canopen.switch_off import POWERED_STATES, SDO_TIMEOUT_S, SwitchOff, state_of
+from jointctl.drivers.canopen.thermometer import Thermometer
+from jointctl.drivers.canopen.watchdog_guard import WatchdogGuard, is_kept
+from jointctl.drivers.canopen.watchdog_proof import prove_watchdog
+from jointctl.drivers.drive import UNTOUCHED, Approval, CommissioningReport, is_safe
+from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
+from jointctl.firmware_py.states import in_words
 
 SEARCH_S = 0.3
 GATE_S = 0.05  # a wait is interrupted after so long at most

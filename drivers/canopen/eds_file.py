@@ -14,9 +14,9 @@ from typing import Any
 import canopen
 from canopen.objectdictionary import ODRecord, ODVariable, datatypes
 
-from drivers.canopen.eds_text import Sections, number_of, parse_sections, read_text, shown
-from drivers.canopen.standard_objects import BITS, CYCLIC, TYPE_NAME, standard_type
-from drivers.errors import ConfigurationError
+from jointctl.drivers.canopen.eds_text import Sections, number_of, parse_sections, read_text, shown
+from jointctl.drivers.canopen.standard_objects import BITS, CYCLIC, TYPE_NAME, standard_type
+from jointctl.drivers.errors import ConfigurationError
 
 DEFTYPES = 0x1000  # indices below are data types
 ARRAY, RECORD = 8, 9

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from drivers.errors import ConfigurationError
+from jointctl.drivers.errors import ConfigurationError
 
 LARGEST_BYTES = 16_000_000
 LONGEST_NUMBER = 40

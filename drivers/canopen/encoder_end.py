@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import canopen
 
-from drivers.canopen.eds_file import read_eds
-from drivers.canopen.encoder_node import EncoderFindings, commission_encoder, require_no_alarm
-from drivers.canopen.identifiers import NmtCommand
-from drivers.canopen.network import send_nmt
-from drivers.canopen.object_access import ObjectAccess
-from drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.canopen.eds_file import read_eds
+from jointctl.drivers.canopen.encoder_node import EncoderFindings, commission_encoder, require_no_alarm
+from jointctl.drivers.canopen.identifiers import NmtCommand
+from jointctl.drivers.canopen.network import send_nmt
+from jointctl.drivers.canopen.object_access import ObjectAccess
+from jointctl.drivers.canopen.settings import CanopenSettings
 
 
 class EncoderEnd:

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.canopen.encoder_settings import DRIVE_RANGE_COUNTS, JointEncoderSettings
-from drivers.canopen.identifiers import TPDO1_ID, TPDO2_ID
-from drivers.canopen.object_access import ObjectAccess
-from drivers.canopen.pdo_layout import COMMUNICATION_TPDO, MappedObject
-from drivers.canopen.pdo_map import EVERY_SYNC, configure_pdo, disable_pdo, pdos_of
-from drivers.canopen.synchronisation import listen_to_our_sync
-from drivers.errors import DeviceError
+from jointctl.drivers.canopen.encoder_settings import DRIVE_RANGE_COUNTS, JointEncoderSettings
+from jointctl.drivers.canopen.identifiers import TPDO1_ID, TPDO2_ID
+from jointctl.drivers.canopen.object_access import ObjectAccess
+from jointctl.drivers.canopen.pdo_layout import COMMUNICATION_TPDO, MappedObject
+from jointctl.drivers.canopen.pdo_map import EVERY_SYNC, configure_pdo, disable_pdo, pdos_of
+from jointctl.drivers.canopen.synchronisation import listen_to_our_sync
+from jointctl.drivers.errors import DeviceError
 
 CIA406_PROFILE = 406
 POSITION_VALUE = MappedObject(0x6004, 0, 32, "position value")

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numba.core import types
 
-from drivers.answer_window import LOOK_LATE_NS
-from drivers.can.frame_io import receive_frame, send_frame, stamp_frame, stamp_of
-from drivers.can.frames import Frame
-from drivers.canopen.cyclic import accept_frame, answer_owed, begin_cycle, end_cycle
-from drivers.canopen.port import (
+from jointctl.drivers.answer_window import LOOK_LATE_NS
+from jointctl.drivers.can.frame_io import receive_frame, send_frame, stamp_frame, stamp_of
+from jointctl.drivers.can.frames import Frame
+from jointctl.drivers.canopen.cyclic import accept_frame, answer_owed, begin_cycle, end_cycle
+from jointctl.drivers.canopen.port import (
     FRAME_SLOTS,
     SCRATCH_WORDS,
     SLOT_RECEIVED,
@@ -22,10 +22,10 @@ from drivers.canopen.port import (
     SLOT_SYNC,
     CanopenPort,
 )
-from firmware_py.kernel import exported, kernel, record_array_type
-from firmware_py.libc import monotonic_ns, wait_readable_ns
-from firmware_py.records import Command, Sample
-from firmware_py.schema import dtype_of, new
+from jointctl.firmware_py.kernel import exported, kernel, record_array_type
+from jointctl.firmware_py.libc import monotonic_ns, wait_readable_ns
+from jointctl.firmware_py.records import Command, Sample
+from jointctl.firmware_py.schema import dtype_of, new
 
 _PORT = record_array_type(dtype_of(CanopenPort))
 _FRAMES = record_array_type(dtype_of(Frame))

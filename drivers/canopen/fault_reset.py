@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.canopen.cia402 import ControlWord, State, state_of_word
-from drivers.canopen.object_access import ObjectAccess
-from drivers.errors import DeviceError
-from firmware_py.states import in_words
+from jointctl.drivers.canopen.cia402 import ControlWord, State, state_of_word
+from jointctl.drivers.canopen.object_access import ObjectAccess
+from jointctl.drivers.errors import DeviceError
+from jointctl.firmware_py.states import in_words
 
 ATTEMPTS = 3
 SETTLE_S = 0.1  # for the fault to come back if its cause is still there

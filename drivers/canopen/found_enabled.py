@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.at_rest import STOP_HINT, refuse_unless_at_rest
-from drivers.canopen.cia402 import State
-from drivers.canopen.object_access import ObjectAccess
-from drivers.canopen.switch_off import POWERED_STATES, brake, state_of
-from drivers.drive import Approval
-from drivers.errors import BusError
-from firmware_py.states import in_words
+from jointctl.drivers.at_rest import STOP_HINT, refuse_unless_at_rest
+from jointctl.drivers.canopen.cia402 import State
+from jointctl.drivers.canopen.object_access import ObjectAccess
+from jointctl.drivers.canopen.switch_off import POWERED_STATES, brake, state_of
+from jointctl.drivers.drive import Approval
+from jointctl.drivers.errors import BusError
+from jointctl.firmware_py.states import in_words
 
 QUESTION = "The drive is enabled, at rest, and no one else is on the bus. Brake it and switch it off?"
 

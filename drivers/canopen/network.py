@@ -9,8 +9,8 @@ from typing import Any
 import can
 import canopen
 
-from drivers.canopen.bus_watchers import BusFailure, OtherControllers
-from drivers.canopen.identifiers import NMT_ID, NmtCommand
+from jointctl.drivers.canopen.bus_watchers import BusFailure, OtherControllers
+from jointctl.drivers.canopen.identifiers import NMT_ID, NmtCommand
 
 NOTIFIER_S = 0.05  # how long the receiving thread waits before it looks whether it is to end
 

@@ -18,8 +18,8 @@ import canopen
 from canopen.objectdictionary import ObjectDictionaryError
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from drivers.canopen.sdo_download import download
-from drivers.errors import DeviceError, NoDeviceError
+from jointctl.drivers.canopen.sdo_download import download
+from jointctl.drivers.errors import DeviceError, NoDeviceError
 
 ATTEMPTS = 3
 COLLISIONS = 10  # with the transfers of another master on the one SDO channel, such as those of `jointctl stop`

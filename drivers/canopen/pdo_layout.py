@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.canopen.identifiers import RPDO1_ID, TPDO1_ID
-from drivers.canopen.object_access import ObjectAccess, object_name
-from drivers.errors import DeviceError
+from jointctl.drivers.canopen.identifiers import RPDO1_ID, TPDO1_ID
+from jointctl.drivers.canopen.object_access import ObjectAccess, object_name
+from jointctl.drivers.errors import DeviceError
 
 DISABLED = 0x80000000
 NO_REMOTE_REQUEST = 0x40000000

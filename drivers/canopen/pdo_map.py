@@ -9,9 +9,9 @@ from __future__ import annotations
 import contextlib
 from dataclasses import replace
 
-from drivers.canopen.identifiers import LAST_SYNCHRONOUS
-from drivers.canopen.object_access import ObjectAccess, was_refused
-from drivers.canopen.pdo_layout import (
+from jointctl.drivers.canopen.identifiers import LAST_SYNCHRONOUS
+from jointctl.drivers.canopen.object_access import ObjectAccess, was_refused
+from jointctl.drivers.canopen.pdo_layout import (
     COMMUNICATION_RPDO,
     COMMUNICATION_TPDO,
     CONTROL,
@@ -32,7 +32,7 @@ from drivers.canopen.pdo_layout import (
     own_layout,
     read_map,
 )
-from drivers.errors import DeviceError
+from jointctl.drivers.errors import DeviceError
 
 EVERY_SYNC = 1
 FIRST_IDENTIFIER, LAST_IDENTIFIER = 0x181, 0x57F

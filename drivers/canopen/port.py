@@ -7,7 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
-from firmware_py.schema import array_of, f8, i4, i8, record, u1, u4
+from jointctl.firmware_py.schema import array_of, f8, i4, i8, record, u1, u4
 
 # slots of the frame array that goes with a port
 SLOT_SYNC = 0

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.canopen.cia402 import ControlWord, State, state_of_word
-from drivers.canopen.object_access import ObjectAccess
-from drivers.errors import DeviceError
-from firmware_py.states import in_words
+from jointctl.drivers.canopen.cia402 import ControlWord, State, state_of_word
+from jointctl.drivers.canopen.object_access import ObjectAccess
+from jointctl.drivers.errors import DeviceError
+from jointctl.firmware_py.states import in_words
 
 POLL_S = 0.05
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from drivers.canopen.cia402 import State
-from drivers.canopen.encoder_settings import DRIVE_RANGE_COUNTS, JointEncoderSettings
-from drivers.canopen.identifiers import EMERGENCY_ID, HEARTBEAT_ID, SYNC_ID, TPDO1_ID, TPDO2_ID
-from drivers.canopen.pdo_layout import PdoLayout, own_layout
-from drivers.canopen.port import AlignTo, CanopenPort
-from drivers.canopen.second_position import centred
-from drivers.canopen.settings import CanopenSettings
-from firmware_py.schema import new
+from jointctl.drivers.canopen.cia402 import State
+from jointctl.drivers.canopen.encoder_settings import DRIVE_RANGE_COUNTS, JointEncoderSettings
+from jointctl.drivers.canopen.identifiers import EMERGENCY_ID, HEARTBEAT_ID, SYNC_ID, TPDO1_ID, TPDO2_ID
+from jointctl.drivers.canopen.pdo_layout import PdoLayout, own_layout
+from jointctl.drivers.canopen.port import AlignTo, CanopenPort
+from jointctl.drivers.canopen.second_position import centred
+from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.firmware_py.schema import new
 
 PERMILLE = 1000.0
 # units of 60FF besides the encoder's counts per second: motor speed [rad/s] of one unit

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import can
 import canopen
 
-from drivers.canopen.object_access import ABORT_TEXT
+from jointctl.drivers.canopen.object_access import ABORT_TEXT
 
 ANSWER_S = 1.0  # how long an answer may take
 QUIET_S = 0.05  # no one else may have used the SDO channel for so long: it is one for all masters

@@ -6,10 +6,10 @@ restarted is not believed: no sample counts any more.
 
 from __future__ import annotations
 
-from drivers.can.frames import Frame
-from drivers.canopen.port import AlignTo, CanopenPort, SecondPosition
-from firmware_py.kernel import kernel
-from firmware_py.records import ENCODER_RESTARTED, Sample
+from jointctl.drivers.can.frames import Frame
+from jointctl.drivers.canopen.port import AlignTo, CanopenPort, SecondPosition
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.records import ENCODER_RESTARTED, Sample
 
 SEEN_FIRST, SEEN_SECOND = 1, 2
 _BOTH = SEEN_FIRST | SEEN_SECOND

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.canopen.encoder_settings import JointEncoderSettings
-from drivers.canopen.thermometer import TemperatureObject
+from jointctl.drivers.canopen.encoder_settings import JointEncoderSettings
+from jointctl.drivers.canopen.thermometer import TemperatureObject
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,13 @@ import can
 import canopen
 from canopen.objectdictionary import ODVariable
 
-from drivers.canopen.cia402 import ControlWord, State, state_of_word
-from drivers.canopen.identifiers import NmtCommand
-from drivers.canopen.network import new_network, send_nmt
-from drivers.canopen.object_access import ObjectAccess
-from drivers.canopen.standard_objects import standard_type
-from drivers.errors import DeviceError, JointctlError
-from firmware_py.states import in_words
+from jointctl.drivers.canopen.cia402 import ControlWord, State, state_of_word
+from jointctl.drivers.canopen.identifiers import NmtCommand
+from jointctl.drivers.canopen.network import new_network, send_nmt
+from jointctl.drivers.canopen.object_access import ObjectAccess
+from jointctl.drivers.canopen.standard_objects import standard_type
+from jointctl.drivers.errors import DeviceError, JointctlError
+from jointctl.firmware_py.states import in_words
 
 SDO_TIMEOUT_S = 0.3
 QUICK_STOP_S = 1.0  # how long a moving joint may brake before its power is taken

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from drivers.canopen.identifiers import SYNC_ID
-from drivers.canopen.object_access import ObjectAccess
-from drivers.errors import DeviceError
+from jointctl.drivers.canopen.identifiers import SYNC_ID
+from jointctl.drivers.canopen.object_access import ObjectAccess
+from jointctl.drivers.errors import DeviceError
 
 PRODUCES_SYNC = 0x40000000
 LONGEST_PERIOD = 255

@@ -17,10 +17,10 @@ import canopen
 from canopen.objectdictionary import ObjectDictionaryError
 from canopen.objectdictionary.datatypes import NUMBER_TYPES
 
-from drivers.canopen.object_access import object_name
-from drivers.canopen.sdo_reads import SdoReads
-from drivers.drive import Reading
-from drivers.errors import DeviceError
+from jointctl.drivers.canopen.object_access import object_name
+from jointctl.drivers.canopen.sdo_reads import SdoReads
+from jointctl.drivers.drive import Reading
+from jointctl.drivers.errors import DeviceError
 
 PERIOD_S = 1.0
 _WIDEST_BITS = 32  # of an expedited answer

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from drivers.canopen.object_access import ObjectAccess
-from drivers.errors import DeviceError
+from jointctl.drivers.canopen.object_access import ObjectAccess
+from jointctl.drivers.errors import DeviceError
 
 STEEP_PERMILLE_PS = 1_000_000
 TQ_REMARK = "torque mode with profile (TQ) instead of cyclic synchronous torque"

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.canopen.object_access import ObjectAccess, object_name
-from drivers.canopen.pdo_layout import COMMUNICATION_RPDO, LAST_PDO
-from drivers.canopen.pdo_map import EVENT_TIMER
-from drivers.canopen.sdo_reads import SdoReads
-from drivers.errors import DeviceError
+from jointctl.drivers.canopen.object_access import ObjectAccess, object_name
+from jointctl.drivers.canopen.pdo_layout import COMMUNICATION_RPDO, LAST_PDO
+from jointctl.drivers.canopen.pdo_map import EVENT_TIMER
+from jointctl.drivers.canopen.sdo_reads import SdoReads
+from jointctl.drivers.errors import DeviceError
 
 PERIOD_S = 1.0
 MISSED = 3  # reads in a row without an answer, until it is an error before enabling and a warning afterwards

@@ -11,8 +11,8 @@ from collections.abc import Callable
 
 import canopen
 
-from drivers.canopen.identifiers import EMERGENCY_ID, HEARTBEAT_ID, NmtState
-from drivers.errors import DeviceError
+from jointctl.drivers.canopen.identifiers import EMERGENCY_ID, HEARTBEAT_ID, NmtState
+from jointctl.drivers.errors import DeviceError
 
 HEARTBEAT_LOST = 0x8130  # EMCY error code of CiA 301
 BEATS = 6

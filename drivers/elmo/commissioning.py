@@ -5,23 +5,23 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from drivers.at_rest import refuse_unless_at_rest
-from drivers.drive import Approval, CommissioningReport, DriveIdentity
-from drivers.elmo.codes import (
+from jointctl.drivers.at_rest import refuse_unless_at_rest
+from jointctl.drivers.drive import Approval, CommissioningReport, DriveIdentity
+from jointctl.drivers.elmo.codes import (
     AMPLIFIER_MASK,
     FAULT_LATCHED,
     motor_off_cause,
     status_text,
 )
-from drivers.elmo.dialogue import Dialogue, RefusedError
-from drivers.elmo.interpreter import encode
-from drivers.elmo.limits import write_limits
-from drivers.elmo.line_budget import LARGEST_SHARE, MeasuredExchange, highest_rate_Hz, measured_exchange
-from drivers.elmo.serial_port import BytePort, SerialPort
-from drivers.elmo.settings import ElmoSettings
-from drivers.elmo.switch_off import switch_off
-from drivers.elmo.unit_modes import SPEED_MODE, TORQUE_MODE, set_speed_mode, set_torque_mode
-from drivers.errors import BusError, ConfigurationError, DeviceError, NoDeviceError
+from jointctl.drivers.elmo.dialogue import Dialogue, RefusedError
+from jointctl.drivers.elmo.interpreter import encode
+from jointctl.drivers.elmo.limits import write_limits
+from jointctl.drivers.elmo.line_budget import LARGEST_SHARE, MeasuredExchange, highest_rate_Hz, measured_exchange
+from jointctl.drivers.elmo.serial_port import BytePort, SerialPort
+from jointctl.drivers.elmo.settings import ElmoSettings
+from jointctl.drivers.elmo.switch_off import switch_off
+from jointctl.drivers.elmo.unit_modes import SPEED_MODE, TORQUE_MODE, set_speed_mode, set_torque_mode
+from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, NoDeviceError
 
 MEASURED_CYCLES = 20
 TC_STEP_A = 1e-3

@@ -21,12 +21,12 @@ import math
 
 import numpy as np
 
-from drivers.elmo.characters import CR, EQUALS, MINUS, POINT, ZERO
-from drivers.elmo.codes import SERVO_ON, UnitMode
-from drivers.elmo.port import EXPECTED_MAX, OUT_MAX, TEXT_MAX, ElmoPort, Question
-from firmware_py.kernel import kernel
-from firmware_py.records import LINE_GONE, Command, Sample
-from firmware_py.states import DriveRequest, DriveState
+from jointctl.drivers.elmo.characters import CR, EQUALS, MINUS, POINT, ZERO
+from jointctl.drivers.elmo.codes import SERVO_ON, UnitMode
+from jointctl.drivers.elmo.port import EXPECTED_MAX, OUT_MAX, TEXT_MAX, ElmoPort, Question
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.records import LINE_GONE, Command, Sample
+from jointctl.firmware_py.states import DriveRequest, DriveState
 
 SILENT_CYCLES = 3
 STATUS_SPARE_CYCLES = 8  # SR is asked every other cycle, and a lost reply must not stop the joint

@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from drivers.elmo.codes import error_text
-from drivers.elmo.interpreter import Interpreter, Reply, ReplyKind, encode
-from drivers.elmo.serial_port import BytePort
-from drivers.errors import BusError, DeviceError, NoDeviceError
+from jointctl.drivers.elmo.codes import error_text
+from jointctl.drivers.elmo.interpreter import Interpreter, Reply, ReplyKind, encode
+from jointctl.drivers.elmo.serial_port import BytePort
+from jointctl.drivers.errors import BusError, DeviceError, NoDeviceError
 
 ATTEMPTS = 3
 SILENCE_S = 0.03  # no byte for so long: the line is quiet

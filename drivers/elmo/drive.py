@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
-from drivers.drive import DriveIdentity
-from drivers.elmo.codes import (
+from jointctl.drivers.drive import DriveIdentity
+from jointctl.drivers.elmo.codes import (
     AMPLIFIER_MASK,
     FAULT_LATCHED,
     motor_off_cause,
 )
-from drivers.elmo.commissioning import ElmoCommissioning
-from drivers.elmo.dialogue import changed
-from drivers.elmo.inspection import Fact, read_facts
-from drivers.elmo.interpreter import ReplyKind, encode
-from drivers.elmo.port import ElmoPort
-from drivers.elmo.switch_off import switch_off
-from drivers.elmo.unit_modes import set_torque_mode
-from drivers.errors import DeviceError, JointctlError
-from firmware_py.schema import new
+from jointctl.drivers.elmo.commissioning import ElmoCommissioning
+from jointctl.drivers.elmo.dialogue import changed
+from jointctl.drivers.elmo.inspection import Fact, read_facts
+from jointctl.drivers.elmo.interpreter import ReplyKind, encode
+from jointctl.drivers.elmo.port import ElmoPort
+from jointctl.drivers.elmo.switch_off import switch_off
+from jointctl.drivers.elmo.unit_modes import set_torque_mode
+from jointctl.drivers.errors import DeviceError, JointctlError
+from jointctl.firmware_py.schema import new
 
 ENABLE_RETRY_S = 0.5
 

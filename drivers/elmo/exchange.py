@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numba.core import types
 
-from drivers.answer_window import LOOK_LATE_NS
-from drivers.elmo.cyclic import begin_cycle, end_cycle, note_written
-from drivers.elmo.port import READ_MAX, SCRATCH_WORDS, ElmoPort
-from drivers.elmo.replies import take_byte
-from firmware_py.kernel import exported, kernel, record_array_type
-from firmware_py.libc import EAGAIN, EINTR, errno, external, monotonic_ns, poll_events, wait_readable_ns
-from firmware_py.records import Command, Sample
-from firmware_py.schema import dtype_of
+from jointctl.drivers.answer_window import LOOK_LATE_NS
+from jointctl.drivers.elmo.cyclic import begin_cycle, end_cycle, note_written
+from jointctl.drivers.elmo.port import READ_MAX, SCRATCH_WORDS, ElmoPort
+from jointctl.drivers.elmo.replies import take_byte
+from jointctl.firmware_py.kernel import exported, kernel, record_array_type
+from jointctl.firmware_py.libc import EAGAIN, EINTR, errno, external, monotonic_ns, poll_events, wait_readable_ns
+from jointctl.firmware_py.records import Command, Sample
+from jointctl.firmware_py.schema import dtype_of
 
 _read = external("read", types.intp, types.int32, types.uintp, types.uintp)
 _write = external("write", types.intp, types.int32, types.uintp, types.uintp)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.elmo.codes import UnitMode, error_text, motor_fault_text, status_text
-from drivers.elmo.dialogue import Dialogue, RefusedError
-from drivers.elmo.settings import ElmoSettings
-from drivers.errors import DeviceError
+from jointctl.drivers.elmo.codes import UnitMode, error_text, motor_fault_text, status_text
+from jointctl.drivers.elmo.dialogue import Dialogue, RefusedError
+from jointctl.drivers.elmo.settings import ElmoSettings
+from jointctl.drivers.errors import DeviceError
 
 UNIT_MODES = {int(mode): mode.name.lower() for mode in UnitMode}
 # name, index, what it is, what one count or ampere of it means

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from drivers.elmo.dialogue import Dialogue, RefusedError
-from drivers.elmo.settings import ElmoSettings
-from drivers.errors import DeviceError
+from jointctl.drivers.elmo.dialogue import Dialogue, RefusedError
+from jointctl.drivers.elmo.settings import ElmoSettings
+from jointctl.drivers.errors import DeviceError
 
 PEAK_SHARE = 1.02  # in speed mode, of the current of limits.torque_max_Nm: the loop must see that it is reached
 

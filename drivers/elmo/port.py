@@ -7,7 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
-from firmware_py.schema import array_of, f8, i4, i8, record, u1
+from jointctl.firmware_py.schema import array_of, f8, i4, i8, record, u1
 
 TEXT_MAX = 16  # longest cyclic command: JV=-12345678901 and CR
 EXPECTED_MAX = 8  # commands that wait for their reply

@@ -7,14 +7,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from drivers.elmo.characters import CR, MINUS, NINE, PLUS, POINT, QUESTION_MARK, SEMICOLON, ZERO
-from drivers.elmo.codes import AMPLIFIER_MASK, FAULT_LATCHED, SERVO_ON, UNIT_MODE_MASK, UNIT_MODE_SHIFT, UnitMode
-from drivers.elmo.line_budget import BITS_PER_CHARACTER
-from drivers.elmo.port import EXPECTED_MAX, LINE_MAX, ElmoPort, Question
-from drivers.position_counts import WRAP, take_counts
-from firmware_py.kernel import kernel
-from firmware_py.records import Sample
-from firmware_py.states import DriveState
+from jointctl.drivers.elmo.characters import CR, MINUS, NINE, PLUS, POINT, QUESTION_MARK, SEMICOLON, ZERO
+from jointctl.drivers.elmo.codes import (
+    AMPLIFIER_MASK,
+    FAULT_LATCHED,
+    SERVO_ON,
+    UNIT_MODE_MASK,
+    UNIT_MODE_SHIFT,
+    UnitMode,
+)
+from jointctl.drivers.elmo.line_budget import BITS_PER_CHARACTER
+from jointctl.drivers.elmo.port import EXPECTED_MAX, LINE_MAX, ElmoPort, Question
+from jointctl.drivers.position_counts import WRAP, take_counts
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.records import Sample
+from jointctl.firmware_py.states import DriveState
 
 NOTHING = -1
 FAULT_CAUSE_CYCLES = 4  # status replies to wait for MF before a fault is told without its cause

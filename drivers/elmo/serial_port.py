@@ -11,8 +11,8 @@ from typing import Any, Protocol
 import serial
 from serial.tools import list_ports
 
-from drivers.errors import BusError
-from drivers.port_users import users_text
+from jointctl.drivers.errors import BusError
+from jointctl.drivers.port_users import users_text
 
 READ_MAX = 512
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from drivers.elmo.codes import AMPLIFIER_MASK, FAULT_LATCHED, MOTOR_MUST_BE_ON, motor_off_cause
-from drivers.elmo.dialogue import Dialogue, RefusedError
-from drivers.elmo.serial_port import BytePort
-from drivers.errors import DeviceError, JointctlError
+from jointctl.drivers.elmo.codes import AMPLIFIER_MASK, FAULT_LATCHED, MOTOR_MUST_BE_ON, motor_off_cause
+from jointctl.drivers.elmo.dialogue import Dialogue, RefusedError
+from jointctl.drivers.elmo.serial_port import BytePort
+from jointctl.drivers.errors import DeviceError, JointctlError
 
 SAFE_ATTEMPTS = 5
 # TC and ST before MO: where the drive takes no MO=0 it is without torque, or its jog has ended, all the same.  JV=0, so

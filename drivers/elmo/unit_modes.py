@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import contextlib
 
-from drivers.elmo.codes import UnitMode
-from drivers.elmo.dialogue import Dialogue, RefusedError
-from drivers.elmo.settings import ElmoSettings
-from drivers.errors import DeviceError
+from jointctl.drivers.elmo.codes import UnitMode
+from jointctl.drivers.elmo.dialogue import Dialogue, RefusedError
+from jointctl.drivers.elmo.settings import ElmoSettings
+from jointctl.drivers.errors import DeviceError
 
 TORQUE_MODE, SPEED_MODE = "torque (UM=1)", "speed (UM=2)"  # as commissioning reports them
 

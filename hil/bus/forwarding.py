@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numba.core import types
 
-from firmware_py import libc
-from firmware_py.kernel import kernel
-from firmware_py.libc import errno, load_acquire, monotonic_ns, store_release
-from firmware_py.schema import i4, i8, record
-from hil.bus.frames import FRAME_SIZE
-from hil.bus.timing import NO_NODE, finish_frame, frame_bits, pend_frame
+from jointctl.firmware_py import libc
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.libc import errno, load_acquire, monotonic_ns, store_release
+from jointctl.firmware_py.schema import i4, i8, record
+from jointctl.hil.bus.frames import FRAME_SIZE
+from jointctl.hil.bus.timing import NO_NODE, finish_frame, frame_bits, pend_frame
 
 MAX_CLIENTS = 32
 QUEUE_DEPTH = 64  # frames per client that wait for the bus (with timing)

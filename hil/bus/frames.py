@@ -9,7 +9,7 @@ from typing import Annotated
 
 import numpy as np
 
-from firmware_py.schema import array_of, i4, record, u1, u4
+from jointctl.firmware_py.schema import array_of, i4, record, u1, u4
 
 FRAME_SIZE = 16
 QUEUE_LENGTH = 32

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.kernel import kernel
-from firmware_py.libc import NANOSECONDS
-from firmware_py.schema import i8, record
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.libc import NANOSECONDS
+from jointctl.firmware_py.schema import i8, record
 
 EXTENDED = 0x80000000
 REMOTE = 0x40000000

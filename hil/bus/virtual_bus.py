@@ -29,8 +29,8 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.schema import new
-from hil.bus.forwarding import (
+from jointctl.firmware_py.schema import new
+from jointctl.hil.bus.forwarding import (
     CONNECTED,
     MAX_CLIENTS,
     NO_FD,
@@ -41,8 +41,8 @@ from hil.bus.forwarding import (
     run_hub,
     store_stop,
 )
-from hil.bus.frames import WireFrame
-from hil.bus.timing import NO_NODE, Wire
+from jointctl.hil.bus.frames import WireFrame
+from jointctl.hil.bus.timing import NO_NODE, Wire
 
 _LONGEST_PATH = 107
 _CHANNEL_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")

@@ -9,11 +9,11 @@ bit 9 follows the NMT state (0 while stopped).
 
 from __future__ import annotations
 
-from firmware_py.kernel import kernel
-from hil.bus.frames import FrameQueue
-from hil.canopen.cia402_homing import begin_homing, interrupt_homing
-from hil.canopen.device_errors import LENGTH_ERRORS, report_cleared, report_error
-from hil.canopen.device_records import Device, DriveObjects, HomingState, Mode, NmtState, PowerState, int64
+from jointctl.firmware_py.kernel import kernel
+from jointctl.hil.bus.frames import FrameQueue
+from jointctl.hil.canopen.cia402_homing import begin_homing, interrupt_homing
+from jointctl.hil.canopen.device_errors import LENGTH_ERRORS, report_cleared, report_error
+from jointctl.hil.canopen.device_records import Device, DriveObjects, HomingState, Mode, NmtState, PowerState, int64
 
 _HALT = 0x0100
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import math
 
-from firmware_py.kernel import kernel
-from hil.canopen.device_records import Device, HomingState, int64
+from jointctl.firmware_py.kernel import kernel
+from jointctl.hil.canopen.device_records import Device, HomingState, int64
 
 _SPARE_S = 1.0
 

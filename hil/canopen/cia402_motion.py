@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import math
 
-from firmware_py.kernel import kernel
-from hil.canopen.cia402_homing import homing_target_radps
-from hil.canopen.device_records import Device, DriveObjects, Mode, PowerState, int64
+from jointctl.firmware_py.kernel import kernel
+from jointctl.hil.canopen.cia402_homing import homing_target_radps
+from jointctl.hil.canopen.device_records import Device, DriveObjects, Mode, PowerState, int64
 
 _HALT = 0x0100
 _STANDSTILL_RADPS = 0.01

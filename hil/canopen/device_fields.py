@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hil.canopen.device_records import CONSUMERS, HISTORY, MAPPED, PDOS
+from jointctl.hil.canopen.device_records import CONSUMERS, HISTORY, MAPPED, PDOS
 
 
 def _fields() -> dict[tuple[int, int], str]:

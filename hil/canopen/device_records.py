@@ -15,8 +15,8 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from firmware_py.schema import array_of, f8, i1, i2, i4, i8, record, u1, u2, u4
-from hil.canopen.encoder_records import EncoderNode
+from jointctl.firmware_py.schema import array_of, f8, i1, i2, i4, i8, record, u1, u2, u4
+from jointctl.hil.canopen.encoder_records import EncoderNode
 
 # Widens an object's value before arithmetic (uint8 << 8 would overflow in plain Python); typed for mypy.
 int64: Callable[[Any], int] = np.int64  # type: ignore[assignment]

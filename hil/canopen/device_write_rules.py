@@ -8,8 +8,8 @@ of a mapping are those of CiA 301, 7.5.2.36 and 7.5.2.38: an object that is not 
 
 from __future__ import annotations
 
-from hil.canopen.device_records import EVENT_DRIVEN, LAST_SYNCHRONOUS, PowerState
-from hil.canopen.object_dictionary import (
+from jointctl.hil.canopen.device_records import EVENT_DRIVEN, LAST_SYNCHRONOUS, PowerState
+from jointctl.hil.canopen.object_dictionary import (
     DEVICE_STATE,
     INVALID_VALUE,
     NO_OBJECT,

@@ -10,12 +10,12 @@ import math
 
 import numpy as np
 
-from firmware_py.kernel import kernel
-from hil.bus.frames import FrameQueue
-from hil.canopen.device_errors import COB_ID_INVALID, push_frame
-from hil.canopen.device_records import EVENT_DRIVEN, LAST_SYNCHRONOUS, NmtState, int64
-from hil.canopen.encoder_records import MAPPED, EncoderNode
-from hil.plant.records import PlantState
+from jointctl.firmware_py.kernel import kernel
+from jointctl.hil.bus.frames import FrameQueue
+from jointctl.hil.canopen.device_errors import COB_ID_INVALID, push_frame
+from jointctl.hil.canopen.device_records import EVENT_DRIVEN, LAST_SYNCHRONOUS, NmtState, int64
+from jointctl.hil.canopen.encoder_records import MAPPED, EncoderNode
+from jointctl.hil.plant.records import PlantState
 
 _MS = 1_000_000
 POSITION_ALARM = 1  # bit of 6503

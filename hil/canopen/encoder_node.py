@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hil.canopen.device_records import NmtState
-from hil.canopen.device_write_rules import check_write
-from hil.canopen.encoder_core import restart_encoder
-from hil.canopen.encoder_records import FIELDS
-from hil.canopen.object_dictionary import ObjectDictionary, field_view, load_entries
-from hil.canopen.sdo_server import SdoServer
+from jointctl.hil.canopen.device_records import NmtState
+from jointctl.hil.canopen.device_write_rules import check_write
+from jointctl.hil.canopen.encoder_core import restart_encoder
+from jointctl.hil.canopen.encoder_records import FIELDS
+from jointctl.hil.canopen.object_dictionary import ObjectDictionary, field_view, load_entries
+from jointctl.hil.canopen.sdo_server import SdoServer
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import numpy as np
 
-from firmware_py.schema import array_of, f8, i4, i8, record, u1, u2, u4
+from jointctl.firmware_py.schema import array_of, f8, i4, i8, record, u1, u2, u4
 
 MAPPED = 2
 

@@ -17,9 +17,9 @@ import canopen
 import numpy as np
 from canopen.objectdictionary import ODVariable
 
-from firmware_py.schema import dtype_of
-from hil.canopen.device_fields import FIELDS
-from hil.canopen.device_records import Device
+from jointctl.firmware_py.schema import dtype_of
+from jointctl.hil.canopen.device_fields import FIELDS
+from jointctl.hil.canopen.device_records import Device
 
 _TYPES = {1: "u1", 2: "i1", 3: "<i2", 4: "<i4", 5: "u1", 6: "<u2", 7: "<u4"}
 _VISIBLE_STRING = 9

@@ -12,8 +12,8 @@ import json
 import os
 from pathlib import Path
 
-from hil.canopen.device_records import PowerState
-from hil.canopen.object_dictionary import CANNOT_STORE, DEVICE_STATE, HARDWARE, ObjectDictionary, SdoAbort
+from jointctl.hil.canopen.device_records import PowerState
+from jointctl.hil.canopen.object_dictionary import CANNOT_STORE, DEVICE_STATE, HARDWARE, ObjectDictionary, SdoAbort
 
 SAVE = 0x65766173
 LOAD = 0x64616F6C

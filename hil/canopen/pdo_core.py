@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from firmware_py.kernel import kernel
-from hil.bus.frames import FrameQueue
-from hil.canopen.cia402_core import apply_controlword
-from hil.canopen.device_errors import (
+from jointctl.firmware_py.kernel import kernel
+from jointctl.hil.bus.frames import FrameQueue
+from jointctl.hil.canopen.cia402_core import apply_controlword
+from jointctl.hil.canopen.device_errors import (
     COB_ID_INVALID,
     RPDO_ERROR,
     RPDO_LENGTH_ERROR,
@@ -24,7 +24,7 @@ from hil.canopen.device_errors import (
     push_frame,
     raise_error,
 )
-from hil.canopen.device_records import (
+from jointctl.hil.canopen.device_records import (
     EVENT_DRIVEN,
     LAST_SYNCHRONOUS,
     PDOS,

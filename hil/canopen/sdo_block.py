@@ -14,7 +14,7 @@ import binascii
 import struct
 from collections.abc import Callable
 
-from hil.canopen.object_dictionary import (
+from jointctl.hil.canopen.object_dictionary import (
     BLOCK_SIZE,
     CRC_ERROR,
     LENGTH_MISMATCH,

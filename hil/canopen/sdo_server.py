@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 
-from hil.canopen.object_dictionary import (
+from jointctl.hil.canopen.object_dictionary import (
     LENGTH_MISMATCH,
     TIMED_OUT,
     TOGGLE_ERROR,
@@ -19,7 +19,7 @@ from hil.canopen.object_dictionary import (
     ObjectDictionary,
     SdoAbort,
 )
-from hil.canopen.sdo_block import LARGEST_BLOCK, BlockDownload, BlockUpload
+from jointctl.hil.canopen.sdo_block import LARGEST_BLOCK, BlockDownload, BlockUpload
 
 TIMEOUT_NS = 1_000_000_000  # longest pause of a client inside a transfer
 _LONGEST_STRING = 256

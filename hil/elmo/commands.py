@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from hil.elmo.motor import UM_POSITION
+from jointctl.hil.elmo.motor import UM_POSITION
 
 BAD_COMMAND, BAD_INDEX, NOT_IN_THIS_MODE, SYNTAX, OUT_OF_RANGE = 2, 3, 12, 19, 21
 NOT_ASSIGNABLE, OUT_OF_LIMIT, MOTOR_MUST_BE_OFF, MOTOR_MUST_BE_ON, BAD_UNIT_MODE = 23, 28, 57, 58, 60

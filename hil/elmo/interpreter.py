@@ -12,8 +12,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from firmware_py.schema import new
-from hil.elmo.commands import (
+from jointctl.firmware_py.schema import new
+from jointctl.hil.elmo.commands import (
     AMPLIFIER_NOT_READY,
     BAD_COMMAND,
     BAD_INDEX,
@@ -33,7 +33,7 @@ from hil.elmo.commands import (
     ElmoDeviceSettings,
     RefusedCommandError,
 )
-from hil.elmo.motor import (
+from jointctl.hil.elmo.motor import (
     SPEED_BANDWIDTH_RADPS,
     UM_POSITION,
     UM_SPEED,

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import math
 
-from firmware_py.kernel import kernel
-from firmware_py.schema import f8, i4, i8, record
-from hil.plant.encoder import encoder_counts
-from hil.plant.joint import step_plant
-from hil.plant.records import PlantConstants, PlantState
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.schema import f8, i4, i8, record
+from jointctl.hil.plant.encoder import encoder_counts
+from jointctl.hil.plant.joint import step_plant
+from jointctl.hil.plant.records import PlantConstants, PlantState
 
 UM_TORQUE, UM_SPEED, UM_POSITION = 1, 2, 5
 MF_SPEED_ERROR = 0x80

@@ -12,10 +12,10 @@ from enum import IntEnum
 
 import numpy as np
 
-from firmware_py.kernel import kernel
-from hil.bus.frames import FRAME_SIZE, QUEUE_LENGTH, FrameQueue
-from hil.canopen.device_records import int64
-from hil.faults.kinds import LATE_FRAMES, FaultKind, FaultMemory, draw, is_active
+from jointctl.firmware_py.kernel import kernel
+from jointctl.hil.bus.frames import FRAME_SIZE, QUEUE_LENGTH, FrameQueue
+from jointctl.hil.canopen.device_records import int64
+from jointctl.hil.faults.kinds import LATE_FRAMES, FaultKind, FaultMemory, draw, is_active
 
 
 class FrameClass(IntEnum):

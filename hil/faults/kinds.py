@@ -14,11 +14,11 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from firmware_py.kernel import kernel
-from firmware_py.schema import array_of, dtype_of, f8, i4, i8, new, record, u1
-from hil.bus.frames import FRAME_SIZE, FrameQueue
-from hil.plant.records import u8
-from hil.plant.xorshift import next_state, unit_number
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.schema import array_of, dtype_of, f8, i4, i8, new, record, u1
+from jointctl.hil.bus.frames import FRAME_SIZE, FrameQueue
+from jointctl.hil.plant.records import u8
+from jointctl.hil.plant.xorshift import next_state, unit_number
 
 MAX_FAULTS = 8
 LATE_FRAMES = 256  # that wait in the delay line; more are lost

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from firmware_py.kernel import kernel
-from hil.canopen.device_core import restart
-from hil.canopen.device_records import Device, PowerState, int64
-from hil.faults.kinds import FaultConstants, FaultKind, FaultMemory, is_active
-from hil.plant.encoder import shaft_position_rad
-from hil.plant.records import PlantConstants, PlantState
+from jointctl.firmware_py.kernel import kernel
+from jointctl.hil.canopen.device_core import restart
+from jointctl.hil.canopen.device_records import Device, PowerState, int64
+from jointctl.hil.faults.kinds import FaultConstants, FaultKind, FaultMemory, is_active
+from jointctl.hil.plant.encoder import shaft_position_rad
+from jointctl.hil.plant.records import PlantConstants, PlantState
 
 
 @kernel

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.kernel import kernel
-from hil.canopen.device_core import accept_frame
-from hil.canopen.device_records import int64
-from hil.faults.frame_faults import pass_frame
-from hil.faults.kinds import FaultKind
+from jointctl.firmware_py.kernel import kernel
+from jointctl.hil.canopen.device_core import accept_frame
+from jointctl.hil.canopen.device_records import int64
+from jointctl.hil.faults.frame_faults import pass_frame
+from jointctl.hil.faults.kinds import FaultKind
 
 
 @kernel

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from firmware_py.kernel import inlined
-from hil.plant.records import DELAY_SLOTS, PlantConstants, PlantState
+from jointctl.firmware_py.kernel import inlined
+from jointctl.hil.plant.records import DELAY_SLOTS, PlantConstants, PlantState
 
 
 @inlined

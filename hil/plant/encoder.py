@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import math
 
-from firmware_py.kernel import kernel
-from hil.plant.records import PlantConstants, PlantState
-from hil.plant.xorshift import next_state, unit_number
+from jointctl.firmware_py.kernel import kernel
+from jointctl.hil.plant.records import PlantConstants, PlantState
+from jointctl.hil.plant.xorshift import next_state, unit_number
 
 
 @kernel

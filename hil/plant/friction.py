@@ -19,10 +19,10 @@ Not modelled: dwell-time dependence of the static friction, dependence on load t
 
 from __future__ import annotations
 
-from firmware_py.friction import friction_motor_torque_Nm
-from firmware_py.kernel import inlined, kernel
-from hil.plant.actuator import sine_of_turns
-from hil.plant.records import FrictionKind, PlantConstants, PlantState
+from jointctl.firmware_py.friction import friction_motor_torque_Nm
+from jointctl.firmware_py.kernel import inlined, kernel
+from jointctl.hil.plant.actuator import sine_of_turns
+from jointctl.hil.plant.records import FrictionKind, PlantConstants, PlantState
 
 _LEAST_FRICTION_Nm = 1e-9  # a curve that touches zero must not divide by it
 

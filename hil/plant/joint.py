@@ -15,14 +15,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from firmware_py.friction import paper_friction
-from firmware_py.kernel import inlined, kernel
-from firmware_py.schema import new
-from hil.plant.actuator import step_current, torque_ripple_Nm
-from hil.plant.encoder import encoder_counts
-from hil.plant.friction import advance
-from hil.plant.records import EncoderSide, FrictionKind, PlantConstants, PlantState
-from hil.plant.settings import PlantSettings, decay
+from jointctl.firmware_py.friction import paper_friction
+from jointctl.firmware_py.kernel import inlined, kernel
+from jointctl.firmware_py.schema import new
+from jointctl.hil.plant.actuator import step_current, torque_ripple_Nm
+from jointctl.hil.plant.encoder import encoder_counts
+from jointctl.hil.plant.friction import advance
+from jointctl.hil.plant.records import EncoderSide, FrictionKind, PlantConstants, PlantState
+from jointctl.hil.plant.settings import PlantSettings, decay
 
 __all__ = ["R1", "EncoderSide", "FrictionKind", "PlantSettings", "encoder_counts", "plant", "step_plant"]
 

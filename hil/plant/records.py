@@ -11,8 +11,8 @@ from typing import Annotated
 
 import numpy as np
 
-from firmware_py.records import FrictionConstants
-from firmware_py.schema import array_of, f8, i4, i8, record
+from jointctl.firmware_py.records import FrictionConstants
+from jointctl.firmware_py.schema import array_of, f8, i4, i8, record
 
 RIPPLES = 4
 DELAY_SLOTS = 1024  # the command delay is below this many substeps

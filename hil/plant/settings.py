@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields
 from numbers import Integral, Real
 from typing import Any
 
-from firmware_py.records import FrictionConstants
-from firmware_py.schema import dtype_of
-from hil.plant.records import DELAY_SLOTS, RIPPLES, EncoderSide, FrictionKind
+from jointctl.firmware_py.records import FrictionConstants
+from jointctl.firmware_py.schema import dtype_of
+from jointctl.hil.plant.records import DELAY_SLOTS, RIPPLES, EncoderSide, FrictionKind
 
 # name: smallest and largest accepted value
 _RANGES: dict[str, tuple[float, float]] = {

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from firmware_py.kernel import kernel
+from jointctl.firmware_py.kernel import kernel
 
 _TO_UNIT = 2.0**-53
 _SHIFTS = (np.uint64(13), np.uint64(7), np.uint64(17))

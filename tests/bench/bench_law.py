@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.records import AxisState, Command, LogRecord, Sample
-from firmware_py.schema import new
-from tools.benchmarks.c_programs import FAST_MATH, OPTIMISED, law_library
-from tools.benchmarks.law_speed import (
+from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
+from jointctl.firmware_py.schema import new
+from jointctl.tools.benchmarks.c_programs import FAST_MATH, OPTIMISED, law_library
+from jointctl.tools.benchmarks.law_speed import (
     NUMPY_TICKS,
     SAME_NUMBERS,
     allocations,
@@ -26,10 +26,10 @@ from tools.benchmarks.law_speed import (
     run_hidden,
     sine_inputs,
 )
-from tools.benchmarks.numpy_law import NumpyLaw
-from tools.configuration.load import load_config, shipped_config
-from tools.configuration.records import axis_constants
-from tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.benchmarks.numpy_law import NumpyLaw
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.simulation.lockstep import LockstepJoint
 
 TICKS = 10_000
 

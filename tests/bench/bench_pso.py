@@ -17,11 +17,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
-from tools.identification.models import FORMS, legendre
-from tools.identification.polish import vector_limits
-from tools.identification.pso import SwarmSettings, run_swarms
-from tools.identification.variable_projection import Problem, make_problem, project
+from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
+from jointctl.tools.identification.models import FORMS, legendre
+from jointctl.tools.identification.polish import vector_limits
+from jointctl.tools.identification.pso import SwarmSettings, run_swarms
+from jointctl.tools.identification.variable_projection import Problem, make_problem, project
 
 PART = 100  # iterations that pyswarms does
 LEAST_RATIO = 20.0

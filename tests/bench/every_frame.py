@@ -29,9 +29,15 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from drivers.errors import JointctlError  # noqa: E402
-from firmware_py.realtime import Word  # noqa: E402
-from firmware_py.states import Fault  # noqa: E402
+from jointctl.drivers.errors import JointctlError  # noqa: E402
+from jointctl.firmware_py.realtime import Word  # noqa: E402
+from jointctl.firmware_py.states import Fault  # noqa: E402
+from jointctl.tools.configuration.config import Config  # noqa: E402
+from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
+from jointctl.tools.running.control import Control  # noqa: E402
+from jointctl.tools.running.display.phase_lines import PhaseLines  # noqa: E402
+from jointctl.tools.running.stop_signals import STOP_COMMAND, StopSignals  # noqa: E402
+from jointctl.tools.running.supervisor import Supervisor  # noqa: E402
 from tests.simulated_programs import (  # noqa: E402
     World,
     quiet_output,
@@ -39,12 +45,6 @@ from tests.simulated_programs import (  # noqa: E402
     stop_of_another_computer,
     stop_of_this_computer,
 )
-from tools.configuration.config import Config  # noqa: E402
-from tools.configuration.load import load_config, shipped_config  # noqa: E402
-from tools.running.control import Control  # noqa: E402
-from tools.running.display.phase_lines import PhaseLines  # noqa: E402
-from tools.running.stop_signals import STOP_COMMAND, StopSignals  # noqa: E402
-from tools.running.supervisor import Supervisor  # noqa: E402
 
 VERBOSE = False
 CLOCK = time.monotonic  # the computer's own
@@ -245,11 +245,11 @@ def new_supervisor(kind: str, config: Config, control: Control, folder: Path) ->
     output, log = quiet_output(), folder / "log.mcap"
     if kind == "run":
         return Supervisor(config, output, log, lambda _: True, control, display=lambda: PhaseLines(output))
-    from tools.sweeping.carry_out import SweepSupervisor, with_mode
-    from tools.sweeping.meter import SweepMeter
-    from tools.sweeping.options import SweepOptions, make_plan
-    from tools.sweeping.statistics import Tolerance
-    from tools.verbs.sweep import joint_model
+    from jointctl.tools.sweeping.carry_out import SweepSupervisor, with_mode
+    from jointctl.tools.sweeping.meter import SweepMeter
+    from jointctl.tools.sweeping.options import SweepOptions, make_plan
+    from jointctl.tools.sweeping.statistics import Tolerance
+    from jointctl.tools.verbs.sweep import joint_model
 
     config = with_mode(config, "auto")
     options = SweepOptions(points=2, min_speed_radps=0.1, max_speed_radps=0.2, dwell_s=0.3, warm_up_turns=0.0)
@@ -288,7 +288,7 @@ class Exhaustion:
                 return world.frames
 
     def _start(self, config: Config, world: World, folder: Path) -> Session:
-        from tools.running import supervisor as supervisor_module
+        from jointctl.tools.running import supervisor as supervisor_module
 
         made = supervisor_module.LoopHandle
 

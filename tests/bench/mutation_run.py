@@ -155,7 +155,7 @@ def _members(enumeration: str) -> list[str]:
 
 def changed_code(module: str, tree: ast.Module) -> dict[str, Any]:
     """Function name -> the code object that the changed module gives it; module-level values are as they were."""
-    loaded = importlib.import_module(module[:-3].replace("/", "."))
+    loaded = importlib.import_module("jointctl." + module[:-3].replace("/", "."))
     space = dict(vars(loaded))
     defined = [node for node in tree.body if isinstance(node, (ast.FunctionDef, ast.ClassDef))]
     exec(compile(ast.Module([*defined], []), str(ROOT / module), "exec"), space)

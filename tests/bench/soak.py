@@ -25,10 +25,10 @@ import tomlkit
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from tools.configuration.load import shipped_config  # noqa: E402
-from tools.recording.log_facts import missing_records  # noqa: E402
-from tools.recording.run_log_reader import read_run_log  # noqa: E402
-from tools.simulation.virtual_joint import separate_virtual_joint  # noqa: E402
+from jointctl.tools.configuration.load import shipped_config  # noqa: E402
+from jointctl.tools.recording.log_facts import missing_records  # noqa: E402
+from jointctl.tools.recording.run_log_reader import read_run_log  # noqa: E402
+from jointctl.tools.simulation.virtual_joint import separate_virtual_joint  # noqa: E402
 
 SETTLED_S = 60.0  # memory of the first minute is start-up
 COMPARED_S = 60.0  # first and last minute are compared
@@ -127,7 +127,7 @@ def soak(minutes: float, folder: Path, every_s: float) -> dict[str, Any]:
     channel = f"soak-{os.getpid()}"
     load_before = os.getloadavg()
     with separate_virtual_joint(config, channel) as joint:
-        command = [sys.executable, "-P", "-m", "tools.cli", "run", str(config), "-y", "--json", "-c", channel]
+        command = [sys.executable, "-P", "-m", "jointctl.tools.cli", "run", str(config), "-y", "--json", "-c", channel]
         run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL)
         watched = {"run": Watched(run.pid), "virtual joint": Watched(joint.pid)}
         started_s = time.monotonic()

@@ -26,12 +26,12 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from firmware_py.states import Fault, Notice  # noqa: E402
-from tools.configuration.load import load_config, shipped_config  # noqa: E402
-from tools.experiments.controllers import controller_constants, named  # noqa: E402
-from tools.experiments.ensemble import EnsembleSettings, random_plant  # noqa: E402
-from tools.experiments.scenarios import Scenario, run_scenario  # noqa: E402
-from tools.simulation.lockstep import LockstepJoint  # noqa: E402
+from jointctl.firmware_py.states import Fault, Notice  # noqa: E402
+from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
+from jointctl.tools.experiments.controllers import controller_constants, named  # noqa: E402
+from jointctl.tools.experiments.ensemble import EnsembleSettings, random_plant  # noqa: E402
+from jointctl.tools.experiments.scenarios import Scenario, run_scenario  # noqa: E402
+from jointctl.tools.simulation.lockstep import LockstepJoint  # noqa: E402
 
 MOTIONS: tuple[Scenario, ...] = get_args(Scenario)
 CONTROLLERS = ("paper", "precise", "pid")

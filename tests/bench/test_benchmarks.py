@@ -15,23 +15,23 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from drivers.errors import ConfigurationError, UsageError
-from firmware_py.states import ControllerKind
-from tools.benchmarks import c_programs
-from tools.benchmarks.c_programs import NoCompilerError, compiler
-from tools.benchmarks.compiled_loops import at_rate, on_the_core, run_cyclictest
-from tools.benchmarks.law_memory import FIRST_WEIGHT, law_doubles, state_doubles
-from tools.benchmarks.law_speed import SAME_NUMBERS, difference, kernel_ticks, law_rows, sine_inputs
-from tools.benchmarks.load import LOADS, busy_core, cores, load, on_core
-from tools.benchmarks.loop_times import times_from_ns
-from tools.benchmarks.numpy_law import NumpyLaw
-from tools.benchmarks.outcome import outcome_data, outcome_table, write_outcome
-from tools.benchmarks.paired import Row, compared, interleaved, measured, skipped
-from tools.cli.main import app
-from tools.configuration.load import load_config, shipped_config
-from tools.configuration.records import axis_constants
-from tools.output import Output
-from tools.verbs.bench import bench
+from jointctl.drivers.errors import ConfigurationError, UsageError
+from jointctl.firmware_py.states import ControllerKind
+from jointctl.tools.benchmarks import c_programs
+from jointctl.tools.benchmarks.c_programs import NoCompilerError, compiler
+from jointctl.tools.benchmarks.compiled_loops import at_rate, on_the_core, run_cyclictest
+from jointctl.tools.benchmarks.law_memory import FIRST_WEIGHT, law_doubles, state_doubles
+from jointctl.tools.benchmarks.law_speed import SAME_NUMBERS, difference, kernel_ticks, law_rows, sine_inputs
+from jointctl.tools.benchmarks.load import LOADS, busy_core, cores, load, on_core
+from jointctl.tools.benchmarks.loop_times import times_from_ns
+from jointctl.tools.benchmarks.numpy_law import NumpyLaw
+from jointctl.tools.benchmarks.outcome import outcome_data, outcome_table, write_outcome
+from jointctl.tools.benchmarks.paired import Row, compared, interleaved, measured, skipped
+from jointctl.tools.cli.main import app
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.output import Output
+from jointctl.tools.verbs.bench import bench
 
 
 @pytest.fixture(scope="module")
@@ -186,7 +186,7 @@ def test_another_rate_or_core_changes_nothing_else():
 
 def test_every_verb_of_the_command_line_is_timed(monkeypatch: pytest.MonkeyPatch):
     asked: dict[str, Any] = {}
-    monkeypatch.setattr("tools.verbs.bench.bench", lambda _, **options: asked.update(options) or 0)
+    monkeypatch.setattr("jointctl.tools.verbs.bench.bench", lambda _, **options: asked.update(options) or 0)
     assert CliRunner().invoke(app, ["bench"]).exit_code == 0
     assert {"run", "hil", "check", "identify", "fault-campaign"} <= set(asked["verbs"])
 

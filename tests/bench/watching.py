@@ -28,13 +28,13 @@ import tomlkit
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from firmware_py.states import AxisPhase  # noqa: E402
+from jointctl.firmware_py.states import AxisPhase  # noqa: E402
+from jointctl.tools.configuration.load import shipped_config  # noqa: E402
+from jointctl.tools.recording.run_log_reader import read_run_log  # noqa: E402
 from tests.browser import PROGRAM, Browser  # noqa: E402
-from tools.configuration.load import shipped_config  # noqa: E402
-from tools.recording.run_log_reader import read_run_log  # noqa: E402
 
 WAYS = ("alone", "served, no page", "one page")
-JOINTCTL = (sys.executable, "-P", "-m", "tools.cli")
+JOINTCTL = (sys.executable, "-P", "-m", "jointctl.tools.cli")
 
 
 @contextmanager

@@ -11,11 +11,11 @@ from typing import Protocol
 import can
 import numpy as np
 
-from drivers.can.frame_io import receive_frame, send_frame
-from drivers.can.frames import Frame
-from drivers.can.open import open_cyclic_end
-from firmware_py.libc import WAIT_SCRATCH_WORDS, wait_readable_ns
-from firmware_py.schema import new
+from jointctl.drivers.can.frame_io import receive_frame, send_frame
+from jointctl.drivers.can.frames import Frame
+from jointctl.drivers.can.open import open_cyclic_end
+from jointctl.firmware_py.libc import WAIT_SCRATCH_WORDS, wait_readable_ns
+from jointctl.firmware_py.schema import new
 
 LONG_S = 10.0  # far more than is ever needed: a limit against hanging, not a measure of speed
 SHORT_S = 0.05

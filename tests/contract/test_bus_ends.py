@@ -13,10 +13,10 @@ import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
 
-from drivers.can import virtual_bus
-from drivers.can.open import open_python_can
-from hil.bus import virtual_bus as hil_bus
-from hil.bus.virtual_bus import VirtualBusHub
+from jointctl.drivers.can import virtual_bus
+from jointctl.drivers.can.open import open_python_can
+from jointctl.hil.bus import virtual_bus as hil_bus
+from jointctl.hil.bus.virtual_bus import VirtualBusHub
 from tests.contract.ends_of_a_bus import (
     EXTENDED,
     LONG_S,

@@ -9,16 +9,16 @@ from typing import Any, ClassVar, Literal, Protocol
 
 import pytest
 
-from drivers.canopen.settings import CanopenSettings
-from drivers.drive import Declined, Drive
-from drivers.elmo.drive import ElmoDrive
-from drivers.errors import DeviceError, NoDeviceError
-from hil.canopen.device_records import PowerState
-from hil.elmo.device import ElmoDevice
-from tools.configuration.conversions import torque_constant_NmpA
-from tools.configuration.elmo_settings import elmo_settings, with_port_override
-from tools.configuration.load import load_config, shipped_config
-from tools.verbs.hil_serial import serve_virtual_elmo
+from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.drive import Declined, Drive
+from jointctl.drivers.elmo.drive import ElmoDrive
+from jointctl.drivers.errors import DeviceError, NoDeviceError
+from jointctl.hil.canopen.device_records import PowerState
+from jointctl.hil.elmo.device import ElmoDevice
+from jointctl.tools.configuration.conversions import torque_constant_NmpA
+from jointctl.tools.configuration.elmo_settings import elmo_settings, with_port_override
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.verbs.hil_serial import serve_virtual_elmo
 
 
 class Bench(Protocol):

@@ -13,18 +13,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.can.frame_io import stamp_frame
-from drivers.can.frames import Frame
-from drivers.canopen.exchange import end, exchange_memory, receive
-from drivers.canopen.port import CanopenPort
-from firmware_py.records import Command, Sample
-from firmware_py.schema import new
-from hil.canopen.device import Cia402Device, DeviceSettings
-from hil.faults.kinds import FaultConstants, FaultKind, no_faults
-from hil.frame_stamps import OLDEST_STAMP_NS, sent_ns_of
-from hil.plant.joint import plant
-from hil.plant.records import FrictionKind
-from hil.realtime_device import RealtimeDevice
+from jointctl.drivers.can.frame_io import stamp_frame
+from jointctl.drivers.can.frames import Frame
+from jointctl.drivers.canopen.exchange import end, exchange_memory, receive
+from jointctl.drivers.canopen.port import CanopenPort
+from jointctl.firmware_py.records import Command, Sample
+from jointctl.firmware_py.schema import new
+from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
+from jointctl.hil.faults.kinds import FaultConstants, FaultKind, no_faults
+from jointctl.hil.frame_stamps import OLDEST_STAMP_NS, sent_ns_of
+from jointctl.hil.plant.joint import plant
+from jointctl.hil.plant.records import FrictionKind
+from jointctl.hil.realtime_device import RealtimeDevice
 from tests.places import EDS
 
 NODE = 5

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import pytest
 import typer
 
+from jointctl.tools.cli.main import app
 from tests.places import ROOT
-from tools.cli.main import app
 
 PAGES = [ROOT / "README.md", *(ROOT / name for name in ("CHANGELOG.md", "CONTRIBUTING.md")), *ROOT.glob("docs/**/*.md")]
 FENCE = re.compile(r"^```(?P<info>[^\n`]*)\n(?P<body>.*?)^```$", re.MULTILINE | re.DOTALL)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import tomllib
 
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.reference import reference, rows_of
+from jointctl.tools.configuration.sections import Limits
 from tests.places import ROOT
-from tools.configuration.config import Config
-from tools.configuration.reference import reference, rows_of
-from tools.configuration.sections import Limits
 
 
 def test_the_page_is_up_to_date() -> None:
-    told = "is stale: python -m tools.configuration.reference docs/configuration.md"
+    told = "is stale: python -m jointctl.tools.configuration.reference docs/configuration.md"
     assert (ROOT / "docs" / "configuration.md").read_text() == reference(), told
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 
-from drivers.errors import DECLINED, INTERRUPTED, JointctlError
+from jointctl.drivers.errors import DECLINED, INTERRUPTED, JointctlError
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.identification.sweep_file import SWEEP_COLUMNS
+from jointctl.tools.recording.can_log import CAN_TOPIC
+from jointctl.tools.recording.run_log import EVENT_TOPIC, RECORD_TOPIC
+from jointctl.tools.verbs.fault_campaign import EXIT_VIOLATIONS
+from jointctl.tools.verbs.params import DIFFERENT
 from tests.places import ROOT
-from tools.configuration.config import Config
-from tools.identification.sweep_file import SWEEP_COLUMNS
-from tools.recording.can_log import CAN_TOPIC
-from tools.recording.run_log import EVENT_TOPIC, RECORD_TOPIC
-from tools.verbs.fault_campaign import EXIT_VIOLATIONS
-from tools.verbs.params import DIFFERENT
 
 DOCS = ROOT / "docs"
 NO_CLASS = {0, EXIT_VIOLATIONS, DIFFERENT, DECLINED, INTERRUPTED}

@@ -5,8 +5,8 @@ from __future__ import annotations
 import ast
 import re
 
+from jointctl.tools.running.events.fault_text import FAULT_TEXTS
 from tests.places import ROOT
-from tools.running.events.fault_text import FAULT_TEXTS
 
 PAGE = (ROOT / "docs" / "troubleshooting.md").read_text()
 GAP = "…"

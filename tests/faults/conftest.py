@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from hil.faults.kinds import FaultKind, no_faults
+from jointctl.hil.faults.kinds import FaultKind, no_faults
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.simulation.lockstep import LockstepJoint
 from tests.hil.conftest import bench as bench
 from tests.places import CONFIGS
-from tools.configuration.load import load_config
-from tools.simulation.lockstep import LockstepJoint
 
 
 @pytest.fixture(scope="module")

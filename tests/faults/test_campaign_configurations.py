@@ -10,25 +10,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.errors import ConfigurationError
-from firmware_py.states import AxisPhase, CommandKind
-from hil.faults.kinds import FaultKind
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.states import AxisPhase, CommandKind
+from jointctl.hil.faults.kinds import FaultKind
+from jointctl.tools.campaign import judge as judge_module
+from jointctl.tools.campaign.envelope import envelope, reaction_s
+from jointctl.tools.campaign.fault_classes import FAULT_CLASSES
+from jointctl.tools.campaign.fitness import require_fit
+from jointctl.tools.campaign.judge import in_time, judge, run_scenario
+from jointctl.tools.campaign.runner import campaign_joint, run_campaign
+from jointctl.tools.campaign.scenario import BEFORE_s, draw_scenario, fitted
+from jointctl.tools.campaign.sweep_motion import LONGEST_s, SweepStrokes, placed_sweep
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.output import Output
+from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.verbs.fault_campaign import fault_campaign
 from tests.faults.campaign_variants import VARIANTS, write_variant
 from tests.faults.test_fault_campaign import WIDE, good_run
 from tests.places import CONFIGS
-from tools.campaign import judge as judge_module
-from tools.campaign.envelope import envelope, reaction_s
-from tools.campaign.fault_classes import FAULT_CLASSES
-from tools.campaign.fitness import require_fit
-from tools.campaign.judge import in_time, judge, run_scenario
-from tools.campaign.runner import campaign_joint, run_campaign
-from tools.campaign.scenario import BEFORE_s, draw_scenario, fitted
-from tools.campaign.sweep_motion import LONGEST_s, SweepStrokes, placed_sweep
-from tools.configuration.config import Config
-from tools.configuration.load import load_config
-from tools.output import Output
-from tools.simulation.lockstep import LockstepJoint
-from tools.verbs.fault_campaign import fault_campaign
 
 KINDS = len(FAULT_CLASSES)
 

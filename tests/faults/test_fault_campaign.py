@@ -14,27 +14,27 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.records import LogRecord
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase, DriveRequest, Fault
-from hil.canopen.device_records import PowerState
-from hil.faults.kinds import FaultKind
-from hil.lockstep import TRUE_POWER_STATE, TRUTHS
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault
+from jointctl.hil.canopen.device_records import PowerState
+from jointctl.hil.faults.kinds import FaultKind
+from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUTHS
+from jointctl.tools.campaign import judge as judge_module
+from jointctl.tools.campaign import runner
+from jointctl.tools.campaign.envelope import Envelope, envelope, reaction_s
+from jointctl.tools.campaign.fault_classes import FAULT_CLASSES
+from jointctl.tools.campaign.judge import judge, run_scenario
+from jointctl.tools.campaign.report import campaign_figure, rows_by_kind
+from jointctl.tools.campaign.scenario import draw_scenario
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.drawing import png
+from jointctl.tools.output import Output
+from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
+from jointctl.tools.verbs.fault_campaign import fault_campaign
 from tests.page_figures import foreign_colours, svgs
 from tests.places import CONFIGS
-from tools.campaign import judge as judge_module
-from tools.campaign import runner
-from tools.campaign.envelope import Envelope, envelope, reaction_s
-from tools.campaign.fault_classes import FAULT_CLASSES
-from tools.campaign.judge import judge, run_scenario
-from tools.campaign.report import campaign_figure, rows_by_kind
-from tools.campaign.scenario import draw_scenario
-from tools.configuration.config import Config
-from tools.configuration.load import load_config
-from tools.drawing import png
-from tools.output import Output
-from tools.simulation.lockstep import LockstepJoint, LockstepRun
-from tools.verbs.fault_campaign import fault_campaign
 
 CONFIG = CONFIGS / "virtual.toml"
 KINDS = len(FAULT_CLASSES)

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.schema import new
-from firmware_py.states import Fault
-from hil.bus.frames import FRAME_SIZE, FrameQueue
-from hil.faults.frame_faults import pass_frame, take_due
-from hil.faults.kinds import MAX_FAULTS, FaultConstants, FaultKind, fault_memory, is_active, no_faults
-from hil.lockstep import TRUE_ACTUATOR_Nm, TRUE_POSITION_rad
-from tools.simulation.lockstep import LockstepJoint
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import Fault
+from jointctl.hil.bus.frames import FRAME_SIZE, FrameQueue
+from jointctl.hil.faults.frame_faults import pass_frame, take_due
+from jointctl.hil.faults.kinds import MAX_FAULTS, FaultConstants, FaultKind, fault_memory, is_active, no_faults
+from jointctl.hil.lockstep import TRUE_ACTUATOR_Nm, TRUE_POSITION_rad
+from jointctl.tools.simulation.lockstep import LockstepJoint
 
 MakeFault = Callable[..., Any]
 NODE = 1

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES
-from firmware_py.states import AxisPhase, Fault
-from hil.canopen.device_records import PowerState
-from hil.faults.kinds import FaultKind
-from hil.lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
-from tools.simulation.lockstep import LockstepJoint, LockstepRun
+from jointctl.drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES
+from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.hil.canopen.device_records import PowerState
+from jointctl.hil.faults.kinds import FaultKind
+from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
+from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
 
 MakeFault = Callable[..., Any]
 AT_s = 2.0  # after the power stage is on: the joint tracks

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase, Fault
-from hil.faults.kinds import FaultConstants, FaultKind
-from tools.simulation.lockstep import LockstepJoint
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.hil.faults.kinds import FaultConstants, FaultKind
+from jointctl.tools.simulation.lockstep import LockstepJoint
 
 MakeFault = Callable[..., Any]
 AT_s = 2.0

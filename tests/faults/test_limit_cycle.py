@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.states import AxisPhase, Fault, Notice, Reaction
+from jointctl.firmware_py.states import AxisPhase, Fault, Notice, Reaction
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.experiments.controllers import controller_constants, named
+from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
 from tests.bench.swing_alarms import outcomes, tasks
-from tools.configuration.load import load_config, shipped_config
-from tools.experiments.controllers import controller_constants, named
-from tools.simulation.lockstep import LockstepJoint, LockstepRun
 
 LIMIT_Nm = 60.0
 NEAR_LIMIT_Nm = 57.0  # a torque that reaches it on both sides swings between its limits

@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.realtime import Word
-from firmware_py.records import LogRecord
-from firmware_py.schema import dtype_of
-from firmware_py.states import AxisPhase, Fault, StopRequest
+from jointctl.firmware_py.realtime import Word
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import dtype_of
+from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.configuration.records import axis_constants, trajectory_table
+from jointctl.tools.recording.run_log import RunLogWriter
+from jointctl.tools.recording.run_log_reader import read_run_log
+from jointctl.tools.running.loop.loop_handle import LoopHandle
+from jointctl.tools.running.loop.shared_block import RING_RECORDS, SharedBlock
+from jointctl.tools.running.open_drive import open_drive
 from tests.hil.moving_run import Moving, gone
-from tools.configuration.load import load_config
-from tools.configuration.records import axis_constants, trajectory_table
-from tools.recording.run_log import RunLogWriter
-from tools.recording.run_log_reader import read_run_log
-from tools.running.loop.loop_handle import LoopHandle
-from tools.running.loop.shared_block import RING_RECORDS, SharedBlock
-from tools.running.open_drive import open_drive
 
 
 @pytest.fixture

@@ -16,18 +16,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.states import AxisPhase, DriveRequest, Fault
-from hil.faults.kinds import LOCKSTEP_ONLY, FaultKind
+from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault
+from jointctl.hil.faults.kinds import LOCKSTEP_ONLY, FaultKind
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.configuration.plant import FAULT_KINDS
+from jointctl.tools.configuration.plant_settings import fault_constants
+from jointctl.tools.output import Output
+from jointctl.tools.running.control import Control
+from jointctl.tools.running.stop_signals import StopSignals
+from jointctl.tools.running.supervisor import RunResult, Supervisor
 from tests.places import CONFIGS
 from tests.real_time_joint import real_time_joint
-from tools.configuration.config import Config
-from tools.configuration.load import load_config
-from tools.configuration.plant import FAULT_KINDS
-from tools.configuration.plant_settings import fault_constants
-from tools.output import Output
-from tools.running.control import Control
-from tools.running.stop_signals import StopSignals
-from tools.running.supervisor import RunResult, Supervisor
 
 SHIPPED = (CONFIGS / "virtual.toml").read_text()
 AT_s = 0.7
@@ -185,7 +185,7 @@ def test_faults_come_from_the_configuration(tmp_path: Path) -> None:
     ],
 )
 def test_a_bad_fault_is_refused_by_one_line(tmp_path: Path, table: str, words: str) -> None:
-    from drivers.errors import ConfigurationError
+    from jointctl.drivers.errors import ConfigurationError
 
     with pytest.raises(ConfigurationError) as caught:
         configured(tmp_path, f"\n[[virtual.faults]]\n{table}\n")

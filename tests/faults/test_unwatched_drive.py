@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.can.frames import Frame
-from drivers.canopen import exchange, switch_off
-from drivers.canopen.cia402 import ControlWord, State
-from drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES, accept_frame, end_cycle, get_i16, get_u16
-from drivers.canopen.port import FRAME_SLOTS, SCRATCH_WORDS, SLOT_RPDO, CanopenPort
-from drivers.drive import is_safe
-from drivers.errors import BusError, DeviceError
-from firmware_py.records import Command, Sample
-from firmware_py.schema import new
-from firmware_py.states import DriveRequest
-from hil.canopen.device_core import power_on
-from hil.canopen.device_records import NmtState
+from jointctl.drivers.can.frames import Frame
+from jointctl.drivers.canopen import exchange, switch_off
+from jointctl.drivers.canopen.cia402 import ControlWord, State
+from jointctl.drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES, accept_frame, end_cycle, get_i16, get_u16
+from jointctl.drivers.canopen.port import FRAME_SLOTS, SCRATCH_WORDS, SLOT_RPDO, CanopenPort
+from jointctl.drivers.drive import is_safe
+from jointctl.drivers.errors import BusError, DeviceError
+from jointctl.firmware_py.records import Command, Sample
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import DriveRequest
+from jointctl.hil.canopen.device_core import power_on
+from jointctl.hil.canopen.device_records import NmtState
 
 ENABLED, DISABLED = 0x0637, 0x0650
 WATCHDOG = 126 << 16 | 200  # 1016:1 as configs/virtual.toml arms it

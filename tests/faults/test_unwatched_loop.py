@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from firmware_py.realtime import Histogram
-from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, StopRequest
+from jointctl.firmware_py.realtime import Histogram
+from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, StopRequest
+from jointctl.tools.running.supervisor import Supervisor
 from tests.unit.drivers.elmo.talk import Talk
 from tests.unit.firmware_py.stub_loop import ANSWER_ns, Loop
-from tools.running.supervisor import Supervisor
 
 # --- serial drive: a status that is old ----------------------------------------------------------------------------
 

@@ -16,10 +16,10 @@ import can
 import canopen
 import tomlkit
 
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.recording.run_log_reader import read_run_log
 from tests.places import CONFIGS
 from tests.real_time_joint import real_time_joint
-from tools.configuration.load import load_config
-from tools.recording.run_log_reader import read_run_log
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Started:
     def __init__(self, folder: Path, arguments: tuple[str, ...], **options: Any) -> None:
         number = len(list(folder.glob("*.stderr")))
         self._files = [folder / f"{number}.stdout", folder / f"{number}.stderr"]
-        command = [sys.executable, "-P", "-m", "tools.cli", *arguments]
+        command = [sys.executable, "-P", "-m", "jointctl.tools.cli", *arguments]
         with self._files[0].open("wb") as out, self._files[1].open("wb") as err:
             options = {"stdin": subprocess.DEVNULL, "stdout": out, "stderr": err, **options}
             self.process = subprocess.Popen(command, cwd=folder, start_new_session=True, **options)

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
+from jointctl.tools.configuration.load import load_config
 from tests.hil.bench import Bench
 from tests.hil.serial_bench import SerialBench, end_line_guards, name_kept
 from tests.places import CONFIGS
 from tests.real_time_joint import real_time_serial_joint
-from tools.configuration.load import load_config
 
 
 @pytest.fixture

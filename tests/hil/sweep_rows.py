@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.friction import friction_curve_Nm
-from tools.configuration.config import Config
-from tools.configuration.conversions import friction_constants
+from jointctl.firmware_py.friction import friction_curve_Nm
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import friction_constants
 
 
 def rows(out: Path) -> Any:

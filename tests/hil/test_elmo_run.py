@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from firmware_py.states import AxisPhase
-from hil.elmo.device import ElmoDevice
+from jointctl.firmware_py.states import AxisPhase
+from jointctl.hil.elmo.device import ElmoDevice
 
 
 def test_a_run_tracks_the_sine_and_ends_with_the_motor_off(serial_bench: Any) -> None:

@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.errors import DataError
-from firmware_py.friction import DEGREE, friction_curve_Nm
-from tools.configuration.config import Config
-from tools.configuration.conversions import friction_constants
-from tools.configuration.load import load_config, shipped_config
-from tools.configuration.sections import Friction
-from tools.identification.friction_file import read_friction_data
-from tools.identification.friction_section import section_values
-from tools.identification.identification import identify_friction
-from tools.identification.options import Options
-from tools.identification.pso import SwarmSettings
-from tools.output import Output
-from tools.simulation.lockstep import LockstepJoint
-from tools.sweeping.options import SweepOptions
-from tools.verbs.sweep import sweep
+from jointctl.drivers.errors import DataError
+from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import friction_constants
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.sections import Friction
+from jointctl.tools.identification.friction_file import read_friction_data
+from jointctl.tools.identification.friction_section import section_values
+from jointctl.tools.identification.identification import identify_friction
+from jointctl.tools.identification.options import Options
+from jointctl.tools.identification.pso import SwarmSettings
+from jointctl.tools.output import Output
+from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.sweeping.options import SweepOptions
+from jointctl.tools.verbs.sweep import sweep
 
 POINTS = 60
 SMALL = {"folds": 3, "swarm": SwarmSettings(particles=60, iterations=100)}

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 from serial.tools import list_ports
 
-from drivers.elmo.serial_port import usb_serial_number
-from tools.running.guard.line_guard import GuardOrder, LineGuard
+from jointctl.drivers.elmo.serial_port import usb_serial_number
+from jointctl.tools.running.guard.line_guard import GuardOrder, LineGuard
 
 
 @dataclass

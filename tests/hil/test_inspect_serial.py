@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from drivers.port_users import port_users
-from tools.inspection.findings import NOTE, OK, PROBLEM
-from tools.inspection.serial_health import latency_finding, port_finding
+from jointctl.drivers.port_users import port_users
+from jointctl.tools.inspection.findings import NOTE, OK, PROBLEM
+from jointctl.tools.inspection.serial_health import latency_finding, port_finding
 
 
 def findings(finished: Any) -> dict[str, Any]:

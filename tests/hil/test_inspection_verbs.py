@@ -10,7 +10,7 @@ from typing import Any
 import can
 import pytest
 
-from firmware_py.states import AxisPhase
+from jointctl.firmware_py.states import AxisPhase
 
 
 def lines(text: str) -> list[dict[str, Any]]:

@@ -8,14 +8,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.states import Fault, Notice
-from tools.analysis.learning_loop import LearningSettings, learning_convergence
-from tools.analysis.loop_settings import loop_settings
-from tools.configuration.config import Config
-from tools.experiments.controllers import Controller, changed, controller_config, controller_constants, from_file
-from tools.experiments.paper_runs import ideal, law, r1
-from tools.experiments.scenarios import Scenario, run_scenario
-from tools.simulation.lockstep import LockstepJoint, LockstepRun
+from jointctl.firmware_py.states import Fault, Notice
+from jointctl.tools.analysis.learning_loop import LearningSettings, learning_convergence
+from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.experiments.controllers import (
+    Controller,
+    changed,
+    controller_config,
+    controller_constants,
+    from_file,
+)
+from jointctl.tools.experiments.paper_runs import ideal, law, r1
+from jointctl.tools.experiments.scenarios import Scenario, run_scenario
+from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
 
 
 def joint(config: Config, duration_s: float, **virtual: Any) -> Config:

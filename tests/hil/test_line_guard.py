@@ -19,10 +19,10 @@ from typing import Any
 
 import pytest
 
-from tools.running.guard.guard_call import guard_address, running_supervisor
-from tools.running.guard.line_guard import GuardOrder
+from jointctl.tools.running.guard.guard_call import guard_address, running_supervisor
+from jointctl.tools.running.guard.line_guard import GuardOrder
 
-GUARD, LOOP = "tools.running.guard.line_guard", "tools.running.loop.loop_process"
+GUARD, LOOP = "jointctl.tools.running.guard.line_guard", "jointctl.tools.running.loop.loop_process"
 
 
 def gone(pid: int) -> bool:

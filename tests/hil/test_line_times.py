@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-LOOP = "tools.running.loop.loop_process"
+LOOP = "jointctl.tools.running.loop.loop_process"
 POLL_S = 0.001
 
 

@@ -11,16 +11,16 @@ from typing import Any, Self
 import numpy as np
 import pytest
 
-from firmware_py.states import AxisPhase, StopRequest
-from tools.configuration.load import load_config
-from tools.output import Output
-from tools.recording.run_log import Event
-from tools.recording.run_log_reader import read_run_log
-from tools.running.control import Control
-from tools.running.display.display import OnlyShows, Snapshot
-from tools.running.display.viewer_request import ViewerRequest
-from tools.running.stop_signals import StopSignals
-from tools.running.supervisor import RunResult, Supervisor
+from jointctl.firmware_py.states import AxisPhase, StopRequest
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.output import Output
+from jointctl.tools.recording.run_log import Event
+from jointctl.tools.recording.run_log_reader import read_run_log
+from jointctl.tools.running.control import Control
+from jointctl.tools.running.display.display import OnlyShows, Snapshot
+from jointctl.tools.running.display.viewer_request import ViewerRequest
+from jointctl.tools.running.stop_signals import StopSignals
+from jointctl.tools.running.supervisor import RunResult, Supervisor
 
 WHO = "a test"
 SINE = {"kind": "sine", "duration_s": 0.0, "amplitude_rad": 0.1, "frequency_Hz": 0.5, "offset_rad": 0.2}

@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.realtime import HISTOGRAM_BINS
-from firmware_py.records import LogRecord
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase, DriveState, Fault
-from tools.output import Output
-from tools.recording.log_facts import missing_records
-from tools.running.display.display import Snapshot
-from tools.running.display.live_panel import LivePanel, run_display
-from tools.running.display.panel import panel, time_left
-from tools.running.display.phase_lines import PhaseLines
+from jointctl.firmware_py.realtime import HISTOGRAM_BINS
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, DriveState, Fault
+from jointctl.tools.output import Output
+from jointctl.tools.recording.log_facts import missing_records
+from jointctl.tools.running.display.display import Snapshot
+from jointctl.tools.running.display.live_panel import LivePanel, run_display
+from jointctl.tools.running.display.panel import panel, time_left
+from jointctl.tools.running.display.phase_lines import PhaseLines
 
 ESCAPE = "\x1b["
 TERMINAL = {**os.environ, "TERM": "xterm-256color"}

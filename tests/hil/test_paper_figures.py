@@ -11,22 +11,30 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.errors import ConfigurationError
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.margins import phase_margin_deg
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.experiments.controllers import named
+from jointctl.tools.experiments.error_figures import ErrorFigures, error_figures, settling_s
+from jointctl.tools.experiments.paper_identification import identify_paper_friction
+from jointctl.tools.experiments.paper_rows import PaperRun, network_difference_mrad, paper_rows
+from jointctl.tools.experiments.paper_runs import (
+    AFTER_s,
+    Experiment,
+    experiments,
+    friction_estimate,
+    hidden_outputs,
+    ideal,
+    law,
+)
+from jointctl.tools.experiments.study_runs import StudyResult, quantile, run_study
+from jointctl.tools.identification.options import Options
+from jointctl.tools.identification.pso import SwarmSettings
+from jointctl.tools.output import Output
+from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.verbs.paper import paper
 from tests.page_figures import foreign_colours, svgs
-from tools.analysis.loop_settings import loop_settings
-from tools.analysis.margins import phase_margin_deg
-from tools.configuration.load import load_config, shipped_config
-from tools.experiments.controllers import named
-from tools.experiments.error_figures import ErrorFigures, error_figures, settling_s
-from tools.experiments.paper_identification import identify_paper_friction
-from tools.experiments.paper_rows import PaperRun, network_difference_mrad, paper_rows
-from tools.experiments.paper_runs import AFTER_s, Experiment, experiments, friction_estimate, hidden_outputs, ideal, law
-from tools.experiments.study_runs import StudyResult, quantile, run_study
-from tools.identification.options import Options
-from tools.identification.pso import SwarmSettings
-from tools.output import Output
-from tools.simulation.lockstep import LockstepJoint
-from tools.verbs.paper import paper
 
 _RUN = Experiment.run  # a test replaces it
 _ALL = {experiment.key: experiment for experiment in experiments()}
@@ -128,7 +136,7 @@ def test_the_verb_prints_one_table_and_draws_a_page_for_each_figure(
 ) -> None:
     monkeypatch.setattr(Experiment, "run", lambda self: made(self.key).run)
     few = Options(swarm=SwarmSettings(particles=60, iterations=200))
-    monkeypatch.setattr("tools.verbs.paper.identify_paper_friction", lambda: identify_paper_friction(few))
+    monkeypatch.setattr("jointctl.tools.verbs.paper.identify_paper_friction", lambda: identify_paper_friction(few))
     out, err = io.StringIO(), io.StringIO()
     page = tmp_path / "paper.html"
     assert paper(Output(json=True, stdout=out, stderr=err), folder=tmp_path, report=page) == 0

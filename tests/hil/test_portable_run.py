@@ -25,20 +25,19 @@ import can
 import pytest
 import tomlkit
 
-from drivers.can.open import open_python_can
-from drivers.canopen.drive import CanopenDrive
-from firmware_py.realtime import Word
-from firmware_py.sequence import reset_axis
-from firmware_py.states import AxisPhase, Fault
-from tests.places import ROOT
-from tools.configuration.config import Config
-from tools.configuration.drive_settings import canopen_settings
-from tools.configuration.load import load_config, shipped_config
-from tools.configuration.records import axis_constants
-from tools.running.loop.portable_loop import run_portable_loop, warm_up
-from tools.running.loop.shared_block import SharedBlock
-from tools.simulation.device_pump import PumpedDevice
-from tools.simulation.virtual_joint import new_device, serve_virtual_joint
+from jointctl.drivers.can.open import open_python_can
+from jointctl.drivers.canopen.drive import CanopenDrive
+from jointctl.firmware_py.realtime import Word
+from jointctl.firmware_py.sequence import reset_axis
+from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.drive_settings import canopen_settings
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.running.loop.portable_loop import run_portable_loop, warm_up
+from jointctl.tools.running.loop.shared_block import SharedBlock
+from jointctl.tools.simulation.device_pump import PumpedDevice
+from jointctl.tools.simulation.virtual_joint import new_device, serve_virtual_joint
 
 RATE_HZ = 100.0
 PERIOD_NS = round(1e9 / RATE_HZ)
@@ -188,14 +187,23 @@ def multicast_config(tmp_path: Path) -> Iterator[Path]:
 
 def environment() -> dict[str, str]:
     environ = {key: value for key, value in os.environ.items() if not key.startswith("CAN_")}
-    environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), environ.get("PYTHONPATH"))))
     return environ
 
 
 @contextlib.contextmanager
 def joint_process(path: Path) -> Iterator[subprocess.Popen[bytes]]:
     read_end, write_end = os.pipe()
-    command = [sys.executable, "-P", "-m", "tools.cli", "hil", str(path), "--ready-fd", str(write_end), "--quiet"]
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "jointctl.tools.cli",
+        "hil",
+        str(path),
+        "--ready-fd",
+        str(write_end),
+        "--quiet",
+    ]
     process = subprocess.Popen(command, pass_fds=(write_end,), env=environment())
     os.close(write_end)
     try:
@@ -209,7 +217,7 @@ def joint_process(path: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def start_run(path: Path) -> subprocess.Popen[str]:
-    command = [sys.executable, "-P", "-m", "tools.cli", "run", str(path), "-y", "--json"]
+    command = [sys.executable, "-P", "-m", "jointctl.tools.cli", "run", str(path), "-y", "--json"]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment())
 
 
@@ -235,7 +243,7 @@ def loop_pid(parent: int) -> int | None:
         with contextlib.suppress(OSError):
             text = path.read_text()
             if int(text.rpartition(")")[2].split()[1]) == parent:
-                if b"tools.running.loop.loop_process" in (path.parent / "cmdline").read_bytes():
+                if b"jointctl.tools.running.loop.loop_process" in (path.parent / "cmdline").read_bytes():
                     return int(path.parent.name)
     return None
 

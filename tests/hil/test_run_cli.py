@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.states import AxisPhase, DriveRequest, DriveState
+from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState
 from tests.hil.terminal import Terminal
 from tests.places import CONFIGS
 

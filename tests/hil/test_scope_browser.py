@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from firmware_py.states import AxisPhase, Fault
+from jointctl.firmware_py.states import AxisPhase, Fault
 from tests.browser import PROGRAM, Browser, Tab
 
 MISSING = [name for name in ("nicegui", "websockets") if importlib.util.find_spec(name) is None]
@@ -161,7 +161,7 @@ def test_stop_works_when_nothing_else_on_the_page_does(bench: Any, browser: Brow
 
 def test_a_stop_that_does_not_arrive_is_told(bench: Any, browser: Browser) -> None:
     scope, tab, _ = opened(bench, browser)
-    server = scope.child("tools.scoping.server")
+    server = scope.child("jointctl.tools.scoping.server")
     os.kill(server, signal.SIGSTOP)
     tab.click("stop")
     tab.until("document.querySelector('[data-testid=\"stop-word\"]').innerText.includes('STOP DID NOT ARRIVE')")
@@ -174,7 +174,7 @@ def test_a_stop_that_does_not_arrive_is_told(bench: Any, browser: Browser) -> No
 def test_a_run_led_from_the_page_brakes_when_its_server_ends(bench: Any, browser: Browser) -> None:
     scope, tab, _ = opened(bench, browser)
     start(tab)
-    os.kill(scope.child("tools.scoping.server"), signal.SIGKILL)
+    os.kill(scope.child("jointctl.tools.scoping.server"), signal.SIGKILL)
     scope.finished(60.0)
     assert "no page shows or stops the joint, braking" in scope.err
     assert "stopped by the end of the scope's server; the joint is switch on disabled" in scope.err
@@ -224,7 +224,7 @@ def test_a_stalled_or_closed_browser_costs_the_run_nothing(bench: Any, browser: 
     scope, tab, _ = opened(bench, browser)
     start(tab)
     moves(tab)
-    server = scope.child("tools.scoping.server")
+    server = scope.child("jointctl.tools.scoping.server")
     before_kB, before_supervisor_kB = resident_kB(server), resident_kB(scope.process.pid)
     os.killpg(browser.process.pid, signal.SIGSTOP)
     time.sleep(15.0)

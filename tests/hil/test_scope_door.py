@@ -80,14 +80,14 @@ def test_without_the_token_nothing_is_shown_or_taken(bench: Any, live: bool) -> 
     with connect(way, additional_headers={"cookie": cookie}, open_timeout=20) as door:
         assert door.recv(timeout=20)
 
-    assert processes_that_show("tools.scoping.server" if live else shown)  # the test does look
+    assert processes_that_show("jointctl.tools.scoping.server" if live else shown)  # the test does look
     assert processes_that_show(token) == []
 
     if not live:
         scope.signal(signal.SIGINT)
         scope.finished(30.0)
         return
-    child = scope.child("tools.scoping.server")
+    child = scope.child("jointctl.tools.scoping.server")
     for _ in range(3):  # what another user would do
         assert status(f"{place}stop", "POST")[0] == 403
     time.sleep(0.5)

@@ -12,20 +12,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.errors import INTERRUPTED, ConfigurationError, DataError
+from jointctl.drivers.errors import INTERRUPTED, ConfigurationError, DataError
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.drawing import save_png
+from jointctl.tools.experiments.controllers import TABLE, controller_config, named
+from jointctl.tools.experiments.ensemble import EnsembleSettings, random_plant
+from jointctl.tools.experiments.error_figures import FAILED, ErrorFigures
+from jointctl.tools.experiments.study_figure import study_figure
+from jointctl.tools.experiments.study_runs import PlantResult, StudyResult, quantile, run_study, write_csv
+from jointctl.tools.experiments.study_settings import StudySettings, checked, load_study, study_controllers
+from jointctl.tools.output import Output
+from jointctl.tools.simulation.lockstep import DirectBus
+from jointctl.tools.verbs.study import study
 from tests.page_figures import foreign_colours, svgs
-from tools.configuration.config import Config
-from tools.configuration.load import load_config, shipped_config
-from tools.drawing import save_png
-from tools.experiments.controllers import TABLE, controller_config, named
-from tools.experiments.ensemble import EnsembleSettings, random_plant
-from tools.experiments.error_figures import FAILED, ErrorFigures
-from tools.experiments.study_figure import study_figure
-from tools.experiments.study_runs import PlantResult, StudyResult, quantile, run_study, write_csv
-from tools.experiments.study_settings import StudySettings, checked, load_study, study_controllers
-from tools.output import Output
-from tools.simulation.lockstep import DirectBus
-from tools.verbs.study import study
 
 
 @pytest.fixture
@@ -165,7 +165,7 @@ def test_the_results_never_replace_the_settings_or_a_controller(base: Config, tm
 def test_the_verb_prints_json_and_says_when_it_was_interrupted(
     base: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tools.verbs.study.load_config", lambda _: base)
+    monkeypatch.setattr("jointctl.tools.verbs.study.load_config", lambda _: base)
     settings = checked({"plants": 2, "after_s": 1.0, "controllers": ["precise"]}, "test")
     out, err = io.StringIO(), io.StringIO()
     page = tmp_path / "a.html"
@@ -180,7 +180,7 @@ def test_the_verb_prints_json_and_says_when_it_was_interrupted(
 
     partial = StudyResult(("precise",), short_study(base, 1, 1).plants[:1], True)
     partial = StudyResult(("precise",), tuple(PlantResult(0, "lugre", 19, p.figures[:1]) for p in partial.plants), True)
-    monkeypatch.setattr("tools.verbs.study.run_study", lambda *_, **__: partial)
+    monkeypatch.setattr("jointctl.tools.verbs.study.run_study", lambda *_, **__: partial)
     out, err = io.StringIO(), io.StringIO()
     assert study(settings, Output(stdout=out, stderr=err)) == INTERRUPTED
     assert "interrupted: only 1 of 2 plants" in err.getvalue()

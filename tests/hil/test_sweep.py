@@ -11,21 +11,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.errors import DeviceError, MotionFault
-from firmware_py.friction import friction_curve_Nm
+from jointctl.drivers.errors import DeviceError, MotionFault
+from jointctl.firmware_py.friction import friction_curve_Nm
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import friction_constants
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.sections import Friction
+from jointctl.tools.identification.friction_file import read_friction_data
+from jointctl.tools.identification.friction_section import section_values
+from jointctl.tools.identification.identification import identify_friction
+from jointctl.tools.identification.options import Options
+from jointctl.tools.identification.pso import SwarmSettings
+from jointctl.tools.output import Output
+from jointctl.tools.sweeping.options import SweepOptions
+from jointctl.tools.verbs.sweep import sweep
 from tests.hil.sweep_rows import rows, truth_Nm
-from tools.configuration.config import Config
-from tools.configuration.conversions import friction_constants
-from tools.configuration.load import load_config, shipped_config
-from tools.configuration.sections import Friction
-from tools.identification.friction_file import read_friction_data
-from tools.identification.friction_section import section_values
-from tools.identification.identification import identify_friction
-from tools.identification.options import Options
-from tools.identification.pso import SwarmSettings
-from tools.output import Output
-from tools.sweeping.options import SweepOptions
-from tools.verbs.sweep import sweep
 
 QUANTISATION_Nm = 0.0005  # one per mille of the rated motor torque
 
@@ -191,7 +191,7 @@ def test_a_dry_run_in_lockstep_writes_nothing(config: Config, tmp_path: Path) ->
 def test_options_type_matches_the_command(config: Config) -> None:
     from inspect import signature
 
-    from tools.cli.sweep_command import sweep_command
+    from jointctl.tools.cli.sweep_command import sweep_command
 
     parameters = set(signature(sweep_command).parameters) - {
         "config", "out", "interface", "channel", "bitrate", "port", "target", "json", "quiet",

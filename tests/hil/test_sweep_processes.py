@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.recording.run_log_reader import read_run_log
 from tests.hil.sweep_rows import rows, truth_Nm
-from tools.configuration.load import load_config, shipped_config
-from tools.recording.run_log_reader import read_run_log
 
 SHORT = ("--max-speed", "1.0", "--min-speed", "0.5", "--points", "6", "--dwell", "0.3", "--warm-up", "0")
 
@@ -25,7 +25,7 @@ class SweepProcess:
         self._err = bench.folder / f"sweep-{len(list(bench.folder.glob('sweep-*')))}.stderr"
         with self._err.open("wb") as err:
             self.process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "tools.cli", "sweep", *arguments], cwd=bench.folder,
+                [sys.executable, "-P", "-m", "jointctl.tools.cli", "sweep", *arguments], cwd=bench.folder,
                 stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=err, start_new_session=True,
             )  # fmt: skip
 

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.friction import friction_curve_Nm
-from hil.elmo.device import ElmoDevice
-from hil.elmo.motor import MF_POSITION_LIMIT
-from tools.configuration.conversions import friction_constants
-from tools.configuration.load import load_config
+from jointctl.firmware_py.friction import friction_curve_Nm
+from jointctl.hil.elmo.device import ElmoDevice
+from jointctl.hil.elmo.motor import MF_POSITION_LIMIT
+from jointctl.tools.configuration.conversions import friction_constants
+from jointctl.tools.configuration.load import load_config
 
-GUARD, LOOP = "tools.running.guard.line_guard", "tools.running.loop.loop_process"
+GUARD, LOOP = "jointctl.tools.running.guard.line_guard", "jointctl.tools.running.loop.loop_process"
 SHORT = ("--points", "2", "--grid", "log", "--max-speed", "0.3", "--min-speed", "0.29", "--warm-up", "0", "-y")
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import canopen
 import pytest
 
-from drivers.can.open import open_cyclic_end
-from hil.bus.virtual_bus import VirtualBusHub
-from hil.canopen.device import Cia402Device, DeviceSettings
-from hil.plant.joint import plant
-from hil.realtime_device import RealtimeDevice
+from jointctl.drivers.can.open import open_cyclic_end
+from jointctl.hil.bus.virtual_bus import VirtualBusHub
+from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
+from jointctl.hil.plant.joint import plant
+from jointctl.hil.realtime_device import RealtimeDevice
 from tests.hil.conftest import bench as bench
 from tests.places import EDS
 

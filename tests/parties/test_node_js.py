@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from drivers.can.open import open_cyclic_end
+from jointctl.drivers.can.open import open_cyclic_end
 
 SCRIPT = Path(__file__).with_name("master.js")
 

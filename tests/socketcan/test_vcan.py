@@ -16,9 +16,9 @@ import can
 import pytest
 import tomlkit
 
-from drivers.can.open import open_cyclic_end
-from drivers.errors import BusError
-from tools.recording.run_log_reader import read_run_log
+from jointctl.drivers.can.open import open_cyclic_end
+from jointctl.drivers.errors import BusError
+from jointctl.tools.recording.run_log_reader import read_run_log
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "virtual.toml"
 ON_VCAN = ("-i", "socketcan", "-c", "vcan0")
@@ -39,7 +39,7 @@ SLOW_GUEST = ("-y", "--allow-low-margin")
 
 
 def jointctl(*arguments: str) -> list[str]:
-    return [sys.executable, "-P", "-m", "tools.cli", *arguments]
+    return [sys.executable, "-P", "-m", "jointctl.tools.cli", *arguments]
 
 
 @pytest.fixture

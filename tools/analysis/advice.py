@@ -10,9 +10,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from firmware_py.states import ControllerKind
-from tools.analysis.linear_loop import LoopSettings
-from tools.analysis.margins import phase_margin_deg
+from jointctl.firmware_py.states import ControllerKind
+from jointctl.tools.analysis.linear_loop import LoopSettings
+from jointctl.tools.analysis.margins import phase_margin_deg
 
 _STEPS = 60  # of a scan, each a few per cent
 _BISECTIONS = 14

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from tools.analysis.linear_loop import LoopSettings, linear_loop
-from tools.analysis.margins import Margins, frequencies_radps, margins
-from tools.drawing import BLUE, GREY, ORANGE, RED, SOFT, canvas, save_png
+from jointctl.tools.analysis.linear_loop import LoopSettings, linear_loop
+from jointctl.tools.analysis.margins import Margins, frequencies_radps, margins
+from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, SOFT, canvas, save_png
 
 _LOWEST_HZ = 0.1
 _DAMPING_LINES = (0.1, 0.3, 0.5, 0.7)

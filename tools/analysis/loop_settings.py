@@ -12,16 +12,16 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from drivers.canopen.identifiers import LAST_SYNCHRONOUS
-from drivers.errors import ConfigurationError
-from firmware_py.states import ControllerKind
-from firmware_py.velocity import low_pass_gain
-from tools.analysis.linear_loop import LoopSettings
-from tools.configuration.conversions import joint_rad_per_count
-from tools.configuration.records import hidden_layer
+from jointctl.drivers.canopen.identifiers import LAST_SYNCHRONOUS
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.states import ControllerKind
+from jointctl.firmware_py.velocity import low_pass_gain
+from jointctl.tools.analysis.linear_loop import LoopSettings
+from jointctl.tools.configuration.conversions import joint_rad_per_count
+from jointctl.tools.configuration.records import hidden_layer
 
 if TYPE_CHECKING:
-    from tools.configuration.config import Config
+    from jointctl.tools.configuration.config import Config
 
 STEP_SHARE = 0.2  # of the torque limit; `precise` with 17 bit is below, with 16 bit, where it chatters, above
 

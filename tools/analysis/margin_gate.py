@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from drivers.errors import MarginError
-from tools.analysis.advice import Remedy, longest_delay_s, remedies
-from tools.analysis.learning_loop import Convergence, LearningSettings, learning_convergence
-from tools.analysis.linear_loop import LoopSettings
-from tools.analysis.loop_settings import loop_settings
-from tools.analysis.margins import Margins, margins
-from tools.configuration.config import Config
+from jointctl.drivers.errors import MarginError
+from jointctl.tools.analysis.advice import Remedy, longest_delay_s, remedies
+from jointctl.tools.analysis.learning_loop import Convergence, LearningSettings, learning_convergence
+from jointctl.tools.analysis.linear_loop import LoopSettings
+from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.margins import Margins, margins
+from jointctl.tools.configuration.config import Config
 
 
 def require_margin(config: Config, delay_s: float | None = None, *, allow_low_margin: bool = False) -> Margins:

@@ -12,17 +12,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from firmware_py.lyapunov import eigenvalues, solve_lyapunov_p, ultimate_bounds
-from firmware_py.states import ControllerKind
-from tools.analysis.linear_loop import (
+from jointctl.firmware_py.lyapunov import eigenvalues, solve_lyapunov_p, ultimate_bounds
+from jointctl.firmware_py.states import ControllerKind
+from jointctl.tools.analysis.linear_loop import (
     MAX_DELAY_PERIODS,
     LinearLoop,
     LoopSettings,
     linear_loop,
     network_gains,
 )
-from tools.analysis.narrowing import least_between, zero_between
-from tools.analysis.sampled_joint import Array
+from jointctl.tools.analysis.narrowing import least_between, zero_between
+from jointctl.tools.analysis.sampled_joint import Array
 
 _POINTS = 3000
 _DECADES = 6.5  # below pi / T

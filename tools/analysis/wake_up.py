@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.kernel import kernel
-from firmware_py.libc import monotonic_ns, sleep_until_ns
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.libc import monotonic_ns, sleep_until_ns
 
 
 @kernel

@@ -11,7 +11,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from drivers.errors import JointctlError
+from jointctl.drivers.errors import JointctlError
 
 SOURCES = Path(__file__).resolve().parents[2] / "tests" / "bench" / "c"
 OPTIMISED = ("-O3", "-march=native")

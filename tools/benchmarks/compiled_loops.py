@@ -17,19 +17,19 @@ from typing import Any
 
 import numpy as np
 
-from drivers.can.open import open_cyclic_end
-from drivers.drive import Drive
-from drivers.errors import JointctlError
-from firmware_py.states import DriveState, StopRequest
-from tools.analysis.idle_states import cores_awake
-from tools.analysis.wake_up import fifo, wake_up_lateness_ns
-from tools.benchmarks.law_memory import setting_doubles
-from tools.benchmarks.load import load, on_core
-from tools.benchmarks.loop_times import NO_VALUES, LoopTimes, times_from_ns
-from tools.configuration.config import Config
-from tools.configuration.records import axis_constants, trajectory_table
-from tools.running.loop.loop_handle import RECEIVE_SHARE, LoopHandle
-from tools.running.open_drive import open_drive
+from jointctl.drivers.can.open import open_cyclic_end
+from jointctl.drivers.drive import Drive
+from jointctl.drivers.errors import JointctlError
+from jointctl.firmware_py.states import DriveState, StopRequest
+from jointctl.tools.analysis.idle_states import cores_awake
+from jointctl.tools.analysis.wake_up import fifo, wake_up_lateness_ns
+from jointctl.tools.benchmarks.law_memory import setting_doubles
+from jointctl.tools.benchmarks.load import load, on_core
+from jointctl.tools.benchmarks.loop_times import NO_VALUES, LoopTimes, times_from_ns
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.records import axis_constants, trajectory_table
+from jointctl.tools.running.loop.loop_handle import RECEIVE_SHARE, LoopHandle
+from jointctl.tools.running.open_drive import open_drive
 
 SETTLE_S = 0.5  # from the start of the loop until the drive is enabled, and a little more
 POLL_S = 0.02

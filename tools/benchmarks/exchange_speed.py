@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tools.benchmarks.c_programs import NoCompilerError, exchange_program
-from tools.benchmarks.compiled_loops import (
+from jointctl.tools.benchmarks.c_programs import NoCompilerError, exchange_program
+from jointctl.tools.benchmarks.compiled_loops import (
     at_rate,
     cyclictest_path,
     on_the_core,
@@ -25,12 +25,12 @@ from tools.benchmarks.compiled_loops import (
     run_ours,
     run_sleep_only,
 )
-from tools.benchmarks.load import LOADS, cores
-from tools.benchmarks.loop_times import LoopTimes
-from tools.benchmarks.paired import Row, compared, interleaved, skipped
-from tools.benchmarks.python_loops import run_canopen_sync, run_python_can
-from tools.configuration.config import Config
-from tools.simulation.virtual_joint import separate_virtual_joint
+from jointctl.tools.benchmarks.load import LOADS, cores
+from jointctl.tools.benchmarks.loop_times import LoopTimes
+from jointctl.tools.benchmarks.paired import Row, compared, interleaved, skipped
+from jointctl.tools.benchmarks.python_loops import run_canopen_sync, run_python_can
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.simulation.virtual_joint import separate_virtual_joint
 
 Loop = Callable[[Config, float, str], LoopTimes]  # one segment: joint, seconds, name of the load
 GROUP = "loop"

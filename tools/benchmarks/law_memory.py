@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from drivers.errors import ConfigurationError
-from firmware_py.records import NEURONS
-from firmware_py.states import ControllerKind, FeedForward
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.records import NEURONS
+from jointctl.firmware_py.states import ControllerKind, FeedForward
 
 STATE_DOUBLES = 12 + 2 * NEURONS
 FIRST_WEIGHT = 12  # struct law_state: twelve scalars, then weights, then hidden

@@ -16,17 +16,17 @@ from typing import Any
 import numpy as np
 from numba.core import runtime
 
-from firmware_py.computed_torque import reset_law, step_law
-from firmware_py.kernel import kernel
-from firmware_py.rbfnn import network_torque_Nm
-from firmware_py.records import AxisConstants, AxisState
-from firmware_py.safety import limited_torque_Nm
-from firmware_py.schema import new
-from firmware_py.velocity import step_velocity
-from tools.benchmarks.c_programs import FAST_MATH, OPTIMISED, NoCompilerError, law_library
-from tools.benchmarks.law_memory import STATE_DOUBLES, law_doubles, require_comparable, state_doubles
-from tools.benchmarks.numpy_law import NumpyLaw
-from tools.benchmarks.paired import Row, compared, interleaved, measured, skipped
+from jointctl.firmware_py.computed_torque import reset_law, step_law
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.rbfnn import network_torque_Nm
+from jointctl.firmware_py.records import AxisConstants, AxisState
+from jointctl.firmware_py.safety import limited_torque_Nm
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.velocity import step_velocity
+from jointctl.tools.benchmarks.c_programs import FAST_MATH, OPTIMISED, NoCompilerError, law_library
+from jointctl.tools.benchmarks.law_memory import STATE_DOUBLES, law_doubles, require_comparable, state_doubles
+from jointctl.tools.benchmarks.numpy_law import NumpyLaw
+from jointctl.tools.benchmarks.paired import Row, compared, interleaved, measured, skipped
 
 GROUP = "control law"
 SAME_NUMBERS = 1e-12  # of the largest torque

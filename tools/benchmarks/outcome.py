@@ -16,9 +16,9 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from tools.benchmarks.paired import Row
-from tools.drawing import GREEN, GREY, INK, RED, canvas, save_png
-from tools.written_file import writing
+from jointctl.tools.benchmarks.paired import Row
+from jointctl.tools.drawing import GREEN, GREY, INK, RED, canvas, save_png
+from jointctl.tools.written_file import writing
 
 
 def conditions() -> dict[str, Any]:

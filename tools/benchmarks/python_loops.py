@@ -13,13 +13,13 @@ import can
 import canopen
 import numpy as np
 
-from drivers.can.virtual_bus import VirtualBus
-from drivers.canopen.identifiers import RPDO1_ID, SYNC_ID, TPDO1_ID
-from tools.benchmarks.compiled_loops import commissioned
-from tools.benchmarks.load import load
-from tools.benchmarks.loop_times import NO_VALUES, LoopTimes, times_from_ns
-from tools.configuration.config import Config
-from tools.running.loop.loop_handle import RECEIVE_SHARE
+from jointctl.drivers.can.virtual_bus import VirtualBus
+from jointctl.drivers.canopen.identifiers import RPDO1_ID, SYNC_ID, TPDO1_ID
+from jointctl.tools.benchmarks.compiled_loops import commissioned
+from jointctl.tools.benchmarks.load import load
+from jointctl.tools.benchmarks.loop_times import NO_VALUES, LoopTimes, times_from_ns
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.running.loop.loop_handle import RECEIVE_SHARE
 
 
 def _frame(identifier: int, data: bytes = b"") -> can.Message:

@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
-from tools.benchmarks.paired import Row, compared, interleaved, measured, skipped
-from tools.configuration.config import Config
-from tools.identification.models import FORMS, legendre
-from tools.identification.polish import vector_limits
-from tools.identification.pso import SwarmSettings, run_swarms
-from tools.identification.variable_projection import Problem, make_problem
-from tools.simulation.lockstep import LockstepJoint
+from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
+from jointctl.tools.benchmarks.paired import Row, compared, interleaved, measured, skipped
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.identification.models import FORMS, legendre
+from jointctl.tools.identification.polish import vector_limits
+from jointctl.tools.identification.pso import SwarmSettings, run_swarms
+from jointctl.tools.identification.variable_projection import Problem, make_problem
+from jointctl.tools.simulation.lockstep import LockstepJoint
 
 LOCKSTEP_S = 100.0
 LOCKSTEP_GOAL_S = 0.15

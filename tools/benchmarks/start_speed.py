@@ -18,10 +18,10 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from drivers.errors import JointctlError
-from tools.benchmarks.paired import Row, compared, interleaved, measured
-from tools.configuration.config import Config
-from tools.simulation.virtual_joint import separate_virtual_joint
+from jointctl.drivers.errors import JointctlError
+from jointctl.tools.benchmarks.paired import Row, compared, interleaved, measured
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.simulation.virtual_joint import separate_virtual_joint
 
 GROUP = "start"
 HELP_GOAL_S = 0.3
@@ -33,7 +33,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def _environment(cache: Path | None = None) -> dict[str, str]:
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    environment = dict(os.environ)
     if cache is not None:
         environment["JOINTCTL_CACHE_DIR"] = str(cache)
     return environment
@@ -58,7 +58,7 @@ def command_s(*arguments: str) -> float:
 
 def until_enabled_s(config_path: Path, channel: str, cache: Path | None = None) -> float:
     """Seconds from the start of `run` to its first phase with the drive enabled; the run is stopped then."""
-    command = [sys.executable, "-P", "-m", "tools.cli", "run", str(config_path.resolve()), "-y"]
+    command = [sys.executable, "-P", "-m", "jointctl.tools.cli", "run", str(config_path.resolve()), "-y"]
     # a busy computer may delay a few of the first cycles so that the margin gate refuses: not what is measured here
     command += ["--allow-low-margin"]
     command += ["--interface", "jointctl", "--channel", channel]
@@ -98,12 +98,14 @@ def _wait_for(process: subprocess.Popen[bytes], words: tuple[str, ...], begin_s:
 
 def start_rows(config: Config, *, runs: int, cold: bool, verbs: Sequence[str]) -> Iterator[Row]:
     """The start of `verbs`, and of `run` until the drive is enabled, on a virtual joint of its own."""
-    command_s("-m", "tools.cli", "--help")
-    cli, bare = interleaved(runs, lambda: command_s("-m", "tools.cli", "--help"), lambda: command_s("-c", "pass"))
+    command_s("-m", "jointctl.tools.cli", "--help")
+    cli, bare = interleaved(
+        runs, lambda: command_s("-m", "jointctl.tools.cli", "--help"), lambda: command_s("-c", "pass")
+    )
     yield measured(GROUP, "jointctl --help", cli, "s", goal=HELP_GOAL_S, note=f"best {min(cli):.2f} s")
     yield compared(GROUP, "jointctl --help", cli, bare, "s", "python -c pass")
     for verb in verbs:
-        taken = [command_s("-m", "tools.cli", verb, "--help") for _ in range(2)]
+        taken = [command_s("-m", "jointctl.tools.cli", verb, "--help") for _ in range(2)]
         yield measured(GROUP, f"jointctl {verb} --help", [min(taken)], "s")
     channel = f"benchstart{os.getpid()}"
     with separate_virtual_joint(config.path, channel):

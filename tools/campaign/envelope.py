@@ -32,10 +32,10 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES
-from hil.faults.kinds import FaultKind
-from tools.campaign.scenario import Scenario
-from tools.configuration.config import Config
+from jointctl.drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES
+from jointctl.hil.faults.kinds import FaultKind
+from jointctl.tools.campaign.scenario import Scenario
+from jointctl.tools.configuration.config import Config
 
 REACTION_s = 0.010
 FILTER_CONSTANTS = 3.0

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from firmware_py.states import Fault
-from hil.faults.kinds import FaultKind
+from jointctl.firmware_py.states import Fault
+from jointctl.hil.faults.kinds import FaultKind
 
 LONG_s = 30.0  # longer than any scenario
 MOTION = frozenset(

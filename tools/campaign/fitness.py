@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from drivers.errors import ConfigurationError
-from tools.campaign.envelope import load_Nm
-from tools.configuration.config import Config
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.campaign.envelope import load_Nm
+from jointctl.tools.configuration.config import Config
 
 LEAST_SCALE = 0.9  # of the friction, RIPPLE_Nm the most of the motor: what a scenario draws
 RIPPLE_Nm = 1.4

@@ -7,20 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.records import Reference
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase, DriveRequest, Fault, Reaction
-from firmware_py.trajectory import reference_at
-from hil.canopen.device_records import PowerState
-from hil.faults.kinds import FaultKind
-from hil.lockstep import TRUE_POWER_STATE, TRUE_POSITION_rad, TRUE_VELOCITY_radps
-from tools.campaign.envelope import STANDSTILL_RADPS, Envelope, envelope
-from tools.campaign.fault_classes import FAULT_CLASSES, LATE_CAUSES
-from tools.campaign.scenario import BEFORE_s, Scenario, fitted, plant_of
-from tools.campaign.sweep_motion import LONGEST_s, SweepStrokes, placed_sweep
-from tools.configuration.config import Config
-from tools.configuration.records import axis_constants
-from tools.simulation.lockstep import LockstepJoint, LockstepRun
+from jointctl.firmware_py.records import Reference
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault, Reaction
+from jointctl.firmware_py.trajectory import reference_at
+from jointctl.hil.canopen.device_records import PowerState
+from jointctl.hil.faults.kinds import FaultKind
+from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_POSITION_rad, TRUE_VELOCITY_radps
+from jointctl.tools.campaign.envelope import STANDSTILL_RADPS, Envelope, envelope
+from jointctl.tools.campaign.fault_classes import FAULT_CLASSES, LATE_CAUSES
+from jointctl.tools.campaign.scenario import BEFORE_s, Scenario, fitted, plant_of
+from jointctl.tools.campaign.sweep_motion import LONGEST_s, SweepStrokes, placed_sweep
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
 
 APPROACH_s = 1.0
 SPARE_s = 14.0  # for waiting, enabling and stopping

@@ -12,10 +12,10 @@ from typing import Any
 
 from rich.table import Table
 
-from firmware_py.states import Fault
-from tools.campaign.judge import Verdict
-from tools.campaign.scenario import draw_scenario
-from tools.drawing import INK, MID_BLUE, MID_GREEN, MID_RED, canvas
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.campaign.judge import Verdict
+from jointctl.tools.campaign.scenario import draw_scenario
+from jointctl.tools.drawing import INK, MID_BLUE, MID_GREEN, MID_RED, canvas
 
 MANY = 1000  # scenarios: more are drawn as specks
 

@@ -8,13 +8,13 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from tools.campaign.judge import Verdict, judge
-from tools.campaign.scenario import draw_scenario
-from tools.configuration.config import Config
-from tools.configuration.load import load_config
-from tools.simulation.lockstep import LockstepJoint
-from tools.simulation.workers import interrupts_left_to_the_parent
-from tools.sweeping.carry_out import with_mode
+from jointctl.tools.campaign.judge import Verdict, judge
+from jointctl.tools.campaign.scenario import draw_scenario
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.simulation.workers import interrupts_left_to_the_parent
+from jointctl.tools.sweeping.carry_out import with_mode
 
 AT_ONCE = 16  # scenarios that a worker takes at a time
 _worker: dict[str, object] = {}

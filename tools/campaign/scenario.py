@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.schema import new
-from firmware_py.velocity import low_pass_gain
-from hil.faults.kinds import FaultConstants, FaultKind
-from hil.plant.joint import plant
-from hil.plant.records import FrictionKind
-from tools.campaign.fault_classes import EMERGENCY_CODES, FAULT_CLASSES, SIGNED, Sizes
-from tools.campaign.sweep_motion import LONGEST_s, SweepStrokes, draw_strokes
-from tools.configuration.config import Config
-from tools.configuration.plant_settings import plant_settings
-from tools.configuration.trajectory import Hold, MinJerk, Sine, Trapezoid
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.velocity import low_pass_gain
+from jointctl.hil.faults.kinds import FaultConstants, FaultKind
+from jointctl.hil.plant.joint import plant
+from jointctl.hil.plant.records import FrictionKind
+from jointctl.tools.campaign.fault_classes import EMERGENCY_CODES, FAULT_CLASSES, SIGNED, Sizes
+from jointctl.tools.campaign.sweep_motion import LONGEST_s, SweepStrokes, draw_strokes
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.plant_settings import plant_settings
+from jointctl.tools.configuration.trajectory import Hold, MinJerk, Sine, Trapezoid
 
 HARMLESS_SHARE = 0.35
 REACH_RAD = 0.4  # of the trajectories; the limits are at 0.7

@@ -11,18 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from tools.configuration.config import Config
-from tools.simulation.lockstep import LockstepJoint
-from tools.sweeping.carry_out import (
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.sweeping.carry_out import (
     VELOCITY_MODES,
     middle_rad,
     position_margin_rad,
     sweep_constants,
     with_tracking_law,
 )
-from tools.sweeping.grid import SweepPoint
-from tools.sweeping.options import ACCELERATION_SHARE
-from tools.sweeping.plan import PlanSettings, plan_motion, shifted
+from jointctl.tools.sweeping.grid import SweepPoint
+from jointctl.tools.sweeping.options import ACCELERATION_SHARE
+from jointctl.tools.sweeping.plan import PlanSettings, plan_motion, shifted
 
 SLOWEST_SHARE, FASTEST_SHARE = 0.03, 0.5  # of limits.velocity_max_radps; a real sweep goes up to 0.9 of it
 SETTLE_s = 0.1

@@ -1,5 +1,5 @@
-"""`python -m tools.cli`: the command line without the installed script."""
+"""`python -m jointctl.tools.cli`: the command line without the installed script."""
 
-from tools.cli.start import main
+from jointctl.tools.cli.start import main
 
 main()

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from tools.cli.options import COMPARE, Json, Quiet, Report, Workers, loaded
-from tools.output import Output
+from jointctl.tools.cli.options import COMPARE, Json, Quiet, Report, Workers, loaded
+from jointctl.tools.output import Output
 
 LARGEST = 2**31 - 1  # of a seed or of a scenario's number
 
@@ -23,7 +23,7 @@ def paper(
     quiet: Quiet = False,
 ) -> None:
     """Reproduce every experiment of the paper on the virtual joint, in lockstep: its figure beside ours."""
-    from tools.verbs.paper import paper as run_paper
+    from jointctl.tools.verbs.paper import paper as run_paper
 
     output = Output(json=json, quiet=quiet)
     raise typer.Exit(run_paper(output, folder=figures, identification=not no_identification, report=report))
@@ -47,8 +47,8 @@ def study(
     quiet: Quiet = False,
 ) -> None:
     """Compare controllers on many random joints: medians and 5-95 % ranges of error, peak and settling time."""
-    from tools.experiments.study_settings import StudySettings, checked, load_study
-    from tools.verbs.study import study as run_study
+    from jointctl.tools.experiments.study_settings import StudySettings, checked, load_study
+    from jointctl.tools.verbs.study import study as run_study
 
     given: dict[str, Any] = {
         "plants": plants,
@@ -80,7 +80,7 @@ def fault_campaign(
     quiet: Quiet = False,
 ) -> None:
     """Random faults on random joints in lockstep; every safety invariant is checked in every scenario."""
-    from tools.verbs.fault_campaign import fault_campaign as run_campaign
+    from jointctl.tools.verbs.fault_campaign import fault_campaign as run_campaign
 
     output = Output(json=json, quiet=quiet)
     raise typer.Exit(
@@ -107,7 +107,7 @@ def bench(
     quiet: Quiet = False,
 ) -> None:
     """Speed as paired ratios: the law against C and numpy, the loop against C and others, lockstep, swarm, start."""
-    from tools.verbs.bench import bench as run_bench
+    from jointctl.tools.verbs.bench import bench as run_bench
 
     verbs = sorted(getattr(context.find_root().command, "commands", {}))
     output = Output(json=json, quiet=quiet)

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tools.cli.option_group import grouped
-from tools.cli.options import FRICTION, Json, Quiet, Report, config_path
-from tools.cli.sweep_command import sweep_command
-from tools.output import Output
+from jointctl.tools.cli.option_group import grouped
+from jointctl.tools.cli.options import FRICTION, Json, Quiet, Report, config_path
+from jointctl.tools.cli.sweep_command import sweep_command
+from jointctl.tools.output import Output
 
 if TYPE_CHECKING:
-    from tools.identification.foreign_table import ForeignFormat
+    from jointctl.tools.identification.foreign_table import ForeignFormat
 
 Data = Annotated[Path, typer.Argument(metavar="DATA", help="CSV of velocity plateaus, from sweep or elsewhere")]
 Model = Annotated[str, typer.Option("--model", help="multi-stage, stribeck, coulomb-viscous, or auto (held-out error)")]
@@ -38,7 +38,7 @@ class TableOptions:
     delimiter: Annotated[str, typer.Option("--delimiter", help="between columns: auto, or the character")] = "auto"
 
     def told(self) -> ForeignFormat:
-        from tools.identification.foreign_table import ForeignFormat
+        from jointctl.tools.identification.foreign_table import ForeignFormat
 
         return ForeignFormat(**asdict(self))
 
@@ -80,9 +80,9 @@ def identify(
     quiet: Quiet = False,
 ) -> None:
     """Fit the friction model (11) to measured plateaus; writes TOML, figures and a report beside the data."""
-    from tools.identification.options import Options
-    from tools.identification.pso import SwarmSettings
-    from tools.verbs.identify import identify as run_identify
+    from jointctl.tools.identification.options import Options
+    from jointctl.tools.identification.pso import SwarmSettings
+    from jointctl.tools.verbs.identify import identify as run_identify
 
     options = Options(
         model=model,
@@ -116,7 +116,7 @@ def validate(
     quiet: Quiet = False,
 ) -> None:
     """An identified friction model against other data of the same joint."""
-    from tools.verbs.validate import validate as run_validate
+    from jointctl.tools.verbs.validate import validate as run_validate
 
     raise typer.Exit(
         run_validate(config_path(config), data, Output(json=json, quiet=quiet), told=table.told(), figure=figure)

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from drivers.errors import ConfigurationError
-from tools.cli.option_group import grouped
-from tools.cli.options import INSPECT, BusOptions, CanOptions, Json, Quiet, loaded
-from tools.output import Output
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.cli.option_group import grouped
+from jointctl.tools.cli.options import INSPECT, BusOptions, CanOptions, Json, Quiet, loaded
+from jointctl.tools.output import Output
 
 if TYPE_CHECKING:
-    from tools.configuration.config import Config
-    from tools.inspection.subject import Subject
+    from jointctl.tools.configuration.config import Config
+    from jointctl.tools.inspection.subject import Subject
 
 _NICENESS = 10  # of the monitor: the loop of a run beside it goes first
 MaybeConfig = Annotated[
@@ -33,7 +33,7 @@ def config_of(path: Path | None, bus: CanOptions) -> Config | None:
 
 def canopen_subject(config: Config | None, bus: CanOptions, eds: Path | None) -> Subject:
     """What a CANopen branch looks at."""
-    from tools.inspection.subject import subject_of_config, subject_of_flags
+    from jointctl.tools.inspection.subject import subject_of_config, subject_of_flags
 
     if config is None:
         return subject_of_flags(bus.interface, bus.channel, bus.bitrate, bus.target, eds)
@@ -56,7 +56,7 @@ def scan(
     quiet: Quiet = False,
 ) -> None:
     """Which CANopen nodes are on the bus: identity, device type, NMT state, drive state.  Reads only."""
-    from tools.verbs.scan import scan as run_scan
+    from jointctl.tools.verbs.scan import scan as run_scan
 
     subject = subject_of(config, bus)
     raise typer.Exit(run_scan(subject, Output(json=json, quiet=quiet), listen_s=listen, passive=passive))
@@ -75,10 +75,10 @@ def info(
     joint = config_of(config, bus)
     output = Output(json=json, quiet=quiet)
     if joint is not None and joint.is_serial:
-        from tools.verbs.info_serial import info_serial
+        from jointctl.tools.verbs.info_serial import info_serial
 
         raise typer.Exit(info_serial(joint, output))
-    from tools.verbs.info import info as run_info
+    from jointctl.tools.verbs.info import info as run_info
 
     raise typer.Exit(run_info(canopen_subject(joint, bus, eds), output))
 
@@ -105,11 +105,11 @@ def monitor(
     joint = config_of(config, bus)
     output = Output(json=json, quiet=quiet)
     if joint is not None and joint.is_serial:
-        from tools.verbs.monitor_serial import monitor_serial
+        from jointctl.tools.verbs.monitor_serial import monitor_serial
 
         raise typer.Exit(monitor_serial(joint, output, count=count, duration_s=duration, changes=changes))
-    from tools.verbs.monitor import monitor as run_monitor
-    from tools.verbs.monitor import selection_of
+    from jointctl.tools.verbs.monitor import monitor as run_monitor
+    from jointctl.tools.verbs.monitor import selection_of
 
     selection = selection_of(cob_id or [], kind or [], node or [], count, duration, changes)
     subject = canopen_subject(joint, bus, eds)
@@ -134,7 +134,7 @@ def params_dump(
     quiet: Quiet = False,
 ) -> None:
     """Read every readable object of the EDS.  Reads only."""
-    from tools.verbs.params import dump
+    from jointctl.tools.verbs.params import dump
 
     subject = subject_of(config, bus, eds)
     raise typer.Exit(dump(subject, Output(json=json, quiet=quiet), out))
@@ -157,7 +157,7 @@ def params_restore(
     quiet: Quiet = False,
 ) -> None:
     """Write the parameters that differ, read each back, tell what was refused.  The drive must be off."""
-    from tools.verbs.params import place_index, restore_file
+    from jointctl.tools.verbs.params import place_index, restore_file
 
     subject = subject_of(config, bus, eds)
     indices = [place_index(text) for text in skip or []]
@@ -177,9 +177,9 @@ def params_diff(
     quiet: Quiet = False,
 ) -> None:
     """Compare two files, or a file and a drive.  Exit code 11 if they differ."""
-    from tools.inspection.objects import Objects
-    from tools.inspection.parameter_file import is_parameter_file, load_parameters
-    from tools.verbs.params import diff, parameters_of_drive
+    from jointctl.tools.inspection.objects import Objects
+    from jointctl.tools.inspection.parameter_file import is_parameter_file, load_parameters
+    from jointctl.tools.verbs.params import diff, parameters_of_drive
 
     output = Output(json=json, quiet=quiet)
     objects, sides = Objects(), []

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from tools.cli.option_group import grouped
-from tools.cli.options import LOOK, AllowLowMargin, CanOptions, Json, Quiet, loaded
-from tools.output import Output
+from jointctl.tools.cli.option_group import grouped
+from jointctl.tools.cli.options import LOOK, AllowLowMargin, CanOptions, Json, Quiet, loaded
+from jointctl.tools.output import Output
 
 LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="run log (MCAP)")]
 
@@ -19,7 +19,7 @@ log_app = typer.Typer(help="Look at a run log: what it holds, a picture, other f
 @log_app.command("info")
 def info(log: LogPath, json: Json = False) -> None:
     """What the log holds, the run in numbers, its events."""
-    from tools.verbs.log import log_info
+    from jointctl.tools.verbs.log import log_info
 
     raise typer.Exit(log_info(log, Output(json=json)))
 
@@ -31,7 +31,7 @@ def plot(
     json: Json = False,
 ) -> None:
     """The picture of the run."""
-    from tools.verbs.log import log_plot
+    from jointctl.tools.verbs.log import log_plot
 
     raise typer.Exit(log_plot(log, Output(json=json), out))
 
@@ -44,7 +44,7 @@ def export(
     json: Json = False,
 ) -> None:
     """The log in another format."""
-    from tools.verbs.log import log_export
+    from jointctl.tools.verbs.log import log_export
 
     raise typer.Exit(log_export(log, Output(json=json), format, out))
 
@@ -55,7 +55,7 @@ def report(
     json: Json = False,
 ) -> None:
     """One self-contained page about a run, or about several beside each other."""
-    from tools.verbs.report import report as run_report
+    from jointctl.tools.verbs.report import report as run_report
 
     raise typer.Exit(run_report(logs, Output(json=json), out))
 
@@ -75,8 +75,8 @@ def scope(
     quiet: Quiet = False,
 ) -> None:
     """A local web page: a run log to zoom into, or a joint to start, watch, change and stop from the browser."""
-    from tools.verbs.scope import live_scope
-    from tools.verbs.scope import scope as run_scope
+    from jointctl.tools.verbs.scope import live_scope
+    from jointctl.tools.verbs.scope import scope as run_scope
 
     output = Output(quiet=quiet)
     if path.suffix == ".mcap":

@@ -12,14 +12,14 @@ from typing import Annotated, Any
 
 import typer
 
-from drivers.errors import INTERRUPTED, DataError, JointctlError, UsageError
-from drivers.printable import one_line
-from tools.cli import experiments as cli_experiments
-from tools.cli import friction as cli_friction
-from tools.cli import inspection as cli_inspection
-from tools.cli import logs as cli_log
-from tools.cli.option_group import grouped
-from tools.cli.options import (
+from jointctl.drivers.errors import INTERRUPTED, DataError, JointctlError, UsageError
+from jointctl.drivers.printable import one_line
+from jointctl.tools.cli import experiments as cli_experiments
+from jointctl.tools.cli import friction as cli_friction
+from jointctl.tools.cli import inspection as cli_inspection
+from jointctl.tools.cli import logs as cli_log
+from jointctl.tools.cli.option_group import grouped
+from jointctl.tools.cli.options import (
     BEGIN,
     MOVE,
     AllowLowMargin,
@@ -32,9 +32,9 @@ from tools.cli.options import (
     config_path,
     loaded,
 )
-from tools.cli.standard_streams import never_refuse_a_character, occupy_standard_streams
-from tools.cli.unexpected_end import end_unexpected
-from tools.output import Output, abandon, let_go
+from jointctl.tools.cli.standard_streams import never_refuse_a_character, occupy_standard_streams
+from jointctl.tools.cli.unexpected_end import end_unexpected
+from jointctl.tools.output import Output, abandon, let_go
 
 EPILOG = (
     "First steps: `jointctl demo` shows all of it on a virtual joint; `jointctl doctor` tells what this computer can "
@@ -75,7 +75,7 @@ def demo(
     quiet: Quiet = False,
 ) -> None:
     """Track a trajectory on the virtual joint: no hardware, no set-up."""
-    from tools.verbs.demo import demo as run_demo
+    from jointctl.tools.verbs.demo import demo as run_demo
 
     raise typer.Exit(run_demo(config_path(config), Output(json=json, quiet=quiet), duration_s=duration))
 
@@ -96,7 +96,7 @@ def run(
     quiet: Quiet = False,
 ) -> None:
     """Track the configured trajectory on a real or virtual joint."""
-    from tools.verbs.run import run as run_run
+    from jointctl.tools.verbs.run import run as run_run
 
     joint = loaded(config, bus)
     raise typer.Exit(
@@ -118,7 +118,7 @@ def new(
     quiet: Quiet = False,
 ) -> None:
     """Write a configuration of your own, a copy of a shipped one to fill in."""
-    from tools.verbs.new import new as run_new
+    from jointctl.tools.verbs.new import new as run_new
 
     raise typer.Exit(run_new(file, Output(quiet=quiet), shipped=shipped))
 
@@ -136,13 +136,13 @@ def hil(
     quiet: Quiet = False,
 ) -> None:
     """Keep the virtual joint up, on a virtual bus or a pseudo-terminal, for other programs to attach to."""
-    from tools.verbs.hil import hil as run_hil
+    from jointctl.tools.verbs.hil import hil as run_hil
 
     if serial and config == Path("virtual"):
         config = Path("elmo_serial")
     joint = loaded(config, bus)
     if serial or link is not None or joint.is_serial:
-        from tools.verbs.hil_serial import hil_serial, refuse_options
+        from jointctl.tools.verbs.hil_serial import hil_serial, refuse_options
 
         refuse_options(joint, port=bus.port, timing=timing)
         raise typer.Exit(hil_serial(joint, Output(quiet=quiet), link=link, ready_fd=ready_fd))
@@ -158,8 +158,8 @@ def stop(
     json: Json = False,
 ) -> None:
     """Stop and disable the drive now, also while another program controls it."""
-    from tools.configuration.stop_target import GivenTarget
-    from tools.verbs.stop import stop as run_stop
+    from jointctl.tools.configuration.stop_target import GivenTarget
+    from jointctl.tools.verbs.stop import stop as run_stop
 
     given = GivenTarget(bus.interface, bus.channel, bus.bitrate, bus.port, bus.target)
     raise typer.Exit(run_stop(config_path(config), Output(json=json), given))
@@ -174,7 +174,7 @@ def clear_fault(
     json: Json = False,
 ) -> None:
     """Reset the drive's fault; it stays disabled."""
-    from tools.verbs.clear_fault import clear_fault as run_clear_fault
+    from jointctl.tools.verbs.clear_fault import clear_fault as run_clear_fault
 
     joint = loaded(config, bus)
     raise typer.Exit(run_clear_fault(joint, Output(json=json)))
@@ -203,10 +203,10 @@ def doctor(
     """
     joint = loaded(config, bus)
     if motion:
-        from tools.verbs.doctor_motion import doctor_motion
+        from jointctl.tools.verbs.doctor_motion import doctor_motion
 
         raise typer.Exit(doctor_motion(joint, Output(json=json, quiet=quiet), assume_yes=yes, torque_Nm=torque))
-    from tools.verbs.doctor import doctor as run_doctor
+    from jointctl.tools.verbs.doctor import doctor as run_doctor
 
     raise typer.Exit(run_doctor(joint, Output(json=json, quiet=quiet), cold=cold))
 
@@ -220,7 +220,7 @@ def check(
     json: Json = False,
 ) -> None:
     """Is the control loop stable enough?  Margins, bounds and what would help."""
-    from tools.verbs.check import check as run_check
+    from jointctl.tools.verbs.check import check as run_check
 
     joint = loaded(config)
     raise typer.Exit(run_check(joint, Output(json=json), delay, figure=figure, allow_low_margin=allow_low_margin))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from tools.configuration.config import Config
+    from jointctl.tools.configuration.config import Config
 
 Interface = Annotated[str | None, typer.Option("-i", "--interface", help="python-can interface (env CAN_INTERFACE)")]
 Channel = Annotated[
@@ -64,7 +64,7 @@ LOOK, COMPARE = "Look at a run", "Compare and measure"
 
 def config_path(path: Path) -> Path:
     """The file itself, or a shipped configuration of that name."""
-    from tools.configuration.load import shipped_config
+    from jointctl.tools.configuration.load import shipped_config
 
     shipped = shipped_config(str(path))
     return shipped if not os.path.exists(path) and os.path.exists(shipped) else path
@@ -72,8 +72,8 @@ def config_path(path: Path) -> Path:
 
 def loaded(path: Path, bus: CanOptions | None = None) -> Config:
     """The configuration with what the command line and the environment say about bus, port and node."""
-    from tools.configuration.elmo_settings import with_port_override
-    from tools.configuration.load import load_config, with_bus_overrides
+    from jointctl.tools.configuration.elmo_settings import with_port_override
+    from jointctl.tools.configuration.load import load_config, with_bus_overrides
 
     bus = BusOptions() if bus is None else bus
     config = with_port_override(load_config(config_path(path)), bus.port if isinstance(bus, BusOptions) else None)

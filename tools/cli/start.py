@@ -35,7 +35,7 @@ def main() -> None:
     if ours:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     _require_descriptors()
-    from tools.cli.main import main as run
+    from jointctl.tools.cli.main import main as run
 
     if ours:
         signal.signal(signal.SIGINT, signal.default_int_handler)

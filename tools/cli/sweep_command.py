@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from tools.cli.option_group import grouped
-from tools.cli.options import (
+from jointctl.tools.cli.option_group import grouped
+from jointctl.tools.cli.options import (
     BusOptions,
     ConfigPath,
     DryRun,
@@ -18,7 +18,7 @@ from tools.cli.options import (
     Yes,
     loaded,
 )
-from tools.output import Output
+from jointctl.tools.output import Output
 
 
 @grouped
@@ -66,8 +66,8 @@ def sweep_command(
     quiet: Quiet = False,
 ) -> None:
     """Measure friction: plateaus of constant speed in both directions, into a CSV file for `identify`."""
-    from tools.sweeping.options import SweepOptions
-    from tools.verbs.sweep import sweep
+    from jointctl.tools.sweeping.options import SweepOptions
+    from jointctl.tools.verbs.sweep import sweep
 
     configuration = loaded(config, bus)
     options = SweepOptions(

@@ -10,9 +10,9 @@ import os
 import sys
 from typing import NoReturn
 
-from drivers.errors import JointctlError
-from drivers.printable import one_line
-from tools.output import Output
+from jointctl.drivers.errors import JointctlError
+from jointctl.drivers.printable import one_line
+from jointctl.tools.output import Output
 
 TRACEBACK = "JOINTCTL_TRACEBACK"  # in the environment: show where an unexpected error comes from
 

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic_core import PydanticCustomError
 
-from drivers.can.channel import NAME, RESERVED, split_channel, with_options
-from drivers.can.open import CYCLIC_INTERFACES
+from jointctl.drivers.can.channel import NAME, RESERVED, split_channel, with_options
+from jointctl.drivers.can.open import CYCLIC_INTERFACES
 
 if TYPE_CHECKING:
-    from tools.configuration.sections import Bus
+    from jointctl.tools.configuration.sections import Bus
 
 ALLOWED = "names of python-can with texts, numbers, true or false; none for socketcan and jointctl"
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from drivers.canopen.identifiers import EVENT_DRIVEN, LAST_SYNCHRONOUS
-from tools.configuration.config import Config
-from tools.configuration.conversions import RADPS_PER_UNIT, velocity_of_a_count_radps
-from tools.configuration.elmo_settings import serial_problems
-from tools.configuration.sections import Friction, FrictionDirection
+from jointctl.drivers.canopen.identifiers import EVENT_DRIVEN, LAST_SYNCHRONOUS
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import RADPS_PER_UNIT, velocity_of_a_count_radps
+from jointctl.tools.configuration.elmo_settings import serial_problems
+from jointctl.tools.configuration.sections import Friction, FrictionDirection
 
 CAN_RATE_HZ = (100.0, 4000.0)
 SWING_PERIODS = 4.0  # that half a swing takes at least: a faster one no sampled loop can follow

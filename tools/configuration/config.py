@@ -11,12 +11,12 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field, PrivateAttr
 
-from drivers.errors import ConfigurationError
-from tools.configuration.bus_options import whole_channel
-from tools.configuration.elmo import ElmoSerial
-from tools.configuration.joint_encoder import JointEncoder
-from tools.configuration.plant import Virtual
-from tools.configuration.sections import (
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.configuration.bus_options import whole_channel
+from jointctl.tools.configuration.elmo import ElmoSerial
+from jointctl.tools.configuration.joint_encoder import JointEncoder
+from jointctl.tools.configuration.plant import Virtual
+from jointctl.tools.configuration.sections import (
     Bus,
     Control,
     Drive,
@@ -31,7 +31,7 @@ from tools.configuration.sections import (
     Section,
     Sequence,
 )
-from tools.configuration.trajectory import Trajectory
+from jointctl.tools.configuration.trajectory import Trajectory
 
 SHIPPED_FOLDER = Path(__file__).resolve().parents[2] / "configs"
 

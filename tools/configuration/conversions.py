@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from firmware_py import friction as friction_model
-from tools.configuration.config import Config
-from tools.configuration.sections import Friction, FrictionDirection
+from jointctl.firmware_py import friction as friction_model
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.sections import Friction, FrictionDirection
 
 RADPS_PER_UNIT = {"deg/s": math.pi / 180.0, "rad/s": 1.0, "r/min": math.tau / 60.0}
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from drivers.can.bit_timing import bus_load, highest_rate_Hz
-from drivers.canopen.encoder_settings import JointEncoderSettings
-from drivers.canopen.settings import CanopenSettings
-from drivers.canopen.thermometer import TemperatureObject
-from drivers.errors import ConfigurationError
-from hil.canopen.device import DeviceSettings
-from hil.canopen.encoder_node import EncoderSettings
-from tools.configuration.config import Config
-from tools.configuration.conversions import torque_constant_NmpA
-from tools.configuration.object_place import index_and_sub
+from jointctl.drivers.can.bit_timing import bus_load, highest_rate_Hz
+from jointctl.drivers.canopen.encoder_settings import JointEncoderSettings
+from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.canopen.thermometer import TemperatureObject
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.hil.canopen.device import DeviceSettings
+from jointctl.hil.canopen.encoder_node import EncoderSettings
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import torque_constant_NmpA
+from jointctl.tools.configuration.object_place import index_and_sub
 
 TPDO_BYTES, RPDO_BYTES = 8, 4
 VELOCITY_RPDO_BYTES = 6  # 60FF is longer than 6071

@@ -12,9 +12,9 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, PrivateAttr
 from pydantic_core import PydanticCustomError
 
-from drivers.elmo.port import SERIAL
-from drivers.errors import ConfigurationError
-from tools.configuration.sections import Ampere, Direction, Rule, Section, between
+from jointctl.drivers.elmo.port import SERIAL
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.configuration.sections import Ampere, Direction, Rule, Section, between
 
 KIND = "elmo_serial"
 BAUD_RATES_bitps = (9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600)

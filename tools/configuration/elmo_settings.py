@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from drivers.elmo.line_budget import highest_rate_Hz
-from drivers.elmo.settings import ElmoSettings
-from drivers.errors import ConfigurationError
-from hil.elmo.commands import ElmoDeviceSettings
-from tools.configuration.config import Config
-from tools.configuration.conversions import torque_constant_NmpA
-from tools.configuration.elmo import KIND, ElmoSerial
+from jointctl.drivers.elmo.line_budget import highest_rate_Hz
+from jointctl.drivers.elmo.settings import ElmoSettings
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.hil.elmo.commands import ElmoDeviceSettings
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import torque_constant_NmpA
+from jointctl.tools.configuration.elmo import KIND, ElmoSerial
 
 RAMP_SPARE = 4.0  # of the drive's ramps in speed mode over sequence.brake_radps2: steeper than what the sweep asks for
 

@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from tools.configuration.object_place import ObjectPlace
-from tools.configuration.sections import Direction, Node, Section, between
+from jointctl.tools.configuration.object_place import ObjectPlace
+from jointctl.tools.configuration.sections import Direction, Node, Section, between
 
 
 class JointEncoder(Section):

@@ -11,16 +11,22 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import PydanticCustomError
 
-from drivers.can.channel import split_channel
-from drivers.errors import ConfigurationError
-from firmware_py.input_file import LARGEST_TABLE_BYTES, LARGEST_TEXT_BYTES, parse_toml, read_input, require_input
-from tools.configuration.bus_options import whole_channel
-from tools.configuration.checks import problems_between_sections
-from tools.configuration.config import SHIPPED_FOLDER, Config
-from tools.configuration.elmo import with_serial_bus
-from tools.configuration.plant_settings import plant_problems
-from tools.configuration.problems import ConfigurationProblems, problem_line, problem_lines, raise_if
-from tools.configuration.sections import Bus, Drive
+from jointctl.drivers.can.channel import split_channel
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.input_file import (
+    LARGEST_TABLE_BYTES,
+    LARGEST_TEXT_BYTES,
+    parse_toml,
+    read_input,
+    require_input,
+)
+from jointctl.tools.configuration.bus_options import whole_channel
+from jointctl.tools.configuration.checks import problems_between_sections
+from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config
+from jointctl.tools.configuration.elmo import with_serial_bus
+from jointctl.tools.configuration.plant_settings import plant_problems
+from jointctl.tools.configuration.problems import ConfigurationProblems, problem_line, problem_lines, raise_if
+from jointctl.tools.configuration.sections import Bus, Drive
 
 
 def shipped_config(name: str) -> Path:

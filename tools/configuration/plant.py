@@ -13,8 +13,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator
 from pydantic_core import PydanticCustomError
 
-from hil.faults.kinds import LOCKSTEP_ONLY, MAX_FAULTS, FaultKind
-from tools.configuration.sections import Friction, Rule, Section, between
+from jointctl.hil.faults.kinds import LOCKSTEP_ONLY, MAX_FAULTS, FaultKind
+from jointctl.tools.configuration.sections import Friction, Rule, Section, between
 
 OWN_KEYS = ("friction_kind", "inertia_scale", "friction", "faults")
 FAULT_KINDS = tuple(kind.name.lower() for kind in FaultKind if kind not in (FaultKind.NONE, *LOCKSTEP_ONLY))

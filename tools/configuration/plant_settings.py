@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from drivers.errors import ConfigurationError
-from firmware_py.schema import new
-from hil.faults.kinds import FaultConstants, FaultKind, no_faults
-from hil.plant.records import EncoderSide, FrictionKind
-from hil.plant.settings import PlantSettings
-from tools.configuration.config import Config
-from tools.configuration.conversions import friction_constants, torque_constant_NmpA
-from tools.configuration.plant import OWN_KEYS, Virtual
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.schema import new
+from jointctl.hil.faults.kinds import FaultConstants, FaultKind, no_faults
+from jointctl.hil.plant.records import EncoderSide, FrictionKind
+from jointctl.hil.plant.settings import PlantSettings
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import friction_constants, torque_constant_NmpA
+from jointctl.tools.configuration.plant import OWN_KEYS, Virtual
 
 
 def fault_constants(config: Config) -> Any:

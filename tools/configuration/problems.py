@@ -11,9 +11,9 @@ from typing import Any, get_args
 
 from pydantic import BaseModel
 
-from drivers.errors import ConfigurationError
-from drivers.printable import one_line
-from tools.configuration.config import Config
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.drivers.printable import one_line
+from jointctl.tools.configuration.config import Config
 
 
 class ConfigurationProblems(ConfigurationError):

@@ -7,21 +7,26 @@ from typing import Any
 
 import numpy as np
 
-from drivers.errors import ConfigurationError
-from firmware_py.live_change import gains_of
-from firmware_py.lyapunov import solve_lyapunov_p
-from firmware_py.motion_peak import approach_duration_s, approach_start, peak_of
-from firmware_py.records import NEURONS, AxisConstants, Gains, TrajectoryConstants
-from firmware_py.schema import dtype_of, new
-from firmware_py.states import ControllerKind, FeedForward, LimitSource, TrajectoryKind, ZeroSpeedRule
-from firmware_py.trajectory_table import ends_meet, table_from_csv
-from firmware_py.velocity import low_pass_gain
-from tools.configuration.checks import extremes_problems
-from tools.configuration.config import Config
-from tools.configuration.conversions import friction_constants, law_resolution_rad, period_s, static_friction_Nm
-from tools.configuration.elmo import ElmoSerial
-from tools.configuration.problems import ConfigurationProblems
-from tools.configuration.sections import Control
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.live_change import gains_of
+from jointctl.firmware_py.lyapunov import solve_lyapunov_p
+from jointctl.firmware_py.motion_peak import approach_duration_s, approach_start, peak_of
+from jointctl.firmware_py.records import NEURONS, AxisConstants, Gains, TrajectoryConstants
+from jointctl.firmware_py.schema import dtype_of, new
+from jointctl.firmware_py.states import ControllerKind, FeedForward, LimitSource, TrajectoryKind, ZeroSpeedRule
+from jointctl.firmware_py.trajectory_table import ends_meet, table_from_csv
+from jointctl.firmware_py.velocity import low_pass_gain
+from jointctl.tools.configuration.checks import extremes_problems
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import (
+    friction_constants,
+    law_resolution_rad,
+    period_s,
+    static_friction_Nm,
+)
+from jointctl.tools.configuration.elmo import ElmoSerial
+from jointctl.tools.configuration.problems import ConfigurationProblems
+from jointctl.tools.configuration.sections import Control
 
 # the paper's centres, in rad and in rad/s: -c_p, 0, c_p with c_p = 1e-2 [-5 -3 -1 -0.8 -0.4 -0.1 -0.05]
 _PAPER_HALF = (0.05, 0.03, 0.01, 0.008, 0.004, 0.001, 0.0005)

@@ -1,4 +1,4 @@
-"""docs/configuration.md from the models of the configuration: `python -m tools.configuration.reference [FILE]`.
+"""docs/configuration.md from the models: `python -m jointctl.tools.configuration.reference [FILE]`.
 
 Key, type, range and default are those that pydantic checks with; the meaning is the comment at the key in the source,
 behind it or in lines of their own above it.
@@ -17,8 +17,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
 
-from tools.configuration.config import Config
-from tools.configuration.sections import Rule
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.sections import Rule
 
 UNITS = {
     "Nm": "Nm", "A": "A", "rad": "rad", "radps": "rad/s", "radps2": "rad/s²", "s": "s", "Hz": "Hz", "Nmps": "Nm/s",
@@ -29,7 +29,7 @@ UNITS = {
 TYPES = {float: "number", int: "whole number", str: "text", bool: "true, false"}
 HEAD = """# Configuration reference
 
-Made from the models by `python -m tools.configuration.reference docs/configuration.md`; do not edit.
+Made from the models by `python -m jointctl.tools.configuration.reference docs/configuration.md`; do not edit.
 
 A configuration is one TOML file. The unit of a quantity is part of its key. A key without a default must be there; one
 with the default *none* may be left out. Ranges are wide: they catch a wrong unit or a slip of the finger, not a bold

@@ -14,9 +14,9 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
-from firmware_py.records import NEURONS
-from tools.configuration.bus_options import ALLOWED, checked_options
-from tools.configuration.object_place import ObjectPlace
+from jointctl.firmware_py.records import NEURONS
+from jointctl.tools.configuration.bus_options import ALLOWED, checked_options
+from jointctl.tools.configuration.object_place import ObjectPlace
 
 
 def interval_text(low: float, high: float, open_low: bool = False) -> str:

@@ -17,14 +17,14 @@ from typing import Any
 
 from pydantic_core import PydanticCustomError
 
-from drivers.can.channel import split_channel, with_options
-from drivers.can.open import CYCLIC_INTERFACES, SHARED_INTERFACES
-from drivers.canopen.identifiers import HIGHEST_NODE
-from drivers.elmo.port import SERIAL
-from drivers.errors import ConfigurationError
-from firmware_py.input_file import parse_toml, read_input
-from tools.configuration.bus_options import checked_options
-from tools.configuration.elmo import BAUD_RATES_TEXT, KIND, BAUD_RATES_bitps
+from jointctl.drivers.can.channel import split_channel, with_options
+from jointctl.drivers.can.open import CYCLIC_INTERFACES, SHARED_INTERFACES
+from jointctl.drivers.canopen.identifiers import HIGHEST_NODE
+from jointctl.drivers.elmo.port import SERIAL
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.input_file import parse_toml, read_input
+from jointctl.tools.configuration.bus_options import checked_options
+from jointctl.tools.configuration.elmo import BAUD_RATES_TEXT, KIND, BAUD_RATES_bitps
 
 REPLY_TIMEOUT_S = 0.2
 _HEADING = re.compile(r"\s*\[\s*(\w+)\s*\]\s*(#.*)?")

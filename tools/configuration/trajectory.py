@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from tools.configuration.sections import Angle, Section, between
+from jointctl.tools.configuration.sections import Angle, Section, between
 
 Duration = Annotated[float, between(0.0, 1e6)]  # 0 = until stopped
 Frequency = Annotated[float, between(0.0, 100.0, open_low=True)]

@@ -13,13 +13,13 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from drivers.errors import ConfigurationError
-from tools.configuration.checks import problems_between_sections
-from tools.configuration.config import Config
-from tools.configuration.elmo_settings import refuse_serial
-from tools.configuration.load import load_config, shipped_config
-from tools.configuration.records import axis_constants
-from tools.configuration.sections import Control, Friction
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.configuration.checks import problems_between_sections
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.elmo_settings import refuse_serial
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.configuration.sections import Control, Friction
 
 _MODEL_BASED: dict[str, Any] = {"zero_rule": "zero", "matched_filter": True}
 _STIFF: dict[str, Any] = {**_MODEL_BASED, "kp": 2500.0, "kv": 130.0, "feed_forward": "lugre_desired"}

@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator
 from pydantic_core import PydanticCustomError
 
-from tools.configuration.config import Config
-from tools.configuration.sections import Section, between
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.sections import Section, between
 
 RPDO_AT_ONCE = 255  # the plant's own delay is then the whole delay from command to torque
 

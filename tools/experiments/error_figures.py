@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from firmware_py.states import Fault
-from tools.simulation.lockstep import LockstepRun
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.simulation.lockstep import LockstepRun
 
 SETTLED_rad = 1e-3
 _STILL_OUTSIDE = 0.9  # outside the band in the last tenth of the trajectory: not settled at all

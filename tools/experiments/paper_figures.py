@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from tools.drawing import BLUE, GREEN, GREY, ORANGE, RED, canvas
-from tools.experiments.paper_rows import Runs
-from tools.experiments.paper_runs import friction_estimate, hidden_outputs
-from tools.experiments.scenarios import event_s
-from tools.recording.run_figure import drawn_indices
-from tools.simulation.lockstep import LockstepRun
+from jointctl.tools.drawing import BLUE, GREEN, GREY, ORANGE, RED, canvas
+from jointctl.tools.experiments.paper_rows import Runs
+from jointctl.tools.experiments.paper_runs import friction_estimate, hidden_outputs
+from jointctl.tools.experiments.scenarios import event_s
+from jointctl.tools.recording.run_figure import drawn_indices
+from jointctl.tools.simulation.lockstep import LockstepRun
 
 _START_s = 1.0
 

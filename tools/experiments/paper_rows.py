@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tools.experiments.error_figures import error_figures
-from tools.experiments.paper_identification import PaperIdentification
-from tools.experiments.paper_runs import AFTER_s, Experiment, friction_estimate
-from tools.simulation.lockstep import LockstepRun
+from jointctl.tools.experiments.error_figures import error_figures
+from jointctl.tools.experiments.paper_identification import PaperIdentification
+from jointctl.tools.experiments.paper_runs import AFTER_s, Experiment, friction_estimate
+from jointctl.tools.simulation.lockstep import LockstepRun
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from drivers.errors import MotionFault
-from firmware_py.states import Fault
-from tools.configuration.config import Config
-from tools.configuration.load import load_config, shipped_config
-from tools.experiments.controllers import Controller, changed, controller_constants, from_file, paper_control
-from tools.experiments.ensemble import RPDO_AT_ONCE
-from tools.experiments.scenarios import Scenario, run_scenario
-from tools.simulation.lockstep import LockstepJoint, LockstepRun
+from jointctl.drivers.errors import MotionFault
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.experiments.controllers import Controller, changed, controller_constants, from_file, paper_control
+from jointctl.tools.experiments.ensemble import RPDO_AT_ONCE
+from jointctl.tools.experiments.scenarios import Scenario, run_scenario
+from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
 
 AFTER_s = 75.0  # the paper looks at the errors from here on
 Q_SIMULATION = 2500.0

@@ -13,8 +13,8 @@ from __future__ import annotations
 import math
 from typing import Any, Literal
 
-from drivers.errors import ConfigurationError
-from tools.simulation.lockstep import LockstepJoint, LockstepRun
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
 
 Scenario = Literal["sine", "frequency", "amplitude", "load"]
 CHANGE_s = 82.5

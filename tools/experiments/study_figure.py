@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from tools.drawing import BLUE, GREY, INK, canvas
-from tools.experiments.study_runs import StudyResult
+from jointctl.tools.drawing import BLUE, GREY, INK, canvas
+from jointctl.tools.experiments.study_runs import StudyResult
 
 _PANELS = (
     ("peak_mrad", "peak error [mrad]"),

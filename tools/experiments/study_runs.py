@@ -17,15 +17,15 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.errors import ConfigurationError
-from tools.configuration.config import Config
-from tools.experiments.controllers import Controller, controller_constants
-from tools.experiments.ensemble import EnsembleSettings, random_plant
-from tools.experiments.error_figures import ErrorFigures, error_figures
-from tools.experiments.scenarios import Scenario, run_scenario
-from tools.simulation.lockstep import LockstepJoint
-from tools.simulation.workers import interrupts_left_to_the_parent
-from tools.written_file import writing
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.experiments.controllers import Controller, controller_constants
+from jointctl.tools.experiments.ensemble import EnsembleSettings, random_plant
+from jointctl.tools.experiments.error_figures import ErrorFigures, error_figures
+from jointctl.tools.experiments.scenarios import Scenario, run_scenario
+from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.simulation.workers import interrupts_left_to_the_parent
+from jointctl.tools.written_file import writing
 
 Progress = Callable[[float], None]
 

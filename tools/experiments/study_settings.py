@@ -21,13 +21,13 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, ValidationError
 
-from drivers.errors import ConfigurationError
-from firmware_py.input_file import parse_toml, read_input
-from tools.configuration.problems import suggestion
-from tools.configuration.sections import Section, between
-from tools.experiments.controllers import DEFAULT, Controller, changed, named, one_line
-from tools.experiments.ensemble import EnsembleSettings
-from tools.experiments.scenarios import Scenario
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.input_file import parse_toml, read_input
+from jointctl.tools.configuration.problems import suggestion
+from jointctl.tools.configuration.sections import Section, between
+from jointctl.tools.experiments.controllers import DEFAULT, Controller, changed, named, one_line
+from jointctl.tools.experiments.ensemble import EnsembleSettings
+from jointctl.tools.experiments.scenarios import Scenario
 
 
 def _names(value: Any) -> Any:

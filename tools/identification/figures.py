@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.friction import DEGREE
-from tools.drawing import BLUE, GREY, ORANGE, RED, canvas
-from tools.identification.friction_data import FrictionData, relative_errors
-from tools.identification.models import Branch
-from tools.identification.result import DIRECTIONS, Identification
+from jointctl.firmware_py.friction import DEGREE
+from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, canvas
+from jointctl.tools.identification.friction_data import FrictionData, relative_errors
+from jointctl.tools.identification.models import Branch
+from jointctl.tools.identification.result import DIRECTIONS, Identification
 
 _CURVE_POINTS = 600
 _FLOOR = 1e-5  # [%] drawn at least, on a logarithmic axis

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.errors import UsageError
-from tools.configuration.conversions import RADPS_PER_UNIT
-from tools.identification.friction_data import FrictionData, from_table, numbers
-from tools.identification.table_file import TableFile
+from jointctl.drivers.errors import UsageError
+from jointctl.tools.configuration.conversions import RADPS_PER_UNIT
+from jointctl.tools.identification.friction_data import FrictionData, from_table, numbers
+from jointctl.tools.identification.table_file import TableFile
 
 SIDES = ("joint", "motor")
 

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.errors import DataError
-from tools.identification.table_file import TableFile
+from jointctl.drivers.errors import DataError
+from jointctl.tools.identification.table_file import TableFile
 
 MIN_PER_DIRECTION = 12
 LEAST_TORQUE_Nm, LEAST_SHARE = 1e-12, 1e-6  # of a point, absolute and of the greatest, that has a relative error

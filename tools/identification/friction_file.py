@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drivers.errors import DataError
-from tools.identification.foreign_table import ForeignFormat, check_told, read_foreign
-from tools.identification.friction_data import FrictionData, check_directions, tidied
-from tools.identification.sweep_file import read_sweep
-from tools.identification.table_file import read_table
+from jointctl.drivers.errors import DataError
+from jointctl.tools.identification.foreign_table import ForeignFormat, check_told, read_foreign
+from jointctl.tools.identification.friction_data import FrictionData, check_directions, tidied
+from jointctl.tools.identification.sweep_file import read_sweep
+from jointctl.tools.identification.table_file import read_table
 
 
 def read_friction_data(path: str | Path, told: ForeignFormat | None = None, *, both: bool = True) -> FrictionData:

@@ -12,13 +12,13 @@ from typing import Any
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
 
-from drivers.errors import ConfigurationError
-from firmware_py.friction import DEGREE
-from firmware_py.input_file import read_input
-from tools.configuration.load import load_config
-from tools.configuration.problems import ConfigurationProblems
-from tools.identification.models import Branch
-from tools.written_file import replace_file
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.friction import DEGREE
+from jointctl.firmware_py.input_file import read_input
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.configuration.problems import ConfigurationProblems
+from jointctl.tools.identification.models import Branch
+from jointctl.tools.written_file import replace_file
 
 MARK = "# identified by jointctl: "
 

@@ -7,18 +7,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivers.errors import DataError
-from firmware_py.friction import DEGREE
-from tools.identification.friction_data import FrictionData
-from tools.identification.intervals import uncertainty
-from tools.identification.models import FORMS, MIN_PER_STAGE, Form
-from tools.identification.options import Options
-from tools.identification.plausibility import JointLimits, check_branches, check_data
-from tools.identification.polish import polish
-from tools.identification.pso import SwarmResult, run_swarms
-from tools.identification.result import DIRECTIONS, Direction, Identification
-from tools.identification.selection import MAX_OUTLIERS, choose, find_outliers, held_out_rss, with_form
-from tools.identification.variable_projection import Fit, Problem, make_problem, project
+from jointctl.drivers.errors import DataError
+from jointctl.firmware_py.friction import DEGREE
+from jointctl.tools.identification.friction_data import FrictionData
+from jointctl.tools.identification.intervals import uncertainty
+from jointctl.tools.identification.models import FORMS, MIN_PER_STAGE, Form
+from jointctl.tools.identification.options import Options
+from jointctl.tools.identification.plausibility import JointLimits, check_branches, check_data
+from jointctl.tools.identification.polish import polish
+from jointctl.tools.identification.pso import SwarmResult, run_swarms
+from jointctl.tools.identification.result import DIRECTIONS, Direction, Identification
+from jointctl.tools.identification.selection import MAX_OUTLIERS, choose, find_outliers, held_out_rss, with_form
+from jointctl.tools.identification.variable_projection import Fit, Problem, make_problem, project
 
 _BAD_FIT = 0.15  # RMSE over mean friction
 _EXACT = 1e-6  # of the greatest friction: between errors below nothing measured decides

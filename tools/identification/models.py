@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.friction import branch_constants, branch_torque_Nm
+from jointctl.firmware_py.friction import branch_constants, branch_torque_Nm
 
 MIN_PER_STAGE = 5  # points; a stage has four parameters
 

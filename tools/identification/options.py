@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from drivers.errors import UsageError
-from firmware_py.friction import DEGREE
-from tools.identification.pso import SwarmSettings
+from jointctl.drivers.errors import UsageError
+from jointctl.firmware_py.friction import DEGREE
+from jointctl.tools.identification.pso import SwarmSettings
 
 SLOWEST_degps, FASTEST_degps = 1e-4, 6e4
 STATIC_MAX_Nm = 1e3  # at the motor

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tools.identification.friction_data import FrictionData
-from tools.identification.models import Branch
+from jointctl.tools.identification.friction_data import FrictionData
+from jointctl.tools.identification.models import Branch
 
 _OPPOSING = 0.9  # least share of points whose torque has the sign of the velocity
 _SPEED_WARN_RADPS, _SPEED_MAX_RADPS = 30.0, 1000.0  # of a joint behind a reducer

@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import least_squares
 
-from tools.identification.models import legendre
-from tools.identification.variable_projection import Fit, Problem
+from jointctl.tools.identification.models import legendre
+from jointctl.tools.identification.variable_projection import Fit, Problem
 
 
 def vector_limits(problem: Problem) -> np.ndarray:

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tools.identification.polish import beta_from_vector, vector_limits
-from tools.identification.swarm_kernels import (
+from jointctl.tools.identification.polish import beta_from_vector, vector_limits
+from jointctl.tools.identification.swarm_kernels import (
     advance_swarm,
     fill_uniform,
     splitmix64,
@@ -31,7 +31,7 @@ from tools.identification.swarm_kernels import (
     stream_seed,
     suffix_sums,
 )
-from tools.identification.variable_projection import Fit, Problem, knee_candidates
+from jointctl.tools.identification.variable_projection import Fit, Problem, knee_candidates
 
 CHUNK = 50  # iterations between two looks at the stop flag: some milliseconds
 

@@ -7,11 +7,11 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from firmware_py.friction import DEGREE
-from tools.identification.friction_data import relative_figures
-from tools.identification.intervals import NAMES
-from tools.identification.models import FORMS
-from tools.identification.result import DIRECTIONS, Identification
+from jointctl.firmware_py.friction import DEGREE
+from jointctl.tools.identification.friction_data import relative_figures
+from jointctl.tools.identification.intervals import NAMES
+from jointctl.tools.identification.models import FORMS
+from jointctl.tools.identification.result import DIRECTIONS, Identification
 
 _UNITS = {
     "tc": "Nm", "ts": "Nm", "ws": "deg/s", "tv": "Nm s/deg",

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from tools.identification.friction_data import FrictionData, relative_figures
-from tools.identification.intervals import Uncertainty
-from tools.identification.models import Branch
-from tools.identification.options import Options
-from tools.identification.pso import SwarmResult
-from tools.identification.variable_projection import Fit
+from jointctl.tools.identification.friction_data import FrictionData, relative_figures
+from jointctl.tools.identification.intervals import Uncertainty
+from jointctl.tools.identification.models import Branch
+from jointctl.tools.identification.options import Options
+from jointctl.tools.identification.pso import SwarmResult
+from jointctl.tools.identification.variable_projection import Fit
 
 DIRECTIONS = (("positive", 1), ("negative", -1))
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from tools.identification.models import FORMS, Form, basis
-from tools.identification.variable_projection import Problem, project, static_limit_Nm
+from jointctl.tools.identification.models import FORMS, Form, basis
+from jointctl.tools.identification.variable_projection import Problem, project, static_limit_Nm
 
 MAX_OUTLIERS = 0.2  # of a direction's points: beyond, it is the model that does not fit
 _TIE = 1.01  # held-out errors within 1 % count as equal, then fewer parameters win

@@ -15,8 +15,8 @@ import math
 
 import numpy as np
 
-from firmware_py.kernel import inlined, kernel
-from tools.identification.models import legendre
+from jointctl.firmware_py.kernel import inlined, kernel
+from jointctl.tools.identification.models import legendre
 
 TABLE_NODES = 2048
 _MASK = (1 << 64) - 1

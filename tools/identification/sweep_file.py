@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from drivers.errors import DataError, UsageError
-from firmware_py.input_file import parse_json
-from tools.identification.foreign_table import ForeignFormat
-from tools.identification.friction_data import FrictionData, from_table, numbers
-from tools.identification.table_file import TableFile, read_bytes
+from jointctl.drivers.errors import DataError, UsageError
+from jointctl.firmware_py.input_file import parse_json
+from jointctl.tools.identification.foreign_table import ForeignFormat
+from jointctl.tools.identification.friction_data import FrictionData, from_table, numbers
+from jointctl.tools.identification.table_file import TableFile, read_bytes
 
 SWEEP_COLUMNS = (
     "velocity_radps", "current_A", "motor_torque_Nm", "velocity_std_radps", "current_std_A", "samples", "settled",

@@ -11,8 +11,8 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.errors import DataError, UsageError
-from firmware_py.input_file import LARGEST_TABLE_BYTES, number_from, read_input
+from jointctl.drivers.errors import DataError, UsageError
+from jointctl.firmware_py.input_file import LARGEST_TABLE_BYTES, number_from, read_input
 
 DELIMITERS = {"auto": "", "comma": ",", "semicolon": ";", "tab": "\t", "space": " ", ",": ",", ";": ";", "\t": "\t"}
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from tools.identification.models import MIN_PER_STAGE, Branch, Form, basis, branch
+from jointctl.tools.identification.models import MIN_PER_STAGE, Branch, Form, basis, branch
 
 SCAN = 48  # values of ws
 

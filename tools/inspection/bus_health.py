@@ -15,17 +15,17 @@ from typing import Any
 import can
 import numpy as np
 
-from drivers.can.bit_timing import bus_load, highest_rate_Hz
-from drivers.can.link_state import SHORT_QUEUE, link_problem, link_state
-from drivers.can.open import CYCLIC_INTERFACES, open_python_can
-from drivers.can.socketcan import up_command
-from drivers.canopen.identifiers import SDO_ANSWER_ID, SDO_REQUEST_ID
-from drivers.errors import BusError
-from tools.configuration.config import Config
-from tools.configuration.drive_settings import HIGHEST_LOAD, cycle_bytes
-from tools.inspection.findings import NOTE, OK, PROBLEM, Finding, file_text
-from tools.running.loop.loop_handle import RECEIVE_SHARE
-from tools.running.loop.portable_loop import HIGHEST_RATE_HZ
+from jointctl.drivers.can.bit_timing import bus_load, highest_rate_Hz
+from jointctl.drivers.can.link_state import SHORT_QUEUE, link_problem, link_state
+from jointctl.drivers.can.open import CYCLIC_INTERFACES, open_python_can
+from jointctl.drivers.can.socketcan import up_command
+from jointctl.drivers.canopen.identifiers import SDO_ANSWER_ID, SDO_REQUEST_ID
+from jointctl.drivers.errors import BusError
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.drive_settings import HIGHEST_LOAD, cycle_bytes
+from jointctl.tools.inspection.findings import NOTE, OK, PROBLEM, Finding, file_text
+from jointctl.tools.running.loop.loop_handle import RECEIVE_SHARE
+from jointctl.tools.running.loop.portable_loop import HIGHEST_RATE_HZ
 
 SDO_READS = 20
 _SDO_TIMEOUT_S = 0.3

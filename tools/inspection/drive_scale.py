@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from tools.configuration.config import Config
-from tools.inspection.findings import NOTE, OK, Finding
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.inspection.findings import NOTE, OK, Finding
 
 TOLERANCE = 0.001
 _CURE = "encoder.counts_per_turn, encoder.side, joint.reduction_ratio; or the drive scales 6064 by 6091 and 6092: "

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from drivers.canopen.cia402 import SUPPORTED_MODE_BIT, Mode, state_text
-from drivers.canopen.identifiers import LAST_SYNCHRONOUS, NmtCommand, NmtState
+from jointctl.drivers.canopen.cia402 import SUPPORTED_MODE_BIT, Mode, state_text
+from jointctl.drivers.canopen.identifiers import LAST_SYNCHRONOUS, NmtCommand, NmtState
 
 # CiA 402-2, 6041: bits that say more than the state
 _STATUS_BITS = {

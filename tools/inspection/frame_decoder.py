@@ -9,8 +9,8 @@ from typing import Any
 
 import can
 
-from drivers.can.error_frames import error_frame_text
-from drivers.canopen.identifiers import (
+from jointctl.drivers.can.error_frames import error_frame_text
+from jointctl.drivers.canopen.identifiers import (
     EMERGENCY_ID,
     FUNCTION_MASK,
     HEARTBEAT_ID,
@@ -21,11 +21,11 @@ from drivers.canopen.identifiers import (
     SYNC_ID,
     TPDO1_ID,
 )
-from tools.inspection import drive_words
-from tools.inspection.objects import Objects, Place
-from tools.inspection.pdo_maps import PdoMaps
-from tools.inspection.sdo_frames import SdoFrames
-from tools.running.events.emergency_text import emergency_text
+from jointctl.tools.inspection import drive_words
+from jointctl.tools.inspection.objects import Objects, Place
+from jointctl.tools.inspection.pdo_maps import PdoMaps
+from jointctl.tools.inspection.sdo_frames import SdoFrames
+from jointctl.tools.running.events.emergency_text import emergency_text
 
 KINDS = ("nmt", "sync", "time", "emcy", "pdo", "sdo", "heartbeat", "lss", "error", "other")
 

@@ -18,8 +18,8 @@ from typing import Any
 import can
 import canopen
 
-from drivers.canopen.cia402 import state_text
-from drivers.canopen.identifiers import (
+from jointctl.drivers.canopen.cia402 import state_text
+from jointctl.drivers.canopen.identifiers import (
     EMERGENCY_ID,
     FUNCTION_MASK,
     HEARTBEAT_ID,
@@ -28,9 +28,9 @@ from drivers.canopen.identifiers import (
     SDO_REQUEST_ID,
     SYNC_ID,
 )
-from tools.inspection import drive_words
-from tools.inspection.objects import Objects
-from tools.inspection.sdo_reading import SdoReader
+from jointctl.tools.inspection import drive_words
+from jointctl.tools.inspection.objects import Objects
+from jointctl.tools.inspection.sdo_reading import SdoReader
 
 LISTEN_S = 1.2  # a little more than the usual heartbeat period of one second
 PACE_S = 0.002  # between two questions; 127 of them take a quarter of a second

@@ -10,13 +10,13 @@ from typing import Any
 import canopen
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
-from drivers.canopen.eds_file import read_eds
-from drivers.canopen.object_access import object_name
-from drivers.errors import ConfigurationError
-from firmware_py.input_file import require_input
-from tools.inspection import drive_words
-from tools.inspection.standard_objects import standard_variable
-from tools.running.events.emergency_text import emergency_text
+from jointctl.drivers.canopen.eds_file import read_eds
+from jointctl.drivers.canopen.object_access import object_name
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.input_file import require_input
+from jointctl.tools.inspection import drive_words
+from jointctl.tools.inspection.standard_objects import standard_variable
+from jointctl.tools.running.events.emergency_text import emergency_text
 
 SIGNED = frozenset(datatypes.SIGNED_TYPES)
 INTEGERS = frozenset(datatypes.INTEGER_TYPES)

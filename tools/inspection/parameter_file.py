@@ -16,10 +16,10 @@ from typing import Any
 import canopen
 import tomlkit
 
-from drivers.errors import DataError
-from firmware_py.input_file import parse_toml, read_input
-from tools.inspection.objects import Objects, Place, read_dictionary
-from tools.inspection.parameters import ParameterSet, Value, shown, variables
+from jointctl.drivers.errors import DataError
+from jointctl.firmware_py.input_file import parse_toml, read_input
+from jointctl.tools.inspection.objects import Objects, Place, read_dictionary
+from jointctl.tools.inspection.parameters import ParameterSet, Value, shown, variables
 
 FORMAT = "jointctl parameters 1"
 _DICTIONARIES = (".dcf", ".eds")

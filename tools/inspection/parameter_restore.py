@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from drivers.canopen.pdo_layout import DISABLED
-from drivers.canopen.sdo_download import download
-from tools.inspection.objects import Place
-from tools.inspection.parameters import Value
-from tools.inspection.sdo_reading import ATTEMPTS, Refusal, SdoReader, abort_text
+from jointctl.drivers.canopen.pdo_layout import DISABLED
+from jointctl.drivers.canopen.sdo_download import download
+from jointctl.tools.inspection.objects import Place
+from jointctl.tools.inspection.parameters import Value
+from jointctl.tools.inspection.sdo_reading import ATTEMPTS, Refusal, SdoReader, abort_text
 
 _SPAN = 0x200
 _COMMUNICATION, _MAPPING_OFFSET = (0x1400, 0x1800), 0x200

@@ -9,8 +9,8 @@ from typing import Any
 import canopen
 from canopen.objectdictionary import ODVariable
 
-from tools.inspection.objects import Objects, Place
-from tools.inspection.sdo_reading import Refusal, SdoReader
+from jointctl.tools.inspection.objects import Objects, Place
+from jointctl.tools.inspection.sdo_reading import Refusal, SdoReader
 
 Value = int | float | str | bytes
 # Writable, but commands or process data and not settings: error history, store and restore, programme download,

@@ -12,9 +12,17 @@ from typing import Any
 
 import canopen
 
-from drivers.canopen.identifiers import NODE_MASK, RPDO1_ID, SDO_ANSWER_ID, TPDO1_ID
-from drivers.canopen.pdo_layout import CONTROL, DISABLED, POSITION, STATUS, TARGET_TORQUE, TARGET_VELOCITY, TORQUE
-from tools.inspection.objects import SIGNED, Objects
+from jointctl.drivers.canopen.identifiers import NODE_MASK, RPDO1_ID, SDO_ANSWER_ID, TPDO1_ID
+from jointctl.drivers.canopen.pdo_layout import (
+    CONTROL,
+    DISABLED,
+    POSITION,
+    STATUS,
+    TARGET_TORQUE,
+    TARGET_VELOCITY,
+    TORQUE,
+)
+from jointctl.tools.inspection.objects import SIGNED, Objects
 
 PREDEFINED = 4  # PDOs of each direction in the predefined connection set
 _SPAN = 0x200

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from tools.inspection.objects import Objects, Place
-from tools.inspection.sdo_reading import abort_text
+from jointctl.tools.inspection.objects import Objects, Place
+from jointctl.tools.inspection.sdo_reading import abort_text
 
 _LONGEST = 1 << 16  # of a transfer that is gathered
 Learn = Callable[[int, int, int, int], None]  # node, index, sub-index, value

@@ -12,8 +12,8 @@ from typing import Any
 import canopen
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from drivers.errors import NoDeviceError
-from tools.inspection.objects import Objects, Place
+from jointctl.drivers.errors import NoDeviceError
+from jointctl.tools.inspection.objects import Objects, Place
 
 TIMEOUT_S = 0.3
 ATTEMPTS = 2

@@ -8,15 +8,15 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-from drivers.elmo.codes import AMPLIFIER_MASK, FAULT_LATCHED, motor_off_cause, status_text
-from drivers.elmo.drive import ElmoDrive
-from drivers.elmo.line_budget import cycle_characters, highest_rate_Hz
-from drivers.errors import BusError, JointctlError
-from drivers.port_users import users_text
-from tools.configuration.config import Config
-from tools.configuration.elmo_settings import elmo_section
-from tools.inspection.findings import NOTE, OK, PROBLEM, Finding, file_text
-from tools.inspection.serial_subject import inspected_drive
+from jointctl.drivers.elmo.codes import AMPLIFIER_MASK, FAULT_LATCHED, motor_off_cause, status_text
+from jointctl.drivers.elmo.drive import ElmoDrive
+from jointctl.drivers.elmo.line_budget import cycle_characters, highest_rate_Hz
+from jointctl.drivers.errors import BusError, JointctlError
+from jointctl.drivers.port_users import users_text
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.elmo_settings import elmo_section
+from jointctl.tools.inspection.findings import NOTE, OK, PROBLEM, Finding, file_text
+from jointctl.tools.inspection.serial_subject import inspected_drive
 
 SLOW_LATENCY_MS = 1  # an FTDI adapter holds received characters back for up to 16 ms as it comes
 

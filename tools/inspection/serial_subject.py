@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from drivers.drive import DriveIdentity
-from drivers.elmo.drive import ElmoDrive
-from drivers.errors import BusError
-from tools.configuration.config import Config
-from tools.configuration.conversions import torque_constant_NmpA
-from tools.configuration.elmo_settings import elmo_section, elmo_settings
-from tools.running.guard.guard_call import running_supervisor
+from jointctl.drivers.drive import DriveIdentity
+from jointctl.drivers.elmo.drive import ElmoDrive
+from jointctl.drivers.errors import BusError
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import torque_constant_NmpA
+from jointctl.tools.configuration.elmo_settings import elmo_section, elmo_settings
+from jointctl.tools.running.guard.guard_call import running_supervisor
 
 
 @contextmanager

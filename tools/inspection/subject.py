@@ -12,12 +12,12 @@ from pathlib import Path
 import can
 import canopen
 
-from drivers.can.link_state import interface_blamed
-from drivers.can.open import open_python_can
-from drivers.canopen.network import new_network
-from drivers.errors import BusError, ConfigurationError
-from tools.configuration.config import Config
-from tools.inspection.objects import Objects, read_dictionary
+from jointctl.drivers.can.link_state import interface_blamed
+from jointctl.drivers.can.open import open_python_can
+from jointctl.drivers.canopen.network import new_network
+from jointctl.drivers.errors import BusError, ConfigurationError
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.inspection.objects import Objects, read_dictionary
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from drivers.drive import Approval, CommissioningReport
-from tools.configuration.config import Config
-from tools.motion_check.plan import CheckPlan, check_constants, config_of_check, motion_table
-from tools.output import Output
-from tools.running.control import Control
-from tools.running.loop.loop_handle import LoopHandle
-from tools.running.supervisor import Supervisor
+from jointctl.drivers.drive import Approval, CommissioningReport
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.motion_check.plan import CheckPlan, check_constants, config_of_check, motion_table
+from jointctl.tools.output import Output
+from jointctl.tools.running.control import Control
+from jointctl.tools.running.loop.loop_handle import LoopHandle
+from jointctl.tools.running.supervisor import Supervisor
 
 
 class CheckSupervisor(Supervisor):

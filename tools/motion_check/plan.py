@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from drivers.drive import CommissioningReport
-from drivers.errors import ConfigurationError
-from firmware_py.states import TrajectoryKind
-from firmware_py.trajectory_table import spline_table
-from tools.configuration.config import Config
-from tools.configuration.conversions import joint_rad_per_count, static_friction_Nm, velocity_of_a_count_radps
-from tools.configuration.elmo import ElmoSerial
-from tools.configuration.records import APPROACH_MIN_S, axis_constants
+from jointctl.drivers.drive import CommissioningReport
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.states import TrajectoryKind
+from jointctl.firmware_py.trajectory_table import spline_table
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import joint_rad_per_count, static_friction_Nm, velocity_of_a_count_radps
+from jointctl.tools.configuration.elmo import ElmoSerial
+from jointctl.tools.configuration.records import APPROACH_MIN_S, axis_constants
 
 TRAVEL_rad, TRAVEL_MAX_rad = 0.04, 0.3  # of the reference, to each side
 TRAVEL_COUNTS = 60.0  # so coarse an encoder takes more travel

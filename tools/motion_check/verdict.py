@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.states import AxisPhase, Fault
-from tools.configuration.config import Config
-from tools.configuration.conversions import law_resolution_rad
-from tools.inspection.findings import NOTE, OK, PROBLEM, Finding
-from tools.motion_check.plan import CheckPlan
-from tools.running.events.fault_text import FaultText
+from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import law_resolution_rad
+from jointctl.tools.inspection.findings import NOTE, OK, PROBLEM, Finding
+from jointctl.tools.motion_check.plan import CheckPlan
+from jointctl.tools.running.events.fault_text import FaultText
 
 MOVED_SHARE = 0.03  # of the travel: less is no motion
 MOVED_COUNTS = 6.0

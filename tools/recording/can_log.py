@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.can.frames import ERROR_FLAG
+from jointctl.drivers.can.frames import ERROR_FLAG
 
 CAN_TOPIC, CAN_SCHEMA = "/can", "can_msgs/msg/Frame"
 CAN_DEFINITION = (

@@ -12,8 +12,8 @@ from typing import IO, Any, Self
 
 import numpy as np
 
-from firmware_py.records import LogRecord
-from firmware_py.schema import dtype_of
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import dtype_of
 
 IN_MEMORY = 60_000  # records: 20 MB
 

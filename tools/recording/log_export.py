@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from drivers.errors import DataError
-from tools.recording.can_log import candump_lines
-from tools.recording.run_log_reader import RunLog
+from jointctl.drivers.errors import DataError
+from jointctl.tools.recording.can_log import candump_lines
+from jointctl.tools.recording.run_log_reader import RunLog
 
 _ROWS = 10_000  # turned into Python numbers at once
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from tools.recording.log_export import calendar_offset_ns
-from tools.recording.run_log import ERROR, THINNING, WARNING, Event
-from tools.recording.run_log_reader import RunLog
+from jointctl.tools.recording.log_export import calendar_offset_ns
+from jointctl.tools.recording.run_log import ERROR, THINNING, WARNING, Event
+from jointctl.tools.recording.run_log_reader import RunLog
 
 _LEVELS = ((ERROR, "error"), (WARNING, "warning"), (20, "information"), (0, "debug"))
 

@@ -7,12 +7,12 @@ import shutil
 import time
 from pathlib import Path
 
-from drivers.errors import DataError
-from firmware_py.records import LogRecord
-from firmware_py.schema import dtype_of
-from tools.configuration.config import Config
-from tools.recording.kept_records import IN_MEMORY
-from tools.written_file import writing
+from jointctl.drivers.errors import DataError
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import dtype_of
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.recording.kept_records import IN_MEMORY
+from jointctl.tools.written_file import writing
 
 MESSAGE_BYTES = dtype_of(LogRecord).itemsize + 40  # of the log file for a record
 UNKNOWN_S = 60.0  # room for a run until it is stopped

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from drivers.errors import DataError
-from firmware_py.states import AxisPhase, fault_name
-from tools.drawing import BLUE, COLOURS, GREEN, GREY, INK, ORANGE, RED, TEAL, VIOLET, canvas, save_png
+from jointctl.drivers.errors import DataError
+from jointctl.firmware_py.states import AxisPhase, fault_name
+from jointctl.tools.drawing import BLUE, COLOURS, GREEN, GREY, INK, ORANGE, RED, TEAL, VIOLET, canvas, save_png
 
 POINTS = 4000  # a bucket of samples is drawn by its least and greatest value, so that no peak is lost
 _PARTS = {

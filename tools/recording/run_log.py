@@ -24,12 +24,12 @@ from typing import IO, Any, Self
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from drivers.errors import DataError
-from firmware_py.records import LogRecord
-from firmware_py.schema import dtype_of
-from tools.recording.can_log import CAN_DEFINITION, CAN_SCHEMA, CAN_TOPIC, frame_times_ns
-from tools.recording.cdr import CDR_HEADER, event_body, message_definition
-from tools.recording.chunk_indexes import ChunkIndexes
+from jointctl.drivers.errors import DataError
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import dtype_of
+from jointctl.tools.recording.can_log import CAN_DEFINITION, CAN_SCHEMA, CAN_TOPIC, frame_times_ns
+from jointctl.tools.recording.cdr import CDR_HEADER, event_body, message_definition
+from jointctl.tools.recording.chunk_indexes import ChunkIndexes
 
 RECORD_TOPIC, RECORD_SCHEMA = "/joint", "jointctl_msgs/msg/LogRecord"
 EVENT_TOPIC, EVENT_SCHEMA = "/events", "jointctl_msgs/msg/Event"

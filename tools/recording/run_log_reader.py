@@ -14,13 +14,13 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 
-from drivers.errors import DataError
-from firmware_py.input_file import LARGEST_LOG_BYTES, open_input
-from firmware_py.records import LogRecord
-from firmware_py.schema import dtype_of
-from tools.recording.can_log import CAN_FRAME, CAN_TOPIC
-from tools.recording.cdr import CDR_HEADER, event_from_body, message_definition
-from tools.recording.run_log import (
+from jointctl.drivers.errors import DataError
+from jointctl.firmware_py.input_file import LARGEST_LOG_BYTES, open_input
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import dtype_of
+from jointctl.tools.recording.can_log import CAN_FRAME, CAN_TOPIC
+from jointctl.tools.recording.cdr import CDR_HEADER, event_from_body, message_definition
+from jointctl.tools.recording.run_log import (
     EVENT_TOPIC,
     RECORD_SCHEMA,
     RECORD_TOPIC,

@@ -7,8 +7,8 @@ import json
 import platform
 from importlib.metadata import PackageNotFoundError, version
 
-from drivers.drive import CommissioningReport
-from tools.configuration.config import Config
+from jointctl.drivers.drive import CommissioningReport
+from jointctl.tools.configuration.config import Config
 
 _PACKAGES = ("jointctl", "numpy", "numba", "python-can", "canopen", "mcap")
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from firmware_py.states import AxisPhase, Fault, fault_name
+from jointctl.firmware_py.states import AxisPhase, Fault, fault_name
 
 SETTLED_RAD = 1e-3
 _TIMES = ("wake_late", "round_trip", "work")  # rows of the loop's histograms, and LogRecord fields with _ns

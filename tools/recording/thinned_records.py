@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.records import LogRecord
-from firmware_py.schema import dtype_of
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import dtype_of
 
 
 class ThinnedRecords:

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.states import AxisPhase
-from tools.drawing import INK, SERIES, SOFT
-from tools.reporting.figure import draw
-from tools.reporting.page import Block, Figure, Paragraph
-from tools.reporting.run_figures import binned, friction_points, legend_above, line
+from jointctl.firmware_py.states import AxisPhase
+from jointctl.tools.drawing import INK, SERIES, SOFT
+from jointctl.tools.reporting.figure import draw
+from jointctl.tools.reporting.page import Block, Figure, Paragraph
+from jointctl.tools.reporting.run_figures import binned, friction_points, legend_above, line
 
 SAME_MOTION_rad = 1e-3
 _SHORTEST = 10  # samples in common

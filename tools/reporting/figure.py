@@ -12,8 +12,8 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from tools.drawing import COLOURS, canvas, save_figure
-from tools.reporting.page import Figure
+from jointctl.tools.drawing import COLOURS, canvas, save_figure
+from jointctl.tools.reporting.page import Figure
 
 
 def draw(height_in: float, paint: Callable[[Any], None], alt: str, caption: str = "") -> Figure:

@@ -15,9 +15,9 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
-from drivers.errors import DataError
-from drivers.printable import printable
-from tools.written_file import replace_file, require_target
+from jointctl.drivers.errors import DataError
+from jointctl.drivers.printable import printable
+from jointctl.tools.written_file import replace_file, require_target
 
 _TEMPLATE = "page.html.j2"
 
@@ -96,7 +96,7 @@ def _shown(value: Any) -> Any:
 @cache
 def _environment() -> Environment:
     return Environment(
-        loader=PackageLoader("tools.reporting", "."),
+        loader=PackageLoader("jointctl.tools.reporting", "."),
         autoescape=select_autoescape(default=True, default_for_string=True),
         undefined=StrictUndefined,
         finalize=_shown,

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.states import AxisPhase, fault_name
-from tools.drawing import BLUE, COLOURS, GREEN, GREY, INK, MID_BLUE, ORANGE, RED, SOFT, TEAL, VIOLET
-from tools.recording.run_figure import drawn_indices
-from tools.reporting.figure import draw
-from tools.reporting.page import Figure
+from jointctl.firmware_py.states import AxisPhase, fault_name
+from jointctl.tools.drawing import BLUE, COLOURS, GREEN, GREY, INK, MID_BLUE, ORANGE, RED, SOFT, TEAL, VIOLET
+from jointctl.tools.recording.run_figure import drawn_indices
+from jointctl.tools.reporting.figure import draw
+from jointctl.tools.reporting.page import Figure
 
 POINTS = 1600  # more than the page is wide; least and greatest of each bucket, so that no peak is lost
 _PARTS = (

@@ -6,12 +6,12 @@ import tomllib
 from collections.abc import Sequence
 from typing import Any
 
-from firmware_py.input_file import parse_toml
-from firmware_py.states import Fault
-from tools.recording.log_facts import began_at, event_rows, missing_in
-from tools.recording.run_log_reader import RunLog
-from tools.recording.run_summary import Range, RunSummary, TimeSummary
-from tools.reporting.page import Table
+from jointctl.firmware_py.input_file import parse_toml
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.recording.log_facts import began_at, event_rows, missing_in
+from jointctl.tools.recording.run_log_reader import RunLog
+from jointctl.tools.recording.run_summary import Range, RunSummary, TimeSummary
+from jointctl.tools.reporting.page import Table
 
 Figures = list[tuple[str, float | None, int]]
 _EVENTS_SHOWN = 300

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from tools.drawing import RED
-from tools.recording.run_log_reader import RunLog
-from tools.reporting.figure import draw
-from tools.reporting.page import Figure
+from jointctl.tools.drawing import RED
+from jointctl.tools.recording.run_log_reader import RunLog
+from jointctl.tools.reporting.figure import draw
+from jointctl.tools.reporting.page import Figure
 
 LEAST_READINGS = 10  # fewer are told by the table
 

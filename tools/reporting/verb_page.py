@@ -8,9 +8,9 @@ from pathlib import Path
 
 from rich.table import Table as TerminalTable
 
-from tools.narrow_table import cell_text
-from tools.output import Output
-from tools.reporting.page import Block, Paragraph, Section, Table, page, write_page
+from jointctl.tools.narrow_table import cell_text
+from jointctl.tools.output import Output
+from jointctl.tools.reporting.page import Block, Paragraph, Section, Table, page, write_page
 
 _PAIR = re.compile(r"(?<=\d), (?=-?\d)")
 _RANGE = "\N{NO-BREAK SPACE}..\N{NO-BREAK SPACE}"

@@ -10,11 +10,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from drivers.bus_lock import STOP_WITHIN_S, BusLock
-from drivers.canopen.switch_off import OFF_S, QUICK_STOP_S
-from tools.configuration.config import Config
-from tools.output import Output
-from tools.running.stop_signals import StopSignals, stop_signals
+from jointctl.drivers.bus_lock import STOP_WITHIN_S, BusLock
+from jointctl.drivers.canopen.switch_off import OFF_S, QUICK_STOP_S
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.output import Output
+from jointctl.tools.running.stop_signals import StopSignals, stop_signals
 
 FILES_S = 4.0  # for log and messages, after the drive is off
 

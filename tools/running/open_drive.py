@@ -8,24 +8,24 @@ from typing import Any
 
 import can
 
-from drivers.can.link_state import interface_blamed
-from drivers.can.open import CYCLIC_INTERFACES, SHARED_INTERFACES, open_python_can
-from drivers.canopen.drive import CanopenDrive
-from drivers.drive import Approval, CommissioningReport, Drive
-from drivers.elmo.codes import motor_fault_text
-from drivers.elmo.drive import ElmoDrive
-from drivers.elmo.line_budget import command_time_s
-from firmware_py.realtime import Histogram
-from firmware_py.states import Fault
-from tools.configuration.config import Config
-from tools.configuration.conversions import torque_constant_NmpA
-from tools.configuration.drive_settings import canopen_settings, cyclic_bus_load
-from tools.configuration.elmo import ElmoSerial
-from tools.configuration.elmo_settings import elmo_settings, serial_line_share
-from tools.running.events.fault_text import FaultText, fault_text
-from tools.running.events.serial_fault_text import serial_fault_text
-from tools.running.loop.loop_delay import QUANTILE, measured_delay_s, quantile_s
-from tools.running.loop.portable_loop import check_portable_rate
+from jointctl.drivers.can.link_state import interface_blamed
+from jointctl.drivers.can.open import CYCLIC_INTERFACES, SHARED_INTERFACES, open_python_can
+from jointctl.drivers.canopen.drive import CanopenDrive
+from jointctl.drivers.drive import Approval, CommissioningReport, Drive
+from jointctl.drivers.elmo.codes import motor_fault_text
+from jointctl.drivers.elmo.drive import ElmoDrive
+from jointctl.drivers.elmo.line_budget import command_time_s
+from jointctl.firmware_py.realtime import Histogram
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import torque_constant_NmpA
+from jointctl.tools.configuration.drive_settings import canopen_settings, cyclic_bus_load
+from jointctl.tools.configuration.elmo import ElmoSerial
+from jointctl.tools.configuration.elmo_settings import elmo_settings, serial_line_share
+from jointctl.tools.running.events.fault_text import FaultText, fault_text
+from jointctl.tools.running.events.serial_fault_text import serial_fault_text
+from jointctl.tools.running.loop.loop_delay import QUANTILE, measured_delay_s, quantile_s
+from jointctl.tools.running.loop.portable_loop import check_portable_rate
 
 
 def check_cyclic_rate(config: Config) -> None:

@@ -10,25 +10,25 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
-from drivers.drive import SettingsGuard
-from firmware_py.realtime import Histogram, Word
-from firmware_py.states import AxisPhase, Fault, StopRequest, in_words
-from tools.analysis.margin_gate import require_margin
-from tools.configuration.config import Config
-from tools.recording.can_log import frame_array
-from tools.recording.kept_records import KeptRecords
-from tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter
-from tools.running.changes.viewer_orders import ViewerOrders
-from tools.running.display.display import Display, Snapshot
-from tools.running.events.event_finder import EventFinder, phase_name
-from tools.running.events.notice_text import NoticeFinder
-from tools.running.guard.guard_handle import GUARD_ENDED, GuardHandle
-from tools.running.loop.loop_handle import LoopHandle
-from tools.running.open_drive import drive_fault_text, loop_delay_s
-from tools.running.stop_signals import StopSignals
-from tools.running.watch.bus_watch import BusWatch
-from tools.running.watch.frame_recorder import FrameRecorder
-from tools.running.watch.temperature_watch import TemperatureWatch
+from jointctl.drivers.drive import SettingsGuard
+from jointctl.firmware_py.realtime import Histogram, Word
+from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest, in_words
+from jointctl.tools.analysis.margin_gate import require_margin
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.recording.can_log import frame_array
+from jointctl.tools.recording.kept_records import KeptRecords
+from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter
+from jointctl.tools.running.changes.viewer_orders import ViewerOrders
+from jointctl.tools.running.display.display import Display, Snapshot
+from jointctl.tools.running.events.event_finder import EventFinder, phase_name
+from jointctl.tools.running.events.notice_text import NoticeFinder
+from jointctl.tools.running.guard.guard_handle import GUARD_ENDED, GuardHandle
+from jointctl.tools.running.loop.loop_handle import LoopHandle
+from jointctl.tools.running.open_drive import drive_fault_text, loop_delay_s
+from jointctl.tools.running.stop_signals import StopSignals
+from jointctl.tools.running.watch.bus_watch import BusWatch
+from jointctl.tools.running.watch.frame_recorder import FrameRecorder
+from jointctl.tools.running.watch.temperature_watch import TemperatureWatch
 
 DELAY_CYCLES = 300  # how many cycles with the drive off the loop delay is measured over
 

@@ -14,7 +14,7 @@ import signal
 import time
 from collections.abc import Callable
 
-from drivers.bus_lock import STARTING, is_marked, lock_holders, lock_name, marked_processes, wait_for_answers
+from jointctl.drivers.bus_lock import STARTING, is_marked, lock_holders, lock_name, marked_processes, wait_for_answers
 
 LONGEST_S = 180.0  # that a program may ask for: two time-outs of a stop are at most 60 s each
 STARTING_S = 10.0  # how long a program that was just started may take until it controls its bus

@@ -14,32 +14,32 @@ from typing import Any
 
 import numpy as np
 
-from drivers.drive import Approval, CommissioningReport, Declined, Drive
-from drivers.errors import BusError, DataError, DeviceError, JointctlError, MotionFault, NoDeviceError
-from firmware_py.states import Fault, StopRequest
-from tools.configuration.config import Config
-from tools.configuration.records import axis_constants, trajectory_table
-from tools.output import Output
-from tools.recording.kept_records import KeptRecords
-from tools.recording.run_log import ERROR, INFO, WARNING, RunLogWriter
-from tools.recording.run_metadata import run_metadata
-from tools.recording.run_summary import summarise
-from tools.running.control import Control
-from tools.running.display.display import Display
-from tools.running.display.phase_lines import PhaseLines
-from tools.running.events.held_up import held_up_text
-from tools.running.guard.guard_handle import GuardHandle, start_guard
-from tools.running.guard.kept_awake import kept_awake
-from tools.running.loop.loop_handle import LoopHandle
-from tools.running.open_drive import check_cyclic_rate, commission, drive_fault_text, open_drive
-from tools.running.permission.readiness import require_same_motion
-from tools.running.result.drive_end import warn_unless_off
-from tools.running.result.run_result import RunResult as RunResult
-from tools.running.run_watch import Around, RunParts, RunWatch
-from tools.running.stop_signals import StopSignals
-from tools.running.watch.bus_watch import bus_watch
-from tools.running.watch.frame_recorder import recording
-from tools.running.watch.temperature_watch import TemperatureWatch
+from jointctl.drivers.drive import Approval, CommissioningReport, Declined, Drive
+from jointctl.drivers.errors import BusError, DataError, DeviceError, JointctlError, MotionFault, NoDeviceError
+from jointctl.firmware_py.states import Fault, StopRequest
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.records import axis_constants, trajectory_table
+from jointctl.tools.output import Output
+from jointctl.tools.recording.kept_records import KeptRecords
+from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, RunLogWriter
+from jointctl.tools.recording.run_metadata import run_metadata
+from jointctl.tools.recording.run_summary import summarise
+from jointctl.tools.running.control import Control
+from jointctl.tools.running.display.display import Display
+from jointctl.tools.running.display.phase_lines import PhaseLines
+from jointctl.tools.running.events.held_up import held_up_text
+from jointctl.tools.running.guard.guard_handle import GuardHandle, start_guard
+from jointctl.tools.running.guard.kept_awake import kept_awake
+from jointctl.tools.running.loop.loop_handle import LoopHandle
+from jointctl.tools.running.open_drive import check_cyclic_rate, commission, drive_fault_text, open_drive
+from jointctl.tools.running.permission.readiness import require_same_motion
+from jointctl.tools.running.result.drive_end import warn_unless_off
+from jointctl.tools.running.result.run_result import RunResult as RunResult
+from jointctl.tools.running.run_watch import Around, RunParts, RunWatch
+from jointctl.tools.running.stop_signals import StopSignals
+from jointctl.tools.running.watch.bus_watch import bus_watch
+from jointctl.tools.running.watch.frame_recorder import recording
+from jointctl.tools.running.watch.temperature_watch import TemperatureWatch
 
 POLL_S = 0.02
 

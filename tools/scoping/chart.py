@@ -6,7 +6,7 @@ from typing import Any
 
 from nicegui import ui
 
-from tools.scoping.history import SIGNALS, History, crossing_s
+from jointctl.tools.scoping.history import SIGNALS, History, crossing_s
 
 SPANS_s = (2, 5, 10, 30, 60)
 FIRST_SIGNALS = ("desired angle [rad]", "angle [rad]", "command torque [Nm]")

@@ -6,10 +6,10 @@ import contextlib
 from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
-from firmware_py.states import StopRequest
-from tools.recording.run_log import Event
-from tools.running.display.display import Display, Snapshot
-from tools.running.display.viewer_request import ViewerRequest
+from jointctl.firmware_py.states import StopRequest
+from jointctl.tools.recording.run_log import Event
+from jointctl.tools.running.display.display import Display, Snapshot
+from jointctl.tools.running.display.viewer_request import ViewerRequest
 
 
 class Displays:

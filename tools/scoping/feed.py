@@ -14,11 +14,11 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any, Self
 
-from firmware_py.states import StopRequest
-from tools.recording.run_log import Event
-from tools.running.display.display import Snapshot
-from tools.running.display.viewer_request import LONGEST_BYTES, ViewerRequest, decoded
-from tools.scoping.order import ScopeOrder
+from jointctl.firmware_py.states import StopRequest
+from jointctl.tools.recording.run_log import Event
+from jointctl.tools.running.display.display import Snapshot
+from jointctl.tools.running.display.viewer_request import LONGEST_BYTES, ViewerRequest, decoded
+from jointctl.tools.scoping.order import ScopeOrder
 
 RECORDS, EVENT, SETTINGS = b"R", b"E", b"S"  # first byte of a message
 REQUESTS = 16  # of viewers, at most between two looks
@@ -180,7 +180,7 @@ def scope_server(
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     fed = ScopeOrder(**{**asdict(order), "feed_fd": theirs.fileno()})
     process = subprocess.Popen(
-        [sys.executable, "-P", "-m", "tools.scoping.server"],
+        [sys.executable, "-P", "-m", "jointctl.tools.scoping.server"],
         pass_fds=(theirs.fileno(),),
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,

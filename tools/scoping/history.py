@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from drivers.printable import printable
-from firmware_py.records import LogRecord
-from firmware_py.schema import dtype_of, new
-from tools.recording.run_figure import drawn_indices
-from tools.recording.run_log import Event
-from tools.reporting.run_figures import powered
+from jointctl.drivers.printable import printable
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import dtype_of, new
+from jointctl.tools.recording.run_figure import drawn_indices
+from jointctl.tools.recording.run_log import Event
+from jointctl.tools.reporting.run_figures import powered
 
 RING_RECORDS = 1 << 16  # 65 s at 1 kHz
 EVENTS = 50

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
 
-from drivers.errors import DataError, UsageError
-from drivers.printable import printable
+from jointctl.drivers.errors import DataError, UsageError
+from jointctl.drivers.printable import printable
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The scope's web server: `python -m tools.scoping.server`, started by `run --scope` and by `scope CONFIG`.
+"""The scope's web server: `python -m jointctl.tools.scoping.server`, started by `run --scope` and by `scope CONFIG`.
 
 What it is to serve, and the token that it asks for, come as JSON on its standard input: what stands among the arguments
 or in the environment of a process can be read by others.
@@ -16,13 +16,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-from tools.recording.run_log import Event
-from tools.recording.run_log_reader import read_run_log
-from tools.running.display.viewer_request import ViewerRequest, viewer
-from tools.scoping.access import AccessControl
-from tools.scoping.feed import COUNT_AGAIN_S, EVENT, RECORDS, SETTINGS
-from tools.scoping.history import EVENTS, RING_RECORDS, History
-from tools.scoping.order import ScopeOrder
+from jointctl.tools.recording.run_log import Event
+from jointctl.tools.recording.run_log_reader import read_run_log
+from jointctl.tools.running.display.viewer_request import ViewerRequest, viewer
+from jointctl.tools.scoping.access import AccessControl
+from jointctl.tools.scoping.feed import COUNT_AGAIN_S, EVENT, RECORDS, SETTINGS
+from jointctl.tools.scoping.history import EVENTS, RING_RECORDS, History
+from jointctl.tools.scoping.order import ScopeOrder
 
 _LONGEST = 1 << 20  # bytes of a message
 MESSAGES = 20  # that a page which was cut off for a moment gets again
@@ -131,8 +131,8 @@ def serve(order: ScopeOrder) -> None:
     # the import takes seconds, and only this process needs it
     from nicegui import app, ui
 
-    from tools.scoping.page import build_page
-    from tools.scoping.stop_button import STOP_PATH
+    from jointctl.tools.scoping.page import build_page
+    from jointctl.tools.scoping.stop_button import STOP_PATH
 
     feed: Feed | None = None
     if order.feed_fd >= 0:

@@ -14,9 +14,9 @@ from typing import Any
 import can
 import numpy as np
 
-from drivers.can.virtual_bus import decode, encode
-from hil.canopen.device import Cia402Device
-from hil.device_loop import ENDED_WORD, SEND_ERRORS_WORD, STOP_WORD, WORDS
+from jointctl.drivers.can.virtual_bus import decode, encode
+from jointctl.hil.canopen.device import Cia402Device
+from jointctl.hil.device_loop import ENDED_WORD, SEND_ERRORS_WORD, STOP_WORD, WORDS
 
 _LONGEST_WAIT_NS = 2_000_000  # timers and the plant move on at least this often
 _FRAMES_AT_ONCE = 64  # received before timers are looked at again

@@ -14,23 +14,23 @@ from typing import Any
 import can
 import numpy as np
 
-from drivers.can.virtual_bus import decode, encode
-from drivers.canopen.drive import CanopenDrive
-from drivers.canopen.exchange import accept, begin, end, exchange_memory
-from drivers.drive import CommissioningReport
-from drivers.errors import ConfigurationError
-from firmware_py.records import AxisState, Command, LogRecord, Sample
-from firmware_py.schema import new
-from firmware_py.sequence import reset_axis
-from firmware_py.states import AxisPhase, Fault
-from hil.bus.frames import FRAME_SIZE
-from hil.canopen.device import Cia402Device
-from hil.faults.kinds import fault_memory
-from hil.lockstep import TRUTHS, TRUE_POSITION_rad, run_lockstep
-from tools.configuration.config import Config
-from tools.configuration.drive_settings import canopen_settings
-from tools.configuration.records import axis_constants, trajectory_table
-from tools.simulation.virtual_joint import new_device
+from jointctl.drivers.can.virtual_bus import decode, encode
+from jointctl.drivers.canopen.drive import CanopenDrive
+from jointctl.drivers.canopen.exchange import accept, begin, end, exchange_memory
+from jointctl.drivers.drive import CommissioningReport
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.sequence import reset_axis
+from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.hil.bus.frames import FRAME_SIZE
+from jointctl.hil.canopen.device import Cia402Device
+from jointctl.hil.faults.kinds import fault_memory
+from jointctl.hil.lockstep import TRUTHS, TRUE_POSITION_rad, run_lockstep
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.drive_settings import canopen_settings
+from jointctl.tools.configuration.records import axis_constants, trajectory_table
+from jointctl.tools.simulation.virtual_joint import new_device
 
 _COMMISSIONING_STEP_NS = 1000  # the device's clock goes on a little with every frame
 _LISTENER_S = 5.0  # at most: it may have gone

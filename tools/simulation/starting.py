@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from drivers.errors import JointctlError
+from jointctl.drivers.errors import JointctlError
 
 TELL_S = 15.0  # how often it is told that it still compiles
 IDLE_S = 60.0  # alive, but at work for less than WORK_S in so long: it hangs

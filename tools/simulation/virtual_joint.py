@@ -11,17 +11,17 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from drivers.can.open import CYCLIC_INTERFACES, open_cyclic_end, open_python_can
-from drivers.errors import BusError, ConfigurationError
-from hil.bus.virtual_bus import VirtualBusError, VirtualBusHub, default_socket_path
-from hil.canopen.device import Cia402Device
-from hil.plant.joint import plant
-from hil.realtime_device import RealtimeDevice
-from tools.configuration.config import Config
-from tools.configuration.drive_settings import device_settings
-from tools.configuration.plant_settings import fault_constants, plant_settings
-from tools.simulation.device_pump import PumpedDevice
-from tools.simulation.starting import Starting
+from jointctl.drivers.can.open import CYCLIC_INTERFACES, open_cyclic_end, open_python_can
+from jointctl.drivers.errors import BusError, ConfigurationError
+from jointctl.hil.bus.virtual_bus import VirtualBusError, VirtualBusHub, default_socket_path
+from jointctl.hil.canopen.device import Cia402Device
+from jointctl.hil.plant.joint import plant
+from jointctl.hil.realtime_device import RealtimeDevice
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.drive_settings import device_settings
+from jointctl.tools.configuration.plant_settings import fault_constants, plant_settings
+from jointctl.tools.simulation.device_pump import PumpedDevice
+from jointctl.tools.simulation.starting import Starting
 
 _POLL_S = 0.1
 
@@ -71,7 +71,7 @@ def separate_virtual_joint(
     `tell` gets a line now and then while it compiles.  Raises `BusError` if it ends, or hangs, before it is ready.
     """
     read_end, write_end = os.pipe()
-    command = [sys.executable, "-P", "-m", "tools.cli", "hil", str(config_path), "--interface", "jointctl"]
+    command = [sys.executable, "-P", "-m", "jointctl.tools.cli", "hil", str(config_path), "--interface", "jointctl"]
     command += ["--channel", channel, "--ready-fd", str(write_end), "--quiet"]
     process = subprocess.Popen(command, pass_fds=(write_end,), stdin=subprocess.DEVNULL, start_new_session=True)
     os.close(write_end)

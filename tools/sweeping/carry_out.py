@@ -14,26 +14,26 @@ from typing import Any
 
 import numpy as np
 
-from drivers.drive import Approval, CommissioningReport
-from drivers.elmo.unit_modes import SPEED_MODE
-from drivers.errors import ConfigurationError, DeviceError, UsageError
-from firmware_py.motion_peak import approach_duration_s
-from firmware_py.records import Reference
-from firmware_py.schema import new
-from firmware_py.states import CommandKind, Fault, TrajectoryKind
-from tools.configuration.config import Config
-from tools.configuration.elmo import ElmoSerial, UnitModeChoice
-from tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_constants
-from tools.output import Output
-from tools.recording.run_log import THINNING
-from tools.recording.thinned_records import ThinnedRecords
-from tools.running.control import Control
-from tools.running.loop.loop_handle import LoopHandle
-from tools.running.run_watch import RunParts, RunWatch
-from tools.running.supervisor import Supervisor
-from tools.simulation.lockstep import LockstepJoint
-from tools.sweeping.meter import SweepMeter
-from tools.sweeping.plan import SweepMotion, shifted
+from jointctl.drivers.drive import Approval, CommissioningReport
+from jointctl.drivers.elmo.unit_modes import SPEED_MODE
+from jointctl.drivers.errors import ConfigurationError, DeviceError, UsageError
+from jointctl.firmware_py.motion_peak import approach_duration_s
+from jointctl.firmware_py.records import Reference
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import CommandKind, Fault, TrajectoryKind
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.elmo import ElmoSerial, UnitModeChoice
+from jointctl.tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_constants
+from jointctl.tools.output import Output
+from jointctl.tools.recording.run_log import THINNING
+from jointctl.tools.recording.thinned_records import ThinnedRecords
+from jointctl.tools.running.control import Control
+from jointctl.tools.running.loop.loop_handle import LoopHandle
+from jointctl.tools.running.run_watch import RunParts, RunWatch
+from jointctl.tools.running.supervisor import Supervisor
+from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.sweeping.meter import SweepMeter
+from jointctl.tools.sweeping.plan import SweepMotion, shifted
 
 DRIVE_MODES = {"auto": "velocity or torque", "csv": "csv", "pv": "pv"}  # option: `CanopenSettings.mode`
 SERIAL_MODES: dict[str, UnitModeChoice] = {"auto": "auto", "speed": "speed", "torque": "torque"}

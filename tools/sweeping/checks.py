@@ -8,11 +8,11 @@ A serial drive tells amperes and has no rated torque: its torque constant cannot
 
 from __future__ import annotations
 
-from drivers.drive import CommissioningReport
-from drivers.errors import ConfigurationError, DeviceError
-from tools.configuration.config import Config
-from tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
-from tools.configuration.elmo import ElmoSerial
+from jointctl.drivers.drive import CommissioningReport
+from jointctl.drivers.errors import ConfigurationError, DeviceError
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
+from jointctl.tools.configuration.elmo import ElmoSerial
 
 DOUBTFUL_FACTOR = 1.25  # motors are rated at a speed, where losses take part of the torque
 WRONG_FACTOR = 3.0

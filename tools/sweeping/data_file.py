@@ -17,11 +17,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from drivers.errors import DataError
-from firmware_py.input_file import LARGEST_TABLE_BYTES, parse_json, read_input
-from tools.identification.sweep_file import SWEEP_COLUMNS, sidecar_contents
-from tools.sweeping.meter import MeasuredPoint
-from tools.written_file import writing
+from jointctl.drivers.errors import DataError
+from jointctl.firmware_py.input_file import LARGEST_TABLE_BYTES, parse_json, read_input
+from jointctl.tools.identification.sweep_file import SWEEP_COLUMNS, sidecar_contents
+from jointctl.tools.sweeping.meter import MeasuredPoint
+from jointctl.tools.written_file import writing
 
 HEADING = ",".join(SWEEP_COLUMNS) + "\n"
 

@@ -13,8 +13,8 @@ import random
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.errors import DataError, UsageError
-from firmware_py.input_file import number_from, read_input
+from jointctl.drivers.errors import DataError, UsageError
+from jointctl.firmware_py.input_file import number_from, read_input
 
 GRIDS = ("near-zero", "linear", "log", "list")
 DEFAULT_POINTS = 225

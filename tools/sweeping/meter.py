@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.states import AxisPhase
-from tools.sweeping.grid import SweepPoint
-from tools.sweeping.plan import Window
-from tools.sweeping.statistics import LEAST_SAMPLES, PlateauResult, Samples, Tolerance, plateau
+from jointctl.firmware_py.states import AxisPhase
+from jointctl.tools.sweeping.grid import SweepPoint
+from jointctl.tools.sweeping.plan import Window
+from jointctl.tools.sweeping.statistics import LEAST_SAMPLES, PlateauResult, Samples, Tolerance, plateau
 
 FEWEST_IN_WINDOW = 2
 

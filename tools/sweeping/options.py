@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from drivers.errors import DataError, UsageError
-from tools.configuration.config import Config
-from tools.sweeping.carry_out import position_margin_rad
-from tools.sweeping.checks import measuring_constants
-from tools.sweeping.grid import (
+from jointctl.drivers.errors import DataError, UsageError
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.sweeping.carry_out import position_margin_rad
+from jointctl.tools.sweeping.checks import measuring_constants
+from jointctl.tools.sweeping.grid import (
     DEFAULT_POINTS,
     MOST_POINTS,
     SPEED_RATIO,
@@ -21,9 +21,9 @@ from tools.sweeping.grid import (
     ordered_points,
     plan_hash,
 )
-from tools.sweeping.plan import PlanSettings, SweepMotion, fastest_radps, plan_motion
-from tools.sweeping.statistics import LEAST_SAMPLES
-from tools.written_file import require_target
+from jointctl.tools.sweeping.plan import PlanSettings, SweepMotion, fastest_radps, plan_motion
+from jointctl.tools.sweeping.statistics import LEAST_SAMPLES
+from jointctl.tools.written_file import require_target
 
 SPEED_SHARE = 0.9  # of limits.velocity_max_radps that the fastest plateau may have
 ACCELERATION_SHARE = 0.8  # of sequence.brake_radps2: braking must always be possible

@@ -21,8 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.errors import UsageError
-from tools.sweeping.grid import SweepPoint
+from jointctl.drivers.errors import UsageError
+from jointctl.tools.sweeping.grid import SweepPoint
 
 TEETH = 4
 MOST_STROKES = 8  # of one point; more travel helps more than more strokes

@@ -7,18 +7,18 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from drivers.errors import JointctlError, UsageError
-from tools.benchmarks.exchange_speed import Rounds, exchange_rows
-from tools.benchmarks.law_speed import law_rows
-from tools.benchmarks.outcome import conditions, outcome_data, outcome_table, write_outcome
-from tools.benchmarks.paired import Row, skipped
-from tools.benchmarks.simulation_speed import lockstep_rows, swarm_rows
-from tools.benchmarks.start_speed import start_rows
-from tools.configuration.config import Config
-from tools.configuration.load import load_config, shipped_config
-from tools.configuration.records import axis_constants
-from tools.output import Output
-from tools.written_file import prepare_folder
+from jointctl.drivers.errors import JointctlError, UsageError
+from jointctl.tools.benchmarks.exchange_speed import Rounds, exchange_rows
+from jointctl.tools.benchmarks.law_speed import law_rows
+from jointctl.tools.benchmarks.outcome import conditions, outcome_data, outcome_table, write_outcome
+from jointctl.tools.benchmarks.paired import Row, skipped
+from jointctl.tools.benchmarks.simulation_speed import lockstep_rows, swarm_rows
+from jointctl.tools.benchmarks.start_speed import start_rows
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.output import Output
+from jointctl.tools.written_file import prepare_folder
 
 PARTS = ("law", "loop", "lockstep", "swarm", "start")
 

@@ -8,15 +8,15 @@ from typing import Any
 
 from rich.table import Table
 
-from tools.analysis.advice import Remedy, remedies
-from tools.analysis.linear_loop import LoopSettings
-from tools.analysis.loop_settings import Assumption, loop_settings, not_modelled
-from tools.analysis.margin_gate import learning_of, meets, refusal, refuse_diverging_learning
-from tools.analysis.margins import Margins, Theory, margins, theory
-from tools.configuration.config import Config
-from tools.drawing import require_png
-from tools.output import Output
-from tools.verbs.check_serial import line_text, refuse_rate
+from jointctl.tools.analysis.advice import Remedy, remedies
+from jointctl.tools.analysis.linear_loop import LoopSettings
+from jointctl.tools.analysis.loop_settings import Assumption, loop_settings, not_modelled
+from jointctl.tools.analysis.margin_gate import learning_of, meets, refusal, refuse_diverging_learning
+from jointctl.tools.analysis.margins import Margins, Theory, margins, theory
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.drawing import require_png
+from jointctl.tools.output import Output
+from jointctl.tools.verbs.check_serial import line_text, refuse_rate
 
 
 def check(
@@ -53,7 +53,7 @@ def check(
         value = f"factor {learning.worst_factor:.2f} at {learning.worst_Hz:.1f} Hz"
         table.add_row("learning", value, "what is left to learn after one repetition, below 1 it converges")
     if figure is not None:
-        from tools.analysis.loop_figure import save_loop_figure
+        from jointctl.tools.analysis.loop_figure import save_loop_figure
 
         save_loop_figure(settings, figure, config.path.name, minimum_deg)
         table.add_row("picture", str(figure), "")

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from drivers.elmo.line_budget import LARGEST_SHARE, highest_rate_Hz
-from drivers.errors import ConfigurationError
-from tools.analysis.advice import remedies
-from tools.analysis.linear_loop import LoopSettings
-from tools.analysis.loop_settings import loop_settings
-from tools.analysis.margin_gate import meets
-from tools.analysis.margins import margins
-from tools.configuration.config import Config
-from tools.configuration.elmo_settings import elmo_section, serial_line_share
+from jointctl.drivers.elmo.line_budget import LARGEST_SHARE, highest_rate_Hz
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.analysis.advice import remedies
+from jointctl.tools.analysis.linear_loop import LoopSettings
+from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.margin_gate import meets
+from jointctl.tools.analysis.margins import margins
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.elmo_settings import elmo_section, serial_line_share
 
 HIGHEST_CUTOFF = 0.48  # of the rate; the configuration allows less than half
 

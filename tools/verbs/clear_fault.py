@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from drivers.can.link_state import interface_blamed
-from drivers.errors import INTERRUPTED
-from tools.configuration.config import Config
-from tools.configuration.elmo import ElmoSerial
-from tools.output import Output
-from tools.running.control import in_control
-from tools.running.open_drive import open_drive
-from tools.running.result import drive_end
-from tools.running.result.drive_end import warn_unless_off
-from tools.verbs.stop_serial import refuse_while_running
+from jointctl.drivers.can.link_state import interface_blamed
+from jointctl.drivers.errors import INTERRUPTED
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.elmo import ElmoSerial
+from jointctl.tools.output import Output
+from jointctl.tools.running.control import in_control
+from jointctl.tools.running.open_drive import open_drive
+from jointctl.tools.running.result import drive_end
+from jointctl.tools.running.result.drive_end import warn_unless_off
+from jointctl.tools.verbs.stop_serial import refuse_while_running
 
 
 def clear_fault(config: Config, output: Output) -> int:

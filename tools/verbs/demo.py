@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from drivers.errors import ConfigurationError
-from tools.configuration.config import Config
-from tools.configuration.elmo_settings import refuse_serial
-from tools.configuration.load import load_config, with_bus_overrides
-from tools.output import Output
-from tools.simulation.virtual_joint import separate_virtual_joint
-from tools.verbs.run import run
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.elmo_settings import refuse_serial
+from jointctl.tools.configuration.load import load_config, with_bus_overrides
+from jointctl.tools.output import Output
+from jointctl.tools.simulation.virtual_joint import separate_virtual_joint
+from jointctl.tools.verbs.run import run
 
 LONGEST_S = 86_400.0
 

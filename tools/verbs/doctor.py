@@ -12,13 +12,13 @@ from dataclasses import asdict
 from rich.table import Table
 from rich.text import Text
 
-from firmware_py.kernel import cache_folder
-from tools.configuration.config import Config
-from tools.inspection.bus_health import adapters, bus_budget, drive_finding, interface_state
-from tools.inspection.computer import kernel_cache, kernel_findings, scheduling, software, wake_up
-from tools.inspection.findings import NOTE, OK, PROBLEM, Finding
-from tools.inspection.serial_health import serial_findings
-from tools.output import Output
+from jointctl.firmware_py.kernel import cache_folder
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.inspection.bus_health import adapters, bus_budget, drive_finding, interface_state
+from jointctl.tools.inspection.computer import kernel_cache, kernel_findings, scheduling, software, wake_up
+from jointctl.tools.inspection.findings import NOTE, OK, PROBLEM, Finding
+from jointctl.tools.inspection.serial_health import serial_findings
+from jointctl.tools.output import Output
 
 
 def findings(config: Config, *, cold: bool = False, wake_cycles: int | None = None) -> Iterator[Finding]:

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from drivers.drive import CommissioningReport
-from drivers.errors import DECLINED, INTERRUPTED
-from firmware_py.states import Fault
-from tools.configuration.config import Config
-from tools.inspection.drive_scale import judged
-from tools.inspection.findings import Finding
-from tools.motion_check.carry_out import CheckSupervisor
-from tools.motion_check.plan import CheckPlan, make_plan, require_room
-from tools.motion_check.verdict import ended_finding, motion_findings
-from tools.output import Output
-from tools.recording.log_folder import log_path
-from tools.running.control import Control, in_control
-from tools.running.permission.consent import agreed, approval, require_terminal
-from tools.running.permission.envelope import remark_lines, where_lines
-from tools.running.permission.readiness import prepare_log, require_ready
-from tools.running.result import drive_end
-from tools.running.result.drive_end import require_off
-from tools.verbs.doctor import report_findings
+from jointctl.drivers.drive import CommissioningReport
+from jointctl.drivers.errors import DECLINED, INTERRUPTED
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.inspection.drive_scale import judged
+from jointctl.tools.inspection.findings import Finding
+from jointctl.tools.motion_check.carry_out import CheckSupervisor
+from jointctl.tools.motion_check.plan import CheckPlan, make_plan, require_room
+from jointctl.tools.motion_check.verdict import ended_finding, motion_findings
+from jointctl.tools.output import Output
+from jointctl.tools.recording.log_folder import log_path
+from jointctl.tools.running.control import Control, in_control
+from jointctl.tools.running.permission.consent import agreed, approval, require_terminal
+from jointctl.tools.running.permission.envelope import remark_lines, where_lines
+from jointctl.tools.running.permission.readiness import prepare_log, require_ready
+from jointctl.tools.running.result import drive_end
+from jointctl.tools.running.result.drive_end import require_off
+from jointctl.tools.verbs.doctor import report_findings
 
 
 def check_envelope(config: Config, plan: CheckPlan, report: CommissioningReport) -> list[str]:

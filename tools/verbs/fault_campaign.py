@@ -5,20 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from drivers.errors import INTERRUPTED
-from tools.campaign.fitness import require_fit
-from tools.campaign.judge import Verdict, judge
-from tools.campaign.report import campaign_figure, rows_by_kind, table, violations, write_json
-from tools.campaign.runner import campaign_joint, run_campaign
-from tools.campaign.scenario import draw_scenario
-from tools.configuration.config import Config
-from tools.configuration.elmo_settings import refuse_serial
-from tools.drawing import save_png
-from tools.output import Output
-from tools.reporting.figure import svg_figure
-from tools.reporting.page import Details, Paragraph, Section, Table, check_target
-from tools.reporting.verb_page import from_terminal, write_verb_page
-from tools.written_file import prepare_folder
+from jointctl.drivers.errors import INTERRUPTED
+from jointctl.tools.campaign.fitness import require_fit
+from jointctl.tools.campaign.judge import Verdict, judge
+from jointctl.tools.campaign.report import campaign_figure, rows_by_kind, table, violations, write_json
+from jointctl.tools.campaign.runner import campaign_joint, run_campaign
+from jointctl.tools.campaign.scenario import draw_scenario
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.elmo_settings import refuse_serial
+from jointctl.tools.drawing import save_png
+from jointctl.tools.output import Output
+from jointctl.tools.reporting.figure import svg_figure
+from jointctl.tools.reporting.page import Details, Paragraph, Section, Table, check_target
+from jointctl.tools.reporting.verb_page import from_terminal, write_verb_page
+from jointctl.tools.written_file import prepare_folder
 
 EXIT_VIOLATIONS = 10
 SHOWN = 20

@@ -9,16 +9,16 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from drivers.errors import ConfigurationError, DataError
-from hil.elmo.device import ElmoDevice
-from hil.elmo.interpreter import ElmoInterpreter
-from hil.plant.joint import plant
-from tools.configuration.config import Config
-from tools.configuration.elmo_settings import elmo_device_settings, elmo_section
-from tools.configuration.plant_settings import plant_settings
-from tools.output import Output
-from tools.running.stop_signals import stop_signals
-from tools.verbs.hil import make_realtime, wait_for_end
+from jointctl.drivers.errors import ConfigurationError, DataError
+from jointctl.hil.elmo.device import ElmoDevice
+from jointctl.hil.elmo.interpreter import ElmoInterpreter
+from jointctl.hil.plant.joint import plant
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.elmo_settings import elmo_device_settings, elmo_section
+from jointctl.tools.configuration.plant_settings import plant_settings
+from jointctl.tools.output import Output
+from jointctl.tools.running.stop_signals import stop_signals
+from jointctl.tools.verbs.hil import make_realtime, wait_for_end
 
 
 def new_elmo_device(config: Config) -> ElmoDevice:

@@ -11,25 +11,25 @@ from typing import Any
 
 import numpy as np
 
-from drivers.errors import ConfigurationError, DataError
-from tools.configuration.conversions import torque_constant_NmpA
-from tools.configuration.load import load_config, shipped_config
-from tools.drawing import png
-from tools.identification.figures import convergence_figure, fit_figure
-from tools.identification.foreign_table import ForeignFormat
-from tools.identification.friction_file import read_friction_data
-from tools.identification.friction_section import section_values, snippet, write_into
-from tools.identification.identification import identify_friction
-from tools.identification.options import Options
-from tools.identification.plausibility import JointLimits
-from tools.identification.report import error_table, identification_report, model_table, parameter_table
-from tools.identification.result import Identification
-from tools.output import Output
-from tools.reporting.figure import svg_figure
-from tools.reporting.page import Block, Details, Section, check_target
-from tools.reporting.verb_page import from_terminal, write_verb_page
-from tools.reporting.verb_page import remarks as notes_of
-from tools.written_file import replace_file, require_target
+from jointctl.drivers.errors import ConfigurationError, DataError
+from jointctl.tools.configuration.conversions import torque_constant_NmpA
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.drawing import png
+from jointctl.tools.identification.figures import convergence_figure, fit_figure
+from jointctl.tools.identification.foreign_table import ForeignFormat
+from jointctl.tools.identification.friction_file import read_friction_data
+from jointctl.tools.identification.friction_section import section_values, snippet, write_into
+from jointctl.tools.identification.identification import identify_friction
+from jointctl.tools.identification.options import Options
+from jointctl.tools.identification.plausibility import JointLimits
+from jointctl.tools.identification.report import error_table, identification_report, model_table, parameter_table
+from jointctl.tools.identification.result import Identification
+from jointctl.tools.output import Output
+from jointctl.tools.reporting.figure import svg_figure
+from jointctl.tools.reporting.page import Block, Details, Section, check_target
+from jointctl.tools.reporting.verb_page import from_terminal, write_verb_page
+from jointctl.tools.reporting.verb_page import remarks as notes_of
+from jointctl.tools.written_file import replace_file, require_target
 
 
 def joint_limits(config_path: Path) -> JointLimits:

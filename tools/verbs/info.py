@@ -8,10 +8,10 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from tools.inspection.drive_info import drive_info
-from tools.inspection.sdo_reading import SdoReader
-from tools.inspection.subject import Subject, canopen_network
-from tools.output import Output
+from jointctl.tools.inspection.drive_info import drive_info
+from jointctl.tools.inspection.sdo_reading import SdoReader
+from jointctl.tools.inspection.subject import Subject, canopen_network
+from jointctl.tools.output import Output
 
 _TITLES = {
     "identity": "Identity", "errors": "Errors", "state": "State", "ratings": "Ratings", "limits": "Limits",

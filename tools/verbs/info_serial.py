@@ -6,10 +6,10 @@ from dataclasses import asdict
 
 from rich.table import Table
 
-from tools.configuration.config import Config
-from tools.configuration.elmo_settings import elmo_section
-from tools.inspection.serial_subject import inspected_drive
-from tools.output import Output
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.elmo_settings import elmo_section
+from jointctl.tools.inspection.serial_subject import inspected_drive
+from jointctl.tools.output import Output
 
 
 def info_serial(config: Config, output: Output) -> int:

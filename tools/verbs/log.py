@@ -8,14 +8,14 @@ from typing import Any
 from rich.console import Group
 from rich.table import Table
 
-from drivers.errors import DataError
-from tools.output import Output
-from tools.recording.log_export import FORMATS
-from tools.recording.log_facts import began_at, event_rows, kept_share, level_name, missing_in
-from tools.recording.run_figure import save_run_figure
-from tools.recording.run_log_reader import RunLog, read_run_log
-from tools.recording.run_summary import summarise, summary_table
-from tools.written_file import replace_file, require_target
+from jointctl.drivers.errors import DataError
+from jointctl.tools.output import Output
+from jointctl.tools.recording.log_export import FORMATS
+from jointctl.tools.recording.log_facts import began_at, event_rows, kept_share, level_name, missing_in
+from jointctl.tools.recording.run_figure import save_run_figure
+from jointctl.tools.recording.run_log_reader import RunLog, read_run_log
+from jointctl.tools.recording.run_summary import summarise, summary_table
+from jointctl.tools.written_file import replace_file, require_target
 
 _SHOWN_EVENTS = 100
 

@@ -10,16 +10,16 @@ from typing import Any
 
 import can
 
-from drivers.errors import BusError, ConfigurationError
-from tools.configuration.drive_settings import TORQUE_MODES
-from tools.inspection.drive_info import pdo_maps
-from tools.inspection.frame_decoder import KINDS, Decoded, FrameDecoder
-from tools.inspection.objects import Objects
-from tools.inspection.pdo_maps import PdoMaps
-from tools.inspection.sdo_reading import SdoReader
-from tools.inspection.subject import Subject, canopen_network
-from tools.output import Output
-from tools.running.stop_signals import stop_signals
+from jointctl.drivers.errors import BusError, ConfigurationError
+from jointctl.tools.configuration.drive_settings import TORQUE_MODES
+from jointctl.tools.inspection.drive_info import pdo_maps
+from jointctl.tools.inspection.frame_decoder import KINDS, Decoded, FrameDecoder
+from jointctl.tools.inspection.objects import Objects
+from jointctl.tools.inspection.pdo_maps import PdoMaps
+from jointctl.tools.inspection.sdo_reading import SdoReader
+from jointctl.tools.inspection.subject import Subject, canopen_network
+from jointctl.tools.output import Output
+from jointctl.tools.running.stop_signals import stop_signals
 
 POLL_S = 0.1
 

@@ -10,13 +10,13 @@ import json
 import time
 from dataclasses import dataclass
 
-from drivers.elmo.codes import CURRENT_LIMITED, FAULT_LATCHED, SERVO_ON, motor_off_cause, status_text
-from drivers.elmo.drive import ElmoDrive
-from tools.configuration.config import Config
-from tools.configuration.elmo_settings import elmo_section
-from tools.inspection.serial_subject import inspected_drive
-from tools.output import Output
-from tools.running.stop_signals import stop_signals
+from jointctl.drivers.elmo.codes import CURRENT_LIMITED, FAULT_LATCHED, SERVO_ON, motor_off_cause, status_text
+from jointctl.drivers.elmo.drive import ElmoDrive
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.elmo_settings import elmo_section
+from jointctl.tools.inspection.serial_subject import inspected_drive
+from jointctl.tools.output import Output
+from jointctl.tools.running.stop_signals import stop_signals
 
 INTERVAL_S = 0.1
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drivers.errors import DataError
-from tools.configuration.load import read_text, shipped_config
-from tools.output import Output
+from jointctl.drivers.errors import DataError
+from jointctl.tools.configuration.load import read_text, shipped_config
+from jointctl.tools.output import Output
 
 
 def new(path: Path, output: Output, *, shipped: str) -> int:

@@ -8,20 +8,20 @@ from typing import Any
 
 from rich.table import Table
 
-from tools.drawing import save_png
-from tools.experiments.error_figures import error_figures
-from tools.experiments.paper_identification import (
+from jointctl.tools.drawing import save_png
+from jointctl.tools.experiments.error_figures import error_figures
+from jointctl.tools.experiments.paper_identification import (
     PaperIdentification,
     identification_figure,
     identify_paper_friction,
 )
-from tools.experiments.paper_rows import PaperRow, PaperRun, paper_rows
-from tools.experiments.paper_runs import AFTER_s, experiments
-from tools.output import Output
-from tools.reporting.figure import svg_figure
-from tools.reporting.page import Section, check_target
-from tools.reporting.verb_page import from_terminal, write_verb_page
-from tools.written_file import prepare_folder
+from jointctl.tools.experiments.paper_rows import PaperRow, PaperRun, paper_rows
+from jointctl.tools.experiments.paper_runs import AFTER_s, experiments
+from jointctl.tools.output import Output
+from jointctl.tools.reporting.figure import svg_figure
+from jointctl.tools.reporting.page import Section, check_target
+from jointctl.tools.reporting.verb_page import from_terminal, write_verb_page
+from jointctl.tools.written_file import prepare_folder
 
 PAPER = (
     "Shen, Zhou, Yu, Wang: Design of Adaptive RBFNN and Computed-torque Control for Manipulator Joint "
@@ -73,7 +73,7 @@ def paper(
 
 def _figures(runs: dict[str, PaperRun], identified: PaperIdentification | None) -> dict[str, Any]:
     """By the name of the file, in the paper's order."""
-    from tools.experiments.paper_figures import draw_all
+    from jointctl.tools.experiments.paper_figures import draw_all
 
     found = {"fig07_identification": identification_figure(identified)} if identified is not None else {}
     return {**found, **draw_all(runs)}

@@ -9,15 +9,15 @@ from typing import Any
 
 from rich.table import Table
 
-from drivers.canopen.bus_watchers import OtherControllers
-from drivers.canopen.cia402 import State, state_of_word, state_text
-from drivers.canopen.identifiers import NmtCommand
-from drivers.canopen.network import send_nmt
-from drivers.errors import DECLINED, ConfigurationError, DataError, DeviceError
-from tools.inspection.objects import Objects, Place
-from tools.inspection.parameter_file import load_parameters, toml_text, write_dcf
-from tools.inspection.parameter_restore import Written, restore
-from tools.inspection.parameters import (
+from jointctl.drivers.canopen.bus_watchers import OtherControllers
+from jointctl.drivers.canopen.cia402 import State, state_of_word, state_text
+from jointctl.drivers.canopen.identifiers import NmtCommand
+from jointctl.drivers.canopen.network import send_nmt
+from jointctl.drivers.errors import DECLINED, ConfigurationError, DataError, DeviceError
+from jointctl.tools.inspection.objects import Objects, Place
+from jointctl.tools.inspection.parameter_file import load_parameters, toml_text, write_dcf
+from jointctl.tools.inspection.parameter_restore import Written, restore
+from jointctl.tools.inspection.parameters import (
     Difference,
     ParameterSet,
     Value,
@@ -28,12 +28,12 @@ from tools.inspection.parameters import (
     shown,
     variables,
 )
-from tools.inspection.sdo_reading import Refusal, SdoReader
-from tools.inspection.subject import Subject, canopen_network
-from tools.output import Output
-from tools.running.control import control_of
-from tools.running.permission.consent import agreed, require_terminal
-from tools.written_file import writing
+from jointctl.tools.inspection.sdo_reading import Refusal, SdoReader
+from jointctl.tools.inspection.subject import Subject, canopen_network
+from jointctl.tools.output import Output
+from jointctl.tools.running.control import control_of
+from jointctl.tools.running.permission.consent import agreed, require_terminal
+from jointctl.tools.written_file import writing
 
 DIFFERENT = 11  # exit code of diff
 MASTER_NODE = 126  # of jointctl, unless a configuration has another one

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from drivers.errors import DataError
-from firmware_py.states import Fault
-from tools.output import Output
-from tools.recording.run_log_reader import RunLog, read_run_log
-from tools.recording.run_summary import RunSummary, summarise
-from tools.reporting.comparison import comparison
-from tools.reporting.page import Block, Details, Paragraph, Section, check_target, page, write_page
-from tools.reporting.run_figures import run_figures
-from tools.reporting.run_tables import events_table, figure_tables, what_ran
-from tools.reporting.temperature_figure import temperature_figure
+from jointctl.drivers.errors import DataError
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.output import Output
+from jointctl.tools.recording.run_log_reader import RunLog, read_run_log
+from jointctl.tools.recording.run_summary import RunSummary, summarise
+from jointctl.tools.reporting.comparison import comparison
+from jointctl.tools.reporting.page import Block, Details, Paragraph, Section, check_target, page, write_page
+from jointctl.tools.reporting.run_figures import run_figures
+from jointctl.tools.reporting.run_tables import events_table, figure_tables, what_ran
+from jointctl.tools.reporting.temperature_figure import temperature_figure
 
 MOST_LOGS = 6  # columns that fit on a page
 

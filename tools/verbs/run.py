@@ -5,21 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from drivers.drive import CommissioningReport
-from drivers.errors import DECLINED, INTERRUPTED
-from tools.configuration.config import Config
-from tools.output import Output
-from tools.recording.log_folder import log_path
-from tools.running.control import in_control
-from tools.running.display.display import Display
-from tools.running.display.live_panel import run_display
-from tools.running.permission.consent import agreed, approval, require_terminal
-from tools.running.permission.envelope import motion_envelope
-from tools.running.permission.readiness import prepare_log, require_ready, require_start
-from tools.running.result import drive_end
-from tools.running.result.drive_end import require_off
-from tools.running.result.run_report import report_run, run_title
-from tools.running.supervisor import Supervisor
+from jointctl.drivers.drive import CommissioningReport
+from jointctl.drivers.errors import DECLINED, INTERRUPTED
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.output import Output
+from jointctl.tools.recording.log_folder import log_path
+from jointctl.tools.running.control import in_control
+from jointctl.tools.running.display.display import Display
+from jointctl.tools.running.display.live_panel import run_display
+from jointctl.tools.running.permission.consent import agreed, approval, require_terminal
+from jointctl.tools.running.permission.envelope import motion_envelope
+from jointctl.tools.running.permission.readiness import prepare_log, require_ready, require_start
+from jointctl.tools.running.result import drive_end
+from jointctl.tools.running.result.drive_end import require_off
+from jointctl.tools.running.result.run_report import report_run, run_title
+from jointctl.tools.running.supervisor import Supervisor
 
 
 def run(
@@ -81,9 +81,9 @@ def _displays(
     if scope is None:
         yield terminal
         return
-    from tools.scoping.displays import Displays
-    from tools.scoping.feed import scope_server
-    from tools.scoping.order import scope_order
+    from jointctl.tools.scoping.displays import Displays
+    from jointctl.tools.scoping.feed import scope_server
+    from jointctl.tools.scoping.order import scope_order
 
     order = scope_order(title, *scope, cia402=not config.is_serial)
     output.address(f"scope: {order.url}")

@@ -6,11 +6,11 @@ import time
 
 from rich.table import Table
 
-from drivers.canopen.identifiers import HIGHEST_NODE
-from drivers.errors import NoDeviceError
-from tools.inspection.node_scan import LISTEN_S, Ear, Heard, ask_everybody, describe
-from tools.inspection.subject import Subject, canopen_network
-from tools.output import Output
+from jointctl.drivers.canopen.identifiers import HIGHEST_NODE
+from jointctl.drivers.errors import NoDeviceError
+from jointctl.tools.inspection.node_scan import LISTEN_S, Ear, Heard, ask_everybody, describe
+from jointctl.tools.inspection.subject import Subject, canopen_network
+from jointctl.tools.output import Output
 
 _NOT_CANOPEN = "power the drives; check the bit rate of each (a drive that keeps silent may only send when asked)"
 

@@ -7,25 +7,25 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drivers.drive import CommissioningReport
-from drivers.errors import DECLINED, INTERRUPTED, JointctlError
-from firmware_py.states import StopRequest
-from tools.output import Output
-from tools.recording.log_folder import log_path
-from tools.recording.run_log_reader import read_run_log
-from tools.running.control import in_control
-from tools.running.display.live_panel import run_display
-from tools.running.permission.envelope import motion_envelope
-from tools.running.permission.readiness import prepare_log, require_ready, require_start
-from tools.running.result.drive_end import words
-from tools.running.result.run_report import report_run, run_title
-from tools.running.supervisor import Supervisor
-from tools.scoping.displays import Displays
-from tools.scoping.feed import ScopeFeed, scope_server
-from tools.scoping.order import scope_order
+from jointctl.drivers.drive import CommissioningReport
+from jointctl.drivers.errors import DECLINED, INTERRUPTED, JointctlError
+from jointctl.firmware_py.states import StopRequest
+from jointctl.tools.output import Output
+from jointctl.tools.recording.log_folder import log_path
+from jointctl.tools.recording.run_log_reader import read_run_log
+from jointctl.tools.running.control import in_control
+from jointctl.tools.running.display.live_panel import run_display
+from jointctl.tools.running.permission.envelope import motion_envelope
+from jointctl.tools.running.permission.readiness import prepare_log, require_ready, require_start
+from jointctl.tools.running.result.drive_end import words
+from jointctl.tools.running.result.run_report import report_run, run_title
+from jointctl.tools.running.supervisor import Supervisor
+from jointctl.tools.scoping.displays import Displays
+from jointctl.tools.scoping.feed import ScopeFeed, scope_server
+from jointctl.tools.scoping.order import scope_order
 
 if TYPE_CHECKING:
-    from tools.configuration.config import Config
+    from jointctl.tools.configuration.config import Config
 
 HOST, PORT = "127.0.0.1", 8642
 POLL_S = 0.05
@@ -38,7 +38,7 @@ def scope(path: Path, output: Output, *, host: str = HOST, port: int = PORT) -> 
     read_run_log(path)  # what is wrong with it is to be told here
     order = scope_order(path.stem, host, port, log=str(path))
     output.address(f"scope: {order.url}  (Ctrl-C ends it)")
-    from tools.scoping.server import serve
+    from jointctl.tools.scoping.server import serve
 
     serve(order)
     return 0

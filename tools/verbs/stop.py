@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drivers.can.open import open_python_can
-from drivers.canopen.switch_off import stop_node
-from drivers.errors import ConfigurationError, JointctlError
-from tools.configuration.stop_target import CanTarget, GivenTarget, SerialTarget, stop_target
-from tools.output import Output
-from tools.running.result.drive_end import require_off
-from tools.running.stop_call import StopCall
-from tools.verbs.stop_serial import stop_serial
+from jointctl.drivers.can.open import open_python_can
+from jointctl.drivers.canopen.switch_off import stop_node
+from jointctl.drivers.errors import ConfigurationError, JointctlError
+from jointctl.tools.configuration.stop_target import CanTarget, GivenTarget, SerialTarget, stop_target
+from jointctl.tools.output import Output
+from jointctl.tools.running.result.drive_end import require_off
+from jointctl.tools.running.stop_call import StopCall
+from jointctl.tools.verbs.stop_serial import stop_serial
 
 
 def stop(path: Path, output: Output, given: GivenTarget | None = None) -> int:
@@ -49,7 +49,7 @@ def _stop_canopen(target: CanTarget) -> str:
 
 
 def _warn_of(path: Path, output: Output) -> None:
-    from tools.configuration.load import load_config  # the stop itself does not wait for its modules
+    from jointctl.tools.configuration.load import load_config  # the stop itself does not wait for its modules
 
     try:
         load_config(path)

@@ -8,14 +8,14 @@
 
 from __future__ import annotations
 
-from drivers.elmo.dialogue import Dialogue
-from drivers.elmo.serial_port import SerialPort
-from drivers.elmo.switch_off import switch_off
-from drivers.errors import BusError, JointctlError
-from tools.configuration.elmo import ElmoSerial
-from tools.configuration.stop_target import SerialTarget
-from tools.output import Output
-from tools.running.guard.guard_call import GuardCall, running_supervisor
+from jointctl.drivers.elmo.dialogue import Dialogue
+from jointctl.drivers.elmo.serial_port import SerialPort
+from jointctl.drivers.elmo.switch_off import switch_off
+from jointctl.drivers.errors import BusError, JointctlError
+from jointctl.tools.configuration.elmo import ElmoSerial
+from jointctl.tools.configuration.stop_target import SerialTarget
+from jointctl.tools.output import Output
+from jointctl.tools.running.guard.guard_call import GuardCall, running_supervisor
 
 SHARED_ATTEMPTS = 10  # the other user of the line takes some replies
 

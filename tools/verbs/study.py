@@ -8,18 +8,18 @@ from typing import Any
 
 from rich.table import Table
 
-from drivers.errors import INTERRUPTED
-from tools.configuration.elmo_settings import refuse_serial
-from tools.configuration.load import load_config, shipped_config
-from tools.drawing import require_png, save_png
-from tools.experiments.controllers import controller_config
-from tools.experiments.study_runs import StudyResult, quantile, run_study, write_csv
-from tools.experiments.study_settings import StudySettings, study_controllers
-from tools.output import Output
-from tools.reporting.figure import svg_figure
-from tools.reporting.page import Details, Section, check_target
-from tools.reporting.verb_page import from_terminal, write_verb_page
-from tools.written_file import prepare_target, refuse_overwriting
+from jointctl.drivers.errors import INTERRUPTED
+from jointctl.tools.configuration.elmo_settings import refuse_serial
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.drawing import require_png, save_png
+from jointctl.tools.experiments.controllers import controller_config
+from jointctl.tools.experiments.study_runs import StudyResult, quantile, run_study, write_csv
+from jointctl.tools.experiments.study_settings import StudySettings, study_controllers
+from jointctl.tools.output import Output
+from jointctl.tools.reporting.figure import svg_figure
+from jointctl.tools.reporting.page import Details, Section, check_target
+from jointctl.tools.reporting.verb_page import from_terminal, write_verb_page
+from jointctl.tools.written_file import prepare_target, refuse_overwriting
 
 _COLUMNS = (
     ("peak_mrad", "peak [mrad]"),
@@ -95,7 +95,7 @@ def study(
 
 
 def _figure(result: StudyResult, settings: StudySettings, title: str) -> Any:
-    from tools.experiments.study_figure import study_figure
+    from jointctl.tools.experiments.study_figure import study_figure
 
     return study_figure(result, f"{title}, after {settings.after_s:g} s")
 

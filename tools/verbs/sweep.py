@@ -13,29 +13,35 @@ from typing import Any
 
 from rich.table import Table
 
-from drivers.drive import CommissioningReport
-from drivers.errors import DECLINED, INTERRUPTED, MotionFault
-from firmware_py.states import Fault
-from tools.configuration.config import Config
-from tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
-from tools.output import Advance, Output
-from tools.recording.log_folder import log_path
-from tools.reporting.page import check_target
-from tools.running.control import Control, in_control
-from tools.running.events.fault_text import FaultText, fault_text
-from tools.running.permission.consent import agreed, approval, require_terminal
-from tools.running.permission.envelope import remark_lines, where_lines
-from tools.running.permission.readiness import require_ready
-from tools.running.result import drive_end
-from tools.sweeping.carry_out import SweepSupervisor, approach_time_s, middle_rad, sweep_in_lockstep, with_mode
-from tools.sweeping.checks import constant_remarks, recorded_limits, refuse_constants, require_torque, torque_source
-from tools.sweeping.data_file import SweepFile
-from tools.sweeping.grid import SweepPoint
-from tools.sweeping.meter import JointModel, MeasuredPoint, SweepMeter
-from tools.sweeping.options import SweepOptions, check_files, make_plan
-from tools.sweeping.plan import PlanSettings, SweepMotion
-from tools.sweeping.statistics import Tolerance
-from tools.sweeping.sweep_page import write_sweep_page
+from jointctl.drivers.drive import CommissioningReport
+from jointctl.drivers.errors import DECLINED, INTERRUPTED, MotionFault
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
+from jointctl.tools.output import Advance, Output
+from jointctl.tools.recording.log_folder import log_path
+from jointctl.tools.reporting.page import check_target
+from jointctl.tools.running.control import Control, in_control
+from jointctl.tools.running.events.fault_text import FaultText, fault_text
+from jointctl.tools.running.permission.consent import agreed, approval, require_terminal
+from jointctl.tools.running.permission.envelope import remark_lines, where_lines
+from jointctl.tools.running.permission.readiness import require_ready
+from jointctl.tools.running.result import drive_end
+from jointctl.tools.sweeping.carry_out import SweepSupervisor, approach_time_s, middle_rad, sweep_in_lockstep, with_mode
+from jointctl.tools.sweeping.checks import (
+    constant_remarks,
+    recorded_limits,
+    refuse_constants,
+    require_torque,
+    torque_source,
+)
+from jointctl.tools.sweeping.data_file import SweepFile
+from jointctl.tools.sweeping.grid import SweepPoint
+from jointctl.tools.sweeping.meter import JointModel, MeasuredPoint, SweepMeter
+from jointctl.tools.sweeping.options import SweepOptions, check_files, make_plan
+from jointctl.tools.sweeping.plan import PlanSettings, SweepMotion
+from jointctl.tools.sweeping.statistics import Tolerance
+from jointctl.tools.sweeping.sweep_page import write_sweep_page
 
 RELATIVE_TOLERANCE = 0.01
 OVERHEAD_S = 3.0  # commissioning, enabling, release

@@ -7,21 +7,21 @@ from typing import Any
 
 import numpy as np
 
-from drivers.errors import ConfigurationError, DataError
-from tools.configuration.conversions import friction_constants
-from tools.configuration.load import load_config
-from tools.drawing import png, require_png
-from tools.identification.figures import fit_figure
-from tools.identification.foreign_table import ForeignFormat
-from tools.identification.friction_data import FrictionData, relative_figures
-from tools.identification.friction_file import read_friction_data
-from tools.identification.models import Branch
-from tools.identification.plausibility import check_data
-from tools.identification.report import error_table
-from tools.identification.result import DIRECTIONS
-from tools.output import Output
-from tools.verbs.identify import joint_limits
-from tools.written_file import replace_file
+from jointctl.drivers.errors import ConfigurationError, DataError
+from jointctl.tools.configuration.conversions import friction_constants
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.drawing import png, require_png
+from jointctl.tools.identification.figures import fit_figure
+from jointctl.tools.identification.foreign_table import ForeignFormat
+from jointctl.tools.identification.friction_data import FrictionData, relative_figures
+from jointctl.tools.identification.friction_file import read_friction_data
+from jointctl.tools.identification.models import Branch
+from jointctl.tools.identification.plausibility import check_data
+from jointctl.tools.identification.report import error_table
+from jointctl.tools.identification.result import DIRECTIONS
+from jointctl.tools.output import Output
+from jointctl.tools.verbs.identify import joint_limits
+from jointctl.tools.written_file import replace_file
 
 
 def _branch(record: Any) -> Branch:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from firmware_py.states import ControllerKind
-from tools.analysis.linear_loop import LoopSettings
+from jointctl.firmware_py.states import ControllerKind
+from jointctl.tools.analysis.linear_loop import LoopSettings
 
 _HALF = (0.05, 0.03, 0.01, 0.008, 0.004, 0.001, 0.0005)
 CENTRES = tuple((c, c) for c in (*_HALF, 0.0, *(-c for c in _HALF)))

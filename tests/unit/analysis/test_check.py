@@ -9,16 +9,16 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import ConfigurationError, DataError, JointctlError, MarginError, UsageError
-from firmware_py.states import ControllerKind
-from tools.analysis.linear_loop import CONTROLLERS
-from tools.analysis.loop_settings import loop_settings, not_modelled
-from tools.analysis.margin_gate import require_margin
-from tools.analysis.margins import phase_margin_deg
-from tools.configuration.config import Config
-from tools.configuration.load import load_config, shipped_config
-from tools.output import Output
-from tools.verbs.check import check
+from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MarginError, UsageError
+from jointctl.firmware_py.states import ControllerKind
+from jointctl.tools.analysis.linear_loop import CONTROLLERS
+from jointctl.tools.analysis.loop_settings import loop_settings, not_modelled
+from jointctl.tools.analysis.margin_gate import require_margin
+from jointctl.tools.analysis.margins import phase_margin_deg
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.output import Output
+from jointctl.tools.verbs.check import check
 
 
 @pytest.fixture(autouse=True)

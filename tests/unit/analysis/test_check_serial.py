@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import ConfigurationError, MarginError
-from tools.configuration.elmo_settings import refuse_serial
-from tools.configuration.load import load_config, shipped_config
-from tools.experiments.controllers import from_file
-from tools.output import Output
-from tools.verbs.check import check
-from tools.verbs.fault_campaign import fault_campaign
+from jointctl.drivers.errors import ConfigurationError, MarginError
+from jointctl.tools.configuration.elmo_settings import refuse_serial
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.experiments.controllers import from_file
+from jointctl.tools.output import Output
+from jointctl.tools.verbs.check import check
+from jointctl.tools.verbs.fault_campaign import fault_campaign
 
 SHIPPED = shipped_config("elmo_serial").read_text()
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from jointctl.tools.analysis.advice import longest_delay_s, remedies
+from jointctl.tools.analysis.linear_loop import linear_loop
+from jointctl.tools.analysis.margins import delay_margin_s, margins, phase_margin_deg, theory
 from tests.unit.analysis.specified_loops import ANY_KIND, Q1800, Q2500
-from tools.analysis.advice import longest_delay_s, remedies
-from tools.analysis.linear_loop import linear_loop
-from tools.analysis.margins import delay_margin_s, margins, phase_margin_deg, theory
 
 # --- section 4 of the control specification ---
 

@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from firmware_py.states import ControllerKind
+from jointctl.firmware_py.states import ControllerKind
+from jointctl.tools.analysis.linear_loop import linear_loop
+from jointctl.tools.analysis.margins import delay_margin_s, margins, phase_margin_deg
+from jointctl.tools.analysis.sampled_joint import sampled_joint
 from tests.unit.analysis.specified_loops import ANY_KIND, Q1800, Q2500
-from tools.analysis.linear_loop import linear_loop
-from tools.analysis.margins import delay_margin_s, margins, phase_margin_deg
-from tools.analysis.sampled_joint import sampled_joint
 
 
 @settings(max_examples=30, deadline=None)

@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from firmware_py.computed_torque import reset_law, step_law
-from firmware_py.kernel import JIT_DISABLED, kernel
-from firmware_py.lyapunov import solve_lyapunov_p
-from firmware_py.records import LawConstants, LawState, Reference, VelocityConstants, VelocityState
-from firmware_py.schema import new
-from firmware_py.velocity import low_pass_gain, step_velocity
-from hil.plant.joint import plant, step_plant
-from hil.plant.records import DELAY_SLOTS
+from jointctl.firmware_py.computed_torque import reset_law, step_law
+from jointctl.firmware_py.kernel import JIT_DISABLED, kernel
+from jointctl.firmware_py.lyapunov import solve_lyapunov_p
+from jointctl.firmware_py.records import LawConstants, LawState, Reference, VelocityConstants, VelocityState
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.velocity import low_pass_gain, step_velocity
+from jointctl.hil.plant.joint import plant, step_plant
+from jointctl.hil.plant.records import DELAY_SLOTS
+from jointctl.tools.analysis.linear_loop import LoopSettings
+from jointctl.tools.analysis.margins import delay_margin_s
 from tests.unit.analysis.specified_loops import ANY_KIND, Q2500
-from tools.analysis.linear_loop import LoopSettings
-from tools.analysis.margins import delay_margin_s
 
 # plain Python is three hundred times slower: coarser and shorter there
 SUBSTEP_s = 100e-6 if JIT_DISABLED else 25e-6

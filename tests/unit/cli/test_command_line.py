@@ -15,11 +15,11 @@ from typing import Any
 import pytest
 import typer
 
-from drivers.errors import ConfigurationError, DataError
-from tools.cli.main import EPILOG, app
-from tools.configuration.load import SHIPPED_FOLDER, load_config
-from tools.output import Output
-from tools.verbs.new import new
+from jointctl.drivers.errors import ConfigurationError, DataError
+from jointctl.tools.cli.main import EPILOG, app
+from jointctl.tools.configuration.load import SHIPPED_FOLDER, load_config
+from jointctl.tools.output import Output
+from jointctl.tools.verbs.new import new
 
 QUIET = Output(stdout=io.StringIO(), stderr=io.StringIO())
 MARKUP = re.compile(r"\[[a-z#/@]")  # what the help's formatter takes for a style, and swallows
@@ -50,7 +50,9 @@ def test_the_help_names_every_shipped_configuration() -> None:
 
 
 def test_the_version_is_that_of_the_package() -> None:
-    shown = subprocess.run([sys.executable, "-m", "tools.cli", "--version"], capture_output=True, text=True, check=True)
+    shown = subprocess.run(
+        [sys.executable, "-m", "jointctl.tools.cli", "--version"], capture_output=True, text=True, check=True
+    )
     assert shown.stdout == f"jointctl {version('jointctl')}\n"
 
 

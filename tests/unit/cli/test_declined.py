@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from drivers.drive import CommissioningReport, DriveIdentity
-from drivers.errors import DECLINED
-from tools.configuration.load import load_config, shipped_config
-from tools.output import Output
-from tools.sweeping.options import SweepOptions
-from tools.verbs import doctor_motion, run, sweep
+from jointctl.drivers.drive import CommissioningReport, DriveIdentity
+from jointctl.drivers.errors import DECLINED
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.output import Output
+from jointctl.tools.sweeping.options import SweepOptions
+from jointctl.tools.verbs import doctor_motion, run, sweep
 
 REPORT = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.0, 0.1, 1e-5)
 

@@ -11,12 +11,12 @@ import time
 
 import pytest
 
-from tools.simulation.workers import interrupts_left_to_the_parent
+from jointctl.tools.simulation.workers import interrupts_left_to_the_parent
 
 STUCK = (
     "import sys, time, types; sys.modules['typer'] = slow = types.ModuleType('typer');"
     "slow.__getattr__ = lambda name: (print('importing', flush=True), time.sleep(60));"
-    "import tools.cli.start as start; start.main()"
+    "import jointctl.tools.cli.start as start; start.main()"
 )
 
 
@@ -33,7 +33,7 @@ def test_during_the_imports_it_ends_without_a_traceback(number: signal.Signals, 
 def test_where_it_is_ignored_it_stays_ignored() -> None:
     code = (
         "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); import sys; sys.argv = ['jointctl', '--version'];"
-        "import tools.cli.start as start, atexit;"
+        "import jointctl.tools.cli.start as start, atexit;"
         "atexit.register(lambda: print(signal.getsignal(signal.SIGINT).name)); start.main()"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60.0)
@@ -43,7 +43,7 @@ def test_where_it_is_ignored_it_stays_ignored() -> None:
 def test_a_verb_has_the_handler_of_python_again() -> None:
     code = (
         "import sys, signal; sys.argv = ['jointctl', '--version'];"
-        "import tools.cli.start as start, atexit;"
+        "import jointctl.tools.cli.start as start, atexit;"
         "atexit.register(lambda: print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)); start.main()"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drivers import errors
+from jointctl.drivers import errors
 
 
 @pytest.mark.parametrize(

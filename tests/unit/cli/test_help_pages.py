@@ -9,8 +9,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from tools.cli.main import app
-from tools.experiments.paper_identification import synthetic_sweep
+from jointctl.tools.cli.main import app
+from jointctl.tools.experiments.paper_identification import synthetic_sweep
 
 
 def pages() -> list[tuple[str, ...]]:

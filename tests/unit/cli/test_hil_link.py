@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import DataError
-from tools.verbs import hil_serial
-from tools.verbs.hil_serial import _make_link, _target
+from jointctl.drivers.errors import DataError
+from jointctl.tools.verbs import hil_serial
+from jointctl.tools.verbs.hil_serial import _make_link, _target
 
 
 @pytest.fixture

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from tools.configuration.load import load_config, shipped_config
-from tools.output import Output
-from tools.verbs import hil, hil_serial
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.output import Output
+from jointctl.tools.verbs import hil, hil_serial
 
 
 @pytest.mark.parametrize("serial", [False, True])

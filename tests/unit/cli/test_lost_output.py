@@ -12,10 +12,10 @@ from typing import IO
 
 import pytest
 
-from drivers.errors import DataError
-from tools.output import Output
+from jointctl.drivers.errors import DataError
+from jointctl.tools.output import Output
 
-JOINTCTL = f"{sys.executable} -m tools.cli"
+JOINTCTL = f"{sys.executable} -m jointctl.tools.cli"
 
 
 def shell(line: str) -> subprocess.CompletedProcess[str]:
@@ -74,7 +74,7 @@ def test_one_that_never_catches_up_does_not_change_the_exit_code(unbuffered: str
     code = (
         "import os, sys; os.set_blocking(2, False); sys.argv = ['jointctl', 'check', 'absent.toml']\n"
         "try:\n    os.write(2, bytes(1 << 20))\nexcept BlockingIOError:\n    pass\n"
-        "import tools.cli.start as start; start.main()"
+        "import jointctl.tools.cli.start as start; start.main()"
     )
     reading, writing = os.pipe()
     try:
@@ -106,7 +106,7 @@ def test_a_verb_works_with_closed_streams(closed: str) -> None:
 
 def test_nothing_else_gets_the_number_of_a_closed_stream() -> None:
     code = (
-        "from tools.cli.standard_streams import occupy_standard_streams as occupy; occupy(); import os;"
+        "from jointctl.tools.cli.standard_streams import occupy_standard_streams as occupy; occupy(); import os;"
         "assert all(os.readlink(f'/proc/self/fd/{n}') == os.devnull and os.get_inheritable(n) for n in (0, 1, 2));"
         "print('no harm')"
     )

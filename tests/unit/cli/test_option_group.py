@@ -9,7 +9,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from tools.cli.option_group import grouped
+from jointctl.tools.cli.option_group import grouped
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from tools.narrow_table import width_of
-from tools.output import Output
-from tools.verbs.info import info_table
+from jointctl.tools.narrow_table import width_of
+from jointctl.tools.output import Output
+from jointctl.tools.verbs.info import info_table
 
 NUMBERS = ["0.0949 .. 0.358", "0.00788 .. 0.0162", "0.00762 .. 0.00944"]
 PATH = "runs/a_joint_with_a_long_name-20260101-120000.mcap"

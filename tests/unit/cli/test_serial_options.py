@@ -9,10 +9,10 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from drivers.errors import ConfigurationError
-from tools.cli.main import app
-from tools.cli.options import BusOptions, CanOptions, loaded
-from tools.configuration.elmo_settings import elmo_section
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.cli.main import app
+from jointctl.tools.cli.options import BusOptions, CanOptions, loaded
+from jointctl.tools.configuration.elmo_settings import elmo_section
 
 SERIAL, CAN = Path("elmo_serial"), Path("virtual")
 
@@ -71,6 +71,6 @@ def test_its_twin_serves(monkeypatch: pytest.MonkeyPatch) -> None:
         served.append((config.drive.kind, options))
         return 0
 
-    monkeypatch.setattr("tools.verbs.hil_serial.hil_serial", stand_in)
+    monkeypatch.setattr("jointctl.tools.verbs.hil_serial.hil_serial", stand_in)
     assert CliRunner().invoke(app, ["hil", "--serial", "--link", "tty"]).exit_code == 0
     assert served == [("elmo_serial", {"link": "tty", "ready_fd": None})]

@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
-from tools.cli import main as main_module
-from tools.cli.start import FREE_DESCRIPTORS
-from tools.cli.unexpected_end import TRACEBACK
+from jointctl.tools.cli import main as main_module
+from jointctl.tools.cli.start import FREE_DESCRIPTORS
+from jointctl.tools.cli.unexpected_end import TRACEBACK
 
-COMMAND = [sys.executable, "-P", "-m", "tools.cli"]
+COMMAND = [sys.executable, "-P", "-m", "jointctl.tools.cli"]
 
 
 def ended(*arguments: str, files: int | None = None, **options: Any) -> subprocess.CompletedProcess[str]:
@@ -110,7 +110,7 @@ def test_every_reader_refuses_what_is_no_file(tmp_path: Path, arguments: tuple[s
     (tmp_path / "zero.eds").symlink_to("/dev/zero")
     if ".eds" in arguments[-1]:
         name = name.removeprefix("/dev/")
-    done = ended(*(word.format(name) for word in arguments), cwd=tmp_path, env={**os.environ, "PYTHONPATH": _ROOT})
+    done = ended(*(word.format(name) for word in arguments), cwd=tmp_path)
     assert done.returncode in (2, 3, 8), done.stderr
     assert "Traceback" not in done.stderr
     assert len([line for line in done.stderr.splitlines() if line.startswith("error: ")]) == 1

@@ -10,7 +10,7 @@ import pytest
 
 
 def run(*words: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "tools.cli", *words]
+    command = [sys.executable, "-m", "jointctl.tools.cli", *words]
     return subprocess.run(command, capture_output=True, text=True, timeout=60.0, env={**os.environ, "COLUMNS": "40"})
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import DataError
-from tools.experiments.study_settings import StudySettings
-from tools.output import Output
-from tools.verbs import study as study_module
-from tools.written_file import prepare_folder, prepare_target, replace_file, require_target
+from jointctl.drivers.errors import DataError
+from jointctl.tools.experiments.study_settings import StudySettings
+from jointctl.tools.output import Output
+from jointctl.tools.verbs import study as study_module
+from jointctl.tools.written_file import prepare_folder, prepare_target, replace_file, require_target
 
 
 def test_a_folder_is_made_and_one_that_is_there_stays(tmp_path: Path) -> None:

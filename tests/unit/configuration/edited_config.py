@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import ConfigurationError
-from tools.configuration.config import Config
-from tools.configuration.load import load_config, shipped_config
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config, shipped_config
 
 VIRTUAL = shipped_config("virtual").read_text()
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import ConfigurationError
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.configuration.load import load_config, shipped_config, with_bus_overrides
 from tests.unit.configuration.edited_config import VIRTUAL, load, problems, replaced
-from tools.configuration.load import load_config, shipped_config, with_bus_overrides
 
 UNIT = " (the unit is part of the key)"
 

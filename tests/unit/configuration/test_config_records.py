@@ -8,24 +8,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.errors import ConfigurationError
-from firmware_py import friction as friction_model
-from firmware_py.motion_peak import approach_peak, approach_start, peak_of
-from firmware_py.records import VelocityState
-from firmware_py.schema import new
-from firmware_py.states import ControllerKind, FeedForward, TrajectoryKind
-from firmware_py.velocity import step_velocity
-from tests.unit.configuration.edited_config import VIRTUAL, load, problems
-from tools.configuration.checks import trajectory_extremes
-from tools.configuration.conversions import (
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py import friction as friction_model
+from jointctl.firmware_py.motion_peak import approach_peak, approach_start, peak_of
+from jointctl.firmware_py.records import VelocityState
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import ControllerKind, FeedForward, TrajectoryKind
+from jointctl.firmware_py.velocity import step_velocity
+from jointctl.tools.configuration.checks import trajectory_extremes
+from jointctl.tools.configuration.conversions import (
     friction_constants,
     joint_rad_per_count,
     torque_constant_NmpA,
     velocity_of_a_count_radps,
 )
-from tools.configuration.load import load_config, shipped_config
-from tools.configuration.plant_settings import plant_settings
-from tools.configuration.records import approach_s, axis_constants, trajectory_table
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.plant_settings import plant_settings
+from jointctl.tools.configuration.records import approach_s, axis_constants, trajectory_table
+from tests.unit.configuration.edited_config import VIRTUAL, load, problems
 
 
 def test_records_of_the_paper() -> None:
@@ -124,7 +124,7 @@ def test_shipped_checks_agree_with_the_trajectory_itself(tmp_path: Path) -> None
 
 
 def test_plant_settings_are_accepted_by_the_plant() -> None:
-    from hil.plant.joint import plant
+    from jointctl.hil.plant.joint import plant
 
     settings = plant_settings(load_config(shipped_config("virtual")))
     constants, state = plant(**settings)

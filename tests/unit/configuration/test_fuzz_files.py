@@ -11,17 +11,17 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivers.errors import ConfigurationError, DataError
-from firmware_py.records import LogRecord
-from firmware_py.schema import dtype_of
-from firmware_py.trajectory_table import table_from_csv
-from hil.canopen.object_dictionary import ObjectDictionary
+from jointctl.drivers.errors import ConfigurationError, DataError
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import dtype_of
+from jointctl.firmware_py.trajectory_table import table_from_csv
+from jointctl.hil.canopen.object_dictionary import ObjectDictionary
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.identification.friction_file import read_friction_data
+from jointctl.tools.recording.run_log import RunLogWriter
+from jointctl.tools.recording.run_log_reader import read_run_log
 from tests.places import CONFIGS
-from tools.configuration.config import Config
-from tools.configuration.load import load_config
-from tools.identification.friction_file import read_friction_data
-from tools.recording.run_log import RunLogWriter
-from tools.recording.run_log_reader import read_run_log
 
 TOML = (CONFIGS / "virtual.toml").read_text()
 EDS = (CONFIGS / "virtual_joint.eds").read_text()
@@ -95,7 +95,7 @@ def test_any_value_for_any_key(tmp_path: Path, number: int, value: str) -> None:
 @slow
 @given(content=st.one_of(damaged(EDS), st.binary(max_size=200)))
 def test_any_eds_text_for_the_virtual_drive(tmp_path: Path, content: bytes) -> None:
-    from tools.simulation.virtual_joint import new_device
+    from jointctl.tools.simulation.virtual_joint import new_device
 
     path = tmp_path / "virtual_joint.eds"
     path.write_bytes(content)
@@ -116,7 +116,7 @@ def test_any_eds_text_for_the_driver(tmp_path: Path, content: bytes, settings_of
 
     import can
 
-    from drivers.canopen.drive import CanopenDrive
+    from jointctl.drivers.canopen.drive import CanopenDrive
 
     path = tmp_path / "drive.eds"
     path.write_bytes(content)

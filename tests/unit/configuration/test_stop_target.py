@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import ConfigurationError
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.configuration.stop_target import CanTarget, GivenTarget, SerialTarget, stop_target
 from tests.places import CONFIGS
-from tools.configuration.load import load_config
-from tools.configuration.stop_target import CanTarget, GivenTarget, SerialTarget, stop_target
 
 NOTHING: dict[str, str] = {}
 

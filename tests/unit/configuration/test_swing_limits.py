@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.records import axis_constants
 from tests.unit.configuration.edited_config import load, problems
-from tools.configuration.load import load_config, shipped_config
-from tools.configuration.records import axis_constants
 
 ANCHOR = "standstill_radps = .*"
 

@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.errors import ConfigurationError, DataError
-from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
-from tools.configuration.config import Config
-from tools.configuration.load import load_config, shipped_config
-from tools.identification.foreign_table import ForeignFormat
-from tools.identification.options import Options
-from tools.identification.pso import SwarmSettings
-from tools.identification.sweep_file import SWEEP_COLUMNS, sidecar_contents
-from tools.output import Output
-from tools.sweeping.checks import constant_remarks, recorded_limits, refuse_constants
-from tools.sweeping.options import SweepOptions
-from tools.verbs.identify import identify
-from tools.verbs.sweep import sweep
+from jointctl.drivers.errors import ConfigurationError, DataError
+from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.identification.foreign_table import ForeignFormat
+from jointctl.tools.identification.options import Options
+from jointctl.tools.identification.pso import SwarmSettings
+from jointctl.tools.identification.sweep_file import SWEEP_COLUMNS, sidecar_contents
+from jointctl.tools.output import Output
+from jointctl.tools.sweeping.checks import constant_remarks, recorded_limits, refuse_constants
+from jointctl.tools.sweeping.options import SweepOptions
+from jointctl.tools.verbs.identify import identify
+from jointctl.tools.verbs.sweep import sweep
 
 QUICK = Options(folds=3, swarm=SwarmSettings(particles=40, iterations=40))
 CONFIG = shipped_config("sweep_virtual")

@@ -15,13 +15,13 @@ from typing import IO
 
 import pytest
 
-from drivers.bus_lock import NAMES, BusLock, Holder, lock_name, wait_for_answers
-from drivers.errors import BusError
-from tools.running.stop_call import StopCall
+from jointctl.drivers.bus_lock import NAMES, BusLock, Holder, lock_name, wait_for_answers
+from jointctl.drivers.errors import BusError
+from jointctl.tools.running.stop_call import StopCall
 
 LOCK = """
 import sys, time
-from drivers.bus_lock import BusLock
+from jointctl.drivers.bus_lock import BusLock
 lock = BusLock(*sys.argv[1:])
 print("mine", flush=True)
 time.sleep(60)
@@ -121,7 +121,7 @@ def test_no_process_that_was_started_keeps_the_lock(channel: str) -> None:
 
 HOLD = """
 import signal, sys, time
-from drivers.bus_lock import BusLock
+from jointctl.drivers.bus_lock import BusLock
 stopped = []
 lock = BusLock(*sys.argv[1:], on_stop=lambda: stopped.append(1))
 print("mine", flush=True)

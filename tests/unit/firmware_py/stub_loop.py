@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numba.core import types
 
-from firmware_py.kernel import exported, record_array_type
-from firmware_py.libc import monotonic_ns, store_release
-from firmware_py.realtime import HISTOGRAM_BINS, WORDS, Word, run_loop
-from firmware_py.records import AxisState, Command, LogRecord, Sample
-from firmware_py.schema import dtype_of, new
-from firmware_py.sequence import reset_axis
-from firmware_py.states import DriveRequest, DriveState, FeedForward
+from jointctl.firmware_py.kernel import exported, record_array_type
+from jointctl.firmware_py.libc import monotonic_ns, store_release
+from jointctl.firmware_py.realtime import HISTOGRAM_BINS, WORDS, Word, run_loop
+from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
+from jointctl.firmware_py.schema import dtype_of, new
+from jointctl.firmware_py.sequence import reset_axis
+from jointctl.firmware_py.states import DriveRequest, DriveState, FeedForward
 
 PERIOD_ns = 1_000_000
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.friction import (
+from jointctl.firmware_py.friction import (
     DEGREE,
     branch_constants,
     branch_torque_Nm,
@@ -18,7 +18,7 @@ from firmware_py.friction import (
     friction_motor_torque_Nm,
     paper_friction,
 )
-from firmware_py.states import ZeroSpeedRule
+from jointctl.firmware_py.states import ZeroSpeedRule
 
 JUST = 1e-9
 # joint speed [deg/s], motor torque [Nm]

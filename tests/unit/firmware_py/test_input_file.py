@@ -11,7 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from firmware_py.input_file import DEEPEST, number_from, open_input, parse_json, parse_toml, read_input, require_input
+from jointctl.firmware_py.input_file import (
+    DEEPEST,
+    number_from,
+    open_input,
+    parse_json,
+    parse_toml,
+    read_input,
+    require_input,
+)
 
 SMALL = 10
 

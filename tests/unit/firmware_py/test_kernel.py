@@ -17,8 +17,8 @@ import pytest
 from numba.core import caching
 from numba.core.errors import NumbaError
 
-from firmware_py import kernel as kernel_module
-from firmware_py.kernel import kernel, source_hash
+from jointctl.firmware_py import kernel as kernel_module
+from jointctl.firmware_py.kernel import kernel, source_hash
 from tests.places import ROOT
 
 PACKAGES = ("firmware_py", "drivers", "hil", "tools")
@@ -125,7 +125,7 @@ def test_an_edited_verb_does_not(copy_of_sources: Path) -> None:
 def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-c", code],
-        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+        env={**os.environ, **environment},
         capture_output=True,
         text=True,
         check=False,
@@ -134,7 +134,7 @@ def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str
 
 
 def test_the_cache_is_where_the_variable_says(tmp_path: Path) -> None:
-    code = "from firmware_py.kernel import cache_folder, kernel; print(cache_folder)"
+    code = "from jointctl.firmware_py.kernel import cache_folder, kernel; print(cache_folder)"
     result = run_python(code, JOINTCTL_CACHE_DIR=str(tmp_path))
     assert result.stdout.strip() == str(tmp_path / f"numba-{source_hash()}")
     assert Path(result.stdout.strip()).is_dir()
@@ -143,8 +143,9 @@ def test_the_cache_is_where_the_variable_says(tmp_path: Path) -> None:
 def test_without_a_folder_it_still_works(tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("")
-    code = "from firmware_py.lyapunov import eigenvalues; from firmware_py.kernel import cache_folder, kernel\n"
-    code += "from firmware_py.safety import within\nprint(cache_folder, within(1.0, 0.0, 2.0))"
+    code = "from jointctl.firmware_py.lyapunov import eigenvalues\n"
+    code += "from jointctl.firmware_py.kernel import cache_folder, kernel\n"
+    code += "from jointctl.firmware_py.safety import within\nprint(cache_folder, within(1.0, 0.0, 2.0))"
     assert run_python(code, JOINTCTL_CACHE_DIR=str(blocked)).stdout.split() == ["None", "True"]
 
 
@@ -203,7 +204,6 @@ def test_the_same_tests_pass_in_plain_python_and_cover_the_safety_code(tmp_path:
     environment = {
         **os.environ,
         "NUMBA_DISABLE_JIT": "1",
-        "PYTHONPATH": str(ROOT),
         "COVERAGE_FILE": str(tmp_path / ".coverage"),
     }
     result = subprocess.run(

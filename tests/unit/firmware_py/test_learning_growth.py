@@ -7,15 +7,15 @@ from typing import Any
 
 import pytest
 
-from firmware_py.iterative_learning import (
+from jointctl.firmware_py.iterative_learning import (
     GROWN,
     learning_torque_Nm,
     record_correction,
     reset_learning,
     watch_learning,
 )
-from firmware_py.records import LearningConstants, LearningState
-from firmware_py.schema import new
+from jointctl.firmware_py.records import LearningConstants, LearningState
+from jointctl.firmware_py.schema import new
 
 BINS = 40
 CYCLE_s = 1e-3

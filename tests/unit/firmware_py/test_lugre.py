@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.friction import friction_motor_torque_Nm, paper_friction
-from firmware_py.lugre import step_lugre
-from firmware_py.records import LuGreConstants
-from firmware_py.schema import new
+from jointctl.firmware_py.friction import friction_motor_torque_Nm, paper_friction
+from jointctl.firmware_py.lugre import step_lugre
+from jointctl.firmware_py.records import LuGreConstants
+from jointctl.firmware_py.schema import new
 
 RATIO = 121.0
 

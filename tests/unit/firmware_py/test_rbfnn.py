@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.lyapunov import solve_lyapunov_p
-from firmware_py.rbfnn import adapt_network, network_torque_Nm, reset_network
-from firmware_py.records import NEURONS, NetworkConstants, NetworkState
-from firmware_py.schema import new
+from jointctl.firmware_py.lyapunov import solve_lyapunov_p
+from jointctl.firmware_py.rbfnn import adapt_network, network_torque_Nm, reset_network
+from jointctl.firmware_py.records import NEURONS, NetworkConstants, NetworkState
+from jointctl.firmware_py.schema import new
 
 INERTIA_kgm2 = 2.1
 HALF = (0.05, 0.03, 0.01, 0.008, 0.004, 0.001, 0.0005)

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.realtime import HISTOGRAM_BINS, Histogram, Word, count
-from firmware_py.states import AxisPhase, DriveRequest, Fault
-from tests.places import ROOT
+from jointctl.firmware_py.realtime import HISTOGRAM_BINS, Histogram, Word, count
+from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault
 from tests.unit.firmware_py.stub_loop import (
     BUSY_CYCLE,
     CYCLE,
@@ -190,10 +189,10 @@ ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
 ours.setblocking(False)
 
 def driver_run(cycles):
-    from drivers.canopen.exchange import exchange_memory, receive, send
-    from drivers.canopen.port import CanopenPort
-    from firmware_py.schema import new
-    from firmware_py.realtime import run_loop
+    from jointctl.drivers.canopen.exchange import exchange_memory, receive, send
+    from jointctl.drivers.canopen.port import CanopenPort
+    from jointctl.firmware_py.schema import new
+    from jointctl.firmware_py.realtime import run_loop
     global port, frames, scratch
     if "port" not in globals():
         port = new(CanopenPort)
@@ -230,7 +229,7 @@ def test_no_memory_is_allocated_per_cycle(exchange: str) -> None:
     """Neither when the loop begins nor afterwards, tracking with every part of the law."""
     result = subprocess.run(
         [sys.executable, "-c", _COUNT_ALLOCATIONS, exchange],
-        env={**os.environ, "NUMBA_NRT_STATS": "1", "PYTHONPATH": str(ROOT)},
+        env={**os.environ, "NUMBA_NRT_STATS": "1"},
         capture_output=True,
         text=True,
         check=False,

@@ -8,9 +8,9 @@ from typing import Annotated
 import numpy as np
 import pytest
 
-from firmware_py import records
-from firmware_py.kernel import kernel
-from firmware_py.schema import array_of, dtype_of, f8, i1, i2, i4, i8, new, record, u1, u2, u4, view
+from jointctl.firmware_py import records
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.schema import array_of, dtype_of, f8, i1, i2, i4, i8, new, record, u1, u2, u4, view
 
 
 @record

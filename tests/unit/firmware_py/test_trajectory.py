@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_py.records import Reference, TrajectoryConstants
-from firmware_py.schema import new
-from firmware_py.states import TrajectoryKind
-from firmware_py.trajectory import approach_at, brake_step, plan_approach, reference_at, trapezoid_times_s
+from jointctl.firmware_py.records import Reference, TrajectoryConstants
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import TrajectoryKind
+from jointctl.firmware_py.trajectory import approach_at, brake_step, plan_approach, reference_at, trapezoid_times_s
 
 NO_TABLE = np.zeros((0, 5))
 PAPER_SINE = {"amplitude_rad": 0.35, "omega_radps": 0.2 * math.pi}

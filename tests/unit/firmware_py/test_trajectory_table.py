@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_py.motion_peak import approach_duration_s, approach_peak, peak_of
-from firmware_py.records import Reference, TrajectoryConstants
-from firmware_py.schema import new
-from firmware_py.states import TrajectoryKind
-from firmware_py.trajectory import reference_at
-from firmware_py.trajectory_table import ends_meet, table_from_csv
+from jointctl.firmware_py.motion_peak import approach_duration_s, approach_peak, peak_of
+from jointctl.firmware_py.records import Reference, TrajectoryConstants
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import TrajectoryKind
+from jointctl.firmware_py.trajectory import reference_at
+from jointctl.firmware_py.trajectory_table import ends_meet, table_from_csv
 
 POINTS = "time_s,position_rad\n10,0.0\n11,0.5\n12.5,-0.25\n13,0.0\n"
 
@@ -223,10 +223,10 @@ def test_an_approach_to_a_start_above_the_limits_is_refused():
 _BOTH_WAYS = """
 import json
 import numpy as np
-from firmware_py.records import Reference, TrajectoryConstants
-from firmware_py.schema import new
-from firmware_py.trajectory import approach_at, brake_step, plan_approach, reference_at
-from hil.plant.joint import R1, encoder_counts, plant, step_plant
+from jointctl.firmware_py.records import Reference, TrajectoryConstants
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.trajectory import approach_at, brake_step, plan_approach, reference_at
+from jointctl.hil.plant.joint import R1, encoder_counts, plant, step_plant
 
 c, r, a, out = new(TrajectoryConstants)[0], new(Reference)[0], np.zeros(6), []
 c.repeats, c.start_rad, c.target_rad, c.move_s, c.dwell_s = 1, 0.1, 0.9, 1.3, 0.2
@@ -260,7 +260,7 @@ print(json.dumps(out))
 def test_compiled_and_plain_python_agree():
     results = []
     for disabled in ("0", "1"):
-        environment = {**os.environ, "NUMBA_DISABLE_JIT": disabled, "PYTHONPATH": os.pathsep.join(sys.path)}
+        environment = {**os.environ, "NUMBA_DISABLE_JIT": disabled}
         done = subprocess.run(
             [sys.executable, "-W", "error", "-c", _BOTH_WAYS],
             env=environment,

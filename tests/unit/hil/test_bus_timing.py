@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.can.bit_timing import worst_frame_bits
-from firmware_py.schema import new
-from hil.bus.frames import WireFrame
-from hil.bus.timing import (
+from jointctl.drivers.can.bit_timing import worst_frame_bits
+from jointctl.firmware_py.schema import new
+from jointctl.hil.bus.frames import WireFrame
+from jointctl.hil.bus.timing import (
     EXTENDED,
     NO_NODE,
     REMOTE,

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 import serial
 
-from hil.elmo.commands import ElmoDeviceSettings
-from hil.elmo.device import ElmoDevice
-from hil.elmo.interpreter import ElmoInterpreter
-from hil.elmo.motor import MF_OVERSPEED, MF_POSITION_LIMIT, MF_SPEED_ERROR
-from hil.plant.joint import plant
+from jointctl.hil.elmo.commands import ElmoDeviceSettings
+from jointctl.hil.elmo.device import ElmoDevice
+from jointctl.hil.elmo.interpreter import ElmoInterpreter
+from jointctl.hil.elmo.motor import MF_OVERSPEED, MF_POSITION_LIMIT, MF_SPEED_ERROR
+from jointctl.hil.plant.joint import plant
 
 COUNTS = 2**19
 PER_RAD = COUNTS / 6.283185307179586

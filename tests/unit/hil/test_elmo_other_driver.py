@@ -15,10 +15,10 @@ from collections.abc import Iterator
 import pytest
 import serial
 
-from hil.elmo.commands import ElmoDeviceSettings
-from hil.elmo.device import ElmoDevice
-from hil.elmo.interpreter import ElmoInterpreter
-from hil.plant.joint import plant
+from jointctl.hil.elmo.commands import ElmoDeviceSettings
+from jointctl.hil.elmo.device import ElmoDevice
+from jointctl.hil.elmo.interpreter import ElmoInterpreter
+from jointctl.hil.plant.joint import plant
 
 COUNTS = 2**19
 SERVO_ON, MOVING = 1 << 4, 0x3 << 14

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import socket
 import stat
 import subprocess
@@ -14,12 +13,11 @@ from pathlib import Path
 
 import pytest
 
-import hil
-from firmware_py.schema import new
-from hil.bus.forwarding import MAX_CLIENTS
-from hil.bus.frames import WireFrame
-from hil.bus.timing import frame_bits
-from hil.bus.virtual_bus import VirtualBusError, VirtualBusHub, default_socket_path, remove_dead_sockets
+from jointctl.firmware_py.schema import new
+from jointctl.hil.bus.forwarding import MAX_CLIENTS
+from jointctl.hil.bus.frames import WireFrame
+from jointctl.hil.bus.timing import frame_bits
+from jointctl.hil.bus.virtual_bus import VirtualBusError, VirtualBusHub, default_socket_path, remove_dead_sockets
 
 FRAME = b"\x81\x01\x00\x00\x08\x00\x00\x00" + bytes(range(8))
 
@@ -82,12 +80,11 @@ def test_a_live_hub_is_a_clear_error_and_stays_alive(path: Path) -> None:
 
 def test_the_socket_of_a_killed_hub_is_replaced(path: Path) -> None:
     program = (
-        "import sys; from hil.bus.virtual_bus import VirtualBusHub as Hub; "
+        "import sys; from jointctl.hil.bus.virtual_bus import VirtualBusHub as Hub; "
         "Hub(sys.argv[1]).start(); print('up', flush=True); input()"
     )
-    environment = {**os.environ, "PYTHONPATH": str(Path(hil.__file__).parent.parent)}
     with subprocess.Popen(
-        [sys.executable, "-c", program, str(path)], env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [sys.executable, "-c", program, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == b"up\n"

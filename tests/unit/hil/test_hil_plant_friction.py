@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from firmware_py.friction import friction_motor_torque_Nm, paper_friction
-from firmware_py.kernel import kernel
-from hil.plant.joint import FrictionKind, plant, step_plant
+from jointctl.firmware_py.friction import friction_motor_torque_Nm, paper_friction
+from jointctl.firmware_py.kernel import kernel
+from jointctl.hil.plant.joint import FrictionKind, plant, step_plant
 
 RATIO = 121.0
 DEGREE = math.pi / 180.0

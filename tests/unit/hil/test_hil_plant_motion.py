@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from firmware_py.kernel import kernel
-from hil.plant.joint import R1, FrictionKind, plant, step_plant
+from jointctl.firmware_py.kernel import kernel
+from jointctl.hil.plant.joint import R1, FrictionKind, plant, step_plant
 
 STEP_s = 50e-6
 

@@ -10,18 +10,18 @@ import can
 import numpy as np
 import pytest
 
-from drivers.canopen.exchange import accept, begin, end, exchange_memory
-from drivers.canopen.settings import CanopenSettings
-from firmware_py.records import AxisState, Command, LogRecord, Sample
-from firmware_py.schema import new
-from firmware_py.sequence import reset_axis
-from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault
-from hil.bus.frames import FrameQueue
-from hil.lockstep import RECEIVED_SLOT, RPDO_SLOT, run_lockstep
-from tools.configuration.load import load_config, shipped_config
-from tools.configuration.records import axis_constants
-from tools.simulation.lockstep import DirectBus, LockstepJoint
-from tools.simulation.virtual_joint import new_device
+from jointctl.drivers.canopen.exchange import accept, begin, end, exchange_memory
+from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.sequence import reset_axis
+from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault
+from jointctl.hil.bus.frames import FrameQueue
+from jointctl.hil.lockstep import RECEIVED_SLOT, RPDO_SLOT, run_lockstep
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.simulation.lockstep import DirectBus, LockstepJoint
+from jointctl.tools.simulation.virtual_joint import new_device
 
 PERIOD_ns = 1_000_000
 
@@ -64,7 +64,7 @@ def lockstep(device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, vir
 
 
 def test_slots_agree_with_the_driver() -> None:
-    from drivers.canopen import port
+    from jointctl.drivers.canopen import port
 
     assert (RPDO_SLOT, RECEIVED_SLOT) == (port.SLOT_RPDO, port.SLOT_RECEIVED)
 

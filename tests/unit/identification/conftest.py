@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from tools.configuration.load import shipped_config
+from jointctl.tools.configuration.load import shipped_config
 
 
 @pytest.fixture

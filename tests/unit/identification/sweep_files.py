@@ -5,9 +5,9 @@ import json
 
 import numpy as np
 
-from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
-from tools.identification.sweep_file import SWEEP_COLUMNS, sidecar_contents
-from tools.output import Output
+from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
+from jointctl.tools.identification.sweep_file import SWEEP_COLUMNS, sidecar_contents
+from jointctl.tools.output import Output
 
 
 def write_sweep(path, seed=0, factor=1.0, noise_Nm=0.0046):

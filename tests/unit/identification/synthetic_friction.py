@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
-from tools.identification.friction_data import FrictionData
-from tools.identification.options import Options
-from tools.identification.plausibility import JointLimits
-from tools.identification.pso import SwarmSettings
+from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
+from jointctl.tools.identification.friction_data import FrictionData
+from jointctl.tools.identification.options import Options
+from jointctl.tools.identification.plausibility import JointLimits
+from jointctl.tools.identification.pso import SwarmSettings
 
 NOISE_Nm = 0.0046
 UNIFORM_radps = np.linspace(-200.0, 200.0, 225) * DEGREE

@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from drivers.errors import DataError, UsageError
-from tools.identification.foreign_table import ForeignFormat
-from tools.identification.friction_file import read_friction_data
-from tools.identification.sweep_file import SWEEP_COLUMNS, sidecar_contents
+from jointctl.drivers.errors import DataError, UsageError
+from jointctl.tools.identification.foreign_table import ForeignFormat
+from jointctl.tools.identification.friction_file import read_friction_data
+from jointctl.tools.identification.sweep_file import SWEEP_COLUMNS, sidecar_contents
 
 RATIO, CONSTANT = 121.0, 0.1
 SPEEDS = np.concatenate([-np.arange(1, 14)[::-1], np.arange(1, 14)]) * 0.2

@@ -5,13 +5,13 @@ import threading
 import numpy as np
 import pytest
 
-from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
-from tools.identification import pso, swarm_kernels
-from tools.identification.models import FORMS, basis, legendre, legendre_to_powers
-from tools.identification.polish import beta_from_vector, polish, vector_limits
-from tools.identification.pso import SwarmSettings, run_swarm, run_swarms
-from tools.identification.swarm_kernels import squared_error, stage_table, suffix_sums
-from tools.identification.variable_projection import knee_candidates, make_problem, project, solve_linear
+from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
+from jointctl.tools.identification import pso, swarm_kernels
+from jointctl.tools.identification.models import FORMS, basis, legendre, legendre_to_powers
+from jointctl.tools.identification.polish import beta_from_vector, polish, vector_limits
+from jointctl.tools.identification.pso import SwarmSettings, run_swarm, run_swarms
+from jointctl.tools.identification.swarm_kernels import squared_error, stage_table, suffix_sums
+from jointctl.tools.identification.variable_projection import knee_candidates, make_problem, project, solve_linear
 
 NOISE_Nm = 0.0046
 VELOCITY_radps = np.linspace(-200.0, 200.0, 225) * DEGREE

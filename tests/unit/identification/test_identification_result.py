@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.errors import DataError, UsageError
-from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
+from jointctl.drivers.errors import DataError, UsageError
+from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
+from jointctl.tools.identification.identification import identify_friction
+from jointctl.tools.identification.models import FORMS, MIN_PER_STAGE
+from jointctl.tools.identification.options import Options
+from jointctl.tools.identification.pso import SwarmSettings
 from tests.unit.identification.synthetic_friction import LIMITS, QUICK, DENSE_radps, NOISE_Nm, UNIFORM_radps, paper_data
-from tools.identification.identification import identify_friction
-from tools.identification.models import FORMS, MIN_PER_STAGE
-from tools.identification.options import Options
-from tools.identification.pso import SwarmSettings
 
 
 @pytest.mark.parametrize("velocity_radps", [UNIFORM_radps, DENSE_radps])

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
+from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
+from jointctl.tools.identification.intervals import uncertainty
+from jointctl.tools.identification.models import FORMS
+from jointctl.tools.identification.selection import choose, find_outliers, fold_numbers, held_out_rss
+from jointctl.tools.identification.variable_projection import make_problem, project
 from tests.unit.identification.synthetic_friction import DENSE_radps, NOISE_Nm, UNIFORM_radps, paper_data
-from tools.identification.intervals import uncertainty
-from tools.identification.models import FORMS
-from tools.identification.selection import choose, find_outliers, fold_numbers, held_out_rss
-from tools.identification.variable_projection import make_problem, project
 
 
 def one_direction(seed, form="multi-stage", velocity_radps=UNIFORM_radps, **settings):

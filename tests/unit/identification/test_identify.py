@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 import tomlkit
 
-from drivers.errors import ConfigurationError, DataError
-from firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
+from jointctl.drivers.errors import ConfigurationError, DataError
+from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
+from jointctl.tools.configuration.conversions import friction_constants
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.identification import identification
+from jointctl.tools.identification.foreign_table import ForeignFormat
+from jointctl.tools.identification.friction_section import MARK, snippet, with_section
+from jointctl.tools.identification.options import Options
+from jointctl.tools.identification.pso import SwarmSettings
+from jointctl.tools.verbs.identify import identify
 from tests.page_figures import foreign_colours, svgs
 from tests.unit.identification.sweep_files import output, write_sweep
-from tools.configuration.conversions import friction_constants
-from tools.configuration.load import load_config
-from tools.identification import identification
-from tools.identification.foreign_table import ForeignFormat
-from tools.identification.friction_section import MARK, snippet, with_section
-from tools.identification.options import Options
-from tools.identification.pso import SwarmSettings
-from tools.verbs.identify import identify
 
 QUICK = Options(folds=3, swarm=SwarmSettings(particles=80, iterations=120))
 VALUES = {
@@ -186,7 +186,9 @@ def test_nothing_is_written_after_an_error(sweep, config, spoil, error):
 
 
 def test_a_result_that_the_configuration_refuses_leaves_it_alone(sweep, config, monkeypatch):
-    monkeypatch.setattr("tools.verbs.identify.section_values", lambda p, n: {**VALUES, "velocity_unit": "furlong"})
+    monkeypatch.setattr(
+        "jointctl.tools.verbs.identify.section_values", lambda p, n: {**VALUES, "velocity_unit": "furlong"}
+    )
     before = contents(sweep.parent)
     with pytest.raises(ConfigurationError, match=r"joint.toml: friction.velocity_unit \(=furlong\)") as caught:
         identify(sweep, output(), into=config, options=QUICK)

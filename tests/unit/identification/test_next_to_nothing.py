@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.errors import DataError
+from jointctl.drivers.errors import DataError
+from jointctl.tools.identification.friction_data import LEAST_SHARE, relative_errors, relative_figures
+from jointctl.tools.identification.friction_file import read_friction_data
+from jointctl.tools.output import Output
+from jointctl.tools.verbs.validate import validate
 from tests.places import CONFIGS
-from tools.identification.friction_data import LEAST_SHARE, relative_errors, relative_figures
-from tools.identification.friction_file import read_friction_data
-from tools.output import Output
-from tools.verbs.validate import validate
 
 SPEEDS = [0.1 * k for k in range(-10, 11) if k]
 

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.errors import DataError
+from jointctl.drivers.errors import DataError
+from jointctl.tools.identification.identification import identify_friction
+from jointctl.tools.identification.models import FORMS
+from jointctl.tools.identification.plausibility import JointLimits, check_branches, check_data
+from jointctl.tools.identification.variable_projection import make_problem, project
 from tests.unit.identification.synthetic_friction import LIMITS, QUICK, paper_data
-from tools.identification.identification import identify_friction
-from tools.identification.models import FORMS
-from tools.identification.plausibility import JointLimits, check_branches, check_data
-from tools.identification.variable_projection import make_problem, project
 
 
 def test_one_point_far_off_on_the_wrong_side_is_told_as_such():

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import DataError, UsageError
+from jointctl.drivers.errors import DataError, UsageError
+from jointctl.tools.verbs.validate import validate
 from tests.unit.identification.sweep_files import output, write_sweep
-from tools.verbs.validate import validate
 
 
 def test_validate_reports_the_error_on_other_data(config, tmp_path):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from firmware_py.states import Fault
-from tools.configuration.config import Config
-from tools.inspection.findings import Finding
-from tools.motion_check.plan import CheckPlan, check_constants, config_of_check, make_plan, motion_table
-from tools.motion_check.verdict import motion_findings
-from tools.running.events.fault_text import fault_text
-from tools.simulation.lockstep import LockstepJoint
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.inspection.findings import Finding
+from jointctl.tools.motion_check.plan import CheckPlan, check_constants, config_of_check, make_plan, motion_table
+from jointctl.tools.motion_check.verdict import motion_findings
+from jointctl.tools.running.events.fault_text import fault_text
+from jointctl.tools.simulation.lockstep import LockstepJoint
 
 
 def check_in_lockstep(joint: LockstepJoint, config: Config, plan: CheckPlan, faults: Any = None) -> tuple[Any, Fault]:

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from jointctl.tools.verbs.params import dump
 from tests.unit.inspection.parameter_verbs import output, subject, writes
-from tools.verbs.params import dump
 
 
 @pytest.fixture

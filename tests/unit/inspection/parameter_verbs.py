@@ -7,11 +7,11 @@ import struct
 from pathlib import Path
 from typing import Any
 
-from tools.configuration.load import shipped_config
-from tools.inspection.parameters import ParameterSet, read_parameters
-from tools.inspection.sdo_reading import SdoReader
-from tools.inspection.subject import Subject, canopen_network
-from tools.output import Output
+from jointctl.tools.configuration.load import shipped_config
+from jointctl.tools.inspection.parameters import ParameterSet, read_parameters
+from jointctl.tools.inspection.sdo_reading import SdoReader
+from jointctl.tools.inspection.subject import Subject, canopen_network
+from jointctl.tools.output import Output
 
 EDS = shipped_config("virtual").with_name("virtual_joint.eds")
 

@@ -13,13 +13,12 @@ import can
 import numpy as np
 import pytest
 
-from drivers.can.link_state import parse_link
-from drivers.errors import BusError
-from tests.unit.inspection.system_files import write
-from tools.configuration.config import Config
-from tools.configuration.load import load_config, shipped_config
-from tools.inspection import bus_health, computer
-from tools.inspection.bus_health import (
+from jointctl.drivers.can.link_state import parse_link
+from jointctl.drivers.errors import BusError
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.inspection import bus_health, computer
+from jointctl.tools.inspection.bus_health import (
     SDO_READS,
     adapters,
     bus_budget,
@@ -27,10 +26,11 @@ from tools.inspection.bus_health import (
     interface_state,
     sdo_round_trips_us,
 )
-from tools.inspection.findings import NOTE, OK, PROBLEM, Finding
-from tools.output import Output
-from tools.verbs import doctor as doctor_module
-from tools.verbs.doctor import doctor, findings
+from jointctl.tools.inspection.findings import NOTE, OK, PROBLEM, Finding
+from jointctl.tools.output import Output
+from jointctl.tools.verbs import doctor as doctor_module
+from jointctl.tools.verbs.doctor import doctor, findings
+from tests.unit.inspection.system_files import write
 
 
 @pytest.fixture(scope="module")

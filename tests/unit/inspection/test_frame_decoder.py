@@ -9,12 +9,12 @@ from typing import Any
 import can
 import pytest
 
-from drivers.errors import ConfigurationError
-from tools.configuration.load import shipped_config
-from tools.inspection import drive_words
-from tools.inspection.frame_decoder import Decoded, FrameDecoder
-from tools.inspection.objects import Objects, read_dictionary
-from tools.inspection.pdo_maps import PdoMaps
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.configuration.load import shipped_config
+from jointctl.tools.inspection import drive_words
+from jointctl.tools.inspection.frame_decoder import Decoded, FrameDecoder
+from jointctl.tools.inspection.objects import Objects, read_dictionary
+from jointctl.tools.inspection.pdo_maps import PdoMaps
 
 EDS = shipped_config("virtual").with_name("virtual_joint.eds")
 

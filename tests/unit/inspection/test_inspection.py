@@ -12,20 +12,20 @@ from typing import Any
 import can
 import pytest
 
-from drivers.canopen.standard_objects import standard_type
-from drivers.errors import ConfigurationError, NoDeviceError
-from tools.configuration.load import load_config, shipped_config
-from tools.inspection import node_scan
-from tools.inspection.drive_info import drive_info, pdo_maps
-from tools.inspection.node_scan import Ear
-from tools.inspection.objects import Objects
-from tools.inspection.sdo_reading import SdoReader
-from tools.inspection.standard_objects import standard_variable
-from tools.inspection.subject import Subject, canopen_network, subject_of_config, subject_of_flags
-from tools.output import Output
-from tools.verbs.info import info
-from tools.verbs.monitor import Selection, monitor, selection_of
-from tools.verbs.scan import scan
+from jointctl.drivers.canopen.standard_objects import standard_type
+from jointctl.drivers.errors import ConfigurationError, NoDeviceError
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.inspection import node_scan
+from jointctl.tools.inspection.drive_info import drive_info, pdo_maps
+from jointctl.tools.inspection.node_scan import Ear
+from jointctl.tools.inspection.objects import Objects
+from jointctl.tools.inspection.sdo_reading import SdoReader
+from jointctl.tools.inspection.standard_objects import standard_variable
+from jointctl.tools.inspection.subject import Subject, canopen_network, subject_of_config, subject_of_flags
+from jointctl.tools.output import Output
+from jointctl.tools.verbs.info import info
+from jointctl.tools.verbs.monitor import Selection, monitor, selection_of
+from jointctl.tools.verbs.scan import scan
 
 SDO_READ = (0x40, 0x60, 0x70)  # initiate upload, upload segment with either toggle bit
 

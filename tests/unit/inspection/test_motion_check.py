@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase, Fault
-from hil.faults.kinds import FaultConstants, FaultKind
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.hil.faults.kinds import FaultConstants, FaultKind
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.inspection.findings import OK, PROBLEM
+from jointctl.tools.motion_check.plan import check_constants, config_of_check, make_plan, motion_table
+from jointctl.tools.motion_check.verdict import motion_findings
+from jointctl.tools.running.events.fault_text import fault_text
+from jointctl.tools.simulation.lockstep import LockstepJoint
 from tests.two_encoders import NODE, config_with
 from tests.unit.inspection.checked_joint import checked
-from tools.configuration.config import Config
-from tools.inspection.findings import OK, PROBLEM
-from tools.motion_check.plan import check_constants, config_of_check, make_plan, motion_table
-from tools.motion_check.verdict import motion_findings
-from tools.running.events.fault_text import fault_text
-from tools.simulation.lockstep import LockstepJoint
 
 WAYS = ("positive", "negative")
 

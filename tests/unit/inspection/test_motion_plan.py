@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.drive import CommissioningReport, DriveIdentity
-from drivers.errors import ConfigurationError
+from jointctl.drivers.drive import CommissioningReport, DriveIdentity
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.configuration.conversions import velocity_of_a_count_radps
+from jointctl.tools.configuration.records import APPROACH_MIN_S
+from jointctl.tools.inspection.drive_scale import judged
+from jointctl.tools.inspection.findings import NOTE, OK
+from jointctl.tools.motion_check.plan import check_constants, config_of_check, make_plan, motion_table, require_room
+from jointctl.tools.verbs.doctor_motion import check_envelope
 from tests.two_encoders import config_with
-from tools.configuration.conversions import velocity_of_a_count_radps
-from tools.configuration.records import APPROACH_MIN_S
-from tools.inspection.drive_scale import judged
-from tools.inspection.findings import NOTE, OK
-from tools.motion_check.plan import check_constants, config_of_check, make_plan, motion_table, require_room
-from tools.verbs.doctor_motion import check_envelope
 
 
 def test_the_torque_is_that_of_friction_and_gravity_and_never_above_the_limit(tmp_path: Path) -> None:

@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.records import LogRecord
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase, Fault
-from hil.faults.kinds import FaultConstants, FaultKind
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.hil.faults.kinds import FaultConstants, FaultKind
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.inspection.findings import PROBLEM
+from jointctl.tools.motion_check.plan import make_plan
+from jointctl.tools.motion_check.verdict import motion_findings
+from jointctl.tools.output import Output
+from jointctl.tools.running.events.fault_text import fault_text
+from jointctl.tools.verbs import doctor_motion as doctor_motion_module
 from tests.two_encoders import NODE, config_with
 from tests.unit.inspection.checked_joint import checked
-from tools.configuration.config import Config
-from tools.inspection.findings import PROBLEM
-from tools.motion_check.plan import make_plan
-from tools.motion_check.verdict import motion_findings
-from tools.output import Output
-from tools.running.events.fault_text import fault_text
-from tools.verbs import doctor_motion as doctor_motion_module
 
 WAY_FAULTS = (Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR, Fault.POSITION_LIMIT, Fault.POSITION_DISAGREEMENT)
 

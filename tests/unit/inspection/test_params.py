@@ -8,14 +8,14 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import ConfigurationError, DataError
+from jointctl.drivers.errors import ConfigurationError, DataError
+from jointctl.tools.configuration.load import shipped_config
+from jointctl.tools.inspection.objects import Objects, Place, read_dictionary
+from jointctl.tools.inspection.parameter_file import is_parameter_file, load_parameters, toml_text, write_dcf
+from jointctl.tools.inspection.parameters import COMMANDS, ParameterSet, differences, is_parameter, variables
+from jointctl.tools.inspection.subject import Subject
+from jointctl.tools.verbs.params import DIFFERENT, diff, dump
 from tests.unit.inspection.parameter_verbs import EDS, change, output, read, subject
-from tools.configuration.load import shipped_config
-from tools.inspection.objects import Objects, Place, read_dictionary
-from tools.inspection.parameter_file import is_parameter_file, load_parameters, toml_text, write_dcf
-from tools.inspection.parameters import COMMANDS, ParameterSet, differences, is_parameter, variables
-from tools.inspection.subject import Subject
-from tools.verbs.params import DIFFERENT, diff, dump
 
 
 class TestDump:

@@ -11,10 +11,10 @@ from typing import Any
 import can
 import pytest
 
-from drivers.errors import DECLINED, BusError, ConfigurationError, DeviceError, UsageError
+from jointctl.drivers.errors import DECLINED, BusError, ConfigurationError, DeviceError, UsageError
+from jointctl.tools.inspection.objects import Place
+from jointctl.tools.verbs.params import place_index, restore_file
 from tests.unit.inspection.parameter_verbs import change, output, read, subject, writes
-from tools.inspection.objects import Place
-from tools.verbs.params import place_index, restore_file
 
 
 def restored(device: Any, file: Path, **how: Any) -> int:

@@ -12,7 +12,7 @@ from functools import cache
 
 import pytest
 
-from firmware_py.states import Fault
+from jointctl.firmware_py.states import Fault
 from tests.places import ROOT
 from tests.unit.project.twin_places import CAN, FAULTS, SERIAL
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import importlib.metadata
 import os
 import subprocess
 import sys
@@ -11,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_py.kernel import TOOLS_WITH_KERNELS
+from jointctl.firmware_py.kernel import TOOLS_WITH_KERNELS
 from tests.places import ROOT
 
 TOP_LEVEL = ("firmware_py", "drivers", "hil", "tools", "configs")
@@ -30,19 +29,31 @@ def imported(path: Path) -> set[str]:
     return found
 
 
-@pytest.mark.parametrize("name", TOP_LEVEL)
-def test_nobody_else_owns_our_top_level_names(name: str) -> None:
-    owners = set(importlib.metadata.packages_distributions().get(name, ()))
-    assert owners <= {"jointctl"}, f"{name} also comes from {owners - {'jointctl'}}"
-    assert (ROOT / name / "__init__.py").is_file()
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_module_is_imported_by_the_name_of_its_folder(path: Path) -> None:
+    """One name for each module: `jointctl.drivers`, never `drivers`."""
+    wrong = {name for name in imported(path) if name.split(".")[0] in TOP_LEVEL}
+    assert not wrong, f"{path.relative_to(ROOT)} imports {wrong}"
 
 
-def test_layers_are_kept() -> None:
+def test_the_links_are_the_folders_under_their_installed_names() -> None:
+    links = ROOT / ".typed" / "jointctl"
+    if not links.exists():
+        pytest.skip("this is no clone: an sdist has no links")
+    assert {link.name for link in links.iterdir()} == {"__init__.py", *TOP_LEVEL}
+    for name in TOP_LEVEL:
+        assert (links / name).resolve() == ROOT / name
+
+
+def test_layers_are_kept(tmp_path: Path) -> None:
     """The contract of pyproject.toml, by import-linter."""
     command = [sys.executable, "-c", "from importlinter.cli import lint_imports_command as run; run()", "--no-cache"]
-    done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)}
-    )
+    (tmp_path / "jointctl").mkdir()  # it finds only packages in folders of their names
+    (tmp_path / "jointctl" / "__init__.py").touch()
+    for name in TOP_LEVEL:
+        (tmp_path / "jointctl" / name).symlink_to(ROOT / name)
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "4 kept, 0 broken" in done.stdout
 
@@ -57,7 +68,7 @@ def test_layers_are_kept() -> None:
 )
 def test_layers_hold_for_imports_inside_functions_too(package: str, forbidden: tuple[str, ...]) -> None:
     for path in (ROOT / package).rglob("*.py"):
-        wrong = {name for name in imported(path) if name.split(".")[0] in forbidden}
+        wrong = {name for name in imported(path) if name.split(".")[:2] in [["jointctl", layer] for layer in forbidden]}
         assert not wrong, f"{path.relative_to(ROOT)} imports {wrong}"
 
 
@@ -66,7 +77,11 @@ def test_kernels_are_only_where_the_cache_key_looks() -> None:
     for path in (ROOT / "tools").rglob("*.py"):
         if path.relative_to(ROOT / "tools").parts[0] in TOOLS_WITH_KERNELS:
             continue
-        decorators = {"firmware_py.kernel.kernel", "firmware_py.kernel.inlined", "firmware_py.kernel.exported"}
+        decorators = {
+            "jointctl.firmware_py.kernel.kernel",
+            "jointctl.firmware_py.kernel.inlined",
+            "jointctl.firmware_py.kernel.exported",
+        }
         wrong = {name for name in imported(path) if name in decorators or name.split(".")[0] == "numba"}
         assert not wrong, f"{path.relative_to(ROOT)} imports {wrong}: kernels live in {TOOLS_WITH_KERNELS}"
 
@@ -76,9 +91,9 @@ def test_kernels_do_not_depend_on_what_the_cache_key_leaves_out(name: str) -> No
     """A constant that a kernel takes from a module outside the key could change without a recompilation."""
     for path in (ROOT / "tools" / name).rglob("*.py"):
         names = imported(path)
-        if "firmware_py.kernel.kernel" in names:
-            inside = tuple(f"tools.{package}" for package in TOOLS_WITH_KERNELS)
-            wrong = {n for n in names if n.startswith("tools.") and not n.startswith(inside)}
+        if "jointctl.firmware_py.kernel.kernel" in names:
+            inside = tuple(f"jointctl.tools.{package}" for package in TOOLS_WITH_KERNELS)
+            wrong = {n for n in names if n.startswith("jointctl.tools.") and not n.startswith(inside)}
             assert not wrong, f"{path.relative_to(ROOT)} has kernels and imports {wrong}"
 
 

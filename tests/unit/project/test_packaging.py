@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import ConfigurationError
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.configuration.load import SHIPPED_FOLDER, load_config
 from tests.places import ROOT
-from tools.configuration.load import SHIPPED_FOLDER, load_config
 
 TOP = ("firmware_py", "drivers", "hil", "tools", "configs")
 NOT_SHIPPED = ("__pycache__",)
@@ -23,8 +23,9 @@ def project() -> dict[str, Any]:
 
 
 def test_every_package_of_the_tree_is_installed(project: dict[str, Any]) -> None:
-    folders = {str(file.parent.relative_to(ROOT)) for top in TOP for file in (ROOT / top).rglob("__init__.py")}
-    assert {name.replace(".", "/") for name in project["tool"]["setuptools"]["packages"]} == folders
+    folders = {file.parent.relative_to(ROOT).parts for top in TOP for file in (ROOT / top).rglob("__init__.py")}
+    names = {".".join(("jointctl", *parts)) for parts in folders} | {"jointctl"}
+    assert set(project["tool"]["setuptools"]["packages"]) == names
 
 
 def test_every_module_is_in_a_package() -> None:
@@ -39,7 +40,7 @@ def test_every_file_that_is_no_module_is_package_data(project: dict[str, Any]) -
         for file in (ROOT / top).rglob("*"):
             if file.is_dir() or file.suffix in (".py", ".pyc") or set(NOT_SHIPPED) & set(file.parts):
                 continue
-            package = ".".join(file.parent.relative_to(ROOT).parts)
+            package = ".".join(("jointctl", *file.parent.relative_to(ROOT).parts))
             assert any(fnmatch.fnmatch(file.name, pattern) for pattern in patterns.get(package, ())), file
 
 

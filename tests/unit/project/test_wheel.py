@@ -21,6 +21,7 @@ import pytest
 from tests.places import ROOT
 
 TOP = ("firmware_py", "drivers", "hil", "tools", "configs")
+FACE = "interface"
 READ = (
     "docs",
     "tests",
@@ -55,7 +56,7 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if int(version("setuptools").split(".")[0]) < 77:
         pytest.skip("the build needs setuptools 77 or newer")
     tree, out = tmp_path_factory.mktemp("tree"), tmp_path_factory.mktemp("sdist")
-    for name in files(ROOT, *TOP, *READ):
+    for name in files(ROOT, *TOP, FACE, *READ):
         (tree / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, tree / name)
     with tarfile.open(build("sdist", tree, out)) as archive:
@@ -78,12 +79,15 @@ def metadata(unpacked: Path) -> Message:
 
 
 def test_the_sdist_holds_every_file_to_build_test_and_read(sources: Path) -> None:
-    assert files(sources, *TOP, *READ) == files(ROOT, *TOP, *READ)
+    assert files(sources, *TOP, FACE, *READ) == files(ROOT, *TOP, FACE, *READ)
 
 
 def test_a_wheel_holds_every_file_of_the_tree_and_nothing_else(unpacked: Path) -> None:
-    assert files(unpacked, *TOP) == files(ROOT, *TOP)
-    assert {folder.name for folder in unpacked.iterdir() if folder.suffix != ".dist-info"} == set(TOP)
+    package = unpacked / "jointctl"
+    assert files(package, *TOP) == files(ROOT, *TOP)
+    assert files(package, *(path.name for path in package.glob("*.py"))) == files(ROOT / FACE, "__init__.py")
+    assert {folder.name for folder in package.iterdir() if folder.is_dir()} == set(TOP)
+    assert {folder.name for folder in unpacked.iterdir() if folder.suffix != ".dist-info"} == {"jointctl"}
 
 
 def test_what_the_metadata_say(unpacked: Path, metadata: Message) -> None:
@@ -106,7 +110,22 @@ def test_it_works_from_an_empty_folder(unpacked: Path, tmp_path: Path) -> None:
             timeout=120.0,
         ).stdout  # fmt: skip
 
-    shown = python("-c", "import tools, configs; print(tools.__file__, configs.__file__)")
+    shown = python("-c", "import jointctl.tools, jointctl.configs as c; print(jointctl.tools.__file__, c.__file__)")
     assert shown.count(str(unpacked)) == 2
-    python("-m", "tools.cli", "new", "joint.toml", "--from", "virtual")
+    python("-m", "jointctl.tools.cli", "new", "joint.toml", "--from", "virtual")
     assert (tmp_path / "joint.toml").read_text() == (ROOT / "configs" / "virtual.toml").read_text()
+
+
+def test_folders_of_the_user_with_our_names_do_not_matter(unpacked: Path, tmp_path: Path) -> None:
+    """As under ROS 2, whose PYTHONPATH has many a `tools`."""
+    for name in TOP:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("raise ImportError('the wrong package')\n")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(unpacked)])}
+    command = [sys.executable, "-P", "-m", "jointctl.tools.cli", "--version"]
+    shown = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, env=environment)
+    assert shown.stdout.startswith("jointctl ")
+    environment["PYTHONPATH"] = str(unpacked)
+    code = f"import importlib.util as u; print([name for name in {TOP} if u.find_spec(name)])"
+    shown = subprocess.run([*command[:2], "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert shown.stdout.strip() == "[]"

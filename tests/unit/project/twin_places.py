@@ -6,7 +6,7 @@ the case that trips, or the one just inside the limit.
 
 from __future__ import annotations
 
-from firmware_py.states import Fault
+from jointctl.firmware_py.states import Fault
 
 SAFETY = "unit/firmware_py/axis/test_safety.py::"
 EDGES = "unit/firmware_py/axis/test_surroundings_edges.py::"

@@ -12,12 +12,12 @@ from mcap.reader import make_reader
 from mcap.records import ChunkIndex
 from mcap.writer import Writer
 
-from firmware_py.records import LogRecord
-from firmware_py.schema import new
-from tools.recording import chunk_indexes, run_log
-from tools.recording.chunk_indexes import ChunkIndexes
-from tools.recording.run_log import INFO, RunLogWriter
-from tools.recording.run_log_reader import read_run_log
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import new
+from jointctl.tools.recording import chunk_indexes, run_log
+from jointctl.tools.recording.chunk_indexes import ChunkIndexes
+from jointctl.tools.recording.run_log import INFO, RunLogWriter
+from jointctl.tools.recording.run_log_reader import read_run_log
 
 FIRST = ChunkIndex(
     chunk_length=170_000,

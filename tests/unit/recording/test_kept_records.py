@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from firmware_py.records import LogRecord
-from firmware_py.schema import dtype_of
-from tools.recording.kept_records import KeptRecords
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import dtype_of
+from jointctl.tools.recording.kept_records import KeptRecords
 
 
 def numbered(first: int, count: int) -> np.ndarray:

@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from drivers.errors import DataError, MotionFault
-from firmware_py.records import LogRecord
-from firmware_py.schema import dtype_of
-from tools.configuration.config import Config
-from tools.output import Output
-from tools.recording.log_folder import log_path, remove_oldest, require_room
-from tools.running.permission.readiness import prepare_log, require_ready
+from jointctl.drivers.errors import DataError, MotionFault
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import dtype_of
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.output import Output
+from jointctl.tools.recording.log_folder import log_path, remove_oldest, require_room
+from jointctl.tools.running.permission.readiness import prepare_log, require_ready
 
 
 class Usage(NamedTuple):

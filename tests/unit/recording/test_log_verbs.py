@@ -16,19 +16,19 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from drivers.errors import ConfigurationError, DataError
-from firmware_py.records import LogRecord
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase, DriveState
-from tools.output import Output
-from tools.recording.can_log import frame_array, frame_times_ns
-from tools.recording.log_export import FORMATS, columns, parquet_bytes
-from tools.recording.log_facts import missing_records
-from tools.recording.run_log import THINNING, RunLogWriter
-from tools.recording.run_log_reader import read_run_log
-from tools.running.events.event_finder import EventFinder
-from tools.running.watch.frame_recorder import FrameRecorder, recording
-from tools.verbs.log import log_export, log_info, log_plot
+from jointctl.drivers.errors import ConfigurationError, DataError
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, DriveState
+from jointctl.tools.output import Output
+from jointctl.tools.recording.can_log import frame_array, frame_times_ns
+from jointctl.tools.recording.log_export import FORMATS, columns, parquet_bytes
+from jointctl.tools.recording.log_facts import missing_records
+from jointctl.tools.recording.run_log import THINNING, RunLogWriter
+from jointctl.tools.recording.run_log_reader import read_run_log
+from jointctl.tools.running.events.event_finder import EventFinder
+from jointctl.tools.running.watch.frame_recorder import FrameRecorder, recording
+from jointctl.tools.verbs.log import log_export, log_info, log_plot
 
 START_NS = 5_000_000_000
 WORDS = {DriveState.OFF: 0x0250, DriveState.STARTING: 0x0233, DriveState.ENABLED: 0x1237, DriveState.FAULT: 0x0218}

@@ -12,12 +12,12 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from drivers.errors import DataError
-from firmware_py.records import LogRecord
-from firmware_py.schema import dtype_of, new
-from tools.recording.cdr import event_body, event_from_body, message_definition
-from tools.recording.run_log import ERROR, INFO, RunLogWriter
-from tools.recording.run_log_reader import read_run_log
+from jointctl.drivers.errors import DataError
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import dtype_of, new
+from jointctl.tools.recording.cdr import event_body, event_from_body, message_definition
+from jointctl.tools.recording.run_log import ERROR, INFO, RunLogWriter
+from jointctl.tools.recording.run_log_reader import read_run_log
 
 
 def sample_records(count: int, first: int = 0) -> np.recarray:
@@ -116,9 +116,9 @@ def test_a_killed_writer_leaves_what_was_flushed(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     script = (
         "import sys, time\n"
-        "from firmware_py.records import LogRecord\n"
-        "from firmware_py.schema import new\n"
-        "from tools.recording.run_log import RunLogWriter\n"
+        "from jointctl.firmware_py.records import LogRecord\n"
+        "from jointctl.firmware_py.schema import new\n"
+        "from jointctl.tools.recording.run_log import RunLogWriter\n"
         "log = RunLogWriter(sys.argv[1], {'versions': {'a': '1'}}, flush_s=0.0)\n"
         "records = new(LogRecord, 1000)\n"
         "records['cycle'] = range(1000)\n"

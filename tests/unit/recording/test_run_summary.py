@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from drivers.errors import DataError
-from firmware_py.realtime import HISTOGRAM_BINS, Histogram
-from firmware_py.states import Fault
+from jointctl.drivers.errors import DataError
+from jointctl.firmware_py.realtime import HISTOGRAM_BINS, Histogram
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.output import Output
+from jointctl.tools.recording.run_figure import drawn_indices, save_run_figure
+from jointctl.tools.recording.run_summary import _TIMES, histogram_times, summarise, summary_table
 from tests.run_records import run_records
-from tools.output import Output
-from tools.recording.run_figure import drawn_indices, save_run_figure
-from tools.recording.run_summary import _TIMES, histogram_times, summarise, summary_table
 
 
 def test_error_is_that_of_tracking_only() -> None:

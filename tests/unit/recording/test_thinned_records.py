@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.records import LogRecord
-from firmware_py.schema import dtype_of
-from tools.recording.thinned_records import ThinnedRecords
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import dtype_of
+from jointctl.tools.recording.thinned_records import ThinnedRecords
 
 
 def numbered(count: int) -> Any:

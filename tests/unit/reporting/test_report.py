@@ -12,19 +12,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.errors import DataError
-from firmware_py.records import LogRecord
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase, DriveState, Fault
-from tools.drawing import COLOURS
-from tools.output import Output
-from tools.recording.run_log import INFO, RunLogWriter
-from tools.recording.run_summary import summarise
-from tools.reporting.comparison import aligned, at_times
-from tools.reporting.figure import draw
-from tools.reporting.page import Details, Figure, Paragraph, Section, Table, page, write_page
-from tools.reporting.run_figures import binned, friction_points, run_figures
-from tools.verbs.report import MOST_LOGS, log_names, report, verdict
+from jointctl.drivers.errors import DataError
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, DriveState, Fault
+from jointctl.tools.drawing import COLOURS
+from jointctl.tools.output import Output
+from jointctl.tools.recording.run_log import INFO, RunLogWriter
+from jointctl.tools.recording.run_summary import summarise
+from jointctl.tools.reporting.comparison import aligned, at_times
+from jointctl.tools.reporting.figure import draw
+from jointctl.tools.reporting.page import Details, Figure, Paragraph, Section, Table, page, write_page
+from jointctl.tools.reporting.run_figures import binned, friction_points, run_figures
+from jointctl.tools.verbs.report import MOST_LOGS, log_names, report, verdict
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 

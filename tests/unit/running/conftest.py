@@ -7,13 +7,13 @@ from collections.abc import Iterator
 
 import pytest
 
-from firmware_py.sequence import reset_axis
-from firmware_py.states import TrajectoryKind
+from jointctl.firmware_py.sequence import reset_axis
+from jointctl.firmware_py.states import TrajectoryKind
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.running.loop import portable_loop
+from jointctl.tools.running.loop.shared_block import SharedBlock
 from tests.unit.running.portable_bus import LIMIT, OWN_HEARTBEAT, RPDO, SYNC, TPDO, Clock
-from tools.configuration.load import load_config, shipped_config
-from tools.configuration.records import axis_constants
-from tools.running.loop import portable_loop
-from tools.running.loop.shared_block import SharedBlock
 
 
 @pytest.fixture(scope="module")

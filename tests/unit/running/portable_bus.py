@@ -9,8 +9,8 @@ from typing import Any
 
 import can
 
-from tools.running.loop.portable_loop import run_portable_loop
-from tools.running.loop.shared_block import SharedBlock
+from jointctl.tools.running.loop.portable_loop import run_portable_loop
+from jointctl.tools.running.loop.shared_block import SharedBlock
 
 PERIOD_NS = 1_000_000
 RECEIVE_NS = 600_000

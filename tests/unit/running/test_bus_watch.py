@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from drivers.can.error_frames import BUS_OFF, CONTROLLER
-from drivers.can.link_state import LinkState
-from firmware_py.states import Fault
-from tools.configuration.config import Config
-from tools.configuration.load import load_config, shipped_config
-from tools.running.events.fault_text import fault_text
-from tools.running.watch import bus_watch as module
-from tools.running.watch.bus_watch import BusWatch, bus_watch
+from jointctl.drivers.can.error_frames import BUS_OFF, CONTROLLER
+from jointctl.drivers.can.link_state import LinkState
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.running.events.fault_text import fault_text
+from jointctl.tools.running.watch import bus_watch as module
+from jointctl.tools.running.watch.bus_watch import BusWatch, bus_watch
 
 TEXT = fault_text(Fault.STALE_SAMPLE, 5.0, 0)
 

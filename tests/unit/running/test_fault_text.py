@@ -6,10 +6,10 @@ import math
 
 import pytest
 
-from firmware_py.records import ENCODER_RESTARTED
-from firmware_py.states import Fault
-from tools.running.events.fault_text import FAULT_TEXTS, TWO_ENCODER_TEXTS, fault_text
-from tools.running.events.serial_fault_text import SERIAL_FAULT_TEXTS, serial_fault_text
+from jointctl.firmware_py.records import ENCODER_RESTARTED
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.running.events.fault_text import FAULT_TEXTS, TWO_ENCODER_TEXTS, fault_text
+from jointctl.tools.running.events.serial_fault_text import SERIAL_FAULT_TEXTS, serial_fault_text
 
 FAULTS = [fault for fault in Fault if fault is not Fault.NONE]
 WITH_STATUSWORD = (

@@ -8,15 +8,15 @@ from typing import Any
 
 import pytest
 
-from drivers.elmo.switch_off import SWITCH_OFF
-from drivers.errors import MotionFault
-from firmware_py.realtime import WORDS, Word
-from firmware_py.states import Fault, StopRequest
-from tools.running.guard import line_guard
-from tools.running.guard.guard_handle import SPARE_S
-from tools.running.guard.line_guard import LATE_S, OBEY_S, GuardOrder, LineGuard
-from tools.running.loop import loop_handle
-from tools.running.loop.loop_handle import OPENING_S, SILENT_S, LoopHandle
+from jointctl.drivers.elmo.switch_off import SWITCH_OFF
+from jointctl.drivers.errors import MotionFault
+from jointctl.firmware_py.realtime import WORDS, Word
+from jointctl.firmware_py.states import Fault, StopRequest
+from jointctl.tools.running.guard import line_guard
+from jointctl.tools.running.guard.guard_handle import SPARE_S
+from jointctl.tools.running.guard.line_guard import LATE_S, OBEY_S, GuardOrder, LineGuard
+from jointctl.tools.running.loop import loop_handle
+from jointctl.tools.running.loop.loop_handle import OPENING_S, SILENT_S, LoopHandle
 
 NOW_ns = 10_000_000_000_000
 MICROSECOND_ns = 1000

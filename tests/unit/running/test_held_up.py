@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.records import LogRecord
-from firmware_py.schema import new
-from firmware_py.states import Fault
-from tools.running.events.fault_text import FaultText
-from tools.running.events.held_up import held_up_text, longest_pause_s
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.running.events.fault_text import FaultText
+from jointctl.tools.running.events.held_up import held_up_text, longest_pause_s
 
 RATE_Hz = 125.0
 TEXT = FaultText("it happened", "the cable", "check it")

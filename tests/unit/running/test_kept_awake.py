@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.output import Output
+from jointctl.tools.running.guard import kept_awake as module
+from jointctl.tools.running.guard.kept_awake import kept_awake
 from tests.places import ROOT
-from tools.configuration.config import Config
-from tools.configuration.load import load_config, shipped_config
-from tools.output import Output
-from tools.running.guard import kept_awake as module
-from tools.running.guard.kept_awake import kept_awake
 
 GRANTS = """#!/bin/sh
 echo "asked $*" >>"$0.log"

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.drive import CommissioningReport, DriveIdentity
-from firmware_py.states import AxisPhase, DriveState, Fault
+from jointctl.drivers.drive import CommissioningReport, DriveIdentity
+from jointctl.firmware_py.states import AxisPhase, DriveState, Fault
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.configuration.records import MOVED_COUNTS, axis_constants
+from jointctl.tools.motion_check.plan import check_constants, config_of_check, make_plan, motion_table
+from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.sweeping.carry_out import middle_rad, sweep_constants
+from jointctl.tools.sweeping.grid import both_directions, ordered_points
+from jointctl.tools.sweeping.plan import PlanSettings, plan_motion, shifted
 from tests.places import CONFIGS
-from tools.configuration.config import Config
-from tools.configuration.load import load_config
-from tools.configuration.records import MOVED_COUNTS, axis_constants
-from tools.motion_check.plan import check_constants, config_of_check, make_plan, motion_table
-from tools.simulation.lockstep import LockstepJoint
-from tools.sweeping.carry_out import middle_rad, sweep_constants
-from tools.sweeping.grid import both_directions, ordered_points
-from tools.sweeping.plan import PlanSettings, plan_motion, shifted
 
 
 def config_with(folder: Path, **changes: str) -> Config:

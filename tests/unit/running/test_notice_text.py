@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
-from firmware_py.records import AxisState
-from firmware_py.schema import new
-from firmware_py.states import Fault, Notice
-from tools.recording.run_log import ERROR, WARNING
-from tools.running.events.fault_text import FAULT_TEXTS, fault_text
-from tools.running.events.notice_text import NoticeFinder
-from tools.running.run_watch import RunWatch
-from tools.running.stop_signals import StopSignals
+from jointctl.firmware_py.records import AxisState
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import Fault, Notice
+from jointctl.tools.recording.run_log import ERROR, WARNING
+from jointctl.tools.running.events.fault_text import FAULT_TEXTS, fault_text
+from jointctl.tools.running.events.notice_text import NoticeFinder
+from jointctl.tools.running.run_watch import RunWatch
+from jointctl.tools.running.stop_signals import StopSignals
 
 
 def state_with(notices: int) -> Any:

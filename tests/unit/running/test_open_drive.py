@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import BusError
+from jointctl.drivers.errors import BusError
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.output import Output
+from jointctl.tools.running.control import in_control
+from jointctl.tools.running.open_drive import open_drive
 from tests.places import CONFIGS
-from tools.configuration.load import load_config
-from tools.output import Output
-from tools.running.control import in_control
-from tools.running.open_drive import open_drive
 
 
 def test_a_bus_that_cannot_be_opened_can_be_tried_again(tmp_path: Path) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import can
 import pytest
 
-from firmware_py.sequence import reset_axis
-from firmware_py.states import AxisPhase, Fault
+from jointctl.firmware_py.sequence import reset_axis
+from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.tools.running.loop.shared_block import SharedBlock
 from tests.unit.running.portable_bus import LIMIT, RPDO, SYNC, TPDO, DriveBus, frame, run
-from tools.running.loop.shared_block import SharedBlock
 
 
 def lose_rpdo(bus: DriveBus, identifier: int, error: Exception) -> None:

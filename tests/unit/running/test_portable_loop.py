@@ -7,11 +7,11 @@ from typing import Any
 import can
 import pytest
 
-from firmware_py.realtime import Histogram, Word
-from firmware_py.states import AxisPhase, Fault, StopRequest
+from jointctl.firmware_py.realtime import Histogram, Word
+from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest
+from jointctl.tools.running.loop import portable_loop
+from jointctl.tools.running.loop.shared_block import SharedBlock
 from tests.unit.running.portable_bus import OWN_HEARTBEAT, PERIOD_NS, RPDO, SYNC, Clock, DriveBus, run
-from tools.running.loop import portable_loop
-from tools.running.loop.shared_block import SharedBlock
 
 
 def test_a_regular_run_ends_disabled_and_is_logged(block: SharedBlock) -> None:

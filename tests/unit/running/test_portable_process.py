@@ -8,10 +8,10 @@ import sys
 
 import pytest
 
-from drivers.errors import ConfigurationError
-from tools.running.loop import loop_process
-from tools.running.loop.portable_loop import HIGHEST_RATE_HZ, check_portable_rate, held_rate_Hz, portable_note
-from tools.running.loop.shared_block import SharedBlock
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.running.loop import loop_process
+from jointctl.tools.running.loop.portable_loop import HIGHEST_RATE_HZ, check_portable_rate, held_rate_Hz, portable_note
+from jointctl.tools.running.loop.shared_block import SharedBlock
 
 
 @pytest.mark.parametrize("rate_Hz", [1.0, 499.0, 500.0])

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.records import LogRecord
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase, DriveState, Fault
-from tools.running.events.emergency_text import emergency_text
-from tools.running.events.event_finder import OVERRUN_CYCLES, EventFinder
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, DriveState, Fault
+from jointctl.tools.running.events.emergency_text import emergency_text
+from jointctl.tools.running.events.event_finder import OVERRUN_CYCLES, EventFinder
 
 START_NS = 5_000_000_000
 WORDS = {DriveState.OFF: 0x0250, DriveState.STARTING: 0x0233, DriveState.ENABLED: 0x1237, DriveState.FAULT: 0x0218}

@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.errors import DataError, DeviceError
-from firmware_py.realtime import HISTOGRAM_BINS, Histogram
-from firmware_py.states import Fault
+from jointctl.drivers.errors import DataError, DeviceError
+from jointctl.firmware_py.realtime import HISTOGRAM_BINS, Histogram
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.output import Output
+from jointctl.tools.recording.run_log import ERROR, WARNING, Event
+from jointctl.tools.recording.run_summary import summarise
+from jointctl.tools.running.display.phase_lines import PhaseLines
+from jointctl.tools.running.events.fault_text import fault_text
+from jointctl.tools.running.result import run_report
+from jointctl.tools.running.result.run_result import RunResult
 from tests.run_records import run_records
-from tools.configuration.load import load_config, shipped_config
-from tools.output import Output
-from tools.recording.run_log import ERROR, WARNING, Event
-from tools.recording.run_summary import summarise
-from tools.running.display.phase_lines import PhaseLines
-from tools.running.events.fault_text import fault_text
-from tools.running.result import run_report
-from tools.running.result.run_result import RunResult
 
 CONFIG = load_config(shipped_config("virtual"))
 WITHOUT_PICTURE = CONFIG.model_copy(update={"log": CONFIG.log.model_copy(update={"picture": False})})

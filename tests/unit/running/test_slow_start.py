@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 
-from tools.running.loop.slow_start import slow_start
+from jointctl.tools.running.loop.slow_start import slow_start
 
 
 def test_a_slow_start_is_told_once() -> None:

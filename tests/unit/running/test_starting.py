@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from drivers.errors import BusError
-from tools.simulation.starting import IDLE_S, TELL_S, Starting, processor_time_s
+from jointctl.drivers.errors import BusError
+from jointctl.tools.simulation.starting import IDLE_S, TELL_S, Starting, processor_time_s
 
 
 class Waiting:

@@ -10,20 +10,20 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from drivers.canopen.thermometer import TemperatureObject
-from drivers.drive import Reading
-from drivers.errors import ConfigurationError
-from firmware_py.records import LogRecord
-from firmware_py.schema import dtype_of
+from jointctl.drivers.canopen.thermometer import TemperatureObject
+from jointctl.drivers.drive import Reading
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import dtype_of
+from jointctl.tools.configuration.drive_settings import temperature_object
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.recording.log_export import csv_bytes, npz_bytes, table_columns
+from jointctl.tools.recording.run_log import RunLogWriter
+from jointctl.tools.recording.run_log_reader import read_run_log
+from jointctl.tools.recording.run_summary import summarise
+from jointctl.tools.reporting.temperature_figure import temperature_figure
+from jointctl.tools.running.watch.temperature_watch import STALE_S, TemperatureWatch
 from tests.places import CONFIGS
-from tools.configuration.drive_settings import temperature_object
-from tools.configuration.load import load_config
-from tools.recording.log_export import csv_bytes, npz_bytes, table_columns
-from tools.recording.run_log import RunLogWriter
-from tools.recording.run_log_reader import read_run_log
-from tools.recording.run_summary import summarise
-from tools.reporting.temperature_figure import temperature_figure
-from tools.running.watch.temperature_watch import STALE_S, TemperatureWatch
 
 # --- configuration ---------------------------------------------------------------------------------------------
 

@@ -10,31 +10,31 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.canopen.commissioning import disable
-from drivers.drive import UNTOUCHED, CommissioningReport, DriveIdentity
-from drivers.errors import ConfigurationError, DeviceError, MotionFault
-from firmware_py.friction import branch_torque_Nm
-from firmware_py.realtime import HISTOGRAM_BINS, Histogram
-from firmware_py.states import Fault
-from tools.configuration import checks
-from tools.configuration.config import Config
-from tools.configuration.conversions import RADPS_PER_UNIT, friction_constants
-from tools.configuration.load import load_config, shipped_config
-from tools.configuration.records import trajectory_table
-from tools.output import Output
-from tools.running.control import Control
-from tools.running.display.phase_lines import PhaseLines
-from tools.running.permission.envelope import motion_envelope
-from tools.running.permission.readiness import require_start
-from tools.running.run_watch import Around, RunParts
-from tools.running.stop_signals import StopSignals
-from tools.running.supervisor import Supervisor
-from tools.running.watch.bus_watch import BusWatch
-from tools.simulation.lockstep import LockstepJoint
-from tools.sweeping.carry_out import SweepSupervisor
-from tools.sweeping.checks import require_torque
-from tools.sweeping.options import SweepOptions, make_plan
-from tools.verbs import scope as scope_module
+from jointctl.drivers.canopen.commissioning import disable
+from jointctl.drivers.drive import UNTOUCHED, CommissioningReport, DriveIdentity
+from jointctl.drivers.errors import ConfigurationError, DeviceError, MotionFault
+from jointctl.firmware_py.friction import branch_torque_Nm
+from jointctl.firmware_py.realtime import HISTOGRAM_BINS, Histogram
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.configuration import checks
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import RADPS_PER_UNIT, friction_constants
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.records import trajectory_table
+from jointctl.tools.output import Output
+from jointctl.tools.running.control import Control
+from jointctl.tools.running.display.phase_lines import PhaseLines
+from jointctl.tools.running.permission.envelope import motion_envelope
+from jointctl.tools.running.permission.readiness import require_start
+from jointctl.tools.running.run_watch import Around, RunParts
+from jointctl.tools.running.stop_signals import StopSignals
+from jointctl.tools.running.supervisor import Supervisor
+from jointctl.tools.running.watch.bus_watch import BusWatch
+from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.sweeping.carry_out import SweepSupervisor
+from jointctl.tools.sweeping.checks import require_torque
+from jointctl.tools.sweeping.options import SweepOptions, make_plan
+from jointctl.tools.verbs import scope as scope_module
 
 VIRTUAL = shipped_config("virtual").read_text()
 AT_ONCE = ('approach_s = "auto"', "approach_s = 0")

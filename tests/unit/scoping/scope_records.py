@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.records import LogRecord
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase
 
 
 def records(count: int, first: int = 0) -> Any:

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import DataError, UsageError
-from tools.scoping import order as order_module
-from tools.scoping.access import COOKIE, allowed, cookie_name
-from tools.scoping.order import ScopeOrder, scope_order
+from jointctl.drivers.errors import DataError, UsageError
+from jointctl.tools.scoping import order as order_module
+from jointctl.tools.scoping.access import COOKIE, allowed, cookie_name
+from jointctl.tools.scoping.order import ScopeOrder, scope_order
 
 
 def request(host: str, query: str = "", **headers: str) -> dict[str, Any]:

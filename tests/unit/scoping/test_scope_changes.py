@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.drive import CommissioningReport, DriveIdentity
-from drivers.errors import MotionFault
-from firmware_py.realtime import HISTOGRAM_BINS, Word
-from firmware_py.records import AxisState, LogRecord
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase, StopRequest
-from tools.configuration.records import axis_constants
-from tools.output import Output
-from tools.running.changes.new_motion import new_motion
-from tools.running.display.panel import time_left
-from tools.running.display.viewer_request import ViewerRequest
-from tools.running.run_watch import Around, RunParts, RunWatch
-from tools.running.stop_signals import StopSignals
-from tools.running.watch.bus_watch import BusWatch
-from tools.verbs import scope as scope_module
+from jointctl.drivers.drive import CommissioningReport, DriveIdentity
+from jointctl.drivers.errors import MotionFault
+from jointctl.firmware_py.realtime import HISTOGRAM_BINS, Word
+from jointctl.firmware_py.records import AxisState, LogRecord
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, StopRequest
+from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.output import Output
+from jointctl.tools.running.changes.new_motion import new_motion
+from jointctl.tools.running.display.panel import time_left
+from jointctl.tools.running.display.viewer_request import ViewerRequest
+from jointctl.tools.running.run_watch import Around, RunParts, RunWatch
+from jointctl.tools.running.stop_signals import StopSignals
+from jointctl.tools.running.watch.bus_watch import BusWatch
+from jointctl.tools.verbs import scope as scope_module
 
 TABLE = np.zeros((1, 5))
 
@@ -32,7 +32,7 @@ class Panels:
     """The change panels' fields without a browser."""
 
     def __init__(self, **shown: float) -> None:
-        panels = pytest.importorskip("tools.scoping.change_panels")
+        panels = pytest.importorskip("jointctl.tools.scoping.change_panels")
         self.asked: list[tuple[str, dict[str, Any]]] = []
         self.panels = panels.ChangePanels.__new__(panels.ChangePanels)
         self.panels._ask = lambda kind, values: self.asked.append((kind, values))

@@ -15,21 +15,21 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from firmware_py.realtime import HISTOGRAM_BINS
-from firmware_py.states import StopRequest
+from jointctl.firmware_py.realtime import HISTOGRAM_BINS
+from jointctl.firmware_py.states import StopRequest
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.output import Output
+from jointctl.tools.recording.run_log import INFO, Event
+from jointctl.tools.running.changes.viewer_orders import UNWATCHED, ViewerOrders
+from jointctl.tools.running.display.display import Snapshot
+from jointctl.tools.running.display.phase_lines import PhaseLines
+from jointctl.tools.running.display.viewer_request import ViewerRequest
+from jointctl.tools.scoping import feed as feed_module
+from jointctl.tools.scoping import server as server_module
+from jointctl.tools.scoping.displays import Displays
+from jointctl.tools.scoping.feed import EVENT, PIECE, RECORDS, SETTINGS, ScopeFeed
+from jointctl.tools.scoping.history import History
 from tests.unit.scoping.scope_records import records
-from tools.configuration.load import load_config, shipped_config
-from tools.output import Output
-from tools.recording.run_log import INFO, Event
-from tools.running.changes.viewer_orders import UNWATCHED, ViewerOrders
-from tools.running.display.display import Snapshot
-from tools.running.display.phase_lines import PhaseLines
-from tools.running.display.viewer_request import ViewerRequest
-from tools.scoping import feed as feed_module
-from tools.scoping import server as server_module
-from tools.scoping.displays import Displays
-from tools.scoping.feed import EVENT, PIECE, RECORDS, SETTINGS, ScopeFeed
-from tools.scoping.history import History
 
 
 def snapshot(rows: Any) -> Snapshot:

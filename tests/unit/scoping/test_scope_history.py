@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from firmware_py.states import AxisPhase
+from jointctl.firmware_py.states import AxisPhase
+from jointctl.tools.recording.run_log import INFO, Event
+from jointctl.tools.scoping.history import EVENTS, POINTS, SIGNALS, History, crossing_s, percentiles_us
 from tests.unit.scoping.scope_records import records
-from tools.recording.run_log import INFO, Event
-from tools.scoping.history import EVENTS, POINTS, SIGNALS, History, crossing_s, percentiles_us
 
 
 def test_the_memory_is_a_ring() -> None:

@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.errors import DataError
-from firmware_py.records import LogRecord
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase
-from tools.identification.friction_file import read_friction_data
-from tools.identification.sweep_file import SWEEP_COLUMNS
-from tools.sweeping.data_file import HEADING, SweepFile
-from tools.sweeping.grid import SweepPoint
-from tools.sweeping.meter import JointModel, MeasuredPoint, SweepMeter
-from tools.sweeping.plan import Window
-from tools.sweeping.statistics import LEAST_SAMPLES, PlateauResult, Tolerance
+from jointctl.drivers.errors import DataError
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase
+from jointctl.tools.identification.friction_file import read_friction_data
+from jointctl.tools.identification.sweep_file import SWEEP_COLUMNS
+from jointctl.tools.sweeping.data_file import HEADING, SweepFile
+from jointctl.tools.sweeping.grid import SweepPoint
+from jointctl.tools.sweeping.meter import JointModel, MeasuredPoint, SweepMeter
+from jointctl.tools.sweeping.plan import Window
+from jointctl.tools.sweeping.statistics import LEAST_SAMPLES, PlateauResult, Tolerance
 
 MODEL = JointModel(100.0, 0.0, 0.0, 1.2e-5, (18.0 / math.tau,))
 FAST, BACK = SweepPoint(0, 0.5, 0), SweepPoint(1, -0.5, 0)

@@ -9,16 +9,16 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import ConfigurationError, DataError, DeviceError, JointctlError, UsageError
-from tools.configuration.config import Config
-from tools.configuration.elmo_settings import elmo_section, elmo_settings
-from tools.configuration.load import load_config, shipped_config
-from tools.configuration.plant_settings import plant_settings
-from tools.output import Output
-from tools.sweeping.carry_out import ACCELERATION_SPARE, middle_rad, with_mode, with_tracking_law
-from tools.sweeping.options import QUICK_S, SweepOptions, make_plan
-from tools.sweeping.statistics import LEAST_SAMPLES
-from tools.verbs.sweep import sweep
+from jointctl.drivers.errors import ConfigurationError, DataError, DeviceError, JointctlError, UsageError
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.elmo_settings import elmo_section, elmo_settings
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.plant_settings import plant_settings
+from jointctl.tools.output import Output
+from jointctl.tools.sweeping.carry_out import ACCELERATION_SPARE, middle_rad, with_mode, with_tracking_law
+from jointctl.tools.sweeping.options import QUICK_S, SweepOptions, make_plan
+from jointctl.tools.sweeping.statistics import LEAST_SAMPLES
+from jointctl.tools.verbs.sweep import sweep
 
 SWEEP = shipped_config("sweep_virtual")
 

@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.errors import DataError, UsageError
-from firmware_py.motion_peak import peak_of
-from firmware_py.records import Reference, TrajectoryConstants
-from firmware_py.schema import new
-from firmware_py.states import TrajectoryKind
-from firmware_py.trajectory import reference_at
-from tools.sweeping.grid import (
+from jointctl.drivers.errors import DataError, UsageError
+from jointctl.firmware_py.motion_peak import peak_of
+from jointctl.firmware_py.records import Reference, TrajectoryConstants
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import TrajectoryKind
+from jointctl.firmware_py.trajectory import reference_at
+from jointctl.tools.sweeping.grid import (
     SweepPoint,
     both_directions,
     grid_speeds,
@@ -25,7 +25,7 @@ from tools.sweeping.grid import (
     ordered_points,
     plan_hash,
 )
-from tools.sweeping.plan import PlanSettings, SweepMotion, fastest_radps, plan_motion, shifted, stroke_of
+from jointctl.tools.sweeping.plan import PlanSettings, SweepMotion, fastest_radps, plan_motion, shifted, stroke_of
 
 RATIO = 121.0
 

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from tools.configuration.load import load_config, shipped_config
-from tools.output import Advance, Output
-from tools.sweeping.options import SweepOptions
-from tools.verbs import sweep as verb
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.output import Advance, Output
+from jointctl.tools.sweeping.options import SweepOptions
+from jointctl.tools.verbs import sweep as verb
 
 
 class Bars(Output):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tools.sweeping.statistics import (
+from jointctl.tools.sweeping.statistics import (
     BATCHES,
     LEAST_SAMPLES,
     Samples,

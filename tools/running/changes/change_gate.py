@@ -6,12 +6,12 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from drivers.errors import ConfigurationError, MarginError
-from tools.analysis.loop_settings import loop_settings
-from tools.analysis.margin_gate import require_margin
-from tools.analysis.margins import phase_margin_deg
-from tools.configuration.checks import problems_between_sections
-from tools.configuration.config import Config
+from jointctl.drivers.errors import ConfigurationError, MarginError
+from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.margin_gate import require_margin
+from jointctl.tools.analysis.margins import phase_margin_deg
+from jointctl.tools.configuration.checks import problems_between_sections
+from jointctl.tools.configuration.config import Config
 
 STEPS = 8  # of the straight line from the gains in force to the new ones
 

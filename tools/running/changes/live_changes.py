@@ -11,19 +11,19 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.errors import ConfigurationError, JointctlError
-from firmware_py.change_records import ChangeAnswer, ChangeKind, MotionChange
-from firmware_py.kernel import plain
-from firmware_py.live_change import gains_of
-from firmware_py.motion_peak import peak_of
-from firmware_py.records import Gains
-from firmware_py.schema import dtype_of, new
-from firmware_py.states import AxisPhase, CommandKind
-from tools.configuration.config import Config
-from tools.recording.run_log import INFO, WARNING
-from tools.running.changes.change_gate import checked_gains, require_change
-from tools.running.changes.new_motion import motion_in_words, new_motion
-from tools.running.display.viewer_request import ViewerRequest
+from jointctl.drivers.errors import ConfigurationError, JointctlError
+from jointctl.firmware_py.change_records import ChangeAnswer, ChangeKind, MotionChange
+from jointctl.firmware_py.kernel import plain
+from jointctl.firmware_py.live_change import gains_of
+from jointctl.firmware_py.motion_peak import peak_of
+from jointctl.firmware_py.records import Gains
+from jointctl.firmware_py.schema import dtype_of, new
+from jointctl.firmware_py.states import AxisPhase, CommandKind
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.recording.run_log import INFO, WARNING
+from jointctl.tools.running.changes.change_gate import checked_gains, require_change
+from jointctl.tools.running.changes.new_motion import motion_in_words, new_motion
+from jointctl.tools.running.display.viewer_request import ViewerRequest
 
 NAMES = tuple(dtype_of(Gains).names or ())
 # the plain function: nothing is to be compiled or loaded while the supervisor watches

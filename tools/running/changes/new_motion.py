@@ -8,17 +8,17 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from drivers.errors import ConfigurationError
-from firmware_py.motion_peak import peak_of
-from firmware_py.records import TrajectoryConstants
-from firmware_py.schema import new
-from firmware_py.states import TrajectoryKind, in_words
-from tools.configuration.checks import extremes_problems
-from tools.configuration.config import Config
-from tools.configuration.problems import problem_line
-from tools.configuration.records import fill_trajectory
-from tools.configuration.sections import Section
-from tools.configuration.trajectory import Trajectory
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.motion_peak import peak_of
+from jointctl.firmware_py.records import TrajectoryConstants
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import TrajectoryKind, in_words
+from jointctl.tools.configuration.checks import extremes_problems
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.problems import problem_line
+from jointctl.tools.configuration.records import fill_trajectory
+from jointctl.tools.configuration.sections import Section
+from jointctl.tools.configuration.trajectory import Trajectory
 
 CONFIGURED = "configured"
 

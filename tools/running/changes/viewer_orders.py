@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Self
 
-from drivers.errors import DataError
-from tools.configuration.config import Config
-from tools.recording.run_log import INFO, WARNING, Event, RunLogWriter
-from tools.running.changes.live_changes import LiveChanges, settings_of
-from tools.running.display.display import Display
-from tools.running.display.viewer_request import ViewerRequest
+from jointctl.drivers.errors import DataError
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.recording.run_log import INFO, WARNING, Event, RunLogWriter
+from jointctl.tools.running.changes.live_changes import LiveChanges, settings_of
+from jointctl.tools.running.display.display import Display
+from jointctl.tools.running.display.viewer_request import ViewerRequest
 
 SETTINGS_s = 0.5  # how often the page is told how things stand
 UNWATCHED = "no page is open any more; the joint goes on, Ctrl-C or `jointctl stop` brakes it"

@@ -8,9 +8,9 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
-from firmware_py.states import StopRequest
-from tools.recording.run_log import Event
-from tools.running.display.viewer_request import ViewerRequest
+from jointctl.firmware_py.states import StopRequest
+from jointctl.tools.recording.run_log import Event
+from jointctl.tools.running.display.viewer_request import ViewerRequest
 
 
 @dataclass(frozen=True)

@@ -19,12 +19,12 @@ from rich.console import Console
 from rich.live import Live
 from rich.panel import Panel
 
-from drivers.printable import message_line, printable
-from tools.output import Output
-from tools.recording.run_log import ERROR, Event
-from tools.running.display.display import Display, OnlyShows, Snapshot
-from tools.running.display.panel import NOTES, panel
-from tools.running.display.phase_lines import PhaseLines
+from jointctl.drivers.printable import message_line, printable
+from jointctl.tools.output import Output
+from jointctl.tools.recording.run_log import ERROR, Event
+from jointctl.tools.running.display.display import Display, OnlyShows, Snapshot
+from jointctl.tools.running.display.panel import NOTES, panel
+from jointctl.tools.running.display.phase_lines import PhaseLines
 
 REFRESH_s = 0.25
 CLOSE_s = 1.0  # how long the end of a run waits for the last frame

@@ -8,11 +8,11 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from firmware_py.realtime import Histogram
-from firmware_py.states import AxisPhase
-from tools.running.display.display import Snapshot
-from tools.running.events.event_finder import drive_state_name, fault_words, phase_name
-from tools.running.loop.loop_delay import quantile_s
+from jointctl.firmware_py.realtime import Histogram
+from jointctl.firmware_py.states import AxisPhase
+from jointctl.tools.running.display.display import Snapshot
+from jointctl.tools.running.events.event_finder import drive_state_name, fault_words, phase_name
+from jointctl.tools.running.loop.loop_delay import quantile_s
 
 NOTES = 3  # how many of the newest remarks stay in the panel
 _QUANTILE = 0.99

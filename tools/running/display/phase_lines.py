@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 from typing import Self
 
-from tools.output import Output
-from tools.recording.run_log import ERROR, Event
-from tools.running.display.display import OnlyShows, Snapshot
+from jointctl.tools.output import Output
+from jointctl.tools.recording.run_log import ERROR, Event
+from jointctl.tools.running.display.display import OnlyShows, Snapshot
 
 
 class PhaseLines(OnlyShows):

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from drivers.canopen.cia402 import State, state_of_word, state_text
-from drivers.elmo.codes import motor_fault_text
-from firmware_py.states import AxisPhase, DriveState, Fault, fault_name, in_words
-from tools.recording.run_log import ERROR, INFO, WARNING, Event
-from tools.running.events.emergency_text import emergency_text
-from tools.running.events.fault_text import FAULT_TEXTS
+from jointctl.drivers.canopen.cia402 import State, state_of_word, state_text
+from jointctl.drivers.elmo.codes import motor_fault_text
+from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, fault_name, in_words
+from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, Event
+from jointctl.tools.running.events.emergency_text import emergency_text
+from jointctl.tools.running.events.fault_text import FAULT_TEXTS
 
 OVERRUN_CYCLES = 10  # so many skipped slots in one go are worth a line
 _BAD = (State.FAULT, State.FAULT_REACTION_ACTIVE, State.UNDEFINED)

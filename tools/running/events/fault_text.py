@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.canopen.cia402 import state_text
-from firmware_py.records import ENCODER_RESTARTED
-from firmware_py.states import Fault
-from tools.running.events.emergency_text import emergency_text
+from jointctl.drivers.canopen.cia402 import state_text
+from jointctl.firmware_py.records import ENCODER_RESTARTED
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.running.events.emergency_text import emergency_text
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.states import Fault
-from tools.running.events.fault_text import FaultText
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.running.events.fault_text import FaultText
 
 BEFORE_s = 0.5  # a pause longer ago has shown what it could do
 LEAST_s = 0.005

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from firmware_py.states import Notice
-from tools.recording.run_log import WARNING, Event
+from jointctl.firmware_py.states import Notice
+from jointctl.tools.recording.run_log import WARNING, Event
 
 
 def notice_text(notice: Notice, state: Any) -> str:

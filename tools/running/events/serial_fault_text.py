@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from drivers.elmo.codes import SERVO_ON
-from firmware_py.states import Fault
-from tools.running.events.fault_text import FAULT_TEXTS, FaultText
+from jointctl.drivers.elmo.codes import SERVO_ON
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.running.events.fault_text import FAULT_TEXTS, FaultText
 
 # {value}: the number that tripped the limit; {word}: the same as a hexadecimal status register (SR)
 SERIAL_FAULT_TEXTS: dict[Fault, FaultText] = {

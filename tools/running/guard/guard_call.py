@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 import socket
 
-from drivers.local_socket import ANSWER_S, may_ask, received_line, send_line
+from jointctl.drivers.local_socket import ANSWER_S, may_ask, received_line, send_line
 
 ENDED_S = 25.0  # for a run to end, and a drive that is silent to be tried again
 

@@ -9,14 +9,14 @@ import socket
 import subprocess
 import sys
 
-from drivers.elmo.serial_port import usb_serial_number
-from drivers.errors import JointctlError
-from firmware_py.realtime import WORDS, Word
-from firmware_py.states import StopRequest
-from tools.configuration.config import Config
-from tools.configuration.elmo import ElmoSerial
-from tools.running.guard.line_guard import GuardOrder
-from tools.running.loop.loop_handle import SILENT_S, LoopHandle
+from jointctl.drivers.elmo.serial_port import usb_serial_number
+from jointctl.drivers.errors import JointctlError
+from jointctl.firmware_py.realtime import WORDS, Word
+from jointctl.firmware_py.states import StopRequest
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.elmo import ElmoSerial
+from jointctl.tools.running.guard.line_guard import GuardOrder
+from jointctl.tools.running.loop.loop_handle import SILENT_S, LoopHandle
 
 READY_TIMEOUT_S = 20.0
 SPARE_S = 1.0  # the supervisor is to be first
@@ -42,7 +42,7 @@ class GuardHandle:
         )  # fmt: skip
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "tools.running.guard.line_guard", order.argument()],
+                [sys.executable, "-P", "-m", "jointctl.tools.running.guard.line_guard", order.argument()],
                 pass_fds=passed, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True,
             )  # fmt: skip
         finally:

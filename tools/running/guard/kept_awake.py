@@ -12,8 +12,8 @@ import select
 import subprocess
 from collections.abc import Iterator
 
-from tools.configuration.config import Config
-from tools.output import Output
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.output import Output
 
 WHAT = "sleep:handle-lid-switch"
 HELD_TIMEOUT_S = 2.0

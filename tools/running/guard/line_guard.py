@@ -1,4 +1,4 @@
-"""The guard of a serial line: `python -m tools.running.guard.line_guard JSON`, a small process that does little.
+"""The guard of a serial line, `python -m jointctl.tools.running.guard.line_guard JSON`: a small process.
 
 A serial drive does not notice that the programs behind it have died: it holds its last torque command for ever.  So a
 third process waits, in a session of its own, and says TC=0, JV=0, ST, MO=0
@@ -27,12 +27,12 @@ import time
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from drivers.elmo.dialogue import Dialogue
-from drivers.elmo.serial_port import SerialPort, open_descriptor, usb_serial_number
-from drivers.elmo.switch_off import SWITCH_OFF, switch_off
-from drivers.errors import BusError, JointctlError
-from drivers.local_socket import listener, may_ask, received_line, send_line
-from tools.running.guard.guard_call import guard_address
+from jointctl.drivers.elmo.dialogue import Dialogue
+from jointctl.drivers.elmo.serial_port import SerialPort, open_descriptor, usb_serial_number
+from jointctl.drivers.elmo.switch_off import SWITCH_OFF, switch_off
+from jointctl.drivers.errors import BusError, JointctlError
+from jointctl.drivers.local_socket import listener, may_ask, received_line, send_line
+from jointctl.tools.running.guard.guard_call import guard_address
 
 REACH_S = 60.0  # how long a drive that does not answer is tried again: time to plug a cable in
 OBEY_S = 5.0  # how long a run may take to end after `jointctl stop`

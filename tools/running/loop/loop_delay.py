@@ -9,9 +9,9 @@ import math
 
 import numpy as np
 
-from drivers.can.bit_timing import worst_frame_bits
-from drivers.canopen.identifiers import EVENT_DRIVEN
-from firmware_py.realtime import Histogram
+from jointctl.drivers.can.bit_timing import worst_frame_bits
+from jointctl.drivers.canopen.identifiers import EVENT_DRIVEN
+from jointctl.firmware_py.realtime import Histogram
 
 RPDO_BYTES = 4
 QUANTILE = 0.99

@@ -11,15 +11,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from drivers.errors import MotionFault
-from firmware_py.libc import NANOSECONDS
-from firmware_py.realtime import Word
-from firmware_py.sequence import reset_axis
-from firmware_py.states import AxisPhase, Fault, StopRequest
-from tools.configuration.config import Config
-from tools.running.loop.loop_process import LoopOrder
-from tools.running.loop.shared_block import SharedBlock
-from tools.simulation.starting import Starting
+from jointctl.drivers.errors import MotionFault
+from jointctl.firmware_py.libc import NANOSECONDS
+from jointctl.firmware_py.realtime import Word
+from jointctl.firmware_py.sequence import reset_axis
+from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.running.loop.loop_process import LoopOrder
+from jointctl.tools.running.loop.shared_block import SharedBlock
+from jointctl.tools.simulation.starting import Starting
 
 KILL_S = 1.0  # how long a killed process may take to go
 SILENT_S = 2.0  # without a cycle for so long, the loop hangs
@@ -59,7 +59,7 @@ class LoopHandle:
             tail_path=None if tail_path is None else str(tail_path.absolute()),
         )
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "tools.running.loop.loop_process", order.argument()],
+            [sys.executable, "-P", "-m", "jointctl.tools.running.loop.loop_process", order.argument()],
             pass_fds=(self.block.fd,) if marker_fd is None else (self.block.fd, marker_fd),
             stdin=subprocess.DEVNULL,
             start_new_session=True,  # keys that a terminal turns into signals are not for the loop

@@ -1,4 +1,4 @@
-"""The process that runs the loop and nothing else: `python -m tools.running.loop.loop_process JSON`.
+"""The process that runs the loop and nothing else: `python -m jointctl.tools.running.loop.loop_process JSON`.
 
 The loop is the compiled one where the bus is a file descriptor, else the plain Python one of `portable_loop`.
 
@@ -24,12 +24,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from drivers.errors import JointctlError
-from firmware_py.libc import NANOSECONDS
-from firmware_py.realtime import Word
-from tools.analysis.idle_states import cores_awake
-from tools.running.loop.ready_loop import FOREVER, ReadyLoop, loop_call
-from tools.running.loop.slow_start import slow_start
+from jointctl.drivers.errors import JointctlError
+from jointctl.firmware_py.libc import NANOSECONDS
+from jointctl.firmware_py.realtime import Word
+from jointctl.tools.analysis.idle_states import cores_awake
+from jointctl.tools.running.loop.ready_loop import FOREVER, ReadyLoop, loop_call
+from jointctl.tools.running.loop.slow_start import slow_start
 
 _MLOCK_CURRENT_AND_FUTURE = 3
 _POLL_S = 0.001
@@ -86,7 +86,7 @@ def become_realtime(cpu: int | None, priority: int | None, threads: Sequence[int
 
 def compiled_call(block: Any, period_ns: int, receive_ns: int) -> Callable[[int], int]:
     """`loop_call` on a CAN bus that is a descriptor."""
-    from drivers.canopen import exchange
+    from jointctl.drivers.canopen import exchange
 
     return loop_call(exchange, block, period_ns, receive_ns)
 
@@ -94,8 +94,8 @@ def compiled_call(block: Any, period_ns: int, receive_ns: int) -> Callable[[int]
 @contextmanager
 def compiled_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
     """The compiled loop, warm and attached to the bus."""
-    from drivers.can.frames import FRAME_BYTES
-    from drivers.can.open import open_cyclic_end
+    from jointctl.drivers.can.frames import FRAME_BYTES
+    from jointctl.drivers.can.open import open_cyclic_end
 
     call = compiled_call(block, order.period_ns, order.receive_ns)
     call(0)  # compiles, or loads from the cache
@@ -127,8 +127,8 @@ def portable_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
     An adapter that serves one program at a time belongs to commissioning until the loop is let go, which opens it then
     (see `CanopenDrive.start_cyclic`).
     """
-    from drivers.can.open import SHARED_INTERFACES, known_interface, open_python_can
-    from tools.running.loop.portable_loop import (
+    from jointctl.drivers.can.open import SHARED_INTERFACES, known_interface, open_python_can
+    from jointctl.tools.running.loop.portable_loop import (
         check_portable_rate,
         held_rate_Hz,
         portable_note,
@@ -162,13 +162,13 @@ def portable_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
 
 def run(order: LoopOrder) -> int:
     """Warm up, wait for GO, run the loop; returns the exit code."""
-    from drivers.can.open import CYCLIC_INTERFACES
-    from drivers.elmo.port import SERIAL
-    from tools.running.loop.shared_block import SharedBlock
+    from jointctl.drivers.can.open import CYCLIC_INTERFACES
+    from jointctl.drivers.elmo.port import SERIAL
+    from jointctl.tools.running.loop.shared_block import SharedBlock
 
     block = SharedBlock(order.block_fd, order.table_rows, order.interface)
     if order.interface == SERIAL:
-        from tools.running.loop.serial_loop import serial_loop
+        from jointctl.tools.running.loop.serial_loop import serial_loop
 
         loop: Callable[[LoopOrder, Any], AbstractContextManager[ReadyLoop]] = serial_loop
     else:
@@ -200,7 +200,7 @@ def run(order: LoopOrder) -> int:
 
 def save_tail(block: Any, path: Path) -> None:
     """Write what the ring holds: the joint is off by now, and nobody else is left to keep the last seconds."""
-    from tools.recording.run_log import ERROR, RunLogWriter
+    from jointctl.tools.recording.run_log import ERROR, RunLogWriter
 
     records, lost = block.new_records(0, int(block.words[Word.HEAD]))
     with RunLogWriter(path, {"tail": {"why": "the supervising process had gone", "records_before": str(lost)}}) as log:

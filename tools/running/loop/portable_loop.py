@@ -28,18 +28,18 @@ from typing import Any
 import can
 import numpy as np
 
-from drivers.can.frames import ERROR_FLAG, Frame
-from drivers.can.virtual_bus import decode, encode
-from drivers.canopen.cyclic import accept_frame, answer_owed, begin_cycle, end_cycle
-from drivers.canopen.port import FRAME_SLOTS, SLOT_RECEIVED, SLOT_RPDO, SLOT_SYNC
-from drivers.errors import ConfigurationError
-from firmware_py.axis import step_axis
-from firmware_py.libc import NANOSECONDS, sleep_until_ns
-from firmware_py.realtime import Histogram, Word, count, note_suspension, write_log
-from firmware_py.schema import INT32_MAX, new
-from firmware_py.states import AxisPhase, DriveRequest
-from tools.running.loop.loop_delay import QUANTILE, quantile_s
-from tools.running.loop.shared_block import SharedBlock
+from jointctl.drivers.can.frames import ERROR_FLAG, Frame
+from jointctl.drivers.can.virtual_bus import decode, encode
+from jointctl.drivers.canopen.cyclic import accept_frame, answer_owed, begin_cycle, end_cycle
+from jointctl.drivers.canopen.port import FRAME_SLOTS, SLOT_RECEIVED, SLOT_RPDO, SLOT_SYNC
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.axis import step_axis
+from jointctl.firmware_py.libc import NANOSECONDS, sleep_until_ns
+from jointctl.firmware_py.realtime import Histogram, Word, count, note_suspension, write_log
+from jointctl.firmware_py.schema import INT32_MAX, new
+from jointctl.firmware_py.states import AxisPhase, DriveRequest
+from jointctl.tools.running.loop.loop_delay import QUANTILE, quantile_s
+from jointctl.tools.running.loop.shared_block import SharedBlock
 
 HIGHEST_RATE_HZ = 500.0
 FOREVER = 1 << 62

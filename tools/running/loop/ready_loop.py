@@ -28,7 +28,7 @@ def loop_call(exchange: Any, block: Any, period_ns: int, receive_ns: int) -> Cal
 
     0 only compiles, or loads from the cache.
     """
-    from firmware_py.realtime import run_loop
+    from jointctl.firmware_py.realtime import run_loop
 
     frames, scratch = exchange.exchange_memory()
     timespec = np.zeros(2, np.int64)

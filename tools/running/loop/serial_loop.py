@@ -13,9 +13,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from drivers.elmo.serial_port import open_descriptor
-from drivers.elmo.switch_off import SWITCH_OFF
-from tools.running.loop.ready_loop import FOREVER, ReadyLoop, loop_call
+from jointctl.drivers.elmo.serial_port import open_descriptor
+from jointctl.drivers.elmo.switch_off import SWITCH_OFF
+from jointctl.tools.running.loop.ready_loop import FOREVER, ReadyLoop, loop_call
 
 
 @contextmanager
@@ -25,7 +25,7 @@ def serial_loop(order: Any, block: Any) -> Iterator[ReadyLoop]:
     The port is opened when the loop is let go: by then the supervisor has locked and configured it.  However the
     loop ends, the drive is told to switch off: it would keep its last torque command for ever.
     """
-    from drivers.elmo import exchange
+    from jointctl.drivers.elmo import exchange
 
     call = loop_call(exchange, block, order.period_ns, order.receive_ns)
     call(0)  # compiles, or loads from the cache

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from drivers.canopen.port import CanopenPort
-from drivers.elmo.port import SERIAL, ElmoPort
-from firmware_py.realtime import HISTOGRAM_BINS, WORDS, Histogram, Word
-from firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
-from firmware_py.schema import dtype_of
+from jointctl.drivers.canopen.port import CanopenPort
+from jointctl.drivers.elmo.port import SERIAL, ElmoPort
+from jointctl.firmware_py.realtime import HISTOGRAM_BINS, WORDS, Histogram, Word
+from jointctl.firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
+from jointctl.firmware_py.schema import dtype_of
 
 RING_RECORDS = 1 << 14  # 16 s at 1 kHz
 _LINE = 64  # bytes; nothing of one array shares a cache line with another

@@ -8,8 +8,8 @@ import sys
 import time
 from pathlib import Path
 
-from tools.running.loop.loop_process import compiled_call
-from tools.running.loop.shared_block import SharedBlock
+from jointctl.tools.running.loop.loop_process import compiled_call
+from jointctl.tools.running.loop.shared_block import SharedBlock
 
 PROBE_TIMEOUT_S = 600.0
 
@@ -27,7 +27,7 @@ def start_time_s(cache: Path | None = None) -> float:
     Raises subprocess.SubprocessError if the process fails.
     """
     environment = dict(os.environ, **({"JOINTCTL_CACHE_DIR": str(cache)} if cache else {}))
-    command = [sys.executable, "-P", "-m", "tools.running.loop.start_time"]
+    command = [sys.executable, "-P", "-m", "jointctl.tools.running.loop.start_time"]
     started_s = time.monotonic()
     subprocess.run(command, env=environment, check=True, timeout=PROBE_TIMEOUT_S, capture_output=True)
     return time.monotonic() - started_s

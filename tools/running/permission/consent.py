@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import sys
 
-from drivers.drive import Approval
-from drivers.errors import UsageError
-from tools.output import Output
+from jointctl.drivers.drive import Approval
+from jointctl.drivers.errors import UsageError
+from jointctl.tools.output import Output
 
 MOVE = "Move the joint?"
 

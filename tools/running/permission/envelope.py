@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from drivers.drive import CommissioningReport
-from firmware_py.motion_peak import peak_of
-from firmware_py.records import Reference
-from firmware_py.schema import new
-from firmware_py.trajectory import reference_at
-from tools.configuration.config import Config
-from tools.configuration.records import axis_constants, trajectory_table
+from jointctl.drivers.drive import CommissioningReport
+from jointctl.firmware_py.motion_peak import peak_of
+from jointctl.firmware_py.records import Reference
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.trajectory import reference_at
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.records import axis_constants, trajectory_table
 
 
 def motion_envelope(config: Config, report: CommissioningReport) -> list[str]:

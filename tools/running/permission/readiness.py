@@ -6,17 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.drive import CommissioningReport
-from drivers.errors import ConfigurationError, MotionFault
-from firmware_py.motion_peak import approach_start
-from firmware_py.records import TrajectoryConstants
-from firmware_py.schema import new
-from firmware_py.states import Fault
-from tools.configuration.config import Config
-from tools.configuration.records import fill_trajectory, trajectory_table
-from tools.output import Output
-from tools.recording.log_folder import remove_oldest, require_room
-from tools.running.events.fault_text import fault_text
+from jointctl.drivers.drive import CommissioningReport
+from jointctl.drivers.errors import ConfigurationError, MotionFault
+from jointctl.firmware_py.motion_peak import approach_start
+from jointctl.firmware_py.records import TrajectoryConstants
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.records import fill_trajectory, trajectory_table
+from jointctl.tools.output import Output
+from jointctl.tools.recording.log_folder import remove_oldest, require_room
+from jointctl.tools.running.events.fault_text import fault_text
 
 START_SHARE = 0.1  # of the following error: how far from the trajectory a run without an approach may begin
 

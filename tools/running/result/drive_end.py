@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 
-from drivers.drive import UNTOUCHED, is_safe
-from drivers.errors import DeviceError
-from tools.output import Output
+from jointctl.drivers.drive import UNTOUCHED, is_safe
+from jointctl.drivers.errors import DeviceError
+from jointctl.tools.output import Output
 
 ADVICE = "use the emergency stop"
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from drivers.errors import INTERRUPTED, DataError, MotionFault
-from firmware_py.states import Fault
-from tools.configuration.config import Config
-from tools.output import Output
-from tools.recording.run_figure import save_run_figure
-from tools.recording.run_summary import summary_table
-from tools.running.result.drive_end import require_off
-from tools.running.result.run_result import RunResult
+from jointctl.drivers.errors import INTERRUPTED, DataError, MotionFault
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.output import Output
+from jointctl.tools.recording.run_figure import save_run_figure
+from jointctl.tools.recording.run_summary import summary_table
+from jointctl.tools.running.result.drive_end import require_off
+from jointctl.tools.running.result.run_result import RunResult
 
 
 def run_title(config: Config) -> str:

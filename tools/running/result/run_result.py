@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.states import Fault
-from tools.recording.run_summary import RunSummary
-from tools.running.events.fault_text import FaultText
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.recording.run_summary import RunSummary
+from jointctl.tools.running.events.fault_text import FaultText
 
 
 @dataclass(frozen=True)

@@ -13,14 +13,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
-from drivers.can import socketcan
-from drivers.can.error_frames import error_frame_text, trouble
-from drivers.can.frames import FRAME_STRUCT
-from drivers.can.link_state import link_problem, link_state, send_problem
-from drivers.errors import BusError
-from firmware_py.states import Fault
-from tools.configuration.config import Config
-from tools.running.events.fault_text import FaultText
+from jointctl.drivers.can import socketcan
+from jointctl.drivers.can.error_frames import error_frame_text, trouble
+from jointctl.drivers.can.frames import FRAME_STRUCT
+from jointctl.drivers.can.link_state import link_problem, link_state, send_problem
+from jointctl.drivers.errors import BusError
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.running.events.fault_text import FaultText
 
 _SOL_CAN_RAW = 101
 _CAN_RAW_FILTER = 1

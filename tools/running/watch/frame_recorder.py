@@ -18,9 +18,9 @@ from typing import Any
 
 import can
 
-from drivers.can.open import SHARED_INTERFACES, open_python_can
-from drivers.errors import ConfigurationError
-from tools.configuration.config import Config
+from jointctl.drivers.can.open import SHARED_INTERFACES, open_python_can
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.configuration.config import Config
 
 QUEUE_FRAMES = 1 << 16  # more than 20 s at 1 kHz
 RECEIVE_S = 0.1  # how long the thread waits before it looks whether it is to end

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 
-from drivers.drive import Thermometer
-from tools.recording.run_log import WARNING, RunLogWriter
+from jointctl.drivers.drive import Thermometer
+from jointctl.tools.recording.run_log import WARNING, RunLogWriter
 
 STALE_S = 3.0  # three requests without a reading: what was read before is not the temperature any more
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.can.bit_timing import bus_load, highest_rate_Hz, worst_cycle_bits, worst_frame_bits
-from drivers.errors import ConfigurationError
-from tools.configuration.drive_settings import cyclic_bus_load
-from tools.configuration.load import load_config, shipped_config
+from jointctl.drivers.can.bit_timing import bus_load, highest_rate_Hz, worst_cycle_bits, worst_frame_bits
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.configuration.drive_settings import cyclic_bus_load
+from jointctl.tools.configuration.load import load_config, shipped_config
 
 SYNC, POSITION, TORQUE = 0, 8, 4
 

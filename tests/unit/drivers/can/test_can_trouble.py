@@ -9,8 +9,8 @@ from typing import Any
 import can
 import pytest
 
-from drivers.can.error_frames import BUS_OFF, CONTROLLER, COUNTERS, NO_ACK, PROTOCOL, error_frame_text, trouble
-from drivers.can.link_state import (
+from jointctl.drivers.can.error_frames import BUS_OFF, CONTROLLER, COUNTERS, NO_ACK, PROTOCOL, error_frame_text, trouble
+from jointctl.drivers.can.link_state import (
     LinkState,
     interface_blamed,
     link_problem,
@@ -18,14 +18,14 @@ from drivers.can.link_state import (
     parse_link,
     send_problem,
 )
-from drivers.canopen.settings import CanopenSettings
-from drivers.errors import BusError, JointctlError, NoDeviceError
-from tools.inspection.subject import Subject
-from tools.output import Output
-from tools.running.open_drive import commission
-from tools.verbs.clear_fault import clear_fault
-from tools.verbs.info import info
-from tools.verbs.scan import scan
+from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.errors import BusError, JointctlError, NoDeviceError
+from jointctl.tools.inspection.subject import Subject
+from jointctl.tools.output import Output
+from jointctl.tools.running.open_drive import commission
+from jointctl.tools.verbs.clear_fault import clear_fault
+from jointctl.tools.verbs.info import info
+from jointctl.tools.verbs.scan import scan
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,9 @@ SILENCE = NoDeviceError("node 1 does not answer", hint="power, wiring")
 def test_silence_on_a_sick_interface_tells_its_trouble_and_the_cure(
     data: dict[str, Any], words: str, cure: str, failure: JointctlError, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("drivers.can.link_state.link_state", lambda channel: parse_link(real_interface(**data)))
+    monkeypatch.setattr(
+        "jointctl.drivers.can.link_state.link_state", lambda channel: parse_link(real_interface(**data))
+    )
     with pytest.raises(type(failure)) as caught, interface_blamed("socketcan", "can0", 1_000_000):
         raise failure
     assert caught.value.message.startswith(f"{failure.message}; CAN interface can0 ")
@@ -131,7 +133,7 @@ def test_silence_on_a_sound_interface_or_another_bus_stays_as_it_is(
     interface: str, state: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     link = parse_link(real_interface(state=state)) if state else None  # None: no such interface, or no program `ip`
-    monkeypatch.setattr("drivers.can.link_state.link_state", lambda channel: link)
+    monkeypatch.setattr("jointctl.drivers.can.link_state.link_state", lambda channel: link)
     with pytest.raises(NoDeviceError) as caught, interface_blamed(interface, "can0", 1_000_000):
         raise SILENCE
     assert caught.value is SILENCE
@@ -143,12 +145,13 @@ def test_who_hears_nobody_on_an_interface_of_another_bit_rate_says_so(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     link = parse_link(real_interface(bittiming={"bitrate": 500000}))
-    monkeypatch.setattr("drivers.can.link_state.link_state", lambda channel: link)
+    monkeypatch.setattr("jointctl.drivers.can.link_state.link_state", lambda channel: link)
     monkeypatch.setattr(
-        "tools.inspection.subject.open_python_can", lambda *_: can.Bus(interface="virtual", channel=empty_bus.channel)
+        "jointctl.tools.inspection.subject.open_python_can",
+        lambda *_: can.Bus(interface="virtual", channel=empty_bus.channel),
     )
     monkeypatch.setattr(
-        "tools.verbs.clear_fault.open_drive", lambda config, gate: empty_bus.drive(settings_of_virtual_joint)
+        "jointctl.tools.verbs.clear_fault.open_drive", lambda config, gate: empty_bus.drive(settings_of_virtual_joint)
     )
     bus = virtual_config.bus.model_copy(update={"interface": "socketcan", "channel": "can0"})
     config, output = virtual_config.model_copy(update={"bus": bus}), Output(quiet=True)

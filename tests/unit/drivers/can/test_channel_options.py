@@ -15,14 +15,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.bus_lock import lock_name
-from drivers.can.channel import NAME, split_channel, with_options
-from drivers.can.open import open_python_can
-from drivers.can.serial_adapter import port_path
-from drivers.errors import BusError, ConfigurationError
+from jointctl.drivers.bus_lock import lock_name
+from jointctl.drivers.can.channel import NAME, split_channel, with_options
+from jointctl.drivers.can.open import open_python_can
+from jointctl.drivers.can.serial_adapter import port_path
+from jointctl.drivers.errors import BusError, ConfigurationError
+from jointctl.tools.configuration.load import load_config, with_bus_overrides
+from jointctl.tools.configuration.stop_target import GivenTarget, stop_target
 from tests.places import CONFIGS
-from tools.configuration.load import load_config, with_bus_overrides
-from tools.configuration.stop_target import GivenTarget, stop_target
 
 values = st.one_of(
     st.text(st.characters(codec="utf-8")), st.integers(-(10**17), 10**17), st.booleans(),

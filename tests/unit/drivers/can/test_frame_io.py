@@ -8,16 +8,14 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import drivers
-from drivers.can.frame_io import receive_frame, send_frame
-from drivers.can.frames import FRAME_BYTES, Frame
-from firmware_py.libc import WAIT_SCRATCH_WORDS, wait_readable_ns
-from firmware_py.schema import dtype_of, new
+from jointctl.drivers.can.frame_io import receive_frame, send_frame
+from jointctl.drivers.can.frames import FRAME_BYTES, Frame
+from jointctl.firmware_py.libc import WAIT_SCRATCH_WORDS, wait_readable_ns
+from jointctl.firmware_py.schema import dtype_of, new
 
 Pair = tuple[socket.socket, socket.socket]
 
@@ -26,13 +24,13 @@ import socket, sys, threading
 import numba
 import numpy as np
 from numba.core.runtime import rtsys
-from drivers.can.frame_io import receive_frame, send_frame
-from drivers.can.frames import Frame
-from drivers.can.virtual_bus import connect
-from firmware_py.kernel import kernel
-from firmware_py.libc import WAIT_SCRATCH_WORDS, wait_readable_ns
-from firmware_py.schema import new
-from hil.bus.virtual_bus import VirtualBusHub
+from jointctl.drivers.can.frame_io import receive_frame, send_frame
+from jointctl.drivers.can.frames import Frame
+from jointctl.drivers.can.virtual_bus import connect
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.libc import WAIT_SCRATCH_WORDS, wait_readable_ns
+from jointctl.firmware_py.schema import new
+from jointctl.hil.bus.virtual_bus import VirtualBusHub
 
 @numba.njit(error_model="numpy", nogil=True)
 def exchange(source, sink, frames, scratch, count):
@@ -159,7 +157,6 @@ def test_waiting(pair: Pair) -> None:
 def test_no_allocation_in_100_000_exchanges_nor_in_the_hub(tmp_path_factory: pytest.TempPathFactory) -> None:
     environment = {key: value for key, value in os.environ.items() if key != "NUMBA_DISABLE_JIT"}
     environment["NUMBA_NRT_STATS"] = "1"
-    environment["PYTHONPATH"] = str(Path(drivers.__file__).parent.parent)
     path = tmp_path_factory.mktemp("b") / "bus.sock"
     done = subprocess.run(
         [sys.executable, "-c", ALLOCATION_COUNT, str(path)],

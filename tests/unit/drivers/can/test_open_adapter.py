@@ -13,9 +13,9 @@ from typing import Any
 import can
 import pytest
 
-from drivers.can.foreign_bus import tamed
-from drivers.can.open import open_python_can
-from drivers.errors import BusError
+from jointctl.drivers.can.foreign_bus import tamed
+from jointctl.drivers.can.open import open_python_can
+from jointctl.drivers.errors import BusError
 
 
 def test_unknown_interface_of_python_can() -> None:

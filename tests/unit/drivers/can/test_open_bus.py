@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from drivers.can import socketcan
-from drivers.can.open import open_cyclic_end
-from drivers.errors import BusError
+from jointctl.drivers.can import socketcan
+from jointctl.drivers.can.open import open_cyclic_end
+from jointctl.drivers.errors import BusError
 
 
 class FakeCanSocket:

@@ -10,9 +10,9 @@ from typing import Any
 import can
 import pytest
 
-from drivers.can import open as open_module
-from drivers.can.open import open_python_can
-from drivers.errors import BusError
+from jointctl.drivers.can import open as open_module
+from jointctl.drivers.can.open import open_python_can
+from jointctl.drivers.errors import BusError
 
 # these open something on any computer
 WORKING = {"virtual", "udp_multicast", "jointctl"}

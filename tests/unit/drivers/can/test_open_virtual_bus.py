@@ -11,11 +11,11 @@ import can
 import pytest
 
 import drivers
-from drivers.can import virtual_bus
-from drivers.can.open import open_cyclic_end, open_python_can
-from drivers.can.virtual_bus import VirtualBus
-from drivers.errors import BusError
-from hil.bus.virtual_bus import VirtualBusHub
+from jointctl.drivers.can import virtual_bus
+from jointctl.drivers.can.open import open_cyclic_end, open_python_can
+from jointctl.drivers.can.virtual_bus import VirtualBus
+from jointctl.drivers.errors import BusError
+from jointctl.hil.bus.virtual_bus import VirtualBusHub
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from drivers.canopen.settings import CanopenSettings
-from drivers.drive import CommissioningReport
+from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.drive import CommissioningReport
 from tests.unit.drivers.canopen.odd_drive import opened
 from tests.unit.drivers.canopen.wire import Wire
 
@@ -46,4 +46,4 @@ def commission(
 @pytest.fixture
 def short_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
     """Answers that do not come are waited for a short time only."""
-    monkeypatch.setattr("drivers.canopen.drive.SDO_TIMEOUT_S", 0.15)
+    monkeypatch.setattr("jointctl.drivers.canopen.drive.SDO_TIMEOUT_S", 0.15)

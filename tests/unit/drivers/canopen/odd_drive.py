@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from drivers.canopen.drive import CanopenDrive
-from drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.canopen.drive import CanopenDrive
+from jointctl.drivers.canopen.settings import CanopenSettings
 
 NO_ACCESS, READ_ONLY, OUT_OF_RANGE, DEVICE_STATE = 0x06010000, 0x06010002, 0x06090030, 0x08000022
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.canopen.cia402 import (
+from jointctl.drivers.canopen.cia402 import (
     SUPPORTED_MODE_BIT,
     ControlWord,
     Mode,
@@ -15,7 +15,7 @@ from drivers.canopen.cia402 import (
     state_of_word,
     state_text,
 )
-from firmware_py.states import DriveRequest, DriveState
+from jointctl.firmware_py.states import DriveRequest, DriveState
 
 # mask, value: CiA 402-2, table "state coding"
 TABLE = {

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from drivers.canopen.settings import CanopenSettings
-from drivers.errors import ConfigurationError, DeviceError, JointctlError, NoDeviceError
+from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.errors import ConfigurationError, DeviceError, JointctlError, NoDeviceError
 from tests.unit.drivers.canopen.odd_drive import opened, value
 
 pytestmark = pytest.mark.usefixtures("short_timeout")

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from drivers.canopen.connection_loss import rpdo_deadline_ms
-from drivers.canopen.settings import CanopenSettings
-from drivers.errors import DeviceError
-from hil.canopen.device_records import PowerState
+from jointctl.drivers.canopen.connection_loss import rpdo_deadline_ms
+from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.errors import DeviceError
+from jointctl.hil.canopen.device_records import PowerState
 
 MS = 1_000_000
 

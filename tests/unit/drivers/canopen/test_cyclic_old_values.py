@@ -11,9 +11,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from drivers.canopen import exchange
-from drivers.canopen.cia402 import State
-from drivers.canopen.cyclic import answer_owed, begin_cycle
+from jointctl.drivers.canopen import exchange
+from jointctl.drivers.canopen.cia402 import State
+from jointctl.drivers.canopen.cyclic import answer_owed, begin_cycle
 from tests.unit.drivers.canopen.wire import RAD_PER_COUNT, STATUSWORDS, Wire
 
 

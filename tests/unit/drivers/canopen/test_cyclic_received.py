@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
-from drivers.canopen.cia402 import State
-from drivers.canopen.cyclic import ERROR_SHOWN_CYCLES, begin_cycle, get_i16, get_i32, get_u16, put_u16
-from firmware_py.states import DriveState
+from jointctl.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
+from jointctl.drivers.canopen.cia402 import State
+from jointctl.drivers.canopen.cyclic import ERROR_SHOWN_CYCLES, begin_cycle, get_i16, get_i32, get_u16, put_u16
+from jointctl.firmware_py.states import DriveState
 from tests.unit.drivers.canopen.wire import RAD_PER_COUNT, Wire
 
 # --- what is received ------------------------------------------------------------------------------------------

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.canopen import exchange
-from drivers.canopen.cia402 import State
-from drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES, begin_cycle, torque_permille
-from drivers.canopen.port import FRAME_SLOTS, SCRATCH_WORDS
-from firmware_py.states import DriveRequest
+from jointctl.drivers.canopen import exchange
+from jointctl.drivers.canopen.cia402 import State
+from jointctl.drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES, begin_cycle, torque_permille
+from jointctl.drivers.canopen.port import FRAME_SLOTS, SCRATCH_WORDS
+from jointctl.firmware_py.states import DriveRequest
 from tests.unit.drivers.canopen.wire import STATUSWORDS, Wire
 
 

@@ -10,9 +10,9 @@ from canopen.objectdictionary import datatypes
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from drivers.canopen.eds_file import EdsFile, read_eds
-from drivers.canopen.eds_text import decoded, number_of, parse_sections
-from drivers.errors import ConfigurationError
+from jointctl.drivers.canopen.eds_file import EdsFile, read_eds
+from jointctl.drivers.canopen.eds_text import decoded, number_of, parse_sections
+from jointctl.drivers.errors import ConfigurationError
 from tests.places import EDS
 
 TEXT = EDS.read_text()

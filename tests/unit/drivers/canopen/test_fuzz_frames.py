@@ -11,16 +11,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivers.can.frames import Frame
-from drivers.canopen.cyclic import accept_frame, begin_cycle, end_cycle
-from drivers.canopen.port import FRAME_SLOTS, SLOT_RECEIVED, SLOT_RPDO
-from drivers.canopen.scaling import new_port
-from firmware_py.records import Command, Sample
-from firmware_py.schema import new
-from firmware_py.states import DriveRequest, DriveState
+from jointctl.drivers.can.frames import Frame
+from jointctl.drivers.canopen.cyclic import accept_frame, begin_cycle, end_cycle
+from jointctl.drivers.canopen.port import FRAME_SLOTS, SLOT_RECEIVED, SLOT_RPDO
+from jointctl.drivers.canopen.scaling import new_port
+from jointctl.firmware_py.records import Command, Sample
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import DriveRequest, DriveState
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.simulation.virtual_joint import new_device
 from tests.places import CONFIGS
-from tools.configuration.load import load_config
-from tools.simulation.virtual_joint import new_device
 
 quick = settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 identifiers = st.one_of(

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivers.canopen.eds_file import read_eds
-from drivers.canopen.object_access import ATTEMPTS, ObjectAccess
-from drivers.errors import DeviceError, NoDeviceError
+from jointctl.drivers.canopen.eds_file import read_eds
+from jointctl.drivers.canopen.object_access import ATTEMPTS, ObjectAccess
+from jointctl.drivers.errors import DeviceError, NoDeviceError
 
 quick = settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 OBJECTS = ((0x6041, 0), (0x6064, 0), (0x1000, 0), (0x1018, 1), (0x6060, 0), (0x6077, 0))

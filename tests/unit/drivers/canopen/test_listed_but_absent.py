@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import DeviceError
+from jointctl.drivers.errors import DeviceError
 from tests.unit.drivers.canopen.odd_drive import opened, value
 
 pytestmark = pytest.mark.usefixtures("short_timeout")

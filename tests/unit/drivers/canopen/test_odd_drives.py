@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import DeviceError, NoDeviceError
+from jointctl.drivers.errors import DeviceError, NoDeviceError
 from tests.unit.drivers.canopen.odd_drive import OUT_OF_RANGE, READ_ONLY, store, value
 
 pytestmark = pytest.mark.usefixtures("short_timeout")

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from drivers.canopen.settings import CanopenSettings
-from drivers.drive import CommissioningReport
-from drivers.errors import DeviceError
+from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.drive import CommissioningReport
+from jointctl.drivers.errors import DeviceError
 from tests.unit.drivers.canopen.odd_drive import opened
 
 pytestmark = pytest.mark.usefixtures("short_timeout")

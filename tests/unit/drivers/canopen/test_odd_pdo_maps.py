@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from drivers.can.frames import Frame
-from drivers.canopen.cyclic import accept_frame, end_cycle
-from drivers.errors import DeviceError
-from firmware_py.records import Command, Sample
-from firmware_py.schema import new
-from firmware_py.states import DriveRequest
+from jointctl.drivers.can.frames import Frame
+from jointctl.drivers.canopen.cyclic import accept_frame, end_cycle
+from jointctl.drivers.errors import DeviceError
+from jointctl.firmware_py.records import Command, Sample
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import DriveRequest
 from tests.unit.drivers.canopen.odd_drive import NO_ACCESS, OUT_OF_RANGE, READ_ONLY, store, value
 
 pytestmark = pytest.mark.usefixtures("short_timeout")

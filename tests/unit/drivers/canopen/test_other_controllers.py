@@ -5,8 +5,8 @@ from __future__ import annotations
 import can
 import pytest
 
-from drivers.canopen.bus_watchers import LISTEN_S, OtherControllers
-from drivers.errors import BusError
+from jointctl.drivers.canopen.bus_watchers import LISTEN_S, OtherControllers
+from jointctl.drivers.errors import BusError
 
 NODE, MASTER = 5, 126
 

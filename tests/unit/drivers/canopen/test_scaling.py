@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from drivers.canopen.cia402 import State
-from drivers.canopen.scaling import joint_angle_per_count_rad, joint_torque_per_permille_Nm, new_port
-from drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.canopen.cia402 import State
+from jointctl.drivers.canopen.scaling import joint_angle_per_count_rad, joint_torque_per_permille_Nm, new_port
+from jointctl.drivers.canopen.settings import CanopenSettings
 
 SETTINGS = CanopenSettings(
     node=5, eds_path=Path("drive.eds"), mode="cst", rate_Hz=1000.0, heartbeat_s=0.2, master_node=127,

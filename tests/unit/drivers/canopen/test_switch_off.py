@@ -14,15 +14,15 @@ from typing import Any
 import can
 import pytest
 
-from drivers.drive import UNTOUCHED, CommissioningReport, Declined, DriveIdentity, is_safe
-from drivers.errors import BusError, DataError, DeviceError
-from hil.canopen.device_records import PowerState
+from jointctl.drivers.drive import UNTOUCHED, CommissioningReport, Declined, DriveIdentity, is_safe
+from jointctl.drivers.errors import BusError, DataError, DeviceError
+from jointctl.hil.canopen.device_records import PowerState
+from jointctl.tools.output import Output
+from jointctl.tools.running import supervisor as supervisor_module
+from jointctl.tools.running.result.drive_end import require_off, words
+from jointctl.tools.verbs import run as run_module
+from jointctl.tools.verbs import stop as stop_module
 from tests.places import CONFIGS
-from tools.output import Output
-from tools.running import supervisor as supervisor_module
-from tools.running.result.drive_end import require_off, words
-from tools.verbs import run as run_module
-from tools.verbs import stop as stop_module
 
 ENABLED, SWITCHED_ON = 0x27, 0x23
 NMT_STOP = (0x000, b"\x02\x01")

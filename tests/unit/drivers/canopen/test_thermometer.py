@@ -10,9 +10,9 @@ import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
 
-from drivers.canopen.thermometer import TemperatureObject, Thermometer
-from drivers.drive import Reading
-from drivers.errors import DeviceError
+from jointctl.drivers.canopen.thermometer import TemperatureObject, Thermometer
+from jointctl.drivers.drive import Reading
+from jointctl.drivers.errors import DeviceError
 
 INDEX, NODE = 0x2103, 5
 S = 1_000_000_000

@@ -10,21 +10,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.can.frames import Frame
-from drivers.canopen.cyclic import accept_frame
-from drivers.errors import ConfigurationError, DeviceError
-from firmware_py.records import Sample
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase, Fault
-from hil.faults.kinds import FaultConstants, FaultKind
+from jointctl.drivers.can.frames import Frame
+from jointctl.drivers.canopen.cyclic import accept_frame
+from jointctl.drivers.errors import ConfigurationError, DeviceError
+from jointctl.firmware_py.records import Sample
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.hil.faults.kinds import FaultConstants, FaultKind
+from jointctl.tools.configuration.drive_settings import canopen_settings, cyclic_bus_load
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.inspection.bus_health import bus_budget
+from jointctl.tools.running.open_drive import drive_fault_text
+from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.simulation.virtual_joint import new_device
 from tests.places import CONFIGS
 from tests.two_encoders import NODE, cycle, port_of, short_run
-from tools.configuration.drive_settings import canopen_settings, cyclic_bus_load
-from tools.configuration.load import load_config
-from tools.inspection.bus_health import bus_budget
-from tools.running.open_drive import drive_fault_text
-from tools.simulation.lockstep import LockstepJoint
-from tools.simulation.virtual_joint import new_device
 
 DRIVE = {**{k: v for k, v in NODE.items() if k != "node"}, "source": "drive"}
 
@@ -53,8 +53,8 @@ def test_a_run_with_two_encoders(tmp_path: Path, encoder: dict[str, Any]) -> Non
 def test_commissioning_refuses(tmp_path: Path, change: dict[str, Any], message: str) -> None:
     good = short_run(tmp_path, NODE)
     device = new_device(good)
-    from drivers.canopen.drive import CanopenDrive
-    from tools.simulation.lockstep import DirectBus
+    from jointctl.drivers.canopen.drive import CanopenDrive
+    from jointctl.tools.simulation.lockstep import DirectBus
 
     bus = DirectBus(device)
     settings = canopen_settings(short_run(tmp_path, {**NODE, **change}))
@@ -67,8 +67,8 @@ def test_commissioning_refuses(tmp_path: Path, change: dict[str, Any], message: 
 
 
 def test_an_encoder_with_an_alarm_is_refused(tmp_path: Path) -> None:
-    from drivers.canopen.drive import CanopenDrive
-    from tools.simulation.lockstep import DirectBus
+    from jointctl.drivers.canopen.drive import CanopenDrive
+    from jointctl.tools.simulation.lockstep import DirectBus
 
     config = short_run(tmp_path, NODE)
     device = new_device(config)
@@ -83,8 +83,8 @@ def test_an_encoder_with_an_alarm_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("alarm", [True, False])
 def test_an_alarm_that_comes_while_the_question_is_open_is_refused(tmp_path: Path, alarm: bool) -> None:
     """Its EMCY comes while nobody listens."""
-    from drivers.canopen.drive import CanopenDrive
-    from tools.simulation.lockstep import DirectBus
+    from jointctl.drivers.canopen.drive import CanopenDrive
+    from jointctl.tools.simulation.lockstep import DirectBus
 
     config = short_run(tmp_path, NODE)
     device = new_device(config)
@@ -125,7 +125,7 @@ def test_a_configuration_that_is_wrong_about_one_encoder(tmp_path: Path, key: st
     """The joint is what the file says; the controller is told otherwise."""
     good = LockstepJoint(short_run(tmp_path, NODE, virtual__initial_position_rad=0.1))
     wrong = canopen_settings(short_run(tmp_path, NODE, virtual__initial_position_rad=0.1, **{key: value}))
-    from drivers.canopen.scaling import joint_angle_per_count_rad
+    from jointctl.drivers.canopen.scaling import joint_angle_per_count_rad
 
     good._port[0].position_radpcount = joint_angle_per_count_rad(wrong) * wrong.encoder_direction
     run = good.run()

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from drivers.canopen.drive import CanopenDrive
-from drivers.errors import BusError, DeviceError
+from jointctl.drivers.canopen.drive import CanopenDrive
+from jointctl.drivers.errors import BusError, DeviceError
 from tests.unit.drivers.canopen.odd_drive import opened
 
 WATCHED = {0x1016: 4, 0x1400: 2, 0x6007: 2, 0x6061: 1}  # and the bytes of each

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from drivers.canopen.watchdog_proof import BEATS, prove_watchdog
-from drivers.errors import DeviceError
+from jointctl.drivers.canopen.watchdog_proof import BEATS, prove_watchdog
+from jointctl.drivers.errors import DeviceError
 
 NODE, MASTER, TIMEOUT_s = 1, 126, 0.2
 

@@ -7,13 +7,13 @@ import struct
 
 import numpy as np
 
-from drivers.can.frames import Frame
-from drivers.canopen.cia402 import State
-from drivers.canopen.cyclic import accept_frame, end_cycle
-from drivers.canopen.port import FRAME_SLOTS, CanopenPort
-from firmware_py.records import Command, Sample
-from firmware_py.schema import new
-from firmware_py.states import DriveRequest
+from jointctl.drivers.can.frames import Frame
+from jointctl.drivers.canopen.cia402 import State
+from jointctl.drivers.canopen.cyclic import accept_frame, end_cycle
+from jointctl.drivers.canopen.port import FRAME_SLOTS, CanopenPort
+from jointctl.firmware_py.records import Command, Sample
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import DriveRequest
 
 RAD_PER_COUNT = 2.0 * math.pi / 2**19
 STATUSWORDS = {

@@ -6,12 +6,12 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from drivers.elmo.drive import ElmoDrive
-from drivers.elmo.settings import ElmoSettings
-from drivers.errors import JointctlError
-from hil.elmo.commands import ElmoDeviceSettings
-from hil.elmo.interpreter import ElmoInterpreter
-from hil.plant.joint import plant
+from jointctl.drivers.elmo.drive import ElmoDrive
+from jointctl.drivers.elmo.settings import ElmoSettings
+from jointctl.drivers.errors import JointctlError
+from jointctl.hil.elmo.commands import ElmoDeviceSettings
+from jointctl.hil.elmo.interpreter import ElmoInterpreter
+from jointctl.hil.plant.joint import plant
 
 COUNTS = 2**19
 SETTINGS = ElmoSettings(

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from drivers.elmo.cyclic import begin_cycle, end_cycle
-from drivers.elmo.port import ElmoPort
-from drivers.elmo.replies import take_byte
-from firmware_py.records import Command, Sample
-from firmware_py.schema import new
-from firmware_py.states import DriveRequest, DriveState
-from hil.elmo.commands import ElmoDeviceSettings
-from hil.elmo.interpreter import ElmoInterpreter
-from hil.plant.joint import plant
+from jointctl.drivers.elmo.cyclic import begin_cycle, end_cycle
+from jointctl.drivers.elmo.port import ElmoPort
+from jointctl.drivers.elmo.replies import take_byte
+from jointctl.firmware_py.records import Command, Sample
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import DriveRequest, DriveState
+from jointctl.hil.elmo.commands import ElmoDeviceSettings
+from jointctl.hil.elmo.interpreter import ElmoInterpreter
+from jointctl.hil.plant.joint import plant
 
 PERIOD_S = 1.0 / 150.0
 PER_RAD = 2**19 / math.tau

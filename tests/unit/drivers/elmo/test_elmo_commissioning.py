@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from drivers.elmo.line_budget import cycle_characters, highest_rate_Hz, measured_exchange
-from drivers.errors import ConfigurationError, DeviceError, JointctlError, NoDeviceError
-from hil.elmo.motor import switch_off
+from jointctl.drivers.elmo.line_budget import cycle_characters, highest_rate_Hz, measured_exchange
+from jointctl.drivers.errors import ConfigurationError, DeviceError, JointctlError, NoDeviceError
+from jointctl.hil.elmo.motor import switch_off
 from tests.unit.drivers.elmo.memory_port import COUNTS, SETTINGS, MemoryPort
 
 

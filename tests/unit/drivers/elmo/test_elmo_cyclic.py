@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.elmo.cyclic import begin_cycle, current_mA, end_cycle, put_command, velocity_cps
-from drivers.elmo.port import ElmoPort, Question
-from drivers.elmo.replies import parse_number
-from firmware_py.schema import new
-from firmware_py.states import DriveRequest, DriveState
-from hil.elmo.motor import switch_off
+from jointctl.drivers.elmo.cyclic import begin_cycle, current_mA, end_cycle, put_command, velocity_cps
+from jointctl.drivers.elmo.port import ElmoPort, Question
+from jointctl.drivers.elmo.replies import parse_number
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import DriveRequest, DriveState
+from jointctl.hil.elmo.motor import switch_off
 from tests.unit.drivers.elmo.talk import PER_RAD, PERIOD_S, RAMP_CPS2, Talk
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from drivers.elmo.serial_port import SerialPort
-from drivers.errors import BusError, DeviceError, NoDeviceError
-from hil.elmo.motor import switch_off
+from jointctl.drivers.elmo.serial_port import SerialPort
+from jointctl.drivers.errors import BusError, DeviceError, NoDeviceError
+from jointctl.hil.elmo.motor import switch_off
 from tests.unit.drivers.elmo.memory_port import MemoryPort
 
 

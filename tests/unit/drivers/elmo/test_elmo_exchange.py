@@ -10,10 +10,10 @@ import time
 
 import pytest
 
-from drivers.elmo.exchange import exchange_memory, receive
-from drivers.elmo.port import ElmoPort
-from firmware_py.records import Sample
-from firmware_py.schema import new
+from jointctl.drivers.elmo.exchange import exchange_memory, receive
+from jointctl.drivers.elmo.port import ElmoPort
+from jointctl.firmware_py.records import Sample
+from jointctl.firmware_py.schema import new
 
 REPLY = b"PX\r42;"
 LOOK_S = struct.pack("ll", 0, 1000)  # how long a look at an empty line takes: its descriptor is one that blocks

@@ -9,8 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.elmo.codes import error_text, motor_fault_names, motor_fault_text, motor_off_cause, status_text, unit_mode
-from drivers.elmo.interpreter import REPLY_MAX, Interpreter, Reply, ReplyKind, encode, parse_reply
+from jointctl.drivers.elmo.codes import (
+    error_text,
+    motor_fault_names,
+    motor_fault_text,
+    motor_off_cause,
+    status_text,
+    unit_mode,
+)
+from jointctl.drivers.elmo.interpreter import REPLY_MAX, Interpreter, Reply, ReplyKind, encode, parse_reply
 
 
 @pytest.mark.parametrize(

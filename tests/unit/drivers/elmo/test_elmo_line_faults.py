@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.elmo.cyclic import begin_cycle, end_cycle, note_written, put_command
-from drivers.elmo.interpreter import ReplyKind, parse_reply
-from drivers.elmo.port import EXPECTED_MAX, LINE_MAX, Question
-from drivers.elmo.replies import take_byte
-from firmware_py.records import LINE_GONE
-from firmware_py.states import DriveRequest, DriveState
+from jointctl.drivers.elmo.cyclic import begin_cycle, end_cycle, note_written, put_command
+from jointctl.drivers.elmo.interpreter import ReplyKind, parse_reply
+from jointctl.drivers.elmo.port import EXPECTED_MAX, LINE_MAX, Question
+from jointctl.drivers.elmo.replies import take_byte
+from jointctl.firmware_py.records import LINE_GONE
+from jointctl.firmware_py.states import DriveRequest, DriveState
 from tests.unit.drivers.elmo.talk import Talk
 
 

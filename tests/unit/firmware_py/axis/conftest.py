@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from firmware_py.records import AxisState
-from firmware_py.schema import new
-from firmware_py.sequence import reset_axis
+from jointctl.firmware_py.records import AxisState
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.sequence import reset_axis
 
 
 @pytest.fixture

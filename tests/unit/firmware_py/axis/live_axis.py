@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from firmware_py.change_records import ChangeAnswer, ChangeKind
-from firmware_py.live_change import gains_of
-from firmware_py.records import TrajectoryConstants
-from firmware_py.schema import new
-from firmware_py.states import TrajectoryKind
+from jointctl.firmware_py.change_records import ChangeAnswer, ChangeKind
+from jointctl.firmware_py.live_change import gains_of
+from jointctl.firmware_py.records import TrajectoryConstants
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import TrajectoryKind
 
 GAINS = ("kp", "kv", "ki", "observer_radps", "learning_rate")
 RAMP_s = 0.05

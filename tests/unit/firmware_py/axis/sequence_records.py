@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from firmware_py.records import Sample
-from firmware_py.schema import new
-from firmware_py.states import DriveState
+from jointctl.firmware_py.records import Sample
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import DriveState
 
 
 def sample_of(drive_state: DriveState) -> Any:

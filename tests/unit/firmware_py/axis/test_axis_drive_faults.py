@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from firmware_py.records import LINE_GONE
-from firmware_py.sequence import reset_axis
-from firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction, StopRequest
+from jointctl.firmware_py.records import LINE_GONE
+from jointctl.firmware_py.sequence import reset_axis
+from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction, StopRequest
 from tests.axis_on_stub_joint import NewRig, assert_fault, assert_well
 
 

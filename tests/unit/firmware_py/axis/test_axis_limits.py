@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from firmware_py.states import AxisPhase, DriveRequest, Fault, Reaction
+from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault, Reaction
 from tests.axis_on_stub_joint import NewRig, assert_fault, assert_well
 
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from firmware_py.records import LimitConstants, Swing, SwingState
-from firmware_py.safety import (
+from jointctl.firmware_py.records import LimitConstants, Swing, SwingState
+from jointctl.firmware_py.safety import (
     ERROR_SWINGS,
     GROWING_SWINGS,
     GROWTH,
@@ -20,8 +20,8 @@ from firmware_py.safety import (
     swing_fault,
     swing_Hz,
 )
-from firmware_py.schema import new
-from firmware_py.states import Fault
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import Fault
 
 SLOWEST = 300
 

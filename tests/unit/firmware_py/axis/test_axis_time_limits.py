@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from firmware_py.states import AxisPhase, Fault, Reaction, StopRequest
+from jointctl.firmware_py.states import AxisPhase, Fault, Reaction, StopRequest
 from tests.axis_on_stub_joint import NewRig, assert_fault, assert_well, finish
 
 

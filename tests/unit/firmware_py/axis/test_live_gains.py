@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from firmware_py.change_records import ChangeAnswer, ChangeKind
-from firmware_py.live_change import gains_allowed, gains_of, set_gains
-from firmware_py.lyapunov import solve_lyapunov_p
-from firmware_py.records import Gains
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase, ControllerKind, Fault, StopRequest
+from jointctl.firmware_py.change_records import ChangeAnswer, ChangeKind
+from jointctl.firmware_py.live_change import gains_allowed, gains_of, set_gains
+from jointctl.firmware_py.lyapunov import solve_lyapunov_p
+from jointctl.firmware_py.records import Gains
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, ControllerKind, Fault, StopRequest
 from tests.axis_on_stub_joint import NewRig
 from tests.unit.firmware_py.axis.live_axis import GAINS, RAMP_s, answered, hold, live, post
 

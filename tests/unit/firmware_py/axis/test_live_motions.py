@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from firmware_py.change_records import ChangeAnswer, ChangeKind, MotionChange
-from firmware_py.live_change import move_duration_s, trajectory_allowed
-from firmware_py.records import TrajectoryConstants
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase, Fault, StopRequest, TrajectoryKind
+from jointctl.firmware_py.change_records import ChangeAnswer, ChangeKind, MotionChange
+from jointctl.firmware_py.live_change import move_duration_s, trajectory_allowed
+from jointctl.firmware_py.records import TrajectoryConstants
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest, TrajectoryKind
 from tests.axis_on_stub_joint import NewRig
 from tests.unit.firmware_py.axis.live_axis import answered, hold, live, post
 

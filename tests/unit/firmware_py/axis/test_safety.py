@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_py.records import LimitConstants
-from firmware_py.safety import (
+from jointctl.firmware_py.records import LimitConstants
+from jointctl.firmware_py.safety import (
     drive_fault,
     encoders_disagree,
     limit_position_rad,
@@ -21,8 +21,8 @@ from firmware_py.safety import (
     reference_fault,
     within,
 )
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase, DriveState, Fault, LimitSource, Reaction
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, LimitSource, Reaction
 
 NOT_FINITE = (math.nan, math.inf, -math.inf)
 

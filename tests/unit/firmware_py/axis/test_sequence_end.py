@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from firmware_py.records import LINE_GONE
-from firmware_py.sequence import ANSWER_CYCLES, enter, released_torque_Nm, step_stopping
-from firmware_py.states import AxisPhase, DriveState, Fault, Reaction
+from jointctl.firmware_py.records import LINE_GONE
+from jointctl.firmware_py.sequence import ANSWER_CYCLES, enter, released_torque_Nm, step_stopping
+from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, Reaction
 from tests.unit.firmware_py.axis.sequence_records import sample_of
 
 

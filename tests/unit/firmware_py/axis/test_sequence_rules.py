@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from firmware_py.records import AxisState, Command
-from firmware_py.schema import new
-from firmware_py.sequence import enter, powered, react, request_stop, reset_axis, trip, write_command
-from firmware_py.states import AxisPhase, DriveRequest, Fault, Reaction, StopRequest
+from jointctl.firmware_py.records import AxisState, Command
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.sequence import enter, powered, react, request_stop, reset_axis, trip, write_command
+from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault, Reaction, StopRequest
 
 GOAL = {
     Reaction.RAMP: AxisPhase.RAMPING,

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.records import Sample
-from firmware_py.schema import new
-from firmware_py.sequence import compare_encoders, step_enabling, step_waiting
-from firmware_py.states import AxisPhase, DriveState, Fault, Reaction
-from firmware_py.trajectory import approach_at
+from jointctl.firmware_py.records import Sample
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.sequence import compare_encoders, step_enabling, step_waiting
+from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, Reaction
+from jointctl.firmware_py.trajectory import approach_at
 from tests.unit.firmware_py.axis.sequence_records import sample_of
 
 

@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 
-from firmware_py.frozen_reading import PUSHED_CYCLES, check_reading
-from firmware_py.records import AxisState, Sample
-from firmware_py.safety import reaction_to
-from firmware_py.schema import new
-from firmware_py.sequence import reset_axis
-from firmware_py.states import AxisPhase, CommandKind, DriveState, Fault, Reaction
-from firmware_py.surroundings import check_surroundings, check_suspension
+from jointctl.firmware_py.frozen_reading import PUSHED_CYCLES, check_reading
+from jointctl.firmware_py.records import AxisState, Sample
+from jointctl.firmware_py.safety import reaction_to
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.sequence import reset_axis
+from jointctl.firmware_py.states import AxisPhase, CommandKind, DriveState, Fault, Reaction
+from jointctl.firmware_py.surroundings import check_surroundings, check_suspension
 
 
 def after(fault: Fault, phase: AxisPhase) -> AxisPhase:

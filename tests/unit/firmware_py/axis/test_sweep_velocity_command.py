@@ -9,15 +9,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.can.frames import Frame
-from drivers.canopen.cia402 import State
-from drivers.canopen.cyclic import end_cycle, get_i32, velocity_units
-from drivers.canopen.port import FRAME_SLOTS, SLOT_RPDO
-from drivers.canopen.scaling import new_port
-from firmware_py.records import Command, LimitConstants, Sample
-from firmware_py.schema import new
-from firmware_py.states import AxisPhase, CommandKind, DriveRequest, DriveState, Fault, StopRequest, TrajectoryKind
-from firmware_py.velocity_command import limited_velocity_radps
+from jointctl.drivers.can.frames import Frame
+from jointctl.drivers.canopen.cia402 import State
+from jointctl.drivers.canopen.cyclic import end_cycle, get_i32, velocity_units
+from jointctl.drivers.canopen.port import FRAME_SLOTS, SLOT_RPDO
+from jointctl.drivers.canopen.scaling import new_port
+from jointctl.firmware_py.records import Command, LimitConstants, Sample
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import (
+    AxisPhase,
+    CommandKind,
+    DriveRequest,
+    DriveState,
+    Fault,
+    StopRequest,
+    TrajectoryKind,
+)
+from jointctl.firmware_py.velocity_command import limited_velocity_radps
 
 PERIOD_s = 1e-3
 

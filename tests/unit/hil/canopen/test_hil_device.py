@@ -6,7 +6,7 @@ import struct
 
 import pytest
 
-from hil.canopen.device import DeviceSettings
+from jointctl.hil.canopen.device import DeviceSettings
 from tests.virtual_drive import NODE, Rig
 
 

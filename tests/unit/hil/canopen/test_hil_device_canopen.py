@@ -10,10 +10,10 @@ from typing import Any
 import canopen
 import pytest
 
-from hil.canopen.device import Cia402Device, DeviceSettings
-from hil.device_loop import SEND_ERRORS_WORD
-from hil.plant.joint import plant
-from hil.realtime_device import RealtimeDevice
+from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
+from jointctl.hil.device_loop import SEND_ERRORS_WORD
+from jointctl.hil.plant.joint import plant
+from jointctl.hil.realtime_device import RealtimeDevice
 from tests.places import EDS
 from tests.virtual_drive import NODE, Network
 

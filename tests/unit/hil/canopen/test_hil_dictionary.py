@@ -9,9 +9,9 @@ import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
 
-from drivers.canopen.sdo_download import download
-from hil.canopen.device import Cia402Device, DeviceSettings
-from hil.plant.joint import plant
+from jointctl.drivers.canopen.sdo_download import download
+from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
+from jointctl.hil.plant.joint import plant
 from tests.places import EDS
 from tests.virtual_drive import NODE, Network
 

@@ -10,10 +10,10 @@ from typing import Any
 import canopen
 import pytest
 
-from drivers.canopen.eds_file import read_eds
+from jointctl.drivers.canopen.eds_file import read_eds
+from jointctl.tools.simulation.virtual_joint import new_device
 from tests.places import CONFIGS
 from tests.two_encoders import NODE, short_run
-from tools.simulation.virtual_joint import new_device
 
 
 def frame(identifier: int, data: bytes) -> bytes:

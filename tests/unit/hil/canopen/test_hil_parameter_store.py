@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.canopen.device import DeviceSettings
+from jointctl.hil.canopen.device import DeviceSettings
 from tests.virtual_drive import NODE, Rig
 
 SAVE = int.from_bytes(b"save", "little")

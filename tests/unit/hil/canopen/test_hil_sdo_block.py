@@ -11,9 +11,9 @@ from typing import Any
 import canopen
 import pytest
 
-from hil.canopen.device import Cia402Device, DeviceSettings
-from hil.canopen.sdo_server import TIMEOUT_NS, SdoServer
-from hil.plant.joint import plant
+from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
+from jointctl.hil.canopen.sdo_server import TIMEOUT_NS, SdoServer
+from jointctl.hil.plant.joint import plant
 from tests.places import EDS
 
 NODE = 5

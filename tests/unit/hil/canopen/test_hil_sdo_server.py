@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from firmware_py.schema import new
-from hil.canopen.device import Cia402Device, DeviceSettings
-from hil.canopen.device_fields import FIELDS
-from hil.canopen.device_records import Device
-from hil.canopen.object_dictionary import load_entries
-from hil.canopen.pdo_core import read_object, write_object
-from hil.plant.joint import plant
+from jointctl.firmware_py.schema import new
+from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
+from jointctl.hil.canopen.device_fields import FIELDS
+from jointctl.hil.canopen.device_records import Device
+from jointctl.hil.canopen.object_dictionary import load_entries
+from jointctl.hil.canopen.pdo_core import read_object, write_object
+from jointctl.hil.plant.joint import plant
 from tests.places import ROOT
 
 EDS = ROOT / "configs" / "virtual_joint.eds"
