@@ -11,6 +11,7 @@ while the loop waits with the drive off, and from 100 ms after enabling until th
 from __future__ import annotations
 
 import argparse
+import contextlib
 import gc
 import json
 import os
@@ -21,7 +22,7 @@ import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,8 @@ FIRST_MOTION_CYCLES = 100  # of the approach, in which every frame is tried
 ENABLING_s = 0.05  # a write while the loop enables is seen at the supervisor's next look
 QUIET_s = 0.2  # for so long after the end the drive must stay off
 LONGEST_s = 30.0
+PROGRESS_s = 60.0
+WARM_UP = ("stop", "NMT stop", "SDO 6007 = 0", "frames to the drive lost")
 # What is waited for, shorter than on a joint: the time that is allowed follows.
 SHORT = {"duration_s": 0.3, "release_s": 0.02, "heartbeat_s": 0.1, "wait_timeout_s": 1.0, "enable_timeout_s": 1.0,
          "stop_timeout_s": 1.0, "off_timeout_s": 0.5}  # fmt: skip
@@ -273,6 +276,8 @@ class Exhaustion:
         """The number of frames of the undisturbed run."""
         with tempfile.TemporaryDirectory() as name:
             config, joint = prepared(self.kind, self.deadline, Path(name))
+            for injection in WARM_UP:
+                self._warm_up(config, joint, Path(name), injection)
             with simulated(joint) as world:
                 self.session = self._start(config, world, Path(name))
                 self.motion_cycle = -1
@@ -286,6 +291,16 @@ class Exhaustion:
                 assert self.session.outcome == "done", (self.session.outcome, self.session.text)
                 assert not world.powered
                 return world.frames
+
+    def _warm_up(self, config: Config, joint: Config, folder: Path, name: str) -> None:
+        """One run with an injection: what is loaded or remembered at its first use would be so in every child."""
+        with simulated(joint) as world:
+            session = self._start(config, world, folder)
+            world.run(lambda: session.phase == "approach")
+            world.fast = world.long_naps = True
+            INJECTIONS[name].act(session)
+            world.run(lambda: world.now_ns > LONGEST_s * 1e9)
+        SEEN.clear()
 
     def _start(self, config: Config, world: World, folder: Path) -> Session:
         from jointctl.tools.running import supervisor as supervisor_module
@@ -382,6 +397,29 @@ def report(rows: list[dict[str, Any]], frames: dict[str, int], elapsed_s: float)
     return len(bad)
 
 
+def rows_of_parts(command: list[str], workers: int) -> Iterator[dict[str, Any]]:
+    """What that many processes find, each with its share of the frames; their progress on stderr."""
+    with contextlib.ExitStack() as stack:
+        outputs = [stack.enter_context(tempfile.TemporaryFile("w+")) for _ in range(workers)]
+        parts = [
+            subprocess.Popen([*command, "--part", f"{k}/{workers}"], stdout=output) for k, output in enumerate(outputs)
+        ]
+        for part in parts:
+            stack.callback(part.kill)
+        next_s = CLOCK() + PROGRESS_s
+        while any(part.poll() is None for part in parts):
+            time.sleep(0.2)
+            if CLOCK() > next_s:
+                next_s += PROGRESS_s
+                done = sum(os.pread(output.fileno(), 1 << 30, 0).count(b"\n") for output in outputs)
+                print(f"{' '.join(command[2:6])}: {done} injections", file=sys.stderr, flush=True)
+        for part, output in zip(parts, outputs, strict=True):
+            if part.returncode:
+                raise SystemExit(f"a part ended with code {part.returncode}")
+            output.seek(0)
+            yield from map(json.loads, output)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kind", choices=("run", "sweep"), action="append")
@@ -404,19 +442,11 @@ def main() -> int:
         for deadline in deadlines:
             command = [sys.executable, __file__, "--kind", kind, "--deadline", deadline, "--every", str(given.every)]
             command += ["--rest", str(given.rest)]
-            parts = [
-                subprocess.Popen([*command, "--part", f"{k}/{given.workers}"], stdout=subprocess.PIPE, text=True)
-                for k in range(given.workers)
-            ]
-            for part in parts:
-                for line in part.communicate()[0].splitlines():
-                    row = json.loads(line)
-                    if "frames" in row:
-                        frames[f"{kind}, {'with' if deadline == 'yes' else 'without'} 1400:5"] = row["frames"]
-                    else:
-                        rows.append(row)
-                if part.returncode:
-                    raise SystemExit(f"a part ended with code {part.returncode}")
+            for row in rows_of_parts(command, given.workers):
+                if "frames" in row:
+                    frames[f"{kind}, {'with' if deadline == 'yes' else 'without'} 1400:5"] = row["frames"]
+                else:
+                    rows.append(row)
             print(f"{kind}, 1400:5 {deadline}: {len(rows)} injections so far, "
                   f"{sum(bool(row['problems']) for row in rows)} violations, {CLOCK() - started_s:.0f} s",
                   file=sys.stderr, flush=True)  # fmt: skip
