@@ -255,7 +255,7 @@ def new_supervisor(kind: str, config: Config, control: Control, folder: Path) ->
     from jointctl.tools.verbs.sweep import joint_model
 
     config = with_mode(config, "auto")
-    options = SweepOptions(points=2, min_speed_radps=0.1, max_speed_radps=0.2, dwell_s=0.3, warm_up_turns=0.0)
+    options = SweepOptions(points=2, min_speed_radps=0.4, max_speed_radps=0.5, dwell_s=0.1, warm_up_turns=0.0)
     plan = make_plan(config, options)
     motion = plan.motion(plan.points, 0.0, 1.0)
     meter = SweepMeter(motion.windows, joint_model(config, plan.settings), lambda _: None)
