@@ -1,44 +1,111 @@
-"""One tick of one joint: sample in, command out.
-
-    position -> phase and reference -> velocity -> safety -> law -> finite check, torque limit, rate limit
-
-With CommandKind.VELOCITY the last part is the velocity command -> finite check, velocity limit, acceleration limit.
-
-The phases themselves are in `sequence`, the limits in `safety`.
-"""
+"""One tick of one joint: sample in, command out; with the velocity filter and the velocity command that it uses."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from jointctl.firmware_py.change_records import MotionChange
-from jointctl.firmware_py.computed_torque import step_law
-from jointctl.firmware_py.frozen_reading import check_reading
 from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.law import step_law
 from jointctl.firmware_py.live_change import step_change, step_new_motion
-from jointctl.firmware_py.records import AxisConstants, AxisState, Command, LimitConstants, Sample
-from jointctl.firmware_py.safety import limit_position_rad, limited_torque_Nm, motion_fault, reference_fault
-from jointctl.firmware_py.sequence import (
-    compare_encoders,
+from jointctl.firmware_py.records import (
+    AxisConstants,
+    AxisState,
+    Command,
+    MotionChange,
+    Reference,
+    Sample,
+    VelocityCommandConstants,
+    VelocityConstants,
+    VelocityState,
+)
+from jointctl.firmware_py.safety import (
+    check_encoders,
+    check_finite,
+    check_jump,
+    check_motion,
+    check_reading,
+    check_reference,
+    check_saturation,
+    check_stop_time,
+    check_supervision,
+    check_swing,
     enter,
+    limited_torque_Nm,
+    limited_velocity_radps,
     powered,
     react,
+    take_notice,
+    watch_rest,
+)
+from jointctl.firmware_py.sequence import (
     released_torque_Nm,
     request_stop,
     step_enabling,
     step_stopping,
     step_waiting,
-    trip,
     write_command,
 )
 from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, Reaction
-from jointctl.firmware_py.surroundings import check_surroundings
-from jointctl.firmware_py.swing_check import check_swing, take_notice, watch_rest
 from jointctl.firmware_py.trajectory import approach_at, brake_step, reference_at, repetition
-from jointctl.firmware_py.velocity import step_velocity
-from jointctl.firmware_py.velocity_command import limited_velocity_radps, velocity_command_radps
 
-REACTION_CYCLES = 2  # between seeing that the reference leaves its limits and the first braked cycle
+# --- Velocity from position differences with a first-order low-pass ---
+# The filter lags, and a velocity error e' = filter(q') - q_d' then carries the lag of q' but not of q_d', which an
+# integrating law absorbs as a bias.  `error_rate_radps` is the matched version: the difference quotient of e = q -
+# q_d sent as a whole through the same filter.
+
+
+@kernel
+def low_pass_gain(cutoff_Hz: float, interval_s: float) -> float:
+    """Weight of the new value in one step of the exactly discretised first-order low-pass; 1 = no filter."""
+    if cutoff_Hz <= 0.0:
+        return 1.0
+    return 1.0 - math.exp(-2.0 * math.pi * cutoff_Hz * interval_s)
+
+
+@kernel
+def step_velocity(
+    constants: VelocityConstants, state: VelocityState, position_rad: float, error_rad: float, elapsed_cycles: int
+) -> None:
+    """Take a sample that came `elapsed_cycles` (>= 1) periods after the last one; the first one only primes."""
+    if state.primed == 0:
+        state.primed = 1
+        state.velocity_radps = 0.0
+        state.error_rate_radps = 0.0
+    else:
+        interval_s = elapsed_cycles * constants.period_s
+        if elapsed_cycles == 1:
+            gain = constants.period_gain
+        else:
+            gain = low_pass_gain(constants.cutoff_Hz, interval_s)
+        state.velocity_radps += gain * ((position_rad - state.last_position_rad) / interval_s - state.velocity_radps)
+        state.error_rate_radps += gain * ((error_rad - state.last_error_rad) / interval_s - state.error_rate_radps)
+    state.last_position_rad = position_rad
+    state.last_error_rad = error_rad
+
+
+# --- The velocity command: the reference's velocity plus a small position correction ---
+# For a drive that closes the velocity loop itself:
+# v = v_d - k (q - q_d)          at the joint, rad/s, k = position_gain_ps [1/s]
+#
+# The correction keeps the joint on the planned motion (a drive's velocity loop alone drifts); it is small on purpose,
+# so that at constant speed the torque is what friction asks for.  Sent only if it is finite, then limited by the
+# velocity limit and by the acceleration limit, in that order.  Not modelled: the drive's own ramps and limits.
+
+
+@kernel
+def velocity_command_radps(constants: VelocityCommandConstants, reference: Reference, position_rad: float) -> float:
+    """The unlimited velocity command [rad/s]."""
+    return reference.velocity_radps - constants.position_gain_ps * (position_rad - reference.position_rad)
+
+
+# --- One tick of one joint: sample in, command out ---
+# position -> phase and reference -> velocity -> safety -> law -> finite check, torque limit, rate limit
+#
+# With CommandKind.VELOCITY the last part is the velocity command -> finite check, velocity limit, acceleration limit.
+#
+# The phases themselves are in `sequence`, the limits in `safety`.
 
 
 @kernel
@@ -53,10 +120,7 @@ def _take_position(constants: AxisConstants, state: AxisState, sample: Sample, e
         state.measured_position_rad += state.velocity.velocity_radps * elapsed_cycles * constants.velocity.period_s
         return 0
     gap_cycles = state.sample_age_cycles + elapsed_cycles
-    if state.velocity.primed != 0:
-        moved_rad = abs(sample.position_rad - state.velocity.last_position_rad)
-        if not moved_rad <= constants.limits.position_jump_max_rad * gap_cycles:
-            trip(state, Fault.POSITION_JUMP, moved_rad, 0)
+    check_jump(constants, state, sample, gap_cycles)
     changed = not abs(sample.position_rad - state.frozen_at_rad) <= constants.limits.frozen_tolerance_rad
     if changed:
         state.frozen_at_rad = sample.position_rad
@@ -69,7 +133,7 @@ def _take_position(constants: AxisConstants, state: AxisState, sample: Sample, e
     state.measured_position_rad = sample.position_rad
     state.second_position_rad = sample.second_position_rad
     state.measured_torque_Nm = sample.torque_Nm
-    compare_encoders(constants.limits, state, sample)
+    check_encoders(constants.limits, state, sample)
     return gap_cycles
 
 
@@ -95,15 +159,7 @@ def _move_reference(constants: AxisConstants, state: AxisState, table: np.ndarra
     else:
         _brake(constants, state, elapsed_cycles)
         return
-    reference = state.reference
-    fault = reference_fault(
-        constants.limits,
-        reference.position_rad,
-        reference.velocity_radps,
-        constants.sequence.brake_radps2,
-        REACTION_CYCLES * constants.law.period_s,
-    )
-    trip(state, fault, state.reference.position_rad, 0)
+    check_reference(constants, state)
 
 
 @kernel
@@ -121,36 +177,7 @@ def _brake(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> N
         state.still_cycles += elapsed_cycles
         if state.still_cycles >= constants.sequence.settle_cycles:
             enter(state, AxisPhase.RELEASING)
-    if state.phase_cycle > constants.sequence.stop_max_cycles:
-        trip(state, Fault.STOP_TIMEOUT, state.velocity.velocity_radps, 0)
-
-
-@kernel
-def _check_motion(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> None:
-    """Measured position, velocity and following error against their limits."""
-    check_reading(constants, state, elapsed_cycles)
-    error_rad = state.measured_position_rad - state.reference.position_rad
-    value = limit_position_rad(constants.limits, state.measured_position_rad, state.second_position_rad)
-    fault = motion_fault(constants.limits, value, state.velocity.velocity_radps, error_rad)
-    if fault == Fault.VELOCITY_LIMIT:
-        value = state.velocity.velocity_radps
-    elif fault == Fault.FOLLOWING_ERROR:
-        value = error_rad
-    trip(state, fault, value, 0)
-
-
-@kernel
-def _check_saturation(limits: LimitConstants, state: AxisState, torque_Nm: float, elapsed_cycles: int) -> None:
-    """A torque at its limit, or none that is a number, for too long.
-
-    It is forgotten as slowly as it came: a torque that jumps from limit to limit is none the better for it.
-    """
-    if not abs(torque_Nm) < limits.torque_max_Nm:
-        state.saturated_cycles += elapsed_cycles
-        if state.saturated_cycles > limits.saturation_max_cycles:
-            trip(state, Fault.TORQUE_SATURATED, torque_Nm, 0)
-    else:
-        state.saturated_cycles = max(state.saturated_cycles - elapsed_cycles, 0)
+    check_stop_time(constants, state)
 
 
 @kernel
@@ -179,10 +206,9 @@ def _command_torque(constants: AxisConstants, state: AxisState, table: np.ndarra
     torque_Nm, finite = limited_torque_Nm(
         limits, state.unlimited_torque_Nm, state.command_torque_Nm, constants.law.period_s
     )
-    if not finite:
-        trip(state, Fault.NOT_FINITE, state.unlimited_torque_Nm, 0)
+    check_finite(state, finite, state.unlimited_torque_Nm)
     check_swing(constants, state, torque_Nm)
-    _check_saturation(limits, state, torque_Nm, elapsed_cycles)
+    check_saturation(limits, state, torque_Nm, elapsed_cycles)
     take_notice(constants, state, torque_Nm)
     state.command_torque_Nm = torque_Nm if powered(state.phase) else 0.0
 
@@ -214,10 +240,9 @@ def _command_velocity(constants: AxisConstants, state: AxisState, elapsed_cycles
         state.command_velocity_radps,
         elapsed_cycles * period_s,
     )
-    if not finite:
-        trip(state, Fault.NOT_FINITE, unlimited_radps, 0)
+    check_finite(state, finite, unlimited_radps)
     check_swing(constants, state, state.measured_torque_Nm)
-    _check_saturation(limits, state, state.measured_torque_Nm, elapsed_cycles)
+    check_saturation(limits, state, state.measured_torque_Nm, elapsed_cycles)
     state.command_velocity_radps = velocity_radps if powered(state.phase) else 0.0
 
 
@@ -246,7 +271,7 @@ def step_axis(
         state.fault_encoder_error = sample.encoder_error
     gap_cycles = _take_position(constants, state, sample, elapsed_cycles)
     request_stop(state, stop_request)
-    check_surroundings(constants, state, sample, elapsed_cycles - 1, supervisor_age_cycles)
+    check_supervision(constants, state, sample, elapsed_cycles - 1, supervisor_age_cycles)
     if state.phase == AxisPhase.WAITING:
         step_waiting(constants, state, sample)
     elif state.phase == AxisPhase.ENABLING:
@@ -262,7 +287,8 @@ def step_axis(
         error_rad = state.measured_position_rad - state.reference.position_rad
         step_velocity(constants.velocity, state.velocity, state.measured_position_rad, error_rad, gap_cycles)
     if powered(state.phase):
-        _check_motion(constants, state, elapsed_cycles)
+        check_reading(constants, state, elapsed_cycles)
+        check_motion(constants, state)
     if constants.command_kind == CommandKind.VELOCITY:
         _command_velocity(constants, state, elapsed_cycles)
     else:

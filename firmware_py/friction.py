@@ -9,8 +9,7 @@ Each direction is stored mirrored (positive speed, positive friction), so that o
 
 (11) prints the exponent of the negative direction as -v/ws, which diverges; mirrored it is -|v|/ws.
 The two stages need not meet at the knee (Table 3 has steps of 0.0017 and 0.0013 Nm).
-Not modelled: position, temperature and load dependence.
-"""
+Not modelled: position, temperature and load dependence."""
 
 from __future__ import annotations
 
@@ -21,9 +20,22 @@ from typing import Any
 import numpy as np
 
 from jointctl.firmware_py.kernel import inlined, kernel
-from jointctl.firmware_py.records import FrictionBranch, FrictionConstants
+from jointctl.firmware_py.records import FrictionBranch, FrictionConstants, LuGreConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ZeroSpeedRule
+
+# --- Multi-stage friction model (11): Stribeck near zero speed, a cubic polynomial beyond the knee ---
+# Torque is that at the MOTOR, speed that of the JOINT in rad/s; the joint feels `reduction_ratio` times the torque.
+# Each direction is stored mirrored (positive speed, positive friction), so that one expression serves both:
+#
+#     u = |v| <= knee :  tc + (ts - tc) exp(-u / ws) + tv u
+#     u > knee        :  a0 + a1 u + a2 u^2 + a3 u^3
+#     u > maximum     :  value and slope at the maximum are held (the data end there, so extrapolation is a guess)
+#
+# (11) prints the exponent of the negative direction as -v/ws, which diverges; mirrored it is -|v|/ws. The two stages
+# need not meet at the knee (Table 3 has steps of 0.0017 and 0.0013 Nm). Not modelled: position, temperature and load
+# dependence.
+
 
 DEGREE = math.pi / 180.0
 
@@ -124,3 +136,33 @@ def friction_curve_Nm(constants: Any, velocity_radps: np.ndarray) -> np.ndarray:
     """(11) at many velocities; arrays of shape (N,)."""
     friction = constants[0]
     return np.array([friction_motor_torque_Nm(friction, float(v)) for v in velocity_radps])
+
+
+# --- LuGre friction driven by a given velocity, for compensation: bristle deflection z [rad] at the joint ---
+# z' = v - sigma0 |v| / g(v) z,     tau = sigma0 z + sigma1 z' + (viscous part)
+#
+# g(v) is the whole sliding curve n tau_f(v) of (11), viscous part included, so that the steady state is exactly (11)
+# and no separate viscous term is added.  z is updated by the exact solution over one period at constant v, which is
+# stable for any stiffness and period.
+
+
+@kernel
+def step_lugre(
+    lugre: LuGreConstants,
+    friction: FrictionConstants,
+    reduction_ratio: float,
+    deflection_rad: float,
+    velocity_radps: float,
+    period_s: float,
+) -> tuple[float, float]:
+    """(new deflection [rad], friction torque at the joint [Nm]) after `period_s` at `velocity_radps`."""
+    speed = abs(velocity_radps)
+    if speed == 0.0:
+        return deflection_rad, lugre.stiffness_Nmprad * deflection_rad
+    branch = friction.positive if velocity_radps > 0.0 else friction.negative
+    sliding_Nm = reduction_ratio * branch_torque_Nm(branch, speed)
+    settled_rad = math.copysign(sliding_Nm / lugre.stiffness_Nmprad, velocity_radps)
+    decay = math.exp(-speed * period_s * lugre.stiffness_Nmprad / sliding_Nm)
+    moved_rad = settled_rad + (deflection_rad - settled_rad) * decay
+    rate_radps = (moved_rad - deflection_rad) / period_s
+    return moved_rad, lugre.stiffness_Nmprad * moved_rad + lugre.damping_Nmspr * rate_radps

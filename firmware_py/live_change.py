@@ -17,25 +17,22 @@ import math
 
 import numpy as np
 
-from jointctl.firmware_py.change_records import (
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.law import reset_learning, right_column_of_p
+from jointctl.firmware_py.libc import load_acquire
+from jointctl.firmware_py.records import (
+    AxisConstants,
+    AxisState,
     ChangeAnswer,
     ChangeConstants,
     ChangeKind,
     ChangeRequest,
     ChangeState,
     Gains,
-    MotionChange,
-)
-from jointctl.firmware_py.iterative_learning import reset_learning
-from jointctl.firmware_py.kernel import kernel
-from jointctl.firmware_py.libc import load_acquire
-from jointctl.firmware_py.lyapunov import right_column_of_p
-from jointctl.firmware_py.records import (
-    AxisConstants,
-    AxisState,
     LawConstants,
     LawState,
     LimitConstants,
+    MotionChange,
     TrajectoryConstants,
 )
 from jointctl.firmware_py.safety import within

@@ -17,9 +17,9 @@ from jointctl.firmware_py.axis import step_axis
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.libc import boottime_ns, load_acquire, monotonic_ns, sleep_until_ns, store_release
 from jointctl.firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
+from jointctl.firmware_py.safety import check_suspension
 from jointctl.firmware_py.schema import INT32_MAX
 from jointctl.firmware_py.states import AxisPhase
-from jointctl.firmware_py.surroundings import check_suspension
 
 HISTOGRAM_BINS = 4097  # 1 us each; the last one holds everything later
 

@@ -1,35 +1,285 @@
 """Every record of the controller: constants (`*Constants`, set once), state (`*State`), and what passes between blocks.
 
-SI units throughout.  `joint_` is the low-velocity side of the reducer, `motor_` the other one.
-"""
+SI units throughout.  `joint_` is the low-velocity side of the reducer, `motor_` the other one."""
 
 from __future__ import annotations
 
+from enum import IntEnum
 from typing import Annotated
 
 import numpy as np
 
-from jointctl.firmware_py.change_records import ChangeConstants as ChangeConstants
-from jointctl.firmware_py.change_records import ChangeRequest as ChangeRequest
-from jointctl.firmware_py.change_records import ChangeState as ChangeState
-from jointctl.firmware_py.change_records import Gains as Gains
-from jointctl.firmware_py.law_records import LEARNING_BINS as LEARNING_BINS
-from jointctl.firmware_py.law_records import NEURONS as NEURONS
-from jointctl.firmware_py.law_records import TORQUE_HISTORY as TORQUE_HISTORY
-from jointctl.firmware_py.law_records import FrictionBranch as FrictionBranch
-from jointctl.firmware_py.law_records import FrictionConstants as FrictionConstants
-from jointctl.firmware_py.law_records import LawConstants as LawConstants
-from jointctl.firmware_py.law_records import LawState as LawState
-from jointctl.firmware_py.law_records import LearningConstants as LearningConstants
-from jointctl.firmware_py.law_records import LearningState as LearningState
-from jointctl.firmware_py.law_records import LuGreConstants as LuGreConstants
-from jointctl.firmware_py.law_records import NetworkConstants as NetworkConstants
-from jointctl.firmware_py.law_records import NetworkState as NetworkState
-from jointctl.firmware_py.law_records import ObserverConstants as ObserverConstants
-from jointctl.firmware_py.law_records import ObserverState as ObserverState
-from jointctl.firmware_py.motion_records import Reference as Reference
-from jointctl.firmware_py.motion_records import TrajectoryConstants as TrajectoryConstants
 from jointctl.firmware_py.schema import array_of, f8, i4, i8, record, u4
+
+# --- The control law: friction model, network, observer, learning, and the law that holds them ---
+# Constants are set once, state changes in every cycle.  SI units; `joint_` is the low-velocity side of the reducer.
+# Import them from `firmware_py.records`, which has every record.
+
+
+NEURONS = 15
+TORQUE_HISTORY = 16  # cycles that an observer can look back
+LEARNING_BINS = 1 << 14
+
+
+@record
+class FrictionBranch:
+    """One direction of the multi-stage model (11), mirrored to positive speed and friction.
+
+    Speeds are those of the joint [rad/s], torques those at the motor [Nm].
+    """
+
+    coulomb_Nm: f8
+    static_Nm: f8
+    stribeck_speed_radps: f8
+    viscous_Nmspr: f8
+    cubic: Annotated[np.ndarray, array_of(f8, 4)]  # a0..a3 of a0 + a1 v + a2 v^2 + a3 v^3
+    knee_radps: f8  # the Stribeck stage holds up to here, the cubic one beyond
+    max_radps: f8  # beyond here the end slope is held
+
+
+@record
+class FrictionConstants:
+    positive: FrictionBranch
+    negative: FrictionBranch
+
+
+@record
+class LuGreConstants:
+    """Bristle stiffness and damping at the joint; the sliding curve comes from (11)."""
+
+    stiffness_Nmprad: f8
+    damping_Nmspr: f8
+
+
+@record
+class NetworkConstants:
+    """The radial basis function network of (14) and its adaptation law (24)."""
+
+    centres: Annotated[np.ndarray, array_of(f8, NEURONS, 2)]  # [rad, rad/s]
+    inverse_width: Annotated[np.ndarray, array_of(f8, NEURONS)]  # 1 / (2 b^2)
+    learning_rate: f8  # beta
+    p_b: Annotated[np.ndarray, array_of(f8, 2)]  # P B = [P12, P22] / M0
+    initial_weight: f8
+    leakage: f8  # sigma-modification [1/s], 0 = off
+    weight_limit: f8  # projection |w_i| <= limit [Nm], 0 = off
+    dead_zone_rad: f8  # no adaptation while |e| is below, 0 = off
+
+
+@record
+class NetworkState:
+    weights: Annotated[np.ndarray, array_of(f8, NEURONS)]  # [Nm]
+    hidden: Annotated[np.ndarray, array_of(f8, NEURONS)]  # h(x), kept for the log
+
+
+@record
+class ObserverConstants:
+    """See `disturbance_observer`."""
+
+    bandwidth_radps: f8  # 0 = off
+    delay_cycles: i8  # from the command to the torque that it becomes
+
+
+@record
+class ObserverState:
+    integral_Nms: f8
+    disturbance_Nm: f8
+    newest: i8
+    sent_torque_Nm: Annotated[np.ndarray, array_of(f8, TORQUE_HISTORY)]
+
+
+@record
+class LearningConstants:
+    """See `iterative_learning`."""
+
+    gain: f8  # 0 = off
+    error_gain_ps2: f8  # J error_gain e is learned on top of what feedback and observer added [1/s^2]
+    lead_cycles: i8
+    half_width: i8  # of the smoothing, in bins
+    blend_s: f8
+    growth: f8  # of the error from one repetition to the next that counts as growing; 0 = not watched
+
+
+@record
+class LearningState:
+    epoch: i8
+    bins: i8
+    filled: i8  # bins written since the epoch began
+    present_bin: i8
+    last_bin: i8
+    weight: f8
+    torque_Nm: f8  # what is fed forward now
+    squares_rad2: f8  # sum of the squared errors of this repetition
+    samples: i8  # in that sum
+    error_rad: f8  # root mean square of the repetition before; 0 = there was none
+    grown: i4  # repetitions in a row whose error was greater than that of the one before
+    stopped: i4  # switched off for the rest of the run, because the error grew
+    learned_Nm: Annotated[np.ndarray, array_of(f8, LEARNING_BINS)]
+    recorded_Nm: Annotated[np.ndarray, array_of(f8, LEARNING_BINS)]
+
+
+@record
+class LawConstants:
+    kind: i4  # ControllerKind
+    feed_forward: i4  # FeedForward
+    zero_rule: i4  # ZeroSpeedRule
+    matched_filter: i4  # e' from the filtered error difference instead of filtered velocity minus desired velocity
+    period_s: f8
+    inertia_kgm2: f8  # M0
+    coriolis_Nmspr: f8  # C0
+    gravity_Nm: f8  # G0(q) = gravity_Nm sin(q - gravity_zero_rad)
+    gravity_zero_rad: f8
+    kp: f8  # [1/s^2]
+    kv: f8  # [1/s]
+    ki: f8  # [1/s^3], PID
+    integral_limit_rads: f8  # PID, 0 = none
+    reduction_ratio: f8
+    zero_band_radps: f8
+    friction: FrictionConstants
+    lugre: LuGreConstants
+    network: NetworkConstants
+    observer: ObserverConstants
+    learning: LearningConstants
+
+
+@record
+class LawState:
+    network: NetworkState
+    observer: ObserverState
+    learning: LearningState
+    lugre_deflection_rad: f8
+    integral_rads: f8
+    # kept for the log: the parts of the torque at the joint
+    inertia_torque_Nm: f8
+    feedback_torque_Nm: f8
+    friction_torque_Nm: f8
+    gravity_torque_Nm: f8
+    network_torque_Nm: f8  # fhat, which is subtracted
+    observer_torque_Nm: f8
+    learned_torque_Nm: f8
+
+
+# --- The desired motion ---
+
+
+@record
+class Reference:
+    position_rad: f8
+    velocity_radps: f8
+    acceleration_radps2: f8
+
+
+@record
+class TrajectoryConstants:
+    """One trajectory; which fields matter depends on `kind`."""
+
+    kind: i4  # TrajectoryKind
+    repeats: i4  # point-to-point kinds and tables: start again at the end
+    table_rows: i4
+    duration_s: f8  # of the run; 0 = until stopped
+    # SINE: offset + amplitude sin(omega (t + shift)), with a second set from switch_s on (0 = no switch)
+    amplitude_rad: f8
+    omega_radps: f8
+    shift_s: f8
+    offset_rad: f8
+    switch_s: f8
+    amplitude2_rad: f8
+    omega2_radps: f8
+    shift2_s: f8
+    offset2_rad: f8
+    # MIN_JERK, TRAPEZOID: from start to target and, when repeated, back, resting dwell_s at each end
+    start_rad: f8
+    target_rad: f8
+    move_s: f8  # MIN_JERK: duration of one move
+    speed_radps: f8  # TRAPEZOID
+    acceleration_radps2: f8  # TRAPEZOID
+    dwell_s: f8
+
+
+# --- What may change while the joint moves: gains and the motion; see `live_change` ---
+# Import them from `firmware_py.records`, which has every record.
+
+
+class ChangeKind(IntEnum):
+    """What a request asks for."""
+
+    GAINS = 1
+    MOTION = 2
+
+
+class ChangeAnswer(IntEnum):
+    """What the loop did with the newest request."""
+
+    NONE = 0
+    TAKEN = 1
+    WRONG_KIND = 2
+    WRONG_PHASE = 3  # not while the joint is under way, or it is being stopped
+    GAIN_LIMIT = 4  # not finite, or outside of the limits of the configuration
+    MOTION_LIMIT = 5  # position or speed outside of the limits, or not finite
+    NOT_FROM_REST = 6  # the new motion does not begin at rest
+
+
+class MotionChange(IntEnum):
+    """Where a change of the motion is; the phase stays TRACKING."""
+
+    NONE = 0
+    BRAKING = 1  # the reference comes to rest
+    MOVING = 2  # from there to the start of the new motion
+
+
+@record
+class Gains:
+    """Those of `LawConstants` that may change; what the kind of law does not use has no room to change."""
+
+    kp: f8  # [1/s^2]
+    kv: f8  # [1/s]
+    ki: f8  # [1/s^3], PID
+    observer_radps: f8
+    learning_rate: f8  # of the network
+
+
+@record
+class ChangeRequest:
+    """Written by the supervisor before it counts `ChangeConstants.order` up, and never while a request is open."""
+
+    first: i8  # the order's number; with `last` it shows that the whole request has arrived
+    kind: i4  # ChangeKind
+    gains: Gains
+    trajectory: TrajectoryConstants
+    last: i8
+
+
+@record
+class ChangeConstants:
+    """The limits of a change, and the letter box: the only part of the constants that changes after the start."""
+
+    low: Gains
+    high: Gains
+    ramp_s: f8  # duration of a change of gains
+    q1: f8  # Q = diag(q1, q2) of the Lyapunov equation
+    q2: f8
+    move_speed_radps: f8  # peak of a move to the start of a new motion
+    move_acceleration_radps2: f8
+    move_min_s: f8
+    request: ChangeRequest
+    order: Annotated[np.ndarray, array_of(i8, 1)]  # number of the newest request, 0 = none
+
+
+@record
+class ChangeState:
+    answered: i8  # number of the newest request that was answered
+    answer: i4  # ChangeAnswer
+    ramping: i4  # 1 while gains change
+    ramp_s: f8  # since the change of gains began
+    motion: i4  # MotionChange
+    start: Gains
+    target: Gains
+    now: Gains  # between the two
+    goal: Reference  # of the new motion at its start, at rest
+    move_s: f8
+    next_trajectory: TrajectoryConstants
+
+
+# --- One joint: limits, phases, samples, commands ---
 
 
 @record

@@ -1,6 +1,7 @@
-"""The limits of the loop, as pure functions: which fault a value means, what is done about a fault.
+"""Every limit and supervision of the loop, in the order in which a cycle checks them.
 
-Every limit is inclusive: a value equal to the limit is allowed.  A NaN is never allowed.
+A fault is latched once and never reset; a later one can only make the reaction stronger.  Every limit is inclusive: a
+value equal to the limit is allowed.  A NaN is never allowed.  The phases that the reactions lead to: `sequence`.
 """
 
 from __future__ import annotations
@@ -8,10 +9,18 @@ from __future__ import annotations
 import math
 
 from jointctl.firmware_py.kernel import kernel
-from jointctl.firmware_py.records import LimitConstants, Swing, SwingConstants, SwingState
-from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, LimitSource, Reaction
+from jointctl.firmware_py.records import (
+    AxisConstants,
+    AxisState,
+    LimitConstants,
+    Sample,
+    Swing,
+    SwingConstants,
+    SwingState,
+)
+from jointctl.firmware_py.states import AxisPhase, CommandKind, DriveState, Fault, LimitSource, Notice, Reaction
 
-# Half swings in a row that are a limit cycle.  On 480 runs of joints that are well there were 2 at most of either kind,
+# Half swings in a row that are a limit cycle.  On 480 runs of healthy joints there were 2 at most of either kind,
 # and 6 that grew.
 TORQUE_SWINGS = 4
 ERROR_SWINGS = 6
@@ -19,12 +28,246 @@ GROWING_SWINGS = 8
 GROWTH = 1.05  # from one half swing to the next
 REVERSAL_SWINGS = 3  # that friction alone makes of one reversal of the reference: they do not count
 REST_STEPS = 8.0  # times the steps of the reading at rest: a smaller swing is the encoder's
+REACTION_CYCLES = 2  # between seeing that the reference leaves its limits and the first braked cycle
+PUSHED_CYCLES = 20  # at a torque that a healthy joint gives way to: it moves by a milliradian in that time
+
+
+# --- What is done about a fault ---
+
+
+@kernel
+def reaction_to(fault: int, phase: int) -> Reaction:
+    """What to do about a fault.
+
+    Off only where the drive does not follow anyway or no torque is applied yet: it drops a gravity load.  A ramp
+    only where the measurement and the law can still be trusted.  Everything else is the drive's quick stop.
+    """
+    if fault == Fault.NONE:
+        return Reaction.NONE
+    if phase <= AxisPhase.ENABLING or phase >= AxisPhase.QUICK_STOPPING:
+        return Reaction.OFF
+    if fault == Fault.DRIVE_FAULT or fault == Fault.DRIVE_NOT_ENABLED or fault == Fault.DRIVE_RESTARTED:
+        return Reaction.OFF
+    if fault == Fault.REFERENCE_LIMIT or fault == Fault.SUPERVISOR_LOST or fault == Fault.OVERRUN:
+        return Reaction.RAMP
+    return Reaction.QUICK_STOP
+
+
+@kernel
+def enter(state: AxisState, phase: int) -> None:
+    """Begin a phase."""
+    state.phase = phase
+    state.phase_cycle = 0
+    state.held_up_cycles = 0
+    state.good_samples = 0
+
+
+@kernel
+def powered(phase: int) -> bool:
+    """Whether the loop itself commands torque in this phase."""
+    return phase >= AxisPhase.APPROACH and phase <= AxisPhase.RELEASING
+
+
+@kernel
+def react(state: AxisState, reaction: int) -> None:
+    """Go forward to the phase of the reaction; never weakens the one in force."""
+    if reaction <= state.reaction or state.phase >= AxisPhase.FINISHED:
+        return
+    state.reaction = reaction
+    if reaction == Reaction.OFF:
+        if state.phase < AxisPhase.DISABLING:
+            enter(state, AxisPhase.DISABLING)
+    elif reaction == Reaction.QUICK_STOP:
+        if state.phase < AxisPhase.QUICK_STOPPING:
+            enter(state, AxisPhase.QUICK_STOPPING)
+    elif state.phase < AxisPhase.RAMPING:
+        enter(state, AxisPhase.RAMPING)
+
+
+@kernel
+def latch_fault(state: AxisState, fault: int, value: float, drive_error: int) -> None:
+    """Keep the first fault and the value that showed it."""
+    if state.fault == Fault.NONE:
+        state.fault = fault
+        state.fault_value = value
+        state.fault_drive_error = drive_error
+
+
+@kernel
+def trip(state: AxisState, fault: int, value: float, drive_error: int) -> None:
+    """Latch the first fault and the value that showed it, and take the stronger reaction."""
+    if fault == Fault.NONE:
+        return
+    latch_fault(state, fault, value, drive_error)
+    react(state, reaction_to(fault, state.phase))
 
 
 @kernel
 def within(value: float, low: float, high: float) -> bool:
     """low <= value <= high; False for NaN (every comparison with NaN is false)."""
     return low <= value and value <= high
+
+
+# --- 1. A new sample: a jump, and two encoders that disagree ---
+
+
+@kernel
+def check_jump(constants: AxisConstants, state: AxisState, sample: Sample, gap_cycles: int) -> None:
+    """A new sample farther from the last one than the joint can move in `gap_cycles` periods."""
+    if state.velocity.primed != 0:
+        moved_rad = abs(sample.position_rad - state.velocity.last_position_rad)
+        if not moved_rad <= constants.limits.position_jump_max_rad * gap_cycles:
+            trip(state, Fault.POSITION_JUMP, moved_rad, 0)
+
+
+@kernel
+def encoders_disagree(limits: LimitConstants, law_rad: float, other_rad: float, torque_Nm: float) -> bool:
+    """Whether two encoders of one joint differ by more than allowed; a flexible reducer twists under `torque_Nm`."""
+    if limits.disagreement_max_rad <= 0.0:
+        return False
+    allowed_rad = limits.disagreement_max_rad + limits.twist_radpNm * abs(torque_Nm)
+    return not abs(law_rad - other_rad) <= allowed_rad
+
+
+@kernel
+def check_encoders(limits: LimitConstants, state: AxisState, sample: Sample) -> None:
+    """A new sample of a joint with two encoders.  Not while the drive brakes: one reaction is enough."""
+    if state.phase <= AxisPhase.RELEASING and encoders_disagree(
+        limits, sample.position_rad, sample.second_position_rad, state.command_torque_Nm
+    ):
+        trip(state, Fault.POSITION_DISAGREEMENT, sample.second_position_rad - sample.position_rad, sample.drive_error)
+
+
+# --- 2. Drive, bus, schedule and supervisor; a computer that slept ---
+
+
+@kernel
+def drive_fault(drive_state: int, enabled_expected: bool, restarts: int) -> Fault:
+    """Fault of the drive's own state; a restart first: the drive has lost its configuration."""
+    if restarts != 0:
+        return Fault.DRIVE_RESTARTED
+    if drive_state == DriveState.FAULT or drive_state == DriveState.FAULT_BRAKING:
+        return Fault.DRIVE_FAULT
+    if enabled_expected and drive_state != DriveState.ENABLED:
+        return Fault.DRIVE_NOT_ENABLED
+    return Fault.NONE
+
+
+@kernel
+def _check_drive(state: AxisState, sample: Sample) -> None:
+    """Restart, fault, or not enabled any more.
+
+    A drive that brakes by itself (Quick Stop Active, on its watchdog say) is left braking: power off would make it
+    coast, and drop a load.
+    """
+    fault = drive_fault(sample.drive_state, powered(state.phase), sample.restarts)
+    if fault == Fault.DRIVE_NOT_ENABLED and sample.drive_state == DriveState.STOPPING:
+        latch_fault(state, fault, float(sample.status_word), sample.drive_error)
+        react(state, Reaction.QUICK_STOP)
+    else:
+        trip(state, fault, float(sample.status_word), sample.drive_error)
+
+
+@kernel
+def check_supervision(
+    constants: AxisConstants, state: AxisState, sample: Sample, skipped_cycles: int, supervisor_age_cycles: int
+) -> None:
+    """Faults of the drive, the bus, the schedule and the supervisor; the drive's first, it tells most of the cause."""
+    if state.phase >= AxisPhase.DISABLING:
+        return
+    _check_drive(state, sample)
+    limits = constants.limits
+    if state.phase >= AxisPhase.ENABLING and state.phase <= AxisPhase.RELEASING:
+        if state.sample_age_cycles > limits.sample_age_max_cycles:
+            trip(state, Fault.STALE_SAMPLE, float(state.sample_age_cycles), sample.drive_error)
+        if sample.bus_errors > limits.sample_age_max_cycles:
+            trip(state, Fault.BUS_ERROR, float(sample.bus_errors), 0)
+        # not before: in WAITING the power is off, and without the supervisor's word it stays off
+        if 0 < constants.sequence.supervisor_max_cycles < supervisor_age_cycles:
+            trip(state, Fault.SUPERVISOR_LOST, float(supervisor_age_cycles), 0)
+        # last: samples that stay away as well tell more, and sooner
+        if 0 < limits.heartbeat_age_max_cycles < sample.heartbeat_age_cycles:
+            trip(state, Fault.DRIVE_SILENT, float(sample.heartbeat_age_cycles), sample.drive_error)
+    if powered(state.phase) and skipped_cycles > limits.skipped_max_cycles:
+        trip(state, Fault.OVERRUN, float(skipped_cycles), 0)
+
+
+@kernel
+def check_suspension(state: AxisState, suspended_s: float) -> None:
+    """The computer slept for so long: nobody watched, whatever the clock of the loop says."""
+    if state.phase < AxisPhase.QUICK_STOPPING:
+        trip(state, Fault.SUSPENDED, suspended_s, 0)
+
+
+# --- 3. The desired motion; a stop that takes too long ---
+
+
+@kernel
+def reference_fault(
+    limits: LimitConstants, position_rad: float, velocity_radps: float, brake_radps2: float, ahead_s: float
+) -> Fault:
+    """Fault of the desired motion: braked `ahead_s` from now, it must come to rest inside the position limits."""
+    stop_rad = position_rad + velocity_radps * (ahead_s + 0.5 * abs(velocity_radps) / brake_radps2)
+    if not within(position_rad, limits.position_min_rad, limits.position_max_rad):
+        return Fault.REFERENCE_LIMIT
+    if not within(stop_rad, limits.position_min_rad, limits.position_max_rad):
+        return Fault.REFERENCE_LIMIT
+    if not within(velocity_radps, -limits.velocity_max_radps, limits.velocity_max_radps):
+        return Fault.REFERENCE_LIMIT
+    return Fault.NONE
+
+
+@kernel
+def check_reference(constants: AxisConstants, state: AxisState) -> None:
+    """The desired motion, before it is followed."""
+    reference = state.reference
+    fault = reference_fault(
+        constants.limits,
+        reference.position_rad,
+        reference.velocity_radps,
+        constants.sequence.brake_radps2,
+        REACTION_CYCLES * constants.law.period_s,
+    )
+    trip(state, fault, state.reference.position_rad, 0)
+
+
+@kernel
+def check_stop_time(constants: AxisConstants, state: AxisState) -> None:
+    """RAMPING: the joint must come to rest in time."""
+    if state.phase_cycle > constants.sequence.stop_max_cycles:
+        trip(state, Fault.STOP_TIMEOUT, state.velocity.velocity_radps, 0)
+
+
+# --- 4. The measured motion: a reading that stands still, then position, velocity and following error ---
+
+
+@kernel
+def check_reading(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> None:
+    """A reading that stands still although the reference moves on, or although the joint is pushed hard.
+
+    It must be early: behind a stuck encoder the law pushes ever harder, and the joint moves unseen, long before the
+    following error is too large.  Where the drive closes the velocity loop, the torque is the one that it measures.
+    Of an overrun's `elapsed_cycles`, the reference's way counts for one: the drive was told of no other.
+    """
+    limits = constants.limits
+    torque_Nm = state.command_torque_Nm
+    if constants.command_kind == CommandKind.VELOCITY:
+        torque_Nm = state.measured_torque_Nm
+    state.frozen_way_rad += (state.reference.position_rad - state.frozen_reference_rad) / elapsed_cycles
+    state.frozen_reference_rad = state.reference.position_rad
+    way_rad = state.frozen_way_rad
+    if state.frozen_samples == 0:
+        state.frozen_way_rad = 0.0
+        state.pushed_cycles = 0
+    elif state.sample_age_cycles == 0:
+        if 0.0 < limits.frozen_max_rad < abs(way_rad):
+            trip(state, Fault.POSITION_FROZEN, way_rad, 0)
+        if 0.0 < limits.frozen_torque_Nm < abs(torque_Nm):
+            state.pushed_cycles += 1
+            if state.pushed_cycles > PUSHED_CYCLES:
+                trip(state, Fault.POSITION_FROZEN, way_rad, 0)
+        else:
+            state.pushed_cycles = 0
 
 
 @kernel
@@ -52,12 +295,60 @@ def limit_position_rad(limits: LimitConstants, law_rad: float, other_rad: float)
 
 
 @kernel
-def encoders_disagree(limits: LimitConstants, law_rad: float, other_rad: float, torque_Nm: float) -> bool:
-    """Whether two encoders of one joint differ by more than allowed; a flexible reducer twists under `torque_Nm`."""
-    if limits.disagreement_max_rad <= 0.0:
-        return False
-    allowed_rad = limits.disagreement_max_rad + limits.twist_radpNm * abs(torque_Nm)
-    return not abs(law_rad - other_rad) <= allowed_rad
+def check_motion(constants: AxisConstants, state: AxisState) -> None:
+    """Measured position, velocity and following error against their limits."""
+    error_rad = state.measured_position_rad - state.reference.position_rad
+    value = limit_position_rad(constants.limits, state.measured_position_rad, state.second_position_rad)
+    fault = motion_fault(constants.limits, value, state.velocity.velocity_radps, error_rad)
+    if fault == Fault.VELOCITY_LIMIT:
+        value = state.velocity.velocity_radps
+    elif fault == Fault.FOLLOWING_ERROR:
+        value = error_rad
+    trip(state, fault, value, 0)
+
+
+# --- 5. The command: finite, limit, rate limit, in that order ---
+
+
+@kernel
+def limited_torque_Nm(
+    limits: LimitConstants, torque_Nm: float, last_torque_Nm: float, period_s: float
+) -> tuple[float, bool]:
+    """(torque to send [Nm], finite): finite check, torque limit, rate limit, in that order.
+
+    Not finite: zero torque is returned at once, without the rate limit, and the caller must stop the joint.
+    """
+    if not math.isfinite(torque_Nm):
+        return 0.0, False
+    limited = min(max(torque_Nm, -limits.torque_max_Nm), limits.torque_max_Nm)
+    step = limits.torque_rate_max_Nmps * period_s
+    limited = min(max(limited, last_torque_Nm - step), last_torque_Nm + step)
+    return limited, True
+
+
+@kernel
+def limited_velocity_radps(
+    limits: LimitConstants, acceleration_max_radps2: float, velocity_radps: float, last_radps: float, interval_s: float
+) -> tuple[float, bool]:
+    """(velocity to send [rad/s], finite): finite check, velocity limit, acceleration limit, in that order.
+
+    `interval_s` is the time since the last command.  Not finite: zero at once, and the caller must stop the joint.
+    """
+    if not math.isfinite(velocity_radps):
+        return 0.0, False
+    limited = min(max(velocity_radps, -limits.velocity_max_radps), limits.velocity_max_radps)
+    step = acceleration_max_radps2 * interval_s
+    return min(max(limited, last_radps - step), last_radps + step), True
+
+
+@kernel
+def check_finite(state: AxisState, finite: bool, unlimited: float) -> None:
+    """A command that is no number: it was not sent (`limited_torque_Nm`, `limited_velocity_radps`)."""
+    if not finite:
+        trip(state, Fault.NOT_FINITE, unlimited, 0)
+
+
+# --- 6. A joint that swings instead of settling ---
 
 
 @kernel
@@ -137,6 +428,14 @@ def note_rest(state: SwingState, position_rad: float, moving: bool) -> None:
 
 
 @kernel
+def watch_rest(constants: AxisConstants, state: AxisState, sample: Sample) -> None:
+    """A new sample, before its velocity is taken: while the power is off, what does the reading do by itself?"""
+    if state.phase == AxisPhase.WAITING:
+        moving = not abs(state.velocity.velocity_radps) <= constants.limits.standstill_radps
+        note_rest(state.swing, sample.position_rad, state.velocity.primed == 0 or moving)
+
+
+@kernel
 def swing_fault(
     limits: LimitConstants,
     state: SwingState,
@@ -186,6 +485,45 @@ def swing_Hz(state: SwingState, period_s: float) -> float:
 
 
 @kernel
+def check_swing(constants: AxisConstants, state: AxisState, torque_Nm: float) -> None:
+    """A torque or an error that swings while the law is active; `torque_Nm` is the command, or the measured torque.
+
+    What the desired acceleration asks for is no swing, however quick.  While the torque is released, nothing is looked
+    at: the law is no longer active.
+    """
+    if state.phase < AxisPhase.APPROACH or state.phase > AxisPhase.RAMPING:
+        return
+    reference = state.reference
+    fault = swing_fault(
+        constants.limits,
+        state.swing,
+        torque_Nm - constants.law.inertia_kgm2 * reference.acceleration_radps2,
+        state.measured_position_rad - reference.position_rad,
+        reference.velocity_radps,
+        state.cycle,
+    )
+    if fault != Fault.NONE:
+        trip(state, fault, swing_Hz(state.swing, constants.law.period_s), 0)
+
+
+# --- 7. A command that stays at its limit; what is reported without a stop ---
+
+
+@kernel
+def check_saturation(limits: LimitConstants, state: AxisState, torque_Nm: float, elapsed_cycles: int) -> None:
+    """A torque at its limit, or none that is a number, for too long.
+
+    It is forgotten as slowly as it came: a torque that jumps from limit to limit is none the better for it.
+    """
+    if not abs(torque_Nm) < limits.torque_max_Nm:
+        state.saturated_cycles += elapsed_cycles
+        if state.saturated_cycles > limits.saturation_max_cycles:
+            trip(state, Fault.TORQUE_SATURATED, torque_Nm, 0)
+    else:
+        state.saturated_cycles = max(state.saturated_cycles - elapsed_cycles, 0)
+
+
+@kernel
 def torque_noise(constants: SwingConstants, state: SwingState, change_Nm: float) -> bool:
     """Take the change of the command in this cycle; whether their mean is more than is worth a warning."""
     state.noise_Nm += constants.noise_gain * (abs(change_Nm) - state.noise_Nm)
@@ -193,61 +531,13 @@ def torque_noise(constants: SwingConstants, state: SwingState, change_Nm: float)
 
 
 @kernel
-def reference_fault(
-    limits: LimitConstants, position_rad: float, velocity_radps: float, brake_radps2: float, ahead_s: float
-) -> Fault:
-    """Fault of the desired motion: braked `ahead_s` from now, it must come to rest inside the position limits."""
-    stop_rad = position_rad + velocity_radps * (ahead_s + 0.5 * abs(velocity_radps) / brake_radps2)
-    if not within(position_rad, limits.position_min_rad, limits.position_max_rad):
-        return Fault.REFERENCE_LIMIT
-    if not within(stop_rad, limits.position_min_rad, limits.position_max_rad):
-        return Fault.REFERENCE_LIMIT
-    if not within(velocity_radps, -limits.velocity_max_radps, limits.velocity_max_radps):
-        return Fault.REFERENCE_LIMIT
-    return Fault.NONE
-
-
-@kernel
-def drive_fault(drive_state: int, enabled_expected: bool, restarts: int) -> Fault:
-    """Fault of the drive's own state; a restart first: the drive has lost its configuration."""
-    if restarts != 0:
-        return Fault.DRIVE_RESTARTED
-    if drive_state == DriveState.FAULT or drive_state == DriveState.FAULT_BRAKING:
-        return Fault.DRIVE_FAULT
-    if enabled_expected and drive_state != DriveState.ENABLED:
-        return Fault.DRIVE_NOT_ENABLED
-    return Fault.NONE
-
-
-@kernel
-def reaction_to(fault: int, phase: int) -> Reaction:
-    """What to do about a fault.
-
-    Off only where the drive does not follow anyway or no torque is applied yet: it drops a gravity load.  A ramp
-    only where the measurement and the law can still be trusted.  Everything else is the drive's quick stop.
-    """
-    if fault == Fault.NONE:
-        return Reaction.NONE
-    if phase <= AxisPhase.ENABLING or phase >= AxisPhase.QUICK_STOPPING:
-        return Reaction.OFF
-    if fault == Fault.DRIVE_FAULT or fault == Fault.DRIVE_NOT_ENABLED or fault == Fault.DRIVE_RESTARTED:
-        return Reaction.OFF
-    if fault == Fault.REFERENCE_LIMIT or fault == Fault.SUPERVISOR_LOST or fault == Fault.OVERRUN:
-        return Reaction.RAMP
-    return Reaction.QUICK_STOP
-
-
-@kernel
-def limited_torque_Nm(
-    limits: LimitConstants, torque_Nm: float, last_torque_Nm: float, period_s: float
-) -> tuple[float, bool]:
-    """(torque to send [Nm], finite): finite check, torque limit, rate limit, in that order.
-
-    Not finite: zero torque is returned at once, without the rate limit, and the caller must stop the joint.
-    """
-    if not math.isfinite(torque_Nm):
-        return 0.0, False
-    limited = min(max(torque_Nm, -limits.torque_max_Nm), limits.torque_max_Nm)
-    step = limits.torque_rate_max_Nmps * period_s
-    limited = min(max(limited, last_torque_Nm - step), last_torque_Nm + step)
-    return limited, True
+def take_notice(constants: AxisConstants, state: AxisState, torque_Nm: float) -> None:
+    """What is reported without ending the run; `torque_Nm` is the command that follows `state.command_torque_Nm`."""
+    if not powered(state.phase):
+        return
+    if torque_noise(constants.limits.swing, state.swing, torque_Nm - state.command_torque_Nm):
+        if state.notices & Notice.TORQUE_NOISE == 0:
+            state.swing.noise_told_Nm = state.swing.noise_Nm
+        state.notices |= Notice.TORQUE_NOISE
+    if state.law.learning.stopped != 0:
+        state.notices |= Notice.LEARNING_OFF

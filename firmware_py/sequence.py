@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from jointctl.firmware_py.computed_torque import reset_law
 from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.law import reset_law
 from jointctl.firmware_py.live_change import reset_change
-from jointctl.firmware_py.records import LINE_GONE, AxisConstants, AxisState, Command, LimitConstants, Sample
-from jointctl.firmware_py.safety import encoders_disagree, limit_position_rad, motion_fault, reaction_to, reset_swing
+from jointctl.firmware_py.records import LINE_GONE, AxisConstants, AxisState, Command, Sample
+from jointctl.firmware_py.safety import enter, limit_position_rad, motion_fault, react, reset_swing, trip
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction, StopRequest
 from jointctl.firmware_py.trajectory import plan_approach, reference_at
 
@@ -55,55 +55,6 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
 
 
 @kernel
-def enter(state: AxisState, phase: int) -> None:
-    """Begin a phase."""
-    state.phase = phase
-    state.phase_cycle = 0
-    state.held_up_cycles = 0
-    state.good_samples = 0
-
-
-@kernel
-def powered(phase: int) -> bool:
-    """Whether the loop itself commands torque in this phase."""
-    return phase >= AxisPhase.APPROACH and phase <= AxisPhase.RELEASING
-
-
-@kernel
-def react(state: AxisState, reaction: int) -> None:
-    """Go forward to the phase of the reaction; never weakens the one in force."""
-    if reaction <= state.reaction or state.phase >= AxisPhase.FINISHED:
-        return
-    state.reaction = reaction
-    if reaction == Reaction.OFF:
-        if state.phase < AxisPhase.DISABLING:
-            enter(state, AxisPhase.DISABLING)
-    elif reaction == Reaction.QUICK_STOP:
-        if state.phase < AxisPhase.QUICK_STOPPING:
-            enter(state, AxisPhase.QUICK_STOPPING)
-    elif state.phase < AxisPhase.RAMPING:
-        enter(state, AxisPhase.RAMPING)
-
-
-@kernel
-def latch_fault(state: AxisState, fault: int, value: float, drive_error: int) -> None:
-    """Keep the first fault and the value that showed it."""
-    if state.fault == Fault.NONE:
-        state.fault = fault
-        state.fault_value = value
-        state.fault_drive_error = drive_error
-
-
-@kernel
-def trip(state: AxisState, fault: int, value: float, drive_error: int) -> None:
-    """Latch the first fault and the value that showed it, and take the stronger reaction."""
-    if fault == Fault.NONE:
-        return
-    latch_fault(state, fault, value, drive_error)
-    react(state, reaction_to(fault, state.phase))
-
-
-@kernel
 def waited_too_long(state: AxisState, longest_cycles: int) -> bool:
     """Whether the phase's time is over.
 
@@ -115,15 +66,6 @@ def waited_too_long(state: AxisState, longest_cycles: int) -> bool:
     if state.phase_cycle - state.held_up_cycles <= longest_cycles:
         trip(state, Fault.OVERRUN, float(state.held_up_cycles), 0)
     return True
-
-
-@kernel
-def compare_encoders(limits: LimitConstants, state: AxisState, sample: Sample) -> None:
-    """A new sample of a joint with two encoders.  Not while the drive brakes: one reaction is enough."""
-    if state.phase <= AxisPhase.RELEASING and encoders_disagree(
-        limits, sample.position_rad, sample.second_position_rad, state.command_torque_Nm
-    ):
-        trip(state, Fault.POSITION_DISAGREEMENT, sample.second_position_rad - sample.position_rad, sample.drive_error)
 
 
 @kernel

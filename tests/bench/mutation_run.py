@@ -28,11 +28,10 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 UNIT_TESTS = ROOT / "tests" / "unit"
 TESTS = {  # below UNIT_TESTS
-    "firmware_py/safety.py": ("firmware_py/axis/test_safety", "firmware_py/axis/test_axis_*"),
+    "firmware_py/safety.py": (
+        "firmware_py/axis/test_safety", "firmware_py/axis/test_axis_*", "firmware_py/axis/test_supervision_edges",
+    ),
     "firmware_py/sequence.py": ("firmware_py/axis/test_sequence_*", "firmware_py/axis/test_axis_*"),
-    "firmware_py/surroundings.py": ("firmware_py/axis/test_surroundings_edges",),
-    "firmware_py/frozen_reading.py": ("firmware_py/axis/test_surroundings_edges",),
-    "firmware_py/swing_check.py": ("firmware_py/axis/test_axis_swing*",),
     "drivers/canopen/cia402.py": ("drivers/canopen/test_cia402",),
     "drivers/canopen/bus_watchers.py": ("drivers/canopen/test_other_controllers", "drivers/canopen/test_switch_off"),
     "drivers/canopen/found_enabled.py": ("drivers/canopen/test_switch_off",),

@@ -28,9 +28,9 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from jointctl.firmware_py.lyapunov import solve_lyapunov_p
+from jointctl.firmware_py.axis import low_pass_gain
+from jointctl.firmware_py.law import solve_lyapunov_p
 from jointctl.firmware_py.states import ControllerKind
-from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.tools.analysis.sampled_joint import Array, ComplexArray, SampledJoint, StateSpace, sampled_joint
 
 _POSITIVE = ("period_s", "inertia_kgm2", "kp", "kv")

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 from jointctl.drivers.canopen.identifiers import LAST_SYNCHRONOUS
 from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.axis import low_pass_gain
 from jointctl.firmware_py.states import ControllerKind
-from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.tools.analysis.linear_loop import LoopSettings
 from jointctl.tools.configuration.conversions import joint_rad_per_count
 from jointctl.tools.configuration.records import hidden_layer

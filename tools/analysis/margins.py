@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jointctl.firmware_py.lyapunov import eigenvalues, solve_lyapunov_p, ultimate_bounds
+from jointctl.firmware_py.law import eigenvalues, solve_lyapunov_p, ultimate_bounds
 from jointctl.firmware_py.states import ControllerKind
 from jointctl.tools.analysis.linear_loop import (
     MAX_DELAY_PERIODS,

@@ -16,13 +16,12 @@ from typing import Any
 import numpy as np
 from numba.core import runtime
 
-from jointctl.firmware_py.computed_torque import reset_law, step_law
+from jointctl.firmware_py.axis import step_velocity
 from jointctl.firmware_py.kernel import kernel
-from jointctl.firmware_py.rbfnn import network_torque_Nm
+from jointctl.firmware_py.law import network_torque_Nm, reset_law, step_law
 from jointctl.firmware_py.records import AxisConstants, AxisState
 from jointctl.firmware_py.safety import limited_torque_Nm
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.velocity import step_velocity
 from jointctl.tools.benchmarks.c_programs import FAST_MATH, OPTIMISED, NoCompilerError, law_library
 from jointctl.tools.benchmarks.law_memory import STATE_DOUBLES, law_doubles, require_comparable, state_doubles
 from jointctl.tools.benchmarks.numpy_law import NumpyLaw

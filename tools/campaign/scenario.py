@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from jointctl.firmware_py.axis import low_pass_gain
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.hil.faults.kinds import FaultConstants, FaultKind
 from jointctl.hil.plant.joint import plant
 from jointctl.hil.plant.records import FrictionKind

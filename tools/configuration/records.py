@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 
 from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.axis import low_pass_gain
+from jointctl.firmware_py.law import solve_lyapunov_p
 from jointctl.firmware_py.live_change import gains_of
-from jointctl.firmware_py.lyapunov import solve_lyapunov_p
-from jointctl.firmware_py.motion_peak import approach_duration_s, approach_start, peak_of
 from jointctl.firmware_py.records import NEURONS, AxisConstants, Gains, TrajectoryConstants
 from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.states import ControllerKind, FeedForward, LimitSource, TrajectoryKind, ZeroSpeedRule
-from jointctl.firmware_py.trajectory_table import ends_meet, table_from_csv
-from jointctl.firmware_py.velocity import low_pass_gain
+from jointctl.firmware_py.trajectory import approach_duration_s, approach_start, ends_meet, peak_of, table_from_csv
 from jointctl.tools.configuration.checks import extremes_problems
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import (

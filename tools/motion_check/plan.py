@@ -17,7 +17,7 @@ import numpy as np
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import TrajectoryKind
-from jointctl.firmware_py.trajectory_table import spline_table
+from jointctl.firmware_py.trajectory import spline_table
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import joint_rad_per_count, static_friction_Nm, velocity_of_a_count_radps
 from jointctl.tools.configuration.elmo import ElmoSerial

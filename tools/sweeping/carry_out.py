@@ -17,10 +17,10 @@ import numpy as np
 from jointctl.drivers.drive import Approval, CommissioningReport
 from jointctl.drivers.elmo.unit_modes import SPEED_MODE
 from jointctl.drivers.errors import ConfigurationError, DeviceError, UsageError
-from jointctl.firmware_py.motion_peak import approach_duration_s
 from jointctl.firmware_py.records import Reference
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import CommandKind, Fault, TrajectoryKind
+from jointctl.firmware_py.trajectory import approach_duration_s
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo import ElmoSerial, UnitModeChoice
 from jointctl.tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_constants

@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jointctl.firmware_py.computed_torque import reset_law, step_law
+from jointctl.firmware_py.axis import low_pass_gain, step_velocity
 from jointctl.firmware_py.kernel import JIT_DISABLED, kernel
-from jointctl.firmware_py.lyapunov import solve_lyapunov_p
+from jointctl.firmware_py.law import reset_law, solve_lyapunov_p, step_law
 from jointctl.firmware_py.records import LawConstants, LawState, Reference, VelocityConstants, VelocityState
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.velocity import low_pass_gain, step_velocity
 from jointctl.hil.plant.joint import plant, step_plant
 from jointctl.hil.plant.records import DELAY_SLOTS
 from jointctl.tools.analysis.linear_loop import LoopSettings

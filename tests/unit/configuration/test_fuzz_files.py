@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from jointctl.drivers.errors import ConfigurationError, DataError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
-from jointctl.firmware_py.trajectory_table import table_from_csv
+from jointctl.firmware_py.trajectory import table_from_csv
 from jointctl.hil.canopen.object_dictionary import ObjectDictionary
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config

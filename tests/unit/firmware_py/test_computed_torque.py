@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointctl.firmware_py.computed_torque import friction_feed_forward_Nm, reset_law, step_law
-from jointctl.firmware_py.friction import friction_motor_torque_Nm
-from jointctl.firmware_py.lugre import step_lugre
+from jointctl.firmware_py.friction import friction_motor_torque_Nm, step_lugre
+from jointctl.firmware_py.law import friction_feed_forward_Nm, reset_law, step_law
 from jointctl.firmware_py.records import LawState, Reference, VelocityState
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ControllerKind, FeedForward, ZeroSpeedRule

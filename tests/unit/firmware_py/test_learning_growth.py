@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from jointctl.firmware_py.iterative_learning import (
+from jointctl.firmware_py.law import (
     GROWN,
     learning_torque_Nm,
     record_correction,

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointctl.firmware_py.friction import friction_motor_torque_Nm, paper_friction
-from jointctl.firmware_py.lugre import step_lugre
+from jointctl.firmware_py.friction import friction_motor_torque_Nm, paper_friction, step_lugre
 from jointctl.firmware_py.records import LuGreConstants
 from jointctl.firmware_py.schema import new
 

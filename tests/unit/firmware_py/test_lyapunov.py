@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from jointctl.firmware_py.lyapunov import eigenvalues, solve_lyapunov_p, ultimate_bounds
+from jointctl.firmware_py.law import eigenvalues, solve_lyapunov_p, ultimate_bounds
 
 KP, KV = 784.0, 56.0
 

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointctl.firmware_py.lyapunov import solve_lyapunov_p
-from jointctl.firmware_py.rbfnn import adapt_network, network_torque_Nm, reset_network
+from jointctl.firmware_py.law import adapt_network, network_torque_Nm, reset_network, solve_lyapunov_p
 from jointctl.firmware_py.records import NEURONS, NetworkConstants, NetworkState
 from jointctl.firmware_py.schema import new
 

@@ -11,12 +11,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jointctl.firmware_py.motion_peak import approach_duration_s, approach_peak, peak_of
 from jointctl.firmware_py.records import Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import TrajectoryKind
-from jointctl.firmware_py.trajectory import reference_at
-from jointctl.firmware_py.trajectory_table import ends_meet, table_from_csv
+from jointctl.firmware_py.trajectory import (
+    approach_duration_s,
+    approach_peak,
+    ends_meet,
+    peak_of,
+    reference_at,
+    table_from_csv,
+)
 
 POINTS = "time_s,position_rad\n10,0.0\n11,0.5\n12.5,-0.25\n13,0.0\n"
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
+from jointctl.firmware_py.axis import low_pass_gain, step_velocity
 from jointctl.firmware_py.records import VelocityConstants, VelocityState
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.velocity import low_pass_gain, step_velocity
 
 PERIOD_s = 1e-3
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 from jointctl.firmware_py.states import Fault
 
 SAFETY = "unit/firmware_py/axis/test_safety.py::"
-EDGES = "unit/firmware_py/axis/test_surroundings_edges.py::"
-SURROUNDINGS = "unit/firmware_py/axis/test_surroundings.py::"
+EDGES = "unit/firmware_py/axis/test_supervision_edges.py::"
+SUPERVISION = "unit/firmware_py/axis/test_supervision.py::"
 ELMO_CYCLIC = "unit/drivers/elmo/test_elmo_cyclic.py::"
 HANGS = "unit/running/test_hang_limits.py::"
 AXIS_LIMITS = "unit/firmware_py/axis/test_axis_limits.py::"
@@ -112,12 +112,12 @@ FAULTS: dict[Fault, tuple[str, str]] = {  # what trips, and its twin
         EDGES + "test_the_way_behind_a_reading_that_stands_still | (0.5, False)",
     ),
     Fault.SUSPENDED: (
-        SURROUNDINGS + "test_standby_just_shorter_and_just_longer_than_it_can_be_measured | (100_000, True)",
-        SURROUNDINGS + "test_standby_just_shorter_and_just_longer_than_it_can_be_measured | (-100_000, False)",
+        SUPERVISION + "test_standby_just_shorter_and_just_longer_than_it_can_be_measured | (100_000, True)",
+        SUPERVISION + "test_standby_just_shorter_and_just_longer_than_it_can_be_measured | (-100_000, False)",
     ),
     Fault.DRIVE_SILENT: (
-        SURROUNDINGS + "test_a_drive_whose_heartbeat_stays_away | (600, 601, True)",
-        SURROUNDINGS + "test_a_drive_whose_heartbeat_stays_away | (600, 600, False)",
+        SUPERVISION + "test_a_drive_whose_heartbeat_stays_away | (600, 601, True)",
+        SUPERVISION + "test_a_drive_whose_heartbeat_stays_away | (600, 600, False)",
     ),
     Fault.POSITION_DISAGREEMENT: (
         AXIS_SAMPLES + "test_the_other_encoder | (0.0101, True)",

@@ -12,11 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jointctl.drivers.errors import DataError, UsageError
-from jointctl.firmware_py.motion_peak import peak_of
 from jointctl.firmware_py.records import Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import TrajectoryKind
-from jointctl.firmware_py.trajectory import reference_at
+from jointctl.firmware_py.trajectory import peak_of, reference_at
 from jointctl.tools.sweeping.grid import (
     SweepPoint,
     both_directions,

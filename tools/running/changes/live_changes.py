@@ -12,13 +12,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from jointctl.drivers.errors import ConfigurationError, JointctlError
-from jointctl.firmware_py.change_records import ChangeAnswer, ChangeKind, MotionChange
 from jointctl.firmware_py.kernel import plain
 from jointctl.firmware_py.live_change import gains_of
-from jointctl.firmware_py.motion_peak import peak_of
-from jointctl.firmware_py.records import Gains
+from jointctl.firmware_py.records import ChangeAnswer, ChangeKind, Gains, MotionChange
 from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.states import AxisPhase, CommandKind
+from jointctl.firmware_py.trajectory import peak_of
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.recording.run_log import INFO, WARNING
 from jointctl.tools.running.changes.change_gate import checked_gains, require_change

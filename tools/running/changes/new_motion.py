@@ -9,10 +9,10 @@ from typing import Any
 from pydantic import ValidationError
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.firmware_py.motion_peak import peak_of
 from jointctl.firmware_py.records import TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import TrajectoryKind, in_words
+from jointctl.firmware_py.trajectory import peak_of
 from jointctl.tools.configuration.checks import extremes_problems
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.problems import problem_line

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from jointctl.drivers.drive import CommissioningReport
-from jointctl.firmware_py.motion_peak import peak_of
 from jointctl.firmware_py.records import Reference
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.trajectory import reference_at
+from jointctl.firmware_py.trajectory import peak_of, reference_at
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import axis_constants, trajectory_table
 

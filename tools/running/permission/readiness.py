@@ -8,10 +8,10 @@ import numpy as np
 
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError, MotionFault
-from jointctl.firmware_py.motion_peak import approach_start
 from jointctl.firmware_py.records import TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import Fault
+from jointctl.firmware_py.trajectory import approach_start
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import fill_trajectory, trajectory_table
 from jointctl.tools.output import Output

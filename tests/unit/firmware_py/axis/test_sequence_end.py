@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 
 from jointctl.firmware_py.records import LINE_GONE
-from jointctl.firmware_py.sequence import ANSWER_CYCLES, enter, released_torque_Nm, step_stopping
+from jointctl.firmware_py.safety import enter
+from jointctl.firmware_py.sequence import ANSWER_CYCLES, released_torque_Nm, step_stopping
 from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, Reaction
 from tests.unit.firmware_py.axis.sequence_records import sample_of
 

@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 from jointctl.firmware_py.records import AxisState, Command
+from jointctl.firmware_py.safety import enter, powered, react, trip
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.sequence import enter, powered, react, request_stop, reset_axis, trip, write_command
+from jointctl.firmware_py.sequence import request_stop, reset_axis, write_command
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault, Reaction, StopRequest
 
 GOAL = {

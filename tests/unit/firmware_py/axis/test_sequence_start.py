@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from jointctl.firmware_py.records import Sample
+from jointctl.firmware_py.safety import check_encoders
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.sequence import compare_encoders, step_enabling, step_waiting
+from jointctl.firmware_py.sequence import step_enabling, step_waiting
 from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, Reaction
 from jointctl.firmware_py.trajectory import approach_at
 from tests.unit.firmware_py.axis.sequence_records import sample_of
@@ -222,7 +223,7 @@ def test_two_encoders_are_compared_until_the_drive_brakes(
     state.phase = phase
     sample = sample_of(DriveState.ENABLED)
     sample.position_rad, sample.second_position_rad = 0.5, 0.5 + apart_rad
-    compare_encoders(axis.limits, state, sample)
+    check_encoders(axis.limits, state, sample)
     if abs(apart_rad) < 0.01 or phase > AxisPhase.RELEASING:
         assert (state.fault, state.phase) == (Fault.NONE, phase)
         return
@@ -239,5 +240,5 @@ def test_a_flexible_reducer_between_two_encoders_may_twist(axis: Any, state: Any
     sample = sample_of(DriveState.ENABLED)
     for apart_rad, fault in ((0.0299, Fault.NONE), (0.0301, Fault.POSITION_DISAGREEMENT)):
         sample.second_position_rad = apart_rad
-        compare_encoders(axis.limits, state, sample)
+        check_encoders(axis.limits, state, sample)
         assert state.fault == fault

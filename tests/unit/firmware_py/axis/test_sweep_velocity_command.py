@@ -14,6 +14,7 @@ from jointctl.drivers.canopen.cia402 import State
 from jointctl.drivers.canopen.cyclic import end_cycle, get_i32, velocity_units
 from jointctl.drivers.canopen.port import FRAME_SLOTS, SLOT_RPDO
 from jointctl.drivers.canopen.scaling import new_port
+from jointctl.firmware_py.axis import limited_velocity_radps
 from jointctl.firmware_py.records import Command, LimitConstants, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import (
@@ -25,7 +26,6 @@ from jointctl.firmware_py.states import (
     StopRequest,
     TrajectoryKind,
 )
-from jointctl.firmware_py.velocity_command import limited_velocity_radps
 
 PERIOD_s = 1e-3
 

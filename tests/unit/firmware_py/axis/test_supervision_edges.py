@@ -6,13 +6,11 @@ from typing import Any
 
 import pytest
 
-from jointctl.firmware_py.frozen_reading import PUSHED_CYCLES, check_reading
 from jointctl.firmware_py.records import AxisState, Sample
-from jointctl.firmware_py.safety import reaction_to
+from jointctl.firmware_py.safety import PUSHED_CYCLES, check_reading, check_supervision, check_suspension, reaction_to
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, CommandKind, DriveState, Fault, Reaction
-from jointctl.firmware_py.surroundings import check_surroundings, check_suspension
 
 
 def after(fault: Fault, phase: AxisPhase) -> AxisPhase:
@@ -62,7 +60,7 @@ def test_each_limit_at_its_edge_in_each_phase(
             state.sample_age_cycles = value
         elif what not in ("skipped", "supervisor"):
             setattr(sample, what, value)
-        check_surroundings(axis, state, sample, value if what == "skipped" else 0, value if what == "supervisor" else 0)
+        check_supervision(axis, state, sample, value if what == "skipped" else 0, value if what == "supervisor" else 0)
         assert state.fault == (fault if trips else Fault.NONE)
         if not trips:
             assert (state.phase, state.reaction) == (phase, Reaction.NONE)
@@ -80,7 +78,7 @@ def test_what_is_not_watched_does_not_trip(axis_constants: Any, limit: str) -> N
     reset_axis(axis, state)
     state.phase, sample.drive_state = AxisPhase.TRACKING, DriveState.ENABLED
     sample.heartbeat_age_cycles = 0 if limit.startswith("super") else 1_000_000
-    check_surroundings(axis, state, sample, 0, 1_000_000 if limit.startswith("super") else 0)
+    check_supervision(axis, state, sample, 0, 1_000_000 if limit.startswith("super") else 0)
     assert state.fault == Fault.NONE
 
 
@@ -216,5 +214,5 @@ def test_the_error_code_of_the_drive_belongs_to_faults_that_the_drive_has_a_part
     if what == "suspended":
         check_suspension(state, 2.0)
     else:
-        check_surroundings(axis, state, sample, 2 * (what == "skipped"), 2 * (what == "supervisor"))
+        check_supervision(axis, state, sample, 2 * (what == "skipped"), 2 * (what == "supervisor"))
     assert (state.fault, state.fault_drive_error) == (fault, 0x2310 if told else 0)

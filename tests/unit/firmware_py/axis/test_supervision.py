@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointctl.firmware_py.frozen_reading import PUSHED_CYCLES
 from jointctl.firmware_py.realtime import SUSPENDED_MIN_NS, WORDS, Word, note_suspension
 from jointctl.firmware_py.records import AxisState
+from jointctl.firmware_py.safety import PUSHED_CYCLES, check_suspension
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, CommandKind, DriveRequest, DriveState, Fault, Reaction, StopRequest
-from jointctl.firmware_py.surroundings import check_suspension
 from tests.unit.firmware_py.stub_loop import Loop
 
 NewRig = Callable[..., Any]
