@@ -28,9 +28,9 @@ from jointctl.firmware_py.libc import (
     send,
     store_release,
 )
-from jointctl.hil.bus.frames import FRAME_SIZE, FrameQueue
+from jointctl.hil.bus.virtual_bus import FRAME_SIZE, FrameQueue
 from jointctl.hil.canopen.device_core import accept_frame, advance
-from jointctl.hil.canopen.device_records import Device, NmtState, int64
+from jointctl.hil.canopen.records import Device, NmtState, int64
 from jointctl.hil.faults.frame_faults import append_frame, pass_frame, take_due
 from jointctl.hil.faults.kinds import FaultMemory
 from jointctl.hil.faults.plant_faults import step_faults

@@ -13,8 +13,8 @@ from __future__ import annotations
 import numpy as np
 
 from jointctl.firmware_py.kernel import kernel
-from jointctl.hil.bus.frames import FrameQueue
-from jointctl.hil.canopen.device_records import int64
+from jointctl.hil.bus.virtual_bus import FrameQueue
+from jointctl.hil.canopen.records import int64
 
 OLDEST_STAMP_NS = 100_000_000  # an older one is not believed
 STAMPED_LAG_NS = 3_000_000  # how far drive and plant stay behind while frames are stamped

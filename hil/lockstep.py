@@ -21,12 +21,11 @@ from jointctl.firmware_py.axis import step_axis
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.realtime import write_log
 from jointctl.firmware_py.states import AxisPhase, StopRequest
-from jointctl.hil.bus.frames import FRAME_SIZE
+from jointctl.hil.bus.virtual_bus import FRAME_SIZE
 from jointctl.hil.canopen.device_core import accept_frame, advance
-from jointctl.hil.faults.frame_faults import take_due
+from jointctl.hil.faults.frame_faults import clock_step_cycles, collect, hand_over, take_due, to_drive
 from jointctl.hil.faults.kinds import FaultKind, fault_memory, kind_active, no_faults
 from jointctl.hil.faults.plant_faults import step_faults
-from jointctl.hil.faults.wire import clock_step_cycles, collect, hand_over, to_drive
 
 # columns of the array of true values that a run may leave
 TRUE_POSITION_rad, TRUE_VELOCITY_radps, TRUE_FRICTION_Nm, TRUE_ACTUATOR_Nm, TRUE_POWER_STATE = range(5)

@@ -9,7 +9,7 @@ import time
 import numpy as np
 
 from jointctl.firmware_py.schema import new
-from jointctl.hil.bus.frames import FRAME_SIZE, FrameQueue
+from jointctl.hil.bus.virtual_bus import FRAME_SIZE, FrameQueue
 from jointctl.hil.canopen.device import Cia402Device
 from jointctl.hil.device_loop import STOP_WORD, WORDS, run_device, store_release_word
 from jointctl.hil.faults.kinds import fault_memory, no_faults

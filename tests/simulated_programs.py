@@ -39,8 +39,8 @@ from jointctl.firmware_py.realtime import Word
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase
-from jointctl.hil.bus.frames import FRAME_SIZE
-from jointctl.hil.canopen.device_records import PowerState
+from jointctl.hil.bus.virtual_bus import FRAME_SIZE
+from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUTHS, run_lockstep
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_settings import canopen_settings

@@ -1,7 +1,7 @@
 """CiA 402 power state machine of the virtual drive: controlword in, statusword out, stops and faults.
 
 Transitions 0 and 1 (power on to Switch On Disabled) need no time here.  Commands with bit 7 set are ignored except
-for its rising edge in Fault.  Stop ramps are carried out by `cia402_motion`; here they are only started.
+for its rising edge in Fault.  Stop ramps are carried out by `motion`; here they are only started.
 Halt (bit 8) acts in modes 1, 3, 4 and 6, along the ramp that 605D names; in torque mode that is always 6087.
 Not modelled: a missing power supply (bit 4 is always set, 6079 is constant);
 bit 9 follows the NMT state (0 while stopped).
@@ -10,10 +10,10 @@ bit 9 follows the NMT state (0 while stopped).
 from __future__ import annotations
 
 from jointctl.firmware_py.kernel import kernel
-from jointctl.hil.bus.frames import FrameQueue
-from jointctl.hil.canopen.cia402_homing import begin_homing, interrupt_homing
+from jointctl.hil.bus.virtual_bus import FrameQueue
 from jointctl.hil.canopen.device_errors import LENGTH_ERRORS, report_cleared, report_error
-from jointctl.hil.canopen.device_records import Device, DriveObjects, HomingState, Mode, NmtState, PowerState, int64
+from jointctl.hil.canopen.motion import begin_homing, interrupt_homing
+from jointctl.hil.canopen.records import Device, DriveObjects, HomingState, Mode, NmtState, PowerState, int64
 
 _HALT = 0x0100
 

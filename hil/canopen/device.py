@@ -11,14 +11,12 @@ from typing import Any
 import numpy as np
 
 from jointctl.firmware_py.schema import dtype_of, new
-from jointctl.hil.bus.frames import FRAME_SIZE, FrameQueue
+from jointctl.hil.bus.virtual_bus import FRAME_SIZE, FrameQueue
 from jointctl.hil.canopen.device_core import accept_frame, advance, power_on
-from jointctl.hil.canopen.device_records import Device, NmtState
-from jointctl.hil.canopen.device_write_rules import check_write
+from jointctl.hil.canopen.dictionary import ObjectDictionary, ParameterStore, check_write
 from jointctl.hil.canopen.encoder_node import EncoderSettings, VirtualEncoder
-from jointctl.hil.canopen.object_dictionary import ObjectDictionary
-from jointctl.hil.canopen.parameter_store import ParameterStore
-from jointctl.hil.canopen.sdo_server import SdoServer
+from jointctl.hil.canopen.records import Device, NmtState
+from jointctl.hil.canopen.sdo import SdoServer
 from jointctl.hil.plant.records import PlantConstants, PlantState
 
 

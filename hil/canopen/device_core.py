@@ -13,19 +13,13 @@ import math
 import numpy as np
 
 from jointctl.firmware_py.kernel import inlined, kernel
-from jointctl.hil.bus.frames import FrameQueue
+from jointctl.hil.bus.virtual_bus import FrameQueue
 from jointctl.hil.canopen.cia402_core import (
     apply_controlword,
     outside_position_limit,
     power_off,
     raise_fault,
     status_word,
-)
-from jointctl.hil.canopen.cia402_motion import (
-    demand_is_held,
-    demand_torque_Nm,
-    following_error_tripped,
-    follows_velocity,
 )
 from jointctl.hil.canopen.device_errors import (
     FOLLOWING_ERROR,
@@ -38,10 +32,16 @@ from jointctl.hil.canopen.device_errors import (
     raise_error,
     send_emergency,
 )
-from jointctl.hil.canopen.device_records import CONSUMERS, Device, HomingState, Mode, NmtState, PowerState, int64
 from jointctl.hil.canopen.device_timers import answer_node_guard, enter_nmt, run_timers
 from jointctl.hil.canopen.encoder_core import accept_encoder_frame, step_encoder
-from jointctl.hil.canopen.pdo_core import mark_events, receive_rpdo, receive_sync
+from jointctl.hil.canopen.motion import (
+    demand_is_held,
+    demand_torque_Nm,
+    following_error_tripped,
+    follows_velocity,
+)
+from jointctl.hil.canopen.pdo import mark_events, receive_rpdo, receive_sync
+from jointctl.hil.canopen.records import CONSUMERS, Device, HomingState, Mode, NmtState, PowerState, int64
 from jointctl.hil.plant.joint import encoder_counts, step_plant
 from jointctl.hil.plant.records import PlantConstants, PlantState
 

@@ -6,7 +6,7 @@ Every function takes the time of the caller's clock [ns] and returns when it wan
 from __future__ import annotations
 
 from jointctl.firmware_py.kernel import kernel
-from jointctl.hil.bus.frames import FrameQueue
+from jointctl.hil.bus.virtual_bus import FrameQueue
 from jointctl.hil.canopen.cia402_core import abort_connection
 from jointctl.hil.canopen.device_errors import (
     HEARTBEAT_ERRORS,
@@ -23,8 +23,8 @@ from jointctl.hil.canopen.device_errors import (
     report_error,
     send_waiting_emergencies,
 )
-from jointctl.hil.canopen.device_records import CONSUMERS, PDOS, Device, NmtState, int64
-from jointctl.hil.canopen.pdo_core import send_due_tpdos, start_pdos
+from jointctl.hil.canopen.pdo import send_due_tpdos, start_pdos
+from jointctl.hil.canopen.records import CONSUMERS, PDOS, Device, NmtState, int64
 
 _FAR_NS = 1_000_000_000
 _MS = 1_000_000

@@ -11,10 +11,9 @@ import math
 import numpy as np
 
 from jointctl.firmware_py.kernel import kernel
-from jointctl.hil.bus.frames import FrameQueue
+from jointctl.hil.bus.virtual_bus import FrameQueue
 from jointctl.hil.canopen.device_errors import COB_ID_INVALID, push_frame
-from jointctl.hil.canopen.device_records import EVENT_DRIVEN, LAST_SYNCHRONOUS, NmtState, int64
-from jointctl.hil.canopen.encoder_records import MAPPED, EncoderNode
+from jointctl.hil.canopen.records import ENCODER_MAPPED, EVENT_DRIVEN, LAST_SYNCHRONOUS, EncoderNode, NmtState, int64
 from jointctl.hil.plant.records import PlantState
 
 _MS = 1_000_000
@@ -63,7 +62,7 @@ def _send_tpdo(node: EncoderNode, plant: PlantState, queue: FrameQueue) -> None:
     if slot < 0:
         return
     size = 0
-    for i in range(min(int64(group.tpdo_count), MAPPED)):
+    for i in range(min(int64(group.tpdo_count), ENCODER_MAPPED)):
         entry = int64(group.tpdo_mapping[i])
         value = _mapped_value(node, entry)
         for _ in range((entry & 0xFF) // 8):

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jointctl.hil.canopen.device_records import NmtState
-from jointctl.hil.canopen.device_write_rules import check_write
+from jointctl.hil.canopen.dictionary import ObjectDictionary, check_write, field_view, load_entries
 from jointctl.hil.canopen.encoder_core import restart_encoder
-from jointctl.hil.canopen.encoder_records import FIELDS
-from jointctl.hil.canopen.object_dictionary import ObjectDictionary, field_view, load_entries
-from jointctl.hil.canopen.sdo_server import SdoServer
+from jointctl.hil.canopen.records import ENCODER_FIELDS, NmtState
+from jointctl.hil.canopen.sdo import SdoServer
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,7 @@ class EncoderDictionary(ObjectDictionary):
 
     def __init__(self, eds_path: Path, node_id: int, memory: Any) -> None:
         self._take_entries(load_entries(eds_path, node_id))
-        for key, field in FIELDS.items():
+        for key, field in ENCODER_FIELDS.items():
             if key not in self.entries:
                 raise ValueError(f"{eds_path.name}: object {key[0]:04X}:{key[1]} must be there, the encoder uses it")
             self._live[key] = field_view(memory, ("encoder", "objects"), field)

@@ -4,35 +4,16 @@ Written from the description of the protocol, not from the driver: a constant th
 cancel out.  Replies here are without echo; `hil.elmo.device` adds it, with the times of the line.
 
 Not modelled: programs, recorder, homing, PVT, tables, digital outputs, saving to flash (SV is taken and does nothing),
-and the limits that real drives put on the order in which HL, LL, VH and VL may be written.
-"""
+and the limits that real drives put on the order in which HL, LL, VH and VL may be written."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from jointctl.firmware_py.schema import new
-from jointctl.hil.elmo.commands import (
-    AMPLIFIER_NOT_READY,
-    BAD_COMMAND,
-    BAD_INDEX,
-    BAD_UNIT_MODE,
-    COMMAND,
-    INDEXED,
-    MOTOR_FIELDS,
-    MOTOR_MUST_BE_OFF,
-    MOTOR_MUST_BE_ON,
-    NOT_ASSIGNABLE,
-    NOT_IN_THIS_MODE,
-    NUMBER,
-    OUT_OF_LIMIT,
-    OUT_OF_RANGE,
-    SYNTAX,
-    WHOLE,
-    ElmoDeviceSettings,
-    RefusedCommandError,
-)
 from jointctl.hil.elmo.motor import (
     SPEED_BANDWIDTH_RADPS,
     UM_POSITION,
@@ -44,6 +25,53 @@ from jointctl.hil.elmo.motor import (
     status_register,
     switch_off,
 )
+
+# --- Its language: error codes, the shape of a command, where a setting is kept ---
+
+
+BAD_COMMAND, BAD_INDEX, NOT_IN_THIS_MODE, SYNTAX, OUT_OF_RANGE = 2, 3, 12, 19, 21
+NOT_ASSIGNABLE, OUT_OF_LIMIT, MOTOR_MUST_BE_OFF, MOTOR_MUST_BE_ON, BAD_UNIT_MODE = 23, 28, 57, 58, 60
+AMPLIFIER_NOT_READY = 66
+COMMAND = re.compile(r"([A-Z]{2})(?:\[(\d{1,4})\])?(?:=(.*))?", re.ASCII)
+NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+MOTOR_FIELDS = {
+    ("CL", 1): "continuous_A", ("PL", 1): "peak_A", ("PL", 2): "peak_s",
+    ("HL", 2): "speed_high_cps", ("LL", 2): "speed_low_cps",
+    ("HL", 3): "position_high_counts", ("LL", 3): "position_low_counts",
+    ("ER", 2): "speed_error_cps", ("ER", 3): "position_error_counts",
+    ("SP", 0): "profile_cps", ("AC", 0): "acceleration_cps2", ("DC", 0): "deceleration_cps2",
+    ("SD", 0): "stop_deceleration_cps2",
+}  # fmt: skip
+WHOLE = frozenset(("HL", "LL", "ER", "SP", "AC", "DC", "SD"))
+INDEXED = frozenset(("CL", "PL", "HL", "LL", "ER", "VL", "VH", "CA"))
+
+
+class RefusedCommandError(Exception):
+    """Carries the error code."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(code)
+        self.code = code
+
+
+@dataclass(frozen=True, kw_only=True)
+class ElmoDeviceSettings:
+    """The virtual drive itself; what the joint is like is in the plant."""
+
+    version: str = "Whistle 1.01.06.22 31Oct2006"
+    maximum_current_A: float = 20.0  # MC
+    counts_per_turn: int = 524288  # CA[18]
+    current_sign: int = 1  # -1: positive current drives the counts down
+    power_on_unit_mode: int = UM_POSITION
+
+
+# --- The command interpreter of the virtual Elmo drive: one command in, one reply out, the plant behind it ---
+# Written from the description of the protocol, not from the driver: a constant that is wrong on one side cannot
+# cancel out.  Replies here are without echo; `hil.elmo.device` adds it, with the times of the line.
+#
+# Not modelled: programs, recorder, homing, PVT, tables, digital outputs, saving to flash (SV is taken and does
+# nothing), and the limits that real drives put on the order in which HL, LL, VH and VL may be written.
+
 
 SUBSTEPS_AT_ONCE_S = 2.0  # after a longer sleep of this process, time is lost rather than caught up
 

@@ -13,8 +13,7 @@ import math
 
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.schema import f8, i4, i8, record
-from jointctl.hil.plant.encoder import encoder_counts
-from jointctl.hil.plant.joint import step_plant
+from jointctl.hil.plant.joint import encoder_counts, step_plant
 from jointctl.hil.plant.records import PlantConstants, PlantState
 
 UM_TORQUE, UM_SPEED, UM_POSITION = 1, 2, 5

@@ -16,9 +16,9 @@ import numpy as np
 
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.schema import array_of, dtype_of, f8, i4, i8, new, record, u1
-from jointctl.hil.bus.frames import FRAME_SIZE, FrameQueue
+from jointctl.hil.bus.virtual_bus import FRAME_SIZE, FrameQueue
+from jointctl.hil.plant.joint import next_state, unit_number
 from jointctl.hil.plant.records import u8
-from jointctl.hil.plant.xorshift import next_state, unit_number
 
 MAX_FAULTS = 8
 LATE_FRAMES = 256  # that wait in the delay line; more are lost

@@ -13,7 +13,7 @@ from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.drivers.drive import Declined, Drive
 from jointctl.drivers.elmo.drive import ElmoDrive
 from jointctl.drivers.errors import DeviceError, NoDeviceError
-from jointctl.hil.canopen.device_records import PowerState
+from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.elmo.device import ElmoDevice
 from jointctl.tools.configuration.conversions import torque_constant_NmpA
 from jointctl.tools.configuration.elmo_settings import elmo_settings, with_port_override

@@ -17,7 +17,7 @@ import pytest
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault
-from jointctl.hil.canopen.device_records import PowerState
+from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.faults.kinds import FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUTHS
 from jointctl.tools.campaign import judge as judge_module

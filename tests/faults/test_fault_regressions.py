@@ -10,7 +10,7 @@ import pytest
 
 from jointctl.drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES
 from jointctl.firmware_py.states import AxisPhase, Fault
-from jointctl.hil.canopen.device_records import PowerState
+from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.faults.kinds import FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
 from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun

@@ -20,7 +20,7 @@ from jointctl.firmware_py.records import Command, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import DriveRequest
 from jointctl.hil.canopen.device_core import power_on
-from jointctl.hil.canopen.device_records import NmtState
+from jointctl.hil.canopen.records import NmtState
 
 ENABLED, DISABLED = 0x0637, 0x0650
 WATCHDOG = 126 << 16 | 200  # 1016:1 as configs/virtual.toml arms it

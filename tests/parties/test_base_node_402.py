@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from canopen.profiles.p402 import BaseNode402
 
-from jointctl.hil.canopen.device_records import PowerState
+from jointctl.hil.canopen.records import PowerState
 
 
 def wait(true: Callable[[], bool], timeout_s: float = 5.0) -> bool:

@@ -11,7 +11,7 @@ from jointctl.firmware_py.records import Reference
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault, Reaction
 from jointctl.firmware_py.trajectory import reference_at
-from jointctl.hil.canopen.device_records import PowerState
+from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.faults.kinds import FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_POSITION_rad, TRUE_VELOCITY_radps
 from jointctl.tools.campaign.envelope import STANDSTILL_RADPS, Envelope, envelope

@@ -5,7 +5,7 @@ from __future__ import annotations
 from jointctl.drivers.elmo.line_budget import highest_rate_Hz
 from jointctl.drivers.elmo.settings import ElmoSettings
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.hil.elmo.commands import ElmoDeviceSettings
+from jointctl.hil.elmo.interpreter import ElmoDeviceSettings
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import torque_constant_NmpA
 from jointctl.tools.configuration.elmo import KIND, ElmoSerial

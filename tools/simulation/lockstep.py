@@ -23,7 +23,7 @@ from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, Fault
-from jointctl.hil.bus.frames import FRAME_SIZE
+from jointctl.hil.bus.virtual_bus import FRAME_SIZE
 from jointctl.hil.canopen.device import Cia402Device
 from jointctl.hil.faults.kinds import fault_memory
 from jointctl.hil.lockstep import TRUTHS, TRUE_POSITION_rad, run_lockstep

@@ -15,7 +15,7 @@ from jointctl.drivers.errors import ConfigurationError, DataError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
 from jointctl.firmware_py.trajectory import table_from_csv
-from jointctl.hil.canopen.object_dictionary import ObjectDictionary
+from jointctl.hil.canopen.dictionary import ObjectDictionary
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.identification.friction_file import read_friction_data

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from jointctl.drivers.can.bit_timing import worst_frame_bits
 from jointctl.firmware_py.schema import new
-from jointctl.hil.bus.frames import WireFrame
 from jointctl.hil.bus.timing import (
     EXTENDED,
     NO_NODE,
@@ -23,6 +22,7 @@ from jointctl.hil.bus.timing import (
     frame_bits,
     pend_frame,
 )
+from jointctl.hil.bus.virtual_bus import WireFrame
 
 STANDARD_BITS, EXTENDED_BITS = 47, 67  # of a frame without data and stuff bits, interframe space included
 

@@ -10,9 +10,8 @@ from typing import Any
 import pytest
 import serial
 
-from jointctl.hil.elmo.commands import ElmoDeviceSettings
 from jointctl.hil.elmo.device import ElmoDevice
-from jointctl.hil.elmo.interpreter import ElmoInterpreter
+from jointctl.hil.elmo.interpreter import ElmoDeviceSettings, ElmoInterpreter
 from jointctl.hil.elmo.motor import MF_OVERSPEED, MF_POSITION_LIMIT, MF_SPEED_ERROR
 from jointctl.hil.plant.joint import plant
 

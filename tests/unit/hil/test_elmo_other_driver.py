@@ -15,9 +15,8 @@ from collections.abc import Iterator
 import pytest
 import serial
 
-from jointctl.hil.elmo.commands import ElmoDeviceSettings
 from jointctl.hil.elmo.device import ElmoDevice
-from jointctl.hil.elmo.interpreter import ElmoInterpreter
+from jointctl.hil.elmo.interpreter import ElmoDeviceSettings, ElmoInterpreter
 from jointctl.hil.plant.joint import plant
 
 COUNTS = 2**19

@@ -14,10 +14,15 @@ from pathlib import Path
 import pytest
 
 from jointctl.firmware_py.schema import new
-from jointctl.hil.bus.forwarding import MAX_CLIENTS
-from jointctl.hil.bus.frames import WireFrame
 from jointctl.hil.bus.timing import frame_bits
-from jointctl.hil.bus.virtual_bus import VirtualBusError, VirtualBusHub, default_socket_path, remove_dead_sockets
+from jointctl.hil.bus.virtual_bus import (
+    MAX_CLIENTS,
+    VirtualBusError,
+    VirtualBusHub,
+    WireFrame,
+    default_socket_path,
+    remove_dead_sockets,
+)
 
 FRAME = b"\x81\x01\x00\x00\x08\x00\x00\x00" + bytes(range(8))
 

@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from jointctl.hil.plant.actuator import sine_of_turns
-from jointctl.hil.plant.joint import R1, EncoderSide, PlantSettings, encoder_counts, plant, step_plant
+from jointctl.hil.plant.joint import R1, EncoderSide, PlantSettings, encoder_counts, plant, sine_of_turns, step_plant
 
 RATIO = 121.0
 

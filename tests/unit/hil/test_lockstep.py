@@ -16,7 +16,7 @@ from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault
-from jointctl.hil.bus.frames import FrameQueue
+from jointctl.hil.bus.virtual_bus import FrameQueue
 from jointctl.hil.lockstep import RECEIVED_SLOT, RPDO_SLOT, run_lockstep
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.records import axis_constants

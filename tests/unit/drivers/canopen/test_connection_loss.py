@@ -13,7 +13,7 @@ import pytest
 from jointctl.drivers.canopen.connection_loss import rpdo_deadline_ms
 from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.drivers.errors import DeviceError
-from jointctl.hil.canopen.device_records import PowerState
+from jointctl.hil.canopen.records import PowerState
 
 MS = 1_000_000
 

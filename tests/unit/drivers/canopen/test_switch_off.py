@@ -16,7 +16,7 @@ import pytest
 
 from jointctl.drivers.drive import UNTOUCHED, CommissioningReport, Declined, DriveIdentity, is_safe
 from jointctl.drivers.errors import BusError, DataError, DeviceError
-from jointctl.hil.canopen.device_records import PowerState
+from jointctl.hil.canopen.records import PowerState
 from jointctl.tools.output import Output
 from jointctl.tools.running import supervisor as supervisor_module
 from jointctl.tools.running.result.drive_end import require_off, words

@@ -9,8 +9,7 @@ from typing import Any
 from jointctl.drivers.elmo.drive import ElmoDrive
 from jointctl.drivers.elmo.settings import ElmoSettings
 from jointctl.drivers.errors import JointctlError
-from jointctl.hil.elmo.commands import ElmoDeviceSettings
-from jointctl.hil.elmo.interpreter import ElmoInterpreter
+from jointctl.hil.elmo.interpreter import ElmoDeviceSettings, ElmoInterpreter
 from jointctl.hil.plant.joint import plant
 
 COUNTS = 2**19

@@ -11,8 +11,7 @@ from jointctl.drivers.elmo.replies import take_byte
 from jointctl.firmware_py.records import Command, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import DriveRequest, DriveState
-from jointctl.hil.elmo.commands import ElmoDeviceSettings
-from jointctl.hil.elmo.interpreter import ElmoInterpreter
+from jointctl.hil.elmo.interpreter import ElmoDeviceSettings, ElmoInterpreter
 from jointctl.hil.plant.joint import plant
 
 PERIOD_S = 1.0 / 150.0

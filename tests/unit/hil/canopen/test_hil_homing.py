@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from jointctl.hil.canopen.device_records import HomingState
+from jointctl.hil.canopen.records import HomingState
 from tests.virtual_drive import NODE, Rig
 
 HOMING = 6

@@ -12,7 +12,7 @@ import canopen
 import pytest
 
 from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
-from jointctl.hil.canopen.sdo_server import TIMEOUT_NS, SdoServer
+from jointctl.hil.canopen.sdo import TIMEOUT_NS, SdoServer
 from jointctl.hil.plant.joint import plant
 from tests.places import EDS
 

@@ -10,10 +10,9 @@ import pytest
 
 from jointctl.firmware_py.schema import new
 from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
-from jointctl.hil.canopen.device_fields import FIELDS
-from jointctl.hil.canopen.device_records import Device
-from jointctl.hil.canopen.object_dictionary import load_entries
-from jointctl.hil.canopen.pdo_core import read_object, write_object
+from jointctl.hil.canopen.dictionary import load_entries
+from jointctl.hil.canopen.pdo import read_object, write_object
+from jointctl.hil.canopen.records import FIELDS, Device
 from jointctl.hil.plant.joint import plant
 from tests.places import ROOT
 

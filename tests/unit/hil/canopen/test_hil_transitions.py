@@ -6,7 +6,7 @@ import struct
 
 import pytest
 
-from jointctl.hil.canopen.device_records import PowerState
+from jointctl.hil.canopen.records import PowerState
 from tests.virtual_drive import NODE, Rig
 
 S = PowerState

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from jointctl.firmware_py.kernel import kernel
-from jointctl.hil.bus.frames import FrameQueue
+from jointctl.hil.bus.virtual_bus import FrameQueue
 from jointctl.hil.canopen.cia402_core import apply_controlword
 from jointctl.hil.canopen.device_errors import (
     COB_ID_INVALID,
@@ -24,7 +24,7 @@ from jointctl.hil.canopen.device_errors import (
     push_frame,
     raise_error,
 )
-from jointctl.hil.canopen.device_records import (
+from jointctl.hil.canopen.records import (
     EVENT_DRIVEN,
     LAST_SYNCHRONOUS,
     PDOS,
