@@ -11,6 +11,7 @@ import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from jointctl.hil.elmo.device import ElmoDevice
 from jointctl.tools.configuration.config import Config
@@ -28,14 +29,14 @@ def schedule(thread: int, policy: int, priority: int) -> None:
 
 
 @contextmanager
-def real_time_joint(config: Config) -> Iterator[None]:
+def real_time_joint(config: Config) -> Iterator[Any]:
     """Bus and CANopen drive of `config`; only their compiled threads come first."""
     before = set(threading.enumerate())
-    with serve_virtual_joint(config):
+    with serve_virtual_joint(config) as joint:
         for thread in set(threading.enumerate()) - before:
             if thread.name != "device-sdo" and thread.name.startswith(COMPILED) and thread.native_id is not None:
                 schedule(thread.native_id, os.SCHED_FIFO, BEFORE_A_LOOP)
-        yield
+        yield joint
 
 
 @contextmanager

@@ -54,14 +54,19 @@ class Witness:
         return float(np.abs(way_rad / way_s).max())
 
 
+def alive(pid: int) -> bool:
+    """Whether the process has not ended; a zombie has."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
 def gone(pid: int, timeout_s: float = 10.0) -> bool:
-    """Wait until the process has ended (a zombie has)."""
+    """Wait until the process has ended."""
     give_up = time.monotonic() + timeout_s
     while time.monotonic() < give_up:
-        try:
-            if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z":
-                return True
-        except FileNotFoundError:
+        if not alive(pid):
             return True
         time.sleep(0.01)
     return False

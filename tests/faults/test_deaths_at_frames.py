@@ -1,0 +1,220 @@
+"""Real processes that are killed right after a chosen frame of a run: the drive is off in time, and off for good.
+
+The same after every frame, at simulated time: tests/bench/every_frame.py.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import struct
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import can
+import pytest
+
+from jointctl.drivers.bus_lock import lock_name, marked_processes
+from jointctl.drivers.canopen.identifiers import NMT_ID, RPDO1_ID, SDO_REQUEST_ID, SYNC_ID, NmtCommand
+from jointctl.hil.canopen.device_records import PowerState
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config
+from tests.hil.moving_run import ENABLED, QUICK_STOP_ACTIVE, alive, gone
+from tests.real_time_joint import real_time_joint
+
+NODE = 1
+FAULT_REACTION_ACTIVE = 0x0F  # of the statusword
+POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
+ENABLE = 0x0F  # controlword, from which on the loop counts
+SHUTDOWN, SWITCH_ON, DISABLE = 0x06, 0x07, 0x00
+FASTEST_RADPS = 0.25  # of the motion
+LONGEST_S = 180.0  # until the frame; the first start may have to compile
+NOISE_S = 0.3  # by which a busy computer may see or do something later
+IN_FLIGHT_S = 0.05  # a command that the dead have sent before
+QUIET_S = 1.0  # for so long it must stay off
+ENDED_S = 10.0  # for the processes that were not killed
+CHANGES: dict[str, Any] = {
+    "sequence__approach_s": 0.3, "trajectory__duration_s": 0.5, "sequence__stop_timeout_s": 1.0,
+    "sequence__off_timeout_s": 0.7, "sequence__supervisor_timeout_s": 0.8,
+}  # fmt: skip
+
+
+class Counts:
+    """What the bus has carried so far."""
+
+    def __init__(self) -> None:
+        self.frames = self.requests = self.syncs = self.syncs_enabled = 0
+        self.started = False  # NMT
+        self.controlwords: list[int] = []  # each change
+
+    def take(self, message: can.Message) -> None:
+        self.frames += 1
+        identifier, data = message.arbitration_id, bytes(message.data)
+        if identifier == SDO_REQUEST_ID + NODE:
+            self.requests += 1
+        elif identifier == SYNC_ID:
+            self.syncs += 1
+            self.syncs_enabled += ENABLE in self.controlwords
+        elif identifier == NMT_ID and data[0] == NmtCommand.START:
+            self.started = True
+        elif identifier == RPDO1_ID + NODE:
+            word = int.from_bytes(data[:2], "little")
+            if self.controlwords[-1:] != [word]:
+                self.controlwords.append(word)
+
+
+Moment = Callable[[Counts], bool]
+
+
+def sdo_request(number: int) -> Moment:
+    return lambda seen: seen.requests >= number
+
+
+def sync(number: int) -> Moment:
+    """Of the loop, which waits with the drive off at first."""
+    return lambda seen: seen.syncs >= number
+
+
+def controlword(word: int) -> Moment:
+    return lambda seen: word in seen.controlwords
+
+
+def sync_after_enabling(number: int) -> Moment:
+    return lambda seen: seen.syncs_enabled >= number
+
+
+def disabling(seen: Counts) -> bool:
+    return ENABLE in seen.controlwords and seen.controlwords[-1] == DISABLE
+
+
+@dataclass
+class Death:
+    """A run, and what an onlooker saw of it: frames, and the truth about the power stage."""
+
+    bench: Any
+    config: Config
+    device: Any
+    bus: can.BusABC
+    counts: Counts = field(default_factory=Counts)
+    changes: list[tuple[float, bool]] = field(default_factory=list)  # (time [s], whether there is power)
+    killed_s: float = 0.0
+    powered_then: bool = False
+
+    @property
+    def powered(self) -> bool:
+        return self.device.device[0].state in POWERED
+
+    def look(self, until_s: float, moment: Moment = lambda _: False) -> bool:
+        """Take all that is sent until then; True right after the frame that makes it the moment."""
+        while time.monotonic() < until_s:
+            message = self.bus.recv(0.001)
+            if self.powered != (self.changes[-1][1] if self.changes else False):
+                self.changes.append((time.monotonic(), self.powered))
+            if message is not None:
+                self.counts.take(message)
+                if moment(self.counts):
+                    return True
+        return False
+
+    def start(self, moment: Moment, names: tuple[str, ...]) -> None:
+        """A run until the moment; then these die, the supervisor first, so that it cannot act on the loop's death."""
+        self.run = self.bench.start("run", "joint.toml", "-y")
+        give_up_s = time.monotonic() + LONGEST_S
+        while not (children := self.run.children()):
+            assert self.run.process.poll() is None, self.run.err
+            assert time.monotonic() < give_up_s
+            time.sleep(0.02)
+        (self.loop,) = children  # before anything is sent
+        assert self.look(time.monotonic() + LONGEST_S, moment), self.run.err
+        assert self.run.process.poll() is None, self.run.err
+        for name, pid in (("supervisor", self.run.process.pid), ("loop", self.loop)):
+            if name in names:
+                os.kill(pid, signal.SIGKILL)
+        self.killed_s, self.powered_then = time.monotonic(), self.powered
+
+    def is_over(self) -> bool:
+        return not (self.powered or alive(self.run.process.pid) or alive(self.loop))
+
+    def off_after_s(self) -> float:
+        """From the death until the power went off for the last time; 0 where there was none."""
+        return max((at_s - self.killed_s for at_s, on in self.changes if not on), default=0.0)
+
+    def enabled_after_s(self) -> list[float]:
+        return [at_s - self.killed_s for at_s, on in self.changes if on and at_s > self.killed_s]
+
+    def judge(self, names: tuple[str, ...]) -> None:
+        allowed_s = time_allowed_s(self.config, names) + NOISE_S
+        while time.monotonic() < self.killed_s + allowed_s and not self.is_over():
+            self.look(time.monotonic() + 0.05)
+        assert not self.powered, f"with power {allowed_s:.2f} s after the death"
+        self.look(time.monotonic() + QUIET_S)
+        assert not self.powered
+        assert self.off_after_s() <= allowed_s
+        enabled = self.enabled_after_s()
+        assert len(enabled) <= (0 if self.powered_then else 1), enabled
+        if "loop" in names:
+            assert all(after_s <= IN_FLIGHT_S for after_s in enabled), enabled
+
+    def nobody_is_left(self) -> None:
+        assert gone(self.run.process.pid, ENDED_S)
+        assert gone(self.loop, ENDED_S)
+        assert not marked_processes(lock_name("jointctl", self.bench.channel))
+
+
+def time_allowed_s(config: Config, names: tuple[str, ...]) -> float:
+    """docs/safety.md: until the reaction begins, and what it takes."""
+    sequence = config.sequence
+    braking_s = FASTEST_RADPS / sequence.brake_radps2
+    if "loop" in names:
+        return 20.0 / config.loop.rate_Hz + config.canopen.heartbeat_s + braking_s
+    return sequence.supervisor_timeout_s + braking_s + sequence.release_s
+
+
+@pytest.fixture
+def death(bench: Any) -> Iterator[Death]:
+    config = load_config(bench.folder / bench.config(**CHANGES))
+    with real_time_joint(config) as joint, can.Bus(interface="jointctl", channel=bench.channel) as bus:
+        yield Death(bench, config, joint._device, bus)
+        bench.end()
+
+
+LOOP, SUPERVISOR, BOTH = ("loop",), ("supervisor",), ("supervisor", "loop")
+DEATHS: dict[str, tuple[Moment, tuple[str, ...]]] = {
+    "commissioning, 10th SDO request, loop": (sdo_request(10), LOOP),
+    "commissioning, 50th SDO request, both": (sdo_request(50), BOTH),
+    "commissioning, 100th SDO request, supervisor": (sdo_request(100), SUPERVISOR),
+    "NMT start, both": (lambda seen: seen.started, BOTH),
+    "waiting, supervisor": (sync(150), SUPERVISOR),
+    "enabling, switch on, both": (controlword(SWITCH_ON), BOTH),
+    "enabling, loop": (controlword(ENABLE), LOOP),
+    "approach, 5 ms, supervisor": (sync_after_enabling(5), SUPERVISOR),
+    "approach, 60 ms, both": (sync_after_enabling(60), BOTH),
+    "tracking, both": (sync_after_enabling(600), BOTH),
+    "stopping, loop": (sync_after_enabling(850), LOOP),
+    "disabling, supervisor": (disabling, SUPERVISOR),
+}
+
+
+@pytest.mark.parametrize(("moment", "names"), DEATHS.values(), ids=DEATHS)
+def test_after_the_death_the_drive_is_off_in_time_and_stays_off(
+    death: Death, moment: Moment, names: tuple[str, ...]
+) -> None:
+    death.start(moment, names)
+    death.judge(names)
+    death.nobody_is_left()
+    if names == LOOP:
+        death.run.finished(ENDED_S).refused(death.run.process.returncode, "the loop process")
+        assert death.run.process.returncode > 0
+    state = death.bench.status_word() & 0x6F  # as the drive tells an independent client
+    assert state not in (ENABLED, QUICK_STOP_ACTIVE, FAULT_REACTION_ACTIVE)
+
+
+def test_a_drive_without_its_watchdog_is_seen_to_keep_its_power(death: Death) -> None:
+    """The checks above can fail: both are dead, and abort connection (6007) says that nothing is to be done."""
+    death.start(sync_after_enabling(60), BOTH)
+    no_action = struct.pack("<BHBI", 0x2B, 0x6007, 0, 0)
+    death.bus.send(can.Message(arbitration_id=SDO_REQUEST_ID + NODE, data=no_action, is_extended_id=False))
+    with pytest.raises(AssertionError, match="with power"):
+        death.judge(BOTH)
