@@ -18,6 +18,12 @@ Sections = dict[str, dict[str, str]]
 _LINE_END = re.compile(r"\r\n|\r|\n")
 _SECTION = re.compile(r"\[\s*(.*?)\s*\]")
 _NODE_ID = re.compile(r"\+?\$NODEID\+?")
+_NUMBERS = (  # the first form counts; `int` by itself takes more, such as 1_0
+    (re.compile(r"[+-]?0X[0-9A-F]+"), 16),
+    (re.compile(r"[+-]?0[0-7]+"), 8),
+    (re.compile(r"[+-]?[0-9]+"), 10),
+    (re.compile(r"[0-9]*[A-F][0-9A-F]*"), 16),
+)
 
 
 def shown(text: str) -> str:
@@ -89,21 +95,15 @@ def number_of(text: str, node: int) -> int | None:
 
     Hexadecimal digits without 0x are taken where they can be nothing else (1F).
     """
-    compact = re.sub(r"\s", "", text).upper().rstrip("UL")
-    if len(compact) > LONGEST_NUMBER:
+    compact = re.sub(r"\s", "", text)
+    if len(compact) > LONGEST_NUMBER or not compact.isascii():
         return None
+    compact = compact.upper().rstrip("UL")
     if "$NODEID" in compact:
         rest = _NODE_ID.sub("", compact)
         offset = number_of(rest, node) if rest else 0
         return None if offset is None else offset + node
-    try:
-        return int(compact, 0)
-    except ValueError:
-        pass
-    if re.fullmatch(r"0[0-7]+", compact):
-        return int(compact, 8)
-    if re.fullmatch(r"[0-9]+", compact):
-        return int(compact)
-    if re.fullmatch(r"[0-9]*[A-F][0-9A-F]*", compact):
-        return int(compact, 16)
+    for form, base in _NUMBERS:
+        if form.fullmatch(compact):
+            return int(compact, base)
     return None

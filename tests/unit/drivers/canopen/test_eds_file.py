@@ -81,11 +81,20 @@ def test_the_same_objects_whatever_the_file_looks_like(tmp_path: Path, data: byt
         ("0x1F", 31), ("0X1f", 31), ("31", 31), ("1F", 31), ("ff", 255), ("017", 15), ("08", 8), (" 0x10 ", 16),
         ("$NODEID+0x180", 0x185), ("0x180+$NODEID", 0x185), ("$nodeid", 5), ("$NODEID + 0x600", 0x605),
         ("0x80000000UL", 1 << 31), ("-5", -5), ("", None), ("none", None), ("0x", None), ("1.5", None),
-        ("12h", None), ("9" * 5000, None), ("$NODEID+x", None),
+        ("12h", None), ("9" * 5000, None), ("$NODEID+x", None), ("0", 0), ("+0x10", 16), ("-0x10", -16),
+        # what Python takes for a number, and CiA 306 does not know
+        ("1_0", None), ("0x1_0", None), ("0_7", None), ("1F_0", None), ("$NODEID+1_0", None), ("0o17", None),
+        ("\u0661", None), ("\ufb00", None),
     ],
 )  # fmt: skip
 def test_numbers(text: str, value: int | None) -> None:
     assert number_of(text, 5) == value
+
+
+def test_a_python_style_number_is_told_and_left_out(tmp_path: Path) -> None:
+    eds = eds_of(tmp_path, edited("6071", "DefaultValue=0", "DefaultValue=1_0"))
+    assert eds.dictionary.get_variable(0x6071).default is None
+    assert eds.all_remarks() == ["EDS drive.eds: [6071] defaultvalue (=1_0) is no INTEGER16: ignored"]
 
 
 def test_a_missing_data_type_is_that_of_the_standard(tmp_path: Path) -> None:
