@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ from jointctl.firmware_py.states import StopRequest
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 STOP_COMMAND = "jointctl stop"
+AGAIN_S = 0.05
 _ESCALATION = (StopRequest.RAMP, StopRequest.QUICK_STOP, StopRequest.OFF)
 
 
@@ -29,6 +31,7 @@ class StopSignals:
         self.raising = raising
         self.commanded_ns = 0  # CLOCK_MONOTONIC of `jointctl stop`; 0 = it has not come
         self.on_command: Callable[[StopRequest], None] = lambda _: None  # reaches a loop that runs, at once
+        self._again = False  # the next signal is no new one
 
     @property
     def request(self) -> StopRequest:
@@ -43,20 +46,28 @@ class StopSignals:
 
     def on_signal(self, number: int, _: FrameType | None) -> None:
         """Signal handler."""
-        self.count += 1
-        self.name = self.name or signal.Signals(number).name
+        if self._again:
+            self._again = False
+        else:
+            self.count += 1
+            self.name = self.name or signal.Signals(number).name
         if self.raising:
             raise KeyboardInterrupt
+
+    def raise_again(self) -> threading.Timer:
+        """Soon, in the main thread: what was raised there has not got through."""
+        self._again = True
+        timer = threading.Timer(AGAIN_S, _wake_main)
+        timer.daemon = True
+        timer.start()
+        return timer
 
     def on_stop_command(self) -> None:
         """`jointctl stop` has come; in another thread than the run."""
         self.commanded_ns = time.monotonic_ns()
         self.name = STOP_COMMAND
         self.on_command(self.request)
-        main = threading.main_thread().ident
-        if main is not None:  # wakes whatever the run waits for
-            with contextlib.suppress(ProcessLookupError):
-                signal.pthread_kill(main, signal.SIGTERM)
+        _wake_main()  # from whatever the run waits for
 
     def leave_if_asked(self) -> None:
         """`KeyboardInterrupt` once a stop was asked for: between two steps before the joint may move."""
@@ -73,13 +84,46 @@ class StopSignals:
             self.raising = before
 
 
+def _wake_main() -> None:
+    main = threading.main_thread().ident
+    if main is not None:
+        with contextlib.suppress(ProcessLookupError):
+            signal.pthread_kill(main, signal.SIGTERM)
+
+
 @contextmanager
 def stop_signals(*, raising: bool = False) -> Iterator[StopSignals]:
     """Collect stop signals while the block runs instead of ending the program."""
     signals = StopSignals(raising=raising)
     before = {number: signal.signal(number, signals.on_signal) for number in STOP_SIGNALS}
     try:
-        yield signals
+        with _nothing_lost(signals):
+            yield signals
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def _nothing_lost(signals: StopSignals) -> Iterator[None]:
+    """A KeyboardInterrupt that comes up in a callback of a library, as of the compiler, or in `__del__`, ends there.
+
+    Python would only print it, and go on: it is raised again instead.
+    """
+    show = sys.unraisablehook
+    timers: list[threading.Timer] = []
+
+    def on_lost(lost: sys.UnraisableHookArgs) -> None:
+        if lost.exc_type is KeyboardInterrupt:
+            timers.append(signals.raise_again())
+        else:
+            show(lost)
+
+    sys.unraisablehook = on_lost
+    try:
+        yield
+    finally:
+        sys.unraisablehook, signals.raising = show, False
+        for timer in timers:  # none may come when the signals have their old meaning again
+            timer.cancel()
+            timer.join()
