@@ -79,6 +79,21 @@ def test_a_stop_latches_wherever_the_run_is(bench: Any, delay_s: float) -> None:
     assert bench.disabled()
 
 
+@pytest.mark.parametrize("verb", [("sweep", "-y", "-o", "data.csv"), ("doctor", "--motion", "-y"), ("clear-fault",)])
+def test_whatever_is_stopped_says_that_a_stop_has_ended_it(bench: Any, verb: tuple[str, ...]) -> None:
+    """And it takes the frames of that stop for no other controller's."""
+    config = bench.config()
+    bench.joint(config)
+    started = bench.start(*verb, config)
+    assert bench.run("stop", config).code == 0
+    ended = started.finished(20.0)
+    assert ended.code == 130, ended.err
+    assert "interrupted by jointctl stop; " in ended.err
+    assert "another controller" not in ended.err
+    assert "Traceback" not in ended.err
+    assert bench.disabled()
+
+
 def test_a_run_that_hangs_is_ended_with_its_loop(bench: Any) -> None:
     config = bench.config(trajectory__duration_s=30.0, sequence__supervisor_timeout_s=30.0)
     bench.joint(config)

@@ -26,7 +26,7 @@ def clear_fault(config: Config, output: Output) -> int:
         except KeyboardInterrupt:
             state = drive.make_safe(asked=bool(control.signals.commanded_ns))
             warn_unless_off(state, output)
-            output.note(f"interrupted{control.signals.by_command}; {drive_end.words(state)}")
+            output.note(f"interrupted{control.signals.by_command}; {drive_end.words(state, interrupted=True)}")
             return INTERRUPTED
         finally:
             drive.close()

@@ -63,7 +63,7 @@ def live_scope(
                 _wait_for_prepare(feed, runs.told)
             return runs.code
         except KeyboardInterrupt:
-            output.note(f"scope ended; {words(runs.drive_state)}")
+            output.note(f"scope ended{runs.ended_by}; {words(runs.drive_state, interrupted=True)}")
             return runs.code
 
 
@@ -75,6 +75,7 @@ class _Runs:
         self._allow_low_margin = allow_low_margin
         self.code = 0  # exit code of the last one
         self.drive_state = ""  # after the last one
+        self.ended_by = ""  # in words, where `jointctl stop` has ended it
         self._ended = False  # whether a signal or `jointctl stop` has ended the program as well
         self.told: dict[str, Any] = {}  # to the page, of how the last one ended
 
@@ -112,6 +113,7 @@ class _Runs:
                 except KeyboardInterrupt:
                     if control.signals.commanded_ns:
                         self.code = INTERRUPTED
+                    self.ended_by = control.signals.by_command
                     raise
                 finally:
                     self.drive_state, self._ended = supervisor.drive_state, control.signals.count > 0

@@ -306,6 +306,7 @@ def sweep(config: Config, output: Output, out: Path, options: SweepOptions | Non
                 command.control = stack.enter_context(in_control(command.config, output))
             return command.run()
         except KeyboardInterrupt:
-            output.note("interrupted; nothing moved" + ("" if command.file is None else " any more"))
+            by = command.control.signals.by_command if command.control is not None else ""
+            output.note(f"interrupted{by}; nothing moved" + ("" if command.file is None else " any more"))
             drive_end.require_off(command.drive_state)
             return INTERRUPTED

@@ -183,13 +183,13 @@ def test_a_drive_that_says_nothing_is_told_by_the_loop_and_not_as_a_delay(
 
 @pytest.mark.parametrize(
     ("state", "said"),
-    [("switch on disabled", "the drive is disabled"), (UNTOUCHED, "another controller has it"), ("", "no drive")],
+    [("switch on disabled", "the drive is disabled"), (UNTOUCHED, "the drive was left as it is"), ("", "no drive")],
 )
 def test_the_end_of_the_scope_tells_how_the_drive_is(
     monkeypatch: pytest.MonkeyPatch, capsys: Any, virtual_config: Any, state: str, said: str
 ) -> None:
     class Runs:
-        code, drive_state, told = 0, state, {}
+        code, drive_state, told, ended_by = 0, state, {}, ""
 
         def __init__(self, *_: Any, **__: Any) -> None: ...
         def one(self) -> bool:

@@ -29,9 +29,14 @@ def require_off(state: str) -> None:
         raise DeviceError(f"the drive did not confirm that it is off (={state})", ADVICE)
 
 
-def words(state: str) -> str:
-    """For a run that was not begun: how the drive is; `DeviceError` as above."""
+def words(state: str, *, interrupted: bool = False) -> str:
+    """For a run that was not begun: how the drive is; `DeviceError` as above.
+
+    `interrupted`: by the user, which is why the drive was not taken over, if it was not.
+    """
     require_off(state)
+    if state == UNTOUCHED and interrupted:
+        return "the drive was left as it is"
     if state == UNTOUCHED:
         return "the drive was left alone: another controller has it"
     return "the drive is disabled" if state else "no drive was used"

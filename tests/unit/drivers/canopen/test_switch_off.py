@@ -276,6 +276,7 @@ def test_its_twin_is_off(monkeypatch: pytest.MonkeyPatch, virtual_config: Any, c
 def test_the_words_for_a_run_that_was_not_begun(state: str, said: str) -> None:
     require_off(state)
     assert said in words(state)
+    assert words(state, interrupted=True) == ("the drive was left as it is" if state == UNTOUCHED else words(state))
 
 
 # --- a drive that somebody else has enabled, without SYNC ----------------------------------------------------------
