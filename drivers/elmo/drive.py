@@ -15,12 +15,13 @@ from jointctl.drivers.elmo.dialogue import changed
 from jointctl.drivers.elmo.inspection import Fact, read_facts
 from jointctl.drivers.elmo.interpreter import ReplyKind, encode
 from jointctl.drivers.elmo.port import ElmoPort
-from jointctl.drivers.elmo.switch_off import switch_off
+from jointctl.drivers.elmo.switch_off import SAFE_ATTEMPTS, switch_off
 from jointctl.drivers.elmo.unit_modes import set_torque_mode
 from jointctl.drivers.errors import DeviceError, JointctlError
 from jointctl.firmware_py.schema import new
 
 ENABLE_RETRY_S = 0.5
+ASKED_ATTEMPTS = 20  # twice those of `jointctl stop`, which talks on the same line meanwhile and takes replies
 
 
 class ElmoDrive(ElmoCommissioning):
@@ -94,12 +95,15 @@ class ElmoDrive(ElmoCommissioning):
     # --- the end ---
 
     def make_safe(self, *, asked: bool = False) -> str:
-        """TC=0, JV=0, ST, MO=0 until MO reads 0.  Never raises; a drive that was never found is left alone."""
+        """TC=0, JV=0, ST, MO=0 until MO reads 0.  Never raises; a drive that was never found is left alone.
+
+        `asked`: by `jointctl stop`.  Whoever of the two is done first leaves the line to the other.
+        """
         self._line.gate = lambda: None
         if not self._taken:
             return "untouched"
         try:
-            return switch_off(self._byte_port, self._line)
+            return switch_off(self._byte_port, self._line, ASKED_ATTEMPTS if asked else SAFE_ATTEMPTS)
         except JointctlError as error:
             return f"unknown: {error.message}; only the drive's own limits stop it now, use the emergency stop"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from jointctl.drivers.elmo.serial_port import SerialPort
 from jointctl.drivers.errors import BusError, DeviceError, NoDeviceError
 from jointctl.hil.elmo.motor import switch_off
+from jointctl.tools.verbs.stop_serial import SHARED_ATTEMPTS
 from tests.unit.drivers.elmo.memory_port import MemoryPort
 
 
@@ -189,6 +191,18 @@ class TestMakeSafe:
         state = drive.make_safe()
         assert state.startswith("unknown: ")
         assert "emergency stop" in state
+
+    @pytest.mark.parametrize("asked", [True, False])
+    def test_a_stop_that_takes_replies_on_the_same_line_is_outlasted(self, port: MemoryPort, asked: bool) -> None:
+        """As long as `jointctl stop` tries; its twin without that word gives up before."""
+        drive = port.drive()
+        drive.commission()
+        port.device.execute(b"MO=1")
+        lines = itertools.count()  # two of each attempt
+        port.answer = lambda line, reply: b"" if next(lines) < 4 * SHARED_ATTEMPTS else reply
+        state = drive.make_safe(asked=asked)
+        assert state == "off" if asked else state.startswith("unknown: ")
+        assert port.device.m.motor_on == 0
 
 
 class TestSerialPort:
