@@ -78,7 +78,7 @@ class BusLock:
         try:
             self._refuse_others()
             self.marker_fd = os.memfd_create(self._name)
-            _no_longer_starting()
+            no_longer_starting()
         except BaseException:
             self.close()
             raise
@@ -325,12 +325,13 @@ def is_marked(pid: int, name: str, proc: Path = Path("/proc")) -> bool:
     return False
 
 
-def _no_longer_starting() -> None:
+def no_longer_starting() -> None:
     """Take the mark away that the program gave itself when it was started (`STARTING`)."""
-    for link in Path("/proc/self/fd").iterdir():
-        with contextlib.suppress(OSError):
-            if os.readlink(link).startswith(f"/memfd:{STARTING} "):
-                os.close(int(link.name))
+    with contextlib.suppress(OSError):  # a system without /proc
+        for link in Path("/proc/self/fd").iterdir():
+            with contextlib.suppress(OSError):
+                if os.readlink(link).startswith(f"/memfd:{STARTING} "):
+                    os.close(int(link.name))
 
 
 def lock_name(interface: str, channel: str) -> str:

@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from jointctl.drivers.bus_lock import no_longer_starting
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import DECLINED, INTERRUPTED, JointctlError
 from jointctl.firmware_py.states import StopRequest
@@ -35,6 +36,7 @@ PREPARED_S = 300.0  # what was found and shown holds for so long; then the run i
 
 def scope(path: Path, output: Output, *, host: str = HOST, port: int = PORT) -> int:
     """Serve a run log; the page can zoom, but there is nothing to stop.  Returns the exit code."""
+    no_longer_starting()  # it never controls a bus, and `jointctl stop` need not wait for it
     read_run_log(path)  # what is wrong with it is to be told here
     order = scope_order(path.stem, host, port, log=str(path))
     output.address(f"scope: {order.url}  (Ctrl-C ends it)")

@@ -17,6 +17,7 @@ import pytest
 
 from jointctl.drivers.bus_lock import NAMES, BusLock, Holder, lock_name, wait_for_answers
 from jointctl.drivers.errors import BusError
+from jointctl.tools.running import stop_call
 from jointctl.tools.running.stop_call import StopCall
 
 LOCK = """
@@ -213,6 +214,18 @@ def test_garbage_and_silence_keep_no_one_from_stopping(channel: str, data: bytes
         assert holder.within_s is not None
         assert stopped == [1]
         holder.close()
+
+
+def test_a_program_that_starts_for_too_long_is_named(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stop_call, "STARTING_S", 0.6)
+    monkeypatch.setattr(stop_call, "TOLD_S", 0.2)
+    slow = "import os, time\nmark = os.memfd_create('jointctl-starting')\nprint('mine', flush=True)\ntime.sleep(60.0)\n"
+    notes: list[str] = []
+    with controller(channel, slow) as process, StopCall("socketcan", channel) as call:
+        assert not call.end(notes.append)
+        assert process.poll() is None  # it may be another joint's
+    named = [note for note in notes if str(process.pid) in note]
+    assert [note.split(" for ")[0] for note in named] == ["waiting", "not waiting any longer"]
 
 
 def test_a_program_that_starts_is_waited_for(channel: str) -> None:
