@@ -34,6 +34,7 @@ TESTS = {  # below UNIT_TESTS
     "firmware_py/sequence.py": ("firmware_py/axis/test_sequence_*", "firmware_py/axis/test_axis_*"),
     "drivers/canopen/cia402.py": ("drivers/canopen/test_cia402",),
     "drivers/canopen/bus_watchers.py": ("drivers/canopen/test_other_controllers", "drivers/canopen/test_switch_off"),
+    "drivers/at_rest.py": ("drivers/canopen/test_switch_off", "drivers/elmo/test_elmo_commissioning"),
     "drivers/canopen/found_enabled.py": ("drivers/canopen/test_switch_off",),
     "drivers/canopen/switch_off.py": ("drivers/canopen/test_switch_off",),
     "drivers/canopen/watchdog_guard.py": ("drivers/canopen/test_watchdog_guard",),
@@ -51,6 +52,7 @@ TESTS = {  # below UNIT_TESTS
 }  # fmt: skip
 KERNELS = (*(module for module in TESTS if module.startswith("firmware_py")), "drivers/canopen/cia402.py")
 LONGEST_S = 120.0  # of processor time: on a busy computer a sound mutant must not count as one that hangs
+LONGEST_TEST_S, LONGEST_TEST_FACTOR = 15.0, 10.0  # a test may take the sum of these, the second of its own time
 COMPARISONS: dict[type, tuple[type, ...]] = {
     ast.Lt: (ast.LtE, ast.GtE), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.LtE), ast.GtE: (ast.Gt, ast.Lt),
     ast.Eq: (ast.NotEq,), ast.NotEq: (ast.Eq,),
@@ -193,7 +195,7 @@ class Session:
         source = (ROOT / self._module).read_text()
         items, durations_s = list(session.items), [0.0] * len(session.items)
         noticed = [0] * len(items)
-        if self._first_failure(session, items, range(len(items)), None, durations_s) is not None:
+        if self._first_failure(session, items, range(len(items)), {}, durations_s) is not None:
             print(f"{self._module}: its tests fail without any change", file=sys.stderr)
             self.refused = True
             return True
@@ -201,7 +203,7 @@ class Session:
         started, lines = time.monotonic(), source.splitlines()
         for line, what, tree in found:
             order = sorted(range(len(items)), key=lambda i: (-noticed[i], durations_s[i]))
-            by = self._first_failure(session, items, order, changed_code(self._module, tree), None)
+            by = self._first_failure(session, items, order, changed_code(self._module, tree), durations_s)
             if by is None:
                 text = lines[line - 1].strip()
                 print(f"  {self._module}:{line}: {what}: {text}", flush=True)
@@ -214,36 +216,47 @@ class Session:
 
     @staticmethod
     def _first_failure(
-        session: Any, items: list[Any], order: Any, code: dict[str, Any] | None, durations_s: list[float] | None
+        session: Any, items: list[Any], order: Any, code: dict[str, Any], durations_s: list[float]
     ) -> int | None:
-        """Index of the first test that fails in a child process; -1 if it hangs or dies, None if all pass."""
+        """Index of the first test that fails in a child process; -1 if it hangs or dies, None if all pass.
+
+        `durations_s`: of each test by the clock, 0 where that is not known; without a change of code it is measured.
+        """
         read_fd, write_fd = os.pipe()
         child = os.fork()
         if child == 0:
+            os.setpgid(0, 0)  # with what its tests start
             signal.setitimer(signal.ITIMER_PROF, LONGEST_S)
             quiet = os.open(os.devnull, os.O_WRONLY)
             os.dup2(quiet, 1)
             os.dup2(quiet, 2)
-            for function, changed in (code or {}).values():
+            for function, changed in code.values():
                 function.__code__ = changed
             with contextlib.suppress(BaseException):
                 ordered = [items[i] for i in order]
                 for place, (item, following) in enumerate(zip(ordered, [*ordered[1:], None], strict=True)):
-                    began_s = time.process_time()
+                    began_s = time.monotonic()
+                    if code:
+                        longest_s = LONGEST_TEST_S + LONGEST_TEST_FACTOR * durations_s[order[place]]
+                        signal.setitimer(signal.ITIMER_REAL, longest_s)
                     item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
                     passed = not session.testsfailed
-                    os.write(write_fd, f"{order[place]} {time.process_time() - began_s} {passed:d}\n".encode())
+                    os.write(write_fd, f"{order[place]} {time.monotonic() - began_s} {passed:d}\n".encode())
                     if not passed:
                         break
                 else:
                     os.write(write_fd, b"all\n")
             os._exit(0)
         os.close(write_fd)
-        with os.fdopen(read_fd) as answers:
-            told = answers.read().splitlines()
-        os.waitpid(child, 0)
+        try:
+            with os.fdopen(read_fd) as answers:
+                told = answers.read().splitlines()
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(child, signal.SIGKILL)
+            os.waitpid(child, 0)
         if told and told[-1] == "all":
-            if durations_s is not None:
+            if not code:
                 for line in told[:-1]:
                     durations_s[int(line.split()[0])] = float(line.split()[1])
             return None
