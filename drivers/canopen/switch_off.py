@@ -37,16 +37,15 @@ def state_of(objects: ObjectAccess) -> State:
     return state_of_word(objects.read(0x6041, what="statusword"))
 
 
-def brake(objects: ObjectAccess, sleep: Callable[[float], None]) -> bool:
-    """If the drive is powered, its quick stop, until it is off or QUICK_STOP_S is over; whether it was powered."""
+def brake(objects: ObjectAccess, sleep: Callable[[float], None]) -> None:
+    """If the drive is powered, its quick stop, until it is off or QUICK_STOP_S is over."""
     for attempt in range(round(QUICK_STOP_S / POLL_S)):
         state = state_of(objects)
         if state not in POWERED_STATES:
-            return attempt > 0
+            return
         if attempt == 0 and state is State.OPERATION_ENABLED:
             objects.write(0x6040, 0, ControlWord.QUICK_STOP, what="controlword")
         sleep(POLL_S)
-    return True
 
 
 class SwitchOff:
@@ -106,7 +105,6 @@ class SwitchOff:
             self._sleep(POLL_S)
 
     def _attempt(self) -> str:
-        state = State.UNDEFINED
         self._tell(NmtCommand.ENTER_PRE_OPERATIONAL, self._encoder_node)
         self._tell(NmtCommand.ENTER_PRE_OPERATIONAL, self._node)
         brake(self._objects, self._sleep)
@@ -126,11 +124,10 @@ class SwitchOff:
         return words
 
 
-def _standard_objects(node: int) -> canopen.ObjectDictionary:
+def _standard_objects() -> canopen.ObjectDictionary:
     """What `SwitchOff` uses, as the standard has it."""
     new_dictionary: Any = canopen.ObjectDictionary
     dictionary = new_dictionary()
-    dictionary.node_id = node
 
     def variable(index: int, sub: int) -> Any:
         found: Any = ODVariable(f"{index:04X}:{sub}", index, sub)
@@ -154,7 +151,7 @@ def stop_node(
     network = new_network(bus, sleep)
     network.connect()
     try:
-        remote = network.add_node(node, _standard_objects(node))
+        remote = network.add_node(node, _standard_objects())
         remote.sdo.RESPONSE_TIMEOUT = sdo_timeout_s or SDO_TIMEOUT_S
         switch_off = SwitchOff(network, node, ObjectAccess(remote, "CiA 402"), encoder_node, sleep)
         return switch_off.make_safe(brake_first=True)

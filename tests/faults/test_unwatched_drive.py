@@ -60,10 +60,10 @@ def test_make_safe_reaches_a_drive_that_its_watchdog_stops_meanwhile(
         drive.commission()
         brake = switch_off.brake
 
-        def stopped_meanwhile(objects: Any, sleep: Any) -> bool:
+        def stopped_meanwhile(objects: Any, sleep: Any) -> None:
             monkeypatch.setattr(switch_off, "brake", brake)
             drive._node.nmt.send_command(2)
-            return brake(objects, sleep)
+            brake(objects, sleep)
 
         monkeypatch.setattr(switch_off, "brake", stopped_meanwhile)
         assert drive.make_safe() == "switch on disabled"  # "stopped" answers no SDO: pre-operational once more

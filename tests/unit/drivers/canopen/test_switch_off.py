@@ -14,8 +14,12 @@ from typing import Any
 import can
 import pytest
 
+from jointctl.drivers.at_rest import refuse_unless_at_rest
+from jointctl.drivers.canopen import switch_off as switch_off_module
+from jointctl.drivers.canopen.cia402 import State
+from jointctl.drivers.canopen.switch_off import POLL_S, SDO_TIMEOUT_S, SwitchOff, brake
 from jointctl.drivers.drive import UNTOUCHED, CommissioningReport, Declined, DriveIdentity, is_safe
-from jointctl.drivers.errors import BusError, DataError, DeviceError
+from jointctl.drivers.errors import BusError, DataError, DeviceError, NoDeviceError
 from jointctl.hil.canopen.records import PowerState
 from jointctl.tools.output import Output
 from jointctl.tools.running import supervisor as supervisor_module
@@ -23,6 +27,7 @@ from jointctl.tools.running.result.drive_end import require_off, words
 from jointctl.tools.verbs import run as run_module
 from jointctl.tools.verbs import stop as stop_module
 from tests.places import CONFIGS
+from tests.unit.drivers.canopen.wire import STATUSWORDS
 
 ENABLED, SWITCHED_ON = 0x27, 0x23
 NMT_STOP = (0x000, b"\x02\x01")
@@ -73,6 +78,158 @@ def test_nobody_answers(empty_bus: Any) -> None:
     state = empty_bus.stop_drive()
     assert state.startswith("unknown: ")
     assert NMT_STOP in empty_bus.requests
+
+
+@pytest.mark.parametrize(("configured_s", "used_s"), [(None, SDO_TIMEOUT_S), (0.15, 0.15)])
+def test_a_stop_brakes_first_waits_for_answers_as_configured_and_closes_its_bus(
+    device_on_bus: Any, monkeypatch: pytest.MonkeyPatch, configured_s: float | None, used_s: float
+) -> None:
+    calls: list[tuple[float, bool]] = []
+
+    def make_safe(switch_off: Any, *, brake_first: bool) -> str:
+        calls.append((switch_off._objects._node.sdo.RESPONSE_TIMEOUT, brake_first))
+        return "switch on disabled"
+
+    monkeypatch.setattr(SwitchOff, "make_safe", make_safe)
+    bus: Any = bus_of(device_on_bus)
+    switch_off_module.stop_node(bus, 1, sdo_timeout_s=configured_s)
+    assert (calls, bus._is_shutdown) == ([(used_s, True)], True)
+
+
+# --- step by step, on a drive in memory ------------------------------------------------------------------------------
+
+ON, BRAKING, SWITCHED, OFF = (
+    State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.SWITCHED_ON, State.SWITCH_ON_DISABLED,
+)  # fmt: skip
+QUICK_STOP, NO_VOLTAGE = (0x6040, 0, 0x02), (0x6040, 0, 0x00)
+TO_PRE_OPERATIONAL = [(0x000, b"\x80\x07"), (0x000, b"\x80\x01")]  # the encoder at node 7, the drive at node 1
+STOPPED = (0x000, b"\x02\x01")
+NO_TARGETS = [(0x6071, 0, 0), (0x60FF, 0, 0)]
+SILENCE, DEAD_BUS = NoDeviceError("no answer"), can.CanOperationError("dead")
+
+
+class DriveInMemory:
+    """Bus and objects of a drive that shows one state after the other, the last one for ever; an error is raised.
+
+    `log`: what it was told, and how long it was left alone.
+    """
+
+    def __init__(self, *states: State | Exception, deaf_to: bytes = b"", refused: int = 0) -> None:
+        self.states = list(states)
+        self.deaf_to, self.refused = deaf_to, refused
+        self.log: list[Any] = []
+
+    def read(self, index: int, sub: int = 0, *, what: str) -> int:
+        state = self.states.pop(0) if len(self.states) > 1 else self.states[0]
+        if isinstance(state, Exception):
+            raise state
+        return STATUSWORDS[state]
+
+    def write(self, index: int, sub: int, value: int, *, what: str) -> None:
+        self.log.append((index, sub, value))
+        if index == self.refused:
+            raise DeviceError("refused")
+
+    write_if_present = write
+
+    def send_message(self, can_id: int, data: bytes) -> None:
+        if data == self.deaf_to:
+            raise DEAD_BUS
+        self.log.append((can_id, data))
+
+    def wait(self, seconds: float) -> None:
+        self.log.append(seconds)
+
+    def made_safe(self, **how: bool) -> str:
+        bus: Any = self
+        return SwitchOff(bus, 1, bus, 7, self.wait).make_safe(**how)
+
+
+@pytest.mark.parametrize(
+    ("states", "log"),
+    [
+        ([ON, BRAKING, OFF], [QUICK_STOP, POLL_S, POLL_S]),
+        ([ON, ON, OFF], [QUICK_STOP, POLL_S, POLL_S]),  # told once
+        ([BRAKING, ON, OFF], [POLL_S, POLL_S]),
+        ([ON], [QUICK_STOP, *[POLL_S] * 50]),  # one second
+        ([OFF], []),
+        ([SWITCHED], []),
+    ],
+)
+def test_the_quick_stop_is_asked_for_once_and_waited_for(states: list[State], log: list[Any]) -> None:
+    drive: Any = DriveInMemory(*states)
+    brake(drive, drive.wait)
+    assert drive.log == log
+
+
+@pytest.mark.parametrize(
+    ("states", "state", "log"),
+    [
+        ([OFF], "switch on disabled", [NO_VOLTAGE, *NO_TARGETS]),
+        ([State.FAULT], "fault", [NO_VOLTAGE, *NO_TARGETS]),
+        ([SWITCHED, SWITCHED, OFF], "switch on disabled", [NO_VOLTAGE, POLL_S, NO_VOLTAGE, *NO_TARGETS]),
+        ([SWITCHED], "switched on", [*[NO_VOLTAGE, POLL_S] * 50, *NO_TARGETS]),
+        (
+            [BRAKING], "quick stop active, it did not obey; NMT stop was sent",
+            [*[POLL_S] * 50, *[NO_VOLTAGE, POLL_S] * 50, *NO_TARGETS, STOPPED],
+        ),
+    ],
+)  # fmt: skip
+def test_out_of_operational_before_the_controlword_is_ours(states: list[State], state: str, log: list[Any]) -> None:
+    drive = DriveInMemory(*states)
+    assert drive.made_safe() == state
+    assert drive.log == [*TO_PRE_OPERATIONAL, *log]
+
+
+@pytest.mark.parametrize(
+    ("states", "log"),
+    [
+        ([ON, BRAKING, BRAKING, OFF], [QUICK_STOP, POLL_S, POLL_S]),
+        ([ON, *[BRAKING] * 50, OFF], [QUICK_STOP, *[POLL_S] * 50]),
+        ([ON, BRAKING, SWITCHED, OFF], [QUICK_STOP, POLL_S]),  # its controller does not leave it alone
+        ([BRAKING, OFF], []),
+        ([OFF], []),
+        ([SILENCE, OFF], []),
+        ([DEAD_BUS, OFF], []),
+    ],
+)
+def test_anothers_drive_brakes_before_it_leaves_operational(states: list[Any], log: list[Any]) -> None:
+    drive = DriveInMemory(*states)
+    assert drive.made_safe(brake_first=True) == "switch on disabled"
+    assert drive.log == [*log, *TO_PRE_OPERATIONAL, NO_VOLTAGE, *NO_TARGETS]
+
+
+@pytest.mark.parametrize("refused", [0x6071, 0x60FF])
+def test_a_drive_without_a_target_is_switched_off_all_the_same(refused: int) -> None:
+    drive = DriveInMemory(OFF, refused=refused)
+    assert drive.made_safe() == "switch on disabled"
+    assert drive.log == [*TO_PRE_OPERATIONAL, NO_VOLTAGE, *NO_TARGETS]
+
+
+@pytest.mark.parametrize(
+    ("states", "deaf_to", "state", "log"),
+    [
+        ([SILENCE, OFF], b"", "switch on disabled", [*TO_PRE_OPERATIONAL, NO_VOLTAGE, *NO_TARGETS]),
+        ([SILENCE], b"", "unknown: no answer; NMT stop was sent", [*TO_PRE_OPERATIONAL, STOPPED]),
+        (
+            [SILENCE], STOPPED[1], "unknown: no answer; the bus does not take frames any more",
+            TO_PRE_OPERATIONAL,
+        ),
+        (
+            [SILENCE, DEAD_BUS], b"", "unknown: the bus does not take frames any more (dead)",
+            TO_PRE_OPERATIONAL,
+        ),
+    ],
+)  # fmt: skip
+def test_silence_is_tried_once_more(states: list[Any], deaf_to: bytes, state: str, log: list[Any]) -> None:
+    drive = DriveInMemory(*states, deaf_to=deaf_to)
+    assert drive.made_safe() == state
+    assert drive.log == [*TO_PRE_OPERATIONAL, *log]
+
+
+def test_on_a_dead_bus_the_state_is_unknown() -> None:
+    drive = DriveInMemory(OFF, deaf_to=TO_PRE_OPERATIONAL[0][1])
+    assert drive.made_safe() == "unknown: the bus does not take frames any more (dead)"
 
 
 # --- the verb ------------------------------------------------------------------------------------------------------
@@ -338,6 +495,46 @@ def test_an_enabled_drive_that_turns_is_left_alone(
     finally:
         drive.close()
     assert (powered(device_on_bus), len(asked)) == ((True, 0) if turns else (False, 1))
+
+
+@pytest.mark.parametrize(
+    ("rad_per_count", "counts", "turns"),
+    [(1.0, 2, False), (1.0, 3, True), (1.25e-5, 8, False), (1.25e-5, 9, True), (-1.25e-5, 8, False)],
+)
+def test_at_rest_a_joint_may_move_two_counts_or_a_ten_thousandth(
+    rad_per_count: float, counts: int, turns: bool
+) -> None:
+    readings = iter([1000, *[1000 + counts] * 50])
+    asked: list[str] = []
+    with (
+        pytest.raises(DeviceError, match=rf"turns \({counts} counts in 0.5 s\)") if turns else contextlib.nullcontext()
+    ):
+        refuse_unless_at_rest(
+            "it", lambda: next(readings), rad_per_count, lambda question: asked.append(question) is None, "?",
+            lambda _: None,
+        )  # fmt: skip
+    assert asked == ([] if turns else ["?"])
+
+
+def test_it_is_watched_for_half_a_second_before_the_question_and_again_after_the_answer() -> None:
+    log: list[Any] = []
+    refuse_unless_at_rest(
+        "it", lambda: log.append("look") or 0, 1.0, lambda question: log.append(question) is None, "may I?",
+        log.append, lambda: log.append("others"),
+    )  # fmt: skip
+    watch = ["look", *[0.05, "look"] * 10, "others"]
+    assert log == [*watch, "may I?", *watch]
+
+
+@pytest.mark.parametrize("answered", [False, True])
+def test_whatever_begins_to_turn_it_until_the_last_look_leaves_it_alone(answered: bool) -> None:
+    readings = iter([*[0] * (21 if answered else 10), *[50] * 50])
+    asked: list[str] = []
+    with pytest.raises(DeviceError, match="turns"):
+        refuse_unless_at_rest(
+            "it", lambda: next(readings), 1.0, lambda question: asked.append(question) is None, "?", lambda _: None
+        )
+    assert bool(asked) is answered
 
 
 def test_its_twin_that_is_off_is_not_braked(device_on_bus: Any, settings_of_virtual_joint: Any) -> None:
