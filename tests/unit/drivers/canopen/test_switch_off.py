@@ -17,6 +17,7 @@ import pytest
 from jointctl.drivers.at_rest import refuse_unless_at_rest
 from jointctl.drivers.canopen import switch_off as switch_off_module
 from jointctl.drivers.canopen.cia402 import State
+from jointctl.drivers.canopen.found_enabled import brake_if_enabled
 from jointctl.drivers.canopen.switch_off import POLL_S, SDO_TIMEOUT_S, SwitchOff, brake
 from jointctl.drivers.drive import UNTOUCHED, CommissioningReport, Declined, DriveIdentity, is_safe
 from jointctl.drivers.errors import BusError, DataError, DeviceError, NoDeviceError
@@ -120,6 +121,8 @@ class DriveInMemory:
         self.log: list[Any] = []
 
     def read(self, index: int, sub: int = 0, *, what: str) -> int:
+        if index == 0x6064:
+            return 0
         state = self.states.pop(0) if len(self.states) > 1 else self.states[0]
         if isinstance(state, Exception):
             raise state
@@ -535,6 +538,15 @@ def test_whatever_begins_to_turn_it_until_the_last_look_leaves_it_alone(answered
             "it", lambda: next(readings), 1.0, lambda question: asked.append(question) is None, "?", lambda _: None
         )
     assert bool(asked) is answered
+
+
+@pytest.mark.parametrize(("afterwards", "anothers"), [(ON, True), (BRAKING, False), (OFF, False)])
+def test_one_that_is_enabled_again_after_its_quick_stop_is_anothers(afterwards: State, anothers: bool) -> None:
+    drive: Any = DriveInMemory(ON, ON, OFF, afterwards)
+    with pytest.raises(BusError, match="enabled again after its quick stop") if anothers else contextlib.nullcontext():
+        remark = brake_if_enabled(drive, 1, 1.0, lambda _: True, lambda _: None, lambda: None)
+        assert "the drive was enabled, at rest" in remark
+    assert drive.log == [QUICK_STOP]
 
 
 def test_its_twin_that_is_off_is_not_braked(device_on_bus: Any, settings_of_virtual_joint: Any) -> None:
