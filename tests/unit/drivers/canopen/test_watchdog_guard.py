@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from typing import Any
 
 import pytest
 
 from jointctl.drivers.canopen.drive import CanopenDrive
+from jointctl.drivers.canopen.watchdog_guard import PERIOD_S, WatchdogGuard, is_kept
 from jointctl.drivers.errors import BusError, DeviceError
 from tests.unit.drivers.canopen.odd_drive import opened
 
@@ -103,3 +105,97 @@ def test_while_the_delay_is_measured_it_reads_nothing_and_listens(run: Run) -> N
     run.bus.send(0x601, struct.pack("<BHBI", 0x2B, 0x6007, 0, 0))
     with pytest.raises(BusError, match="writes object 6007"):
         run.guard.poll(may_ask=False)
+
+
+# --- what it makes of answers, without a drive -----------------------------------------------------------------------
+
+
+class Answers:
+    """A guard of 6007, which was set to 3, and of mode 10; the test says what the drive answers."""
+
+    def __init__(self) -> None:
+        self.polls = 0
+        self.places: list[tuple[int, int, float]] = []
+        self._hear: dict[int, Any] = {}
+        stub: Any = self
+        self.guard = WatchdogGuard(stub, stub, 1, 10, lambda: None)
+
+    def verified(self) -> dict[tuple[int, int], tuple[int, str]]:
+        return {(0x6007, 0): (3, "abort connection option"), (0x6072, 0): (500, "max torque")}
+
+    def encoded(self, index: int, sub: int, value: int, *, what: str) -> bytes:
+        return value.to_bytes(WATCHED[index], "little")
+
+    def add(self, index: int, sub: int, period_s: float, on_answer: Any) -> None:
+        self.places.append((index, sub, period_s))
+        self._hear[index] = on_answer
+
+    def poll(self) -> None:
+        self.polls += 1
+
+    def says(self, index: int, data: bytes | None) -> list[str]:
+        self._hear[index](0, data, "" if data is not None else "silence")
+        return self.guard.poll()
+
+    def confirm(self) -> None:
+        self.says(0x6007, b"\x03\0")
+        assert not self.guard.confirmed
+        self.says(0x6061, b"\x0a")
+        assert self.guard.confirmed
+
+
+def test_it_reads_what_was_set_to_stop_the_drive_and_the_mode() -> None:
+    answers = Answers()
+    assert answers.places == [(0x6007, 0, PERIOD_S), (0x6061, 0, PERIOD_S)]
+    answers.guard.poll(may_ask=False)
+    assert answers.polls == 0
+    answers.guard.poll()
+    assert answers.polls == 1
+
+
+@pytest.mark.parametrize(
+    ("index", "sub", "kept"),
+    [
+        (0x1016, 1, True), (0x1016, 2, False), (0x1017, 1, False), (0x6007, 0, True), (0x6007, 1, False),
+        (0x6008, 0, False), (0x1400, 5, True), (0x1400, 4, False), (0x13FF, 5, False), (0x15FF, 5, True),
+        (0x1600, 5, False),
+    ],
+)  # fmt: skip
+def test_what_is_kept_is_who_is_watched_the_reaction_and_every_deadline(index: int, sub: int, kept: bool) -> None:
+    assert is_kept(index, sub) is kept
+
+
+def test_bytes_behind_the_value_are_not_part_of_it() -> None:
+    answers = Answers()
+    assert answers.says(0x6007, b"\x03\0\xff\xff") == []
+
+
+def test_the_first_change_is_told_with_both_values() -> None:
+    answers = Answers()
+    text = "node 1: object 6007 (abort connection option) was changed to 18 (12h) by another program, 3 was set"
+    for data in (b"\x12\0\xff\xff", b"\x05\0"):
+        with pytest.raises(DeviceError, match=re.escape(text)):
+            answers.says(0x6007, data)
+
+
+@pytest.mark.parametrize("confirmed", [False, True])
+def test_three_reads_in_a_row_without_an_answer_are_told_and_two_are_not(confirmed: bool) -> None:
+    answers = Answers()
+    if confirmed:
+        answers.confirm()
+    for said in (None, None, b"\x03\0", None, None):
+        assert answers.says(0x6007, said) == []
+    text = "node 1: object 6007 (abort connection option) cannot be read any more: silence"
+    if confirmed:
+        assert answers.says(0x6007, None) == [text]
+        assert answers.says(0x6007, None) == []  # once
+    else:
+        with pytest.raises(DeviceError, match=re.escape(text)):
+            answers.says(0x6007, None)
+
+
+def test_every_object_that_cannot_be_read_is_told() -> None:
+    answers = Answers()
+    answers.confirm()
+    told = [answers.says(index, None) for index in (0x6007, 0x6061) for _ in range(3)]
+    assert [len(warnings) for warnings in told] == [0, 0, 1, 0, 0, 1]

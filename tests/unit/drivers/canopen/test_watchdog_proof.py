@@ -86,3 +86,53 @@ def test_a_watchdog_that_trips_while_the_heartbeat_comes_is_refused(timeout_s: f
             prove(network)
     else:
         assert prove(network) == "EMCY 8130h"
+
+
+class Telling(StubNetwork):
+    """Says `frames` one after the other as soon as the heartbeat is stopped, and notes every wait."""
+
+    def __init__(self, *frames: tuple[int, bytes]) -> None:
+        super().__init__(None)
+        self.frames = frames
+        self.waits_s: list[float] = []
+
+    def sleep(self, seconds: float) -> None:
+        self.waits_s.append(seconds)
+        if len(self.waits_s) == BEATS + 1:
+            for can_id, data in self.frames:
+                self.subscribers[can_id](can_id, bytearray(data), 0.0)
+
+
+def heartbeats(*data: bytes) -> list[tuple[int, bytes]]:
+    return [(0x700 + NODE, part) for part in data]
+
+
+@pytest.mark.parametrize(
+    ("frames", "seen"),
+    [
+        ([(0x80 + NODE, b"\x30\x81")], "EMCY 8130h"),
+        ([(0x80 + NODE, b"\x30")], ""),
+        (heartbeats(b"\x05", b"\x04"), "NMT state 4"),
+        (heartbeats(b"\x05", b"\x04", b"\x7f"), "NMT state 4"),
+        (heartbeats(b"\x05"), ""),
+        (heartbeats(b"\x05", b"\x85"), ""),  # the highest bit is not part of the state
+        (heartbeats(b"\x00", b""), ""),
+        ([EMERGENCY, *heartbeats(b"\x05", b"\x04")], "EMCY 8130h"),
+        ([*heartbeats(b"\x05", b"\x04"), EMERGENCY], "EMCY 8130h"),
+    ],
+)
+def test_what_is_a_reaction_and_what_is_not(frames: list[tuple[int, bytes]], seen: str) -> None:
+    network = Telling(*frames)
+    if seen:
+        assert prove(network) == seen
+    else:
+        with pytest.raises(DeviceError, match=r"was stopped for 0.8 s and the drive did not react"):
+            prove(network)
+    assert network.subscribers == {}
+
+
+def test_a_third_of_the_timeout_between_beats_and_four_timeouts_of_silence() -> None:
+    network = Telling()
+    with pytest.raises(DeviceError):
+        prove(network)
+    assert network.waits_s == pytest.approx([TIMEOUT_s / 3.0] * 6 + [TIMEOUT_s / 20.0] * 80)
