@@ -5,7 +5,7 @@ from __future__ import annotations
 import can
 import pytest
 
-from jointctl.drivers.canopen.bus_watchers import LISTEN_S, OtherControllers
+from jointctl.drivers.canopen.bus_watchers import FAILURE_PAUSE_S, LISTEN_S, BusFailure, OtherControllers
 from jointctl.drivers.errors import BusError
 
 NODE, MASTER = 5, 126
@@ -60,11 +60,19 @@ def test_frames_with_long_identifiers_are_no_frames_of_canopen() -> None:
     assert heard(listening(), 0x080, extended=True) == ""
 
 
+def test_frames_of_errors_are_no_ones_command() -> None:
+    others = listening()
+    others.on_message_received(can.Message(arbitration_id=0x080, is_error_frame=True, is_extended_id=False))
+    assert others.found() == ""
+
+
 def test_heartbeats_of_other_nodes_are_kept_as_such() -> None:
     others = listening()
-    for node in (7, 3, 7, NODE):
+    for node in (7, 3, 7, 1, 127, NODE):
         assert heard(others, 0x700 + node, b"\x05") == ""
-    assert others.heartbeats == {3, 7}
+    for identifier in (0x700, 0x780):  # of no node
+        assert heard(others, identifier, b"\x05") == ""
+    assert others.heartbeats == {1, 3, 7, 127}
 
 
 @pytest.mark.parametrize(
@@ -74,6 +82,9 @@ def test_heartbeats_of_other_nodes_are_kept_as_such() -> None:
         (0x600 + NODE, b"\x23\x16\x10\x01\0\0\0\0", "1 x SDO request that writes object 1016"),
         (0x600 + NODE, b"\x2b\x40\x60\x00\x0f\0\0\0", "1 x SDO request that writes object 6040"),
         (0x600 + NODE, b"\xc2\x00\x14\x05\0\0\0\0", "1 x SDO request that writes object 1400"),
+        (0x600 + NODE, b"\x23\x16\x10\x01", "1 x SDO request that writes object 1016"),
+        (0x600 + NODE, b"\x23\x16\x10", ""),  # too short to write anything
+        (0x600 + 7, b"\x23\x16\x10\x01\0\0\0\0", ""),  # to another drive
         (0x600 + NODE, b"\x2b\x72\x60\x00\x0f\0\0\0", ""),  # 6072: it does not decide whether there is power
         (0x600 + NODE, b"\x40\x16\x10\x01\0\0\0\0", ""),  # a reading
         (0x080, b"", ""), (0x200 + NODE, bytes(4), ""), (0x700 + MASTER, b"\x05", ""),  # our own loop sends them
@@ -91,6 +102,29 @@ def test_rpdos_by_the_drives_own_word_count_from_the_beginning() -> None:
     assert others.found() == "3 x RPDO of the drive (333h)"
     heard(others, 0x334, bytes(8))
     assert "1 x RPDO of the drive (334h)" in others.found()
+
+
+def test_an_rpdo_that_is_known_already_is_not_counted_twice() -> None:
+    others = listening()
+    heard(others, 0x200 + NODE, bytes(4))
+    others.add_rpdos([0x200 + NODE])
+    assert others.found() == "1 x RPDO to node 5 (205h)"
+
+
+def test_four_kinds_of_frames_are_named_and_the_others_counted() -> None:
+    others = listening()
+    for identifier in (0x080, 0x080, 0x205, 0x305, 0x405, 0x505, 0x605):
+        heard(others, identifier, bytes(8))
+    found = others.found()
+    assert found.startswith("2 x SYNC (080h), 1 x ")
+    assert found.endswith(" and 2 other kinds")
+    assert found.count(" x ") == 4
+
+
+def test_a_bus_that_fails_is_left_alone_for_a_moment() -> None:
+    pauses_s: list[float] = []
+    BusFailure(pauses_s.append).on_error(can.CanOperationError("dead"))
+    assert pauses_s == [FAILURE_PAUSE_S]
 
 
 @pytest.mark.parametrize(("passed_s", "left_s"), [(0.0, LISTEN_S), (0.4, LISTEN_S - 0.4), (LISTEN_S, 0.0), (9.0, 0.0)])
