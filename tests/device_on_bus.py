@@ -6,6 +6,7 @@ import itertools
 import struct
 import threading
 import time
+from collections.abc import Callable
 
 import can
 
@@ -125,7 +126,9 @@ class DeviceOnBus:
         bus = can.Bus(interface="virtual", channel=self.channel)
         return stop_node(bus, 1, sdo_timeout_s=0.15, sleep=lambda s: time.sleep(s / DEVICE_TIME_FACTOR))
 
-    def drive(self, settings: CanopenSettings, *, listened: bool = True) -> CanopenDrive:
+    def drive(
+        self, settings: CanopenSettings, *, listened: bool = True, gate: Callable[[], None] = lambda: None
+    ) -> CanopenDrive:
         """The real driver on another end of this bus; its waiting is short, but long for the device.
 
         `listened`: it has listened to the bus for long enough already.
@@ -145,7 +148,7 @@ class DeviceOnBus:
             bus.send(can.Message(arbitration_id=PASS_TIME, data=struct.pack("<d", seconds)))
             passed.wait(5.0)
 
-        drive = CanopenDrive(bus, settings, sleep=sleep)
+        drive = CanopenDrive(bus, settings, sleep=sleep, gate=gate)
         if listened:
             drive._others._started_s -= LISTEN_S
         assert drive._network.notifier is not None

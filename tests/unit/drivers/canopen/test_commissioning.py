@@ -10,11 +10,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import can
 import pytest
 
+from jointctl.drivers.canopen.drive import GATE_S, REOPEN_ATTEMPTS, REOPEN_PAUSE_S, CanopenDrive
 from jointctl.drivers.canopen.settings import CanopenSettings
-from jointctl.drivers.errors import ConfigurationError, DeviceError, JointctlError, NoDeviceError
-from tests.unit.drivers.canopen.odd_drive import opened, value
+from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
+from tests.unit.drivers.canopen.odd_drive import opened, store, value
 
 pytestmark = pytest.mark.usefixtures("short_timeout")
 
@@ -261,9 +263,213 @@ def test_an_eds_file_that_cannot_be_read(
     assert "\n" not in str(caught.value)
 
 
-def test_no_port_before_commissioning(device_on_bus: Any, settings_of_virtual_joint: CanopenSettings) -> None:
+@pytest.mark.parametrize("step", ["port", "start_cyclic"])
+def test_nothing_goes_on_before_commissioning(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, step: str
+) -> None:
     with (
         opened(device_on_bus, settings_of_virtual_joint) as drive,
         pytest.raises(DeviceError, match="not been commissioned"),
     ):
-        drive.port()
+        getattr(drive, step)()
+
+
+# --- the user's stop, other controllers, a bus that fails ------------------------------------------------------------
+
+
+class Stop(Exception):
+    """What the gate raises."""
+
+
+@pytest.mark.parametrize(("wait_s", "slices_s"), [(0.0, []), (GATE_S, [GATE_S]), (0.12, [GATE_S, GATE_S, 0.02])])
+def test_a_wait_looks_for_a_stop_before_each_of_its_parts_and_at_its_end(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, wait_s: float, slices_s: list[float]
+) -> None:
+    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+        log: list[float] = []
+        drive._sleep, drive._gate = log.append, lambda: log.append(-1.0)
+        drive._pause(wait_s)
+    assert log == pytest.approx([number for part in slices_s for number in (-1.0, part)] + [-1.0])
+
+
+def test_once_a_stop_was_asked_for_the_drive_is_only_made_safe(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings
+) -> None:
+    def gate() -> None:
+        if asked:
+            raise Stop
+
+    asked: list[bool] = []
+    drive = device_on_bus.drive(settings_of_virtual_joint, gate=gate)
+    try:
+        drive.commission()
+        asked.append(True)
+        device_on_bus.requests.clear()
+        for step in (drive.commission, drive.start_cyclic, lambda: drive._objects.read(0x1000, what="device type")):
+            with pytest.raises(Stop):
+                step()
+        assert device_on_bus.requests == []
+        assert drive.make_safe() == "switch on disabled"
+    finally:
+        drive.close()
+
+
+@pytest.mark.parametrize(("configured_s", "used_s"), [(None, 0.15), (0.7, 0.7)])
+def test_answers_are_waited_for_as_configured(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, configured_s: float | None, used_s: float
+) -> None:
+    with opened(device_on_bus, dataclasses.replace(settings_of_virtual_joint, sdo_timeout_s=configured_s)) as drive:
+        waits_s: float = drive._node.sdo.RESPONSE_TIMEOUT
+    assert waits_s == used_s
+
+
+def test_a_drive_that_cannot_be_made_leaves_no_bus_open(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, tmp_path: Path
+) -> None:
+    bus: Any = can.Bus(interface="virtual", channel=device_on_bus.channel)
+    with pytest.raises(ConfigurationError):
+        CanopenDrive(bus, dataclasses.replace(settings_of_virtual_joint, eds_path=tmp_path / "none.eds"))
+    assert bus._is_shutdown
+
+
+@pytest.mark.parametrize(("heartbeat_of", "anothers"), [(42, True), (43, False)])
+def test_a_drive_that_watches_a_node_on_the_bus_is_anothers(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, heartbeat_of: int, anothers: bool
+) -> None:
+    store(device_on_bus, 0x1016, 1, 42 << 16 | 500)
+    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+        for node in (heartbeat_of, 9):
+            device_on_bus.send(0x700 + node, b"\x05")
+        if anothers:
+            with pytest.raises(BusError, match=r"node 1 watches the heartbeat of node 42 \(1016\)"):
+                drive.commission()
+            assert not any(cob == 0 for cob, _ in device_on_bus.requests)
+        else:
+            assert "other nodes are on the bus: heartbeats of 9, 43" in drive.commission().remarks
+
+
+def test_an_rpdo_that_only_the_drive_knows_of_is_anothers_command(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings
+) -> None:
+    device_on_bus.answers[0x1401, 1] = 0x333
+    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+        device_on_bus.send(0x333, bytes(8))
+        with pytest.raises(BusError, match=r"another controller is active on this bus: 1 x RPDO of the drive \(333h\)"):
+            drive.commission()
+
+
+@pytest.mark.parametrize("step", ["commission", "start_cyclic"])
+@pytest.mark.parametrize("seen", [True, False])
+def test_what_another_controller_has_spoilt_is_told_as_its_doing(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, seen: bool, step: str
+) -> None:
+    def gate() -> None:
+        written = device_on_bus.requests and device_on_bus.requests[-1][1][1:3] == b"\x72\x60"
+        if written or step == "start_cyclic":
+            device_on_bus.send(0x080, b"")
+
+    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+        if step == "start_cyclic":
+            drive.commission()
+        device_on_bus.answers[0x6072, 0] = 3000
+        drive._objects.gate = gate if seen else lambda: None
+        with pytest.raises(BusError if seen else DeviceError, match="SYNC" if seen else "6072"):
+            getattr(drive, step)()
+
+
+@pytest.mark.parametrize(("step", "when"), [("commission", "during commissioning"), ("start_cyclic", "before the run")])
+def test_a_bus_that_fails_is_told_with_the_step(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, step: str, when: str
+) -> None:
+    def dead(*_: Any) -> None:
+        raise can.CanOperationError("no buffer space")
+
+    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+        if step == "start_cyclic":
+            drive.commission()
+        drive._network.send_message = dead  # type: ignore[method-assign]
+        with pytest.raises(BusError, match=f"the bus failed {when}: no buffer space"):
+            getattr(drive, step)()
+        del drive._network.send_message
+
+
+def test_a_drive_that_has_lost_its_mode_is_not_started(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings
+) -> None:
+    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+        drive.commission()
+        device_on_bus.requests.clear()
+        device_on_bus.answers[0x6061, 0] = 8
+        with pytest.raises(DeviceError, match="node 1: 6061 shows mode 8, it was 10"):
+            drive.start_cyclic()
+        assert (0x000, b"\x01\x01") not in device_on_bus.requests
+
+
+# --- an adapter that serves one program at a time --------------------------------------------------------------------
+
+
+class Adapter:
+    """Opens the bus of a test again, at the n-th attempt."""
+
+    def __init__(self, bus: Any, drive: CanopenDrive, at_attempt: int) -> None:
+        self._bus, self._at_attempt = bus, at_attempt
+        self.attempts, self.pauses_s = 0, list[float]()
+        drive._reopen, drive._sleep = self.open, self.pauses_s.append
+
+    def open(self) -> Any:
+        self.attempts += 1
+        if self.attempts < self._at_attempt:
+            raise BusError("still in use")
+        return can.Bus(interface="virtual", channel=self._bus.channel)
+
+
+@pytest.mark.parametrize("at_attempt", [1, 3, REOPEN_ATTEMPTS])
+def test_an_adapter_is_lent_to_the_loop_and_taken_back(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, at_attempt: int
+) -> None:
+    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+        drive.commission()
+        adapter = Adapter(device_on_bus, drive, at_attempt)
+        lent: Any = drive._network.bus
+        drive.start_cyclic()
+        assert lent._is_shutdown
+        assert drive.settings_guard() is drive.thermometer() is None
+        assert drive.make_safe() == "switch on disabled"
+        assert adapter.attempts == at_attempt
+        assert adapter.pauses_s == [REOPEN_PAUSE_S] * (at_attempt - 1)
+        assert drive.make_safe() == "switch on disabled"
+        assert adapter.attempts == at_attempt  # it has it
+
+
+def test_an_adapter_that_does_not_come_back_leaves_the_watchdog_to_stop_the_joint(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings
+) -> None:
+    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+        drive.commission()
+        adapter = Adapter(device_on_bus, drive, REOPEN_ATTEMPTS + 1)
+        drive.start_cyclic()
+        state = drive.make_safe()
+    assert state.startswith("unknown: the bus cannot be opened again (still in use)")
+    assert "watchdog stops the joint within 0.2 s" in state
+    assert adapter.attempts == REOPEN_ATTEMPTS
+
+
+@pytest.mark.parametrize("change", ["mode", "deadline", "another"])
+def test_a_drive_that_changes_at_its_start_is_not_lent(
+    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, change: str
+) -> None:
+    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+        drive.commission()
+        Adapter(device_on_bus, drive, 1)
+
+        def gate() -> None:
+            if (0x000, b"\x01\x01") in device_on_bus.requests:
+                device_on_bus.answers.update({(0x6061, 0): 8} if change == "mode" else {})
+                device_on_bus.answers.update({(0x1400, 5): 0} if change == "deadline" else {})
+                if change == "another":
+                    device_on_bus.send(0x000, b"\x80\x01")
+
+        drive._objects.gate = gate
+        with pytest.raises(BusError if change == "another" else DeviceError):
+            drive.start_cyclic()
+        assert not drive._lent
