@@ -4,21 +4,36 @@ from __future__ import annotations
 
 import errno
 import os
+import selectors
 import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import IO, Any
 
 import pytest
 
-from jointctl.drivers.bus_lock import NAMES, BusLock, Holder, lock_name, wait_for_answers
+from jointctl.drivers import bus_lock
+from jointctl.drivers.bus_lock import (
+    NAMES,
+    STARTING,
+    STOP_WITHIN_S,
+    BusLock,
+    Holder,
+    is_marked,
+    lock_holders,
+    lock_name,
+    marked_processes,
+    wait_for_answers,
+)  # fmt: skip
+from jointctl.drivers.can.virtual_bus import socket_path
 from jointctl.drivers.errors import BusError
-from jointctl.tools.running import stop_call
+from jointctl.drivers.local_socket import send_line
 from jointctl.tools.running.stop_call import StopCall
 
 LOCK = """
@@ -73,6 +88,7 @@ def test_links_lead_to_the_same_bus(tmp_path: Path) -> None:
     device, link = str(tmp_path / "ttyACM0"), str(tmp_path / "adapter")
     assert lock_name("slcan", f"{link}@115200") == lock_name("slcan", device)
     assert lock_name("jointctl", link) == lock_name("jointctl", device)
+    assert lock_name("jointctl", "no-such-bus") == lock_name("jointctl", str(socket_path("no-such-bus")))
     assert lock_name("seeedstudio", link) == lock_name("seeedstudio", device) != lock_name("slcan", device)
 
 
@@ -238,179 +254,219 @@ def test_a_program_that_starts_is_waited_for(channel: str) -> None:
         assert process.wait(5.0) == 0
 
 
-# --- a stop step by step, in simulated time --------------------------------------------------------------------------
-
-FOR_EVER = 1e9
+# --- the protocol and the marks, one by one --------------------------------------------------------------------------
 
 
-class Program:
-    """As `Holder`: a program that holds a name of the lock, until `leaves_s`."""
-
-    def __init__(self, pid: int = 7, *, leaves_s: float = FOR_EVER, **said: Any) -> None:
-        self.pid, self._leaves_s = pid, leaves_s
-        self.is_controller: bool = said.get("is_controller", True)
-        self.within_s: float | None = said.get("within_s")
-        self.refused: str = said.get("refused", "")
-        self.log: list[str] = []
-        self.computer: Computer | None = None
-
-    def send(self, ask: str) -> None:
-        self.log.append(ask)
-
-    def close(self) -> None:
-        self.log.append("closed")
-
-    @property
-    def left(self) -> bool:
-        assert self.computer is not None
-        return self.computer.now_s >= self._leaves_s
+def caller_of(channel: str) -> socket.socket:
+    caller = socket.socket(socket.AF_UNIX)
+    caller.settimeout(5.0)
+    caller.connect(b"\0" + lock_name("socketcan", channel).encode())
+    return caller
 
 
-class Computer:
-    """`holders`: who has the lock at each further look.  `starting`, `marked`: process -> when it loses its mark."""
-
-    def __init__(
-        self, monkeypatch: pytest.MonkeyPatch, *holders: list[Program], marked: dict[int, float] | None = None,
-        starting: dict[int, float] | None = None, deaf_to: tuple[signal.Signals, ...] = (),
-    ) -> None:  # fmt: skip
-        self.now_s = 0.0
-        self.holders = [*holders]
-        self.marks = {stop_call.STARTING: starting or {}, lock_name("socketcan", "x"): marked or {}}
-        self.deaf_to = deaf_to
-        self.signals: list[tuple[list[int], str, float]] = []
-        self.notes: list[str] = []
-        for program in (program for look in holders for program in look):
-            program.computer = self
-        monkeypatch.setattr(stop_call, "time", SimpleNamespace(monotonic=lambda: self.now_s, sleep=self.sleep))
-        monkeypatch.setattr(stop_call, "lock_holders", lambda *_: self.holders.pop(0) if self.holders else [])
-        monkeypatch.setattr(stop_call, "wait_for_answers", lambda _: None)
-        monkeypatch.setattr(stop_call, "is_marked", self.is_marked)
-        monkeypatch.setattr(
-            stop_call, "marked_processes", lambda name: [pid for pid in self.marks[name] if self.is_marked(pid, name)]
-        )
-        monkeypatch.setattr(stop_call, "_signalled", self.signalled)
-
-    def sleep(self, seconds: float) -> None:
-        self.now_s = round(self.now_s + seconds, 6)
-
-    def is_marked(self, pid: int, name: str) -> bool:
-        return self.now_s < self.marks[name][pid]
-
-    def signalled(self, pids: list[int], name: str, number: signal.Signals, wait_s: float) -> list[int]:
-        self.signals.append((pids, number.name, wait_s))
-        if number in self.deaf_to:
-            return pids
-        for pid in pids:
-            self.marks[name][pid] = self.now_s
-        return []
-
-    def stopped(self) -> bool:
-        with StopCall("socketcan", "x") as call:
-            return call.end(self.notes.append)
+def asked(channel: str, ask: str) -> Holder:
+    """To be closed."""
+    (holder,) = lock_holders("socketcan", channel)
+    holder.send(ask)
+    wait_for_answers([holder])
+    return holder
 
 
-def test_where_no_one_has_the_bus_nothing_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
-    computer = Computer(monkeypatch)
-    assert not computer.stopped()
-    assert (computer.now_s, computer.notes, computer.signals) == (0.0, [], [])
+def test_a_stop_counts_once_and_its_signals_are_blocked_where_it_is_called(channel: str) -> None:
+    masks: list[set[signal.Signals]] = []
+
+    def on_stop() -> None:
+        masks.append(signal.pthread_sigmask(signal.SIG_BLOCK, []))  # type: ignore[arg-type]
+
+    with BusLock("socketcan", channel, on_stop, 3.5):
+        who = asked(channel, "who")
+        assert (who.is_controller, who.within_s, who.refused, masks) == (True, None, "", [])
+        stops = [asked(channel, "stop") for _ in range(2)]
+        assert [stop.within_s for stop in stops] == [3.5, 3.5]
+        assert not stops[0].left
+    assert len(masks) == 1
+    assert {signal.SIGINT, signal.SIGTERM, signal.SIGHUP} <= masks[0]
+    assert all(holder.left for holder in (who, *stops))
+    for holder in (who, *stops):
+        holder.close()
+
+
+def test_a_stop_of_another_user_is_refused(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    stopped: list[int] = []
+    monkeypatch.setattr(bus_lock, "may_ask", lambda _: False)
+    with BusLock("socketcan", channel, lambda: stopped.append(1)):
+        holder = asked(channel, "stop")
+        assert (holder.refused, holder.within_s) == ("this program belongs to another user", None)
+        holder.close()
+    assert stopped == []
+
+
+def test_a_program_that_cannot_stop_acknowledges_all_the_same(channel: str) -> None:
+    with BusLock("socketcan", channel):
+        holder = asked(channel, "stop")
+        assert holder.within_s == STOP_WITHIN_S
+        holder.close()
+
+
+def test_a_request_may_come_in_parts_and_again(channel: str) -> None:
+    with BusLock("socketcan", channel), caller_of(channel) as caller:
+        for part in (b'{"ask"', b': "who"}', b"\n"):
+            caller.sendall(part)
+            time.sleep(0)
+        first = caller.recv(1000)
+        caller.sendall(b'{"ask": "who"}\n')
+        assert caller.recv(1000) == first != b""
+
+
+@pytest.mark.parametrize(("length", "answered"), [(256, True), (257, False)])
+def test_a_request_has_256_bytes_at_most(channel: str, length: int, answered: bool) -> None:
+    with BusLock("socketcan", channel), caller_of(channel) as caller:
+        caller.sendall(b'{"ask": "who"}'.ljust(length - 1) + b"\n")
+        assert bool(caller.recv(1000)) is answered
+
+
+def test_the_65th_caller_takes_the_place_of_the_oldest(channel: str) -> None:
+    with BusLock("socketcan", channel), ExitStack() as stack:
+        callers = []
+        for _ in range(64):
+            callers.append(stack.enter_context(caller_of(channel)))
+            callers[-1].sendall(b'{"ask": "who"}\n')
+            assert callers[-1].recv(1000)
+        callers[0].sendall(b'{"ask": "who"}\n')
+        assert callers[0].recv(1000)
+        stack.enter_context(caller_of(channel))
+        assert callers[0].recv(1000) == b""
+        callers[1].sendall(b'{"ask": "who"}\n')
+        assert callers[1].recv(1000)
 
 
 @pytest.mark.parametrize(
-    ("leaves_s", "unmarked_s", "within_s", "waited_s", "forced"),
+    ("answer", "is_controller", "within_s"),
     [
-        (1.0, 0.5, 8.0, 1.0, False),
-        (0.5, 2.0, 8.0, 2.0, False),  # one of its processes takes longer
-        (FOR_EVER, 0.0, 3.0, 3.0, False),
-        (FOR_EVER, FOR_EVER, 3.0, 3.0, True),
-        (FOR_EVER, FOR_EVER, 0.0, 0.0, True),
-        (FOR_EVER, FOR_EVER, 1000.0, stop_call.LONGEST_S, True),
+        ({"controls": "NAME", "pid": 0, "within_s": 2}, True, 2.0),
+        ({"controls": "NAME", "pid": 0, "within_s": "2"}, True, None),
+        ({"controls": "NAME", "pid": 0}, True, None),
+        ({"controls": "another", "pid": 0, "within_s": 2}, False, None),
+        ({"controls": "NAME", "pid": 1, "within_s": 2}, False, None),
+        ({"refused": "never"}, False, None),
     ],
 )
-def test_one_that_acknowledges_has_its_own_time(
-    monkeypatch: pytest.MonkeyPatch, leaves_s: float, unmarked_s: float, within_s: float, waited_s: float, forced: bool
+def test_a_controller_answers_for_this_lock_and_for_itself(
+    channel: str, answer: dict[str, Any], is_controller: bool, within_s: float | None
 ) -> None:
-    program = Program(leaves_s=leaves_s, within_s=within_s)
-    computer = Computer(monkeypatch, [program], marked={7: unmarked_s})
-    assert computer.stopped()
-    assert computer.now_s == waited_s
-    assert computer.notes[0] == "stopping the program that controls the bus (pid 7)"
-    assert (len(computer.notes), bool(computer.signals)) == (1 + forced, forced)
-    assert program.log == ["stop", "closed"]
+    name = lock_name("socketcan", channel)
+    said = {**answer, "pid": answer.get("pid", 0) + os.getpid(), "controls": answer.get("controls", "-")}
+    said["controls"] = said["controls"].replace("NAME", name)
+    with socket.socket(socket.AF_UNIX) as squatter:
+        squatter.bind(b"\0" + name.encode())
+        squatter.listen()
+        holder = Holder(name, 0)
+        assert not holder.poll()
+        with squatter.accept()[0] as end:
+            send_line(end, said)
+            assert holder.poll()
+            assert (holder.is_controller, holder.within_s, holder.refused) == (is_controller, within_s, "")
+            assert not holder.left
+        assert holder.left
+        holder.close()
 
 
-def test_of_two_controllers_the_slower_one_decides(monkeypatch: pytest.MonkeyPatch) -> None:
-    computer = Computer(monkeypatch, [Program(7, within_s=2.0, leaves_s=1.0), Program(8, within_s=5.0)])
-    assert computer.stopped()
-    assert computer.now_s == 5.0
-
-
-@pytest.mark.parametrize("said", [{}, {"refused": "it is another's"}, {"is_controller": False, "within_s": 8.0}])
-def test_no_time_is_given_to_one_that_does_not_acknowledge(
-    monkeypatch: pytest.MonkeyPatch, said: dict[str, Any]
+def test_an_answer_that_does_not_come_is_waited_for_as_long_as_said(
+    channel: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    computer = Computer(monkeypatch, [Program(**said)])
-    assert computer.stopped() is said.get("is_controller", True)
-    refused = "the program that controls the bus (pid 7) cannot be ended: it is another's"
-    assert computer.notes == ([refused] if "refused" in said else [])
-    assert computer.now_s == 0.0
+    clock = iter([10.0, 10.0, 11.0, 12.0])
+    waits_s: list[float] = []
+    with socket.socket(socket.AF_UNIX) as squatter:
+        squatter.bind(b"\0" + lock_name("socketcan", channel).encode())
+        squatter.listen()
+        (holder,) = lock_holders("socketcan", channel)
+        monkeypatch.setattr(bus_lock, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+        monkeypatch.setattr(selectors.DefaultSelector, "select", lambda _, wait_s: waits_s.append(wait_s) or [])
+        wait_for_answers([holder], 2.0)
+        holder.close()
+    assert waits_s == [2.0, 1.0]
 
 
-@pytest.mark.parametrize("first", [[], [Program(6, is_controller=False)]])
-def test_a_controller_that_came_after_the_request_gets_one_of_its_own(
-    monkeypatch: pytest.MonkeyPatch, first: list[Program]
+def marked_proc(folder: Path, marks: dict[int | str, list[str]]) -> Path:
+    """A /proc with these processes and the links of their descriptors."""
+    for pid, links in marks.items():
+        (folder / str(pid) / "fd").mkdir(parents=True)
+        for number, link in enumerate(links):
+            (folder / str(pid) / "fd" / str(number)).symlink_to(link)
+    return folder
+
+
+def test_the_processes_of_a_controller_are_found_by_their_mark(tmp_path: Path) -> None:
+    mark = "/memfd:its-name (deleted)"
+    others = {11: ["/dev/null", "/memfd:its-name-1 (deleted)"], "self": [mark], os.getpid(): [mark], 12: []}
+    proc = marked_proc(tmp_path, {7: ["/dev/null", mark], 8: [mark], **others})
+    (tmp_path / "8" / "fd" / "a file").touch()  # no link: it has gone while it was looked at
+    (tmp_path / "13").mkdir()
+    assert sorted(marked_processes("its-name", proc)) == [7, 8]
+    assert [pid for pid in (7, 8, 11, 12, 13, 14) if is_marked(pid, "its-name", proc)] == [7, 8]
+
+
+@pytest.mark.parametrize(("still", "refused"), [([[42], []], False), ([[42], [42]], True), ([[], []], False)])
+def test_a_process_that_was_just_started_gets_a_moment_to_let_the_lock_go(
+    channel: str, monkeypatch: pytest.MonkeyPatch, still: list[list[int]], refused: bool
 ) -> None:
-    later = Program(leaves_s=0.1, within_s=8.0)
-    computer = Computer(monkeypatch, first, [later], marked={7: 0.1})
-    assert computer.stopped()
-    assert later.log == ["stop", "closed"]
-    assert all(program.log == ["stop", "closed"] for program in first)
-    assert computer.signals == []
+    pauses_s: list[float] = []
+    looks = iter(still)
+    monkeypatch.setattr(bus_lock, "marked_processes", lambda _: next(looks))
+    monkeypatch.setattr(bus_lock, "time", SimpleNamespace(sleep=pauses_s.append, monotonic=time.monotonic))
+    monkeypatch.setattr(bus_lock, "program_name", lambda pid: f"program {pid}")
+    with pytest.raises(BusError, match=r"does not answer .*\(program 42, pid 42\)") if refused else nullcontext():
+        BusLock("socketcan", channel).close()
+    assert len(pauses_s) == bool(still[0])
 
 
-def test_a_controller_that_was_asked_is_not_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    computer = Computer(monkeypatch, [Program(within_s=8.0, leaves_s=0.1)], marked={7: 0.1})
-    computer.stopped()
-    assert computer.notes == ["stopping the program that controls the bus (pid 7)"]
+def test_the_marks_follow_the_lock(channel: str) -> None:
+    starting_fd = os.memfd_create(STARTING)
+    lock = BusLock("socketcan", channel)
+    marker_fd = lock.marker_fd
+    assert marker_fd is not None
+    assert os.readlink(f"/proc/self/fd/{marker_fd}") == f"/memfd:{lock_name('socketcan', channel)} (deleted)"
+    with suppress(OSError):  # its number may have another use by now
+        assert STARTING not in os.readlink(f"/proc/self/fd/{starting_fd}")
+    lock.close()
+    assert lock.marker_fd is None
 
 
-@pytest.mark.parametrize(("started_s", "waited_s"), [(0.0, 0.0), (3.0, 3.0), (FOR_EVER, stop_call.STARTING_S)])
-def test_one_that_starts_is_waited_for_and_ended_as_well(
-    monkeypatch: pytest.MonkeyPatch, started_s: float, waited_s: float
-) -> None:
-    later = Program(leaves_s=0.0, within_s=8.0)
-    computer = Computer(monkeypatch, [], [later], starting={7: started_s, 8: 0.0})
-    assert computer.stopped()
-    assert computer.now_s == waited_s
-    assert later.log == ["stop", "closed"]
+def test_no_descriptor_is_left_behind(channel: str) -> None:
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(2):
+        with BusLock("socketcan", channel), pytest.raises(BusError):
+            BusLock("socketcan", channel)
+    with pytest.raises(OSError, match="refused"):
+        Holder(lock_name("socketcan", channel), 0)
+    assert len(os.listdir("/proc/self/fd")) == before
 
 
-@pytest.mark.parametrize("deaf_to", [(), (signal.SIGTERM,), (signal.SIGTERM, signal.SIGKILL)])
-def test_what_is_left_is_ended_by_force(monkeypatch: pytest.MonkeyPatch, deaf_to: tuple[signal.Signals, ...]) -> None:
-    computer = Computer(monkeypatch, [], [], marked={7: FOR_EVER, 9: FOR_EVER}, deaf_to=deaf_to)
-    computer.stopped()
-    left = [7, 9] if deaf_to else []
-    assert computer.signals[:2] == [([7, 9], "SIGTERM", stop_call.TERM_S), (left, "SIGKILL", stop_call.KILL_S)]
-    assert computer.notes[0] == f"it does not end by itself: ending process 7, 9; {stop_call.ARMED}"
-    cannot = "process 7, 9 cannot be ended; the drive may be enabled again"
-    assert (cannot in computer.notes) is (signal.SIGKILL in deaf_to)
+def test_who_has_just_gone_has_no_name(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(_: int) -> str:
+        raise OSError
+
+    monkeypatch.setattr(bus_lock, "program_name", gone)
+    with BusLock("socketcan", channel), pytest.raises(BusError, match=rf"\(pid {os.getpid()}\)"):
+        BusLock("socketcan", channel)
 
 
-@pytest.mark.parametrize("marked", [True, False])
-def test_only_what_acts_for_the_controller_gets_the_signal(monkeypatch: pytest.MonkeyPatch, marked: bool) -> None:
-    monkeypatch.setattr(stop_call, "is_marked", lambda pid, name: marked and name == "its name")
-    monkeypatch.setattr(stop_call, "time", SimpleNamespace(monotonic=lambda: 0.0))
-    open_before = len(os.listdir("/proc/self/fd"))
-    with subprocess.Popen(["sleep", "60"]) as process, subprocess.Popen(["true"]) as gone:
-        gone.wait()
-        assert stop_call._signalled([gone.pid, process.pid], "its name", signal.SIGTERM, 0.5) == []
-        if not marked:
-            process.kill()
-        assert process.wait() == (-signal.SIGTERM if marked else -signal.SIGKILL)
-    assert len(os.listdir("/proc/self/fd")) == open_before
+def test_another_error_than_a_name_in_use_means_no_lock(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[bytes] = []
+
+    def forbidden(address: bytes) -> None:
+        tried.append(address)
+        raise OSError(errno.EACCES, "not here")
+
+    monkeypatch.setattr(bus_lock, "listener", forbidden)
+    with BusLock("socketcan", channel) as lock:
+        assert (lock.marker_fd, lock.remarks, len(tried)) == (None, [], 1)
 
 
-def test_those_that_live_on_after_a_signal_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stop_call, "is_marked", lambda *_: True)
-    with subprocess.Popen(["sleep", "60"]) as process:
-        assert stop_call._signalled([process.pid], "its name", signal.SIGCONT, 0.01) == [process.pid]
-        process.kill()
+def test_there_is_no_lock_on_other_systems(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "darwin")
+    with BusLock("socketcan", channel) as lock:
+        assert lock.marker_fd is None
+        assert lock_holders("socketcan", channel) == []
+    monkeypatch.undo()
+    assert lock_holders("virtual", channel) == []
