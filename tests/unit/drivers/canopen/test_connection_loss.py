@@ -77,7 +77,7 @@ def test_the_twins_that_say_how_they_stop(
 
 @pytest.mark.parametrize(
     ("heartbeat_s", "rate_Hz", "milliseconds"),
-    [(0.2, 1000.0, 100), (0.05, 1000.0, 25), (0.1, 50.0, 100), (200.0, 1000.0, 65535)],
+    [(0.2, 1000.0, 100), (0.05, 1000.0, 25), (0.1, 50.0, 100), (2.0, 1000.0, 1000), (200.0, 1000.0, 65535)],
 )
 def test_the_deadline_follows_from_heartbeat_and_rate(
     settings_of_virtual_joint: CanopenSettings, heartbeat_s: float, rate_Hz: float, milliseconds: int
