@@ -375,6 +375,9 @@ def test_a_controller_answers_for_this_lock_and_for_itself(
             send_line(end, said)
             assert holder.poll()
             assert (holder.is_controller, holder.within_s, holder.refused) == (is_controller, within_s, "")
+            send_line(end, {"controls": "nothing any more"})
+            assert holder.poll()
+            assert holder.is_controller is is_controller  # the first answer counts
             assert not holder.left
         assert holder.left
         holder.close()
@@ -476,6 +479,8 @@ def test_there_is_no_lock_on_other_systems(channel: str, monkeypatch: pytest.Mon
     monkeypatch.setattr(sys, "platform", "darwin")
     with BusLock("socketcan", channel) as lock:
         assert lock.marker_fd is None
-        assert lock_holders("socketcan", channel) == []
-    monkeypatch.undo()
+    monkeypatch.setattr(bus_lock, "_holders", lambda *_: ["one"])
+    assert lock_holders("socketcan", channel) == []
+    monkeypatch.setattr(sys, "platform", "linux")
     assert lock_holders("virtual", channel) == []
+    assert lock_holders("socketcan", channel) == ["one"]
