@@ -318,6 +318,13 @@ def test_a_request_may_come_in_parts_and_again(channel: str) -> None:
         assert caller.recv(1000) == first != b""
 
 
+@pytest.mark.parametrize("data", [b"garbage\n", b"[1]\n"])
+def test_what_is_no_request_ends_the_connection(channel: str, data: bytes) -> None:
+    with BusLock("socketcan", channel), caller_of(channel) as caller:
+        caller.sendall(data)
+        assert caller.recv(1000) == b""
+
+
 @pytest.mark.parametrize(("length", "answered"), [(256, True), (257, False)])
 def test_a_request_has_256_bytes_at_most(channel: str, length: int, answered: bool) -> None:
     with BusLock("socketcan", channel), caller_of(channel) as caller:
