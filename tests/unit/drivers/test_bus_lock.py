@@ -406,6 +406,17 @@ def test_an_answer_that_does_not_come_is_waited_for_as_long_as_said(
     assert waits_s == [2.0, 1.0]
 
 
+def test_once_all_have_answered_no_one_waits(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([10.0, 10.0])  # a third look at it would be an error
+    with BusLock("socketcan", channel):
+        (holder,) = lock_holders("socketcan", channel)
+        holder.send("who")
+        monkeypatch.setattr(bus_lock, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+        wait_for_answers([holder])
+        assert holder.is_controller
+        holder.close()
+
+
 def marked_proc(folder: Path, marks: dict[int | str, list[str]]) -> Path:
     """A /proc with these processes and the links of their descriptors."""
     for pid, links in marks.items():
