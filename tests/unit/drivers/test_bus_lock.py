@@ -390,6 +390,17 @@ def test_a_controller_answers_for_this_lock_and_for_itself(
         holder.close()
 
 
+def test_one_that_dies_before_it_has_read_has_left(channel: str) -> None:
+    with socket.socket(socket.AF_UNIX) as squatter:
+        squatter.bind(b"\0" + lock_name("socketcan", channel).encode())
+        squatter.listen()
+        (holder,) = lock_holders("socketcan", channel)
+        holder.send("who")
+        squatter.accept()[0].close()
+        assert holder.left
+        holder.close()
+
+
 def test_an_answer_that_does_not_come_is_waited_for_as_long_as_said(
     channel: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
