@@ -66,7 +66,7 @@ class StopCall:
         while pids := [pid for pid in pids if is_marked(pid, STARTING)]:
             which = f"process {', '.join(map(str, pids))}, which is starting and may be about to control the bus"
             waited_s = time.monotonic() - began_s
-            if waited_s > STARTING_S:
+            if waited_s >= STARTING_S:
                 note(f"not waiting any longer for {which}: end it, or stop again when it runs")
                 return
             if waited_s > TOLD_S and not told:
