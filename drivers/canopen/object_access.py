@@ -28,6 +28,7 @@ NO_ANSWER = "No SDO response received"  # by the library, in contrast to an answ
 Result = TypeVar("Result")
 ABSENT = (0x06020000, 0x06090011)  # no such object, no such sub-index
 ABORT_TEXT = {
+    0x05040000: "the transfer timed out, as when frames are lost",
     0x06010000: "access is not supported",
     0x06090030: "value out of range",
     0x06090031: "value too high",

@@ -57,7 +57,7 @@ class SdoReads:
         """In the receiving thread; judged in `poll`."""
         self._answers.append((self._clock_ns(), bytes(data)))
 
-    def poll(self) -> None:
+    def poll(self, *, may_ask: bool = True) -> None:
         """Take what has come, and ask for what is due."""
         while self._answers:
             came_ns, data = self._answers.popleft()
@@ -67,7 +67,7 @@ class SdoReads:
         if (read := self._open) is not None and now_ns - self._asked_ns >= ANSWER_S * 1e9:
             self._open = None
             read.on_answer(now_ns, None, f"no answer within {ANSWER_S:g} s")
-        if self._open is not None or now_ns < self._quiet_ns:
+        if not may_ask or self._open is not None or now_ns < self._quiet_ns:
             return
         due = [read for read in self._reads if read.next_ns <= now_ns]
         if due:

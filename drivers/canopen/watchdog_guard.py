@@ -66,11 +66,10 @@ class WatchdogGuard:
     def poll(self, *, may_ask: bool = True) -> list[str]:
         """What is to be warned of; `DeviceError` where something was changed, or cannot be read before enabling.
 
-        Without `may_ask` it only listens.
+        Without `may_ask` it only listens, and takes the answers that come.
         """
         self._refuse_others()
-        if may_ask:
-            self._reads.poll()
+        self._reads.poll(may_ask=may_ask)
         if self._changed:
             raise DeviceError(self._changed, _HINT)
         warnings = []

@@ -1,6 +1,7 @@
 """A stop, a death, another controller or a loss after EVERY frame of a run: is the joint off in time, and off for good?
 
     python tests/bench/every_frame.py [--kind run|sweep] [--deadline yes|no] [--every 1] [--rest 20] [--workers 2]
+                                      [--phase NAME] [--injection NAME]
 
 The run is simulated (`tests/simulated_programs.py`): supervisor, loop, `jointctl stop` and virtual drive at simulated
 time, frame by frame.  Right after frame k the process is forked for each injection; the child carries the run on to
@@ -50,7 +51,7 @@ from tests.simulated_programs import (  # noqa: E402
 VERBOSE = False
 CLOCK = time.monotonic  # the computer's own
 FIRST_MOTION_CYCLES = 100  # of the approach, in which every frame is tried
-ENABLING_s = 0.05  # a write while the loop enables is seen at the supervisor's next look
+ENABLING_s = 0.05  # another controller's write while the loop enables is seen at the supervisor's next look
 QUIET_s = 0.2  # for so long after the end the drive must stay off
 LONGEST_s = 30.0
 PROGRESS_s = 60.0
@@ -139,13 +140,15 @@ def lose(direction: str) -> Callable[[Session], None]:
 class Injection:
     """`reaction_s`: until the joint is being stopped, at most (docs/safety.md); `causes`: one must be in the message.
 
-    `may_enable`: the program that would enable cannot know of it yet.
+    `may_enable`: the program that would enable cannot know of it yet.  `other_controller`: it writes to the drive while
+    the loop enables it, which goes on until the supervisor's next look.
     """
 
     act: Callable[[Session], None]
     reaction_s: Callable[[Config], float]
     causes: tuple[str, ...] = ()
     may_enable: bool = False
+    other_controller: bool = False
 
 
 def at_once(_: Config) -> float:
@@ -163,10 +166,13 @@ def by_ramp(config: Config) -> float:
 OTHERS = ("another controller", "another program", "DRIVE_", "STALE", "NO_SAMPLES", "SAMPLES_MISSING", "ENABLE_TIMEOUT",
           "OFF_TIMEOUT", "does not answer", "got no answer", "changed", "was set", "refused", "mode")  # fmt: skip
 SILENCE = ("no answer", "does not answer", "STALE", "NO_SAMPLES", "SAMPLES_MISSING", "DRIVE_", "did not react",
-           "ENABLE_TIMEOUT", "OFF_TIMEOUT", "did not confirm", "watchdog tripped", "cannot be read")  # fmt: skip
+           "ENABLE_TIMEOUT", "OFF_TIMEOUT", "did not confirm", "watchdog tripped", "cannot be read",
+           "timed out")  # fmt: skip
 INJECTIONS = {
     "stop": Injection(lambda s: stop_of_this_computer(s.world, s.signals, s.node), at_once, (STOP_COMMAND,)),
-    "stop of another computer": Injection(lambda s: stop_of_another_computer(s.world, s.node), at_once, OTHERS),
+    "stop of another computer": Injection(
+        lambda s: stop_of_another_computer(s.world, s.node), at_once, OTHERS, other_controller=True
+    ),
     "loop dies": Injection(die("loop"), by_heartbeat, ("loop process",), may_enable=True),
     "supervisor dies": Injection(die("supervisor"), by_ramp, may_enable=True),
     "both die": Injection(die("loop", "supervisor"), by_heartbeat, may_enable=True),
@@ -174,12 +180,14 @@ INJECTIONS = {
     "NMT stop": Injection(nmt(2), at_once, OTHERS),
     "NMT reset node": Injection(nmt(129), at_once, OTHERS),
     "NMT reset communication": Injection(nmt(130), at_once, OTHERS),
-    "SDO 1016:1 = 0": Injection(write_object(0x1016, 1, 0, 4), at_once, OTHERS, may_enable=True),
-    "SDO 1400:5 = 0": Injection(write_object(0x1400, 5, 0, 2), at_once, OTHERS, may_enable=True),
-    "SDO 6007 = 0": Injection(write_object(0x6007, 0, 0, 2), at_once, OTHERS, may_enable=True),
-    "SDO 6060 = 1": Injection(write_object(0x6060, 0, 1, 1), at_once, OTHERS, may_enable=True),
-    "SDO 6040 = 0": Injection(write_object(0x6040, 0, 0, 2), at_once, OTHERS, may_enable=True),
-    "SDO 6040 = 0Fh": Injection(write_object(0x6040, 0, 0x0F, 2), at_once, OTHERS, may_enable=True),
+    "SDO 1016:1 = 0": Injection(write_object(0x1016, 1, 0, 4), at_once, OTHERS, may_enable=True, other_controller=True),
+    "SDO 1400:5 = 0": Injection(write_object(0x1400, 5, 0, 2), at_once, OTHERS, may_enable=True, other_controller=True),
+    "SDO 6007 = 0": Injection(write_object(0x6007, 0, 0, 2), at_once, OTHERS, may_enable=True, other_controller=True),
+    "SDO 6060 = 1": Injection(write_object(0x6060, 0, 1, 1), at_once, OTHERS, may_enable=True, other_controller=True),
+    "SDO 6040 = 0": Injection(write_object(0x6040, 0, 0, 2), at_once, OTHERS, may_enable=True, other_controller=True),
+    "SDO 6040 = 0Fh": Injection(
+        write_object(0x6040, 0, 0x0F, 2), at_once, OTHERS, may_enable=True, other_controller=True
+    ),
     "frames to the drive lost": Injection(lose("lost_to_drive"), by_heartbeat, SILENCE),
     "frames of the drive lost": Injection(lose("lost_from_drive"), by_heartbeat, SILENCE, may_enable=True),
 }
@@ -198,12 +206,19 @@ class Verdict:
     problems: list[str] = field(default_factory=list)
 
 
-def judge(session: Session, name: str, frame: int, phase: str, injected_ns: int, powered: bool) -> Verdict:
-    """After the run has ended."""
+def judge(
+    session: Session,
+    name: str,
+    frame: int,
+    phase: str,
+    injected_ns: int,
+    powered: bool,
+    changes: list[tuple[int, bool]],
+) -> Verdict:
+    """After the run has ended; `powered` is the drive's power at the injection, `changes` are those after it."""
     world, config, injection = session.world, session.config, INJECTIONS[name]
     sequence = config.sequence
     allowed_s = injection.reaction_s(config) + sequence.stop_timeout_s + sequence.off_timeout_s
-    changes = [(time_ns, on) for time_ns, on in world.power_changes if time_ns >= injected_ns]
     off_ns = max((time_ns for time_ns, on in changes if not on), default=injected_ns)
     verdict = Verdict(frame, phase, name, (off_ns - injected_ns) * 1e-9, session.outcome, session.text[:300])
     problems = verdict.problems
@@ -213,7 +228,10 @@ def judge(session: Session, name: str, frame: int, phase: str, injected_ns: int,
         problems.append(f"off after {verdict.off_after_s:.2f} s, allowed are {allowed_s:.2f} s")
     ons = [time_ns for time_ns, on in changes if on]
     late = [time_ns for time_ns in ons if (time_ns - injected_ns) * 1e-9 > ENABLING_s]
-    if ons and not injection.may_enable:
+    if phase == "enabling" and injection.other_controller:
+        if late:
+            problems.append(f"enabled {(late[-1] - injected_ns) * 1e-6:.1f} ms after it")
+    elif ons and not injection.may_enable:
         problems.append(f"enabled {(ons[0] - injected_ns) * 1e-6:.1f} ms after it")
     elif (
         len(ons) > 1 or (ons and powered) or (late and name != "supervisor dies" and name != "frames of the drive lost")
@@ -270,7 +288,9 @@ class Exhaustion:
         self.kind, self.deadline, self.every, self.rest, self.part, self.out = kind, deadline, every, rest, part, out
         self.child = False
         self.chosen = self.in_rest = 0
-        self.why: tuple[str, int, str, int, bool] | None = None
+        self.phases: list[str] = []  # the only ones, or all
+        self.injections = list(INJECTIONS)
+        self.why: tuple[str, int, str, int, bool, int] | None = None
 
     def run(self) -> int:
         """The number of frames of the undisturbed run."""
@@ -330,6 +350,8 @@ class Exhaustion:
             self.in_rest += 1
             if self.in_rest % self.rest:
                 return False
+        if self.phases and phase not in self.phases:
+            return False
         self.chosen += 1
         return (self.chosen % self.every) == 0 and (self.chosen // self.every) % self.part[1] == self.part[0]
 
@@ -339,7 +361,7 @@ class Exhaustion:
         phase = self.session.phase
         if not self._wanted(phase):
             return
-        for name in INJECTIONS:
+        for name in self.injections:
             if os.fork():
                 _, status = os.wait()
                 if status:
@@ -351,7 +373,7 @@ class Exhaustion:
             self.child = True
             world = self.session.world
             world.fast, world.long_naps = True, phase != "commissioning"
-            self.why = (name, number, phase, world.now_ns, world.powered)
+            self.why = (name, number, phase, world.now_ns, world.powered, len(world.power_changes))
             INJECTIONS[name].act(self.session)
             return
 
@@ -361,8 +383,8 @@ class Exhaustion:
         world = self.session.world
         world.pass_time(10.0, lambda: not world.powered)
         world.pass_time(QUIET_s)
-        name, number, phase, injected_ns, powered = self.why
-        verdict = judge(self.session, name, number, phase, injected_ns, powered)
+        name, number, phase, injected_ns, powered, before = self.why
+        verdict = judge(self.session, name, number, phase, injected_ns, powered, world.power_changes[before:])
         if VERBOSE:
             print(name, phase, injected_ns, powered, world.power_changes, verdict, file=sys.stderr)
         self.out.write(json.dumps(vars(verdict)) + "\n")
@@ -427,12 +449,15 @@ def main() -> int:
     parser.add_argument("--every", type=int, default=1, help="every Nth of the frames that would be tried")
     parser.add_argument("--rest", type=int, default=20, help="every Nth frame where nothing changes")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--phase", action="append", help="only frames of this phase, as it is named in a violation")
+    parser.add_argument("--injection", choices=list(INJECTIONS), action="append", help="only this one")
     parser.add_argument("--part", help=argparse.SUPPRESS)
     given = parser.parse_args()
     kinds, deadlines = given.kind or ["run", "sweep"], given.deadline or ["yes", "no"]
     if given.part:
         number, count = map(int, given.part.split("/"))
         one = Exhaustion(kinds[0], deadlines[0] == "yes", given.every, given.rest, (number, count), sys.stdout)
+        one.phases, one.injections = given.phase or [], given.injection or one.injections
         sys.stdout.write(json.dumps({"frames": one.run()}) + "\n")
         return 0
     rows: list[dict[str, Any]] = []
@@ -441,7 +466,8 @@ def main() -> int:
     for kind in kinds:
         for deadline in deadlines:
             command = [sys.executable, __file__, "--kind", kind, "--deadline", deadline, "--every", str(given.every)]
-            command += ["--rest", str(given.rest)]
+            command += ["--rest", str(given.rest), *(f"--phase={name}" for name in given.phase or [])]
+            command += [f"--injection={name}" for name in given.injection or []]
             for row in rows_of_parts(command, given.workers):
                 if "frames" in row:
                     frames[f"{kind}, {'with' if deadline == 'yes' else 'without'} 1400:5"] = row["frames"]

@@ -190,7 +190,7 @@ class Supervisor:
             raise
         elapsed_s = (time.monotonic_ns() - started_ns) * 1e-9
         watch.take_records()
-        self._raise_what_others_did(watch, loop)
+        self._raise_what_others_did(watch)
         state = drive.make_safe(asked=bool(signals.commanded_ns))
         watch.take_records()
         watch.tell_bus_news()  # it often explains the fault that has ended the run
@@ -201,12 +201,12 @@ class Supervisor:
         return self._result(watch, state, elapsed_s)
 
     @staticmethod
-    def _raise_what_others_did(watch: RunWatch, loop: LoopHandle) -> None:
-        """A fault of the loop is explained by another controller's frames, if some came: `MotionFault`."""
-        if watch.settings_guard is None or watch.around.signals.commanded_ns or loop.verdict()[0] is Fault.NONE:
+    def _raise_what_others_did(watch: RunWatch) -> None:
+        """Another controller's frames since the last look end the run too, and explain a fault: `MotionFault`."""
+        if watch.settings_guard is None or watch.around.signals.commanded_ns:
             return
         try:
-            watch.settings_guard.poll()
+            watch.settings_guard.poll(may_ask=False)  # an answer would come into the way of switching off
         except (DeviceError, BusError) as error:
             watch.log.write_event(ERROR, "supervisor", str(error))
             raise MotionFault(error.message, error.hint) from None
