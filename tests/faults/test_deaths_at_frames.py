@@ -18,7 +18,7 @@ import pytest
 
 from jointctl.drivers.bus_lock import lock_name, marked_processes
 from jointctl.drivers.canopen.identifiers import NMT_ID, RPDO1_ID, SDO_REQUEST_ID, SYNC_ID, NmtCommand
-from jointctl.hil.canopen.device_records import PowerState
+from jointctl.hil.canopen.records import PowerState
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from tests.hil.moving_run import ENABLED, QUICK_STOP_ACTIVE, alive

@@ -182,7 +182,8 @@ class Supervisor:
         except (DeviceError, BusError) as error:  # another program has the drive, or has changed what stops it
             self._brake(loop, signals, StopRequest.QUICK_STOP)
             watch.take_records()
-            if not signals.commanded_ns:  # `jointctl stop` sends such frames as well
+            # `jointctl stop` sends such frames as well
+            if not signals.commanded_ns and not self._explained_by_restart(error, loop):
                 watch.log.write_event(ERROR, "supervisor", str(error))
                 raise MotionFault(error.message, error.hint) from None
         except BaseException:
@@ -190,7 +191,7 @@ class Supervisor:
             raise
         elapsed_s = (time.monotonic_ns() - started_ns) * 1e-9
         watch.take_records()
-        self._raise_what_others_did(watch)
+        self._raise_what_others_did(watch, loop)
         state = drive.make_safe(asked=bool(signals.commanded_ns))
         watch.take_records()
         watch.tell_bus_news()  # it often explains the fault that has ended the run
@@ -201,13 +202,19 @@ class Supervisor:
         return self._result(watch, state, elapsed_s)
 
     @staticmethod
-    def _raise_what_others_did(watch: RunWatch) -> None:
+    def _explained_by_restart(error: JointctlError, loop: LoopHandle) -> bool:
+        """Objects of a drive that has restarted are as they were at power-on: no other program has changed them."""
+        return isinstance(error, DeviceError) and loop.verdict()[0] is Fault.DRIVE_RESTARTED
+
+    def _raise_what_others_did(self, watch: RunWatch, loop: LoopHandle) -> None:
         """Another controller's frames since the last look end the run too, and explain a fault: `MotionFault`."""
         if watch.settings_guard is None or watch.around.signals.commanded_ns:
             return
         try:
             watch.settings_guard.poll(may_ask=False)  # an answer would come into the way of switching off
         except (DeviceError, BusError) as error:
+            if self._explained_by_restart(error, loop):
+                return
             watch.log.write_event(ERROR, "supervisor", str(error))
             raise MotionFault(error.message, error.hint) from None
 
