@@ -130,7 +130,7 @@ class Answers:
         self.places.append((index, sub, period_s))
         self._hear[index] = on_answer
 
-    def poll(self) -> None:
+    def poll(self, *, may_ask: bool = True) -> None:
         self.polls += 1
 
     def says(self, index: int, data: bytes | None) -> list[str]:
