@@ -131,7 +131,7 @@ class Answers:
         self._hear[index] = on_answer
 
     def poll(self, *, may_ask: bool = True) -> None:
-        self.polls += 1
+        self.polls += may_ask
 
     def says(self, index: int, data: bytes | None) -> list[str]:
         self._hear[index](0, data, "" if data is not None else "silence")
