@@ -14,6 +14,7 @@ from jointctl.tools.simulation.virtual_joint import separate_virtual_joint
 from jointctl.tools.verbs.run import run
 
 LONGEST_S = 86_400.0
+PATIENCE_S = 0.15  # a shared computer may stand still for so long; here only simulated metal waits for it
 
 
 def demo(config_path: Path, output: Output, *, duration_s: float | None = None) -> int:
@@ -26,9 +27,18 @@ def demo(config_path: Path, output: Output, *, duration_s: float | None = None) 
     config = with_bus_overrides(config, interface="jointctl", channel=channel, environ={})
     if duration_s is not None:
         config = _with_duration(config, duration_s)
+    config = with_patience(config)
     output.note("starting the virtual joint")
     with separate_virtual_joint(config_path, channel, output.note):
         return run(config, output, assume_yes=True)
+
+
+def with_patience(config: Config) -> Config:
+    """With limits on late samples and skipped periods that a busy computer keeps; less than the drive's own watch."""
+    longest_s = min(PATIENCE_S, 0.75 * config.canopen.heartbeat_s)
+    limits = config.limits
+    update = {key: max(getattr(limits, key), longest_s) for key in ("sample_age_max_s", "skipped_max_s")}
+    return config.model_copy(update={"limits": limits.model_copy(update=update)})
 
 
 def _with_duration(config: Config, duration_s: float) -> Config:
