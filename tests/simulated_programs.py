@@ -1,6 +1,6 @@
 """Supervisor, loop, `jointctl stop` and the virtual drive at simulated time, in one process that can be forked.
 
-Each program is a greenlet that runs the code that ships: the real `Supervisor`, the real driver, the portable loop on
+Each program is a greenlet that runs the code that ships: the real `Session`, the real driver, the portable loop on
 the kernels of the compiled one, the real `stop_node`.  Only what waits is replaced: sleeping lets the drive and the
 other programs go on, and an SDO answer is there or does not come.  A frame is delivered in the instant in which it is
 sent; every frame is counted, and a hook runs after it.  Nothing depends on the computer's clock.
@@ -45,7 +45,7 @@ from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUTHS, run_lockstep
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_settings import canopen_settings
 from jointctl.tools.output import Output
-from jointctl.tools.running import supervisor as supervisor_module
+from jointctl.tools.running import session as session_module
 from jointctl.tools.running.loop import loop_handle as loop_module
 from jointctl.tools.running.loop import portable_loop, shared_block
 from jointctl.tools.running.loop.loop_handle import LoopHandle
@@ -417,11 +417,11 @@ def simulated(joint: Config) -> Iterator[World]:
             (portable_loop, "sleep_until_ns", lambda *when: loops[-1].wait_for_cycle(*when)),
             (portable_loop, "note_suspension", lambda *_: None),
             (shared_block, "mmap", private),
-            (supervisor_module, "LoopHandle", new_loop),
-            (supervisor_module, "open_drive", open_simulated),
-            (supervisor_module, "recording", lambda _: contextlib.nullcontext()),
-            (supervisor_module, "kept_awake", lambda *_: contextlib.nullcontext()),
-            (supervisor_module, "RunLogWriter", SilentLog),
+            (session_module, "LoopHandle", new_loop),
+            (session_module, "open_drive", open_simulated),
+            (session_module, "recording", lambda _: contextlib.nullcontext()),
+            (session_module, "kept_awake", lambda *_: contextlib.nullcontext()),
+            (session_module, "RunLogWriter", SilentLog),
         ):
             stack.callback(setattr, place, name, getattr(place, name))
             setattr(place, name, value)

@@ -28,15 +28,15 @@ from jointctl.tools.benchmarks.law_speed import (
 )
 from jointctl.tools.benchmarks.numpy_law import NumpyLaw
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.configuration.records import axis_constants
 from jointctl.tools.simulation.lockstep import LockstepJoint
+from tests.sessions import constants_of
 
 TICKS = 10_000
 
 
 @pytest.fixture(scope="module")
 def constants() -> Any:
-    return axis_constants(load_config(shipped_config("virtual")))
+    return constants_of(load_config(shipped_config("virtual")))
 
 
 def timed(benchmark: Any, ticks: Callable[[np.ndarray, np.ndarray], None], inputs: np.ndarray) -> None:

@@ -24,7 +24,7 @@ import tempfile
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +38,10 @@ from jointctl.tools.configuration.config import Config  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
 from jointctl.tools.running.control import Control  # noqa: E402
 from jointctl.tools.running.display.phase_lines import PhaseLines  # noqa: E402
+from jointctl.tools.running.permission.consent import TerminalConsent  # noqa: E402
+from jointctl.tools.running.plan import resolve  # noqa: E402
+from jointctl.tools.running.session import Session  # noqa: E402
 from jointctl.tools.running.stop_signals import STOP_COMMAND, StopSignals  # noqa: E402
-from jointctl.tools.running.supervisor import Supervisor  # noqa: E402
 from tests.simulated_programs import (  # noqa: E402
     World,
     quiet_output,
@@ -62,13 +64,13 @@ SHORT = {"duration_s": 0.3, "release_s": 0.02, "heartbeat_s": 0.1, "wait_timeout
 
 
 @dataclass
-class Session:
+class Scene:
     """One run, and what became of it."""
 
     world: World
     config: Config
     signals: StopSignals
-    supervisor: Supervisor
+    supervisor: Session
     outcome: str = ""  # how the supervisor ended: "" while it runs
     text: str = ""
 
@@ -108,22 +110,22 @@ class Session:
 SEEN: list[Any] = []  # loops of this process
 
 
-def write_object(index: int, sub: int, value: int, size: int) -> Callable[[Session], None]:
+def write_object(index: int, sub: int, value: int, size: int) -> Callable[[Scene], None]:
     """An expedited SDO download of another master."""
 
-    def inject(session: Session) -> None:
+    def inject(session: Scene) -> None:
         data = struct.pack("<BHB", 0x23 | (4 - size) << 2, index, sub) + value.to_bytes(4, "little")
         session.world.send(None, 0x600 + session.node, data)
 
     return inject
 
 
-def nmt(command: int) -> Callable[[Session], None]:
+def nmt(command: int) -> Callable[[Scene], None]:
     return lambda session: session.world.send(None, 0, bytes([command, session.node]))
 
 
-def die(*names: str) -> Callable[[Session], None]:
-    def inject(session: Session) -> None:
+def die(*names: str) -> Callable[[Scene], None]:
+    def inject(session: Scene) -> None:
         loop = session.loop
         if "loop" in names and loop is not None:
             loop._process.kill()
@@ -132,7 +134,7 @@ def die(*names: str) -> Callable[[Session], None]:
     return inject
 
 
-def lose(direction: str) -> Callable[[Session], None]:
+def lose(direction: str) -> Callable[[Scene], None]:
     return lambda session: setattr(session.world, direction, True)
 
 
@@ -144,7 +146,7 @@ class Injection:
     the loop enables it, which goes on until the supervisor's next look.
     """
 
-    act: Callable[[Session], None]
+    act: Callable[[Scene], None]
     reaction_s: Callable[[Config], float]
     causes: tuple[str, ...] = ()
     may_enable: bool = False
@@ -207,7 +209,7 @@ class Verdict:
 
 
 def judge(
-    session: Session,
+    session: Scene,
     name: str,
     frame: int,
     phase: str,
@@ -262,23 +264,26 @@ def prepared(kind: str, deadline: bool, folder: Path) -> tuple[Config, Config]:
     return load_config(folder / f"{kind}.toml"), load_config(folder / "drive.toml")
 
 
-def new_supervisor(kind: str, config: Config, control: Control, folder: Path) -> Supervisor:
+def new_session(kind: str, config: Config, control: Control, folder: Path) -> Session:
     output, log = quiet_output(), folder / "log.mcap"
+    consent = TerminalConsent(output, assume_yes=True)
     if kind == "run":
-        return Supervisor(config, output, log, lambda _: True, control, display=lambda: PhaseLines(output))
-    from jointctl.tools.sweeping.carry_out import SweepSupervisor, with_mode
+        plan = replace(resolve(config), log_path=log)
+        return Session(plan, consent, output, control, lambda _: PhaseLines(output))
+    from jointctl.tools.sweeping.carry_out import MeterDisplay, SweepPass, config_of_sweep, sweep_run
     from jointctl.tools.sweeping.meter import SweepMeter
     from jointctl.tools.sweeping.options import SweepOptions, make_plan
     from jointctl.tools.sweeping.statistics import Tolerance
     from jointctl.tools.verbs.sweep import joint_model
 
-    config = with_mode(config, "auto")
+    config = config_of_sweep(config, "auto")
     options = SweepOptions(points=2, min_speed_radps=0.4, max_speed_radps=0.5, dwell_s=0.1, warm_up_turns=0.0)
     plan = make_plan(config, options)
     motion = plan.motion(plan.points, 0.0, 1.0)
     meter = SweepMeter(motion.windows, joint_model(config, plan.settings), lambda _: None)
     meter.tolerance = Tolerance(0.01, 0.001)
-    return SweepSupervisor(config, output, log, lambda _: True, motion, meter, lambda _: None, control)
+    swept = replace(sweep_run(SweepPass(config, motion, plan.points)), log_path=log)
+    return Session(swept, consent, output, control, lambda _: MeterDisplay(meter, output, "", motion.duration_s))
 
 
 class Exhaustion:
@@ -322,19 +327,19 @@ class Exhaustion:
             world.run(lambda: world.now_ns > LONGEST_s * 1e9)
         SEEN.clear()
 
-    def _start(self, config: Config, world: World, folder: Path) -> Session:
-        from jointctl.tools.running import supervisor as supervisor_module
+    def _start(self, config: Config, world: World, folder: Path) -> Scene:
+        from jointctl.tools.running import session as session_module
 
-        made = supervisor_module.LoopHandle
+        made = session_module.LoopHandle
 
         def make(*arguments: Any, **more: Any) -> Any:
             SEEN.append(made(*arguments, **more))
             return SEEN[-1]
 
-        supervisor_module.LoopHandle = make  # type: ignore[misc, assignment]
+        session_module.LoopHandle = make  # type: ignore[misc, assignment]
         signals = StopSignals()
-        supervisor = new_supervisor(self.kind, config, Control(signals), folder)
-        session = Session(world, supervisor._config, signals, supervisor)
+        supervisor = new_session(self.kind, config, Control(signals), folder)
+        session = Scene(world, supervisor.plan.config, signals, supervisor)
         world.start("supervisor", session.carry_out)
         return session
 

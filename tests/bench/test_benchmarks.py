@@ -29,14 +29,14 @@ from jointctl.tools.benchmarks.outcome import outcome_data, outcome_table, write
 from jointctl.tools.benchmarks.paired import Row, compared, interleaved, measured, skipped
 from jointctl.tools.cli.main import app
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.configuration.records import axis_constants
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.bench import bench
+from tests.sessions import constants_of
 
 
 @pytest.fixture(scope="module")
 def constants():
-    return axis_constants(load_config(shipped_config("virtual")))
+    return constants_of(load_config(shipped_config("virtual")))
 
 
 def test_the_ratio_is_the_median_of_the_pairs_and_not_the_ratio_of_the_medians():

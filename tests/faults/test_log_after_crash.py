@@ -15,13 +15,14 @@ from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
 from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest
 from jointctl.tools.configuration.load import load_config
-from jointctl.tools.configuration.records import axis_constants, trajectory_table
+from jointctl.tools.configuration.records import trajectory_table
 from jointctl.tools.recording.run_log import RunLogWriter
 from jointctl.tools.recording.run_log_reader import read_run_log
 from jointctl.tools.running.loop.loop_handle import LoopHandle
 from jointctl.tools.running.loop.shared_block import RING_RECORDS, SharedBlock
 from jointctl.tools.running.open_drive import open_drive
 from tests.hil.moving_run import Moving, gone
+from tests.sessions import constants_of
 
 
 @pytest.fixture
@@ -86,7 +87,7 @@ def test_a_reader_that_stalls_loses_records_which_are_counted_and_the_loop_goes_
             report = drive.commission()
             loop.wait_ready()
             drive.start_cyclic()
-            loop.go(axis_constants(config, start_position_rad=report.start_position_rad), drive.port())
+            loop.go(constants_of(config, start_position_rad=report.start_position_rad), drive.port())
             give_up = time.monotonic() + 2.0 * seconds
             while loop.cycles < RING_RECORDS + 1000:
                 assert loop.running()

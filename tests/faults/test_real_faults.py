@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import uuid
 from collections.abc import Callable
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +21,10 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.configuration.plant import FAULT_KINDS
 from jointctl.tools.configuration.plant_settings import fault_constants
-from jointctl.tools.output import Output
-from jointctl.tools.running.control import Control
-from jointctl.tools.running.stop_signals import StopSignals
-from jointctl.tools.running.supervisor import RunResult, Supervisor
+from jointctl.tools.running.result.run_result import RunResult
 from tests.places import CONFIGS
 from tests.real_time_joint import real_time_joint
+from tests.sessions import session_of
 
 SHIPPED = (CONFIGS / "virtual.toml").read_text()
 AT_s = 0.7
@@ -65,11 +62,7 @@ def run_with(tmp_path: Path) -> RunWith:
         path.write_text(text)
         config = load_config(path)
         with real_time_joint(config):
-            supervisor = Supervisor(
-                config, Output(quiet=True, stderr=StringIO()), tmp_path / "run.mcap", lambda _: True,
-                Control(StopSignals()), allow_low_margin=True,
-            )  # fmt: skip
-            result = supervisor.run()
+            result = session_of(config, tmp_path / "run.mcap", allow_low_margin=True).run()
         assert result is not None
         return result
 

@@ -8,7 +8,7 @@ import pytest
 
 from jointctl.firmware_py.realtime import Histogram
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, StopRequest
-from jointctl.tools.running.supervisor import Supervisor
+from jointctl.tools.running.session import Session
 from tests.unit.drivers.elmo.talk import Talk
 from tests.unit.firmware_py.stub_loop import ANSWER_ns, Loop
 
@@ -79,11 +79,11 @@ def test_a_stop_signal_is_heard_while_a_failed_supervisor_brakes(virtual_config:
     class Signals:
         request = request_
 
-    supervisor = Supervisor.__new__(Supervisor)
-    supervisor._config = virtual_config
+    session = Session.__new__(Session)
+    session._config = virtual_config
     loop: Any = _BrakingLoop()
     signals: Any = Signals()
-    supervisor._brake(loop, signals)
+    session._brake(loop, signals)
     assert max(loop.asked) == max(StopRequest.RAMP, request_)
 
 

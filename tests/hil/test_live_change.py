@@ -13,14 +13,12 @@ import pytest
 
 from jointctl.firmware_py.states import AxisPhase, StopRequest
 from jointctl.tools.configuration.load import load_config
-from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import Event
 from jointctl.tools.recording.run_log_reader import read_run_log
-from jointctl.tools.running.control import Control
 from jointctl.tools.running.display.display import OnlyShows, Snapshot
 from jointctl.tools.running.display.viewer_request import ViewerRequest
-from jointctl.tools.running.stop_signals import StopSignals
-from jointctl.tools.running.supervisor import RunResult, Supervisor
+from jointctl.tools.running.result.run_result import RunResult
+from tests.sessions import session_of
 
 WHO = "a test"
 SINE = {"kind": "sine", "duration_s": 0.0, "amplitude_rad": 0.1, "frequency_Hz": 0.5, "offset_rad": 0.2}
@@ -77,9 +75,7 @@ def carried_out(bench: Any, *requests: tuple[str, dict[str, Any]], **changes: An
     config = load_config(bench.folder / name)
     script = Script([ViewerRequest(kind, WHO, values) for kind, values in requests])
     path = Path(bench.folder) / "runs" / "live.mcap"
-    result = Supervisor(
-        config, Output(quiet=True), path, lambda report: True, Control(StopSignals()), display=lambda: script
-    ).run()
+    result = session_of(config, path, lambda _: script).run()
     assert result is not None
     return script, result
 
@@ -178,8 +174,6 @@ def test_before_the_joint_is_under_way_nothing_is_taken(bench: Any, kind: str) -
     script = Early([ViewerRequest(kind, WHO, {"kp": 700.0, "position_rad": 0.1})])
     config = load_config(bench.folder / name)
     path = Path(bench.folder) / "runs" / "early.mcap"
-    Supervisor(
-        config, Output(quiet=True), path, lambda report: True, Control(StopSignals()), display=lambda: script
-    ).run()
+    session_of(config, path, lambda _: script).run()
     told = [text for text in script.events if text.startswith("parameter change")]
     assert told == ["parameter change refused: the joint is not under way, or it is being stopped; asked for by a test"]

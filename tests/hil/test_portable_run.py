@@ -33,11 +33,11 @@ from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_settings import canopen_settings
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.configuration.records import axis_constants
 from jointctl.tools.running.loop.portable_loop import run_portable_loop, warm_up
 from jointctl.tools.running.loop.shared_block import SharedBlock
 from jointctl.tools.simulation.device_pump import PumpedDevice
 from jointctl.tools.simulation.virtual_joint import new_device, serve_virtual_joint
+from tests.sessions import constants_of
 
 RATE_HZ = 100.0
 PERIOD_NS = round(1e9 / RATE_HZ)
@@ -150,7 +150,7 @@ def test_a_run_in_threads_on_the_bus_of_one_process(config: Config) -> None:
         drive = CanopenDrive(open_bus(config), canopen_settings(config))
         try:
             report = drive.commission()
-            block.constants[:] = axis_constants(config, start_position_rad=report.start_position_rad)
+            block.constants[:] = constants_of(config, start_position_rad=report.start_position_rad)
             reset_axis(block.constants[0], block.state[0])
             block.port[:] = drive.port()
             block.words[Word.SUPERVISOR_NS] = time.monotonic_ns()

@@ -60,7 +60,7 @@ def commissioned(config: Config) -> Iterator[tuple[Drive, Any]]:
     drive = open_drive(config)
     try:
         report = drive.commission()
-        yield drive, axis_constants(config, start_position_rad=report.start_position_rad)
+        yield drive, axis_constants(config, trajectory_table(config), start_position_rad=report.start_position_rad)
     finally:
         drive.make_safe()
         drive.close()

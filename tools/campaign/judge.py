@@ -54,11 +54,11 @@ def run_scenario(config: Config, joint: LockstepJoint, scenario: Scenario) -> tu
     sequence = config.sequence.model_copy(update={"approach_s": APPROACH_s})
     shown = config.model_copy(update={"trajectory": scenario.trajectory, "sequence": sequence})
     first = new(Reference)
-    reference_at(axis_constants(shown)[0].trajectory, joint.table, 0, 0.0, first[0])
+    reference_at(axis_constants(shown, joint.table)[0].trajectory, joint.table, 0, 0.0, first[0])
     limits = config.limits
     start = float(first[0].position_rad) + scenario.start_offset_rad
     start = min(max(start, limits.position_min_rad + 0.05), limits.position_max_rad - 0.05)
-    constants = axis_constants(shown, start_position_rad=start)
+    constants = axis_constants(shown, joint.table, start_position_rad=start)
     return _carry_out(shown, joint, scenario, constants, start, scenario.trajectory.duration_s)
 
 

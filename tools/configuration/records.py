@@ -46,8 +46,8 @@ NOISE_OF_RATE = (
 APPROACH_SPEED = 0.25  # share of limits.velocity_max_radps that an automatic approach may use
 
 
-def axis_constants(config: Config, *, start_position_rad: float | None = None) -> Any:
-    """A record array of one `AxisConstants`.
+def axis_constants(config: Config, table: np.ndarray, *, start_position_rad: float | None = None) -> Any:
+    """A record array of one `AxisConstants`; `table` is that of `trajectory_table`.
 
     `start_position_rad` is where the joint stands; a joint that is elsewhere at the start ends the run.  Where it is
     not known, that is not checked, and `approach_s = "auto"` takes the whole range of motion as the distance.
@@ -58,15 +58,18 @@ def axis_constants(config: Config, *, start_position_rad: float | None = None) -
     axis.velocity.period_s = period_s(config)
     axis.velocity.cutoff_Hz = config.control.velocity_cutoff_Hz
     axis.velocity.period_gain = low_pass_gain(config.control.velocity_cutoff_Hz, period_s(config))
-    fill_trajectory(axis.trajectory, config)
+    fill_trajectory(axis.trajectory, config, table)
     _fill_limits(axis.limits, config)
-    _fill_sequence(axis.sequence, config, start_position_rad)
+    _fill_sequence(axis.sequence, config, table, start_position_rad)
     fill_change(axis.change, axis.law, config)
     return constants
 
 
 def trajectory_table(config: Config) -> np.ndarray:
-    """Rows (N, 5) of a table trajectory, checked against the limits; for the other kinds one row of zeros."""
+    """Rows (N, 5) of a table trajectory, checked against the limits; for the other kinds one row of zeros.
+
+    This reads trajectory.file: once for each run (`tools.session.plan`).
+    """
     path = config.table_path
     if path is None:
         return np.zeros((1, 5))
@@ -150,8 +153,8 @@ def fill_change(record: Any, law: Any, config: Config) -> None:
     record.move_min_s = MOVE_MIN_S
 
 
-def fill_trajectory(record: Any, config: Config) -> None:
-    """`TrajectoryConstants` of [trajectory]."""
+def fill_trajectory(record: Any, config: Config, table: np.ndarray) -> None:
+    """`TrajectoryConstants` of [trajectory]; `table` as in `axis_constants`."""
     trajectory = config.trajectory
     record.kind = TrajectoryKind[trajectory.kind.upper()]
     record.duration_s = trajectory.duration_s
@@ -167,7 +170,7 @@ def fill_trajectory(record: Any, config: Config) -> None:
         record.start_rad = record.target_rad = trajectory.position_rad
     elif trajectory.kind == "table":
         record.repeats = int(trajectory.repeat)
-        record.table_rows = len(trajectory_table(config))
+        record.table_rows = len(table)
     else:
         record.repeats = int(trajectory.repeat)
         record.start_rad, record.target_rad = trajectory.start_rad, trajectory.target_rad
@@ -221,9 +224,9 @@ def _fill_swing(record: Any, config: Config) -> None:
     record.noise_gain = 1.0 / _cycles(config, NOISE_S)
 
 
-def _fill_sequence(record: Any, config: Config, start_position_rad: float | None) -> None:
+def _fill_sequence(record: Any, config: Config, table: np.ndarray, start_position_rad: float | None) -> None:
     sequence = config.sequence
-    record.approach_s = approach_s(config, start_position_rad)
+    record.approach_s = approach_s(config, table, start_position_rad)
     if start_position_rad is not None:
         record.start_rad = start_position_rad
         record.moved_max_rad = max(config.limits.following_error_max_rad, MOVED_COUNTS * law_resolution_rad(config))
@@ -238,7 +241,7 @@ def _fill_sequence(record: Any, config: Config, start_position_rad: float | None
     record.supervisor_max_cycles = _cycles(config, sequence.supervisor_timeout_s)
 
 
-def approach_s(config: Config, start_position_rad: float | None = None) -> float:
+def approach_s(config: Config, table: np.ndarray, start_position_rad: float | None = None) -> float:
     """Time of the approach; "auto": the shortest within a quarter of the velocity limit, and 1 s at least.
 
     Where the trajectory itself begins faster than that, its own speed at the start plus a fifth is allowed.  Without
@@ -249,8 +252,8 @@ def approach_s(config: Config, start_position_rad: float | None = None) -> float
         return float(chosen)
     limits = config.limits
     constants = new(TrajectoryConstants)
-    fill_trajectory(constants[0], config)
-    start = approach_start(constants[0], trajectory_table(config))
+    fill_trajectory(constants[0], config, table)
+    start = approach_start(constants[0], table)
     speed = max(APPROACH_SPEED * limits.velocity_max_radps, 1.2 * abs(float(start.velocity_radps)))
     acceleration = max(config.sequence.brake_radps2, 1.2 * abs(float(start.acceleration_radps2)))
     ends = (limits.position_min_rad, limits.position_max_rad)

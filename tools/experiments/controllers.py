@@ -18,7 +18,7 @@ from jointctl.tools.configuration.checks import problems_between_sections
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo_settings import refuse_serial
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.configuration.records import axis_constants, trajectory_table
 from jointctl.tools.configuration.sections import Control, Friction
 
 _MODEL_BASED: dict[str, Any] = {"zero_rule": "zero", "matched_filter": True}
@@ -115,6 +115,8 @@ def controller_config(base: Config, controller: Controller) -> Config:
 
 def controller_constants(base: Config, controller: Controller, start_position_rad: float) -> Any:
     """`AxisConstants` of this law on the base joint, unsupervised: simulated time has no wall clock."""
-    constants = axis_constants(controller_config(base, controller), start_position_rad=start_position_rad)
+    constants = axis_constants(
+        controller_config(base, controller), trajectory_table(base), start_position_rad=start_position_rad
+    )
     constants[0].sequence.supervisor_max_cycles = 0
     return constants

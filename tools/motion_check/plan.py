@@ -22,6 +22,8 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import joint_rad_per_count, static_friction_Nm, velocity_of_a_count_radps
 from jointctl.tools.configuration.elmo import ElmoSerial
 from jointctl.tools.configuration.records import APPROACH_MIN_S, axis_constants
+from jointctl.tools.recording.log_folder import log_path
+from jointctl.tools.running.plan import Placed, RunPlan, joint_lines, remark_lines
 
 TRAVEL_rad, TRAVEL_MAX_rad = 0.04, 0.3  # of the reference, to each side
 TRAVEL_COUNTS = 60.0  # so coarse an encoder takes more travel
@@ -113,17 +115,6 @@ def config_of_check(config: Config, plan: CheckPlan) -> Config:
     return config.model_copy(update={"limits": limits, "control": control, "drive": drive})
 
 
-def require_room(config: Config, plan: CheckPlan, start_rad: float) -> None:
-    """`ConfigurationError` if the joint stands too near to a limit."""
-    low, high = config.limits.position_min_rad, config.limits.position_max_rad
-    if not low + plan.travel_rad <= start_rad <= high - plan.travel_rad:
-        raise ConfigurationError(
-            f"the joint stands at {start_rad:.4f} rad; the check moves it by up to {plan.travel_rad:g} rad to both "
-            f"sides and needs [{low + plan.travel_rad:g}..{high - plan.travel_rad:g}]",
-            "turn it by hand with the power off, or mend limits.position_*, encoder.zero_counts",
-        )
-
-
 def motion_table(plan: CheckPlan, start_rad: float) -> np.ndarray:
     """Rows of `trajectory.reference_at`, float64 (N, 5): smooth ramps from stop to stop, and a rest at each."""
     times_s, places, end_s, place = [0.0], [0.0], 0.0, 0.0
@@ -139,16 +130,63 @@ def motion_table(plan: CheckPlan, start_rad: float) -> np.ndarray:
     return spline_table(np.array(times_s), position_rad)
 
 
-def check_constants(config: Config, plan: CheckPlan, report: CommissioningReport, table: np.ndarray) -> Any:
-    """`AxisConstants` of the check; `config` is that of `config_of_check`."""
-    start_rad = report.start_position_rad
-    hold = config.model_copy(update={"sequence": config.sequence.model_copy(update={"approach_s": APPROACH_MIN_S})})
-    constants = axis_constants(hold, start_position_rad=start_rad)
-    axis = constants[0]
-    axis.trajectory.kind, axis.trajectory.repeats = TrajectoryKind.TABLE, 0
-    axis.trajectory.table_rows, axis.trajectory.duration_s = len(table), float(table[-1, 0])
-    axis.limits.position_min_rad = max(axis.limits.position_min_rad, start_rad - plan.reach_rad)
-    axis.limits.position_max_rad = min(axis.limits.position_max_rad, start_rad + plan.reach_rad)
-    axis.limits.frozen_max_rad = STANDING_WAY * plan.travel_rad
-    axis.limits.frozen_torque_Nm = min(plan.gravity_Nm + PUSH_SHARE * plan.spring_Nm, MOST_PUSH * plan.torque_Nm)
-    return constants
+@dataclass(frozen=True)
+class CheckMotion:
+    """The motion of the check; see `running.plan.Motion`.  `config` is that of `config_of_check`."""
+
+    config: Config
+    plan: CheckPlan
+
+    @property
+    def table(self) -> np.ndarray:
+        """See `Motion`."""
+        return motion_table(self.plan, 0.0)
+
+    def placed(self, report: CommissioningReport) -> Placed:
+        """See `Motion`; about the place where the joint stands."""
+        table = motion_table(self.plan, report.start_position_rad)
+        return Placed(self.constants(report, table), table, tuple(self._envelope(report)))
+
+    def require_start(self, start_position_rad: float) -> None:
+        """`ConfigurationError` if the joint stands too near to a limit."""
+        limits, travel_rad = self.config.limits, self.plan.travel_rad
+        low, high = limits.position_min_rad + travel_rad, limits.position_max_rad - travel_rad
+        if not low <= start_position_rad <= high:
+            raise ConfigurationError(
+                f"the joint stands at {start_position_rad:.4f} rad; the check moves it by up to {travel_rad:g} rad to "
+                f"both sides and needs [{low:g}..{high:g}]",
+                "turn it by hand with the power off, or mend limits.position_*, encoder.zero_counts",
+            )
+
+    def _envelope(self, report: CommissioningReport) -> list[str]:
+        """What is about to happen, in lines."""
+        plan, start = self.plan, report.start_position_rad
+        return [
+            *joint_lines(report),
+            f"motion     a soft spring pulls the joint towards {start + plan.travel_rad:+.3f}, then "
+            f"{start - plan.travel_rad:+.3f} rad, {plan.duration_s:.0f} s",
+            f"limits     {plan.torque_Nm:.1f} Nm, {plan.velocity_radps:.2f} rad/s; it is braked beyond "
+            f"{plan.reach_rad:.2g} rad to either side: keep it free and unloaded, a hand on the emergency stop",
+            "watch      which way it turns first: it must be the one that you call positive",
+            *remark_lines(report.remarks),
+        ]
+
+    def constants(self, report: CommissioningReport, table: np.ndarray) -> Any:
+        """`AxisConstants` of the check along `table`."""
+        config, plan, start_rad = self.config, self.plan, report.start_position_rad
+        hold = config.model_copy(update={"sequence": config.sequence.model_copy(update={"approach_s": APPROACH_MIN_S})})
+        constants = axis_constants(hold, table, start_position_rad=start_rad)
+        axis = constants[0]
+        axis.trajectory.kind, axis.trajectory.repeats = TrajectoryKind.TABLE, 0
+        axis.trajectory.table_rows, axis.trajectory.duration_s = len(table), float(table[-1, 0])
+        axis.limits.position_min_rad = max(axis.limits.position_min_rad, start_rad - plan.reach_rad)
+        axis.limits.position_max_rad = min(axis.limits.position_max_rad, start_rad + plan.reach_rad)
+        axis.limits.frozen_max_rad = STANDING_WAY * plan.travel_rad
+        axis.limits.frozen_torque_Nm = min(plan.gravity_Nm + PUSH_SHARE * plan.spring_Nm, MOST_PUSH * plan.torque_Nm)
+        return constants
+
+
+def check_run(config: Config, plan: CheckPlan) -> RunPlan:
+    """The plan of a session; `config` is the user's own."""
+    inner = config_of_check(config, plan)
+    return RunPlan(inner, CheckMotion(inner, plan), log_path(config))

@@ -5,6 +5,8 @@ Everything new goes into the log and to the display here; what opens, lets go an
 
 from __future__ import annotations
 
+import contextlib
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,12 +14,12 @@ from typing import Any, Self
 
 from jointctl.drivers.drive import SettingsGuard
 from jointctl.firmware_py.realtime import Histogram, Word
-from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest, in_words
+from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, StopRequest, in_words
 from jointctl.tools.analysis.margin_gate import require_margin
-from jointctl.tools.configuration.config import Config
 from jointctl.tools.recording.can_log import frame_array
 from jointctl.tools.recording.kept_records import KeptRecords
 from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter
+from jointctl.tools.recording.thinned_records import ThinnedRecords
 from jointctl.tools.running.changes.viewer_orders import ViewerOrders
 from jointctl.tools.running.display.display import Display, Snapshot
 from jointctl.tools.running.events.event_finder import EventFinder, phase_name
@@ -25,6 +27,7 @@ from jointctl.tools.running.events.notice_text import NoticeFinder
 from jointctl.tools.running.guard.guard_handle import GUARD_ENDED, GuardHandle
 from jointctl.tools.running.loop.loop_handle import LoopHandle
 from jointctl.tools.running.open_drive import drive_fault_text, loop_delay_s
+from jointctl.tools.running.plan import RunPlan
 from jointctl.tools.running.stop_signals import StopSignals
 from jointctl.tools.running.watch.bus_watch import BusWatch
 from jointctl.tools.running.watch.frame_recorder import FrameRecorder
@@ -58,7 +61,9 @@ class RunParts:
 class RunWatch:
     """Watches one run; `poll` it."""
 
-    def __init__(self, config: Config, parts: RunParts, *, allow_low_margin: bool = False) -> None:
+    def __init__(self, plan: RunPlan, axis: Any, parts: RunParts) -> None:
+        """`axis`: the `AxisConstants` that the loop is about to get."""
+        config = plan.config
         self.config, self.loop, self.around = config, parts.loop, parts.around
         self.log, self.kept, self.display = parts.log, parts.kept, parts.display
         self.temperature = TemperatureWatch()  # until the drive's own thermometer is known
@@ -66,21 +71,26 @@ class RunWatch:
         self._allowed = False  # whether the loop may enable
         self.delay_s: float | None = None  # of the loop, once it is measured
         self._stopped_by_viewer = ""
-        self._allow_low_margin = allow_low_margin
+        self._allow_low_margin = plan.allow_low_margin
+        by_velocity = axis.command_kind == CommandKind.VELOCITY
+        self._drives_loop_ps = float(axis.velocity_command.position_gain_ps) if by_velocity else None
+        self._decimated = ThinnedRecords(plan.log_every, round(plan.log_full_rate_s * config.loop.rate_Hz))
         self._phase, self._asked = AxisPhase.WAITING, StopRequest.NONE
         self._events = EventFinder(cia402=not config.is_serial, fault_words=self._fault_words)
         self._notices = NoticeFinder()
         self._orders = ViewerOrders(
             config, self.loop.block, self.log.path, parts.metadata, self._tell_scope, lambda: self.delay_s,
-            allow_low_margin=allow_low_margin,
+            allow_low_margin=plan.allow_low_margin,
         )  # fmt: skip
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Viewers can change nothing any more; a recording of theirs ends."""
+        """Viewers can change nothing any more; a recording of theirs ends.  The log gets what is held back of it."""
         self._orders.__exit__(*exception)
+        with contextlib.suppress(OSError):  # a full disk may be why this ends
+            self._keep(self._decimated.last())
 
     @property
     def stopped_by(self) -> str:
@@ -130,13 +140,22 @@ class RunWatch:
             self.log.write_event(WARNING, "bus", text)
             self.display.note(text)
 
-    def take_records(self) -> None:
-        """What the loop has written since the last call: to log, viewers and display, and the events in it."""
+    def take_records(self, *, last: bool = False) -> None:
+        """What the loop has written since the last call: to log, viewers and display, and the events in it.
+
+        `last`: the loop has ended; what the decimation of the log still holds back goes into it.
+        """
         if self.around.recorder is not None and (frames := self.around.recorder.new_frames()):
             self.log.write_frames(frame_array(frames))
-        if not len(records := self.loop.new_records()):
-            return
-        self.keep(records)
+        records = self.loop.new_records()
+        if len(records):
+            self._keep(self._decimated.take(records))
+            self._show(records)
+        if last:
+            self._keep(self._decimated.last())
+
+    def _show(self, records: Any) -> None:
+        """New records, shape (N,), to viewers and display, and the events in them."""
         self._orders.keep(records)
         commanded = self.around.signals.commanded_ns != 0  # the drive is off then, and the loop cannot know why
         # first: what has been reported may explain the fault that follows
@@ -151,10 +170,11 @@ class RunWatch:
         degC = self.temperature.newest_degC
         self.display.show(Snapshot(records[-1], skipped, histograms, duration_s, cia402, records, degC))
 
-    def keep(self, records: Any) -> None:
-        """What becomes of new records: the log, and `kept` for the summary at the end."""
-        self.kept.append(records)
-        self.log.write_records(records)
+    def _keep(self, records: Any) -> None:
+        """Into the log, and kept for the summary at the end."""
+        if len(records):
+            self.kept.append(records)
+            self.log.write_records(records)
 
     def check_delay(self) -> None:
         """Once enough cycles have run with the drive off: refuse the gains, or let the loop enable."""
@@ -177,7 +197,13 @@ class RunWatch:
             self.loop.allow_enable()
 
     def margin_text(self, delay_s: float) -> str:
-        """What is left of the stability with that delay, in words; raises if it is too little to enable."""
+        """What is left of the stability with that delay, in words; raises if it is too little to enable.
+
+        Where the drive closes its velocity loop by itself, ours is the slow position correction.
+        """
+        if self._drives_loop_ps is not None:
+            margin_deg = math.degrees(0.5 * math.pi - self._drives_loop_ps * delay_s)
+            return f"position correction with {margin_deg:.0f} deg phase margin"
         found = require_margin(self.config, delay_s, allow_low_margin=self._allow_low_margin)
         return f"phase margin {found.phase_margin_deg:.0f} deg"
 

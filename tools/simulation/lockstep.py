@@ -132,7 +132,7 @@ class LockstepJoint:
 
     def constants(self) -> Any:
         """Fresh `AxisConstants` for this joint where it stands; may be changed before `run`."""
-        constants = axis_constants(self.config, start_position_rad=self.report.start_position_rad)
+        constants = axis_constants(self.config, self.table, start_position_rad=self.report.start_position_rad)
         constants[0].sequence.supervisor_max_cycles = 0  # nobody to watch: simulated time has no wall clock
         return constants
 

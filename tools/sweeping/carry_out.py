@@ -1,4 +1,4 @@
-"""Carrying out the motion of a sweep: on the drive through the same loop and supervisor as `run`, or in lockstep.
+"""Carrying out the motion of a sweep: on the drive through the same loop and session as `run`, or in lockstep.
 
 The drive is in a velocity mode if it has one (CSV, else PV; UM=2 on a serial line); else our own law closes the
 velocity loop on torque.  In every mode the torque is the one that the drive measures.
@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 
-from jointctl.drivers.drive import Approval, CommissioningReport
+from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.elmo.unit_modes import SPEED_MODE
 from jointctl.drivers.errors import ConfigurationError, DeviceError, UsageError
 from jointctl.firmware_py.records import Reference
@@ -24,14 +24,14 @@ from jointctl.firmware_py.trajectory import approach_duration_s
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo import ElmoSerial, UnitModeChoice
 from jointctl.tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_constants
-from jointctl.tools.output import Output
-from jointctl.tools.recording.run_log import THINNING
-from jointctl.tools.recording.thinned_records import ThinnedRecords
-from jointctl.tools.running.control import Control
-from jointctl.tools.running.loop.loop_handle import LoopHandle
-from jointctl.tools.running.run_watch import RunParts, RunWatch
-from jointctl.tools.running.supervisor import Supervisor
+from jointctl.tools.output import Advance, Output
+from jointctl.tools.recording.log_folder import log_path
+from jointctl.tools.running.display.display import OnlyShows, Snapshot
+from jointctl.tools.running.permission.consent import Consent
+from jointctl.tools.running.plan import Placed, RunPlan, joint_lines, remark_lines
 from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.sweeping.checks import constant_remarks, require_torque
+from jointctl.tools.sweeping.grid import SweepPoint
 from jointctl.tools.sweeping.meter import SweepMeter
 from jointctl.tools.sweeping.plan import SweepMotion, shifted
 
@@ -42,8 +42,11 @@ POSITION_GAIN_ps = 5.0  # slow: far below any drive's velocity loop, fast enough
 OBSERVER_radps = 30.0  # of the law that takes the place of one without an integral action
 ACCELERATION_SPARE = 3.0  # limit of the velocity command's slope over sequence.brake_radps2
 LOG_EVERY = 20  # records of the run log: a sweep takes minutes, and its data are in its own file
-LOG_WHOLE_S = 2.0  # the last ones are in it whole
+LOG_FULL_RATE_S = 2.0  # the last ones are all in it
 LOCKSTEP_RECORDS = 250_000
+OVERHEAD_S = 3.0  # commissioning, enabling, release
+
+Begin = Callable[[CommissioningReport], None]  # called when the joint is known and may move
 
 
 def with_mode(config: Config, mode: str) -> Config:
@@ -60,6 +63,11 @@ def with_mode(config: Config, mode: str) -> Config:
         return config
     drive = config.drive.model_copy(update={"mode": DRIVE_MODES[mode]})
     return config.model_copy(update={"drive": drive})
+
+
+def config_of_sweep(config: Config, mode: str) -> Config:
+    """The configuration in the wanted mode, with the law that a sweep on torque uses."""
+    return with_tracking_law(with_mode(config, mode))
 
 
 def with_tracking_law(config: Config) -> Config:
@@ -98,7 +106,7 @@ def approach_time_s(config: Config, start_rad: float, middle: float) -> float:
 
 def sweep_constants(config: Config, report: CommissioningReport, motion: SweepMotion) -> Any:
     """`AxisConstants` for the motion (already about its middle) in the mode that the drive was set to."""
-    constants = axis_constants(config, start_position_rad=report.start_position_rad)
+    constants = axis_constants(config, motion.table, start_position_rad=report.start_position_rad)
     axis = constants[0]
     axis.trajectory.kind = TrajectoryKind.TABLE
     axis.trajectory.repeats = 0
@@ -112,99 +120,107 @@ def sweep_constants(config: Config, report: CommissioningReport, motion: SweepMo
     return constants
 
 
-class SweepWatch(RunWatch):
-    """Gives the records of a sweep to its meter, and thinned to the run log; `prepare` it first."""
+@dataclass(frozen=True)
+class SweepPass:
+    """One way along points of a sweep; see `running.plan.Motion`.  `config` is that of `config_of_sweep`."""
 
-    def prepare(self, meter: SweepMeter, progress: Callable[[float], None], *, velocity_mode: bool) -> None:
-        """`progress` is told the time on the motion [s]."""
-        self._meter, self._progress, self._velocity_mode = meter, progress, velocity_mode
-        self._thinned = ThinnedRecords(LOG_EVERY, round(LOG_WHOLE_S * self.config.loop.rate_Hz))
+    config: Config
+    motion: SweepMotion
+    points: Sequence[SweepPoint]
 
-    def margin_text(self, delay_s: float) -> str:
-        """In a velocity mode the drive closes its loop itself; ours is the slow position correction."""
-        if not self._velocity_mode:
-            return super().margin_text(delay_s)
-        margin_deg = math.degrees(0.5 * math.pi - POSITION_GAIN_ps * delay_s)
-        return f"position correction with {margin_deg:.0f} deg phase margin"
+    @property
+    def table(self) -> np.ndarray:
+        """See `Motion`."""
+        return self.motion.table
 
-    def take_records(self) -> None:
-        """As for any run; at the end also those that the thinning still holds."""
-        super().take_records()
-        if not self.loop.running():
-            self._write(self._thinned.last())
+    def placed(self, report: CommissioningReport) -> Placed:
+        """See `Motion`; about the place where the joint stands, as far as the limits allow."""
+        require_torque(report)
+        motion = shifted(self.motion, middle_rad(self.config, self.motion, report.start_position_rad))
+        return Placed(sweep_constants(self.config, report, motion), motion.table, tuple(self._envelope(report)))
 
-    def keep(self, records: Any) -> None:
-        """See `RunWatch`."""
-        self._write(self._thinned.take(records))
-        self._meter.temperature_degC = self.temperature.newest_degC
-        self._meter.feed(records)
+    def require_start(self, start_position_rad: float) -> None:
+        """From everywhere within the limits."""
+
+    def _envelope(self, report: CommissioningReport) -> list[str]:
+        """What is about to happen, in lines."""
+        config, motion = self.config, self.motion
+        limits = config.limits
+        start = report.start_position_rad
+        middle = middle_rad(config, motion, start)
+        approach_s = approach_time_s(config, start, middle)
+        speeds = sorted(abs(p.velocity_radps) for p in self.points)
+        total_s = motion.duration_s + approach_s + OVERHEAD_S
+        gravity_Nm = config.joint.gravity_Nm
+        own = [f"joint.gravity_Nm (={gravity_Nm:g}) is subtracted from what is measured"] if gravity_Nm else []
+        return [
+            *joint_lines(report),
+            f"approach   to {middle:+.4f} rad in {approach_s:.1f} s",
+            f"sweep      {len(self.points)} points from {speeds[0]:.4g} to {speeds[-1]:.4g} rad/s, "
+            "both directions together",
+            f"motion     {middle + motion.low_rad:+.3f} .. {middle + motion.high_rad:+.3f} rad, back and forth, "
+            f"about {_duration_text(total_s)}; points that do not settle are visited once more",
+            f"limits     {limits.position_min_rad:+.3f} .. {limits.position_max_rad:+.3f} rad, "
+            f"{limits.velocity_max_radps:.2f} rad/s, {limits.torque_max_Nm:.1f} Nm",
+            *remark_lines((*own, *constant_remarks(config), *report.remarks)),
+        ]
+
+
+def _duration_text(time_s: float) -> str:
+    return f"{time_s:.0f} s" if time_s < 100.0 else f"{round(time_s / 60.0)} min"
+
+
+def sweep_run(swept: SweepPass, *, allow_low_margin: bool = False) -> RunPlan:
+    """The plan of a session along it."""
+    return RunPlan(swept.config, swept, log_path(swept.config), allow_low_margin, LOG_EVERY, LOG_FULL_RATE_S)
+
+
+class MeterDisplay(OnlyShows):
+    """Gives the records of a pass to the meter, and its progress to the terminal."""
+
+    def __init__(self, meter: SweepMeter, output: Output, title: str, duration_s: float) -> None:
+        self._meter, self._output, self._title, self._duration_s = meter, output, title, duration_s
+        self._stack = contextlib.ExitStack()
+        self._advance: Advance | None = None
+
+    def note(self, text: str) -> None:
+        """The lines of the run say it."""
+
+    phase = note
+
+    def show(self, snapshot: Snapshot) -> None:
+        """See `Display`; `DataError` or `OSError` where the data cannot be written: the run is over."""
+        self._meter.temperature_degC = snapshot.temperature_degC
+        self._meter.feed(snapshot.records)
         with contextlib.suppress(OSError):  # the terminal may have been closed
-            self._progress(float(records[-1].trajectory_s))
+            if self._advance is None:  # not before: it would paint over what the loop says while it starts
+                self._advance = self._stack.enter_context(self._output.progress(self._title, self._duration_s))
+            self._advance(max(0.0, float(snapshot.record.trajectory_s)))
 
-    def _write(self, records: Any) -> None:
-        if len(records):
-            super().keep(records)
+    def __enter__(self) -> Self:
+        return self
 
-
-class SweepSupervisor(Supervisor):
-    """A supervised run along the motion of a sweep."""
-
-    def __init__(
-        self,
-        config: Config,
-        output: Output,
-        log_path: Path,
-        confirm: Callable[[CommissioningReport], bool],
-        motion: SweepMotion,
-        meter: SweepMeter,
-        progress: Callable[[float], None],
-        control: Control,
-        approve: Approval | None = None,
-        *,
-        allow_low_margin: bool = False,
-    ) -> None:
-        super().__init__(config, output, log_path, confirm, control, approve=approve, allow_low_margin=allow_low_margin)
-        self._motion = motion
-        self._meter = meter
-        self._progress = progress
-        self._velocity_mode = False
-
-    def _table(self) -> np.ndarray:
-        return self._motion.table
-
-    def _constants(self, loop: LoopHandle, report: CommissioningReport) -> Any:
-        self._velocity_mode = report.mode in VELOCITY_MODES
-        if not self._velocity_mode:
-            self._config = with_tracking_law(self._config)
-        motion = shifted(self._motion, middle_rad(self._config, self._motion, report.start_position_rad))
-        loop.block.table[:] = motion.table
-        return sweep_constants(self._config, report, motion)
-
-    def _metadata(self, report: CommissioningReport) -> dict[str, dict[str, str]]:
-        return {**super()._metadata(report), THINNING: {"every": str(LOG_EVERY), "whole_s": f"{LOG_WHOLE_S:g}"}}
-
-    def _make_watch(self, parts: RunParts) -> RunWatch:
-        watch = SweepWatch(self._config, parts, allow_low_margin=self._allow_low_margin)
-        watch.prepare(self._meter, self._progress, velocity_mode=self._velocity_mode)
-        return watch
+    def __exit__(self, *exception: Any) -> None:
+        """Take the progress away."""
+        self._stack.__exit__(*exception)
 
 
 def sweep_in_lockstep(
-    config: Config, motion: SweepMotion, meter: SweepMeter, confirm: Callable[[CommissioningReport], bool]
+    swept: SweepPass, meter: SweepMeter, consent: Consent, begin: Begin
 ) -> tuple[Fault, float] | None:
-    """The whole motion on the virtual joint in simulated time; the fault and its value, None if `confirm` declined."""
+    """The whole motion on the virtual joint in simulated time; the fault and its value, None after a dry run."""
+    config = swept.config
     if config.is_serial:
         raise UsageError('--lockstep is for drive.kind = "canopen": the serial joint runs in real time only')
     joint = LockstepJoint(config)
-    if not confirm(joint.report):
+    placed = swept.placed(joint.report)
+    consent.show(placed.lines)
+    if consent.dry_run:
         return None
-    if joint.report.mode not in VELOCITY_MODES:
-        joint.config = config = with_tracking_law(config)
-    placed = shifted(motion, middle_rad(config, motion, joint.report.start_position_rad))
-    joint.table = placed.table
-    constants = sweep_constants(config, joint.report, placed)
-    constants[0].sequence.supervisor_max_cycles = 0
-    cycles = (placed.duration_s + float(constants[0].sequence.approach_s)) * config.loop.rate_Hz
-    run = joint.run(constants, log_every=max(1, math.ceil(cycles / LOCKSTEP_RECORDS)))
+    begin(joint.report)
+    joint.table, axis = placed.table, placed.constants[0]
+    axis.sequence.supervisor_max_cycles = 0
+    cycles = (swept.motion.duration_s + float(axis.sequence.approach_s)) * config.loop.rate_Hz
+    run = joint.run(placed.constants, log_every=max(1, math.ceil(cycles / LOCKSTEP_RECORDS)))
     meter.feed(run.log)
     return run.fault, float(run.state.fault_value)

@@ -16,7 +16,7 @@ from jointctl.tools.benchmarks.simulation_speed import lockstep_rows, swarm_rows
 from jointctl.tools.benchmarks.start_speed import start_rows
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.configuration.records import axis_constants, trajectory_table
 from jointctl.tools.output import Output
 from jointctl.tools.written_file import prepare_folder
 
@@ -25,7 +25,7 @@ PARTS = ("law", "loop", "lockstep", "swarm", "start")
 
 def _part(name: str, config: Config, folder: Path, quick: bool, verbs: Sequence[str]) -> Iterator[Row]:
     parts: dict[str, Callable[[], Iterator[Row]]] = {
-        "law": lambda: law_rows(axis_constants(config), folder, pairs=15 if quick else 61),
+        "law": lambda: law_rows(axis_constants(config, trajectory_table(config)), folder, pairs=15 if quick else 61),
         "loop": lambda: exchange_rows(
             config,
             folder,

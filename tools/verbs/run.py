@@ -9,17 +9,15 @@ from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import DECLINED, INTERRUPTED
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
-from jointctl.tools.recording.log_folder import log_path
 from jointctl.tools.running.control import in_control
-from jointctl.tools.running.display.display import Display
+from jointctl.tools.running.display.display import Display, Displays
 from jointctl.tools.running.display.live_panel import run_display
-from jointctl.tools.running.permission.consent import agreed, approval, require_terminal
-from jointctl.tools.running.permission.envelope import motion_envelope
-from jointctl.tools.running.permission.readiness import prepare_log, require_ready, require_start
+from jointctl.tools.running.permission.consent import TerminalConsent, require_terminal
+from jointctl.tools.running.plan import resolve
 from jointctl.tools.running.result import drive_end
 from jointctl.tools.running.result.drive_end import require_off
 from jointctl.tools.running.result.run_report import report_run, run_title
-from jointctl.tools.running.supervisor import Supervisor
+from jointctl.tools.running.session import Session
 
 
 def run(
@@ -37,34 +35,18 @@ def run(
     """
     if not (assume_yes or dry_run):
         require_terminal()
-
-    def confirm(report: CommissioningReport) -> bool:
-        for line in motion_envelope(config, report):
-            output.fact(line)
-        if dry_run:
-            return False
-        require_ready(config, report, path)
-        require_start(config, report.start_position_rad)
-        if not (assume_yes or agreed(output)):
-            return False
-        prepare_log(config, path, output)
-        return True
-
-    path = log_path(config)
-    title = run_title(config)
-    approve = None if dry_run else approval(output, assume_yes=assume_yes)
-    with _displays(config, output, title, scope) as display, in_control(config, output) as control:
-        supervisor = Supervisor(
-            config, output, path, confirm, control, approve=approve, allow_low_margin=allow_low_margin, display=display
-        )
+    plan = resolve(config, allow_low_margin=allow_low_margin)
+    consent = TerminalConsent(output, assume_yes=assume_yes, dry_run=dry_run)
+    with _displays(config, output, run_title(config), scope) as display, in_control(config, output) as control:
+        session = Session(plan, consent, output, control, display)
         try:
-            result = supervisor.run()
+            result = session.run()
         except KeyboardInterrupt:
             output.note(f"interrupted{control.signals.by_command}; nothing moved")
-            require_off(supervisor.drive_state)
+            require_off(session.drive_state)
             return INTERRUPTED
     if result is None:
-        left = drive_end.words(supervisor.drive_state)
+        left = drive_end.words(session.drive_state)
         output.note(
             f"dry run: nothing moved; the drive was commissioned; {left}" if dry_run else f"nothing moved; {left}"
         )
@@ -75,13 +57,12 @@ def run(
 @contextmanager
 def _displays(
     config: Config, output: Output, title: str, scope: tuple[str, int] | None
-) -> Iterator[Callable[[], Display]]:
+) -> Iterator[Callable[[CommissioningReport], Display]]:
     """What shows the run: the terminal, and the page if one is wanted."""
     terminal = run_display(output, title)
     if scope is None:
-        yield terminal
+        yield lambda _: terminal()
         return
-    from jointctl.tools.scoping.displays import Displays
     from jointctl.tools.scoping.feed import scope_server
     from jointctl.tools.scoping.order import scope_order
 
@@ -89,4 +70,4 @@ def _displays(
     output.address(f"scope: {order.url}")
     with scope_server(order) as feed:
         feed.settings({"stage": "terminal"})
-        yield lambda: Displays([terminal(), feed])
+        yield lambda _: Displays([terminal(), feed])

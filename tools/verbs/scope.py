@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import secrets
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jointctl.drivers.bus_lock import no_longer_starting
-from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import DECLINED, INTERRUPTED, JointctlError
 from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.output import Output
-from jointctl.tools.recording.log_folder import log_path
 from jointctl.tools.recording.run_log_reader import read_run_log
 from jointctl.tools.running.control import in_control
+from jointctl.tools.running.display.display import Displays
 from jointctl.tools.running.display.live_panel import run_display
-from jointctl.tools.running.permission.envelope import motion_envelope
-from jointctl.tools.running.permission.readiness import prepare_log, require_ready, require_start
+from jointctl.tools.running.plan import resolve
 from jointctl.tools.running.result.drive_end import words
 from jointctl.tools.running.result.run_report import report_run, run_title
-from jointctl.tools.running.supervisor import Supervisor
-from jointctl.tools.scoping.displays import Displays
+from jointctl.tools.running.session import Session
 from jointctl.tools.scoping.feed import ScopeFeed, scope_server
 from jointctl.tools.scoping.order import scope_order
 
@@ -87,39 +85,26 @@ class _Runs:
 
     def one(self) -> bool:
         """Prepare, wait for Start, run, report; whether a signal has ended the program as well."""
-        output, feed, path = self._output, self._feed, log_path(self._config)
+        output, feed, config = self._output, self._feed, self._config
         feed.forget()
         self._tell("preparing", [])
-
-        def confirm(report: CommissioningReport) -> bool:
-            lines = motion_envelope(self._config, report)
-            for line in lines:
-                output.note(line)
-            require_ready(self._config, report, path)
-            require_start(self._config, report.start_position_rad)
-            agreed = confirmed(feed, lines)
-            if agreed:
-                prepare_log(self._config, path, output)
-            self.code = 0 if agreed else DECLINED
-            return agreed
-
         terminal = run_display(output, self._title)
         try:
-            with in_control(self._config, output) as control:
-                supervisor = Supervisor(
-                    self._config, output, path, confirm, control, allow_low_margin=self._allow_low_margin,
-                    display=lambda: Displays([terminal(), feed]),
-                )  # fmt: skip
+            plan = resolve(config, allow_low_margin=self._allow_low_margin)
+            with in_control(config, output) as control:
+                consent = PageConsent(feed, output)
+                session = Session(plan, consent, output, control, lambda _: Displays([terminal(), feed]))
                 try:
-                    result = supervisor.run()
+                    result = session.run()
                 except KeyboardInterrupt:
                     if control.signals.commanded_ns:
                         self.code = INTERRUPTED
                     self.ended_by = control.signals.by_command
                     raise
                 finally:
-                    self.drive_state, self._ended = supervisor.drive_state, control.signals.count > 0
+                    self.drive_state, self._ended = session.drive_state, control.signals.count > 0
             if result is None:
+                self.code = DECLINED
                 why = "stopped before it began" if feed.stop_request() else f"not started within {PREPARED_S:g} s"
                 self._tell("declined", [f"{why}; nothing moved; {words(self.drive_state)}"])
                 return False
@@ -139,6 +124,24 @@ class _Runs:
             lines.insert(0, f"{result.fault.name}: {text.happened}; {text.advice}")
         self._tell("ended", lines)
         return self._ended
+
+
+class PageConsent:
+    """The viewer who presses Start below the envelope; see `Consent`.  Nobody at the page may brake a drive."""
+
+    dry_run, brake = False, None
+
+    def __init__(self, feed: ScopeFeed, output: Output) -> None:
+        self._feed, self._output = feed, output
+
+    def show(self, lines: Sequence[str]) -> None:
+        """See `Consent`; the page shows them with its question."""
+        for line in lines:
+            self._output.note(line)
+
+    def agreed(self, lines: Sequence[str]) -> bool:
+        """See `Consent`."""
+        return confirmed(self._feed, list(lines))
 
 
 def confirmed(feed: ScopeFeed, lines: list[str], patience_s: float = PREPARED_S) -> bool:

@@ -18,33 +18,26 @@ from jointctl.drivers.errors import DECLINED, INTERRUPTED, MotionFault
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
-from jointctl.tools.output import Advance, Output
-from jointctl.tools.recording.log_folder import log_path
+from jointctl.tools.output import Output
 from jointctl.tools.reporting.page import check_target
 from jointctl.tools.running.control import Control, in_control
+from jointctl.tools.running.display.display import Display, Displays
+from jointctl.tools.running.display.phase_lines import PhaseLines
 from jointctl.tools.running.events.fault_text import FaultText, fault_text
-from jointctl.tools.running.permission.consent import agreed, approval, require_terminal
-from jointctl.tools.running.permission.envelope import remark_lines, where_lines
-from jointctl.tools.running.permission.readiness import require_ready
+from jointctl.tools.running.permission.consent import TerminalConsent, require_terminal
 from jointctl.tools.running.result import drive_end
-from jointctl.tools.sweeping.carry_out import SweepSupervisor, approach_time_s, middle_rad, sweep_in_lockstep, with_mode
-from jointctl.tools.sweeping.checks import (
-    constant_remarks,
-    recorded_limits,
-    refuse_constants,
-    require_torque,
-    torque_source,
-)
+from jointctl.tools.running.session import Session
+from jointctl.tools.sweeping.carry_out import MeterDisplay, SweepPass, config_of_sweep, sweep_in_lockstep, sweep_run
+from jointctl.tools.sweeping.checks import recorded_limits, refuse_constants, torque_source
 from jointctl.tools.sweeping.data_file import SweepFile
 from jointctl.tools.sweeping.grid import SweepPoint
 from jointctl.tools.sweeping.meter import JointModel, MeasuredPoint, SweepMeter
 from jointctl.tools.sweeping.options import SweepOptions, check_files, make_plan
-from jointctl.tools.sweeping.plan import PlanSettings, SweepMotion
+from jointctl.tools.sweeping.plan import PlanSettings
 from jointctl.tools.sweeping.statistics import Tolerance
 from jointctl.tools.sweeping.sweep_page import write_sweep_page
 
 RELATIVE_TOLERANCE = 0.01
-OVERHEAD_S = 3.0  # commissioning, enabling, release
 REVISITS = 1  # of points that did not settle, with REVISIT_DWELL times the dwell
 REVISIT_DWELL = 3.0
 
@@ -59,39 +52,12 @@ def joint_model(config: Config, settings: PlanSettings) -> JointModel:
     )  # fmt: skip
 
 
-def duration_text(time_s: float) -> str:
-    minutes = round(time_s / 60.0)
-    return f"{time_s:.0f} s" if time_s < 100.0 else f"{minutes} min"
-
-
-def envelope(config: Config, report: CommissioningReport, motion: SweepMotion, points: list[SweepPoint]) -> list[str]:
-    """What is about to happen, in lines."""
-    limits = config.limits
-    start = report.start_position_rad
-    middle = middle_rad(config, motion, start)
-    approach_s = approach_time_s(config, start, middle)
-    speeds = sorted(abs(p.velocity_radps) for p in points)
-    total_s = motion.duration_s + approach_s + OVERHEAD_S
-    lines = [
-        *where_lines(report),
-        f"approach   to {middle:+.4f} rad in {approach_s:.1f} s",
-        f"sweep      {len(points)} points from {speeds[0]:.4g} to {speeds[-1]:.4g} rad/s, both directions together",
-        f"motion     {middle + motion.low_rad:+.3f} .. {middle + motion.high_rad:+.3f} rad, back and forth, "
-        f"about {duration_text(total_s)}; points that do not settle are visited once more",
-        f"limits     {limits.position_min_rad:+.3f} .. {limits.position_max_rad:+.3f} rad, "
-        f"{limits.velocity_max_radps:.2f} rad/s, {limits.torque_max_Nm:.1f} Nm",
-    ]
-    gravity_Nm = config.joint.gravity_Nm
-    own = [f"joint.gravity_Nm (={gravity_Nm:g}) is subtracted from what is measured"] if gravity_Nm else []
-    return lines + remark_lines((*own, *constant_remarks(config), *report.remarks))
-
-
 class Sweep:
     """One `sweep` command: plan, ask, measure, report."""
 
     def __init__(self, config: Config, output: Output, out: Path, options: SweepOptions) -> None:
         refuse_constants(config)
-        self.config = with_mode(config, options.mode)
+        self.config = config_of_sweep(config, options.mode)
         self.output = output
         self.out = out
         self.options = options
@@ -101,7 +67,9 @@ class Sweep:
         self.drive_state = ""
         self._time_offset_s = 0.0
         self._unsettled: dict[int, SweepPoint] = {}
-        self._confirmed = self._declined = False
+        self._consent = TerminalConsent(
+            output, assume_yes=options.assume_yes or options.lockstep, dry_run=options.dry_run
+        )
 
     def run(self) -> int:
         """The exit code: 0, 12 if declined, 130 after an interruption; raises `MotionFault` and the other errors."""
@@ -148,39 +116,35 @@ class Sweep:
         motion = self.plan.motion(points, warm_up_turns, dwell_factor)
         self._time_offset_s = self.file.elapsed_s if self.file is not None else 0.0
         meter = SweepMeter(motion.windows, joint_model(config, self.plan.settings), self._on_point)
+        swept = SweepPass(config, motion, points)
 
-        def confirm(report: CommissioningReport) -> bool:
+        def begin(report: CommissioningReport) -> None:
             resolution_Nm = report.torque_resolution_Nm / config.joint.reduction_ratio
-            require_torque(report)
             meter.tolerance = Tolerance(RELATIVE_TOLERANCE, 0.5 * resolution_Nm)
-            return self._confirm(report, motion, points)
+            if self.file is None:
+                constant, ratio = torque_constant_NmpA(config), config.joint.reduction_ratio
+                self.file = SweepFile.create(self.out, ratio, constant, self.plan.hash, self._about(report))
 
         if options.lockstep:
-            ended = sweep_in_lockstep(config, motion, meter, confirm)
+            ended = sweep_in_lockstep(swept, meter, self._consent, begin)
             if ended is None:
                 return None
             fault, value = ended
             self._raise_fault(fault, fault_text(fault, value, 0) if fault is not Fault.NONE else None)
             return ""
-        with contextlib.ExitStack() as stack:
-            bars: list[Advance] = []
 
-            def progress(done_s: float) -> None:
-                if not bars:  # not before: it would paint over the question, and what the loop says while it starts
-                    title = "1 point" if len(points) == 1 else f"{len(points)} points"
-                    bars.append(stack.enter_context(self.output.progress(title, motion.duration_s)))
-                bars[0](max(0.0, done_s))
+        def display(report: CommissioningReport) -> Display:
+            begin(report)
+            title = "1 point" if len(points) == 1 else f"{len(points)} points"
+            return Displays([PhaseLines(self.output), MeterDisplay(meter, self.output, title, motion.duration_s)])
 
-            assert self.control is not None
-            approve = None if options.dry_run else self._approve
-            supervisor = SweepSupervisor(
-                config, self.output, log_path(config), confirm, motion, meter, progress, self.control, approve,
-                allow_low_margin=options.allow_low_margin,
-            )  # fmt: skip
-            try:
-                result = supervisor.run()
-            finally:
-                self.drive_state = supervisor.drive_state
+        assert self.control is not None
+        plan = sweep_run(swept, allow_low_margin=options.allow_low_margin)
+        session = Session(plan, self._consent, self.output, self.control, display)
+        try:
+            result = session.run()
+        finally:
+            self.drive_state = session.drive_state
         if result is None:
             return None
         if meter.lost_points:
@@ -190,29 +154,6 @@ class Sweep:
             self.output.warning(f"{result.lost_records} log records were lost: the supervisor was too slow")
         self._raise_fault(result.fault, result.fault_text)
         return result.stopped_by
-
-    def _approve(self, question: str) -> bool:
-        agreed_to = approval(self.output, assume_yes=self.options.assume_yes)(question)
-        self._declined = self._declined or not agreed_to
-        return agreed_to
-
-    def _confirm(self, report: CommissioningReport, motion: SweepMotion, points: list[SweepPoint]) -> bool:
-        if not self._confirmed:
-            for line in envelope(self.config, report, motion, points):
-                self.output.fact(line)
-            if self.options.dry_run:
-                return False
-            if not self.options.lockstep:
-                require_ready(self.config, report, log_path(self.config))
-            if not (self.options.assume_yes or self.options.lockstep or agreed(self.output)):
-                self._declined = True
-                return False
-            self._confirmed = True
-        if self.file is None:
-            constant = torque_constant_NmpA(self.config)
-            ratio = self.config.joint.reduction_ratio
-            self.file = SweepFile.create(self.out, ratio, constant, self.plan.hash, self._about(report))
-        return True
 
     def _about(self, report: CommissioningReport) -> dict[str, Any]:
         """What the sidecar tells besides the constants."""
@@ -260,7 +201,7 @@ class Sweep:
         if stopped is None:
             left = "nothing moved; " + drive_end.words(self.drive_state)
             self.output.note(f"dry run: {left}" if self.options.dry_run else left)
-            return DECLINED if self._declined else 0
+            return 0 if self.options.dry_run else DECLINED
         drive_end.require_off(self.drive_state)
         assert self.file is not None
         done = len(self.file.done)

@@ -20,15 +20,17 @@ REPORT = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.0, 0.1, 1e-
 
 
 class Asking:
-    """A supervisor that asks, and does no more."""
+    """A session that asks, and does no more."""
 
     drive_state = "switch on disabled"
 
-    def __init__(self, config: Any, output: Any, path: Any, confirm: Any, *_: Any, **__: Any) -> None:
-        self._confirm = confirm
+    def __init__(self, plan: Any, consent: Any, *_: Any) -> None:
+        self._plan, self._consent = plan, consent
 
     def run(self) -> None:
-        self._confirm(REPORT)
+        placed = self._plan.motion.placed(REPORT)
+        self._consent.show(placed.lines)
+        assert self._consent.dry_run or not self._consent.agreed(placed.lines)
 
 
 class Terminal(io.StringIO):
@@ -41,9 +43,9 @@ class Terminal(io.StringIO):
 def test_no_is_a_code_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str, answer: str) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "stdin", Terminal(answer))
-    monkeypatch.setattr(run, "Supervisor", Asking)
-    monkeypatch.setattr(sweep, "SweepSupervisor", Asking)
-    monkeypatch.setattr(doctor_motion, "CheckSupervisor", Asking)
+    monkeypatch.setattr(run, "Session", Asking)
+    monkeypatch.setattr(sweep, "Session", Asking)
+    monkeypatch.setattr(doctor_motion, "Session", Asking)
     output = Output(stdout=io.StringIO(), stderr=io.StringIO())
     if verb == "run":
         code = run.run(load_config(shipped_config("virtual")), output, assume_yes=False)
@@ -59,8 +61,8 @@ def test_no_is_a_code_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize("verb", ["run", "sweep"])
 def test_a_dry_run_is_a_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(run, "Supervisor", Asking)
-    monkeypatch.setattr(sweep, "SweepSupervisor", Asking)
+    monkeypatch.setattr(run, "Session", Asking)
+    monkeypatch.setattr(sweep, "Session", Asking)
     output = Output(stdout=io.StringIO(), stderr=io.StringIO())
     if verb == "run":
         code = run.run(load_config(shipped_config("virtual")), output, assume_yes=False, dry_run=True)

@@ -24,12 +24,15 @@ from jointctl.tools.configuration.conversions import (
 )
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.plant_settings import plant_settings
-from jointctl.tools.configuration.records import approach_s, axis_constants, trajectory_table
+from jointctl.tools.configuration.records import approach_s, trajectory_table
+from tests.sessions import constants_of
 from tests.unit.configuration.edited_config import VIRTUAL, load, problems
+
+NO_TABLE = np.zeros((1, 5))
 
 
 def test_records_of_the_paper() -> None:
-    axis = axis_constants(load_config(shipped_config("paper")))[0]
+    axis = constants_of(load_config(shipped_config("paper")))[0]
     law = axis.law
     assert law.kind == ControllerKind.COMPUTED_TORQUE_RBF
     assert law.feed_forward == FeedForward.MEASURED
@@ -49,7 +52,7 @@ def test_records_of_the_paper() -> None:
 
 @pytest.mark.parametrize("name", ["virtual", "paper"])
 def test_friction_of_the_files_is_table_3(name: str) -> None:
-    law = axis_constants(load_config(shipped_config(name)))[0].law
+    law = constants_of(load_config(shipped_config(name)))[0].law
     velocity = np.radians([12.6, -12.6, 40.0, 40.01, -40.0, -40.01, 100.0, 200.0, -200.0])
     torque = [friction_model.friction_motor_torque_Nm(law.friction, v) for v in velocity]
     np.testing.assert_allclose(
@@ -96,15 +99,15 @@ def test_ampere_conventions_and_encoder_sides(tmp_path: Path) -> None:
 
 def test_the_automatic_approach_keeps_to_its_speed_and_is_no_longer_than_needed(tmp_path: Path) -> None:
     config = load(tmp_path)
-    assert approach_s(config, 0.0) == 1.0
-    start = approach_start(axis_constants(config, start_position_rad=0.0)[0].trajectory)
+    assert approach_s(config, NO_TABLE, 0.0) == 1.0
+    start = approach_start(constants_of(config, start_position_rad=0.0)[0].trajectory)
     allowed = 1.2 * 0.35 * 0.2 * math.pi  # of the sine's own speed at its start, above a quarter of the limit
-    duration = approach_s(config, -0.6)
+    duration = approach_s(config, NO_TABLE, -0.6)
     assert approach_peak(-0.6, start, duration).velocity_radps <= allowed * (1.0 + 1e-6)
     assert approach_peak(-0.6, start, 0.99 * duration).velocity_radps > allowed
     # an unknown place is taken as the farther end of the range
-    assert approach_s(config) == max(approach_s(config, -0.7), approach_s(config, 0.7))
-    assert approach_s(load(tmp_path, "approach_s = .*", "approach_s = 0"), 0.6) == 0.0
+    assert approach_s(config, NO_TABLE) == max(approach_s(config, NO_TABLE, -0.7), approach_s(config, NO_TABLE, 0.7))
+    assert approach_s(load(tmp_path, "approach_s = .*", "approach_s = 0"), NO_TABLE, 0.6) == 0.0
 
 
 def test_shipped_checks_agree_with_the_trajectory_itself(tmp_path: Path) -> None:
@@ -119,7 +122,7 @@ def test_shipped_checks_agree_with_the_trajectory_itself(tmp_path: Path) -> None
     ):
         text = VIRTUAL[:start] + f"[trajectory]\nduration_s = 0.0\n{keys}\n\n" + VIRTUAL[end:]
         config = load(tmp_path, text=text)
-        peak = peak_of(axis_constants(config)[0].trajectory)
+        peak = peak_of(constants_of(config)[0].trajectory)
         assert trajectory_extremes(config.trajectory) == pytest.approx(peak[:3]), keys
 
 
@@ -142,7 +145,7 @@ def test_a_table_trajectory_is_read_and_checked(tmp_path: Path) -> None:
     way.write_text("time_s,position_rad\n0,0\n1,0.1\n2,0.2\n3,0.2\n")
     config = load(tmp_path, text=text)
     assert trajectory_table(config).shape[1] == 5
-    assert axis_constants(config)[0].trajectory.table_rows == len(trajectory_table(config))
+    assert constants_of(config)[0].trajectory.table_rows == len(trajectory_table(config))
     with pytest.raises(ConfigurationError, match="needs a table that ends where it begins"):
         trajectory_table(load(tmp_path, "file = ", "repeat = true\nfile = ", text))
     way.write_text("time_s,position_rad\n0,0\n1,0.1\n2,0.8\n3,0.8\n")
@@ -162,5 +165,5 @@ def test_the_velocity_of_one_count_is_what_the_filter_makes_of_it(
     config = load(tmp_path, "rate_Hz = .*", f"rate_Hz = {rate_Hz}", text)
     state = new(VelocityState)[0]
     for position_rad in (0.0, abs(joint_rad_per_count(config))):
-        step_velocity(axis_constants(config)[0].velocity, state, position_rad, 0.0, 1)
+        step_velocity(constants_of(config)[0].velocity, state, position_rad, 0.0, 1)
     assert velocity_of_a_count_radps(config) == pytest.approx(state.velocity_radps)

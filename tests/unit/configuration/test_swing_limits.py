@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.configuration.records import axis_constants
+from tests.sessions import constants_of
 from tests.unit.configuration.edited_config import load, problems
 
 ANCHOR = "standstill_radps = .*"
@@ -20,7 +20,7 @@ def added(line: str) -> str:
 @pytest.mark.parametrize("name", ["virtual", "paper", "precise", "sweep_virtual"])
 def test_the_monitor_is_on_in_every_file_that_does_not_name_it(name: str) -> None:
     config = load_config(shipped_config(name))
-    axis = axis_constants(config)[0]
+    axis = constants_of(config)[0]
     swing = axis.limits.swing
     assert swing.torque_Nm == 60.0  # half of -60..60
     assert swing.error_rad == pytest.approx(0.05 * config.limits.following_error_max_rad)
@@ -32,18 +32,18 @@ def test_the_monitor_is_on_in_every_file_that_does_not_name_it(name: str) -> Non
 
 def test_each_key_reaches_its_record(tmp_path: Path) -> None:
     keys = ("swing_torque_share = 0.75", "swing_error_share = 0.1", "swing_slowest_s = 0.5", "torque_noise_share = 0.1")
-    axis = axis_constants(load(tmp_path, ANCHOR, added("\n".join(keys))))[0]
+    axis = constants_of(load(tmp_path, ANCHOR, added("\n".join(keys))))[0]
     swing = axis.limits.swing
     assert (swing.torque_Nm, swing.slowest_cycles) == (90.0, 500)
     assert (swing.error_rad, swing.noise_Nm) == (pytest.approx(0.005), pytest.approx(6.0))
     text = shipped_config("precise").read_text()
-    axis = axis_constants(load(tmp_path, ANCHOR, added("learning_growth = 1.5"), text))[0]
+    axis = constants_of(load(tmp_path, ANCHOR, added("learning_growth = 1.5"), text))[0]
     assert axis.law.learning.growth == 1.5
 
 
 def test_noise_is_also_what_comes_near_the_rate_limit(tmp_path: Path) -> None:
     """2 Nm in a cycle are allowed: 12 Nm would never come."""
-    axis = axis_constants(load(tmp_path, "torque_rate_max_Nmps = .*", "torque_rate_max_Nmps = 2000.0"))[0]
+    axis = constants_of(load(tmp_path, "torque_rate_max_Nmps = .*", "torque_rate_max_Nmps = 2000.0"))[0]
     assert axis.limits.swing.noise_Nm == pytest.approx(1.2)
 
 

@@ -196,7 +196,7 @@ def test_the_same_tests_pass_in_plain_python_and_cover_the_safety_code(tmp_path:
         "COVERAGE_FILE": str(tmp_path / ".coverage"),
     }
     result = subprocess.run(
-        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=300.0
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=1200.0
     )
     assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
     files = json.loads(report.read_text())["files"]

@@ -19,9 +19,9 @@ from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fau
 from jointctl.hil.bus.virtual_bus import FrameQueue
 from jointctl.hil.lockstep import RECEIVED_SLOT, RPDO_SLOT, run_lockstep
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.configuration.records import axis_constants
 from jointctl.tools.simulation.lockstep import DirectBus, LockstepJoint
 from jointctl.tools.simulation.virtual_joint import new_device
+from tests.sessions import constants_of
 
 PERIOD_ns = 1_000_000
 
@@ -41,7 +41,7 @@ class Lockstep:
         bus.stop()
         self.device = bus.device
         self.start_ns = (bus.now_ns // PERIOD_ns + 1) * PERIOD_ns
-        self.constants = axis_constants(config, start_position_rad=report.start_position_rad)
+        self.constants = constants_of(config, start_position_rad=report.start_position_rad)
         self.state, self.sample, self.command = new(AxisState), new(Sample), new(Command)
         reset_axis(self.constants[0], self.state[0])
         self.frames, _ = exchange_memory()

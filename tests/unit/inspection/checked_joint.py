@@ -7,7 +7,7 @@ from typing import Any
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.inspection.findings import Finding
-from jointctl.tools.motion_check.plan import CheckPlan, check_constants, config_of_check, make_plan, motion_table
+from jointctl.tools.motion_check.plan import CheckMotion, CheckPlan, config_of_check, make_plan, motion_table
 from jointctl.tools.motion_check.verdict import motion_findings
 from jointctl.tools.running.events.fault_text import fault_text
 from jointctl.tools.simulation.lockstep import LockstepJoint
@@ -16,7 +16,7 @@ from jointctl.tools.simulation.lockstep import LockstepJoint
 def check_in_lockstep(joint: LockstepJoint, config: Config, plan: CheckPlan, faults: Any = None) -> tuple[Any, Fault]:
     """The same motion on a virtual joint in simulated time: its records and the fault."""
     table = motion_table(plan, joint.report.start_position_rad)
-    constants = check_constants(config_of_check(config, plan), plan, joint.report, table)
+    constants = CheckMotion(config_of_check(config, plan), plan).constants(joint.report, table)
     constants[0].sequence.supervisor_max_cycles = 0  # nobody watches in simulated time
     joint.table = table
     run = joint.run(constants) if faults is None else joint.run_with_faults(faults, constants)

@@ -13,7 +13,7 @@ from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.faults.kinds import FaultConstants, FaultKind
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.inspection.findings import OK, PROBLEM
-from jointctl.tools.motion_check.plan import check_constants, config_of_check, make_plan, motion_table
+from jointctl.tools.motion_check.plan import CheckMotion, config_of_check, make_plan, motion_table
 from jointctl.tools.motion_check.verdict import motion_findings
 from jointctl.tools.running.events.fault_text import fault_text
 from jointctl.tools.simulation.lockstep import LockstepJoint
@@ -143,8 +143,8 @@ def test_a_dead_encoder_is_found_before_the_joint_has_gone_far(tmp_path: Path, s
     faults = new(FaultConstants, 1)
     faults[0].kind, faults[0].start_s, faults[0].duration_s = FaultKind.ENCODER_STUCK, 0.5, 100.0
     plan, joint = make_plan(config, None), LockstepJoint(config)
-    constants = check_constants(
-        config_of_check(config, plan), plan, joint.report, motion_table(plan, joint.report.start_position_rad)
+    constants = CheckMotion(config_of_check(config, plan), plan).constants(
+        joint.report, motion_table(plan, joint.report.start_position_rad)
     )
     constants[0].sequence.supervisor_max_cycles = 0
     joint.table = motion_table(plan, joint.report.start_position_rad)

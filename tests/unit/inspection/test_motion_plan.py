@@ -15,8 +15,7 @@ from jointctl.tools.configuration.conversions import velocity_of_a_count_radps
 from jointctl.tools.configuration.records import APPROACH_MIN_S
 from jointctl.tools.inspection.drive_scale import judged
 from jointctl.tools.inspection.findings import NOTE, OK
-from jointctl.tools.motion_check.plan import check_constants, config_of_check, make_plan, motion_table, require_room
-from jointctl.tools.verbs.doctor_motion import check_envelope
+from jointctl.tools.motion_check.plan import CheckMotion, config_of_check, make_plan, motion_table
 from tests.two_encoders import config_with
 
 
@@ -34,7 +33,7 @@ def test_the_check_only_narrows_torque_speed_and_travel(tmp_path: Path) -> None:
     config = config_with(tmp_path)
     plan = make_plan(config, None)
     report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.1, 0.06, 1e-5)
-    made = check_constants(config_of_check(config, plan), plan, report, motion_table(plan, 0.1))[0].limits
+    made = CheckMotion(config_of_check(config, plan), plan).constants(report, motion_table(plan, 0.1))[0].limits
     assert made.torque_max_Nm == plan.torque_Nm < config.limits.torque_max_Nm
     assert made.velocity_max_radps == 0.5 < config.limits.velocity_max_radps
     assert (made.position_min_rad, made.position_max_rad) == pytest.approx((0.0, 0.2))
@@ -49,7 +48,7 @@ def test_a_standing_joint_is_never_pushed_unwatched(tmp_path: Path, torque_Nm: f
     config = config_with(tmp_path, joint__gravity_Nm=gravity_Nm, virtual__gravity_Nm=gravity_Nm)
     plan = make_plan(config, torque_Nm)
     report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.1, 0.06, 1e-5)
-    made = check_constants(config_of_check(config, plan), plan, report, motion_table(plan, 0.1))[0].limits
+    made = CheckMotion(config_of_check(config, plan), plan).constants(report, motion_table(plan, 0.1))[0].limits
     assert made.frozen_torque_Nm == pytest.approx(watched_Nm)
     assert made.frozen_torque_Nm < plan.torque_Nm
 
@@ -68,10 +67,10 @@ def test_room_on_both_sides_is_needed(tmp_path: Path, start_rad: float, refused:
     config = config_with(tmp_path)
     plan = make_plan(config, None)
     if not refused:
-        require_room(config, plan, start_rad)
+        CheckMotion(config, plan).require_start(start_rad)
         return
     with pytest.raises(ConfigurationError, match=r"needs \[-0\.66\.\.0\.66\]"):
-        require_room(config, plan, start_rad)
+        CheckMotion(config, plan).require_start(start_rad)
 
 
 def test_a_coarse_encoder_takes_more_travel_and_time_and_is_told_so(tmp_path: Path) -> None:
@@ -85,7 +84,7 @@ def test_a_coarse_encoder_takes_more_travel_and_time_and_is_told_so(tmp_path: Pa
     config = config_with(tmp_path, encoder__counts_per_turn=8192)
     assert make_plan(config, None).velocity_radps > 2.0 * velocity_of_a_count_radps(config) > fine.velocity_radps
     report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.1, 0.06, 1e-5)
-    assert "braked beyond 0.23 rad to either side" in " ".join(check_envelope(config, plan, report))
+    assert "braked beyond 0.23 rad to either side" in " ".join(CheckMotion(config, plan).placed(report).lines)
     coarsest = config_with(tmp_path, encoder__counts_per_turn=512, control__velocity_cutoff_Hz=10.0)
     assert make_plan(coarsest, None).travel_rad == 0.3
 

@@ -98,10 +98,10 @@ def test_an_interruption_does_not_hide_the_fault(
     text = fault_text(fault, 0.6, 0) if fault is not Fault.NONE else None
     result = SimpleNamespace(
         stopped_by="SIGINT", drive_state="switch on disabled", records=sound_records(config), fault=fault,
-        fault_text=text, log_path=tmp_path / "run.mcap",
+        fault_text=text, log_path=tmp_path / "run.mcap", report=SimpleNamespace(counts_per_motor_turn=0.0),
     )  # fmt: skip
     stub = lambda *_: SimpleNamespace(run=lambda: result)  # noqa: E731
-    monkeypatch.setattr(doctor_motion_module, "CheckSupervisor", stub)
+    monkeypatch.setattr(doctor_motion_module, "Session", stub)
     code = doctor_motion_module.doctor_motion(config, Output(), assume_yes=True)
     told = capsys.readouterr()
     assert code == (130 if fault is Fault.NONE else 1)

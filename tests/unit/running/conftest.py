@@ -10,9 +10,9 @@ import pytest
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import TrajectoryKind
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.configuration.records import axis_constants
 from jointctl.tools.running.loop import portable_loop
 from jointctl.tools.running.loop.shared_block import SharedBlock
+from tests.sessions import constants_of
 from tests.unit.running.portable_bus import LIMIT, OWN_HEARTBEAT, RPDO, SYNC, TPDO, Clock
 
 
@@ -35,7 +35,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 def block(clock: Clock, warm: None) -> Iterator[SharedBlock]:
     """Holds position 0 for 50 ms; no limit of the schedule or of the supervisor is at work."""
     block = SharedBlock.create(1)
-    block.constants[:] = axis_constants(load_config(shipped_config("virtual")), start_position_rad=0.0)
+    block.constants[:] = constants_of(load_config(shipped_config("virtual")), start_position_rad=0.0)
     axis = block.constants[0]
     axis.trajectory.kind = TrajectoryKind.HOLD
     axis.trajectory.duration_s = 0.05

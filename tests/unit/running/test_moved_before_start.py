@@ -13,13 +13,14 @@ from jointctl.drivers.drive import CommissioningReport, DriveIdentity
 from jointctl.firmware_py.states import AxisPhase, DriveState, Fault
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
-from jointctl.tools.configuration.records import MOVED_COUNTS, axis_constants
-from jointctl.tools.motion_check.plan import check_constants, config_of_check, make_plan, motion_table
+from jointctl.tools.configuration.records import MOVED_COUNTS
+from jointctl.tools.motion_check.plan import CheckMotion, config_of_check, make_plan, motion_table
 from jointctl.tools.simulation.lockstep import LockstepJoint
 from jointctl.tools.sweeping.carry_out import middle_rad, sweep_constants
 from jointctl.tools.sweeping.grid import both_directions, ordered_points
 from jointctl.tools.sweeping.plan import PlanSettings, plan_motion, shifted
 from tests.places import CONFIGS
+from tests.sessions import constants_of
 
 
 def config_with(folder: Path, **changes: str) -> Config:
@@ -60,11 +61,11 @@ def test_within_the_following_error_it_is_driven(tmp_path: Path, by_rad: float) 
 
 def test_the_tolerance(tmp_path: Path) -> None:
     config = config_with(tmp_path)
-    sequence = axis_constants(config, start_position_rad=0.25)[0].sequence
+    sequence = constants_of(config, start_position_rad=0.25)[0].sequence
     assert (sequence.start_rad, sequence.moved_max_rad) == (0.25, config.limits.following_error_max_rad)
-    assert axis_constants(config)[0].sequence.moved_max_rad == 0.0  # not known where it stands: not checked
+    assert constants_of(config)[0].sequence.moved_max_rad == 0.0  # not known where it stands: not checked
     coarse = config_with(tmp_path, counts_per_turn="256", following_error_max_rad="0.05", velocity_cutoff_Hz="5.0")
-    sequence = axis_constants(coarse, start_position_rad=0.25)[0].sequence
+    sequence = constants_of(coarse, start_position_rad=0.25)[0].sequence
     assert sequence.moved_max_rad == pytest.approx(MOVED_COUNTS * math.tau / 256)
 
 
@@ -88,5 +89,5 @@ def test_the_motion_check_looks_as_well(tmp_path: Path) -> None:
     config = config_with(tmp_path)
     plan = make_plan(config, None)
     report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.1, 0.06, 1e-5)
-    check = check_constants(config_of_check(config, plan), plan, report, motion_table(plan, 0.1))[0].sequence
+    check = CheckMotion(config_of_check(config, plan), plan).constants(report, motion_table(plan, 0.1))[0].sequence
     assert (check.start_rad, check.moved_max_rad) == (0.1, pytest.approx(1.25 * plan.travel_rad))

@@ -65,7 +65,7 @@ def test_a_run_tells_them_to_log_display_and_viewers_before_the_fault() -> None:
     )  # fmt: skip
     watch.loop = SimpleNamespace(block=block, new_records=lambda: records)
     watch.around = SimpleNamespace(recorder=None, signals=StopSignals())
-    watch.keep = lambda _: None
+    watch._keep, watch._decimated = lambda _: None, SimpleNamespace(take=lambda new: new)
     watch._orders = SimpleNamespace(keep=lambda _: None)
     watch._notices, watch._events = NoticeFinder(), SimpleNamespace(take=lambda _: [fault])
     watch._tell = lambda event, shown=True: told.append(event)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from jointctl.drivers.drive import CommissioningReport, DriveIdentity
 from jointctl.drivers.errors import DataError, DeviceError
 from jointctl.firmware_py.realtime import HISTOGRAM_BINS, Histogram
 from jointctl.firmware_py.states import Fault
@@ -27,6 +28,8 @@ from tests.run_records import run_records
 CONFIG = load_config(shipped_config("virtual"))
 WITHOUT_PICTURE = CONFIG.model_copy(update={"log": CONFIG.log.model_copy(update={"picture": False})})
 
+REPORT = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.0, 0.1, 1e-5)
+
 
 def result(folder: Path, fault: Fault) -> RunResult:
     records = run_records()
@@ -34,7 +37,7 @@ def result(folder: Path, fault: Fault) -> RunResult:
     return RunResult(
         summary=summarise(records, histograms), records=records, histograms=histograms, fault=fault,
         fault_text=fault_text(fault, 5.0, 0) if fault is not Fault.NONE else None, stopped_by="", drive_state="off",
-        bus_load=0.3, serial=True, lost_records=0, log_path=folder / "run.mcap",
+        bus_load=0.3, serial=True, lost_records=0, log_path=folder / "run.mcap", report=REPORT,
     )  # fmt: skip
 
 

@@ -15,23 +15,19 @@ from jointctl.drivers.drive import UNTOUCHED, CommissioningReport, DriveIdentity
 from jointctl.drivers.errors import ConfigurationError, DeviceError, MotionFault
 from jointctl.firmware_py.friction import branch_torque_Nm
 from jointctl.firmware_py.realtime import HISTOGRAM_BINS, Histogram
-from jointctl.firmware_py.states import Fault
+from jointctl.firmware_py.states import CommandKind, Fault
 from jointctl.tools.configuration import checks
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import RADPS_PER_UNIT, friction_constants
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.configuration.records import trajectory_table
 from jointctl.tools.output import Output
-from jointctl.tools.running.control import Control
 from jointctl.tools.running.display.phase_lines import PhaseLines
-from jointctl.tools.running.permission.envelope import motion_envelope
-from jointctl.tools.running.permission.readiness import require_start
-from jointctl.tools.running.run_watch import Around, RunParts
+from jointctl.tools.running.plan import resolve
+from jointctl.tools.running.run_watch import Around, RunParts, RunWatch
 from jointctl.tools.running.stop_signals import StopSignals
-from jointctl.tools.running.supervisor import Supervisor
 from jointctl.tools.running.watch.bus_watch import BusWatch
 from jointctl.tools.simulation.lockstep import LockstepJoint
-from jointctl.tools.sweeping.carry_out import SweepSupervisor
+from jointctl.tools.sweeping.carry_out import POSITION_GAIN_ps
 from jointctl.tools.sweeping.checks import require_torque
 from jointctl.tools.sweeping.options import SweepOptions, make_plan
 from jointctl.tools.verbs import scope as scope_module
@@ -63,9 +59,9 @@ def test_without_an_approach_the_joint_must_stand_where_the_trajectory_begins(
 ) -> None:
     config = config_of(tmp_path, AT_ONCE)
     with pytest.raises(MotionFault, match="approach_s") if refused else contextlib.nullcontext():
-        require_start(config, start_rad)
-    require_start(config_of(tmp_path), start_rad)  # with one it may stand elsewhere
-    lines = motion_envelope(config, report(start_rad))
+        resolve(config).motion.require_start(start_rad)
+    resolve(config_of(tmp_path)).motion.require_start(start_rad)  # with one it may stand elsewhere
+    lines = resolve(config).motion.placed(report(start_rad)).lines
     assert "approach   none: at once to +0.0000 rad" in lines
 
 
@@ -76,7 +72,7 @@ def test_that_is_why_it_would_be_pulled_there_with_all_its_torque(tmp_path: Path
     assert run.fault is Fault.NONE  # 0.04 rad are less than the following error that is allowed
     assert np.max(np.abs(run.log.command_torque_Nm)) == config.limits.torque_max_Nm
     with pytest.raises(MotionFault, match="approach_s"):
-        require_start(config, joint.report.start_position_rad)
+        resolve(config).motion.require_start(joint.report.start_position_rad)
 
 
 # --- the second sine -----------------------------------------------------------------------------------------------
@@ -118,24 +114,19 @@ def with_table(tmp_path: Path) -> tuple[Config, Path]:
     return load_config(path), way
 
 
-@pytest.mark.parametrize(
-    ("text", "same"),
-    [
-        ("time_s,position_rad\n0,0\n1,0.1\n2,0.2\n3,0.2\n", True),
-        ("time_s,position_rad\n0,0\n1,0.1\n2,0.2\n", False),  # shorter: the loop would stop dead at its second row
-        ("time_s,position_rad\n0,0.4\n1,0.1\n2,0.2\n3,0.2\n", False),
-    ],
-)
-def test_a_table_that_was_edited_meanwhile_is_not_carried_out(tmp_path: Path, text: str, same: bool) -> None:
+@pytest.mark.parametrize("text", ["time_s,position_rad\n0,0\n1,0.1\n", "time_s,position_rad\n0,0.4\n1,0.1\n", ""])
+def test_a_table_that_was_edited_meanwhile_changes_nothing(tmp_path: Path, text: str) -> None:
+    """The file is read once, when the run is planned: what was shown is what the loop gets."""
     config, way = with_table(tmp_path)
-    supervisor = Supervisor(config, Output(), tmp_path / "log.mcap", lambda _: True, Control(StopSignals()))
-    loop: Any = SimpleNamespace(block=SimpleNamespace(table=trajectory_table(config)))
+    plan, before = resolve(config), resolve(config).motion.placed(report())
     way.write_text(text)
-    if same:
-        assert supervisor._constants(loop, report())[0].trajectory.table_rows == 4
-        return
-    with pytest.raises(ConfigurationError, match=r"trajectory\.file was changed after it had been read"):
-        supervisor._constants(loop, report())
+    placed = plan.motion.placed(report())
+    plan.motion.require_start(0.1)
+    assert np.array_equal(placed.table, before.table)
+    assert np.array_equal(placed.table, plan.motion.table)
+    assert placed.constants.tobytes() == before.constants.tobytes()
+    assert placed.constants[0].trajectory.table_rows == 4
+    assert placed.lines == before.lines
 
 
 # --- what the user is told -----------------------------------------------------------------------------------------
@@ -166,14 +157,11 @@ def test_a_drive_that_says_nothing_is_told_by_the_loop_and_not_as_a_delay(
     loop: Any = SilentLoop(samples)
     nothing: Any = None
     parts = RunParts(loop, Around(StopSignals(), BusWatch(config, None)), log, nothing, PhaseLines(Output()), {})
-    control = Control(StopSignals())
-    supervisor: Supervisor = Supervisor(config, Output(), log.path, lambda _: True, control)
+    plan = resolve(config)
+    axis = plan.motion.placed(report()).constants[0]
     if velocity:
-        supervisor = SweepSupervisor(
-            config, Output(), log.path, lambda _: True, nothing, nothing, lambda _: None, control
-        )
-        supervisor._velocity_mode = True
-    with supervisor._make_watch(parts) as watch:
+        axis.command_kind, axis.velocity_command.position_gain_ps = CommandKind.VELOCITY, POSITION_GAIN_ps
+    with RunWatch(plan, axis, parts) as watch:
         watch.check_delay()
     assert loop.may_enable is (samples > 0)
     assert (watch.delay_s is None) is (samples == 0)

@@ -10,20 +10,23 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.drive import CommissioningReport, DriveIdentity
-from jointctl.drivers.errors import MotionFault
+from jointctl.drivers.errors import DECLINED, MotionFault
 from jointctl.firmware_py.realtime import HISTOGRAM_BINS, Word
 from jointctl.firmware_py.records import AxisState, LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, StopRequest
-from jointctl.tools.configuration.records import axis_constants
 from jointctl.tools.output import Output
+from jointctl.tools.running import session as session_module
 from jointctl.tools.running.changes.new_motion import new_motion
 from jointctl.tools.running.display.panel import time_left
 from jointctl.tools.running.display.viewer_request import ViewerRequest
+from jointctl.tools.running.plan import resolve
 from jointctl.tools.running.run_watch import Around, RunParts, RunWatch
+from jointctl.tools.running.session import Session
 from jointctl.tools.running.stop_signals import StopSignals
 from jointctl.tools.running.watch.bus_watch import BusWatch
 from jointctl.tools.verbs import scope as scope_module
+from tests.sessions import constants_of
 
 TABLE = np.zeros((1, 5))
 
@@ -96,7 +99,7 @@ def test_a_motion_without_an_end_says_so(
     assert words.endswith(", until stopped") is not ends
     assert virtual_config.trajectory.duration_s > 0.0
     shown: list[Any] = []
-    axis = axis_constants(virtual_config, start_position_rad=0.0)
+    axis = constants_of(virtual_config, start_position_rad=0.0)
     axis[0].trajectory = constants[0]  # as the loop has taken it
     block = SimpleNamespace(
         constants=axis,
@@ -109,7 +112,7 @@ def test_a_motion_without_an_end_says_so(
     sink.write_event = lambda *_: None
     loop: Any = SimpleNamespace(block=block, new_records=lambda: new(LogRecord, 1).view(np.recarray))
     around = Around(StopSignals(), BusWatch(virtual_config, None))
-    RunWatch(virtual_config, RunParts(loop, around, sink, sink, display, {})).take_records()
+    RunWatch(resolve(virtual_config), axis[0], RunParts(loop, around, sink, sink, display, {})).take_records()
     assert (time_left(1e4, shown[0].duration_s, AxisPhase.TRACKING) == "until stopped") is not ends
 
 
@@ -150,27 +153,23 @@ def test_what_run_checks_is_checked_before_start(
         if refused:
             raise MotionFault("outside", "move it")
 
-    class Declining:
-        """A supervisor that asks and does not run."""
-
-        drive_state = "switch on disabled"
-
-        def __init__(self, config: Any, output: Any, path: Any, confirm: Any, control: Any, **_: Any) -> None:
-            self._confirm = confirm
+    class Asking(Session):
+        """Asks, and does not run."""
 
         def run(self) -> None:
-            self._confirm(CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.0, 0.1, 1e-5))
+            self.drive_state = "switch on disabled"
+            self._allowed(CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.0, 0.1, 1e-5))
 
-    monkeypatch.setattr(scope_module, "Supervisor", Declining)
-    monkeypatch.setattr(scope_module, "require_ready", require_ready)
-    monkeypatch.setattr(scope_module, "prepare_log", lambda *_: calls.append("log prepared"))
+    monkeypatch.setattr(scope_module, "Session", Asking)
+    monkeypatch.setattr(session_module, "require_ready", require_ready)
+    monkeypatch.setattr(session_module, "prepare_log", lambda *_: calls.append("log prepared"))
     feed: Any = Feed()
     runs = scope_module._Runs(virtual_config, Output(), feed, "title", allow_low_margin=False)
     assert runs.one() is False
     assert calls == (["checked"] if refused else ["checked", "log prepared"])
     assert ("ready" in [told["stage"] for told in feed.told]) is not refused
     assert feed.told[-1]["stage"] == ("ended" if refused else "declined")
-    assert runs.code == (7 if refused else 0)
+    assert runs.code == (7 if refused else DECLINED)
     assert runs.drive_state == "switch on disabled"
 
 

@@ -36,7 +36,7 @@ def new_motion(config: Config, table: Any, values: Mapping[str, Any]) -> tuple[A
     trajectory = _trajectory(config, values)
     constants = new(TrajectoryConstants)
     record: Any = constants[0]
-    fill_trajectory(record, config.model_copy(update={"trajectory": trajectory}))
+    fill_trajectory(record, config.model_copy(update={"trajectory": trajectory}), table)
     if record.kind == TrajectoryKind.SINE:
         record.shift_s, record.switch_s = 0.5 * math.pi / record.omega_radps, 0.0
     peak = peak_of(record, table)

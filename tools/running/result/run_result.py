@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from jointctl.drivers.drive import CommissioningReport
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.recording.run_summary import RunSummary
 from jointctl.tools.running.events.fault_text import FaultText
@@ -28,3 +29,4 @@ class RunResult:
     serial: bool
     lost_records: int
     log_path: Path
+    report: CommissioningReport

@@ -23,7 +23,7 @@ from jointctl.drivers.drive import UNTOUCHED, CommissioningReport, Declined, Dri
 from jointctl.drivers.errors import BusError, DataError, DeviceError, NoDeviceError
 from jointctl.hil.canopen.records import PowerState
 from jointctl.tools.output import Output
-from jointctl.tools.running import supervisor as supervisor_module
+from jointctl.tools.running import session as session_module
 from jointctl.tools.running.result.drive_end import require_off, words
 from jointctl.tools.verbs import run as run_module
 from jointctl.tools.verbs import stop as stop_module
@@ -405,9 +405,9 @@ class NoLoop:
 def left_by_a_dry_run(monkeypatch: pytest.MonkeyPatch, config: Any, state: str) -> int:
     report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.0, 0.1, 1e-5)
     drive = SimpleNamespace(commission=lambda _: report, make_safe=lambda *, asked: state, close=lambda: None)
-    monkeypatch.setattr(supervisor_module, "LoopHandle", NoLoop)
-    monkeypatch.setattr(supervisor_module, "open_drive", lambda *_: drive)
-    monkeypatch.setattr(supervisor_module, "start_guard", lambda *_: None)
+    monkeypatch.setattr(session_module, "LoopHandle", NoLoop)
+    monkeypatch.setattr(session_module, "open_drive", lambda *_: drive)
+    monkeypatch.setattr(session_module, "start_guard", lambda *_: None)
     return run_module.run(config, Output(), assume_yes=True, dry_run=True)
 
 

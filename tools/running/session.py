@@ -1,7 +1,7 @@
 """One run from the configuration to the summary: commission, let the loop go, watch it, log it, make the drive safe.
 
-The supervisor never touches the torque.  It writes a sign of life and a stop word; everything that must happen in
-time happens in the loop process.
+The session supervises: it never touches the torque.  It writes a sign of life and a stop word; everything that must
+happen in time happens in the loop process.
 """
 
 from __future__ import annotations
@@ -9,19 +9,14 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import Any, TypeVar
 
 from jointctl.drivers.drive import Approval, CommissioningReport, Declined, Drive
 from jointctl.drivers.errors import BusError, DataError, DeviceError, JointctlError, MotionFault, NoDeviceError
 from jointctl.firmware_py.states import Fault, StopRequest
-from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.records import axis_constants, trajectory_table
 from jointctl.tools.output import Output
 from jointctl.tools.recording.kept_records import KeptRecords
-from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, RunLogWriter
+from jointctl.tools.recording.run_log import ERROR, INFO, THINNING, WARNING, RunLogWriter
 from jointctl.tools.recording.run_metadata import run_metadata
 from jointctl.tools.recording.run_summary import summarise
 from jointctl.tools.running.control import Control
@@ -32,7 +27,9 @@ from jointctl.tools.running.guard.guard_handle import GuardHandle, start_guard
 from jointctl.tools.running.guard.kept_awake import kept_awake
 from jointctl.tools.running.loop.loop_handle import LoopHandle
 from jointctl.tools.running.open_drive import check_cyclic_rate, commission, drive_fault_text, open_drive
-from jointctl.tools.running.permission.readiness import require_same_motion
+from jointctl.tools.running.permission.consent import Consent
+from jointctl.tools.running.permission.readiness import prepare_log, require_ready
+from jointctl.tools.running.plan import Placed, RunPlan
 from jointctl.tools.running.result.drive_end import warn_unless_off
 from jointctl.tools.running.result.run_result import RunResult as RunResult
 from jointctl.tools.running.run_watch import Around, RunParts, RunWatch
@@ -42,6 +39,7 @@ from jointctl.tools.running.watch.frame_recorder import recording
 from jointctl.tools.running.watch.temperature_watch import TemperatureWatch
 
 POLL_S = 0.02
+Answer = TypeVar("Answer")
 
 
 def came_before(fault: Fault, records: Any, time_ns: int) -> bool:
@@ -50,40 +48,35 @@ def came_before(fault: Fault, records: Any, time_ns: int) -> bool:
     return fault is not Fault.NONE and len(faulty) > 0 and int(faulty[0].time_ns) <= time_ns
 
 
-class Supervisor:
-    """Carries out one run.  `confirm(report)` is asked before anything can move; False ends the run.
+class Session:
+    """Carries out one plan: run, sweep, motion check and live page differ in plan, consent and display only.
 
-    `display` makes what shows the run while it goes on; by default a line for each phase.
+    `consent` has the last word before anything moves.  `display` makes what shows the run, once the joint is known;
+    by default a line for each phase.
     """
 
     def __init__(
         self,
-        config: Config,
+        plan: RunPlan,
+        consent: Consent,
         output: Output,
-        log_path: Path,
-        confirm: Callable[[CommissioningReport], bool],
         control: Control,
-        *,
-        approve: Approval | None = None,
-        allow_low_margin: bool = False,
-        display: Callable[[], Display] | None = None,
+        display: Callable[[CommissioningReport], Display] | None = None,
     ) -> None:
-        """`approve` is asked before a drive that is found enabled is braked; None: it is left as it is."""
-        self._config, self._output, self._log_path, self._confirm = config, output, log_path, confirm
-        self._control, self._approve = control, approve
+        self.plan, self._config = plan, plan.config
+        self._consent, self._output, self._control = consent, output, control
         self.signals = control.signals
-        self._allow_low_margin = allow_low_margin
-        self._make_display = display or (lambda: PhaseLines(output))
+        self._make_display = display or (lambda _: PhaseLines(output))
         self.drive_state = ""  # in words, after the run
 
     def run(self) -> RunResult | None:
-        """The whole run; None if the user declined.  Afterwards the drive is off, or `drive_state` says otherwise."""
+        """The whole run; None if it was declined.  Afterwards the drive is off, or `drive_state` says otherwise."""
         config, signals = self._config, self.signals
         check_cyclic_rate(config)
-        tail_path = self._log_path.with_suffix(".tail.mcap")
+        tail_path = self.plan.log_path.with_suffix(".tail.mcap")
         with (
             signals.held(),
-            LoopHandle(config, self._table(), tail_path, self._control.marker_fd) as loop,
+            LoopHandle(config, self.plan.motion.table, tail_path, self._control.marker_fd) as loop,
             recording(config) as recorder,
             bus_watch(config) as bus_news,
             kept_awake(config, self._output),
@@ -93,23 +86,24 @@ class Supervisor:
             try:
                 guard = start_guard(config, loop)
                 try:
-                    report = commission(config, drive, self._asking(self._approve))
+                    report = commission(config, drive, self._may_brake())
                 except Declined:
                     return None
                 signals.leave_if_asked()
-                if not self._ask(lambda: self._confirm(report)):
+                placed = self._ask(lambda: self._allowed(report))
+                if placed is None:
                     return None
                 loop.wait_ready(signals.leave_if_asked, self._output.note)
                 signals.leave_if_asked()
                 if guard is not None:
                     guard.wait_ready()
-                return self._supervise(drive, loop, report, Around(signals, bus_news, recorder, guard))
+                return self._supervise(drive, loop, report, placed, Around(signals, bus_news, recorder, guard))
             except (BusError, DeviceError, NoDeviceError):
                 if signals.commanded_ns:  # the frames of that stop look like another controller's
                     raise KeyboardInterrupt from None
                 raise
             except OSError as error:
-                raise DataError(f"{self._log_path}: cannot be written: {error.strerror or error}") from None
+                raise DataError(f"{self.plan.log_path}: cannot be written: {error.strerror or error}") from None
             finally:
                 self.drive_state = drive.make_safe(asked=bool(signals.commanded_ns))
                 drive.close()
@@ -117,7 +111,7 @@ class Supervisor:
                     guard.release(self.drive_state)
                 warn_unless_off(self.drive_state, self._output)
 
-    def _ask(self, question: Callable[[], bool]) -> bool:
+    def _ask(self, question: Callable[[], Answer]) -> Answer:
         """The answer of the user, whom a stop may interrupt."""
         self.signals.raising = True
         try:
@@ -125,40 +119,44 @@ class Supervisor:
         finally:
             self.signals.raising = False
 
-    def _asking(self, approve: Approval | None) -> Approval | None:
-        return None if approve is None else lambda text: self._ask(lambda: approve(text))
+    def _may_brake(self) -> Approval | None:
+        brake = self._consent.brake
+        return None if brake is None else lambda text: self._ask(lambda: brake(text))
 
-    def _table(self) -> np.ndarray:
-        """Rows of the motion, (N, 5); their number is fixed before the drive is known."""
-        return trajectory_table(self._config)
+    def _allowed(self, report: CommissioningReport) -> Placed | None:
+        """The motion from where the joint stands, shown, possible and agreed to; None if it is not to be."""
+        plan, start_rad = self.plan, report.start_position_rad
+        placed = plan.motion.placed(report)
+        self._consent.show(placed.lines)
+        if self._consent.dry_run:
+            return None
+        require_ready(self._config, report, plan.log_path)
+        plan.motion.require_start(start_rad)
+        if not self._consent.agreed(placed.lines):
+            return None
+        prepare_log(self._config, plan.log_path, self._output)
+        return placed
 
-    def _constants(self, loop: LoopHandle, report: CommissioningReport) -> Any:
-        """`AxisConstants` for the joint as it was found; may still write the rows of `loop.block.table`."""
-        constants = axis_constants(self._config, start_position_rad=report.start_position_rad)
-        require_same_motion(self._config, loop.block.table)
-        return constants
-
-    def _metadata(self, report: CommissioningReport) -> dict[str, dict[str, str]]:
-        """What the log says besides the records."""
-        return run_metadata(self._config, report)
-
-    def _make_watch(self, parts: RunParts) -> RunWatch:
-        """The watch over the run that is about to begin."""
-        return RunWatch(self._config, parts, allow_low_margin=self._allow_low_margin)
-
-    def _supervise(self, drive: Drive, loop: LoopHandle, report: CommissioningReport, around: Around) -> RunResult:
-        metadata = self._metadata(report)
+    def _supervise(
+        self, drive: Drive, loop: LoopHandle, report: CommissioningReport, placed: Placed, around: Around
+    ) -> RunResult:
+        plan = self.plan
+        metadata = run_metadata(self._config, report)
+        if plan.log_every > 1:
+            metadata[THINNING] = {"every": str(plan.log_every), "whole_s": f"{plan.log_full_rate_s:g}"}
+        loop.block.table[:] = placed.table
+        placed.constants[0].sequence.may_enable = 0
         with (
-            RunLogWriter(self._log_path, metadata) as log,
-            KeptRecords(self._log_path.parent) as kept,
-            self._make_display() as display,
+            RunLogWriter(plan.log_path, metadata) as log,
+            KeptRecords(plan.log_path.parent) as kept,
+            self._make_display(report) as display,
+            RunWatch(plan, placed.constants[0], RunParts(loop, around, log, kept, display, metadata)) as watch,
         ):
-            constants = self._constants(loop, report)
-            constants[0].sequence.may_enable = 0
-            with self._make_watch(RunParts(loop, around, log, kept, display, metadata)) as watch:
-                return self._carry_out(drive, loop, constants, watch)
+            return self._carry_out(drive, loop, placed.constants, report, watch)
 
-    def _carry_out(self, drive: Drive, loop: LoopHandle, constants: Any, watch: RunWatch) -> RunResult:
+    def _carry_out(
+        self, drive: Drive, loop: LoopHandle, constants: Any, report: CommissioningReport, watch: RunWatch
+    ) -> RunResult:
         signals = watch.around.signals
         loop.listen()
         signals.on_command = loop.request_stop
@@ -175,13 +173,13 @@ class Supervisor:
                 time.sleep(POLL_S)
         except MotionFault as error:
             state = drive.make_safe()
-            watch.take_records()
+            watch.take_records(last=True)
             watch.tell_bus_news()
             watch.log.write_event(ERROR, "supervisor", str(error))
             raise MotionFault(error.message, f"{error.hint}; drive state now: {state}") from None
         except (DeviceError, BusError) as error:  # another program has the drive, or has changed what stops it
             self._brake(loop, signals, StopRequest.QUICK_STOP)
-            watch.take_records()
+            watch.take_records(last=True)
             # `jointctl stop` sends such frames as well
             if not signals.commanded_ns and not self._explained_by_restart(error, loop):
                 watch.log.write_event(ERROR, "supervisor", str(error))
@@ -190,16 +188,16 @@ class Supervisor:
             self._brake(loop, signals)
             raise
         elapsed_s = (time.monotonic_ns() - started_ns) * 1e-9
-        watch.take_records()
+        watch.take_records(last=True)
         self._raise_what_others_did(watch, loop)
         state = drive.make_safe(asked=bool(signals.commanded_ns))
-        watch.take_records()
+        watch.take_records(last=True)
         watch.tell_bus_news()  # it often explains the fault that has ended the run
         watch.log.write_event(INFO, "drive", f"after the run: {state}")
         recorder = watch.around.recorder
         if recorder is not None and recorder.dropped:
             watch.log.write_event(WARNING, "log", f"{recorder.dropped} CAN frames were not recorded: too slow")
-        return self._result(watch, state, elapsed_s)
+        return self._result(watch, report, state, elapsed_s)
 
     @staticmethod
     def _explained_by_restart(error: JointctlError, loop: LoopHandle) -> bool:
@@ -232,7 +230,7 @@ class Supervisor:
                 loop.beat()
                 time.sleep(POLL_S)
 
-    def _result(self, watch: RunWatch, drive_state: str, elapsed_s: float) -> RunResult:
+    def _result(self, watch: RunWatch, report: CommissioningReport, drive_state: str, elapsed_s: float) -> RunResult:
         loop = watch.loop
         if not len(watch.kept):
             raise JointctlError("the loop ended without one cycle")
@@ -258,5 +256,6 @@ class Supervisor:
             bus_load=float(loop.block.port[0].bits_sent) / (self._config.bus.bitrate_bitps * elapsed_s),
             serial=self._config.is_serial,
             lost_records=loop.lost_records,
-            log_path=self._log_path,
+            log_path=self.plan.log_path,
+            report=report,
         )

@@ -1,0 +1,136 @@
+"""What a run is, resolved before anything is opened: configuration in force, motion, log, and what of it is recorded.
+
+Every file is read here, once.  What a session does beyond this plan depends on the joint alone, as commissioning finds
+it (`Motion.placed`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from jointctl.drivers.drive import CommissioningReport
+from jointctl.drivers.errors import MotionFault
+from jointctl.firmware_py.records import Reference, TrajectoryConstants
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.trajectory import approach_start, peak_of, reference_at
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.records import axis_constants, fill_trajectory, trajectory_table
+from jointctl.tools.recording.log_folder import log_path
+
+START_SHARE = 0.1  # of the following error: how far from the trajectory a run without an approach may begin
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A motion from where the joint stands: what the loop gets, and the same in words."""
+
+    constants: Any  # array of one AxisConstants
+    table: np.ndarray  # rows of the reference, float64 (N, 5)
+    lines: tuple[str, ...]  # the motion envelope
+
+
+class Motion(Protocol):
+    """What a session moves: a configured trajectory, the plateaus of a sweep, the spring of the motion check."""
+
+    @property
+    def table(self) -> np.ndarray:
+        """Rows of the reference, float64 (N, 5), before the joint is known; their number is final."""
+        ...
+
+    def placed(self, report: CommissioningReport) -> Placed:
+        """From where commissioning found the joint; `JointctlError` where that cannot be."""
+        ...
+
+    def require_start(self, start_position_rad: float) -> None:
+        """`JointctlError` where the motion must not begin from there; asked when the envelope was shown."""
+        ...
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """One run, whichever verb it is for.  `log_every` above 1: only so many records go into the log, the last
+    `log_full_rate_s` seconds all of them.
+    """
+
+    config: Config
+    motion: Motion
+    log_path: Path
+    allow_low_margin: bool = False
+    log_every: int = 1
+    log_full_rate_s: float = 0.0
+
+
+def joint_lines(report: CommissioningReport) -> list[str]:
+    """Of every envelope: which drive it is, and where the joint stands."""
+    identity = report.identity
+    return [
+        f"drive      {identity.name or 'unnamed'}, vendor {identity.vendor}, serial {identity.serial or 'unknown'}, "
+        f"{report.mode}",
+        f"now at     {report.start_position_rad:+.4f} rad",
+    ]
+
+
+def remark_lines(remarks: Iterable[str]) -> list[str]:
+    """The last lines of every envelope."""
+    return [f"remark     {remark}" for remark in remarks]
+
+
+def resolve(config: Config, *, allow_low_margin: bool = False) -> RunPlan:
+    """The plan of `run`; `ConfigurationError` for a table that leaves the limits or cannot be read."""
+    motion = ConfiguredMotion(config, trajectory_table(config))
+    return RunPlan(config, motion, log_path(config), allow_low_margin)
+
+
+@dataclass(frozen=True)
+class ConfiguredMotion:
+    """Section [trajectory]; see `Motion`."""
+
+    config: Config
+    table: np.ndarray
+
+    def placed(self, report: CommissioningReport) -> Placed:
+        """See `Motion`."""
+        constants = axis_constants(self.config, self.table, start_position_rad=report.start_position_rad)
+        return Placed(constants, self.table, tuple(self._envelope(constants[0], report)))
+
+    def require_start(self, start_position_rad: float) -> None:
+        """`MotionFault` if there is no approach and the trajectory begins elsewhere: it would be pulled there."""
+        if self.config.sequence.approach_s != 0.0:
+            return
+        constants = new(TrajectoryConstants)
+        fill_trajectory(constants[0], self.config, self.table)
+        first_rad = float(approach_start(constants[0], self.table).position_rad)
+        allowed_rad = START_SHARE * self.config.limits.following_error_max_rad
+        if not abs(first_rad - start_position_rad) <= allowed_rad:
+            raise MotionFault(
+                f"the joint stands at {start_position_rad:.4f} rad, and with sequence.approach_s (=0) it must stand "
+                f"within {allowed_rad:g} rad of the beginning of the trajectory, {first_rad:.4f} rad",
+                'give it time, sequence.approach_s = "auto"; without, it would be pulled there with all its torque',
+            )
+
+    def _envelope(self, axis: Any, report: CommissioningReport) -> list[str]:
+        """Lines that say where the joint will go, how fast, with how much torque, for how long."""
+        config = self.config
+        low, high, speed, acceleration = peak_of(axis.trajectory, self.table)
+        first = new(Reference)[0]
+        reference_at(axis.trajectory, self.table, 0, 0.0, first)
+        approach = float(axis.sequence.approach_s)
+        limits, duration = config.limits, config.trajectory.duration_s
+        time_text = f"{approach + duration:.0f} s" if duration else "until stopped"
+        return [
+            *joint_lines(report),
+            f"approach   to {first.position_rad:+.4f} rad in {approach:.1f} s"
+            if approach
+            else f"approach   none: at once to {first.position_rad:+.4f} rad",
+            f"trajectory {config.trajectory.kind}: {low:+.4f} .. {high:+.4f} rad, up to {speed:.3f} rad/s "
+            f"and {acceleration:.3f} rad/s2, {time_text}",
+            f"limits     {limits.position_min_rad:+.3f} .. {limits.position_max_rad:+.3f} rad, "
+            f"{limits.velocity_max_radps:.2f} rad/s, {limits.torque_max_Nm:.1f} Nm, "
+            f"following error {limits.following_error_max_rad:.3f} rad",
+            *remark_lines(report.remarks),
+        ]
