@@ -1,7 +1,7 @@
 """A joint-side encoder as a node of its own (CiA 406): identified, checked, and sending its position at every SYNC.
 
 It is a sensor: nothing in it can move the joint, so it needs no watchdog of ours.  Its silence, its EMCY and its
-restart end the run (`second_position`).
+restart end the run (`cyclic.publish_sample`).
 """
 
 from __future__ import annotations

@@ -6,11 +6,10 @@ import math
 from typing import Any
 
 from jointctl.drivers.canopen.cia402 import State
+from jointctl.drivers.canopen.cyclic import AlignTo, CanopenPort, centred
 from jointctl.drivers.canopen.encoder_settings import DRIVE_RANGE_COUNTS, JointEncoderSettings
 from jointctl.drivers.canopen.identifiers import EMERGENCY_ID, HEARTBEAT_ID, SYNC_ID, TPDO1_ID, TPDO2_ID
 from jointctl.drivers.canopen.pdo_layout import PdoLayout, own_layout
-from jointctl.drivers.canopen.port import AlignTo, CanopenPort
-from jointctl.drivers.canopen.second_position import centred
 from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.firmware_py.schema import new
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.canopen.port import CanopenPort
+from jointctl.drivers.canopen.cyclic import CanopenPort
 from jointctl.drivers.elmo.port import SERIAL, ElmoPort
 from jointctl.firmware_py.realtime import HISTOGRAM_BINS, WORDS, Histogram, Word
 from jointctl.firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample

@@ -12,8 +12,13 @@ from hypothesis import strategies as st
 
 from jointctl.drivers.canopen import exchange
 from jointctl.drivers.canopen.cia402 import State
-from jointctl.drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES, begin_cycle, torque_permille
-from jointctl.drivers.canopen.port import FRAME_SLOTS, SCRATCH_WORDS
+from jointctl.drivers.canopen.cyclic import (
+    FRAME_SLOTS,
+    SCRATCH_WORDS,
+    UNHEEDED_MAX_CYCLES,
+    begin_cycle,
+    torque_permille,
+)
 from jointctl.firmware_py.states import DriveRequest
 from tests.unit.drivers.canopen.wire import STATUSWORDS, Wire
 
