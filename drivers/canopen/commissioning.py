@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from jointctl.drivers.canopen.cia402 import SUPPORTED_MODE_BIT, ControlWord, Mode, State, state_of_word
 from jointctl.drivers.canopen.connection_loss import arm_reaction, arm_rpdo_deadline
-from jointctl.drivers.canopen.eds_file import EdsFile
+from jointctl.drivers.canopen.eds import EdsFile
 from jointctl.drivers.canopen.encoder_node import EncoderFindings, commission_drive_object
 from jointctl.drivers.canopen.object_access import ObjectAccess
 from jointctl.drivers.canopen.pdo_layout import TARGET_TORQUE, TARGET_VELOCITY, PdoLayout

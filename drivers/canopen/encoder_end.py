@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import canopen
 
-from jointctl.drivers.canopen.eds_file import read_eds
+from jointctl.drivers.canopen.eds import read_eds
 from jointctl.drivers.canopen.encoder_node import EncoderFindings, commission_encoder, require_no_alarm
 from jointctl.drivers.canopen.identifiers import NmtCommand
 from jointctl.drivers.canopen.network import send_nmt

@@ -7,10 +7,9 @@ from typing import Any
 
 from jointctl.drivers.canopen.cia402 import State
 from jointctl.drivers.canopen.cyclic import AlignTo, CanopenPort, centred
-from jointctl.drivers.canopen.encoder_settings import DRIVE_RANGE_COUNTS, JointEncoderSettings
 from jointctl.drivers.canopen.identifiers import EMERGENCY_ID, HEARTBEAT_ID, SYNC_ID, TPDO1_ID, TPDO2_ID
 from jointctl.drivers.canopen.pdo_layout import PdoLayout, own_layout
-from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.canopen.settings import DRIVE_RANGE_COUNTS, CanopenSettings, JointEncoderSettings
 from jointctl.firmware_py.schema import new
 
 PERMILLE = 1000.0
