@@ -9,7 +9,6 @@ from typing import Any
 
 import can
 
-from jointctl.drivers.canopen.bus_watchers import OtherControllers
 from jointctl.drivers.canopen.commissioning import VELOCITY_MODES, Findings, commission
 from jointctl.drivers.canopen.connection_loss import clear_rpdo_deadlines, rpdo_identifiers, watched_nodes
 from jointctl.drivers.canopen.eds import read_eds
@@ -17,11 +16,10 @@ from jointctl.drivers.canopen.encoder_end import EncoderEnd
 from jointctl.drivers.canopen.fault_reset import reset_fault
 from jointctl.drivers.canopen.found_enabled import brake_if_enabled
 from jointctl.drivers.canopen.identifiers import NmtCommand
-from jointctl.drivers.canopen.network import new_network, report_own_frames
-from jointctl.drivers.canopen.object_access import ATTEMPTS as SDO_ATTEMPTS
-from jointctl.drivers.canopen.object_access import ObjectAccess
+from jointctl.drivers.canopen.network import OtherControllers, new_network, report_own_frames
 from jointctl.drivers.canopen.scaling import joint_angle_per_count_rad, new_port, start_position_rad
-from jointctl.drivers.canopen.sdo_reads import SdoReads
+from jointctl.drivers.canopen.sdo import ATTEMPTS as SDO_ATTEMPTS
+from jointctl.drivers.canopen.sdo import ObjectAccess, SdoReads
 from jointctl.drivers.canopen.settings import DRIVE_RANGE_COUNTS, CanopenSettings
 from jointctl.drivers.canopen.switch_off import POWERED_STATES, SDO_TIMEOUT_S, SwitchOff, state_of
 from jointctl.drivers.canopen.thermometer import Thermometer

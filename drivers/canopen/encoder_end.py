@@ -8,7 +8,7 @@ from jointctl.drivers.canopen.eds import read_eds
 from jointctl.drivers.canopen.encoder_node import EncoderFindings, commission_encoder, require_no_alarm
 from jointctl.drivers.canopen.identifiers import NmtCommand
 from jointctl.drivers.canopen.network import send_nmt
-from jointctl.drivers.canopen.object_access import ObjectAccess
+from jointctl.drivers.canopen.sdo import ObjectAccess
 from jointctl.drivers.canopen.settings import CanopenSettings
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from jointctl.drivers.canopen.cia402 import ControlWord, State, state_of_word
-from jointctl.drivers.canopen.object_access import ObjectAccess
+from jointctl.drivers.canopen.sdo import ObjectAccess
 from jointctl.drivers.errors import DeviceError
 from jointctl.firmware_py.states import in_words
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from jointctl.drivers.at_rest import STOP_HINT, refuse_unless_at_rest
 from jointctl.drivers.canopen.cia402 import State
-from jointctl.drivers.canopen.object_access import ObjectAccess
+from jointctl.drivers.canopen.sdo import ObjectAccess
 from jointctl.drivers.canopen.switch_off import POWERED_STATES, brake, state_of
 from jointctl.drivers.drive import Approval
 from jointctl.drivers.errors import BusError

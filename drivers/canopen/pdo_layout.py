@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jointctl.drivers.canopen.identifiers import RPDO1_ID, TPDO1_ID
-from jointctl.drivers.canopen.object_access import ObjectAccess, object_name
+from jointctl.drivers.canopen.sdo import ObjectAccess, object_name
 from jointctl.drivers.errors import DeviceError
 
 DISABLED = 0x80000000

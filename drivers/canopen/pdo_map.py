@@ -10,7 +10,6 @@ import contextlib
 from dataclasses import replace
 
 from jointctl.drivers.canopen.identifiers import LAST_SYNCHRONOUS
-from jointctl.drivers.canopen.object_access import ObjectAccess, was_refused
 from jointctl.drivers.canopen.pdo_layout import (
     COMMUNICATION_RPDO,
     COMMUNICATION_TPDO,
@@ -32,6 +31,7 @@ from jointctl.drivers.canopen.pdo_layout import (
     own_layout,
     read_map,
 )
+from jointctl.drivers.canopen.sdo import ObjectAccess, was_refused
 from jointctl.drivers.errors import DeviceError
 
 EVERY_SYNC = 1

@@ -19,7 +19,7 @@ from jointctl.drivers.canopen.cia402 import ControlWord, State, state_of_word
 from jointctl.drivers.canopen.eds import standard_type
 from jointctl.drivers.canopen.identifiers import NmtCommand
 from jointctl.drivers.canopen.network import new_network, send_nmt
-from jointctl.drivers.canopen.object_access import ObjectAccess
+from jointctl.drivers.canopen.sdo import ObjectAccess
 from jointctl.drivers.errors import DeviceError, JointctlError
 from jointctl.firmware_py.states import in_words
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from jointctl.drivers.canopen.identifiers import SYNC_ID
-from jointctl.drivers.canopen.object_access import ObjectAccess
+from jointctl.drivers.canopen.sdo import ObjectAccess
 from jointctl.drivers.errors import DeviceError
 
 PRODUCES_SYNC = 0x40000000

@@ -16,8 +16,7 @@ import canopen
 from canopen.objectdictionary import ObjectDictionaryError
 from canopen.objectdictionary.datatypes import NUMBER_TYPES
 
-from jointctl.drivers.canopen.object_access import object_name
-from jointctl.drivers.canopen.sdo_reads import SdoReads
+from jointctl.drivers.canopen.sdo import SdoReads, object_name
 from jointctl.drivers.canopen.settings import TemperatureObject
 from jointctl.drivers.drive import Reading
 from jointctl.drivers.errors import DeviceError

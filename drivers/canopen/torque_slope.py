@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from jointctl.drivers.canopen.object_access import ObjectAccess
+from jointctl.drivers.canopen.sdo import ObjectAccess
 from jointctl.drivers.errors import DeviceError
 
 STEEP_PERMILLE_PS = 1_000_000

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from jointctl.drivers.canopen.object_access import ObjectAccess, object_name
 from jointctl.drivers.canopen.pdo_layout import COMMUNICATION_RPDO, LAST_PDO
 from jointctl.drivers.canopen.pdo_map import EVENT_TIMER
-from jointctl.drivers.canopen.sdo_reads import SdoReads
+from jointctl.drivers.canopen.sdo import ObjectAccess, SdoReads, object_name
 from jointctl.drivers.errors import DeviceError
 
 PERIOD_S = 1.0

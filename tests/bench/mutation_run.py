@@ -33,7 +33,7 @@ TESTS = {  # below UNIT_TESTS
     ),
     "firmware_py/sequence.py": ("firmware_py/axis/test_sequence_*", "firmware_py/axis/test_axis_*"),
     "drivers/canopen/cia402.py": ("drivers/canopen/test_cia402",),
-    "drivers/canopen/bus_watchers.py": ("drivers/canopen/test_other_controllers", "drivers/canopen/test_switch_off"),
+    "drivers/canopen/network.py": ("drivers/canopen/test_other_controllers", "drivers/canopen/test_switch_off"),
     "drivers/at_rest.py": ("drivers/canopen/test_switch_off", "drivers/elmo/test_elmo_commissioning"),
     "drivers/canopen/found_enabled.py": ("drivers/canopen/test_switch_off",),
     "drivers/canopen/switch_off.py": ("drivers/canopen/test_switch_off",),
