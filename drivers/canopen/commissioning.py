@@ -14,10 +14,15 @@ from jointctl.drivers.canopen.cia402 import SUPPORTED_MODE_BIT, ControlWord, Mod
 from jointctl.drivers.canopen.connection_loss import arm_reaction, arm_rpdo_deadline
 from jointctl.drivers.canopen.eds import EdsFile
 from jointctl.drivers.canopen.encoder_node import EncoderFindings, commission_drive_object
-from jointctl.drivers.canopen.pdo_layout import TARGET_TORQUE, TARGET_VELOCITY, PdoLayout
-from jointctl.drivers.canopen.pdo_map import configure_loop_pdos
+from jointctl.drivers.canopen.pdo import (
+    TARGET_TORQUE,
+    TARGET_VELOCITY,
+    PdoLayout,
+    configure_loop_pdos,
+    joint_torque_per_permille_Nm,
+    joint_velocity_per_unit_radps,
+)
 from jointctl.drivers.canopen.readiness import wait_until_ready
-from jointctl.drivers.canopen.scaling import joint_torque_per_permille_Nm, joint_velocity_per_unit_radps
 from jointctl.drivers.canopen.sdo import ObjectAccess
 from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.drivers.canopen.switch_off import POWERED_STATES, state_of

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import contextlib
 
-from jointctl.drivers.canopen.pdo_layout import COMMUNICATION_RPDO, DISABLED, IDENTIFIER
-from jointctl.drivers.canopen.pdo_map import EVENT_TIMER, pdos_of
+from jointctl.drivers.canopen.pdo import COMMUNICATION_RPDO, DISABLED, EVENT_TIMER, IDENTIFIER, pdos_of
 from jointctl.drivers.canopen.sdo import ObjectAccess
 from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.drivers.errors import DeviceError

@@ -17,7 +17,7 @@ from jointctl.drivers.canopen.fault_reset import reset_fault
 from jointctl.drivers.canopen.found_enabled import brake_if_enabled
 from jointctl.drivers.canopen.identifiers import NmtCommand
 from jointctl.drivers.canopen.network import OtherControllers, new_network, report_own_frames
-from jointctl.drivers.canopen.scaling import joint_angle_per_count_rad, new_port, start_position_rad
+from jointctl.drivers.canopen.pdo import joint_angle_per_count_rad, new_port, start_position_rad
 from jointctl.drivers.canopen.sdo import ATTEMPTS as SDO_ATTEMPTS
 from jointctl.drivers.canopen.sdo import ObjectAccess, SdoReads
 from jointctl.drivers.canopen.settings import DRIVE_RANGE_COUNTS, CanopenSettings

@@ -9,11 +9,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jointctl.drivers.canopen.identifiers import TPDO1_ID, TPDO2_ID
-from jointctl.drivers.canopen.pdo_layout import COMMUNICATION_TPDO, MappedObject
-from jointctl.drivers.canopen.pdo_map import EVERY_SYNC, configure_pdo, disable_pdo, pdos_of
+from jointctl.drivers.canopen.pdo import (
+    COMMUNICATION_TPDO,
+    EVERY_SYNC,
+    MappedObject,
+    configure_pdo,
+    disable_pdo,
+    listen_to_our_sync,
+    pdos_of,
+)
 from jointctl.drivers.canopen.sdo import ObjectAccess
 from jointctl.drivers.canopen.settings import DRIVE_RANGE_COUNTS, JointEncoderSettings
-from jointctl.drivers.canopen.synchronisation import listen_to_our_sync
 from jointctl.drivers.errors import DeviceError
 
 CIA406_PROFILE = 406

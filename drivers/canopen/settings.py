@@ -66,7 +66,7 @@ class CanopenSettings:
     rated_torque_Nm: float | None = None
     rated_tolerance: float = 0.01
     max_torque_permille: int | None = None
-    velocity_unit: str = "counts/s"  # of 60FF: a key of `scaling.VELOCITY_UNITS`
+    velocity_unit: str = "counts/s"  # of 60FF: a key of `pdo.VELOCITY_UNITS`
     torque_rate_max_Nmps: float = 0.0  # of the loop, at the joint; what a torque slope (6087) must follow
     boot_timeout_s: float = 0.0  # how long a drive may take to answer and to leave Not Ready to Switch On
     joint_encoder: JointEncoderSettings | None = None

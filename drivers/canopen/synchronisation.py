@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from jointctl.drivers.canopen.identifiers import SYNC_ID
+from jointctl.drivers.canopen.pdo import listen_to_our_sync
 from jointctl.drivers.canopen.sdo import ObjectAccess
 from jointctl.drivers.errors import DeviceError
 
-PRODUCES_SYNC = 0x40000000
 LONGEST_PERIOD = 255
 
 
@@ -19,19 +18,6 @@ def interpolation_period(rate_Hz: float) -> tuple[int, int]:
     if value > LONGEST_PERIOD:
         raise DeviceError(f"loop.rate_Hz (={rate_Hz:g}) has no 60C2 value: the period must be 1..255 x 10^n s")
     return value, exponent
-
-
-def listen_to_our_sync(objects: ObjectAccess, rate_Hz: float) -> None:
-    """1005 = 80h without production, 1006 our period if it is used at all, 1019 = 0: our SYNC carries no counter."""
-    found = objects.read_if_present(0x1005, what="COB-ID SYNC")
-    if found is not None and found & (PRODUCES_SYNC | 0x7FF) != SYNC_ID:
-        objects.write_verified(0x1005, 0, SYNC_ID, what="COB-ID SYNC")
-        objects.remarks.append(f"1005 was {found & 0xFFFFFFFF:08X}h, it is now {SYNC_ID:08X}h")
-    period_us = round(1e6 / rate_Hz)
-    if objects.read_if_present(0x1006, what="communication cycle period") not in (None, 0, period_us):
-        objects.write_verified(0x1006, 0, period_us, what="communication cycle period")
-    if objects.read_if_present(0x1019, what="synchronous counter overflow value"):
-        objects.write_verified(0x1019, 0, 0, what="synchronous counter overflow value")
 
 
 def set_sync(objects: ObjectAccess, rate_Hz: float, *, cyclic: bool) -> dict[str, str]:

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from jointctl.drivers.canopen.pdo_layout import COMMUNICATION_RPDO, LAST_PDO
-from jointctl.drivers.canopen.pdo_map import EVENT_TIMER
+from jointctl.drivers.canopen.pdo import COMMUNICATION_RPDO, EVENT_TIMER, LAST_PDO
 from jointctl.drivers.canopen.sdo import ObjectAccess, SdoReads, object_name
 from jointctl.drivers.errors import DeviceError
 
