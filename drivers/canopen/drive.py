@@ -10,21 +10,31 @@ from typing import Any
 import can
 
 from jointctl.drivers.canopen.commissioning import VELOCITY_MODES, Findings, commission
-from jointctl.drivers.canopen.connection_loss import clear_rpdo_deadlines, rpdo_identifiers, watched_nodes
 from jointctl.drivers.canopen.eds import read_eds
-from jointctl.drivers.canopen.encoder_end import EncoderEnd
-from jointctl.drivers.canopen.fault_reset import reset_fault
-from jointctl.drivers.canopen.found_enabled import brake_if_enabled
+from jointctl.drivers.canopen.encoder import EncoderEnd
 from jointctl.drivers.canopen.identifiers import NmtCommand
 from jointctl.drivers.canopen.network import OtherControllers, new_network, report_own_frames
 from jointctl.drivers.canopen.pdo import joint_angle_per_count_rad, new_port, start_position_rad
 from jointctl.drivers.canopen.sdo import ATTEMPTS as SDO_ATTEMPTS
 from jointctl.drivers.canopen.sdo import ObjectAccess, SdoReads
 from jointctl.drivers.canopen.settings import DRIVE_RANGE_COUNTS, CanopenSettings
-from jointctl.drivers.canopen.switch_off import POWERED_STATES, SDO_TIMEOUT_S, SwitchOff, state_of
+from jointctl.drivers.canopen.switch_off import (
+    POWERED_STATES,
+    SDO_TIMEOUT_S,
+    SwitchOff,
+    brake_if_enabled,
+    reset_fault,
+    state_of,
+)
 from jointctl.drivers.canopen.thermometer import Thermometer
-from jointctl.drivers.canopen.watchdog_guard import WatchdogGuard, is_kept
-from jointctl.drivers.canopen.watchdog_proof import prove_watchdog
+from jointctl.drivers.canopen.watchdog import (
+    WatchdogGuard,
+    clear_rpdo_deadlines,
+    is_kept,
+    prove_watchdog,
+    rpdo_identifiers,
+    watched_nodes,
+)
 from jointctl.drivers.drive import UNTOUCHED, Approval, CommissioningReport, is_safe
 from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
 from jointctl.firmware_py.states import in_words
