@@ -32,7 +32,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Self
 
-from jointctl.drivers.can.serial_adapter import port_path
+from jointctl.drivers.can.channel import port_path
 from jointctl.drivers.can.virtual_bus import socket_path
 from jointctl.drivers.errors import BusError
 from jointctl.drivers.local_socket import ANSWER_S, listener, may_ask, parsed_line, process_behind, send_line

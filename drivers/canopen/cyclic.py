@@ -19,8 +19,7 @@ from typing import Annotated
 
 import numpy as np
 
-from jointctl.drivers.can.bit_timing import worst_frame_bits
-from jointctl.drivers.can.frames import ERROR_FLAG, Frame
+from jointctl.drivers.can.frames import ERROR_FLAG, Frame, worst_frame_bits
 from jointctl.drivers.canopen.cia402 import State, control_word, decode_state, drive_state
 from jointctl.drivers.canopen.identifiers import NmtState
 from jointctl.drivers.position_counts import HALF_WRAP, WRAP, take_counts

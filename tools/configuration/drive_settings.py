@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from jointctl.drivers.can.bit_timing import bus_load, highest_rate_Hz
+from jointctl.drivers.can.frames import bus_load, highest_rate_Hz
 from jointctl.drivers.canopen.settings import CanopenSettings, JointEncoderSettings, TemperatureObject
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.hil.canopen.device import DeviceSettings
