@@ -9,6 +9,8 @@ from typing import Any, Protocol
 UNTOUCHED = "untouched"  # of `Drive.make_safe`: this program has not taken the drive over
 Approval = Callable[[str], bool]  # of a question, by the user
 SAFE_STATES = ("switch on disabled", "fault", "off")
+# of a cyclic exchange: an answer that is looked at so long after its window's end still counts; a wait may end late
+LOOK_LATE_NS = 200_000
 
 
 def is_safe(state: str) -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numba.core import types
 
-from jointctl.drivers.answer_window import LOOK_LATE_NS
+from jointctl.drivers.drive import LOOK_LATE_NS
 from jointctl.drivers.elmo.cyclic import (
     READ_MAX,
     SCRATCH_WORDS,
