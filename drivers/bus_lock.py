@@ -143,7 +143,7 @@ class BusLock:
     # --- the thread ---
 
     def _serve(self) -> None:
-        """Answer whoever asks; returns when `close` wakes it."""
+        """Answer the callers; returns when `close` wakes it."""
         signal.pthread_sigmask(signal.SIG_BLOCK, set(signal.valid_signals()) - {signal.SIGKILL, signal.SIGSTOP})
         callers: dict[socket.socket, bytes] = {}
         with selectors.DefaultSelector() as selector:

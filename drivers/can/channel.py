@@ -71,7 +71,7 @@ def check_options(interface: str, options: Mapping[str, Option]) -> None:
         if name in RESERVED:
             raise BusError(f"option {name} of the bus: is no option, it has a key of its own or is not the user's")
     if interface not in can.interfaces.BACKENDS:
-        return  # python-can tells which there are
+        return  # python-can's own error lists them
     module, name = can.interfaces.BACKENDS[interface]
     made = getattr(import_module(module), name)
     known, words, required = _parameters(made.__mro__)

@@ -57,7 +57,7 @@ def open_socket(channel: str) -> socket.socket:
         end.setsockopt(_SOL_CAN_RAW, _CAN_RAW_RECV_OWN_MSGS, 0)
         end.bind((channel,))
         end.setblocking(False)
-        # A bind to an interface that is down succeeds; the state is only told as a pending error.
+        # A bind to an interface that is down succeeds; the state only comes as a pending error.
         pending = end.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
         if pending:
             raise OSError(pending, "interface is down")
@@ -87,7 +87,7 @@ _HEALTHY = ("ERROR-ACTIVE", "ERROR-WARNING")
 
 @dataclass(frozen=True)
 class LinkState:
-    """None where the interface does not tell: a virtual one has neither bit rate nor state."""
+    """None where the interface does not report it: a virtual one has neither bit rate nor state."""
 
     name: str
     kind: str  # "can", "vcan", ...
@@ -175,8 +175,8 @@ def send_problem(channel: str, code: int) -> tuple[str, str] | None:
 
 @contextmanager
 def interface_blamed(interface: str, channel: str, bitrate_bitps: int | None) -> Iterator[None]:
-    """A failure of the bus, or the silence of everybody on it, inside also tells what is wrong with a SocketCAN
-    interface, if something is, and the command that mends it."""
+    """A failure of the bus, or the silence of everyone on it, inside also states what is wrong with a SocketCAN
+    interface, if something is, and the command that fixes it."""
     try:
         yield
     except (BusError, NoDeviceError) as error:
@@ -233,7 +233,7 @@ def error_frame_text(identifier: int, data: bytes) -> str:
 
 
 def trouble(identifier: int, data: bytes) -> str:
-    """The worst state that an error frame tells: "bus-off", "error passive", "no acknowledge" and so on; "" if none.
+    """The worst state that an error frame reports: "bus-off", "error passive", "no acknowledge" and so on; "" if none.
 
     An error warning, a lost arbitration and a return to error active are no trouble.
     """

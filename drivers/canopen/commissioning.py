@@ -96,7 +96,7 @@ def identify(objects: ObjectAccess, settings: CanopenSettings, eds: EdsFile, fin
 
 
 def _compare_with_eds(settings: CanopenSettings, eds: EdsFile, vendor: int, product: int, findings: Findings) -> None:
-    """An EDS of another maker is refused, unless the configuration names the drive's maker; another product is told."""
+    """An EDS of another maker is refused, unless the configuration names its maker; of another product: a remark."""
     if eds.vendor_id and vendor and eds.vendor_id != vendor:
         text = f"EDS {eds.name} is of vendor {eds.vendor_id:#x}, node {settings.node} is of vendor {vendor:#x}"
         if settings.vendor_id is None:
@@ -205,7 +205,7 @@ def limit_velocity(objects: ObjectAccess, settings: CanopenSettings, findings: F
 
 
 def _compare_rated(name: str, found: float, expected: float | None, tolerance: float, unit: str) -> list[str]:
-    """What to tell the user; `DeviceError` where they do not agree."""
+    """Remarks for the user; `DeviceError` where they do not agree."""
     if expected is None:
         return [f"drive.{name} is not given: nothing to compare the drive's {found:g} {unit} with"] if found else []
     if found == 0.0:

@@ -39,7 +39,7 @@ SEEN_FIRST, SEEN_SECOND = 1, 2
 _BOTH = SEEN_FIRST | SEEN_SECOND
 # A drive that was commanded to stop and still reports that it is enabled, or reports nothing, does not receive us (SYNC
 # or RPDO lost).  Its watchdog is what is left: after so many cycles the heartbeat is withheld for the rest of the run.
-UNHEEDED_MAX_CYCLES = 20
+IGNORED_MAX_CYCLES = 20
 # an error code stays for so long although the drive has reset it: it may be why the joint stops
 ERROR_SHOWN_CYCLES = 20
 _WORST_BITS = np.array([worst_frame_bits(length) for length in range(9)])
@@ -122,11 +122,11 @@ class CanopenPort:
     seen: i4  # TPDOs since the last SYNC: 1 the drive's, 2 the second encoder's
     answered: i4  # those of them that came before the RPDO
     surplus: i8  # TPDOs after those: doubled or late
-    heartbeat_watched: i4  # the drive has been told to send its own
+    heartbeat_watched: i4  # the drive was set to send its own
     heartbeat_heard_cycle: i8
     error_cycle: i8  # in which the last EMCY came
     error_reset: i4  # the drive has said since that the error is gone
-    unheeded_cycles: i4  # in a row in which the drive stayed enabled although it was asked to stop
+    ignored_cycles: i4  # in a row in which the drive stayed enabled although it was asked to stop
     malformed: i8  # TPDOs that were too short
     error_frames: i8
     send_failures: i8
@@ -241,7 +241,7 @@ def begin_cycle(port: CanopenPort, frames: np.ndarray) -> int:
     due = port.heartbeat_cycles > 0 and port.cycle % port.heartbeat_cycles == 0
     port.cycle += 1
     port.seen = 0
-    if not due or port.unheeded_cycles > UNHEEDED_MAX_CYCLES:
+    if not due or port.ignored_cycles > IGNORED_MAX_CYCLES:
         return 1
     frames[SLOT_HEARTBEAT].can_id = port.own_heartbeat_id
     frames[SLOT_HEARTBEAT].length = 1
@@ -254,7 +254,7 @@ def begin_cycle(port: CanopenPort, frames: np.ndarray) -> int:
 def answer_owed(port: CanopenPort) -> bool:
     """Before `begin_cycle`: whether the last SYNC still lacks a TPDO, so that the next one may belong to it.
 
-    Not on the virtual bus, where a stamp tells.
+    Not on the virtual bus, where a stamp shows it.
     """
     wanted = SEEN_FIRST if port.second.tpdo_id == 0 else SEEN_FIRST | SEEN_SECOND
     return port.cycle > 0 and port.stamped == 0 and port.seen & wanted != wanted
@@ -307,7 +307,7 @@ def _accept_second(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int)
 
 @kernel
 def accept_frame(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -> bool:
-    """Take one received frame; True if it was the TPDO with a new sample.  Foreign frames are only counted."""
+    """Take one received frame; True if it was the TPDO with a new sample.  Others are only counted."""
     port.bits_sent += _WORST_BITS[min(frame.length, 8)]
     if frame.can_id & ERROR_FLAG != 0:
         port.error_frames += 1
@@ -364,7 +364,7 @@ def end_cycle(port: CanopenPort, frames: np.ndarray, sample: Sample, command: Co
     if port.heartbeat_watched != 0:
         sample.heartbeat_age_cycles = min(port.cycle - port.heartbeat_heard_cycle, INT32_MAX)
     request = np.int64(command.request)
-    if request == DriveRequest.ENABLE and port.unheeded_cycles > UNHEEDED_MAX_CYCLES:
+    if request == DriveRequest.ENABLE and port.ignored_cycles > IGNORED_MAX_CYCLES:
         request = np.int64(DriveRequest.OFF)
     frame = frames[SLOT_RPDO]
     frame.can_id = port.rpdo_id
@@ -374,9 +374,9 @@ def end_cycle(port: CanopenPort, frames: np.ndarray, sample: Sample, command: Co
     put_u16(frame.payload, port.control_at, control_word(port.state, request))  # type: ignore[arg-type]
     enabled = request == DriveRequest.ENABLE and port.state == State.OPERATION_ENABLED
     if request != DriveRequest.ENABLE and port.state == State.OPERATION_ENABLED:
-        port.unheeded_cycles += 1
-    elif port.unheeded_cycles <= UNHEEDED_MAX_CYCLES:
-        port.unheeded_cycles = 0
+        port.ignored_cycles += 1
+    elif port.ignored_cycles <= IGNORED_MAX_CYCLES:
+        port.ignored_cycles = 0
     if port.target_is_velocity != 0:
         units = velocity_units(port, command.velocity_radps) if enabled else 0
         put_u16(frame.payload, port.target_at, units)

@@ -51,7 +51,7 @@ class CanopenDrive:
     It listens for other controllers from its making on.  `gate` is called between any two steps before the loop runs,
     and raises once the user has asked for a stop: no step follows then but those of `make_safe`.
     Where an adapter serves one program at a time, `reopen` is given: `start_cyclic` closes the bus for the loop, and
-    `make_safe` opens it again.  In between nobody but the loop talks to the drive; it is disabled until the loop
+    `make_safe` opens it again.  In between no one but the loop talks to the drive; it is disabled until the loop
     enables it, and from the loop's first heartbeat on its own watchdog stops it when the loop ends.
     """
 
@@ -70,7 +70,7 @@ class CanopenDrive:
         self._taken = False  # whether the drive has heard anything from us
         self._started = False  # whether the loop may send SYNC
         self._reopen = reopen
-        self._lent = False
+        self._handed_over = False
         self._thermometer: Thermometer | None = None
         self._reads: SdoReads | None = None
         self._guard: WatchdogGuard | None = None
@@ -237,7 +237,7 @@ class CanopenDrive:
             self._others.refuse()
             self._gate()
             self._started = True
-            self._encoder.tell(NmtCommand.START)
+            self._encoder.send_command(NmtCommand.START)
             self._node.nmt.send_command(NmtCommand.START)
             self._others.own_loop_begins()
             if self._reopen is not None:
@@ -255,7 +255,7 @@ class CanopenDrive:
             self._others.refuse()
             raise
         if self._reopen is not None:
-            self._lent = True
+            self._handed_over = True
             with contextlib.suppress(Exception):  # the next one to open it gets the error
                 self._network.disconnect()
 
@@ -270,7 +270,7 @@ class CanopenDrive:
 
     def _take_back(self) -> None:
         """Open the bus again if the loop has had it; `BusError` if it cannot be opened."""
-        if not self._lent or self._reopen is None:
+        if not self._handed_over or self._reopen is None:
             return
         for attempt in range(1, REOPEN_ATTEMPTS + 1):
             try:
@@ -281,7 +281,7 @@ class CanopenDrive:
                     raise
                 self._sleep(REOPEN_PAUSE_S)
         self._network.connect()
-        self._lent = False
+        self._handed_over = False
 
     def port(self) -> Any:
         """See `Drive.port`."""
@@ -301,7 +301,7 @@ class CanopenDrive:
 
     def thermometer(self) -> Thermometer | None:
         """See `Drive.thermometer`; a bus that the loop has for itself carries no SDO of ours."""
-        return None if self._lent else self._thermometer
+        return None if self._handed_over else self._thermometer
 
     def make_safe(self, *, asked: bool = False) -> str:
         """See `SwitchOff.make_safe`.

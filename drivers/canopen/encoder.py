@@ -110,7 +110,7 @@ class EncoderEnd:
             self._eds_remarks = eds.all_remarks()
             self._objects = ObjectAccess(node, eds.name, eds.unusable)
 
-    def tell(self, command: NmtCommand) -> None:
+    def send_command(self, command: NmtCommand) -> None:
         """An NMT command."""
         if self._node is not None:
             send_nmt(self._network, command, self._node)
@@ -120,7 +120,7 @@ class EncoderEnd:
         encoder = self._settings.joint_encoder
         if self._objects is None or encoder is None:
             return None
-        self.tell(NmtCommand.ENTER_PRE_OPERATIONAL)
+        self.send_command(NmtCommand.ENTER_PRE_OPERATIONAL)
         self._objects.forget_verified()
         self._objects.remarks.clear()
         found = commission_encoder(self._objects, encoder, self._settings.rate_Hz, self._settings.heartbeat_s)

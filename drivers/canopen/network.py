@@ -47,7 +47,7 @@ class OtherControllers(can.Listener):
     """Notices what only a controller sends: SYNC, NMT commands, SDO requests and RPDOs to `nodes`, our heartbeat.
 
     It listens from its making on.  Some interfaces hand us the frames that we send ourselves: the first of them that
-    `sent` is told of shows it, and from then on each counts once.
+    `sent` gets shows it, and from then on each counts once.
     """
 
     def __init__(self, nodes: Collection[int], master_node: int, clock: Callable[[], float] = time.monotonic) -> None:

@@ -191,7 +191,7 @@ class ObjectAccess:
             raise DeviceError(f"{place} has {len(variable)} bits, which do not hold {value}") from None
 
     def highest(self, index: int, sub: int = 0) -> int | None:
-        """HighLimit of the EDS; None if it does not tell."""
+        """HighLimit of the EDS; None if it has none."""
         variable = self._variable(index, sub)
         return None if variable is None else variable.max
 

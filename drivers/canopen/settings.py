@@ -73,4 +73,4 @@ class CanopenSettings:
     encoder_incremental: bool = False
     sdo_timeout_s: float | None = None  # of one SDO request; None: `switch_off.SDO_TIMEOUT_S`
     velocity_max_radps: float | None = None  # at the joint, for the drive's own limit in the velocity modes
-    temperature: TemperatureObject | None = None  # what tells it, if anything
+    temperature: TemperatureObject | None = None  # the object that holds it, if any

@@ -66,7 +66,7 @@ class SwitchOff:
         self._network, self._node, self._objects, self._encoder_node = network, node, objects, encoder_node
         self._sleep = sleep
 
-    def _tell(self, command: NmtCommand, node: int | None) -> None:
+    def _send_nmt(self, command: NmtCommand, node: int | None) -> None:
         if node is not None:
             send_nmt(self._network, command, node)
 
@@ -92,7 +92,7 @@ class SwitchOff:
             return self._attempt()
         except JointctlError as error:
             try:
-                self._tell(NmtCommand.STOP, self._node)
+                self._send_nmt(NmtCommand.STOP, self._node)
             except can.CanError:
                 return f"unknown: {error}; the bus does not take frames any more"
             return f"unknown: {error}; NMT stop was sent"
@@ -110,8 +110,8 @@ class SwitchOff:
             self._sleep(POLL_S)
 
     def _attempt(self) -> str:
-        self._tell(NmtCommand.ENTER_PRE_OPERATIONAL, self._encoder_node)
-        self._tell(NmtCommand.ENTER_PRE_OPERATIONAL, self._node)
+        self._send_nmt(NmtCommand.ENTER_PRE_OPERATIONAL, self._encoder_node)
+        self._send_nmt(NmtCommand.ENTER_PRE_OPERATIONAL, self._node)
         brake(self._objects, self._sleep)
         for _ in range(round(OFF_S / POLL_S)):
             self._objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
@@ -124,7 +124,7 @@ class SwitchOff:
                 self._objects.write_if_present(index, 0, 0, what=what)
         words = in_words(state)
         if state in POWERED_STATES:
-            self._tell(NmtCommand.STOP, self._node)
+            self._send_nmt(NmtCommand.STOP, self._node)
             return f"{words}, it did not obey; NMT stop was sent"
         return words
 
@@ -152,7 +152,7 @@ def stop_node(
     sdo_timeout_s: float | None = None,
     sleep: Callable[[float], None] = time.sleep,
 ) -> str:
-    """Stop and disable the drive at `node` whoever controls it; closes `bus`.  See `SwitchOff.make_safe`."""
+    """Stop and disable the drive at `node`, another controller's as well; closes `bus`.  See `SwitchOff.make_safe`."""
     network = new_network(bus, sleep)
     network.connect()
     try:

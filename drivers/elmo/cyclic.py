@@ -57,7 +57,7 @@ SCRATCH_WORDS = 8
 SILENT_CYCLES = 3
 STATUS_SPARE_CYCLES = 8  # SR is asked every other cycle, and a lost reply must not stop the joint
 NOTHING = -1
-FAULT_CAUSE_CYCLES = 4  # status replies to wait for MF before a fault is told without its cause
+FAULT_CAUSE_CYCLES = 4  # status replies to wait for MF before a fault is reported without its cause
 USUAL_STEP_NS = 20_000  # in a cycle
 UNEVEN_SHARE = 16  # a position may come a 16th of a period later than usual
 LEFT_OUT_MAX = 3  # in a row
@@ -124,7 +124,7 @@ class ElmoPort:
     silent_cycles: i8  # cycles since a reply came although one was due
     quiet: i4  # cycles in which it says nothing until the line is silent: old replies are not taken for new ones
     heard_bytes: i8  # in this cycle
-    window_ns: i8  # when the window of this cycle ends: by it cycles are told apart
+    window_ns: i8  # when the window of this cycle ends: by it cycles are distinguished
     asked_ns: i8  # when this cycle began
     usual_answer_ns: i8  # from there to the position, its median followed slowly; 0 = none yet
     left_out: i4  # how many positions in a row came unusually late and were left out
@@ -213,7 +213,7 @@ def _take_status(port: ElmoPort, sample: Sample, status: int) -> None:
         sample.restarts += 1
     port.unit_mode = mode
     if status & (FAULT_LATCHED | AMPLIFIER_MASK) != 0:
-        # the cause (MF) is asked for before the fault is told; the power stage is off already
+        # the cause (MF) is asked for before the fault is reported; the power stage is off already
         port.fault_seen += 1
         if port.motor_fault != 0 or port.fault_seen > FAULT_CAUSE_CYCLES:
             sample.drive_state = DriveState.FAULT
@@ -446,7 +446,7 @@ def begin_cycle(port: ElmoPort, sample: Sample) -> None:
     port.out_length = 0
     port.no_sample_cycles += 1
     port.no_status_cycles += 1
-    # positions alone do not tell whether the motor is on: an old status is none (a silent line is told by the sample)
+    # positions alone do not show whether the motor is on: an old status is none (a silent line shows in the sample)
     old_cycles = 2 * port.dead_man_cycles + STATUS_SPARE_CYCLES
     if port.no_status_cycles > old_cycles and port.no_sample_cycles <= port.dead_man_cycles:
         sample.drive_state = DriveState.UNKNOWN
@@ -494,7 +494,7 @@ def _put_dead_man(port: ElmoPort, command: Command) -> None:
 
 @kernel
 def end_cycle(port: ElmoPort, sample: Sample, command: Command) -> None:
-    """What the drive is told in this cycle, and one of the slower questions."""
+    """What is sent to the drive in this cycle, and one of the slower questions."""
     port.out_length = 0
     if command.request == DriveRequest.ENABLE:
         if port.no_sample_cycles > port.dead_man_cycles:

@@ -92,7 +92,7 @@ def parse_reply(command: bytes, frame: bytes, echo: bool | None = None) -> Reply
 
 
 class Interpreter:
-    """One command at a time: `begin` gives the bytes to send, `feed` takes what came, `poll` tells a time-out."""
+    """One command at a time: `begin` gives the bytes to send, `feed` takes what came, `poll` reports a time-out."""
 
     def __init__(self, echo: bool | None = None) -> None:
         self.echo = echo
@@ -116,7 +116,7 @@ class Interpreter:
         return command
 
     def feed(self, data: bytes, now_s: float) -> Reply | None:
-        """Take received bytes; the reply once it is complete.  Bytes behind its end are garbage: nobody asked."""
+        """Take received bytes; the reply once it is complete.  Bytes behind its end answer nothing: garbage."""
         for at, byte in enumerate(data):
             if self._command is None:
                 self.garbage_bytes += len(data) - at

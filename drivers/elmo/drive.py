@@ -77,7 +77,7 @@ class Fact:
 
 
 def read_facts(line: Dialogue, settings: ElmoSettings) -> list[Fact]:
-    """Everything a drive of this family tells; what it does not know is said so, because firmwares differ."""
+    """Everything a drive of this family reports; what it does not know is stated so, because firmwares differ."""
     facts = []
     questions = list(_QUESTIONS)
     parameter = settings.counts_parameter
@@ -161,7 +161,7 @@ class ElmoDrive:
         self._line = Dialogue(self._byte_port, settings.reply_timeout_s, clock)
         self._line.gate = gate
         self._clock, self._sleep = clock, sleep
-        self._taken = False  # whether a drive has been found and told anything
+        self._taken = False  # whether a drive has been found and was sent anything
         self._commissioned = False
         self._speed_mode = False
 
@@ -232,7 +232,7 @@ class ElmoDrive:
         )
 
     def _set_echo(self) -> None:
-        """EO, and proof that the drive does it: the loop tells replies apart by it."""
+        """EO, and proof that the drive does it: the loop distinguishes replies by it."""
         line, wanted = self._line, self._settings.echo
         try:
             line.assign("EO", int(wanted))
@@ -393,7 +393,7 @@ class ElmoDrive:
         return position_rad, line.number("VX") * settings.rad_per_count, line.number("IQ") * settings.torque_NmpA
 
     def facts(self) -> list[Fact]:
-        """Everything that it tells about itself; after `identify`."""
+        """Everything that it reports about itself; after `identify`."""
         return read_facts(self._line, self._settings)
 
     def status(self) -> tuple[int, int]:
@@ -405,7 +405,7 @@ class ElmoDrive:
     def make_safe(self, *, asked: bool = False) -> str:
         """TC=0, JV=0, ST, MO=0 until MO reads 0.  Never raises; a drive that was never found is left alone.
 
-        `asked`: by `jointctl stop`.  Whoever of the two is done first leaves the line to the other.
+        `asked`: by `jointctl stop`.  The one of the two that is done first leaves the line to the other.
         """
         self._line.gate = lambda: None
         if not self._taken:

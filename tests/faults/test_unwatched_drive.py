@@ -14,9 +14,9 @@ from jointctl.drivers.canopen import exchange, switch_off
 from jointctl.drivers.canopen.cia402 import ControlWord, State
 from jointctl.drivers.canopen.cyclic import (
     FRAME_SLOTS,
+    IGNORED_MAX_CYCLES,
     SCRATCH_WORDS,
     SLOT_RPDO,
-    UNHEEDED_MAX_CYCLES,
     CanopenPort,
     accept_frame,
     end_cycle,
@@ -159,7 +159,7 @@ class Wire:
 
 @pytest.mark.parametrize(
     ("cycles", "enables"),
-    [(UNHEEDED_MAX_CYCLES - 1, True), (UNHEEDED_MAX_CYCLES, True), (UNHEEDED_MAX_CYCLES + 1, False), (100, False)],
+    [(IGNORED_MAX_CYCLES - 1, True), (IGNORED_MAX_CYCLES, True), (IGNORED_MAX_CYCLES + 1, False), (100, False)],
 )
 def test_without_a_heartbeat_the_drive_is_never_enabled(cycles: int, enables: bool) -> None:
     wire = Wire()
