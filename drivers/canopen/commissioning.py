@@ -148,7 +148,7 @@ def disable(objects: ObjectAccess, settings: CanopenSettings, pause: Pause) -> N
     for index, what in ((0x60FF, "target velocity"), (0x60B1, "velocity offset"), (0x60B2, "torque offset")):
         objects.write_if_present(index, 0, 0, what=what)
     for _ in range(ATTEMPTS):
-        state = state_of_word(objects.read(0x6041, what="statusword"))
+        state = state_of(objects)
         if state is not State.OPERATION_ENABLED and state is not State.QUICK_STOP_ACTIVE:
             break
         pause(PAUSE_S)

@@ -196,14 +196,14 @@ def reset_fault(objects: ObjectAccess, pause: Callable[[float], None]) -> str:
     for _ in range(RESET_ATTEMPTS):
         objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
         pause(SETTLE_S)
-        state = state_of_word(objects.read(0x6041, what="statusword"))
+        state = state_of(objects)
         if state not in (State.FAULT, State.FAULT_REACTION_ACTIVE):
             words = in_words(state)
             return f"fault {code:04X}h was reset, the drive is {words}" if code else f"no fault: the drive is {words}"
         code = objects.read_if_present(0x603F, what="error code") or code
         objects.write(0x6040, 0, ControlWord.FAULT_RESET, what="controlword")
         pause(SETTLE_S)
-    state = state_of_word(objects.read(0x6041, what="statusword"))
+    state = state_of(objects)
     if state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
         raise DeviceError(
             f"the drive stays in fault (error code {code:04X}h) after {RESET_ATTEMPTS} resets",
