@@ -32,7 +32,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Self
 
-from jointctl.drivers.can.serial_adapter import port_path
+from jointctl.drivers.can.channel import port_path
 from jointctl.drivers.can.virtual_bus import socket_path
 from jointctl.drivers.errors import BusError
 from jointctl.drivers.local_socket import ANSWER_S, listener, may_ask, parsed_line, process_behind, send_line
@@ -143,7 +143,7 @@ class BusLock:
     # --- the thread ---
 
     def _serve(self) -> None:
-        """Answer whoever asks; returns when `close` wakes it."""
+        """Answer the callers; returns when `close` wakes it."""
         signal.pthread_sigmask(signal.SIG_BLOCK, set(signal.valid_signals()) - {signal.SIGKILL, signal.SIGSTOP})
         callers: dict[socket.socket, bytes] = {}
         with selectors.DefaultSelector() as selector:

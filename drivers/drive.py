@@ -9,6 +9,8 @@ from typing import Any, Protocol
 UNTOUCHED = "untouched"  # of `Drive.make_safe`: this program has not taken the drive over
 Approval = Callable[[str], bool]  # of a question, by the user
 SAFE_STATES = ("switch on disabled", "fault", "off")
+# of a cyclic exchange: an answer that is looked at so long after its window's end still counts; a wait may end late
+LOOK_LATE_NS = 200_000
 
 
 def is_safe(state: str) -> bool:
@@ -22,7 +24,7 @@ class Declined(Exception):
 
 @dataclass(frozen=True)
 class DriveIdentity:
-    """Who answered; empty strings where the drive does not tell."""
+    """Who answered; empty strings where the drive does not report it."""
 
     vendor: str
     product: str
@@ -44,7 +46,7 @@ class CommissioningReport:
     remarks: tuple[str, ...] = ()
     loop_delay_s: float | None = None  # measured, position sample to torque command; None = not measured
     counts_per_motor_turn: float = 0.0  # of the encoder, by the drive's own word; 0 = it does not report it
-    measures_torque: bool = True  # False: the drive does not tell its torque in the cyclic exchange, it reads as zero
+    measures_torque: bool = True  # False: the drive does not report its torque in the cyclic exchange, it reads as zero
 
 
 @dataclass(frozen=True)

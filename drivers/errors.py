@@ -1,6 +1,6 @@
 """Every error that a user can meet, as one tree; the class decides the exit code of the command line.
 
-The message is one printable line that names the thing, its value and what is allowed.  The hint is one line that tells
+The message is one printable line that names the thing, its value and what is allowed.  The hint is one line that states
 what to do about it (often a command to type), or empty.
 """
 

@@ -1,4 +1,4 @@
-"""Who has a serial port open, and what a process is called: asked of the system, so that nobody has to guess."""
+"""Who has a serial port open, and what a process is called: asked of the system."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def port_users(path: str, proc: Path = Path("/proc")) -> list[PortUser]:
 
 
 def program_name(pid: int, proc: Path = Path("/proc")) -> str:
-    """The program as its command line tells it; `OSError` where there is no such process."""
+    """The program by its command line; `OSError` where there is no such process."""
     words = [Path(word).name for word in (proc / str(pid) / "cmdline").read_text(errors="replace").split("\0") if word]
     for at, word in enumerate(words):
         if word == "-m" and at + 1 < len(words):
@@ -45,5 +45,5 @@ def program_name(pid: int, proc: Path = Path("/proc")) -> str:
 
 
 def users_text(path: str) -> str:
-    """`jointctl, pid 1234`; empty where nobody is to be seen."""
+    """`jointctl, pid 1234`; empty where none is to be seen."""
     return "; ".join(f"{user.name}, pid {user.pid}" for user in port_users(path))

@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 import can
 
-from jointctl.drivers.canopen.bus_watchers import LISTEN_S
 from jointctl.drivers.canopen.drive import CanopenDrive
+from jointctl.drivers.canopen.network import LISTEN_S
 from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.drivers.canopen.switch_off import stop_node
 from jointctl.hil.canopen.device import Cia402Device

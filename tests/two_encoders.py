@@ -43,7 +43,7 @@ def short_run(folder: Path, encoder: dict[str, Any], **changes: Any) -> Config:
 
 
 def port_of(folder: Path, encoder: dict[str, Any], **changes: Any) -> Any:
-    from jointctl.drivers.canopen.scaling import new_port
+    from jointctl.drivers.canopen.pdo import new_port
 
     return new_port(canopen_settings(short_run(folder, encoder, **changes)), 0.06, 1000, second_range_counts=1 << 20)
 

@@ -58,6 +58,11 @@ def _word(value: Option) -> str:
     return word if _value(word) == value and isinstance(_value(word), str) else f"'{word}'"
 
 
+def port_path(channel: str) -> str:
+    """The device file of `/dev/ttyACM0@115200`, as python-can writes port and baud rate."""
+    return split_channel(channel)[0].partition("@")[0]
+
+
 def check_options(interface: str, options: Mapping[str, Option]) -> None:
     """`BusError` for an option that the interface does not have, and for one that it needs."""
     if interface in ("socketcan", "jointctl") and options:
@@ -66,7 +71,7 @@ def check_options(interface: str, options: Mapping[str, Option]) -> None:
         if name in RESERVED:
             raise BusError(f"option {name} of the bus: is no option, it has a key of its own or is not the user's")
     if interface not in can.interfaces.BACKENDS:
-        return  # python-can tells which there are
+        return  # python-can's own error lists them
     module, name = can.interfaces.BACKENDS[interface]
     made = getattr(import_module(module), name)
     known, words, required = _parameters(made.__mro__)

@@ -1,24 +1,27 @@
 """Open a bus by the names that python-can gives it: interface, channel, bit rate.
 
 Two kinds of end: a cyclic end is a file descriptor that the compiled loop uses ("socketcan" and "jointctl"); any
-interface of python-can serves for commissioning and for the plain Python loop.
+interface of python-can serves for commissioning and for the plain Python loop.  Such a bus of a third party is
+normalised, and the serial port of an adapter (slcan), which serves one program at a time, is locked.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import logging
+import os
 import socket
 from collections.abc import Iterator
 from typing import Any
 
 import can
 
-from jointctl.drivers.can import serial_adapter, socketcan, virtual_bus
-from jointctl.drivers.can.channel import check_options, split_channel
-from jointctl.drivers.can.foreign_bus import tamed
+from jointctl.drivers.can import socketcan, virtual_bus
+from jointctl.drivers.can.channel import check_options, port_path, split_channel
 from jointctl.drivers.errors import BusError
+from jointctl.drivers.port_users import users_text
 
 CYCLIC_INTERFACES = ("socketcan", "jointctl")
 # several programs can open them at once; any other may serve one at a time
@@ -59,6 +62,77 @@ def _without_its_log() -> Iterator[None]:
         log.setLevel(level)
 
 
+@contextlib.contextmanager
+def reserved_port(channel: str, *, exclusive: bool) -> Iterator[None]:
+    """`OSError` if the port cannot be opened, `BusError` if `exclusive` and a program of ours has it.
+
+    Opening it would close the CAN channel under that program's feet.  The port stays open meanwhile, so that its
+    control lines, which restart some adapters, do not move in between.
+    """
+    if "://" in channel:  # pyserial's URLs: no device file
+        yield
+        return
+    path = port_path(channel)
+    descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        if exclusive:
+            lock_port(descriptor, path)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def lock_port(descriptor: int, path: str) -> None:
+    """Keep others off as long as the descriptor is open; `BusError` names the program that has the port."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        users = users_text(path)
+        raise BusError(
+            f"the adapter on {path} is in use by another program{f' ({users})' if users else ''}",
+            "it serves one at a time: end that program; `jointctl stop` switches the drive off all the same",
+        ) from None
+
+
+def _failure(doing: str, error: Exception) -> can.CanOperationError:
+    return can.CanOperationError(f"{doing} failed: {str(error) or type(error).__name__}", getattr(error, "errno", None))
+
+
+def normalised(bus: can.BusABC) -> can.BusABC:
+    """The same bus; `send` and `recv` raise only `can.CanError`, and what cannot be decoded is a lost frame.
+
+    So python-can documents it, and not all interfaces keep to it: slcan, for one, raises ValueError for a line that is
+    not whole, as they come when two programs use one adapter.  Code that makes a joint safe over such a bus must go on,
+    or get the bus's failure, but not end with a traceback.
+    """
+    send, receive = bus.send, bus.recv
+
+    def checked_send(msg: can.Message, timeout: float | None = None) -> None:
+        try:
+            send(msg, timeout)
+        except can.CanError:
+            raise
+        except Exception as error:
+            raise _failure("sending", error) from error
+
+    def checked_receive(timeout: float | None = None) -> can.Message | None:
+        try:
+            return receive(timeout)
+        except (ValueError, IndexError):
+            return None
+        except can.CanError as error:
+            if not (isinstance(error.__cause__, UnicodeDecodeError) and hasattr(bus, "flush")):
+                raise
+            bus.flush()  # slcan keeps what it could not decode, and would fail at each line from here on
+            return None
+        except Exception as error:
+            raise _failure("receiving", error) from error
+
+    changed: Any = bus  # the methods of this one object
+    changed.send, changed.recv = checked_send, checked_receive
+    return bus
+
+
 @_without_its_log()
 def open_python_can(
     interface: str, channel: str, bitrate: int | None = None, *, exclusive: bool = True, **settings: Any
@@ -67,7 +141,7 @@ def open_python_can(
 
     `bitrate` [bit/s] is passed on where given; SocketCAN and the virtual bus ignore it.  `settings`, and the options in
     `channel` (`drivers.can.channel`), go to the interface.  The interface "jointctl" works even where the package is
-    not installed.  `exclusive` False is for whoever has to switch the drive off whoever has the serial adapter.
+    not installed.  `exclusive` False: to switch the drive off although another program has the serial adapter.
     """
     place = f"{interface}:{channel}"
     channel, options = split_channel(channel)
@@ -84,20 +158,20 @@ def open_python_can(
             # python-can binds to an interface that is down without a word: ask the kernel first.
             socketcan.open_socket(channel).close()
         if interface == "slcan":
-            with serial_adapter.reserved(channel, exclusive=exclusive):
+            with reserved_port(channel, exclusive=exclusive):
                 bus = can.Bus(channel=channel, interface=interface, ignore_config=True, **settings)
             if exclusive and "://" not in channel:
-                serial_adapter.lock(bus.fileno(), serial_adapter.port_path(channel))
-            return tamed(bus)
-        return tamed(can.Bus(channel=channel, interface=interface, ignore_config=True, **settings))
+                lock_port(bus.fileno(), port_path(channel))
+            return normalised(bus)
+        return normalised(can.Bus(channel=channel, interface=interface, ignore_config=True, **settings))
     except NotImplementedError as error:  # also CanInterfaceNotImplementedError
         known_interface(interface)
         raise BusError(f"interface {interface} cannot be used here: {error}", "install its driver") from None
     except ImportError as error:
         raise BusError(f"interface {interface} needs a module that is not installed: {error}", "install it") from None
     except PermissionError:
-        cure = "sudo usermod -aG dialout $USER" if interface == "slcan" else "add the user to the device's group"
-        raise BusError(f"no permission to open {place}", f"{cure}; log in again") from None
+        remedy = "sudo usermod -aG dialout $USER" if interface == "slcan" else "add the user to the device's group"
+        raise BusError(f"no permission to open {place}", f"{remedy}; log in again") from None
     except OSError as error:
         if error.errno in (errno.ENODEV, errno.ENOENT, errno.ENXIO):
             raise BusError(f"no such device: {place}", "plug in the adapter") from None

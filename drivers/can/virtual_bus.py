@@ -44,7 +44,7 @@ def default_socket_path(channel: str) -> Path:
 
 
 def socket_path(channel: str) -> Path:
-    """A channel with a '/' is a path, else a name in this user's own folder, which nobody else may have made."""
+    """A channel with a '/' is a path, else a name in this user's own folder, which no one else may have made."""
     if "/" in channel:
         return Path(channel)
     path = default_socket_path(channel)

@@ -11,18 +11,21 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from jointctl.drivers.canopen.cia402 import SUPPORTED_MODE_BIT, ControlWord, Mode, State, state_of_word
-from jointctl.drivers.canopen.connection_loss import arm_reaction, arm_rpdo_deadline
-from jointctl.drivers.canopen.eds_file import EdsFile
-from jointctl.drivers.canopen.encoder_node import EncoderFindings, commission_drive_object
-from jointctl.drivers.canopen.object_access import ObjectAccess
-from jointctl.drivers.canopen.pdo_layout import TARGET_TORQUE, TARGET_VELOCITY, PdoLayout
-from jointctl.drivers.canopen.pdo_map import configure_loop_pdos
-from jointctl.drivers.canopen.readiness import wait_until_ready
-from jointctl.drivers.canopen.scaling import joint_torque_per_permille_Nm, joint_velocity_per_unit_radps
+from jointctl.drivers.canopen.eds import EdsFile
+from jointctl.drivers.canopen.encoder import EncoderFindings, commission_drive_object
+from jointctl.drivers.canopen.pdo import (
+    TARGET_TORQUE,
+    TARGET_VELOCITY,
+    PdoLayout,
+    configure_loop_pdos,
+    joint_torque_per_permille_Nm,
+    joint_velocity_per_unit_radps,
+    listen_to_our_sync,
+)
+from jointctl.drivers.canopen.sdo import ObjectAccess
 from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.drivers.canopen.switch_off import POWERED_STATES, state_of
-from jointctl.drivers.canopen.synchronisation import set_sync
-from jointctl.drivers.canopen.torque_slope import set_torque_slope
+from jointctl.drivers.canopen.watchdog import arm_reaction, arm_rpdo_deadline
 from jointctl.drivers.drive import DriveIdentity
 from jointctl.drivers.errors import DeviceError
 from jointctl.firmware_py.states import in_words
@@ -42,9 +45,13 @@ CYCLIC_MODES = (Mode.CYCLIC_SYNC_TORQUE, Mode.CYCLIC_SYNC_VELOCITY)
 VELOCITY_MODES = (Mode.CYCLIC_SYNC_VELOCITY, Mode.PROFILE_VELOCITY)
 LARGEST_UNSIGNED = 0xFFFFFFFF
 STEEP_RADPS2 = 1000.0  # profile acceleration at the joint, above any that the loop asks for
+STEEP_PERMILLE_PS = 1_000_000
+TQ_REMARK = "torque mode with profile (TQ) instead of cyclic synchronous torque"
+LONGEST_PERIOD = 255  # of 60C2:1
 LARGEST_PERMILLE = 32767  # 6071 is a signed 16 bit number
 ATTEMPTS = 20
-PAUSE_S = 0.01  # between two looks at a drive that has been told to change its state or mode
+PAUSE_S = 0.01  # between two looks at a drive that was commanded to change its state or mode
+READY_POLL_S = 0.05  # between two looks at a drive that is not ready yet
 Pause = Callable[[float], None]
 
 
@@ -89,7 +96,7 @@ def identify(objects: ObjectAccess, settings: CanopenSettings, eds: EdsFile, fin
 
 
 def _compare_with_eds(settings: CanopenSettings, eds: EdsFile, vendor: int, product: int, findings: Findings) -> None:
-    """An EDS of another maker is refused, unless the configuration names the drive's maker; another product is told."""
+    """An EDS of another maker is refused, unless the configuration names its maker; of another product: a remark."""
     if eds.vendor_id and vendor and eds.vendor_id != vendor:
         text = f"EDS {eds.name} is of vendor {eds.vendor_id:#x}, node {settings.node} is of vendor {vendor:#x}"
         if settings.vendor_id is None:
@@ -101,10 +108,35 @@ def _compare_with_eds(settings: CanopenSettings, eds: EdsFile, vendor: int, prod
         )
 
 
+def wait_until_ready(objects: ObjectAccess, node: int, timeout_s: float, pause: Pause) -> None:
+    """Until the statusword is that of a drive which can be switched on; `DeviceError` after `timeout_s`.
+
+    Transition 1 is the drive's own, but some leave Not Ready only after a first controlword.  They get Shutdown and
+    Disable Voltage in turn: neither applies power.
+    """
+    looks = max(1, round(timeout_s / READY_POLL_S))
+    for look in range(looks):
+        status_word = objects.read(0x6041, what="statusword")
+        state = state_of_word(status_word)
+        if state not in (State.NOT_READY_TO_SWITCH_ON, State.UNDEFINED):
+            if state is State.READY_TO_SWITCH_ON:
+                objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
+            return
+        if look == looks - 1:
+            break
+        word = ControlWord.DISABLE_VOLTAGE if look % 2 else ControlWord.SHUTDOWN
+        objects.write(0x6040, 0, word, what="controlword")
+        pause(READY_POLL_S)
+    raise DeviceError(
+        f"node {node} is {in_words(state)} (statusword {status_word:04X}h) after {timeout_s:g} s",
+        hint="motor supply, safe torque off (STO) and enable inputs; a drive that takes longer: drive.boot_timeout_s",
+    )
+
+
 def disable(objects: ObjectAccess, settings: CanopenSettings, pause: Pause) -> None:
     """Zero every target that could move the motor at enable, take the power stage off, refuse a drive in fault.
 
-    It was off before commissioning began (`found_enabled`): one that has power now has got it from another controller.
+    It was off before commissioning began (`brake_if_enabled`): one that has power now has it from another controller.
     """
     if (state := state_of(objects)) in POWERED_STATES:
         raise DeviceError(
@@ -116,7 +148,7 @@ def disable(objects: ObjectAccess, settings: CanopenSettings, pause: Pause) -> N
     for index, what in ((0x60FF, "target velocity"), (0x60B1, "velocity offset"), (0x60B2, "torque offset")):
         objects.write_if_present(index, 0, 0, what=what)
     for _ in range(ATTEMPTS):
-        state = state_of_word(objects.read(0x6041, what="statusword"))
+        state = state_of(objects)
         if state is not State.OPERATION_ENABLED and state is not State.QUICK_STOP_ACTIVE:
             break
         pause(PAUSE_S)
@@ -173,7 +205,7 @@ def limit_velocity(objects: ObjectAccess, settings: CanopenSettings, findings: F
 
 
 def _compare_rated(name: str, found: float, expected: float | None, tolerance: float, unit: str) -> list[str]:
-    """What to tell the user; `DeviceError` where they do not agree."""
+    """Remarks for the user; `DeviceError` where they do not agree."""
     if expected is None:
         return [f"drive.{name} is not given: nothing to compare the drive's {found:g} {unit} with"] if found else []
     if found == 0.0:
@@ -181,6 +213,30 @@ def _compare_rated(name: str, found: float, expected: float | None, tolerance: f
     if abs(found - expected) > tolerance * expected:
         raise DeviceError(f"drive.{name} (={expected:g}) does not agree with the drive's {found:g} {unit}")
     return []
+
+
+def set_torque_slope(objects: ObjectAccess, torque_per_permille_Nm: float, torque_rate_max_Nmps: float) -> list[str]:
+    """Make 6087 [permille/s], the ramp of the profile torque mode (TQ), as steep as the drive allows; remarks.
+
+    `DeviceError` if it stays below `torque_rate_max_Nmps`, the loop's own limit: the law would reckon with a torque
+    that the drive has not reached yet, which is a delay that no margin accounts for.
+    """
+    if not objects.has(0x6087):
+        return [f"{TQ_REMARK}; no object 6087: see in the drive's manual that its torque ramp is steep or off"]
+    highest = objects.highest(0x6087)
+    steep = STEEP_PERMILLE_PS if highest is None else min(STEEP_PERMILLE_PS, highest)
+    try:
+        slope = objects.write_verified(0x6087, 0, steep, what="torque slope")
+    except DeviceError:
+        slope = objects.read(0x6087, what="torque slope")
+    slope_Nmps = slope * torque_per_permille_Nm
+    if slope_Nmps < torque_rate_max_Nmps:
+        raise DeviceError(
+            f"the drive ramps its torque with at most {slope_Nmps:.0f} Nm/s (6087 = {slope} permille/s), slower than "
+            f"limits.torque_rate_max_Nmps (={torque_rate_max_Nmps:g})",
+            hint=f"set limits.torque_rate_max_Nmps to {slope_Nmps:.0f} or less, or use cyclic synchronous torque",
+        )
+    return [TQ_REMARK] if slope == STEEP_PERMILLE_PS else [f"{TQ_REMARK}; 6087 = {slope} permille/s"]
 
 
 def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
@@ -213,6 +269,28 @@ def limit_torque(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
     if findings.mode is Mode.TORQUE:
         findings.remarks += set_torque_slope(objects, scale, settings.torque_rate_max_Nmps)
     findings.settings["max torque"] = f"{findings.max_permille} permille = {findings.max_permille * scale:.1f} Nm"
+
+
+def interpolation_period(rate_Hz: float) -> tuple[int, int]:
+    """(60C2:1, 60C2:2): the period as value x 10^exponent s; `DeviceError` where there is no such value."""
+    value, exponent = round(1e6 / rate_Hz), -6
+    while value % 10 == 0 and exponent < 0:
+        value //= 10
+        exponent += 1
+    if value > LONGEST_PERIOD:
+        raise DeviceError(f"loop.rate_Hz (={rate_Hz:g}) has no 60C2 value: the period must be 1..255 x 10^n s")
+    return value, exponent
+
+
+def set_sync(objects: ObjectAccess, rate_Hz: float, *, cyclic: bool) -> dict[str, str]:
+    """Settings for the report.  60C2 = SYNC period: needed in the cyclic modes, optional in the profile modes."""
+    listen_to_our_sync(objects, rate_Hz)
+    if not cyclic and not (objects.has(0x60C2, 1) and objects.has(0x60C2, 2)):
+        return {}
+    value, exponent = interpolation_period(rate_Hz)
+    objects.write_verified(0x60C2, 1, value, what="interpolation time period")
+    objects.write_verified(0x60C2, 2, exponent, what="interpolation time index")
+    return {"60C2": f"{value}e{exponent} s"}
 
 
 def counts_per_motor_turn(objects: ObjectAccess) -> float:

@@ -1,42 +1,138 @@
 """The cyclic protocol of one CANopen drive without any input or output: frames to send, frames received.
 
-The real loop, the portable loop and the lockstep simulation all use these three functions:
+The real loop, the portable loop and the lockstep simulation all use these three functions on the same record:
 
     begin_cycle  ->  SYNC, and the heartbeat when it is due
     accept_frame <-  TPDO (statusword, position, torque), EMCY, heartbeat and boot-up of the drive
     end_cycle    ->  RPDO (controlword, target torque or target velocity)
+
+Two encoders on one joint: a sample counts once both have answered the same SYNC.  So the loss of either ends the run as
+a stale sample.  An encoder node that reports an error (EMCY) or that has restarted is not believed: no sample counts
+any more.
 """
 
 from __future__ import annotations
 
 import math
+from enum import IntEnum
+from typing import Annotated
 
 import numpy as np
 
-from jointctl.drivers.can.bit_timing import worst_frame_bits
-from jointctl.drivers.can.frames import ERROR_FLAG, Frame
+from jointctl.drivers.can.frames import ERROR_FLAG, Frame, worst_frame_bits
 from jointctl.drivers.canopen.cia402 import State, control_word, decode_state, drive_state
 from jointctl.drivers.canopen.identifiers import NmtState
-from jointctl.drivers.canopen.port import SLOT_HEARTBEAT, SLOT_RPDO, SLOT_SYNC, CanopenPort
-from jointctl.drivers.canopen.second_position import (
-    SEEN_FIRST,
-    SEEN_SECOND,
-    publish_sample,
-    take_second_counts,
-    watch_second,
-)
 from jointctl.drivers.position_counts import HALF_WRAP, WRAP, take_counts
 from jointctl.firmware_py.kernel import kernel
-from jointctl.firmware_py.records import Command, Sample
-from jointctl.firmware_py.schema import INT32_MAX
+from jointctl.firmware_py.records import ENCODER_RESTARTED, Command, Sample
+from jointctl.firmware_py.schema import INT32_MAX, array_of, f8, i4, i8, record, u1, u4
 from jointctl.firmware_py.states import DriveRequest
 
-# A drive that was told to stop and still says that it is enabled, or says nothing, does not hear us (SYNC or RPDO
-# lost).  Its watchdog is what is left: after so many cycles the heartbeat is withheld for the rest of the run.
-UNHEEDED_MAX_CYCLES = 20
+# slots of the frame array that goes with a port
+SLOT_SYNC = 0
+SLOT_HEARTBEAT = 1
+SLOT_RPDO = 2
+SLOT_RECEIVED = 3
+FRAME_SLOTS = 4
+SCRATCH_WORDS = 8
+SEEN_FIRST, SEEN_SECOND = 1, 2
+_BOTH = SEEN_FIRST | SEEN_SECOND
+# A drive that was commanded to stop and still reports that it is enabled, or reports nothing, does not receive us (SYNC
+# or RPDO lost).  Its watchdog is what is left: after so many cycles the heartbeat is withheld for the rest of the run.
+IGNORED_MAX_CYCLES = 20
 # an error code stays for so long although the drive has reset it: it may be why the joint stops
 ERROR_SHOWN_CYCLES = 20
 _WORST_BITS = np.array([worst_frame_bits(length) for length in range(9)])
+
+
+class AlignTo(IntEnum):
+    """What to do about an encoder that does not know its angle when it is switched on."""
+
+    NOTHING = 0  # both are absolute
+    FIRST = 1  # the second one takes the angle of the first
+    SECOND = 2
+
+
+@record
+class SecondPosition:
+    """A second encoder of the joint: a node of its own (CiA 406), or another object of the drive."""
+
+    tpdo_id: u4  # 0 = there is none
+    tpdo_length: i4
+    position_at: i4  # byte position of 32 bits
+    emergency_id: u4  # of an encoder node; 0 = none
+    heartbeat_id: u4
+    range_counts: i8  # the reading runs over at this many counts
+    zero_counts: i8
+    radpcount: f8  # direction included, at the joint
+    align: i4  # AlignTo
+    feeds_law: i4
+    # state
+    primed: i4
+    aligned: i4
+    last_counts: i8  # as received
+    counts: i8  # since zero_counts, unwrapped
+    offset_rad: f8
+    error: i4  # EMCY error code that is present
+    lost: i4  # it has restarted: what it counts from is not known any more
+
+
+@record
+class CanopenPort:
+    """Identifiers, layout and scaling (set by commissioning), and what has been seen on the bus."""
+
+    fd: i4
+    stamped: i4  # frames carry the time they were sent: virtual bus only
+    node: i4
+    sync_id: u4
+    tpdo_id: u4
+    rpdo_id: u4
+    emergency_id: u4
+    heartbeat_id: u4  # of the drive
+    own_heartbeat_id: u4
+    heartbeat_cycles: i4  # own heartbeat every so many cycles; 0 = none
+    tpdo_length: i4
+    rpdo_length: i4
+    # byte positions inside the PDOs; -1 = not mapped
+    status_at: i4
+    position_at: i4
+    torque_at: i4
+    control_at: i4
+    target_at: i4
+    rpdo_filler: Annotated[np.ndarray, array_of(u1, 8)]  # of the RPDO where nothing is written
+    # scaling, directions included: all at the joint
+    position_radpcount: f8
+    zero_counts: i8
+    torque_Nmppermille: f8
+    max_permille: i4
+    target_is_velocity: i4  # the target is 60FF (32 bit) instead of 6071 (16 bit)
+    velocity_radpspunit: f8  # of 60FF
+    clock: Annotated[np.ndarray, array_of(i8, 2)]  # scratch of the stamps
+    second: SecondPosition
+    # state
+    first_rad: f8  # position by 6064
+    first_offset_rad: f8
+    primed: i4
+    last_counts: i8  # as received, 32 bit
+    counts: i8  # unwrapped
+    cycle: i8
+    state: i4  # cia402.State
+    nmt_state: i4
+    in_cycle: i4  # 1 from SYNC to RPDO
+    seen: i4  # TPDOs since the last SYNC: 1 the drive's, 2 the second encoder's
+    answered: i4  # those of them that came before the RPDO
+    surplus: i8  # TPDOs after those: doubled or late
+    heartbeat_watched: i4  # the drive was set to send its own
+    heartbeat_heard_cycle: i8
+    error_cycle: i8  # in which the last EMCY came
+    error_reset: i4  # the drive has said since that the error is gone
+    ignored_cycles: i4  # in a row in which the drive stayed enabled although it was asked to stop
+    malformed: i8  # TPDOs that were too short
+    error_frames: i8
+    send_failures: i8
+    consecutive_failures: i4
+    last_errno: i4
+    bits_sent: i8  # both directions, worst-case stuffing
 
 
 @kernel
@@ -67,6 +163,73 @@ def put_u16(data: np.ndarray, at: int, value: int) -> None:
     data[at + 1] = value >> 8 & 0xFF
 
 
+# --- a second encoder ---
+
+
+@kernel
+def centred(counts: int, range_counts: int) -> int:
+    """`counts` modulo the range, in [-range/2, range/2)."""
+    half = range_counts // 2
+    return (counts + half) % range_counts - half
+
+
+@kernel
+def take_second_counts(second: SecondPosition, reading: int) -> None:
+    """Unwrap the reading: the joint moves less than half the range between two samples.
+
+    The first one is taken as the angle nearest to zero, so that a range of one turn may run over beside it.
+    """
+    if second.primed == 0:
+        second.primed = 1
+        second.counts = centred(reading - second.zero_counts, second.range_counts)
+    else:
+        second.counts += centred(reading - second.last_counts, second.range_counts)
+    second.last_counts = reading
+
+
+@kernel
+def watch_second(second: SecondPosition, frame: Frame, sample: Sample) -> None:
+    """EMCY and heartbeat of an encoder node."""
+    if frame.can_id == second.emergency_id:
+        if frame.length >= 2:
+            second.error = get_u16(frame.payload, 0)
+            if second.lost == 0:
+                sample.encoder_error = second.error
+    elif frame.length >= 1 and frame.payload[0] & 0x7F == 0:
+        second.lost = 1
+        sample.encoder_error = ENCODER_RESTARTED
+
+
+@kernel
+def publish_sample(port: CanopenPort, sample: Sample, now_ns: int) -> bool:
+    """The sample, if it is complete: with a second encoder, both positions of this cycle."""
+    second = port.second
+    if second.tpdo_id == 0:
+        sample.position_rad = port.first_rad
+        sample.time_ns = now_ns
+        sample.count += 1
+        return True
+    if port.seen != _BOTH or second.error != 0 or second.lost != 0:
+        return False
+    second_rad = second.counts * second.radpcount
+    if second.aligned == 0:
+        second.aligned = 1
+        if second.align == AlignTo.FIRST:
+            second.offset_rad = port.first_rad - second_rad
+        elif second.align == AlignTo.SECOND:
+            port.first_offset_rad = second_rad - port.first_rad
+    first_rad = port.first_rad + port.first_offset_rad
+    second_rad += second.offset_rad
+    sample.position_rad = second_rad if second.feeds_law != 0 else first_rad
+    sample.second_position_rad = first_rad if second.feeds_law != 0 else second_rad
+    sample.time_ns = now_ns
+    sample.count += 1
+    return True
+
+
+# --- a cycle ---
+
+
 @kernel
 def begin_cycle(port: CanopenPort, frames: np.ndarray) -> int:
     """Write SYNC (slot 0) and, when due, the heartbeat (slot 1); returns how many frames to send."""
@@ -78,7 +241,7 @@ def begin_cycle(port: CanopenPort, frames: np.ndarray) -> int:
     due = port.heartbeat_cycles > 0 and port.cycle % port.heartbeat_cycles == 0
     port.cycle += 1
     port.seen = 0
-    if not due or port.unheeded_cycles > UNHEEDED_MAX_CYCLES:
+    if not due or port.ignored_cycles > IGNORED_MAX_CYCLES:
         return 1
     frames[SLOT_HEARTBEAT].can_id = port.own_heartbeat_id
     frames[SLOT_HEARTBEAT].length = 1
@@ -91,7 +254,7 @@ def begin_cycle(port: CanopenPort, frames: np.ndarray) -> int:
 def answer_owed(port: CanopenPort) -> bool:
     """Before `begin_cycle`: whether the last SYNC still lacks a TPDO, so that the next one may belong to it.
 
-    Not on the virtual bus, where a stamp tells.
+    Not on the virtual bus, where a stamp shows it.
     """
     wanted = SEEN_FIRST if port.second.tpdo_id == 0 else SEEN_FIRST | SEEN_SECOND
     return port.cycle > 0 and port.stamped == 0 and port.seen & wanted != wanted
@@ -144,7 +307,7 @@ def _accept_second(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int)
 
 @kernel
 def accept_frame(port: CanopenPort, frame: Frame, sample: Sample, now_ns: int) -> bool:
-    """Take one received frame; True if it was the TPDO with a new sample.  Foreign frames are only counted."""
+    """Take one received frame; True if it was the TPDO with a new sample.  Others are only counted."""
     port.bits_sent += _WORST_BITS[min(frame.length, 8)]
     if frame.can_id & ERROR_FLAG != 0:
         port.error_frames += 1
@@ -201,7 +364,7 @@ def end_cycle(port: CanopenPort, frames: np.ndarray, sample: Sample, command: Co
     if port.heartbeat_watched != 0:
         sample.heartbeat_age_cycles = min(port.cycle - port.heartbeat_heard_cycle, INT32_MAX)
     request = np.int64(command.request)
-    if request == DriveRequest.ENABLE and port.unheeded_cycles > UNHEEDED_MAX_CYCLES:
+    if request == DriveRequest.ENABLE and port.ignored_cycles > IGNORED_MAX_CYCLES:
         request = np.int64(DriveRequest.OFF)
     frame = frames[SLOT_RPDO]
     frame.can_id = port.rpdo_id
@@ -211,9 +374,9 @@ def end_cycle(port: CanopenPort, frames: np.ndarray, sample: Sample, command: Co
     put_u16(frame.payload, port.control_at, control_word(port.state, request))  # type: ignore[arg-type]
     enabled = request == DriveRequest.ENABLE and port.state == State.OPERATION_ENABLED
     if request != DriveRequest.ENABLE and port.state == State.OPERATION_ENABLED:
-        port.unheeded_cycles += 1
-    elif port.unheeded_cycles <= UNHEEDED_MAX_CYCLES:
-        port.unheeded_cycles = 0
+        port.ignored_cycles += 1
+    elif port.ignored_cycles <= IGNORED_MAX_CYCLES:
+        port.ignored_cycles = 0
     if port.target_is_velocity != 0:
         units = velocity_units(port, command.velocity_radps) if enabled else 0
         put_u16(frame.payload, port.target_at, units)

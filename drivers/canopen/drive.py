@@ -9,25 +9,32 @@ from typing import Any
 
 import can
 
-from jointctl.drivers.canopen.bus_watchers import OtherControllers
 from jointctl.drivers.canopen.commissioning import VELOCITY_MODES, Findings, commission
-from jointctl.drivers.canopen.connection_loss import clear_rpdo_deadlines, rpdo_identifiers, watched_nodes
-from jointctl.drivers.canopen.eds_file import read_eds
-from jointctl.drivers.canopen.encoder_end import EncoderEnd
-from jointctl.drivers.canopen.encoder_settings import DRIVE_RANGE_COUNTS
-from jointctl.drivers.canopen.fault_reset import reset_fault
-from jointctl.drivers.canopen.found_enabled import brake_if_enabled
+from jointctl.drivers.canopen.eds import read_eds
+from jointctl.drivers.canopen.encoder import EncoderEnd
 from jointctl.drivers.canopen.identifiers import NmtCommand
-from jointctl.drivers.canopen.network import new_network, report_own_frames
-from jointctl.drivers.canopen.object_access import ATTEMPTS as SDO_ATTEMPTS
-from jointctl.drivers.canopen.object_access import ObjectAccess
-from jointctl.drivers.canopen.scaling import joint_angle_per_count_rad, new_port, start_position_rad
-from jointctl.drivers.canopen.sdo_reads import SdoReads
-from jointctl.drivers.canopen.settings import CanopenSettings
-from jointctl.drivers.canopen.switch_off import POWERED_STATES, SDO_TIMEOUT_S, SwitchOff, state_of
+from jointctl.drivers.canopen.network import OtherControllers, new_network, report_own_frames
+from jointctl.drivers.canopen.pdo import joint_angle_per_count_rad, new_port, start_position_rad
+from jointctl.drivers.canopen.sdo import ATTEMPTS as SDO_ATTEMPTS
+from jointctl.drivers.canopen.sdo import ObjectAccess, SdoReads
+from jointctl.drivers.canopen.settings import DRIVE_RANGE_COUNTS, CanopenSettings
+from jointctl.drivers.canopen.switch_off import (
+    POWERED_STATES,
+    SDO_TIMEOUT_S,
+    SwitchOff,
+    brake_if_enabled,
+    reset_fault,
+    state_of,
+)
 from jointctl.drivers.canopen.thermometer import Thermometer
-from jointctl.drivers.canopen.watchdog_guard import WatchdogGuard, is_kept
-from jointctl.drivers.canopen.watchdog_proof import prove_watchdog
+from jointctl.drivers.canopen.watchdog import (
+    WatchdogGuard,
+    clear_rpdo_deadlines,
+    is_kept,
+    prove_watchdog,
+    rpdo_identifiers,
+    watched_nodes,
+)
 from jointctl.drivers.drive import UNTOUCHED, Approval, CommissioningReport, is_safe
 from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
 from jointctl.firmware_py.states import in_words
@@ -44,7 +51,7 @@ class CanopenDrive:
     It listens for other controllers from its making on.  `gate` is called between any two steps before the loop runs,
     and raises once the user has asked for a stop: no step follows then but those of `make_safe`.
     Where an adapter serves one program at a time, `reopen` is given: `start_cyclic` closes the bus for the loop, and
-    `make_safe` opens it again.  In between nobody but the loop talks to the drive; it is disabled until the loop
+    `make_safe` opens it again.  In between no one but the loop talks to the drive; it is disabled until the loop
     enables it, and from the loop's first heartbeat on its own watchdog stops it when the loop ends.
     """
 
@@ -63,7 +70,7 @@ class CanopenDrive:
         self._taken = False  # whether the drive has heard anything from us
         self._started = False  # whether the loop may send SYNC
         self._reopen = reopen
-        self._lent = False
+        self._handed_over = False
         self._thermometer: Thermometer | None = None
         self._reads: SdoReads | None = None
         self._guard: WatchdogGuard | None = None
@@ -230,7 +237,7 @@ class CanopenDrive:
             self._others.refuse()
             self._gate()
             self._started = True
-            self._encoder.tell(NmtCommand.START)
+            self._encoder.send_command(NmtCommand.START)
             self._node.nmt.send_command(NmtCommand.START)
             self._others.own_loop_begins()
             if self._reopen is not None:
@@ -248,7 +255,7 @@ class CanopenDrive:
             self._others.refuse()
             raise
         if self._reopen is not None:
-            self._lent = True
+            self._handed_over = True
             with contextlib.suppress(Exception):  # the next one to open it gets the error
                 self._network.disconnect()
 
@@ -263,7 +270,7 @@ class CanopenDrive:
 
     def _take_back(self) -> None:
         """Open the bus again if the loop has had it; `BusError` if it cannot be opened."""
-        if not self._lent or self._reopen is None:
+        if not self._handed_over or self._reopen is None:
             return
         for attempt in range(1, REOPEN_ATTEMPTS + 1):
             try:
@@ -274,7 +281,7 @@ class CanopenDrive:
                     raise
                 self._sleep(REOPEN_PAUSE_S)
         self._network.connect()
-        self._lent = False
+        self._handed_over = False
 
     def port(self) -> Any:
         """See `Drive.port`."""
@@ -294,7 +301,7 @@ class CanopenDrive:
 
     def thermometer(self) -> Thermometer | None:
         """See `Drive.thermometer`; a bus that the loop has for itself carries no SDO of ours."""
-        return None if self._lent else self._thermometer
+        return None if self._handed_over else self._thermometer
 
     def make_safe(self, *, asked: bool = False) -> str:
         """See `SwitchOff.make_safe`.

@@ -10,18 +10,21 @@ from typing import Any
 import numpy as np
 from numba.core import types
 
-from jointctl.drivers.answer_window import LOOK_LATE_NS
 from jointctl.drivers.can.frame_io import receive_frame, send_frame, stamp_frame, stamp_of
 from jointctl.drivers.can.frames import Frame
-from jointctl.drivers.canopen.cyclic import accept_frame, answer_owed, begin_cycle, end_cycle
-from jointctl.drivers.canopen.port import (
+from jointctl.drivers.canopen.cyclic import (
     FRAME_SLOTS,
     SCRATCH_WORDS,
     SLOT_RECEIVED,
     SLOT_RPDO,
     SLOT_SYNC,
     CanopenPort,
+    accept_frame,
+    answer_owed,
+    begin_cycle,
+    end_cycle,
 )
+from jointctl.drivers.drive import LOOK_LATE_NS
 from jointctl.firmware_py.kernel import exported, kernel, record_array_type
 from jointctl.firmware_py.libc import monotonic_ns, wait_readable_ns
 from jointctl.firmware_py.records import Command, Sample

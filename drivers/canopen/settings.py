@@ -2,11 +2,41 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from jointctl.drivers.canopen.encoder_settings import JointEncoderSettings
-from jointctl.drivers.canopen.thermometer import TemperatureObject
+DRIVE_RANGE_COUNTS = 1 << 32  # of an object of the drive: a signed 32 bit number that runs over
+
+
+@dataclass(frozen=True)
+class JointEncoderSettings:
+    """An encoder node of its own (`node`), else the object of the drive that holds its position."""
+
+    counts_per_turn: int  # of the joint
+    direction: int
+    zero_counts: int
+    incremental: bool  # it takes the angle of the other encoder when a run begins
+    feeds_law: bool
+    node: int | None = None
+    eds_path: Path | None = None  # of the node
+    index: int = 0x60E4
+    sub: int = 1
+
+    @property
+    def rad_per_count(self) -> float:
+        """Joint angle of one count, direction included."""
+        return self.direction * math.tau / self.counts_per_turn
+
+
+@dataclass(frozen=True)
+class TemperatureObject:
+    """Which object holds the temperature: `unit_degC` times its value, and `offset_degC`."""
+
+    index: int
+    sub: int = 0
+    unit_degC: float = 1.0
+    offset_degC: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -36,11 +66,11 @@ class CanopenSettings:
     rated_torque_Nm: float | None = None
     rated_tolerance: float = 0.01
     max_torque_permille: int | None = None
-    velocity_unit: str = "counts/s"  # of 60FF: a key of `scaling.VELOCITY_UNITS`
+    velocity_unit: str = "counts/s"  # of 60FF: a key of `pdo.VELOCITY_UNITS`
     torque_rate_max_Nmps: float = 0.0  # of the loop, at the joint; what a torque slope (6087) must follow
     boot_timeout_s: float = 0.0  # how long a drive may take to answer and to leave Not Ready to Switch On
     joint_encoder: JointEncoderSettings | None = None
     encoder_incremental: bool = False
     sdo_timeout_s: float | None = None  # of one SDO request; None: `switch_off.SDO_TIMEOUT_S`
     velocity_max_radps: float | None = None  # at the joint, for the drive's own limit in the velocity modes
-    temperature: TemperatureObject | None = None  # what tells it, if anything
+    temperature: TemperatureObject | None = None  # the object that holds it, if any

@@ -1,4 +1,4 @@
-"""Taking the power from a CiA 402 drive over SDO, for whoever has to: the driver after a run, `jointctl stop`.
+"""Taking the power from a CiA 402 drive over SDO, and resetting its fault: the driver after a run, `jointctl stop`.
 
 `stop_node` needs neither a configuration that holds nor an EDS: the few objects have the types that CiA 301 and 402
 give them.
@@ -15,18 +15,23 @@ import can
 import canopen
 from canopen.objectdictionary import ODVariable
 
+from jointctl.drivers.at_rest import STOP_HINT, refuse_unless_at_rest
 from jointctl.drivers.canopen.cia402 import ControlWord, State, state_of_word
+from jointctl.drivers.canopen.eds import standard_type
 from jointctl.drivers.canopen.identifiers import NmtCommand
 from jointctl.drivers.canopen.network import new_network, send_nmt
-from jointctl.drivers.canopen.object_access import ObjectAccess
-from jointctl.drivers.canopen.standard_objects import standard_type
-from jointctl.drivers.errors import DeviceError, JointctlError
+from jointctl.drivers.canopen.sdo import ObjectAccess
+from jointctl.drivers.drive import Approval
+from jointctl.drivers.errors import BusError, DeviceError, JointctlError
 from jointctl.firmware_py.states import in_words
 
 SDO_TIMEOUT_S = 0.3
 QUICK_STOP_S = 1.0  # how long a moving joint may brake before its power is taken
 OFF_S = 1.0  # how long a drive may take to be off; some run through a brake delay of their own first
 POLL_S = 0.02
+RESET_ATTEMPTS = 3
+SETTLE_S = 0.1  # for the fault to come back if its cause is still there
+QUESTION = "The drive is enabled, at rest, and no one else is on the bus. Brake it and switch it off?"
 OFF_STATES = (State.SWITCH_ON_DISABLED, State.FAULT)
 POWERED_STATES = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE)
 _OBJECTS = (0x6040, 0x6041, 0x6071, 0x60FF)
@@ -61,7 +66,7 @@ class SwitchOff:
         self._network, self._node, self._objects, self._encoder_node = network, node, objects, encoder_node
         self._sleep = sleep
 
-    def _tell(self, command: NmtCommand, node: int | None) -> None:
+    def _send_nmt(self, command: NmtCommand, node: int | None) -> None:
         if node is not None:
             send_nmt(self._network, command, node)
 
@@ -87,7 +92,7 @@ class SwitchOff:
             return self._attempt()
         except JointctlError as error:
             try:
-                self._tell(NmtCommand.STOP, self._node)
+                self._send_nmt(NmtCommand.STOP, self._node)
             except can.CanError:
                 return f"unknown: {error}; the bus does not take frames any more"
             return f"unknown: {error}; NMT stop was sent"
@@ -105,8 +110,8 @@ class SwitchOff:
             self._sleep(POLL_S)
 
     def _attempt(self) -> str:
-        self._tell(NmtCommand.ENTER_PRE_OPERATIONAL, self._encoder_node)
-        self._tell(NmtCommand.ENTER_PRE_OPERATIONAL, self._node)
+        self._send_nmt(NmtCommand.ENTER_PRE_OPERATIONAL, self._encoder_node)
+        self._send_nmt(NmtCommand.ENTER_PRE_OPERATIONAL, self._node)
         brake(self._objects, self._sleep)
         for _ in range(round(OFF_S / POLL_S)):
             self._objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
@@ -119,7 +124,7 @@ class SwitchOff:
                 self._objects.write_if_present(index, 0, 0, what=what)
         words = in_words(state)
         if state in POWERED_STATES:
-            self._tell(NmtCommand.STOP, self._node)
+            self._send_nmt(NmtCommand.STOP, self._node)
             return f"{words}, it did not obey; NMT stop was sent"
         return words
 
@@ -147,7 +152,7 @@ def stop_node(
     sdo_timeout_s: float | None = None,
     sleep: Callable[[float], None] = time.sleep,
 ) -> str:
-    """Stop and disable the drive at `node` whoever controls it; closes `bus`.  See `SwitchOff.make_safe`."""
+    """Stop and disable the drive at `node`, another controller's as well; closes `bus`.  See `SwitchOff.make_safe`."""
     network = new_network(bus, sleep)
     network.connect()
     try:
@@ -156,5 +161,52 @@ def stop_node(
         switch_off = SwitchOff(network, node, ObjectAccess(remote, "CiA 402"), encoder_node, sleep)
         return switch_off.make_safe(brake_first=True)
     finally:
-        with contextlib.suppress(Exception):  # what went wrong on it has been told
+        with contextlib.suppress(Exception):  # what went wrong on it has been reported
             network.disconnect()
+
+
+def brake_if_enabled(
+    objects: ObjectAccess, node: int, rad_per_count: float, approve: Approval | None,
+    pause: Callable[[float], None], refuse_others: Callable[[], None],
+) -> str:  # fmt: skip
+    """The quick stop of a drive that is enabled and at rest, once `approve` has agreed; a remark, "" where it is off.
+
+    Raises as `refuse_unless_at_rest`.  Only SDO is used: NMT could end its motion without braking.
+    """
+    state = state_of(objects)
+    if state not in POWERED_STATES:
+        return ""
+    refuse_unless_at_rest(
+        f"node {node} is {in_words(state)}", lambda: objects.read(0x6064, what="position actual value"),
+        rad_per_count, approve, QUESTION, pause, refuse_others,
+    )  # fmt: skip
+    brake(objects, pause)
+    if (state := state_of(objects)) is State.OPERATION_ENABLED:
+        raise BusError(f"node {node} was enabled again after its quick stop: another controller has it", STOP_HINT)
+    return "the drive was enabled, at rest: it has been braked by its quick stop and switched off"
+
+
+def reset_fault(objects: ObjectAccess, pause: Callable[[float], None]) -> str:
+    """Because the user asked for it: nothing else in jointctl resets a fault.  What was reset, in words.
+
+    The reset is the rising edge of controlword bit 7, so the bit is cleared first.  If the cause is still there the
+    fault comes back: a few attempts, then `DeviceError`.  The drive stays disabled throughout.
+    """
+    code = 0
+    for _ in range(RESET_ATTEMPTS):
+        objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
+        pause(SETTLE_S)
+        state = state_of(objects)
+        if state not in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+            words = in_words(state)
+            return f"fault {code:04X}h was reset, the drive is {words}" if code else f"no fault: the drive is {words}"
+        code = objects.read_if_present(0x603F, what="error code") or code
+        objects.write(0x6040, 0, ControlWord.FAULT_RESET, what="controlword")
+        pause(SETTLE_S)
+    state = state_of(objects)
+    if state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+        raise DeviceError(
+            f"the drive stays in fault (error code {code:04X}h) after {RESET_ATTEMPTS} resets",
+            "its cause is still there: supply, temperature, encoder, heartbeat; see the drive's manual for the code",
+        )
+    return f"fault {code:04X}h was reset, the drive is {in_words(state)}"

@@ -10,30 +10,19 @@ import math
 import struct
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import canopen
 from canopen.objectdictionary import ObjectDictionaryError
 from canopen.objectdictionary.datatypes import NUMBER_TYPES
 
-from jointctl.drivers.canopen.object_access import object_name
-from jointctl.drivers.canopen.sdo_reads import SdoReads
+from jointctl.drivers.canopen.sdo import SdoReads, object_name
+from jointctl.drivers.canopen.settings import TemperatureObject
 from jointctl.drivers.drive import Reading
 from jointctl.drivers.errors import DeviceError
 
 PERIOD_S = 1.0
 _WIDEST_BITS = 32  # of an expedited answer
-
-
-@dataclass(frozen=True)
-class TemperatureObject:
-    """Which object holds the temperature: `unit_degC` times its value, and `offset_degC`."""
-
-    index: int
-    sub: int = 0
-    unit_degC: float = 1.0
-    offset_degC: float = 0.0
 
 
 class Thermometer:

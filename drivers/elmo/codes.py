@@ -1,4 +1,4 @@
-"""The numbers of an Elmo drive in words: error codes (EC), motor fault (MF), status register (SR), unit modes (UM).
+"""The numbers of an Elmo drive: error codes (EC), motor fault (MF), status register (SR), unit modes (UM) in words.
 
 Source: the command reference of the drive family as far as two public drivers and the project's facts sheet state it.
 A code that is not listed is shown as its number: the list is not complete.
@@ -7,6 +7,11 @@ A code that is not listed is shown as its number: the list is not complete.
 from __future__ import annotations
 
 from enum import IntEnum
+
+# the characters of the ASCII interpreter's language, for kernels, which handle bytes
+CR, SEMICOLON, QUESTION_MARK = 0x0D, 0x3B, 0x3F
+PLUS, MINUS, POINT, EQUALS = 0x2B, 0x2D, 0x2E, 0x3D
+ZERO, NINE = 0x30, 0x39
 
 # EC: why the last command was refused
 ERROR_CODES: dict[int, str] = {

@@ -11,10 +11,16 @@ from typing import Any
 import numpy as np
 from numba.core import types
 
-from jointctl.drivers.answer_window import LOOK_LATE_NS
-from jointctl.drivers.elmo.cyclic import begin_cycle, end_cycle, note_written
-from jointctl.drivers.elmo.port import READ_MAX, SCRATCH_WORDS, ElmoPort
-from jointctl.drivers.elmo.replies import take_byte
+from jointctl.drivers.drive import LOOK_LATE_NS
+from jointctl.drivers.elmo.cyclic import (
+    READ_MAX,
+    SCRATCH_WORDS,
+    ElmoPort,
+    begin_cycle,
+    end_cycle,
+    note_written,
+    take_byte,
+)
 from jointctl.firmware_py.kernel import exported, kernel, record_array_type
 from jointctl.firmware_py.libc import EAGAIN, EINTR, errno, external, monotonic_ns, poll_events, wait_readable_ns
 from jointctl.firmware_py.records import Command, Sample

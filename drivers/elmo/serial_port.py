@@ -36,7 +36,7 @@ class BytePort(Protocol):
 class SerialPort:
     """8N1, no flow control.  Locked against a second `jointctl`; the loop process opens the same port without lock.
 
-    `exclusive` False is for whoever has to switch the drive off whoever has the port.
+    `exclusive` False: to switch the drive off although another program has the port.
     """
 
     def __init__(self, path: str, baud_rate_bitps: int, *, exclusive: bool = True) -> None:
@@ -67,7 +67,7 @@ class SerialPort:
 
     def close(self) -> None:
         with contextlib.suppress(Exception):
-            self._serial.reset_output_buffer()  # closing would wait for bytes that nobody takes any more
+            self._serial.reset_output_buffer()  # closing would wait for bytes that no one takes any more
         with contextlib.suppress(Exception):
             self._serial.close()
 
@@ -94,7 +94,7 @@ def open_descriptor(path: str) -> int:
 
 
 def usb_serial_number(path: str) -> str | None:
-    """Of the USB adapter behind a port; None where the system tells none: other ports, cheap adapters."""
+    """Of the USB adapter behind a port; None where the system knows none: other ports, cheap adapters."""
     device = os.path.realpath(path)
     try:
         return next((found.serial_number or None for found in list_ports.comports() if found.device == device), None)

@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+SERIAL = "serial"  # stands for such a line where a CAN bus has the name of its python-can interface
+
 
 @dataclass(frozen=True)
 class ElmoSettings:

@@ -1,4 +1,4 @@
-"""Torque and speed zero, motor off on a serial line, for whoever has to say it: drive, loop, guard, `jointctl stop`."""
+"""Torque and speed zero, motor off on a serial line: sent by drive, loop, guard and `jointctl stop`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jointctl.drivers.errors import DeviceError, JointctlError
 
 SAFE_ATTEMPTS = 5
 # TC and ST before MO: where the drive takes no MO=0 it is without torque, or its jog has ended, all the same.  JV=0, so
-# that no later BG jogs on; without a BG, which in a unit mode that somebody else has chosen would begin a motion.
+# that no later BG jogs on; without a BG, which in a unit mode that another program has chosen would begin a motion.
 # The first CR ends a half command.
 COMMANDS = (b"TC=0", b"JV=0", b"ST", b"MO=0")
 SWITCH_OFF = b"\r" + b"".join(command + b"\r" for command in COMMANDS)
@@ -18,7 +18,7 @@ SWITCH_OFF = b"\r" + b"".join(command + b"\r" for command in COMMANDS)
 def switch_off(port: BytePort, line: Dialogue, attempts: int = SAFE_ATTEMPTS) -> str:
     """TC=0, JV=0, ST, MO=0 until MO reads 0; returns `off`, or `off, fault: ...`.
 
-    Raises the last error where the drive did not confirm; it has been told all the same, as far as the port took it.
+    Raises the last error where the drive did not confirm; all commands were sent, as far as the port took them.
     """
     line.interpreter.echo = None  # a drive that restarted has its own setting again
     error: JointctlError | None = None

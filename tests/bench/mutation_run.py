@@ -33,13 +33,13 @@ TESTS = {  # below UNIT_TESTS
     ),
     "firmware_py/sequence.py": ("firmware_py/axis/test_sequence_*", "firmware_py/axis/test_axis_*"),
     "drivers/canopen/cia402.py": ("drivers/canopen/test_cia402",),
-    "drivers/canopen/bus_watchers.py": ("drivers/canopen/test_other_controllers", "drivers/canopen/test_switch_off"),
+    "drivers/canopen/network.py": ("drivers/canopen/test_other_controllers", "drivers/canopen/test_switch_off"),
     "drivers/at_rest.py": ("drivers/canopen/test_switch_off", "drivers/elmo/test_elmo_commissioning"),
-    "drivers/canopen/found_enabled.py": ("drivers/canopen/test_switch_off",),
     "drivers/canopen/switch_off.py": ("drivers/canopen/test_switch_off",),
-    "drivers/canopen/watchdog_guard.py": ("drivers/canopen/test_watchdog_guard",),
-    "drivers/canopen/watchdog_proof.py": ("drivers/canopen/test_watchdog_proof",),
-    "drivers/canopen/connection_loss.py": ("drivers/canopen/test_connection_loss", "drivers/canopen/test_switch_off"),
+    "drivers/canopen/watchdog.py": (
+        "drivers/canopen/test_connection_loss", "drivers/canopen/test_watchdog_proof",
+        "drivers/canopen/test_watchdog_guard", "drivers/canopen/test_switch_off",
+    ),
     "drivers/canopen/commissioning.py": (
         "drivers/canopen/test_commissioning", "drivers/canopen/test_odd_drives", "drivers/canopen/test_connection_loss",
     ),

@@ -15,8 +15,8 @@ import pytest
 
 from jointctl.drivers.can.frame_io import stamp_frame
 from jointctl.drivers.can.frames import Frame
+from jointctl.drivers.canopen.cyclic import CanopenPort
 from jointctl.drivers.canopen.exchange import end, exchange_memory, receive
-from jointctl.drivers.canopen.port import CanopenPort
 from jointctl.firmware_py.records import Command, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.hil.canopen.device import Cia402Device, DeviceSettings

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointctl.drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES
+from jointctl.drivers.canopen.cyclic import IGNORED_MAX_CYCLES
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.faults.kinds import FaultKind
@@ -38,7 +38,7 @@ def test_a_drive_that_does_not_hear_the_loop_is_stopped_by_its_own_watchdog(
     tripped = int(np.argmax(run.log.fault != Fault.NONE))
     enabled = int(np.argmax(run.truth[:, TRUE_POWER_STATE] == PowerState.OPERATION_ENABLED))
     known_s = (tripped - enabled) * 1e-3 - AT_s
-    longest_s = known_s + UNHEEDED_MAX_CYCLES * 1e-3 + HEARTBEAT_s + 0.01
+    longest_s = known_s + IGNORED_MAX_CYCLES * 1e-3 + HEARTBEAT_s + 0.01
     assert seconds_until(run, PowerState.QUICK_STOP_ACTIVE) <= longest_s
     assert run.truth[-1, TRUE_POWER_STATE] == PowerState.SWITCH_ON_DISABLED
 

@@ -12,8 +12,17 @@ import pytest
 from jointctl.drivers.can.frames import Frame
 from jointctl.drivers.canopen import exchange, switch_off
 from jointctl.drivers.canopen.cia402 import ControlWord, State
-from jointctl.drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES, accept_frame, end_cycle, get_i16, get_u16
-from jointctl.drivers.canopen.port import FRAME_SLOTS, SCRATCH_WORDS, SLOT_RPDO, CanopenPort
+from jointctl.drivers.canopen.cyclic import (
+    FRAME_SLOTS,
+    IGNORED_MAX_CYCLES,
+    SCRATCH_WORDS,
+    SLOT_RPDO,
+    CanopenPort,
+    accept_frame,
+    end_cycle,
+    get_i16,
+    get_u16,
+)
 from jointctl.drivers.drive import is_safe
 from jointctl.drivers.errors import BusError, DeviceError
 from jointctl.firmware_py.records import Command, Sample
@@ -150,7 +159,7 @@ class Wire:
 
 @pytest.mark.parametrize(
     ("cycles", "enables"),
-    [(UNHEEDED_MAX_CYCLES - 1, True), (UNHEEDED_MAX_CYCLES, True), (UNHEEDED_MAX_CYCLES + 1, False), (100, False)],
+    [(IGNORED_MAX_CYCLES - 1, True), (IGNORED_MAX_CYCLES, True), (IGNORED_MAX_CYCLES + 1, False), (100, False)],
 )
 def test_without_a_heartbeat_the_drive_is_never_enabled(cycles: int, enables: bool) -> None:
     wire = Wire()

@@ -16,7 +16,7 @@ quick stop with what the load leaves of it:
 `t` is `REACTION_s` where the loop measures and is heard, or more where these take longer: one period each for sample
 and command, the velocity filter (three time constants, 5 ms at 100 Hz) and the motor's delay and lag.  Where the drive
 does not hear the loop it holds the last torque, or in a sweep the last velocity, until its own watchdog acts: age limit
-of the samples + UNHEEDED_MAX_CYCLES + drive.heartbeat_s.
+of the samples + IGNORED_MAX_CYCLES + drive.heartbeat_s.
 
 A reading that is wrong by w (jump, drift) shifts the true position by w.  Behind a stuck encoder the joint is blind
 until POSITION_FROZEN: it is pushed with at most frozen_torque_Nm for longer than PUSHED_CYCLES, 16 Nm more than the
@@ -32,7 +32,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from jointctl.drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES
+from jointctl.drivers.canopen.cyclic import IGNORED_MAX_CYCLES
 from jointctl.hil.faults.kinds import FaultKind
 from jointctl.tools.campaign.scenario import Scenario
 from jointctl.tools.configuration.config import Config
@@ -79,8 +79,8 @@ def reaction_s(config: Config, kind: FaultKind) -> float:
     """Longest time from passing a limit to the beginning of the reaction."""
     age_s, measuring_s = config.limits.sample_age_max_s, _measuring_s(config)
     if kind in _UNHEARD:
-        unheeded_s = UNHEEDED_MAX_CYCLES / config.loop.rate_Hz
-        return measuring_s + age_s + unheeded_s + config.canopen.heartbeat_s
+        ignored_s = IGNORED_MAX_CYCLES / config.loop.rate_Hz
+        return measuring_s + age_s + ignored_s + config.canopen.heartbeat_s
     if kind in _BLIND_FOR_A_WHILE:
         return measuring_s + age_s
     return measuring_s

@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from jointctl.drivers.can.bit_timing import bus_load, highest_rate_Hz
-from jointctl.drivers.canopen.encoder_settings import JointEncoderSettings
-from jointctl.drivers.canopen.settings import CanopenSettings
-from jointctl.drivers.canopen.thermometer import TemperatureObject
+from jointctl.drivers.can.frames import bus_load, highest_rate_Hz
+from jointctl.drivers.canopen.settings import CanopenSettings, JointEncoderSettings, TemperatureObject
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.hil.canopen.device import DeviceSettings
 from jointctl.hil.canopen.encoder_node import EncoderSettings

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, PrivateAttr
 from pydantic_core import PydanticCustomError
 
-from jointctl.drivers.elmo.port import SERIAL
+from jointctl.drivers.elmo.settings import SERIAL
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.configuration.sections import Ampere, Direction, Rule, Section, between
 

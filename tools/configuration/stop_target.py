@@ -20,7 +20,7 @@ from pydantic_core import PydanticCustomError
 from jointctl.drivers.can.channel import split_channel, with_options
 from jointctl.drivers.can.open import CYCLIC_INTERFACES, SHARED_INTERFACES
 from jointctl.drivers.canopen.identifiers import HIGHEST_NODE
-from jointctl.drivers.elmo.port import SERIAL
+from jointctl.drivers.elmo.settings import SERIAL
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.input_file import parse_toml, read_input
 from jointctl.tools.configuration.bus_options import checked_options

@@ -15,10 +15,9 @@ from typing import Any
 import can
 import numpy as np
 
-from jointctl.drivers.can.bit_timing import bus_load, highest_rate_Hz
-from jointctl.drivers.can.link_state import SHORT_QUEUE, link_problem, link_state
+from jointctl.drivers.can.frames import bus_load, highest_rate_Hz
 from jointctl.drivers.can.open import CYCLIC_INTERFACES, open_python_can
-from jointctl.drivers.can.socketcan import up_command
+from jointctl.drivers.can.socketcan import SHORT_QUEUE, link_problem, link_state, up_command
 from jointctl.drivers.canopen.identifiers import SDO_ANSWER_ID, SDO_REQUEST_ID
 from jointctl.drivers.errors import BusError
 from jointctl.tools.configuration.config import Config

@@ -9,7 +9,7 @@ from typing import Any
 
 import can
 
-from jointctl.drivers.can.error_frames import error_frame_text
+from jointctl.drivers.can.socketcan import error_frame_text
 from jointctl.drivers.canopen.identifiers import (
     EMERGENCY_ID,
     FUNCTION_MASK,

@@ -10,8 +10,8 @@ from typing import Any
 import canopen
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
-from jointctl.drivers.canopen.eds_file import read_eds
-from jointctl.drivers.canopen.object_access import object_name
+from jointctl.drivers.canopen.eds import read_eds
+from jointctl.drivers.canopen.sdo import object_name
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.input_file import require_input
 from jointctl.tools.inspection import drive_words

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from jointctl.drivers.canopen.pdo_layout import DISABLED
-from jointctl.drivers.canopen.sdo_download import download
+from jointctl.drivers.canopen.pdo import DISABLED
+from jointctl.drivers.canopen.sdo import download
 from jointctl.tools.inspection.objects import Place
 from jointctl.tools.inspection.parameters import Value
 from jointctl.tools.inspection.sdo_reading import ATTEMPTS, Refusal, SdoReader, abort_text

@@ -13,7 +13,7 @@ from typing import Any
 import canopen
 
 from jointctl.drivers.canopen.identifiers import NODE_MASK, RPDO1_ID, SDO_ANSWER_ID, TPDO1_ID
-from jointctl.drivers.canopen.pdo_layout import (
+from jointctl.drivers.canopen.pdo import (
     CONTROL,
     DISABLED,
     POSITION,

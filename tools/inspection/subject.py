@@ -12,8 +12,8 @@ from pathlib import Path
 import can
 import canopen
 
-from jointctl.drivers.can.link_state import interface_blamed
 from jointctl.drivers.can.open import open_python_can
+from jointctl.drivers.can.socketcan import interface_blamed
 from jointctl.drivers.canopen.network import new_network
 from jointctl.drivers.errors import BusError, ConfigurationError
 from jointctl.tools.configuration.config import Config

@@ -8,8 +8,8 @@ from typing import Any
 
 import can
 
-from jointctl.drivers.can.link_state import interface_blamed
 from jointctl.drivers.can.open import CYCLIC_INTERFACES, SHARED_INTERFACES, open_python_can
+from jointctl.drivers.can.socketcan import interface_blamed
 from jointctl.drivers.canopen.drive import CanopenDrive
 from jointctl.drivers.drive import Approval, CommissioningReport, Drive
 from jointctl.drivers.elmo.codes import motor_fault_text

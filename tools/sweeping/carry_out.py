@@ -15,7 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from jointctl.drivers.drive import CommissioningReport
-from jointctl.drivers.elmo.unit_modes import SPEED_MODE
+from jointctl.drivers.elmo.commissioning import SPEED_MODE
 from jointctl.drivers.errors import ConfigurationError, DeviceError, UsageError
 from jointctl.firmware_py.records import Reference
 from jointctl.firmware_py.schema import new

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from jointctl.drivers.can.link_state import interface_blamed
+from jointctl.drivers.can.socketcan import interface_blamed
 from jointctl.drivers.errors import INTERRUPTED
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo import ElmoSerial

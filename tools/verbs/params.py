@@ -9,10 +9,9 @@ from typing import Any
 
 from rich.table import Table
 
-from jointctl.drivers.canopen.bus_watchers import OtherControllers
 from jointctl.drivers.canopen.cia402 import State, state_of_word, state_text
 from jointctl.drivers.canopen.identifiers import NmtCommand
-from jointctl.drivers.canopen.network import send_nmt
+from jointctl.drivers.canopen.network import OtherControllers, send_nmt
 from jointctl.drivers.errors import DECLINED, ConfigurationError, DataError, DeviceError
 from jointctl.tools.inspection.objects import Objects, Place
 from jointctl.tools.inspection.parameter_file import load_parameters, toml_text, write_dcf

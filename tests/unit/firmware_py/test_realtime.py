@@ -190,7 +190,7 @@ ours.setblocking(False)
 
 def driver_run(cycles):
     from jointctl.drivers.canopen.exchange import exchange_memory, receive, send
-    from jointctl.drivers.canopen.port import CanopenPort
+    from jointctl.drivers.canopen.cyclic import CanopenPort
     from jointctl.firmware_py.schema import new
     from jointctl.firmware_py.realtime import run_loop
     global port, frames, scratch

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jointctl.drivers.can.bit_timing import worst_frame_bits
+from jointctl.drivers.can.frames import worst_frame_bits
 from jointctl.firmware_py.schema import new
 from jointctl.hil.bus.timing import (
     EXTENDED,

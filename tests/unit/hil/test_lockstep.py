@@ -64,9 +64,9 @@ def lockstep(device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, vir
 
 
 def test_slots_agree_with_the_driver() -> None:
-    from jointctl.drivers.canopen import port
+    from jointctl.drivers.canopen import cyclic
 
-    assert (RPDO_SLOT, RECEIVED_SLOT) == (port.SLOT_RPDO, port.SLOT_RECEIVED)
+    assert (RPDO_SLOT, RECEIVED_SLOT) == (cyclic.SLOT_RPDO, cyclic.SLOT_RECEIVED)
 
 
 def test_a_whole_run_through_the_real_codec(lockstep: Lockstep) -> None:

@@ -13,7 +13,7 @@ import can
 import numpy as np
 import pytest
 
-from jointctl.drivers.can.link_state import parse_link
+from jointctl.drivers.can.socketcan import parse_link
 from jointctl.drivers.errors import BusError
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config

@@ -12,7 +12,7 @@ from typing import Any
 import can
 import pytest
 
-from jointctl.drivers.canopen.standard_objects import standard_type
+from jointctl.drivers.canopen.eds import standard_type
 from jointctl.drivers.errors import ConfigurationError, NoDeviceError
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.inspection import node_scan

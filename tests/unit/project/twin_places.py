@@ -150,8 +150,8 @@ CAN: dict[tuple[str, str], tuple[str, str] | tuple[Fault, ...]] = {
         "_of_the_drive | (0.098, False)",
     ),
     ("loop", "that it is heard"): (
-        CYCLIC_SENT + "test_a_drive_that_stays_enabled_loses_the_heartbeat | (UNHEEDED_MAX_CYCLES + 1, 1)",
-        CYCLIC_SENT + "test_a_drive_that_stays_enabled_loses_the_heartbeat | (UNHEEDED_MAX_CYCLES, 2)",
+        CYCLIC_SENT + "test_a_drive_that_stays_enabled_loses_the_heartbeat | (IGNORED_MAX_CYCLES + 1, 1)",
+        CYCLIC_SENT + "test_a_drive_that_stays_enabled_loses_the_heartbeat | (IGNORED_MAX_CYCLES, 2)",
     ),
     ("loop", "the drive"): (Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED, Fault.DRIVE_RESTARTED),
     ("loop", "the drive's communication"): (Fault.DRIVE_SILENT,),

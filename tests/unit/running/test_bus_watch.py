@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from jointctl.drivers.can.error_frames import BUS_OFF, CONTROLLER
-from jointctl.drivers.can.link_state import LinkState
+from jointctl.drivers.can.socketcan import BUS_OFF, CONTROLLER, LinkState
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config

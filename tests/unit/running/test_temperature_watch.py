@@ -10,7 +10,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from jointctl.drivers.canopen.thermometer import TemperatureObject
+from jointctl.drivers.canopen.settings import TemperatureObject
 from jointctl.drivers.drive import Reading
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.records import LogRecord

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from jointctl.drivers.can.bit_timing import worst_frame_bits
+from jointctl.drivers.can.frames import worst_frame_bits
 from jointctl.drivers.canopen.identifiers import EVENT_DRIVEN
 from jointctl.firmware_py.realtime import Histogram
 

@@ -163,7 +163,7 @@ def portable_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
 def run(order: LoopOrder) -> int:
     """Warm up, wait for GO, run the loop; returns the exit code."""
     from jointctl.drivers.can.open import CYCLIC_INTERFACES
-    from jointctl.drivers.elmo.port import SERIAL
+    from jointctl.drivers.elmo.settings import SERIAL
     from jointctl.tools.running.loop.shared_block import SharedBlock
 
     block = SharedBlock(order.block_fd, order.table_rows, order.interface)

@@ -30,8 +30,16 @@ import numpy as np
 
 from jointctl.drivers.can.frames import ERROR_FLAG, Frame
 from jointctl.drivers.can.virtual_bus import decode, encode
-from jointctl.drivers.canopen.cyclic import accept_frame, answer_owed, begin_cycle, end_cycle
-from jointctl.drivers.canopen.port import FRAME_SLOTS, SLOT_RECEIVED, SLOT_RPDO, SLOT_SYNC
+from jointctl.drivers.canopen.cyclic import (
+    FRAME_SLOTS,
+    SLOT_RECEIVED,
+    SLOT_RPDO,
+    SLOT_SYNC,
+    accept_frame,
+    answer_owed,
+    begin_cycle,
+    end_cycle,
+)
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.axis import step_axis
 from jointctl.firmware_py.libc import NANOSECONDS, sleep_until_ns

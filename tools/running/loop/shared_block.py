@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.canopen.port import CanopenPort
-from jointctl.drivers.elmo.port import SERIAL, ElmoPort
+from jointctl.drivers.canopen.cyclic import CanopenPort
+from jointctl.drivers.elmo.cyclic import ElmoPort
+from jointctl.drivers.elmo.settings import SERIAL
 from jointctl.firmware_py.realtime import HISTOGRAM_BINS, WORDS, Histogram, Word
 from jointctl.firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import dtype_of

@@ -14,9 +14,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from jointctl.drivers.can import socketcan
-from jointctl.drivers.can.error_frames import error_frame_text, trouble
 from jointctl.drivers.can.frames import FRAME_STRUCT
-from jointctl.drivers.can.link_state import link_problem, link_state, send_problem
+from jointctl.drivers.can.socketcan import error_frame_text, link_problem, link_state, send_problem, trouble
 from jointctl.drivers.errors import BusError
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.config import Config

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from jointctl.drivers.can.bit_timing import bus_load, highest_rate_Hz, worst_cycle_bits, worst_frame_bits
+from jointctl.drivers.can.frames import bus_load, highest_rate_Hz, worst_cycle_bits, worst_frame_bits
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.configuration.drive_settings import cyclic_bus_load
 from jointctl.tools.configuration.load import load_config, shipped_config

@@ -9,14 +9,20 @@ from typing import Any
 import can
 import pytest
 
-from jointctl.drivers.can.error_frames import BUS_OFF, CONTROLLER, COUNTERS, NO_ACK, PROTOCOL, error_frame_text, trouble
-from jointctl.drivers.can.link_state import (
+from jointctl.drivers.can.socketcan import (
+    BUS_OFF,
+    CONTROLLER,
+    COUNTERS,
+    NO_ACK,
+    PROTOCOL,
     LinkState,
+    error_frame_text,
     interface_blamed,
     link_problem,
     link_state,
     parse_link,
     send_problem,
+    trouble,
 )
 from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.drivers.errors import BusError, JointctlError, NoDeviceError
@@ -115,9 +121,7 @@ SILENCE = NoDeviceError("node 1 does not answer", hint="power, wiring")
 def test_silence_on_a_sick_interface_tells_its_trouble_and_the_cure(
     data: dict[str, Any], words: str, cure: str, failure: JointctlError, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        "jointctl.drivers.can.link_state.link_state", lambda channel: parse_link(real_interface(**data))
-    )
+    monkeypatch.setattr("jointctl.drivers.can.socketcan.link_state", lambda channel: parse_link(real_interface(**data)))
     with pytest.raises(type(failure)) as caught, interface_blamed("socketcan", "can0", 1_000_000):
         raise failure
     assert caught.value.message.startswith(f"{failure.message}; CAN interface can0 ")
@@ -133,7 +137,7 @@ def test_silence_on_a_sound_interface_or_another_bus_stays_as_it_is(
     interface: str, state: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     link = parse_link(real_interface(state=state)) if state else None  # None: no such interface, or no program `ip`
-    monkeypatch.setattr("jointctl.drivers.can.link_state.link_state", lambda channel: link)
+    monkeypatch.setattr("jointctl.drivers.can.socketcan.link_state", lambda channel: link)
     with pytest.raises(NoDeviceError) as caught, interface_blamed(interface, "can0", 1_000_000):
         raise SILENCE
     assert caught.value is SILENCE
@@ -145,7 +149,7 @@ def test_who_hears_nobody_on_an_interface_of_another_bit_rate_says_so(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     link = parse_link(real_interface(bittiming={"bitrate": 500000}))
-    monkeypatch.setattr("jointctl.drivers.can.link_state.link_state", lambda channel: link)
+    monkeypatch.setattr("jointctl.drivers.can.socketcan.link_state", lambda channel: link)
     monkeypatch.setattr(
         "jointctl.tools.inspection.subject.open_python_can",
         lambda *_: can.Bus(interface="virtual", channel=empty_bus.channel),

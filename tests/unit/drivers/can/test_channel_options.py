@@ -16,9 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jointctl.drivers.bus_lock import lock_name
-from jointctl.drivers.can.channel import NAME, split_channel, with_options
+from jointctl.drivers.can.channel import NAME, port_path, split_channel, with_options
 from jointctl.drivers.can.open import open_python_can
-from jointctl.drivers.can.serial_adapter import port_path
 from jointctl.drivers.errors import BusError, ConfigurationError
 from jointctl.tools.configuration.load import load_config, with_bus_overrides
 from jointctl.tools.configuration.stop_target import GivenTarget, stop_target

@@ -13,8 +13,7 @@ from typing import Any
 import can
 import pytest
 
-from jointctl.drivers.can.foreign_bus import tamed
-from jointctl.drivers.can.open import open_python_can
+from jointctl.drivers.can.open import normalised, open_python_can
 from jointctl.drivers.errors import BusError
 
 
@@ -122,7 +121,7 @@ class Odd:
     ],
 )
 def test_a_third_party_bus_fails_in_one_way(error: Exception, text: str, code: int | None) -> None:
-    bus = tamed(Odd(error))  # type: ignore[arg-type]
+    bus = normalised(Odd(error))  # type: ignore[arg-type]
     for call in (lambda: bus.send(can.Message()), lambda: bus.recv(0.0)):
         with pytest.raises(can.CanOperationError, match=re.escape(text)) as caught:
             call()

@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from jointctl.drivers.canopen.connection_loss import (
+from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.canopen.watchdog import (
     arm_reaction,
     arm_rpdo_deadline,
     clear_rpdo_deadlines,
@@ -18,7 +19,6 @@ from jointctl.drivers.canopen.connection_loss import (
     rpdo_identifiers,
     watched_nodes,
 )
-from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.drivers.errors import DeviceError
 from jointctl.hil.canopen.records import PowerState
 

@@ -12,8 +12,13 @@ from hypothesis import strategies as st
 
 from jointctl.drivers.canopen import exchange
 from jointctl.drivers.canopen.cia402 import State
-from jointctl.drivers.canopen.cyclic import UNHEEDED_MAX_CYCLES, begin_cycle, torque_permille
-from jointctl.drivers.canopen.port import FRAME_SLOTS, SCRATCH_WORDS
+from jointctl.drivers.canopen.cyclic import (
+    FRAME_SLOTS,
+    IGNORED_MAX_CYCLES,
+    SCRATCH_WORDS,
+    begin_cycle,
+    torque_permille,
+)
 from jointctl.firmware_py.states import DriveRequest
 from tests.unit.drivers.canopen.wire import STATUSWORDS, Wire
 
@@ -46,7 +51,7 @@ def test_heartbeat_schedule(wire: Wire, every: int, expected: list[int]) -> None
     assert [begin_cycle(wire.port, wire.frames) for _ in range(7)] == expected
 
 
-@pytest.mark.parametrize(("cycles", "frames"), [(UNHEEDED_MAX_CYCLES, 2), (UNHEEDED_MAX_CYCLES + 1, 1)])
+@pytest.mark.parametrize(("cycles", "frames"), [(IGNORED_MAX_CYCLES, 2), (IGNORED_MAX_CYCLES + 1, 1)])
 def test_a_drive_that_stays_enabled_loses_the_heartbeat(enabled: Wire, cycles: int, frames: int) -> None:
     enabled.port.heartbeat_cycles = 1
     for _ in range(cycles):
@@ -56,7 +61,7 @@ def test_a_drive_that_stays_enabled_loses_the_heartbeat(enabled: Wire, cycles: i
     # a drive that obeys in the end: within the limit all is forgotten, beyond it its watchdog stays without a heartbeat
     enabled.tpdo(STATUSWORDS[State.SWITCH_ON_DISABLED])
     enabled.rpdo(0.0, DriveRequest.QUICK_STOP)
-    assert enabled.port.unheeded_cycles == (0 if frames == 2 else cycles)
+    assert enabled.port.ignored_cycles == (0 if frames == 2 else cycles)
     assert begin_cycle(enabled.port, enabled.frames) == frames
 
 

@@ -10,8 +10,7 @@ from canopen.objectdictionary import datatypes
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from jointctl.drivers.canopen.eds_file import EdsFile, read_eds
-from jointctl.drivers.canopen.eds_text import decoded, number_of, parse_sections
+from jointctl.drivers.canopen.eds import EdsFile, decoded, number_of, parse_sections, read_eds
 from jointctl.drivers.errors import ConfigurationError
 from tests.places import EDS
 

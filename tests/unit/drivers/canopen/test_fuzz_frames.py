@@ -12,9 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from jointctl.drivers.can.frames import Frame
-from jointctl.drivers.canopen.cyclic import accept_frame, begin_cycle, end_cycle
-from jointctl.drivers.canopen.port import FRAME_SLOTS, SLOT_RECEIVED, SLOT_RPDO
-from jointctl.drivers.canopen.scaling import new_port
+from jointctl.drivers.canopen.cyclic import FRAME_SLOTS, SLOT_RECEIVED, SLOT_RPDO, accept_frame, begin_cycle, end_cycle
+from jointctl.drivers.canopen.pdo import new_port
 from jointctl.firmware_py.records import Command, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import DriveRequest, DriveState

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from jointctl.drivers.canopen.eds_file import read_eds
-from jointctl.drivers.canopen.object_access import ATTEMPTS, ObjectAccess
+from jointctl.drivers.canopen.eds import read_eds
+from jointctl.drivers.canopen.sdo import ATTEMPTS, ObjectAccess
 from jointctl.drivers.errors import DeviceError, NoDeviceError
 
 quick = settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

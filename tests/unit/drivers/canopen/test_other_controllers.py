@@ -5,7 +5,7 @@ from __future__ import annotations
 import can
 import pytest
 
-from jointctl.drivers.canopen.bus_watchers import FAILURE_PAUSE_S, LISTEN_S, BusFailure, OtherControllers
+from jointctl.drivers.canopen.network import FAILURE_PAUSE_S, LISTEN_S, BusFailure, OtherControllers
 from jointctl.drivers.errors import BusError
 
 NODE, MASTER = 5, 126

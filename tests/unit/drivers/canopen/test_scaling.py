@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from jointctl.drivers.canopen.cia402 import State
-from jointctl.drivers.canopen.scaling import joint_angle_per_count_rad, joint_torque_per_permille_Nm, new_port
+from jointctl.drivers.canopen.pdo import joint_angle_per_count_rad, joint_torque_per_permille_Nm, new_port
 from jointctl.drivers.canopen.settings import CanopenSettings
 
 SETTINGS = CanopenSettings(

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from jointctl.drivers.can.frames import Frame
-from jointctl.drivers.canopen.cyclic import accept_frame, begin_cycle, end_cycle
-from jointctl.drivers.canopen.second_position import centred
+from jointctl.drivers.canopen.cyclic import accept_frame, begin_cycle, centred, end_cycle
 from jointctl.firmware_py.records import ENCODER_RESTARTED, Command, Sample
 from jointctl.firmware_py.schema import new
 from tests.two_encoders import NODE, cycle, port_of, tell

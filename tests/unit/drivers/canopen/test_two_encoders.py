@@ -125,7 +125,7 @@ def test_a_configuration_that_is_wrong_about_one_encoder(tmp_path: Path, key: st
     """The joint is what the file says; the controller is told otherwise."""
     good = LockstepJoint(short_run(tmp_path, NODE, virtual__initial_position_rad=0.1))
     wrong = canopen_settings(short_run(tmp_path, NODE, virtual__initial_position_rad=0.1, **{key: value}))
-    from jointctl.drivers.canopen.scaling import joint_angle_per_count_rad
+    from jointctl.drivers.canopen.pdo import joint_angle_per_count_rad
 
     good._port[0].position_radpcount = joint_angle_per_count_rad(wrong) * wrong.encoder_direction
     run = good.run()

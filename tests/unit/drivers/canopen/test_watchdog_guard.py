@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from jointctl.drivers.canopen.drive import CanopenDrive
-from jointctl.drivers.canopen.watchdog_guard import PERIOD_S, WatchdogGuard, is_kept
+from jointctl.drivers.canopen.watchdog import PERIOD_S, WatchdogGuard, is_kept
 from jointctl.drivers.errors import BusError, DeviceError
 from tests.unit.drivers.canopen.odd_drive import opened
 

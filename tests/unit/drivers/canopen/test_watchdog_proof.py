@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from jointctl.drivers.canopen.watchdog_proof import BEATS, prove_watchdog
+from jointctl.drivers.canopen.watchdog import BEATS, prove_watchdog
 from jointctl.drivers.errors import DeviceError
 
 NODE, MASTER, TIMEOUT_s = 1, 126, 0.2

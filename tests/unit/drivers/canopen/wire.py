@@ -9,8 +9,7 @@ import numpy as np
 
 from jointctl.drivers.can.frames import Frame
 from jointctl.drivers.canopen.cia402 import State
-from jointctl.drivers.canopen.cyclic import accept_frame, end_cycle
-from jointctl.drivers.canopen.port import FRAME_SLOTS, CanopenPort
+from jointctl.drivers.canopen.cyclic import FRAME_SLOTS, CanopenPort, accept_frame, end_cycle
 from jointctl.firmware_py.records import Command, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import DriveRequest

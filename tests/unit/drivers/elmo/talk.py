@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from jointctl.drivers.elmo.cyclic import begin_cycle, end_cycle
-from jointctl.drivers.elmo.port import ElmoPort
-from jointctl.drivers.elmo.replies import take_byte
+from jointctl.drivers.elmo.cyclic import ElmoPort, begin_cycle, end_cycle, take_byte
 from jointctl.firmware_py.records import Command, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import DriveRequest, DriveState

@@ -10,9 +10,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jointctl.drivers.elmo.cyclic import begin_cycle, current_mA, end_cycle, put_command, velocity_cps
-from jointctl.drivers.elmo.port import ElmoPort, Question
-from jointctl.drivers.elmo.replies import parse_number
+from jointctl.drivers.elmo.cyclic import (
+    ElmoPort,
+    Question,
+    begin_cycle,
+    current_mA,
+    end_cycle,
+    parse_number,
+    put_command,
+    velocity_cps,
+)
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import DriveRequest, DriveState
 from jointctl.hil.elmo.motor import switch_off

@@ -10,8 +10,8 @@ import time
 
 import pytest
 
+from jointctl.drivers.elmo.cyclic import ElmoPort
 from jointctl.drivers.elmo.exchange import exchange_memory, receive
-from jointctl.drivers.elmo.port import ElmoPort
 from jointctl.firmware_py.records import Sample
 from jointctl.firmware_py.schema import new
 

@@ -17,7 +17,7 @@ from jointctl.drivers.elmo.codes import (
     status_text,
     unit_mode,
 )
-from jointctl.drivers.elmo.interpreter import REPLY_MAX, Interpreter, Reply, ReplyKind, encode, parse_reply
+from jointctl.drivers.elmo.dialogue import REPLY_MAX, Interpreter, Reply, ReplyKind, encode, parse_reply
 
 
 @pytest.mark.parametrize(

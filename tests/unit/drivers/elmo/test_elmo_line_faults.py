@@ -9,10 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jointctl.drivers.elmo.cyclic import begin_cycle, end_cycle, note_written, put_command
-from jointctl.drivers.elmo.interpreter import ReplyKind, parse_reply
-from jointctl.drivers.elmo.port import EXPECTED_MAX, LINE_MAX, Question
-from jointctl.drivers.elmo.replies import take_byte
+from jointctl.drivers.elmo.cyclic import (
+    EXPECTED_MAX,
+    LINE_MAX,
+    Question,
+    begin_cycle,
+    end_cycle,
+    note_written,
+    put_command,
+    take_byte,
+)
+from jointctl.drivers.elmo.dialogue import ReplyKind, parse_reply
 from jointctl.firmware_py.records import LINE_GONE
 from jointctl.firmware_py.states import DriveRequest, DriveState
 from tests.unit.drivers.elmo.talk import Talk

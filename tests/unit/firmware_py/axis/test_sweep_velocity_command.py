@@ -11,9 +11,8 @@ import pytest
 
 from jointctl.drivers.can.frames import Frame
 from jointctl.drivers.canopen.cia402 import State
-from jointctl.drivers.canopen.cyclic import end_cycle, get_i32, velocity_units
-from jointctl.drivers.canopen.port import FRAME_SLOTS, SLOT_RPDO
-from jointctl.drivers.canopen.scaling import new_port
+from jointctl.drivers.canopen.cyclic import FRAME_SLOTS, SLOT_RPDO, end_cycle, get_i32, velocity_units
+from jointctl.drivers.canopen.pdo import new_port
 from jointctl.firmware_py.axis import limited_velocity_radps
 from jointctl.firmware_py.records import Command, LimitConstants, Sample
 from jointctl.firmware_py.schema import new

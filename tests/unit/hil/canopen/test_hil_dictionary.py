@@ -9,7 +9,7 @@ import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
 
-from jointctl.drivers.canopen.sdo_download import download
+from jointctl.drivers.canopen.sdo import download
 from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
 from jointctl.hil.plant.joint import plant
 from tests.places import EDS

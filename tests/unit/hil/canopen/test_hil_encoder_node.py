@@ -10,7 +10,7 @@ from typing import Any
 import canopen
 import pytest
 
-from jointctl.drivers.canopen.eds_file import read_eds
+from jointctl.drivers.canopen.eds import read_eds
 from jointctl.tools.simulation.virtual_joint import new_device
 from tests.places import CONFIGS
 from tests.two_encoders import NODE, short_run

@@ -1,19 +1,29 @@
-"""A joint-side encoder as a node of its own (CiA 406): identified, checked, and sending its position at every SYNC.
+"""A second encoder of the joint: a node of its own (CiA 406), or another object of the drive.
 
-It is a sensor: nothing in it can move the joint, so it needs no watchdog of ours.  Its silence, its EMCY and its
-restart end the run (`second_position`).
+It is identified, checked, and sends its position at every SYNC.  A node is a sensor: nothing in it can move the joint,
+so it needs no watchdog of ours.  Its silence, its EMCY and its restart end the run (`cyclic.publish_sample`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jointctl.drivers.canopen.encoder_settings import DRIVE_RANGE_COUNTS, JointEncoderSettings
-from jointctl.drivers.canopen.identifiers import TPDO1_ID, TPDO2_ID
-from jointctl.drivers.canopen.object_access import ObjectAccess
-from jointctl.drivers.canopen.pdo_layout import COMMUNICATION_TPDO, MappedObject
-from jointctl.drivers.canopen.pdo_map import EVERY_SYNC, configure_pdo, disable_pdo, pdos_of
-from jointctl.drivers.canopen.synchronisation import listen_to_our_sync
+import canopen
+
+from jointctl.drivers.canopen.eds import read_eds
+from jointctl.drivers.canopen.identifiers import TPDO1_ID, TPDO2_ID, NmtCommand
+from jointctl.drivers.canopen.network import send_nmt
+from jointctl.drivers.canopen.pdo import (
+    COMMUNICATION_TPDO,
+    EVERY_SYNC,
+    MappedObject,
+    configure_pdo,
+    disable_pdo,
+    listen_to_our_sync,
+    pdos_of,
+)
+from jointctl.drivers.canopen.sdo import ObjectAccess
+from jointctl.drivers.canopen.settings import DRIVE_RANGE_COUNTS, CanopenSettings, JointEncoderSettings
 from jointctl.drivers.errors import DeviceError
 
 CIA406_PROFILE = 406
@@ -24,7 +34,7 @@ ALARMS = 0x6503
 
 @dataclass(frozen=True)
 class EncoderFindings:
-    """What the node told."""
+    """What was read from the node, or from the drive."""
 
     range_counts: int
     start_counts: int
@@ -79,3 +89,48 @@ def commission_drive_object(objects: ObjectAccess, settings: JointEncoderSetting
     configure_pdo(objects, base, TPDO2_ID + node, EVERY_SYNC, (mapped,))
     start = objects.read(mapped.index, mapped.sub, what=mapped.name)
     return EncoderFindings(DRIVE_RANGE_COUNTS, start, f"object {settings.index:04X}:{settings.sub} of the drive")
+
+
+class EncoderEnd:
+    """The joint's encoder node as the driver of the drive uses it; where there is none, every method does nothing.
+
+    `ConfigurationError` if its EDS cannot be read.
+    """
+
+    def __init__(self, network: canopen.Network, settings: CanopenSettings, timeout_s: float) -> None:
+        encoder = settings.joint_encoder
+        self._network, self._settings = network, settings
+        self._node = encoder.node if encoder is not None else None
+        self._objects: ObjectAccess | None = None
+        self._eds_remarks: list[str] = []
+        if encoder is not None and encoder.node is not None and encoder.eds_path is not None:
+            eds = read_eds(encoder.eds_path, encoder.node, encoder=True)
+            node = network.add_node(encoder.node, eds.dictionary)
+            node.sdo.RESPONSE_TIMEOUT = timeout_s
+            self._eds_remarks = eds.all_remarks()
+            self._objects = ObjectAccess(node, eds.name, eds.unusable)
+
+    def send_command(self, command: NmtCommand) -> None:
+        """An NMT command."""
+        if self._node is not None:
+            send_nmt(self._network, command, self._node)
+
+    def commission(self) -> tuple[EncoderFindings, list[str]] | None:
+        """Identify, check and map; findings and remarks."""
+        encoder = self._settings.joint_encoder
+        if self._objects is None or encoder is None:
+            return None
+        self.send_command(NmtCommand.ENTER_PRE_OPERATIONAL)
+        self._objects.forget_verified()
+        self._objects.remarks.clear()
+        found = commission_encoder(self._objects, encoder, self._settings.rate_Hz, self._settings.heartbeat_s)
+        return found, self._eds_remarks + self._objects.remarks
+
+    def verify_again(self) -> None:
+        """See `ObjectAccess.verify_again`; `DeviceError` as well if the encoder has an alarm by now.
+
+        Its EMCY may have come while no one listened.
+        """
+        if self._objects is not None and self._node is not None:
+            self._objects.verify_again()
+            require_no_alarm(self._objects, self._node)

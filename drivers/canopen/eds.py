@@ -12,19 +12,166 @@ from pathlib import Path
 from typing import Any
 
 import canopen
-from canopen.objectdictionary import ODRecord, ODVariable, datatypes
+from canopen.objectdictionary import ODRecord, ODVariable
+from canopen.objectdictionary import datatypes as types
 
-from jointctl.drivers.canopen.eds_text import Sections, number_of, parse_sections, read_text, shown
-from jointctl.drivers.canopen.standard_objects import BITS, CYCLIC, TYPE_NAME, standard_type
 from jointctl.drivers.errors import ConfigurationError
+
+# --- data types of the objects that jointctl uses, by CiA 301, 402 and 406: what a file is measured by ---
+
+U8, U16, U32 = types.UNSIGNED8, types.UNSIGNED16, types.UNSIGNED32
+I8, I16, I32 = types.INTEGER8, types.INTEGER16, types.INTEGER32
+
+TYPE_NAME = {
+    types.BOOLEAN: "BOOLEAN", I8: "INTEGER8", I16: "INTEGER16", I32: "INTEGER32", types.INTEGER64: "INTEGER64",
+    U8: "UNSIGNED8", U16: "UNSIGNED16", U32: "UNSIGNED32", types.UNSIGNED64: "UNSIGNED64",
+}  # fmt: skip
+BITS = {
+    types.BOOLEAN: 8, I8: 8, U8: 8, I16: 16, U16: 16, types.INTEGER24: 24, types.UNSIGNED24: 24, I32: 32, U32: 32,
+    types.INTEGER40: 40, types.UNSIGNED40: 40, types.INTEGER48: 48, types.UNSIGNED48: 48, types.INTEGER56: 56,
+    types.UNSIGNED56: 56, types.INTEGER64: 64, types.UNSIGNED64: 64,
+}  # fmt: skip
+
+_EVERY_DEVICE = {0x1000: U32, 0x1001: U8, 0x1005: U32, 0x1006: U32, 0x1014: U32, 0x1017: U16, 0x1019: U8}
+_DRIVE = _EVERY_DEVICE | {
+    0x6007: I16, 0x603F: U16, 0x6040: U16, 0x6041: U16, 0x605A: I16, 0x6060: I8, 0x6061: I8, 0x6064: I32,
+    0x6071: I16, 0x6072: U16, 0x6075: U32, 0x6076: U32, 0x6077: I16, 0x607F: U32, 0x6083: U32, 0x6084: U32,
+    0x6087: U32, 0x60B1: I32, 0x60B2: I16, 0x60FF: I32, 0x6502: U32,
+}  # fmt: skip
+_ENCODER = _EVERY_DEVICE | {0x6001: U32, 0x6002: U32, 0x6004: U32, 0x6200: U16, 0x6503: U16}
+_MEMBERS = {
+    (0x1018, 1): U32, (0x1018, 2): U32, (0x1018, 3): U32, (0x1018, 4): U32, (0x1029, 1): U8,
+    (0x60E4, 1): I32, (0x60C2, 1): U8, (0x60C2, 2): I8,
+}  # fmt: skip
+_COMMUNICATION = {0: U8, 1: U32, 2: U8, 3: U16, 5: U16, 6: U8}
+# mapped by the loop: their length is the length of their place in the PDO
+CYCLIC = frozenset({(0x6040, 0), (0x6041, 0), (0x6064, 0), (0x6071, 0), (0x6077, 0), (0x60FF, 0), (0x6004, 0)})
+
+
+def standard_type(index: int, sub: int, *, encoder: bool = False) -> int | None:
+    """DataType (CiA 301, table 44) of an object of a drive or encoder; None for one that jointctl does not use."""
+    single = _ENCODER if encoder else _DRIVE
+    if sub == 0 and index in single:
+        return single[index]
+    if (index, sub) in _MEMBERS:
+        return _MEMBERS[index, sub]
+    if 0x1400 <= index < 0x1600 or 0x1800 <= index < 0x1A00:
+        return _COMMUNICATION.get(sub)
+    if 0x1600 <= index < 0x1800 or 0x1A00 <= index < 0x1C00 or index == 0x1016:
+        return U8 if sub == 0 else U32
+    return None
+
+
+# --- the file's text (CiA 306) as sections of keys: nothing here raises for a bad line, every defect is one remark ---
+
+LARGEST_BYTES = 16_000_000
+LONGEST_NUMBER = 40
+LONGEST_SHOWN = 60
+Sections = dict[str, dict[str, str]]
+
+_LINE_END = re.compile(r"\r\n|\r|\n")
+_SECTION = re.compile(r"\[\s*(.*?)\s*\]")
+_NODE_ID = re.compile(r"\+?\$NODEID\+?")
+_NUMBERS = (  # the first form counts; `int` by itself takes more, such as 1_0
+    (re.compile(r"[+-]?0X[0-9A-F]+"), 16),
+    (re.compile(r"[+-]?0[0-7]+"), 8),
+    (re.compile(r"[+-]?[0-9]+"), 10),
+    (re.compile(r"[0-9]*[A-F][0-9A-F]*"), 16),
+)
+
+
+def shown(text: str) -> str:
+    """What a file holds, for a message: one line, no control characters, not too long."""
+    clean = "".join(character if character.isprintable() else "?" for character in text)
+    return clean if len(clean) <= LONGEST_SHOWN else clean[:LONGEST_SHOWN] + "..."
+
+
+def decoded(data: bytes) -> tuple[str, list[str]]:
+    """Text of UTF-8 (with or without byte order mark), UTF-16 with a mark, else Latin-1, which takes any byte."""
+    remarks = []
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        text = data.decode("utf-16", errors="replace")
+        remarks.append("is UTF-16, CiA 306 asks for ASCII")
+    else:
+        try:
+            text = data.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = data.decode("latin-1").removeprefix("\xef\xbb\xbf")
+            remarks.append("is not UTF-8: read as Latin-1")
+    if "\0" in text:
+        text = text.replace("\0", "")
+        remarks.append("holds NUL characters, which were skipped")
+    return text, remarks
+
+
+def read_text(path: Path) -> tuple[str, list[str]]:
+    """The file's text and what is odd about its encoding; `ConfigurationError` if it cannot be read at all."""
+    refusal = f"drive.eds (={path}) is not a readable EDS file:"
+    try:
+        if path.stat().st_size > LARGEST_BYTES:
+            raise ConfigurationError(f"{refusal} {path.stat().st_size} bytes, at most {LARGEST_BYTES} are read")
+        return decoded(path.read_bytes())
+    except OSError as error:
+        raise ConfigurationError(f"{refusal} {error.strerror or error}") from error
+
+
+def parse_sections(text: str) -> tuple[Sections, list[str]]:
+    """Sections by their name in lower case, keys in lower case.  What comes first counts."""
+    sections: Sections = {}
+    remarks: list[str] = []
+    current: dict[str, str] | None = None
+    name = ""
+    for number, raw in enumerate(_LINE_END.split(text), start=1):
+        line = raw.strip()
+        if not line or line[0] in ";#":
+            continue
+        header = _SECTION.match(line)
+        if header is not None:
+            name = header[1].lower()
+            if name in sections:
+                remarks.append(f"line {number}: [{shown(header[1])}] a second time: only what the first lacks is taken")
+            current = sections.setdefault(name, {})
+            continue
+        key, equals, value = line.partition("=")
+        if not equals or not key.strip():
+            remarks.append(f"line {number}: neither [section] nor key=value: skipped")
+        elif current is None:
+            remarks.append(f"line {number}: before the first section: skipped")
+        else:
+            key, value = key.strip().lower(), re.split(r"\s;", value, maxsplit=1)[0].strip()
+            if current.setdefault(key, value) != value:
+                remarks.append(f"line {number}: [{shown(name)}] {shown(key)} a second time with another value: skipped")
+    return sections, remarks
+
+
+def number_of(text: str, node: int) -> int | None:
+    """A number as CiA 306 writes it: decimal, 0x.., octal with a leading 0, $NODEID+..; None if it is none.
+
+    Hexadecimal digits without 0x are taken where they can be nothing else (1F).
+    """
+    compact = re.sub(r"\s", "", text)
+    if len(compact) > LONGEST_NUMBER or not compact.isascii():
+        return None
+    compact = compact.upper().rstrip("UL")
+    if "$NODEID" in compact:
+        rest = _NODE_ID.sub("", compact)
+        offset = number_of(rest, node) if rest else 0
+        return None if offset is None else offset + node
+    for form, base in _NUMBERS:
+        if form.fullmatch(compact):
+            return int(compact, base)
+    return None
+
+
+# --- sections as an object dictionary ---
 
 DEFTYPES = 0x1000  # indices below are data types
 ARRAY, RECORD = 8, 9
 COMPACT_MOST = 254
 _INDEX = re.compile(r"(?:0x)?([0-9a-f]{4})")
 _SUB_INDEX = re.compile(r"(?:0x)?([0-9a-f]{4})\s*sub\s*([0-9a-f]{1,2})")
-_STRINGS = (datatypes.VISIBLE_STRING, datatypes.OCTET_STRING, datatypes.UNICODE_STRING, datatypes.DOMAIN)
-_KNOWN_TYPES = frozenset({*BITS, *_STRINGS, datatypes.REAL32, datatypes.REAL64, 0xC, 0xD})
+_STRINGS = (types.VISIBLE_STRING, types.OCTET_STRING, types.UNICODE_STRING, types.DOMAIN)
+_KNOWN_TYPES = frozenset({*BITS, *_STRINGS, types.REAL32, types.REAL64, 0xC, 0xD})
 
 
 @dataclass
@@ -34,7 +181,7 @@ class EdsFile:
     name: str
     dictionary: canopen.ObjectDictionary
     encoder: bool = False  # of an encoder (CiA 406), else of a drive (CiA 402)
-    vendor_id: int | None = None  # None: the file does not tell
+    vendor_id: int | None = None  # None: the file does not state it
     product_code: int | None = None
     remarks: list[str] = field(default_factory=list)  # about the file and the objects that jointctl uses
     other_defects: list[str] = field(default_factory=list)  # in objects that it does not use
@@ -169,7 +316,7 @@ def _value(eds: EdsFile, index: int, sub: int, key: str, text: str, data_type: i
     if not text:
         return None
     bits = BITS[data_type]
-    signed = data_type in datatypes.SIGNED_TYPES
+    signed = data_type in types.SIGNED_TYPES
     value = number_of(text, node)
     if value is not None and signed and 1 << (bits - 1) <= value < 1 << bits:
         value -= 1 << bits  # two's complement, as 0x8000 for the least INTEGER16

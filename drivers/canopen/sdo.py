@@ -1,4 +1,4 @@
-"""Reading and writing the drive's objects over SDO, with EDS and drive as the judges of what exists.
+"""The drive's objects over SDO: written and read one by one, or read again and again beside the loop.
 
 An EDS often describes more than the drive at hand has (other firmware, an option that was not bought).  What may be
 absent counts as absent when the drive itself says so; what must be there is refused with that reason.
@@ -8,24 +8,31 @@ Time-outs are retried (drives leave SDOs unanswered now and then); an abort is a
 
 from __future__ import annotations
 
+import io
 import random
 import struct
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
+import can
 import canopen
 from canopen.objectdictionary import ObjectDictionaryError
+from canopen.sdo.client import SdoClient, WritableStream
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from jointctl.drivers.canopen.sdo_download import download
 from jointctl.drivers.errors import DeviceError, NoDeviceError
 
 ATTEMPTS = 3
 COLLISIONS = 10  # with the transfers of another master on the one SDO channel, such as those of `jointctl stop`
 COLLISION_PAUSE_S = 0.01
 NO_ANSWER = "No SDO response received"  # by the library, in contrast to an answer that does not fit
-Result = TypeVar("Result")
+ANSWER_S = 1.0  # how long an answer may take
+QUIET_S = 0.05  # no one else may have used the SDO channel for so long: it is one for all masters
+_UPLOAD, _ABORT = 0x40, 0x80  # command specifiers of CiA 301, 7.2.4.3
+_ANSWERS = 16  # that may wait between two looks; others on the bus may use the same SDO channel
 ABSENT = (0x06020000, 0x06090011)  # no such object, no such sub-index
 ABORT_TEXT = {
     0x05040000: "the transfer timed out, as when frames are lost",
@@ -41,6 +48,50 @@ ABORT_TEXT = {
     0x06040042: "mapped objects exceed the PDO length",
     0x08000022: "not in the present device state",
 }
+Result = TypeVar("Result")
+
+
+class _DownloadStream(WritableStream):
+    """The library's stream, after which nothing follows once the transfer has failed.
+
+    The canopen library's `SdoClient.download` leaves its stream open when a segmented transfer (more than 4 bytes, or
+    none: CiA 301, 7.2.4.3.3) is refused at its beginning or not answered.  Whenever that stream is collected, its
+    destructor sends one more segment, which belongs to no transfer and may fall into another one, waits for the answer,
+    and fails; since Python 3.13 that failure is printed with its traceback.  Refused later, the same segment is sent
+    again, and the abort code of that hides the reason.  Here the stream of a failed transfer ends silently.
+    `_begun`: the server takes part in a transfer, whose last segment `close` may send.
+    """
+
+    _begun = False
+
+    def __init__(self, client: SdoClient, index: int, sub: int, size: int) -> None:
+        super().__init__(client, index, sub, size)  # type: ignore[no-untyped-call]
+        self._begun = True
+
+    def write(self, data: Any) -> int:
+        """Send the next segment, or all of an expedited transfer; how many bytes were taken."""
+        self._begun = False
+        taken = int(super().write(data))  # type: ignore[no-untyped-call]
+        self._begun = True
+        return taken
+
+    def close(self) -> None:
+        """End the transfer where there is one."""
+        if self._begun:
+            super().close()  # type: ignore[no-untyped-call]
+        else:
+            io.RawIOBase.close(self)
+
+
+def download(client: SdoClient, index: int, sub: int, data: bytes) -> None:
+    """Write `data` to an object: expedited up to 4 bytes, else in segments.
+
+    Raises `SdoAbortedError` if the server refuses, `SdoCommunicationError` if it does not answer, as the library does.
+    """
+    with _DownloadStream(client, index, sub, len(data)) as stream:
+        rest = memoryview(data)
+        while rest:
+            rest = rest[stream.write(rest) :]
 
 
 def was_refused(error: Exception) -> bool:
@@ -64,7 +115,7 @@ class ObjectAccess:
         self._eds_name = eds_name
         self._unusable = unusable or {}
         self.remarks: list[str] = []  # what was tolerated
-        self.gate: Callable[[], None] = lambda: None  # raises where no more is to be said to the drive
+        self.gate: Callable[[], None] = lambda: None  # raises where nothing more may be sent to the drive
         self._verified: dict[tuple[int, int], tuple[int, str]] = {}  # what `write_verified` has set, and its name
         self._answered: dict[tuple[int, int], bool] = {}  # whether the drive has what the EDS lists
 
@@ -84,7 +135,7 @@ class ObjectAccess:
             except SdoAbortedError as error:  # any other refusal is one of this moment, or of reading
                 self._answered[index, sub] = error.code not in ABSENT
             except (SdoCommunicationError, struct.error):
-                return ""  # whoever needs the object will see
+                return ""  # the caller that needs the object will see
         return "" if self._answered[index, sub] else f"node {self._node.id}, unlike EDS {self._eds_name}, has no"
 
     def require(self, index: int, sub: int = 0, *, what: str) -> None:
@@ -140,7 +191,7 @@ class ObjectAccess:
             raise DeviceError(f"{place} has {len(variable)} bits, which do not hold {value}") from None
 
     def highest(self, index: int, sub: int = 0) -> int | None:
-        """HighLimit of the EDS; None if it does not tell."""
+        """HighLimit of the EDS; None if it has none."""
         variable = self._variable(index, sub)
         return None if variable is None else variable.max
 
@@ -256,3 +307,87 @@ class ObjectAccess:
             return bytes(self._node.sdo.upload(index, 0)).rstrip(b"\0").decode("latin-1").strip()
         except (SdoAbortedError, SdoCommunicationError, struct.error):  # the last: an answer that is too short
             return ""
+
+
+# --- read again and again, asked and answered without waiting ---
+
+
+@dataclass
+class SdoRead:
+    """One object; `on_answer(time_ns, data, problem)` gets its bytes, or None and why."""
+
+    index: int
+    sub: int
+    period_s: float
+    on_answer: Callable[[int, bytes | None, str], None]
+    next_ns: int = 0
+
+
+class SdoReads:
+    """Call `poll` often.  It never waits and never raises for what the drive or the bus does.
+
+    One SDO upload at a time.  On the bus it costs two frames of the lowest priority but for the heartbeats, which delay
+    a cycle's frames by one frame at most (0.14 ms at 1 Mbit/s).
+    """
+
+    def __init__(
+        self, network: canopen.Network, node: canopen.RemoteNode, clock_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self._network, self._clock_ns = network, clock_ns
+        self._rx, self._tx = node.sdo.rx_cobid, node.sdo.tx_cobid
+        self._reads: list[SdoRead] = []
+        self._answers: deque[tuple[int, bytes]] = deque(maxlen=_ANSWERS)
+        self._open: SdoRead | None = None  # whose answer is waited for
+        self._asked_ns = 0
+        self._quiet_ns = clock_ns()  # not before
+        network.subscribe(self._tx, self._on_frame)
+
+    def add(self, index: int, sub: int, period_s: float, on_answer: Callable[..., None]) -> None:
+        """Read it from now on."""
+        self._reads.append(SdoRead(index, sub, period_s, on_answer, self._clock_ns()))
+
+    def _on_frame(self, _: int, data: bytearray, __: float) -> None:
+        """In the receiving thread; judged in `poll`."""
+        self._answers.append((self._clock_ns(), bytes(data)))
+
+    def poll(self, *, may_ask: bool = True) -> None:
+        """Take what has come, and ask for what is due."""
+        while self._answers:
+            came_ns, data = self._answers.popleft()
+            if self._open is None or not self._take(self._open, came_ns, data):
+                self._quiet_ns = came_ns + round(QUIET_S * 1e9)
+        now_ns = self._clock_ns()
+        if (read := self._open) is not None and now_ns - self._asked_ns >= ANSWER_S * 1e9:
+            self._open = None
+            read.on_answer(now_ns, None, f"no answer within {ANSWER_S:g} s")
+        if not may_ask or self._open is not None or now_ns < self._quiet_ns:
+            return
+        due = [read for read in self._reads if read.next_ns <= now_ns]
+        if due:
+            self._ask(min(due, key=lambda read: read.next_ns), now_ns)
+
+    def _ask(self, read: SdoRead, now_ns: int) -> None:
+        read.next_ns = now_ns + round(read.period_s * 1e9)
+        try:
+            self._network.send_message(self._rx, struct.pack("<BHB4x", _UPLOAD, read.index, read.sub))
+        except (can.CanError, OSError):  # the loop sees what is wrong with the bus, and reports it
+            return
+        self._open, self._asked_ns = read, now_ns
+
+    def _take(self, read: SdoRead, came_ns: int, data: bytes) -> bool:
+        """Whether these bytes are the answer of the SDO server to this request."""
+        if len(data) != 8 or struct.unpack_from("<HB", data, 1) != (read.index, read.sub):
+            return False
+        value, problem = None, ""
+        if data[0] == _ABORT:
+            (code,) = struct.unpack_from("<I", data, 4)
+            problem = f"{ABORT_TEXT.get(code, 'refused')} (SDO abort {code:08X}h)"
+        elif data[0] & 0xE0 != _UPLOAD:
+            return False
+        elif data[0] & 2:
+            value = data[4 : 4 + (4 - (data[0] >> 2 & 3) if data[0] & 1 else 4)]
+        else:
+            problem = f"{data.hex()} is no expedited answer"
+        self._open = None
+        read.on_answer(came_ns, value, problem)
+        return True

@@ -1,0 +1,463 @@
+"""The loop's PDOs: what lies where in them, how they are set up, and what their numbers mean at the joint.
+
+They are set up in the order that CiA 301 asks for, and read back: pre-operational, COB-ID with bit 31 set, transmission
+type, sub 0 = 0, entries, sub 0 = n, COB-ID enabled.  A drive that does not let its map be changed is taken as it is if
+one of its PDOs holds what the loop needs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+from jointctl.drivers.canopen.cia402 import State
+from jointctl.drivers.canopen.cyclic import AlignTo, CanopenPort, centred
+from jointctl.drivers.canopen.identifiers import (
+    EMERGENCY_ID,
+    HEARTBEAT_ID,
+    LAST_SYNCHRONOUS,
+    RPDO1_ID,
+    SYNC_ID,
+    TPDO1_ID,
+    TPDO2_ID,
+)
+from jointctl.drivers.canopen.sdo import ObjectAccess, object_name, was_refused
+from jointctl.drivers.canopen.settings import DRIVE_RANGE_COUNTS, CanopenSettings, JointEncoderSettings
+from jointctl.drivers.errors import DeviceError
+from jointctl.firmware_py.schema import new
+
+DISABLED = 0x80000000
+NO_REMOTE_REQUEST = 0x40000000
+EXTENDED = 0x20000000
+IDENTIFIER = 0x7FF
+COMMUNICATION_TPDO = 0x1800
+COMMUNICATION_RPDO = 0x1400
+MAPPING_OFFSET = 0x200  # 1400 -> 1600, 1800 -> 1A00
+LAST_PDO = 0x1FF
+LONGEST_BYTES = 8
+PRODUCES_SYNC = 0x40000000  # bit of 1005
+EVERY_SYNC = 1
+FIRST_IDENTIFIER, LAST_IDENTIFIER = 0x181, 0x57F
+INHIBIT_TIME, EVENT_TIMER = 3, 5
+FIXED_HINT = "change the map with the drive maker's software, or use a drive whose PDOs can be mapped"
+DUMMIES = 0x20  # data types mapped as place holders have indices below
+
+
+@dataclass(frozen=True)
+class MappedObject:
+    """One entry of a PDO."""
+
+    index: int
+    sub: int
+    bits: int
+    name: str
+
+    def entry(self) -> int:
+        """The 32 bit mapping entry."""
+        return self.index << 16 | self.sub << 8 | self.bits
+
+    def __str__(self) -> str:
+        return f"{self.name} ({object_name(self.index, self.sub)})"
+
+
+STATUS = MappedObject(0x6041, 0, 16, "statusword")
+POSITION = MappedObject(0x6064, 0, 32, "position actual value")
+TORQUE = MappedObject(0x6077, 0, 16, "torque actual value")
+CONTROL = MappedObject(0x6040, 0, 16, "controlword")
+TARGET_TORQUE = MappedObject(0x6071, 0, 16, "target torque")
+TARGET_VELOCITY = MappedObject(0x60FF, 0, 32, "target velocity")
+_NAMES = {item.entry(): item.name for item in (STATUS, POSITION, TORQUE, CONTROL, TARGET_TORQUE, TARGET_VELOCITY)}
+
+# Further objects that a fixed RPDO may carry: zero is what they must hold while a torque or a velocity is commanded
+# (60FF and 60B2 would add to it, 607A is not looked at).  6060 gets the mode, 6072 the limit; nothing else is known
+# to be harmless: a zero in 60FE, say, may open a brake.
+ZERO_IS_RIGHT = frozenset({0x6071, 0x60FF, 0x607A, 0x60B0, 0x60B1, 0x60B2})
+MODE, TORQUE_LIMIT = 0x6060, 0x6072
+
+
+@dataclass(frozen=True)
+class PdoLayout:
+    """Identifiers, lengths and byte positions of the two PDOs of the loop; -1 = not mapped."""
+
+    tpdo_id: int
+    rpdo_id: int
+    tpdo_length: int
+    rpdo_length: int
+    status_at: int
+    position_at: int
+    torque_at: int
+    control_at: int
+    target_at: int
+    fill: bytes = bytes(LONGEST_BYTES)  # of the RPDO where the loop writes nothing
+
+
+def own_layout(node: int, *, velocity: bool = False, torque: bool = True) -> PdoLayout:
+    """Statusword, position, torque; controlword and target torque (or target velocity)."""
+    return PdoLayout(
+        tpdo_id=TPDO1_ID + node,
+        rpdo_id=RPDO1_ID + node,
+        tpdo_length=8 if torque else 6,
+        rpdo_length=6 if velocity else 4,
+        status_at=0,
+        position_at=2,
+        torque_at=6 if torque else -1,
+        control_at=0,
+        target_at=2,
+    )
+
+
+@dataclass(frozen=True)
+class PdoMap:
+    """One PDO as the drive has it."""
+
+    base: int  # of its communication record
+    cob_id: int
+    transmission_type: int
+    entries: tuple[MappedObject, ...]
+
+    @property
+    def identifier(self) -> int:
+        return self.cob_id & IDENTIFIER
+
+    @property
+    def bytes(self) -> int:
+        return (sum(item.bits for item in self.entries) + 7) // 8
+
+    def at(self, wanted: MappedObject) -> int:
+        """Byte position of an object; -1 if it is not mapped, has another length or begins inside a byte."""
+        bit = 0
+        for item in self.entries:
+            if (item.index, item.sub, item.bits) == (wanted.index, wanted.sub, wanted.bits) and bit % 8 == 0:
+                return bit // 8
+            bit += item.bits
+        return -1
+
+    def holds(self, *wanted: MappedObject) -> bool:
+        return self.bytes <= LONGEST_BYTES and all(self.at(item) >= 0 for item in wanted)
+
+
+def read_map(objects: ObjectAccess, base: int) -> PdoMap:
+    """What the drive has as the PDO whose communication record is at `base`."""
+    what = f"PDO {base:04X}"
+    mapping = base + MAPPING_OFFSET
+    count = objects.read_if_present(mapping, 0, what=f"{what} number of mapped objects") or 0
+    entries = []
+    for position in range(1, min(count, 64) + 1):
+        raw = objects.read(mapping, position, what=f"{what} mapping entry {position}") & 0xFFFFFFFF
+        name = _NAMES.get(raw, "dummy" if raw >> 16 < DUMMIES else "object")
+        entries.append(MappedObject(raw >> 16, raw >> 8 & 0xFF, raw & 0xFF, name))
+    return PdoMap(
+        base,
+        objects.read(base, 1, what=f"{what} COB-ID") & 0xFFFFFFFF,
+        objects.read(base, 2, what=f"{what} transmission type") & 0xFF,
+        tuple(entries),
+    )
+
+
+def fill_of(rpdo: PdoMap, target: MappedObject, mode: int, max_permille: int) -> bytes:
+    """Bytes of the RPDO between those that the loop writes; `DeviceError` if an object in it is not understood."""
+    filled, bit = 0, 0
+    for item in rpdo.entries:
+        key = item.index, item.sub
+        if key == (MODE, 0):
+            filled |= (mode & (1 << item.bits) - 1) << bit
+        elif key == (TORQUE_LIMIT, 0):
+            filled |= (max_permille & (1 << item.bits) - 1) << bit
+        elif item.index >= DUMMIES and key not in ((CONTROL.index, 0), (target.index, 0)):
+            if item.index not in ZERO_IS_RIGHT:
+                raise DeviceError(
+                    f"PDO {rpdo.base:04X} cannot be changed and also carries object {object_name(*key)}: "
+                    "jointctl does not know what to send there",
+                    hint="map it with the drive maker's software, or store a map without that object",
+                )
+        bit += item.bits
+    return filled.to_bytes(LONGEST_BYTES, "little")
+
+
+# --- set-up of SYNC and PDOs ---
+
+
+def listen_to_our_sync(objects: ObjectAccess, rate_Hz: float) -> None:
+    """1005 = 80h without production, 1006 our period if it is used at all, 1019 = 0: our SYNC carries no counter."""
+    found = objects.read_if_present(0x1005, what="COB-ID SYNC")
+    if found is not None and found & (PRODUCES_SYNC | 0x7FF) != SYNC_ID:
+        objects.write_verified(0x1005, 0, SYNC_ID, what="COB-ID SYNC")
+        objects.remarks.append(f"1005 was {found & 0xFFFFFFFF:08X}h, it is now {SYNC_ID:08X}h")
+    period_us = round(1e6 / rate_Hz)
+    if objects.read_if_present(0x1006, what="communication cycle period") not in (None, 0, period_us):
+        objects.write_verified(0x1006, 0, period_us, what="communication cycle period")
+    if objects.read_if_present(0x1019, what="synchronous counter overflow value"):
+        objects.write_verified(0x1019, 0, 0, what="synchronous counter overflow value")
+
+
+def configure_pdo(
+    objects: ObjectAccess, base: int, cob_id: int, transmission_type: int, mapped: tuple[MappedObject, ...]
+) -> None:
+    """Map `mapped` into the PDO whose communication record is at `base`; the node is pre-operational.
+
+    Bit 30 (no remote request) stays as the drive has it: some insist on it.
+    """
+    mapping = base + MAPPING_OFFSET
+    what = f"PDO {base:04X}"
+    found = objects.read(base, 1, what=f"{what} COB-ID") & 0xFFFFFFFF
+    cob_id |= found & NO_REMOTE_REQUEST
+    objects.write(base, 1, cob_id | DISABLED, what=f"{what} COB-ID")
+    try:
+        objects.write_verified(base, 2, transmission_type, what=f"{what} transmission type")
+    except DeviceError as error:
+        if base < COMMUNICATION_TPDO and transmission_type > LAST_SYNCHRONOUS:
+            raise DeviceError(error.message, hint="set drive.rpdo_transmission_type = 1") from error.__cause__
+        raise
+    objects.write(mapping, 0, 0, what=f"{what} number of mapped objects")
+    for position, item in enumerate(mapped, start=1):
+        objects.write_verified(mapping, position, item.entry(), what=f"{what} mapping of {item.name}")
+    objects.write_verified(mapping, 0, len(mapped), what=f"{what} number of mapped objects")
+    if base >= COMMUNICATION_TPDO:
+        quiet_timers(objects, base)
+    objects.write_verified(base, 1, cob_id, what=f"{what} COB-ID")
+
+
+def quiet_timers(objects: ObjectAccess, base: int) -> None:
+    """No inhibit time and no event timer: a TPDO answers each SYNC, neither less often nor more."""
+    for sub, what in ((INHIBIT_TIME, "inhibit time"), (EVENT_TIMER, "event timer")):
+        if objects.read_if_present(base, sub, what=f"PDO {base:04X} {what}"):
+            try:
+                objects.write_verified(base, sub, 0, what=f"PDO {base:04X} {what}")
+            except DeviceError as error:
+                objects.remarks.append(f"{error.message}; a synchronous PDO should not heed it")
+
+
+def disable_pdo(objects: ObjectAccess, base: int) -> None:
+    """Set bit 31 of a PDO that is not used; its other bits stay.  One that stays enabled is a remark."""
+    what = f"PDO {base:04X} COB-ID"
+    cob_id = objects.read_if_present(base, 1, what=what)
+    if cob_id is None or cob_id & DISABLED:
+        return
+    cob_id &= 0xFFFFFFFF
+    try:
+        objects.write_verified(base, 1, cob_id | DISABLED, what=what)
+    except DeviceError as error:
+        objects.remarks.append(f"{error.message}; it stays enabled on {cob_id & IDENTIFIER:03X}h")
+
+
+def pdos_of(objects: ObjectAccess, first: int) -> list[int]:
+    """Communication records from `first` (1400 or 1800) that the EDS lists."""
+    return [base for base in objects.indices(first, first + LAST_PDO) if objects.has(base, 1)]
+
+
+def configure_loop_pdos(
+    objects: ObjectAccess,
+    node: int,
+    rpdo_transmission_type: int,
+    target: MappedObject = TARGET_TORQUE,
+    *,
+    mode: int = 0,
+    max_permille: int = 0,
+    spare: frozenset[int] = frozenset(),
+) -> PdoLayout:
+    """TPDO1 = statusword, position, torque at every SYNC; RPDO1 = controlword, `target`; the others off.
+
+    Where the drive refuses that, the first of its PDOs that holds what is needed is used as it is; `mode` and
+    `max_permille` then fill 6060 and 6072 in it.  PDOs in `spare` stay as they are.
+    Raises `DeviceError` with what is missing.
+    """
+    for item in (STATUS, POSITION, CONTROL, target):
+        objects.require(item.index, item.sub, what=item.name)
+    mapped = (STATUS, POSITION, TORQUE) if objects.has(TORQUE.index) else (STATUS, POSITION)
+    own = own_layout(node, velocity=target is not TARGET_TORQUE, torque=TORQUE in mapped)
+    tpdo = _map_or_find(objects, COMMUNICATION_TPDO, own.tpdo_id, EVERY_SYNC, mapped)
+    rpdo = _map_or_find(objects, COMMUNICATION_RPDO, own.rpdo_id, rpdo_transmission_type, (CONTROL, target))
+    for first, kept in ((COMMUNICATION_TPDO, tpdo), (COMMUNICATION_RPDO, rpdo)):
+        for base in pdos_of(objects, first):
+            if base != (first if kept is None else kept.base) and base not in spare:
+                disable_pdo(objects, base)
+    layout = own
+    if tpdo is not None:
+        layout = replace(
+            layout, tpdo_id=tpdo.identifier, tpdo_length=tpdo.bytes, status_at=tpdo.at(STATUS),
+            position_at=tpdo.at(POSITION), torque_at=tpdo.at(TORQUE),
+        )  # fmt: skip
+    if rpdo is not None:
+        fill = fill_of(rpdo, target, mode, max_permille)
+        layout = replace(
+            layout, rpdo_id=rpdo.identifier, rpdo_length=rpdo.bytes, control_at=rpdo.at(CONTROL),
+            target_at=rpdo.at(target), fill=fill,
+        )  # fmt: skip
+    return layout
+
+
+def _map_or_find(
+    objects: ObjectAccess, base: int, identifier: int, kind: int, mapped: tuple[MappedObject, ...]
+) -> PdoMap | None:
+    """None if the PDO at `base` was mapped as wanted, else the drive's own PDO that is used instead."""
+    objects.require(base, 1, what="PDO communication parameter")
+    before = read_map(objects, base)
+    try:
+        configure_pdo(objects, base, identifier, kind, mapped)
+        return None
+    except DeviceError as error:
+        if not was_refused(error):
+            raise
+        refused = error
+    _restore(objects, before)
+    needed = tuple(item for item in mapped if item is not TORQUE)  # the measured torque is only logged
+    found = next((m for m in (read_map(objects, b) for b in pdos_of(objects, base)) if m.holds(*needed)), None)
+    if found is None:
+        missing = ", ".join(str(item) for item in needed)
+        raise DeviceError(
+            f"{refused.message}; and none of the drive's own {'TPDOs' if base >= COMMUNICATION_TPDO else 'RPDOs'} "
+            f"holds {missing} together",
+            hint=refused.hint or FIXED_HINT,
+        )
+    found = _use_as_it_is(objects, before if found.base == base and before.holds(*needed) else found, kind)
+    objects.remarks.append(f"{refused.message}: PDO {found.base:04X} is used as it is, on {found.identifier:03X}h")
+    return found
+
+
+def _restore(objects: ObjectAccess, before: PdoMap) -> None:
+    """A drive may accept the first steps of a new map and refuse the others: undo what can be undone."""
+    mapping = before.base + MAPPING_OFFSET
+    for position, item in enumerate(before.entries, start=1):
+        with contextlib.suppress(DeviceError):
+            if objects.read(mapping, position, what="mapping entry") != item.entry():
+                objects.write(mapping, position, item.entry(), what="mapping entry")
+    with contextlib.suppress(DeviceError):
+        objects.write(mapping, 0, len(before.entries), what="number of mapped objects")
+
+
+def _use_as_it_is(objects: ObjectAccess, pdo: PdoMap, kind: int) -> PdoMap:
+    """Enable a PDO with the drive's own map; its transmission type must suit the loop."""
+    what = f"PDO {pdo.base:04X}"
+    found_kind = pdo.transmission_type
+    with contextlib.suppress(DeviceError):
+        found_kind = objects.write_verified(pdo.base, 2, kind, what=f"{what} transmission type")
+    if pdo.base >= COMMUNICATION_TPDO:
+        if found_kind != EVERY_SYNC:
+            raise DeviceError(
+                f"{what} cannot be changed and has transmission type {found_kind}: it does not answer every SYNC",
+                hint=FIXED_HINT,
+            )
+        quiet_timers(objects, pdo.base)
+    elif found_kind != kind and not (found_kind <= LAST_SYNCHRONOUS and kind <= LAST_SYNCHRONOUS):
+        raise DeviceError(
+            f"{what} cannot be changed and has transmission type {found_kind}, the configuration says {kind}",
+            hint=f"set drive.rpdo_transmission_type = {found_kind}, so that the delay of the loop is known",
+        )
+    if pdo.cob_id & EXTENDED or not FIRST_IDENTIFIER <= pdo.identifier <= LAST_IDENTIFIER:
+        raise DeviceError(f"{what} cannot be changed and has COB-ID {pdo.cob_id:08X}h, which is no PDO's", FIXED_HINT)
+    objects.write_verified(pdo.base, 1, pdo.cob_id & ~DISABLED, what=f"{what} COB-ID")
+    return pdo
+
+
+# --- scaling: counts and per mille to radians and newton metres of the joint, and back ---
+
+
+PERMILLE = 1000.0
+# units of 60FF besides the encoder's counts per second: motor speed [rad/s] of one unit
+VELOCITY_UNITS = {"counts/s": None, "r/min": math.tau / 60.0, "0.1 r/min": math.tau / 600.0}
+
+
+def joint_torque_per_permille_Nm(settings: CanopenSettings, rated_torque_mNm: int, rated_current_mA: int) -> float:
+    """Joint torque [Nm] of 1/1000 of rated in objects 6071 and 6077, without the direction."""
+    if settings.torque_reference == "rated_torque":
+        motor_Nm = rated_torque_mNm * 1e-3
+    else:
+        motor_Nm = rated_current_mA * 1e-3 * settings.torque_constant_NmpA
+    return motor_Nm * settings.reduction_ratio / PERMILLE
+
+
+def joint_angle_per_count_rad(settings: CanopenSettings) -> float:
+    """Joint angle [rad] of one count of 6064, without the direction."""
+    ratio = settings.reduction_ratio if settings.encoder_on_motor else 1.0
+    return 2.0 * math.pi / (settings.counts_per_turn * ratio)
+
+
+def joint_velocity_per_unit_radps(settings: CanopenSettings) -> float:
+    """Joint velocity [rad/s] of one unit of 60FF, 606C and 607F, without the direction."""
+    motor_radps = VELOCITY_UNITS[settings.velocity_unit]
+    if motor_radps is None:
+        return joint_angle_per_count_rad(settings)
+    return motor_radps / settings.reduction_ratio
+
+
+def new_port(
+    settings: CanopenSettings,
+    torque_per_permille_Nm: float,
+    max_permille: int,
+    *,
+    velocity: bool = False,
+    layout: PdoLayout | None = None,
+    heartbeat_watched: bool = True,
+    second_range_counts: int = DRIVE_RANGE_COUNTS,
+) -> Any:
+    """A `CanopenPort` record array of one record; the file descriptor is still missing.
+
+    `velocity`: the drive is in a velocity mode and the RPDO carries 60FF.  `layout`: of the PDOs (None: our own).
+    `heartbeat_watched`: the drive sends its own heartbeat.
+    """
+    layout = layout or own_layout(settings.node, velocity=velocity)
+    ports = new(CanopenPort)
+    port = ports[0]
+    port.fd = -1
+    port.node = settings.node
+    port.sync_id = SYNC_ID
+    port.emergency_id = EMERGENCY_ID + settings.node
+    port.heartbeat_id = HEARTBEAT_ID + settings.node
+    port.own_heartbeat_id = HEARTBEAT_ID + settings.master_node
+    # three heartbeats within the drive's time-out, so that one or two lost ones do not stop the joint
+    port.heartbeat_cycles = max(1, int(settings.heartbeat_s * settings.rate_Hz / 3.0))
+    port.heartbeat_watched = int(heartbeat_watched)
+    for key in (
+        "tpdo_id", "rpdo_id", "tpdo_length", "rpdo_length",
+        "status_at", "position_at", "torque_at", "control_at", "target_at",
+    ):  # fmt: skip
+        setattr(port, key, getattr(layout, key))
+    for i, value in enumerate(layout.fill):
+        port.rpdo_filler[i] = value
+    port.target_is_velocity = int(velocity)
+    # the drive counts speed in the direction of its encoder
+    port.velocity_radpspunit = joint_velocity_per_unit_radps(settings) * settings.encoder_direction
+    port.position_radpcount = joint_angle_per_count_rad(settings) * settings.encoder_direction
+    port.zero_counts = settings.zero_counts
+    port.torque_Nmppermille = torque_per_permille_Nm * settings.torque_direction
+    port.max_permille = max_permille
+    port.state = State.UNDEFINED
+    if settings.joint_encoder is not None:
+        _fill_second(port.second, settings, settings.joint_encoder, second_range_counts)
+    return ports
+
+
+def _fill_second(second: Any, settings: CanopenSettings, encoder: JointEncoderSettings, range_counts: int) -> None:
+    """The second encoder of the joint."""
+    if encoder.node is None:
+        second.tpdo_id = TPDO2_ID + settings.node
+    else:
+        second.tpdo_id = TPDO1_ID + encoder.node
+        second.emergency_id = EMERGENCY_ID + encoder.node
+        second.heartbeat_id = HEARTBEAT_ID + encoder.node
+    second.tpdo_length = 4
+    second.position_at = 0
+    second.range_counts = range_counts
+    second.zero_counts = encoder.zero_counts
+    second.radpcount = encoder.rad_per_count
+    second.feeds_law = int(encoder.feeds_law)
+    if encoder.incremental:
+        second.align = AlignTo.FIRST
+    elif settings.encoder_incremental:
+        second.align = AlignTo.SECOND
+
+
+def start_position_rad(settings: CanopenSettings, first_counts: int, second_counts: int, range_counts: int) -> float:
+    """Where the joint stands by the encoder that feeds the law; an incremental one takes the other's angle."""
+    first_rad = (first_counts - settings.zero_counts) * joint_angle_per_count_rad(settings) * settings.encoder_direction
+    encoder = settings.joint_encoder
+    if encoder is None:
+        return first_rad
+    second_rad = centred(second_counts - encoder.zero_counts, range_counts) * encoder.rad_per_count
+    if encoder.incremental:
+        return first_rad
+    if settings.encoder_incremental or encoder.feeds_law:
+        return second_rad
+    return first_rad
