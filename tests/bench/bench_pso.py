@@ -18,10 +18,9 @@ import numpy as np
 import pytest
 
 from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
+from jointctl.tools.identification.fit import Problem, make_problem, project, vector_limits
 from jointctl.tools.identification.models import FORMS, legendre
-from jointctl.tools.identification.polish import vector_limits
-from jointctl.tools.identification.pso import SwarmSettings, run_swarms
-from jointctl.tools.identification.variable_projection import Problem, make_problem, project
+from jointctl.tools.identification.swarm import SwarmSettings, run_swarms
 
 PART = 100  # iterations that pyswarms does
 LEAST_RATIO = 20.0

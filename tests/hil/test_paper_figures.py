@@ -29,8 +29,8 @@ from jointctl.tools.experiments.paper_runs import (
     law,
 )
 from jointctl.tools.experiments.study_runs import StudyResult, quantile, run_study
-from jointctl.tools.identification.options import Options
-from jointctl.tools.identification.pso import SwarmSettings
+from jointctl.tools.identification.identification import Options
+from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.output import Output
 from jointctl.tools.simulation.lockstep import LockstepJoint
 from jointctl.tools.verbs.paper import paper

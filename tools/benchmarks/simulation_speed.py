@@ -14,10 +14,9 @@ import numpy as np
 from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
 from jointctl.tools.benchmarks.paired import Row, compared, interleaved, measured, skipped
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.identification.fit import Problem, make_problem, vector_limits
 from jointctl.tools.identification.models import FORMS, legendre
-from jointctl.tools.identification.polish import vector_limits
-from jointctl.tools.identification.pso import SwarmSettings, run_swarms
-from jointctl.tools.identification.variable_projection import Problem, make_problem
+from jointctl.tools.identification.swarm import SwarmSettings, run_swarms
 from jointctl.tools.simulation.lockstep import LockstepJoint
 
 LOCKSTEP_S = 100.0

@@ -13,11 +13,9 @@ from typing import Any
 import numpy as np
 
 from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
-from jointctl.tools.identification.figures import fit_figure
 from jointctl.tools.identification.friction_data import FrictionData
-from jointctl.tools.identification.identification import identify_friction
-from jointctl.tools.identification.options import Options
-from jointctl.tools.identification.result import Identification
+from jointctl.tools.identification.identification import Identification, Options, identify_friction
+from jointctl.tools.identification.identification_report import fit_figure
 
 POINTS = 225
 NOISE_Nm = 0.0046
