@@ -21,8 +21,6 @@ from jointctl.drivers.can.open import open_cyclic_end
 from jointctl.drivers.drive import Drive
 from jointctl.drivers.errors import JointctlError
 from jointctl.firmware_py.states import DriveState, StopRequest
-from jointctl.tools.analysis.idle_states import cores_awake
-from jointctl.tools.analysis.wake_up import fifo, wake_up_lateness_ns
 from jointctl.tools.benchmarks.law_memory import setting_doubles
 from jointctl.tools.benchmarks.load import load, on_core
 from jointctl.tools.benchmarks.loop_times import NO_VALUES, LoopTimes, times_from_ns
@@ -30,6 +28,7 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import axis_constants, trajectory_table
 from jointctl.tools.running.loop.loop_handle import RECEIVE_SHARE, LoopHandle
 from jointctl.tools.running.open_drive import open_drive
+from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
 
 SETTLE_S = 0.5  # from the start of the loop until the drive is enabled, and a little more
 POLL_S = 0.02
