@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from jointctl.drivers.errors import DataError
+from jointctl.tools.campaign.campaign import MANY, campaign_figure, rows_by_kind, table
 from jointctl.tools.campaign.judge import Verdict
-from jointctl.tools.campaign.report import MANY, campaign_figure, rows_by_kind, table
 from jointctl.tools.drawing import BLUE, canvas, png, save_png
 from jointctl.tools.experiments.error_figures import ErrorFigures
 from jointctl.tools.experiments.study_figure import study_figure
