@@ -47,7 +47,7 @@ def study(
     quiet: Quiet = False,
 ) -> None:
     """Compare controllers on many random joints: medians and 5-95 % ranges of error, peak and settling time."""
-    from jointctl.tools.experiments.study_settings import StudySettings, checked, load_study
+    from jointctl.tools.experiments.controller_study import StudySettings, checked, load_study
     from jointctl.tools.verbs.study import study as run_study
 
     given: dict[str, Any] = {
