@@ -1,4 +1,4 @@
-"""The verbs around simulated experiments: paper, study, fault-campaign, bench."""
+"""The verbs around simulated experiments: paper, study, fault-campaign."""
 
 from __future__ import annotations
 
@@ -98,25 +98,8 @@ def fault_campaign(
     )
 
 
-def bench(
-    context: typer.Context,
-    quick: Annotated[bool, typer.Option("--quick", help="shorter, with more noise")] = False,
-    out: Annotated[Path | None, typer.Option("--out", help="folder for bench.json and bench.png")] = None,
-    only: Annotated[list[str] | None, typer.Option("--only", help="law, loop, lockstep, swarm or start")] = None,
-    json: Json = False,
-    quiet: Quiet = False,
-) -> None:
-    """Speed as paired ratios: the law against C and numpy, the loop against C and others, lockstep, swarm, start."""
-    from jointctl.tools.verbs.bench import bench as run_bench
-
-    verbs = sorted(getattr(context.find_root().command, "commands", {}))
-    output = Output(json=json, quiet=quiet)
-    raise typer.Exit(run_bench(output, quick=quick, out=out, only=tuple(only or ()), verbs=verbs))
-
-
 def register(app: typer.Typer) -> None:
     """Add the verbs."""
     app.command(rich_help_panel=COMPARE)(paper)
     app.command(rich_help_panel=COMPARE)(study)
     app.command("fault-campaign", rich_help_panel=COMPARE)(fault_campaign)
-    app.command(rich_help_panel=COMPARE)(bench)
