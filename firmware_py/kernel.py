@@ -27,9 +27,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-# In `tools` only these three packages may hold kernels (a test sees to it), so that editing a verb does not recompile.
-TOOLS_WITH_KERNELS = ("analysis", "benchmarks", "identification")
-_KERNEL_FOLDERS = ("firmware_py", "drivers", "hil", *(f"tools/{name}" for name in TOOLS_WITH_KERNELS))
+# In `tools` only these sources may hold kernels (a test sees to it), so that editing a verb does not recompile.
+TOOLS_WITH_KERNELS = ("identification/**/*.py", "wake_up.py")
+_KERNEL_SOURCES = (
+    *(f"{layer}/**/*.py" for layer in ("firmware_py", "drivers", "hil")),
+    *(f"tools/{pattern}" for pattern in TOOLS_WITH_KERNELS),
+)
 _KEPT_CACHES = 4
 
 
@@ -37,8 +40,8 @@ def source_hash(root: Path | None = None) -> str:
     """Hash (16 hex digits) of every source that can hold a kernel or a constant of one, and of interpreter and CPU."""
     root = root or Path(__file__).resolve().parent.parent
     digest = hashlib.sha256(f"{sys.version}{os.uname().machine}".encode())
-    for folder in _KERNEL_FOLDERS:
-        for path in sorted((root / folder).rglob("*.py")):
+    for pattern in _KERNEL_SOURCES:
+        for path in sorted(root.glob(pattern)):
             digest.update(str(path.relative_to(root)).encode())
             digest.update(path.read_bytes())
     return digest.hexdigest()[:16]

@@ -1,7 +1,7 @@
 """The control tick and its parts, alone: kernel, C, numpy.
 
 Not collected by default (its name); run `python -m pytest tests/bench/bench_law.py`.  It needs pytest-benchmark and a
-C compiler.  For paired ratios on a busy computer use `jointctl bench --only law`.
+C compiler.  For paired ratios on a busy computer use `python -m tests.bench.speed --only law`.
 """
 
 from __future__ import annotations
@@ -15,10 +15,13 @@ import pytest
 
 from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import new
-from jointctl.tools.benchmarks.c_programs import FAST_MATH, OPTIMISED, law_library
-from jointctl.tools.benchmarks.law_speed import (
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.simulation.lockstep import LockstepJoint
+from tests.bench.c_programs import FAST_MATH, OPTIMISED, law_library
+from tests.bench.law_speed import (
     NUMPY_TICKS,
     SAME_NUMBERS,
+    NumpyLaw,
     allocations,
     c_function,
     difference,
@@ -26,9 +29,6 @@ from jointctl.tools.benchmarks.law_speed import (
     run_hidden,
     sine_inputs,
 )
-from jointctl.tools.benchmarks.numpy_law import NumpyLaw
-from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.simulation.lockstep import LockstepJoint
 from tests.sessions import constants_of
 
 TICKS = 10_000

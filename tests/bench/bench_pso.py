@@ -17,28 +17,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
-from jointctl.tools.identification.models import FORMS, legendre
-from jointctl.tools.identification.polish import vector_limits
-from jointctl.tools.identification.pso import SwarmSettings, run_swarms
-from jointctl.tools.identification.variable_projection import Problem, make_problem, project
+from jointctl.tools.identification.fit import Problem, project, vector_limits
+from jointctl.tools.identification.models import legendre
+from jointctl.tools.identification.swarm import SwarmSettings, run_swarms
+from tests.bench.simulation_speed import paper_problems, written_cost
 
 PART = 100  # iterations that pyswarms does
 LEAST_RATIO = 20.0
 MOST_s = 10.0  # "a few seconds" on two cores, with room for a busy machine
-
-
-def paper_problems() -> list[Problem]:
-    velocity = np.linspace(-200.0, 200.0, 225) * DEGREE
-    torque = friction_curve_Nm(paper_friction(), velocity) + np.random.default_rng(1).normal(0.0, 0.0046, 225)
-    problems = []
-    for sign in (1, -1):
-        chosen = sign * velocity > 0.0
-        problems.append(
-            make_problem(FORMS["multi-stage"], sign * velocity[chosen], sign * torque[chosen], 40.0 * DEGREE,
-                         (None, 20.0 * DEGREE))
-        )  # fmt: skip
-    return problems
 
 
 def ours_s(problems: list[Problem]) -> float:
@@ -50,19 +36,6 @@ def ours_s(problems: list[Problem]) -> float:
         assert result.iterations == 5000
         assert result.fit.rmse_Nm <= 1.01 * project(problem).rmse_Nm
     return elapsed_s
-
-
-def written_cost(problem: Problem) -> Callable[[np.ndarray], np.ndarray]:
-    x, y = problem.x, problem.y_Nm
-    polynomials = legendre(x, problem.knee)
-
-    def cost(p: np.ndarray) -> np.ndarray:
-        ts, tc = p[:, :1], p[:, :1] * p[:, 1:2]
-        stribeck = tc + (ts - tc) * np.exp(-x / np.exp(p[:, 2:3])) + p[:, 3:4] * x
-        model = np.where(x <= problem.knee, stribeck, p[:, 4:] @ polynomials.T)
-        return np.sum((model - y) ** 2, axis=1)
-
-    return cost
 
 
 def tuned_cost(problem: Problem) -> Callable[[np.ndarray], np.ndarray]:

@@ -3,9 +3,9 @@
     python tests/bench/swing_alarms.py [--seed 1 --seed 2] [--plants 40] [--runs 200] [--controllers paper,precise,pid]
         [--base precise] [--with-stop] [--workers 2]
 
-Each seed draws another ensemble (`tools/experiments/ensemble.py`); each of its joints runs each motion of `study`
-(`tools/experiments/scenarios.py`) under each controller, to the end of the trajectory.  `--runs` takes so many of all
-these runs by chance, `--with-stop` goes on through the controlled stop.  Prints a row for each controller, and ends
+Each seed draws another ensemble (`tools/experiments/controller_study.py`); each of its joints runs each motion of
+`study` (`tools/experiments/scenarios.py`) under each controller, to the end of the trajectory.  `--runs` takes so many
+of all these runs by chance, `--with-stop` goes on through the controlled stop.  Prints a row for each controller, ends
 with 1 if a run was ended by the monitor, was told to be noisy, or lost its learning.
 """
 
@@ -28,8 +28,8 @@ sys.path.insert(0, str(ROOT))
 
 from jointctl.firmware_py.states import Fault, Notice  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
+from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant  # noqa: E402
 from jointctl.tools.experiments.controllers import controller_constants, named  # noqa: E402
-from jointctl.tools.experiments.ensemble import EnsembleSettings, random_plant  # noqa: E402
 from jointctl.tools.experiments.scenarios import Scenario, run_scenario  # noqa: E402
 from jointctl.tools.simulation.lockstep import LockstepJoint  # noqa: E402
 

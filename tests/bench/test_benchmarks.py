@@ -13,24 +13,33 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from jointctl.drivers.errors import ConfigurationError, UsageError
 from jointctl.firmware_py.states import ControllerKind
-from jointctl.tools.benchmarks import c_programs
-from jointctl.tools.benchmarks.c_programs import NoCompilerError, compiler
-from jointctl.tools.benchmarks.compiled_loops import at_rate, on_the_core, run_cyclictest
-from jointctl.tools.benchmarks.law_memory import FIRST_WEIGHT, law_doubles, state_doubles
-from jointctl.tools.benchmarks.law_speed import SAME_NUMBERS, difference, kernel_ticks, law_rows, sine_inputs
-from jointctl.tools.benchmarks.load import LOADS, busy_core, cores, load, on_core
-from jointctl.tools.benchmarks.loop_times import times_from_ns
-from jointctl.tools.benchmarks.numpy_law import NumpyLaw
-from jointctl.tools.benchmarks.outcome import outcome_data, outcome_table, write_outcome
-from jointctl.tools.benchmarks.paired import Row, compared, interleaved, measured, skipped
-from jointctl.tools.cli.main import app
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.bench import bench
+from tests.bench import c_programs, speed
+from tests.bench.c_programs import (
+    FIRST_WEIGHT,
+    OPTIMISED,
+    NoCompilerError,
+    law_doubles,
+    law_library,
+    state_doubles,
+)
+from tests.bench.exchange_speed import (
+    LOADS,
+    at_rate,
+    busy_core,
+    cores,
+    load,
+    on_core,
+    on_the_core,
+    run_cyclictest,
+    times_from_ns,
+)
+from tests.bench.law_speed import SAME_NUMBERS, NumpyLaw, difference, kernel_ticks, law_rows, sine_inputs
+from tests.bench.paired import Row, compared, interleaved, measured, outcome_data, outcome_table, skipped, write_outcome
 from tests.sessions import constants_of
 
 
@@ -119,7 +128,7 @@ def test_without_compiler_or_sources_the_comparison_is_skipped_with_a_word(const
     else:
         monkeypatch.setattr(c_programs, "SOURCES", tmp_path / "none")
     with pytest.raises(NoCompilerError):
-        compiler()
+        law_library(tmp_path, OPTIMISED)
     rows = list(law_rows(constants, tmp_path, pairs=1))
     assert rows[0].note.startswith("skipped: ")
     assert math.isnan(rows[0].ratio)
@@ -186,8 +195,8 @@ def test_another_rate_or_core_changes_nothing_else():
 
 def test_every_verb_of_the_command_line_is_timed(monkeypatch: pytest.MonkeyPatch):
     asked: dict[str, Any] = {}
-    monkeypatch.setattr("jointctl.tools.verbs.bench.bench", lambda _, **options: asked.update(options) or 0)
-    assert CliRunner().invoke(app, ["bench"]).exit_code == 0
+    monkeypatch.setattr(speed, "bench", lambda _, **options: asked.update(options) or 0)
+    assert speed.main([]) == 0
     assert {"run", "hil", "check", "identify", "fault-campaign"} <= set(asked["verbs"])
 
 
@@ -216,4 +225,12 @@ def test_the_report_is_a_table_json_and_a_picture(tmp_path: Path):
 
 def test_a_part_that_does_not_exist_is_named():
     with pytest.raises(UsageError, match=r"only \(=lop\) must be one of law, loop, lockstep, swarm, start"):
-        bench(Output(quiet=True), only=["lop"])
+        speed.bench(Output(quiet=True), only=["lop"])
+
+
+def test_an_error_is_one_line_and_an_exit_code(capsys: pytest.CaptureFixture[str]):
+    assert speed.main(["--only", "lop"]) == UsageError.exit_code
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert "only (=lop)" in shown.err
+    assert "Traceback" not in shown.err

@@ -14,13 +14,17 @@ from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import AxisPhase, CommandKind
 from jointctl.hil.faults.kinds import FaultKind
 from jointctl.tools.campaign import judge as judge_module
-from jointctl.tools.campaign.envelope import envelope, reaction_s
-from jointctl.tools.campaign.fault_classes import FAULT_CLASSES
-from jointctl.tools.campaign.fitness import require_fit
-from jointctl.tools.campaign.judge import in_time, judge, run_scenario
-from jointctl.tools.campaign.runner import campaign_joint, run_campaign
-from jointctl.tools.campaign.scenario import BEFORE_s, draw_scenario, fitted
-from jointctl.tools.campaign.sweep_motion import LONGEST_s, SweepStrokes, placed_sweep
+from jointctl.tools.campaign.campaign import campaign_joint, run_campaign
+from jointctl.tools.campaign.fault_scenarios import (
+    FAULT_CLASSES,
+    BEFORE_s,
+    LONGEST_s,
+    SweepStrokes,
+    draw_scenario,
+    fitted,
+    placed_sweep,
+)
+from jointctl.tools.campaign.judge import envelope, in_time, judge, reaction_s, require_fit, run_scenario
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.output import Output

@@ -20,13 +20,11 @@ from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault
 from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.faults.kinds import FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUTHS
+from jointctl.tools.campaign import campaign as runner
 from jointctl.tools.campaign import judge as judge_module
-from jointctl.tools.campaign import runner
-from jointctl.tools.campaign.envelope import Envelope, envelope, reaction_s
-from jointctl.tools.campaign.fault_classes import FAULT_CLASSES
-from jointctl.tools.campaign.judge import judge, run_scenario
-from jointctl.tools.campaign.report import campaign_figure, rows_by_kind
-from jointctl.tools.campaign.scenario import draw_scenario
+from jointctl.tools.campaign.campaign import campaign_figure, rows_by_kind
+from jointctl.tools.campaign.fault_scenarios import FAULT_CLASSES, draw_scenario
+from jointctl.tools.campaign.judge import Envelope, envelope, judge, reaction_s, run_scenario
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.drawing import png

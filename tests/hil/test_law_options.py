@@ -19,7 +19,7 @@ from jointctl.tools.experiments.controllers import (
     controller_constants,
     from_file,
 )
-from jointctl.tools.experiments.paper_runs import ideal, law, r1
+from jointctl.tools.experiments.paper_experiments import ideal, law, r1
 from jointctl.tools.experiments.scenarios import Scenario, run_scenario
 from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
 

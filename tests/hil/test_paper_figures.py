@@ -15,22 +15,24 @@ from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.analysis.loop_settings import loop_settings
 from jointctl.tools.analysis.margins import phase_margin_deg
 from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.experiments.controller_study import StudyResult, quantile, run_study
 from jointctl.tools.experiments.controllers import named
-from jointctl.tools.experiments.error_figures import ErrorFigures, error_figures, settling_s
-from jointctl.tools.experiments.paper_identification import identify_paper_friction
-from jointctl.tools.experiments.paper_rows import PaperRun, network_difference_mrad, paper_rows
-from jointctl.tools.experiments.paper_runs import (
+from jointctl.tools.experiments.paper_experiments import (
     AFTER_s,
     Experiment,
+    PaperRun,
     experiments,
     friction_estimate,
     hidden_outputs,
     ideal,
+    identify_paper_friction,
     law,
+    network_difference_mrad,
+    paper_rows,
 )
-from jointctl.tools.experiments.study_runs import StudyResult, quantile, run_study
-from jointctl.tools.identification.options import Options
-from jointctl.tools.identification.pso import SwarmSettings
+from jointctl.tools.experiments.scenarios import ErrorFigures, error_figures, settling_s
+from jointctl.tools.identification.identification import Options
+from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.output import Output
 from jointctl.tools.simulation.lockstep import LockstepJoint
 from jointctl.tools.verbs.paper import paper

@@ -16,12 +16,22 @@ from jointctl.drivers.errors import INTERRUPTED, ConfigurationError, DataError
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.drawing import save_png
+from jointctl.tools.experiments.controller_study import (
+    EnsembleSettings,
+    PlantResult,
+    StudyResult,
+    StudySettings,
+    checked,
+    load_study,
+    quantile,
+    random_plant,
+    run_study,
+    study_controllers,
+    study_figure,
+    write_csv,
+)
 from jointctl.tools.experiments.controllers import TABLE, controller_config, named
-from jointctl.tools.experiments.ensemble import EnsembleSettings, random_plant
-from jointctl.tools.experiments.error_figures import FAILED, ErrorFigures
-from jointctl.tools.experiments.study_figure import study_figure
-from jointctl.tools.experiments.study_runs import PlantResult, StudyResult, quantile, run_study, write_csv
-from jointctl.tools.experiments.study_settings import StudySettings, checked, load_study, study_controllers
+from jointctl.tools.experiments.scenarios import FAILED, ErrorFigures
 from jointctl.tools.output import Output
 from jointctl.tools.simulation.lockstep import DirectBus
 from jointctl.tools.verbs.study import study

@@ -17,11 +17,10 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import friction_constants
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.sections import Friction
-from jointctl.tools.identification.friction_file import read_friction_data
-from jointctl.tools.identification.friction_section import section_values
-from jointctl.tools.identification.identification import identify_friction
-from jointctl.tools.identification.options import Options
-from jointctl.tools.identification.pso import SwarmSettings
+from jointctl.tools.identification.friction_data import read_friction_data
+from jointctl.tools.identification.identification import Options, identify_friction
+from jointctl.tools.identification.identification_report import section_values
+from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.output import Output
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.verbs.sweep import sweep

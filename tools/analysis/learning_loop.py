@@ -20,9 +20,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jointctl.tools.analysis.linear_loop import LoopSettings, linear_loop
+from jointctl.tools.analysis.linear_loop import Array, LoopSettings, linear_loop
 from jointctl.tools.analysis.margins import frequencies_radps
-from jointctl.tools.analysis.sampled_joint import Array
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,167 @@
-"""The gate before enabling: a loop without enough phase margin is refused, with what would mend it."""
+"""The gate before enabling: a loop without enough phase margin is refused, with what would bring it there.
+
+The remedies change one setting at a time, each with the number found by search.  A search starts at the present value
+and looks for the nearest one that meets the margin; what it returns has been rounded to three digits towards the safe
+side and computed again.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
 from jointctl.drivers.errors import MarginError
-from jointctl.tools.analysis.advice import Remedy, longest_delay_s, remedies
+from jointctl.firmware_py.states import ControllerKind
 from jointctl.tools.analysis.learning_loop import Convergence, LearningSettings, learning_convergence
 from jointctl.tools.analysis.linear_loop import LoopSettings
 from jointctl.tools.analysis.loop_settings import loop_settings
-from jointctl.tools.analysis.margins import Margins, margins
+from jointctl.tools.analysis.margins import Margins, margins, phase_margin_deg
 from jointctl.tools.configuration.config import Config
+
+# --- remedies ---
+
+_STEPS = 60  # of a scan, each a few per cent
+_BISECTIONS = 14
+_SCAN_RATIO = 1.04
+_HIGHEST_CUTOFF = 0.49  # of the rate; the configuration allows less than half
+
+
+@dataclass(frozen=True)
+class Remedy:
+    """One change that reaches the margin."""
+
+    text: str  # what to write into the configuration, and instead of what
+    settings: LoopSettings
+    phase_margin_deg: float
+
+
+def _rounded(value: float, upwards: bool) -> float:
+    if value == 0.0:
+        return 0.0
+    unit = 10.0 ** (math.floor(math.log10(abs(value))) - 2)
+    count = math.ceil(value / unit) if upwards else math.floor(value / unit)
+    return float(f"{count * unit:.3g}")
+
+
+def _boundary(bad: float, good: float, meets: Callable[[float], bool]) -> float:
+    """The value next to `bad` that meets the margin; `good` does."""
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (bad + good)
+        if meets(middle):
+            good = middle
+        else:
+            bad = middle
+    return good
+
+
+def _search(
+    settings: LoopSettings,
+    minimum_deg: float,
+    start: float,
+    end: float,
+    change: Callable[[float], LoopSettings],
+) -> tuple[float, LoopSettings, float] | None:
+    """(value, settings, phase margin) nearest to `start` on the way to `end` (both > 0, a scan by ratio)."""
+
+    def meets(value: float) -> bool:
+        return phase_margin_deg(change(value)) >= minimum_deg
+
+    steps = min(_STEPS, max(1, math.ceil(abs(math.log(end / start)) / math.log(_SCAN_RATIO))))
+    bad = start
+    for i in range(1, steps + 1):
+        value = start * (end / start) ** (i / steps)
+        if meets(value):
+            value = _rounded(_boundary(bad, value, meets), end > start)
+            reached = phase_margin_deg(change(value))
+            return (value, change(value), reached) if reached >= minimum_deg else None
+        bad = value
+    return None
+
+
+def remedies(settings: LoopSettings, minimum_deg: float) -> list[Remedy]:
+    """Changes that each reach `minimum_deg`, the mildest for the tracking error first; empty if none does alone."""
+    s = settings
+    network = s.kind == ControllerKind.COMPUTED_TORQUE_RBF and s.learning_rate > 0.0
+    found = []
+
+    def add(text: str, result: tuple[float, LoopSettings, float] | None) -> None:
+        if result is not None:
+            found.append(Remedy(text.format(value=result[0], changed=result[1]), result[1], result[2]))
+
+    highest = _HIGHEST_CUTOFF / s.period_s
+    if 0.0 < s.cutoff_Hz < highest:
+        result = _search(s, minimum_deg, s.cutoff_Hz, highest, lambda v: replace(s, cutoff_Hz=v))
+        add(f"control.velocity_cutoff_Hz = {{value:g}} (now {s.cutoff_Hz:g})", result)
+    if network:
+        q1, q2 = s.q
+        if q1 == q2:
+            result = _search(s, minimum_deg, q1, q1 * 1e-3, lambda v: replace(s, q=(v, v)))
+            add(f"control.q = {{value:g}} (now {q1:g}; adaptation in proportion)", result)
+        result = _search(s, minimum_deg, s.learning_rate, s.learning_rate * 1e-3, lambda v: replace(s, learning_rate=v))
+        add(f"control.learning_rate = {{value:g}} (now {s.learning_rate:g})", result)
+    if s.kind == ControllerKind.PID and s.ki > 0.0:
+        result = _search(s, minimum_deg, s.ki, s.ki * 1e-3, lambda v: replace(s, ki=v))
+        add(f"control.ki = {{value:g}} (now {s.ki:g})", result)
+    if s.kind == ControllerKind.COMPUTED_TORQUE_OBSERVER and s.observer_radps > 0.0:
+        result = _search(
+            s, minimum_deg, s.observer_radps, s.observer_radps * 1e-3, lambda v: replace(s, observer_radps=v)
+        )
+        add(f"control.observer_radps = {{value:g}} (now {s.observer_radps:g})", result)
+    result = _search(s, minimum_deg, s.kv, s.kv * 6.0, lambda v: replace(s, kv=v))
+    add(f"control.kv = {{value:g}} (now {s.kv:g})", result)
+    if result is None:
+        result = _search(s, minimum_deg, s.kv, s.kv / 6.0, lambda v: replace(s, kv=v))
+        add(f"control.kv = {{value:g}} (now {s.kv:g})", result)
+    result = _search(s, minimum_deg, 1.0, 0.03, lambda v: slower(s, v))
+    add("a slower loop: control.kp = {changed.kp:.4g}, kv = {changed.kv:.4g}" + _rest_text(s, network), result)
+    return found
+
+
+def slower(settings: LoopSettings, factor: float) -> LoopSettings:
+    """Every closed-loop mode of the theory `factor` times as fast: kp, kv, and Q, ki or the observer, scaled together.
+
+    s^3 + kv s^2 + (kp + a P22) s + a P12 needs P22 ~ factor^2 and P12 ~ factor^3: q2 ~ factor^3 and q1 ~ factor^5.
+    Q = q I keeps its shape with factor^3; its slow mode is slow anyway.
+    """
+    q1, q2 = settings.q
+    scaled = (q1 * factor ** (3 if q1 == q2 else 5), q2 * factor**3)
+    return replace(
+        settings,
+        kp=settings.kp * factor**2,
+        kv=settings.kv * factor,
+        q=scaled,
+        ki=settings.ki * factor**3,
+        observer_radps=settings.observer_radps * factor,
+    )
+
+
+def _rest_text(settings: LoopSettings, network: bool) -> str:
+    if settings.kind == ControllerKind.PID:
+        return ", ki = {changed.ki:.4g}"
+    if settings.kind == ControllerKind.COMPUTED_TORQUE_OBSERVER:
+        return ", observer_radps = {changed.observer_radps:.4g}"
+    if not network:
+        return ""
+    if settings.q[0] == settings.q[1]:
+        return ", q = {changed.q[0]:.4g}"
+    return ", q = [{changed.q[0]:.4g}, {changed.q[1]:.4g}]"
+
+
+def longest_delay_s(settings: LoopSettings, minimum_deg: float) -> float | None:
+    """The longest loop delay up to the present one that still leaves the margin; None if even no delay does not."""
+
+    def meets(delay_s: float) -> bool:
+        return phase_margin_deg(replace(settings, delay_s=delay_s)) >= minimum_deg
+
+    if not meets(0.0):
+        return None
+    if meets(settings.delay_s):
+        return settings.delay_s
+    return _rounded(_boundary(settings.delay_s, 0.0, meets), False)
+
+
+# --- the gate ---
 
 
 def require_margin(config: Config, delay_s: float | None = None, *, allow_low_margin: bool = False) -> Margins:

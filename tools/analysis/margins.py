@@ -2,12 +2,13 @@
 
 Phase and gain margins and the sensitivity are read off L(e^{j omega T}), which is exact for the sampled loop.  The
 delay margin is exact too: the additional delay at which a closed-loop eigenvalue reaches the unit circle; the quotient
-phase margin / crossover frequency only tells where to search, because a delay inside a period is not a pure phase.
+phase margin / crossover frequency only indicates where to search, because a delay inside a period is not a pure phase.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,13 +17,51 @@ from jointctl.firmware_py.law import eigenvalues, solve_lyapunov_p, ultimate_bou
 from jointctl.firmware_py.states import ControllerKind
 from jointctl.tools.analysis.linear_loop import (
     MAX_DELAY_PERIODS,
+    Array,
     LinearLoop,
     LoopSettings,
     linear_loop,
     network_gains,
 )
-from jointctl.tools.analysis.narrowing import least_between, zero_between
-from jointctl.tools.analysis.sampled_joint import Array
+
+# --- zeros and minima by a grid that shrinks round by round: every start of a motion would wait for scipy.optimize ---
+
+_ROUND_POINTS = 33  # of a round; an odd number keeps a symmetric extremum on the grid
+
+Function = Callable[[np.ndarray], np.ndarray]
+
+
+def zero_between(function: Function, low: float, high: float, tolerance: float = 1e-12) -> float:
+    """Where `function` changes its sign between `low` and `high` > `low`; the first such place on the grid.
+
+    `function` maps an array of places, shape (N,), to real values of the same shape.  Raises ValueError without a
+    change of sign.
+    """
+    while True:
+        places = np.linspace(low, high, _ROUND_POINTS)
+        positive = function(places) > 0.0
+        changes = np.flatnonzero(positive[:-1] != positive[1:])
+        if not len(changes):
+            raise ValueError(f"no change of sign between {low} and {high}")
+        last_width = high - low
+        low, high = float(places[changes[0]]), float(places[changes[0] + 1])
+        if high - low <= tolerance or high - low >= last_width:
+            return 0.5 * (low + high)
+
+
+def least_between(function: Function, low: float, high: float, tolerance: float = 1e-9) -> tuple[float, float]:
+    """(place, value) of the least value that `function`, as above, has on the grids from `low` to `high` > `low`."""
+    while True:
+        places = np.linspace(low, high, _ROUND_POINTS)
+        values = function(places)
+        least = int(np.argmin(values))
+        last_width = high - low
+        low, high = float(places[max(least - 1, 0)]), float(places[min(least + 1, _ROUND_POINTS - 1)])
+        if high - low <= tolerance or high - low >= last_width:
+            return float(places[least]), float(values[least])
+
+
+# --- margins ---
 
 _POINTS = 3000
 _DECADES = 6.5  # below pi / T

@@ -1,4 +1,4 @@
-"""The verbs around simulated experiments: paper, study, fault-campaign, bench."""
+"""The verbs around simulated experiments: paper, study, fault-campaign."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def study(
     quiet: Quiet = False,
 ) -> None:
     """Compare controllers on many random joints: medians and 5-95 % ranges of error, peak and settling time."""
-    from jointctl.tools.experiments.study_settings import StudySettings, checked, load_study
+    from jointctl.tools.experiments.controller_study import StudySettings, checked, load_study
     from jointctl.tools.verbs.study import study as run_study
 
     given: dict[str, Any] = {
@@ -98,25 +98,8 @@ def fault_campaign(
     )
 
 
-def bench(
-    context: typer.Context,
-    quick: Annotated[bool, typer.Option("--quick", help="shorter, with more noise")] = False,
-    out: Annotated[Path | None, typer.Option("--out", help="folder for bench.json and bench.png")] = None,
-    only: Annotated[list[str] | None, typer.Option("--only", help="law, loop, lockstep, swarm or start")] = None,
-    json: Json = False,
-    quiet: Quiet = False,
-) -> None:
-    """Speed as paired ratios: the law against C and numpy, the loop against C and others, lockstep, swarm, start."""
-    from jointctl.tools.verbs.bench import bench as run_bench
-
-    verbs = sorted(getattr(context.find_root().command, "commands", {}))
-    output = Output(json=json, quiet=quiet)
-    raise typer.Exit(run_bench(output, quick=quick, out=out, only=tuple(only or ()), verbs=verbs))
-
-
 def register(app: typer.Typer) -> None:
     """Add the verbs."""
     app.command(rich_help_panel=COMPARE)(paper)
     app.command(rich_help_panel=COMPARE)(study)
     app.command("fault-campaign", rich_help_panel=COMPARE)(fault_campaign)
-    app.command(rich_help_panel=COMPARE)(bench)

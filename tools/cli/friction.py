@@ -15,7 +15,7 @@ from jointctl.tools.cli.sweep_command import sweep_command
 from jointctl.tools.output import Output
 
 if TYPE_CHECKING:
-    from jointctl.tools.identification.foreign_table import ForeignFormat
+    from jointctl.tools.identification.friction_data import ForeignFormat
 
 Data = Annotated[Path, typer.Argument(metavar="DATA", help="CSV of velocity plateaus, from sweep or elsewhere")]
 Model = Annotated[str, typer.Option("--model", help="multi-stage, stribeck, coulomb-viscous, or auto (held-out error)")]
@@ -38,7 +38,7 @@ class TableOptions:
     delimiter: Annotated[str, typer.Option("--delimiter", help="between columns: auto, or the character")] = "auto"
 
     def told(self) -> ForeignFormat:
-        from jointctl.tools.identification.foreign_table import ForeignFormat
+        from jointctl.tools.identification.friction_data import ForeignFormat
 
         return ForeignFormat(**asdict(self))
 
@@ -80,8 +80,8 @@ def identify(
     quiet: Quiet = False,
 ) -> None:
     """Fit the friction model (11) to measured plateaus; writes TOML, figures and a report beside the data."""
-    from jointctl.tools.identification.options import Options
-    from jointctl.tools.identification.pso import SwarmSettings
+    from jointctl.tools.identification.identification import Options
+    from jointctl.tools.identification.swarm import SwarmSettings
     from jointctl.tools.verbs.identify import identify as run_identify
 
     options = Options(

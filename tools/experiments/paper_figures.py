@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from jointctl.tools.drawing import BLUE, GREEN, GREY, ORANGE, RED, canvas
-from jointctl.tools.experiments.paper_rows import Runs
-from jointctl.tools.experiments.paper_runs import friction_estimate, hidden_outputs
+from jointctl.tools.experiments.paper_experiments import Runs, friction_estimate, hidden_outputs
 from jointctl.tools.experiments.scenarios import event_s
 from jointctl.tools.recording.run_figure import drawn_indices
 from jointctl.tools.simulation.lockstep import LockstepRun

@@ -1,21 +1,165 @@
-"""Friction data: one point for each speed at which friction was measured, and which of them are used.
+"""Friction data: points of speed and torque, from the file of our own sweep or from any table of numbers.
 
-Points are sorted by speed, so the order of the file does not matter; repeats of a speed are all kept, each a
-measurement of its own (averaging would hide their spread); a line that is an exact copy of another one is a mistake of
-copying and counts once; a point at zero speed says nothing, since friction is set-valued there; points that never
-settled are left out.  All of this is told in `notes`.
+One point for each speed at which friction was measured.  Points are sorted by speed, so the order of the file does not
+matter; repeats of a speed are all kept, each a measurement of its own (averaging would hide their spread); a line that
+is an exact copy of another one is a mistake of copying and counts once; a point at zero speed says nothing, since
+friction is set-valued there; points that never settled are left out.  All of this is reported in `notes`.
+
+The file of a sweep is a CSV (joint speed, motor torque), one plateau a line, in the order measured:
+
+    velocity_radps,current_A,motor_torque_Nm,velocity_std_radps,current_std_A,samples,settled,position_min_rad,
+    position_max_rad,time_s,temperature_degC,direction,pass
+
+settled is 1 if the mean's confidence interval was met before the time limit, direction is 1 or -1, pass counts repeats
+from 0, temperature_degC may be empty.  Beside it lies a JSON file of the same stem with at least reduction_ratio and
+torque_constant_NmpA, and, if known, limits (torque_max_Nm, velocity_max_radps of the joint); both signs are such that
+friction opposes motion (torque and velocity have the same sign).
+
+Of any other table the user gives columns, units and sides; nothing is guessed.  Delimiter, decimal comma, byte-order
+mark, comments and quotes are recognised.  Every problem is one `DataError` that names file, line and value.
 """
 
 from __future__ import annotations
 
+import csv
+import hashlib
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.errors import DataError
-from jointctl.tools.identification.table_file import TableFile
+from jointctl.drivers.errors import DataError, UsageError
+from jointctl.firmware_py.input_file import LARGEST_TABLE_BYTES, number_from, parse_json, read_input
+from jointctl.tools.configuration.conversions import RADPS_PER_UNIT
+
+# --- a CSV file of numbers ---
+
+DELIMITERS = {"auto": "", "comma": ",", "semicolon": ";", "tab": "\t", "space": " ", ",": ",", ";": ";", "\t": "\t"}
+LARGEST_NUMBER = 1e100  # whatever it means, its squares are numbers as well
+
+
+@dataclass(frozen=True)
+class TableFile:
+    """The text cells of a file; `rows` holds (line number, cells)."""
+
+    path: Path
+    sha256: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[int, tuple[str, ...]], ...]
+    decimal_comma: bool
+    ended: bool  # the last line has its line end
+
+    def column(self, name: str) -> int:
+        """Index of a column by its name (case ignored) or number from 1."""
+        lowered = [c.lower() for c in self.columns]
+        if lowered.count(name.lower()) > 1:
+            raise DataError(f"{self.path}: column {name!r} occurs {lowered.count(name.lower())} times")
+        if name.lower() in lowered:
+            return lowered.index(name.lower())
+        if name.isdigit() and 1 <= int(name) <= len(self.columns):
+            return int(name) - 1
+        raise DataError(f"{self.path}: no column {name!r}", f"the file has: {', '.join(self.columns)}")
+
+    def number(self, row: tuple[int, tuple[str, ...]], index: int, *, empty: float | None = None) -> float:
+        """A finite number; an empty cell is `empty` if that is given."""
+        line, cells = row
+        text = cells[index].strip()
+        if not text and empty is not None:
+            return empty
+        try:
+            value = number_from(text.replace(",", ".") if self.decimal_comma else text)
+        except ValueError:
+            value = math.nan
+        if not abs(value) <= LARGEST_NUMBER:
+            raise DataError(
+                f"{self.path}: line {line}: {self.columns[index]} (={text[:40] or 'empty'}) must be a finite number"
+                + (f", at most {LARGEST_NUMBER:g}" if math.isfinite(value) else "")
+            )
+        return value
+
+
+def read_bytes(path: Path) -> bytes:
+    try:
+        return read_input(path, LARGEST_TABLE_BYTES)
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file") from None
+    except IsADirectoryError:
+        raise DataError(f"{path}: is a folder, not a data file") from None
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+def _text(path: Path, content: bytes) -> str:
+    if b"\0" in content[:65536] and not content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise DataError(f"{path}: is a binary file (byte {content.index(0)} is zero), not a CSV table")
+    try:
+        return content.decode("utf-16" if content.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: byte {error.start} is not UTF-8 text: not a CSV table") from None
+
+
+def _delimiter(path: Path, header: str, wanted: str) -> str:
+    if wanted not in DELIMITERS:
+        raise UsageError(f"--delimiter (={wanted}) must be one of auto, comma, semicolon, tab, space")
+    if wanted != "auto":
+        return DELIMITERS[wanted]
+    for candidate in (";", "\t", ","):  # a comma may be a decimal one, so it comes last
+        if candidate in header:
+            return candidate
+    if len(header.split()) > 1:
+        return " "
+    raise DataError(f"{path}: line 1 (={header[:40]}) must hold at least two columns", "tell --delimiter")
+
+
+def read_table(path: Path, delimiter: str = "auto") -> TableFile:
+    """Header and rows; lines that begin with # and empty lines are skipped."""
+    content = read_bytes(path)
+    lines = [(n, line) for n, line in enumerate(_text(path, content).splitlines(), 1)
+             if line.strip() and not line.lstrip().startswith("#")]  # fmt: skip
+    if not lines:
+        raise DataError(f"{path}: is empty: a header and one line a point are needed")
+    mark = _delimiter(path, lines[0][1], delimiter)
+
+    def split(line: str) -> tuple[str, ...]:
+        if mark == " ":
+            return tuple(line.split())
+        return tuple(cell.strip() for cell in next(csv.reader([line], delimiter=mark)))
+
+    columns = split(lines[0][1])
+    if all(_is_number(cell.replace(",", ".")) for cell in columns):
+        # no header: the columns have numbers only
+        columns = tuple(str(k + 1) for k in range(len(columns)))
+    else:
+        del lines[0]
+    rows = tuple((n, split(line)) for n, line in lines)
+    if not rows:
+        raise DataError(f"{path}: has a header but no points")
+    for n, cells in rows:
+        if len(cells) != len(columns):
+            last = " (the last line: is the file cut off?)" if n == rows[-1][0] else ""
+            raise DataError(f"{path}: line {n} has {len(cells)} columns, the header {len(columns)}{last}")
+    return TableFile(
+        path, hashlib.sha256(content).hexdigest(), columns, rows, mark == ";" and _comma(rows), content.endswith(b"\n")
+    )
+
+
+def _is_number(text: str) -> bool:
+    try:
+        number_from(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _comma(rows: tuple[tuple[int, tuple[str, ...]], ...]) -> bool:
+    """Decimal commas: with ; between the columns, some cell has a comma and none has a point."""
+    text = "".join("".join(cells) for _, cells in rows)
+    return "," in text and "." not in text
+
+
+# --- the points, and which of them are used ---
 
 MIN_PER_DIRECTION = 12
 LEAST_TORQUE_Nm, LEAST_SHARE = 1e-12, 1e-6  # of a point, absolute and of the greatest, that has a relative error
@@ -63,7 +207,7 @@ def from_table(
 def tidied(data: FrictionData, *, ordered: bool) -> FrictionData:
     """The points that are used, sorted, with notes on what was done.
 
-    `ordered`: the file is expected to be in order of velocity, so that it is told where it is not.
+    `ordered`: the file is expected to be in order of velocity, so that a note says where it is not.
     """
     notes = []
     cells = np.column_stack([data.velocity_radps, data.motor_torque_Nm])
@@ -125,3 +269,192 @@ def check_directions(data: FrictionData, both: bool) -> None:
         raise DataError(f"{data.path}: {text}: at least {MIN_PER_DIRECTION} are needed in each direction")
     if max(counts.values()) == 0:
         raise DataError(f"{data.path}: {text}")
+
+
+# --- a table with columns of other names ---
+
+SIDES = ("joint", "motor")
+
+
+@dataclass(frozen=True)
+class ForeignFormat:
+    """How to read a table that is not ours; None = not told."""
+
+    velocity_column: str | None = None
+    torque_column: str | None = None
+    current_column: str | None = None
+    velocity_unit: str | None = None
+    side: str | None = None  # of the velocity
+    torque_side: str | None = None
+    ratio: float | None = None
+    torque_constant_NmpA: float | None = None
+    delimiter: str = "auto"
+
+    @property
+    def mapped(self) -> bool:
+        return bool(self.velocity_column or self.torque_column or self.current_column)
+
+
+def check_told(told: ForeignFormat) -> None:
+    """`UsageError` names a flag whose value is not allowed."""
+    for flag, value, allowed in (
+        ("--velocity-unit", told.velocity_unit, tuple(RADPS_PER_UNIT)),
+        ("--side", told.side, SIDES),
+        ("--torque-side", told.torque_side, SIDES),
+    ):
+        if value is not None and value not in allowed:
+            raise UsageError(f"{flag} (={value}) must be one of {', '.join(allowed)}")
+    for flag, number, low, high in (
+        ("--ratio", told.ratio, 1.0, 1000.0),
+        ("--torque-constant", told.torque_constant_NmpA, 1e-6, 100.0),
+    ):
+        if number is not None and not low <= number <= high:
+            raise UsageError(f"{flag} (={number:g}) must be in [{low:g}..{high:g}]")
+    if told.torque_column and told.current_column:
+        raise UsageError("--torque-column and --current-column: give one of them, the friction comes from one")
+
+
+def read_foreign(table: TableFile, told: ForeignFormat) -> FrictionData:
+    """Points in our units; `UsageError` where something that a table does not tell was not told."""
+    if not told.velocity_column:
+        raise UsageError("--velocity-column is missing", f"the file has: {', '.join(table.columns)}")
+    if not (told.torque_column or told.current_column):
+        raise UsageError("--torque-column or --current-column is missing", f"the file has: {', '.join(table.columns)}")
+    for flag, value in (("--velocity-unit", told.velocity_unit), ("--side", told.side), ("--ratio", told.ratio)):
+        if value is None:
+            raise UsageError(f"{flag} is missing: a table of numbers does not tell it", "nothing is guessed")
+    assert told.velocity_unit is not None
+    assert told.ratio is not None
+    scale = RADPS_PER_UNIT[told.velocity_unit] / (told.ratio if told.side == "motor" else 1.0)
+    velocity = numbers(table, told.velocity_column) * scale
+    if told.current_column:
+        if told.torque_constant_NmpA is None:
+            raise UsageError("--torque-constant is missing: --current-column needs it [Nm/A at the motor]")
+        if told.torque_side == "joint":
+            raise UsageError("--torque-side (=joint) is for --torque-column: a current gives torque at the motor")
+        torque = numbers(table, told.current_column) * told.torque_constant_NmpA
+    else:
+        assert told.torque_column is not None
+        if told.torque_side is None:
+            raise UsageError("--torque-side is missing: a table of numbers does not tell it", "motor or joint")
+        torque = numbers(table, told.torque_column) / (told.ratio if told.torque_side == "joint" else 1.0)
+    settled = np.ones(len(velocity), bool)
+    return from_table(table, velocity, torque, settled, told.ratio, told.torque_constant_NmpA)
+
+
+# --- the file of our own sweep, and its sidecar ---
+
+SWEEP_COLUMNS = (
+    "velocity_radps", "current_A", "motor_torque_Nm", "velocity_std_radps", "current_std_A", "samples", "settled",
+    "position_min_rad", "position_max_rad", "time_s", "temperature_degC", "direction", "pass",
+)  # fmt: skip
+SIDECAR_FORMAT = "jointctl friction sweep 1"
+_SAME_CONSTANT = 0.02  # motor_torque_Nm against current_A times the torque constant, median
+
+
+def sidecar_contents(reduction_ratio: float, torque_constant_NmpA: float, **more: Any) -> dict[str, Any]:
+    """What the sweep writes beside its CSV; `more` is recorded as it is (configuration, drive, versions, time)."""
+    return {
+        "format": SIDECAR_FORMAT,
+        "reduction_ratio": reduction_ratio,
+        "torque_constant_NmpA": torque_constant_NmpA,
+        "units": {
+            "velocity_radps": "joint",
+            "motor_torque_Nm": "motor, with the sign of the velocity where it opposes motion",
+            "current_A": "of the drive, times torque_constant_NmpA gives motor_torque_Nm",
+        },
+        **more,
+    }
+
+
+def _sidecar(path: Path) -> dict[str, Any]:
+    beside = path.with_suffix(".json")
+    if not beside.exists():
+        raise DataError(f"{beside}: missing: the sidecar of the sweep holds the ratio", "or give --ratio")
+    try:
+        content = parse_json(read_bytes(beside).decode("utf-8"))
+    except (ValueError, UnicodeDecodeError) as error:
+        raise DataError(f"{beside}: not valid JSON: {error}") from None
+    if not isinstance(content, dict):
+        raise DataError(f"{beside}: must be a JSON object with reduction_ratio and torque_constant_NmpA")
+    for key, low, high in (("reduction_ratio", 1.0, 1000.0), ("torque_constant_NmpA", 1e-6, 100.0)):
+        value = content.get(key)
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+            raise DataError(f"{beside}: {key} (={value}) must be a number in [{low:g}..{high:g}]")
+    return content
+
+
+def _recorded_limits(beside: Path, sidecar: dict[str, Any]) -> tuple[float, float] | None:
+    """Greatest torque and speed of the joint that the sweep was allowed; sidecars of others need not have them."""
+    limits = sidecar.get("limits")
+    if limits is None:
+        return None
+    found = []
+    for key in ("torque_max_Nm", "velocity_max_radps"):
+        value = limits.get(key) if isinstance(limits, dict) else None
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < 1e6:
+            raise DataError(f"{beside}: limits.{key} (={value}) must be a number in (0..1e+06)")
+        found.append(float(value))
+    return found[0], found[1]
+
+
+def read_sweep(table: TableFile, told: ForeignFormat) -> FrictionData:
+    """Points of a sweep and the constants of its sidecar (or `--ratio`); `DataError` where they contradict."""
+    for flag, value in (("--velocity-unit", told.velocity_unit), ("--side", told.side), ("--torque-side",
+                        told.torque_side), ("--torque-constant", told.torque_constant_NmpA)):  # fmt: skip
+        if value is not None:
+            raise UsageError(f"{flag} (={value}) is for tables with mapped columns: a sweep file tells its own units")
+    if not table.ended:
+        # the sweep ends every line, so this one may have lost digits
+        raise DataError(f"{table.path}: the last line has no end: the file is cut off", "remove the last line")
+    ratio, constant, limits = told.ratio or math.nan, math.nan, None
+    if told.ratio is None or table.path.with_suffix(".json").exists():
+        sidecar = _sidecar(table.path)
+        ratio, constant = float(sidecar["reduction_ratio"]), float(sidecar["torque_constant_NmpA"])
+        limits = _recorded_limits(table.path.with_suffix(".json"), sidecar)
+        if told.ratio is not None and abs(told.ratio / ratio - 1.0) > 1e-6:
+            raise DataError(
+                f"--ratio (={told.ratio:g}) differs from reduction_ratio (={ratio:g}) in the sidecar of {table.path}"
+            )
+    velocity = numbers(table, "velocity_radps")
+    torque = numbers(table, "motor_torque_Nm")
+    settled = np.ones(len(velocity), bool)
+    if "settled" in table.columns:
+        values = numbers(table, "settled")
+        for (line, _), value in zip(table.rows, values, strict=True):
+            if value not in (0.0, 1.0):
+                raise DataError(f"{table.path}: line {line}: settled (={value:g}) must be 0 or 1")
+        settled = values == 1.0
+    if "current_A" in table.columns and math.isfinite(constant):
+        current = numbers(table, "current_A")
+        moving = np.abs(current) > 0.2 * np.max(np.abs(current), initial=0.0)
+        if np.any(moving):
+            found = float(np.median(torque[moving] / current[moving]))
+            if not abs(found / constant - 1.0) <= _SAME_CONSTANT:
+                raise DataError(
+                    f"{table.path}: motor_torque_Nm is {found:.4g} times current_A, but torque_constant_NmpA "
+                    f"(={constant:g}) in the sidecar: one of them is wrong"
+                )
+    data = from_table(table, velocity, torque, settled, ratio, constant if math.isfinite(constant) else None)
+    return replace(data, recorded_limits=limits)
+
+
+def read_friction_data(path: str | Path, told: ForeignFormat | None = None, *, both: bool = True) -> FrictionData:
+    """Read and check; `both` asks for enough points in both directions, else one is enough to go on with."""
+    path, told = Path(path), told or ForeignFormat()
+    check_told(told)
+    table = read_table(path, told.delimiter)
+    ours = not told.mapped and "velocity_radps" in table.columns and "motor_torque_Nm" in table.columns
+    if ours:
+        data = read_sweep(table, told)
+    elif told.mapped:
+        data = read_foreign(table, told)
+    else:
+        raise DataError(
+            f"{path}: not a sweep of ours: columns velocity_radps and motor_torque_Nm are missing; "
+            f"it has {', '.join(table.columns)}",
+            "tell --velocity-column and --torque-column or --current-column",
+        )
+    data = tidied(data, ordered=not ours)
+    check_directions(data, both)
+    return data

@@ -1,24 +1,185 @@
-"""From friction data to an identified model: outliers, knee, swarm, polish, cross-check, selection, intervals."""
+"""From friction data to an identified model: outliers, knee, swarm, polish, cross-check, selection, intervals.
+
+`Options` says what to fit, `identify_friction` does it, `Identification` is what was found.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.errors import DataError
+from jointctl.drivers.errors import DataError, UsageError
 from jointctl.firmware_py.friction import DEGREE
-from jointctl.tools.identification.friction_data import FrictionData
-from jointctl.tools.identification.intervals import uncertainty
-from jointctl.tools.identification.models import FORMS, MIN_PER_STAGE, Form
-from jointctl.tools.identification.options import Options
+from jointctl.tools.identification.fit import (
+    MAX_OUTLIERS,
+    Fit,
+    Problem,
+    choose,
+    find_outliers,
+    held_out_rss,
+    make_problem,
+    polish,
+    project,
+    with_form,
+)
+from jointctl.tools.identification.friction_data import FrictionData, relative_figures
+from jointctl.tools.identification.models import FORMS, MIN_PER_STAGE, Branch, Form
 from jointctl.tools.identification.plausibility import JointLimits, check_branches, check_data
-from jointctl.tools.identification.polish import polish
-from jointctl.tools.identification.pso import SwarmResult, run_swarms
-from jointctl.tools.identification.result import DIRECTIONS, Direction, Identification
-from jointctl.tools.identification.selection import MAX_OUTLIERS, choose, find_outliers, held_out_rss, with_form
-from jointctl.tools.identification.variable_projection import Fit, Problem, make_problem, project
+from jointctl.tools.identification.swarm import SwarmResult, SwarmSettings, run_swarms
+from jointctl.tools.identification.uncertainty import Uncertainty, uncertainty
+
+# --- the flags of `jointctl identify`, and what of them is allowed ---
+
+SLOWEST_degps, FASTEST_degps = 1e-4, 6e4
+STATIC_MAX_Nm = 1e3  # at the motor
+MODELS = ("multi-stage", "stribeck", "coulomb-viscous", "auto")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to fit and how; speeds in joint rad/s."""
+
+    model: str = "multi-stage"
+    continuous: bool = False
+    search_knee: bool = False
+    knee_radps: float = 40.0 * DEGREE
+    ws_min_radps: float | None = None  # None: a third of the lowest speed
+    ws_max_radps: float = 20.0 * DEGREE
+    static_max_Nm: float | None = None  # None: 1.25 times the greatest friction near zero speed
+    outlier_threshold: float = 5.0
+    folds: int = 10
+    swarm: SwarmSettings = field(default_factory=SwarmSettings)
+
+    def check(self) -> None:
+        """Raise `UsageError` for a value out of range."""
+        s = self.swarm
+        for name, value, low, high in (
+            ("--outlier-threshold", self.outlier_threshold, 0.0, 100.0), ("--folds", self.folds, 2, 100),
+            ("--particles", s.particles, 2, 100_000), ("--iterations", s.iterations, 1, 1_000_000),
+            ("--inertia", s.inertia, 0.0, 1.0), ("--cognitive", s.cognitive, 0.0, 4.0),
+            ("--social", s.social, 0.0, 4.0), ("--seed", s.seed, 0, 2**63 - 1), ("--stall", s.stall, 0, 1_000_000),
+        ):  # fmt: skip
+            if not low <= value <= high:
+                raise UsageError(f"{name} (={value:g}) must be in [{low:g}..{high:g}]")
+        # as they are given on the command line: in deg/s
+        for name, value_radps in (("--knee", self.knee_radps), ("--ws-max", self.ws_max_radps)):
+            if not SLOWEST_degps <= value_radps / DEGREE <= FASTEST_degps:
+                allowed = f"[{SLOWEST_degps:g}..{FASTEST_degps:g}] deg/s"
+                raise UsageError(f"{name} (={value_radps / DEGREE:g} deg/s) must be in {allowed}")
+        if self.ws_min_radps is not None and not 0.0 < self.ws_min_radps < self.ws_max_radps:
+            allowed = f"(0..{self.ws_max_radps / DEGREE:g}) deg/s"
+            raise UsageError(f"--ws-min (={self.ws_min_radps / DEGREE:g} deg/s) must be in {allowed}")
+        if self.static_max_Nm is not None and not 0.0 < self.static_max_Nm <= STATIC_MAX_Nm:
+            raise UsageError(f"--static-max (={self.static_max_Nm:g} Nm) must be in (0..{STATIC_MAX_Nm:g}]")
+        if self.model not in MODELS:
+            raise UsageError(f"--model (={self.model}) must be one of {', '.join(MODELS)}")
+
+
+# --- what was found, of both directions ---
+
+DIRECTIONS = (("positive", 1), ("negative", -1))
+
+
+@dataclass(frozen=True)
+class Direction:
+    """The result of one direction; arrays over the used points are in `fit.problem`, mirrored."""
+
+    fit: Fit
+    swarm: SwarmResult | None
+    projected_rmse_Nm: float
+    source: str  # where the parameters come from: swarm and polish, or variable projection
+    uncertainty: Uncertainty
+    index: np.ndarray  # of the used points in the data
+    outliers: np.ndarray  # indices in the data
+
+
+@dataclass(frozen=True)
+class Identification:
+    """All that there is to tell; `errors_Nm` is measured minus model over the used points of both directions."""
+
+    data: FrictionData
+    options: Options
+    model: str
+    directions: dict[str, Direction]
+    rmse_by_model_Nm: dict[str, float]
+    held_out_by_model_Nm: dict[str, float]
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def branches(self) -> dict[str, Branch]:
+        return {word: found.fit.branch() for word, found in self.directions.items()}
+
+    @property
+    def errors_Nm(self) -> np.ndarray:
+        parts = []
+        for word, sign in DIRECTIONS:
+            fit = self.directions[word].fit
+            parts.append(sign * (fit.problem.y_Nm - fit.torque_Nm(fit.problem.x)))
+        return np.concatenate(parts)
+
+    @property
+    def measured_Nm(self) -> np.ndarray:
+        return np.concatenate([sign * self.directions[word].fit.problem.y_Nm for word, sign in DIRECTIONS])
+
+    @property
+    def rmse_Nm(self) -> float:
+        return float(np.sqrt(np.mean(self.errors_Nm**2)))
+
+    @property
+    def projected_rmse_Nm(self) -> float:
+        """What variable projection reaches: the least possible."""
+        return _pooled({w: d.projected_rmse_Nm for w, d in self.directions.items()}, self.directions)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as numbers, texts, lists and dicts; parameters mirrored, joint rad/s and motor Nm."""
+        errors, swarm = self.errors_Nm, self.options.swarm
+        relative = relative_figures(errors, self.measured_Nm)
+        return {
+            "data": str(self.data.path), "data_sha256": self.data.sha256, "model": self.model,
+            "reduction_ratio": self.data.reduction_ratio, "points": len(errors),
+            "rmse_Nm": self.rmse_Nm, "max_error_Nm": float(np.max(np.abs(errors))),
+            "relative_rmse": relative[0],
+            "relative_max_error": relative[1],
+            "held_out_rmse_Nm": self.held_out_by_model_Nm[self.model],
+            "projected_rmse_Nm": self.projected_rmse_Nm,
+            "models": {
+                name: {"rmse_Nm": self.rmse_by_model_Nm[name], "held_out_rmse_Nm": self.held_out_by_model_Nm[name]}
+                for name in self.rmse_by_model_Nm
+            },
+            "swarm": {
+                "seed": swarm.seed, "particles": swarm.particles, "iterations": swarm.iterations,
+                "inertia": swarm.inertia, "cognitive": swarm.cognitive, "social": swarm.social,
+            },
+            "directions": {word: _direction_dict(found, self.data) for word, found in self.directions.items()},
+            "notes": list(self.notes), "warnings": list(self.warnings),
+        }  # fmt: skip
+
+
+def _direction_dict(found: Direction, data: FrictionData) -> dict[str, Any]:
+    model = found.fit.branch()
+    return {
+        "parameters": {
+            name: {"value": i.value, "low": i.low, "high": i.high, "weak": i.weak or None}
+            for name, i in found.uncertainty.intervals.items()
+        },
+        "knee_radps": model.knee_radps, "max_radps": model.max_radps, "rmse_Nm": found.fit.rmse_Nm,
+        "swarm_rmse_Nm": found.swarm.fit.rmse_Nm if found.swarm else None,
+        "projected_rmse_Nm": found.projected_rmse_Nm, "source": found.source,
+        "iterations": found.swarm.iterations if found.swarm else 0,
+        "outlier_lines": [int(n) for n in data.line[found.outliers]],
+    }  # fmt: skip
+
+
+def _pooled(rmse: dict[str, float], directions: dict[str, Any]) -> float:
+    count = {word: len(d.fit.problem.x) for word, d in directions.items()}
+    return float(np.sqrt(sum(rmse[w] ** 2 * count[w] for w in rmse) / sum(count.values())))
+
+
+# --- how it is found ---
 
 _BAD_FIT = 0.15  # RMSE over mean friction
 _EXACT = 1e-6  # of the greatest friction: between errors below nothing measured decides

@@ -17,11 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from jointctl.tools.analysis.idle_states import cores_awake
-from jointctl.tools.analysis.wake_up import fifo, wake_up_lateness_ns
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.inspection.findings import NOTE, OK, PROBLEM, Finding, file_text
 from jointctl.tools.running.loop.start_time import start_time_s
+from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
 
 DEFAULT_PRIORITY = 60
 _GOOD_CLOCKS = ("tsc", "kvm-clock", "arch_sys_counter", "riscv_clocksource")

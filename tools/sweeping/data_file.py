@@ -1,6 +1,6 @@
 """The files of a sweep: rows are written as they are measured, so that an interrupted sweep keeps them.
 
-Beside the CSV (format: `tools.identification.sweep_file`) lies its JSON sidecar; it also holds the plan's hash and
+Beside the CSV (format: `tools.identification.friction_data`) lies its JSON sidecar; it also holds the plan's hash and
 which of the plan's points the rows are, so that a sweep can be resumed.  The row is written first: rows beyond the
 sidecar's list were cut off by a crash, and are measured again.  A busy disk can take longer to confirm a row than the
 loop goes without its supervisor, so a thread waits for it.
@@ -19,7 +19,7 @@ from typing import Any
 
 from jointctl.drivers.errors import DataError
 from jointctl.firmware_py.input_file import LARGEST_TABLE_BYTES, parse_json, read_input
-from jointctl.tools.identification.sweep_file import SWEEP_COLUMNS, sidecar_contents
+from jointctl.tools.identification.friction_data import SWEEP_COLUMNS, sidecar_contents
 from jointctl.tools.sweeping.meter import MeasuredPoint
 from jointctl.tools.written_file import writing
 

@@ -8,10 +8,9 @@ from typing import Any
 
 from rich.table import Table
 
-from jointctl.tools.analysis.advice import Remedy, remedies
 from jointctl.tools.analysis.linear_loop import LoopSettings
 from jointctl.tools.analysis.loop_settings import Assumption, loop_settings, not_modelled
-from jointctl.tools.analysis.margin_gate import learning_of, meets, refusal, refuse_diverging_learning
+from jointctl.tools.analysis.margin_gate import Remedy, learning_of, meets, refusal, refuse_diverging_learning, remedies
 from jointctl.tools.analysis.margins import Margins, Theory, margins, theory
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.drawing import require_png

@@ -7,10 +7,9 @@ from dataclasses import replace
 
 from jointctl.drivers.elmo.line_budget import LARGEST_SHARE, highest_rate_Hz
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.tools.analysis.advice import remedies
 from jointctl.tools.analysis.linear_loop import LoopSettings
 from jointctl.tools.analysis.loop_settings import loop_settings
-from jointctl.tools.analysis.margin_gate import meets
+from jointctl.tools.analysis.margin_gate import meets, remedies
 from jointctl.tools.analysis.margins import margins
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo_settings import elmo_section, serial_line_share

@@ -6,11 +6,17 @@ from pathlib import Path
 from typing import Any
 
 from jointctl.drivers.errors import INTERRUPTED
-from jointctl.tools.campaign.fitness import require_fit
-from jointctl.tools.campaign.judge import Verdict, judge
-from jointctl.tools.campaign.report import campaign_figure, rows_by_kind, table, violations, write_json
-from jointctl.tools.campaign.runner import campaign_joint, run_campaign
-from jointctl.tools.campaign.scenario import draw_scenario
+from jointctl.tools.campaign.campaign import (
+    campaign_figure,
+    campaign_joint,
+    rows_by_kind,
+    run_campaign,
+    table,
+    violations,
+    write_json,
+)
+from jointctl.tools.campaign.fault_scenarios import draw_scenario
+from jointctl.tools.campaign.judge import Verdict, judge, require_fit
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo_settings import refuse_serial
 from jointctl.tools.drawing import save_png

@@ -15,15 +15,20 @@ from jointctl.drivers.errors import ConfigurationError, DataError
 from jointctl.tools.configuration.conversions import torque_constant_NmpA
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.drawing import png
-from jointctl.tools.identification.figures import convergence_figure, fit_figure
-from jointctl.tools.identification.foreign_table import ForeignFormat
-from jointctl.tools.identification.friction_file import read_friction_data
-from jointctl.tools.identification.friction_section import section_values, snippet, write_into
-from jointctl.tools.identification.identification import identify_friction
-from jointctl.tools.identification.options import Options
+from jointctl.tools.identification.friction_data import ForeignFormat, read_friction_data
+from jointctl.tools.identification.identification import Identification, Options, identify_friction
+from jointctl.tools.identification.identification_report import (
+    convergence_figure,
+    error_table,
+    fit_figure,
+    identification_report,
+    model_table,
+    parameter_table,
+    section_values,
+    snippet,
+    write_into,
+)
 from jointctl.tools.identification.plausibility import JointLimits
-from jointctl.tools.identification.report import error_table, identification_report, model_table, parameter_table
-from jointctl.tools.identification.result import Identification
 from jointctl.tools.output import Output
 from jointctl.tools.reporting.figure import svg_figure
 from jointctl.tools.reporting.page import Block, Details, Section, check_target

@@ -9,14 +9,17 @@ from typing import Any
 from rich.table import Table
 
 from jointctl.tools.drawing import save_png
-from jointctl.tools.experiments.error_figures import error_figures
-from jointctl.tools.experiments.paper_identification import (
+from jointctl.tools.experiments.paper_experiments import (
+    AFTER_s,
     PaperIdentification,
+    PaperRow,
+    PaperRun,
+    experiments,
     identification_figure,
     identify_paper_friction,
+    paper_rows,
 )
-from jointctl.tools.experiments.paper_rows import PaperRow, PaperRun, paper_rows
-from jointctl.tools.experiments.paper_runs import AFTER_s, experiments
+from jointctl.tools.experiments.scenarios import error_figures
 from jointctl.tools.output import Output
 from jointctl.tools.reporting.figure import svg_figure
 from jointctl.tools.reporting.page import Section, check_target

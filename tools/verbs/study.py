@@ -12,9 +12,16 @@ from jointctl.drivers.errors import INTERRUPTED
 from jointctl.tools.configuration.elmo_settings import refuse_serial
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.drawing import require_png, save_png
+from jointctl.tools.experiments.controller_study import (
+    StudyResult,
+    StudySettings,
+    quantile,
+    run_study,
+    study_controllers,
+    study_figure,
+    write_csv,
+)
 from jointctl.tools.experiments.controllers import controller_config
-from jointctl.tools.experiments.study_runs import StudyResult, quantile, run_study, write_csv
-from jointctl.tools.experiments.study_settings import StudySettings, study_controllers
 from jointctl.tools.output import Output
 from jointctl.tools.reporting.figure import svg_figure
 from jointctl.tools.reporting.page import Details, Section, check_target
@@ -95,7 +102,6 @@ def study(
 
 
 def _figure(result: StudyResult, settings: StudySettings, title: str) -> Any:
-    from jointctl.tools.experiments.study_figure import study_figure
 
     return study_figure(result, f"{title}, after {settings.after_s:g} s")
 

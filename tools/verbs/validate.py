@@ -11,14 +11,16 @@ from jointctl.drivers.errors import ConfigurationError, DataError
 from jointctl.tools.configuration.conversions import friction_constants
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.drawing import png, require_png
-from jointctl.tools.identification.figures import fit_figure
-from jointctl.tools.identification.foreign_table import ForeignFormat
-from jointctl.tools.identification.friction_data import FrictionData, relative_figures
-from jointctl.tools.identification.friction_file import read_friction_data
+from jointctl.tools.identification.friction_data import (
+    ForeignFormat,
+    FrictionData,
+    read_friction_data,
+    relative_figures,
+)
+from jointctl.tools.identification.identification import DIRECTIONS
+from jointctl.tools.identification.identification_report import error_table, fit_figure
 from jointctl.tools.identification.models import Branch
 from jointctl.tools.identification.plausibility import check_data
-from jointctl.tools.identification.report import error_table
-from jointctl.tools.identification.result import DIRECTIONS
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.identify import joint_limits
 from jointctl.tools.written_file import replace_file

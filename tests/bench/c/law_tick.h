@@ -2,7 +2,7 @@
  *
  * Written to be compared with them: same operations in the same order, same memory per tick, no phases.
  * SI units; torques at the joint unless the name says motor.  Every field is a double, so that numpy can fill the
- * structures as flat arrays (tools/benchmarks/law_memory.py has the same order).
+ * structures as flat arrays (tests/bench/c_programs.py has the same order).
  */
 #ifndef LAW_TICK_H
 #define LAW_TICK_H

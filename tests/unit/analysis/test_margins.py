@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jointctl.tools.analysis.advice import longest_delay_s, remedies
 from jointctl.tools.analysis.linear_loop import linear_loop
+from jointctl.tools.analysis.margin_gate import longest_delay_s, remedies
 from jointctl.tools.analysis.margins import delay_margin_s, margins, phase_margin_deg, theory
 from tests.unit.analysis.specified_loops import ANY_KIND, Q1800, Q2500
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from jointctl.tools.analysis.narrowing import least_between, zero_between
+from jointctl.tools.analysis.margins import least_between, zero_between
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 2.0), (1.4, 1.5)])

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from jointctl.firmware_py.states import ControllerKind
-from jointctl.tools.analysis.linear_loop import linear_loop
+from jointctl.tools.analysis.linear_loop import linear_loop, sampled_joint
 from jointctl.tools.analysis.margins import delay_margin_s, margins, phase_margin_deg
-from jointctl.tools.analysis.sampled_joint import sampled_joint
 from tests.unit.analysis.specified_loops import ANY_KIND, Q1800, Q2500
 
 

@@ -10,7 +10,7 @@ import typer
 from typer.testing import CliRunner
 
 from jointctl.tools.cli.main import app
-from jointctl.tools.experiments.paper_identification import synthetic_sweep
+from jointctl.tools.experiments.paper_experiments import synthetic_sweep
 
 
 def pages() -> list[tuple[str, ...]]:

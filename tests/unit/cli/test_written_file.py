@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from jointctl.drivers.errors import DataError
-from jointctl.tools.experiments.study_settings import StudySettings
+from jointctl.tools.experiments.controller_study import StudySettings
 from jointctl.tools.output import Output
 from jointctl.tools.verbs import study as study_module
 from jointctl.tools.written_file import prepare_folder, prepare_target, replace_file, require_target

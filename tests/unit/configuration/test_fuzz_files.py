@@ -18,7 +18,7 @@ from jointctl.firmware_py.trajectory import table_from_csv
 from jointctl.hil.canopen.dictionary import ObjectDictionary
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
-from jointctl.tools.identification.friction_file import read_friction_data
+from jointctl.tools.identification.friction_data import read_friction_data
 from jointctl.tools.recording.run_log import RunLogWriter
 from jointctl.tools.recording.run_log_reader import read_run_log
 from tests.places import CONFIGS

@@ -15,10 +15,9 @@ from jointctl.drivers.errors import ConfigurationError, DataError
 from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.identification.foreign_table import ForeignFormat
-from jointctl.tools.identification.options import Options
-from jointctl.tools.identification.pso import SwarmSettings
-from jointctl.tools.identification.sweep_file import SWEEP_COLUMNS, sidecar_contents
+from jointctl.tools.identification.friction_data import SWEEP_COLUMNS, ForeignFormat, sidecar_contents
+from jointctl.tools.identification.identification import Options
+from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.output import Output
 from jointctl.tools.sweeping.checks import constant_remarks, recorded_limits, refuse_constants
 from jointctl.tools.sweeping.options import SweepOptions

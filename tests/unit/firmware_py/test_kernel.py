@@ -103,7 +103,15 @@ def test_the_hash_depends_on_the_sources_and_not_on_their_place(copy_of_sources:
 
 
 @pytest.mark.parametrize(
-    "edited", ["firmware_py/friction.py", "drivers/can/frame_io.py", "drivers/canopen/cyclic.py", "hil/plant/joint.py"]
+    "edited",
+    [
+        "firmware_py/friction.py",
+        "drivers/can/frame_io.py",
+        "drivers/canopen/cyclic.py",
+        "hil/plant/joint.py",
+        "tools/identification/fit.py",
+        "tools/wake_up.py",
+    ],
 )
 def test_an_edited_callee_changes_the_hash(copy_of_sources: Path, edited: str) -> None:
     before = source_hash(copy_of_sources)

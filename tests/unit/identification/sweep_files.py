@@ -6,7 +6,7 @@ import json
 import numpy as np
 
 from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
-from jointctl.tools.identification.sweep_file import SWEEP_COLUMNS, sidecar_contents
+from jointctl.tools.identification.friction_data import SWEEP_COLUMNS, sidecar_contents
 from jointctl.tools.output import Output
 
 

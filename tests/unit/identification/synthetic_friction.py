@@ -6,9 +6,9 @@ import numpy as np
 
 from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
 from jointctl.tools.identification.friction_data import FrictionData
-from jointctl.tools.identification.options import Options
+from jointctl.tools.identification.identification import Options
 from jointctl.tools.identification.plausibility import JointLimits
-from jointctl.tools.identification.pso import SwarmSettings
+from jointctl.tools.identification.swarm import SwarmSettings
 
 NOISE_Nm = 0.0046
 UNIFORM_radps = np.linspace(-200.0, 200.0, 225) * DEGREE

@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.errors import DataError, UsageError
-from jointctl.tools.identification.foreign_table import ForeignFormat
-from jointctl.tools.identification.friction_file import read_friction_data
-from jointctl.tools.identification.sweep_file import SWEEP_COLUMNS, sidecar_contents
+from jointctl.tools.identification.friction_data import (
+    SWEEP_COLUMNS,
+    ForeignFormat,
+    read_friction_data,
+    sidecar_contents,
+)
 
 RATIO, CONSTANT = 121.0, 0.1
 SPEEDS = np.concatenate([-np.arange(1, 14)[::-1], np.arange(1, 14)]) * 0.2

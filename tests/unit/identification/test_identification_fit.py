@@ -6,12 +6,27 @@ import numpy as np
 import pytest
 
 from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
-from jointctl.tools.identification import pso, swarm_kernels
+from jointctl.tools.identification.fit import (
+    beta_from_vector,
+    knee_candidates,
+    make_problem,
+    polish,
+    project,
+    solve_linear,
+    vector_limits,
+)
 from jointctl.tools.identification.models import FORMS, basis, legendre, legendre_to_powers
-from jointctl.tools.identification.polish import beta_from_vector, polish, vector_limits
-from jointctl.tools.identification.pso import SwarmSettings, run_swarm, run_swarms
-from jointctl.tools.identification.swarm_kernels import squared_error, stage_table, suffix_sums
-from jointctl.tools.identification.variable_projection import knee_candidates, make_problem, project, solve_linear
+from jointctl.tools.identification.swarm import (
+    CHUNK,
+    SwarmSettings,
+    fill_uniform,
+    run_swarm,
+    run_swarms,
+    squared_error,
+    stage_table,
+    stream_seed,
+    suffix_sums,
+)
 
 NOISE_Nm = 0.0046
 VELOCITY_radps = np.linspace(-200.0, 200.0, 225) * DEGREE
@@ -182,9 +197,9 @@ def test_the_same_seed_gives_the_same_bits_whatever_the_threads():
 
 
 def test_the_random_stream_is_xorshift64():
-    random, numbers = np.array([swarm_kernels.stream_seed(7, 0)]), np.empty(50)
+    random, numbers = np.array([stream_seed(7, 0)]), np.empty(50)
     state = int(random[0])
-    swarm_kernels.fill_uniform(random, numbers)
+    fill_uniform(random, numbers)
     for number in numbers:
         for shift in (13, -7, 17):
             state ^= (state << shift if shift > 0 else state >> -shift) & (2**64 - 1)
@@ -195,7 +210,7 @@ def test_the_random_stream_is_xorshift64():
 def test_random_numbers_are_uniform_and_streams_differ():
     numbers = np.empty((2, 20000))
     for stream in range(2):
-        swarm_kernels.fill_uniform(np.array([swarm_kernels.stream_seed(1, stream)]), numbers[stream])
+        fill_uniform(np.array([stream_seed(1, stream)]), numbers[stream])
     assert numbers.min() >= 0.0
     assert numbers.max() < 1.0
     counts = np.histogram(numbers[0], bins=20, range=(0.0, 1.0))[0]
@@ -214,12 +229,12 @@ def test_a_stop_ends_the_swarm_within_a_chunk_and_progress_counts():
 
     def progress(done):
         seen.append(done)
-        if done >= 2 * pso.CHUNK:
+        if done >= 2 * CHUNK:
             stop.set()
 
     result = run_swarm(paper_problems(0)[0], SMALL, stop=stop, progress=progress)
-    assert seen == [pso.CHUNK, 2 * pso.CHUNK]
-    assert result.iterations == len(result.curve_Nm) == 2 * pso.CHUNK
+    assert seen == [CHUNK, 2 * CHUNK]
+    assert result.iterations == len(result.curve_Nm) == 2 * CHUNK
 
 
 def test_an_interruption_stops_both_threads():

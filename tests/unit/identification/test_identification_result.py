@@ -7,10 +7,9 @@ import pytest
 
 from jointctl.drivers.errors import DataError, UsageError
 from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
-from jointctl.tools.identification.identification import identify_friction
+from jointctl.tools.identification.identification import Options, identify_friction
 from jointctl.tools.identification.models import FORMS, MIN_PER_STAGE
-from jointctl.tools.identification.options import Options
-from jointctl.tools.identification.pso import SwarmSettings
+from jointctl.tools.identification.swarm import SwarmSettings
 from tests.unit.identification.synthetic_friction import LIMITS, QUICK, DENSE_radps, NOISE_Nm, UNIFORM_radps, paper_data
 
 

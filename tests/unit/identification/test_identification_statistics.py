@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
-from jointctl.tools.identification.intervals import uncertainty
+from jointctl.tools.identification.fit import choose, find_outliers, fold_numbers, held_out_rss, make_problem, project
 from jointctl.tools.identification.models import FORMS
-from jointctl.tools.identification.selection import choose, find_outliers, fold_numbers, held_out_rss
-from jointctl.tools.identification.variable_projection import make_problem, project
+from jointctl.tools.identification.uncertainty import uncertainty
 from tests.unit.identification.synthetic_friction import DENSE_radps, NOISE_Nm, UNIFORM_radps, paper_data
 
 

@@ -13,10 +13,10 @@ from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_frict
 from jointctl.tools.configuration.conversions import friction_constants
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.identification import identification
-from jointctl.tools.identification.foreign_table import ForeignFormat
-from jointctl.tools.identification.friction_section import MARK, snippet, with_section
-from jointctl.tools.identification.options import Options
-from jointctl.tools.identification.pso import SwarmSettings
+from jointctl.tools.identification.friction_data import ForeignFormat
+from jointctl.tools.identification.identification import Options
+from jointctl.tools.identification.identification_report import MARK, snippet, with_section
+from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.verbs.identify import identify
 from tests.page_figures import foreign_colours, svgs
 from tests.unit.identification.sweep_files import output, write_sweep

@@ -11,8 +11,12 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.errors import DataError
-from jointctl.tools.identification.friction_data import LEAST_SHARE, relative_errors, relative_figures
-from jointctl.tools.identification.friction_file import read_friction_data
+from jointctl.tools.identification.friction_data import (
+    LEAST_SHARE,
+    read_friction_data,
+    relative_errors,
+    relative_figures,
+)
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.validate import validate
 from tests.places import CONFIGS

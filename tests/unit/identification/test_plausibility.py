@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.errors import DataError
+from jointctl.tools.identification.fit import make_problem, project
 from jointctl.tools.identification.identification import identify_friction
 from jointctl.tools.identification.models import FORMS
 from jointctl.tools.identification.plausibility import JointLimits, check_branches, check_data
-from jointctl.tools.identification.variable_projection import make_problem, project
 from tests.unit.identification.synthetic_friction import LIMITS, QUICK, paper_data
 
 

@@ -9,12 +9,11 @@ from typing import Any
 import pytest
 
 from jointctl.drivers.errors import DataError
+from jointctl.tools.campaign.campaign import MANY, campaign_figure, rows_by_kind, table
 from jointctl.tools.campaign.judge import Verdict
-from jointctl.tools.campaign.report import MANY, campaign_figure, rows_by_kind, table
 from jointctl.tools.drawing import BLUE, canvas, png, save_png
-from jointctl.tools.experiments.error_figures import ErrorFigures
-from jointctl.tools.experiments.study_figure import study_figure
-from jointctl.tools.experiments.study_runs import PlantResult, StudyResult
+from jointctl.tools.experiments.controller_study import PlantResult, StudyResult, study_figure
+from jointctl.tools.experiments.scenarios import ErrorFigures
 from jointctl.tools.output import Output
 from jointctl.tools.reporting.figure import svg_figure
 from tests.page_figures import foreign_colours, svgs

@@ -17,8 +17,7 @@ from jointctl.drivers.errors import DataError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase
-from jointctl.tools.identification.friction_file import read_friction_data
-from jointctl.tools.identification.sweep_file import SWEEP_COLUMNS
+from jointctl.tools.identification.friction_data import SWEEP_COLUMNS, read_friction_data
 from jointctl.tools.sweeping.data_file import HEADING, SweepFile
 from jointctl.tools.sweeping.grid import SweepPoint
 from jointctl.tools.sweeping.meter import JointModel, MeasuredPoint, SweepMeter

@@ -27,9 +27,9 @@ from typing import Any
 from jointctl.drivers.errors import JointctlError
 from jointctl.firmware_py.libc import NANOSECONDS
 from jointctl.firmware_py.realtime import Word
-from jointctl.tools.analysis.idle_states import cores_awake
 from jointctl.tools.running.loop.ready_loop import FOREVER, ReadyLoop, loop_call
 from jointctl.tools.running.loop.slow_start import slow_start
+from jointctl.tools.wake_up import cores_awake
 
 _MLOCK_CURRENT_AND_FUTURE = 3
 _POLL_S = 0.001

@@ -1,24 +1,34 @@
-"""`jointctl bench`: the speed of this program against C, numpy and Python libraries, on this computer, in one run."""
+"""The speed of this program against C, numpy and Python libraries, on this computer, in one run.
+
+    python -m tests.bench.speed [--quick] [--out FOLDER] [--only law --only loop ...] [--json] [--quiet]
+
+Writes a table, or JSON, to stdout, and bench.json and bench.png into the folder.
+"""
 
 from __future__ import annotations
 
+import argparse
 import logging
+import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
+
+import typer
 
 from jointctl.drivers.errors import JointctlError, UsageError
-from jointctl.tools.benchmarks.exchange_speed import Rounds, exchange_rows
-from jointctl.tools.benchmarks.law_speed import law_rows
-from jointctl.tools.benchmarks.outcome import conditions, outcome_data, outcome_table, write_outcome
-from jointctl.tools.benchmarks.paired import Row, skipped
-from jointctl.tools.benchmarks.simulation_speed import lockstep_rows, swarm_rows
-from jointctl.tools.benchmarks.start_speed import start_rows
+from jointctl.tools.cli.main import app
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.records import axis_constants, trajectory_table
 from jointctl.tools.output import Output
 from jointctl.tools.written_file import prepare_folder
+from tests.bench.exchange_speed import Rounds, exchange_rows
+from tests.bench.law_speed import law_rows
+from tests.bench.paired import Row, conditions, outcome_data, outcome_table, skipped, write_outcome
+from tests.bench.simulation_speed import lockstep_rows, swarm_rows
+from tests.bench.start_speed import start_rows
 
 PARTS = ("law", "loop", "lockstep", "swarm", "start")
 
@@ -80,3 +90,25 @@ def bench(
         for path in write_outcome(out, rows, data):
             output.note(f"wrote {path}")
     return 0
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """The exit code."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--quick", action="store_true", help="shorter, with more noise")
+    parser.add_argument("--out", type=Path, help="folder for bench.json and bench.png")
+    parser.add_argument("--only", action="append", default=[], help="law, loop, lockstep, swarm or start")
+    parser.add_argument("--json", action="store_true", help="JSON on stdout instead of the table")
+    parser.add_argument("--quiet", action="store_true", help="only the result")
+    chosen = parser.parse_args(words)
+    output = Output(json=chosen.json, quiet=chosen.quiet)
+    commands: Any = typer.main.get_command(app)
+    try:
+        return bench(output, quick=chosen.quick, out=chosen.out, only=chosen.only, verbs=sorted(commands.commands))
+    except JointctlError as error:
+        output.error(error.message, error.hint)
+        return error.exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

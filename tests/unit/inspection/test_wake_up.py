@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from jointctl.tools.analysis.idle_states import cores_awake
+from jointctl.tools.wake_up import cores_awake
 
 
 def open_files() -> set[str]:

@@ -19,9 +19,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from jointctl.drivers.errors import JointctlError
-from jointctl.tools.benchmarks.paired import Row, compared, interleaved, measured
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.simulation.virtual_joint import separate_virtual_joint
+from tests.bench.paired import Row, compared, interleaved, measured
 
 GROUP = "start"
 HELP_GOAL_S = 0.3
@@ -29,7 +29,6 @@ ENABLED_GOAL_S = 3.0
 LONGEST_S = 240.0  # a cold start compiles everything
 END_S = 10.0
 ENABLED = ("approach", "tracking")  # the first phase with the drive enabled, as `run` names it on stderr
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def _environment(cache: Path | None = None) -> dict[str, str]:

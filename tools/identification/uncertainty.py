@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from jointctl.tools.identification.fit import Fit, solve_linear
 from jointctl.tools.identification.models import Branch, basis, branch
-from jointctl.tools.identification.variable_projection import Fit, solve_linear
 
 LEVEL = 0.95
 PROFILE_POINTS = 120

@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 
 from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
-from jointctl.tools.benchmarks.paired import Row, compared, interleaved, measured, skipped
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.identification.fit import Problem, make_problem, vector_limits
 from jointctl.tools.identification.models import FORMS, legendre
-from jointctl.tools.identification.polish import vector_limits
-from jointctl.tools.identification.pso import SwarmSettings, run_swarms
-from jointctl.tools.identification.variable_projection import Problem, make_problem
+from jointctl.tools.identification.swarm import SwarmSettings, run_swarms
 from jointctl.tools.simulation.lockstep import LockstepJoint
+from tests.bench.paired import Row, compared, interleaved, measured, skipped
 
 LOCKSTEP_S = 100.0
 LOCKSTEP_GOAL_S = 0.15
@@ -51,7 +50,7 @@ def lockstep_rows(config: Config, *, runs: int) -> Iterator[Row]:
     yield measured("simulation", "one cycle of it", [value / cycles * 1e9 for value in bare], "ns")
 
 
-def _problems() -> list[Problem]:
+def paper_problems() -> list[Problem]:
     """Table 3 at 225 speeds with noise, a problem for each direction."""
     velocity = np.linspace(-200.0, 200.0, SPEEDS) * DEGREE
     noise = np.random.default_rng(1).normal(0.0, NOISE_Nm, SPEEDS)
@@ -68,7 +67,7 @@ def _problems() -> list[Problem]:
     return found
 
 
-def _cost(problem: Problem) -> Callable[[np.ndarray], np.ndarray]:
+def written_cost(problem: Problem) -> Callable[[np.ndarray], np.ndarray]:
     """(11) vectorised over the particles, as pyswarms' manual asks for: (particles, 8) -> (particles,)."""
     x, y = problem.x, problem.y_Nm
     polynomials = legendre(x, problem.knee)
@@ -93,7 +92,7 @@ def _pyswarms_s(problems: list[Problem], iterations: int) -> float:
         swarm: Any = single.GlobalBestPSO(
             n_particles=1000, dimensions=limits.shape[1], bounds=(limits[0], limits[1]), options=options
         )
-        cost = _cost(problem)
+        cost = written_cost(problem)
         begin_s = time.perf_counter()
         swarm.optimize(cost, iters=iterations, verbose=False)
         total_s += time.perf_counter() - begin_s
@@ -102,7 +101,7 @@ def _pyswarms_s(problems: list[Problem], iterations: int) -> float:
 
 def swarm_rows(*, pairs: int, pyswarms_iterations: int) -> Iterator[Row]:
     """1000 particles, 5000 iterations, both directions; pyswarms does a part of them."""
-    problems = _problems()
+    problems = paper_problems()
     run_swarms(problems, SwarmSettings(iterations=1))  # compiles
 
     def ours() -> float:

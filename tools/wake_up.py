@@ -1,20 +1,49 @@
-"""How late this computer wakes up: a compiled sleep loop that does nothing else.
+"""How late this computer wakes up, and what makes it wake up in time: no deep idle states, real-time priority.
 
-The same absolute deadlines and the same sleep as the control loop, so that the figures are a lower bound of what the
-loop will see.  Not measured: the latency of the CAN adapter, and page faults of a process that is not locked in memory.
+Waking up from a deep idle state takes up to 100 us or more.  The kernel's interface against them is
+/dev/cpu_dma_latency (Documentation/power/pm_qos_interface): as long as it is held open, no core enters an idle state
+with a longer exit latency than was written.  cyclictest does the same.
+
+Measured is a compiled sleep loop that does nothing else, with the same absolute deadlines and the same sleep as the
+control loop, so that the figures are a lower bound of what the loop will see.  Not measured: the latency of the CAN
+adapter, and page faults of a process that is not locked in memory.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import struct
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.libc import monotonic_ns, sleep_until_ns
+
+LATENCY_DEVICE = Path("/dev/cpu_dma_latency")
+_NO_LATENCY = struct.pack("=i", 0)
+
+
+@contextlib.contextmanager
+def cores_awake(device: Path = LATENCY_DEVICE) -> Iterator[str]:
+    """Inside the block no core sleeps deeply; gives the refusal in words, or an empty text."""
+    try:
+        fd = os.open(device, os.O_WRONLY | os.O_CLOEXEC)
+    except OSError as error:
+        yield f"{device}: {error.strerror or error}"
+        return
+    try:
+        try:
+            os.write(fd, _NO_LATENCY)
+            refused = ""
+        except OSError as error:
+            refused = f"{device}: {error.strerror or error}"
+        yield refused
+    finally:
+        os.close(fd)
 
 
 @kernel

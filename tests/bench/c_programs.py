@@ -1,14 +1,73 @@
-"""The controller's constants as the flat arrays of float64 that tests/bench/c/law_tick.h declares as structures."""
+"""The C sources for comparison, compiled for this very computer, and the constants as the flat arrays that they take.
+
+Without a compiler the comparisons with C are skipped.  The order of the arrays is that of the structures in
+c/law_tick.h, float64 throughout.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import shutil
+import subprocess
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.errors import ConfigurationError
+from jointctl.drivers.errors import ConfigurationError, JointctlError
 from jointctl.firmware_py.records import NEURONS
 from jointctl.firmware_py.states import ControllerKind, FeedForward
+
+# --- the programs ---
+
+SOURCES = Path(__file__).resolve().parent / "c"
+OPTIMISED = ("-O3", "-march=native")
+FAST_MATH = (*OPTIMISED, "-ffast-math")
+
+
+class NoCompilerError(JointctlError):
+    """There is nothing to compile with."""
+
+
+def compiler() -> str:
+    """Path of the C compiler; `NoCompilerError` in one line."""
+
+    for name in ("gcc", "cc"):
+        found = shutil.which(name)
+        if found:
+            return found
+    raise NoCompilerError("no C compiler on this computer")
+
+
+def _compile(source: str, target: Path, options: tuple[str, ...]) -> None:
+    command = [compiler(), *options, str(SOURCES / source), "-o", str(target), "-lm"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode != 0:
+        first = (result.stderr.strip().splitlines() or ["no message"])[0]
+        raise NoCompilerError(f"{source} does not compile: {first}")
+
+
+def law_library(folder: Path, options: tuple[str, ...]) -> ctypes.CDLL:
+    """law_tick.c as a library with the given optimisation."""
+    target = folder / f"law{'-'.join(options).replace('=', '-')}.so"
+    _compile("law_tick.c", target, (*options, "-shared", "-fPIC"))
+    library = ctypes.CDLL(str(target))
+    for name in ("run_ticks", "run_hidden"):
+        getattr(library, name).argtypes = [ctypes.c_void_p] * 4 + [ctypes.c_long]
+        getattr(library, name).restype = None
+    for name in ("law_doubles", "state_doubles"):
+        getattr(library, name).restype = ctypes.c_long
+    return library
+
+
+def exchange_program(folder: Path) -> Path:
+    """exchange_loop.c as a program."""
+    target = folder / "exchange_loop"
+    _compile("exchange_loop.c", target, OPTIMISED)
+    return target
+
+
+# --- their memory ---
 
 STATE_DOUBLES = 12 + 2 * NEURONS
 FIRST_WEIGHT = 12  # struct law_state: twelve scalars, then weights, then hidden

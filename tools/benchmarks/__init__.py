@@ -1,1 +1,0 @@
-"""Paired measurements of speed: ours against C, numpy and other loops."""

@@ -1,0 +1,364 @@
+"""A study: every controller on many random joints, in as many processes as there are processors.
+
+What a controller that was tuned on one joint meets on the next one.  Each plant is drawn from its own seed, so that
+plant k of a study is the same whatever else is in it, commissioned once and then run under each controller.  The result
+does not depend on the number of processes.  A study comes from flags and from a TOML file:
+
+    plants = 40
+    seed = 1
+    scenario = "sine"                 # sine, frequency, amplitude, load
+    controllers = ["paper", "precise", "my_joint.toml"]
+
+    [plant]                           # any of the ranges of `EnsembleSettings`
+    encoder_bits = [14, 16]
+
+    [variants.more_damping]           # keys of [control] changed, on top of a named controller
+    of = "precise"
+    kv = 180.0
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import multiprocessing
+import os
+import tomllib
+from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationError
+from pydantic_core import PydanticCustomError
+
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.input_file import parse_toml, read_input
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.problems import suggestion
+from jointctl.tools.configuration.sections import Section, between
+from jointctl.tools.drawing import BLUE, GREY, INK, canvas
+from jointctl.tools.experiments.controllers import DEFAULT, Controller, changed, controller_constants, named, one_line
+from jointctl.tools.experiments.scenarios import RPDO_AT_ONCE, ErrorFigures, Scenario, error_figures, run_scenario
+from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.simulation.workers import interrupts_left_to_the_parent
+from jointctl.tools.written_file import writing
+
+# --- random realistic joints ---
+
+
+def _interval(low: float, high: float) -> Any:
+    """Two numbers in ascending order, each in [low..high]."""
+
+    def check(value: tuple[float, float]) -> tuple[float, float]:
+        if not low <= value[0] <= value[1] <= high:
+            raise PydanticCustomError(
+                "interval",
+                "must be two numbers in ascending order in {range}",
+                {"range": f"[{low:g}..{high:g}]"},
+            )
+        return value
+
+    return AfterValidator(check)
+
+
+def _as_tuple(value: Any) -> Any:
+    """A list of TOML as the tuple that a frozen model holds."""
+    return tuple(value) if isinstance(value, list) else value
+
+
+_FromList = BeforeValidator(_as_tuple)
+Interval = tuple[float, float]
+
+
+class EnsembleSettings(Section):
+    """Ranges of the plants; (low, high) are uniform unless the comment says otherwise."""
+
+    friction_scale: Annotated[Interval, _FromList, _interval(0.0, 10.0)] = (0.9, 1.1)  # per direction
+    stick_slip_share: Annotated[float, between(0.0, 1.0)] = 0.25  # the others have LuGre friction
+    bristle_stiffness_Nmprad: Annotated[Interval, _FromList, _interval(1.0, 1e7)] = (3e4, 2.5e5)  # log-uniform
+    bristle_damping_Nmspr: Annotated[float, between(0.0, 1e5)] = 200.0
+    encoder_bits: Annotated[tuple[int, int], _FromList, _interval(8, 26)] = (17, 20)
+    current_lag_s: Annotated[Interval, _FromList, _interval(0.0, 0.1)] = (0.3e-3, 1.0e-3)
+    command_delay_s: Annotated[Interval, _FromList, _interval(0.0, 0.01)] = (0.5e-3, 2.0e-3)
+    # 2 per motor turn; a third of it 10 per motor turn
+    torque_ripple_Nm: Annotated[Interval, _FromList, _interval(0.0, 1e4)] = (0.0, 1.5)
+    friction_ripple: Annotated[Interval, _FromList, _interval(0.0, 0.9)] = (0.0, 0.05)  # 18 per joint turn
+    inertia_scale: Annotated[Interval, _FromList, _interval(0.1, 10.0)] = (0.95, 1.05)
+
+
+def random_plant(base: Config, settings: EnsembleSettings, seed: int, index: int) -> Config:
+    """The configuration with the virtual joint number `index` of the study with this seed."""
+    random = np.random.default_rng([seed, index])
+
+    def uniform(interval: tuple[float, float]) -> float:
+        return float(random.uniform(*interval))
+
+    low, high = settings.bristle_stiffness_Nmprad
+    ripple = uniform(settings.torque_ripple_Nm)
+    virtual: dict[str, Any] = {
+        "friction_positive_scale": uniform(settings.friction_scale),
+        "friction_negative_scale": uniform(settings.friction_scale),
+        "friction_kind": "stick_slip" if random.random() < settings.stick_slip_share else "lugre",
+        "bristle_stiffness_Nmprad": float(np.exp(random.uniform(np.log(low), np.log(high)))),
+        "bristle_damping_Nmspr": settings.bristle_damping_Nmspr,
+        "current_lag_s": uniform(settings.current_lag_s),
+        "command_delay_s": uniform(settings.command_delay_s),
+        "torque_ripple_Nm": (ripple, ripple / 3.0),
+        "torque_ripple_per_motor_turn": (2.0, 10.0),
+        "torque_ripple_phase_rad": tuple(float(x) for x in random.uniform(0.0, 2.0 * np.pi, 2)),
+        "friction_ripple": uniform(settings.friction_ripple),
+        "friction_ripple_per_joint_turn": 18.0,
+        "inertia_scale": uniform(settings.inertia_scale),
+        "initial_position_rad": 0.0,
+    }
+    bits = int(random.integers(settings.encoder_bits[0], settings.encoder_bits[1] + 1))
+    assert base.virtual is not None
+    return base.model_copy(
+        update={
+            "virtual": base.virtual.model_copy(update=virtual),
+            "encoder": base.encoder.model_copy(update={"counts_per_turn": 2**bits, "side": "joint"}),
+            "drive": base.drive.model_copy(update={"rpdo_transmission_type": RPDO_AT_ONCE}),
+        }
+    )
+
+
+# --- what is compared ---
+
+
+class StudySettings(Section):
+    """One study; a flag of the command line replaces the value of the file."""
+
+    plants: Annotated[int, between(1, 100_000)] = 40
+    seed: Annotated[int, between(0, 2**31)] = 1
+    after_s: Annotated[float, between(0.0, 1e5)] = 75.0  # errors count from here on
+    scenario: Scenario = "sine"
+    base: str = "precise"  # configuration of everything but law and plant
+    controllers: Annotated[tuple[str, ...], BeforeValidator(_as_tuple)] = DEFAULT
+    plant: EnsembleSettings = EnsembleSettings()
+    variants: dict[str, dict[str, Any]] = Field(default_factory=dict)
+
+
+def load_study(path: Path) -> StudySettings:
+    """Read and check a study file; names of files in it are relative to the working folder."""
+    try:
+        data = parse_toml(read_input(path).decode("utf-8-sig"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ConfigurationError(f"{path}: cannot be read as TOML: {reason}") from None
+    return checked(data, str(path))
+
+
+def checked(data: dict[str, Any], origin: str) -> StudySettings:
+    """`StudySettings` of these keys; the first problem as one line that begins with `origin`."""
+    try:
+        return StudySettings.model_validate(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        if first["type"] == "extra_forbidden":
+            model = EnsembleSettings if first["loc"][0] == "plant" else StudySettings
+            known = list(model.model_fields)
+            hint = suggestion(str(first["loc"][-1]), known)
+            key = ".".join(str(part) for part in first["loc"])
+            raise ConfigurationError(f"{origin}: {key} is not a known key{hint}") from None
+        raise ConfigurationError(one_line(error, origin)) from None
+
+
+def study_controllers(settings: StudySettings) -> list[Controller]:
+    """The named ones, then the variants."""
+    found = named(settings.controllers)
+    for name, keys in settings.variants.items():
+        if "of" not in keys:
+            raise ConfigurationError(f"variants.{name}.of is missing: the controller that it changes")
+        if any(controller.name == name for controller in found):
+            raise ConfigurationError(f"variants.{name} must not have the name of another controller")
+        parent = named((str(keys["of"]),))[0]
+        changes = {key: value for key, value in keys.items() if key != "of"}
+        found.append(Controller(name, changed(parent.control, changes, f"variants.{name}"), parent.friction))
+    return found
+
+
+# --- the runs ---
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class PlantTask:
+    """One plant of the study, and what to run on it; it is sent to a process."""
+
+    base: Config
+    plant: EnsembleSettings
+    seed: int
+    index: int
+    controllers: tuple[Controller, ...]
+    scenario: Scenario
+    after_s: float
+
+
+@dataclass(frozen=True)
+class PlantResult:
+    """Figures of one plant under each controller, in their order."""
+
+    index: int
+    friction_kind: str
+    encoder_bits: int
+    figures: tuple[ErrorFigures, ...]
+
+
+@dataclass(frozen=True)
+class StudyResult:
+    """All plants that were finished, in the order of their index."""
+
+    controllers: tuple[str, ...]
+    plants: tuple[PlantResult, ...]
+    interrupted: bool
+
+    def values(self, controller: str, figure: str) -> np.ndarray:
+        """One figure of one controller over the plants, shape (plants,); inf where a fault ended the run."""
+        column = self.controllers.index(controller)
+        return np.array([float(getattr(plant.figures[column], figure)) for plant in self.plants])
+
+    def faults(self, controller: str) -> int:
+        column = self.controllers.index(controller)
+        return sum(1 for plant in self.plants if plant.figures[column].fault)
+
+
+def quantile(values: np.ndarray, share: float) -> float:
+    """Linear between two values; with infinite ones among them the upper of the two, since inf - inf is nothing."""
+    method = "linear" if np.all(np.isfinite(values)) else "higher"
+    return float(np.quantile(values, share, method=method))  # type: ignore[call-overload]
+
+
+def run_plant(task: PlantTask) -> PlantResult:
+    """Commission the plant and run every controller on it."""
+    config = random_plant(task.base, task.plant, task.seed, task.index)
+    joint = LockstepJoint(config)
+    figures = []
+    for controller in task.controllers:
+        constants = controller_constants(config, controller, joint.report.start_position_rad)
+        figures.append(error_figures(run_scenario(joint, constants, task.scenario), task.after_s))
+    assert config.virtual is not None
+    bits = round(math.log2(config.encoder.counts_per_turn))
+    return PlantResult(task.index, config.virtual.friction_kind, bits, tuple(figures))
+
+
+def run_study(
+    base: Config,
+    controllers: list[Controller],
+    *,
+    plants: int,
+    seed: int,
+    settings: EnsembleSettings | None = None,
+    scenario: Scenario = "sine",
+    after_s: float = 75.0,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> StudyResult:
+    """All runs; `progress` hears how many plants are done.  Ctrl-C ends it early and keeps what is there.
+
+    `workers` None takes every processor that this process may use; 1 stays in this process.
+    """
+    if not 0.0 <= after_s < base.trajectory.duration_s:
+        raise ConfigurationError(f"after_s (={after_s:g}) must be in [0..{base.trajectory.duration_s:g}), the run")
+    settings = EnsembleSettings() if settings is None else settings
+    order = tuple(controllers)
+    tasks = [PlantTask(base, settings, seed, index, order, scenario, after_s) for index in range(plants)]
+    workers = min(plants, workers or len(os.sched_getaffinity(0)))
+    done: list[PlantResult] = []
+    interrupted = False
+
+    def take(result: PlantResult) -> None:
+        done.append(result)
+        if progress is not None:
+            progress(float(len(done)))
+
+    try:
+        if workers == 1:
+            for task in tasks:
+                take(run_plant(task))
+        else:
+            _run_in_processes(tasks, workers, take)
+    except KeyboardInterrupt:
+        interrupted = True
+    done.sort(key=lambda result: result.index)
+    return StudyResult(tuple(c.name for c in order), tuple(done), interrupted)
+
+
+def _run_in_processes(tasks: list[PlantTask], workers: int, take: Callable[[PlantResult], None]) -> None:
+    """Spawned, not forked: nothing of this process (threads, open buses) is to be inherited."""
+    before = set(multiprocessing.active_children())
+    executor = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+    ended = False
+    try:
+        with interrupts_left_to_the_parent():
+            pending: set[Future[PlantResult]] = {executor.submit(run_plant, task) for task in tasks}
+        while pending:
+            finished, pending = wait(pending, return_when=FIRST_COMPLETED)
+            for future in finished:
+                take(future.result())
+        ended = True
+    finally:
+        # after an interruption or an error nobody wants the plants that are still being simulated
+        executor.shutdown(wait=ended, cancel_futures=True)
+        if not ended:
+            for process in set(multiprocessing.active_children()) - before:
+                process.terminate()
+
+
+def write_csv(result: StudyResult, path: Path) -> None:
+    """One line for each run."""
+    names = [field.name for field in fields(ErrorFigures)]
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["plant", "friction_kind", "encoder_bits", "controller", *names])
+            for plant in result.plants:
+                for name, figures in zip(result.controllers, plant.figures, strict=True):
+                    writer.writerow(
+                        [plant.index, plant.friction_kind, plant.encoder_bits, name, *asdict(figures).values()]
+                    )
+
+
+# --- box plots, logarithmic ---
+
+_PANELS = (
+    ("peak_mrad", "peak error [mrad]"),
+    ("rmse_mrad", "RMSE [mrad]"),
+    ("true_rmse_mrad", "RMSE of the joint\nitself [mrad]"),
+)
+
+
+def study_figure(result: StudyResult, title: str) -> Any:
+    """The boxes: quartiles; whiskers 5 and 95 %; dots beyond."""
+    count = len(result.controllers)
+    with canvas(1.8 + 0.42 * count, title) as figure:
+        axes = figure.subplots(1, len(_PANELS), sharey=True)
+        for axis, (key, label) in zip(axes, _PANELS, strict=True):
+            _boxes(axis, result, key)
+            axis.set_xscale("log")
+            axis.set_xmargin(0.04)
+            axis.set_xlabel(label)
+            axis.grid(True, which="both", axis="x", linewidth=0.5)
+            axis.grid(False, axis="y")
+        axes[0].set_yticks(range(1, count + 1), [name.replace("_", " ") for name in result.controllers])
+        axes[0].invert_yaxis()
+        return figure
+
+
+def _boxes(axis: Any, result: StudyResult, key: str) -> None:
+    drawn = [result.values(name, key) for name in result.controllers]
+    axis.boxplot(
+        [values[np.isfinite(values)] for values in drawn],
+        orientation="horizontal",
+        whis=(5, 95),
+        widths=0.6,
+        boxprops={"color": BLUE},
+        medianprops={"color": INK, "linewidth": 1.6},
+        whiskerprops={"color": BLUE},
+        capprops={"color": BLUE},
+        flierprops={"marker": ".", "markersize": 3, "markeredgecolor": GREY},
+    )

@@ -1,0 +1,323 @@
+"""The best fit of one direction: exact minimum, polish of a swarm's end, outliers, and the choice of a model.
+
+For a given Stribeck speed ws and knee the rest is linear least squares with 0 <= tc <= ts <= static_max, solved exactly
+by going along the limits that it violates.  What remains is one dimension: a scan over log ws, refined around its best
+places (variable projection, Golub and Pereyra 1973).  Takes milliseconds; it is the cross-check of the particle swarm,
+and serves selection and intervals.  The knee of the discontinuous model matters only through which points lie beyond
+it, so it is searched among the midpoints between neighbouring speeds; the continuous model uses the same candidates.
+
+The polish is least squares over all parameters together, from the place where the swarm ended.  Outliers are found by
+a robust test, a model is chosen by its error on points held out of the fit (k-fold).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares, minimize_scalar
+
+from jointctl.tools.identification.models import FORMS, MIN_PER_STAGE, Branch, Form, basis, branch, legendre
+
+SCAN = 48  # values of ws
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One direction to be fitted, sorted and normalised: x = u / top_radps."""
+
+    form: Form
+    x: np.ndarray
+    y_Nm: np.ndarray
+    top_radps: float
+    knee: float
+    ws_low: float
+    ws_high: float
+    static_max_Nm: float
+
+    def part(self, keep: np.ndarray) -> Problem:
+        """The same problem with some of its points."""
+        return replace(self, x=self.x[keep], y_Nm=self.y_Nm[keep])
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Parameters of one direction (normalised) and the squared error on the points that they were fitted to."""
+
+    problem: Problem
+    beta: np.ndarray
+    ws: float
+    knee: float
+    rss: float
+
+    @property
+    def rmse_Nm(self) -> float:
+        return float(np.sqrt(self.rss / len(self.problem.x)))
+
+    def torque_Nm(self, x: np.ndarray) -> np.ndarray:
+        return basis(self.problem.form, x, self.ws, self.knee) @ self.beta
+
+    def branch(self) -> Branch:
+        return branch(self.problem.form, self.beta, self.ws, self.knee, self.problem.top_radps)
+
+
+def make_problem(
+    form: Form,
+    speed_radps: np.ndarray,
+    friction_Nm: np.ndarray,
+    knee_radps: float,
+    ws_limits_radps: tuple[float | None, float],
+    static_max_Nm: float | None = None,
+) -> Problem:
+    """Normalise one direction (mirrored: speed > 0) and choose the limits that were not given.
+
+    The data say nothing below the lowest speed: a Stribeck speed under a third of it, or a static friction of more
+    than 1.25 times the greatest friction measured near it, would be invented, not measured, and too much friction
+    compensation at low speed makes a joint creep.
+    """
+    order = np.argsort(speed_radps, kind="stable")
+    top = float(speed_radps[order[-1]])
+    x, y = speed_radps[order] / top, friction_Nm[order]
+    knee = knee_radps / top if form.cubic else 1.0
+    ws_high = ws_limits_radps[1] / top
+    ws_low = float(x[0]) / 3.0 if ws_limits_radps[0] is None else ws_limits_radps[0] / top
+    limit = static_limit_Nm(form, x, y, knee) if static_max_Nm is None else static_max_Nm
+    return Problem(form, x, y, top, knee, min(ws_low, 0.5 * ws_high), ws_high, limit)
+
+
+def static_limit_Nm(form: Form, x: np.ndarray, y_Nm: np.ndarray, knee: float) -> float:
+    """Greatest static friction that a fit may claim; without a cubic stage tc carries the whole curve, so all count."""
+    near_zero = x <= max(4.0 * x[0], knee / 8.0) if form.cubic else np.ones(len(x), bool)
+    return 1.25 * float(np.max(np.abs(y_Nm[near_zero])))
+
+
+def _least_squares(columns: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
+    beta = np.linalg.lstsq(columns, y, rcond=None)[0]
+    residual = y - columns @ beta
+    return beta, float(residual @ residual)
+
+
+def solve_linear(problem: Problem, ws: float, knee: float) -> tuple[np.ndarray, float]:
+    """Best linear parameters with 0 <= tc <= ts <= static_max; returns (beta, squared error)."""
+    columns, y, limit = basis(problem.form, problem.x, ws, knee), problem.y_Nm, problem.static_max_Nm
+    beta, rss = _least_squares(columns, y)
+    if not problem.form.stribeck:
+        if beta[0] >= 0.0:
+            return beta, rss
+        rest, rss = _least_squares(columns[:, 1:], y) if columns.shape[1] > 1 else (beta[1:], float(y @ y))
+        return np.concatenate([[0.0], rest]), rss
+    tc, ts = beta[0], beta[1]
+    slack = 1e-12 * limit
+    # the optimum of a convex problem lies on one of the limits that the free optimum violates; each is an edge of the
+    # triangle of allowed (tc, ts), from one corner to the other
+    corners = (0.0, 0.0), (0.0, limit), (limit, limit)
+    edges = []
+    if tc < -slack:
+        edges.append((corners[0], corners[1]))
+    if ts > limit + slack:
+        edges.append((corners[1], corners[2]))
+    if tc > ts + slack:
+        edges.append((corners[0], corners[2]))
+    if not edges:
+        return beta, rss
+    return min((_on_edge(columns, y, *edge) for edge in edges), key=lambda found: found[1])
+
+
+def _on_edge(
+    columns: np.ndarray, y: np.ndarray, start: tuple[float, float], end: tuple[float, float]
+) -> tuple[np.ndarray, float]:
+    """Best parameters with (tc, ts) between two corners."""
+    begin, way = np.array(start), np.array(end) - np.array(start)
+    known = y - columns[:, :2] @ begin
+    part, rss = _least_squares(np.column_stack([columns[:, :2] @ way, columns[:, 2:]]), known)
+    share = min(max(float(part[0]), 0.0), 1.0)
+    rest = part[1:]
+    if share != part[0]:
+        rest, rss = _least_squares(columns[:, 2:], known - columns[:, :2] @ way * share)
+    return np.concatenate([begin + share * way, rest]), rss
+
+
+def knee_candidates(problem: Problem) -> np.ndarray:
+    """Midpoints between neighbouring speeds that leave enough points on both sides."""
+    inner = np.unique(problem.x)
+    middle = 0.5 * (inner[1:] + inner[:-1])
+    below = np.searchsorted(problem.x, middle, side="right")
+    return middle[(below >= MIN_PER_STAGE) & (len(problem.x) - below >= MIN_PER_STAGE)]
+
+
+def _best_ws(problem: Problem, knee: float, scan: int) -> Fit:
+    if not problem.form.stribeck:
+        ws = problem.ws_high
+        beta, rss = solve_linear(problem, ws, knee)
+        return Fit(problem, beta, ws, knee, rss)
+
+    def cost(log_ws: float) -> float:
+        return solve_linear(problem, float(np.exp(log_ws)), knee)[1]
+
+    grid = np.linspace(np.log(problem.ws_low), np.log(problem.ws_high), scan)
+    costs = np.array([cost(g) for g in grid])
+    found = [(float(costs[k]), float(grid[k])) for k in (0, scan - 1)]
+    minima = [k for k in range(scan) if costs[k] <= costs[max(k - 1, 0)] and costs[k] <= costs[min(k + 1, scan - 1)]]
+    for k in sorted(minima, key=lambda k: costs[k])[:3]:
+        limits = (float(grid[max(k - 1, 0)]), float(grid[min(k + 1, scan - 1)]))
+        refined = minimize_scalar(cost, bounds=limits, method="bounded", options={"xatol": 1e-9})
+        found.append((float(refined.fun), float(refined.x)))
+    ws = float(np.exp(min(found)[1]))
+    beta, rss = solve_linear(problem, ws, knee)
+    return Fit(problem, beta, ws, knee, rss)
+
+
+def project(problem: Problem, *, search_knee: bool = False) -> Fit:
+    """The best fit there is, within the limits of the problem."""
+    if not (search_knee and problem.form.cubic):
+        return _best_ws(problem, problem.knee, SCAN)
+    candidates = knee_candidates(problem)
+    if not len(candidates):
+        return _best_ws(problem, problem.knee, SCAN)
+    step = max(1, len(candidates) // 25)
+    coarse = {k: _best_ws(problem, float(candidates[k]), 12) for k in range(0, len(candidates), step)}
+    for k in sorted(coarse, key=lambda k: coarse[k].rss)[:3]:
+        for near in range(max(0, k - step + 1), min(len(candidates), k + step)):
+            if near not in coarse:
+                coarse[near] = _best_ws(problem, float(candidates[near]), 12)
+    best = sorted(coarse.values(), key=lambda fit: fit.rss)[:4]
+    return min((_best_ws(problem, fit.knee, SCAN) for fit in best), key=lambda fit: fit.rss)
+
+
+# --- polish; its vector is the particle of `swarm`: [ts, tc / ts, log ws, tv], then the coefficients of the cubic ---
+
+
+def vector_limits(problem: Problem) -> np.ndarray:
+    """Lower and upper limit of each element, shape (2, D): wide enough for any friction of the size measured."""
+    size = float(np.max(np.abs(problem.y_Nm)))
+    steep = 2.0 * size / min(problem.knee, 1.0)
+    limits = [
+        (0.0, problem.static_max_Nm),
+        (0.0, 1.0),
+        (float(np.log(problem.ws_low)), float(np.log(problem.ws_high))),
+        (-steep, steep),
+    ]
+    if problem.form.cubic:
+        limits += [] if problem.form.continuous else [(-size, 2.0 * size)]
+        limits += [(-size, size)] * 3
+    return np.array(limits).T
+
+
+def beta_from_vector(problem: Problem, vector: np.ndarray, knee: float) -> tuple[np.ndarray, float]:
+    """(linear parameters of the form, ws); the polynomials move from [problem.knee..1] to [knee..1]."""
+    low = [vector[0] * vector[1], vector[0], vector[3]]
+    high = vector[4:]
+    if problem.form.cubic and knee != problem.knee:
+        # the same cubic through four places, in the other polynomials
+        at = np.linspace(knee, 1.0, 4)
+        full = np.concatenate([[0.0], high]) if problem.form.continuous else high
+        full = np.linalg.solve(legendre(at, knee), legendre(at, problem.knee) @ full)
+        high = full[1:] if problem.form.continuous else full
+    return np.concatenate([low, high]), float(np.exp(vector[2]))
+
+
+def _vector(fit: Fit) -> np.ndarray:
+    tc, ts, tv = fit.beta[:3]
+    share = tc / ts if ts > 0.0 else 1.0
+    return np.concatenate([[ts, share, np.log(fit.ws), tv], fit.beta[3:]])
+
+
+def polish(fit: Fit) -> Fit:
+    """The local minimum next to `fit`, at its knee; never worse than `fit`. A linear model is already there."""
+    problem, knee = fit.problem, fit.knee
+    if not problem.form.stribeck:
+        return fit
+    lower, upper = vector_limits(problem)
+    margin = 1e-9 * (upper - lower)
+    # a cubic on another knee may leave the box, which only serves to scale
+    start = _vector(fit)
+    lower[3:], upper[3:] = np.minimum(lower[3:], start[3:]), np.maximum(upper[3:], start[3:])
+
+    def unpack(vector: np.ndarray) -> Fit:
+        return Fit(problem, np.concatenate([[vector[0] * vector[1], vector[0]], vector[3:]]),
+                   float(np.exp(vector[2])), knee, 0.0)  # fmt: skip
+
+    def residual(vector: np.ndarray) -> np.ndarray:
+        return unpack(vector).torque_Nm(problem.x) - problem.y_Nm
+
+    found = least_squares(
+        residual, np.clip(start, lower + margin, upper - margin), bounds=(lower, upper), x_scale=upper - lower,
+        xtol=1e-14, ftol=1e-14, gtol=1e-14, max_nfev=400,
+    )  # fmt: skip
+    polished = unpack(found.x)
+    rss = float(2.0 * found.cost)
+    return Fit(problem, polished.beta, polished.ws, knee, rss) if rss < fit.rss else fit
+
+
+# --- which points and which model to believe ---
+
+MAX_OUTLIERS = 0.2  # of a direction's points: beyond, it is the model that does not fit
+_TIE = 1.01  # held-out errors within 1 % count as equal, then fewer parameters win
+
+
+def find_outliers(problem: Problem, threshold: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points that do not belong to the curve: (bool (N,), residual in standard deviations (N,)).
+
+    The residual is that from a fit without the point (r / (1 - h) with the leverage h for a point in the fit), the
+    standard deviation s comes from the median of the kept points, which a few wrong points cannot move.  Repeated
+    until nothing changes, so that one outlier does not hide another.  threshold 0 switches the test off.
+    """
+    out = np.zeros(len(problem.x), bool)
+    score = np.zeros(len(problem.x))
+    if threshold <= 0.0:
+        return out, score
+    for _ in range(20):
+        fit = project(problem.part(~out))
+        columns = basis(problem.form, problem.x, fit.ws, fit.knee)
+        residual = problem.y_Nm - columns @ fit.beta
+        orthonormal = np.linalg.qr(columns[~out])[0]
+        # capped: the lowest speed alone decides on ts, and would otherwise always look innocent or guilty
+        leverage = np.minimum(np.sum(orthonormal**2, axis=1), 0.5)
+        kept = residual[~out]
+        spread = 1.4826 * float(np.median(np.abs(kept))) * np.sqrt(len(kept) / max(len(kept) - columns.shape[1], 1))
+        floor = 1e-6 * float(np.max(np.abs(problem.y_Nm)))  # noiseless data have no outliers from rounding
+        score = residual.copy()
+        score[~out] = kept / (1.0 - leverage)
+        score /= max(spread, floor)
+        found = np.abs(score) > threshold
+        if np.array_equal(found, out) or np.count_nonzero(found) > MAX_OUTLIERS * len(out):
+            return found, score
+        out = found
+    return out, score
+
+
+def fold_numbers(problem: Problem, folds: int, seed: int) -> np.ndarray:
+    """Fold of each point (N,): speeds are dealt at random; repeats of a speed stay together, as they are no news."""
+    speeds, which = np.unique(problem.x, return_inverse=True)
+    dealt = np.arange(len(speeds)) % folds
+    np.random.default_rng(seed).shuffle(dealt)
+    return dealt[which]
+
+
+def held_out_rss(problem: Problem, folds: int, seed: int) -> float:
+    """Squared error over all points, each predicted by a fit that did not see it; the knee stays where it is."""
+    number = fold_numbers(problem, folds, seed)
+    total = 0.0
+    for fold in range(folds):
+        out = number == fold
+        if out.any():
+            fit = project(problem.part(~out))
+            error = problem.y_Nm[out] - fit.torque_Nm(problem.x[out])
+            total += float(error @ error)
+    return total
+
+
+def with_form(problem: Problem, form: Form) -> Problem:
+    """The same points with another model."""
+    knee = problem.knee if form.cubic else 1.0
+    limit = problem.static_max_Nm
+    if form.cubic != problem.form.cubic:
+        limit = static_limit_Nm(form, problem.x, problem.y_Nm, knee)
+    return replace(problem, form=form, knee=knee, static_max_Nm=limit)
+
+
+def choose(held_out_rmse_Nm: dict[str, float]) -> str:
+    """The model of least held-out error; among equals (1 %) the one with the fewest parameters."""
+    best = min(held_out_rmse_Nm.values())
+    good = [name for name, value in held_out_rmse_Nm.items() if value <= _TIE * best]
+    return min(good, key=lambda name: (FORMS[name].parameters, held_out_rmse_Nm[name]))
