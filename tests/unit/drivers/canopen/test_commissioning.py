@@ -455,7 +455,7 @@ def test_an_adapter_that_does_not_come_back_leaves_the_watchdog_to_stop_the_join
 
 
 @pytest.mark.parametrize("change", ["mode", "deadline", "another"])
-def test_a_drive_that_changes_at_its_start_is_not_lent(
+def test_a_drive_that_changes_at_its_start_is_not_handed_over(
     device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, change: str
 ) -> None:
     with opened(device_on_bus, settings_of_virtual_joint) as drive:
@@ -472,4 +472,4 @@ def test_a_drive_that_changes_at_its_start_is_not_lent(
         drive._objects.gate = gate
         with pytest.raises(BusError if change == "another" else DeviceError):
             drive.start_cyclic()
-        assert not drive._lent
+        assert not drive._handed_over
