@@ -11,11 +11,10 @@ from typing import Any
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import axis_constants, trajectory_table
 from jointctl.tools.output import Output
-from jointctl.tools.running.control import Control
-from jointctl.tools.running.permission.consent import TerminalConsent
-from jointctl.tools.running.plan import resolve
-from jointctl.tools.running.session import Session
-from jointctl.tools.running.stop_signals import StopSignals
+from jointctl.tools.session.consent import TerminalConsent
+from jointctl.tools.session.control import Control, StopSignals
+from jointctl.tools.session.plan import resolve
+from jointctl.tools.session.session import Session
 
 
 def session_of(

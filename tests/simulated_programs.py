@@ -45,11 +45,11 @@ from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUTHS, run_lockstep
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_settings import canopen_settings
 from jointctl.tools.output import Output
-from jointctl.tools.running import session as session_module
-from jointctl.tools.running.loop import loop_handle as loop_module
-from jointctl.tools.running.loop import portable_loop, shared_block
-from jointctl.tools.running.loop.loop_handle import LoopHandle
-from jointctl.tools.running.stop_signals import STOP_COMMAND, StopSignals
+from jointctl.tools.session import loop_handle as loop_module
+from jointctl.tools.session import portable_loop
+from jointctl.tools.session import session as session_module
+from jointctl.tools.session.control import STOP_COMMAND, StopSignals
+from jointctl.tools.session.loop_handle import LoopHandle
 from jointctl.tools.simulation.virtual_joint import new_device
 
 STEP_NS = 1_000_000
@@ -265,7 +265,7 @@ class SimulatedLoop(LoopHandle):
     world: World
 
     def __init__(self, config: Config, table: Any, tail_path: Path | None = None, marker_fd: int | None = None) -> None:
-        self.block = shared_block.SharedBlock.create(len(table), config.bus.interface)
+        self.block = loop_module.SharedBlock.create(len(table), config.bus.interface)
         self.block.table[:] = table
         self._tail = self.lost_records = 0
         self._after_end = loop_module._ON_CAN
@@ -416,7 +416,7 @@ def simulated(joint: Config) -> Iterator[World]:
             (switch_off_module, "new_network", new_network),
             (portable_loop, "sleep_until_ns", lambda *when: loops[-1].wait_for_cycle(*when)),
             (portable_loop, "note_suspension", lambda *_: None),
-            (shared_block, "mmap", private),
+            (loop_module, "mmap", private),
             (session_module, "LoopHandle", new_loop),
             (session_module, "open_drive", open_simulated),
             (session_module, "recording", lambda _: contextlib.nullcontext()),

@@ -36,12 +36,15 @@ from jointctl.firmware_py.realtime import Word  # noqa: E402
 from jointctl.firmware_py.states import Fault  # noqa: E402
 from jointctl.tools.configuration.config import Config  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
-from jointctl.tools.running.control import Control  # noqa: E402
-from jointctl.tools.running.display.phase_lines import PhaseLines  # noqa: E402
-from jointctl.tools.running.permission.consent import TerminalConsent  # noqa: E402
-from jointctl.tools.running.plan import resolve  # noqa: E402
-from jointctl.tools.running.session import Session  # noqa: E402
-from jointctl.tools.running.stop_signals import STOP_COMMAND, StopSignals  # noqa: E402
+from jointctl.tools.session.consent import TerminalConsent  # noqa: E402
+from jointctl.tools.session.control import (  # noqa: E402
+    STOP_COMMAND,
+    Control,
+    StopSignals,
+)
+from jointctl.tools.session.display import PhaseLines  # noqa: E402
+from jointctl.tools.session.plan import resolve  # noqa: E402
+from jointctl.tools.session.session import Session  # noqa: E402
 from tests.simulated_programs import (  # noqa: E402
     World,
     quiet_output,
@@ -328,7 +331,7 @@ class Exhaustion:
         SEEN.clear()
 
     def _start(self, config: Config, world: World, folder: Path) -> Scene:
-        from jointctl.tools.running import session as session_module
+        from jointctl.tools.session import session as session_module
 
         made = session_module.LoopHandle
 

@@ -36,8 +36,8 @@ from jointctl.drivers.errors import JointctlError
 from jointctl.firmware_py.states import DriveState, StopRequest
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import axis_constants, trajectory_table
-from jointctl.tools.running.loop.loop_handle import RECEIVE_SHARE, LoopHandle
-from jointctl.tools.running.open_drive import open_drive
+from jointctl.tools.session.loop_handle import RECEIVE_SHARE, LoopHandle
+from jointctl.tools.session.open_drive import open_drive
 from jointctl.tools.simulation.virtual_joint import separate_virtual_joint
 from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
 from tests.bench.c_programs import NoCompilerError, exchange_program, setting_doubles

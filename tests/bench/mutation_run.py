@@ -48,9 +48,8 @@ TESTS = {  # below UNIT_TESTS
         "drivers/canopen/test_two_encoders",
     ),
     "drivers/bus_lock.py": ("drivers/test_bus_lock",),
-    "tools/running/stop_call.py": ("running/test_stop_call", "drivers/test_bus_lock"),
-    "tools/running/stop_signals.py": ("running/test_control",),
-    "tools/running/control.py": ("running/test_control",),
+    "tools/session/stop_call.py": ("session/test_stop_call", "drivers/test_bus_lock"),
+    "tools/session/control.py": ("session/test_control",),
 }  # fmt: skip
 KERNELS = (*(module for module in TESTS if module.startswith("firmware_py")), "drivers/canopen/cia402.py")
 LONGEST_S = 120.0  # of processor time: on a busy computer a sound mutant must not count as one that hangs

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import re
 
-from jointctl.tools.running.events.fault_text import FAULT_TEXTS
+from jointctl.tools.session.fault_words import FAULT_TEXTS
 from tests.places import ROOT
 
 PAGE = (ROOT / "docs" / "troubleshooting.md").read_text()

@@ -18,9 +18,8 @@ from jointctl.tools.configuration.load import load_config
 from jointctl.tools.configuration.records import trajectory_table
 from jointctl.tools.recording.run_log import RunLogWriter
 from jointctl.tools.recording.run_log_reader import read_run_log
-from jointctl.tools.running.loop.loop_handle import LoopHandle
-from jointctl.tools.running.loop.shared_block import RING_RECORDS, SharedBlock
-from jointctl.tools.running.open_drive import open_drive
+from jointctl.tools.session.loop_handle import RING_RECORDS, LoopHandle, SharedBlock
+from jointctl.tools.session.open_drive import open_drive
 from tests.hil.moving_run import Moving, gone
 from tests.sessions import constants_of
 

@@ -21,7 +21,7 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.configuration.plant import FAULT_KINDS
 from jointctl.tools.configuration.plant_settings import fault_constants
-from jointctl.tools.running.result.run_result import RunResult
+from jointctl.tools.session.result import RunResult
 from tests.places import CONFIGS
 from tests.real_time_joint import real_time_joint
 from tests.sessions import session_of

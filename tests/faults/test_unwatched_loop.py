@@ -8,7 +8,7 @@ import pytest
 
 from jointctl.firmware_py.realtime import Histogram
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, StopRequest
-from jointctl.tools.running.session import Session
+from jointctl.tools.session.session import Session
 from tests.unit.drivers.elmo.talk import Talk
 from tests.unit.firmware_py.stub_loop import ANSWER_ns, Loop
 

@@ -81,7 +81,7 @@ def end_line_guards(port: str) -> None:
     for process in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError, ValueError):
             arguments = process.read_text().split("\0")
-            if "jointctl.tools.running.guard.line_guard" in arguments:
+            if "jointctl.tools.session.line_guard" in arguments:
                 guarded = json.loads(next(text for text in arguments if text.startswith("{")))["port"]
                 if os.path.realpath(guarded) == os.path.realpath(port):  # it may be a link to it
                     os.kill(int(process.parent.name), signal.SIGKILL)

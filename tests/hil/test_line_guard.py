@@ -19,10 +19,9 @@ from typing import Any
 
 import pytest
 
-from jointctl.tools.running.guard.guard_call import guard_address, running_supervisor
-from jointctl.tools.running.guard.line_guard import GuardOrder
+from jointctl.tools.session.line_guard import GuardOrder, guard_address, running_supervisor
 
-GUARD, LOOP = "jointctl.tools.running.guard.line_guard", "jointctl.tools.running.loop.loop_process"
+GUARD, LOOP = "jointctl.tools.session.line_guard", "jointctl.tools.session.loop_process"
 
 
 def gone(pid: int) -> bool:

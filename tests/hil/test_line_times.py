@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-LOOP = "jointctl.tools.running.loop.loop_process"
+LOOP = "jointctl.tools.session.loop_process"
 POLL_S = 0.001
 
 

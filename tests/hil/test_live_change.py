@@ -15,9 +15,8 @@ from jointctl.firmware_py.states import AxisPhase, StopRequest
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.recording.run_log import Event
 from jointctl.tools.recording.run_log_reader import read_run_log
-from jointctl.tools.running.display.display import OnlyShows, Snapshot
-from jointctl.tools.running.display.viewer_request import ViewerRequest
-from jointctl.tools.running.result.run_result import RunResult
+from jointctl.tools.session.display import OnlyShows, Snapshot, ViewerRequest
+from jointctl.tools.session.result import RunResult
 from tests.sessions import session_of
 
 WHO = "a test"

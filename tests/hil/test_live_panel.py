@@ -22,10 +22,8 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, DriveState, Fault
 from jointctl.tools.output import Output
 from jointctl.tools.recording.log_facts import missing_records
-from jointctl.tools.running.display.display import Snapshot
-from jointctl.tools.running.display.live_panel import LivePanel, run_display
-from jointctl.tools.running.display.panel import panel, time_left
-from jointctl.tools.running.display.phase_lines import PhaseLines
+from jointctl.tools.session.display import PhaseLines, Snapshot
+from jointctl.tools.session.live_panel import LivePanel, panel, run_display, time_left
 
 ESCAPE = "\x1b["
 TERMINAL = {**os.environ, "TERM": "xterm-256color"}

@@ -33,8 +33,8 @@ from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_settings import canopen_settings
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.running.loop.portable_loop import run_portable_loop, warm_up
-from jointctl.tools.running.loop.shared_block import SharedBlock
+from jointctl.tools.session.loop_handle import SharedBlock
+from jointctl.tools.session.portable_loop import run_portable_loop, warm_up
 from jointctl.tools.simulation.device_pump import PumpedDevice
 from jointctl.tools.simulation.virtual_joint import new_device, serve_virtual_joint
 from tests.sessions import constants_of
@@ -243,7 +243,7 @@ def loop_pid(parent: int) -> int | None:
         with contextlib.suppress(OSError):
             text = path.read_text()
             if int(text.rpartition(")")[2].split()[1]) == parent:
-                if b"jointctl.tools.running.loop.loop_process" in (path.parent / "cmdline").read_bytes():
+                if b"jointctl.tools.session.loop_process" in (path.parent / "cmdline").read_bytes():
                     return int(path.parent.name)
     return None
 

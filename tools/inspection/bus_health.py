@@ -23,8 +23,8 @@ from jointctl.drivers.errors import BusError
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_settings import HIGHEST_LOAD, cycle_bytes
 from jointctl.tools.inspection.findings import NOTE, OK, PROBLEM, Finding, file_text
-from jointctl.tools.running.loop.loop_handle import RECEIVE_SHARE
-from jointctl.tools.running.loop.portable_loop import HIGHEST_RATE_HZ
+from jointctl.tools.session.loop_handle import RECEIVE_SHARE
+from jointctl.tools.session.portable_loop import HIGHEST_RATE_HZ
 
 SDO_READS = 20
 _SDO_TIMEOUT_S = 0.3

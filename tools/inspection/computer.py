@@ -19,7 +19,7 @@ import numpy as np
 
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.inspection.findings import NOTE, OK, PROBLEM, Finding, file_text
-from jointctl.tools.running.loop.start_time import start_time_s
+from jointctl.tools.session.loops import start_time_s
 from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
 
 DEFAULT_PRIORITY = 60

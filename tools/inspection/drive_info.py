@@ -12,7 +12,7 @@ from jointctl.tools.inspection import drive_words
 from jointctl.tools.inspection.objects import Place
 from jointctl.tools.inspection.pdo_maps import PdoMap, PdoMaps
 from jointctl.tools.inspection.sdo_reading import SdoReader
-from jointctl.tools.running.events.emergency_text import emergency_text
+from jointctl.tools.session.fault_words import emergency_text
 
 HISTORY = 8  # entries of 1003 that are shown
 CONSUMERS = 4  # entries of 1016

@@ -25,7 +25,7 @@ from jointctl.tools.inspection import drive_words
 from jointctl.tools.inspection.objects import Objects, Place
 from jointctl.tools.inspection.pdo_maps import PdoMaps
 from jointctl.tools.inspection.sdo_frames import SdoFrames
-from jointctl.tools.running.events.emergency_text import emergency_text
+from jointctl.tools.session.fault_words import emergency_text
 
 KINDS = ("nmt", "sync", "time", "emcy", "pdo", "sdo", "heartbeat", "lss", "error", "other")
 

@@ -16,7 +16,7 @@ from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.input_file import require_input
 from jointctl.tools.inspection import drive_words
 from jointctl.tools.inspection.standard_objects import standard_variable
-from jointctl.tools.running.events.emergency_text import emergency_text
+from jointctl.tools.session.fault_words import emergency_text
 
 SIGNED = frozenset(datatypes.SIGNED_TYPES)
 INTEGERS = frozenset(datatypes.INTEGER_TYPES)

@@ -11,7 +11,7 @@ from jointctl.drivers.errors import BusError
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import torque_constant_NmpA
 from jointctl.tools.configuration.elmo_settings import elmo_section, elmo_settings
-from jointctl.tools.running.guard.guard_call import running_supervisor
+from jointctl.tools.session.line_guard import running_supervisor
 
 
 @contextmanager

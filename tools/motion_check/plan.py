@@ -23,7 +23,7 @@ from jointctl.tools.configuration.conversions import joint_rad_per_count, static
 from jointctl.tools.configuration.elmo import ElmoSerial
 from jointctl.tools.configuration.records import APPROACH_MIN_S, axis_constants
 from jointctl.tools.recording.log_folder import log_path
-from jointctl.tools.running.plan import Placed, RunPlan, joint_lines, remark_lines
+from jointctl.tools.session.plan import Placed, RunPlan, joint_lines, remark_lines
 
 TRAVEL_rad, TRAVEL_MAX_rad = 0.04, 0.3  # of the reference, to each side
 TRAVEL_COUNTS = 60.0  # so coarse an encoder takes more travel
@@ -132,7 +132,7 @@ def motion_table(plan: CheckPlan, start_rad: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class CheckMotion:
-    """The motion of the check; see `running.plan.Motion`.  `config` is that of `config_of_check`."""
+    """The motion of the check; see `session.plan.Motion`.  `config` is that of `config_of_check`."""
 
     config: Config
     plan: CheckPlan

@@ -14,7 +14,7 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import law_resolution_rad
 from jointctl.tools.inspection.findings import NOTE, OK, PROBLEM, Finding
 from jointctl.tools.motion_check.plan import CheckPlan
-from jointctl.tools.running.events.fault_text import FaultText
+from jointctl.tools.session.fault_words import FaultText
 
 MOVED_SHARE = 0.03  # of the travel: less is no motion
 MOVED_COUNTS = 6.0

@@ -16,9 +16,8 @@ from typing import Any, Self
 
 from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.recording.run_log import Event
-from jointctl.tools.running.display.display import Snapshot
-from jointctl.tools.running.display.viewer_request import LONGEST_BYTES, ViewerRequest, decoded
 from jointctl.tools.scoping.order import ScopeOrder
+from jointctl.tools.session.display import LONGEST_BYTES, Snapshot, ViewerRequest, decoded
 
 RECORDS, EVENT, SETTINGS = b"R", b"E", b"S"  # first byte of a message
 REQUESTS = 16  # of viewers, at most between two looks

@@ -8,14 +8,14 @@ from typing import Any, Protocol
 from nicegui import ui
 
 from jointctl.tools.recording.run_log import Event
-from jointctl.tools.running.display.viewer_request import ViewerRequest, viewer
-from jointctl.tools.running.events.event_finder import drive_state_name, fault_words, phase_name
 from jointctl.tools.scoping.change_panels import ChangePanels
 from jointctl.tools.scoping.chart import Chart
 from jointctl.tools.scoping.history import History, percentiles_us
 from jointctl.tools.scoping.order import ScopeOrder
 from jointctl.tools.scoping.start_panel import StartPanel
 from jointctl.tools.scoping.stop_button import StopButton, stale_mark
+from jointctl.tools.session.display import ViewerRequest, viewer
+from jointctl.tools.session.events import drive_state_name, fault_words, phase_name
 
 REFRESH_s = 0.1
 IDLE_SHARE = 3.0  # drawing leaves at least so many times its own duration to everything else, STOP above all

@@ -18,11 +18,11 @@ from typing import Any
 
 from jointctl.tools.recording.run_log import Event
 from jointctl.tools.recording.run_log_reader import read_run_log
-from jointctl.tools.running.display.viewer_request import ViewerRequest, viewer
 from jointctl.tools.scoping.access import AccessControl
 from jointctl.tools.scoping.feed import COUNT_AGAIN_S, EVENT, RECORDS, SETTINGS
 from jointctl.tools.scoping.history import EVENTS, RING_RECORDS, History
 from jointctl.tools.scoping.order import ScopeOrder
+from jointctl.tools.session.display import ViewerRequest, viewer
 
 _LONGEST = 1 << 20  # bytes of a message
 MESSAGES = 20  # that a page which was cut off for a moment gets again

@@ -26,9 +26,9 @@ from jointctl.tools.configuration.elmo import ElmoSerial, UnitModeChoice
 from jointctl.tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_constants
 from jointctl.tools.output import Advance, Output
 from jointctl.tools.recording.log_folder import log_path
-from jointctl.tools.running.display.display import OnlyShows, Snapshot
-from jointctl.tools.running.permission.consent import Consent
-from jointctl.tools.running.plan import Placed, RunPlan, joint_lines, remark_lines
+from jointctl.tools.session.consent import Consent
+from jointctl.tools.session.display import OnlyShows, Snapshot
+from jointctl.tools.session.plan import Placed, RunPlan, joint_lines, remark_lines
 from jointctl.tools.simulation.lockstep import LockstepJoint
 from jointctl.tools.sweeping.checks import constant_remarks, require_torque
 from jointctl.tools.sweeping.grid import SweepPoint
@@ -122,7 +122,7 @@ def sweep_constants(config: Config, report: CommissioningReport, motion: SweepMo
 
 @dataclass(frozen=True)
 class SweepPass:
-    """One way along points of a sweep; see `running.plan.Motion`.  `config` is that of `config_of_sweep`."""
+    """One way along points of a sweep; see `session.plan.Motion`.  `config` is that of `config_of_sweep`."""
 
     config: Config
     motion: SweepMotion

@@ -7,10 +7,10 @@ from jointctl.drivers.errors import INTERRUPTED
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo import ElmoSerial
 from jointctl.tools.output import Output
-from jointctl.tools.running.control import in_control
-from jointctl.tools.running.open_drive import open_drive
-from jointctl.tools.running.result import drive_end
-from jointctl.tools.running.result.drive_end import warn_unless_off
+from jointctl.tools.session import result as drive_end
+from jointctl.tools.session.control import in_control
+from jointctl.tools.session.open_drive import open_drive
+from jointctl.tools.session.result import warn_unless_off
 from jointctl.tools.verbs.stop_serial import refuse_while_running
 
 

@@ -9,11 +9,11 @@ from jointctl.tools.inspection.drive_scale import judged
 from jointctl.tools.motion_check.plan import check_run, make_plan
 from jointctl.tools.motion_check.verdict import ended_finding, motion_findings
 from jointctl.tools.output import Output
-from jointctl.tools.running.control import Control, in_control
-from jointctl.tools.running.permission.consent import TerminalConsent, require_terminal
-from jointctl.tools.running.result import drive_end
-from jointctl.tools.running.result.drive_end import require_off
-from jointctl.tools.running.session import Session
+from jointctl.tools.session import result as drive_end
+from jointctl.tools.session.consent import TerminalConsent, require_terminal
+from jointctl.tools.session.control import Control, in_control
+from jointctl.tools.session.result import require_off
+from jointctl.tools.session.session import Session
 from jointctl.tools.verbs.doctor import report_findings
 
 

@@ -13,9 +13,8 @@ from jointctl.hil.bus.virtual_bus import default_socket_path
 from jointctl.hil.device_loop import ENDED_WORD
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
-from jointctl.tools.running.loop.loop_process import become_realtime
-from jointctl.tools.running.loop.slow_start import slow_start
-from jointctl.tools.running.stop_signals import StopSignals, stop_signals
+from jointctl.tools.session.control import StopSignals, stop_signals
+from jointctl.tools.session.loop_process import become_realtime, slow_start
 from jointctl.tools.simulation.virtual_joint import serve_virtual_joint
 
 _POLL_S = 0.05

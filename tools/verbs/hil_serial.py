@@ -17,7 +17,7 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo_settings import elmo_device_settings, elmo_section
 from jointctl.tools.configuration.plant_settings import plant_settings
 from jointctl.tools.output import Output
-from jointctl.tools.running.stop_signals import stop_signals
+from jointctl.tools.session.control import stop_signals
 from jointctl.tools.verbs.hil import make_realtime, wait_for_end
 
 

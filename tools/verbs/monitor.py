@@ -19,7 +19,7 @@ from jointctl.tools.inspection.pdo_maps import PdoMaps
 from jointctl.tools.inspection.sdo_reading import SdoReader
 from jointctl.tools.inspection.subject import Subject, canopen_network
 from jointctl.tools.output import Output
-from jointctl.tools.running.stop_signals import stop_signals
+from jointctl.tools.session.control import stop_signals
 
 POLL_S = 0.1
 

@@ -16,7 +16,7 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo_settings import elmo_section
 from jointctl.tools.inspection.serial_subject import inspected_drive
 from jointctl.tools.output import Output
-from jointctl.tools.running.stop_signals import stop_signals
+from jointctl.tools.session.control import stop_signals
 
 INTERVAL_S = 0.1
 

@@ -30,8 +30,8 @@ from jointctl.tools.inspection.parameters import (
 from jointctl.tools.inspection.sdo_reading import Refusal, SdoReader
 from jointctl.tools.inspection.subject import Subject, canopen_network
 from jointctl.tools.output import Output
-from jointctl.tools.running.control import control_of
-from jointctl.tools.running.permission.consent import agreed, require_terminal
+from jointctl.tools.session.consent import agreed, require_terminal
+from jointctl.tools.session.control import control_of
 from jointctl.tools.written_file import writing
 
 DIFFERENT = 11  # exit code of diff

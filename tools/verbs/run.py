@@ -9,15 +9,14 @@ from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import DECLINED, INTERRUPTED
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
-from jointctl.tools.running.control import in_control
-from jointctl.tools.running.display.display import Display, Displays
-from jointctl.tools.running.display.live_panel import run_display
-from jointctl.tools.running.permission.consent import TerminalConsent, require_terminal
-from jointctl.tools.running.plan import resolve
-from jointctl.tools.running.result import drive_end
-from jointctl.tools.running.result.drive_end import require_off
-from jointctl.tools.running.result.run_report import report_run, run_title
-from jointctl.tools.running.session import Session
+from jointctl.tools.session import result as drive_end
+from jointctl.tools.session.consent import TerminalConsent, require_terminal
+from jointctl.tools.session.control import in_control
+from jointctl.tools.session.display import Display, Displays
+from jointctl.tools.session.live_panel import run_display
+from jointctl.tools.session.plan import resolve
+from jointctl.tools.session.result import report_run, require_off, run_title
+from jointctl.tools.session.session import Session
 
 
 def run(

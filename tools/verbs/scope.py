@@ -13,15 +13,14 @@ from jointctl.drivers.errors import DECLINED, INTERRUPTED, JointctlError
 from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log_reader import read_run_log
-from jointctl.tools.running.control import in_control
-from jointctl.tools.running.display.display import Displays
-from jointctl.tools.running.display.live_panel import run_display
-from jointctl.tools.running.plan import resolve
-from jointctl.tools.running.result.drive_end import words
-from jointctl.tools.running.result.run_report import report_run, run_title
-from jointctl.tools.running.session import Session
 from jointctl.tools.scoping.feed import ScopeFeed, scope_server
 from jointctl.tools.scoping.order import scope_order
+from jointctl.tools.session.control import in_control
+from jointctl.tools.session.display import Displays
+from jointctl.tools.session.live_panel import run_display
+from jointctl.tools.session.plan import resolve
+from jointctl.tools.session.result import report_run, run_title, words
+from jointctl.tools.session.session import Session
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.config import Config

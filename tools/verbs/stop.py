@@ -9,8 +9,8 @@ from jointctl.drivers.canopen.switch_off import stop_node
 from jointctl.drivers.errors import ConfigurationError, JointctlError
 from jointctl.tools.configuration.stop_target import CanTarget, GivenTarget, SerialTarget, stop_target
 from jointctl.tools.output import Output
-from jointctl.tools.running.result.drive_end import require_off
-from jointctl.tools.running.stop_call import StopCall
+from jointctl.tools.session.result import require_off
+from jointctl.tools.session.stop_call import StopCall
 from jointctl.tools.verbs.stop_serial import stop_serial
 
 

@@ -15,7 +15,7 @@ from jointctl.drivers.errors import BusError, JointctlError
 from jointctl.tools.configuration.elmo import ElmoSerial
 from jointctl.tools.configuration.stop_target import SerialTarget
 from jointctl.tools.output import Output
-from jointctl.tools.running.guard.guard_call import GuardCall, running_supervisor
+from jointctl.tools.session.line_guard import GuardCall, running_supervisor
 
 SHARED_ATTEMPTS = 10  # the other user of the line takes some replies
 

@@ -20,13 +20,12 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
 from jointctl.tools.output import Output
 from jointctl.tools.reporting.page import check_target
-from jointctl.tools.running.control import Control, in_control
-from jointctl.tools.running.display.display import Display, Displays
-from jointctl.tools.running.display.phase_lines import PhaseLines
-from jointctl.tools.running.events.fault_text import FaultText, fault_text
-from jointctl.tools.running.permission.consent import TerminalConsent, require_terminal
-from jointctl.tools.running.result import drive_end
-from jointctl.tools.running.session import Session
+from jointctl.tools.session import result as drive_end
+from jointctl.tools.session.consent import TerminalConsent, require_terminal
+from jointctl.tools.session.control import Control, in_control
+from jointctl.tools.session.display import Display, Displays, PhaseLines
+from jointctl.tools.session.fault_words import FaultText, fault_text
+from jointctl.tools.session.session import Session
 from jointctl.tools.sweeping.carry_out import MeterDisplay, SweepPass, config_of_sweep, sweep_in_lockstep, sweep_run
 from jointctl.tools.sweeping.checks import recorded_limits, refuse_constants, torque_source
 from jointctl.tools.sweeping.data_file import SweepFile

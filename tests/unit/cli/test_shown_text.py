@@ -18,8 +18,8 @@ from jointctl.tools.recording.run_log import INFO, Event
 from jointctl.tools.reporting.figure import draw
 from jointctl.tools.reporting.page import Details, Paragraph, Section, page
 from jointctl.tools.reporting.page import Table as PageTable
-from jointctl.tools.running.display.live_panel import LivePanel
 from jointctl.tools.scoping.history import History
+from jointctl.tools.session.live_panel import LivePanel
 
 EVIL = "a\x1b]0;owned\x07\x1b[2J\x9b31m\u202eb\rc\x7f[red]x[/]<script>alert(1)</script>"
 OBEYED = "\x1b\x07\x9b\u202e\r\x7f"

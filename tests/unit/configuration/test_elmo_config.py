@@ -14,8 +14,8 @@ from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo_settings import elmo_section, serial_line_share, with_port_override
 from jointctl.tools.configuration.load import load_config, shipped_config, with_bus_overrides
-from jointctl.tools.running.events.serial_fault_text import SERIAL_FAULT_TEXTS
-from jointctl.tools.running.open_drive import check_cyclic_rate, drive_fault_text
+from jointctl.tools.session.fault_words import SERIAL_FAULT_TEXTS
+from jointctl.tools.session.open_drive import check_cyclic_rate, drive_fault_text
 
 SHIPPED = shipped_config("elmo_serial").read_text()
 

@@ -34,8 +34,8 @@ from jointctl.drivers.bus_lock import (
 from jointctl.drivers.can.virtual_bus import socket_path
 from jointctl.drivers.errors import BusError
 from jointctl.drivers.local_socket import send_line
-from jointctl.tools.running import stop_call
-from jointctl.tools.running.stop_call import StopCall
+from jointctl.tools.session import stop_call
+from jointctl.tools.session.stop_call import StopCall
 
 LOCK = """
 import sys, time

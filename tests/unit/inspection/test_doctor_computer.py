@@ -14,7 +14,7 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.inspection import computer
 from jointctl.tools.inspection.computer import kernel_cache, kernel_findings, wake_up
 from jointctl.tools.inspection.findings import NOTE, OK, PROBLEM
-from jointctl.tools.running.loop import start_time
+from jointctl.tools.session import loops as start_time
 from jointctl.tools.wake_up import fifo, wake_up_lateness_ns
 from tests.unit.inspection.system_files import write
 

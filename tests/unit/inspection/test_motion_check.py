@@ -15,7 +15,7 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.inspection.findings import OK, PROBLEM
 from jointctl.tools.motion_check.plan import CheckMotion, config_of_check, make_plan, motion_table
 from jointctl.tools.motion_check.verdict import motion_findings
-from jointctl.tools.running.events.fault_text import fault_text
+from jointctl.tools.session.fault_words import fault_text
 from jointctl.tools.simulation.lockstep import LockstepJoint
 from tests.two_encoders import NODE, config_with
 from tests.unit.inspection.checked_joint import checked

@@ -19,7 +19,7 @@ from jointctl.tools.inspection.findings import PROBLEM
 from jointctl.tools.motion_check.plan import make_plan
 from jointctl.tools.motion_check.verdict import motion_findings
 from jointctl.tools.output import Output
-from jointctl.tools.running.events.fault_text import fault_text
+from jointctl.tools.session.fault_words import fault_text
 from jointctl.tools.verbs import doctor_motion as doctor_motion_module
 from tests.two_encoders import NODE, config_with
 from tests.unit.inspection.checked_joint import checked

@@ -18,7 +18,7 @@ from jointctl.firmware_py.schema import dtype_of
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
 from jointctl.tools.recording.log_folder import log_path, remove_oldest, require_room
-from jointctl.tools.running.permission.readiness import prepare_log, require_ready
+from jointctl.tools.session.consent import prepare_log, require_ready
 
 
 class Usage(NamedTuple):

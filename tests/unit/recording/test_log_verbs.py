@@ -26,8 +26,8 @@ from jointctl.tools.recording.log_export import FORMATS, columns, parquet_bytes
 from jointctl.tools.recording.log_facts import missing_records
 from jointctl.tools.recording.run_log import THINNING, RunLogWriter
 from jointctl.tools.recording.run_log_reader import read_run_log
-from jointctl.tools.running.events.event_finder import EventFinder
-from jointctl.tools.running.watch.frame_recorder import FrameRecorder, recording
+from jointctl.tools.session.bus_watch import FrameRecorder, recording
+from jointctl.tools.session.events import EventFinder
 from jointctl.tools.verbs.log import log_export, log_info, log_plot
 
 START_NS = 5_000_000_000

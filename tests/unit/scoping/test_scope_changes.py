@@ -16,15 +16,15 @@ from jointctl.firmware_py.records import AxisState, LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, StopRequest
 from jointctl.tools.output import Output
-from jointctl.tools.running import session as session_module
-from jointctl.tools.running.changes.new_motion import new_motion
-from jointctl.tools.running.display.panel import time_left
-from jointctl.tools.running.display.viewer_request import ViewerRequest
-from jointctl.tools.running.plan import resolve
-from jointctl.tools.running.run_watch import Around, RunParts, RunWatch
-from jointctl.tools.running.session import Session
-from jointctl.tools.running.stop_signals import StopSignals
-from jointctl.tools.running.watch.bus_watch import BusWatch
+from jointctl.tools.session import session as session_module
+from jointctl.tools.session.bus_watch import BusWatch
+from jointctl.tools.session.control import StopSignals
+from jointctl.tools.session.display import ViewerRequest
+from jointctl.tools.session.live_changes import new_motion
+from jointctl.tools.session.live_panel import time_left
+from jointctl.tools.session.plan import resolve
+from jointctl.tools.session.run_watch import Around, RunParts, RunWatch
+from jointctl.tools.session.session import Session
 from jointctl.tools.verbs import scope as scope_module
 from tests.sessions import constants_of
 

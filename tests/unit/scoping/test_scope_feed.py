@@ -20,14 +20,12 @@ from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import INFO, Event
-from jointctl.tools.running.changes.viewer_orders import UNWATCHED, ViewerOrders
-from jointctl.tools.running.display.display import Displays, Snapshot
-from jointctl.tools.running.display.phase_lines import PhaseLines
-from jointctl.tools.running.display.viewer_request import ViewerRequest
 from jointctl.tools.scoping import feed as feed_module
 from jointctl.tools.scoping import server as server_module
 from jointctl.tools.scoping.feed import EVENT, PIECE, RECORDS, SETTINGS, ScopeFeed
 from jointctl.tools.scoping.history import History
+from jointctl.tools.session.display import Displays, PhaseLines, Snapshot, ViewerRequest
+from jointctl.tools.session.live_changes import UNWATCHED, ViewerOrders
 from tests.unit.scoping.scope_records import records
 
 

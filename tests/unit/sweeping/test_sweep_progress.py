@@ -17,7 +17,7 @@ from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.output import Advance, Output
-from jointctl.tools.running.display.display import Snapshot
+from jointctl.tools.session.display import Snapshot
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.verbs import sweep as verb
 

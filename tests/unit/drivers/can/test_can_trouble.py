@@ -28,7 +28,7 @@ from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.drivers.errors import BusError, JointctlError, NoDeviceError
 from jointctl.tools.inspection.subject import Subject
 from jointctl.tools.output import Output
-from jointctl.tools.running.open_drive import commission
+from jointctl.tools.session.open_drive import commission
 from jointctl.tools.verbs.clear_fault import clear_fault
 from jointctl.tools.verbs.info import info
 from jointctl.tools.verbs.scan import scan

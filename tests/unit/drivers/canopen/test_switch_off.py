@@ -22,8 +22,8 @@ from jointctl.drivers.drive import UNTOUCHED, CommissioningReport, Declined, Dri
 from jointctl.drivers.errors import BusError, DataError, DeviceError, NoDeviceError
 from jointctl.hil.canopen.records import PowerState
 from jointctl.tools.output import Output
-from jointctl.tools.running import session as session_module
-from jointctl.tools.running.result.drive_end import require_off, words
+from jointctl.tools.session import session as session_module
+from jointctl.tools.session.result import require_off, words
 from jointctl.tools.verbs import run as run_module
 from jointctl.tools.verbs import stop as stop_module
 from tests.places import CONFIGS

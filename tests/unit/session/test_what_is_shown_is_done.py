@@ -1,0 +1,289 @@
+"""Between what the user was shown and what the joint does nothing may change, and nothing may jump."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jointctl.drivers.canopen.commissioning import disable
+from jointctl.drivers.drive import UNTOUCHED, CommissioningReport, DriveIdentity
+from jointctl.drivers.errors import ConfigurationError, DeviceError, MotionFault
+from jointctl.firmware_py.friction import branch_torque_Nm
+from jointctl.firmware_py.realtime import HISTOGRAM_BINS, Histogram
+from jointctl.firmware_py.states import CommandKind, Fault
+from jointctl.tools.configuration import checks
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import RADPS_PER_UNIT, friction_constants
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.output import Output
+from jointctl.tools.session.bus_watch import BusWatch
+from jointctl.tools.session.control import StopSignals
+from jointctl.tools.session.display import PhaseLines
+from jointctl.tools.session.plan import resolve
+from jointctl.tools.session.run_watch import Around, RunParts, RunWatch
+from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.sweeping.carry_out import POSITION_GAIN_ps
+from jointctl.tools.sweeping.checks import require_torque
+from jointctl.tools.sweeping.options import SweepOptions, make_plan
+from jointctl.tools.verbs import scope as scope_module
+
+VIRTUAL = shipped_config("virtual").read_text()
+AT_ONCE = ('approach_s = "auto"', "approach_s = 0")
+
+
+def config_of(tmp_path: Path, *changes: tuple[str, str]) -> Config:
+    text = VIRTUAL
+    for old, new in changes:
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    path = tmp_path / "joint.toml"
+    path.write_text(text)
+    return load_config(path)
+
+
+def report(start_rad: float = 0.1, **more: Any) -> CommissioningReport:
+    return CommissioningReport(DriveIdentity("", "", "", ""), "cyclic_sync_torque", start_rad, 0.06, 1e-5, **more)
+
+
+# --- no approach ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("start_rad", "refused"), [(0.0, False), (0.005, False), (0.0051, True), (-0.04, True)])
+def test_without_an_approach_the_joint_must_stand_where_the_trajectory_begins(
+    tmp_path: Path, start_rad: float, refused: bool
+) -> None:
+    config = config_of(tmp_path, AT_ONCE)
+    with pytest.raises(MotionFault, match="approach_s") if refused else contextlib.nullcontext():
+        resolve(config).motion.require_start(start_rad)
+    resolve(config_of(tmp_path)).motion.require_start(start_rad)  # with one it may stand elsewhere
+    lines = resolve(config).motion.placed(report(start_rad)).lines
+    assert "approach   none: at once to +0.0000 rad" in lines
+
+
+def test_that_is_why_it_would_be_pulled_there_with_all_its_torque(tmp_path: Path) -> None:
+    config = config_of(tmp_path, AT_ONCE, ("frequency_Hz = 0.1", "frequency_Hz = 0.1\noffset_rad = 0.14"))
+    joint = LockstepJoint(config)
+    run = joint.run()
+    assert run.fault is Fault.NONE  # 0.04 rad are less than the following error that is allowed
+    assert np.max(np.abs(run.log.command_torque_Nm)) == config.limits.torque_max_Nm
+    with pytest.raises(MotionFault, match="approach_s"):
+        resolve(config).motion.require_start(joint.report.start_position_rad)
+
+
+# --- the second sine -----------------------------------------------------------------------------------------------
+
+CREST_s = 2.5
+
+
+@pytest.mark.parametrize(
+    ("switch", "told"),
+    [
+        (f"at_s = {CREST_s}\namplitude_rad = 0.35\nfrequency_Hz = 0.05\nshift_s = 2.5\noffset_rad = 0.0", ""),
+        (f"at_s = {CREST_s}\namplitude_rad = 0.35\nfrequency_Hz = 0.1\nshift_s = 0.0\noffset_rad = 0.0009", ""),
+        (f"at_s = {CREST_s}\namplitude_rad = 0.35\nfrequency_Hz = 0.1\nshift_s = 0.0\noffset_rad = 0.0011", "position"),
+        ("at_s = 3.0\namplitude_rad = 0.35\nfrequency_Hz = 0.1\nshift_s = 0.2\noffset_rad = 0.0", "position"),
+        ("at_s = 5.0\namplitude_rad = -0.35\nfrequency_Hz = 0.1\nshift_s = 0.0\noffset_rad = 0.0", "speed"),
+        ("at_s = 10.0\namplitude_rad = 0.3\nfrequency_Hz = 0.2\nshift_s = 0.0\noffset_rad = 0.0", ""),  # never reached
+    ],
+)
+def test_the_reference_does_not_jump_at_a_switch(tmp_path: Path, switch: str, told: str) -> None:
+    change = ("frequency_Hz = 0.1", f"frequency_Hz = 0.1\n[trajectory.switch]\n{switch}")
+    if not told:
+        config_of(tmp_path, change)
+        return
+    with pytest.raises(ConfigurationError, match=rf"trajectory.switch.at_s .* the {told} would jump"):
+        config_of(tmp_path, change)
+
+
+# --- a table that is edited while the question is open -------------------------------------------------------------
+
+
+def with_table(tmp_path: Path) -> tuple[Config, Path]:
+    way = tmp_path / "way.csv"
+    way.write_text("time_s,position_rad\n0,0\n1,0.1\n2,0.2\n3,0.2\n")
+    start, end = VIRTUAL.index("[trajectory]"), VIRTUAL.index("[virtual]")
+    path = tmp_path / "joint.toml"
+    path.write_text(
+        VIRTUAL[:start] + '[trajectory]\nkind = "table"\nduration_s = 3.0\nfile = "way.csv"\n\n' + VIRTUAL[end:]
+    )
+    return load_config(path), way
+
+
+@pytest.mark.parametrize("text", ["time_s,position_rad\n0,0\n1,0.1\n", "time_s,position_rad\n0,0.4\n1,0.1\n", ""])
+def test_a_table_that_was_edited_meanwhile_changes_nothing(tmp_path: Path, text: str) -> None:
+    """The file is read once, when the run is planned: what was shown is what the loop gets."""
+    config, way = with_table(tmp_path)
+    plan, before = resolve(config), resolve(config).motion.placed(report())
+    way.write_text(text)
+    placed = plan.motion.placed(report())
+    plan.motion.require_start(0.1)
+    assert np.array_equal(placed.table, before.table)
+    assert np.array_equal(placed.table, plan.motion.table)
+    assert placed.constants.tobytes() == before.constants.tobytes()
+    assert placed.constants[0].trajectory.table_rows == 4
+    assert placed.lines == before.lines
+
+
+# --- what the user is told -----------------------------------------------------------------------------------------
+
+
+class SilentLoop:
+    """300 cycles without one sample."""
+
+    def __init__(self, samples: int) -> None:
+        histograms = np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64)
+        histograms[Histogram.WORK, 20] = histograms[Histogram.WAKE, 5] = 300
+        histograms[Histogram.ROUND_TRIP, 100] = samples
+        self.block = SimpleNamespace(histograms=histograms)
+        self.cycles = 300
+        self.may_enable = False
+
+    def allow_enable(self) -> None:
+        self.may_enable = True
+
+
+@pytest.mark.parametrize("velocity", [False, True])
+@pytest.mark.parametrize("samples", [0, 300])
+def test_a_drive_that_says_nothing_is_told_by_the_loop_and_not_as_a_delay(
+    tmp_path: Path, samples: int, velocity: bool
+) -> None:
+    config = config_of(tmp_path)
+    log: Any = SimpleNamespace(path=tmp_path / "log.mcap", write_event=lambda *_: None)
+    loop: Any = SilentLoop(samples)
+    nothing: Any = None
+    parts = RunParts(loop, Around(StopSignals(), BusWatch(config, None)), log, nothing, PhaseLines(Output()), {})
+    plan = resolve(config)
+    axis = plan.motion.placed(report()).constants[0]
+    if velocity:
+        axis.command_kind, axis.velocity_command.position_gain_ps = CommandKind.VELOCITY, POSITION_GAIN_ps
+    with RunWatch(plan, axis, parts) as watch:
+        watch.check_delay()
+    assert loop.may_enable is (samples > 0)
+    assert (watch.delay_s is None) is (samples == 0)
+    if samples:
+        assert watch.delay_s == pytest.approx(1e-3)
+
+
+@pytest.mark.parametrize(
+    ("state", "said"),
+    [("switch on disabled", "the drive is disabled"), (UNTOUCHED, "the drive was left as it is"), ("", "no drive")],
+)
+def test_the_end_of_the_scope_tells_how_the_drive_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: Any, virtual_config: Any, state: str, said: str
+) -> None:
+    class Runs:
+        code, drive_state, told, ended_by = 0, state, {}, ""
+
+        def __init__(self, *_: Any, **__: Any) -> None: ...
+        def one(self) -> bool:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(scope_module, "_Runs", Runs)
+    monkeypatch.setattr(scope_module, "scope_order", lambda *_, **__: SimpleNamespace(url=""))
+    monkeypatch.setattr(scope_module, "scope_server", lambda *_, **__: contextlib.nullcontext())
+    scope_module.live_scope(virtual_config, Output())
+    told = capsys.readouterr().err
+    assert said in told
+    assert ("disabled" in told) is (state == "switch on disabled")
+
+
+def test_a_sweep_on_a_drive_that_does_not_tell_its_torque_is_refused() -> None:
+    with pytest.raises(DeviceError, match="object 6077"):
+        require_torque(report(measures_torque=False))
+    require_torque(report())
+
+
+# --- feed-forward beyond what was measured -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("more", "refused"),
+    [
+        ((), True),
+        ((("velocity_max_radps = 1.0 ", "velocity_max_radps = 0.85 "),), False),  # zero at 50 deg/s = 0.873 rad/s
+        ((('feed_forward = "lugre_desired"', 'feed_forward = "none"'),), False),
+    ],
+)
+def test_a_friction_curve_that_pushes_with_the_motion_below_the_velocity_limit_is_refused(
+    tmp_path: Path, more: tuple[tuple[str, str], ...], refused: bool
+) -> None:
+    """LuGre on such a curve has no steady state: the run ended in the middle of the motion as NOT_FINITE."""
+    curve = (
+        ("a0 = 0.17995 ", "a0 = 0.2 "), ("a1 = 0.0012298\n", "a1 = -0.004\n"), ("a2 = -6.5261e-7\n", "a2 = 0.0\n"),
+        ("a3 = -7.6969e-9\n", "a3 = 0.0\n"), ("\nknee = 40.0", "\nknee = 10.0"), ("max = 200.0 ", "max = 20.0 "),
+    )  # fmt: skip
+    if refused:
+        with pytest.raises(ConfigurationError, match=r"friction.positive: .* oppose .* at 50\.\d+ deg/s it does not"):
+            config_of(tmp_path, *curve, *more)
+    else:
+        config_of(tmp_path, *curve, *more)
+
+
+# --- a sweep that is resumed with another configuration ------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "same"),
+    [
+        (("torque_constant_NmpA = 0.1 ", "torque_constant_NmpA = 0.141 "), False),
+        (("torque_constant_NmpA = 0.1 ", "gravity_Nm = 5.0\ntorque_constant_NmpA = 0.1 "), False),
+        (("\ndirection = 1 ", "\ndirection = -1 "), False),
+        (("kp = 784.0 ", "kp = 700.0 "), True),
+    ],
+)
+def test_points_that_were_measured_with_other_constants_are_another_plan(
+    tmp_path: Path, change: tuple[str, str], same: bool
+) -> None:
+    options = SweepOptions(points=4)
+    first = make_plan(config_of(tmp_path), options).hash
+    assert (make_plan(config_of(tmp_path, change), options).hash == first) is same
+
+
+# --- what a drive adds to its target by itself ---------------------------------------------------------------------
+
+
+class Offsets:
+    """Objects of a drive that is off."""
+
+    remarks: tuple[str, ...] = ()
+
+    def __init__(self) -> None:
+        self.values = {0x6041: 0x40, 0x60FF: 5, 0x60B1: 1000, 0x60B2: 30, 0x6071: 9}
+
+    def read(self, index: int, sub: int = 0, *, what: str) -> int:
+        return self.values[index]
+
+    def write(self, index: int, sub: int, value: int, *, what: str) -> None:
+        self.values[index] = value
+
+    write_verified = write_if_present = write
+
+
+def test_no_target_and_no_offset_is_left_from_before(settings_of_virtual_joint: Any) -> None:
+    objects: Any = Offsets()
+    disable(objects, settings_of_virtual_joint, lambda _: None)
+    assert [objects.values[index] for index in (0x6071, 0x60FF, 0x60B1, 0x60B2)] == [0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("velocity_side", ["joint", "motor"])
+def test_the_check_judges_the_curve_that_the_law_computes(velocity_side: str) -> None:
+    """Reading a configuration must not load the compiler, so `checks` has the curve once more, in its own units."""
+    config = load_config(shipped_config("paper"))
+    assert config.friction is not None
+    friction = config.friction.model_copy(update={"velocity_side": velocity_side})
+    ratio = config.joint.reduction_ratio
+    branches = friction_constants(friction, ratio)[0]
+    radps_per_unit = RADPS_PER_UNIT[friction.velocity_unit] / (ratio if velocity_side == "motor" else 1.0)
+    scale = 1.0 / ratio if friction.torque_side == "joint" else 1.0
+    for direction, branch, sign in (
+        (friction.positive, branches.positive, 1.0), (friction.negative, branches.negative, -1.0),
+    ):  # fmt: skip
+        knee, greatest = abs(direction.knee), abs(direction.max)
+        for speed in (0.01 * knee, 0.5 * knee, 0.999 * knee, 1.001 * knee, 0.6 * greatest, greatest, 1.7 * greatest):
+            computed_Nm = branch_torque_Nm(branch, speed * radps_per_unit)
+            assert scale * checks._sliding_Nm(direction, sign, speed) == pytest.approx(computed_Nm, rel=1e-12)

@@ -1,0 +1,179 @@
+"""A program's control of a joint: the lock of its bus, and the stops that reach it."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import FrameType
+
+from jointctl.drivers.bus_lock import STOP_WITHIN_S, BusLock
+from jointctl.drivers.canopen.switch_off import OFF_S, QUICK_STOP_S
+from jointctl.firmware_py.states import StopRequest
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.output import Output
+
+# --- Ctrl-C, SIGTERM, a closed terminal and `jointctl stop` as stop requests; asking again asks for more ---
+
+
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+STOP_COMMAND = "jointctl stop"
+AGAIN_S = 0.05
+_ESCALATION = (StopRequest.RAMP, StopRequest.QUICK_STOP, StopRequest.OFF)
+
+
+class StopSignals:
+    """Counts stop signals; `request` is what they ask for by now.  Nothing takes a stop back.
+
+    While `raising`, a signal also raises KeyboardInterrupt: it does so wherever nothing has to come to its end first.
+    """
+
+    def __init__(self, *, raising: bool = False) -> None:
+        self.count = 0
+        self.name = ""  # of the first signal, or STOP_COMMAND
+        self.raising = raising
+        self.commanded_ns = 0  # CLOCK_MONOTONIC of `jointctl stop`; 0 = it has not come
+        self.on_command: Callable[[StopRequest], None] = lambda _: None  # reaches a loop that runs, at once
+        self._again = False  # the next signal is no new one
+
+    @property
+    def request(self) -> StopRequest:
+        """NONE, then RAMP, QUICK_STOP and OFF with each further signal; `jointctl stop` is a quick stop at least."""
+        asked = _ESCALATION[min(self.count, len(_ESCALATION)) - 1] if self.count else StopRequest.NONE
+        return max(asked, StopRequest.QUICK_STOP) if self.commanded_ns else asked
+
+    @property
+    def by_command(self) -> str:
+        """` by jointctl stop` where that has ended it, for messages."""
+        return f" by {STOP_COMMAND}" if self.commanded_ns else ""
+
+    def on_signal(self, number: int, _: FrameType | None) -> None:
+        """Signal handler."""
+        if self._again:
+            self._again = False
+        else:
+            self.count += 1
+            self.name = self.name or signal.Signals(number).name
+        if self.raising:
+            raise KeyboardInterrupt
+
+    def raise_again(self) -> threading.Timer:
+        """Soon, in the main thread: what was raised there has not got through."""
+        self._again = True
+        timer = threading.Timer(AGAIN_S, _wake_main)
+        timer.daemon = True
+        timer.start()
+        return timer
+
+    def on_stop_command(self) -> None:
+        """`jointctl stop` has come; in another thread than the run."""
+        self.commanded_ns = time.monotonic_ns()
+        self.name = STOP_COMMAND
+        self.on_command(self.request)
+        _wake_main()  # from whatever the run waits for
+
+    def leave_if_asked(self) -> None:
+        """`KeyboardInterrupt` once a stop was asked for: between two steps before the joint may move."""
+        if self.count or self.commanded_ns:
+            raise KeyboardInterrupt
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """A signal raises nothing inside: what is begun there must come to its end."""
+        before, self.raising = self.raising, False
+        try:
+            yield
+        finally:
+            self.raising = before
+
+
+def _wake_main() -> None:
+    main = threading.main_thread().ident
+    if main is not None:
+        with contextlib.suppress(ProcessLookupError):
+            signal.pthread_kill(main, signal.SIGTERM)
+
+
+@contextmanager
+def stop_signals(*, raising: bool = False) -> Iterator[StopSignals]:
+    """Collect stop signals while the block runs instead of ending the program."""
+    signals = StopSignals(raising=raising)
+    before = {number: signal.signal(number, signals.on_signal) for number in STOP_SIGNALS}
+    try:
+        with _nothing_lost(signals):
+            yield signals
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _nothing_lost(signals: StopSignals) -> Iterator[None]:
+    """A KeyboardInterrupt that comes up in a callback of a library, as of the compiler, or in `__del__`, ends there.
+
+    Python would only print it, and go on: it is raised again instead.
+    """
+    show = sys.unraisablehook
+    timers: list[threading.Timer] = []
+
+    def on_lost(lost: sys.UnraisableHookArgs) -> None:
+        if lost.exc_type is KeyboardInterrupt:
+            timers.append(signals.raise_again())
+        else:
+            show(lost)
+
+    sys.unraisablehook = on_lost
+    try:
+        yield
+    finally:
+        sys.unraisablehook, signals.raising = show, False
+        for timer in timers:  # none may come when the signals have their old meaning again
+            timer.cancel()
+            timer.join()
+
+
+# --- A program's control of a joint, from before anything is sent to the drive until the program ends ---
+# It holds the lock of the bus, collects the user's stops, and passes `jointctl stop` on to whatever it is doing.  One
+# for each verb that moves a joint or changes its drive, around all that it does: a stop between two motions counts
+# too.
+
+
+FILES_S = 4.0  # for log and messages, after the drive is off
+
+
+@dataclass(frozen=True)
+class Control:
+    """`signals` raise KeyboardInterrupt except while the joint may have torque; `marker_fd` is for child processes."""
+
+    signals: StopSignals
+    marker_fd: int | None = None
+
+
+def stop_within_s(config: Config) -> float:
+    """How long the program may take to end after `jointctl stop`: quick stop, switching off, read back, files."""
+    sequence = config.sequence
+    return sequence.stop_timeout_s + sequence.off_timeout_s + QUICK_STOP_S + OFF_S + FILES_S
+
+
+@contextmanager
+def in_control(config: Config, output: Output) -> Iterator[Control]:
+    """`BusError` names the program that has the bus."""
+    with control_of(config.bus.interface, config.bus.channel, output, stop_within_s(config)) as control:
+        yield control
+
+
+@contextmanager
+def control_of(interface: str, channel: str, output: Output, within_s: float = STOP_WITHIN_S) -> Iterator[Control]:
+    """Of a bus; `within_s`: how long the program may take to end after `jointctl stop`."""
+    with (
+        stop_signals(raising=True) as signals,
+        BusLock(interface, channel, signals.on_stop_command, within_s) as lock,
+    ):
+        for remark in lock.remarks:
+            output.warning(remark)
+        yield Control(signals, lock.marker_fd)

@@ -1,0 +1,151 @@
+"""The process that runs the loop and nothing else: `python -m jointctl.tools.session.loop_process JSON`.
+
+The loop is the compiled one where the bus is a file descriptor, else the plain Python one of `portable_loop`.
+
+Signals that a terminal sends are blocked here: stopping is the supervisor's word, and if the supervisor dies the
+loop sees its silence and stops the joint.  If this process dies, its heartbeat on the bus ends and the drive stops
+the joint.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import gc
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any
+
+from jointctl.drivers.errors import JointctlError
+from jointctl.firmware_py.realtime import Word
+from jointctl.tools.session.loop_handle import LoopOrder, SharedBlock
+from jointctl.tools.session.loops import ReadyLoop, compiled_loop, portable_loop, serial_loop
+from jointctl.tools.wake_up import cores_awake
+
+SLOW_START_S = 4.0
+_MLOCK_CURRENT_AND_FUTURE = 3
+_POLL_S = 0.001
+
+
+@contextmanager
+def slow_start(tell: Callable[[str], object], who: str, after_s: float = SLOW_START_S) -> Iterator[Callable[[], None]]:
+    """Tells after `after_s` that `who` compiles, unless what this gives has been called, or the block has ended."""
+    timer = threading.Timer(
+        after_s, tell, [f"{who}: compiling, which only the first start does; it takes a minute or two"]
+    )
+    timer.daemon = True
+    timer.start()
+    try:
+        yield timer.cancel
+    finally:
+        timer.cancel()
+
+
+def _block_signals() -> None:
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP})
+
+
+def become_realtime(cpu: int | None, priority: int | None, threads: Sequence[int] = (0,)) -> list[str]:
+    """Affinity, SCHED_FIFO and locked memory as far as the system allows; returns what it refused.
+
+    For the calling thread, or for those with the given numbers.  To be called when everything is compiled: a compiler
+    at this priority takes a core from everybody, other loops too, until the kernel throttles all real-time threads.
+    """
+    refused = []
+    if cpu is not None:
+        try:
+            os.sched_setaffinity(0, {cpu})
+        except (OSError, AttributeError) as error:
+            refused.append(f"loop.cpu (={cpu}): {error}")
+    if priority is not None:
+        try:
+            for thread in threads:
+                with contextlib.suppress(ProcessLookupError):  # a thread that has ended meanwhile
+                    os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
+        except (OSError, AttributeError) as error:
+            refused.append(f"loop.priority (={priority}): {error}; see `jointctl doctor`")
+    if ctypes.CDLL(None).mlockall(_MLOCK_CURRENT_AND_FUTURE) != 0:
+        refused.append("memory could not be locked: a page fault may delay a cycle")
+    return refused
+
+
+def run(order: LoopOrder) -> int:
+    """Warm up, wait for GO, run the loop; returns the exit code."""
+    from jointctl.drivers.can.open import CYCLIC_INTERFACES
+    from jointctl.drivers.elmo.settings import SERIAL
+
+    block = SharedBlock(order.block_fd, order.table_rows, order.interface)
+    if order.interface == SERIAL:
+        loop: Callable[[LoopOrder, Any], AbstractContextManager[ReadyLoop]] = serial_loop
+    else:
+        loop = compiled_loop if order.interface in CYCLIC_INTERFACES else portable_loop
+
+    def tell(text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
+
+    with slow_start(tell, "loop") as started, loop(order, block) as ready:
+        started()
+        gc.freeze()
+        gc.disable()
+        for line in become_realtime(order.cpu, order.priority):
+            print(f"loop: {line}", file=sys.stderr, flush=True)
+        with cores_awake():  # where that is refused, `doctor` says so
+            block.words[Word.READY] = 1
+            while block.words[Word.GO] == 0:
+                if os.getppid() != order.supervisor_pid:
+                    return 1
+                if block.words[Word.LISTEN] == 0:  # commissioning, its proof of the watchdog, the user's thinking time
+                    ready.flush()
+                time.sleep(_POLL_S)
+            ready.go()
+            block.words[Word.ENDED] = 1
+    if order.tail_path is not None and os.getppid() != order.supervisor_pid:
+        save_tail(block, Path(order.tail_path))
+    return 0
+
+
+def save_tail(block: Any, path: Path) -> None:
+    """Write what the ring holds: the joint is off by now, and nobody else is left to keep the last seconds."""
+    from jointctl.tools.recording.run_log import ERROR, RunLogWriter
+
+    records, lost = block.new_records(0, int(block.words[Word.HEAD]))
+    with RunLogWriter(path, {"tail": {"why": "the supervising process had gone", "records_before": str(lost)}}) as log:
+        log.write_records(records)
+        log.write_event(ERROR, "loop", "the supervising process had gone; these are the last records of the loop")
+
+
+def _place(error: BaseException) -> str:
+    """File and line where it was raised."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    return "" if trace is None else f" at {Path(trace.tb_frame.f_code.co_filename).name}:{trace.tb_lineno}"
+
+
+def main() -> int:
+    """Entry point of the process.
+
+    Whatever goes wrong is one line and an exit code: the end of this process ends the heartbeat, and with it the
+    joint's torque, so there is nothing to wait for.
+    """
+    _block_signals()
+    try:
+        return run(LoopOrder(**json.loads(sys.argv[1])))
+    except JointctlError as error:
+        print(f"loop: {error}", file=sys.stderr, flush=True)
+        return error.exit_code
+    except BaseException as error:
+        text = " ".join(str(error).split())
+        print(f"loop: {type(error).__name__}{_place(error)}: {text}", file=sys.stderr, flush=True)
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

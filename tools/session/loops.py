@@ -1,0 +1,190 @@
+"""The loops, ready to go: compiled on a CAN bus or a serial line, in plain Python over python-can.
+
+`python -m jointctl.tools.session.loops` loads the compiled one, or compiles it: so the time of a start is measured.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jointctl.firmware_py.libc import NANOSECONDS
+from jointctl.tools.session.loop_handle import LoopOrder, SharedBlock
+
+PROBE_TIMEOUT_S = 600.0
+FOREVER = 1 << 62
+
+
+def _nothing() -> None:
+    """For a loop that does not listen before it goes."""
+
+
+@dataclass(frozen=True)
+class ReadyLoop:
+    """A loop that is warm: `go` runs it to its end, `flush` throws away what the bus has said so far."""
+
+    go: Callable[[], object]
+    flush: Callable[[], None] = _nothing
+
+
+def loop_call(exchange: Any, block: Any, period_ns: int, receive_ns: int) -> Callable[[int], int]:
+    """`run_loop` on this memory with this module's exchange, as a function of the greatest number of cycles.
+
+    0 only compiles, or loads from the cache.
+    """
+    from jointctl.firmware_py.realtime import run_loop
+
+    frames, scratch = exchange.exchange_memory()
+    timespec = np.zeros(2, np.int64)
+
+    def call(max_cycles: int) -> int:
+        return int(
+            run_loop(
+                exchange.receive, exchange.send, block.port, frames, scratch, block.constants, block.state, block.table,
+                block.sample, block.command, block.words, block.ring, block.histograms, timespec, period_ns,
+                receive_ns, max_cycles,
+            )
+        )  # fmt: skip
+
+    return call
+
+
+def compiled_call(block: Any, period_ns: int, receive_ns: int) -> Callable[[int], int]:
+    """`loop_call` on a CAN bus that is a descriptor."""
+    from jointctl.drivers.canopen import exchange
+
+    return loop_call(exchange, block, period_ns, receive_ns)
+
+
+@contextmanager
+def compiled_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
+    """The compiled loop, warm and attached to the bus."""
+    from jointctl.drivers.can.frames import FRAME_BYTES
+    from jointctl.drivers.can.open import open_cyclic_end
+
+    call = compiled_call(block, order.period_ns, order.receive_ns)
+    call(0)  # compiles, or loads from the cache
+    with open_cyclic_end(order.interface, order.channel) as end:
+
+        def go() -> None:
+            block.port[0].fd = end.fileno()
+            block.port[0].stamped = order.interface == "jointctl"
+            call(FOREVER)
+
+        def flush() -> None:
+            with contextlib.suppress(OSError):  # nothing waits, or the bus is down: the loop will tell
+                while end.recv(FRAME_BYTES, socket.MSG_DONTWAIT):
+                    pass
+
+        yield ReadyLoop(go, flush)
+
+
+def _leave(bus: Any) -> None:
+    """Close it; of an adapter that is gone, what failed before counts."""
+    with contextlib.suppress(Exception):
+        bus.shutdown()
+
+
+@contextmanager
+def portable_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
+    """The plain Python loop in the same way, and a line that tells what it can hold.
+
+    An adapter that serves one program at a time belongs to commissioning until the loop is let go, which opens it then
+    (see `CanopenDrive.start_cyclic`).
+    """
+    from jointctl.drivers.can.open import SHARED_INTERFACES, known_interface, open_python_can
+    from jointctl.tools.session.portable_loop import (
+        check_portable_rate,
+        held_rate_Hz,
+        portable_note,
+        run_portable_loop,
+        throw_away,
+        warm_up,
+    )
+
+    rate_Hz = NANOSECONDS / order.period_ns
+    known_interface(order.interface)
+    check_portable_rate(order.interface, rate_Hz)
+    warm_up()
+    held_Hz = held_rate_Hz(order.receive_ns / order.period_ns)
+    print(f"loop: {portable_note(order.interface, rate_Hz, held_Hz)}", file=sys.stderr, flush=True)
+
+    with contextlib.ExitStack() as stack:
+
+        def opened() -> Any:
+            bus = open_python_can(order.interface, order.channel, order.bitrate_bitps)
+            stack.callback(_leave, bus)
+            return bus
+
+        if order.interface in SHARED_INTERFACES:
+            bus = opened()
+            yield ReadyLoop(
+                lambda: run_portable_loop(bus, block, order.period_ns, order.receive_ns), lambda: throw_away(bus)
+            )
+        else:
+            yield ReadyLoop(lambda: run_portable_loop(opened(), block, order.period_ns, order.receive_ns))
+
+
+# The loop on a serial line is compiled, and not plain Python as for CAN adapters without a descriptor: a serial port
+# is a descriptor that the C library reads and writes.  Wake-up late p50 / p99 / max at 150 Hz on a noisy 2-core
+# virtual machine, SCHED_FIFO: this loop 27 / 56 / 178 us, a bare Python sleep 43 / 84 / 221 us, and 123 / 155 / 3168
+# us without SCHED_FIFO.
+@contextmanager
+def serial_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
+    """The compiled loop on a serial line, warm.
+
+    The port is opened when the loop is let go: by then the supervisor has locked and configured it.  However the
+    loop ends, the drive is told to switch off: it would keep its last torque command for ever.
+    """
+    from jointctl.drivers.elmo import exchange
+    from jointctl.drivers.elmo.serial_port import open_descriptor
+    from jointctl.drivers.elmo.switch_off import SWITCH_OFF
+
+    call = loop_call(exchange, block, order.period_ns, order.receive_ns)
+    call(0)  # compiles, or loads from the cache
+
+    def go() -> None:
+        fd = open_descriptor(order.channel)
+        try:
+            block.port[0].fd = fd
+            call(FOREVER)
+        finally:
+            with contextlib.suppress(OSError):
+                os.write(fd, SWITCH_OFF)
+            os.close(fd)
+
+    yield ReadyLoop(go)
+
+
+def warm_up_compiled_loop() -> None:
+    """Do what the loop process does before it is ready; no bus is opened, nothing is sent."""
+    block = SharedBlock.create(1)
+    compiled_call(block, 1_000_000, 0)(0)
+    os.close(block.fd)
+
+
+def start_time_s(cache: Path | None = None) -> float:
+    """Seconds from starting a process until the loop is ready in it; `cache` another cache folder than the present.
+
+    Raises subprocess.SubprocessError if the process fails.
+    """
+    environment = dict(os.environ, **({"JOINTCTL_CACHE_DIR": str(cache)} if cache else {}))
+    command = [sys.executable, "-P", "-m", "jointctl.tools.session.loops"]
+    started_s = time.monotonic()
+    subprocess.run(command, env=environment, check=True, timeout=PROBE_TIMEOUT_S, capture_output=True)
+    return time.monotonic() - started_s
+
+
+if __name__ == "__main__":
+    warm_up_compiled_loop()

@@ -1,0 +1,138 @@
+"""What a run leaves behind: how the drive is, figures, log, picture, and what is said at its end."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jointctl.drivers.drive import UNTOUCHED, CommissioningReport, is_safe
+from jointctl.drivers.errors import INTERRUPTED, DataError, DeviceError, MotionFault
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.output import Output
+from jointctl.tools.recording.run_figure import save_run_figure
+from jointctl.tools.recording.run_summary import RunSummary, summary_table
+from jointctl.tools.session.fault_words import FaultText
+
+# --- How a run leaves the drive: whoever tells the user that it is disabled asks here first ---
+
+
+ADVICE = "use the emergency stop"
+
+
+def _off(state: str) -> bool:
+    """Also a drive that this program has not taken over ("": not even opened)."""
+    return state in ("", UNTOUCHED) or is_safe(state)
+
+
+def warn_unless_off(state: str, output: Output) -> None:
+    """One line where the power stage may be on."""
+    if not _off(state):
+        with contextlib.suppress(OSError):  # the terminal may have been closed
+            output.warning(f"the drive did not confirm that it is off: {state}; {ADVICE}")
+
+
+def require_off(state: str) -> None:
+    """`DeviceError` with the true state where the power stage may be on."""
+    if not _off(state):
+        raise DeviceError(f"the drive did not confirm that it is off (={state})", ADVICE)
+
+
+def words(state: str, *, interrupted: bool = False) -> str:
+    """For a run that was not begun: how the drive is; `DeviceError` as above.
+
+    `interrupted`: by the user, which is why the drive was not taken over, if it was not.
+    """
+    require_off(state)
+    if state == UNTOUCHED and interrupted:
+        return "the drive was left as it is"
+    if state == UNTOUCHED:
+        return "the drive was left alone: another controller has it"
+    return "the drive is disabled" if state else "no drive was used"
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run left behind."""
+
+    summary: RunSummary
+    records: Any
+    histograms: np.ndarray[Any, Any]
+    fault: Fault
+    fault_text: FaultText | None
+    stopped_by: str  # name of the signal, or ""
+    drive_state: str  # in words, read after the run
+    bus_load: float  # measured share: CAN with worst-case stuffing, a serial line in its busier direction
+    serial: bool
+    lost_records: int
+    log_path: Path
+    report: CommissioningReport
+
+
+# --- What a run says at its end: a fault in words, then the picture beside the log, and the table on stdout ---
+
+
+def run_title(config: Config) -> str:
+    """What a run is called on its displays and its picture."""
+    return f"{config.path.stem}: {config.trajectory.kind}"
+
+
+def report_run(result: RunResult, output: Output, config: Config) -> int:
+    """Print and save everything, and a picture unless log.picture forbids it; returns the exit code.
+
+    That is 0, the one of `MotionFault`, or 130 after an interruption.  The cause of a fault comes before all
+    else: on a busy computer the picture takes seconds.  `DeviceError` where the drive did not confirm that it is off;
+    both outweigh the `DataError` of a result that cannot be written.
+    """
+    if result.fault_text is not None:
+        text = result.fault_text
+        output.error(f"{result.fault.name} ({int(result.fault)}): {text.happened}", text.advice)
+    drawn = result.log_path.with_suffix(".png") if config.log.picture else None
+    if drawn is not None:
+        try:
+            save_run_figure(result.records, drawn, run_title(config))
+        except DataError as error:
+            output.warning(error.message)
+            drawn = None
+    table = summary_table(result.summary)
+    if result.serial:
+        table.add_row("line load", f"{result.bus_load:.1%} of the characters from the drive")
+    else:
+        table.add_row("bus load", f"{result.bus_load:.1%} at worst-case stuffing")
+    table.add_row("drive afterwards", result.drive_state)
+    table.add_row("log", str(result.log_path))
+    if drawn is not None:
+        table.add_row("picture", str(drawn))
+    try:
+        output.result(table, _data(result, drawn))
+    except DataError as error:
+        if result.fault_text is None:
+            require_off(result.drive_state)
+            raise
+        output.warning(error.message)
+    if result.lost_records:
+        output.warning(f"{result.lost_records} log records were lost: the supervisor was too slow")
+    if result.fault_text is not None:
+        return MotionFault.exit_code
+    require_off(result.drive_state)
+    if result.stopped_by:
+        output.note(f"stopped by {result.stopped_by}; the joint is {result.drive_state}")
+        return INTERRUPTED
+    return 0
+
+
+def _data(result: RunResult, picture: Path | None) -> dict[str, Any]:
+    return {
+        **result.summary.to_dict(),
+        "bus_load": result.bus_load,
+        "fault": None if result.fault is Fault.NONE else result.fault.name,
+        "stopped_by": result.stopped_by or None,
+        "drive_state": result.drive_state,
+        "lost_records": result.lost_records,
+        "log": str(result.log_path),
+        "picture": None if picture is None else str(picture),
+    }

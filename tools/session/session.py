@@ -1,0 +1,255 @@
+"""One run from the configuration to the summary: commission, let the loop go, watch it, log it, make the drive safe.
+
+The session supervises: it never touches the torque.  It writes a sign of life and a stop word; everything that must
+happen in time happens in the loop process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from jointctl.drivers.drive import Approval, CommissioningReport, Declined, Drive
+from jointctl.drivers.errors import BusError, DataError, DeviceError, JointctlError, MotionFault, NoDeviceError
+from jointctl.firmware_py.states import Fault, StopRequest
+from jointctl.tools.output import Output
+from jointctl.tools.recording.kept_records import KeptRecords
+from jointctl.tools.recording.run_log import ERROR, INFO, THINNING, WARNING, RunLogWriter
+from jointctl.tools.recording.run_metadata import run_metadata
+from jointctl.tools.recording.run_summary import summarise
+from jointctl.tools.session.bus_watch import TemperatureWatch, bus_watch, recording
+from jointctl.tools.session.consent import Consent, prepare_log, require_ready
+from jointctl.tools.session.control import Control, StopSignals
+from jointctl.tools.session.display import Display, PhaseLines
+from jointctl.tools.session.fault_words import held_up_text
+from jointctl.tools.session.guard import GuardHandle, kept_awake, start_guard
+from jointctl.tools.session.loop_handle import LoopHandle
+from jointctl.tools.session.open_drive import check_cyclic_rate, commission, drive_fault_text, open_drive
+from jointctl.tools.session.plan import Placed, RunPlan
+from jointctl.tools.session.result import RunResult as RunResult
+from jointctl.tools.session.result import warn_unless_off
+from jointctl.tools.session.run_watch import Around, RunParts, RunWatch
+
+POLL_S = 0.02
+Answer = TypeVar("Answer")
+
+
+def came_before(fault: Fault, records: Any, time_ns: int) -> bool:
+    """Whether the loop had latched its fault by then."""
+    faulty = records[records.fault != Fault.NONE]
+    return fault is not Fault.NONE and len(faulty) > 0 and int(faulty[0].time_ns) <= time_ns
+
+
+class Session:
+    """Carries out one plan: run, sweep, motion check and live page differ in plan, consent and display only.
+
+    `consent` has the last word before anything moves.  `display` makes what shows the run, once the joint is known;
+    by default a line for each phase.
+    """
+
+    def __init__(
+        self,
+        plan: RunPlan,
+        consent: Consent,
+        output: Output,
+        control: Control,
+        display: Callable[[CommissioningReport], Display] | None = None,
+    ) -> None:
+        self.plan, self._config = plan, plan.config
+        self._consent, self._output, self._control = consent, output, control
+        self.signals = control.signals
+        self._make_display = display or (lambda _: PhaseLines(output))
+        self.drive_state = ""  # in words, after the run
+
+    def run(self) -> RunResult | None:
+        """The whole run; None if it was declined.  Afterwards the drive is off, or `drive_state` says otherwise."""
+        config, signals = self._config, self.signals
+        check_cyclic_rate(config)
+        tail_path = self.plan.log_path.with_suffix(".tail.mcap")
+        with (
+            signals.held(),
+            LoopHandle(config, self.plan.motion.table, tail_path, self._control.marker_fd) as loop,
+            recording(config) as recorder,
+            bus_watch(config) as bus_news,
+            kept_awake(config, self._output),
+        ):
+            drive = open_drive(config, signals.leave_if_asked)
+            guard: GuardHandle | None = None
+            try:
+                guard = start_guard(config, loop)
+                try:
+                    report = commission(config, drive, self._may_brake())
+                except Declined:
+                    return None
+                signals.leave_if_asked()
+                placed = self._ask(lambda: self._allowed(report))
+                if placed is None:
+                    return None
+                loop.wait_ready(signals.leave_if_asked, self._output.note)
+                signals.leave_if_asked()
+                if guard is not None:
+                    guard.wait_ready()
+                return self._supervise(drive, loop, report, placed, Around(signals, bus_news, recorder, guard))
+            except (BusError, DeviceError, NoDeviceError):
+                if signals.commanded_ns:  # the frames of that stop look like another controller's
+                    raise KeyboardInterrupt from None
+                raise
+            except OSError as error:
+                raise DataError(f"{self.plan.log_path}: cannot be written: {error.strerror or error}") from None
+            finally:
+                self.drive_state = drive.make_safe(asked=bool(signals.commanded_ns))
+                drive.close()
+                if guard is not None:
+                    guard.release(self.drive_state)
+                warn_unless_off(self.drive_state, self._output)
+
+    def _ask(self, question: Callable[[], Answer]) -> Answer:
+        """The answer of the user, whom a stop may interrupt."""
+        self.signals.raising = True
+        try:
+            return question()
+        finally:
+            self.signals.raising = False
+
+    def _may_brake(self) -> Approval | None:
+        brake = self._consent.brake
+        return None if brake is None else lambda text: self._ask(lambda: brake(text))
+
+    def _allowed(self, report: CommissioningReport) -> Placed | None:
+        """The motion from where the joint stands, shown, possible and agreed to; None if it is not to be."""
+        plan, start_rad = self.plan, report.start_position_rad
+        placed = plan.motion.placed(report)
+        self._consent.show(placed.lines)
+        if self._consent.dry_run:
+            return None
+        require_ready(self._config, report, plan.log_path)
+        plan.motion.require_start(start_rad)
+        if not self._consent.agreed(placed.lines):
+            return None
+        prepare_log(self._config, plan.log_path, self._output)
+        return placed
+
+    def _supervise(
+        self, drive: Drive, loop: LoopHandle, report: CommissioningReport, placed: Placed, around: Around
+    ) -> RunResult:
+        plan = self.plan
+        metadata = run_metadata(self._config, report)
+        if plan.log_every > 1:
+            metadata[THINNING] = {"every": str(plan.log_every), "whole_s": f"{plan.log_full_rate_s:g}"}
+        loop.block.table[:] = placed.table
+        placed.constants[0].sequence.may_enable = 0
+        with (
+            RunLogWriter(plan.log_path, metadata) as log,
+            KeptRecords(plan.log_path.parent) as kept,
+            self._make_display(report) as display,
+            RunWatch(plan, placed.constants[0], RunParts(loop, around, log, kept, display, metadata)) as watch,
+        ):
+            return self._carry_out(drive, loop, placed.constants, report, watch)
+
+    def _carry_out(
+        self, drive: Drive, loop: LoopHandle, constants: Any, report: CommissioningReport, watch: RunWatch
+    ) -> RunResult:
+        signals = watch.around.signals
+        loop.listen()
+        signals.on_command = loop.request_stop
+        if signals.commanded_ns:  # just before: the loop is told all the same, and never enables
+            loop.request_stop(signals.request)
+        drive.start_cyclic()
+        watch.temperature = TemperatureWatch(drive.thermometer(), watch.log)
+        watch.settings_guard = drive.settings_guard()
+        started_ns = time.monotonic_ns()
+        loop.go(constants, drive.port())
+        try:
+            while loop.running():
+                watch.poll()
+                time.sleep(POLL_S)
+        except MotionFault as error:
+            state = drive.make_safe()
+            watch.take_records(last=True)
+            watch.tell_bus_news()
+            watch.log.write_event(ERROR, "supervisor", str(error))
+            raise MotionFault(error.message, f"{error.hint}; drive state now: {state}") from None
+        except (DeviceError, BusError) as error:  # another program has the drive, or has changed what stops it
+            self._brake(loop, signals, StopRequest.QUICK_STOP)
+            watch.take_records(last=True)
+            # `jointctl stop` sends such frames as well
+            if not signals.commanded_ns and not self._explained_by_restart(error, loop):
+                watch.log.write_event(ERROR, "supervisor", str(error))
+                raise MotionFault(error.message, error.hint) from None
+        except BaseException:
+            self._brake(loop, signals)
+            raise
+        elapsed_s = (time.monotonic_ns() - started_ns) * 1e-9
+        watch.take_records(last=True)
+        self._raise_what_others_did(watch, loop)
+        state = drive.make_safe(asked=bool(signals.commanded_ns))
+        watch.take_records(last=True)
+        watch.tell_bus_news()  # it often explains the fault that has ended the run
+        watch.log.write_event(INFO, "drive", f"after the run: {state}")
+        recorder = watch.around.recorder
+        if recorder is not None and recorder.dropped:
+            watch.log.write_event(WARNING, "log", f"{recorder.dropped} CAN frames were not recorded: too slow")
+        return self._result(watch, report, state, elapsed_s)
+
+    @staticmethod
+    def _explained_by_restart(error: JointctlError, loop: LoopHandle) -> bool:
+        """Objects of a drive that has restarted are as they were at power-on: no other program has changed them."""
+        return isinstance(error, DeviceError) and loop.verdict()[0] is Fault.DRIVE_RESTARTED
+
+    def _raise_what_others_did(self, watch: RunWatch, loop: LoopHandle) -> None:
+        """Another controller's frames since the last look end the run too, and explain a fault: `MotionFault`."""
+        if watch.settings_guard is None or watch.around.signals.commanded_ns:
+            return
+        try:
+            watch.settings_guard.poll(may_ask=False)  # an answer would come into the way of switching off
+        except (DeviceError, BusError) as error:
+            if self._explained_by_restart(error, loop):
+                return
+            watch.log.write_event(ERROR, "supervisor", str(error))
+            raise MotionFault(error.message, error.hint) from None
+
+    def _brake(self, loop: LoopHandle, signals: StopSignals, how: StopRequest = StopRequest.RAMP) -> None:
+        """The supervisor cannot go on (disk full, say), but the joint moves: brake it under control, unlogged.
+
+        The user may still ask for more than a ramp.
+        """
+        sequence = self._config.sequence
+        loop.request_stop(how)
+        give_up_s = time.monotonic() + sequence.stop_timeout_s + sequence.release_s + sequence.off_timeout_s
+        with contextlib.suppress(MotionFault):
+            while loop.running() and time.monotonic() < give_up_s:
+                loop.request_stop(signals.request)
+                loop.beat()
+                time.sleep(POLL_S)
+
+    def _result(self, watch: RunWatch, report: CommissioningReport, drive_state: str, elapsed_s: float) -> RunResult:
+        loop = watch.loop
+        if not len(watch.kept):
+            raise JointctlError("the loop ended without one cycle")
+        records = watch.kept.records()
+        state = loop.block.state[0]
+        fault, value = loop.verdict()
+        if watch.around.signals.commanded_ns and not came_before(fault, records, watch.around.signals.commanded_ns):
+            fault = Fault.NONE  # `jointctl stop` has switched the drive off under the loop
+        text = None
+        if fault is not Fault.NONE:
+            errors = int(state.fault_drive_error), int(state.fault_encoder_error)
+            text = drive_fault_text(self._config, fault, value, *errors)
+            text = held_up_text(fault, value, text, records, self._config.loop.rate_Hz)
+            text = watch.around.bus_watch.explained(fault, text, int(loop.block.port[0].last_errno))
+        return RunResult(
+            summary=summarise(records, loop.block.histograms, temperatures_degC=watch.temperature.values_degC),
+            records=records,
+            histograms=loop.block.histograms.copy(),
+            fault=fault,
+            fault_text=text,
+            stopped_by=watch.stopped_by or ("jointctl stop" if loop.stop_requested else ""),
+            drive_state=drive_state,
+            bus_load=float(loop.block.port[0].bits_sent) / (self._config.bus.bitrate_bitps * elapsed_s),
+            serial=self._config.is_serial,
+            lost_records=loop.lost_records,
+            log_path=self.plan.log_path,
+            report=report,
+        )
