@@ -1,15 +1,10 @@
-"""From a configuration to what the driver and the virtual drive need to know, and the arithmetic of the bus."""
+"""From a configuration to what the CANopen driver needs to know, and the arithmetic of the bus."""
 
 from __future__ import annotations
-
-import math
-from typing import Any
 
 from jointctl.drivers.can.frames import bus_load, highest_rate_Hz
 from jointctl.drivers.canopen.settings import CanopenSettings, JointEncoderSettings, TemperatureObject
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.hil.canopen.device import DeviceSettings
-from jointctl.hil.canopen.encoder_node import EncoderSettings
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import torque_constant_NmpA
 from jointctl.tools.configuration.object_place import index_and_sub
@@ -20,8 +15,6 @@ SECOND_POSITION_BYTES = 4
 _FRAMES = ("TPDO", "RPDO", "second encoder")
 TORQUE_MODES = ("cst", "tq", "auto")  # of `CanopenSettings.mode`; the others may end in a velocity mode
 HIGHEST_LOAD = 0.8  # of the bus by the cyclic frames; the rest is for heartbeats, SDO and EMCY
-DEFAULT_RATED_CURRENT_A = 5.0
-DEFAULT_RATED_TORQUE_NM = 0.5
 
 
 def canopen_settings(config: Config) -> CanopenSettings:
@@ -88,34 +81,6 @@ def joint_encoder_settings(config: Config) -> JointEncoderSettings | None:
         index=index,
         sub=sub,
     )
-
-
-def device_settings(config: Config) -> DeviceSettings:
-    """The virtual drive that the configuration describes."""
-    drive = config.canopen
-    return DeviceSettings(
-        node_id=drive.node,
-        rated_current_mA=round((drive.rated_current_A or DEFAULT_RATED_CURRENT_A) * 1000.0),
-        rated_torque_mNm=round((drive.rated_torque_Nm or DEFAULT_RATED_TORQUE_NM) * 1000.0),
-        reduction_ratio=config.joint.reduction_ratio,
-        motor_torque_constant_NmpA=torque_constant_NmpA(config),
-        torque_direction=drive.torque_direction,
-        vendor_id=drive.vendor_id or 0,
-        product_code=drive.product_code or 1,
-        **_second_encoder(config),
-    )
-
-
-def _second_encoder(config: Config) -> dict[str, Any]:
-    """The virtual joint's second encoder: true to the configuration, but for [virtual]."""
-    encoder = config.joint_encoder
-    if encoder is None:
-        return {}
-    counts, zero = encoder.counts_per_turn, encoder.zero_counts
-    path = config.encoder_eds_path
-    if encoder.source == "drive" or path is None or encoder.node is None:
-        return {"second_counts_prad": encoder.direction * counts / math.tau, "second_offset_counts": float(zero)}
-    return {"encoder": EncoderSettings(path, encoder.node, counts, encoder.direction, zero)}
 
 
 def cycle_bytes(config: Config) -> tuple[int, ...]:

@@ -1,11 +1,10 @@
-"""From a configuration to what the serial driver and the virtual serial drive need to know."""
+"""From a configuration to what the serial driver needs to know."""
 
 from __future__ import annotations
 
 from jointctl.drivers.elmo.line_budget import highest_rate_Hz
 from jointctl.drivers.elmo.settings import ElmoSettings
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.hil.elmo.interpreter import ElmoDeviceSettings
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import torque_constant_NmpA
 from jointctl.tools.configuration.elmo import KIND, ElmoSerial
@@ -68,16 +67,6 @@ def elmo_settings(config: Config, torque_constant_NmpA: float) -> ElmoSettings:
         mode=drive.unit_mode,
         product=drive.product,
         counts_parameter=drive.counts_parameter,
-    )
-
-
-def elmo_device_settings(config: Config) -> ElmoDeviceSettings:
-    """The virtual drive that the configuration describes."""
-    drive = elmo_section(config)
-    return ElmoDeviceSettings(
-        maximum_current_A=max(20.0, drive.peak_current_A),
-        counts_per_turn=config.encoder.counts_per_turn,
-        current_sign=drive.torque_direction * config.encoder.direction,
     )
 
 

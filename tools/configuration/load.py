@@ -24,7 +24,6 @@ from jointctl.tools.configuration.bus_options import whole_channel
 from jointctl.tools.configuration.checks import problems_between_sections
 from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config
 from jointctl.tools.configuration.elmo import with_serial_bus
-from jointctl.tools.configuration.plant_settings import plant_problems
 from jointctl.tools.configuration.problems import ConfigurationProblems, problem_line, problem_lines, raise_if
 from jointctl.tools.configuration.sections import Bus, Drive
 
@@ -62,7 +61,7 @@ def load_config(path: str | Path) -> Config:
         raise ConfigurationError(f"{path}: not valid TOML: {error}") from None
     config = _validated(data, str(path))
     config._path, config._text = path, text
-    raise_if([f"{path}: {line}" for line in problems_between_sections(config) + plant_problems(config)])
+    raise_if([f"{path}: {line}" for line in problems_between_sections(config) + _plant_problems(config)])
     eds_path = config.eds_path if isinstance(config.drive, Drive) else None
     for key, file in (
         ("drive.eds", eds_path),
@@ -78,6 +77,15 @@ def load_config(path: str | Path) -> Config:
         except OSError as error:
             raise_if([f"{path}: {key} (={file.name}): cannot be read: {error.strerror or error}"])
     return config
+
+
+def _plant_problems(config: Config) -> list[str]:
+    """What the virtual joint refuses about [virtual]; a configuration without one loads nothing of it."""
+    if config.virtual is None:
+        return []
+    from jointctl.tools.configuration.plant_settings import plant_problems
+
+    return plant_problems(config)
 
 
 def with_bus_overrides(

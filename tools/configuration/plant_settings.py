@@ -1,17 +1,25 @@
-"""From a configuration to the virtual joint: its plant and its faults."""
+"""From a configuration to the virtual joint: its drive, its plant and its faults."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.schema import new
+from jointctl.hil.canopen.device import DeviceSettings
+from jointctl.hil.canopen.encoder_node import EncoderSettings
+from jointctl.hil.elmo.interpreter import ElmoDeviceSettings
 from jointctl.hil.faults.kinds import FaultConstants, FaultKind, no_faults
 from jointctl.hil.plant.records import EncoderSide, FrictionKind
 from jointctl.hil.plant.settings import PlantSettings
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import friction_constants, torque_constant_NmpA
+from jointctl.tools.configuration.elmo_settings import elmo_section
 from jointctl.tools.configuration.plant import OWN_KEYS, Virtual
+
+DEFAULT_RATED_CURRENT_A = 5.0
+DEFAULT_RATED_TORQUE_NM = 0.5
 
 
 def fault_constants(config: Config) -> Any:
@@ -65,3 +73,41 @@ def plant_settings(config: Config) -> dict[str, Any]:
     if table is not None:
         friction = friction_constants(table, config.joint.reduction_ratio)[0]
     return plant_keywords(config, torque_constant_NmpA(config), friction)
+
+
+def device_settings(config: Config) -> DeviceSettings:
+    """The virtual drive that the configuration describes."""
+    drive = config.canopen
+    return DeviceSettings(
+        node_id=drive.node,
+        rated_current_mA=round((drive.rated_current_A or DEFAULT_RATED_CURRENT_A) * 1000.0),
+        rated_torque_mNm=round((drive.rated_torque_Nm or DEFAULT_RATED_TORQUE_NM) * 1000.0),
+        reduction_ratio=config.joint.reduction_ratio,
+        motor_torque_constant_NmpA=torque_constant_NmpA(config),
+        torque_direction=drive.torque_direction,
+        vendor_id=drive.vendor_id or 0,
+        product_code=drive.product_code or 1,
+        **_second_encoder(config),
+    )
+
+
+def _second_encoder(config: Config) -> dict[str, Any]:
+    """The virtual joint's second encoder: true to the configuration, but for [virtual]."""
+    encoder = config.joint_encoder
+    if encoder is None:
+        return {}
+    counts, zero = encoder.counts_per_turn, encoder.zero_counts
+    path = config.encoder_eds_path
+    if encoder.source == "drive" or path is None or encoder.node is None:
+        return {"second_counts_prad": encoder.direction * counts / math.tau, "second_offset_counts": float(zero)}
+    return {"encoder": EncoderSettings(path, encoder.node, counts, encoder.direction, zero)}
+
+
+def elmo_device_settings(config: Config) -> ElmoDeviceSettings:
+    """The virtual drive that the configuration describes."""
+    drive = elmo_section(config)
+    return ElmoDeviceSettings(
+        maximum_current_A=max(20.0, drive.peak_current_A),
+        counts_per_turn=config.encoder.counts_per_turn,
+        current_sign=drive.torque_direction * config.encoder.direction,
+    )

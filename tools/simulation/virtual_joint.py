@@ -18,8 +18,7 @@ from jointctl.hil.canopen.device import Cia402Device
 from jointctl.hil.plant.joint import plant
 from jointctl.hil.realtime_device import RealtimeDevice
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.drive_settings import device_settings
-from jointctl.tools.configuration.plant_settings import fault_constants, plant_settings
+from jointctl.tools.configuration.plant_settings import device_settings, fault_constants, plant_settings
 from jointctl.tools.simulation.device_pump import PumpedDevice
 from jointctl.tools.simulation.starting import Starting
 

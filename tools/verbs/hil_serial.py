@@ -14,8 +14,8 @@ from jointctl.hil.elmo.device import ElmoDevice
 from jointctl.hil.elmo.interpreter import ElmoInterpreter
 from jointctl.hil.plant.joint import plant
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.elmo_settings import elmo_device_settings, elmo_section
-from jointctl.tools.configuration.plant_settings import plant_settings
+from jointctl.tools.configuration.elmo_settings import elmo_section
+from jointctl.tools.configuration.plant_settings import elmo_device_settings, plant_settings
 from jointctl.tools.output import Output
 from jointctl.tools.session.control import stop_signals
 from jointctl.tools.verbs.hil import make_realtime, wait_for_end

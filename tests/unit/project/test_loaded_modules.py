@@ -1,0 +1,56 @@
+"""What a run on hardware loads: nothing of the virtual joint."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from jointctl.hil.faults.kinds import LOCKSTEP_ONLY, FaultKind
+from jointctl.hil.faults.kinds import MAX_FAULTS as MAX_FAULTS_OF_THE_JOINT
+from jointctl.tools.configuration.plant import FAULT_KINDS, MAX_FAULTS
+from tests.places import CONFIGS
+
+SUPERVISOR = """
+import json, sys
+from pathlib import Path
+from jointctl.tools.cli import main, start
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.session.open_drive import check_cyclic_rate
+from jointctl.tools.session.plan import resolve
+from jointctl.tools.verbs.run import run
+config = load_config(Path(sys.argv[1]))
+resolve(config)
+check_cyclic_rate(config)
+print(json.dumps(sorted(sys.modules)))
+"""
+LOOP = """
+import json, sys
+from jointctl.tools.session import loop_process, loops
+from jointctl.tools.session.loop_handle import SharedBlock
+from jointctl.drivers.canopen import exchange
+loops.compiled_call(SharedBlock.create(1), 1_000_000, 0)
+print(json.dumps(sorted(sys.modules)))
+"""
+
+
+@pytest.mark.parametrize("program", [SUPERVISOR, LOOP], ids=["supervisor", "loop"])
+def test_a_run_on_hardware_loads_nothing_of_the_virtual_joint(tmp_path: Path, program: str) -> None:
+    text = (CONFIGS / "virtual.toml").read_text().replace('"jointctl"', '"socketcan"', 1)
+    head, _, rest = text.partition("[virtual]")
+    path = tmp_path / "joint.toml"
+    path.write_text(head + rest[rest.index("[log]") :])
+    command = [sys.executable, "-P", "-c", program, str(path)]
+    found = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    assert "jointctl.drivers.canopen.cyclic" in found
+    assert [name for name in found if name.startswith("jointctl.hil")] == []
+
+
+def test_the_section_knows_the_faults_of_the_joint() -> None:
+    """By their names only: the configuration of a run on hardware does not load them."""
+    mine = tuple(kind.name.lower() for kind in FaultKind if kind not in (FaultKind.NONE, *LOCKSTEP_ONLY))
+    assert mine == FAULT_KINDS
+    assert MAX_FAULTS == MAX_FAULTS_OF_THE_JOINT
