@@ -178,7 +178,7 @@ def params_diff(
 ) -> None:
     """Compare two files, or a file and a drive.  Exit code 11 if they differ."""
     from jointctl.tools.inspection.objects import Objects
-    from jointctl.tools.inspection.parameter_file import is_parameter_file, load_parameters
+    from jointctl.tools.inspection.parameters import is_parameter_file, load_parameters
     from jointctl.tools.verbs.params import diff, parameters_of_drive
 
     output = Output(json=json, quiet=quiet)

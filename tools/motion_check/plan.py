@@ -9,12 +9,14 @@ the velocity limit or the following error of the check, which are as narrow as t
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.drive import CommissioningReport
+from jointctl.drivers.drive import Approval, CommissioningReport
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import TrajectoryKind
 from jointctl.firmware_py.trajectory import spline_table
@@ -22,6 +24,10 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import joint_rad_per_count, static_friction_Nm, velocity_of_a_count_radps
 from jointctl.tools.configuration.elmo import ElmoSerial
 from jointctl.tools.configuration.records import APPROACH_MIN_S, axis_constants
+from jointctl.tools.output import Output
+from jointctl.tools.running.control import Control
+from jointctl.tools.running.loop.loop_handle import LoopHandle
+from jointctl.tools.running.supervisor import Supervisor
 
 TRAVEL_rad, TRAVEL_MAX_rad = 0.04, 0.3  # of the reference, to each side
 TRAVEL_COUNTS = 60.0  # so coarse an encoder takes more travel
@@ -152,3 +158,28 @@ def check_constants(config: Config, plan: CheckPlan, report: CommissioningReport
     axis.limits.frozen_max_rad = STANDING_WAY * plan.travel_rad
     axis.limits.frozen_torque_Nm = min(plan.gravity_Nm + PUSH_SHARE * plan.spring_Nm, MOST_PUSH * plan.torque_Nm)
     return constants
+
+
+class CheckSupervisor(Supervisor):
+    """A supervised run of the check, with a motion and limits of its own; `config` is the user's."""
+
+    def __init__(
+        self,
+        config: Config,
+        output: Output,
+        log_path: Path,
+        confirm: Callable[[CommissioningReport], bool],
+        plan: CheckPlan,
+        control: Control,
+        approve: Approval | None,
+    ) -> None:
+        super().__init__(config_of_check(config, plan), output, log_path, confirm, control, approve=approve)
+        self._plan = plan
+
+    def _table(self) -> np.ndarray:
+        return motion_table(self._plan, 0.0)
+
+    def _constants(self, loop: LoopHandle, report: CommissioningReport) -> Any:
+        table = motion_table(self._plan, report.start_position_rad)
+        loop.block.table[:] = table
+        return check_constants(self._config, self._plan, report, table)

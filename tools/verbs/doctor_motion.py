@@ -6,11 +6,9 @@ from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import DECLINED, INTERRUPTED
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.inspection.drive_scale import judged
-from jointctl.tools.inspection.findings import Finding
-from jointctl.tools.motion_check.carry_out import CheckSupervisor
-from jointctl.tools.motion_check.plan import CheckPlan, make_plan, require_room
-from jointctl.tools.motion_check.verdict import ended_finding, motion_findings
+from jointctl.tools.inspection.health import Finding
+from jointctl.tools.motion_check.plan import CheckPlan, CheckSupervisor, make_plan, require_room
+from jointctl.tools.motion_check.verdict import ended_finding, judged, motion_findings
 from jointctl.tools.output import Output
 from jointctl.tools.recording.log_folder import log_path
 from jointctl.tools.running.control import Control, in_control

@@ -15,21 +15,23 @@ from jointctl.drivers.canopen.identifiers import NmtCommand
 from jointctl.drivers.canopen.network import send_nmt
 from jointctl.drivers.errors import DECLINED, ConfigurationError, DataError, DeviceError
 from jointctl.tools.inspection.objects import Objects, Place
-from jointctl.tools.inspection.parameter_file import load_parameters, toml_text, write_dcf
-from jointctl.tools.inspection.parameter_restore import Written, restore
 from jointctl.tools.inspection.parameters import (
     Difference,
     ParameterSet,
     Value,
+    Written,
     differences,
     identity_of,
     is_parameter,
+    load_parameters,
     read_parameters,
+    restore,
     shown,
+    toml_text,
     variables,
+    write_dcf,
 )
-from jointctl.tools.inspection.sdo_reading import Refusal, SdoReader
-from jointctl.tools.inspection.subject import Subject, canopen_network
+from jointctl.tools.inspection.subject import Refusal, SdoReader, Subject, canopen_network
 from jointctl.tools.output import Output
 from jointctl.tools.running.control import control_of
 from jointctl.tools.running.permission.consent import agreed, require_terminal

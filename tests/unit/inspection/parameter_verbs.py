@@ -9,8 +9,7 @@ from typing import Any
 
 from jointctl.tools.configuration.load import shipped_config
 from jointctl.tools.inspection.parameters import ParameterSet, read_parameters
-from jointctl.tools.inspection.sdo_reading import SdoReader
-from jointctl.tools.inspection.subject import Subject, canopen_network
+from jointctl.tools.inspection.subject import SdoReader, Subject, canopen_network
 from jointctl.tools.output import Output
 
 EDS = shipped_config("virtual").with_name("virtual_joint.eds")

@@ -11,8 +11,17 @@ import pytest
 from jointctl.drivers.errors import ConfigurationError, DataError
 from jointctl.tools.configuration.load import shipped_config
 from jointctl.tools.inspection.objects import Objects, Place, read_dictionary
-from jointctl.tools.inspection.parameter_file import is_parameter_file, load_parameters, toml_text, write_dcf
-from jointctl.tools.inspection.parameters import COMMANDS, ParameterSet, differences, is_parameter, variables
+from jointctl.tools.inspection.parameters import (
+    COMMANDS,
+    ParameterSet,
+    differences,
+    is_parameter,
+    is_parameter_file,
+    load_parameters,
+    toml_text,
+    variables,
+    write_dcf,
+)
 from jointctl.tools.inspection.subject import Subject
 from jointctl.tools.verbs.params import DIFFERENT, diff, dump
 from tests.unit.inspection.parameter_verbs import EDS, change, output, read, subject
