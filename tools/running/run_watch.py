@@ -15,9 +15,8 @@ from jointctl.firmware_py.realtime import Histogram, Word
 from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest, in_words
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.recording.can_log import frame_array
 from jointctl.tools.recording.kept_records import KeptRecords
-from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter
+from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter, frame_array
 from jointctl.tools.running.changes.viewer_orders import ViewerOrders
 from jointctl.tools.running.display.display import Display, Snapshot
 from jointctl.tools.running.events.event_finder import EventFinder, phase_name

@@ -21,8 +21,7 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import axis_constants, trajectory_table
 from jointctl.tools.output import Output
 from jointctl.tools.recording.kept_records import KeptRecords
-from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, RunLogWriter
-from jointctl.tools.recording.run_metadata import run_metadata
+from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, RunLogWriter, run_metadata
 from jointctl.tools.recording.run_summary import summarise
 from jointctl.tools.running.control import Control
 from jointctl.tools.running.display.display import Display
