@@ -36,8 +36,7 @@ from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.records import axis_constants
 from jointctl.tools.running.loop.portable_loop import run_portable_loop, warm_up
 from jointctl.tools.running.loop.shared_block import SharedBlock
-from jointctl.tools.simulation.device_pump import PumpedDevice
-from jointctl.tools.simulation.virtual_joint import new_device, serve_virtual_joint
+from jointctl.tools.simulation.virtual_joint import PumpedDevice, new_device, serve_virtual_joint
 
 RATE_HZ = 100.0
 PERIOD_NS = round(1e9 / RATE_HZ)

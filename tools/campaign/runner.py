@@ -12,8 +12,8 @@ from jointctl.tools.campaign.judge import Verdict, judge
 from jointctl.tools.campaign.scenario import draw_scenario
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
+from jointctl.tools.simulation.child_process import interrupts_left_to_the_parent
 from jointctl.tools.simulation.lockstep import LockstepJoint
-from jointctl.tools.simulation.workers import interrupts_left_to_the_parent
 from jointctl.tools.sweeping.carry_out import with_mode
 
 AT_ONCE = 16  # scenarios that a worker takes at a time

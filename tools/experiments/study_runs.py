@@ -23,8 +23,8 @@ from jointctl.tools.experiments.controllers import Controller, controller_consta
 from jointctl.tools.experiments.ensemble import EnsembleSettings, random_plant
 from jointctl.tools.experiments.error_figures import ErrorFigures, error_figures
 from jointctl.tools.experiments.scenarios import Scenario, run_scenario
+from jointctl.tools.simulation.child_process import interrupts_left_to_the_parent
 from jointctl.tools.simulation.lockstep import LockstepJoint
-from jointctl.tools.simulation.workers import interrupts_left_to_the_parent
 from jointctl.tools.written_file import writing
 
 Progress = Callable[[float], None]

@@ -16,7 +16,7 @@ from jointctl.tools.experiments.error_figures import ErrorFigures
 from jointctl.tools.experiments.study_figure import study_figure
 from jointctl.tools.experiments.study_runs import PlantResult, StudyResult
 from jointctl.tools.output import Output
-from jointctl.tools.reporting.figure import svg_figure
+from jointctl.tools.reporting.page import svg_figure
 from tests.page_figures import foreign_colours, svgs
 
 

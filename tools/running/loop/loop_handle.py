@@ -19,7 +19,7 @@ from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.running.loop.loop_process import LoopOrder
 from jointctl.tools.running.loop.shared_block import SharedBlock
-from jointctl.tools.simulation.starting import Starting
+from jointctl.tools.simulation.child_process import Starting
 
 KILL_S = 1.0  # how long a killed process may take to go
 SILENT_S = 2.0  # without a cycle for so long, the loop hangs
