@@ -81,9 +81,7 @@ def _displays(
     if scope is None:
         yield terminal
         return
-    from jointctl.tools.scoping.displays import Displays
-    from jointctl.tools.scoping.feed import scope_server
-    from jointctl.tools.scoping.order import scope_order
+    from jointctl.tools.scoping.feed import Displays, scope_order, scope_server
 
     order = scope_order(title, *scope, cia402=not config.is_serial)
     output.address(f"scope: {order.url}")

@@ -21,9 +21,7 @@ from jointctl.tools.running.permission.readiness import prepare_log, require_rea
 from jointctl.tools.running.result.drive_end import words
 from jointctl.tools.running.result.run_report import report_run, run_title
 from jointctl.tools.running.supervisor import Supervisor
-from jointctl.tools.scoping.displays import Displays
-from jointctl.tools.scoping.feed import ScopeFeed, scope_server
-from jointctl.tools.scoping.order import scope_order
+from jointctl.tools.scoping.feed import Displays, ScopeFeed, scope_order, scope_server
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.config import Config

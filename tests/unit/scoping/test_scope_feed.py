@@ -26,8 +26,7 @@ from jointctl.tools.running.display.phase_lines import PhaseLines
 from jointctl.tools.running.display.viewer_request import ViewerRequest
 from jointctl.tools.scoping import feed as feed_module
 from jointctl.tools.scoping import server as server_module
-from jointctl.tools.scoping.displays import Displays
-from jointctl.tools.scoping.feed import EVENT, PIECE, RECORDS, SETTINGS, ScopeFeed
+from jointctl.tools.scoping.feed import EVENT, PIECE, RECORDS, SETTINGS, Displays, ScopeFeed
 from jointctl.tools.scoping.history import History
 from tests.unit.scoping.scope_records import records
 
