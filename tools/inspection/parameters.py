@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import logging
+import re
 import tomllib
 import warnings
 from collections.abc import Callable, Iterator
@@ -11,15 +13,16 @@ from pathlib import Path
 from typing import Any
 
 import canopen
-import tomlkit
-from canopen.objectdictionary import ODVariable
+from canopen.objectdictionary import ODVariable, datatypes
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
+from jointctl.drivers.canopen.eds_text import Sections, number_of, parse_sections, read_text
 from jointctl.drivers.canopen.pdo_layout import DISABLED
 from jointctl.drivers.canopen.sdo_download import download
 from jointctl.drivers.errors import DataError
+from jointctl.drivers.printable import printable
 from jointctl.firmware_py.input_file import parse_toml, read_input
-from jointctl.tools.inspection.objects import Objects, Place, read_dictionary
+from jointctl.tools.inspection.objects import INTEGERS, TEXTS, Objects, Place, read_dictionary
 from jointctl.tools.inspection.subject import ATTEMPTS, Refusal, SdoReader, abort_text
 
 Value = int | float | str | bytes
@@ -123,15 +126,14 @@ def shown(objects: Objects, place: Place, value: Value | None) -> str:
     return objects.value_text(place.index, place.sub, value, bits)
 
 
-# --- Parameter files: TOML of our own for people and version control, and DCF (CiA 306) for other tools ---
-# TOML: `format`, [device], [parameters], [readings], [unreadable]; keys are "6072" or "1018:1" in hexadecimal, values
-# numbers, texts, or {hex = "..."} for bytes.  Of a DCF, ParameterValue counts; of an EDS, or where it is missing, the
-# default.
+# --- files: DCF (CiA 306), and the TOML dumps of older versions, which are only read ---
 
-
+# TOML: `format`, [device], [parameters], [readings]; keys are "6072" or "1018:1" in hexadecimal, values numbers, texts,
+# or {hex = "..."} for bytes.  Of a DCF, ParameterValue counts; of an EDS, or where it is missing, the default.
 FORMAT = "jointctl parameters 1"
 _DICTIONARIES = (".dcf", ".eds")
-_HEX_FROM = 0x2000  # below, values are identifiers and mappings, which people read in hexadecimal
+_NUMBERS = INTEGERS | {datatypes.BOOLEAN}  # in a file
+_REMARK = re.compile(r"\s;")  # what follows in a line is none of its value
 
 
 def is_parameter_file(path: Path) -> bool:
@@ -193,58 +195,65 @@ def load_parameters(path: Path, node: int = 1) -> ParameterSet:
 def _load_dictionary(path: Path, node: int) -> ParameterSet:
     found = ParameterSet(path.name)
     dictionary = read_dictionary(path, node)
+    sections, _ = parse_sections(read_text(path)[0])
     for variable in variables(dictionary):
-        value = variable.value if variable.value is not None else variable.default
+        value = _from_dcf(variable, sections)
         if variable.readable and value is not None:
             found.put(variable, value)
     for sub, key in enumerate(("vendor_id", "product_code"), start=1):
         found.device[key] = found.readings.get(Place(0x1018, sub))
+    commissioning = sections.get("devicecomissioning") or sections.get("devicecommissioning") or {}
+    found.device["node"] = number_of(commissioning.get("nodeid", ""), node)
     return found
 
 
-def toml_text(found: ParameterSet, objects: Objects) -> str:
-    """The file, with the names of the objects as comments."""
-    document = tomlkit.document()
-    document.add("format", tomlkit.item(FORMAT))
-    device = tomlkit.table()
-    for key, value in found.device.items():
-        if value is not None:
-            device.add(key, value)
-    document.add("device", device)
-    for name, group in (("parameters", found.parameters), ("readings", found.readings)):
-        table = tomlkit.table()
-        for place, value in group.items():
-            item: Any = tomlkit.inline_table() if isinstance(value, bytes) else None
-            if isinstance(value, bytes):
-                item["hex"] = value.hex()
-            elif isinstance(value, int) and place.index < _HEX_FROM and value > 9:
-                item = tomlkit.items.Integer(value, tomlkit.items.Trivia(), f"{value:#x}")
-            else:
-                item = tomlkit.item(value)
-            words = shown(objects, place, value)
-            item.comment(objects.name(place.index, place.sub) + (f": {words}" if " " in words else ""))
-            table.add(str(place), item)
-        document.add(name, table)
-    refused = tomlkit.table()
-    for place, why in found.unreadable.items():
-        refused.add(str(place), why)
-    document.add("unreadable", refused)
-    return tomlkit.dumps(document)
+def _from_dcf(variable: ODVariable, sections: Sections) -> Value | None:
+    """As `Objects.value` gives it; None where the file has none that makes sense."""
+    if variable.data_type in _NUMBERS:
+        number = variable.value if variable.value is not None else variable.default
+        return bytes([number]) if number is not None and variable.data_type == datatypes.BOOLEAN else number
+    name = f"{variable.index:04x}"
+    keys = sections.get(f"{name}sub{variable.subindex:x}", sections.get(name, {}))
+    text = keys.get("parametervalue", keys.get("defaultvalue"))
+    if text is None or variable.data_type in TEXTS:
+        return text
+    try:
+        return float(text) if variable.data_type in datatypes.FLOAT_TYPES else bytes.fromhex(text)
+    except ValueError:
+        return None
 
 
-def write_dcf(found: ParameterSet, dictionary: canopen.ObjectDictionary, path: Path) -> None:
-    """The EDS with the values as ParameterValue, by the `canopen` library."""
+def _dcf_value(variable: ODVariable, value: Value) -> str | None:
+    """What stands in the file; None for a text that a DCF cannot hold: it has neither quotes nor escapes."""
+    if isinstance(value, bytes):
+        return str(value[0]) if variable.data_type == datatypes.BOOLEAN and value else value.hex()
+    if not isinstance(value, str):
+        return str(value)
+    return value if printable(value) == value.strip() and not _REMARK.search(value) else None
+
+
+def dcf_text(found: ParameterSet, dictionary: canopen.ObjectDictionary) -> str:
+    """The EDS with the values as ParameterValue, by the `canopen` library.
+
+    What the drive did not report has neither value nor default, so that restoring does not write it; a text that a DCF
+    cannot hold is moved to `found.unreadable`.
+    """
     for variable in variables(dictionary):
-        value = (found.parameters | found.readings).get(Place(variable.index, variable.subindex))
-        if value is None:
-            continue
-        # the library writes negative numbers in a way that it cannot read
-        raw: Any = variable
-        raw.value_raw = value.hex() if isinstance(value, bytes) else str(value)
+        raw: Any = variable  # the library writes negative numbers, and bytes, in a way that it cannot read
+        raw.default_raw = None if variable.default is None else str(variable.default)
+        place = Place(variable.index, variable.subindex)
+        group = found.parameters if place in found.parameters else found.readings
+        raw.value_raw = _dcf_value(variable, group[place]) if place in group else None
+        if raw.value_raw is None and variable.readable:
+            variable.default = raw.default_raw = None
+            if group.pop(place, None) is not None:
+                found.unreadable[place] = "a text that a DCF cannot hold"
     logging.getLogger("canopen").setLevel(logging.ERROR)
+    text = io.StringIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of the library, about utcnow
-        canopen.export_od(dictionary, str(path), "dcf")
+        canopen.export_od(dictionary, text, "dcf")
+    return text.getvalue()
 
 
 # --- writing back ---
