@@ -1,6 +1,6 @@
 """One style for every matplotlib picture: a PNG on white as a file, or SVG whose colours follow the page it stands on.
 
-Draw on a `canvas` with the colours of `COLOURS` (and the default text and axes); `tools.reporting.figure` replaces each
+Draw on a `canvas` with the colours of `COLOURS` (and the default text and axes); `tools.reporting.page` replaces each
 of them by a variable of the page.  matplotlib is slow to import, and only wanted here.  No display is needed.
 """
 

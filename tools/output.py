@@ -97,7 +97,7 @@ class Output:
 
     def line(self, text: str) -> bool:
         """One line of a result that comes bit by bit; False if nobody reads it any more."""
-        # the escapes are those of JSON and TOML, so that both stay what they are
+        # the escapes are those of JSON, so that it stays what it is
         return self._write(lambda: print(printable(text, keep="\n"), file=self.stdout, flush=True))
 
     def _write(self, write: Callable[[], None]) -> bool:

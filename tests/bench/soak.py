@@ -26,8 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 from jointctl.tools.configuration.load import shipped_config  # noqa: E402
-from jointctl.tools.recording.log_facts import missing_records  # noqa: E402
-from jointctl.tools.recording.run_log_reader import read_run_log  # noqa: E402
+from jointctl.tools.recording.run_log_reader import missing_records, read_run_log  # noqa: E402
 from jointctl.tools.simulation.virtual_joint import separate_virtual_joint  # noqa: E402
 
 SETTLED_S = 60.0  # memory of the first minute is start-up

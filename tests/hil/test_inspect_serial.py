@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from jointctl.drivers.port_users import port_users
-from jointctl.tools.inspection.findings import NOTE, OK, PROBLEM
+from jointctl.tools.inspection.health import NOTE, OK, PROBLEM
 from jointctl.tools.inspection.serial_health import latency_finding, port_finding
 
 

@@ -21,7 +21,7 @@ from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, DriveState, Fault
 from jointctl.tools.output import Output
-from jointctl.tools.recording.log_facts import missing_records
+from jointctl.tools.recording.run_log_reader import missing_records
 from jointctl.tools.session.display import PhaseLines, Snapshot
 from jointctl.tools.session.live_panel import LivePanel, panel, run_display, time_left
 

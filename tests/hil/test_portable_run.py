@@ -35,8 +35,7 @@ from jointctl.tools.configuration.drive_settings import canopen_settings
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.session.loop_handle import SharedBlock
 from jointctl.tools.session.portable_loop import run_portable_loop, warm_up
-from jointctl.tools.simulation.device_pump import PumpedDevice
-from jointctl.tools.simulation.virtual_joint import new_device, serve_virtual_joint
+from jointctl.tools.simulation.virtual_joint import PumpedDevice, new_device, serve_virtual_joint
 from tests.sessions import constants_of
 
 RATE_HZ = 100.0

@@ -31,10 +31,10 @@ def test_whoever_comes_while_the_joint_moves_is_refused(bench: Any) -> None:
 def test_whoever_comes_while_the_first_is_asked_is_refused(bench: Any) -> None:
     config = bench.config(drive__heartbeat_s=0.5)
     bench.joint(config)
-    assert bench.run("params", "dump", config, "-o", "kept.toml").code == 0
+    assert bench.run("params", "dump", config, "-o", "kept.dcf").code == 0
     first = Terminal(bench, "run", config).saw("[y/N]")
     with can.Bus(interface="jointctl", channel=bench.channel) as ear:
-        for arguments in (*((*verb, config) for verb in OTHERS), ("params", "restore", "kept.toml", config, "-y")):
+        for arguments in (*((*verb, config) for verb in OTHERS), ("params", "restore", "kept.dcf", config, "-y")):
             assert first.started.process.poll() is None, f"the first ended before {arguments}: {first.finished()}"
             bench.run(*arguments).refused(4, "another program controls", f"pid {first.started.process.pid}")
         requests = [message for message in iter(lambda: ear.recv(0.0), None) if message.arbitration_id == SDO_REQUEST]

@@ -19,7 +19,7 @@ import canopen
 import numpy as np
 import pytest
 
-from jointctl.tools.recording.can_log import candump_lines
+from jointctl.tools.recording.log_export import candump_lines
 
 FRAME = np.dtype(
     [

@@ -24,8 +24,8 @@ from jointctl.tools.campaign.judge import Verdict, judge
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.drawing import INK, MID_BLUE, MID_GREEN, MID_RED, canvas
+from jointctl.tools.simulation.child_process import interrupts_left_to_the_parent
 from jointctl.tools.simulation.lockstep import LockstepJoint
-from jointctl.tools.simulation.workers import interrupts_left_to_the_parent
 from jointctl.tools.sweeping.carry_out import with_mode
 
 # --- the runs ---

@@ -125,9 +125,7 @@ params_app = typer.Typer(help="All objects of a drive to a file and back.", no_a
 def params_dump(
     *,
     config: MaybeConfig = None,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="file to write (.toml, .dcf); default: TOML on stdout")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="DCF to write (.dcf); default: stdout")] = None,
     bus: CanOptions,
     eds: Eds = None,
     json: Json = False,
@@ -144,7 +142,7 @@ def params_dump(
 @grouped
 def params_restore(
     *,
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="a dump, or a DCF")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="a DCF, or a TOML dump of an older version")],
     config: MaybeConfig = None,
     bus: CanOptions,
     eds: Eds = None,
@@ -169,7 +167,9 @@ def params_restore(
 @grouped
 def params_diff(
     *,
-    first: Annotated[Path, typer.Argument(metavar="FIRST", help="dump, DCF, EDS; or configuration: its drive now")],
+    first: Annotated[
+        Path, typer.Argument(metavar="FIRST", help="DCF, EDS, older dump; or configuration: its drive now")
+    ],
     second: Annotated[Path, typer.Argument(metavar="SECOND", help="the same")],
     bus: CanOptions,
     readings: Annotated[bool, typer.Option("--readings", help="what is no parameter as well")] = False,
@@ -178,7 +178,7 @@ def params_diff(
 ) -> None:
     """Compare two files, or a file and a drive.  Exit code 11 if they differ."""
     from jointctl.tools.inspection.objects import Objects
-    from jointctl.tools.inspection.parameter_file import is_parameter_file, load_parameters
+    from jointctl.tools.inspection.parameters import is_parameter_file, load_parameters
     from jointctl.tools.verbs.params import diff, parameters_of_drive
 
     output = Output(json=json, quiet=quiet)

@@ -42,8 +42,8 @@ from jointctl.tools.configuration.sections import Section, between
 from jointctl.tools.drawing import BLUE, GREY, INK, canvas
 from jointctl.tools.experiments.controllers import DEFAULT, Controller, changed, controller_constants, named, one_line
 from jointctl.tools.experiments.scenarios import RPDO_AT_ONCE, ErrorFigures, Scenario, error_figures, run_scenario
+from jointctl.tools.simulation.child_process import interrupts_left_to_the_parent
 from jointctl.tools.simulation.lockstep import LockstepJoint
-from jointctl.tools.simulation.workers import interrupts_left_to_the_parent
 from jointctl.tools.written_file import writing
 
 # --- random realistic joints ---

@@ -8,10 +8,19 @@ from __future__ import annotations
 from typing import Any
 
 from jointctl.drivers.canopen.cia402 import state_text
-from jointctl.tools.inspection import drive_words
-from jointctl.tools.inspection.objects import Place
-from jointctl.tools.inspection.pdo_maps import PdoMap, PdoMaps
-from jointctl.tools.inspection.sdo_reading import SdoReader
+from jointctl.tools.inspection.frame_decoder import PdoMap, PdoMaps
+from jointctl.tools.inspection.objects import (
+    ABORT_OPTIONS,
+    QUICK_STOP_OPTIONS,
+    Place,
+    device_type_text,
+    error_register_text,
+    no_error_or,
+    status_bits,
+    supported_modes,
+    transmission_text,
+)
+from jointctl.tools.inspection.subject import SdoReader
 from jointctl.tools.session.fault_words import emergency_text
 
 HISTORY = 8  # entries of 1003 that are shown
@@ -41,7 +50,7 @@ def identity(reader: SdoReader) -> dict[str, Any]:
     vendor, product, revision, serial = (reader.value(0x1018, sub) for sub in (1, 2, 3, 4))
     return {
         "node": reader.node,
-        "device_type": drive_words.device_type_text(device_type),
+        "device_type": device_type_text(device_type),
         "name": reader.value(0x1008),
         "hardware": reader.value(0x1009),
         "software": reader.value(0x100A),
@@ -58,10 +67,10 @@ def state(reader: SdoReader) -> dict[str, Any]:
     return {
         "status_word": None if word is None else f"{word:04X}h",
         "drive_state": None if word is None else state_text(word),
-        "status_bits": [] if word is None else drive_words.status_bits(word),
+        "status_bits": [] if word is None else status_bits(word),
         "mode_selected": reader.text(0x6060),
         "mode_shown": reader.text(0x6061),
-        "supported_modes": None if modes is None else drive_words.supported_modes(modes),
+        "supported_modes": None if modes is None else supported_modes(modes),
     }
 
 
@@ -72,11 +81,11 @@ def errors(reader: SdoReader) -> dict[str, Any]:
     for sub in range(1, min(count or 0, HISTORY) + 1):
         entry = reader.value(0x1003, sub)
         if entry is not None:
-            text = drive_words.no_error_or(entry & 0xFFFF, emergency_text)
+            text = no_error_or(entry & 0xFFFF, emergency_text)
             history.append(text + (f" (maker's part {entry >> 16:04X}h)" if entry >> 16 else ""))
     return {
-        "error_register": None if register is None else drive_words.error_register_text(register),
-        "error_code": None if code is None else drive_words.no_error_or(code, emergency_text),
+        "error_register": None if register is None else error_register_text(register),
+        "error_code": None if code is None else no_error_or(code, emergency_text),
         "history_length": count,
         "history": history,
     }
@@ -119,8 +128,8 @@ def supervision(reader: SdoReader) -> dict[str, Any]:
     return {
         "heartbeat_ms": reader.value(0x1017),
         "watched_heartbeats": consumers,
-        "on_connection_loss": None if abort is None else f"{abort} {drive_words.ABORT_OPTIONS.get(abort, 'its own')}",
-        "on_quick_stop": None if quick is None else f"{quick} {drive_words.QUICK_STOP_OPTIONS.get(quick, 'its own')}",
+        "on_connection_loss": None if abort is None else f"{abort} {ABORT_OPTIONS.get(abort, 'its own')}",
+        "on_quick_stop": None if quick is None else f"{quick} {QUICK_STOP_OPTIONS.get(quick, 'its own')}",
         "on_communication_error": None
         if behaviour is None
         else {0: "0 pre-operational if operational", 1: "1 no change", 2: "2 stopped"}.get(behaviour, str(behaviour)),
@@ -156,7 +165,7 @@ def pdo_rows(reader: SdoReader, pdos: list[PdoMap]) -> list[dict[str, Any]]:
             "pdo": pdo.name,
             "cob_id": None if pdo.cob_id is None else f"{pdo.cob_id:03X}h",
             "enabled": pdo.enabled,
-            "transmission": None if pdo.transmission is None else drive_words.transmission_text(pdo.transmission),
+            "transmission": None if pdo.transmission is None else transmission_text(pdo.transmission),
             "objects": [
                 f"{Place(index, sub)} {reader.objects.name(index, sub)} ({bits} bit)"
                 for index, sub, bits in pdo.entries

@@ -28,9 +28,8 @@ from jointctl.drivers.canopen.identifiers import (
     SDO_REQUEST_ID,
     SYNC_ID,
 )
-from jointctl.tools.inspection import drive_words
-from jointctl.tools.inspection.objects import Objects
-from jointctl.tools.inspection.sdo_reading import SdoReader
+from jointctl.tools.inspection.objects import Objects, device_type_text, nmt_state
+from jointctl.tools.inspection.subject import SdoReader
 
 LISTEN_S = 1.2  # a little more than the usual heartbeat period of one second
 PACE_S = 0.002  # between two questions; 127 of them take a quarter of a second
@@ -108,7 +107,7 @@ def ask_everybody(
 def describe(network: canopen.Network, node: int, answers: bool, nmt: int | None) -> dict[str, Any]:
     """One row of the result."""
     row: dict[str, Any] = {
-        "node": node, "answers_sdo": answers, "nmt_state": drive_words.nmt_state(nmt), "device_type": None,
+        "node": node, "answers_sdo": answers, "nmt_state": nmt_state(nmt), "device_type": None,
         "vendor_id": None, "product_code": None, "revision": None, "serial_number": None, "name": None,
         "drive_state": None,
     }  # fmt: skip
@@ -117,7 +116,7 @@ def describe(network: canopen.Network, node: int, answers: bool, nmt: int | None
     reader = SdoReader(network, node, Objects())
     device_type = reader.value(0x1000)
     if device_type is not None:
-        row["device_type"] = drive_words.device_type_text(device_type)
+        row["device_type"] = device_type_text(device_type)
     for sub, key in ((1, "vendor_id"), (2, "product_code"), (3, "revision")):
         value = reader.value(0x1018, sub)
         row[key] = None if value is None else f"{value:#010x}"

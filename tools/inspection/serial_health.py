@@ -1,4 +1,4 @@
-"""What a serial line allows: port, rights, adapter latency, the rate by baud rate and as measured; the drive."""
+"""What a serial line and its drive allow: port, rights, adapter latency, rate by baud rate and as measured, limits."""
 
 from __future__ import annotations
 
@@ -6,17 +6,38 @@ import getpass
 import os
 import stat
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+from jointctl.drivers.drive import DriveIdentity
 from jointctl.drivers.elmo.codes import AMPLIFIER_MASK, FAULT_LATCHED, motor_off_cause, status_text
 from jointctl.drivers.elmo.drive import ElmoDrive
 from jointctl.drivers.elmo.line_budget import cycle_characters, highest_rate_Hz
 from jointctl.drivers.errors import BusError, JointctlError
 from jointctl.drivers.port_users import users_text
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.elmo_settings import elmo_section
-from jointctl.tools.inspection.findings import NOTE, OK, PROBLEM, Finding, file_text
-from jointctl.tools.inspection.serial_subject import inspected_drive
+from jointctl.tools.configuration.conversions import torque_constant_NmpA
+from jointctl.tools.configuration.elmo_settings import elmo_section, elmo_settings
+from jointctl.tools.inspection.health import NOTE, OK, PROBLEM, Finding, file_text
+from jointctl.tools.session.line_guard import running_supervisor
+
+
+@contextmanager
+def inspected_drive(config: Config) -> Iterator[tuple[ElmoDrive, DriveIdentity]]:
+    """The drive and its identity; nothing is written.  `BusError` if another program has the line, named if a run."""
+    port = elmo_section(config).port
+    pid = running_supervisor(port)
+    if pid is not None:
+        raise BusError(
+            f"a run has {port} (pid {pid}), and a serial line has one user at a time",
+            "its live values: `jointctl run --scope`; its log has every cycle",
+        )
+    drive = ElmoDrive(elmo_settings(config, torque_constant_NmpA(config)))
+    try:
+        yield drive, drive.identify()
+    finally:
+        drive.close()
+
 
 SLOW_LATENCY_MS = 1  # an FTDI adapter holds received characters back for up to 16 ms as it comes
 

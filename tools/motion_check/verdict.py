@@ -1,4 +1,4 @@
-"""What the records of the check say about directions and scale."""
+"""What encoders and records of the check say about directions and scale."""
 
 from __future__ import annotations
 
@@ -12,9 +12,15 @@ import numpy as np
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import law_resolution_rad
-from jointctl.tools.inspection.findings import NOTE, OK, PROBLEM, Finding
+from jointctl.tools.inspection.health import NOTE, OK, PROBLEM, Finding
 from jointctl.tools.motion_check.plan import CheckPlan
 from jointctl.tools.session.fault_words import FaultText
+
+SCALE_TOLERANCE = 0.001  # of the counts of a turn
+_SCALE_CURE = (
+    "encoder.counts_per_turn, encoder.side, joint.reduction_ratio; or the drive scales 6064 by 6091 and 6092: "
+    "then turn the joint by hand by 90 deg with the power off and compare"
+)
 
 MOVED_SHARE = 0.03  # of the travel: less is no motion
 MOVED_COUNTS = 6.0
@@ -27,6 +33,21 @@ _POWERED = (AxisPhase.APPROACH, AxisPhase.TRACKING, AxisPhase.RAMPING)
 # what a joint that runs the wrong way, or whose reading stands, ends with
 _WAY_FAULTS = (Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR, Fault.POSITION_LIMIT, Fault.POSITION_DISAGREEMENT)
 _STANDING_FAULTS = (*_WAY_FAULTS, Fault.POSITION_FROZEN, Fault.TORQUE_SATURATED)
+
+
+def judged(config: Config, counts_per_motor_turn: float) -> Finding:
+    """The drive's counts of one motor turn (608F) against the configuration's."""
+    own, ratio = config.encoder.counts_per_turn, config.joint.reduction_ratio
+    expected = [counts_per_motor_turn]
+    if config.encoder.side == "joint":
+        expected.append(counts_per_motor_turn * ratio)
+    factors = [own / counts for counts in expected]
+    numbers = {"counts_per_motor_turn": counts_per_motor_turn}
+    text = f"encoder.counts_per_turn is {own}, 608F of the drive says {counts_per_motor_turn:.6g} a motor turn"
+    if any(abs(factor - 1.0) < SCALE_TOLERANCE for factor in factors):
+        return Finding("counts", OK, text, "", numbers)
+    shown = " or ".join(f"{factor:.4g}" for factor in factors)
+    return Finding("counts", NOTE, f"{text}: {shown} times as many", _SCALE_CURE, numbers)
 
 
 @dataclass(frozen=True)

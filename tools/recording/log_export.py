@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jointctl.drivers.can.frames import ERROR_FLAG
 from jointctl.drivers.errors import DataError
-from jointctl.tools.recording.can_log import candump_lines
-from jointctl.tools.recording.run_log_reader import RunLog
+from jointctl.tools.recording.run_log import SECOND_NS, frame_times_ns
+from jointctl.tools.recording.run_log_reader import RunLog, calendar_offset_ns
 
 _ROWS = 10_000  # turned into Python numbers at once
 
@@ -42,16 +43,6 @@ def table_columns(log: RunLog) -> dict[str, np.ndarray]:
         read = log.temperatures["temperature_degC"][np.maximum(newest, 0)]
         found["temperature_degC"] = np.where(newest >= 0, read, np.nan)
     return found
-
-
-def calendar_offset_ns(log: RunLog) -> int:
-    """What to add to the log's times for nanoseconds since 1970; 0 if the log does not tell."""
-    clock = log.metadata.get("clock", {})
-    try:
-        at_s = np.datetime64(clock["utc"].removesuffix("+00:00"), "ns").astype(np.int64)
-        return int(at_s) - int(clock["monotonic_ns"])
-    except (KeyError, ValueError):
-        return 0
 
 
 def csv_bytes(log: RunLog, path: Path) -> bytes:
@@ -92,6 +83,23 @@ def parquet_bytes(log: RunLog, path: Path) -> bytes:
     data = io.BytesIO()
     parquet.write_table(table.replace_schema_metadata(metadata), data)
     return data.getvalue()
+
+
+def candump_lines(frames: np.ndarray, offset_ns: int, channel: str) -> Iterator[str]:
+    """`(1436509053.249713) can0 181#2F0100`, as `candump -L` writes; `offset_ns` from the log's clock to the calendar.
+
+    Eight hexadecimal digits mark an extended identifier; an error frame has the error flag in its identifier.
+    """
+    for time_ns, row in zip((frame_times_ns(frames) + offset_ns).tolist(), frames, strict=True):
+        seconds, rest_ns = divmod(time_ns, SECOND_NS)
+        identifier = int(row["id"])
+        if row["is_error"]:
+            name = f"{identifier | ERROR_FLAG:08X}"
+        else:
+            name = f"{identifier:08X}" if row["is_extended"] else f"{identifier:03X}"
+        size = int(row["dlc"])
+        data = f"R{size}" if row["is_rtr"] else bytes(row["data"][:size]).hex().upper()
+        yield f"({seconds}.{rest_ns // 1000:06d}) {channel} {name}#{data}\n"
 
 
 def candump_bytes(log: RunLog, path: Path) -> bytes:

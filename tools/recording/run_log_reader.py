@@ -1,9 +1,10 @@
-"""Run logs read back: everything in the file, or up to the last whole chunk of one that was cut off.  See `run_log`."""
+"""Run logs read back, and what they say about themselves: when a run began, its events, missing records."""
 
 from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Any
@@ -13,33 +14,29 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from mcap.writer import MCAP0_MAGIC
 
 from jointctl.drivers.errors import DataError
 from jointctl.firmware_py.input_file import LARGEST_LOG_BYTES, open_input
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
-from jointctl.tools.recording.can_log import CAN_FRAME, CAN_TOPIC
-from jointctl.tools.recording.cdr import CDR_HEADER, event_from_body, message_definition
+from jointctl.tools.recording.mcap_file import BEFORE_BODY, MESSAGE_HEAD
 from jointctl.tools.recording.run_log import (
+    CAN_FRAME,
+    CAN_TOPIC,
+    CDR_HEADER,
+    ERROR,
     EVENT_TOPIC,
     RECORD_SCHEMA,
     RECORD_TOPIC,
     TEMPERATURE,
     TEMPERATURE_TOPIC,
+    THINNING,
+    WARNING,
     Event,
-)
-
-_MAGIC = b"\x89MCAP0\r\n"
-_BEFORE_BODY = 9  # bytes of opcode and length
-_MESSAGE_HEAD = np.dtype(
-    [
-        ("opcode", "u1"),
-        ("length", "<u8"),
-        ("channel", "<u2"),
-        ("sequence", "<u4"),
-        ("log_ns", "<u8"),
-        ("sent_ns", "<u8"),
-    ]
+    cdr_rows,
+    event_from_body,
+    message_definition,
 )
 
 
@@ -58,7 +55,7 @@ def read_run_log(path: str | Path) -> RunLog:
     path = Path(path)
     try:
         with open_input(path, LARGEST_LOG_BYTES) as file:
-            if file.read(len(_MAGIC)) != _MAGIC:
+            if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                 raise DataError(f"{path}: is not an MCAP file")
             file.seek(0)
             return _read(file, path)
@@ -113,10 +110,7 @@ class _Collector:
             TEMPERATURE_TOPIC: (TEMPERATURE, self.temperature_parts),
         }
         # topics whose messages all have the same size, so that a run of them is an array
-        self._runs = {
-            topic: (np.dtype([*_MESSAGE_HEAD.descr, ("cdr", "V4"), ("record", body)]), parts)
-            for topic, (body, parts) in bodies.items()
-        }
+        self._runs = {topic: (cdr_rows(body), parts) for topic, (body, parts) in bodies.items()}
 
     def take_chunk(self, chunk: Chunk) -> None:
         stream, size = get_chunk_data_stream(chunk, validate_crc=True)
@@ -128,11 +122,11 @@ class _Collector:
                 (channel,) = struct.unpack_from("<H", data, at + 9)
                 topic = self._topics.get(channel, "")
                 message, parts = self._runs.get(topic, (None, None))
-                if message is not None and parts is not None and length == message.itemsize - _BEFORE_BODY:
+                if message is not None and parts is not None and length == message.itemsize - BEFORE_BODY:
                     at += _take_run(data, at, channel, message, parts)
                     continue
                 if topic == EVENT_TOPIC:
-                    body = data[at + _MESSAGE_HEAD.itemsize + len(CDR_HEADER) : at + 9 + length]
+                    body = data[at + MESSAGE_HEAD.itemsize + len(CDR_HEADER) : at + 9 + length]
                     self.events.append(Event(*event_from_body(body)))
             elif opcode == Opcode.CHANNEL:
                 self._take_channel(Channel.read(_stream(data, at, length)))
@@ -151,7 +145,7 @@ class _Collector:
 def _take_run(data: bytes, at: int, channel: int, message: np.dtype[Any], parts: list[np.ndarray]) -> int:
     """Append the run of like messages that begins at `at` to `parts`; how many bytes it is long."""
     rows = np.frombuffer(data, message, (len(data) - at) // message.itemsize, at)
-    length = message.itemsize - _BEFORE_BODY
+    length = message.itemsize - BEFORE_BODY
     same = (rows["opcode"] == Opcode.MESSAGE) & (rows["length"] == length) & (rows["channel"] == channel)
     count = len(rows) if same.all() else int(np.argmin(same))
     parts.append(rows["record"][:count].astype(message["record"]))
@@ -160,3 +154,59 @@ def _take_run(data: bytes, at: int, channel: int, message: np.dtype[Any], parts:
 
 def _stream(data: bytes, at: int, length: int) -> ReadDataStream:
     return ReadDataStream(BytesIO(data[at + 9 : at + 9 + length]))
+
+
+# --- what a log says about itself ---
+
+_LEVELS = ((ERROR, "error"), (WARNING, "warning"), (20, "information"), (0, "debug"))
+
+
+def missing_records(records: Any) -> int:
+    """Cycles that the loop executed but the log does not hold: the cycle counter jumps by more than was skipped."""
+    if len(records) < 2:
+        return 0
+    jumps = np.diff(np.asarray(records["cycle"], np.int64)) - 1 - np.asarray(records["skipped"][1:], np.int64)
+    return int(np.sum(np.maximum(jumps, 0)))
+
+
+def missing_in(log: RunLog) -> int | None:
+    """`missing_records` of a log; None where records were left out on purpose, so that nobody can tell."""
+    return None if THINNING in log.metadata else missing_records(log.records)
+
+
+def kept_share(log: RunLog) -> str:
+    """Which records a thinned log holds, in words; "" for one that holds all."""
+    thinning = log.metadata.get(THINNING)
+    return f"every {thinning['every']}th, the last {thinning['whole_s']} s whole" if thinning else ""
+
+
+def calendar_offset_ns(log: RunLog) -> int:
+    """What to add to the log's times for nanoseconds since 1970; 0 if the log does not tell."""
+    clock = log.metadata.get("clock", {})
+    try:
+        at_s = np.datetime64(clock["utc"].removesuffix("+00:00"), "ns").astype(np.int64)
+        return int(at_s) - int(clock["monotonic_ns"])
+    except (KeyError, ValueError):
+        return 0
+
+
+def began_at(log: RunLog) -> str:
+    """Local time of the first record; "" if the log does not tell."""
+    offset_ns = calendar_offset_ns(log)
+    if not offset_ns or not len(log.records):
+        return ""
+    at = datetime.fromtimestamp((int(log.records["time_ns"][0]) + offset_ns) * 1e-9, UTC)
+    return at.astimezone().isoformat(sep=" ", timespec="seconds")
+
+
+def event_rows(log: RunLog) -> list[tuple[str, str, str, str]]:
+    """(seconds since the first record, level, source, text) of every event."""
+    start_ns = int(log.records["time_ns"][0]) if len(log.records) else log.events[0].time_ns if log.events else 0
+    return [
+        (f"{(event.time_ns - start_ns) * 1e-9:.3f}", level_name(event), event.source, event.text)
+        for event in sorted(log.events, key=lambda event: event.time_ns)
+    ]
+
+
+def level_name(event: Event) -> str:
+    return next(name for level, name in _LEVELS if event.level >= level)

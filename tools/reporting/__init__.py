@@ -1,7 +1,6 @@
 """Reports: one self-contained HTML page, used by every verb that has more to show than a table.
 
-    from jointctl.tools.reporting.page import Section, Table, page, write_page
-    from jointctl.tools.reporting.figure import svg_figure
+    from jointctl.tools.reporting.page import Section, Table, page, svg_figure, write_page
 
     table = Table(["controller", "RMSE [mrad]"], rows)
     picture = svg_figure(figure, "what it shows", "what to note in it")  # a matplotlib figure

@@ -9,8 +9,7 @@ import numpy as np
 
 from jointctl.firmware_py.states import AxisPhase
 from jointctl.tools.drawing import INK, SERIES, SOFT
-from jointctl.tools.reporting.figure import draw
-from jointctl.tools.reporting.page import Block, Figure, Paragraph
+from jointctl.tools.reporting.page import Block, Figure, Paragraph, draw
 from jointctl.tools.reporting.run_figures import binned, friction_points, legend_above, line
 
 SAME_MOTION_rad = 1e-3

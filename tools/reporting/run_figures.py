@@ -1,4 +1,4 @@
-"""The figures of one run: trajectory, error, torque and its parts, network, observer and learning, friction map, times.
+"""The figures of one run: trajectory, error, torque in its parts, network, observer, friction map, times, temperature.
 
 `records` is an array of LogRecord, shape (N,), everywhere.  Times are seconds since the first record.
 """
@@ -13,9 +13,10 @@ import numpy as np
 from jointctl.firmware_py.states import AxisPhase, fault_name
 from jointctl.tools.drawing import BLUE, COLOURS, GREEN, GREY, INK, MID_BLUE, ORANGE, RED, SOFT, TEAL, VIOLET
 from jointctl.tools.recording.run_figure import drawn_indices
-from jointctl.tools.reporting.figure import draw
-from jointctl.tools.reporting.page import Figure
+from jointctl.tools.recording.run_log_reader import RunLog
+from jointctl.tools.reporting.page import Figure, draw
 
+LEAST_READINGS = 10  # of the temperature; fewer are in the table only
 POINTS = 1600  # more than the page is wide; least and greatest of each bucket, so that no peak is lost
 _PARTS = (
     ("friction", "friction", ORANGE),
@@ -284,3 +285,18 @@ def run_figures(records: Any) -> list[Figure]:
         times_figure(records),
     )
     return [figure for figure in found if figure is not None]
+
+
+def temperature_figure(log: RunLog) -> list[Figure]:
+    """The drive's temperature over the run, where it reports one: one figure, or none."""
+    if len(log.temperatures) < LEAST_READINGS:
+        return []
+    time_s = (log.temperatures["time_ns"] - log.records["time_ns"][0]) * 1e-9
+
+    def paint(figure: Any) -> None:
+        axes = figure.subplots()
+        axes.plot(time_s, log.temperatures["temperature_degC"], color=RED, drawstyle="steps-post")
+        axes.set_ylabel("temperature [°C]")
+        axes.set_xlabel("time [s]")
+
+    return [draw(2.2, paint, "Temperature of the drive over time", "As the drive tells it, once a second.")]

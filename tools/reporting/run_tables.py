@@ -8,8 +8,7 @@ from typing import Any
 
 from jointctl.firmware_py.input_file import parse_toml
 from jointctl.firmware_py.states import Fault
-from jointctl.tools.recording.log_facts import began_at, event_rows, missing_in
-from jointctl.tools.recording.run_log_reader import RunLog
+from jointctl.tools.recording.run_log_reader import RunLog, began_at, event_rows, missing_in
 from jointctl.tools.recording.run_summary import Range, RunSummary, TimeSummary
 from jointctl.tools.reporting.page import Table
 

@@ -1,9 +1,10 @@
-"""The supervisor's end: log records and events out; stops, requests and the number of open pages back."""
+"""The supervisor's end of the scope: log records and events out; stops, requests and the number of open pages back."""
 
 from __future__ import annotations
 
 import contextlib
 import json
+import secrets
 import socket
 import subprocess
 import sys
@@ -11,12 +12,14 @@ import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from importlib.util import find_spec
 from typing import Any, Self
 
+from jointctl.drivers.errors import DataError, UsageError
+from jointctl.drivers.printable import printable
 from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.recording.run_log import Event
-from jointctl.tools.scoping.order import ScopeOrder
 from jointctl.tools.session.display import LONGEST_BYTES, Snapshot, ViewerRequest, decoded
 
 RECORDS, EVENT, SETTINGS = b"R", b"E", b"S"  # first byte of a message
@@ -28,6 +31,45 @@ SERVER_SILENT = (
     f"no word from the scope's server for {SILENT_S:g} s: it counts as no page open; Ctrl-C or `jointctl stop` brakes"
 )
 SERVER_ENDED = "the scope's server has ended: no page shows or stops the joint"
+
+
+@dataclass(frozen=True)
+class ScopeOrder:
+    """Launch arguments of the server: where to serve, to whom, and what."""
+
+    title: str
+    host: str
+    port: int
+    token: str  # without it nothing is shown or taken
+    cia402: bool = True
+    feed_fd: int = -1  # -1: show `log` instead
+    log: str = ""
+
+    @property
+    def url(self) -> str:
+        """What to open."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"http://{host}:{self.port}/?token={self.token}"
+
+
+def scope_order(title: str, host: str, port: int, **more: Any) -> ScopeOrder:
+    """A checked order with a new token: other users of this computer, too, would reach a page without one.
+
+    Raises `UsageError` for a wrong port, `DataError` if the scope cannot be served.
+    """
+    if find_spec("nicegui") is None:
+        raise DataError("the scope needs the package nicegui, which is not installed", "install the extra `scope`")
+    if not 1 <= port <= 65535:
+        raise UsageError(f"--port (={port}) must be in [1..65535]")
+    try:
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((host, port))
+    except OSError as error:
+        raise DataError(
+            f"the scope cannot be served at {host}:{port}: {error.strerror or error}", "choose another --port"
+        ) from None
+    return ScopeOrder(printable(title), host, port, secrets.token_urlsafe(16), **more)
 
 
 class ScopeFeed:

@@ -1,27 +1,30 @@
 """The scope's web server: `python -m jointctl.tools.scoping.server`, started by `run --scope` and by `scope CONFIG`.
 
 What it is to serve, and the token that it asks for, come as JSON on its standard input: what stands among the arguments
-or in the environment of a process can be read by others.
+or in the environment of a process can be read by others.  Who has the token that jointctl printed may see the page, no
+one else, on this computer as elsewhere.
 """
 
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import json
 import os
+import secrets
 import socket
 import sys
 import threading
 import time
+from collections.abc import Awaitable, Callable, Iterator, MutableMapping
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
 from jointctl.tools.recording.run_log import Event
 from jointctl.tools.recording.run_log_reader import read_run_log
-from jointctl.tools.scoping.access import AccessControl
-from jointctl.tools.scoping.feed import COUNT_AGAIN_S, EVENT, RECORDS, SETTINGS
+from jointctl.tools.scoping.feed import COUNT_AGAIN_S, EVENT, RECORDS, SETTINGS, ScopeOrder
 from jointctl.tools.scoping.history import EVENTS, RING_RECORDS, History
-from jointctl.tools.scoping.order import ScopeOrder
 from jointctl.tools.session.display import ViewerRequest, viewer
 
 _LONGEST = 1 << 20  # bytes of a message
@@ -31,6 +34,82 @@ _AFTER_END_S = 1.5  # for the pages to show the end of the run
 COUNT_S = 0.5  # how often the open pages are counted
 NICE = 5  # whoever looks on comes after the supervisor, but STOP has to arrive on a busy computer
 RELOAD_S = 3.0  # nobody for so long: the last page is closed, not reloaded
+COOKIE = "jointctl_scope"  # how their names begin
+Scope = MutableMapping[str, Any]
+Application = Callable[[Scope, Any, Any], Awaitable[None]]
+# the address holds the token: it goes to no other site, and into no cache
+_PRIVATE = ((b"referrer-policy", b"no-referrer"), (b"cache-control", b"no-store"))
+
+
+# --- access ---
+
+
+def allowed(scope: Scope, token: str) -> bool:
+    """Whether a request may pass: it has the token, in its address or in a cookie."""
+    headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope.get("headers", [])}
+    origin = headers.get("origin", "")
+    try:
+        if origin and urlsplit(origin).netloc != headers.get("host", ""):
+            return False
+    except ValueError:  # no address at all
+        return False
+    given = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [])
+    words = [*given, *_cookies(headers.get("cookie", ""))]
+    return bool(token) and any(secrets.compare_digest(word.encode(), token.encode()) for word in words)
+
+
+def cookie_name(token: str) -> str:
+    """A name of its own for each server: cookies are for all ports of a computer, and a page must not lose its STOP
+    because another scope was opened in the same browser."""
+    return f"{COOKIE}_{hashlib.sha256(token.encode()).hexdigest()[:8]}"
+
+
+def _cookies(header: str) -> Iterator[str]:
+    """Our values; what other pages of this computer have left beside them does no harm."""
+    for part in header.split(";"):
+        name, _, value = part.strip().partition("=")
+        if name.startswith(COOKIE):
+            yield value
+
+
+class AccessControl:
+    """ASGI layer: refuses with 403, and remembers a good token in a cookie.
+
+    As a plain ASGI layer it sees web sockets as well.  Against pages of other sites in the same browser, an Origin must
+    be the scope's own; such a page has no cookie of ours either.
+    """
+
+    def __init__(self, app: Application, token: str) -> None:
+        self._app = app
+        self._token = token
+
+    async def __call__(self, scope: Scope, receive: Any, send: Any) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        if not allowed(scope, self._token):
+            await _refuse(scope, send)
+            return
+
+        async def with_cookie(message: MutableMapping[str, Any]) -> None:
+            if message["type"] == "http.response.start":
+                value = f"{cookie_name(self._token)}={self._token}; HttpOnly; SameSite=Strict; Path=/"
+                kept = [(key, found) for key, found in message.get("headers", []) if key.lower() != b"cache-control"]
+                message["headers"] = [*kept, *_PRIVATE, (b"set-cookie", value.encode())]
+            await send(message)
+
+        await self._app(scope, receive, with_cookie)
+
+
+async def _refuse(scope: Scope, send: Any) -> None:
+    if scope["type"] == "websocket":
+        await send({"type": "websocket.close", "code": 1008})
+        return
+    await send({"type": "http.response.start", "status": 403, "headers": [(b"content-type", b"text/plain")]})
+    await send({"type": "http.response.body", "body": b"open the address that jointctl printed, token included\n"})
+
+
+# --- the server ---
 
 
 class Feed(threading.Thread):
@@ -131,8 +210,7 @@ def serve(order: ScopeOrder) -> None:
     # the import takes seconds, and only this process needs it
     from nicegui import app, ui
 
-    from jointctl.tools.scoping.page import build_page
-    from jointctl.tools.scoping.stop_button import STOP_PATH
+    from jointctl.tools.scoping.scope_page import STOP_PATH, build_page
 
     feed: Feed | None = None
     if order.feed_fd >= 0:

@@ -16,9 +16,8 @@ from jointctl.drivers.drive import SettingsGuard
 from jointctl.firmware_py.realtime import Histogram, Word
 from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, StopRequest, in_words
 from jointctl.tools.analysis.margin_gate import require_margin
-from jointctl.tools.recording.can_log import frame_array
 from jointctl.tools.recording.kept_records import KeptRecords
-from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter
+from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter, frame_array
 from jointctl.tools.recording.thinned_records import ThinnedRecords
 from jointctl.tools.session.bus_watch import BusWatch, FrameRecorder, TemperatureWatch
 from jointctl.tools.session.control import StopSignals

@@ -14,9 +14,21 @@ from rich.text import Text
 
 from jointctl.firmware_py.kernel import cache_folder
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.inspection.bus_health import adapters, bus_budget, drive_finding, interface_state
-from jointctl.tools.inspection.computer import kernel_cache, kernel_findings, scheduling, software, wake_up
-from jointctl.tools.inspection.findings import NOTE, OK, PROBLEM, Finding
+from jointctl.tools.inspection.health import (
+    NOTE,
+    OK,
+    PROBLEM,
+    Finding,
+    adapters,
+    bus_budget,
+    drive_finding,
+    interface_state,
+    kernel_cache,
+    kernel_findings,
+    scheduling,
+    software,
+    wake_up,
+)
 from jointctl.tools.inspection.serial_health import serial_findings
 from jointctl.tools.output import Output
 

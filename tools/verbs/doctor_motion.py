@@ -5,9 +5,8 @@ from __future__ import annotations
 from jointctl.drivers.errors import DECLINED, INTERRUPTED
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.inspection.drive_scale import judged
 from jointctl.tools.motion_check.plan import check_run, make_plan
-from jointctl.tools.motion_check.verdict import ended_finding, motion_findings
+from jointctl.tools.motion_check.verdict import ended_finding, judged, motion_findings
 from jointctl.tools.output import Output
 from jointctl.tools.session import result as drive_end
 from jointctl.tools.session.consent import TerminalConsent, require_terminal

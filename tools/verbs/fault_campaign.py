@@ -21,9 +21,16 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo_settings import refuse_serial
 from jointctl.tools.drawing import save_png
 from jointctl.tools.output import Output
-from jointctl.tools.reporting.figure import svg_figure
-from jointctl.tools.reporting.page import Details, Paragraph, Section, Table, check_target
-from jointctl.tools.reporting.verb_page import from_terminal, write_verb_page
+from jointctl.tools.reporting.page import (
+    Details,
+    Paragraph,
+    Section,
+    Table,
+    check_target,
+    from_terminal,
+    svg_figure,
+    write_verb_page,
+)
 from jointctl.tools.written_file import prepare_folder
 
 EXIT_VIOLATIONS = 10

@@ -30,10 +30,16 @@ from jointctl.tools.identification.identification_report import (
 )
 from jointctl.tools.identification.plausibility import JointLimits
 from jointctl.tools.output import Output
-from jointctl.tools.reporting.figure import svg_figure
-from jointctl.tools.reporting.page import Block, Details, Section, check_target
-from jointctl.tools.reporting.verb_page import from_terminal, write_verb_page
-from jointctl.tools.reporting.verb_page import remarks as notes_of
+from jointctl.tools.reporting.page import (
+    Block,
+    Details,
+    Section,
+    check_target,
+    from_terminal,
+    svg_figure,
+    write_verb_page,
+)
+from jointctl.tools.reporting.page import remarks as notes_of
 from jointctl.tools.written_file import replace_file, require_target
 
 

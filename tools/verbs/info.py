@@ -9,8 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from jointctl.tools.inspection.drive_info import drive_info
-from jointctl.tools.inspection.sdo_reading import SdoReader
-from jointctl.tools.inspection.subject import Subject, canopen_network
+from jointctl.tools.inspection.subject import SdoReader, Subject, canopen_network
 from jointctl.tools.output import Output
 
 _TITLES = {

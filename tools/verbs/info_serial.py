@@ -8,7 +8,7 @@ from rich.table import Table
 
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo_settings import elmo_section
-from jointctl.tools.inspection.serial_subject import inspected_drive
+from jointctl.tools.inspection.serial_health import inspected_drive
 from jointctl.tools.output import Output
 
 

@@ -11,9 +11,16 @@ from rich.table import Table
 from jointctl.drivers.errors import DataError
 from jointctl.tools.output import Output
 from jointctl.tools.recording.log_export import FORMATS
-from jointctl.tools.recording.log_facts import began_at, event_rows, kept_share, level_name, missing_in
 from jointctl.tools.recording.run_figure import save_run_figure
-from jointctl.tools.recording.run_log_reader import RunLog, read_run_log
+from jointctl.tools.recording.run_log_reader import (
+    RunLog,
+    began_at,
+    event_rows,
+    kept_share,
+    level_name,
+    missing_in,
+    read_run_log,
+)
 from jointctl.tools.recording.run_summary import summarise, summary_table
 from jointctl.tools.written_file import replace_file, require_target
 

@@ -13,11 +13,9 @@ import can
 from jointctl.drivers.errors import BusError, ConfigurationError
 from jointctl.tools.configuration.drive_settings import TORQUE_MODES
 from jointctl.tools.inspection.drive_info import pdo_maps
-from jointctl.tools.inspection.frame_decoder import KINDS, Decoded, FrameDecoder
+from jointctl.tools.inspection.frame_decoder import KINDS, Decoded, FrameDecoder, PdoMaps
 from jointctl.tools.inspection.objects import Objects
-from jointctl.tools.inspection.pdo_maps import PdoMaps
-from jointctl.tools.inspection.sdo_reading import SdoReader
-from jointctl.tools.inspection.subject import Subject, canopen_network
+from jointctl.tools.inspection.subject import SdoReader, Subject, canopen_network
 from jointctl.tools.output import Output
 from jointctl.tools.session.control import stop_signals
 

@@ -14,7 +14,7 @@ from jointctl.drivers.elmo.codes import CURRENT_LIMITED, FAULT_LATCHED, SERVO_ON
 from jointctl.drivers.elmo.drive import ElmoDrive
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo_settings import elmo_section
-from jointctl.tools.inspection.serial_subject import inspected_drive
+from jointctl.tools.inspection.serial_health import inspected_drive
 from jointctl.tools.output import Output
 from jointctl.tools.session.control import stop_signals
 

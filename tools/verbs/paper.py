@@ -21,9 +21,7 @@ from jointctl.tools.experiments.paper_experiments import (
 )
 from jointctl.tools.experiments.scenarios import error_figures
 from jointctl.tools.output import Output
-from jointctl.tools.reporting.figure import svg_figure
-from jointctl.tools.reporting.page import Section, check_target
-from jointctl.tools.reporting.verb_page import from_terminal, write_verb_page
+from jointctl.tools.reporting.page import Section, check_target, from_terminal, svg_figure, write_verb_page
 from jointctl.tools.written_file import prepare_folder
 
 PAPER = (

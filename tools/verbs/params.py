@@ -14,21 +14,22 @@ from jointctl.drivers.canopen.identifiers import NmtCommand
 from jointctl.drivers.canopen.network import OtherControllers, send_nmt
 from jointctl.drivers.errors import DECLINED, ConfigurationError, DataError, DeviceError
 from jointctl.tools.inspection.objects import Objects, Place
-from jointctl.tools.inspection.parameter_file import load_parameters, toml_text, write_dcf
-from jointctl.tools.inspection.parameter_restore import Written, restore
 from jointctl.tools.inspection.parameters import (
     Difference,
     ParameterSet,
     Value,
+    Written,
+    dcf_text,
     differences,
     identity_of,
     is_parameter,
+    load_parameters,
     read_parameters,
+    restore,
     shown,
     variables,
 )
-from jointctl.tools.inspection.sdo_reading import Refusal, SdoReader
-from jointctl.tools.inspection.subject import Subject, canopen_network
+from jointctl.tools.inspection.subject import Refusal, SdoReader, Subject, canopen_network
 from jointctl.tools.output import Output
 from jointctl.tools.session.consent import agreed, require_terminal
 from jointctl.tools.session.control import control_of
@@ -56,16 +57,16 @@ def parameters_of_drive(subject: Subject, output: Output) -> tuple[ParameterSet,
 
 
 def dump(subject: Subject, output: Output, out: Path | None = None) -> int:
-    """Write TOML to stdout or to `out`; a name that ends in .dcf makes a DCF."""
+    """Write a DCF to stdout or to `out`."""
+    if out is not None and out.suffix.lower() != ".dcf":
+        raise DataError(f"{out}: the name of a dump must end in .dcf: parameters are written as DCF only")
+    if out is not None and out.exists():
+        raise DataError(f"{out}: exists already", "give another name; a dump is never overwritten")
     found, objects = parameters_of_drive(subject, output)
+    text = dcf_text(found, objects.required())
     if out is not None:
-        if out.exists():
-            raise DataError(f"{out}: exists already", "give another name; a dump is never overwritten")
         with writing(out):
-            if out.suffix.lower() == ".dcf":
-                write_dcf(found, objects.required(), out)
-            else:
-                out.write_text(toml_text(found, objects))
+            out.write_text(text, encoding="utf-8")
         output.note(
             f"{out}: {len(found.parameters)} parameters, {len(found.readings)} readings, "
             f"{len(found.unreadable)} objects could not be read"
@@ -73,7 +74,7 @@ def dump(subject: Subject, output: Output, out: Path | None = None) -> int:
     if output.json:
         output.result("", _as_data(found))
     elif out is None:
-        output.line(toml_text(found, objects).removesuffix("\n"))
+        output.line(text.rstrip("\n"))
     return 0
 
 

@@ -12,9 +12,8 @@ from jointctl.tools.recording.run_log_reader import RunLog, read_run_log
 from jointctl.tools.recording.run_summary import RunSummary, summarise
 from jointctl.tools.reporting.comparison import comparison
 from jointctl.tools.reporting.page import Block, Details, Paragraph, Section, check_target, page, write_page
-from jointctl.tools.reporting.run_figures import run_figures
+from jointctl.tools.reporting.run_figures import run_figures, temperature_figure
 from jointctl.tools.reporting.run_tables import events_table, figure_tables, what_ran
-from jointctl.tools.reporting.temperature_figure import temperature_figure
 
 MOST_LOGS = 6  # columns that fit on a page
 

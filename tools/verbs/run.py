@@ -62,8 +62,7 @@ def _displays(
     if scope is None:
         yield lambda _: terminal()
         return
-    from jointctl.tools.scoping.feed import scope_server
-    from jointctl.tools.scoping.order import scope_order
+    from jointctl.tools.scoping.feed import scope_order, scope_server
 
     order = scope_order(title, *scope, cia402=not config.is_serial)
     output.address(f"scope: {order.url}")

@@ -13,8 +13,7 @@ from jointctl.drivers.errors import DECLINED, INTERRUPTED, JointctlError
 from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log_reader import read_run_log
-from jointctl.tools.scoping.feed import ScopeFeed, scope_server
-from jointctl.tools.scoping.order import scope_order
+from jointctl.tools.scoping.feed import ScopeFeed, scope_order, scope_server
 from jointctl.tools.session.control import in_control
 from jointctl.tools.session.display import Displays
 from jointctl.tools.session.live_panel import run_display

@@ -23,9 +23,7 @@ from jointctl.tools.experiments.controller_study import (
 )
 from jointctl.tools.experiments.controllers import controller_config
 from jointctl.tools.output import Output
-from jointctl.tools.reporting.figure import svg_figure
-from jointctl.tools.reporting.page import Details, Section, check_target
-from jointctl.tools.reporting.verb_page import from_terminal, write_verb_page
+from jointctl.tools.reporting.page import Details, Section, check_target, from_terminal, svg_figure, write_verb_page
 from jointctl.tools.written_file import prepare_target, refuse_overwriting
 
 _COLUMNS = (

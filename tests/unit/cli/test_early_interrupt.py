@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from jointctl.tools.simulation.workers import interrupts_left_to_the_parent
+from jointctl.tools.simulation.child_process import interrupts_left_to_the_parent
 
 STUCK = (
     "import sys, time, types; sys.modules['typer'] = slow = types.ModuleType('typer');"

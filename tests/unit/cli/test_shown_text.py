@@ -15,8 +15,7 @@ from rich.text import Text
 
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import INFO, Event
-from jointctl.tools.reporting.figure import draw
-from jointctl.tools.reporting.page import Details, Paragraph, Section, page
+from jointctl.tools.reporting.page import Details, Paragraph, Section, draw, page
 from jointctl.tools.reporting.page import Table as PageTable
 from jointctl.tools.scoping.history import History
 from jointctl.tools.session.live_panel import LivePanel

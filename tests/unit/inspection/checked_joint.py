@@ -6,7 +6,7 @@ from typing import Any
 
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.inspection.findings import Finding
+from jointctl.tools.inspection.health import Finding
 from jointctl.tools.motion_check.plan import CheckMotion, CheckPlan, config_of_check, make_plan, motion_table
 from jointctl.tools.motion_check.verdict import motion_findings
 from jointctl.tools.session.fault_words import fault_text

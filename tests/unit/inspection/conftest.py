@@ -14,7 +14,7 @@ from tests.unit.inspection.parameter_verbs import output, subject, writes
 @pytest.fixture
 def file(device_on_bus: Any, tmp_path: Path) -> Path:
     """A dump of the drive as it is."""
-    path = tmp_path / "drive.toml"
+    path = tmp_path / "drive.dcf"
     assert dump(subject(device_on_bus), output()[0], path) == 0
     assert not writes(device_on_bus)
     device_on_bus.requests.clear()

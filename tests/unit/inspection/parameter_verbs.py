@@ -1,18 +1,19 @@
-"""Subject and output of the verb params, and a parameter file that is changed."""
+"""Subject and output of the verb params, and a DCF that is changed."""
 
 from __future__ import annotations
 
 import io
+import re
 import struct
 from pathlib import Path
 from typing import Any
 
 from jointctl.tools.configuration.load import shipped_config
 from jointctl.tools.inspection.parameters import ParameterSet, read_parameters
-from jointctl.tools.inspection.sdo_reading import SdoReader
-from jointctl.tools.inspection.subject import Subject, canopen_network
+from jointctl.tools.inspection.subject import SdoReader, Subject, canopen_network
 from jointctl.tools.output import Output
 
+OLDER_DUMP = Path(__file__).with_name("older_dump.toml")
 EDS = shipped_config("virtual").with_name("virtual_joint.eds")
 
 
@@ -37,10 +38,14 @@ def writes(device: Any) -> list[tuple[int, int]]:
 
 
 def change(file: Path, **values: str) -> None:
-    """Replace the values of objects, `o6072="500"`."""
-    lines = file.read_text().splitlines()
+    """Replace the values of objects in a DCF, `o6072="500"`, `o1018_2="9"`."""
+    text = file.read_text()
     for name, value in values.items():
-        key = name.removeprefix("o").replace("_", ":")
-        (at,) = [i for i, line in enumerate(lines) if line.startswith((f"{key} = ", f'"{key}" = '))]
-        lines[at] = f'"{key}" = {value}'
-    file.write_text("\n".join(lines) + "\n")
+        index, _, sub = name.removeprefix("o").partition("_")
+        section = rf"\[{index}(?:sub{sub})?\]\n" if sub in ("", "0") else rf"\[{index}sub{sub}\]\n"
+        pattern = rf"({section}(?:[^\[\n].*\n)*?ParameterValue=).*"
+        if sub == "" and not re.search(pattern, text):
+            pattern = pattern.replace(section, rf"\[{index}sub0\]\n")
+        text, count = re.subn(pattern, rf"\g<1>{value}", text)
+        assert count == 1, f"{name}: {count} times"
+    file.write_text(text)

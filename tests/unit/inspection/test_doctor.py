@@ -17,16 +17,19 @@ from jointctl.drivers.can.socketcan import parse_link
 from jointctl.drivers.errors import BusError
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.inspection import bus_health, computer
-from jointctl.tools.inspection.bus_health import (
+from jointctl.tools.inspection import health
+from jointctl.tools.inspection.health import (
+    NOTE,
+    OK,
+    PROBLEM,
     SDO_READS,
+    Finding,
     adapters,
     bus_budget,
     drive_finding,
     interface_state,
     sdo_round_trips_us,
 )
-from jointctl.tools.inspection.findings import NOTE, OK, PROBLEM, Finding
 from jointctl.tools.output import Output
 from jointctl.tools.verbs import doctor as doctor_module
 from jointctl.tools.verbs.doctor import doctor, findings
@@ -75,7 +78,7 @@ class SdoBus:
 
 @pytest.fixture
 def short_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bus_health, "_SDO_TIMEOUT_S", 0.01)
+    monkeypatch.setattr(health, "_SDO_TIMEOUT_S", 0.01)
 
 
 class TestBus:
@@ -124,7 +127,7 @@ class TestBus:
         self, config: Config, answers: int, status: str, asked: int, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         bus = SdoBus(config.drive.node, answers)
-        monkeypatch.setattr(bus_health, "open_python_can", lambda *_: bus)
+        monkeypatch.setattr(health, "open_python_can", lambda *_: bus)
         found = drive_finding(config)
         assert (found.status, len(bus.sent), bus.closed) == (status, asked, True)
 
@@ -135,7 +138,7 @@ class TestBus:
             raise can.CanOperationError("bus off")
 
         monkeypatch.setattr(bus, "send", fail)
-        monkeypatch.setattr(bus_health, "open_python_can", lambda *_: bus)
+        monkeypatch.setattr(health, "open_python_can", lambda *_: bus)
         found = drive_finding(config)
         assert (found.status, bus.closed) == (PROBLEM, True)
         assert "bus off" in found.text
@@ -144,7 +147,7 @@ class TestBus:
         def fail(*_: Any) -> None:
             raise BusError("no virtual bus", "start one")
 
-        monkeypatch.setattr(bus_health, "open_python_can", fail)
+        monkeypatch.setattr(health, "open_python_can", fail)
         assert drive_finding(config) == Finding("drive", NOTE, "not asked: no virtual bus", "start one")
 
     @pytest.mark.parametrize(
@@ -162,7 +165,7 @@ class TestBus:
         self, config: Config, data: Any, queue: int, found: Any, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         link = {"ifname": "can0", "flags": ["UP"], "txqlen": queue, "linkinfo": {"info_kind": "can", "info_data": data}}
-        monkeypatch.setattr(bus_health, "link_state", lambda name: parse_link(link))
+        monkeypatch.setattr(health, "link_state", lambda name: parse_link(link))
         told = list(interface_state(changed(config, interface="socketcan", channel="can0")))
         assert [(finding.topic, finding.status) for finding in told] == found
         assert all(finding.cure for finding in told if finding.status != OK)
@@ -177,8 +180,8 @@ class TestBus:
     def test_a_slow_answer_limits_the_rate(
         self, config: Config, rate_Hz: float, status: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(bus_health, "open_python_can", lambda *_: SdoBus(config.drive.node))
-        monkeypatch.setattr(bus_health, "sdo_round_trips_us", lambda *_: [1000.0] * SDO_READS)
+        monkeypatch.setattr(health, "open_python_can", lambda *_: SdoBus(config.drive.node))
+        monkeypatch.setattr(health, "sdo_round_trips_us", lambda *_: [1000.0] * SDO_READS)
         found = drive_finding(changed(config, rate_Hz=rate_Hz))
         assert (found.status, found.numbers["allowed_rate_Hz"]) == (status, 600.0)
 
@@ -209,7 +212,7 @@ class TestReport:
         ]
 
     def test_on_this_computer(self, config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(computer, "start_time_s", lambda cache: 1.0)
+        monkeypatch.setattr(health, "start_time_s", lambda cache: 1.0)
         elsewhere = changed(config, channel="nobody-listens-here")
         found = list(findings(elsewhere, wake_cycles=10))
         topics = [f.topic for f in found]

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.inspection import computer
-from jointctl.tools.inspection.computer import kernel_cache, kernel_findings, wake_up
-from jointctl.tools.inspection.findings import NOTE, OK, PROBLEM
+from jointctl.tools.inspection import health
+from jointctl.tools.inspection.health import NOTE, OK, PROBLEM, kernel_cache, kernel_findings, wake_up
 from jointctl.tools.session import loops as start_time
 from jointctl.tools.wake_up import fifo, wake_up_lateness_ns
 from tests.unit.inspection.system_files import write
@@ -22,7 +21,7 @@ from tests.unit.inspection.system_files import write
 class TestComputer:
     @pytest.mark.parametrize(("text", "status"), [("1\n", OK), ("0\n", NOTE), (None, NOTE)])
     def test_preempt_rt(self, tmp_path: Path, text: str | None, status: str, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(computer.platform, "version", lambda: "#1 SMP PREEMPT_DYNAMIC")
+        monkeypatch.setattr(health.platform, "version", lambda: "#1 SMP PREEMPT_DYNAMIC")
         if text is not None:
             write(tmp_path, "sys/kernel/realtime", text)
         kernel = next(kernel_findings(tmp_path))
@@ -41,7 +40,7 @@ class TestComputer:
     def test_full_preemption_is_advised_where_the_kernel_can(
         self, tmp_path: Path, version: str, options: str, advised: bool, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(computer.platform, "version", lambda: version)
+        monkeypatch.setattr(health.platform, "version", lambda: version)
         write(tmp_path, "proc/cmdline", options + "\n")
         kernel = next(kernel_findings(tmp_path))
         assert ("preempt=full" in kernel.cure) is advised
@@ -90,7 +89,7 @@ class TestWakeUp:
         self, virtual_config: Config, worst_us: int, status: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         late = np.array([10_000] * 99 + [worst_us * 1000])
-        monkeypatch.setattr(computer, "wake_up_lateness_ns", lambda rate, cycles: late)
+        monkeypatch.setattr(health, "wake_up_lateness_ns", lambda rate, cycles: late)
         found = next(wake_up(virtual_config, 100))
         assert found.status == status
         assert (found.numbers["p50_us"], found.numbers["max_us"]) == (10.0, worst_us)
@@ -105,7 +104,7 @@ class TestCache:
 
     def test_cold_is_not_started_unless_asked(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         started: list[Path | None] = []
-        monkeypatch.setattr(computer, "start_time_s", lambda cache: float(not started.append(cache)))
+        monkeypatch.setattr(health, "start_time_s", lambda cache: float(not started.append(cache)))
         (found,) = kernel_cache(tmp_path, False)
         assert (found.status, found.numbers["warm"], started) == (NOTE, False, [])
         write(tmp_path, "firmware_py_1/realtime.run_loop-86.py311.1.nbc", "12345678")
@@ -123,7 +122,7 @@ class TestCache:
         def failing(cache: Path | None) -> float:
             raise subprocess.CalledProcessError(1, "python", stderr=b"Traceback\nImportError: no numba\n")
 
-        monkeypatch.setattr(computer, "start_time_s", failing)
+        monkeypatch.setattr(health, "start_time_s", failing)
         write(tmp_path, "x/realtime.run_loop-86.py311.1.nbc", "1")
         assert list(kernel_cache(tmp_path, False))[1].text == "the loop cannot be started: ImportError: no numba"
 

@@ -11,10 +11,8 @@ import pytest
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.configuration.load import shipped_config
-from jointctl.tools.inspection import drive_words
-from jointctl.tools.inspection.frame_decoder import Decoded, FrameDecoder
-from jointctl.tools.inspection.objects import Objects, read_dictionary
-from jointctl.tools.inspection.pdo_maps import PdoMaps
+from jointctl.tools.inspection.frame_decoder import Decoded, FrameDecoder, PdoMaps
+from jointctl.tools.inspection.objects import Objects, control_text, read_dictionary
 
 EDS = shipped_config("virtual").with_name("virtual_joint.eds")
 
@@ -180,7 +178,7 @@ class TestSdo:
      (0x0002, "quick stop"), (0x0080, "fault reset"), (0x010F, "enable operation, halt")],
 )  # fmt: skip
 def test_controlwords(word: int, text: str) -> None:
-    assert drive_words.control_text(word) == f"{word:04X}h {text}"
+    assert control_text(word) == f"{word:04X}h {text}"
 
 
 def test_any_bytes_are_decoded_without_an_exception(decoder: FrameDecoder) -> None:

@@ -18,10 +18,8 @@ from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.inspection import node_scan
 from jointctl.tools.inspection.drive_info import drive_info, pdo_maps
 from jointctl.tools.inspection.node_scan import Ear
-from jointctl.tools.inspection.objects import Objects
-from jointctl.tools.inspection.sdo_reading import SdoReader
-from jointctl.tools.inspection.standard_objects import standard_variable
-from jointctl.tools.inspection.subject import Subject, canopen_network, subject_of_config, subject_of_flags
+from jointctl.tools.inspection.objects import Objects, standard_variable
+from jointctl.tools.inspection.subject import SdoReader, Subject, canopen_network, subject_of_config, subject_of_flags
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.info import info
 from jointctl.tools.verbs.monitor import Selection, monitor, selection_of

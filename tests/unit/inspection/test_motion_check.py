@@ -12,7 +12,7 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.faults.kinds import FaultConstants, FaultKind
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.inspection.findings import OK, PROBLEM
+from jointctl.tools.inspection.health import OK, PROBLEM
 from jointctl.tools.motion_check.plan import CheckMotion, config_of_check, make_plan, motion_table
 from jointctl.tools.motion_check.verdict import motion_findings
 from jointctl.tools.session.fault_words import fault_text

@@ -13,9 +13,9 @@ from jointctl.drivers.drive import CommissioningReport, DriveIdentity
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.configuration.conversions import velocity_of_a_count_radps
 from jointctl.tools.configuration.records import APPROACH_MIN_S
-from jointctl.tools.inspection.drive_scale import judged
-from jointctl.tools.inspection.findings import NOTE, OK
+from jointctl.tools.inspection.health import NOTE, OK
 from jointctl.tools.motion_check.plan import CheckMotion, config_of_check, make_plan, motion_table
+from jointctl.tools.motion_check.verdict import judged
 from tests.two_encoders import config_with
 
 

@@ -15,7 +15,7 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.faults.kinds import FaultConstants, FaultKind
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.inspection.findings import PROBLEM
+from jointctl.tools.inspection.health import PROBLEM
 from jointctl.tools.motion_check.plan import make_plan
 from jointctl.tools.motion_check.verdict import motion_findings
 from jointctl.tools.output import Output

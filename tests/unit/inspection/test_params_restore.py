@@ -14,7 +14,7 @@ import pytest
 from jointctl.drivers.errors import DECLINED, BusError, ConfigurationError, DeviceError, UsageError
 from jointctl.tools.inspection.objects import Place
 from jointctl.tools.verbs.params import place_index, restore_file
-from tests.unit.inspection.parameter_verbs import change, output, read, subject, writes
+from tests.unit.inspection.parameter_verbs import OLDER_DUMP, change, output, read, subject, writes
 
 
 def restored(device: Any, file: Path, **how: Any) -> int:
@@ -35,11 +35,18 @@ class TestRestore:
         assert {identifier for identifier, _ in device_on_bus.requests} == {0x601}
 
     def test_readings_and_commands_are_never_written(self, device_on_bus: Any, file: Path) -> None:
-        change(file, o6071="300", o6040="15", o6064="5", o6072="700")
-        text = file.read_text().replace("[parameters]", '[parameters]\n"60FF" = 99\n')
-        file.write_text(text.replace('"60FF" = 0', "", 1) if text.count("60FF") > 1 else text)
+        change(file, o6071="300", o6040="15", o6064="5", o60FF="99", o6072="700")
         assert restored(device_on_bus, file) == 0
         assert writes(device_on_bus) == [(0x6072, 0)]
+
+    def test_a_toml_dump_of_an_older_version_is_restored(self, device_on_bus: Any, tmp_path: Path) -> None:
+        path = tmp_path / "older.toml"
+        text = OLDER_DUMP.read_text().replace("6072 = 1000 ", "6072 = 700 ")
+        path.write_text(text.replace("[parameters]", "[parameters]\n6071 = 300\n60C1 = 5"))  # commands, not settings
+        assert restored(device_on_bus, path) == 0
+        assert (0x6072, 0) in writes(device_on_bus)
+        assert not {index for index, _ in writes(device_on_bus)} & {0x6071, 0x60C1}
+        assert read(device_on_bus).parameters[Place(0x6072)] == 700
 
     def test_a_mapping_is_restored_in_the_order_of_cia_301(self, device_on_bus: Any, file: Path) -> None:
         change(file, o1A01="1", o1A01_1="0x606C0020", o1801_2="255", o1801_1="0x281")
@@ -81,12 +88,22 @@ class TestRestore:
 
     @pytest.mark.parametrize("other", [True, False])
     def test_another_device_only_if_told_so(self, device_on_bus: Any, file: Path, other: bool) -> None:
-        file.write_text(file.read_text().replace("product_code = 1", "product_code = 9"))
-        change(file, o6072="700")
+        change(file, o1018_2="9", o6072="700")
         if other:
             assert restored(device_on_bus, file, other_device=True) == 0
         else:
             with pytest.raises(DeviceError, match=r"product_code \(=9\) is not that of the drive \(=1\)"):
+                restored(device_on_bus, file)
+        assert bool(writes(device_on_bus)) == other
+
+    @pytest.mark.parametrize("other", [True, False])
+    def test_another_node_only_if_asked_for(self, device_on_bus: Any, file: Path, other: bool) -> None:
+        change(file, o6072="700")
+        file.write_text(file.read_text().replace("NodeID=1\n", "NodeID=5\n"))
+        if other:
+            assert restored(device_on_bus, file, other_device=True) == 0
+        else:
+            with pytest.raises(DeviceError, match=r"node \(=5\) is not that of the drive \(=1\)"):
                 restored(device_on_bus, file)
         assert bool(writes(device_on_bus)) == other
 

@@ -21,11 +21,9 @@ from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, DriveState
 from jointctl.tools.output import Output
-from jointctl.tools.recording.can_log import frame_array, frame_times_ns
 from jointctl.tools.recording.log_export import FORMATS, columns, parquet_bytes
-from jointctl.tools.recording.log_facts import missing_records
-from jointctl.tools.recording.run_log import THINNING, RunLogWriter
-from jointctl.tools.recording.run_log_reader import read_run_log
+from jointctl.tools.recording.run_log import THINNING, RunLogWriter, frame_array, frame_times_ns
+from jointctl.tools.recording.run_log_reader import missing_records, read_run_log
 from jointctl.tools.session.bus_watch import FrameRecorder, recording
 from jointctl.tools.session.events import EventFinder
 from jointctl.tools.verbs.log import log_export, log_info, log_plot

@@ -15,8 +15,7 @@ from mcap_ros2.decoder import DecoderFactory
 from jointctl.drivers.errors import DataError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of, new
-from jointctl.tools.recording.cdr import event_body, event_from_body, message_definition
-from jointctl.tools.recording.run_log import ERROR, INFO, RunLogWriter
+from jointctl.tools.recording.run_log import ERROR, INFO, RunLogWriter, event_body, event_from_body, message_definition
 from jointctl.tools.recording.run_log_reader import read_run_log
 
 

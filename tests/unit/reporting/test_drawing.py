@@ -15,7 +15,7 @@ from jointctl.tools.drawing import BLUE, canvas, png, save_png
 from jointctl.tools.experiments.controller_study import PlantResult, StudyResult, study_figure
 from jointctl.tools.experiments.scenarios import ErrorFigures
 from jointctl.tools.output import Output
-from jointctl.tools.reporting.figure import svg_figure
+from jointctl.tools.reporting.page import svg_figure
 from tests.page_figures import foreign_colours, svgs
 
 

@@ -21,8 +21,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import INFO, RunLogWriter
 from jointctl.tools.recording.run_summary import summarise
 from jointctl.tools.reporting.comparison import aligned, at_times
-from jointctl.tools.reporting.figure import draw
-from jointctl.tools.reporting.page import Details, Figure, Paragraph, Section, Table, page, write_page
+from jointctl.tools.reporting.page import Details, Figure, Paragraph, Section, Table, draw, page, write_page
 from jointctl.tools.reporting.run_figures import binned, friction_points, run_figures
 from jointctl.tools.verbs.report import MOST_LOGS, log_names, report, verdict
 

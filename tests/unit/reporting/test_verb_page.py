@@ -9,8 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from jointctl.tools.output import Output
-from jointctl.tools.reporting.page import Section
-from jointctl.tools.reporting.verb_page import from_terminal, remarks, write_verb_page
+from jointctl.tools.reporting.page import Section, from_terminal, remarks, write_verb_page
 
 
 def test_a_table_of_the_terminal_keeps_its_words() -> None:

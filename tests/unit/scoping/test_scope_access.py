@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from jointctl.drivers.errors import DataError, UsageError
-from jointctl.tools.scoping import order as order_module
-from jointctl.tools.scoping.access import COOKIE, allowed, cookie_name
-from jointctl.tools.scoping.order import ScopeOrder, scope_order
+from jointctl.tools.scoping import feed as feed_module
+from jointctl.tools.scoping.feed import ScopeOrder, scope_order
+from jointctl.tools.scoping.server import COOKIE, allowed, cookie_name
 
 
 def request(host: str, query: str = "", **headers: str) -> dict[str, Any]:
@@ -59,10 +59,10 @@ def test_the_token_is_asked_for_on_this_computer_too(host: str, query: str, cook
 
 
 def test_orders_are_checked_and_each_has_a_token_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(order_module, "find_spec", lambda name: None)
+    monkeypatch.setattr(feed_module, "find_spec", lambda name: None)
     with pytest.raises(DataError, match="needs the package nicegui"):
         scope_order("t", "127.0.0.1", 8642)
-    monkeypatch.setattr(order_module, "find_spec", lambda name: object())
+    monkeypatch.setattr(feed_module, "find_spec", lambda name: object())
     with pytest.raises(UsageError, match=r"--port \(=0\) must be in \[1..65535\]"):
         scope_order("t", "127.0.0.1", 0)
     with socket.socket() as taken:

@@ -35,7 +35,7 @@ class Panels:
     """The change panels' fields without a browser."""
 
     def __init__(self, **shown: float) -> None:
-        panels = pytest.importorskip("jointctl.tools.scoping.change_panels")
+        panels = pytest.importorskip("jointctl.tools.scoping.scope_page")
         self.asked: list[tuple[str, dict[str, Any]]] = []
         self.panels = panels.ChangePanels.__new__(panels.ChangePanels)
         self.panels._ask = lambda kind, values: self.asked.append((kind, values))

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from jointctl.drivers.errors import BusError
-from jointctl.tools.simulation.starting import IDLE_S, TELL_S, Starting, processor_time_s
+from jointctl.tools.simulation.child_process import IDLE_S, TELL_S, Starting, processor_time_s
 
 
 class Waiting:

@@ -21,7 +21,7 @@ from jointctl.tools.recording.log_export import csv_bytes, npz_bytes, table_colu
 from jointctl.tools.recording.run_log import RunLogWriter
 from jointctl.tools.recording.run_log_reader import read_run_log
 from jointctl.tools.recording.run_summary import summarise
-from jointctl.tools.reporting.temperature_figure import temperature_figure
+from jointctl.tools.reporting.run_figures import temperature_figure
 from jointctl.tools.session.bus_watch import STALE_S, TemperatureWatch
 from tests.places import CONFIGS
 

@@ -19,7 +19,7 @@ from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.faults.kinds import FaultConstants, FaultKind
 from jointctl.tools.configuration.drive_settings import canopen_settings, cyclic_bus_load
 from jointctl.tools.configuration.load import load_config
-from jointctl.tools.inspection.bus_health import bus_budget
+from jointctl.tools.inspection.health import bus_budget
 from jointctl.tools.session.open_drive import drive_fault_text
 from jointctl.tools.simulation.lockstep import LockstepJoint
 from jointctl.tools.simulation.virtual_joint import new_device

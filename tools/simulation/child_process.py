@@ -1,7 +1,7 @@
-"""Waiting for a process that compiles before it is ready: for as long as it works, and saying what it does meanwhile.
+"""Processes that jointctl starts: waiting until one that compiles is ready, and Ctrl-C kept from them.
 
-A fixed time would be wrong: the first start takes a minute on an idle computer and many on a busy one.  A process
-that works uses processor time; one that hangs does not.
+A fixed time to wait would be wrong: the first start takes a minute on an idle computer and many on a busy one.  A
+process that works uses processor time; one that hangs does not.
 """
 
 from __future__ import annotations
@@ -10,7 +10,9 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from pathlib import Path
 
 from jointctl.drivers.errors import JointctlError
@@ -75,3 +77,17 @@ class Starting:
         if now_s - self._told_s >= TELL_S:
             self._told_s = now_s
             self._tell(f"{self._name} is compiling: {so_far} so far, {used_s:.0f} s of processor time")
+
+
+@contextmanager
+def interrupts_left_to_the_parent() -> Iterator[None]:
+    """Processes that are started within hold Ctrl-C back from their first instruction on; here it comes afterwards.
+
+    An initialiser of a worker would be too late: its imports take a second, and each would end with a traceback.
+    """
+    resource_tracker.ensure_running()  # with the first spawned process it would let the signal through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

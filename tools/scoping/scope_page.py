@@ -1,0 +1,406 @@
+"""The scope's page: one viewer, put together from its panels; all viewers look at the same history."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+from nicegui import ui
+
+from jointctl.tools.recording.run_log import Event
+from jointctl.tools.scoping.chart import Chart
+from jointctl.tools.scoping.feed import ScopeOrder
+from jointctl.tools.scoping.history import History, percentiles_us
+from jointctl.tools.session.display import ViewerRequest, viewer
+from jointctl.tools.session.events import drive_state_name, fault_words, phase_name
+
+# --- STOP ---
+
+STOP_PATH = "/stop"
+ANSWER_s = 2.0
+STALE_s = 3.0
+NOT_TAKEN = "STOP DID NOT ARRIVE: Ctrl-C in the terminal, jointctl stop, or the emergency stop"
+STALE = "no news: what this page shows is old, and the joint may move"
+
+_PRESSED = """() => {
+  const word = document.querySelector('[data-testid="stop-word"]')
+  const tell = (text, bad) => { word.textContent = text; word.style.color = bad ? '#c62828' : 'inherit' }
+  tell('…', false)
+  fetch('STOP_PATH', {method: 'POST', signal: AbortSignal.timeout(ANSWER_MS)})
+    .then(answer => { if (!answer.ok) throw answer.status; return answer.text() })
+    .then(text => { tell(text, false); setTimeout(() => word.textContent === text && tell('', false), 8000) })
+    .catch(() => tell('NOT_TAKEN', true))
+}"""
+
+_WATCH = """<script>
+(() => {
+  let seen = '', at = Date.now()
+  setInterval(() => {
+    const beat = document.querySelector('[data-testid="beat"]'), stale = document.querySelector('[data-testid="stale"]')
+    if (!beat || !stale) return
+    if (beat.textContent !== seen) { seen = beat.textContent; at = Date.now() }
+    stale.style.display = Date.now() - at > STALE_MS ? 'block' : 'none'
+  }, 500)
+})()
+</script>"""
+
+
+class StopButton:
+    """The button, what became of the last press, and the mark of a page without news for `STALE_s`.
+
+    A press is a plain HTTP request of its own, so that it works when nothing else on the page does: it needs neither
+    the page's web socket nor its state on the server.  That it did not arrive is shown as well.
+    """
+
+    def __init__(self) -> None:
+        ui.add_body_html(_WATCH.replace("STALE_MS", f"{STALE_s * 1e3:.0f}"))
+        pressed = _PRESSED.replace("STOP_PATH", STOP_PATH).replace("NOT_TAKEN", NOT_TAKEN)
+        pressed = pressed.replace("ANSWER_MS", f"{ANSWER_s * 1e3:.0f}")
+        with ui.column().classes("items-end gap-1 shrink-0"):
+            button = ui.button("STOP", color="red-8").on("click", js_handler=pressed)
+            button.classes("text-3xl font-bold px-14 py-3").props('data-testid="stop"')
+            word = ui.label("").classes("text-sm font-bold").props('data-testid="stop-word"')
+            word.style("max-width: 420px; text-align: right")
+        self._beat: Any = ui.label("").style("display: none").props('data-testid="beat"')
+
+    def beat(self, number: int) -> None:
+        """A sign of life, at least once a second."""
+        self._beat.text = str(number)
+
+
+def stale_mark() -> None:
+    """Where the page says that what it shows is old."""
+    label = ui.label(STALE).props('data-testid="stale"')
+    label.style("display: none; color: white; background: #c62828; padding: 2px 8px; font-weight: 600")
+
+
+# --- before the joint moves ---
+
+Ask = Callable[[str, dict[str, Any]], None]
+
+
+class StartPanel:
+    """What the joint is about to do, the viewer's word that the way is clear, and Start.
+
+    Shown while a run is being prepared from the page (`jointctl scope CONFIG`), and again after its end.
+    """
+
+    def __init__(self, ask: Ask) -> None:
+        self._ask = ask
+        self._number: int | None = None
+        with ui.card().classes("w-full p-3 gap-1").props('flat bordered data-testid="start-panel"') as self._card:
+            self._title = ui.label("").classes("font-bold")
+            self._lines = ui.label("").style("white-space: pre-wrap; font: 13px/1.5 monospace")
+            with ui.row().classes("items-center gap-6"):
+                self._clear = ui.checkbox("this range is clear, and I can reach the emergency stop")
+                self._clear.props('data-testid="clear"').on_value_change(self._on_tick)
+                self._start = ui.button("Start", on_click=self._on_start, color="green-8")
+                self._start.classes("text-lg px-8").props('no-caps data-testid="start"')
+                self._prepare = ui.button("Prepare the next run", on_click=lambda: ask("prepare", {}))
+                self._prepare.props('no-caps outline data-testid="prepare"')
+        self._card.visible = False
+
+    def _on_tick(self) -> None:
+        self._start.enabled = bool(self._clear.value)
+
+    def _on_start(self) -> None:
+        """Only the very envelope that is shown is confirmed: its number goes along."""
+        if self._clear.value and self._number is not None:
+            self._ask("start", {"number": self._number, "clear": True})
+
+    def show(self, settings: Mapping[str, Any]) -> None:
+        """Follow the stage."""
+        stage = settings.get("stage")
+        ready = stage == "ready"
+        self._card.visible = ready or stage in ("ended", "declined")
+        number = settings.get("number")
+        if ready and number != self._number:
+            self._number = number
+            self._clear.value = False
+            self._start.enabled = False
+        self._title.text = "The joint is about to move:" if ready else "The run is over"
+        self._lines.text = "\n".join(settings.get("lines", []))
+        self._clear.visible = self._start.visible = ready
+        self._prepare.visible = not ready
+
+
+# --- what may be changed while it moves: set-point, trajectory, gains; and the recording ---
+
+# kind -> key -> (label, first value)
+FIELDS: dict[str, dict[str, tuple[str, float]]] = {
+    "configured": {},
+    "sine": {
+        "amplitude_rad": ("amplitude [rad]", 0.1), "frequency_Hz": ("frequency [Hz]", 0.2),
+        "offset_rad": ("offset [rad]", 0.0),
+    },
+    "min_jerk": {
+        "start_rad": ("start [rad]", 0.0), "target_rad": ("target [rad]", 0.1), "move_s": ("move [s]", 2.0),
+        "dwell_s": ("rest [s]", 0.5),
+    },
+    "trapezoid": {
+        "start_rad": ("start [rad]", 0.0), "target_rad": ("target [rad]", 0.1), "speed_radps": ("speed [rad/s]", 0.1),
+        "acceleration_radps2": ("acceleration [rad/s2]", 0.5), "dwell_s": ("rest [s]", 0.5),
+    },
+}  # fmt: skip
+ENDLESS = "a set-point, sine, move or trapezoid goes on until it is stopped; the configured motion ends by itself"
+UNITS = {"kp": "kp [1/s2]", "kv": "kv [1/s]", "ki": "ki [1/s3]", "observer_radps": "observer [rad/s]",
+         "learning_rate": "learning rate"}  # fmt: skip
+
+
+class Followed:
+    """A field that shows what is in force until a viewer types into it, and again once that is in force."""
+
+    def __init__(self, field: Any, digits: str) -> None:
+        self.field, self._digits = field, digits
+        self._shown: float | None = _number(field)
+
+    def _same(self, value: float | None, other: float | None) -> bool:
+        """As far as the field shows them: a browser gives back what it shows."""
+        if value is None or other is None:
+            return value is other
+        return format(value, self._digits) == format(other, self._digits)
+
+    @property
+    def typed(self) -> bool:
+        """Whether it holds something of the viewer's own."""
+        return not self._same(_number(self.field), self._shown)
+
+    def follow(self, now: float) -> None:
+        """`now` is in force."""
+        if self.typed and not self._same(_number(self.field), now):
+            return
+        if not self._same(_number(self.field), now):
+            self.field.value = now
+        self._shown = now
+
+
+class ChangePanels:
+    """The right-hand side of the page; nothing here is more than a wish: the supervisor checks each."""
+
+    def __init__(self, ask: Ask) -> None:
+        self._ask = ask
+        self._gains: dict[str, Followed] = {}
+        self._given: dict[str, Any] = {}
+        self._recording = False
+        with ui.column().classes("w-64 shrink-0 gap-2") as self._column:
+            with _card("Set-point"), ui.row().classes("w-full no-wrap items-end gap-2"):
+                self._set_point = ui.number("angle [rad]", value=0.0, step=0.01, format="%.4f")
+                self._set_point.classes("grow").props('dense data-testid="set-point"')
+                self._angle = Followed(self._set_point, ".4f")
+                _button("Go", self._go, "go")
+            with _card("Trajectory"):
+                kinds = {kind: kind.replace("_", " ") for kind in FIELDS}
+                self._kind = ui.select(kinds, value="configured", on_change=self._on_kind).classes("w-full")
+                self._kind.props('dense options-dense data-testid="kind"')
+                self._fields = ui.grid(columns=2).classes("w-full gap-x-2 gap-y-0")
+                _button("Follow it", self._follow, "follow")
+            ui.label(ENDLESS).classes("text-xs text-grey-7")
+            with _card("Gains"):
+                self._gain_rows = ui.grid(columns=2).classes("w-full gap-x-2 gap-y-0")
+                _button("Apply", self._apply, "apply")
+            self._record = _button("Record", self._on_record, "record").classes("w-full")
+            self._recorded = ui.label("the run log has everything in any case").classes("text-xs text-grey-7")
+
+    def _go(self) -> None:
+        self._ask("set_point", {"position_rad": _number(self._set_point)})
+
+    def _on_kind(self) -> None:
+        self._given = {}
+        self._fields.clear()
+        with self._fields:
+            for key, (label, value) in FIELDS[self._kind.value].items():
+                self._given[key] = ui.number(label, value=value, format="%.4g").props(f'dense data-testid="{key}"')
+
+    def _follow(self) -> None:
+        kind = self._kind.value
+        values: dict[str, Any] = {"kind": kind}
+        if kind != "configured":
+            values |= {"duration_s": 0.0, **{key: _number(field) for key, field in self._given.items()}}
+        if kind in ("min_jerk", "trapezoid"):
+            values["repeat"] = True
+        self._ask("trajectory", values)
+
+    def _apply(self) -> None:
+        """Only what was typed: the other gains may be another viewer's by now."""
+        typed = {name: _number(gain.field) for name, gain in self._gains.items() if gain.typed}
+        if typed:
+            self._ask("gains", typed)
+
+    def _on_record(self) -> None:
+        self._ask("record", {"on": not self._recording})
+
+    def show(self, settings: Mapping[str, Any]) -> None:
+        """Gains appear when the supervisor tells them; what the viewer has typed stays."""
+        gains: Mapping[str, Any] = settings.get("gains", {})
+        self._column.visible = settings.get("stage") == "running" and bool(gains)
+        if set(gains) != set(self._gains):
+            self._gain_rows.clear()
+            self._gains = {}
+            with self._gain_rows:
+                for name, (low, now, high) in gains.items():
+                    field = ui.number(UNITS.get(name, name), value=now, min=low, max=high, format="%.5g")
+                    self._gains[name] = Followed(field.props(f'dense data-testid="gain-{name}"'), ".5g")
+        for name, (low, now, high) in gains.items():
+            self._gains[name].follow(now)
+            self._gains[name].field.props(f'hint="now {now:.5g}, {low:.4g} to {high:.4g}"')
+        if "reference_rad" in settings:
+            self._angle.follow(float(settings["reference_rad"]))
+        self._recording = bool(settings.get("recording"))
+        self._record.text = "Stop recording" if self._recording else "Record"
+        self._recorded.text = str(settings.get("recording") or "the run log has everything in any case")
+
+
+def _number(field: Any) -> float | None:
+    return None if field.value is None else float(field.value)
+
+
+def _card(title: str) -> Any:
+    card = ui.card().classes("w-full p-3 gap-1").props("flat bordered")
+    with card:
+        ui.label(title).classes("font-bold leading-tight")
+    return card
+
+
+def _button(text: str, action: Callable[[], None], name: str) -> Any:
+    return ui.button(text, on_click=action).props(f'no-caps dense outline data-testid="{name}"').classes("px-4")
+
+
+# --- the page ---
+
+REFRESH_s = 0.1
+IDLE_SHARE = 3.0  # drawing leaves at least so many times its own duration to everything else, STOP above all
+SLOW = 5  # every so many refreshes the texts are renewed
+STATISTICS_s = 10.0
+SHOWN_EVENTS = 8
+SILENT_s = 2.0  # a run tells something 50 times a second
+CSS = (
+    ".q-field__label{font-size:13px} body{font-size:14px} .nicegui-content{padding:0 14px 10px; gap:8px}"
+    " .scope-head{position:sticky; top:0; z-index:10; background:#fff; padding:10px 0 4px}"
+    " @media (max-width: 900px) {.scope-body{flex-wrap:wrap} .scope-body>*{width:100%}}"
+)
+STAGES = {
+    "terminal": "waiting for the answer in the terminal",
+    "preparing": "preparing the drive; nothing moves",
+    "ready": "ready; nothing moves before Start",
+    "declined": "not started; the drive is disabled",
+}
+
+
+class Link(Protocol):
+    """The way back to the supervisor."""
+
+    def ask(self, request: ViewerRequest) -> bool:
+        """Whether it was taken; STOP has a way of its own."""
+        ...
+
+
+class ScopePage:
+    """What one viewer sees; `link` None means that there is only a log to look at."""
+
+    def __init__(self, order: ScopeOrder, history: History, link: Link | None) -> None:
+        self._order, self._history, self._link = order, history, link
+        self._ticks = 0
+        self._draw_again_s = 0.0
+        client: Any = ui.context.client
+        self._who = viewer(getattr(client, "ip", None))
+        ui.add_css(CSS)
+        self._build()
+        self._tell()
+        ui.timer(REFRESH_s, self._refresh)
+
+    def _build(self) -> None:
+        self._stop: StopButton | None = None
+        with ui.row().classes("w-full items-start no-wrap gap-4 scope-head"):
+            with ui.column().classes("gap-0 grow min-w-0"):
+                ui.label(self._order.title).classes("text-xl font-bold leading-tight")
+                self._state = ui.label("waiting for the run").classes("text-base").props('data-testid="state"')
+                stale_mark()
+            if self._link is not None:
+                self._stop = StopButton()
+        self._start = StartPanel(self._ask) if self._link is not None else None
+        with ui.row().classes("w-full no-wrap items-start gap-4 scope-body"):
+            with ui.column().classes("grow min-w-0 gap-2"):
+                self._chart = Chart(self._history, live=self._link is not None)
+                with ui.row().classes("w-full no-wrap gap-10 items-start scope-body"):
+                    self._deadlines = _text_block(f"Deadlines, last {STATISTICS_s:g} s", "deadlines")
+                    self._events = _text_block("Events", "events")
+            if self._link is not None:
+                self._changes: ChangePanels | None = ChangePanels(self._ask)
+            else:
+                self._changes = None
+
+    def _ask(self, kind: str, values: dict[str, Any]) -> None:
+        if self._link is not None and not self._link.ask(ViewerRequest(kind, self._who, values)):
+            ui.notify("not taken: jointctl does not listen", type="negative", position="top")
+
+    def _refresh(self) -> None:
+        self._ticks += 1
+        if self._ticks % SLOW == 1:
+            self._tell()
+        now_s = time.monotonic()
+        if now_s >= self._draw_again_s:
+            self._chart.refresh()
+            drawn_s = time.monotonic()
+            self._draw_again_s = drawn_s + IDLE_SHARE * (drawn_s - now_s)
+
+    def _tell(self) -> None:
+        """Everything but the picture."""
+        self._texts()
+        if self._stop is not None:
+            self._stop.beat(self._ticks)
+        settings = self._history.settings
+        if self._start is not None:
+            self._start.show(settings)
+        if self._changes is not None:
+            self._changes.show(settings)
+
+    def _texts(self) -> None:
+        stage = str(self._history.settings.get("stage", ""))
+        rows = self._history.newest(STATISTICS_s)
+        events = list(self._history.events)[-SHOWN_EVENTS:]
+        self._events.text = "\n".join(self._line(event) for event in reversed(events)) or "none yet"
+        fault = int(rows[-1]["fault"]) if len(rows) else 0
+        words = [STAGES[stage]] if stage in STAGES else self._words(rows, stage) if len(rows) else []
+        self._state.text = " · ".join(words) or "waiting for the run"
+        silent_s = time.monotonic() - self._history.heard_s
+        if stage == "running" and not self._history.ended and silent_s > SILENT_s:
+            words.append(f"NO NEWS FROM THE RUN for {silent_s:.0f} s")
+        bad = (fault and stage not in STAGES) or (silent_s > SILENT_s and stage == "running")
+        self._state.style(replace="color: #c62828; font-weight: 600" if bad else "color: inherit")
+        if len(rows):
+            lines = [f"{name:13}{text}" for name, text in percentiles_us(rows).items()]
+            lines.append(f"{'skipped':13}{self._history.skipped} cycles since the start")
+            self._deadlines.text = "\n".join([f"{'':13}p50 / p99 / max", *lines])
+
+    def _line(self, event: Event) -> str:
+        return f"{max(0.0, self._history.second(event.time_ns)):7.1f} s  {event.source}: {event.text}"
+
+    def _words(self, rows: Any, stage: str) -> list[str]:
+        last = rows[-1]
+        drive = drive_state_name(int(last["status_word"]), int(last["drive_state"]), cia402=self._order.cia402)
+        words = [phase_name(int(last["phase"])), f"drive: {drive}"]
+        temperature_degC = self._history.settings.get("temperature_degC")
+        if temperature_degC is not None and not self._history.ended and stage != "ended":
+            words.append(f"{temperature_degC:.1f} °C")
+        fault = int(last["fault"])
+        if fault:
+            words.append(f"FAULT: {fault_words(fault)}")
+        if self._history.ended or stage == "ended":
+            words.append("the run has ended")
+        elif motion := self._history.settings.get("motion"):
+            words.append(str(motion))
+        return words
+
+
+def _text_block(title: str, name: str) -> Any:
+    with ui.column().classes("gap-0 min-w-0" if name == "events" else "gap-0 shrink-0"):
+        ui.label(title).classes("font-bold")
+        label = ui.label("-").style("white-space: pre-wrap; font: 12px/1.45 monospace")
+        label.style("" if name == "events" else "white-space: pre")
+        return label.props(f'data-testid="{name}"')
+
+
+def build_page(order: ScopeOrder, history: History, link: Link | None) -> None:
+    """The page of one viewer."""
+    ScopePage(order, history, link)
