@@ -16,7 +16,8 @@ from jointctl.tools.configuration.load import load_config
 from jointctl.tools.simulation.virtual_joint import new_device
 from tests.axis_on_stub_joint import Rig, small_axis_constants
 from tests.device_on_bus import DeviceOnBus
-from tests.places import CONFIGS
+from tests.places import CONFIGS, ROOT
+from tests.tiers import tier_of
 
 
 def pytest_configure() -> None:
@@ -24,6 +25,17 @@ def pytest_configure() -> None:
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ["JOINTCTL_TRACEBACK"] = "1"  # what no one has foreseen is to be seen in what the tests start
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Each test gets the marker of its folder, before -m chooses; `slow` tells why."""
+    for item in items:
+        tier = tier_of(item.path.relative_to(ROOT / "tests"))
+        if tier is not None:
+            item.add_marker(tier)
+        for mark in item.iter_markers("slow"):
+            if not (len(mark.args) == 1 and isinstance(mark.args[0], str)):
+                raise pytest.UsageError(f"{item.nodeid}: pytest.mark.slow needs its reason")
 
 
 @pytest.fixture

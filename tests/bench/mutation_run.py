@@ -291,7 +291,19 @@ def main() -> int:
 
     print(f"part {chosen.part}", flush=True)
     part, parts = (int(text) for text in chosen.part.split("/"))
-    options = ["-s", "-qq", "-p", "no:cacheprovider", "-p", "no:randomly", "-p", "no:xdist", "--hypothesis-seed=0"]
+    options = [
+        "-o",
+        "addopts=--import-mode=importlib",
+        "-s",
+        "-qq",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "no:randomly",
+        "-p",
+        "no:xdist",
+        "--hypothesis-seed=0",
+    ]
     survivors: list[dict[str, Any]] = []
     for module in modules:
         session = Session(module, part, parts)

@@ -196,7 +196,7 @@ def test_the_same_tests_pass_in_plain_python_and_cover_the_safety_code(tmp_path:
     report = tmp_path / "coverage.json"
     files = [str(file) for name in PLAIN for file in sorted((ROOT / "tests" / "unit").glob(f"{name}.py"))]
     assert len(files) >= len(PLAIN)
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *files]
+    command = [sys.executable, "-m", "pytest", "-n0", "-p", "no:cacheprovider", *files]
     command += ["--cov=firmware_py", "--cov=drivers", "--cov-branch", f"--cov-report=json:{report}"]
     environment = {
         **os.environ,

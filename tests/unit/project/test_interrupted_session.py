@@ -22,6 +22,6 @@ def test_sigint_ignored_is_passed_on_otherwise() -> None:
 
 def test_the_first_holds_in_a_session_that_was_started_with_sigint_ignored() -> None:
     chosen = f"{Path(__file__).resolve()}::{test_a_process_of_the_tests_can_be_interrupted.__name__}"
-    command = [*IGNORED, sys.executable, "-m", "pytest", "-p", "no:cacheprovider", chosen]
+    command = [*IGNORED, sys.executable, "-m", "pytest", "-n0", "-p", "no:cacheprovider", chosen]
     found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert found.returncode == 0, found.stdout

@@ -1,0 +1,22 @@
+"""Which tests run when: the markers `realtime` and `parties` go with the folder, `slow` stands at the test."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+FOLDERS = {"hil": "realtime", "faults": "realtime", "docs": "realtime", "socketcan": "realtime", "parties": "parties"}
+# in these folders, but at simulated time
+LOCKSTEP = (
+    *(f"hil/test_{name}.py" for name in ("friction_chain", "law_options", "paper_figures", "study", "sweep")),
+    *(
+        f"faults/test_{name}.py"
+        for name in ("campaign_configurations", "every_frame", "fault_campaign", "fault_engine", "fault_regressions")
+    ),
+)
+
+
+def tier_of(path: Path) -> str | None:
+    """Marker of the tests in a file, given by its place below tests; None: it runs with the others."""
+    if path.as_posix() in LOCKSTEP:
+        return None
+    return FOLDERS.get(path.parts[0])
