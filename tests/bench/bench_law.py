@@ -1,7 +1,7 @@
 """The control tick and its parts, alone: kernel, C, numpy.
 
-Not collected by default (its name); run `python -m pytest -n 0 --benchmark-enable tests/bench/bench_law.py`.  It needs pytest-benchmark and a
-C compiler.  For paired ratios on a busy computer use `python -m tests.bench.speed --only law`.
+Not collected by default (its name); run `python -m pytest -n 0 --benchmark-enable tests/bench/bench_law.py`.  It needs
+pytest-benchmark and a C compiler.  For paired ratios on a busy computer use `python -m tests.bench.speed --only law`.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 """How fast the swarm is: the full budget in seconds, and against PyPI's pyswarms on the same budget and machine.
 
-Not collected by default (its name); run `python -m pytest -n 0 --benchmark-enable tests/bench/bench_pso.py -s`.  Without pyswarms, which is
-not a dependency, the comparison is skipped and says so.  pyswarms' time is proportional to its iterations, so it does
-a part of them and the time is scaled to 5000; ours does them all.  Both optimise the same 8 parameters of each
-direction, within the same limits, with the same weights.  pyswarms gets its cost vectorised over particles, as its
-manual asks for, in two ways: (11) as it is written, with both stages at every point, which the comparison is about;
-and tuned, with the points sorted into their stage and the polynomials made beforehand, which is only printed.  Both
-directions run at the same time with ours, one after the other with pyswarms.
+Not collected by default (its name); run `python -m pytest -n 0 --benchmark-enable tests/bench/bench_pso.py -s`.
+Without pyswarms, which is not a dependency, the comparison is skipped and says so. pyswarms' time is proportional to
+its iterations, so it does a part of them and the time is scaled to 5000; ours does them all. Both optimise the same 8
+parameters of each direction, within the same limits, with the same weights. pyswarms gets its cost vectorised over
+particles, as its manual asks for, in two ways: (11) as it is written, with both stages at every point, which the
+comparison is about; and tuned, with the points sorted into their stage and the polynomials made beforehand, which is
+only printed. Both directions run at the same time with ours, one after the other with pyswarms.
 """
 
 from __future__ import annotations
