@@ -34,6 +34,8 @@ from tests.faults.campaign_variants import VARIANTS, write_variant
 from tests.faults.test_fault_campaign import WIDE, good_run
 from tests.places import CONFIGS
 
+pytestmark = pytest.mark.slow("some sixty faults on each of seven joints")
+
 KINDS = len(FAULT_CLASSES)
 
 

@@ -38,6 +38,8 @@ from jointctl.tools.simulation.lockstep import LockstepJoint
 from jointctl.tools.verbs.paper import paper
 from tests.page_figures import foreign_colours, svgs
 
+pytestmark = pytest.mark.slow("all experiments of the paper, and an ensemble of joints")
+
 _RUN = Experiment.run  # a test replaces it
 _ALL = {experiment.key: experiment for experiment in experiments()}
 

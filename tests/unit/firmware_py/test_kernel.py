@@ -192,6 +192,7 @@ FULLY_COVERED = (
 )
 
 
+@pytest.mark.slow("the tests of the safety code once more, without the compiler")
 def test_the_same_tests_pass_in_plain_python_and_cover_the_safety_code(tmp_path: Path) -> None:
     report = tmp_path / "coverage.json"
     files = [str(file) for name in PLAIN for file in sorted((ROOT / "tests" / "unit").glob(f"{name}.py"))]
