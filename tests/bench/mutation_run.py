@@ -49,7 +49,7 @@ TESTS = {  # below UNIT_TESTS
     ),
     "drivers/bus_lock.py": ("drivers/test_bus_lock",),
     "tools/session/stop_call.py": ("session/test_stop_call", "drivers/test_bus_lock"),
-    "tools/session/control.py": ("session/test_control",),
+    "tools/session/control.py": ("session/test_control", "session/test_stop_signals"),
 }  # fmt: skip
 KERNELS = (*(module for module in TESTS if module.startswith("firmware_py")), "drivers/canopen/cia402.py")
 LONGEST_S = 120.0  # of processor time: on a busy computer a sound mutant must not count as one that hangs
