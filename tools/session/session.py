@@ -27,8 +27,7 @@ from jointctl.tools.session.guard import GuardHandle, kept_awake, start_guard
 from jointctl.tools.session.loop_handle import LoopHandle
 from jointctl.tools.session.open_drive import check_cyclic_rate, commission, drive_fault_text, open_drive
 from jointctl.tools.session.plan import Placed, RunPlan
-from jointctl.tools.session.result import RunResult as RunResult
-from jointctl.tools.session.result import warn_unless_off
+from jointctl.tools.session.result import RunResult, warn_unless_off
 from jointctl.tools.session.run_watch import Around, RunParts, RunWatch
 
 POLL_S = 0.02
