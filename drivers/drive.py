@@ -46,6 +46,7 @@ class CommissioningReport:
     remarks: tuple[str, ...] = ()
     loop_delay_s: float | None = None  # measured, position sample to torque command; None = not measured
     counts_per_motor_turn: float = 0.0  # of the encoder, by the drive's own word; 0 = it does not report it
+    commands_velocity: bool = False  # the loop sends it a velocity, and the drive closes that loop
     measures_torque: bool = True  # False: the drive does not report its torque in the cyclic exchange, it reads as zero
 
 

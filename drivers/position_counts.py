@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Protocol
 
 from jointctl.firmware_py.kernel import kernel
 
@@ -10,12 +10,17 @@ WRAP = 1 << 32
 HALF_WRAP = 1 << 31
 
 
-@kernel
-def take_counts(port: Any, counts: int) -> None:
-    """Unwrap the 32 bit position: the joint moves less than half the range between two samples.
+class PositionCounter(Protocol):
+    """What any driver's record has of it."""
 
-    `port` is any driver's record with the fields primed, last_counts (as received) and counts (unwrapped).
-    """
+    primed: int
+    last_counts: int  # as received
+    counts: int  # unwrapped
+
+
+@kernel
+def take_counts(port: PositionCounter, counts: int) -> None:
+    """Unwrap the 32 bit position: the joint moves less than half the range between two samples."""
     if port.primed == 0:
         port.primed = 1
         port.counts = counts

@@ -48,7 +48,7 @@ from jointctl.firmware_py.sequence import (
     write_command,
 )
 from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, Reaction
-from jointctl.firmware_py.trajectory import approach_at, brake_step, reference_at, repetition
+from jointctl.firmware_py.trajectory import NO_REPETITION, approach_at, brake_step, reference_at, repetition
 
 # --- Velocity from position differences with a first-order low-pass ---
 # The filter lags, and a velocity error e' = filter(q') - q_d' then carries the lag of q' but not of q_d', which an
@@ -186,9 +186,9 @@ def _command_torque(constants: AxisConstants, state: AxisState, table: np.ndarra
     if state.phase == AxisPhase.RELEASING:
         state.unlimited_torque_Nm = released_torque_Nm(constants, state, elapsed_cycles)
     elif powered(state.phase):
-        epoch, repeat_s, local_s = 0, 0.0, 0.0
+        where = NO_REPETITION
         if state.phase == AxisPhase.TRACKING:
-            epoch, repeat_s, local_s = repetition(constants.trajectory, table, state.trajectory_s)
+            where = repetition(constants.trajectory, table, state.trajectory_s)
         state.unlimited_torque_Nm = step_law(
             constants.law,
             state.law,
@@ -196,9 +196,7 @@ def _command_torque(constants: AxisConstants, state: AxisState, table: np.ndarra
             state.velocity,
             state.reference,
             state.command_torque_Nm,
-            epoch,
-            repeat_s,
-            local_s,
+            where,
         )
     else:
         state.unlimited_torque_Nm = 0.0

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,16 +25,6 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ZeroSpeedRule
 
 # --- Multi-stage friction model (11): Stribeck near zero speed, a cubic polynomial beyond the knee ---
-# Torque is that at the MOTOR, speed that of the JOINT in rad/s; the joint feels `reduction_ratio` times the torque.
-# Each direction is stored mirrored (positive speed, positive friction), so that one expression serves both:
-#
-#     u = |v| <= knee :  tc + (ts - tc) exp(-u / ws) + tv u
-#     u > knee        :  a0 + a1 u + a2 u^2 + a3 u^3
-#     u > maximum     :  value and slope at the maximum are held (the data end there, so extrapolation is a guess)
-#
-# (11) prints the exponent of the negative direction as -v/ws, which diverges; mirrored it is -|v|/ws. The two stages
-# need not meet at the knee (Table 3 has steps of 0.0017 and 0.0013 Nm). Not modelled: position, temperature and load
-# dependence.
 
 
 DEGREE = math.pi / 180.0
@@ -80,24 +70,26 @@ def compensation_motor_torque_Nm(
     return friction_motor_torque_Nm(friction, velocity_radps)
 
 
-def branch_constants(
-    tc: float,
-    ts: float,
-    ws: float,
-    tv: float,
-    cubic: Sequence[float],
-    knee: float,
-    maximum: float,
-    *,
-    negative: bool,
-    radps_per_unit: float,
-    torque_scale: float = 1.0,
-) -> Any:
-    """One direction from the numbers as (11) prints them; returns a `FrictionBranch` record.
+class PrintedBranch(NamedTuple):
+    """One direction in the numbers of (11), in any units."""
 
-    `cubic` is (a0, a1, a2, a3) with the signs of (11); `knee` and `maximum` may carry the sign of the direction;
-    speeds are in a unit of `radps_per_unit` rad/s of the joint; `torque_scale` turns the given torque into motor Nm.
+    tc: float
+    ts: float
+    ws: float
+    tv: float
+    cubic: Sequence[float]  # (a0, a1, a2, a3) with the signs of (11)
+    knee: float  # may carry the sign of the direction, as `maximum`
+    maximum: float
+
+
+def branch_constants(
+    printed: PrintedBranch, *, negative: bool, radps_per_unit: float, torque_scale: float = 1.0
+) -> Any:
+    """A `FrictionBranch` record.
+
+    Speeds are in a unit of `radps_per_unit` rad/s of the joint; `torque_scale` turns the given torque into motor Nm.
     """
+    tc, ts, ws, tv, cubic, knee, maximum = printed
     branch = new(FrictionBranch)[0]
     mirror = (-1.0, 1.0, -1.0, 1.0) if negative else (1.0, 1.0, 1.0, 1.0)
     branch.coulomb_Nm = tc * torque_scale
@@ -111,7 +103,7 @@ def branch_constants(
     return branch
 
 
-def friction_constants(positive: Any, negative: Any) -> Any:
+def friction_constants(positive: FrictionBranch, negative: FrictionBranch) -> Any:
     """A `FrictionConstants` record array of one record from two branches."""
     constants = new(FrictionConstants)
     constants[0].positive = positive
@@ -122,17 +114,17 @@ def friction_constants(positive: Any, negative: Any) -> Any:
 def paper_friction() -> Any:
     """Table 3 of the paper: speed in deg/s of the joint, torque at the motor."""
     positive = branch_constants(
-        0.11985, 0.14537, 1.2301, 0.0026518, (0.17995, 0.0012298, -6.5261e-7, -7.6969e-9), 40.0, 200.0,
+        PrintedBranch(0.11985, 0.14537, 1.2301, 0.0026518, (0.17995, 0.0012298, -6.5261e-7, -7.6969e-9), 40.0, 200.0),
         negative=False, radps_per_unit=DEGREE,
     )  # fmt: skip
     negative = branch_constants(
-        0.1063, 0.1575, 2.887, 0.002475, (-0.1272, 0.0022866, 1e-5, 2.1182e-8), -40.0, -200.0,
+        PrintedBranch(0.1063, 0.1575, 2.887, 0.002475, (-0.1272, 0.0022866, 1e-5, 2.1182e-8), -40.0, -200.0),
         negative=True, radps_per_unit=DEGREE,
     )  # fmt: skip
     return friction_constants(positive, negative)
 
 
-def friction_curve_Nm(constants: Any, velocity_radps: np.ndarray) -> np.ndarray:
+def friction_curve_Nm(constants: np.ndarray, velocity_radps: np.ndarray) -> np.ndarray:
     """(11) at many velocities; arrays of shape (N,)."""
     friction = constants[0]
     return np.array([friction_motor_torque_Nm(friction, float(v)) for v in velocity_radps])

@@ -36,7 +36,7 @@ def open_input(path: str | Path, largest_bytes: int) -> IO[bytes]:
     """A regular file, open for reading; nothing else is opened, since that alone can do something to a device."""
     try:
         _check(os.stat(path), path, largest_bytes)
-        # not blocking: it may have become a FIFO meanwhile
+        # not blocking: it may have become a FIFO in the meantime
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     except ValueError:  # a zero or half a character in it
         raise OSError(errno.EINVAL, "is no name of a file", str(path)) from None
@@ -88,7 +88,7 @@ def number_from(text: str) -> float:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """`tomllib.loads`; `TOMLDecodeError` also for what the parser, or whoever shows a value, would stumble over."""
+    """`tomllib.loads`; `TOMLDecodeError` also for what the parser, or code that shows a value, would stumble over."""
     try:
         found = tomllib.loads(text)
     except tomllib.TOMLDecodeError:
@@ -113,7 +113,7 @@ def parse_json(text: str | bytes) -> Any:
     return found
 
 
-def _problem(found: Any) -> str | None:
+def _problem(found: object) -> str | None:
     """What is wrong with a document that was read; without recursion."""
     level = [found]
     for _ in range(DEEPEST):

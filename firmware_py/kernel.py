@@ -25,7 +25,11 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numba.core.typing.templates import Signature
 
 # In `tools` only these sources may hold kernels (a test sees to it), so that editing a verb does not recompile.
 TOOLS_WITH_KERNELS = ("identification/**/*.py", "wake_up.py")
@@ -82,6 +86,7 @@ cache_folder = prepare_cache()
 
 import numba  # noqa: E402  (NUMBA_CACHE_DIR is read while numba is imported)
 from numba.core import caching, types  # noqa: E402
+from numba.extending import register_jitable  # noqa: E402
 
 _numba_config: Any = numba.config
 if cache_folder is not None:
@@ -94,13 +99,25 @@ _cache_file: Any = caching.IndexDataCacheFile
 _save_compiled = _cache_file.save
 
 
-def _save_where_there_is_room(file: Any, key: Any, data: Any) -> None:
+def _save_where_there_is_room(file: caching.IndexDataCacheFile, key: object, data: object) -> None:
     """A disk that takes no more costs the next start some time, not this run."""
     with contextlib.suppress(OSError):
         _save_compiled(file, key, data)
 
 
 _cache_file.save = _save_where_there_is_room
+_load_index = _cache_file._load_index
+
+
+def _index_that_can_be_read(file: Any) -> Any:
+    """An index that is damaged, or names what this program cannot import, costs compiling, not the run."""
+    try:
+        return _load_index(file)
+    except Exception:
+        return {}
+
+
+_cache_file._load_index = _index_that_can_be_read
 
 
 def _no_blas() -> None:
@@ -113,7 +130,8 @@ with contextlib.suppress(ImportError):
 
     _numba_linalg.ensure_blas = _no_blas
 _NO_COUNTS: dict[str, Any] = {"_nrt": False, "cache": cache_folder is not None}
-_OPTIONS: dict[str, Any] = {**_NO_COUNTS, "nogil": True, "error_model": "numpy"}
+_MACHINE: dict[str, Any] = {"_nrt": False, "nogil": True, "error_model": "numpy"}
+_OPTIONS: dict[str, Any] = {**_NO_COUNTS, **_MACHINE}
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -133,7 +151,15 @@ def inlined(function: Function) -> Function:
     return cast(Function, numba.njit(forceinline=True, **_OPTIONS)(function))
 
 
-def exported(signature: Any) -> Callable[[Function], Any]:
+def shared(function: Function) -> Function:
+    """Compile `function` into its compiled callers, and leave it plain Python for callers in Python.
+
+    For what takes functions as arguments: C functions or kernels from the one, Python functions from the other.
+    """
+    return register_jitable(**_MACHINE, forceinline=True)(function)
+
+
+def exported(signature: Signature) -> Callable[[Function], Any]:
     """Compile to a C function of a fixed signature, which a kernel may take as an argument and still be cached.
 
     This is how the loop (which may not import a driver) calls the driver it was given.
@@ -148,6 +174,12 @@ def exported(signature: Any) -> Callable[[Function], Any]:
     return wrap
 
 
-def record_array_type(dtype: Any) -> Any:
+def record_array_type(dtype: np.dtype) -> Any:
     """The numba type of a one-dimensional array of records, for `exported` signatures."""
     return types.Array(numba.from_dtype(dtype), 1, "C")
+
+
+def memory_type(cls: type, *members: Any) -> Any:
+    """The numba type of a NamedTuple of one-dimensional arrays with these dtypes, for `exported` signatures."""
+    named_tuple: Any = types.NamedTuple
+    return named_tuple([types.Array(numba.from_dtype(one), 1, "C") for one in members], cls)

@@ -22,6 +22,7 @@ from jointctl.firmware_py.records import (
     VelocityState,
 )
 from jointctl.firmware_py.states import ControllerKind, FeedForward
+from jointctl.firmware_py.trajectory import Repetition
 
 # --- PID on the joint's inertia, the honest baseline: no model but J ---
 # tau = J (q_d'' - kd e' - kp e - ki int(e) dt)
@@ -345,22 +346,16 @@ def friction_feed_forward_Nm(
 
 
 @kernel
-def _learn(
-    constants: LawConstants,
-    state: LawState,
-    epoch: int,
-    repeat_s: float,
-    local_s: float,
-    correction_Nm: float,
-    error: float,
-) -> float:
+def _learn(constants: LawConstants, state: LawState, where: Repetition, correction_Nm: float, error: float) -> float:
     """Torque from iterative learning [Nm]; what it stops adding at a change is handed to the observer."""
     before_Nm = state.learned_torque_Nm
     epoch_before = state.learning.epoch
-    torque = learning_torque_Nm(constants.learning, state.learning, epoch, repeat_s, local_s, constants.period_s)
+    torque = learning_torque_Nm(
+        constants.learning, state.learning, where.epoch, where.period_s, where.local_s, constants.period_s
+    )
     watch_learning(constants.learning, state.learning, error)
     record_correction(constants.learning, state.learning, correction_Nm)
-    if epoch_before != state.learning.epoch or repeat_s == 0.0:
+    if epoch_before != state.learning.epoch or where.period_s == 0.0:
         add_to_disturbance(constants.observer, state.observer, before_Nm)
         state.observer_torque_Nm = state.observer.disturbance_Nm
     return torque
@@ -402,17 +397,14 @@ def step_law(
     velocity: VelocityState,
     reference: Reference,
     sent_torque_Nm: float,
-    epoch: int,
-    repeat_s: float,
-    local_s: float,
+    where: Repetition,
 ) -> float:
     """One cycle: the unlimited torque at the joint [Nm]; what adapts, adapts afterwards.
 
-    `sent_torque_Nm` is the limited torque of the cycle before.  `epoch`, `repeat_s` and `local_s` say where in a
-    repeating trajectory this is (`trajectory.repetition`); repeat_s = 0 where nothing repeats.
+    `sent_torque_Nm` is the limited torque of the cycle before, `where` the place in a repeating trajectory.
     """
     error = position_rad - reference.position_rad
-    if constants.matched_filter != 0:
+    if constants.filtered_error_rate != 0:
         error_rate = velocity.error_rate_radps
     else:
         error_rate = velocity.velocity_radps - reference.velocity_radps
@@ -427,7 +419,7 @@ def step_law(
     )
     rest_Nm = _rest_torque_Nm(constants, state, error, error_rate, velocity.velocity_radps, sent_torque_Nm)
     correction_Nm = proportional_Nm + rest_Nm - constants.inertia_kgm2 * constants.learning.error_gain_ps2 * error
-    state.learned_torque_Nm = _learn(constants, state, epoch, repeat_s, local_s, correction_Nm, error)
+    state.learned_torque_Nm = _learn(constants, state, where, correction_Nm, error)
     if constants.kind == ControllerKind.COMPUTED_TORQUE_OBSERVER:
         rest_Nm = state.observer_torque_Nm
     return (

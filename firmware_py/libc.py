@@ -9,13 +9,20 @@ from __future__ import annotations
 
 import ctypes
 import errno as errno_codes
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numba.core import types
 from numba.extending import intrinsic
 
 from jointctl.firmware_py.kernel import JIT_DISABLED, kernel
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numba.core.base import BaseContext
+    from numba.core.typing.context import BaseContext as BaseTypingContext
+    from numba.core.typing.templates import Signature
 
 _CTYPES = {
     types.int32: ctypes.c_int32,
@@ -25,7 +32,7 @@ _CTYPES = {
 }
 
 
-def external(name: str, result: Any, *arguments: Any) -> Any:
+def external(name: str, result: types.Type, *arguments: Any) -> Any:
     if not JIT_DISABLED:
         return types.ExternalFunction(name, result(*arguments))
     function = getattr(ctypes.CDLL(None, use_errno=False), name)
@@ -63,11 +70,11 @@ if JIT_DISABLED:
     def _load_int32(address: int) -> int:
         return ctypes.c_int32.from_address(address).value
 
-    def load_acquire(words: Any, index: int) -> int:
+    def load_acquire(words: np.ndarray, index: int) -> int:
         """Read a shared int64 word."""
         return int(words[index])
 
-    def store_release(words: Any, index: int, value: int) -> None:
+    def store_release(words: np.ndarray, index: int, value: int) -> None:
         """Write a shared int64 word."""
         words[index] = value
 
@@ -75,30 +82,38 @@ else:
     from llvmlite import ir
 
     @intrinsic
-    def _load_int32(typing_context: Any, address: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    def _load_int32(typing_context: BaseTypingContext, address: types.Integer) -> Any:
+        def generate(
+            context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+        ) -> Any:
             pointer = builder.inttoptr(arguments[0], ir.IntType(32).as_pointer())
             return builder.load(pointer)
 
         return types.int32(types.uintp), generate
 
     @intrinsic
-    def load_acquire(typing_context: Any, words: Any, index: Any) -> Any:
+    def load_acquire(typing_context: BaseTypingContext, words: types.Array, index: types.Integer) -> Any:
         """Read a shared int64 word so that nothing after it is moved before it (a plain read is hoisted)."""
 
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            array = context.make_array(signature.args[0])(context, builder, arguments[0])
+        def generate(
+            context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+        ) -> Any:
+            array = context.make_array(signature.args[0])(context, builder, arguments[0])  # type: ignore[no-untyped-call]
             pointer = builder.gep(array.data, [arguments[1]])
             return builder.load_atomic(pointer, "acquire", 8)
 
         return types.int64(words, types.int64), generate
 
     @intrinsic
-    def store_release(typing_context: Any, words: Any, index: Any, value: Any) -> Any:
+    def store_release(
+        typing_context: BaseTypingContext, words: types.Array, index: types.Integer, value: types.Integer
+    ) -> Any:
         """Write a shared int64 word so that nothing before it is moved after it."""
 
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            array = context.make_array(signature.args[0])(context, builder, arguments[0])
+        def generate(
+            context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+        ) -> Any:
+            array = context.make_array(signature.args[0])(context, builder, arguments[0])  # type: ignore[no-untyped-call]
             pointer = builder.gep(array.data, [arguments[1]])
             builder.store_atomic(arguments[2], pointer, "release", 8)
 

@@ -122,7 +122,7 @@ class LawConstants:
     kind: i4  # ControllerKind
     feed_forward: i4  # FeedForward
     zero_rule: i4  # ZeroSpeedRule
-    matched_filter: i4  # e' from the filtered error difference instead of filtered velocity minus desired velocity
+    filtered_error_rate: i4  # e' from the filtered error difference instead of filtered velocity minus desired velocity
     period_s: f8
     inertia_kgm2: f8  # M0
     coriolis_Nmspr: f8  # C0
@@ -295,7 +295,7 @@ class VelocityState:
     last_position_rad: f8
     velocity_radps: f8
     last_error_rad: f8
-    error_rate_radps: f8  # the matched filter's e'
+    error_rate_radps: f8  # the filtered error rate's e'
 
 
 @record
@@ -347,7 +347,7 @@ class LimitConstants:
     following_error_max_rad: f8
     position_jump_max_rad: f8  # between two consecutive samples
     frozen_max_rad: f8  # way of the reference while the reading stands still; 0 = not watched
-    frozen_torque_Nm: f8  # that a sound joint would not stand still under; 0 = not watched
+    frozen_torque_Nm: f8  # that a healthy joint would not stand still under; 0 = not watched
     frozen_tolerance_rad: f8  # a reading that changes by no more stands still
     sample_age_max_cycles: i8
     heartbeat_age_max_cycles: i8  # of the drive's own heartbeat; 0 = not watched

@@ -31,24 +31,28 @@ REST_STEPS = 8.0  # times the steps of the reading at rest: a smaller swing is t
 REACTION_CYCLES = 2  # between seeing that the reference leaves its limits and the first braked cycle
 PUSHED_CYCLES = 20  # at a torque that a healthy joint gives way to: it moves by a milliradian in that time
 
+# one bit for the code of each fault with that reaction
+POWER_OFF_FAULTS = sum(1 << fault for fault in Fault if fault.reaction is Reaction.OFF)
+RAMP_FAULTS = sum(1 << fault for fault in Fault if fault.reaction is Reaction.RAMP)
+
 
 # --- What is done about a fault ---
 
 
 @kernel
-def reaction_to(fault: int, phase: int) -> Reaction:
-    """What to do about a fault.
+def powered(phase: int) -> bool:
+    """Whether the loop itself commands torque in this phase."""
+    return phase >= AxisPhase.APPROACH and phase <= AxisPhase.RELEASING
 
-    Off only where the drive does not follow anyway or no torque is applied yet: it drops a gravity load.  A ramp
-    only where the measurement and the law can still be trusted.  Everything else is the drive's quick stop.
-    """
+
+@kernel
+def reaction_to(fault: int, phase: int) -> Reaction:
+    """What to do about a fault, as its row of `Fault` says; off in every phase in which the loop commands no torque."""
     if fault == Fault.NONE:
         return Reaction.NONE
-    if phase <= AxisPhase.ENABLING or phase >= AxisPhase.QUICK_STOPPING:
+    if not powered(phase) or 1 << fault & POWER_OFF_FAULTS:
         return Reaction.OFF
-    if fault == Fault.DRIVE_FAULT or fault == Fault.DRIVE_NOT_ENABLED or fault == Fault.DRIVE_RESTARTED:
-        return Reaction.OFF
-    if fault == Fault.REFERENCE_LIMIT or fault == Fault.SUPERVISOR_LOST or fault == Fault.OVERRUN:
+    if 1 << fault & RAMP_FAULTS:
         return Reaction.RAMP
     return Reaction.QUICK_STOP
 
@@ -60,12 +64,6 @@ def enter(state: AxisState, phase: int) -> None:
     state.phase_cycle = 0
     state.held_up_cycles = 0
     state.good_samples = 0
-
-
-@kernel
-def powered(phase: int) -> bool:
-    """Whether the loop itself commands torque in this phase."""
-    return phase >= AxisPhase.APPROACH and phase <= AxisPhase.RELEASING
 
 
 @kernel
@@ -247,7 +245,7 @@ def check_reading(constants: AxisConstants, state: AxisState, elapsed_cycles: in
 
     It must be early: behind a stuck encoder the law pushes ever harder, and the joint moves unseen, long before the
     following error is too large.  Where the drive closes the velocity loop, the torque is the one that it measures.
-    Of an overrun's `elapsed_cycles`, the reference's way counts for one: the drive was told of no other.
+    Of an overrun's `elapsed_cycles`, the reference's way counts for one: the drive received no other.
     """
     limits = constants.limits
     torque_Nm = state.command_torque_Nm

@@ -26,10 +26,12 @@ u1 = Annotated[int, np.dtype("u1")]
 INT32_MAX = 2_147_483_647  # what an i4 holds at most: saturate before writing to it
 
 _DTYPES: dict[type, np.dtype[Any]] = {}
+_HINTS: dict[type, dict[str, Any]] = {}
 Class = TypeVar("Class", bound=type)
+Mark = TypeVar("Mark")
 
 
-def _field_dtype(hint: Any) -> Any:
+def _field_dtype(hint: object) -> Any:
     if isinstance(hint, type) and hint in _DTYPES:
         return _DTYPES[hint]
     for item in getattr(hint, "__metadata__", ()):
@@ -38,14 +40,14 @@ def _field_dtype(hint: Any) -> Any:
     raise TypeError(f"{hint!r} is not a record field type: use f8, i4, ..., array_of(...) or another record")
 
 
-def array_of(element: Any, *shape: int) -> Any:
+def array_of(element: object, *shape: int) -> Any:
     """Field type of a fixed-size array inside a record: ``Annotated[np.ndarray, array_of(f8, 15)]``."""
     return (_field_dtype(element), shape)
 
 
 def record(cls: Class) -> Class:
     """Class decorator: derive and remember the aligned dtype of the annotated fields."""
-    hints = get_type_hints(cls, include_extras=True)
+    hints = _HINTS[cls] = get_type_hints(cls, include_extras=True)
     fields = []
     for name, hint in hints.items():
         if hasattr(np.record, name) or hasattr(np.recarray, name):
@@ -62,11 +64,21 @@ def dtype_of(cls: type) -> np.dtype[Any]:
     return _DTYPES[cls]
 
 
+def marks_of(cls: type, mark: type[Mark]) -> dict[str, Mark]:
+    """Name -> what stands of that type in the annotation of a field, behind the field's own type."""
+    return {
+        name: item
+        for name, hint in _HINTS[cls].items()
+        for item in getattr(hint, "__metadata__", ())
+        if isinstance(item, mark)
+    }
+
+
 def new(cls: type, count: int = 1) -> Any:
     """A zeroed record array of shape (count,); ``new(Sample)[0]`` is a mutable view of its first record."""
     return np.zeros(count, dtype_of(cls)).view(np.recarray)
 
 
-def view(cls: type, buffer: Any, count: int = 1, offset: int = 0) -> Any:
+def view(cls: type, buffer: bytearray | memoryview | np.ndarray, count: int = 1, offset: int = 0) -> Any:
     """A record array over existing memory (shared with another process)."""
     return np.frombuffer(buffer, dtype_of(cls), count, offset).view(np.recarray)

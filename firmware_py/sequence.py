@@ -58,8 +58,8 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
 def waited_too_long(state: AxisState, longest_cycles: int) -> bool:
     """Whether the phase's time is over.
 
-    Over only because the loop itself was held up: nobody has looked for an answer meanwhile, so that is the cause, and
-    what is missing is not.
+    Over only because the loop itself was held up: no one has looked for an answer then, so that is the cause, and what
+    is missing is not.
     """
     if state.phase_cycle <= longest_cycles:
         return False

@@ -49,46 +49,6 @@ class AxisPhase(IntEnum):
     FINISHED = 8
 
 
-class Fault(IntEnum):
-    """Why a run was ended by the loop; the first one is latched."""
-
-    NONE = 0
-    POSITION_LIMIT = 1
-    VELOCITY_LIMIT = 2
-    REFERENCE_LIMIT = 3  # the desired position or velocity left the limits
-    FOLLOWING_ERROR = 4
-    STALE_SAMPLE = 5
-    NOT_FINITE = 6
-    TORQUE_SATURATED = 7  # at the torque limit for too long
-    DRIVE_FAULT = 8
-    DRIVE_NOT_ENABLED = 9  # left Operation Enabled without being asked
-    DRIVE_RESTARTED = 10
-    ENABLE_TIMEOUT = 11
-    SUPERVISOR_LOST = 12
-    BUS_ERROR = 13
-    STOP_TIMEOUT = 14  # standstill not reached in time
-    OFF_TIMEOUT = 15  # the drive did not confirm power off
-    NO_SAMPLES = 16  # not one valid sample before enabling
-    NOT_AT_STANDSTILL = 17  # the joint moved while waiting to enable
-    OVERRUN = 18  # too many cycles skipped
-    POSITION_JUMP = 19  # the encoder moved faster than the joint can
-    DRIVE_STAYS_ENABLED = 20  # enabled before the loop asked for it, and it does not switch off
-    POSITION_FROZEN = 21  # the reading stands still although the reference moves
-    SUSPENDED = 22  # the computer slept
-    DRIVE_SILENT = 23  # the drive's own heartbeat stays away
-    POSITION_DISAGREEMENT = 24  # the two encoders of the joint differ by more than they may
-    MOVED_BEFORE_START = 25  # the joint is not where it was when the motion was shown
-    SAMPLES_MISSING = 26  # samples came before enabling, but never enough of them in a row
-    LIMIT_CYCLE = 27  # torque or error swing back and forth instead of settling
-
-
-class Notice(IntEnum):
-    """What the loop reports without ending the run; each is one bit of `AxisState.notices`, set once in a run."""
-
-    TORQUE_NOISE = 1  # the command changes too much from cycle to cycle
-    LEARNING_OFF = 2  # iterative learning made the error grow and was switched off
-
-
 class Reaction(IntEnum):
     """What the loop does about a fault or a stop request; a greater one replaces a smaller one."""
 
@@ -96,6 +56,59 @@ class Reaction(IntEnum):
     RAMP = 1  # brake along a ramp under control, then release and disable
     QUICK_STOP = 2  # the drive brakes by itself, then disable
     OFF = 3  # power off at once
+
+
+class Fault(IntEnum):
+    """Why a run was ended by the loop; the first one is latched.  A row is name, code, and reaction.
+
+    The reaction is that of the phases in which the loop commands torque (`safety.powered`).  Before them, and when the
+    drive brakes already, power off is the reaction to each.  OFF only where the drive does not follow anyway: it drops
+    a gravity load.  RAMP only where measurement and law can still be trusted.
+    """
+
+    reaction: Reaction
+
+    def __new__(cls, code: int, reaction: Reaction = Reaction.QUICK_STOP) -> Fault:
+        fault = int.__new__(cls, code)
+        fault._value_ = code
+        fault.reaction = reaction
+        return fault
+
+    NONE = 0, Reaction.NONE
+    POSITION_LIMIT = 1, Reaction.QUICK_STOP
+    VELOCITY_LIMIT = 2, Reaction.QUICK_STOP
+    REFERENCE_LIMIT = 3, Reaction.RAMP  # the desired position or velocity left the limits
+    FOLLOWING_ERROR = 4, Reaction.QUICK_STOP
+    STALE_SAMPLE = 5, Reaction.QUICK_STOP
+    NOT_FINITE = 6, Reaction.QUICK_STOP
+    TORQUE_SATURATED = 7, Reaction.QUICK_STOP  # at the torque limit for too long
+    DRIVE_FAULT = 8, Reaction.OFF
+    DRIVE_NOT_ENABLED = 9, Reaction.OFF  # left Operation Enabled without being asked
+    DRIVE_RESTARTED = 10, Reaction.OFF
+    ENABLE_TIMEOUT = 11, Reaction.QUICK_STOP
+    SUPERVISOR_LOST = 12, Reaction.RAMP
+    BUS_ERROR = 13, Reaction.QUICK_STOP
+    STOP_TIMEOUT = 14, Reaction.QUICK_STOP  # standstill not reached in time
+    OFF_TIMEOUT = 15, Reaction.QUICK_STOP  # the drive did not confirm power off
+    NO_SAMPLES = 16, Reaction.QUICK_STOP  # not one valid sample before enabling
+    NOT_AT_STANDSTILL = 17, Reaction.QUICK_STOP  # the joint moved while waiting to enable
+    OVERRUN = 18, Reaction.RAMP  # too many cycles skipped
+    POSITION_JUMP = 19, Reaction.QUICK_STOP  # the encoder moved faster than the joint can
+    DRIVE_STAYS_ENABLED = 20, Reaction.QUICK_STOP  # enabled before the loop asked for it, and it does not switch off
+    POSITION_FROZEN = 21, Reaction.QUICK_STOP  # the reading stands still although the reference moves
+    SUSPENDED = 22, Reaction.QUICK_STOP  # the computer slept
+    DRIVE_SILENT = 23, Reaction.QUICK_STOP  # the drive's own heartbeat stays away
+    POSITION_DISAGREEMENT = 24, Reaction.QUICK_STOP  # the two encoders of the joint differ by more than they may
+    MOVED_BEFORE_START = 25, Reaction.QUICK_STOP  # the joint is not where it was when the motion was shown
+    SAMPLES_MISSING = 26, Reaction.QUICK_STOP  # samples came before enabling, but never enough of them in a row
+    LIMIT_CYCLE = 27, Reaction.QUICK_STOP  # torque or error swing back and forth instead of settling
+
+
+class Notice(IntEnum):
+    """What the loop reports without ending the run; each is one bit of `AxisState.notices`, set once in a run."""
+
+    TORQUE_NOISE = 1  # the command changes too much from cycle to cycle
+    LEARNING_OFF = 2  # iterative learning made the error grow and was switched off
 
 
 class FeedForward(IntEnum):

@@ -128,16 +128,24 @@ def _point_to_point_at(c: TrajectoryConstants, t_s: float, reference: Reference)
     reference.position_rad += from_rad
 
 
-@kernel
-def repetition(c: TrajectoryConstants, table: np.ndarray, t_s: float) -> tuple[int, float, float]:
-    """(epoch, period [s], time in the period [s]): where in a repeating motion `t_s` is; period 0 if none repeats.
+class Repetition(NamedTuple):
+    """Where in a repeating motion a time is."""
 
-    The epoch changes where the motion changes: at a SINE's switch.
-    """
+    epoch: int  # changes where the motion changes: at a SINE's switch
+    period_s: float  # 0 where nothing repeats
+    local_s: float  # time in the period
+
+
+NO_REPETITION = Repetition(0, 0.0, 0.0)
+
+
+@kernel
+def repetition(c: TrajectoryConstants, table: np.ndarray, t_s: float) -> Repetition:
+    """Where in its repeating motion `t_s` is."""
     epoch = 0
     period_s = 0.0
     if t_s < 0.0:
-        return epoch, 0.0, 0.0
+        return NO_REPETITION
     if c.kind == TrajectoryKind.SINE:
         omega = c.omega_radps
         if c.switch_s > 0.0 and t_s >= c.switch_s:
@@ -153,8 +161,8 @@ def repetition(c: TrajectoryConstants, table: np.ndarray, t_s: float) -> tuple[i
     elif c.repeats != 0 and c.kind == TrajectoryKind.TABLE and c.table_rows >= 2:
         period_s = table[c.table_rows - 1, 0]
     if not period_s > 0.0:
-        return epoch, 0.0, 0.0
-    return epoch, period_s, t_s % period_s
+        return Repetition(epoch, 0.0, 0.0)
+    return Repetition(epoch, period_s, t_s % period_s)
 
 
 @kernel

@@ -28,13 +28,13 @@ from jointctl.firmware_py.libc import (
     send,
     store_release,
 )
+from jointctl.hil.bus.frame_stamps import OLDEST_STAMP_NS, STAMPED_LAG_NS, sent_ns_of, stamp_answers
 from jointctl.hil.bus.virtual_bus import FRAME_SIZE, FrameQueue
 from jointctl.hil.canopen.device_core import accept_frame, advance
 from jointctl.hil.canopen.records import Device, NmtState, int64
 from jointctl.hil.faults.frame_faults import append_frame, pass_frame, take_due
 from jointctl.hil.faults.kinds import FaultMemory
 from jointctl.hil.faults.plant_faults import step_faults
-from jointctl.hil.frame_stamps import OLDEST_STAMP_NS, STAMPED_LAG_NS, sent_ns_of, stamp_answers
 from jointctl.hil.plant.records import PlantConstants, PlantState
 
 ENETDOWN = errno_codes.ENETDOWN
@@ -153,7 +153,7 @@ def _take_from_bus(
     now_ns: int,
     queue: FrameQueue,
 ) -> bool:
-    """One frame of the controller, through the wire's faults, as of the time it was sent; whether it told that time."""
+    """One frame of the controller, through the wire's faults, as of the time it was sent; whether it carried one."""
     sent_ns = sent_ns_of(frame, now_ns)
     if len(faults) == 0:
         _take_frame(device, plant_c, plant_s, frame, service_fd, sent_ns, queue)

@@ -1,7 +1,7 @@
 """Deterministic simulation of controller, codec, drive and joint in one compiled function, faster than real time.
 
-The controller's tick, the driver's frame codec and the virtual drive are the very functions of the real-time run;
-only the bus is replaced: a frame arrives in the instant in which it was sent, in order, and none is lost.  The
+The controller's cycle, the driver's frame codec and the virtual drive are the very functions of the real-time run;
+only bus and clock are replaced: a frame arrives in the instant in which it was sent, in order, and none is lost.  The
 computer's own delay is not modelled either: with a synchronous RPDO (transmission type 1) a command takes effect one
 period after the sample it was computed from, as on a real bus whose round trip fits into the period.
 
@@ -13,31 +13,85 @@ heartbeat then.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from jointctl.firmware_py.axis import step_axis
-from jointctl.firmware_py.kernel import kernel
-from jointctl.firmware_py.realtime import write_log
-from jointctl.firmware_py.states import AxisPhase, StopRequest
-from jointctl.hil.bus.virtual_bus import FRAME_SIZE
+from jointctl.firmware_py.cycle import Clock, CycleMemory, Exchange, Slot, Word, step_cycle
+from jointctl.firmware_py.kernel import inlined, kernel
+from jointctl.firmware_py.libc import load_acquire, store_release
+from jointctl.firmware_py.records import AxisState, Sample
+from jointctl.firmware_py.states import StopRequest
+from jointctl.hil.bus.virtual_bus import FRAME_SIZE, FrameQueue
 from jointctl.hil.canopen.device_core import accept_frame, advance
+from jointctl.hil.canopen.records import Device
 from jointctl.hil.faults.frame_faults import clock_step_cycles, collect, hand_over, take_due, to_drive
-from jointctl.hil.faults.kinds import FaultKind, fault_memory, kind_active, no_faults
+from jointctl.hil.faults.kinds import FaultKind, kind_active
 from jointctl.hil.faults.plant_faults import step_faults
+from jointctl.hil.plant.records import PlantState
 
 # columns of the array of true values that a run may leave
 TRUE_POSITION_rad, TRUE_VELOCITY_radps, TRUE_FRICTION_Nm, TRUE_ACTUATOR_Nm, TRUE_POWER_STATE = range(5)
 TRUTHS = 5
 
-# slots of the frame memory, agreed with whoever passes the codec: sent in begin (up to two), RPDO, received
+# slots of the frame memory, agreed with the caller that passes the codec: sent in begin (up to two), RPDO, received
 RPDO_SLOT = 2
 RECEIVED_SLOT = 3
+# No delay is modelled, but with the time of the request an answer would be that of an earlier one.
+_ANSWER_NS = 1
+# elements of `CycleMemory.timespec`, the scratch of the loop's clock: here it is the clock
+_NOW_NS, _OFF_BUS = 0, 1
+
+
+class Codec(NamedTuple):
+    """The driver's codec as C functions, and its memory; `frame_bytes` uint8[slots, 16] is that of its frames."""
+
+    begin: Callable[[Any], int]  # (link) -> how many frames to send
+    accept: Callable[[Any, int, np.ndarray, int], bool]  # (link, slot, samples, now_ns)
+    end: Callable[[Any, np.ndarray, np.ndarray], None]  # (link, samples, commands)
+    link: Any
+    frame_bytes: np.ndarray
+
+
+class World(NamedTuple):
+    """The virtual drive, operational, with its joint and the wire to it; arrays of one record."""
+
+    device: np.ndarray
+    plant_constants: np.ndarray
+    plant: np.ndarray
+    queue: np.ndarray  # FrameQueue
+    faults: np.ndarray  # FaultConstants[N]
+    fault_memory: np.ndarray
+
+
+class Scenario(NamedTuple):
+    """What happens in a run, besides faults; times in cycles."""
+
+    start_ns: int
+    period_ns: int
+    cycles: int  # at most
+    stop_cycle: int = -1  # in which `stop_request` is made; negative: never
+    stop_request: int = int(StopRequest.RAMP)
+    tail_cycles: int = 0  # for which drive and joint go on without a controller
+    log_every: int = 1  # every so many cycles a record and a row of true values are kept; 0: none
+    ideal_velocity: bool = False  # bypasses encoder and velocity filter: for textbook experiments only
+    supervisor_beats: bool = True  # else its sign of life ages from what `memory.words` holds
+    lost_to_drive: bool = False
+    lost_from_drive: bool = False
+
+
+class _Link(NamedTuple):
+    """What moving frames in memory works on."""
+
+    codec: Codec
+    world: World
+    scenario: Scenario
+    memory: CycleMemory
 
 
 @kernel
-def _write_truth(row: np.ndarray, device: Any, plant: Any) -> None:
+def _write_truth(row: np.ndarray, device: Device, plant: PlantState) -> None:
     row[TRUE_POSITION_rad] = plant.joint_position_rad
     row[TRUE_VELOCITY_radps] = plant.joint_velocity_radps
     row[TRUE_FRICTION_Nm] = plant.friction_torque_Nm
@@ -46,188 +100,158 @@ def _write_truth(row: np.ndarray, device: Any, plant: Any) -> None:
 
 
 @kernel
-def _perfect_measurement(state: Any, sample: Any, plant: Any, period_s: float) -> None:
+def _perfect_measurement(state: AxisState, sample: Sample, plant: PlantState, period_s: float) -> None:
     """Replace the reading by the true position, and prepare the velocity filter so that it gives the true velocity.
 
     With v = the true velocity and the last position one period of v back, v + gain ((q - q_last) / T - v) is v
-    whatever the gain.  The matched filter of e' has no such preparation: it is for `matched_filter` = 0.
+    whatever the gain.  The filtered error rate of e' has no such preparation: it is for `filtered_error_rate` = 0.
     """
     sample.position_rad = plant.joint_position_rad
     state.velocity.velocity_radps = plant.joint_velocity_radps
     state.velocity.last_position_rad = plant.joint_position_rad - plant.joint_velocity_radps * period_s
 
 
-@kernel
-def _empty_mailbox(
-    mailbox: Any, accept: Any, port: np.ndarray, frames: np.ndarray, frame_bytes: np.ndarray, sample: Any, now_ns: int
-) -> None:
+# --- The exchange: frames are moved in memory ---
+
+
+@inlined
+def _to_drive(link: _Link, slot: int, sample: Sample) -> None:
+    """One frame of the controller; its answers are in the queue of the drive, with faults in that of the wire."""
+    world, now_ns = link.world, link.memory.timespec[_NOW_NS]
+    device, joint_c, joint, outgoing = world.device[0], world.plant_constants[0], world.plant[0], world.queue[0]
+    frame = link.codec.frame_bytes[slot]
+    if len(world.faults) > 0:
+        to_drive(world.faults, world.fault_memory[0], frame, device, joint_c, joint, outgoing, now_ns)
+        sample.bus_errors = sample.bus_errors + 1 if link.memory.timespec[_OFF_BUS] != 0 else 0
+    elif not link.scenario.lost_to_drive:
+        accept_frame(device, joint_c, joint, frame, now_ns, outgoing)
+
+
+@inlined
+def _empty_mailbox(mailbox: FrameQueue, codec: Codec, samples: np.ndarray, now_ns: int) -> None:
     """Everything that has arrived goes to the driver's codec."""
+    received = int(RECEIVED_SLOT)
     for index in range(mailbox.count):
         for byte in range(FRAME_SIZE):
-            frame_bytes[RECEIVED_SLOT, byte] = mailbox.frames[index, byte]
-        accept(port, frames, np.int64(RECEIVED_SLOT), sample, np.int64(now_ns))
+            codec.frame_bytes[RECEIVED_SLOT, byte] = mailbox.frames[index, byte]
+        codec.accept(codec.link, received, samples, now_ns)
     mailbox.count = 0
 
 
-@kernel
-def _run(
-    begin: Any,
-    accept: Any,
-    end: Any,
-    port: np.ndarray,
-    frames: np.ndarray,
-    frame_bytes: np.ndarray,
-    constants: np.ndarray,
-    state: np.ndarray,
-    table: np.ndarray,
-    sample: np.ndarray,
-    command: np.ndarray,
-    device: np.ndarray,
-    plant_constants: np.ndarray,
-    plant: np.ndarray,
-    queue: np.ndarray,
-    log: np.ndarray,
-    log_every: int,
-    truth: np.ndarray,
-    faults: np.ndarray,
-    memories: np.ndarray,
-    start_ns: int,
-    period_ns: int,
-    cycles: int,
-    stop_cycle: int,
-    tail_cycles: int,
-    ideal_velocity: bool,
-    stop_request: int,
-    silent_cycles: int,
-    lost_to_drive: bool,
-    lost_from_drive: bool,
-) -> tuple[int, int]:
-    """See `run_lockstep`; (log records, rows of `truth`) written.
+@inlined
+def _receive(link: _Link, samples: np.ndarray, now_ns: int, until_ns: int) -> int:
+    """SYNC to the drive, its answer into the sample; nothing is waited for."""
+    world, codec = link.world, link.codec
+    for slot in range(codec.begin(codec.link)):
+        _to_drive(link, slot, samples[0])
+    if link.scenario.lost_from_drive:
+        world.queue[0].count = 0
+    if len(world.faults) > 0:
+        _empty_mailbox(world.fault_memory[0].to_controller, codec, samples, now_ns + _ANSWER_NS)
+    else:
+        _empty_mailbox(world.queue[0], codec, samples, now_ns + _ANSWER_NS)
+    state, axis = link.memory.state[0], link.memory.constants[0]
+    if link.scenario.ideal_velocity and state.velocity.primed != 0:
+        _perfect_measurement(state, samples[0], world.plant[0], axis.law.period_s)
+    return 0
 
-    Without faults the drive's own queue is the controller's mailbox; with them it is that of the wire.
-    """
-    outgoing, memory, drive, joint_c, joint = queue[0], memories[0], device[0], plant_constants[0], plant[0]
+
+@inlined
+def _send(link: _Link, samples: np.ndarray, commands: np.ndarray) -> int:
+    codec = link.codec
+    codec.end(codec.link, samples, commands)
+    _to_drive(link, RPDO_SLOT, samples[0])
+    return 0
+
+
+@inlined
+def _clock_ns(timespec: np.ndarray) -> int:
+    return int(timespec[_NOW_NS])
+
+
+@inlined
+def _never_slept_ns(words: np.ndarray, timespec: np.ndarray) -> int:
+    """A simulated computer is not suspended."""
+    return 0
+
+
+# --- The run ---
+
+
+@inlined
+def _step_world(world: World, now_ns: int) -> None:
+    """Drive and joint up to now; what has come out of the wire by now is handed over."""
+    device, joint_c, joint, outgoing = world.device[0], world.plant_constants[0], world.plant[0], world.queue[0]
+    faults, memory = world.faults, world.fault_memory[0]
+    if len(faults) > 0:
+        step_faults(faults, memory, device, joint_c, joint, now_ns)
+    advance(device, joint_c, joint, now_ns, outgoing)
+    if len(faults) > 0:
+        collect(faults, memory, device, outgoing, now_ns)
+        take_due(memory, False, now_ns, False, memory.to_controller)
+        take_due(memory, True, now_ns, False, memory.ready)
+        hand_over(faults, memory, device, joint_c, joint, outgoing, now_ns)
+
+
+@kernel
+def _run(memory: CycleMemory, codec: Codec, world: World, scenario: Scenario, truth: np.ndarray) -> tuple[int, int]:
+    """See `run_lockstep`."""
+    words, clock_memory, period_ns = memory.words, memory.timespec, scenario.period_ns
+    faults, fault = world.faults, world.fault_memory[0]
     faulty = len(faults) > 0
-    if memory.epoch_ns < 0:
-        memory.epoch_ns = start_ns
-    outgoing.count = 0
-    written, rows, missed, silent, elapsed = 0, 0, 0, 0, 1
-    off_bus = False
-    finished_at = cycles
-    for cycle in range(cycles + tail_cycles):
-        if cycle >= finished_at + tail_cycles:
+    link = _Link(codec, world, scenario, memory)
+    exchange = Exchange(_receive, _send, link)
+    clock = Clock(_clock_ns, _never_slept_ns)
+    if fault.epoch_ns < 0:
+        fault.epoch_ns = scenario.start_ns
+    if scenario.supervisor_beats:
+        store_release(words, Word.SUPERVISOR_NS, scenario.start_ns - period_ns)
+    world.queue[0].count = 0
+    first, rows, missed, elapsed = load_acquire(words, Word.HEAD), 0, 0, 1
+    finished_at = scenario.cycles
+    for cycle in range(scenario.cycles + scenario.tail_cycles):
+        if cycle >= finished_at + scenario.tail_cycles:
             break
-        now_ns = start_ns + cycle * period_ns
-        if faulty:
-            step_faults(faults, memory, drive, joint_c, joint, now_ns)
-        advance(drive, joint_c, joint, now_ns, outgoing)
-        if faulty:
-            collect(faults, memory, drive, outgoing, now_ns)
-            take_due(memory, False, now_ns, False, memory.to_controller)
-            take_due(memory, True, now_ns, False, memory.ready)
-            hand_over(faults, memory, drive, joint_c, joint, outgoing, now_ns)
-        logged = log_every > 0 and cycle % log_every == 0
+        now_ns = scenario.start_ns + cycle * period_ns
+        _step_world(world, now_ns)
+        logged = scenario.log_every > 0 and cycle % scenario.log_every == 0
         if logged and rows < len(truth):
-            _write_truth(truth[rows], drive, joint)
+            _write_truth(truth[rows], world.device[0], world.plant[0])
             rows += 1
         if cycle >= finished_at:
-            outgoing.count = 0
+            world.queue[0].count = 0
             continue
+        if cycle == scenario.stop_cycle:
+            store_release(words, Word.STOP, scenario.stop_request)
+        if scenario.supervisor_beats and not kind_active(faults, fault, FaultKind.SUPERVISOR_SILENT, now_ns):
+            store_release(words, Word.SUPERVISOR_NS, now_ns)
+        clock_memory[_NOW_NS] = now_ns
         if faulty:
-            silent = silent + 1 if kind_active(faults, memory, FaultKind.SUPERVISOR_SILENT, now_ns) else 0
-            if kind_active(faults, memory, FaultKind.LOOP_HELD_UP, now_ns):
+            if kind_active(faults, fault, FaultKind.LOOP_HELD_UP, now_ns):
                 missed += 1
                 continue
-            elapsed = 1 + missed + clock_step_cycles(faults, memory, now_ns, period_ns)
+            elapsed = 1 + missed + clock_step_cycles(faults, fault, now_ns, period_ns)
             missed = 0
-            off_bus = kind_active(faults, memory, FaultKind.BUS_OFF, now_ns)
-        count = begin(port, frames)
-        for slot in range(count):
-            if faulty:
-                to_drive(faults, memory, frame_bytes[slot], drive, joint_c, joint, outgoing, now_ns)
-                sample[0].bus_errors = sample[0].bus_errors + 1 if off_bus else 0
-            elif not lost_to_drive:
-                accept_frame(drive, joint_c, joint, frame_bytes[slot], now_ns, outgoing)
-        if lost_from_drive:
-            outgoing.count = 0
-        if silent_cycles >= 0:
-            silent = silent_cycles + cycle
-        if faulty:
-            _empty_mailbox(memory.to_controller, accept, port, frames, frame_bytes, sample, now_ns)
-        else:
-            _empty_mailbox(outgoing, accept, port, frames, frame_bytes, sample, now_ns)
-        stop = stop_request if 0 <= stop_cycle <= cycle else StopRequest.NONE
-        if ideal_velocity and state[0].velocity.primed != 0:
-            _perfect_measurement(state[0], sample[0], joint, constants[0].law.period_s)
-        step_axis(constants[0], state[0], table, sample[0], command[0], elapsed, stop, silent)
-        end(port, frames, sample, command)
-        if faulty:
-            to_drive(faults, memory, frame_bytes[RPDO_SLOT], drive, joint_c, joint, outgoing, now_ns)
-            sample[0].bus_errors = sample[0].bus_errors + 1 if off_bus else 0
-        elif not lost_to_drive:
-            accept_frame(drive, joint_c, joint, frame_bytes[RPDO_SLOT], now_ns, outgoing)
-        if logged and written < len(log):
-            write_log(log[written], state[0], sample[0], command[0])
-            log[written].time_ns = now_ns
-            log[written].skipped = elapsed - 1
-            written += 1
-        if state[0].phase == AxisPhase.FINISHED:
+            clock_memory[_OFF_BUS] = 1 if kind_active(faults, fault, FaultKind.BUS_OFF, now_ns) else 0
+        head = load_acquire(words, Word.HEAD)
+        slot = Slot(period_ns, now_ns, now_ns, 0, elapsed, now_ns)
+        if step_cycle(memory, exchange, clock, slot):
             finished_at = cycle + 1
-    return written, rows
+        if not logged:
+            store_release(words, Word.HEAD, head)  # the next record takes its place
+    return load_acquire(words, Word.HEAD) - first, rows
 
 
 def run_lockstep(
-    begin: Any,
-    accept: Any,
-    end: Any,
-    port: np.ndarray,
-    frames: np.ndarray,
-    frame_bytes: np.ndarray,
-    constants: np.ndarray,
-    state: np.ndarray,
-    table: np.ndarray,
-    sample: np.ndarray,
-    command: np.ndarray,
-    device: np.ndarray,
-    plant_constants: np.ndarray,
-    plant: np.ndarray,
-    queue: np.ndarray,
-    log: np.ndarray,
-    log_every: int,
-    start_ns: int,
-    period_ns: int,
-    cycles: int,
-    stop_cycle: int,
-    truth: np.ndarray | None = None,
-    ideal_velocity: bool = False,
-    faults: Any = None,
-    memories: Any = None,
-    tail_cycles: int = 0,
-    stop_request: int = StopRequest.RAMP,
-    silent_cycles: int = -1,
-    lost_to_drive: bool = False,
-    lost_from_drive: bool = False,
+    memory: CycleMemory, codec: Codec, world: World, scenario: Scenario, truth: np.ndarray | None = None
 ) -> tuple[int, int]:
-    """Run until the axis is FINISHED, `cycles` at most, then `tail_cycles` without a controller.
+    """Run until the axis is FINISHED, `scenario.cycles` at most, then `tail_cycles` without a controller.
 
-    Returns the numbers of log records and of rows of `truth` written.
-
-    `begin(port, frames) -> n`, `accept(port, frames, slot, sample, now_ns) -> bool` and
-    `end(port, frames, sample, command)` are the driver's codec; `frame_bytes` uint8[slots, 16] is the memory of
-    `frames`.  The device has been commissioned and is operational.  Every `log_every`-th cycle goes to `log` while
-    there is room (0: none).  `stop_request` is made at `stop_cycle` (negative: never).  `silent_cycles`: the age of the
-    supervisor's sign of life at the beginning (negative: not watched).  `lost_*`: no frame arrives there.
+    `memory` is that of one axis, at power off; its ring holds as many records as it has room for, the newest ones.
     `truth` float64[N, TRUTHS], or None, takes what the joint truly did in the same periods (columns TRUE_*), and in
-    those in which the controller was held up or silent.  `ideal_velocity` bypasses encoder and velocity filter: for
-    textbook experiments only.  `faults` FaultConstants[N], `memories` FaultMemory[1].
+    those in which the controller was held up or silent, while there is room.  Returns the numbers of log records and of
+    rows of `truth` written.
     """
-    if truth is None:
-        truth = np.zeros((0, TRUTHS))
-    faults = no_faults() if faults is None else faults
-    written, rows = _run(
-        begin, accept, end, port, frames, frame_bytes, constants, state, table, sample, command, device,
-        plant_constants, plant, queue, log, log_every, truth, faults,
-        fault_memory(faults) if memories is None else memories, start_ns, period_ns, cycles, stop_cycle, tail_cycles,
-        ideal_velocity, int(stop_request), silent_cycles, lost_to_drive, lost_from_drive,
-    )  # fmt: skip
+    truth = np.zeros((0, TRUTHS)) if truth is None else truth
+    written, rows = _run(memory, codec, world, scenario, truth)
     return int(written), int(rows)

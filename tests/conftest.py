@@ -9,15 +9,20 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from jointctl.drivers.canopen.settings import CanopenSettings
-from jointctl.tools.configuration.drive_settings import canopen_settings
+from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.simulation.virtual_joint import new_device
 from tests.axis_on_stub_joint import Rig, small_axis_constants
 from tests.device_on_bus import DeviceOnBus
 from tests.places import CONFIGS, ROOT
 from tests.tiers import tier_of
+
+# no example is judged by the clock, so that none fails on a busy computer
+settings.register_profile("no clock", deadline=None, suppress_health_check=[*HealthCheck])
+settings.load_profile("no clock")
 
 
 def pytest_configure() -> None:
@@ -58,16 +63,23 @@ def device_on_bus() -> Iterator[DeviceOnBus]:
 
 
 @pytest.fixture
-def empty_bus() -> Iterator[DeviceOnBus]:
-    """A bus on which nobody answers."""
-    with DeviceOnBus(None) as device:
-        yield device
-
-
-@pytest.fixture
 def settings_of_virtual_joint() -> CanopenSettings:
     """What configs/virtual.toml tells the driver; it waits for nobody for long."""
     return dataclasses.replace(canopen_settings(load_config(CONFIGS / "virtual.toml")), boot_timeout_s=0.2)
+
+
+@pytest.fixture
+def joint(device_on_bus: DeviceOnBus, settings_of_virtual_joint: CanopenSettings) -> DeviceOnBus:
+    """The same; `joint.opened()` is the real driver on it."""
+    device_on_bus.settings = settings_of_virtual_joint
+    return device_on_bus
+
+
+@pytest.fixture
+def empty_bus(settings_of_virtual_joint: CanopenSettings) -> Iterator[DeviceOnBus]:
+    """A bus on which no one answers."""
+    with DeviceOnBus(None, settings_of_virtual_joint) as device:
+        yield device
 
 
 @pytest.fixture

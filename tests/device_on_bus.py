@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import struct
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import can
 
@@ -31,10 +34,11 @@ class DeviceOnBus:
     `answers` replaces the value in expedited SDO upload responses, (index, sub) -> value; `mute` lists objects whose
     next requests stay unanswered; `requests` are the frames that came in.  `sequences` are answers used up one by one
     before the true ones; `refused` are downloads answered with that SDO abort code; `deaf_frames` frames are lost.
+    `settings` are what `opened` gives the driver.
     """
 
-    def __init__(self, device: Cia402Device | None) -> None:
-        self.device = device
+    def __init__(self, device: Cia402Device | None, settings: CanopenSettings | None = None) -> None:
+        self.device, self.settings = device, settings
         self.channel = f"device {next(_channels)}"
         self.now_ns = 1_000_000
         self.answers: dict[tuple[int, int], int] = {}
@@ -154,3 +158,24 @@ class DeviceOnBus:
         assert drive._network.notifier is not None
         drive._network.notifier.add_listener(hear)
         return drive
+
+    @contextmanager
+    def opened(self, **changes: Any) -> Iterator[CanopenDrive]:
+        """The real driver with some of its settings changed, closed at the end."""
+        assert self.settings is not None
+        drive = self.drive(dataclasses.replace(self.settings, **changes))
+        try:
+            yield drive
+        finally:
+            drive.close()
+
+    def value(self, index: int, sub: int = 0) -> int:
+        """What the drive's dictionary holds."""
+        assert self.device is not None
+        return int(self.device.objects.value(index, sub))
+
+    def store(self, index: int, sub: int, number: int) -> None:
+        """A default of the drive that is not the virtual one's."""
+        assert self.device is not None
+        size = self.device.objects.entry(index, sub).size
+        self.device.objects.store(index, sub, struct.pack("<q", number)[:size])

@@ -17,6 +17,12 @@ from jointctl.tools.session.plan import resolve
 from jointctl.tools.session.session import Session
 
 
+def output(**how: Any) -> tuple[Output, io.StringIO, io.StringIO]:
+    """An output, and what is written to it and beside it."""
+    out, err = io.StringIO(), io.StringIO()
+    return Output(stdout=out, stderr=err, **how), out, err
+
+
 def session_of(
     config: Config,
     log: Path,

@@ -32,24 +32,24 @@ from canopen.sdo.exceptions import SdoCommunicationError
 from jointctl.drivers.canopen import drive as drive_module
 from jointctl.drivers.canopen import switch_off as switch_off_module
 from jointctl.drivers.canopen.drive import CanopenDrive
-from jointctl.drivers.canopen.exchange import accept, begin, end, exchange_memory
 from jointctl.drivers.canopen.switch_off import stop_node
+from jointctl.firmware_py.cycle import Word
 from jointctl.firmware_py.libc import NANOSECONDS
-from jointctl.firmware_py.realtime import Word
-from jointctl.firmware_py.records import LogRecord
-from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase
-from jointctl.hil.bus.virtual_bus import FRAME_SIZE
 from jointctl.hil.canopen.records import PowerState
-from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUTHS, run_lockstep
+from jointctl.hil.faults.kinds import fault_memory, no_faults
+from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUTHS, Scenario, run_lockstep
+from jointctl.hil.lockstep import World as Joint
+from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.drive_settings import canopen_settings
 from jointctl.tools.output import Output
 from jointctl.tools.session import loop_handle as loop_module
 from jointctl.tools.session import portable_loop
 from jointctl.tools.session import session as session_module
+from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.control import STOP_COMMAND, StopSignals
 from jointctl.tools.session.loop_handle import LoopHandle
+from jointctl.tools.simulation.lockstep import codec_of
 from jointctl.tools.simulation.virtual_joint import new_device
 
 STEP_NS = 1_000_000
@@ -264,16 +264,26 @@ class SimulatedLoop(LoopHandle):
 
     world: World
 
-    def __init__(self, config: Config, table: Any, tail_path: Path | None = None, marker_fd: int | None = None) -> None:
-        self.block = loop_module.SharedBlock.create(len(table), config.bus.interface)
+    def __init__(
+        self, config: Config, table: Any, port: type, tail_path: Path | None = None, marker_fd: int | None = None
+    ) -> None:
+        self.block = loop_module.SharedBlock.create(len(table), port)
         self.block.table[:] = table
         self._tail = self.lost_records = 0
-        self._after_end = loop_module._ON_CAN
+        self._after_end = config.drive.when_the_loop_ends
         self._period_ns = round(NANOSECONDS / config.loop.rate_Hz)
         self._process: Any = SimulatedProcess()
         self._bus = SimulatedBus(self.world)
-        self._frames, _ = exchange_memory()
-        self._frame_bytes = self._frames.view(np.ndarray).view(np.uint8).reshape(len(self._frames), FRAME_SIZE)
+        device = self.world.device
+        self._memory, self._codec = self.block.memory(), codec_of(self.block.port)
+        self._joint = Joint(
+            device.device,
+            device.plant_constants,
+            device.plant_state,
+            device.queue,
+            no_faults(),
+            fault_memory(no_faults()),
+        )
         self._cycles(0, 0)  # loads what is compiled, before anything is forked
         self.block.words[Word.READY] = 1
 
@@ -305,22 +315,15 @@ class SimulatedLoop(LoopHandle):
     def _cycles(self, first_ns: int, cycles: int) -> int:
         """So many whole cycles in one call; how many there were until FINISHED."""
         block, world, period_ns = self.block, self.world, self._period_ns
-        device, log, truth = world.device, new(LogRecord, max(1, cycles)), np.zeros((cycles, TRUTHS))
-        stop = int(block.words[Word.STOP])
-        written, rows = run_lockstep(
-            begin, accept, end, block.port, self._frames, self._frame_bytes, block.constants, block.state, block.table,
-            block.sample, block.command, device.device, device.plant_constants, device.plant_state, device.queue,
-            log, 1, first_ns, period_ns, cycles, 0 if stop else -1, truth, stop_request=stop,
-            silent_cycles=max(0, first_ns - int(block.words[Word.SUPERVISOR_NS])) // period_ns,
+        truth = np.zeros((cycles, TRUTHS))
+        scenario = Scenario(
+            first_ns, period_ns, cycles, supervisor_beats=False,
             lost_to_drive=world.lost_to_drive, lost_from_drive=world.lost_from_drive,
         )  # fmt: skip
-        device.queue[0].count = 0
+        written, rows = run_lockstep(self._memory, self._codec, self._joint, scenario, truth)
+        self._joint.queue[0].count = 0
         for row in range(rows):
             world.note_power(int(truth[row, TRUE_POWER_STATE]), first_ns + row * period_ns)
-        head = int(block.words[Word.HEAD])
-        block.ring[(head + np.arange(written)) % len(block.ring)] = log[:written]
-        block.histograms[:, 1] += written  # the watch over the delay asks whether there is something
-        block.words[Word.HEAD] = head + written
         if written:
             world.now_ns = max(world.now_ns, first_ns + (written - 1) * period_ns)
             block.words[Word.LOOP_NS] = world.now_ns
@@ -415,10 +418,10 @@ def simulated(joint: Config) -> Iterator[World]:
             (drive_module, "new_network", new_network),
             (switch_off_module, "new_network", new_network),
             (portable_loop, "sleep_until_ns", lambda *when: loops[-1].wait_for_cycle(*when)),
-            (portable_loop, "note_suspension", lambda *_: None),
+            (portable_loop, "slept_ns", lambda *_: 0),
             (loop_module, "mmap", private),
             (session_module, "LoopHandle", new_loop),
-            (session_module, "open_drive", open_simulated),
+            (CanopenSession, "open", lambda _, *arguments: open_simulated(*arguments)),
             (session_module, "recording", lambda _: contextlib.nullcontext()),
             (session_module, "kept_awake", lambda *_: contextlib.nullcontext()),
             (session_module, "RunLogWriter", SilentLog),

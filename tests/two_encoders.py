@@ -6,15 +6,13 @@ import struct
 from pathlib import Path
 from typing import Any
 
-import tomlkit
-
 from jointctl.drivers.can.frames import Frame
 from jointctl.drivers.canopen.cyclic import accept_frame, begin_cycle
 from jointctl.firmware_py.schema import new
+from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.drive_settings import canopen_settings
 from jointctl.tools.configuration.load import load_config
-from tests.places import CONFIGS
+from tests.configurations import written
 
 NODE = {
     "source": "node", "node": 2, "counts_per_turn": 524288, "direction": 1, "zero_counts": 100_000,
@@ -24,16 +22,9 @@ NODE = {
 
 def config_with(folder: Path, encoder: dict[str, Any] | None = None, **changes: Any) -> Config:
     """configs/virtual.toml changed; with `encoder` as its [joint_encoder], its own one is on the motor."""
-    document = tomlkit.parse((CONFIGS / "virtual.toml").read_text())
     if encoder is not None:
-        document["joint_encoder"] = encoder
-        changes = {"encoder__side": "motor", "encoder__counts_per_turn": 65536, **changes}
-    for path, value in changes.items():
-        section, key = path.split("__")
-        document[section][key] = value  # type: ignore[index]
-    path = folder / "joint.toml"
-    path.write_text(tomlkit.dumps(document))
-    return load_config(path)
+        changes = {"joint_encoder": encoder, "encoder__side": "motor", "encoder__counts_per_turn": 65536, **changes}
+    return load_config(written(folder / "joint.toml", **changes))
 
 
 def short_run(folder: Path, encoder: dict[str, Any], **changes: Any) -> Config:

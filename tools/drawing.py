@@ -1,7 +1,7 @@
 """One style for every matplotlib picture: a PNG on white as a file, or SVG whose colours follow the page it stands on.
 
-Draw on a `canvas` with the colours of `COLOURS` (and the default text and axes); `tools.reporting.page` replaces each
-of them by a variable of the page.  matplotlib is slow to import, and only wanted here.  No display is needed.
+Draw on a `canvas` with the colours of `COLOURS` (and the default text and axes); `tools.recording.report_page` replaces
+each of them by a variable of the page.  matplotlib is slow to import, and only wanted here.  No display is needed.
 """
 
 from __future__ import annotations
@@ -11,11 +11,14 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, BinaryIO, TextIO
 
 from jointctl.drivers.errors import UsageError
 from jointctl.drivers.printable import printable
 from jointctl.tools.written_file import refuse_overwriting, refuse_special, writing
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # the numbers only mark what to replace; near the page's light colours, so that a plain viewer is right as well
 COLOURS = {
@@ -69,7 +72,7 @@ STYLE: Any = {
 
 
 @contextmanager
-def canvas(height_in: float, title: str = "") -> Iterator[Any]:
+def canvas(height_in: float, title: str = "") -> Iterator[Figure]:
     """A `matplotlib.figure.Figure` of the common width; what is drawn inside the `with` has the style."""
     import matplotlib
     from matplotlib.figure import Figure
@@ -81,7 +84,7 @@ def canvas(height_in: float, title: str = "") -> Iterator[Any]:
         yield figure
 
 
-def save_figure(figure: Any, target: Any, **how: Any) -> None:
+def save_figure(figure: Figure, target: BinaryIO | TextIO, **how: Any) -> None:
     """matplotlib's `savefig` in the common style; names in titles and legends are shown as they may be."""
     import matplotlib
     from matplotlib.text import Text
@@ -93,7 +96,7 @@ def save_figure(figure: Any, target: Any, **how: Any) -> None:
         figure.savefig(target, **how)
 
 
-def png(figure: Any) -> bytes:
+def png(figure: Figure) -> bytes:
     """The picture on white, for a file."""
     data = io.BytesIO()
     save_figure(figure, data, format="png", dpi=_PNG_DPI, facecolor="white")
@@ -108,7 +111,7 @@ def require_png(path: Path, inputs: Iterable[Path]) -> None:
     refuse_special(path)
 
 
-def save_png(figure: Any, path: Path) -> Path:
+def save_png(figure: Figure, path: Path) -> Path:
     """`png` into a file, whose folder is made; returns the path.  `DataError` if it cannot be written."""
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -8,11 +8,10 @@ owned by the caller.  Not for CAN FD (72-byte frames).
 from __future__ import annotations
 
 import errno as errno_codes
-from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.can.frames import FRAME_BYTES, Frame
+from jointctl.drivers.can.frames import FRAME_BYTES
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.libc import EINTR, MSG_DONTWAIT, MSG_NOSIGNAL, errno, recv, send
 
@@ -23,7 +22,7 @@ _WRONG_SIZE = errno_codes.EBADMSG
 
 
 @kernel
-def send_frame(fd: int, frames: Any, index: int) -> int:
+def send_frame(fd: int, frames: np.ndarray, index: int) -> int:
     """Hand `frames[index]` to the bus; 0 if it was taken, else the errno.
 
     A full queue is EAGAIN on the virtual bus and ENOBUFS or EAGAIN on AF_CAN: the frame was not sent.
@@ -41,27 +40,7 @@ def send_frame(fd: int, frames: Any, index: int) -> int:
 
 
 @kernel
-def stamp_frame(frames: Any, index: int, now_ns: int) -> None:
-    """Write the time of sending into the three spare bytes: microseconds modulo 2^24, lowest byte first, never 0.
-
-    For the virtual bus only: the virtual drive then acts on the frame as of that time, however late its process got
-    the processor.  A real drive needs no such help, and on AF_CAN the bytes have to be 0.
-    """
-    time_us = max((now_ns // 1000) & 0xFFFFFF, 1)
-    frame = frames[index]
-    frame.padding = time_us & 0xFF
-    frame.reserved = (time_us >> 8) & 0xFF
-    frame.length8 = time_us >> 16
-
-
-@kernel
-def stamp_of(frame: Frame) -> int:
-    """What `stamp_frame` wrote; the virtual drive's answer bears that of its SYNC.  0 = none, as on every other bus."""
-    return int(frame.padding) | int(frame.reserved) << 8 | int(frame.length8) << 16
-
-
-@kernel
-def receive_frame(fd: int, frames: Any, index: int) -> int:
+def receive_frame(fd: int, frames: np.ndarray, index: int) -> int:
     """Take one waiting frame into `frames[index]`: 1 got one, 0 nothing is waiting, negative: -errno.
 
     -ECONNRESET: the virtual bus ended.  -EBADMSG: a datagram of a wrong size was thrown away (the record is then

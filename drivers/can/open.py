@@ -66,7 +66,7 @@ def _without_its_log() -> Iterator[None]:
 def reserved_port(channel: str, *, exclusive: bool) -> Iterator[None]:
     """`OSError` if the port cannot be opened, `BusError` if `exclusive` and a program of ours has it.
 
-    Opening it would close the CAN channel under that program's feet.  The port stays open meanwhile, so that its
+    Opening it would close the CAN channel under that program's feet.  The port stays open in the meantime, so that its
     control lines, which restart some adapters, do not move in between.
     """
     if "://" in channel:  # pyserial's URLs: no device file

@@ -141,7 +141,7 @@ def link_problem(link: LinkState, bitrate_bitps: int | None = None) -> tuple[str
     if link.state == "BUS-OFF":
         return (
             f"CAN interface {name} is bus-off{counters}: too many of its frames failed",
-            f"a short, missing termination or a wrong bit rate; mend it, then: {restart}",
+            f"a short, missing termination or a wrong bit rate; fix it, then: {restart}",
         )
     if link.state == "ERROR-PASSIVE":
         return (

@@ -330,11 +330,7 @@ def arm_watchdog(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
 
 
 def commission(
-    objects: ObjectAccess,
-    settings: CanopenSettings,
-    eds: EdsFile,
-    pause: Pause,
-    prove: Callable[[], str] | None = None,
+    objects: ObjectAccess, settings: CanopenSettings, eds: EdsFile, pause: Pause, prove: Callable[[], str] | None = None
 ) -> Findings:
     """All steps on a node in pre-operational; it ends disabled, with its PDOs mapped.
 

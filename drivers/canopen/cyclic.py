@@ -82,7 +82,6 @@ class CanopenPort:
     """Identifiers, layout and scaling (set by commissioning), and what has been seen on the bus."""
 
     fd: i4
-    stamped: i4  # frames carry the time they were sent: virtual bus only
     node: i4
     sync_id: u4
     tpdo_id: u4
@@ -91,6 +90,7 @@ class CanopenPort:
     heartbeat_id: u4  # of the drive
     own_heartbeat_id: u4
     heartbeat_cycles: i4  # own heartbeat every so many cycles; 0 = none
+    period_ns: i8  # of the loop; 0: an answer of any age is a sample
     tpdo_length: i4
     rpdo_length: i4
     # byte positions inside the PDOs; -1 = not mapped
@@ -107,7 +107,6 @@ class CanopenPort:
     max_permille: i4
     target_is_velocity: i4  # the target is 60FF (32 bit) instead of 6071 (16 bit)
     velocity_radpspunit: f8  # of 60FF
-    clock: Annotated[np.ndarray, array_of(i8, 2)]  # scratch of the stamps
     second: SecondPosition
     # state
     first_rad: f8  # position by 6064
@@ -118,6 +117,8 @@ class CanopenPort:
     cycle: i8
     state: i4  # cia402.State
     nmt_state: i4
+    wake_ns: i8  # when the last cycle began
+    stale: i4  # 1: what waits before SYNC answers one that is too long ago
     in_cycle: i4  # 1 from SYNC to RPDO
     seen: i4  # TPDOs since the last SYNC: 1 the drive's, 2 the second encoder's
     answered: i4  # those of them that came before the RPDO
@@ -204,6 +205,9 @@ def watch_second(second: SecondPosition, frame: Frame, sample: Sample) -> None:
 def publish_sample(port: CanopenPort, sample: Sample, now_ns: int) -> bool:
     """The sample, if it is complete: with a second encoder, both positions of this cycle."""
     second = port.second
+    if port.stale != 0:
+        port.surplus += 1
+        return False
     if second.tpdo_id == 0:
         sample.position_rad = port.first_rad
         sample.time_ns = now_ns
@@ -231,12 +235,24 @@ def publish_sample(port: CanopenPort, sample: Sample, now_ns: int) -> bool:
 
 
 @kernel
+def note_wake(port: CanopenPort, now_ns: int) -> None:
+    """A cycle begins, before the frames that wait are taken: is an answer among them too old for this slot?
+
+    A drive may answer in the next cycle, each time; what waits for longer than that has waited through a pause of the
+    computer, and as the position of this slot it would be a leap.  It is left out, and the age of the sample counts on.
+    """
+    port.stale = 1 if 2 * (now_ns - port.wake_ns) > 3 * port.period_ns > 0 else 0
+    port.wake_ns = now_ns
+
+
+@kernel
 def begin_cycle(port: CanopenPort, frames: np.ndarray) -> int:
     """Write SYNC (slot 0) and, when due, the heartbeat (slot 1); returns how many frames to send."""
     frames[SLOT_SYNC].can_id = port.sync_id
     frames[SLOT_SYNC].length = 0
     port.bits_sent += _WORST_BITS[0]
     port.in_cycle = 1
+    port.stale = 0
     port.answered = 0
     due = port.heartbeat_cycles > 0 and port.cycle % port.heartbeat_cycles == 0
     port.cycle += 1
@@ -252,12 +268,9 @@ def begin_cycle(port: CanopenPort, frames: np.ndarray) -> int:
 
 @kernel
 def answer_owed(port: CanopenPort) -> bool:
-    """Before `begin_cycle`: whether the last SYNC still lacks a TPDO, so that the next one may belong to it.
-
-    Not on the virtual bus, where a stamp shows it.
-    """
+    """Before `begin_cycle`: whether the last SYNC still lacks a TPDO, so that the next one may belong to it."""
     wanted = SEEN_FIRST if port.second.tpdo_id == 0 else SEEN_FIRST | SEEN_SECOND
-    return port.cycle > 0 and port.stamped == 0 and port.seen & wanted != wanted
+    return port.cycle > 0 and port.seen & wanted != wanted
 
 
 @kernel

@@ -217,14 +217,15 @@ class CanopenDrive:
             settings=findings.settings,
             remarks=tuple(findings.remarks),
             counts_per_motor_turn=findings.counts_per_motor_turn,
+            commands_velocity=findings.mode in VELOCITY_MODES,
             measures_torque=findings.layout is None or findings.layout.torque_at >= 0,
         )
 
     def start_cyclic(self) -> None:
         """NMT operational: PDOs are valid from here on.  The drive stays disabled until the loop enables it.
 
-        The user may have taken minutes to confirm.  A drive that was switched off meanwhile, or that another program
-        has made safe, has lost its watchdog or its limits: everything is read back once more.  `BusError` if another
+        The user may have taken minutes to confirm.  A drive that was switched off since, or that another program has
+        made safe, has lost its watchdog or its limits: everything is read back once more.  `BusError` if another
         controller was on the bus since commissioning began.
         """
         if self._findings is None or self._reads is None:
@@ -331,7 +332,7 @@ class CanopenDrive:
     def _take_watchdog_away(self) -> None:
         """Our heartbeat has ended with the loop; a drive that is off need not watch it any more.
 
-        Another program may have armed it for itself meanwhile: then it stays.
+        Another program may have armed it for itself since: then it stays.
         """
         armed, _ = self._objects.verified().get((0x1016, 1), (0, ""))
         what = "consumer heartbeat time"

@@ -174,7 +174,7 @@ def report_own_frames(network: canopen.Network, others: OtherControllers) -> Non
     """`others` learns what this end sends, so that an interface which hands it back does not make it another's."""
     send: Any = network.send_message
 
-    def send_message(can_id: int, data: Any, remote: bool = False) -> None:
+    def send_message(can_id: int, data: bytes, remote: bool = False) -> None:
         others.sent(can_id, bytes(data))
         send(can_id, data, remote)
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from jointctl.drivers.canopen.cia402 import State
-from jointctl.drivers.canopen.cyclic import AlignTo, CanopenPort, centred
+from jointctl.drivers.canopen.cyclic import AlignTo, CanopenPort, SecondPosition, centred
 from jointctl.drivers.canopen.identifiers import (
     EMERGENCY_ID,
     HEARTBEAT_ID,
@@ -408,6 +408,7 @@ def new_port(
     port.own_heartbeat_id = HEARTBEAT_ID + settings.master_node
     # three heartbeats within the drive's time-out, so that one or two lost ones do not stop the joint
     port.heartbeat_cycles = max(1, int(settings.heartbeat_s * settings.rate_Hz / 3.0))
+    port.period_ns = round(1e9 / settings.rate_Hz)
     port.heartbeat_watched = int(heartbeat_watched)
     for key in (
         "tpdo_id", "rpdo_id", "tpdo_length", "rpdo_length",
@@ -429,7 +430,9 @@ def new_port(
     return ports
 
 
-def _fill_second(second: Any, settings: CanopenSettings, encoder: JointEncoderSettings, range_counts: int) -> None:
+def _fill_second(
+    second: SecondPosition, settings: CanopenSettings, encoder: JointEncoderSettings, range_counts: int
+) -> None:
     """The second encoder of the joint."""
     if encoder.node is None:
         second.tpdo_id = TPDO2_ID + settings.node

@@ -15,15 +15,18 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import can
 import canopen
-from canopen.objectdictionary import ObjectDictionaryError
+from canopen.objectdictionary import ObjectDictionaryError, ODVariable
 from canopen.sdo.client import SdoClient, WritableStream
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from jointctl.drivers.errors import DeviceError, NoDeviceError
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
 
 ATTEMPTS = 3
 COLLISIONS = 10  # with the transfers of another master on the one SDO channel, such as those of `jointctl stop`
@@ -68,7 +71,7 @@ class _DownloadStream(WritableStream):
         super().__init__(client, index, sub, size)  # type: ignore[no-untyped-call]
         self._begun = True
 
-    def write(self, data: Any) -> int:
+    def write(self, data: ReadableBuffer) -> int:
         """Send the next segment, or all of an expedited transfer; how many bytes were taken."""
         self._begun = False
         taken = int(super().write(data))  # type: ignore[no-untyped-call]
@@ -170,7 +173,7 @@ class ObjectAccess:
             )
         return NoDeviceError(f"{place} got no answer in {ATTEMPTS} attempts")
 
-    def _number(self, variable: Any, data: bytes, what: str) -> int:
+    def _number(self, variable: ODVariable, data: bytes, what: str) -> int:
         try:
             value = variable.decode_raw(data)
             if isinstance(value, (int, float)):
@@ -183,7 +186,7 @@ class ObjectAccess:
             hint="use the EDS file that belongs to this drive and firmware",
         )
 
-    def _encoded(self, variable: Any, value: int, what: str) -> bytes:
+    def _encoded(self, variable: ODVariable, value: int, what: str) -> bytes:
         try:
             return bytes(variable.encode_raw(value))
         except (ObjectDictionaryError, ValueError, TypeError):

@@ -91,7 +91,7 @@ def arm_rpdo_deadline(objects: ObjectAccess, settings: CanopenSettings, rpdo_id:
 
 
 def _write_event_timer(objects: ObjectAccess, base: int, cob_id: int, milliseconds: int) -> DeviceError | None:
-    """Why the drive does not take it, or None.  The PDO is disabled meanwhile, as some drives insist."""
+    """Why the drive does not take it, or None.  The PDO is disabled in the meantime, as some drives insist."""
     what = f"PDO {base:04X} COB-ID"
     objects.write(base, 1, cob_id | DISABLED, what=what)
     try:

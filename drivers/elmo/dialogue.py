@@ -1,8 +1,8 @@
-"""The ASCII interpreter of the drive: question and answer, one command at a time, without and with a port.
+r"""The ASCII interpreter of the drive: question and answer, one command at a time, without and with a port.
 
-    PX\\r      -> PX\\r12345;         value, with echo
-    MO=1\\r    -> MO=1\\r;            done
-    UM=9\\r    -> UM=9\\r<byte>?;     refused; EC gives the reason, and the byte is that code
+    PX\r      -> PX\r12345;         value, with echo
+    MO=1\r    -> MO=1\r;            done
+    UM=9\r    -> UM=9\r<byte>?;     refused; EC gives the reason, and the byte is that code
 
 A command is two letters, optional [index], optional =value, ended by CR here: the drive takes ; as well, but then
 the echo would end with the character that ends a reply.  A reply ends with `;`.  With echo off only the part after CR
@@ -22,9 +22,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
-from jointctl.drivers.elmo.codes import error_text
+from jointctl.drivers.elmo.codes import AMPLIFIER_MASK, FAULT_LATCHED, MOTOR_MUST_BE_ON, error_text, motor_off_cause
 from jointctl.drivers.elmo.serial_port import BytePort
-from jointctl.drivers.errors import BusError, DeviceError, NoDeviceError
+from jointctl.drivers.errors import BusError, DeviceError, JointctlError, NoDeviceError
 
 END_OF_COMMAND = b"\r"
 END_OF_REPLY = b";"
@@ -286,3 +286,41 @@ def changed(shown: str, found: str, wanted: str) -> DeviceError:
 
 def _shown(name: str, index: int | None) -> str:
     return name if index is None else f"{name}[{index}]"
+
+
+# --- Torque and speed zero, motor off on a serial line: sent by drive, loop, guard and `jointctl stop` ---
+
+
+SAFE_ATTEMPTS = 5
+# TC and ST before MO: where the drive takes no MO=0 it is without torque, or its jog has ended, all the same.  JV=0, so
+# that no later BG jogs on; without a BG, which in a unit mode that another program has chosen would begin a motion.
+# The first CR ends a half command.
+COMMANDS = (b"TC=0", b"JV=0", b"ST", b"MO=0")
+SWITCH_OFF = b"\r" + b"".join(command + b"\r" for command in COMMANDS)
+
+
+def switch_off(port: BytePort, line: Dialogue, attempts: int = SAFE_ATTEMPTS) -> str:
+    """TC=0, JV=0, ST, MO=0 until MO reads 0; returns `off`, or `off, fault: ...`.
+
+    Raises the last error where the drive did not confirm; all commands were sent, as far as the port took them.
+    """
+    line.interpreter.echo = None  # a drive that restarted has its own setting again
+    error: JointctlError | None = None
+    # at once and unheard, before any time is spent on a line that may be in disorder
+    port.write(SWITCH_OFF)
+    for _ in range(attempts):
+        try:
+            line.resynchronise()
+            for command in COMMANDS:
+                try:
+                    line.ask(command + b"\r", 1)
+                except RefusedError as refusal:
+                    if command == b"MO=0" and refusal.code != MOTOR_MUST_BE_ON:
+                        raise
+            if line.integer("MO") == 0:
+                status = line.integer("SR")
+                cause = motor_off_cause(status, line.integer("MF"))
+                return "off" if not status & (FAULT_LATCHED | AMPLIFIER_MASK) else f"off, fault: {cause}"
+        except JointctlError as failure:
+            error = failure
+    raise error or DeviceError("MO of the drive does not become 0")

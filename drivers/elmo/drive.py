@@ -20,11 +20,10 @@ from jointctl.drivers.elmo.codes import (
 )
 from jointctl.drivers.elmo.commissioning import SPEED_MODE, TORQUE_MODE, set_speed_mode, set_torque_mode, write_limits
 from jointctl.drivers.elmo.cyclic import ElmoPort
-from jointctl.drivers.elmo.dialogue import Dialogue, RefusedError, ReplyKind, changed, encode
+from jointctl.drivers.elmo.dialogue import SAFE_ATTEMPTS, Dialogue, RefusedError, ReplyKind, changed, encode, switch_off
 from jointctl.drivers.elmo.line_budget import LARGEST_SHARE, MeasuredExchange, highest_rate_Hz, measured_exchange
 from jointctl.drivers.elmo.serial_port import BytePort, SerialPort
 from jointctl.drivers.elmo.settings import ElmoSettings
-from jointctl.drivers.elmo.switch_off import SAFE_ATTEMPTS, switch_off
 from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
 from jointctl.firmware_py.schema import new
 
@@ -32,7 +31,7 @@ MEASURED_CYCLES = 20
 TC_STEP_A = 1e-3
 QUESTION = "The motor is on, and at rest. Stop it and switch it off?"
 ENABLE_RETRY_S = 0.5
-ASKED_ATTEMPTS = 20  # twice those of `jointctl stop`, which talks on the same line meanwhile and takes replies
+ASKED_ATTEMPTS = 20  # twice those of `jointctl stop`, which talks on the same line in the meantime and takes replies
 
 # --- what a drive reports, read only: nothing is written, nothing is switched, no counter is reset ---
 
@@ -88,7 +87,7 @@ def read_facts(line: Dialogue, settings: ElmoSettings) -> list[Fact]:
         try:
             text = line.query(name, index)
         except RefusedError as refusal:
-            facts.append(Fact(shown, label, "", f"not told: {error_text(refusal.code)}"))
+            facts.append(Fact(shown, label, "", f"not reported: {error_text(refusal.code)}"))
             continue
         facts.append(_fact(shown, label, text, kind, settings))
     return facts
@@ -191,6 +190,7 @@ class ElmoDrive:
         return CommissioningReport(
             identity=identity,
             mode=SPEED_MODE if self._speed_mode else TORQUE_MODE,
+            commands_velocity=self._speed_mode,
             start_position_rad=(start_counts - settings.zero_counts) * settings.rad_per_count,
             torque_resolution_Nm=TC_STEP_A * abs(settings.torque_NmpA),
             position_resolution_rad=abs(settings.rad_per_count),
@@ -348,8 +348,8 @@ class ElmoDrive:
     def start_cyclic(self) -> None:
         """From here on the loop has the line; this object is silent until `make_safe`.
 
-        The user may have taken minutes to confirm.  A drive whose supply was switched off meanwhile, or that another
-        program has used, has its own unit mode, reference and limits again: all is read back once more before MO=1.
+        The user may have taken minutes to confirm.  A drive whose supply was off since, or that another program has
+        used, has its own unit mode, reference and limits again: all is read back once more before MO=1.
         """
         line, echo = self._line, self._settings.echo
         line.resynchronise()

@@ -6,7 +6,7 @@ Same signatures as `drivers.canopen.exchange`, with bytes in place of frames.
 from __future__ import annotations
 
 import errno as errno_codes
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba.core import types
@@ -21,7 +21,7 @@ from jointctl.drivers.elmo.cyclic import (
     note_written,
     take_byte,
 )
-from jointctl.firmware_py.kernel import exported, kernel, record_array_type
+from jointctl.firmware_py.kernel import exported, kernel, memory_type, record_array_type
 from jointctl.firmware_py.libc import EAGAIN, EINTR, errno, external, monotonic_ns, poll_events, wait_readable_ns
 from jointctl.firmware_py.records import Command, Sample
 from jointctl.firmware_py.schema import dtype_of
@@ -29,14 +29,26 @@ from jointctl.firmware_py.schema import dtype_of
 _read = external("read", types.intp, types.int32, types.uintp, types.uintp)
 _write = external("write", types.intp, types.int32, types.uintp, types.uintp)
 
-_PORT = record_array_type(dtype_of(ElmoPort))
-_SAMPLE = record_array_type(dtype_of(Sample))
-_COMMAND = record_array_type(dtype_of(Command))
-_SCRATCH = types.Array(types.int64, 1, "C")
-_BYTES = types.Array(types.uint8, 1, "C")
+
+class ElmoLink(NamedTuple):
+    """The memory of the exchange: a drive's record, the bytes received, scratch."""
+
+    port: Any  # ElmoPort[1]
+    data: np.ndarray  # uint8[READ_MAX]
+    scratch: np.ndarray  # int64[SCRATCH_WORDS]
+
+
+_SAMPLES = record_array_type(dtype_of(Sample))
+_COMMANDS = record_array_type(dtype_of(Command))
+_LINK = memory_type(ElmoLink, dtype_of(ElmoPort), np.dtype(np.uint8), np.dtype(np.int64))
 
 _GONE_EVENTS = 0x008 | 0x010 | 0x020  # POLLERR, POLLHUP, POLLNVAL
 _EIO = errno_codes.EIO
+
+
+def link_of(port: Any) -> ElmoLink:
+    """`port` ElmoPort[1] with the other memory of the exchange."""
+    return ElmoLink(port, np.zeros(READ_MAX, np.uint8), np.zeros(SCRATCH_WORDS, np.int64))
 
 
 @kernel
@@ -92,43 +104,37 @@ def _flush(port: ElmoPort, sample: Sample) -> int:
     return code
 
 
-@exported(types.int64(_PORT, _BYTES, _SCRATCH, _SAMPLE, types.int64, types.int64))
-def receive(ports: Any, data: np.ndarray, scratch: np.ndarray, samples: Any, now_ns: int, deadline_ns: int) -> int:
-    """Ask for the position and wait for it until `deadline_ns`; returns the time waited [ns].
+@exported(types.int64(_LINK, _SAMPLES, types.int64, types.int64))
+def receive(link: ElmoLink, samples: np.ndarray, now_ns: int, until_ns: int) -> int:
+    """Ask for the position and wait for it until `until_ns`; returns the time waited [ns].
 
     The late replies of the last cycle are taken first, older ones are not believed.  A cycle that was held up past its
     window does not look any more: PX may have gone out late as well, and as the position of this slot its answer would
     be a leap.  The next cycle takes it.
     """
-    port = ports[0]
-    sample = samples[0]
-    port.window_ns = deadline_ns
-    port.window_over = now_ns > deadline_ns
+    port, data, scratch, sample = link.port[0], link.data, link.scratch, samples[0]
+    port.window_ns = until_ns
+    port.window_over = now_ns > until_ns
     port.asked_ns = now_ns
     _drain(port, data, sample, now_ns)
     begin_cycle(port, sample)
     _flush(port, sample)
     started_ns = monotonic_ns(scratch)
     arrived_ns = started_ns
-    while arrived_ns <= deadline_ns + LOOK_LATE_NS:
+    while arrived_ns <= until_ns + LOOK_LATE_NS:
         _drain(port, data, sample, arrived_ns)
-        if port.answered_window_ns == deadline_ns:
+        if port.answered_window_ns == until_ns:
             return monotonic_ns(scratch) - started_ns
-        if arrived_ns >= deadline_ns or port.gone != 0:
+        if arrived_ns >= until_ns or port.gone != 0:
             return arrived_ns - started_ns
-        _wait_ns(port, deadline_ns - arrived_ns, scratch)
+        _wait_ns(port, until_ns - arrived_ns, scratch)
         arrived_ns = monotonic_ns(scratch)
     return arrived_ns - started_ns
 
 
-@exported(types.int32(_PORT, _BYTES, _SAMPLE, _COMMAND))
-def send(ports: Any, data: np.ndarray, samples: Any, commands: Any) -> int:
+@exported(types.int32(_LINK, _SAMPLES, _COMMANDS))
+def send(link: ElmoLink, samples: np.ndarray, commands: np.ndarray) -> int:
     """Send torque or velocity and the slower questions; returns 0 or the errno."""
-    port = ports[0]
+    port = link.port[0]
     end_cycle(port, samples[0], commands[0])
     return np.int32(_flush(port, samples[0]))  # type: ignore[return-value]
-
-
-def exchange_memory() -> tuple[np.ndarray, np.ndarray]:
-    """(bytes, scratch) that go with a port."""
-    return np.zeros(READ_MAX, np.uint8), np.zeros(SCRATCH_WORDS, np.int64)

@@ -13,7 +13,7 @@ destroy each other's frame), bit errors, error and overload frames, acknowledge,
 
 from __future__ import annotations
 
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,6 +37,15 @@ class Wire:
     delivered_ns: i8
     free_ns: i8
     bits: i8  # of the frame on the wire
+
+
+class Waiting(NamedTuple):
+    """The frames that wait for the bus, a ring of the same depth for each node."""
+
+    frames: np.ndarray  # WireFrame[nodes * depth]
+    arrival_ns: np.ndarray  # int64[nodes * depth]
+    heads: np.ndarray  # int64[nodes]
+    counts: np.ndarray  # int64[nodes]
 
 
 @kernel
@@ -64,7 +73,7 @@ def _append(value: int, count: int, crc: int, last: int, run: int, bits: int) ->
 
 
 @kernel
-def frame_bits(frames: Any, index: int) -> int:
+def frame_bits(frames: np.ndarray, index: int) -> int:
     """Exact length [bit] on the wire of `frames[index]` (WireFrame), with stuff bits and 3 interframe bits."""
     identifier = int(np.int64(frames[index]["identifier"]))
     size = int(np.int64(frames[index]["length"]))
@@ -98,12 +107,9 @@ def arbitration_key(identifier: int) -> int:
 
 
 @kernel
-def pend_frame(frame: Any, node: int, now_ns: int, pending: Any, arrival_ns: Any, heads: Any, counts: Any) -> bool:
-    """Queue `frame[0]` at `node`; False if its queue is full.
-
-    `pending` is WireFrame[nodes * depth] and `arrival_ns` int64 of the same length; `heads` and `counts` are
-    int64[nodes].
-    """
+def pend_frame(frame: np.ndarray, node: int, now_ns: int, waiting: Waiting) -> bool:
+    """Queue `frame[0]` at `node`; False if its queue is full."""
+    pending, arrival_ns, heads, counts = waiting
     depth = len(arrival_ns) // len(heads)
     if counts[node] >= depth:
         return False
@@ -115,8 +121,9 @@ def pend_frame(frame: Any, node: int, now_ns: int, pending: Any, arrival_ns: Any
 
 
 @kernel
-def _start_next(wire: Any, pending: Any, arrival_ns: Any, heads: Any, counts: Any, on_wire: Any) -> None:
+def _start_next(wire: np.ndarray, waiting: Waiting, on_wire: np.ndarray) -> None:
     """Arbitrate among the oldest frames of all nodes, at the first moment when the bus is free and one waits."""
+    pending, arrival_ns, heads, counts = waiting
     depth = len(arrival_ns) // len(heads)
     earliest_ns = -1
     for node in range(len(heads)):
@@ -145,16 +152,14 @@ def _start_next(wire: Any, pending: Any, arrival_ns: Any, heads: Any, counts: An
 
 
 @kernel
-def finish_frame(
-    wire: Any, now_ns: int, pending: Any, arrival_ns: Any, heads: Any, counts: Any, on_wire: Any, finished: Any
-) -> int:
+def finish_frame(wire: np.ndarray, now_ns: int, waiting: Waiting, on_wire: np.ndarray, finished: np.ndarray) -> int:
     """The sender of the next frame whose last bit is over at `now_ns`, the frame in `finished[0]`; else NO_NODE.
 
     Called until it returns NO_NODE, it catches up after a late wake-up with the times as they should have been.
     All frames that arrived up to `now_ns` must have been queued before.
     """
     if wire[0].sender == NO_NODE:
-        _start_next(wire, pending, arrival_ns, heads, counts, on_wire)
+        _start_next(wire, waiting, on_wire)
     if wire[0].sender == NO_NODE or now_ns < wire[0].delivered_ns:
         return NO_NODE
     sender = int(wire[0].sender)

@@ -7,6 +7,7 @@ and never holds up the others.
 
 With `timing`, bit times and arbitration are modelled (`hil/bus/timing.py`) and a frame takes its time; a client that
 sends faster than the bus finds its queue full.  Without it, frames are forwarded at once and only counted.
+That a busy computer holds the hub itself up is made up for with `hil/bus/frame_stamps.py`.
 
 Not modelled: acknowledge (a lone node sends successfully), bit errors, error frames, error counters and bus-off,
 overload frames, CAN FD, the delay and queueing inside an adapter."""
@@ -25,7 +26,7 @@ import threading
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numba.core import types
@@ -34,7 +35,8 @@ from jointctl.firmware_py import libc
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.libc import errno, load_acquire, monotonic_ns, store_release
 from jointctl.firmware_py.schema import array_of, i4, i8, new, record, u1, u4
-from jointctl.hil.bus.timing import NO_NODE, Wire, finish_frame, frame_bits, pend_frame
+from jointctl.hil.bus.frame_stamps import SyncWatch, note_sent, over, stamp_of
+from jointctl.hil.bus.timing import NO_NODE, Waiting, Wire, finish_frame, frame_bits, pend_frame
 
 # --- The virtual side's own statement of `struct can_frame` (16 bytes): identifier, length, three spare bytes, data ---
 # Deliberately not shared with the drivers: a wrong constant on one side must not cancel out on the other.
@@ -79,7 +81,16 @@ _ERROR_FRAME = 0x20000000
 _MSG_TRUNC = 0x20
 _SOL_SOCKET, _SO_SNDBUF = int(socket.SOL_SOCKET), int(socket.SO_SNDBUF)
 _CLIENT_BUFFER_BYTES = 1 << 20  # the kernel limits it to net.core.wmem_max
+_SO_TIMESTAMPNS = 35  # the system notes when a frame was sent; it is read with the frame
+_CLOCK_REALTIME = 0  # of that note
 _setsockopt = libc.external("setsockopt", types.int32, types.int32, types.int32, types.int32, types.uintp, types.uintp)
+
+
+_recvmsg = libc.external("recvmsg", types.intp, types.int32, types.uintp, types.int32)
+# words of the scratch: the clock's two, `struct msghdr`, `struct iovec`, and a control message of header and timespec
+_MESSAGE, _VECTOR, _CONTROL, SCRATCH_WORDS = 2, 9, 11, 19
+_CONTROL_BYTES = 64
+_SENT_NOTE = _SO_TIMESTAMPNS << 32 | _SOL_SOCKET  # type and level of the control message
 
 
 @record
@@ -90,6 +101,7 @@ class BusCounters:
     bits: i8  # on the wire, exact, with stuff bits and interframe space
     dropped: i8
     malformed: i8  # datagrams of a wrong size, data length above 8, error frames
+    late: i8  # answers left out, as the computer held them up until their SYNC was over
     clients: i8  # now
     accepted: i8
     refused: i8
@@ -117,7 +129,13 @@ def _poll_word(fd: int, wanted: bool) -> int:
 
 
 @kernel
-def _accept(listener: int, clients: Any, bus: Any, scratch: Any) -> int:
+def _set_option(fd: int, option: int, value: int, scratch: np.ndarray) -> None:
+    scratch[0] = value
+    _setsockopt(np.int32(fd), np.int32(_SOL_SOCKET), np.int32(option), np.uintp(scratch.ctypes.data), np.uintp(4))
+
+
+@kernel
+def _accept(listener: int, clients: np.ndarray, bus: np.ndarray, scratch: np.ndarray) -> int:
     """Take one new client: 1 done, 0 none waits, -1 no descriptor left (do not ask again before one is closed)."""
     fd = libc.accept4(np.int32(listener), np.uintp(0), np.uintp(0), np.int32(libc.SOCK_NONBLOCK_CLOEXEC))
     if fd < 0:
@@ -125,10 +143,8 @@ def _accept(listener: int, clients: Any, bus: Any, scratch: Any) -> int:
         return 0 if code == libc.EAGAIN or code == libc.EINTR or code == _ECONNABORTED else -1
     for node in range(MAX_CLIENTS):
         if clients[node].state == FREE:
-            scratch[0] = _CLIENT_BUFFER_BYTES
-            _setsockopt(
-                np.int32(fd), np.int32(_SOL_SOCKET), np.int32(_SO_SNDBUF), np.uintp(scratch.ctypes.data), np.uintp(4)
-            )
+            _set_option(fd, _SO_SNDBUF, _CLIENT_BUFFER_BYTES, scratch)
+            _set_option(fd, _SO_TIMESTAMPNS, 1, scratch)
             clients[node].fd = fd
             clients[node].state = CONNECTED
             clients[node].sent = 0
@@ -144,16 +160,39 @@ def _accept(listener: int, clients: Any, bus: Any, scratch: Any) -> int:
 
 
 @kernel
-def _read(node: int, hung_up: bool, clients: Any, bus: Any, frame: Any) -> bool:
+def _receive(fd: int, frame: np.ndarray, scratch: np.ndarray) -> int:
+    """recvmsg(2) of one frame; the control message follows in `scratch`."""
+    address = scratch.ctypes.data
+    scratch[_MESSAGE] = 0
+    scratch[_MESSAGE + 1] = 0
+    scratch[_MESSAGE + 2] = address + 8 * _VECTOR
+    scratch[_MESSAGE + 3] = 1
+    scratch[_MESSAGE + 4] = address + 8 * _CONTROL
+    scratch[_MESSAGE + 5] = _CONTROL_BYTES
+    scratch[_MESSAGE + 6] = 0
+    scratch[_VECTOR] = frame.ctypes.data
+    scratch[_VECTOR + 1] = FRAME_SIZE
+    scratch[_CONTROL + 1] = 0
+    flags = np.int32(libc.MSG_DONTWAIT | _MSG_TRUNC)
+    return int(_recvmsg(np.int32(fd), np.uintp(address + 8 * _MESSAGE), flags))
+
+
+@kernel
+def _sent_ns(scratch: np.ndarray) -> int:
+    """When the frame that `_receive` has just read was sent, on the clock of `monotonic_ns`; unknown: now."""
+    noted, seconds, rest_ns = scratch[_CONTROL + 1] == _SENT_NOTE, scratch[_CONTROL + 2], scratch[_CONTROL + 3]
+    libc.clock_gettime(np.int32(_CLOCK_REALTIME), np.uintp(scratch.ctypes.data))
+    age_ns = (scratch[0] - seconds) * libc.NANOSECONDS + scratch[1] - rest_ns
+    now_ns = monotonic_ns(scratch)
+    return now_ns - age_ns if noted and 0 < age_ns < libc.NANOSECONDS else now_ns
+
+
+@kernel
+def _read(node: int, hung_up: bool, clients: np.ndarray, bus: np.ndarray, frame: Any, scratch: np.ndarray) -> bool:
     """Read one frame of a client into `frame[0]`; False if there is none.  A client that has left is closed."""
-    got = libc.recv(
-        np.int32(clients[node].fd),
-        np.uintp(frame.ctypes.data),
-        np.uintp(FRAME_SIZE),
-        np.int32(libc.MSG_DONTWAIT | _MSG_TRUNC),
-    )
+    got = _receive(clients[node].fd, frame, scratch)
     # 0 is either the end or an empty datagram: only the hang-up tells them apart.  An error (a reset because the
-    # client died with unread frames) is told once, and frames that it sent before may still follow: read on.
+    # client died with unread frames) is reported once, and frames that it sent before may still follow: read on.
     if got < 0 or (got == 0 and hung_up):
         if got == 0:
             libc.close(np.int32(clients[node].fd))
@@ -170,7 +209,9 @@ def _read(node: int, hung_up: bool, clients: Any, bus: Any, frame: Any) -> bool:
 
 
 @kernel
-def _deliver(sender: int, bits: int, bitrate_bitps: int, clients: Any, bus: Any, frame: Any) -> None:
+def _deliver(
+    sender: int, bits: int, bitrate_bitps: int, clients: np.ndarray, bus: np.ndarray, frame: np.ndarray
+) -> None:
     """Hand `frame[0]` to every client but its sender, without waiting for any of them."""
     for node in range(MAX_CLIENTS):
         if node != sender and clients[node].fd >= 0:
@@ -191,31 +232,52 @@ def _deliver(sender: int, bits: int, bitrate_bitps: int, clients: Any, bus: Any,
     bus[0].frames += 1
 
 
+class HubMemory(NamedTuple):
+    """What `run_hub` works on; record arrays of one element but for those of the clients."""
+
+    stop_word: np.ndarray  # int64[1]
+    poll_words: np.ndarray  # int64[POLL_COUNT]
+    scratch: np.ndarray  # int64[SCRATCH_WORDS]
+    clients: np.ndarray  # ClientCounters[MAX_CLIENTS]
+    bus: np.ndarray  # BusCounters
+    watch: np.ndarray  # SyncWatch
+    wire: np.ndarray  # Wire
+    frame: np.ndarray  # WireFrame: the one that is read or delivered
+    frame_bytes: np.ndarray  # uint8[1, FRAME_SIZE]: the same memory
+    on_wire: np.ndarray  # WireFrame
+    waiting: Waiting  # with timing
+
+
 @kernel
-def run_hub(
-    listener: int,
-    wake: int,
-    timing: bool,
-    stop_word: Any,
-    poll_words: Any,
-    scratch: Any,
-    clients: Any,
-    bus: Any,
-    wire: Any,
-    frames: Any,
-    on_wire: Any,
-    pending: Any,
-    arrival_ns: Any,
-    heads: Any,
-    counts: Any,
-) -> None:
+def _pass_on(memory: HubMemory, node: int, began_ns: int, timing: bool) -> None:
+    """The frame that has been read from `node`, stamped, to the wire or to the clients; an answer too late to none."""
+    frame, watch, now_ns = memory.frame_bytes[0], memory.watch[0], monotonic_ns(memory.scratch)
+    stamp_us = stamp_of(frame)
+    if stamp_us == 0:
+        note_sent(watch, frame, node, _sent_ns(memory.scratch))
+    elif over(watch, stamp_us, now_ns):
+        memory.bus[0].late += 1
+        return
+    if timing:
+        pend_frame(memory.frame, node, began_ns, memory.waiting)
+    else:
+        bits, bitrate = frame_bits(memory.frame, 0), memory.wire[0].bitrate_bitps
+        _deliver(node, bits, bitrate, memory.clients, memory.bus, memory.frame)
+
+
+@kernel
+def run_hub(listener: int, wake: int, timing: bool, memory: HubMemory) -> None:
     """Forward frames until the stop word is set (and `wake` is readable).  Allocation-free; see VirtualBusHub."""
+    poll_words, scratch, clients, bus, wire = (
+        memory.poll_words, memory.scratch, memory.clients, memory.bus, memory.wire
+    )  # fmt: skip
+    frames, waiting = memory.frame, memory.waiting
     accepting = True
     bitrate = wire[0].bitrate_bitps
     began_ns = monotonic_ns(scratch)
-    while load_acquire(stop_word, 0) == 0:
+    while load_acquire(memory.stop_word, 0) == 0:
         for node in range(MAX_CLIENTS):
-            poll_words[node] = _poll_word(clients[node].fd, counts[node] < QUEUE_DEPTH)
+            poll_words[node] = _poll_word(clients[node].fd, waiting.counts[node] < QUEUE_DEPTH)
         poll_words[_WAKE] = _poll_word(wake, True)
         # The listener is looked at last and served first: a client that connected before a frame was sent is
         # then always there when that frame is read (one frame of each client a round).
@@ -240,19 +302,16 @@ def run_hub(
                 accepting = taken >= 0
             for node in range(MAX_CLIENTS):
                 happened = poll_words[node] >> 48
-                if happened and _read(node, (happened & _GONE) != 0, clients, bus, frames):
-                    if timing:
-                        pend_frame(frames, node, began_ns, pending, arrival_ns, heads, counts)
-                    else:
-                        _deliver(node, frame_bits(frames, 0), bitrate, clients, bus, frames)
+                if happened and _read(node, (happened & _GONE) != 0, clients, bus, frames, scratch):
+                    _pass_on(memory, node, began_ns, timing)
         while timing:
-            sender = finish_frame(wire, began_ns, pending, arrival_ns, heads, counts, on_wire, frames)
+            sender = finish_frame(wire, began_ns, waiting, memory.on_wire, frames)
             if sender == NO_NODE:
                 break
             _deliver(sender, wire[0].bits, bitrate, clients, bus, frames)
         for node in range(MAX_CLIENTS):
             # A slot is used again only when the last frame of the client that left has been on the wire.
-            if clients[node].state == DRAINING and counts[node] == 0 and wire[0].sender != node:
+            if clients[node].state == DRAINING and waiting.counts[node] == 0 and wire[0].sender != node:
                 clients[node].state = FREE
                 accepting = True
     for node in range(MAX_CLIENTS):
@@ -264,22 +323,12 @@ def run_hub(
 
 
 @kernel
-def store_stop(stop_word: Any) -> None:
+def store_stop(stop_word: np.ndarray) -> None:
     """Ask `run_hub` to end."""
     store_release(stop_word, 0, 1)
 
 
 # --- The virtual CAN bus: a hub to which many programs connect, and which hands every frame to all the others ---
-# One AF_UNIX SEQPACKET datagram is one 16-byte `struct can_frame`.  The hub forwards in one thread, so that all
-# clients see all frames in the same order; a client does not get its own frames.  A client whose connect returned
-# before another client sent a frame gets that frame.  A client that does not read loses frames, which are counted,
-# and never holds up the others.
-#
-# With `timing`, bit times and arbitration are modelled (`hil/bus/timing.py`) and a frame takes its time; a client
-# that sends faster than the bus finds its queue full.  Without it, frames are forwarded at once and only counted.
-#
-# Not modelled: acknowledge (a lone node sends successfully), bit errors, error frames, error counters and bus-off,
-# overload frames, CAN FD, the delay and queueing inside an adapter.
 
 
 _LONGEST_PATH = 107
@@ -326,8 +375,8 @@ def _lock_path(path: Path) -> Path:
 def _lock(path: Path) -> int:
     """Descriptor of the locked file beside the socket; BlockingIOError when a hub holds it.
 
-    The lock ends with its process, however that dies: whoever holds it may remove what a dead hub left.  A hub that
-    stops removes the file while it holds the lock, so that a lock counts only if the file still has its name.
+    The lock ends with its process, however that dies: its holder may remove what a dead hub left.  A hub that stops
+    removes the file while it holds the lock, so that a lock counts only if the file still has its name.
     """
     name = _lock_path(path)
     tries_left = _LOCK_TRIES
@@ -397,24 +446,26 @@ class VirtualBusHub:
         self._wire["bitrate_bitps"] = self.bitrate_bitps
         self._wire["sender"] = NO_NODE
 
-    def _arguments(self, listener_fd: int, wake_fd: int) -> tuple[Any, ...]:
-        waiting = MAX_CLIENTS * QUEUE_DEPTH
-        return (
-            listener_fd,
-            wake_fd,
-            self.timing,
-            self._stop_word,
-            np.zeros(POLL_COUNT, np.int64),
-            np.zeros(2, np.int64),
-            self._clients,
-            self._bus,
-            self._wire,
-            new(WireFrame),
-            new(WireFrame),
-            new(WireFrame, waiting),
-            np.zeros(waiting, np.int64),
-            np.zeros(MAX_CLIENTS, np.int64),
-            np.zeros(MAX_CLIENTS, np.int64),
+    def _memory(self) -> HubMemory:
+        length = MAX_CLIENTS * QUEUE_DEPTH
+        frame = new(WireFrame)
+        return HubMemory(
+            stop_word=self._stop_word,
+            poll_words=np.zeros(POLL_COUNT, np.int64),
+            scratch=np.zeros(SCRATCH_WORDS, np.int64),
+            clients=self._clients,
+            bus=self._bus,
+            watch=new(SyncWatch),
+            wire=self._wire,
+            frame=frame,
+            frame_bytes=frame.view(np.ndarray).view(np.uint8).reshape(1, FRAME_SIZE),
+            on_wire=new(WireFrame),
+            waiting=Waiting(
+                new(WireFrame, length),
+                np.zeros(length, np.int64),
+                np.zeros(MAX_CLIENTS, np.int64),
+                np.zeros(MAX_CLIENTS, np.int64),
+            ),
         )
 
     def start(self) -> VirtualBusHub:
@@ -423,7 +474,7 @@ class VirtualBusHub:
             raise VirtualBusError(f"the virtual bus at {self.path} is already started")
         self._reset()
         self._stop_word[0] = 1
-        run_hub(*self._arguments(NO_FD, NO_FD))  # compile or load before anybody can connect
+        run_hub(NO_FD, NO_FD, self.timing, self._memory())  # compile or load before anybody can connect
         self._reset()
         self._listen()
         self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
@@ -458,7 +509,7 @@ class VirtualBusHub:
         if self.timing:
             # The default slack of a timer is 50 us, as long as a short frame at 1 Mbit/s.
             ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1))
-        run_hub(*self._arguments(self._listener.fileno(), self._wake))
+        run_hub(self._listener.fileno(), self._wake, self.timing, self._memory())
 
     def stop(self) -> None:
         """Disconnect all clients and remove the socket; does nothing if the hub does not run."""

@@ -6,7 +6,6 @@ import math
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -88,7 +87,12 @@ class Cia402Device:
     """
 
     def __init__(
-        self, eds_path: Path, settings: DeviceSettings, plant_constants: Any, plant_state: Any, faults: Any = None
+        self,
+        eds_path: Path,
+        settings: DeviceSettings,
+        plant_constants: np.recarray,
+        plant_state: np.recarray,
+        faults: np.recarray | None = None,
     ) -> None:
         for name, array, record in (
             ("plant_constants", plant_constants, PlantConstants),
@@ -99,7 +103,7 @@ class Cia402Device:
         self.settings = settings
         self.plant_constants = plant_constants
         self.plant_state = plant_state
-        self.faults = () if faults is None else faults
+        self.faults: np.ndarray = np.zeros(0) if faults is None else faults
         self.device = new(Device)
         self.queue = new(FrameQueue)
         self._frame = np.zeros(FRAME_SIZE, np.uint8)
@@ -180,7 +184,7 @@ class Cia402Device:
         return frames
 
     def advance(self, now_ns: int) -> list[bytes]:
-        """Run drive and plant up to `now_ns`; the frames (16 bytes each) that were sent meanwhile."""
+        """Run drive and plant up to `now_ns`; the frames (16 bytes each) that were sent in the meantime."""
         advance(self.device[0], self.plant_constants[0], self.plant_state[0], now_ns, self.queue[0])
         return self._take_queue() + self.expire_sdo(now_ns)
 

@@ -121,7 +121,7 @@ def split_field(field: str) -> tuple[str, int]:
     return match[1], int(match[2] or 0)
 
 
-def field_view(memory: Any, path: tuple[str, ...], field: str) -> np.ndarray:
+def field_view(memory: np.recarray, path: tuple[str, ...], field: str) -> np.ndarray:
     """A one-element view into the first `Device` of `memory`: of `field` in the record that `path` leads to."""
     name, element = split_field(field)
     record, offset = dtype_of(Device), 0
@@ -136,7 +136,7 @@ def field_view(memory: Any, path: tuple[str, ...], field: str) -> np.ndarray:
 class ObjectDictionary:
     """Values of all objects of one device; `memory` is its `Device` record array of one element."""
 
-    def __init__(self, eds_path: Path, node_id: int, memory: Any) -> None:
+    def __init__(self, eds_path: Path, node_id: int, memory: np.recarray) -> None:
         self._take_entries(load_entries(eds_path, node_id))
         for key, field in FIELDS.items():
             if key not in self.entries:

@@ -3,12 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Annotated, Any
 
 import numpy as np
 
-from jointctl.firmware_py.schema import array_of, f8, i1, i2, i4, i8, record, u1, u2, u4
+from jointctl.firmware_py.schema import array_of, dtype_of, f8, i1, i2, i4, i8, marks_of, record, u1, u2, u4
+
+
+@dataclass(frozen=True)
+class At:
+    """Index and sub-index of the object that a field holds; of an array, those of its first element."""
+
+    index: int
+    sub: int = 0
+
+
+def object_fields(*records: type) -> dict[tuple[int, int], str]:
+    """(index, sub) -> "field", or "field[element]" of an array, of every field with an `At`."""
+    found: dict[tuple[int, int], str] = {}
+    for cls in records:
+        for name, at in marks_of(cls, At).items():
+            shape = dtype_of(cls)[name].shape
+            elements = [f"{name}[{i}]" for i in range(shape[0])] if shape else [name]
+            found |= {(at.index, at.sub + i): element for i, element in enumerate(elements)}
+    return found
+
 
 # --- Memory of the virtual encoder node (CiA 406): its objects as typed fields, and the state of the compiled core ---
 
@@ -18,22 +39,22 @@ ENCODER_MAPPED = 2
 
 @record
 class EncoderObjects:
-    error_register: u1
-    sync_cob_id: u4
-    emcy_cob_id: u4
-    heartbeat_ms: u2
-    tpdo_cob_id: u4
-    tpdo_type: u1
-    tpdo_inhibit_100us: u2
-    tpdo_timer_ms: u2
-    tpdo_count: u1
-    tpdo_mapping: Annotated[np.ndarray, array_of(u4, ENCODER_MAPPED)]
-    units_per_turn: u4
-    range_counts: u4
-    position: u4
-    cyclic_timer_ms: u2
-    alarms: u2
-    warnings: u2
+    error_register: Annotated[u1, At(0x1001)]
+    sync_cob_id: Annotated[u4, At(0x1005)]
+    emcy_cob_id: Annotated[u4, At(0x1014)]
+    heartbeat_ms: Annotated[u2, At(0x1017)]
+    tpdo_cob_id: Annotated[u4, At(0x1800, 1)]
+    tpdo_type: Annotated[u1, At(0x1800, 2)]
+    tpdo_inhibit_100us: Annotated[u2, At(0x1800, 3)]
+    tpdo_timer_ms: Annotated[u2, At(0x1800, 5)]
+    tpdo_count: Annotated[u1, At(0x1A00)]
+    tpdo_mapping: Annotated[np.ndarray, array_of(u4, ENCODER_MAPPED), At(0x1A00, 1)]
+    units_per_turn: Annotated[u4, At(0x6001)]
+    range_counts: Annotated[u4, At(0x6002)]
+    position: Annotated[u4, At(0x6004)]
+    cyclic_timer_ms: Annotated[u2, At(0x6200)]
+    alarms: Annotated[u2, At(0x6503)]
+    warnings: Annotated[u2, At(0x6505)]
 
 
 @record
@@ -59,33 +80,13 @@ class EncoderNode:
     error_rad: f8  # added to the true angle
 
 
-ENCODER_FIELDS = {
-    (0x1001, 0): "error_register",
-    (0x1005, 0): "sync_cob_id",
-    (0x1014, 0): "emcy_cob_id",
-    (0x1017, 0): "heartbeat_ms",
-    (0x1800, 1): "tpdo_cob_id",
-    (0x1800, 2): "tpdo_type",
-    (0x1800, 3): "tpdo_inhibit_100us",
-    (0x1800, 5): "tpdo_timer_ms",
-    (0x1A00, 0): "tpdo_count",
-    (0x1A00, 1): "tpdo_mapping[0]",
-    (0x1A00, 2): "tpdo_mapping[1]",
-    (0x6001, 0): "units_per_turn",
-    (0x6002, 0): "range_counts",
-    (0x6004, 0): "position",
-    (0x6200, 0): "cyclic_timer_ms",
-    (0x6503, 0): "alarms",
-    (0x6505, 0): "warnings",
-}
+ENCODER_FIELDS = object_fields(EncoderObjects)
 
 
 # --- Memory of the virtual drive: its CANopen objects as typed fields, and the state of the compiled core ---
 # `CommunicationObjects` holds what CiA 301 defines (1000..1FFF), `DriveObjects` what CiA 402 and the maker define.
 # They are separate because "reset communication" restores only the first one.  Units are those of the objects
 # (counts, per mille of the rated value, ms, ...), as in the EDS; the rest of the device is in SI units.
-#
-# `FIELDS` says which field holds which object.
 
 
 # Widens an object's value before arithmetic (uint8 << 8 would overflow in plain Python); typed for mypy.
@@ -145,20 +146,20 @@ class HomingState(IntEnum):
 
 @record
 class CommunicationObjects:
-    error_register: u1
-    error_count: u1
-    error_history: Annotated[np.ndarray, array_of(u4, HISTORY)]
-    sync_cob_id: u4
-    sync_period_us: u4
-    guard_time_ms: u2
-    life_time_factor: u1
-    emcy_cob_id: u4
-    emcy_inhibit_100us: u2
-    consumer_heartbeat: Annotated[np.ndarray, array_of(u4, CONSUMERS)]  # node << 16 | ms
-    producer_heartbeat_ms: u2
-    sync_overflow: u1  # highest value of the SYNC counter, 0 = none
-    error_behaviour: u1
-    identity: Annotated[np.ndarray, array_of(u4, 4)]
+    error_register: Annotated[u1, At(0x1001)]
+    error_count: Annotated[u1, At(0x1003)]
+    error_history: Annotated[np.ndarray, array_of(u4, HISTORY), At(0x1003, 1)]
+    sync_cob_id: Annotated[u4, At(0x1005)]
+    sync_period_us: Annotated[u4, At(0x1006)]
+    guard_time_ms: Annotated[u2, At(0x100C)]
+    life_time_factor: Annotated[u1, At(0x100D)]
+    emcy_cob_id: Annotated[u4, At(0x1014)]
+    emcy_inhibit_100us: Annotated[u2, At(0x1015)]
+    consumer_heartbeat: Annotated[np.ndarray, array_of(u4, CONSUMERS), At(0x1016, 1)]  # node << 16 | ms
+    producer_heartbeat_ms: Annotated[u2, At(0x1017)]
+    sync_overflow: Annotated[u1, At(0x1019)]  # highest value of the SYNC counter, 0 = none
+    error_behaviour: Annotated[u1, At(0x1029, 1)]
+    identity: Annotated[np.ndarray, array_of(u4, 4), At(0x1018, 1)]
     rpdo_cob_id: Annotated[np.ndarray, array_of(u4, PDOS)]
     rpdo_type: Annotated[np.ndarray, array_of(u1, PDOS)]
     rpdo_timer_ms: Annotated[np.ndarray, array_of(u2, PDOS)]
@@ -175,59 +176,59 @@ class CommunicationObjects:
 
 @record
 class DriveObjects:
-    sync_timeout_ms: u2
-    motor_temperature_ddegC: i2  # tenths of a degree
-    abort_option: i2
-    error_code: u2
-    controlword: u2
-    statusword: u2
-    quick_stop_option: i2
-    shutdown_option: i2
-    disable_option: i2
-    halt_option: i2
-    fault_reaction_option: i2
-    mode: i1
-    mode_display: i1
-    demand_position: i4
-    position: i4
-    second_position: i4
-    following_window: u4
-    following_timeout_ms: u2
-    position_window: u4
-    demand_velocity: i4
-    velocity: i4
-    velocity_window: u2
-    target_torque: i2
-    max_torque: u2
-    max_current: u2
-    demand_torque: i2
-    rated_current_mA: u4
-    rated_torque_mNm: u4
-    torque: i2
-    current: i2
-    dc_link_mV: u4
-    target_position: i4
-    home_offset: i4
-    position_limit: Annotated[np.ndarray, array_of(i4, 2)]
-    max_profile_velocity: u4
-    max_motor_speed_rpm: u4
-    profile_velocity: u4
-    profile_acceleration: u4
-    profile_deceleration: u4
-    quick_stop_deceleration: u4
-    motion_profile: i2
-    torque_slope: u4
-    torque_profile: i2
-    encoder_resolution: Annotated[np.ndarray, array_of(u4, 2)]
-    homing_method: i1
-    homing_speed: Annotated[np.ndarray, array_of(u4, 2)]
-    homing_acceleration: u4
-    torque_offset: i2
-    interpolation_time: u1
-    interpolation_exponent: i1
-    following_error: i4
-    target_velocity: i4
-    supported_modes: u4
+    sync_timeout_ms: Annotated[u2, At(0x2102)]
+    motor_temperature_ddegC: Annotated[i2, At(0x2103)]  # tenths of a degree
+    abort_option: Annotated[i2, At(0x6007)]
+    error_code: Annotated[u2, At(0x603F)]
+    controlword: Annotated[u2, At(0x6040)]
+    statusword: Annotated[u2, At(0x6041)]
+    quick_stop_option: Annotated[i2, At(0x605A)]
+    shutdown_option: Annotated[i2, At(0x605B)]
+    disable_option: Annotated[i2, At(0x605C)]
+    halt_option: Annotated[i2, At(0x605D)]
+    fault_reaction_option: Annotated[i2, At(0x605E)]
+    mode: Annotated[i1, At(0x6060)]
+    mode_display: Annotated[i1, At(0x6061)]
+    demand_position: Annotated[i4, At(0x6062)]
+    position: Annotated[i4, At(0x6064)]
+    second_position: Annotated[i4, At(0x60E4, 1)]
+    following_window: Annotated[u4, At(0x6065)]
+    following_timeout_ms: Annotated[u2, At(0x6066)]
+    position_window: Annotated[u4, At(0x6067)]
+    demand_velocity: Annotated[i4, At(0x606B)]
+    velocity: Annotated[i4, At(0x606C)]
+    velocity_window: Annotated[u2, At(0x606D)]
+    target_torque: Annotated[i2, At(0x6071)]
+    max_torque: Annotated[u2, At(0x6072)]
+    max_current: Annotated[u2, At(0x6073)]
+    demand_torque: Annotated[i2, At(0x6074)]
+    rated_current_mA: Annotated[u4, At(0x6075)]
+    rated_torque_mNm: Annotated[u4, At(0x6076)]
+    torque: Annotated[i2, At(0x6077)]
+    current: Annotated[i2, At(0x6078)]
+    dc_link_mV: Annotated[u4, At(0x6079)]
+    target_position: Annotated[i4, At(0x607A)]
+    home_offset: Annotated[i4, At(0x607C)]
+    position_limit: Annotated[np.ndarray, array_of(i4, 2), At(0x607D, 1)]
+    max_profile_velocity: Annotated[u4, At(0x607F)]
+    max_motor_speed_rpm: Annotated[u4, At(0x6080)]
+    profile_velocity: Annotated[u4, At(0x6081)]
+    profile_acceleration: Annotated[u4, At(0x6083)]
+    profile_deceleration: Annotated[u4, At(0x6084)]
+    quick_stop_deceleration: Annotated[u4, At(0x6085)]
+    motion_profile: Annotated[i2, At(0x6086)]
+    torque_slope: Annotated[u4, At(0x6087)]
+    torque_profile: Annotated[i2, At(0x6088)]
+    encoder_resolution: Annotated[np.ndarray, array_of(u4, 2), At(0x608F, 1)]
+    homing_method: Annotated[i1, At(0x6098)]
+    homing_speed: Annotated[np.ndarray, array_of(u4, 2), At(0x6099, 1)]
+    homing_acceleration: Annotated[u4, At(0x609A)]
+    torque_offset: Annotated[i2, At(0x60B2)]
+    interpolation_time: Annotated[u1, At(0x60C2, 1)]
+    interpolation_exponent: Annotated[i1, At(0x60C2, 2)]
+    following_error: Annotated[i4, At(0x60F4)]
+    target_velocity: Annotated[i4, At(0x60FF)]
+    supported_modes: Annotated[u4, At(0x6502)]
 
 
 @record
@@ -308,82 +309,9 @@ class Device:
     following_time_s: f8
 
 
-# --- Which field of the virtual drive's memory holds which object; others are constants of the EDS or strings ---
-
-
+# the objects of the PDOs have an index for each of them; objects without a field are constants of the EDS or strings
 def _fields() -> dict[tuple[int, int], str]:
-    fields = {
-        (0x1001, 0): "error_register",
-        (0x1003, 0): "error_count",
-        (0x1005, 0): "sync_cob_id",
-        (0x1006, 0): "sync_period_us",
-        (0x100C, 0): "guard_time_ms",
-        (0x100D, 0): "life_time_factor",
-        (0x1014, 0): "emcy_cob_id",
-        (0x1015, 0): "emcy_inhibit_100us",
-        (0x1017, 0): "producer_heartbeat_ms",
-        (0x1019, 0): "sync_overflow",
-        (0x1029, 1): "error_behaviour",
-        (0x2102, 0): "sync_timeout_ms",
-        (0x2103, 0): "motor_temperature_ddegC",
-        (0x6007, 0): "abort_option",
-        (0x603F, 0): "error_code",
-        (0x6040, 0): "controlword",
-        (0x6041, 0): "statusword",
-        (0x605A, 0): "quick_stop_option",
-        (0x605B, 0): "shutdown_option",
-        (0x605C, 0): "disable_option",
-        (0x605D, 0): "halt_option",
-        (0x605E, 0): "fault_reaction_option",
-        (0x6060, 0): "mode",
-        (0x6061, 0): "mode_display",
-        (0x6062, 0): "demand_position",
-        (0x6064, 0): "position",
-        (0x6065, 0): "following_window",
-        (0x6066, 0): "following_timeout_ms",
-        (0x6067, 0): "position_window",
-        (0x606B, 0): "demand_velocity",
-        (0x606C, 0): "velocity",
-        (0x606D, 0): "velocity_window",
-        (0x6071, 0): "target_torque",
-        (0x6072, 0): "max_torque",
-        (0x6073, 0): "max_current",
-        (0x6074, 0): "demand_torque",
-        (0x6075, 0): "rated_current_mA",
-        (0x6076, 0): "rated_torque_mNm",
-        (0x6077, 0): "torque",
-        (0x6078, 0): "current",
-        (0x6079, 0): "dc_link_mV",
-        (0x607A, 0): "target_position",
-        (0x607C, 0): "home_offset",
-        (0x607D, 1): "position_limit[0]",
-        (0x607D, 2): "position_limit[1]",
-        (0x607F, 0): "max_profile_velocity",
-        (0x6080, 0): "max_motor_speed_rpm",
-        (0x6081, 0): "profile_velocity",
-        (0x6083, 0): "profile_acceleration",
-        (0x6084, 0): "profile_deceleration",
-        (0x6085, 0): "quick_stop_deceleration",
-        (0x6086, 0): "motion_profile",
-        (0x6087, 0): "torque_slope",
-        (0x6088, 0): "torque_profile",
-        (0x608F, 1): "encoder_resolution[0]",
-        (0x608F, 2): "encoder_resolution[1]",
-        (0x6098, 0): "homing_method",
-        (0x6099, 1): "homing_speed[0]",
-        (0x6099, 2): "homing_speed[1]",
-        (0x609A, 0): "homing_acceleration",
-        (0x60B2, 0): "torque_offset",
-        (0x60C2, 1): "interpolation_time",
-        (0x60C2, 2): "interpolation_exponent",
-        (0x60E4, 1): "second_position",
-        (0x60F4, 0): "following_error",
-        (0x60FF, 0): "target_velocity",
-        (0x6502, 0): "supported_modes",
-    }
-    fields |= {(0x1003, 1 + i): f"error_history[{i}]" for i in range(HISTORY)}
-    fields |= {(0x1016, 1 + i): f"consumer_heartbeat[{i}]" for i in range(CONSUMERS)}
-    fields |= {(0x1018, 1 + i): f"identity[{i}]" for i in range(4)}
+    fields = object_fields(CommunicationObjects, DriveObjects)
     for pdo in range(PDOS):
         for way, base in (("rpdo", 0x1400), ("tpdo", 0x1800)):
             fields[base + pdo, 1] = f"{way}_cob_id[{pdo}]"

@@ -176,10 +176,7 @@ class SdoServer:
     """
 
     def __init__(
-        self,
-        objects: ObjectDictionary,
-        write: Callable[[int, int, bytes], None],
-        block_size: int = LARGEST_BLOCK,
+        self, objects: ObjectDictionary, write: Callable[[int, int, bytes], None], block_size: int = LARGEST_BLOCK
     ) -> None:
         self._objects = objects
         self._write = write

@@ -13,6 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from jointctl.firmware_py.schema import new
 from jointctl.hil.elmo.motor import (
     SPEED_BANDWIDTH_RADPS,
@@ -66,11 +68,6 @@ class ElmoDeviceSettings:
 
 
 # --- The command interpreter of the virtual Elmo drive: one command in, one reply out, the plant behind it ---
-# Written from the description of the protocol, not from the driver: a constant that is wrong on one side cannot
-# cancel out.  Replies here are without echo; `hil.elmo.device` adds it, with the times of the line.
-#
-# Not modelled: programs, recorder, homing, PVT, tables, digital outputs, saving to flash (SV is taken and does
-# nothing), and the limits that real drives put on the order in which HL, LL, VH and VL may be written.
 
 
 SUBSTEPS_AT_ONCE_S = 2.0  # after a longer sleep of this process, time is lost rather than caught up
@@ -79,7 +76,7 @@ SUBSTEPS_AT_ONCE_S = 2.0  # after a longer sleep of this process, time is lost r
 class ElmoInterpreter:
     """`execute(line)` one command without its end; `advance_to(time)` moves drive and joint on."""
 
-    def __init__(self, settings: ElmoDeviceSettings, plant_constants: Any, plant_state: Any) -> None:
+    def __init__(self, settings: ElmoDeviceSettings, plant_constants: np.recarray, plant_state: np.recarray) -> None:
         self.settings = settings
         self.constants, self.state = plant_constants, plant_state
         self.motor: Any = new(ElmoMotor)

@@ -8,21 +8,21 @@ Not modelled: error frames, the error counters of CAN."""
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Any
 
 import numpy as np
 
 from jointctl.firmware_py.kernel import kernel
 from jointctl.hil.bus.virtual_bus import FRAME_SIZE, QUEUE_LENGTH, FrameQueue
 from jointctl.hil.canopen.device_core import accept_frame
-from jointctl.hil.canopen.records import int64
+from jointctl.hil.canopen.records import Device, int64
 from jointctl.hil.faults.kinds import LATE_FRAMES, FaultKind, FaultMemory, draw, is_active
+from jointctl.hil.plant.records import PlantConstants, PlantState
 
 # --- Controller and drive in lockstep, with the wire of `hil.faults.frame_faults` between them ---
 
 
 @kernel
-def collect(faults: Any, memory: Any, device: Any, outgoing: Any, now_ns: int) -> None:
+def collect(faults: np.ndarray, memory: FaultMemory, device: Device, outgoing: FrameQueue, now_ns: int) -> None:
     """What the drive sent goes through the wire into the controller's mailbox."""
     for index in range(outgoing.count):
         pass_frame(faults, memory, outgoing.frames[index], False, device.node_id, now_ns, memory.to_controller)
@@ -30,7 +30,15 @@ def collect(faults: Any, memory: Any, device: Any, outgoing: Any, now_ns: int) -
 
 
 @kernel
-def hand_over(faults: Any, memory: Any, device: Any, plant_c: Any, plant_s: Any, outgoing: Any, now_ns: int) -> None:
+def hand_over(
+    faults: np.ndarray,
+    memory: FaultMemory,
+    device: Device,
+    plant_c: PlantConstants,
+    plant_s: PlantState,
+    outgoing: FrameQueue,
+    now_ns: int,
+) -> None:
     """What came out of the wire at the drive's end is handled, and its answers are sent."""
     ready = memory.ready
     for index in range(ready.count):
@@ -41,13 +49,13 @@ def hand_over(faults: Any, memory: Any, device: Any, plant_c: Any, plant_s: Any,
 
 @kernel
 def to_drive(
-    faults: Any,
-    memory: Any,
+    faults: np.ndarray,
+    memory: FaultMemory,
     frame: np.ndarray,
-    device: Any,
-    plant_c: Any,
-    plant_s: Any,
-    outgoing: Any,
+    device: Device,
+    plant_c: PlantConstants,
+    plant_s: PlantState,
+    outgoing: FrameQueue,
     now_ns: int,
 ) -> None:
     """One frame of the controller goes through the wire."""
@@ -56,7 +64,7 @@ def to_drive(
 
 
 @kernel
-def clock_step_cycles(faults: Any, memory: Any, now_ns: int, period_ns: int) -> int:
+def clock_step_cycles(faults: np.ndarray, memory: FaultMemory, now_ns: int, period_ns: int) -> int:
     """By how many periods the controller's clock jumps in this cycle."""
     for i in range(len(faults)):
         fault = faults[i]
@@ -68,10 +76,6 @@ def clock_step_cycles(faults: Any, memory: Any, now_ns: int, period_ns: int) -> 
 
 
 # --- What becomes of a frame between controller and drive while faults of the wire are present ---
-# `pass_frame` takes each frame and appends what arrives to a queue: nothing, the frame, the frame twice, a damaged
-# one; frames that are late wait in the memory until `take_due`.  CAN's own checksum finds nearly every damaged frame:
-# the corrupted and shortened ones stand for a faulty gateway, adapter or drive. Not modelled: error frames, the error
-# counters of CAN.
 
 
 class FrameClass(IntEnum):
@@ -119,7 +123,7 @@ def append_frame(queue: FrameQueue, frame: np.ndarray) -> int:
 
 @kernel
 def _unstamp(frame: np.ndarray) -> None:
-    """A frame that the wire makes late or doubles shall count when it comes: see `hil.frame_stamps`."""
+    """A frame that the wire makes late or doubles shall count when it comes: see `hil.bus.frame_stamps`."""
     for i in range(5, 8):
         frame[i] = 0
 

@@ -91,7 +91,7 @@ class FaultMemory:
     to_controller: FrameQueue  # lockstep: the controller's mailbox
 
 
-def fault_memory(faults: Any, epoch_ns: int = 0) -> Any:
+def fault_memory(faults: np.ndarray, epoch_ns: int = 0) -> Any:
     """A record array of one `FaultMemory` for these faults; at most MAX_FAULTS of them."""
     if len(faults) > MAX_FAULTS:
         raise ValueError(f"number of faults (={len(faults)}) must be in [0..{MAX_FAULTS}]")

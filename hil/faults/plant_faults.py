@@ -64,12 +64,7 @@ def _end(fault: FaultConstants, device: Device, plant_s: PlantState) -> None:
 
 @kernel
 def step_faults(
-    faults: np.ndarray,
-    memory: FaultMemory,
-    device: Device,
-    plant_c: PlantConstants,
-    plant_s: PlantState,
-    now_ns: int,
+    faults: np.ndarray, memory: FaultMemory, device: Device, plant_c: PlantConstants, plant_s: PlantState, now_ns: int
 ) -> None:
     """Begin and end the faults of drive and plant that are due; call it before the device advances to `now_ns`.
 

@@ -249,14 +249,6 @@ def torque_ripple_Nm(c: PlantConstants, motor_position_rad: float) -> float:
 
 
 # --- The virtual joint: one substep of motor, reducer, friction and load ---
-# J q'' = actuator - friction - load - gravity         (2), (3), every torque at the joint
-#
-# A substep is drift - kick - drift (leapfrog): torques that depend on position are taken half a substep ahead, so
-# that a constant torque is integrated exactly and a spring neither gains nor loses energy.  The joint is rigid;
-# optionally it is two masses joined by the reducer's stiffness and damping, the friction on the motor's side and
-# load, gravity and end stops on the other.
-#
-# Not modelled: backlash, hysteresis of the reducer, Coriolis torque (C0 = 0 for one joint), faults of the drive.
 
 
 __all__ = ["R1", "EncoderSide", "FrictionKind", "PlantSettings", "encoder_counts", "plant", "step_plant"]
@@ -343,10 +335,10 @@ def step_plant(c: PlantConstants, s: PlantState, target_joint_torque_Nm: float) 
     s.time_s = s.substep * c.step_s
 
 
-def _fill_friction(c: Any, settings: PlantSettings) -> None:
+def _fill_friction(c: PlantConstants, settings: PlantSettings) -> None:
     ratio = settings.reduction_ratio
     c.friction_kind = settings.friction_kind
-    c["friction"] = paper_friction() if settings.friction is None else settings.friction
+    c.friction = paper_friction() if settings.friction is None else settings.friction
     c.positive_factor = ratio * settings.friction_positive_scale
     c.negative_factor = ratio * settings.friction_negative_scale
     c.friction_ripple = settings.friction_ripple
@@ -361,7 +353,7 @@ def _fill_friction(c: Any, settings: PlantSettings) -> None:
     c.friction_per_kelvin = settings.friction_per_kelvin
 
 
-def _fill_actuator(c: Any, settings: PlantSettings) -> None:
+def _fill_actuator(c: PlantConstants, settings: PlantSettings) -> None:
     torque_per_current = settings.reduction_ratio * settings.torque_constant_NmpA
     c.torque_per_current_NmpA = torque_per_current
     c.current_per_torque_ApNm = 1.0 / torque_per_current
@@ -377,7 +369,7 @@ def _fill_actuator(c: Any, settings: PlantSettings) -> None:
         c.torque_ripple_phase_turns[i] = phase / (2.0 * math.pi)
 
 
-def _fill_mechanics(c: Any, settings: PlantSettings) -> None:
+def _fill_mechanics(c: PlantConstants, settings: PlantSettings) -> None:
     c.step_s = settings.step_s
     c.inverse_step_Hz = 1.0 / settings.step_s
     driven = settings.motor_side_inertia_kgm2 if settings.flexible else settings.inertia_kgm2
@@ -397,11 +389,11 @@ def _fill_mechanics(c: Any, settings: PlantSettings) -> None:
         "end_stop_stiffness_Nmprad",
         "end_stop_damping_Nmspr",
     ):
-        c[name] = getattr(settings, name)
+        setattr(c, name, getattr(settings, name))
     c.load_step_substep = round(settings.load_step_at_s / settings.step_s)
 
 
-def _fill_encoder(c: Any, settings: PlantSettings) -> None:
+def _fill_encoder(c: PlantConstants, settings: PlantSettings) -> None:
     motor_side = settings.encoder_side == EncoderSide.MOTOR
     shaft_turns = settings.reduction_ratio if motor_side else 1.0
     c.encoder_motor_side = motor_side

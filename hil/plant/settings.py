@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from numbers import Integral, Real
 from typing import Any
 
@@ -11,48 +11,19 @@ from jointctl.firmware_py.records import FrictionConstants
 from jointctl.firmware_py.schema import dtype_of
 from jointctl.hil.plant.records import DELAY_SLOTS, RIPPLES, EncoderSide, FrictionKind
 
-# name: smallest and largest accepted value
-_RANGES: dict[str, tuple[float, float]] = {
-    "step_s": (1e-6, 1e-3),
-    "inertia_kgm2": (1e-3, 1e4),
-    "reduction_ratio": (1.0, 1000.0),
-    "torque_constant_NmpA": (1e-4, 100.0),
-    "current_limit_A": (1e-3, 1e4),
-    "current_lag_s": (0.0, 1.0),
-    "command_delay_s": (0.0, 1.0),
-    "friction_positive_scale": (0.0, 10.0),
-    "friction_negative_scale": (0.0, 10.0),
-    "friction_ripple": (0.0, 0.9),
-    "friction_ripple_per_joint_turn": (0.0, 1e5),
-    "bristle_stiffness_Nmprad": (1.0, 1e7),
-    "bristle_damping_Nmspr": (0.0, 1e5),
-    "motor_side_inertia_kgm2": (1e-3, 1e4),
-    "reducer_stiffness_Nmprad": (1.0, 1e8),
-    "reducer_damping_Nmspr": (0.0, 1e5),
-    "load_torque_Nm": (-1e5, 1e5),
-    "load_step_Nm": (-1e5, 1e5),
-    "load_step_at_s": (0.0, 1e9),
-    "gravity_Nm": (0.0, 1e5),
-    "end_stop_min_rad": (-1e4, 1e4),
-    "end_stop_max_rad": (-1e4, 1e4),
-    "end_stop_stiffness_Nmprad": (1.0, 1e8),
-    "end_stop_damping_Nmspr": (0.0, 1e5),
-    "ambient_degC": (-60.0, 100.0),
-    "heating_KpA2": (0.0, 1e3),
-    "thermal_time_s": (1.0, 1e6),
-    "friction_per_kelvin": (-0.05, 0.05),
-    "encoder_counts_per_turn": (2, 2**40),
-    "encoder_offset_counts": (-(2**40), 2**40),
-    "encoder_noise_counts": (0.0, 1e6),
-    "encoder_direction": (-1, 1),
-    "encoder_seed": (1, 2**63),
-    "initial_position_rad": (-1e4, 1e4),
-}
-_WHOLE_NUMBERS = ("encoder_counts_per_turn", "encoder_offset_counts", "encoder_direction", "encoder_seed")
 
-
-def _allowed(name: str, value: Any, allowed: str) -> ValueError:
+def _allowed(name: str, value: object, allowed: str) -> ValueError:
     return ValueError(f"{name} (={value}) must be {allowed}")
+
+
+def number(default: float, low: float, high: float) -> Any:
+    """Field of a number in [low..high]."""
+    return field(default=default, metadata={"range": (Real, low, high)})
+
+
+def whole(default: int, low: int, high: int) -> Any:
+    """The same of a whole number."""
+    return field(default=default, metadata={"range": (Integral, low, high)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,57 +35,58 @@ class PlantSettings:
     `inertia_kgm2` is the whole joint's; a flexible joint has `motor_side_inertia_kgm2` of it before the reducer.
     """
 
-    step_s: float = 50e-6
-    initial_position_rad: float = 0.0
-    inertia_kgm2: float = 2.1
-    reduction_ratio: float = 121.0
-    torque_constant_NmpA: float = 0.1  # motor side; not given in the paper
-    current_limit_A: float = 100.0
-    current_lag_s: float = 0.0
-    command_delay_s: float = 0.0
+    step_s: float = number(50e-6, 1e-6, 1e-3)
+    initial_position_rad: float = number(0.0, -1e4, 1e4)
+    inertia_kgm2: float = number(2.1, 1e-3, 1e4)
+    reduction_ratio: float = number(121.0, 1.0, 1000.0)
+    torque_constant_NmpA: float = number(0.1, 1e-4, 100.0)  # motor side; not given in the paper
+    current_limit_A: float = number(100.0, 1e-3, 1e4)
+    current_lag_s: float = number(0.0, 0.0, 1.0)
+    command_delay_s: float = number(0.0, 0.0, 1.0)
     torque_ripple_Nm: tuple[float, ...] = ()
     torque_ripple_per_motor_turn: tuple[float, ...] = ()
     torque_ripple_phase_rad: tuple[float, ...] = ()
     friction_kind: FrictionKind = FrictionKind.NONE
     friction: Any = None
-    friction_positive_scale: float = 1.0
-    friction_negative_scale: float = 1.0
-    friction_ripple: float = 0.0  # relative amplitude
-    friction_ripple_per_joint_turn: float = 18.0
-    bristle_stiffness_Nmprad: float = 8e4
-    bristle_damping_Nmspr: float = 200.0
+    friction_positive_scale: float = number(1.0, 0.0, 10.0)
+    friction_negative_scale: float = number(1.0, 0.0, 10.0)
+    friction_ripple: float = number(0.0, 0.0, 0.9)  # relative amplitude
+    friction_ripple_per_joint_turn: float = number(18.0, 0.0, 1e5)
+    bristle_stiffness_Nmprad: float = number(8e4, 1.0, 1e7)
+    bristle_damping_Nmspr: float = number(200.0, 0.0, 1e5)
     flexible: bool = False
-    motor_side_inertia_kgm2: float = 1.2
-    reducer_stiffness_Nmprad: float = 1.3e4
-    reducer_damping_Nmspr: float = 5.0
-    load_torque_Nm: float = 0.0
-    load_step_Nm: float = 0.0
-    load_step_at_s: float = 80.0
-    gravity_Nm: float = 0.0  # m g l of m g l sin(q)
+    motor_side_inertia_kgm2: float = number(1.2, 1e-3, 1e4)
+    reducer_stiffness_Nmprad: float = number(1.3e4, 1.0, 1e8)
+    reducer_damping_Nmspr: float = number(5.0, 0.0, 1e5)
+    load_torque_Nm: float = number(0.0, -1e5, 1e5)
+    load_step_Nm: float = number(0.0, -1e5, 1e5)
+    load_step_at_s: float = number(80.0, 0.0, 1e9)
+    gravity_Nm: float = number(0.0, 0.0, 1e5)  # m g l of m g l sin(q)
     end_stops: bool = False
-    end_stop_min_rad: float = -3.0
-    end_stop_max_rad: float = 3.0
-    end_stop_stiffness_Nmprad: float = 2e5
-    end_stop_damping_Nmspr: float = 200.0
+    end_stop_min_rad: float = number(-3.0, -1e4, 1e4)
+    end_stop_max_rad: float = number(3.0, -1e4, 1e4)
+    end_stop_stiffness_Nmprad: float = number(2e5, 1.0, 1e8)
+    end_stop_damping_Nmspr: float = number(200.0, 0.0, 1e5)
     thermal: bool = False
-    ambient_degC: float = 25.0
-    heating_KpA2: float = 0.5
-    thermal_time_s: float = 900.0
-    friction_per_kelvin: float = -0.005
+    ambient_degC: float = number(25.0, -60.0, 100.0)
+    heating_KpA2: float = number(0.5, 0.0, 1e3)
+    thermal_time_s: float = number(900.0, 1.0, 1e6)
+    friction_per_kelvin: float = number(-0.005, -0.05, 0.05)
     encoder_side: EncoderSide = EncoderSide.JOINT
-    encoder_counts_per_turn: int = 2**19  # of the shaft that the encoder sits on
-    encoder_direction: int = 1
-    encoder_offset_counts: int = 0  # reported at joint position 0
-    encoder_noise_counts: float = 0.0  # standard deviation
-    encoder_seed: int = 1
+    encoder_counts_per_turn: int = whole(2**19, 2, 2**40)  # of the shaft that the encoder sits on
+    encoder_direction: int = whole(1, -1, 1)
+    encoder_offset_counts: int = whole(0, -(2**40), 2**40)  # reported at joint position 0
+    encoder_noise_counts: float = number(0.0, 0.0, 1e6)  # standard deviation
+    encoder_seed: int = whole(1, 1, 2**63)
 
     def __post_init__(self) -> None:
-        for name, (low, high) in _RANGES.items():
-            value = getattr(self, name)
-            kind = "a whole number" if name in _WHOLE_NUMBERS else "a number"
-            accepted = Integral if name in _WHOLE_NUMBERS else Real
+        for item in fields(self):
+            if not item.metadata:
+                continue
+            accepted, low, high = item.metadata["range"]
+            value, kind = getattr(self, item.name), "a whole number" if accepted is Integral else "a number"
             if isinstance(value, bool) or not isinstance(value, accepted) or not low <= float(value) <= high:
-                raise _allowed(name, value, f"{kind} in [{low:.13g}..{high:.13g}]")
+                raise _allowed(item.name, value, f"{kind} in [{low:.13g}..{high:.13g}]")
         self._check_choices()
         self._check_ripples()
         self._check_stability()
@@ -183,7 +155,7 @@ class PlantSettings:
 
     def named(self) -> dict[str, Any]:
         """Every setting by name, for a log or a report."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return {item.name: getattr(self, item.name) for item in fields(self)}
 
 
 def decay(step_s: float, time_constant_s: float) -> float:

@@ -77,9 +77,9 @@ def require_comparable(axis: Any) -> None:
     """The C source knows one law: computed torque with network, LuGre on the desired velocity, matched filter."""
     wanted = (ControllerKind.COMPUTED_TORQUE_RBF, FeedForward.LUGRE_DESIRED, 1, 0.0)
     law = axis.law
-    if (law.kind, law.feed_forward, law.matched_filter, law.learning.gain) != wanted:
+    if (law.kind, law.feed_forward, law.filtered_error_rate, law.learning.gain) != wanted:
         raise ConfigurationError(
-            "bench needs control.kind = computed_torque_rbf, feed_forward = lugre_desired, matched_filter = true "
+            "bench needs control.kind = computed_torque_rbf, feed_forward = lugre_desired, filtered_error_rate = true "
             "and no learning: the C source knows no other law"
         )
 

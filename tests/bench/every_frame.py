@@ -32,8 +32,9 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 from jointctl.drivers.errors import JointctlError  # noqa: E402
-from jointctl.firmware_py.realtime import Word  # noqa: E402
+from jointctl.firmware_py.cycle import Word  # noqa: E402
 from jointctl.firmware_py.states import Fault  # noqa: E402
+from jointctl.tools.configuration.canopen import canopen_section  # noqa: E402
 from jointctl.tools.configuration.config import Config  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
 from jointctl.tools.session.consent import TerminalConsent  # noqa: E402
@@ -79,7 +80,7 @@ class Scene:
 
     @property
     def node(self) -> int:
-        return self.config.canopen.node
+        return canopen_section(self.config).node
 
     @property
     def loop(self) -> Any:
@@ -161,7 +162,7 @@ def at_once(_: Config) -> float:
 
 
 def by_heartbeat(config: Config) -> float:
-    return 20.0 / config.loop.rate_Hz + config.canopen.heartbeat_s + config.limits.sample_age_max_s
+    return 20.0 / config.loop.rate_Hz + canopen_section(config).heartbeat_s + config.limits.sample_age_max_s
 
 
 def by_ramp(config: Config) -> float:

@@ -30,14 +30,16 @@ import numpy as np
 
 from jointctl.drivers.can.open import open_cyclic_end
 from jointctl.drivers.can.virtual_bus import VirtualBus
+from jointctl.drivers.canopen.cyclic import CanopenPort
 from jointctl.drivers.canopen.identifiers import RPDO1_ID, SYNC_ID, TPDO1_ID
 from jointctl.drivers.drive import Drive
 from jointctl.drivers.errors import JointctlError
 from jointctl.firmware_py.states import DriveState, StopRequest
+from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import axis_constants, trajectory_table
+from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.loop_handle import RECEIVE_SHARE, LoopHandle
-from jointctl.tools.session.open_drive import open_drive
 from jointctl.tools.simulation.virtual_joint import separate_virtual_joint
 from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
 from tests.bench.c_programs import NoCompilerError, exchange_program, setting_doubles
@@ -166,7 +168,7 @@ def patient(config: Config) -> Config:
 @contextmanager
 def commissioned(config: Config) -> Iterator[tuple[Drive, Any]]:
     """(drive, AxisConstants) of the joint as it stands; afterwards the drive is off."""
-    drive = open_drive(config)
+    drive = CanopenSession().open(config)
     try:
         report = drive.commission()
         yield drive, axis_constants(config, trajectory_table(config), start_position_rad=report.start_position_rad)
@@ -177,7 +179,7 @@ def commissioned(config: Config) -> Iterator[tuple[Drive, Any]]:
 
 def run_ours(config: Config, seconds: float, load_name: str) -> LoopTimes:
     """The control loop for so long after it has settled; this process only gives its sign of life meanwhile."""
-    with LoopHandle(config, trajectory_table(config)) as loop, commissioned(config) as (drive, constants):
+    with LoopHandle(config, trajectory_table(config), CanopenPort) as loop, commissioned(config) as (drive, constants):
         loop.wait_ready()
         drive.start_cyclic()
         loop.go(constants, drive.port())
@@ -279,7 +281,7 @@ def _frame(identifier: int, data: bytes = b"") -> can.Message:
 def run_python_can(config: Config, seconds: float, load_name: str) -> LoopTimes:
     """Absolute deadlines, SYNC, wait for the TPDO, RPDO, with python-can's send and recv; no law is computed."""
     period_ns = round(1e9 / config.loop.rate_Hz)
-    node = config.canopen.node
+    node = canopen_section(config).node
     sync, rpdo = _frame(SYNC_ID), _frame(RPDO1_ID + node, bytes(4))
     cycles = round(seconds * config.loop.rate_Hz)
     rows, done = np.zeros((cycles, 3), np.int64), 0

@@ -22,6 +22,7 @@ from jointctl.firmware_py.law import network_torque_Nm, reset_law, step_law
 from jointctl.firmware_py.records import AxisConstants, AxisState
 from jointctl.firmware_py.safety import limited_torque_Nm
 from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.trajectory import NO_REPETITION
 from tests.bench.c_programs import (
     FAST_MATH,
     OPTIMISED,
@@ -152,7 +153,7 @@ def run_ticks(constants: np.ndarray, state: np.ndarray, inputs: np.ndarray, torq
         position_rad = inputs[i, 0]
         step_velocity(axis.velocity, now.velocity, position_rad, position_rad - inputs[i, 1], 1)
         unlimited = step_law(
-            axis.law, now.law, position_rad, now.velocity, now.reference, now.command_torque_Nm, 0, 0.0, 0.0
+            axis.law, now.law, position_rad, now.velocity, now.reference, now.command_torque_Nm, NO_REPETITION
         )
         limited, _ = limited_torque_Nm(axis.limits, unlimited, now.command_torque_Nm, axis.law.period_s)
         now.command_torque_Nm = limited

@@ -126,7 +126,18 @@ def soak(minutes: float, folder: Path, every_s: float) -> dict[str, Any]:
     channel = f"soak-{os.getpid()}"
     load_before = os.getloadavg()
     with separate_virtual_joint(config, channel) as joint:
-        command = [sys.executable, "-P", "-m", "jointctl.tools.cli", "run", str(config), "-y", "--json", "-c", channel]
+        command = [
+            sys.executable,
+            "-P",
+            "-m",
+            "jointctl.tools.verbs",
+            "run",
+            str(config),
+            "-y",
+            "--json",
+            "-c",
+            channel,
+        ]
         run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL)
         watched = {"run": Watched(run.pid), "virtual joint": Watched(joint.pid)}
         started_s = time.monotonic()

@@ -18,11 +18,11 @@ from typing import Any
 import typer
 
 from jointctl.drivers.errors import JointctlError, UsageError
-from jointctl.tools.cli.main import app
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.records import axis_constants, trajectory_table
 from jointctl.tools.output import Output
+from jointctl.tools.verbs.main import app
 from jointctl.tools.written_file import prepare_folder
 from tests.bench.exchange_speed import Rounds, exchange_rows
 from tests.bench.law_speed import law_rows

@@ -57,7 +57,7 @@ def command_s(*arguments: str) -> float:
 
 def until_enabled_s(config_path: Path, channel: str, cache: Path | None = None) -> float:
     """Seconds from the start of `run` to its first phase with the drive enabled; the run is stopped then."""
-    command = [sys.executable, "-P", "-m", "jointctl.tools.cli", "run", str(config_path.resolve()), "-y"]
+    command = [sys.executable, "-P", "-m", "jointctl.tools.verbs", "run", str(config_path.resolve()), "-y"]
     # a busy computer may delay a few of the first cycles so that the margin gate refuses: not what is measured here
     command += ["--allow-low-margin"]
     command += ["--interface", "jointctl", "--channel", channel]
@@ -97,14 +97,14 @@ def _wait_for(process: subprocess.Popen[bytes], words: tuple[str, ...], begin_s:
 
 def start_rows(config: Config, *, runs: int, cold: bool, verbs: Sequence[str]) -> Iterator[Row]:
     """The start of `verbs`, and of `run` until the drive is enabled, on a virtual joint of its own."""
-    command_s("-m", "jointctl.tools.cli", "--help")
+    command_s("-m", "jointctl.tools.verbs", "--help")
     cli, bare = interleaved(
-        runs, lambda: command_s("-m", "jointctl.tools.cli", "--help"), lambda: command_s("-c", "pass")
+        runs, lambda: command_s("-m", "jointctl.tools.verbs", "--help"), lambda: command_s("-c", "pass")
     )
     yield measured(GROUP, "jointctl --help", cli, "s", goal=HELP_GOAL_S, note=f"best {min(cli):.2f} s")
     yield compared(GROUP, "jointctl --help", cli, bare, "s", "python -c pass")
     for verb in verbs:
-        taken = [command_s("-m", "jointctl.tools.cli", verb, "--help") for _ in range(2)]
+        taken = [command_s("-m", "jointctl.tools.verbs", verb, "--help") for _ in range(2)]
         yield measured(GROUP, f"jointctl {verb} --help", [min(taken)], "s")
     channel = f"benchstart{os.getpid()}"
     with separate_virtual_joint(config.path, channel):

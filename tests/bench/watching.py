@@ -34,7 +34,7 @@ from jointctl.tools.recording.run_log_reader import read_run_log  # noqa: E402
 from tests.browser import PROGRAM, Browser  # noqa: E402
 
 WAYS = ("alone", "served, no page", "one page")
-JOINTCTL = (sys.executable, "-P", "-m", "jointctl.tools.cli")
+JOINTCTL = (sys.executable, "-P", "-m", "jointctl.tools.verbs")
 
 
 @contextmanager

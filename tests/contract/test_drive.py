@@ -15,10 +15,10 @@ from jointctl.drivers.elmo.drive import ElmoDrive
 from jointctl.drivers.errors import DeviceError, NoDeviceError
 from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.elmo.device import ElmoDevice
-from jointctl.tools.configuration.conversions import torque_constant_NmpA
-from jointctl.tools.configuration.elmo_settings import elmo_settings, with_port_override
-from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.verbs.hil_serial import serve_virtual_elmo
+from jointctl.tools.configuration.drive_section import GivenPlace
+from jointctl.tools.configuration.elmo import elmo_settings
+from jointctl.tools.configuration.load import load_config, moved, shipped_config
+from jointctl.tools.simulation.virtual_elmo import serve_virtual_elmo
 
 
 class Bench(Protocol):
@@ -189,7 +189,7 @@ class TestElmoDrive(DriveContract):
     def bench(self) -> Iterator[Bench]:
         config = load_config(shipped_config("elmo_serial"))
         with serve_virtual_elmo(config) as device:
-            settings = elmo_settings(with_port_override(config, device.path), torque_constant_NmpA(config))
+            settings = elmo_settings(moved(config, GivenPlace(port=device.path)))
             # slow: a busy computer delays the virtual drive, and the measured line is not the subject here
             drive = ElmoDrive(dataclasses.replace(settings, rate_Hz=20.0, mode=self.mode))
             yield ElmoBench(device, drive)

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import pytest
 import typer
 
-from jointctl.tools.cli.main import app
+from jointctl.tools.verbs.main import app
 from tests.places import ROOT
 
 PAGES = [ROOT / "README.md", *(ROOT / name for name in ("CHANGELOG.md", "CONTRIBUTING.md")), *ROOT.glob("docs/**/*.md")]

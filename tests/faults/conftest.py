@@ -15,7 +15,7 @@ from tests.places import CONFIGS
 
 
 @pytest.fixture(scope="module")
-def joint() -> LockstepJoint:
+def lockstep() -> LockstepJoint:
     """The joint of configs/virtual.toml, commissioned once."""
     return LockstepJoint(load_config(CONFIGS / "virtual.toml"))
 

@@ -13,9 +13,11 @@ import pytest
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import AxisPhase, CommandKind
 from jointctl.hil.faults.kinds import FaultKind
-from jointctl.tools.campaign import judge as judge_module
-from jointctl.tools.campaign.campaign import campaign_joint, run_campaign
-from jointctl.tools.campaign.fault_scenarios import (
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.experiments import judge as judge_module
+from jointctl.tools.experiments.campaign import campaign_joint, run_campaign
+from jointctl.tools.experiments.fault_scenarios import (
     FAULT_CLASSES,
     BEFORE_s,
     LONGEST_s,
@@ -24,12 +26,11 @@ from jointctl.tools.campaign.fault_scenarios import (
     fitted,
     placed_sweep,
 )
-from jointctl.tools.campaign.judge import envelope, in_time, judge, reaction_s, require_fit, run_scenario
-from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.load import load_config
+from jointctl.tools.experiments.judge import envelope, in_time, judge, reaction_s, require_fit, run_scenario
 from jointctl.tools.output import Output
 from jointctl.tools.simulation.lockstep import LockstepJoint
 from jointctl.tools.verbs.fault_campaign import fault_campaign
+from tests.configurations import shipped
 from tests.faults.campaign_variants import VARIANTS, write_variant
 from tests.faults.test_fault_campaign import WIDE, good_run
 from tests.places import CONFIGS
@@ -49,9 +50,7 @@ def test_no_scenario_violates_an_invariant_with_other_configurations(tmp_path: P
     assert sum(v.fault != "NONE" for v in found) > len(found) // 4
 
 
-# --- during a sweep --------------------------------------------------------------------------------------------
-
-
+# --- during a sweep ---
 @pytest.fixture(scope="module")
 def sweep() -> tuple[Config, LockstepJoint]:
     return campaign_joint(load_config(CONFIGS / "sweep_virtual.toml"), sweep=True)
@@ -133,14 +132,7 @@ def test_the_invariants_of_a_velocity_command_notice(rows: Any, value: float, wo
     assert any(words in line for line in lines) if words else lines == []
 
 
-# --- the envelope and what it takes for granted ----------------------------------------------------------------
-
-
-def with_load(config: Config, load_Nm: float) -> Config:
-    assert config.virtual is not None
-    return config.model_copy(update={"virtual": config.virtual.model_copy(update={"gravity_Nm": load_Nm})})
-
-
+# --- the envelope and what it takes for granted ---
 def test_a_load_pushes_before_the_reaction_and_is_held_by_less_friction_after_it(virtual_config: Config) -> None:
     joint = LockstepJoint(virtual_config)
     plain = dataclasses.replace(
@@ -149,7 +141,7 @@ def test_a_load_pushes_before_the_reaction_and_is_held_by_less_friction_after_it
         plant={"inertia_kgm2": 2.0, "torque_ripple_Nm": (0.0, 0.0), "friction_positive_scale": 1.0,
                "friction_negative_scale": 1.0},
     )  # fmt: skip
-    allowed = envelope(with_load(virtual_config, 6.0), plain, joint.constants()[0])
+    allowed = envelope(shipped(virtual__gravity_Nm=6.0), plain, joint.constants()[0])
     speed = 1.0 + (60.5 + 6.0) / 2.0 * 0.01
     brake = (121.0 * 0.1063 * 0.95 - 6.0) / 2.0
     assert allowed.velocity_max_radps == pytest.approx(speed)
@@ -162,16 +154,9 @@ def test_a_load_pushes_before_the_reaction_and_is_held_by_less_friction_after_it
     [(1000.0, 100.0, 0.010), (2000.0, 0.0, 0.010), (250.0, 100.0, 0.008 + 0.00477 + 0.0013),
      (1000.0, 20.0, 0.002 + 0.02387 + 0.0013)],
 )  # fmt: skip
-def test_a_slow_loop_or_filter_reacts_later(
-    virtual_config: Config, rate_Hz: float, cutoff_Hz: float, measuring_s: float
-) -> None:
-    changed = virtual_config.model_copy(
-        update={
-            "loop": virtual_config.loop.model_copy(update={"rate_Hz": rate_Hz}),
-            "control": virtual_config.control.model_copy(update={"velocity_cutoff_Hz": cutoff_Hz}),
-        }
-    )
-    assert reaction_s(changed, FaultKind.TORQUE_REVERSED) == pytest.approx(measuring_s, abs=1e-5)
+def test_a_slow_loop_or_filter_reacts_later(rate_Hz: float, cutoff_Hz: float, measuring_s: float) -> None:
+    config = shipped(loop__rate_Hz=rate_Hz, control__velocity_cutoff_Hz=cutoff_Hz)
+    assert reaction_s(config, FaultKind.TORQUE_REVERSED) == pytest.approx(measuring_s, abs=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -179,59 +164,47 @@ def test_a_slow_loop_or_filter_reacts_later(
     [(1000.0, 100.0, False), (2000.0, 200.0, False), (1000.0, 101.0, True), (500.0, 100.0, True), (1000.0, 0.0, True)],
 )
 def test_where_the_velocity_filter_passes_more_a_harmless_reordering_is_one_swap(
-    virtual_config: Config, rate_Hz: float, cutoff_Hz: float, one: bool
+    rate_Hz: float, cutoff_Hz: float, one: bool
 ) -> None:
     """`precise`, seed 13, scenario 12: two swaps within three cycles read as 1.01 rad/s, at a true 0.59 rad/s."""
-    changed = virtual_config.model_copy(
-        update={
-            "loop": virtual_config.loop.model_copy(update={"rate_Hz": rate_Hz}),
-            "control": virtual_config.control.model_copy(update={"velocity_cutoff_Hz": cutoff_Hz}),
-        }
-    )
+    config = shipped(loop__rate_Hz=rate_Hz, control__velocity_cutoff_Hz=cutoff_Hz)
     twin = draw_scenario(13, 12)
     assert (twin.kind, twin.harmless) == (FaultKind.TPDO_REORDERED, True)
-    seen = fitted(changed, twin)
+    seen = fitted(config, twin)
     assert (seen == twin) is not one
     assert not one or (seen.duration_s, seen.magnitude) == (1.5 / rate_Hz, 1.0)
     for other in (dataclasses.replace(twin, harmless=False), draw_scenario(13, 10)):
-        assert fitted(changed, other) == other
+        assert fitted(config, other) == other
 
 
 @pytest.mark.parametrize(("load_Nm", "fits"), [(9.59, True), (9.6, False)])
-def test_a_load_that_friction_does_not_hold_has_no_envelope(virtual_config: Config, load_Nm: float, fits: bool) -> None:
+def test_a_load_that_friction_does_not_hold_has_no_envelope(load_Nm: float, fits: bool) -> None:
     """0.9 x 121 x 0.1063 Nm x 0.95 - 1.4 Nm of ripple."""
     if fits:
-        require_fit(with_load(virtual_config, load_Nm))
+        require_fit(shipped(virtual__gravity_Nm=load_Nm))
         return
     with pytest.raises(ConfigurationError, match=r"\[virtual\] \(=9\.6 Nm\) must be less than 9\.60 Nm.* a brake"):
-        require_fit(with_load(virtual_config, load_Nm))
+        require_fit(shipped(virtual__gravity_Nm=load_Nm))
 
 
 @pytest.mark.parametrize(
     ("section", "key", "value"),
     [
-        ("limits", "position_max_rad", 0.69),
-        ("limits", "position_min_rad", -0.69),
-        ("limits", "velocity_max_radps", 0.99),
-        ("limits", "sample_age_max_s", 0.049),
-        ("limits", "skipped_max_s", 0.049),
-        ("sequence", "supervisor_timeout_s", 0.9),
-        ("drive", "heartbeat_s", 0.19),
+        ("limits", "position_max_rad", 0.69), ("limits", "position_min_rad", -0.69),
+        ("limits", "velocity_max_radps", 0.99), ("limits", "sample_age_max_s", 0.049),
+        ("limits", "skipped_max_s", 0.049), ("sequence", "supervisor_timeout_s", 0.9), ("drive", "heartbeat_s", 0.19),
     ],
-)
+)  # fmt: skip
 def test_tighter_limits_than_the_harmless_faults_are_made_for_are_refused(
     virtual_config: Config, section: str, key: str, value: float
 ) -> None:
     require_fit(virtual_config)
-    changed = virtual_config.model_copy(
-        update={section: getattr(virtual_config, section).model_copy(update={key: value})}
-    )
     with pytest.raises(ConfigurationError, match=rf"{section}\.{key} \(=.*\) must be at least"):
-        require_fit(changed)
+        require_fit(shipped(**{f"{section}__{key}": value}))
 
 
-def test_without_any_friction_there_is_no_campaign(virtual_config: Config) -> None:
+def test_without_any_friction_there_is_no_campaign() -> None:
     with pytest.raises(ConfigurationError, match=r"\[friction\] is missing, and so is \[virtual\.friction\]"):
-        require_fit(virtual_config.model_copy(update={"friction": None}))
+        require_fit(shipped(friction=None))
     with pytest.raises(ConfigurationError, match=r"\[virtual\] is missing"):
-        require_fit(virtual_config.model_copy(update={"virtual": None}))
+        require_fit(shipped(virtual=None))

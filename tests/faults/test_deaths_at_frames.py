@@ -19,6 +19,7 @@ import pytest
 from jointctl.drivers.bus_lock import lock_name, marked_processes
 from jointctl.drivers.canopen.identifiers import NMT_ID, RPDO1_ID, SDO_REQUEST_ID, SYNC_ID, NmtCommand
 from jointctl.hil.canopen.records import PowerState
+from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from tests.hil.moving_run import ENABLED, QUICK_STOP_ACTIVE, alive
@@ -168,7 +169,7 @@ def time_allowed_s(config: Config, names: tuple[str, ...]) -> float:
     sequence = config.sequence
     braking_s = FASTEST_RADPS / sequence.brake_radps2
     if "loop" in names:
-        return 20.0 / config.loop.rate_Hz + config.canopen.heartbeat_s + braking_s
+        return 20.0 / config.loop.rate_Hz + canopen_section(config).heartbeat_s + braking_s
     return sequence.supervisor_timeout_s + braking_s + sequence.release_s
 
 
@@ -185,16 +186,12 @@ DEATHS: dict[str, tuple[Moment, tuple[str, ...]]] = {
     "commissioning, 10th SDO request, loop": (sdo_request(10), LOOP),
     "commissioning, 50th SDO request, both": (sdo_request(50), BOTH),
     "commissioning, 100th SDO request, supervisor": (sdo_request(100), SUPERVISOR),
-    "NMT start, both": (lambda seen: seen.started, BOTH),
-    "waiting, supervisor": (sync(150), SUPERVISOR),
-    "enabling, switch on, both": (controlword(SWITCH_ON), BOTH),
-    "enabling, loop": (controlword(ENABLE), LOOP),
+    "NMT start, both": (lambda seen: seen.started, BOTH), "waiting, supervisor": (sync(150), SUPERVISOR),
+    "enabling, switch on, both": (controlword(SWITCH_ON), BOTH), "enabling, loop": (controlword(ENABLE), LOOP),
     "approach, 5 ms, supervisor": (sync_after_enabling(5), SUPERVISOR),
-    "approach, 60 ms, both": (sync_after_enabling(60), BOTH),
-    "tracking, both": (sync_after_enabling(600), BOTH),
-    "stopping, loop": (sync_after_enabling(850), LOOP),
-    "disabling, supervisor": (disabling, SUPERVISOR),
-}
+    "approach, 60 ms, both": (sync_after_enabling(60), BOTH), "tracking, both": (sync_after_enabling(600), BOTH),
+    "stopping, loop": (sync_after_enabling(850), LOOP), "disabling, supervisor": (disabling, SUPERVISOR),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("moment", "names"), DEATHS.values(), ids=DEATHS)

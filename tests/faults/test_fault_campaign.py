@@ -7,7 +7,6 @@ import json
 import os
 import signal
 import time
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +19,19 @@ from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault
 from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.faults.kinds import FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUTHS
-from jointctl.tools.campaign import campaign as runner
-from jointctl.tools.campaign import judge as judge_module
-from jointctl.tools.campaign.campaign import campaign_figure, rows_by_kind
-from jointctl.tools.campaign.fault_scenarios import FAULT_CLASSES, draw_scenario
-from jointctl.tools.campaign.judge import Envelope, envelope, judge, reaction_s, run_scenario
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.drawing import png
-from jointctl.tools.output import Output
+from jointctl.tools.experiments import campaign as runner
+from jointctl.tools.experiments import judge as judge_module
+from jointctl.tools.experiments.campaign import campaign_figure, rows_by_kind
+from jointctl.tools.experiments.fault_scenarios import FAULT_CLASSES, draw_scenario
+from jointctl.tools.experiments.judge import Envelope, envelope, judge, reaction_s, run_scenario
 from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
 from jointctl.tools.verbs.fault_campaign import fault_campaign
 from tests.page_figures import foreign_colours, svgs
 from tests.places import CONFIGS
+from tests.sessions import output
 
 CONFIG = CONFIGS / "virtual.toml"
 KINDS = len(FAULT_CLASSES)
@@ -45,8 +44,8 @@ def config() -> Config:
 
 
 @pytest.mark.parametrize("seed", [11, 12])
-def test_no_scenario_violates_an_invariant(config: Config, joint: LockstepJoint, seed: int) -> None:
-    found = [judge(config, joint, draw_scenario(seed, number)) for number in range(6 * KINDS)]
+def test_no_scenario_violates_an_invariant(config: Config, lockstep: LockstepJoint, seed: int) -> None:
+    found = [judge(config, lockstep, draw_scenario(seed, number)) for number in range(6 * KINDS)]
     assert [(v.number, v.kind, v.violations) for v in found if v.violations] == []
     assert {v.kind for v in found} == {kind.name.lower() for kind in FAULT_CLASSES}
     assert any(v.harmless for v in found)
@@ -62,15 +61,13 @@ def test_every_kind_of_fault_has_its_class() -> None:
         assert (item.harmful is None) == (not item.causes)
 
 
-def test_number_and_seed_decide_everything(config: Config, joint: LockstepJoint) -> None:
+def test_number_and_seed_decide_everything(config: Config, lockstep: LockstepJoint) -> None:
     assert draw_scenario(3, 40) == draw_scenario(3, 40)
     assert draw_scenario(3, 40) != draw_scenario(4, 40)
-    assert judge(config, joint, draw_scenario(3, 40)) == judge(config, joint, draw_scenario(3, 40))
+    assert judge(config, lockstep, draw_scenario(3, 40)) == judge(config, lockstep, draw_scenario(3, 40))
 
 
-# --- each invariant notices ------------------------------------------------------------------------------------
-
-
+# --- each invariant notices ---
 def good_run(cycles: int = 300, tail: int = 100) -> LockstepRun:
     """A made-up run that satisfies every invariant: off, enabled with a torque that varies, off."""
     log = new(LogRecord, cycles)
@@ -157,27 +154,29 @@ def test_the_time_to_stop_is_checked_at_its_boundary(off_row: int, late: bool) -
     assert any("after the fault" in line for line in lines) is late
 
 
-def test_a_wrong_cause_and_a_fault_that_is_not_noticed_are_violations(config: Config, joint: LockstepJoint) -> None:
+def test_a_wrong_cause_and_a_fault_that_is_not_noticed_are_violations(config: Config, lockstep: LockstepJoint) -> None:
     number = list(FAULT_CLASSES).index(FaultKind.DRIVE_REBOOT)
     scenario = dataclasses.replace(draw_scenario(1, number), at_s=1.5, trajectory=draw_scenario(1, 1).trajectory)
-    run, _ = run_scenario(config, joint, scenario)
-    assert judge_module._cause(run, scenario, 1e-3, joint.start_ns) == []
+    run, _ = run_scenario(config, lockstep, scenario)
+    assert judge_module._cause(run, scenario, 1e-3, lockstep.start_ns) == []
     wrong = dataclasses.replace(run, fault=Fault.VELOCITY_LIMIT)
-    assert "the cause is told as VELOCITY_LIMIT" in judge_module._cause(wrong, scenario, 1e-3, joint.start_ns)[0]
+    assert "the cause is reported as VELOCITY_LIMIT" in judge_module._cause(wrong, scenario, 1e-3, lockstep.start_ns)[0]
     left = dataclasses.replace(run, fault=Fault.DRIVE_NOT_ENABLED)
     for code, told in ((0x8250, False), (0x8130, True)):
         left.state.fault_drive_error = code
-        lines = judge_module._cause(left, dataclasses.replace(scenario, kind=FaultKind.RPDO_LOST), 1e-3, joint.start_ns)
-        assert any("told as 8130h, not 8250h" in line for line in lines) is told
+        lines = judge_module._cause(
+            left, dataclasses.replace(scenario, kind=FaultKind.RPDO_LOST), 1e-3, lockstep.start_ns
+        )
+        assert any("reported as 8130h, not 8250h" in line for line in lines) is told
     harmless = dataclasses.replace(scenario, harmless=True)
-    assert "a harmless fault tripped" in judge_module._cause(run, harmless, 1e-3, joint.start_ns)[0]
+    assert "a harmless fault tripped" in judge_module._cause(run, harmless, 1e-3, lockstep.start_ns)[0]
     early = dataclasses.replace(scenario, at_s=1e6)
-    quiet, _ = run_scenario(config, joint, early)
+    quiet, _ = run_scenario(config, lockstep, early)
     late = dataclasses.replace(scenario, at_s=1.2)
-    assert judge_module._cause(quiet, late, 1e-3, joint.start_ns) == ["the fault was not noticed"]
+    assert judge_module._cause(quiet, late, 1e-3, lockstep.start_ns) == ["the fault was not noticed"]
 
 
-def test_the_envelope_follows_its_derivation(config: Config, joint: LockstepJoint) -> None:
+def test_the_envelope_follows_its_derivation(config: Config, lockstep: LockstepJoint) -> None:
     """Recomputed by hand for a plant of 2 kg m2 without ripple: 60.5 Nm for 10 ms, then friction alone."""
     plain = dataclasses.replace(
         draw_scenario(1, 0),
@@ -185,7 +184,7 @@ def test_the_envelope_follows_its_derivation(config: Config, joint: LockstepJoin
         plant={"inertia_kgm2": 2.0, "torque_ripple_Nm": (0.0, 0.0), "friction_positive_scale": 1.0,
                "friction_negative_scale": 1.0},
     )  # fmt: skip
-    allowed = envelope(config, plain, joint.constants()[0])
+    allowed = envelope(config, plain, lockstep.constants()[0])
     speed = 1.0 + 60.5 / 2.0 * 0.01
     brake = 121.0 * 0.1063 * 0.95 / 2.0
     assert allowed.velocity_max_radps == pytest.approx(speed)
@@ -196,16 +195,9 @@ def test_the_envelope_follows_its_derivation(config: Config, joint: LockstepJoin
     assert reaction_s(config, FaultKind.SYNC_LOST) == pytest.approx(0.01 + 0.05 + 0.02 + 0.2)
 
 
-# --- the verb --------------------------------------------------------------------------------------------------
-
-
-def output() -> tuple[Output, StringIO, StringIO]:
-    out, err = StringIO(), StringIO()
-    return Output(json=True, stdout=out, stderr=err), out, err
-
-
+# --- the verb ---
 def test_the_verb_writes_table_json_and_picture(config: Config, tmp_path: Path) -> None:
-    shown, out, _ = output()
+    shown, out, _ = output(json=True)
     page = tmp_path / "campaign.html"
     assert fault_campaign(config, shown, count=KINDS, seed=5, folder=tmp_path / "new", workers=1, report=page) == 0
     assert [foreign_colours(svg) for svg in svgs(page.read_text())] == [set()]
@@ -222,7 +214,7 @@ def test_a_violation_is_told_with_the_command_that_replays_it(
     config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(judge_module, "_motion", lambda run, allowed: ["made up"])
-    shown, _, err = output()
+    shown, _, err = output(json=True)
     page = tmp_path / "campaign.html"
     assert fault_campaign(config, shown, count=2, seed=5, folder=tmp_path, workers=1, report=page) == 10
     assert page.read_text().count("made up") == 2
@@ -233,7 +225,7 @@ def test_a_violation_is_told_with_the_command_that_replays_it(
 
 
 def test_one_scenario_is_replayed(config: Config) -> None:
-    shown, out, _ = output()
+    shown, out, _ = output(json=True)
     assert fault_campaign(config, shown, seed=5, scenario=7) == 0
     data = json.loads(out.getvalue())
     assert data["scenario"]["number"] == 7
@@ -242,26 +234,26 @@ def test_one_scenario_is_replayed(config: Config) -> None:
 
 def test_ctrl_c_keeps_what_is_done(config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def three(*_: Any) -> Any:
-        joint = LockstepJoint(config)
+        lockstep = LockstepJoint(config)
         for number in range(3):
-            yield judge(config, joint, draw_scenario(1, number))
+            yield judge(config, lockstep, draw_scenario(1, number))
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(5.0)
 
     monkeypatch.setattr(runner, "_verdicts", three)
-    shown, out, _ = output()
+    shown, out, _ = output(json=True)
     assert fault_campaign(config, shown, count=100, folder=tmp_path) == 130
     data = json.loads(out.getvalue())
     assert (data["scenarios"], data["interrupted"]) == (3, True)
     assert json.loads((tmp_path / "campaign.json").read_text())["scenarios"] == 3
 
 
-def test_workers_give_the_same_verdicts_as_one_process(config: Config, joint: LockstepJoint, tmp_path: Path) -> None:
+def test_workers_give_the_same_verdicts_as_one_process(config: Config, lockstep: LockstepJoint, tmp_path: Path) -> None:
     done: list[float] = []
     found, _, interrupted = runner.run_campaign(CONFIG, 9, 40, done.append, workers=2)
     assert not interrupted
     assert done[-1] == 40.0
-    alone = [judge(config, joint, draw_scenario(9, number)) for number in range(40)]
+    alone = [judge(config, lockstep, draw_scenario(9, number)) for number in range(40)]
     assert [dataclasses.astuple(v)[:8] for v in found] == [dataclasses.astuple(v)[:8] for v in alone]
     rows = rows_by_kind(found)
     assert sum(row.scenarios for row in rows) == 40

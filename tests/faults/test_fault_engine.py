@@ -20,7 +20,7 @@ MakeFault = Callable[..., Any]
 NODE = 1
 MS = 1_000_000
 EPOCH_ns = 7 * MS
-STAMP = (7, 8, 9)  # when it was sent, see hil.frame_stamps
+STAMP = (7, 8, 9)  # when it was sent, see hil.bus.frame_stamps
 SYNC, RPDO, OWN_HEARTBEAT = (0x80, 0), (0x201, 4), (0x77E, 1)
 TPDO, HEARTBEAT, EMCY = (0x181, 8), (0x701, 1), (0x81, 8)
 TO_DRIVE, TO_CONTROLLER = (SYNC, RPDO, OWN_HEARTBEAT), (TPDO, HEARTBEAT, EMCY)
@@ -55,14 +55,10 @@ class Wire:
 
 
 LOST = {
-    FaultKind.FRAMES_LOST: {*TO_DRIVE, *TO_CONTROLLER},
-    FaultKind.BUS_OFF: {*TO_DRIVE, *TO_CONTROLLER},
-    FaultKind.SYNC_LOST: {SYNC},
-    FaultKind.RPDO_LOST: {RPDO},
-    FaultKind.TPDO_LOST: {TPDO},
-    FaultKind.CONTROLLER_HEARTBEAT_LOST: {OWN_HEARTBEAT},
-    FaultKind.DRIVE_HEARTBEAT_LOST: {HEARTBEAT},
-}
+    FaultKind.FRAMES_LOST: {*TO_DRIVE, *TO_CONTROLLER}, FaultKind.BUS_OFF: {*TO_DRIVE, *TO_CONTROLLER},
+    FaultKind.SYNC_LOST: {SYNC}, FaultKind.RPDO_LOST: {RPDO}, FaultKind.TPDO_LOST: {TPDO},
+    FaultKind.CONTROLLER_HEARTBEAT_LOST: {OWN_HEARTBEAT}, FaultKind.DRIVE_HEARTBEAT_LOST: {HEARTBEAT},
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", LOST)
@@ -141,20 +137,18 @@ def test_too_many_faults_are_refused() -> None:
         fault_memory(new(FaultConstants, MAX_FAULTS + 1))
 
 
-# --- in lockstep -------------------------------------------------------------------------------------------------
-
-
-def test_without_a_fault_the_run_is_bit_for_bit_that_without_the_engine(joint: LockstepJoint) -> None:
-    plain, wired = joint.run(longest_s=3.0), joint.run_with_faults(no_faults(), longest_s=3.0)
+# --- in lockstep ---
+def test_without_a_fault_the_run_is_bit_for_bit_that_without_the_engine(lockstep: LockstepJoint) -> None:
+    plain, wired = lockstep.run(longest_s=3.0), lockstep.run_with_faults(no_faults(), longest_s=3.0)
     assert plain.log.tobytes() == wired.log.tobytes()
 
 
-def test_a_run_with_faults_repeats_bit_for_bit(joint: LockstepJoint, one_fault: MakeFault) -> None:
+def test_a_run_with_faults_repeats_bit_for_bit(lockstep: LockstepJoint, one_fault: MakeFault) -> None:
     faults = one_fault(FaultKind.FRAMES_LOST, 0.5, magnitude=0.3, seed=5)
-    first, again = joint.run_with_faults(faults, longest_s=4.0), joint.run_with_faults(faults, longest_s=4.0)
+    first, again = lockstep.run_with_faults(faults, longest_s=4.0), lockstep.run_with_faults(faults, longest_s=4.0)
     assert first.log.tobytes() == again.log.tobytes()
     faults[0].seed = 6
-    assert joint.run_with_faults(faults, longest_s=4.0).log.tobytes() != first.log.tobytes()
+    assert lockstep.run_with_faults(faults, longest_s=4.0).log.tobytes() != first.log.tobytes()
 
 
 @pytest.mark.parametrize(
@@ -162,9 +156,9 @@ def test_a_run_with_faults_repeats_bit_for_bit(joint: LockstepJoint, one_fault: 
     [(FaultKind.ENCODER_JUMP, 0.0004, 0.0004), (FaultKind.ENCODER_DRIFT, 0.002, 0.0008)],
 )
 def test_the_encoder_is_wrong_by_the_magnitude(
-    joint: LockstepJoint, one_fault: MakeFault, kind: FaultKind, magnitude: float, shift_rad: float
+    lockstep: LockstepJoint, one_fault: MakeFault, kind: FaultKind, magnitude: float, shift_rad: float
 ) -> None:
-    run = joint.run_with_faults(one_fault(kind, 1.0, magnitude=magnitude), longest_s=1.46)
+    run = lockstep.run_with_faults(one_fault(kind, 1.0, magnitude=magnitude), longest_s=1.46)
     wrong = np.asarray(run.log.position_rad) - run.truth[: len(run.log), TRUE_POSITION_rad]
     enabled = int(np.argmax(run.log.drive_state == 3))
     assert abs(wrong[enabled + 900]) < 2e-5
@@ -172,20 +166,19 @@ def test_the_encoder_is_wrong_by_the_magnitude(
 
 
 @pytest.mark.parametrize(
-    ("kind", "magnitude", "most_Nm"),
-    [(FaultKind.CURRENT_LOOP_DEAD, 1.0, 0.9), (FaultKind.TORQUE_SATURATED, 6.0, 6.9)],
+    ("kind", "magnitude", "most_Nm"), [(FaultKind.CURRENT_LOOP_DEAD, 1.0, 0.9), (FaultKind.TORQUE_SATURATED, 6.0, 6.9)]
 )
 def test_the_motor_yields_no_more_than_it_can(
-    joint: LockstepJoint, one_fault: MakeFault, kind: FaultKind, magnitude: float, most_Nm: float
+    lockstep: LockstepJoint, one_fault: MakeFault, kind: FaultKind, magnitude: float, most_Nm: float
 ) -> None:
     """Torque ripple (0.8 Nm) is there with the power off as well."""
-    run = joint.run_with_faults(one_fault(kind, 2.0, magnitude=magnitude), longest_s=2.5)
+    run = lockstep.run_with_faults(one_fault(kind, 2.0, magnitude=magnitude), longest_s=2.5)
     actuator = np.abs(run.truth[:, TRUE_ACTUATOR_Nm])
     assert actuator[1500:2000].max() > 12.0
     assert actuator[2100:].max() < most_Nm
 
 
-def test_faults_end_and_leave_no_trace(joint: LockstepJoint) -> None:
+def test_faults_end_and_leave_no_trace(lockstep: LockstepJoint) -> None:
     """Short enough to be harmless, one after the other: the run goes on, and the encoder is right in the end."""
     kinds = (
         FaultKind.ENCODER_STUCK, FaultKind.ENCODER_REVERSED, FaultKind.TORQUE_REVERSED, FaultKind.CURRENT_LOOP_DEAD,
@@ -195,6 +188,6 @@ def test_faults_end_and_leave_no_trace(joint: LockstepJoint) -> None:
     for i, kind in enumerate(kinds):
         faults[i].kind, faults[i].start_s, faults[i].duration_s = kind, 0.5 + 0.2 * i, 0.001
         faults[i].magnitude, faults[i].seed = 1.0, 1
-    run = joint.run_with_faults(faults, longest_s=4.0)
+    run = lockstep.run_with_faults(faults, longest_s=4.0)
     assert run.fault is Fault.NONE
     assert abs(run.log.position_rad[-1] - run.truth[len(run.log) - 1, TRUE_POSITION_rad]) < 2e-5

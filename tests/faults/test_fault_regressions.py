@@ -29,10 +29,10 @@ def seconds_until(run: LockstepRun, state: PowerState) -> float:
 
 @pytest.mark.parametrize(("kind", "fault"), [(FaultKind.SYNC_LOST, Fault.STALE_SAMPLE), (FaultKind.RPDO_LOST, None)])
 def test_a_drive_that_does_not_hear_the_loop_is_stopped_by_its_own_watchdog(
-    joint: LockstepJoint, one_fault: MakeFault, kind: FaultKind, fault: Fault | None
+    lockstep: LockstepJoint, one_fault: MakeFault, kind: FaultKind, fault: Fault | None
 ) -> None:
     """The loop went on sending its heartbeat, so that the drive held the last torque until the loop ended, 5 s on."""
-    run = joint.run_with_faults(one_fault(kind, AT_s), tail_s=1.0)
+    run = lockstep.run_with_faults(one_fault(kind, AT_s), tail_s=1.0)
     assert run.fault is not Fault.NONE
     assert fault is None or run.fault is fault
     tripped = int(np.argmax(run.log.fault != Fault.NONE))
@@ -43,15 +43,17 @@ def test_a_drive_that_does_not_hear_the_loop_is_stopped_by_its_own_watchdog(
     assert run.truth[-1, TRUE_POWER_STATE] == PowerState.SWITCH_ON_DISABLED
 
 
+@pytest.mark.trips("drive: the loop's RPDOs", "(0.102, True)")
+@pytest.mark.stays("drive: the loop's RPDOs", "(0.098, False)")
 @pytest.mark.parametrize(("kind", "magnitude"), [(FaultKind.RPDO_LOST, 1.0), (FaultKind.RPDO_LENGTH, 2.0)])
 @pytest.mark.parametrize(("duration_s", "stops"), [(0.098, False), (0.102, True)])
 def test_a_joint_that_holds_while_its_rpdos_stay_away_is_stopped_by_the_deadline_of_the_drive(
-    joint: LockstepJoint, one_fault: MakeFault, kind: FaultKind, magnitude: float, duration_s: float, stops: bool
+    lockstep: LockstepJoint, one_fault: MakeFault, kind: FaultKind, magnitude: float, duration_s: float, stops: bool
 ) -> None:
-    """It stands still, so that no limit of the loop sees the loss; the drive's own error code is told as the cause."""
-    constants = joint.constants()
+    """It stands still, so that no limit of the loop sees the loss; the drive's own error code is the reported cause."""
+    constants = lockstep.constants()
     constants[0].trajectory.amplitude_rad = 0.0
-    run = joint.run_with_faults(one_fault(kind, 4.0, duration_s, magnitude), constants, tail_s=1.0)
+    run = lockstep.run_with_faults(one_fault(kind, 4.0, duration_s, magnitude), constants, tail_s=1.0)
     if stops:
         assert (run.fault, int(run.state.fault_drive_error)) == (Fault.DRIVE_NOT_ENABLED, 0x8250)
         assert run.truth[-1, TRUE_POWER_STATE] == PowerState.SWITCH_ON_DISABLED
@@ -62,22 +64,22 @@ def test_a_joint_that_holds_while_its_rpdos_stay_away_is_stopped_by_the_deadline
 
 
 def test_its_twin_a_drive_that_hears_again_in_time_is_not_left_alone(
-    joint: LockstepJoint, one_fault: MakeFault
+    lockstep: LockstepJoint, one_fault: MakeFault
 ) -> None:
-    run = joint.run_with_faults(one_fault(FaultKind.SYNC_LOST, AT_s, 0.045))
+    run = lockstep.run_with_faults(one_fault(FaultKind.SYNC_LOST, AT_s, 0.045))
     assert run.fault is Fault.NONE
     assert run.state.phase == AxisPhase.FINISHED
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5])
 def test_behind_a_stuck_encoder_the_joint_does_not_run_away(
-    joint: LockstepJoint, one_fault: MakeFault, noise: float
+    lockstep: LockstepJoint, one_fault: MakeFault, noise: float
 ) -> None:
     """The law pushed ever harder: 4.7 rad/s before the following error was seen."""
-    plant = joint.plant_constants.copy()
+    plant = lockstep.plant_constants.copy()
     plant[0].encoder_noise_counts = noise
     for at_s in np.arange(1.0, 8.0, 0.7):
-        run = joint.run_with_faults(one_fault(FaultKind.ENCODER_STUCK, float(at_s)), plant_constants=plant)
+        run = lockstep.run_with_faults(one_fault(FaultKind.ENCODER_STUCK, float(at_s)), plant_constants=plant)
         assert run.fault is Fault.POSITION_FROZEN
         assert np.abs(run.truth[:, TRUE_VELOCITY_radps]).max() < 1.0
 
@@ -85,67 +87,67 @@ def test_behind_a_stuck_encoder_the_joint_does_not_run_away(
 @pytest.mark.parametrize("friction_kind", [2, 3])
 @pytest.mark.parametrize("scale", [0.85, 1.0, 1.15])
 def test_its_twin_a_joint_that_sticks_at_its_reversals_is_not_frozen(
-    joint: LockstepJoint, friction_kind: int, scale: float, one_fault: MakeFault
+    lockstep: LockstepJoint, friction_kind: int, scale: float, one_fault: MakeFault
 ) -> None:
-    plant = joint.plant_constants.copy()
+    plant = lockstep.plant_constants.copy()
     plant[0].friction_kind = friction_kind
     plant[0].positive_factor *= scale
     plant[0].negative_factor *= scale
-    run = joint.run_with_faults(one_fault(FaultKind.NONE), plant_constants=plant)
+    run = lockstep.run_with_faults(one_fault(FaultKind.NONE), plant_constants=plant)
     assert run.fault is Fault.NONE
     assert run.state.phase == AxisPhase.FINISHED
 
 
-def test_missing_samples_are_no_frozen_reading(joint: LockstepJoint, one_fault: MakeFault) -> None:
-    """Samples that stay away were told as a reading that stands still."""
-    run = joint.run_with_faults(one_fault(FaultKind.TPDO_LOST, AT_s))
+def test_missing_samples_are_no_frozen_reading(lockstep: LockstepJoint, one_fault: MakeFault) -> None:
+    """Samples that stay away were reported as a reading that stands still."""
+    run = lockstep.run_with_faults(one_fault(FaultKind.TPDO_LOST, AT_s))
     assert run.fault is Fault.STALE_SAMPLE
-    assert joint.run_with_faults(one_fault(FaultKind.TPDO_LOST, AT_s, 0.045)).fault is Fault.NONE
+    assert lockstep.run_with_faults(one_fault(FaultKind.TPDO_LOST, AT_s, 0.045)).fault is Fault.NONE
 
 
 @pytest.mark.parametrize("share", [0.3, 1.0])
-def test_samples_with_holes_prove_standstill_too(joint: LockstepJoint, one_fault: MakeFault, share: float) -> None:
+def test_samples_with_holes_prove_standstill_too(lockstep: LockstepJoint, one_fault: MakeFault, share: float) -> None:
     """One hole within settle_s began the wait for standstill anew: STOP_TIMEOUT at the end of a good run."""
-    run = joint.run_with_faults(one_fault(FaultKind.TPDO_REORDERED, 0.0, magnitude=share))
+    run = lockstep.run_with_faults(one_fault(FaultKind.TPDO_REORDERED, 0.0, magnitude=share))
     assert run.fault is Fault.NONE
     assert run.state.phase == AxisPhase.FINISHED
 
 
 @pytest.mark.parametrize(("share", "fault"), [(0.05, Fault.NONE), (0.26, Fault.SAMPLES_MISSING)])
 def test_nothing_is_enabled_on_a_bus_that_mixes_up_every_fourth_sample(
-    joint: LockstepJoint, one_fault: MakeFault, share: float, fault: Fault
+    lockstep: LockstepJoint, one_fault: MakeFault, share: float, fault: Fault
 ) -> None:
     """An answer that comes after its cycle is none; the campaign took this for harmless at any time."""
-    run = joint.run_with_faults(one_fault(FaultKind.TPDO_REORDERED, 0.0, magnitude=share), epoch_at_start=True)
+    run = lockstep.run_with_faults(one_fault(FaultKind.TPDO_REORDERED, 0.0, magnitude=share), epoch_at_start=True)
     assert run.fault is fault
     assert (PowerState.OPERATION_ENABLED in run.truth[:, TRUE_POWER_STATE]) == (fault is Fault.NONE)
 
 
-def test_a_watchdog_that_trips_is_told_by_its_error_code(joint: LockstepJoint, one_fault: MakeFault) -> None:
+def test_a_watchdog_that_trips_is_told_by_its_error_code(lockstep: LockstepJoint, one_fault: MakeFault) -> None:
     """A stopped node sends no TPDO: the loop saw stale samples only, and did not tell the drive's 8130h."""
-    run = joint.run_with_faults(one_fault(FaultKind.CONTROLLER_HEARTBEAT_LOST, AT_s))
+    run = lockstep.run_with_faults(one_fault(FaultKind.CONTROLLER_HEARTBEAT_LOST, AT_s))
     assert (run.fault, int(run.state.fault_drive_error)) == (Fault.STALE_SAMPLE, 0x8130)
     assert seconds_until(run, PowerState.QUICK_STOP_ACTIVE) <= HEARTBEAT_s
-    twin = joint.run_with_faults(one_fault(FaultKind.CONTROLLER_HEARTBEAT_LOST, AT_s, 0.06))
+    twin = lockstep.run_with_faults(one_fault(FaultKind.CONTROLLER_HEARTBEAT_LOST, AT_s, 0.06))
     assert twin.fault is Fault.NONE
 
 
 @pytest.mark.parametrize(
     ("at_s", "step_s", "fault"),
     [
-        (0.025, 5.6, Fault.OVERRUN),  # seed 915311, scenarios 1269 and 4927: told as SAMPLES_MISSING
+        (0.025, 5.6, Fault.OVERRUN),  # seed 915311, scenarios 1269 and 4927: reported as SAMPLES_MISSING
         (0.025, 4.97, Fault.OVERRUN),  # the wait ends some cycles after the step
-        (0.0, 5.6, Fault.OVERRUN),  # before the first sample: told as NO_SAMPLES
-        (0.0525, 5.6, Fault.OVERRUN),  # while the drive is asked to enable: told as ENABLE_TIMEOUT
+        (0.0, 5.6, Fault.OVERRUN),  # before the first sample: reported as NO_SAMPLES
+        (0.0525, 5.6, Fault.OVERRUN),  # while the drive is asked to enable: reported as ENABLE_TIMEOUT
         (0.025, 4.9, Fault.NONE),  # the twins: the power is off, and there is time left to wait
         (0.0525, 2.9, Fault.NONE),
     ],
 )
 def test_a_clock_that_leaps_before_enabling_is_told_as_that(
-    joint: LockstepJoint, one_fault: MakeFault, at_s: float, step_s: float, fault: Fault
+    lockstep: LockstepJoint, one_fault: MakeFault, at_s: float, step_s: float, fault: Fault
 ) -> None:
-    """The wait was over at once, and what had not come in the few cycles that there were was told as the cause."""
-    run = joint.run_with_faults(one_fault(FaultKind.CLOCK_STEP, at_s, 0.01, step_s), epoch_at_start=True)
+    """The wait was over at once, and what had not come in the few cycles that there were was reported as the cause."""
+    run = lockstep.run_with_faults(one_fault(FaultKind.CLOCK_STEP, at_s, 0.01, step_s), epoch_at_start=True)
     assert run.fault is fault
     if fault is Fault.OVERRUN:
         assert run.state.fault_value == pytest.approx(1e3 * step_s, abs=1.0)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from jointctl.firmware_py.states import AxisPhase, Fault, Notice, Reaction
-from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.experiments.controllers import controller_constants, named
 from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
 from tests.bench.swing_alarms import outcomes, tasks
+from tests.configurations import shipped
 
 LIMIT_Nm = 60.0
 NEAR_LIMIT_Nm = 57.0  # a torque that reaches it on both sides swings between its limits
@@ -25,14 +25,10 @@ def carry_out(
     watched: bool = True, **virtual: Any,
 ) -> LockstepRun:  # fmt: skip
     """`configs/precise.toml` with another law, encoder or joint."""
-    config = load_config(shipped_config("precise"))
     law = named((controller,))[0].control.model_copy(update=control or {})
-    config = config.model_copy(
-        update={
-            "virtual": config.virtual.model_copy(update=virtual) if config.virtual else None,
-            "trajectory": config.trajectory.model_copy(update={"duration_s": duration_s}),
-            "encoder": config.encoder.model_copy(update={"counts_per_turn": 2**bits, "side": side}),
-        }
+    there = {f"virtual__{key}": value for key, value in virtual.items()}
+    config = shipped(
+        "precise", trajectory__duration_s=duration_s, encoder__counts_per_turn=2**bits, encoder__side=side, **there
     )
     joint = LockstepJoint(config)
     chosen = named((controller,))[0]
@@ -142,6 +138,8 @@ def test_learning_that_makes_the_error_grow_is_switched_off_before_the_joint_swi
         np.testing.assert_array_equal(grown, repetitions)  # who is not tripped is not touched
 
 
+@pytest.mark.trips("loop: the noise of its command", "(16, True)")
+@pytest.mark.stays("loop: the noise of its command", "(17, False)")
 @pytest.mark.parametrize(("bits", "noisy"), [(16, True), (17, False)])
 def test_a_coarse_encoder_is_reported_as_torque_noise(bits: int, noisy: bool) -> None:
     run = carry_out("precise", 20.0, bits=bits)

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointctl.firmware_py.realtime import Word
+from jointctl.drivers.canopen.cyclic import CanopenPort
+from jointctl.firmware_py.cycle import Word
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
 from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest
@@ -18,8 +19,8 @@ from jointctl.tools.configuration.load import load_config
 from jointctl.tools.configuration.records import trajectory_table
 from jointctl.tools.recording.run_log import RunLogWriter
 from jointctl.tools.recording.run_log_reader import read_run_log
+from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.loop_handle import RING_RECORDS, LoopHandle, SharedBlock
-from jointctl.tools.session.open_drive import open_drive
 from tests.hil.moving_run import Moving, gone
 from tests.sessions import constants_of
 
@@ -80,8 +81,8 @@ def test_a_reader_that_stalls_loses_records_which_are_counted_and_the_loop_goes_
     config = load_config(path)
     table = trajectory_table(config)
     seconds = RING_RECORDS / config.loop.rate_Hz + 1.5
-    with LoopHandle(config, table) as loop:
-        drive = open_drive(config)
+    with LoopHandle(config, table, CanopenPort) as loop:
+        drive = CanopenSession().open(config)
         try:
             report = drive.commission()
             loop.wait_ready()
@@ -114,7 +115,7 @@ def test_a_reader_that_stalls_loses_records_which_are_counted_and_the_loop_goes_
 
 
 def test_what_is_written_over_while_it_is_read_is_lost_and_counted() -> None:
-    block = SharedBlock.create(1)
+    block = SharedBlock.create(1, CanopenPort)
     block.ring.cycle = np.arange(RING_RECORDS)
     block.words[Word.HEAD] = RING_RECORDS + 4  # by the time that the copy is made
     records, lost = block.new_records(0, RING_RECORDS)
@@ -125,7 +126,7 @@ def test_what_is_written_over_while_it_is_read_is_lost_and_counted() -> None:
     ("written", "lost"), [(RING_RECORDS, 0), (RING_RECORDS + 1, 1), (3 * RING_RECORDS, 2 * RING_RECORDS)]
 )
 def test_the_ring_at_its_boundary(written: int, lost: int) -> None:
-    block = SharedBlock.create(1)
+    block = SharedBlock.create(1, CanopenPort)
     for number in range(max(0, written - RING_RECORDS), written):
         block.ring[number % RING_RECORDS].cycle = number
     records, counted = block.new_records(0, written)

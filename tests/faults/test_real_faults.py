@@ -19,9 +19,10 @@ from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault
 from jointctl.hil.faults.kinds import LOCKSTEP_ONLY, FaultKind
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
-from jointctl.tools.configuration.plant import FAULT_KINDS
 from jointctl.tools.configuration.plant_settings import fault_constants
+from jointctl.tools.configuration.sections import FAULT_KINDS
 from jointctl.tools.session.result import RunResult
+from tests.configurations import written
 from tests.places import CONFIGS
 from tests.real_time_joint import real_time_joint
 from tests.sessions import session_of
@@ -42,24 +43,18 @@ def run_with(tmp_path: Path) -> RunWith:
     def run(
         kind: FaultKind, duration_s: float, magnitude: float, tracking_s: float = 1.2, heartbeat_s: float = 0.4
     ) -> RunResult:
-        text = SHIPPED.replace('channel = "virtual0"', f'channel = "fault-{os.getpid()}-{uuid.uuid4().hex[:8]}"')
-        text = text.replace('approach_s = "auto"', "approach_s = 0.3")
-        text = text.replace("initial_position_rad = 0.1", "initial_position_rad = 0.0")
-        text = text.replace("duration_s = 10.0", f"duration_s = {tracking_s}")
-        # a busy computer must not be the fault that is seen
-        for key, value in {
-            "sample_age_max_s = 0.05": "sample_age_max_s = 0.25", "skipped_max_s = 0.05": "skipped_max_s = 0.25",
-            "heartbeat_s = 0.2": f"heartbeat_s = {heartbeat_s}", "stop_timeout_s = 3.0": "stop_timeout_s = 1.0",
-            "off_timeout_s = 2.0": "off_timeout_s = 0.7",
-        }.items():  # fmt: skip
-            assert key in text
-            text = text.replace(key, value)
-        text += (
-            f'\n[[virtual.faults]]\nkind = "{kind.name.lower()}"\nat_s = {AT_s}\n'
-            f"duration_s = {duration_s}\nmagnitude = {magnitude}\n"
-        )
-        path = tmp_path / "joint.toml"
-        path.write_text(text)
+        path = written(
+            tmp_path / "joint.toml", bus__channel=f"fault-{os.getpid()}-{uuid.uuid4().hex[:8]}",
+            sequence__approach_s=0.3, virtual__initial_position_rad=0.0, trajectory__duration_s=tracking_s,
+            # a busy computer must not be the fault that is seen
+            limits__sample_age_max_s=0.25, limits__skipped_max_s=0.25, drive__heartbeat_s=heartbeat_s,
+            sequence__stop_timeout_s=1.0, sequence__off_timeout_s=0.7,
+        )  # fmt: skip
+        with path.open("a") as file:
+            file.write(
+                f'\n[[virtual.faults]]\nkind = "{kind.name.lower()}"\nat_s = {AT_s}\n'
+                f"duration_s = {duration_s}\nmagnitude = {magnitude}\n"
+            )
         config = load_config(path)
         with real_time_joint(config):
             result = session_of(config, tmp_path / "run.mcap", allow_low_margin=True).run()
@@ -147,9 +142,7 @@ def test_its_twin_goes_on_to_the_end(run_with: RunWith, kind: FaultKind, duratio
     assert result.records.phase[-1] == AxisPhase.FINISHED
 
 
-# --- the configuration -----------------------------------------------------------------------------------------
-
-
+# --- the configuration ---
 def configured(tmp_path: Path, table: str) -> Config:
     path = tmp_path / "joint.toml"
     path.write_text(SHIPPED + table)

@@ -15,7 +15,6 @@ from jointctl.drivers.canopen.cia402 import ControlWord, State
 from jointctl.drivers.canopen.cyclic import (
     FRAME_SLOTS,
     IGNORED_MAX_CYCLES,
-    SCRATCH_WORDS,
     SLOT_RPDO,
     CanopenPort,
     accept_frame,
@@ -43,29 +42,21 @@ def nmt_state(bus: Any) -> NmtState:
     return NmtState(int(bus.device.device[0].nmt))
 
 
-# --- a drive that does not switch off keeps its watchdog -----------------------------------------------------------
-
-
+# --- a drive that does not switch off keeps its watchdog ---
 @pytest.mark.parametrize(("status", "watchdog"), [(ENABLED, WATCHDOG), (DISABLED, 0)])
-def test_the_watchdog_is_only_disarmed_in_a_drive_that_is_off(
-    device_on_bus: Any, settings_of_virtual_joint: Any, status: int, watchdog: int
-) -> None:
-    drive = device_on_bus.drive(settings_of_virtual_joint)
-    try:
+def test_the_watchdog_is_only_disarmed_in_a_drive_that_is_off(joint: Any, status: int, watchdog: int) -> None:
+    with joint.opened() as drive:
         drive.commission()
-        assert consumer_heartbeat(device_on_bus) == WATCHDOG
-        device_on_bus.answers[0x6041, 0] = status
+        assert consumer_heartbeat(joint) == WATCHDOG
+        joint.answers[0x6041, 0] = status
         drive.make_safe()
-        assert consumer_heartbeat(device_on_bus) == watchdog
-    finally:
-        drive.close()
+        assert consumer_heartbeat(joint) == watchdog
 
 
 def test_make_safe_reaches_a_drive_that_its_watchdog_stops_meanwhile(
-    device_on_bus: Any, settings_of_virtual_joint: Any, monkeypatch: pytest.MonkeyPatch
+    joint: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drive = device_on_bus.drive(settings_of_virtual_joint)
-    try:
+    with joint.opened() as drive:
         drive.commission()
         brake = switch_off.brake
 
@@ -76,23 +67,19 @@ def test_make_safe_reaches_a_drive_that_its_watchdog_stops_meanwhile(
 
         monkeypatch.setattr(switch_off, "brake", stopped_meanwhile)
         assert drive.make_safe() == "switch on disabled"  # "stopped" answers no SDO: pre-operational once more
-    finally:
-        drive.close()
 
 
-# --- between commissioning and the user's "yes" --------------------------------------------------------------------
-
-
-def another_program_stops_it(bus: Any, settings: Any) -> None:
+# --- between commissioning and the user's "yes" ---
+def another_program_stops_it(bus: Any) -> None:
     assert bus.stop_drive() == "switch on disabled"
 
 
-def its_supply_is_switched_off_and_on(bus: Any, settings: Any) -> None:
+def its_supply_is_switched_off_and_on(bus: Any) -> None:
     power_on(bus.device.device[0])
     bus.device.advance(bus.now_ns)
 
 
-def another_mode_is_chosen(bus: Any, settings: Any) -> None:
+def another_mode_is_chosen(bus: Any) -> None:
     bus.answers[0x6061, 0] = 9
 
 
@@ -105,33 +92,25 @@ def another_mode_is_chosen(bus: Any, settings: Any) -> None:
     ],
 )
 def test_a_drive_that_has_changed_since_it_was_commissioned_is_not_started(
-    device_on_bus: Any, settings_of_virtual_joint: Any, meanwhile: Callable[[Any, Any], None], words: str
+    joint: Any, meanwhile: Callable[[Any], None], words: str
 ) -> None:
-    drive = device_on_bus.drive(settings_of_virtual_joint)
-    try:
+    with joint.opened() as drive:
         drive.commission()
-        meanwhile(device_on_bus, settings_of_virtual_joint)
+        meanwhile(joint)
         with pytest.raises((BusError, DeviceError), match=words):
             drive.start_cyclic()
-        assert nmt_state(device_on_bus) != NmtState.OPERATIONAL
-    finally:
-        drive.close()
+        assert nmt_state(joint) != NmtState.OPERATIONAL
 
 
-def test_a_drive_that_is_as_it_was_is_started(device_on_bus: Any, settings_of_virtual_joint: Any) -> None:
-    drive = device_on_bus.drive(settings_of_virtual_joint)
-    try:
+def test_a_drive_that_is_as_it_was_is_started(joint: Any) -> None:
+    with joint.opened() as drive:
         drive.commission()
         drive.start_cyclic()
         assert drive._objects.read(0x1016, 1, what="watchdog") == WATCHDOG
-        assert nmt_state(device_on_bus) == NmtState.OPERATIONAL
-    finally:
-        drive.close()
+        assert nmt_state(joint) == NmtState.OPERATIONAL
 
 
-# --- no enabling once the heartbeat is withheld ---------------------------------------------------------------------
-
-
+# --- no enabling once the heartbeat is withheld ---
 class Wire:
     def __init__(self) -> None:
         self.ports = new(CanopenPort)
@@ -175,38 +154,30 @@ def test_without_a_heartbeat_the_drive_is_never_enabled(cycles: int, enables: bo
     assert wire.rpdo(DriveRequest.ENABLE) == (expected, 100 if enables else 0)
 
 
-# --- SYNC gets through, the RPDO never: the drive keeps its last torque ---------------------------------------------
-
-
+# --- SYNC gets through, the RPDO never: the drive keeps its last torque ---
 @pytest.mark.parametrize("lost", [True, False])
 def test_an_rpdo_that_is_never_sent_counts_although_sync_is(lost: bool) -> None:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with ours, theirs:
-        wire, scratch = Wire(), np.zeros(SCRATCH_WORDS, np.int64)
+        wire = Wire()
+        link = exchange.link_of(wire.ports)._replace(frames=wire.frames)
         for cycle in range(1, 8):
             wire.port.fd = ours.fileno()
-            exchange.receive(wire.ports, wire.frames, scratch, wire.samples, np.int64(0), np.int64(0))
+            exchange.receive(link, wire.samples, np.int64(0), np.int64(0))
             if lost:
                 wire.port.fd = -1
-            exchange.send(wire.ports, wire.frames, wire.samples, wire.commands)
+            exchange.send(link, wire.samples, wire.commands)
             assert wire.samples[0].bus_errors == (cycle if lost else 0)
 
 
-# --- `jointctl stop` says what is true ------------------------------------------------------------------------------
-
-
+# --- `jointctl stop` says what is true ---
 @pytest.mark.parametrize(
     ("state", "safe"),
     [
-        ("switch on disabled", True),
-        ("fault", True),
-        ("off", True),
-        ("off, fault: overspeed", True),
-        ("fault reaction active", False),
-        ("quick stop active", False),
-        ("operation enabled", False),
+        ("switch on disabled", True), ("fault", True), ("off", True), ("off, fault: overspeed", True),
+        ("fault reaction active", False), ("quick stop active", False), ("operation enabled", False),
         ("unknown: no answer", False),
     ],
-)
+)  # fmt: skip
 def test_states_in_which_the_power_stage_is_off(state: str, safe: bool) -> None:
     assert is_safe(state) is safe

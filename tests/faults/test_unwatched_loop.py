@@ -6,15 +6,14 @@ from typing import Any
 
 import pytest
 
-from jointctl.firmware_py.realtime import Histogram
+from jointctl.firmware_py.cycle import Histogram
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, StopRequest
 from jointctl.tools.session.session import Session
-from tests.unit.drivers.elmo.talk import Talk
+from tests.unit.drivers.elmo.virtual_line import Talk
 from tests.unit.firmware_py.stub_loop import ANSWER_ns, Loop
 
-# --- serial drive: a status that is old ----------------------------------------------------------------------------
 
-
+# --- serial drive: a status that is old ---
 @pytest.mark.parametrize("echo", [True, False])
 def test_a_stop_right_after_motor_on_is_said_although_the_status_is_still_off(echo: bool) -> None:
     talk = Talk(echo)
@@ -39,9 +38,7 @@ def test_a_drive_that_tells_positions_but_no_status_is_not_taken_for_enabled(ans
     assert talk.sample.drive_state == (DriveState.ENABLED if answers else DriveState.UNKNOWN)
 
 
-# --- the measured delay, where every sample answers the SYNC before -------------------------------------------------
-
-
+# --- the measured delay, where every sample answers the SYNC before ---
 @pytest.mark.parametrize(("after_wake_ns", "bin_us"), [(-1, 1001), (1, 1)])
 def test_a_sample_that_came_between_the_cycles_is_a_period_old(
     axis_constants: Any, after_wake_ns: int, bin_us: int
@@ -55,9 +52,7 @@ def test_a_sample_that_came_between_the_cycles_is_a_period_old(
     assert bin_us > 1000 or row[bin_us] == 20
 
 
-# --- the supervisor brakes, the user asks for more ------------------------------------------------------------------
-
-
+# --- the supervisor brakes, the user asks for more ---
 class _BrakingLoop:
     def __init__(self) -> None:
         self.asked: list[StopRequest] = []
@@ -87,9 +82,7 @@ def test_a_stop_signal_is_heard_while_a_failed_supervisor_brakes(virtual_config:
     assert max(loop.asked) == max(StopRequest.RAMP, request_)
 
 
-# --- the loop stood still (SIGSTOP, a suspended machine) and goes on -------------------------------------------------
-
-
+# --- the loop stood still (SIGSTOP, a suspended machine) and goes on ---
 @pytest.mark.parametrize("elapsed_cycles", [9, 150, 1_500])
 def test_a_loop_that_stood_still_gives_no_torque_to_a_drive_that_was_stopped_meanwhile(
     rig: Any, elapsed_cycles: int

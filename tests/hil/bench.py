@@ -14,11 +14,10 @@ from typing import Any
 
 import can
 import canopen
-import tomlkit
 
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.recording.run_log_reader import read_run_log
-from tests.places import CONFIGS
+from tests.configurations import written
 from tests.real_time_joint import real_time_joint
 
 
@@ -46,7 +45,7 @@ class Started:
     def __init__(self, folder: Path, arguments: tuple[str, ...], **options: Any) -> None:
         number = len(list(folder.glob("*.stderr")))
         self._files = [folder / f"{number}.stdout", folder / f"{number}.stderr"]
-        command = [sys.executable, "-P", "-m", "jointctl.tools.cli", *arguments]
+        command = [sys.executable, "-P", "-m", "jointctl.tools.verbs", *arguments]
         with self._files[0].open("wb") as out, self._files[1].open("wb") as err:
             options = {"stdin": subprocess.DEVNULL, "stdout": out, "stderr": err, **options}
             self.process = subprocess.Popen(command, cwd=folder, start_new_session=True, **options)
@@ -100,24 +99,13 @@ class Bench:
 
     def config(self, name: str = "joint.toml", base: str = "virtual", **changes: Any) -> str:
         """A shipped configuration with a short trajectory and no way to its start; None removes a key."""
-        document = tomlkit.parse((CONFIGS / f"{base}.toml").read_text())
         short = {
             "bus__channel": self.channel, "trajectory__duration_s": 1.0, "virtual__initial_position_rad": 0.0,
             "log__picture": False,  # test_demo.py looks at one
             # a busy computer must not be the fault that is seen
             "limits__sample_age_max_s": 0.15, "limits__skipped_max_s": 0.15,
         }  # fmt: skip
-        for path, value in {**short, **changes}.items():
-            *sections, key = path.split("__")
-            table: Any = document
-            for section in sections:
-                table = table[section]
-            if value is None:
-                del table[key]
-            else:
-                table[key] = value
-        (self.folder / name).write_text(tomlkit.dumps(document))
-        return name
+        return written(self.folder / name, base, **{**short, **changes}).name
 
     def start(self, *arguments: str, **options: Any) -> Started:
         self._started.append(Started(self.folder, arguments, **options))

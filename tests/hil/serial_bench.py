@@ -12,26 +12,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import tomlkit
-
 from jointctl.hil.elmo.device import ElmoDevice
-from tests.places import CONFIGS
+from tests.configurations import written
 
 # a busy computer may stop this process, and with it the virtual drive, for tens of milliseconds
 # and 100 Hz leaves room for what it adds to the measured delay
 PATIENT: dict[str, Any] = {
-    "loop__rate_Hz": 100.0,
-    "control__kp": 64.0,
-    "control__kv": 16.0,
-    "control__q": 20.0,
-    "control__velocity_cutoff_Hz": 40.0,
-    "limits__sample_age_max_s": 0.5,
-    "limits__skipped_max_s": 0.5,
-    "limits__following_error_max_rad": 0.3,
-    "drive__dead_man_s": 0.3,
-    "log__folder": "runs",
-    "log__picture": False,
-}
+    "loop__rate_Hz": 100.0, "control__kp": 64.0, "control__kv": 16.0, "control__lyapunov_q": 20.0,
+    "control__velocity_cutoff_Hz": 40.0, "limits__sample_age_max_s": 0.5, "limits__skipped_max_s": 0.5,
+    "limits__following_error_max_rad": 0.3, "drive__dead_man_s": 0.3, "log__folder": "runs", "log__picture": False,
+}  # fmt: skip
 
 
 class SerialBench:
@@ -58,12 +48,7 @@ class SerialBench:
 
 
 def serial_config(folder: Path, name: str, values: dict[str, Any]) -> str:
-    document: Any = tomlkit.parse((CONFIGS / "elmo_serial.toml").read_text())
-    for path, value in values.items():
-        section, key = path.split("__")
-        document[section][key] = value
-    (folder / name).write_text(tomlkit.dumps(document))
-    return name
+    return written(folder / name, "elmo_serial", **values).name
 
 
 @contextmanager
@@ -81,7 +66,7 @@ def end_line_guards(port: str) -> None:
     for process in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError, ValueError):
             arguments = process.read_text().split("\0")
-            if "jointctl.tools.session.line_guard" in arguments:
+            if "jointctl.tools.session.elmo_guard" in arguments:
                 guarded = json.loads(next(text for text in arguments if text.startswith("{")))["port"]
                 if os.path.realpath(guarded) == os.path.realpath(port):  # it may be a link to it
                     os.kill(int(process.parent.name), signal.SIGKILL)

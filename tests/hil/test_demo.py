@@ -17,18 +17,9 @@ from jointctl.firmware_py.states import AxisPhase, DriveState
 from tests.places import CONFIGS
 
 ROWS = (
-    "tracking error",
-    "RMSE",
-    "wake-up late, p50/p99/p99.9/max",
-    "work, p50/p99/p99.9/max",
-    "skipped",
-    "bus load",
-    "friction feed-forward",
-    "network torque",
-    "drive afterwards",
-    "log",
-    "picture",
-)
+    "tracking error", "RMSE", "wake-up late, p50/p99/p99.9/max", "work, p50/p99/p99.9/max", "skipped", "bus load",
+    "friction feed-forward", "network torque", "drive afterwards", "log", "picture",
+)  # fmt: skip
 PNG_HEAD = struct.Struct(">8s4x4sII")
 
 

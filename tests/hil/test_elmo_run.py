@@ -18,6 +18,7 @@ from jointctl.firmware_py.states import AxisPhase
 from jointctl.hil.elmo.device import ElmoDevice
 
 
+@pytest.mark.stays("serial loop: its own end, however it comes about")
 def test_a_run_tracks_the_sine_and_ends_with_the_motor_off(serial_bench: Any) -> None:
     config = serial_bench.config(trajectory__duration_s=3.0)
     finished = serial_bench.bench.run("run", config, "-y")
@@ -33,7 +34,7 @@ def test_a_run_tracks_the_sine_and_ends_with_the_motor_off(serial_bench: Any) ->
 
 
 def test_gains_that_the_line_cannot_carry_are_refused_before_anything_moves(serial_bench: Any) -> None:
-    config = serial_bench.config(control__kp=784.0, control__kv=56.0, control__q=1800.0)
+    config = serial_bench.config(control__kp=784.0, control__kv=56.0, control__lyapunov_q=1800.0)
     finished = serial_bench.bench.run("run", config, "-y")
     finished.refused(9, "a slower loop: control.kp", "loop delay")
     assert serial_bench.standing()
@@ -125,6 +126,7 @@ def test_a_drive_that_comes_back_with_another_baud_rate(serial_bench: Any) -> No
     serial_bench.until(serial_bench.standing)
 
 
+@pytest.mark.trips("serial supervisor: the loop process")
 def test_a_killed_loop_is_switched_off_by_its_supervisor(serial_bench: Any) -> None:
     run = serial_bench.bench.start("run", serial_bench.config(), "-y").saw("  tracking")
     loop = run.child("loop_process")
@@ -135,6 +137,7 @@ def test_a_killed_loop_is_switched_off_by_its_supervisor(serial_bench: Any) -> N
     serial_bench.until(serial_bench.standing)
 
 
+@pytest.mark.trips("serial loop: its own end, however it comes about")
 def test_a_killed_supervisor_is_seen_by_the_loop(serial_bench: Any) -> None:
     run = serial_bench.bench.start("run", serial_bench.config(), "-y").saw("  tracking")
     run.signal(signal.SIGKILL)

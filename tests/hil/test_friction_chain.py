@@ -23,6 +23,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.simulation.lockstep import LockstepJoint
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.verbs.sweep import sweep
+from tests.configurations import changed
 
 POINTS = 60
 SMALL = {"folds": 3, "swarm": SwarmSettings(particles=60, iterations=100)}
@@ -31,11 +32,6 @@ SMALL = {"folds": 3, "swarm": SwarmSettings(particles=60, iterations=100)}
 @pytest.fixture(scope="module")
 def bench() -> Config:
     return load_config(shipped_config("sweep_virtual"))
-
-
-def with_virtual(config: Config, **changes: Any) -> Config:
-    assert config.virtual is not None
-    return config.model_copy(update={"virtual": config.virtual.model_copy(update=changes)})
 
 
 def true_friction(config: Config) -> Friction:
@@ -90,11 +86,9 @@ def test_the_identified_curve_is_within_two_percent(bench: Config, identified: F
 
 
 def test_a_noisy_joint_is_identified_as_well(bench: Config, tmp_path: Path) -> None:
-    coarse = bench.encoder.model_copy(update={"counts_per_turn": 2**17})
-    rough = with_virtual(bench, torque_ripple_Nm=(1.5, 0.5), friction_ripple=0.08)
+    rough = changed(bench, virtual__torque_ripple_Nm=(1.5, 0.5), virtual__friction_ripple=0.08)
     # one count a period of this encoder is 0.05 rad/s: less than that cannot be told from standing
-    limits = bench.limits.model_copy(update={"standstill_radps": 0.1})
-    data = data_of(rough.model_copy(update={"encoder": coarse, "limits": limits}), tmp_path)
+    data = data_of(changed(rough, encoder__counts_per_turn=2**17, limits__standstill_radps=0.1), tmp_path)
     assert len(data.direction(1)) + len(data.direction(-1)) >= 0.9 * POINTS
     assert worst_error(model_of(data), true_friction(bench)) < 0.02
 
@@ -106,7 +100,7 @@ KNEE_DEGPS = 70.0
 def late(bench: Config, tmp_path_factory: pytest.TempPathFactory) -> tuple[Friction, Any]:
     """A joint whose stages meet at 70 deg/s with a step, and its sweep."""
     friction = with_knee(true_friction(bench), KNEE_DEGPS, 0.02)
-    return friction, data_of(with_virtual(bench, friction=friction), tmp_path_factory.mktemp("late"))
+    return friction, data_of(changed(bench, virtual__friction=friction), tmp_path_factory.mktemp("late"))
 
 
 def test_another_knee_is_found_by_searching(late: tuple[Friction, Any]) -> None:
@@ -135,16 +129,17 @@ def test_the_knee_of_the_paper_describes_such_a_joint_worse(late: tuple[Friction
 
 def test_a_smooth_knee_elsewhere_is_within_two_percent_when_searched(bench: Config, tmp_path: Path) -> None:
     friction = with_knee(true_friction(bench), 25.0)
-    data = data_of(with_virtual(bench, friction=friction), tmp_path)
+    data = data_of(changed(bench, virtual__friction=friction), tmp_path)
     assert worst_error(model_of(data, search_knee=True), friction) < 0.02
 
 
 def tracking_rmse_rad(config: Config, true: Friction, believed: Friction) -> float:
     """Of the paper's sine on R1, after the first period."""
-    joint = with_virtual(config, friction=true, friction_positive_scale=1.0, friction_negative_scale=1.0)
     lugre = config.friction.lugre if config.friction is not None else None
-    duration = config.trajectory.model_copy(update={"duration_s": 30.0})
-    joint = joint.model_copy(update={"friction": believed.model_copy(update={"lugre": lugre}), "trajectory": duration})
+    joint = changed(
+        config, friction=believed.model_copy(update={"lugre": lugre}), trajectory__duration_s=30.0,
+        virtual__friction=true, virtual__friction_positive_scale=1.0, virtual__friction_negative_scale=1.0,
+    )  # fmt: skip
     run = LockstepJoint(joint).run()
     assert run.fault == 0
     errors = run.true_error_rad[run.tracking]

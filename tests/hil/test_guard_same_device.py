@@ -15,7 +15,7 @@ import pytest
 from serial.tools import list_ports
 
 from jointctl.drivers.elmo.serial_port import usb_serial_number
-from jointctl.tools.session.line_guard import GuardOrder, LineGuard
+from jointctl.tools.session.elmo_guard import GuardOrder, LineGuard
 
 
 @dataclass

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from jointctl.drivers.port_users import port_users
+from jointctl.tools.inspection.elmo_health import latency_finding, port_finding
 from jointctl.tools.inspection.health import NOTE, OK, PROBLEM
-from jointctl.tools.inspection.serial_health import latency_finding, port_finding
 
 
 def findings(finished: Any) -> dict[str, Any]:
@@ -38,7 +38,7 @@ def test_info_tells_everything_in_words_and_in_units_of_the_joint(serial_bench: 
     assert "overspeed" in facts["MF"]["meaning"]
     assert "fault latched" in facts["SR"]["meaning"]
     assert facts["EC"]["meaning"] == "none"
-    assert facts["SN[4]"]["meaning"].startswith("not told: EC")  # firmwares differ: no failure
+    assert facts["SN[4]"]["meaning"].startswith("not reported: EC")  # firmwares differ: no failure
     assert serial_bench.bench.run("info", "serial.toml").out.count("\n") > len(facts)
     assert_untouched(serial_bench)
 
@@ -71,10 +71,10 @@ def test_doctor_measures_the_line_and_reads_the_drive(serial_bench: Any) -> None
 def test_doctor_tells_a_wrong_baud_rate_and_a_fault(serial_bench: Any) -> None:
     wrong = serial_bench.bench.run("doctor", serial_bench.config(drive__baud_rate_bitps=230_400), "--json")
     assert wrong.code == 1
-    assert findings(wrong)["drive"]["cure"].startswith("most likely the baud rate")
+    assert findings(wrong)["drive"]["remedy"].startswith("most likely the baud rate")
     serial_bench.device.interpreter.m.motor_fault = 0x1
     fault = findings(serial_bench.bench.run("doctor", serial_bench.config(), "--json"))["drive state"]
-    assert (fault["status"], "feedback" in fault["text"], "clear-fault" in fault["cure"]) == (PROBLEM, True, True)
+    assert (fault["status"], "feedback" in fault["text"], "clear-fault" in fault["remedy"]) == (PROBLEM, True, True)
 
 
 def test_while_a_run_has_the_line_they_say_so(serial_bench: Any) -> None:
@@ -96,7 +96,7 @@ def test_a_port_is_named_with_what_is_wrong_with_it(tmp_path: Path) -> None:
 def test_without_permission_the_group_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     finding = port_finding("/dev/null")
-    assert (finding.status, "dialout" in finding.cure) == (PROBLEM, True)
+    assert (finding.status, "dialout" in finding.remedy) == (PROBLEM, True)
 
 
 @pytest.mark.parametrize(("latency", "status"), [("1", OK), ("2", PROBLEM), ("16", PROBLEM), (None, OK)])
@@ -107,7 +107,7 @@ def test_the_latency_timer_of_an_adapter(tmp_path: Path, latency: str | None, st
         (folder / "latency_timer").write_text(latency + "\n")
     finding = latency_finding("/dev/ttyUSB7", tmp_path)
     assert finding.status == status
-    assert ("latency_timer" in finding.cure) == (status == PROBLEM)
+    assert ("latency_timer" in finding.remedy) == (status == PROBLEM)
 
 
 def test_users_of_a_port_are_found_and_the_maker_of_a_terminal_is_none() -> None:

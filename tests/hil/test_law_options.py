@@ -22,17 +22,13 @@ from jointctl.tools.experiments.controllers import (
 from jointctl.tools.experiments.paper_experiments import ideal, law, r1
 from jointctl.tools.experiments.scenarios import Scenario, run_scenario
 from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
+from tests.configurations import changed as changed_config
 
 
 def joint(config: Config, duration_s: float, **virtual: Any) -> Config:
     """The joint with other true values, and a trajectory of this length."""
-    assert config.virtual is not None
-    return config.model_copy(
-        update={
-            "virtual": config.virtual.model_copy(update=virtual),
-            "trajectory": config.trajectory.model_copy(update={"duration_s": duration_s}),
-        }
-    )
+    true = {f"virtual__{key}": value for key, value in virtual.items()}
+    return changed_config(config, trajectory__duration_s=duration_s, **true)
 
 
 def run(config: Config, controller: Controller, scenario: Scenario = "sine") -> LockstepRun:
@@ -47,8 +43,6 @@ def tracked(made: LockstepRun) -> Any:
 
 
 # --- friction feed-forward ---
-
-
 def test_feed_forward_on_the_desired_velocity_removes_the_spikes_of_stick_slip() -> None:
     config = joint(r1(), 40.0, friction_kind="stick_slip")
     measured = tracked(run(config, law("measured")))
@@ -63,17 +57,14 @@ def test_feed_forward_on_the_desired_velocity_removes_the_spikes_of_stick_slip()
 @pytest.mark.parametrize(("rule", "torque_Nm"), [("paper", 121.0 * 0.14537), ("zero", 0.0), ("linear", 0.0)])
 def test_the_zero_speed_rule_decides_what_pushes_a_joint_at_rest(rule: str, torque_Nm: float) -> None:
     config = joint(ideal("stick_slip", 0.9, 0.9), 2.0)  # the model overestimates the friction
-    still = config.trajectory.model_copy(update={"amplitude_rad": 0.0})
     controller = law(rule, zero_rule=rule, zero_band_radps=0.01)
-    at_rest = tracked(run(config.model_copy(update={"trajectory": still}), controller))
+    at_rest = tracked(run(changed_config(config, trajectory__amplitude_rad=0.0), controller))
     assert at_rest.friction_torque_Nm[0] == pytest.approx(torque_Nm)
     moved_rad = float(np.max(np.abs(at_rest.position_rad)))
     assert (moved_rad > 1e-5) == (rule == "paper")
 
 
 # --- network ---
-
-
 def test_leakage_stops_the_drift_of_narrow_neurons_under_noise() -> None:
     config = joint(r1(), 60.0, encoder_noise_counts=2.0)
     options = {"feed_forward": "desired", "zero_rule": "zero", "widths": 0.005}
@@ -117,7 +108,7 @@ def test_the_matched_filter_removes_the_bias_that_the_network_learns_from_the_la
 
     def bias_rad(matched: bool) -> float:
         """Mean true error of one stroke, away from the reversals."""
-        made = run(config, law("x", feed_forward="desired", zero_rule="zero", matched_filter=matched))
+        made = run(config, law("x", feed_forward="desired", zero_rule="zero", filtered_error_rate=matched))
         stroke = (made.log.trajectory_s > 23.0) & (made.log.trajectory_s < 27.0) & made.tracking
         return float(abs(np.mean(made.true_error_rad[stroke])))
 
@@ -126,8 +117,6 @@ def test_the_matched_filter_removes_the_bias_that_the_network_learns_from_the_la
 
 
 # --- observer and iterative learning ---
-
-
 @pytest.mark.parametrize("scenario", ["frequency", "amplitude"])
 def test_learning_starts_anew_without_a_jump_when_the_trajectory_changes(scenario: Scenario) -> None:
     log = tracked(run(r1(), from_file("precise"), scenario))
@@ -186,9 +175,7 @@ def test_the_convergence_that_is_computed_is_the_one_that_is_seen(name: str) -> 
 @pytest.mark.parametrize(("side", "counts", "stable"), [("joint", 2**19, False), ("motor", 2**14, True)])
 def test_with_a_soft_reducer_the_encoder_belongs_on_the_motor(side: str, counts: int, stable: bool) -> None:
     config = joint(r1(), 6.0, flexible=True, reducer_stiffness_Nmprad=1.3e4)
-    config = config.model_copy(
-        update={"encoder": config.encoder.model_copy(update={"side": side, "counts_per_turn": counts})}
-    )
+    config = changed_config(config, encoder__side=side, encoder__counts_per_turn=counts)
     made = run_scenario(LockstepJoint(config), controller_constants(config, from_file("precise"), 0.0))
     assert (made.fault is Fault.NONE) == stable
     if stable:

@@ -19,9 +19,9 @@ from typing import Any
 
 import pytest
 
-from jointctl.tools.session.line_guard import GuardOrder, guard_address, running_supervisor
+from jointctl.tools.session.elmo_guard import GuardOrder, guard_address, running_supervisor
 
-GUARD, LOOP = "jointctl.tools.session.line_guard", "jointctl.tools.session.loop_process"
+GUARD, LOOP = "jointctl.tools.session.elmo_guard", "jointctl.tools.session.loop_process"
 
 
 def gone(pid: int) -> bool:
@@ -37,6 +37,7 @@ def tracking(serial_bench: Any, **changes: Any) -> Any:
     return run
 
 
+@pytest.mark.trips("serial guard: loop and supervisor")
 def test_loop_and_supervisor_killed_the_guard_switches_off(serial_bench: Any) -> None:
     run = tracking(serial_bench)
     guard = run.child(GUARD)
@@ -79,6 +80,8 @@ def test_loop_and_supervisor_that_hang_are_seen(serial_bench: Any) -> None:
     assert serial_bench.standing()
 
 
+@pytest.mark.stays("serial guard: loop and supervisor")
+@pytest.mark.stays("serial guard: a drive that was not reached at the end of a run")
 def test_a_run_that_ends_well_leaves_no_guard_behind(serial_bench: Any) -> None:
     run = tracking(serial_bench, trajectory__duration_s=1.0)
     guard = run.child(GUARD)
@@ -88,6 +91,7 @@ def test_a_run_that_ends_well_leaves_no_guard_behind(serial_bench: Any) -> None:
     assert serial_bench.device.last_command == b"MF"  # the supervisor's last question
 
 
+@pytest.mark.trips("serial guard: a drive that was not reached at the end of a run")
 def test_a_port_that_comes_back_is_told_to_switch_off(serial_bench: Any) -> None:
     link = serial_bench.bench.folder / "ttyUSB0"
     link.symlink_to(serial_bench.device.path)

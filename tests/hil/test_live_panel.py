@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointctl.firmware_py.realtime import HISTOGRAM_BINS
+from jointctl.firmware_py.cycle import HISTOGRAM_BINS
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, DriveState, Fault
@@ -86,14 +86,11 @@ def test_the_panel_keeps_its_height() -> None:
 @pytest.mark.parametrize(
     ("trajectory_s", "duration_s", "phase", "text"),
     [
-        (-1.0, 10.0, AxisPhase.APPROACH, "11.0 s"),
-        (0.0, 60.0, AxisPhase.TRACKING, "1:00.0 min"),
-        (0.1, 60.0, AxisPhase.TRACKING, "59.9 s"),
-        (61.0, 60.0, AxisPhase.TRACKING, "0.0 s"),
-        (61.0, 0.0, AxisPhase.TRACKING, "until stopped"),
-        (61.0, 60.0, AxisPhase.RAMPING, "stopping"),
+        (-1.0, 10.0, AxisPhase.APPROACH, "11.0 s"), (0.0, 60.0, AxisPhase.TRACKING, "1:00.0 min"),
+        (0.1, 60.0, AxisPhase.TRACKING, "59.9 s"), (61.0, 60.0, AxisPhase.TRACKING, "0.0 s"),
+        (61.0, 0.0, AxisPhase.TRACKING, "until stopped"), (61.0, 60.0, AxisPhase.RAMPING, "stopping"),
     ],
-)
+)  # fmt: skip
 def test_time_left(trajectory_s: float, duration_s: float, phase: int, text: str) -> None:
     assert time_left(trajectory_s, duration_s, phase) == text
 

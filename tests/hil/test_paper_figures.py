@@ -15,7 +15,7 @@ from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.analysis.loop_settings import loop_settings
 from jointctl.tools.analysis.margins import phase_margin_deg
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.experiments.controller_study import StudyResult, quantile, run_study
+from jointctl.tools.experiments.controller_study import StudyResult, StudySettings, quantile, run_study
 from jointctl.tools.experiments.controllers import named
 from jointctl.tools.experiments.paper_experiments import (
     AFTER_s,
@@ -36,6 +36,7 @@ from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.output import Output
 from jointctl.tools.simulation.lockstep import LockstepJoint
 from jointctl.tools.verbs.paper import paper
+from tests.configurations import changed
 from tests.page_figures import foreign_colours, svgs
 
 pytestmark = pytest.mark.slow("all experiments of the paper, and an ensemble of joints")
@@ -54,8 +55,6 @@ def figures(key: str) -> ErrorFigures:
 
 
 # --- section 4.2 ---
-
-
 @pytest.mark.parametrize(("key", "scale", "correlation"), [("more", 1.1, 0.99), ("less", 0.9, 0.98)])
 def test_the_simulation_of_the_paper(key: str, scale: float, correlation: float) -> None:
     run = made(f"4.2 {key} friction").run
@@ -81,20 +80,15 @@ def test_with_an_exact_model_next_to_nothing_is_left() -> None:
 
 
 # --- tables 4 and 5, fig. 14 ---
-
-
-def test_without_friction_model_on_the_ideal_joint() -> None:
-    found = figures("no model, ideal")
-    assert found.lowest_mrad == pytest.approx(-1.91, rel=0.03)
-    assert found.highest_mrad == pytest.approx(2.14, rel=0.03)
-    assert found.rmse_mrad == pytest.approx(1.525, rel=0.03)
-
-
-def test_without_friction_model_on_the_realistic_joint() -> None:
-    found = figures("no model, R1")
-    assert found.lowest_mrad == pytest.approx(-1.82, rel=0.03)
-    assert found.highest_mrad == pytest.approx(2.05, rel=0.03)
-    assert found.rmse_mrad == pytest.approx(1.48, rel=0.03)
+@pytest.mark.parametrize(
+    ("key", "lowest_mrad", "highest_mrad", "rmse_mrad"),
+    [("no model, ideal", -1.91, 2.14, 1.525), ("no model, R1", -1.82, 2.05, 1.48)],
+)
+def test_without_friction_model(key: str, lowest_mrad: float, highest_mrad: float, rmse_mrad: float) -> None:
+    found = figures(key)
+    assert found.lowest_mrad == pytest.approx(lowest_mrad, rel=0.03)
+    assert found.highest_mrad == pytest.approx(highest_mrad, rel=0.03)
+    assert found.rmse_mrad == pytest.approx(rmse_mrad, rel=0.03)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +134,9 @@ def test_the_verb_prints_one_table_and_draws_a_page_for_each_figure(
 ) -> None:
     monkeypatch.setattr(Experiment, "run", lambda self: made(self.key).run)
     few = Options(swarm=SwarmSettings(particles=60, iterations=200))
-    monkeypatch.setattr("jointctl.tools.verbs.paper.identify_paper_friction", lambda: identify_paper_friction(few))
+    monkeypatch.setattr(
+        "jointctl.tools.experiments.paper_experiments.identify_paper_friction", lambda: identify_paper_friction(few)
+    )
     out, err = io.StringIO(), io.StringIO()
     page = tmp_path / "paper.html"
     assert paper(Output(json=True, stdout=out, stderr=err), folder=tmp_path, report=page) == 0
@@ -163,8 +159,6 @@ def test_the_synthetic_sweep_is_identified_to_its_noise() -> None:
 
 
 # --- configs/precise.toml ---
-
-
 def test_the_precise_law_on_the_realistic_joint() -> None:
     found = figures("precise, R1")
     assert found.peak_mrad < 0.1
@@ -185,28 +179,21 @@ def test_phase_margin_of_the_precise_law() -> None:
 
 
 # --- the ensemble, with few plants ---
-
-
 @pytest.fixture(scope="module")
 def ensemble() -> StudyResult:
     names = ("computed_torque", "pid", "paper_without_friction_model", "paper", "paper_lugre", "network_stiff",
              "observer_stiff", "precise")  # fmt: skip
-    return run_study(load_config(shipped_config("precise")), named(names), plants=5, seed=2, workers=1)
+    return run_study(load_config(shipped_config("precise")), named(names), StudySettings(plants=5, seed=2), workers=1)
 
 
 @pytest.mark.parametrize(
     ("controller", "peak_mrad", "rmse_mrad"),
     [
-        ("computed_torque", 11.7, 9.93),
-        ("pid", 1.39, 0.187),
-        ("paper_without_friction_model", 1.94, 1.33),
-        ("paper", 1.15, 0.288),
-        ("paper_lugre", 0.51, 0.232),
-        ("network_stiff", 0.164, 0.037),
-        ("observer_stiff", 0.24, 0.039),
-        ("precise", 0.085, 0.0110),
+        ("computed_torque", 11.7, 9.93), ("pid", 1.39, 0.187), ("paper_without_friction_model", 1.94, 1.33),
+        ("paper", 1.15, 0.288), ("paper_lugre", 0.51, 0.232), ("network_stiff", 0.164, 0.037),
+        ("observer_stiff", 0.24, 0.039), ("precise", 0.085, 0.0110),
     ],
-)
+)  # fmt: skip
 def test_medians_of_the_ensemble(ensemble: StudyResult, controller: str, peak_mrad: float, rmse_mrad: float) -> None:
     """Five plants scatter; the laws lie apart by more than that."""
     assert ensemble.faults(controller) == 0
@@ -220,8 +207,6 @@ def test_the_precise_law_settles_at_once_and_the_paper_without_model_never(ensem
 
 
 # --- what the figures are made with ---
-
-
 def test_settling_time() -> None:
     time_s = np.linspace(0.0, 10.0, 101)
     error = np.where(time_s < 3.05, 2e-3, 0.5e-3)
@@ -236,8 +221,8 @@ def test_an_ideal_velocity_is_the_true_one_and_needs_the_unmatched_filter() -> N
     run = made("4.2 more friction").run
     np.testing.assert_allclose(run.log.velocity_radps[run.tracking], run.truth[run.tracking, 1], atol=1e-12)
     np.testing.assert_allclose(run.log.position_rad[run.tracking], run.truth[run.tracking, 0], atol=1e-12)
-    matched = Experiment("matched", ideal("sign"), law("matched", matched_filter=True), ideal_velocity=True)
-    with pytest.raises(ConfigurationError, match="matched_filter"):
+    matched = Experiment("matched", ideal("sign"), law("matched", filtered_error_rate=True), ideal_velocity=True)
+    with pytest.raises(ConfigurationError, match="filtered_error_rate"):
         matched.run()
 
 
@@ -249,7 +234,7 @@ def test_the_measured_error_is_the_true_one_within_the_encoders_step() -> None:
 
 def test_a_change_after_the_end_of_the_trajectory_is_refused() -> None:
     plant: Any = ideal("none")
-    short = plant.model_copy(update={"trajectory": plant.trajectory.model_copy(update={"duration_s": 80.0})})
+    short = changed(plant, trajectory__duration_s=80.0)
     with pytest.raises(ConfigurationError, match=r"duration_s \(=80\) must be more than 80"):
         Experiment("late", short, law("late"), "load").run()
     assert LockstepJoint(short).report.start_position_rad == pytest.approx(0.0, abs=1e-5)

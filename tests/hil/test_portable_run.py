@@ -19,47 +19,34 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import can
 import pytest
-import tomlkit
 
 from jointctl.drivers.can.open import open_python_can
+from jointctl.drivers.canopen.cyclic import CanopenPort
 from jointctl.drivers.canopen.drive import CanopenDrive
-from jointctl.firmware_py.realtime import Word
+from jointctl.firmware_py.cycle import Word
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.drive_settings import canopen_settings
-from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.load import load_config
 from jointctl.tools.session.loop_handle import SharedBlock
 from jointctl.tools.session.portable_loop import run_portable_loop, warm_up
 from jointctl.tools.simulation.virtual_joint import PumpedDevice, new_device, serve_virtual_joint
+from tests.configurations import SLOW_LOOP, written
 from tests.sessions import constants_of
 
-RATE_HZ = 100.0
+RATE_HZ = SLOW_LOOP["loop__rate_Hz"]
+JOINTCTL = (sys.executable, "-P", "-m", "jointctl.tools.verbs")
 PERIOD_NS = round(1e9 / RATE_HZ)
 
 
 def written_config(folder: Path, interface: str, channel: str) -> Path:
-    """The shipped virtual joint at 100 Hz: gains for that rate, and limits for a busy computer."""
-    data: Any = tomlkit.parse(shipped_config("virtual").read_text())
-    data["bus"].update(interface=interface, channel=channel)
-    data["drive"]["heartbeat_s"] = 2.0
-    data["loop"].update(rate_Hz=RATE_HZ)
-    del data["loop"]["priority"]
-    data["limits"].update(
-        sample_age_max_s=1.0, skipped_max_s=1.0, following_error_max_rad=0.6, position_jump_max_rad=0.1
-    )
-    data["sequence"].update(supervisor_timeout_s=5.0)
-    data["control"].update(kp=36.0, kv=12.0, q=100.0, learning_rate=1.0, velocity_cutoff_Hz=25.0)
-    data["trajectory"].update(duration_s=1.0, amplitude_rad=0.1)
-    data["virtual"].update(initial_position_rad=0.02)
-    data["log"]["folder"] = str(folder / "runs")
-    path = folder / "joint.toml"
-    path.write_text(tomlkit.dumps(data))
-    return path
+    """The shipped virtual joint with a loop at 100 Hz."""
+    bus = {"bus__interface": interface, "bus__channel": channel, "log__folder": str(folder / "runs")}
+    return written(folder / "joint.toml", **{**SLOW_LOOP, **bus, "trajectory__duration_s": 1.0})
 
 
 @pytest.fixture
@@ -144,7 +131,7 @@ class _FailingBus:
 
 def test_a_run_in_threads_on_the_bus_of_one_process(config: Config) -> None:
     warm_up()
-    block = SharedBlock.create(1)
+    block = SharedBlock.create(1, CanopenPort)
     with contextlib.closing(_Closing(open_bus(config))) as loop_end, serve_virtual_joint(config):
         drive = CanopenDrive(open_bus(config), canopen_settings(config))
         try:
@@ -174,8 +161,6 @@ def test_a_run_in_threads_on_the_bus_of_one_process(config: Config) -> None:
 
 
 # --- two processes on udp_multicast ---
-
-
 @pytest.fixture
 def multicast_config(tmp_path: Path) -> Iterator[Path]:
     """One session of tests at a time: every multicast group of one port shares the frames."""
@@ -193,16 +178,8 @@ def environment() -> dict[str, str]:
 def joint_process(path: Path) -> Iterator[subprocess.Popen[bytes]]:
     read_end, write_end = os.pipe()
     command = [
-        sys.executable,
-        "-P",
-        "-m",
-        "jointctl.tools.cli",
-        "hil",
-        str(path),
-        "--ready-fd",
-        str(write_end),
-        "--quiet",
-    ]
+        sys.executable, "-P", "-m", "jointctl.tools.verbs", "hil", str(path), "--ready-fd", str(write_end), "--quiet",
+    ]  # fmt: skip
     process = subprocess.Popen(command, pass_fds=(write_end,), env=environment())
     os.close(write_end)
     try:
@@ -216,7 +193,7 @@ def joint_process(path: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def start_run(path: Path) -> subprocess.Popen[str]:
-    command = [sys.executable, "-P", "-m", "jointctl.tools.cli", "run", str(path), "-y", "--json"]
+    command = [*JOINTCTL, "run", str(path), "-y", "--json"]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment())
 
 

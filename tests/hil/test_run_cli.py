@@ -30,6 +30,7 @@ def entered(records: Any) -> list[AxisPhase]:
     return [AxisPhase(p) for i, p in enumerate(records.phase) if i == 0 or p != records.phase[i - 1]]
 
 
+@pytest.mark.stays("supervisor: the user")
 def test_two_runs_on_one_joint_and_it_is_disabled_after_each(bench: Any) -> None:
     config = bench.config()
     bench.joint(config)
@@ -77,6 +78,7 @@ def test_a_temperature_that_the_drive_refuses_ends_no_run(bench: Any) -> None:
     assert len(log.temperatures) == 0
 
 
+@pytest.mark.trips("supervisor: the user")
 @pytest.mark.parametrize(("number", "name"), [(signal.SIGINT, "SIGINT"), (signal.SIGTERM, "SIGTERM")])
 def test_one_stop_signal_while_tracking_ramps_down(bench: Any, number: int, name: str) -> None:
     config = bench.config(trajectory__duration_s=30.0)

@@ -19,9 +19,10 @@ from typing import Any
 import can
 import pytest
 
+from tests.configurations import SLOW_LOOP
 from tests.hil.serial_bench import end_line_guards
 
-RATE_HZ = 100.0
+RATE_HZ = SLOW_LOOP["loop__rate_Hz"]
 
 
 class SlcanAdapter:
@@ -114,14 +115,7 @@ class SlcanAdapter:
 
 @pytest.fixture
 def config(bench: Any) -> str:
-    """100 Hz: gains for that rate, and limits for a busy computer."""
-    return bench.config(
-        bus__bitrate_bitps=500_000, loop__rate_Hz=RATE_HZ, loop__priority=None, drive__heartbeat_s=2.0,
-        limits__sample_age_max_s=1.0, limits__skipped_max_s=1.0, limits__following_error_max_rad=0.6,
-        limits__position_jump_max_rad=0.1, sequence__supervisor_timeout_s=5.0, control__kp=36.0, control__kv=12.0,
-        control__q=100.0, control__learning_rate=1.0, control__velocity_cutoff_Hz=25.0, trajectory__amplitude_rad=0.1,
-        virtual__initial_position_rad=0.02,
-    )  # fmt: skip
+    return bench.config(bus__bitrate_bitps=500_000, **SLOW_LOOP)
 
 
 @pytest.fixture

@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from typing import Any
 
+import pytest
+
 FAULT = 0x08
 
 
@@ -28,6 +30,7 @@ def _inject_heartbeat_loss(bench: Any, node: int = 1) -> None:
         network.disconnect()
 
 
+@pytest.mark.trips("user: everything")
 def test_stop_ends_a_run_of_another_terminal(bench: Any) -> None:
     config = bench.config(trajectory__duration_s=30.0)
     bench.joint(config)
@@ -54,6 +57,7 @@ def test_stop_is_not_lost_to_a_file_that_is_being_edited(bench: Any) -> None:
     assert bench.disabled()
 
 
+@pytest.mark.stays("user: everything")
 def test_stop_of_a_resting_joint_is_harmless(bench: Any) -> None:
     config = bench.config()
     bench.joint(config)

@@ -14,7 +14,7 @@ import pytest
 
 from jointctl.drivers.errors import INTERRUPTED, ConfigurationError, DataError
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.load import shipped_config
 from jointctl.tools.drawing import save_png
 from jointctl.tools.experiments.controller_study import (
     EnsembleSettings,
@@ -35,24 +35,22 @@ from jointctl.tools.experiments.scenarios import FAILED, ErrorFigures
 from jointctl.tools.output import Output
 from jointctl.tools.simulation.lockstep import DirectBus
 from jointctl.tools.verbs.study import study
+from tests.configurations import shipped
 from tests.page_figures import foreign_colours, svgs
 
 
 @pytest.fixture
 def base() -> Config:
     """configs/precise.toml with a short trajectory."""
-    config = load_config(shipped_config("precise"))
-    return config.model_copy(update={"trajectory": config.trajectory.model_copy(update={"duration_s": 3.0})})
+    return shipped("precise", trajectory__duration_s=3.0)
 
 
 def short_study(base: Config, seed: int, workers: int) -> StudyResult:
     controllers = named(("paper", "precise"))
-    return run_study(base, controllers, plants=3, seed=seed, after_s=1.0, workers=workers)
+    return run_study(base, controllers, StudySettings(plants=3, seed=seed, after_s=1.0), workers=workers)
 
 
 # --- the plants ---
-
-
 def test_a_plant_depends_on_seed_and_index_only(base: Config) -> None:
     settings = EnsembleSettings()
     assert random_plant(base, settings, 4, 7) == random_plant(base, settings, 4, 7)
@@ -81,8 +79,6 @@ def test_plants_fill_their_ranges_and_stay_inside(base: Config) -> None:
 
 
 # --- running ---
-
-
 def test_same_seed_same_result_with_one_process_and_with_two(base: Config) -> None:
     alone = short_study(base, 1, 1)
     assert short_study(base, 1, 2) == alone
@@ -104,33 +100,26 @@ def test_no_bit_depends_on_how_long_commissioning_took(base: Config, monkeypatch
     assert short_study(base, 1, 1) == quick
 
 
-def test_an_interruption_keeps_what_is_done(base: Config) -> None:
+@pytest.mark.parametrize(("plants", "workers", "least", "most"), [(3, 1, 2, 2), (40, 2, 1, 39)])
+def test_an_interruption_keeps_what_is_done_and_ends_the_other_processes_too(
+    base: Config, plants: int, workers: int, least: int, most: int
+) -> None:
     def interrupt(done: float) -> None:
-        if done == 2.0:
+        if workers > 1 or done == 2.0:
             raise KeyboardInterrupt
 
-    result = run_study(base, named(("paper",)), plants=3, seed=1, after_s=1.0, workers=1, progress=interrupt)
+    settings = StudySettings(plants=plants, seed=1, after_s=1.0)
+    result = run_study(base, named(("paper",)), settings, workers=workers, progress=interrupt)
     assert result.interrupted
-    assert len(result.plants) == 2
-
-
-def test_an_interruption_ends_the_other_processes_too(base: Config) -> None:
-    def interrupt(_: float) -> None:
-        raise KeyboardInterrupt
-
-    result = run_study(base, named(("paper",)), plants=40, seed=1, after_s=1.0, workers=2, progress=interrupt)
-    assert result.interrupted
-    assert 1 <= len(result.plants) < 40
+    assert least <= len(result.plants) <= most
 
 
 def test_a_time_after_the_end_is_refused(base: Config) -> None:
     with pytest.raises(ConfigurationError, match=r"after_s \(=3\) must be in \[0\.\.3\)"):
-        run_study(base, named(("paper",)), plants=1, seed=1, after_s=3.0, workers=1)
+        run_study(base, named(("paper",)), StudySettings(plants=1, seed=1, after_s=3.0), workers=1)
 
 
 # --- quantiles, files ---
-
-
 def test_a_run_that_failed_counts_as_infinitely_bad() -> None:
     good, failed = ErrorFigures("", 1.0, 0.5, -1.0, 1.0, 1.0, 0.5, 0.0, 20.0), ErrorFigures("following_error", *FAILED)
     plants = tuple(PlantResult(i, "lugre", 19, (failed if i == 0 else good,)) for i in range(10))
@@ -158,8 +147,6 @@ def test_csv_has_a_line_for_each_run_and_the_figure_is_drawn(base: Config, tmp_p
 
 
 # --- the verb ---
-
-
 def test_the_results_never_replace_the_settings_or_a_controller(base: Config, tmp_path: Path) -> None:
     file, law = tmp_path / "study.toml", tmp_path / "law.toml"
     file.write_text("plants = 1\n")
@@ -175,7 +162,7 @@ def test_the_results_never_replace_the_settings_or_a_controller(base: Config, tm
 def test_the_verb_prints_json_and_says_when_it_was_interrupted(
     base: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("jointctl.tools.verbs.study.load_config", lambda _: base)
+    monkeypatch.setattr("jointctl.tools.configuration.load.load_config", lambda _: base)
     settings = checked({"plants": 2, "after_s": 1.0, "controllers": ["precise"]}, "test")
     out, err = io.StringIO(), io.StringIO()
     page = tmp_path / "a.html"
@@ -190,7 +177,7 @@ def test_the_verb_prints_json_and_says_when_it_was_interrupted(
 
     partial = StudyResult(("precise",), short_study(base, 1, 1).plants[:1], True)
     partial = StudyResult(("precise",), tuple(PlantResult(0, "lugre", 19, p.figures[:1]) for p in partial.plants), True)
-    monkeypatch.setattr("jointctl.tools.verbs.study.run_study", lambda *_, **__: partial)
+    monkeypatch.setattr("jointctl.tools.experiments.controller_study.run_study", lambda *_, **__: partial)
     out, err = io.StringIO(), io.StringIO()
     assert study(settings, Output(stdout=out, stderr=err)) == INTERRUPTED
     assert "interrupted: only 1 of 2 plants" in err.getvalue()
@@ -200,8 +187,6 @@ def test_the_verb_prints_json_and_says_when_it_was_interrupted(
 
 
 # --- settings and controllers ---
-
-
 def test_every_named_controller_is_a_valid_configuration(base: Config) -> None:
     for controller in named():
         assert controller_config(base, controller).control == controller.control

@@ -13,6 +13,7 @@ import pytest
 
 from jointctl.drivers.errors import DeviceError, MotionFault
 from jointctl.firmware_py.friction import friction_curve_Nm
+from jointctl.tools.configuration.canopen import eds_path
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import friction_constants
 from jointctl.tools.configuration.load import load_config, shipped_config
@@ -24,6 +25,7 @@ from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.output import Output
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.verbs.sweep import sweep
+from tests.configurations import changed
 from tests.hil.sweep_rows import rows, truth_Nm
 
 QUANTISATION_Nm = 0.0005  # one per mille of the rated motor torque
@@ -83,19 +85,16 @@ def test_an_identified_sweep_is_within_two_percent_of_the_truth(config: Config, 
 
 
 def test_a_wrong_torque_constant_of_the_truth_shows_in_the_data(config: Config, tmp_path: Path) -> None:
-    assert config.virtual is not None
-    weak = config.virtual.model_copy(update={"friction_positive_scale": 0.5, "friction_negative_scale": 0.5})
+    weak = changed(config, virtual__friction_positive_scale=0.5, virtual__friction_negative_scale=0.5)
     full = swept(config, tmp_path / "full.csv", points=6)
-    half = swept(config.model_copy(update={"virtual": weak}), tmp_path / "half.csv", points=6)
+    half = swept(weak, tmp_path / "half.csv", points=6)
     assert half["motor_torque_Nm"] / full["motor_torque_Nm"] == pytest.approx(np.full(6, 0.5), rel=0.02)
 
 
 def test_points_that_do_not_settle_are_visited_again_and_marked(config: Config, tmp_path: Path) -> None:
     # too little damping for the negative slope of Stribeck friction: the joint sticks and slips
-    assert config.virtual is not None
-    weak = config.control.model_copy(update={"kp": 400.0, "kv": 12.0, "observer_radps": 3.0})
-    rough = config.virtual.model_copy(update={"friction_kind": "stick_slip"})
-    joint = config.model_copy(update={"virtual": rough, "control": weak})
+    weak = {"control__kp": 400.0, "control__kv": 12.0, "control__observer_radps": 3.0}
+    joint = changed(config, virtual__friction_kind="stick_slip", **weak)
     options = {"points": 4, "min_speed_radps": 0.008, "max_speed_radps": 0.016, "mode": "torque"}
     found = swept(joint, tmp_path / "data.csv", **options)
     unsettled = found[found["settled"] == 0]
@@ -107,7 +106,7 @@ def test_points_that_do_not_settle_are_visited_again_and_marked(config: Config, 
 
 def eds_with_modes(config: Config, folder: Path, supported: int) -> Config:
     """The configuration of a drive with other supported modes (6502)."""
-    text = config.eds_path.read_text()
+    text = eds_path(config).read_text()
     assert text.count("DefaultValue=0x000003AD") == 1
     (folder / "drive.eds").write_text(text.replace("DefaultValue=0x000003AD", f"DefaultValue=0x{supported:08X}"))
     (folder / "joint.toml").write_text(config.text.replace('eds = "virtual_joint.eds"', 'eds = "drive.eds"'))
@@ -115,7 +114,7 @@ def eds_with_modes(config: Config, folder: Path, supported: int) -> Config:
 
 
 def test_a_fault_before_the_first_point_leaves_no_file_and_says_so(config: Config, tmp_path: Path) -> None:
-    weak = config.model_copy(update={"limits": config.limits.model_copy(update={"torque_max_Nm": 33.0})})
+    weak = changed(config, limits__torque_max_Nm=33.0)
     with pytest.raises(MotionFault, match="nothing was measured") as error:
         swept(weak, tmp_path / "data.csv", points=12)
     assert "--resume" not in str(error.value)
@@ -146,8 +145,7 @@ def test_a_mode_that_the_drive_lacks_is_a_device_error(
 def test_a_fault_keeps_what_was_measured_and_resume_completes_it(config: Config, tmp_path: Path) -> None:
     # the first speeds need less torque than the limit, the fastest more: the drive saturates
     # (the warm-up at half the fastest speed needs 35 Nm, without a ripple that would lift it off the limit)
-    limits = config.limits.model_copy(update={"torque_max_Nm": 36.0})
-    weak = config.model_copy(update={"limits": limits})
+    weak = changed(config, limits__torque_max_Nm=36.0)
     out = tmp_path / "data.csv"
     with pytest.raises(MotionFault, match=r"points are in"):
         swept(weak, out, points=12)
@@ -185,14 +183,13 @@ def test_a_dry_run_in_lockstep_writes_nothing(config: Config, tmp_path: Path) ->
 
 
 # --- in real time, as processes ---
-
-
 def test_options_type_matches_the_command(config: Config) -> None:
     from inspect import signature
 
-    from jointctl.tools.cli.sweep_command import sweep_command
+    from jointctl.tools.verbs.sweep import sweep_verb
+    from jointctl.tools.verbs.verb_options import grouped
 
-    parameters = set(signature(sweep_command).parameters) - {
+    parameters = set(signature(grouped(sweep_verb)).parameters) - {
         "config", "out", "interface", "channel", "bitrate", "port", "target", "json", "quiet",
     }  # fmt: skip
     assert len(parameters) == len(dataclasses.fields(SweepOptions))

@@ -25,7 +25,7 @@ class SweepProcess:
         self._err = bench.folder / f"sweep-{len(list(bench.folder.glob('sweep-*')))}.stderr"
         with self._err.open("wb") as err:
             self.process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "jointctl.tools.cli", "sweep", *arguments], cwd=bench.folder,
+                [sys.executable, "-P", "-m", "jointctl.tools.verbs", "sweep", *arguments], cwd=bench.folder,
                 stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=err, start_new_session=True,
             )  # fmt: skip
 

@@ -21,7 +21,7 @@ from jointctl.hil.elmo.motor import MF_POSITION_LIMIT
 from jointctl.tools.configuration.conversions import friction_constants
 from jointctl.tools.configuration.load import load_config
 
-GUARD, LOOP = "jointctl.tools.session.line_guard", "jointctl.tools.session.loop_process"
+GUARD, LOOP = "jointctl.tools.session.elmo_guard", "jointctl.tools.session.loop_process"
 SHORT = ("--points", "2", "--grid", "log", "--max-speed", "0.3", "--min-speed", "0.29", "--warm-up", "0", "-y")
 
 

@@ -14,18 +14,18 @@ from pathlib import Path
 
 import can
 import pytest
-import tomlkit
 
 from jointctl.drivers.can.open import open_cyclic_end
 from jointctl.drivers.errors import BusError
 from jointctl.tools.recording.run_log_reader import read_run_log
+from tests.configurations import written
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "virtual.toml"
 ON_VCAN = ("-i", "socketcan", "-c", "vcan0")
 # A slow guest may need some periods for a cycle, and now and then stand still: gains that do not mind a late command,
 # and limits that do not mind a pause.  This is about the bus; timing is measured elsewhere.
 GENTLE = {
-    "control.kp": 64.0, "control.kv": 16.0, "control.q": 20.0,
+    "control.kp": 64.0, "control.kv": 16.0, "control.lyapunov_q": 20.0,
     "limits.sample_age_max_s": 0.5, "limits.skipped_max_s": 0.5, "limits.following_error_max_rad": 0.3,
     # the guest has one processor: an answer that waited while it stood still seems to belong to the next SYNC
     "limits.position_jump_max_rad": 0.1, "limits.velocity_max_radps": 5.0,
@@ -39,7 +39,7 @@ SLOW_GUEST = ("-y", "--allow-low-margin")
 
 
 def jointctl(*arguments: str) -> list[str]:
-    return [sys.executable, "-P", "-m", "jointctl.tools.cli", *arguments]
+    return [sys.executable, "-P", "-m", "jointctl.tools.verbs", *arguments]
 
 
 @pytest.fixture
@@ -63,12 +63,8 @@ def duration_s() -> float:
 
 @pytest.fixture
 def config(tmp_path: Path, rate_Hz: float, duration_s: float) -> str:
-    document = tomlkit.parse(CONFIG.read_text())
-    for path, value in (GENTLE | {"loop.rate_Hz": rate_Hz, "trajectory.duration_s": duration_s}).items():
-        section, key = path.split(".")
-        document[section][key] = value  # type: ignore[index]
-    (tmp_path / "joint.toml").write_text(tomlkit.dumps(document))
-    return "joint.toml"
+    changes = GENTLE | {"loop.rate_Hz": rate_Hz, "trajectory.duration_s": duration_s}
+    return written(tmp_path / "joint.toml", **{path.replace(".", "__"): value for path, value in changes.items()}).name
 
 
 @pytest.fixture
@@ -178,8 +174,6 @@ def test_the_cyclic_end_is_non_blocking_and_shares_the_bus_with_python_can() -> 
 
 
 # --- what looks at the bus ---
-
-
 @pytest.mark.usefixtures("joint")
 def test_scan_info_and_monitor(tmp_path: Path) -> None:
     found = run(tmp_path, "scan", *ON_VCAN, "--json", "--listen", "0.2")
@@ -248,4 +242,4 @@ def test_doctor_tells_the_state_of_the_interface(tmp_path: Path, config: str) ->
     (found,) = [item for item in json.loads(down.stdout)["findings"] if item["topic"] == "interface"]
     assert (down.returncode, found["status"]) == (1, "problem")
     assert "vcan0 is down" in found["text"]
-    assert "ip link set vcan0 up" in found["cure"]
+    assert "ip link set vcan0 up" in found["remedy"]

@@ -296,10 +296,7 @@ class LinearLoop:
         plant, law = self.joint.state_space(), self.controller
         b = gain * plant.b
         matrix = np.block(
-            [
-                [plant.a + np.outer(b, law.d * plant.c), np.outer(b, law.c)],
-                [np.outer(law.b, plant.c), law.a],
-            ]
+            [[plant.a + np.outer(b, law.d * plant.c), np.outer(b, law.c)], [np.outer(law.b, plant.c), law.a]]
         )
         return np.asarray(np.linalg.eigvals(matrix), dtype=np.complex128)
 

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jointctl.tools.analysis.linear_loop import LoopSettings, linear_loop
 from jointctl.tools.analysis.margins import Margins, frequencies_radps, margins
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, SOFT, canvas, save_png
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _LOWEST_HZ = 0.1
 _DAMPING_LINES = (0.1, 0.3, 0.5, 0.7)
@@ -24,7 +28,7 @@ def save_loop_figure(settings: LoopSettings, path: Path, title: str, minimum_deg
     return save_png(figure, path)
 
 
-def _draw(figure: Any, settings: LoopSettings, found: Margins, minimum_deg: float) -> None:
+def _draw(figure: Figure, settings: LoopSettings, found: Margins, minimum_deg: float) -> None:
     axes = figure.subplots(2, 2, width_ratios=(1.15, 1.0))
     omega = frequencies_radps(settings.period_s)
     omega = omega[omega >= math.tau * _LOWEST_HZ]
@@ -36,13 +40,13 @@ def _draw(figure: Any, settings: LoopSettings, found: Margins, minimum_deg: floa
     _poles(axes[1, 1], found, settings.period_s)
 
 
-def _frequency_axis(axis: Any, frequency_Hz: Any) -> None:
+def _frequency_axis(axis: Axes, frequency_Hz: np.ndarray) -> None:
     axis.set_xscale("log")
     axis.set_xlim(frequency_Hz[0], frequency_Hz[-1])
     axis.set_xlabel("frequency [Hz]")
 
 
-def _magnitude(axis: Any, frequency_Hz: Any, magnitude: Any, found: Margins) -> None:
+def _magnitude(axis: Axes, frequency_Hz: np.ndarray, magnitude: np.ndarray, found: Margins) -> None:
     axis.loglog(frequency_Hz, magnitude, color=BLUE)
     axis.axhline(1.0, color=GREY, linewidth=0.8)
     if found.stable and math.isfinite(found.crossover_Hz):
@@ -55,7 +59,7 @@ def _magnitude(axis: Any, frequency_Hz: Any, magnitude: Any, found: Margins) -> 
     _frequency_axis(axis, frequency_Hz)
 
 
-def _phase(axis: Any, frequency_Hz: Any, phase_deg: Any, found: Margins, minimum_deg: float) -> None:
+def _phase(axis: Axes, frequency_Hz: np.ndarray, phase_deg: np.ndarray, found: Margins, minimum_deg: float) -> None:
     # counted so that the crossover lies in the turn around -180 deg
     near = np.argmin(np.abs(frequency_Hz - (found.crossover_Hz if found.stable else 10.0)))
     phase_deg = phase_deg - 360.0 * round((phase_deg[near] + 180.0) / 360.0)
@@ -73,7 +77,7 @@ def _phase(axis: Any, frequency_Hz: Any, phase_deg: Any, found: Margins, minimum
     _frequency_axis(axis, frequency_Hz)
 
 
-def _sensitivity(axis: Any, frequency_Hz: Any, sensitivity: Any, found: Margins) -> None:
+def _sensitivity(axis: Axes, frequency_Hz: np.ndarray, sensitivity: np.ndarray, found: Margins) -> None:
     axis.semilogy(frequency_Hz, sensitivity, color=BLUE)
     axis.axhline(1.0, color=GREY, linewidth=0.8)
     if found.stable:
@@ -85,7 +89,7 @@ def _sensitivity(axis: Any, frequency_Hz: Any, sensitivity: Any, found: Margins)
     _frequency_axis(axis, frequency_Hz)
 
 
-def _poles(axis: Any, found: Margins, period_s: float) -> None:
+def _poles(axis: Axes, found: Margins, period_s: float) -> None:
     """The slower poles as s = ln z / T; those beyond a third of the Nyquist frequency are left out."""
     reach = math.pi / period_s / 3.0
     poles = [z for z in found.poles if abs(z) > 1e-6]

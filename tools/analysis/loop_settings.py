@@ -12,7 +12,6 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from jointctl.drivers.canopen.identifiers import LAST_SYNCHRONOUS
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.axis import low_pass_gain
 from jointctl.firmware_py.states import ControllerKind
@@ -41,14 +40,7 @@ def _delay(config: Config, measured_s: float | None) -> tuple[float, str]:
         return measured_s, "measured"
     if config.margin.loop_delay_s is not None:
         return config.margin.loop_delay_s, "margin.loop_delay_s"
-    if config.is_serial:
-        return 1.0 / config.loop.rate_Hz, "assumed: at most one period (serial line)"
-    period_s, kind = 1.0 / config.loop.rate_Hz, config.canopen.rpdo_transmission_type
-    if kind > LAST_SYNCHRONOUS:
-        return period_s, f"assumed: at most one period (drive.rpdo_transmission_type = {kind}, asynchronous)"
-    periods = max(kind, 1)
-    count = "one period" if periods == 1 else f"at most {periods} periods"
-    return periods * period_s, f"assumed: {count} (drive.rpdo_transmission_type = {kind}, synchronous)"
+    return config.drive.assumed_delay(config)
 
 
 def loop_settings(config: Config, delay_s: float | None = None) -> tuple[LoopSettings, tuple[Assumption, ...]]:
@@ -69,7 +61,7 @@ def loop_settings(config: Config, delay_s: float | None = None) -> tuple[LoopSet
             ki=control.ki,
             observer_radps=control.observer_radps,
             observer_delay_cycles=control.observer_delay_cycles,
-            q=(control.q[0], control.q[-1]),
+            q=(control.lyapunov_q[0], control.lyapunov_q[-1]),
             learning_rate=control.learning_rate,
             leakage_1ps=control.leakage_1ps,
             centres=centres,

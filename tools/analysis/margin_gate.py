@@ -56,11 +56,7 @@ def _boundary(bad: float, good: float, meets: Callable[[float], bool]) -> float:
 
 
 def _search(
-    settings: LoopSettings,
-    minimum_deg: float,
-    start: float,
-    end: float,
-    change: Callable[[float], LoopSettings],
+    settings: LoopSettings, minimum_deg: float, start: float, end: float, change: Callable[[float], LoopSettings]
 ) -> tuple[float, LoopSettings, float] | None:
     """(value, settings, phase margin) nearest to `start` on the way to `end` (both > 0, a scan by ratio)."""
 
@@ -97,7 +93,7 @@ def remedies(settings: LoopSettings, minimum_deg: float) -> list[Remedy]:
         q1, q2 = s.q
         if q1 == q2:
             result = _search(s, minimum_deg, q1, q1 * 1e-3, lambda v: replace(s, q=(v, v)))
-            add(f"control.q = {{value:g}} (now {q1:g}; adaptation in proportion)", result)
+            add(f"control.lyapunov_q = {{value:g}} (now {q1:g}; adaptation in proportion)", result)
         result = _search(s, minimum_deg, s.learning_rate, s.learning_rate * 1e-3, lambda v: replace(s, learning_rate=v))
         add(f"control.learning_rate = {{value:g}} (now {s.learning_rate:g})", result)
     if s.kind == ControllerKind.PID and s.ki > 0.0:
@@ -144,8 +140,8 @@ def _rest_text(settings: LoopSettings, network: bool) -> str:
     if not network:
         return ""
     if settings.q[0] == settings.q[1]:
-        return ", q = {changed.q[0]:.4g}"
-    return ", q = [{changed.q[0]:.4g}, {changed.q[1]:.4g}]"
+        return ", lyapunov_q = {changed.q[0]:.4g}"
+    return ", lyapunov_q = [{changed.q[0]:.4g}, {changed.q[1]:.4g}]"
 
 
 def longest_delay_s(settings: LoopSettings, minimum_deg: float) -> float | None:

@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from jointctl.drivers.canopen.identifiers import EVENT_DRIVEN, LAST_SYNCHRONOUS
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import RADPS_PER_UNIT, velocity_of_a_count_radps
-from jointctl.tools.configuration.elmo_settings import serial_problems
 from jointctl.tools.configuration.sections import Friction, FrictionDirection
 
-CAN_RATE_HZ = (100.0, 4000.0)
 SWING_PERIODS = 4.0  # that half a swing takes at least: a faster one no sampled loop can follow
 CURVE_POINTS = 200  # at which a friction curve is looked at
 SWITCH_rad, SWITCH_radps = 1e-3, 1e-2  # what rounding of the numbers in a file may leave at a switch
@@ -74,7 +71,7 @@ def switch_problems(trajectory: Any) -> list[str]:
         if not abs(after - before) <= allowed:
             found.append(
                 f"trajectory.switch.at_s (={switch.at_s:g}): the {name} would jump from {before:.4f} to {after:.4f} "
-                f"{unit}; it may by {allowed:g}: mend shift_s, offset_rad or amplitude_rad of the second sine"
+                f"{unit}; it may by {allowed:g}: correct shift_s, offset_rad or amplitude_rad of the second sine"
             )
     return found
 
@@ -240,53 +237,4 @@ def _drive_problems(config: Config) -> list[str]:
         ]
     else:
         weak = []
-    weak += _joint_encoder_problems(config)
-    if config.is_serial:
-        return weak + serial_problems(config)
-    return weak + _canopen_problems(config)
-
-
-def _joint_encoder_problems(config: Config) -> list[str]:
-    encoder, found = config.joint_encoder, []
-    if encoder is None:
-        return []
-    if config.is_serial:
-        return ['[joint_encoder] needs a CANopen drive: drive.kind must be "canopen"']
-    if (encoder.source == "node") != (encoder.node is not None):
-        found.append('joint_encoder.node must be given with source = "node", and only then')
-    if encoder.node is not None and encoder.node in (config.canopen.node, config.canopen.master_node):
-        found.append(f"joint_encoder.node (={encoder.node}) must differ from drive.node and drive.master_node")
-    if encoder.kind == "incremental" and config.encoder.kind == "incremental":
-        found.append("joint_encoder.kind and encoder.kind are both incremental: one of them must know its angle")
-    if encoder.disagreement_max_rad >= config.limits.following_error_max_rad * 10.0:
-        found.append(
-            f"joint_encoder.disagreement_max_rad (={encoder.disagreement_max_rad:g}) must be less than ten times "
-            "limits.following_error_max_rad"
-        )
-    return found
-
-
-def _canopen_problems(config: Config) -> list[str]:
-    drive, limits, found = config.canopen, config.limits, []
-    if not CAN_RATE_HZ[0] <= config.loop.rate_Hz <= CAN_RATE_HZ[1]:
-        found.append(f"loop.rate_Hz (={config.loop.rate_Hz:g}) must be in [{CAN_RATE_HZ[0]:g}..{CAN_RATE_HZ[1]:g}]")
-    if drive.node == drive.master_node:
-        found.append(f"drive.master_node (={drive.master_node}) must differ from drive.node")
-    if LAST_SYNCHRONOUS < drive.rpdo_transmission_type < EVENT_DRIVEN:
-        kind = drive.rpdo_transmission_type
-        found.append(
-            f"drive.rpdo_transmission_type (={kind}) must be in [0..{LAST_SYNCHRONOUS}] or in [{EVENT_DRIVEN}..255]"
-        )
-    if drive.rated_torque_Nm is not None and drive.max_torque_permille is not None:
-        if drive.torque_reference == "rated_torque":
-            reach = drive.rated_torque_Nm * config.joint.reduction_ratio * drive.max_torque_permille / 1000.0
-            if limits.torque_max_Nm > reach * (1.0 + 1e-9):
-                found.append(
-                    f"limits.torque_max_Nm (={limits.torque_max_Nm:g}) must be in (0..{reach:g}], "
-                    "what drive.max_torque_permille allows"
-                )
-    if config.virtual is not None and drive.rated_current_A is None:
-        found.append("drive.rated_current_A is missing: the virtual drive needs it")
-    if config.virtual is not None and drive.rated_torque_Nm is None:
-        found.append("drive.rated_torque_Nm is missing: the virtual drive needs it")
-    return found
+    return weak + config.drive.problems(config)

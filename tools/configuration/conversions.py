@@ -55,10 +55,8 @@ def friction_constants(friction: Friction, reduction_ratio: float) -> Any:
 
     def branch(d: FrictionDirection, negative: bool) -> Any:
         cubic = (d.a0, d.a1, d.a2, d.a3)
-        return friction_model.branch_constants(
-            d.tc_Nm, d.ts_Nm, d.ws, d.tv, cubic, d.knee, d.max,
-            negative=negative, radps_per_unit=speed, torque_scale=scale,
-        )  # fmt: skip
+        printed = friction_model.PrintedBranch(d.tc_Nm, d.ts_Nm, d.ws, d.tv, cubic, d.knee, d.max)
+        return friction_model.branch_constants(printed, negative=negative, radps_per_unit=speed, torque_scale=scale)
 
     return friction_model.friction_constants(branch(friction.positive, False), branch(friction.negative, True))
 

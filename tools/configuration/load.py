@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
-from pydantic_core import PydanticCustomError
 
-from jointctl.drivers.can.channel import split_channel
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.input_file import (
     LARGEST_TABLE_BYTES,
@@ -20,12 +18,9 @@ from jointctl.firmware_py.input_file import (
     read_input,
     require_input,
 )
-from jointctl.tools.configuration.bus_options import whole_channel
 from jointctl.tools.configuration.checks import problems_between_sections
-from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config
-from jointctl.tools.configuration.elmo import with_serial_bus
-from jointctl.tools.configuration.problems import ConfigurationProblems, problem_line, problem_lines, raise_if
-from jointctl.tools.configuration.sections import Bus, Drive
+from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config, ConfigurationProblems, problem_lines, raise_if
+from jointctl.tools.configuration.drive_section import GivenPlace, completed
 
 
 def shipped_config(name: str) -> Path:
@@ -51,25 +46,41 @@ def read_text(path: Path) -> str:
         raise ConfigurationError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
+RENAMED = {  # keys of an older version, read until the next one
+    "control": {"q": "lyapunov_q", "matched_filter": "filtered_error_rate"},
+}
+
+
+def renamed(data: dict[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """The raw configuration with the present names of its keys, and a remark for each old one."""
+    remarks = []
+    for section, keys in RENAMED.items():
+        values = data.get(section)
+        for old, new in keys.items():
+            if isinstance(values, dict) and old in values and new not in values:
+                values = {new if key == old else key: value for key, value in values.items()}
+                data = {**data, section: values}
+                remarks.append(f"{section}.{old} is called {section}.{new} now; the next version does not read {old}")
+    return data, tuple(remarks)
+
+
 def load_config(path: str | Path) -> Config:
-    """Read, check and freeze a configuration; `ConfigurationError` holds one line per problem."""
+    """Read, check and freeze a configuration; `ConfigurationError` holds one line per problem.
+
+    What only the virtual joint can judge of [virtual] is judged where it is made (`plant_settings`).
+    """
     path = Path(path)
     text = read_text(path)
     try:
         data = parse_toml(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigurationError(f"{path}: not valid TOML: {error}") from None
+    data, remarks = renamed(data)
     config = _validated(data, str(path))
-    config._path, config._text = path, text
-    raise_if([f"{path}: {line}" for line in problems_between_sections(config) + _plant_problems(config)])
-    eds_path = config.eds_path if isinstance(config.drive, Drive) else None
-    for key, file in (
-        ("drive.eds", eds_path),
-        ("joint_encoder.eds", config.encoder_eds_path),
-        ("trajectory.file", config.table_path),
-    ):
-        if file is None:
-            continue
+    config._path, config._text, config._remarks = path, text, remarks
+    raise_if([f"{path}: {line}" for line in problems_between_sections(config)])
+    table = (("trajectory.file", config.table_path),) if config.table_path is not None else ()
+    for key, file in (*config.drive.files(config), *table):
         if not os.path.isfile(file):
             raise_if([f"{path}: {key} (={file.name}) must name a file beside the configuration or a shipped one"])
         try:
@@ -79,56 +90,14 @@ def load_config(path: str | Path) -> Config:
     return config
 
 
-def _plant_problems(config: Config) -> list[str]:
-    """What the virtual joint refuses about [virtual]; a configuration without one loads nothing of it."""
-    if config.virtual is None:
-        return []
-    from jointctl.tools.configuration.plant_settings import plant_problems
-
-    return plant_problems(config)
-
-
-def with_bus_overrides(
-    config: Config,
-    interface: str | None = None,
-    channel: str | None = None,
-    bitrate: int | None = None,
-    environ: Mapping[str, str] | None = None,
-) -> Config:
-    """The configuration on another bus: flag beats environment (CAN_INTERFACE, _CHANNEL, _BITRATE) beats file."""
-    if config.is_serial:
-        given = next((value for value in (interface, channel, bitrate) if value is not None), None)
-        if given is not None:
-            raise ConfigurationError(f"command line: {given} names a CAN bus, the drive is on a serial port: use -p")
-        return config  # the environment speaks of CAN only
-    environ = os.environ if environ is None else environ
-    bus: dict[str, Any] = config.bus.model_dump()
-    origin = "command line"
-    if bitrate is None and environ.get("CAN_BITRATE"):
-        origin = "environment"
-        try:
-            bitrate = int(environ["CAN_BITRATE"])
-        except ValueError:
-            value = environ["CAN_BITRATE"]
-            raise ConfigurationError(f"environment: CAN_BITRATE (={value}) must be a whole number of bit/s") from None
-    own = bus["interface"]
-    bus["interface"] = interface or environ.get("CAN_INTERFACE") or own
-    if bus["interface"] != own:  # what the file says besides is for the interface of the file
-        bus["channel"], bus["options"] = split_channel(bus["channel"])[0], None
-    bus["channel"] = channel or environ.get("CAN_CHANNEL") or bus["channel"]
-    bus["bitrate_bitps"] = bus["bitrate_bitps"] if bitrate is None else bitrate
-    try:
-        return config.model_copy(update={"bus": whole_channel(Bus.model_validate(bus))})
-    except PydanticCustomError as error:
-        raise ConfigurationProblems([f"{origin}: bus.{error.message()}"]) from None
-    except ValidationError as error:
-        lines = [problem_line(e, bus, ("bus",)) for e in error.errors(include_url=False)]
-        raise ConfigurationProblems([f"{origin}: {line}" for line in lines]) from None
+def moved(config: Config, given: GivenPlace, environ: Mapping[str, str] | None = None) -> Config:
+    """The configuration of a drive that is elsewhere: flag beats environment (CAN_INTERFACE, ...) beats file."""
+    return config.drive.moved(config, given, os.environ if environ is None else environ)
 
 
 def _validated(data: Mapping[str, Any], name: str) -> Config:
     try:
-        return Config.model_validate(with_serial_bus(data))
+        return Config.model_validate(completed(data))
     except ConfigurationError as error:
         raise ConfigurationProblems([f"{name}: {error.message}"]) from None
     except ValidationError as error:

@@ -9,14 +9,13 @@ from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.schema import new
 from jointctl.hil.canopen.device import DeviceSettings
 from jointctl.hil.canopen.encoder_node import EncoderSettings
-from jointctl.hil.elmo.interpreter import ElmoDeviceSettings
 from jointctl.hil.faults.kinds import FaultConstants, FaultKind, no_faults
 from jointctl.hil.plant.records import EncoderSide, FrictionKind
 from jointctl.hil.plant.settings import PlantSettings
-from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.canopen import canopen_section, encoder_eds_path
+from jointctl.tools.configuration.config import Config, raise_if
 from jointctl.tools.configuration.conversions import friction_constants, torque_constant_NmpA
-from jointctl.tools.configuration.elmo_settings import elmo_section
-from jointctl.tools.configuration.plant import OWN_KEYS, Virtual
+from jointctl.tools.configuration.sections import OWN_KEYS, Virtual
 
 DEFAULT_RATED_CURRENT_A = 5.0
 DEFAULT_RATED_TORQUE_NM = 0.5
@@ -65,19 +64,20 @@ def plant_problems(config: Config) -> list[str]:
 
 
 def plant_settings(config: Config) -> dict[str, Any]:
-    """Keyword arguments for `hil.plant.joint.plant`; needs a [virtual] section."""
+    """Keyword arguments for `hil.plant.joint.plant`; `ConfigurationError` for what the plant refuses of [virtual]."""
     if config.virtual is None:
         raise ConfigurationError(f"{config.path}: [virtual] is missing: the virtual joint needs its true values")
     friction = None
     table = config.virtual.friction or config.friction
     if table is not None:
         friction = friction_constants(table, config.joint.reduction_ratio)[0]
+    raise_if([f"{config.path}: {line}" for line in plant_problems(config)])
     return plant_keywords(config, torque_constant_NmpA(config), friction)
 
 
 def device_settings(config: Config) -> DeviceSettings:
     """The virtual drive that the configuration describes."""
-    drive = config.canopen
+    drive = canopen_section(config)
     return DeviceSettings(
         node_id=drive.node,
         rated_current_mA=round((drive.rated_current_A or DEFAULT_RATED_CURRENT_A) * 1000.0),
@@ -97,17 +97,7 @@ def _second_encoder(config: Config) -> dict[str, Any]:
     if encoder is None:
         return {}
     counts, zero = encoder.counts_per_turn, encoder.zero_counts
-    path = config.encoder_eds_path
+    path = encoder_eds_path(config)
     if encoder.source == "drive" or path is None or encoder.node is None:
         return {"second_counts_prad": encoder.direction * counts / math.tau, "second_offset_counts": float(zero)}
     return {"encoder": EncoderSettings(path, encoder.node, counts, encoder.direction, zero)}
-
-
-def elmo_device_settings(config: Config) -> ElmoDeviceSettings:
-    """The virtual drive that the configuration describes."""
-    drive = elmo_section(config)
-    return ElmoDeviceSettings(
-        maximum_current_A=max(20.0, drive.peak_current_A),
-        counts_per_turn=config.encoder.counts_per_turn,
-        current_sign=drive.torque_direction * config.encoder.direction,
-    )

@@ -16,15 +16,13 @@ from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.states import ControllerKind, FeedForward, LimitSource, TrajectoryKind, ZeroSpeedRule
 from jointctl.firmware_py.trajectory import approach_duration_s, approach_start, ends_meet, peak_of, table_from_csv
 from jointctl.tools.configuration.checks import extremes_problems
-from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.config import Config, ConfigurationProblems
 from jointctl.tools.configuration.conversions import (
     friction_constants,
     law_resolution_rad,
     period_s,
     static_friction_Nm,
 )
-from jointctl.tools.configuration.elmo import ElmoSerial
-from jointctl.tools.configuration.problems import ConfigurationProblems
 from jointctl.tools.configuration.sections import Control
 
 # the paper's centres, in rad and in rad/s: -c_p, 0, c_p with c_p = 1e-2 [-5 -3 -1 -0.8 -0.4 -0.1 -0.05]
@@ -33,9 +31,9 @@ PAPER_CENTRES = (*_PAPER_HALF, 0.0, *(-c for c in _PAPER_HALF))
 APPROACH_MIN_S = 1.0
 MOVE_MIN_S = 0.2  # of a move to a new set-point, however near
 # way of the reference at a standing reading, as a share of the following error that is allowed: without friction
-# feed-forward a sound joint stands that long before it breaks away
+# feed-forward a healthy joint stands that long before it breaks away
 FROZEN_SHARE, FROZEN_SHARE_WITHOUT_MODEL = 0.1, 0.5
-FROZEN_FRICTION = 1.5  # times the static friction: what a sound joint does not stand still under
+FROZEN_FRICTION = 1.5  # times the static friction: what a healthy joint does not stand still under
 HEARTBEATS_MISSED = 3  # periods of the drive's own heartbeat until it counts as silent
 MOVED_COUNTS = 4  # encoder counts by which a joint that nobody has moved may seem to have moved
 FROZEN_COUNTS = 4  # encoder counts by which a standing reading may flicker
@@ -93,7 +91,7 @@ def _fill_law(law: Any, config: Config) -> None:
     law.kind = ControllerKind[control.kind.upper()]
     law.feed_forward = FeedForward[control.feed_forward.upper()]
     law.zero_rule = ZeroSpeedRule[control.zero_rule.upper()]
-    law.matched_filter = int(control.matched_filter)
+    law.filtered_error_rate = int(control.filtered_error_rate)
     law.period_s = period_s(config)
     law.inertia_kgm2 = joint.inertia_kgm2
     law.coriolis_Nmspr = joint.coriolis_Nmspr
@@ -118,7 +116,7 @@ def _fill_law(law: Any, config: Config) -> None:
             law.lugre.stiffness_Nmprad = config.friction.lugre.stiffness_Nmprad
             law.lugre.damping_Nmspr = config.friction.lugre.damping_Nmspr
     network = law.network
-    _, p12, p22 = solve_lyapunov_p(control.kp, control.kv, control.q[0], control.q[-1])
+    _, p12, p22 = solve_lyapunov_p(control.kp, control.kv, control.lyapunov_q[0], control.lyapunov_q[-1])
     network.p_b[0] = p12 / joint.inertia_kgm2
     network.p_b[1] = p22 / joint.inertia_kgm2
     centres, widths = hidden_layer(control)
@@ -147,7 +145,7 @@ def fill_change(record: Any, law: Any, config: Config) -> None:
         setattr(record.low, name, getattr(record.low, name) / factor)
         setattr(record.high, name, getattr(record.high, name) * factor)
     record.ramp_s = config.live.ramp_s
-    record.q1, record.q2 = config.control.q[0], config.control.q[-1]
+    record.q1, record.q2 = config.control.lyapunov_q[0], config.control.lyapunov_q[-1]
     record.move_speed_radps = APPROACH_SPEED * config.limits.velocity_max_radps
     record.move_acceleration_radps2 = config.sequence.brake_radps2
     record.move_min_s = MOVE_MIN_S
@@ -210,8 +208,9 @@ def _fill_limits(record: Any, config: Config) -> None:
     record.saturation_max_cycles = _cycles(config, limits.saturation_max_s)
     record.skipped_max_cycles = _cycles(config, limits.skipped_max_s)
     _fill_swing(record.swing, config)
-    if not isinstance(config.drive, ElmoSerial):  # a serial drive answers in every cycle and sends nothing by itself
-        record.heartbeat_age_max_cycles = _cycles(config, HEARTBEATS_MISSED * config.drive.heartbeat_s)
+    heartbeat_s = config.drive.silence_s()
+    if heartbeat_s is not None:
+        record.heartbeat_age_max_cycles = _cycles(config, HEARTBEATS_MISSED * heartbeat_s)
 
 
 def _fill_swing(record: Any, config: Config) -> None:

@@ -18,7 +18,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.sections import Rule
+from jointctl.tools.configuration.drive_section import KINDS, DriveSection, section_class
+from jointctl.tools.configuration.sections import Rule, Section
 
 UNITS = {
     "Nm": "Nm", "A": "A", "rad": "rad", "radps": "rad/s", "radps2": "rad/s²", "s": "s", "Hz": "Hz", "Nmps": "Nm/s",
@@ -40,7 +41,15 @@ NO_DEFAULT = "required"
 
 
 def comments_of(model: type[BaseModel]) -> dict[str, str]:
-    """Key -> comment, of every key that has one."""
+    """Key -> comment, of every key that has one; what a class says goes before what its base says."""
+    found = {}
+    for cls in reversed(model.__mro__):
+        if issubclass(cls, Section):
+            found.update(_own_comments(cls))
+    return found
+
+
+def _own_comments(model: type[BaseModel]) -> dict[str, str]:
     lines = inspect.getsource(model).splitlines()
     tree = ast.parse("\n".join(lines)).body[0]
     assert isinstance(tree, ast.ClassDef)
@@ -142,12 +151,17 @@ def section_lines(
             yield from section_lines(inner_name, inner, not field.is_required(), seen, comments.get(key, ""))
 
 
+def sections_of_drives() -> list[type[BaseModel]]:
+    """Of all kinds."""
+    return [section for kind in KINDS if (section := section_class(kind)) is not None]
+
+
 def reference() -> str:
     """The whole page."""
     lines = [HEAD.rstrip()]
     seen: dict[type[BaseModel], str] = {}
     for key, field in Config.model_fields.items():
-        models = models_in(field.annotation)
+        models = sections_of_drives() if field.annotation is DriveSection else models_in(field.annotation)
         for model in models:
             kind = get_args(model.model_fields["kind"].annotation)[0] if len(models) > 1 else None
             name = f"[{key}]" if kind is None else f'[{key}], kind = "{kind}"'

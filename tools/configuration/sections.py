@@ -7,6 +7,8 @@ The comment behind a key, or above it, is its meaning: docs/configuration.md is 
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -14,9 +16,9 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
+from jointctl.drivers.can.channel import NAME, RESERVED, split_channel, with_options
+from jointctl.drivers.can.open import CYCLIC_INTERFACES
 from jointctl.firmware_py.records import NEURONS
-from jointctl.tools.configuration.bus_options import ALLOWED, checked_options
-from jointctl.tools.configuration.object_place import ObjectPlace
 
 
 def interval_text(low: float, high: float, open_low: bool = False) -> str:
@@ -108,6 +110,23 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
+ALLOWED = "names of python-can with texts, numbers, true or false; none for socketcan and jointctl"
+
+
+def checked_options(value: Any) -> Any:
+    """For pydantic: a table of names and plain values."""
+    if value is None:
+        return None
+    if not isinstance(value, dict):
+        raise PydanticCustomError("options", 'must be a table: {{ host = "...", port = 29536 }}')
+    for name, option in value.items():
+        if not NAME.fullmatch(str(name)) or name in RESERVED:
+            raise PydanticCustomError("options", "{name} is no option of an interface", {"name": str(name)})
+        if not isinstance(option, (str, int, float)) or (isinstance(option, float) and not math.isfinite(option)):
+            raise PydanticCustomError("options", "{name} must be a text, a number, true or false", {"name": name})
+    return value
+
+
 class Bus(Section):
     interface: Annotated[str, Field(min_length=1)]  # python-can's name; "jointctl" is the virtual bus
     # as the interface names it: can0, PCAN_USBBUS1; the virtual bus' own name
@@ -117,31 +136,16 @@ class Bus(Section):
     options: Annotated[dict[str, Any], BeforeValidator(Rule(ALLOWED, checked_options))] | None = None
 
 
-class Drive(Section):
-    kind: Literal["canopen"]  # a CiA 402 drive on CANopen
-    node: Node  # CANopen node of the drive
-    eds: Annotated[str, Field(min_length=1)]  # beside the configuration file, or the name of a shipped one
-    mode: Literal["cst", "tq", "auto"]  # torque mode: cyclic synchronous, profile, or what 6502 offers
-    vendor_id: Identity | None = None  # expected in 1018:1; none = any
-    product_code: Identity | None = None  # expected in 1018:2; none = any
-    rated_current_A: Annotated[float, between(0.0, 1000.0, open_low=True)] | None = None  # compared with 6075
-    rated_torque_Nm: Annotated[float, between(0.0, 10_000.0, open_low=True)] | None = None  # motor; compared with 6076
-    rated_tolerance: Annotated[float, between(0.0, 0.2)] = 0.01  # of the comparisons with 6075 and 6076, relative
-    torque_reference: Literal["rated_torque", "rated_current"]  # what 1000 permille of 6071 and 6077 mean
-    ampere: Ampere = "sine_amplitude"  # of the drive's amperes
-    max_torque_permille: Annotated[int, between(1, 10_000)] | None = None  # 6072; none = derived from torque_max_Nm
-    torque_direction: Direction = 1  # -1: positive motor torque drives the joint to negative angles
-    velocity_unit: Literal["counts/s", "r/min", "0.1 r/min"] = "counts/s"  # of 60FF; counts of 6064, r/min of the motor
-    heartbeat_s: Annotated[float, between(0.01, 2.0)]  # the drive stops itself when our heartbeat is older
-    master_node: Node = 126  # whose heartbeat the drive watches
-    boot_timeout_s: Annotated[float, between(0.0, 60.0)] = 3.0  # for the first answer, and for leaving Not Ready
-    sdo_timeout_s: Annotated[float, between(0.02, 10.0)] | None = None  # of one SDO request (three times); None = 0.3 s
-    quick_stop_option: Annotated[int, between(0, 8)] = 2  # 605A: 2 = brake on the quick stop ramp, then power off
-    # 1 = the torque is taken over at the next SYNC, 254/255 = at once
-    rpdo_transmission_type: Annotated[int, between(0, 255)] = 1
-    temperature_object: ObjectPlace | None = None  # the drive's own, "2103"; read once a second, to be shown and logged
-    temperature_unit_degC: Annotated[float, between(0.0, 1000.0, open_low=True)] = 1.0  # of one count of it
-    temperature_offset_degC: Annotated[float, between(-1000.0, 1000.0)] = 0.0  # at 0 counts; -273.15 for kelvin
+def whole_channel(bus: Bus) -> Bus:
+    """The bus with its options in `channel`, which then names it completely.
+
+    What stands in the channel already (from the command line) goes before `options`.
+    """
+    channel, given = split_channel(bus.channel)
+    options = {**(bus.options or {}), **given}
+    if options and bus.interface in CYCLIC_INTERFACES:
+        raise PydanticCustomError("options", "options must be absent for the interface {name}", {"name": bus.interface})
+    return bus.model_copy(update={"channel": with_options(channel, options), "options": options or None})
 
 
 class Encoder(Section):
@@ -229,7 +233,7 @@ class Control(Section):
     observer_radps: Annotated[float, between(0.0, 2000.0)] = 0.0  # bandwidth, computed_torque_observer only
     observer_delay_cycles: Annotated[int, between(0, 15)] = 1  # from a command to its torque
     # of the Lyapunov equation: Q = q I, or diag(q1, q2)
-    q: Annotated[tuple[float, ...], _numbers("numbers", 1, 2, low=0.0, high=1e12)]
+    lyapunov_q: Annotated[tuple[float, ...], _numbers("numbers", 1, 2, low=0.0, high=1e12)]
     learning_rate: Annotated[float, between(0.0, 1e9)]  # of the network's weights
     initial_weight_Nm: Annotated[float, between(-1000.0, 1000.0)]  # of each of the 15 neurons
     widths: Annotated[tuple[float, ...], _numbers("widths", 1, NEURONS, low=0.0, high=1e4)]  # of the Gaussians
@@ -244,7 +248,7 @@ class Control(Section):
     zero_rule: Literal["zero", "paper", "linear"]  # friction compensation at exactly zero velocity
     zero_band_radps: Annotated[float, between(0.0, 10.0)] = 0.0  # half width of the linear zero rule
     velocity_cutoff_Hz: Annotated[float, between(0.0, 2000.0)]  # 0 = no filter
-    matched_filter: bool  # filter the velocity error as a whole: no bias from the filter's lag
+    filtered_error_rate: bool  # filter the velocity error as a whole: no bias from the filter's lag
     learning: Learning | None = None
 
 
@@ -301,3 +305,209 @@ class Log(Section):
     keep: Annotated[int, between(0, 100_000)] = 0  # newest runs to keep; 0 = all
     frames: bool = False  # record every CAN frame as well
     picture: bool = True  # of each run, beside its log; takes a second
+
+
+def _checked(value: str) -> str:
+    match = re.fullmatch(r"([0-9A-Fa-f]{4})(?::([0-9]{1,3}))?", value)
+    if match is None or int(match[1], 16) < 0x2000 or int(match[2] or 0) > 254:
+        raise PydanticCustomError("object", 'must be an object such as "60E4:1" (index in hexadecimal, sub-index)')
+    return value
+
+
+ObjectPlace = Annotated[str, AfterValidator(_checked)]
+
+
+def index_and_sub(place: str) -> tuple[int, int]:
+    """(60E4h, 1) of "60E4:1"; sub-index 0 where none is named."""
+    index, _, sub = place.partition(":")
+    return int(index, 16), int(sub or 0)
+
+
+# --- [joint_encoder]: a second encoder of the joint, on the drive or as a node of its own ---
+# The comment behind a key is its meaning, as in `sections`.
+
+
+class JointEncoder(Section):
+    """A second encoder of the joint; [encoder] is the drive's own (6064)."""
+
+    source: Literal["drive", "node"]  # another object of the drive, or an encoder node (CiA 406) on the bus
+    object: ObjectPlace = "60E4:1"  # of the drive
+    node: Node | None = None  # of the encoder node
+    eds: Annotated[str, Field(min_length=1)] = "joint_encoder.eds"  # of the encoder node
+    counts_per_turn: Annotated[int, between(4, 2**31 - 1)]  # of the joint
+    direction: Direction  # of its counts against the joint angle
+    zero_counts: Annotated[int, between(-(2**31), 2**32 - 1)]  # its reading at joint angle 0
+    kind: Literal["absolute", "incremental"] = "absolute"  # incremental: it takes the angle of [encoder] at the start
+    law: Literal["encoder", "joint_encoder"] = "joint_encoder"  # which of the two feeds the law
+    limits: Literal["encoder", "joint_encoder", "both"] = "both"  # which one the position limits are checked with
+    disagreement_max_rad: Annotated[float, between(0.0, 1.0, open_low=True)]  # between the two, at the joint
+    stiffness_Nmprad: Annotated[float, between(0.0, 1e9, open_low=True)] | None = (
+        None  # of the reducer between them: torque / stiffness is allowed in addition
+    )
+
+
+# --- The [trajectory] section: one model per kind of motion; which keys exist depends on `kind` ---
+
+
+Duration = Annotated[float, between(0.0, 1e6)]  # 0 = until stopped
+Frequency = Annotated[float, between(0.0, 100.0, open_low=True)]
+Time = Annotated[float, between(-1e6, 1e6)]
+Move = Annotated[float, between(0.001, 1e5)]
+
+
+class SineSwitch(Section):
+    """The second sine, from at_s on."""
+
+    at_s: Annotated[float, between(0.0, 1e6, open_low=True)]  # trajectory time
+    amplitude_rad: Angle  # from then on
+    frequency_Hz: Frequency  # from then on
+    shift_s: Time  # from then on
+    offset_rad: Angle  # from then on
+
+
+class Sine(Section):
+    kind: Literal["sine"]  # offset_rad + amplitude_rad sin(2 pi frequency_Hz (t + shift_s))
+    duration_s: Duration  # 0 = until stopped
+    amplitude_rad: Angle  # to each side of the offset
+    frequency_Hz: Frequency  # of the sine
+    shift_s: Time = 0.0  # earlier by this time
+    offset_rad: Angle = 0.0  # middle of the motion
+    switch: SineSwitch | None = None
+
+
+class MinJerk(Section):
+    kind: Literal["min_jerk"]  # from start to target without jerk at the ends
+    duration_s: Duration  # 0 = until stopped
+    start_rad: Angle  # where it begins
+    target_rad: Angle  # where it ends
+    move_s: Move  # of one move
+    dwell_s: Annotated[float, between(0.0, 1e5)] = 0.0  # rest at each end
+    repeat: bool = False  # back and forth
+
+
+class Trapezoid(Section):
+    kind: Literal["trapezoid"]  # from start to target at constant acceleration, speed, deceleration
+    duration_s: Duration  # 0 = until stopped
+    start_rad: Angle  # where it begins
+    target_rad: Angle  # where it ends
+    speed_radps: Annotated[float, between(0.0, 1000.0, open_low=True)]  # on the level part
+    acceleration_radps2: Annotated[float, between(0.0, 1e5, open_low=True)]  # also of the deceleration
+    dwell_s: Annotated[float, between(0.0, 1e5)] = 0.0  # rest at each end
+    repeat: bool = False  # back and forth
+
+
+class Table(Section):
+    kind: Literal["table"]  # a cubic spline through the rows of a file
+    duration_s: Duration  # 0 = until stopped
+    file: Annotated[str, Field(min_length=1)]  # CSV beside the configuration: time_s,position_rad
+    repeat: bool = False  # start again at the end, which must meet the beginning
+
+
+class Hold(Section):
+    kind: Literal["hold"]  # stand still
+    duration_s: Duration  # 0 = until stopped
+    position_rad: Angle = 0.0  # where to stand
+
+
+Trajectory = Annotated[Sine | MinJerk | Trapezoid | Table | Hold, Field(discriminator="kind")]
+
+
+# --- The [virtual] section: the true values of the virtual joint, which the controller does not know ---
+# What is not repeated here (reduction ratio, torque constant, encoder) is taken from the other sections; inertia and
+# friction are those of the controller times a scale: the difference is the model error under study.  With a table of
+# its own, [virtual.friction], the joint has friction of which the controller knows nothing.  Keys have the names of
+# `hil.plant.records.PlantSettings`, whose checks apply too.
+
+
+OWN_KEYS = ("friction_kind", "inertia_scale", "friction", "faults")
+MAX_FAULTS = 8
+# by their names in `hil.faults.kinds`, which a run on hardware does not load
+FAULT_KINDS = (
+    "frames_lost", "sync_lost", "rpdo_lost", "tpdo_lost", "controller_heartbeat_lost", "drive_heartbeat_lost",
+    "rpdo_delayed", "tpdo_delayed", "rpdo_duplicated", "tpdo_duplicated", "rpdo_reordered", "tpdo_reordered",
+    "rpdo_corrupted", "tpdo_corrupted", "rpdo_length", "tpdo_length", "foreign_frames", "bus_off",
+    "drive_reboot", "drive_fault", "encoder_stuck", "encoder_jump", "encoder_drift", "encoder_reversed",
+    "torque_reversed", "torque_saturated", "current_loop_dead", "load_jump",
+)  # fmt: skip
+FAULT_KINDS_TEXT = "one of " + ", ".join(FAULT_KINDS)
+
+
+NUMBERS_TEXT = "a list of up to 4 numbers"
+
+
+def _list(value: Any) -> Any:
+    """Lists of TOML as tuples, which a frozen model needs."""
+    good = isinstance(value, (list, tuple)) and len(value) <= 4
+    if not good or any(isinstance(x, bool) or not isinstance(x, (int, float)) for x in value):
+        raise PydanticCustomError("numbers", f"must be {NUMBERS_TEXT}")
+    return tuple(float(x) for x in value)
+
+
+Numbers = Annotated[tuple[float, ...], BeforeValidator(Rule(NUMBERS_TEXT, _list))]
+
+
+def _kind(value: Any) -> Any:
+    if value not in FAULT_KINDS:
+        raise PydanticCustomError("fault_kind", "must be {kinds}", {"kinds": FAULT_KINDS_TEXT})
+    return value
+
+
+class VirtualFault(Section):
+    """One fault on purpose; what `magnitude` means for each kind is explained in `hil.faults.kinds`."""
+
+    kind: Annotated[str, BeforeValidator(Rule(FAULT_KINDS_TEXT, _kind))]  # what goes wrong
+    at_s: Annotated[float, between(0.0, 1e6)]  # after the power stage is on for the first time
+    duration_s: Annotated[float, between(0.0, 1e6, open_low=True)] = 1e6  # how long
+    magnitude: Annotated[float, between(-1e6, 1e6)] = 1.0  # its meaning for each kind is in hil/faults/kinds.py
+    seed: Annotated[int, between(1, 2**31 - 1)] = 1  # of random ones
+
+
+FAULTS_TEXT = f"a list of at most {MAX_FAULTS} faults"
+
+
+def _faults(value: Any) -> Any:
+    """A list of tables as a tuple, which a frozen model needs."""
+    if not isinstance(value, (list, tuple)) or len(value) > MAX_FAULTS:
+        raise PydanticCustomError("faults", f"must be {FAULTS_TEXT}")
+    return tuple(value)
+
+
+class Virtual(Section):
+    step_s: Annotated[float, between(1e-6, 1e-3)] = 50e-6  # of the plant's integration
+    initial_position_rad: Annotated[float, between(-1000.0, 1000.0)] = 0.0  # where the joint stands at the start
+    inertia_scale: Annotated[float, between(0.1, 10.0)] = 1.0  # true inertia over joint.inertia_kgm2
+    current_limit_A: Annotated[float, between(0.001, 10_000.0)] = 100.0  # of the motor
+    current_lag_s: Annotated[float, between(0.0, 1.0)] = 0.0  # of the drive's current loop, first order
+    command_delay_s: Annotated[float, between(0.0, 1.0)] = 0.0  # on top of the period that the synchronous RPDO takes
+    torque_ripple_Nm: Numbers = ()  # amplitudes, at the joint
+    torque_ripple_per_motor_turn: Numbers = ()  # periods of each
+    torque_ripple_phase_rad: Numbers = ()  # of each
+    friction_kind: Literal["none", "sign", "stick_slip", "lugre"]  # how it behaves around standstill
+    friction_positive_scale: Annotated[float, between(0.0, 10.0)] = 1.0  # true friction over that of [friction]
+    friction_negative_scale: Annotated[float, between(0.0, 10.0)] = 1.0  # the same, in the negative direction
+    friction_ripple: Annotated[float, between(0.0, 0.9)] = 0.0  # relative amplitude
+    friction_ripple_per_joint_turn: Annotated[float, between(0.0, 1e5)] = 18.0  # its periods
+    bristle_stiffness_Nmprad: Annotated[float, between(1.0, 1e7)] = 8e4  # of friction_kind lugre
+    bristle_damping_Nmspr: Annotated[float, between(0.0, 1e5)] = 200.0  # of friction_kind lugre
+    flexible: bool = False  # motor and joint as two masses with the reducer between
+    motor_side_inertia_kgm2: Annotated[float, between(1e-3, 1e4)] = 1.2  # at the joint; of joint.inertia_kgm2
+    reducer_stiffness_Nmprad: Annotated[float, between(1.0, 1e8)] = 1.3e4  # with flexible = true
+    reducer_damping_Nmspr: Annotated[float, between(0.0, 1e5)] = 5.0  # with flexible = true
+    load_torque_Nm: Annotated[float, between(-1e5, 1e5)] = 0.0  # constant, at the joint
+    load_step_Nm: Annotated[float, between(-1e5, 1e5)] = 0.0  # a load from load_step_at_s on
+    load_step_at_s: Annotated[float, between(0.0, 1e9)] = 80.0  # of the plant's own time
+    gravity_Nm: Annotated[float, between(0.0, 1e5)] = 0.0  # m g l of m g l sin(q)
+    end_stops: bool = False  # springs at end_stop_min_rad and end_stop_max_rad
+    end_stop_min_rad: Annotated[float, between(-1e4, 1e4)] = -3.0  # lower end stop
+    end_stop_max_rad: Annotated[float, between(-1e4, 1e4)] = 3.0  # upper end stop
+    end_stop_stiffness_Nmprad: Annotated[float, between(1.0, 1e8)] = 2e5  # of both springs
+    end_stop_damping_Nmspr: Annotated[float, between(0.0, 1e5)] = 200.0  # of both springs
+    thermal: bool = False  # friction falls as the joint warms up
+    ambient_degC: Annotated[float, between(-60.0, 100.0)] = 25.0  # around the joint
+    heating_KpA2: Annotated[float, between(0.0, 1e3)] = 0.5  # final warming per squared current
+    thermal_time_s: Annotated[float, between(1.0, 1e6)] = 900.0  # time constant
+    friction_per_kelvin: Annotated[float, between(-0.05, 0.05)] = -0.005  # relative change
+    encoder_noise_counts: Annotated[float, between(0.0, 1e6)] = 0.0  # standard deviation
+    encoder_seed: Annotated[int, between(1, 2**31 - 1)] = 1  # of the noise
+    friction: Friction | None = None  # The true curve, if it is not that of [friction].
+    faults: Annotated[tuple[VirtualFault, ...], BeforeValidator(Rule(FAULTS_TEXT, _faults))] = ()

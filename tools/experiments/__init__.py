@@ -1,1 +1,1 @@
-"""Controllers compared on many simulated joints, and the paper's experiments."""
+"""Controllers compared on many simulated joints, the paper's experiments, and campaigns of random faults."""

@@ -28,7 +28,7 @@ from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationError
@@ -36,8 +36,7 @@ from pydantic_core import PydanticCustomError
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.input_file import parse_toml, read_input
-from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.problems import suggestion
+from jointctl.tools.configuration.config import Config, suggestion
 from jointctl.tools.configuration.sections import Section, between
 from jointctl.tools.drawing import BLUE, GREY, INK, canvas
 from jointctl.tools.experiments.controllers import DEFAULT, Controller, changed, controller_constants, named, one_line
@@ -45,6 +44,10 @@ from jointctl.tools.experiments.scenarios import RPDO_AT_ONCE, ErrorFigures, Sce
 from jointctl.tools.simulation.child_process import interrupts_left_to_the_parent
 from jointctl.tools.simulation.lockstep import LockstepJoint
 from jointctl.tools.written_file import writing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # --- random realistic joints ---
 
@@ -55,16 +58,14 @@ def _interval(low: float, high: float) -> Any:
     def check(value: tuple[float, float]) -> tuple[float, float]:
         if not low <= value[0] <= value[1] <= high:
             raise PydanticCustomError(
-                "interval",
-                "must be two numbers in ascending order in {range}",
-                {"range": f"[{low:g}..{high:g}]"},
+                "interval", "must be two numbers in ascending order in {range}", {"range": f"[{low:g}..{high:g}]"}
             )
         return value
 
     return AfterValidator(check)
 
 
-def _as_tuple(value: Any) -> Any:
+def _as_tuple(value: object) -> Any:
     """A list of TOML as the tuple that a frozen model holds."""
     return tuple(value) if isinstance(value, list) else value
 
@@ -248,12 +249,8 @@ def run_plant(task: PlantTask) -> PlantResult:
 def run_study(
     base: Config,
     controllers: list[Controller],
+    settings: StudySettings,
     *,
-    plants: int,
-    seed: int,
-    settings: EnsembleSettings | None = None,
-    scenario: Scenario = "sine",
-    after_s: float = 75.0,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> StudyResult:
@@ -261,11 +258,14 @@ def run_study(
 
     `workers` None takes every processor that this process may use; 1 stays in this process.
     """
+    after_s, plants = settings.after_s, settings.plants
     if not 0.0 <= after_s < base.trajectory.duration_s:
         raise ConfigurationError(f"after_s (={after_s:g}) must be in [0..{base.trajectory.duration_s:g}), the run")
-    settings = EnsembleSettings() if settings is None else settings
     order = tuple(controllers)
-    tasks = [PlantTask(base, settings, seed, index, order, scenario, after_s) for index in range(plants)]
+    tasks = [
+        PlantTask(base, settings.plant, settings.seed, index, order, settings.scenario, after_s)
+        for index in range(plants)
+    ]
     workers = min(plants, workers or len(os.sched_getaffinity(0)))
     done: list[PlantResult] = []
     interrupted = False
@@ -332,7 +332,7 @@ _PANELS = (
 )
 
 
-def study_figure(result: StudyResult, title: str) -> Any:
+def study_figure(result: StudyResult, title: str) -> Figure:
     """The boxes: quartiles; whiskers 5 and 95 %; dots beyond."""
     count = len(result.controllers)
     with canvas(1.8 + 0.42 * count, title) as figure:
@@ -349,7 +349,7 @@ def study_figure(result: StudyResult, title: str) -> Any:
         return figure
 
 
-def _boxes(axis: Any, result: StudyResult, key: str) -> None:
+def _boxes(axis: Axes, result: StudyResult, key: str) -> None:
     drawn = [result.values(name, key) for name in result.controllers]
     axis.boxplot(
         [values[np.isfinite(values)] for values in drawn],

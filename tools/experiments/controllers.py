@@ -16,12 +16,12 @@ from pydantic import ValidationError
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.configuration.checks import problems_between_sections
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.elmo_settings import refuse_serial
+from jointctl.tools.configuration.drive_section import require_simulated
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.records import axis_constants, trajectory_table
 from jointctl.tools.configuration.sections import Control, Friction
 
-_MODEL_BASED: dict[str, Any] = {"zero_rule": "zero", "matched_filter": True}
+_MODEL_BASED: dict[str, Any] = {"zero_rule": "zero", "filtered_error_rate": True}
 _STIFF: dict[str, Any] = {**_MODEL_BASED, "kp": 2500.0, "kv": 130.0, "feed_forward": "lugre_desired"}
 _OBSERVER: dict[str, Any] = {**_MODEL_BASED, "kind": "computed_torque_observer", "feed_forward": "lugre_desired"}
 
@@ -33,7 +33,7 @@ TABLE: dict[str, dict[str, Any]] = {
     "paper": {},
     "paper_desired": {"feed_forward": "desired"},
     "paper_lugre": {"feed_forward": "lugre_desired"},
-    "network_stiff": {**_STIFF, "q": (2.756e6, 4630.0)},
+    "network_stiff": {**_STIFF, "lyapunov_q": (2.756e6, 4630.0)},
     "observer": {**_OBSERVER, "observer_radps": 60.0},
     "observer_stiff": {**_OBSERVER, "observer_radps": 60.0, "kp": 2500.0, "kv": 100.0},
 }
@@ -97,7 +97,7 @@ def from_file(name: str) -> Controller:
         known = ", ".join(TABLE)
         raise ConfigurationError(f"controller (={name}) must be a configuration file or one of {known}")
     config = load_config(path)
-    refuse_serial(config, "study")
+    require_simulated(config, "study")
     return Controller(path.stem, config.control, config.friction)
 
 

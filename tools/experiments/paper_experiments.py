@@ -99,7 +99,7 @@ def experiments() -> list[Experiment]:
     """All of them, in the order of the paper."""
     with_model = law("with friction model")
     without_model = law("without friction model", feed_forward="none")
-    simulated = law("simulation", q=Q_SIMULATION)
+    simulated = law("simulation", lyapunov_q=Q_SIMULATION)
     desired = law("desired velocity", feed_forward="desired", zero_rule="zero")
     one_integrator = law("one integrator", feed_forward="desired", zero_rule="zero", widths=_ONE_INTEGRATOR_WIDTH)
     precise = from_file("precise")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,22 +12,26 @@ from jointctl.tools.experiments.scenarios import event_s
 from jointctl.tools.recording.run_figure import drawn_indices
 from jointctl.tools.simulation.lockstep import LockstepRun
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 _START_s = 1.0
 
 
-def _draw(axis: Any, time_s: np.ndarray, values: np.ndarray, label: str = "", color: Any = BLUE, **style: Any) -> None:
+def _draw(axis: Axes, time_s: np.ndarray, values: np.ndarray, label: str = "", color: str = BLUE, **style: Any) -> None:
     keep = drawn_indices(values)
     axis.plot(time_s[keep], values[keep], label=label, color=color, **{"linewidth": 1.0, **style})
 
 
-def _tidy(axis: Any, ylabel: str, title: str, *, legend: bool = False) -> None:
+def _tidy(axis: Axes, ylabel: str, title: str, *, legend: bool = False) -> None:
     axis.set_ylabel(ylabel)
     axis.set_title(title)
     if legend:
         axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
-def _scale_to_later(axis: Any, *curves: tuple[np.ndarray, np.ndarray]) -> None:
+def _scale_to_later(axis: Axes, *curves: tuple[np.ndarray, np.ndarray]) -> None:
     """Limits of the axis from what comes after the first second: the start at rest would hide the rest."""
     later = np.concatenate([values[time_s > _START_s] for time_s, values in curves])
     low, high = float(np.min(later)), float(np.max(later))
@@ -36,7 +40,7 @@ def _scale_to_later(axis: Any, *curves: tuple[np.ndarray, np.ndarray]) -> None:
 
 
 def _draw_nodes(
-    axis: Any, time_s: np.ndarray, values: np.ndarray, letter: str, widths: tuple[float, ...] = (1.0, 1.0, 1.0)
+    axis: Axes, time_s: np.ndarray, values: np.ndarray, letter: str, widths: tuple[float, ...] = (1.0, 1.0, 1.0)
 ) -> None:
     """Three of the network's nodes, (N, nodes): the first, the middle, the last."""
     for index, color, width in zip((0, 7, 14), (BLUE, ORANGE, GREEN), widths, strict=True):
@@ -44,13 +48,13 @@ def _draw_nodes(
     _scale_to_later(axis, *((time_s, values[:, index]) for index in (0, 7, 14)))
 
 
-def _draw_precise(axis: Any, time_s: np.ndarray, error_rad: np.ndarray, on: str = "") -> None:
+def _draw_precise(axis: Axes, time_s: np.ndarray, error_rad: np.ndarray, on: str = "") -> None:
     _draw(axis, time_s, error_rad * 1e3, "precise.toml", GREEN)
     axis.set_ylim(-0.4, 0.4)
     _tidy(axis, "error [mrad]", f"not in the paper: configs/precise.toml{on} (note the scale)", legend=True)
 
 
-def _over_time(figure: Any, axes: Any) -> Any:
+def _over_time(figure: Figure, axes: np.ndarray) -> Figure:
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)
     return figure

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -28,10 +28,7 @@ CHANGE_s = 82.5
 LOAD_AT_s = 80.0
 LOAD_Nm = 3.0
 # amplitude [rad], angular frequency [rad/s], shift [s], offset [rad] after the change
-_SECOND_SINE = {
-    "frequency": (0.35, 0.125 * math.pi, 1.5, 0.0),
-    "amplitude": (0.175, 0.2 * math.pi, 0.0, 0.175),
-}
+_SECOND_SINE = {"frequency": (0.35, 0.125 * math.pi, 1.5, 0.0), "amplitude": (0.175, 0.2 * math.pi, 0.0, 0.175)}
 _PROBE_s = 0.5  # of the trajectory, to learn when it begins on the plant's clock
 
 
@@ -41,7 +38,7 @@ def event_s(scenario: Scenario) -> float | None:
 
 
 def run_scenario(
-    joint: LockstepJoint, constants: Any, scenario: Scenario = "sine", *, ideal_velocity: bool = False
+    joint: LockstepJoint, constants: np.recarray, scenario: Scenario = "sine", *, ideal_velocity: bool = False
 ) -> LockstepRun:
     """One run of these constants on this joint, up to the end of the trajectory; neither is changed.
 
@@ -69,13 +66,13 @@ def run_scenario(
     return joint.run(constants, plant_constants=plant_constants, ideal_velocity=ideal_velocity, longest_s=longest_s)
 
 
-def _before_s(constants: Any) -> float:
+def _before_s(constants: np.recarray) -> float:
     """Time of settling and approach; enabling takes some cycles more."""
     sequence = constants[0].sequence
     return float(sequence.approach_s) + float(sequence.settle_cycles) * float(constants[0].law.period_s)
 
 
-def _trajectory_start_s(joint: LockstepJoint, constants: Any) -> float:
+def _trajectory_start_s(joint: LockstepJoint, constants: np.recarray) -> float:
     """The plant's own time at trajectory time 0, from a short run that ends inside the trajectory."""
     probe = joint.run(constants, longest_s=_before_s(constants) + _PROBE_s)
     return float(probe.plant.time_s) - float(probe.log.trajectory_s[-1])

@@ -278,7 +278,7 @@ SIDES = ("joint", "motor")
 
 @dataclass(frozen=True)
 class ForeignFormat:
-    """How to read a table that is not ours; None = not told."""
+    """How to read a table that is not ours; None = not given."""
 
     velocity_column: str | None = None
     torque_column: str | None = None
@@ -295,51 +295,51 @@ class ForeignFormat:
         return bool(self.velocity_column or self.torque_column or self.current_column)
 
 
-def check_told(told: ForeignFormat) -> None:
+def check_given(given: ForeignFormat) -> None:
     """`UsageError` names a flag whose value is not allowed."""
     for flag, value, allowed in (
-        ("--velocity-unit", told.velocity_unit, tuple(RADPS_PER_UNIT)),
-        ("--side", told.side, SIDES),
-        ("--torque-side", told.torque_side, SIDES),
+        ("--velocity-unit", given.velocity_unit, tuple(RADPS_PER_UNIT)),
+        ("--side", given.side, SIDES),
+        ("--torque-side", given.torque_side, SIDES),
     ):
         if value is not None and value not in allowed:
             raise UsageError(f"{flag} (={value}) must be one of {', '.join(allowed)}")
     for flag, number, low, high in (
-        ("--ratio", told.ratio, 1.0, 1000.0),
-        ("--torque-constant", told.torque_constant_NmpA, 1e-6, 100.0),
+        ("--ratio", given.ratio, 1.0, 1000.0),
+        ("--torque-constant", given.torque_constant_NmpA, 1e-6, 100.0),
     ):
         if number is not None and not low <= number <= high:
             raise UsageError(f"{flag} (={number:g}) must be in [{low:g}..{high:g}]")
-    if told.torque_column and told.current_column:
+    if given.torque_column and given.current_column:
         raise UsageError("--torque-column and --current-column: give one of them, the friction comes from one")
 
 
-def read_foreign(table: TableFile, told: ForeignFormat) -> FrictionData:
-    """Points in our units; `UsageError` where something that a table does not tell was not told."""
-    if not told.velocity_column:
+def read_foreign(table: TableFile, given: ForeignFormat) -> FrictionData:
+    """Points in our units; `UsageError` where something that a table does not tell was not given."""
+    if not given.velocity_column:
         raise UsageError("--velocity-column is missing", f"the file has: {', '.join(table.columns)}")
-    if not (told.torque_column or told.current_column):
+    if not (given.torque_column or given.current_column):
         raise UsageError("--torque-column or --current-column is missing", f"the file has: {', '.join(table.columns)}")
-    for flag, value in (("--velocity-unit", told.velocity_unit), ("--side", told.side), ("--ratio", told.ratio)):
+    for flag, value in (("--velocity-unit", given.velocity_unit), ("--side", given.side), ("--ratio", given.ratio)):
         if value is None:
             raise UsageError(f"{flag} is missing: a table of numbers does not tell it", "nothing is guessed")
-    assert told.velocity_unit is not None
-    assert told.ratio is not None
-    scale = RADPS_PER_UNIT[told.velocity_unit] / (told.ratio if told.side == "motor" else 1.0)
-    velocity = numbers(table, told.velocity_column) * scale
-    if told.current_column:
-        if told.torque_constant_NmpA is None:
+    assert given.velocity_unit is not None
+    assert given.ratio is not None
+    scale = RADPS_PER_UNIT[given.velocity_unit] / (given.ratio if given.side == "motor" else 1.0)
+    velocity = numbers(table, given.velocity_column) * scale
+    if given.current_column:
+        if given.torque_constant_NmpA is None:
             raise UsageError("--torque-constant is missing: --current-column needs it [Nm/A at the motor]")
-        if told.torque_side == "joint":
+        if given.torque_side == "joint":
             raise UsageError("--torque-side (=joint) is for --torque-column: a current gives torque at the motor")
-        torque = numbers(table, told.current_column) * told.torque_constant_NmpA
+        torque = numbers(table, given.current_column) * given.torque_constant_NmpA
     else:
-        assert told.torque_column is not None
-        if told.torque_side is None:
+        assert given.torque_column is not None
+        if given.torque_side is None:
             raise UsageError("--torque-side is missing: a table of numbers does not tell it", "motor or joint")
-        torque = numbers(table, told.torque_column) / (told.ratio if told.torque_side == "joint" else 1.0)
+        torque = numbers(table, given.torque_column) / (given.ratio if given.torque_side == "joint" else 1.0)
     settled = np.ones(len(velocity), bool)
-    return from_table(table, velocity, torque, settled, told.ratio, told.torque_constant_NmpA)
+    return from_table(table, velocity, torque, settled, given.ratio, given.torque_constant_NmpA)
 
 
 # --- the file of our own sweep, and its sidecar ---
@@ -398,23 +398,23 @@ def _recorded_limits(beside: Path, sidecar: dict[str, Any]) -> tuple[float, floa
     return found[0], found[1]
 
 
-def read_sweep(table: TableFile, told: ForeignFormat) -> FrictionData:
+def read_sweep(table: TableFile, given: ForeignFormat) -> FrictionData:
     """Points of a sweep and the constants of its sidecar (or `--ratio`); `DataError` where they contradict."""
-    for flag, value in (("--velocity-unit", told.velocity_unit), ("--side", told.side), ("--torque-side",
-                        told.torque_side), ("--torque-constant", told.torque_constant_NmpA)):  # fmt: skip
+    for flag, value in (("--velocity-unit", given.velocity_unit), ("--side", given.side), ("--torque-side",
+                        given.torque_side), ("--torque-constant", given.torque_constant_NmpA)):  # fmt: skip
         if value is not None:
             raise UsageError(f"{flag} (={value}) is for tables with mapped columns: a sweep file tells its own units")
     if not table.ended:
         # the sweep ends every line, so this one may have lost digits
         raise DataError(f"{table.path}: the last line has no end: the file is cut off", "remove the last line")
-    ratio, constant, limits = told.ratio or math.nan, math.nan, None
-    if told.ratio is None or table.path.with_suffix(".json").exists():
+    ratio, constant, limits = given.ratio or math.nan, math.nan, None
+    if given.ratio is None or table.path.with_suffix(".json").exists():
         sidecar = _sidecar(table.path)
         ratio, constant = float(sidecar["reduction_ratio"]), float(sidecar["torque_constant_NmpA"])
         limits = _recorded_limits(table.path.with_suffix(".json"), sidecar)
-        if told.ratio is not None and abs(told.ratio / ratio - 1.0) > 1e-6:
+        if given.ratio is not None and abs(given.ratio / ratio - 1.0) > 1e-6:
             raise DataError(
-                f"--ratio (={told.ratio:g}) differs from reduction_ratio (={ratio:g}) in the sidecar of {table.path}"
+                f"--ratio (={given.ratio:g}) differs from reduction_ratio (={ratio:g}) in the sidecar of {table.path}"
             )
     velocity = numbers(table, "velocity_radps")
     torque = numbers(table, "motor_torque_Nm")
@@ -439,16 +439,16 @@ def read_sweep(table: TableFile, told: ForeignFormat) -> FrictionData:
     return replace(data, recorded_limits=limits)
 
 
-def read_friction_data(path: str | Path, told: ForeignFormat | None = None, *, both: bool = True) -> FrictionData:
+def read_friction_data(path: str | Path, given: ForeignFormat | None = None, *, both: bool = True) -> FrictionData:
     """Read and check; `both` asks for enough points in both directions, else one is enough to go on with."""
-    path, told = Path(path), told or ForeignFormat()
-    check_told(told)
-    table = read_table(path, told.delimiter)
-    ours = not told.mapped and "velocity_radps" in table.columns and "motor_torque_Nm" in table.columns
+    path, given = Path(path), given or ForeignFormat()
+    check_given(given)
+    table = read_table(path, given.delimiter)
+    ours = not given.mapped and "velocity_radps" in table.columns and "motor_torque_Nm" in table.columns
     if ours:
-        data = read_sweep(table, told)
-    elif told.mapped:
-        data = read_foreign(table, told)
+        data = read_sweep(table, given)
+    elif given.mapped:
+        data = read_foreign(table, given)
     else:
         raise DataError(
             f"{path}: not a sweep of ours: columns velocity_radps and motor_torque_Nm are missing; "

@@ -8,7 +8,7 @@ replaces the file in one step; on any error the file stays as it is.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tomlkit
@@ -20,14 +20,18 @@ from tomlkit.exceptions import TOMLKitError
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.friction import DEGREE
 from jointctl.firmware_py.input_file import read_input
+from jointctl.tools.configuration.config import ConfigurationProblems
 from jointctl.tools.configuration.load import load_config
-from jointctl.tools.configuration.problems import ConfigurationProblems
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, canvas
 from jointctl.tools.identification.friction_data import FrictionData, relative_errors, relative_figures
 from jointctl.tools.identification.identification import DIRECTIONS, Identification
 from jointctl.tools.identification.models import FORMS, Branch
 from jointctl.tools.identification.uncertainty import NAMES
 from jointctl.tools.written_file import replace_file
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # --- tables ---
 
@@ -155,7 +159,7 @@ def fit_figure(
 
 
 def _paint_fit(
-    figure: Any,
+    figure: Figure,
     data: FrictionData,
     branches: dict[str, Branch],
     used: dict[str, np.ndarray],
@@ -225,7 +229,7 @@ def _paint_fit(
     figure.align_ylabels(axes)
 
 
-def _points(axis: Any, data: FrictionData, chosen: np.ndarray, label: str, color: str, marker: str) -> None:
+def _points(axis: Axes, data: FrictionData, chosen: np.ndarray, label: str, color: str, marker: str) -> None:
     size = 3.0 if marker == "o" else 7.0
     axis.plot(
         data.velocity_radps[chosen] / DEGREE, data.motor_torque_Nm[chosen], marker, color=color, markersize=size,

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.firmware_py.friction import branch_constants, branch_torque_Nm
+from jointctl.firmware_py.friction import PrintedBranch, branch_constants, branch_torque_Nm
 
 MIN_PER_STAGE = 5  # points; a stage has four parameters
 
@@ -119,10 +119,11 @@ class Branch:
 
     def record(self) -> Any:
         """The `FrictionBranch` record."""
-        return branch_constants(
-            self.coulomb_Nm, self.static_Nm, self.stribeck_radps, self.viscous_Nmspr, self.cubic,
-            self.knee_radps, self.max_radps, negative=False, radps_per_unit=1.0,
+        printed = PrintedBranch(
+            self.coulomb_Nm, self.static_Nm, self.stribeck_radps, self.viscous_Nmspr, self.cubic, self.knee_radps,
+            self.max_radps,
         )  # fmt: skip
+        return branch_constants(printed, negative=False, radps_per_unit=1.0)
 
     def torque_Nm(self, speed_radps: np.ndarray) -> np.ndarray:
         """Friction at the motor [Nm] at speeds >= 0, by the controller's own expression."""

@@ -1,6 +1,6 @@
 """Does the result look like the friction of a joint?  A wrong torque constant, ratio, unit or side shows here.
 
-`problems` are refused, `warnings` are told; each line gives the number it is about.
+`problems` are refused, `warnings` are reported; each line gives the number it is about.
 """
 
 from __future__ import annotations

@@ -26,6 +26,7 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -76,28 +77,52 @@ def fill_uniform(random: np.ndarray, numbers: np.ndarray) -> None:
     random[0] = state
 
 
+class Samples(NamedTuple):
+    """What a particle is compared with."""
+
+    x: np.ndarray  # (N,), sorted
+    y: np.ndarray  # (N,) [Nm]
+    sums: np.ndarray  # (N + 1, 15) from `suffix_sums`
+    table: np.ndarray  # from `stage_table`
+    knee: float
+    fixed_split: int  # of the points, where the knee is not searched
+    has_cubic: bool
+    continuous: bool
+    search_knee: bool
+
+
+class Swarm(NamedTuple):
+    """Particles are the last axis, so that the compiler moves several of them at once."""
+
+    position: np.ndarray  # (D, particles), as `velocity` and `best`
+    velocity: np.ndarray
+    best: np.ndarray
+    best_error: np.ndarray  # (particles,)
+    leader: np.ndarray  # (D,), the best position of all
+    particle: np.ndarray  # (D,), scratch
+    random: np.ndarray  # (particles,), a stream each
+    lower: np.ndarray  # (D,)
+    upper: np.ndarray  # (D,)
+
+
+class Weights(NamedTuple):
+    inertia: float
+    cognitive: float
+    social: float
+
+
 @inlined
-def squared_error(
-    p: np.ndarray,
-    x: np.ndarray,
-    y: np.ndarray,
-    sums: np.ndarray,
-    table: np.ndarray,
-    knee: float,
-    fixed_split: int,
-    has_cubic: bool,
-    continuous: bool,
-    search_knee: bool,
-) -> float:
-    """E of one particle; x (N,) sorted, y (N,) [Nm], sums (N + 1, 15) from `suffix_sums`, table from `stage_table`."""
+def squared_error(p: np.ndarray, samples: Samples) -> float:
+    """E of one particle."""
+    x, y, sums, table, knee = samples.x, samples.y, samples.sums, samples.table, samples.knee
     tc = p[0] * p[1]
     d = p[0] - tc
     tv = p[3]
-    split = fixed_split
+    split = samples.fixed_split
     at_knee = knee
     error = 0.0
-    if search_knee:
-        at_knee = p[7] if continuous else p[8]
+    if samples.search_knee:
+        at_knee = p[7] if samples.continuous else p[8]
         split = np.searchsorted(x, at_knee, side="right")
         inverse_ws = math.exp(-p[2])
         for i in range(split):
@@ -138,8 +163,8 @@ def squared_error(
         # |tc + d e + tv x - y|^2 multiplied out
         error = table[0, 5] + tc * (tc * table[0, 0] + 2.0 * (d * e + tv * table[0, 1] - table[0, 3]))
         error += d * (d * e_e + 2.0 * (tv * e_x - e_y)) + tv * (tv * table[0, 2] - 2.0 * table[0, 4])
-    if has_cubic:
-        if continuous:
+    if samples.has_cubic:
+        if samples.continuous:
             inverse_ws = math.exp(-p[2])
             c1, c2, c3 = p[4], p[5], p[6]
             z = (2.0 * at_knee - knee - 1.0) / (1.0 - knee)
@@ -193,11 +218,10 @@ def move_along(
     low: float,
     high: float,
     lead: float,
-    inertia: float,
-    cognitive: float,
-    social: float,
+    weights: Weights,
 ) -> None:
     """Velocity and position of all particles in one dimension; arrays (particles,), a loop the compiler vectorises."""
+    inertia, cognitive, social = weights
     for i in range(len(position)):
         # two numbers of 31 bits from one draw: plenty for weights, and quickly converted
         state = next_random(random[i])
@@ -213,50 +237,21 @@ def move_along(
 
 
 @kernel
-def advance_swarm(
-    position: np.ndarray,
-    velocity: np.ndarray,
-    best: np.ndarray,
-    best_error: np.ndarray,
-    leader: np.ndarray,
-    particle: np.ndarray,
-    random: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    weights: tuple[float, float, float],
-    x: np.ndarray,
-    y: np.ndarray,
-    sums: np.ndarray,
-    table: np.ndarray,
-    knee: float,
-    fixed_split: int,
-    has_cubic: bool,
-    continuous: bool,
-    search_knee: bool,
-    curve: np.ndarray,
-) -> None:
-    """len(curve) iterations; arrays (D, particles) and the random streams (particles,) are changed in place.
-
-    `leader` (D,) is the best position of all; `curve` receives its squared error after each iteration; `particle` (D,)
-    is scratch.  Particles are the last axis, so that the compiler moves several of them at once.
-    """
+def advance_swarm(swarm: Swarm, weights: Weights, samples: Samples, curve: np.ndarray) -> None:
+    """len(curve) iterations; `curve` receives the leader's squared error after each of them."""
+    position, velocity, best, best_error, leader, particle, random, lower, upper = swarm
     dimensions, particles = position.shape
-    inertia, cognitive, social = weights
     least = best_error[0]
     for i in range(1, particles):
         least = min(least, best_error[i])
     for step in range(len(curve)):
         first = -1
         for d in range(dimensions):
-            move_along(
-                position[d], velocity[d], best[d], random, lower[d], upper[d], leader[d], inertia, cognitive, social
-            )  # fmt: skip
+            move_along(position[d], velocity[d], best[d], random, lower[d], upper[d], leader[d], weights)
         for i in range(particles):
             for d in range(dimensions):
                 particle[d] = position[d, i]
-            error = squared_error(
-                particle, x, y, sums, table, knee, fixed_split, has_cubic, continuous, search_knee
-            )  # fmt: skip
+            error = squared_error(particle, samples)
             if error < best_error[i]:
                 best_error[i] = error
                 for d in range(dimensions):
@@ -327,17 +322,17 @@ def run_swarm(
     velocity = 0.1 * width * (2.0 * speed - 1.0)
     best, best_error = position.copy(), np.full(shape[1], np.inf)
     leader = position[:, 0].copy()
-    particle = np.empty(shape[0])
     curve = np.empty(settings.iterations)
     done, still = 0, 0
     table = stage_table(problem.x[:split], problem.y_Nm[:split], float(lower[2]), float(upper[2]))
-    data = (problem.x, problem.y_Nm, sums, table, problem.knee, split, form.cubic, form.continuous, search_knee)
-    weights = (settings.inertia, settings.cognitive, settings.social)
+    samples = Samples(
+        problem.x, problem.y_Nm, sums, table, problem.knee, split, form.cubic, form.continuous, search_knee
+    )
+    swarm = Swarm(position, velocity, best, best_error, leader, np.empty(shape[0]), random, lower, upper)
+    weights = Weights(settings.inertia, settings.cognitive, settings.social)
     while done < settings.iterations and not (stop is not None and stop.is_set()):
         part = curve[done : done + CHUNK]
-        advance_swarm(
-            position, velocity, best, best_error, leader, particle, random, lower, upper, weights, *data, part
-        )
+        advance_swarm(swarm, weights, samples, part)
         before = curve[done - 1] if done else np.inf
         done += len(part)
         still = still + len(part) if part[-1] >= before * (1.0 - 1e-12) else 0

@@ -30,15 +30,7 @@ from jointctl.drivers.canopen.identifiers import (
     SYNC_ID,
     TPDO1_ID,
 )
-from jointctl.drivers.canopen.pdo import (
-    CONTROL,
-    DISABLED,
-    POSITION,
-    STATUS,
-    TARGET_TORQUE,
-    TARGET_VELOCITY,
-    TORQUE,
-)
+from jointctl.drivers.canopen.pdo import CONTROL, DISABLED, POSITION, STATUS, TARGET_TORQUE, TARGET_VELOCITY, TORQUE
 from jointctl.tools.inspection.objects import NMT_COMMANDS, SIGNED, Objects, Place, error_register_text, nmt_state
 from jointctl.tools.inspection.subject import abort_text
 from jointctl.tools.session.fault_words import emergency_text
@@ -182,7 +174,7 @@ class _Transfer:
     place: Place | None = None
     data: bytearray = field(default_factory=bytearray)
     upload: bool = True
-    pending: bytes = b""  # of an expedited download, told once it is confirmed
+    pending: bytes = b""  # of an expedited download, reported once it is confirmed
 
 
 class SdoFrames:
@@ -299,7 +291,7 @@ def _fields(place: Place | None, **more: Any) -> dict[str, Any]:
 
 
 def _bytes(size: int | None) -> str:
-    return "a number of bytes that is not told," if size is None else f"{size} bytes"
+    return "a number of bytes that is not given," if size is None else f"{size} bytes"
 
 
 def _expedited(data: bytes, objects: Objects, place: Place) -> bytes:
@@ -383,7 +375,7 @@ class FrameDecoder:
             return _heartbeat(node, data)
         return Decoded("other", 0, "")
 
-    def _pdo(self, pdo: Any, data: bytes) -> Decoded:
+    def _pdo(self, pdo: PdoMap, data: bytes) -> Decoded:
         objects = self._of(pdo.node)
         values = list(pdo.values(data, objects))
         fields: dict[str, Any] = {"pdo": pdo.name, "values": {str(Place(i, s)): value for i, s, _, value in values}}

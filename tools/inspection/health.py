@@ -29,8 +29,8 @@ from jointctl.drivers.can.open import CYCLIC_INTERFACES, open_python_can
 from jointctl.drivers.can.socketcan import SHORT_QUEUE, link_problem, link_state, up_command
 from jointctl.drivers.canopen.identifiers import SDO_ANSWER_ID, SDO_REQUEST_ID
 from jointctl.drivers.errors import BusError
+from jointctl.tools.configuration.canopen import HIGHEST_LOAD, canopen_section, cycle_bytes
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.drive_settings import HIGHEST_LOAD, cycle_bytes
 from jointctl.tools.session.loop_handle import RECEIVE_SHARE
 from jointctl.tools.session.loops import start_time_s
 from jointctl.tools.session.portable_loop import HIGHEST_RATE_HZ
@@ -41,12 +41,12 @@ OK, NOTE, PROBLEM = "ok", "note", "problem"
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the report; `cure` tells what to do about it, `numbers` has figures for --json."""
+    """One line of the report; `remedy` tells what to do about it, `numbers` has figures for --json."""
 
     topic: str
     status: str  # ok, note (works, could be better), problem (a run will fail or be unsafe)
     text: str
-    cure: str = ""
+    remedy: str = ""
     numbers: dict[str, Any] = field(default_factory=dict)
 
 
@@ -93,12 +93,12 @@ def _preemption(root: Path) -> Finding:
     kernel, version = platform.release(), platform.version()
     if file_text(root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in version:
         return Finding("kernel", OK, f"{kernel}, PREEMPT_RT")
-    cure = "a real-time kernel bounds the worst wake-up; install one if the measured max is too late"
+    remedy = "a real-time kernel bounds the worst wake-up; install one if the measured max is too late"
     if _FULL in (file_text(root / "proc/cmdline") or "").split():
-        return Finding("kernel", NOTE, f"{kernel}, not PREEMPT_RT, {_FULL}", cure)
+        return Finding("kernel", NOTE, f"{kernel}, not PREEMPT_RT, {_FULL}", remedy)
     if "PREEMPT_DYNAMIC" in version:
-        cure += f"; the kernel option {_FULL} goes half the way"
-    return Finding("kernel", NOTE, f"{kernel}, not PREEMPT_RT", cure)
+        remedy += f"; the kernel option {_FULL} goes half the way"
+    return Finding("kernel", NOTE, f"{kernel}, not PREEMPT_RT", remedy)
 
 
 def kernel_findings(root: Path = Path("/")) -> Iterator[Finding]:
@@ -106,13 +106,13 @@ def kernel_findings(root: Path = Path("/")) -> Iterator[Finding]:
     yield _preemption(root)
     clock = file_text(root / "sys/devices/system/clocksource/clocksource0/current_clocksource")
     good = clock in _GOOD_CLOCKS
-    cure = "" if good else "a slow clock costs microseconds a reading: try the kernel option clocksource=tsc"
-    yield Finding("clock source", OK if good else NOTE, clock or "not told by this system", cure if clock else "")
+    remedy = "" if good else "a slow clock costs microseconds a reading: try the kernel option clocksource=tsc"
+    yield Finding("clock source", OK if good else NOTE, clock or "not reported by this system", remedy if clock else "")
     paths = sorted((root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor"))
     governors = sorted({text for path in paths if (text := file_text(path))})
     good = governors in ([], ["performance"])
-    cure = "" if good else "cores that clock down wake up late: sudo cpupower frequency-set -g performance"
-    yield Finding("CPU governor", OK if good else NOTE, ", ".join(governors) or "not told by this system", cure)
+    remedy = "" if good else "cores that clock down wake up late: sudo cpupower frequency-set -g performance"
+    yield Finding("CPU governor", OK if good else NOTE, ", ".join(governors) or "not reported by this system", remedy)
 
 
 def scheduling() -> Iterator[Finding]:
@@ -136,8 +136,8 @@ def scheduling() -> Iterator[Finding]:
     yield Finding("idle states", OK if good else NOTE, text, "" if good else _LATENCY_RIGHT)
     slack_ns = int(libc.prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0))
     good = 0 < slack_ns <= _MUCH_SLACK_NS
-    cure = "" if good else "without SCHED_FIFO every sleep is that much longer: start jointctl from an ordinary shell"
-    yield Finding("timer slack", OK if good else NOTE, f"{slack_ns / 1000:g} us", cure, {"timer_slack_ns": slack_ns})
+    remedy = "" if good else "without SCHED_FIFO every sleep is that much longer: start jointctl from an ordinary shell"
+    yield Finding("timer slack", OK if good else NOTE, f"{slack_ns / 1000:g} us", remedy, {"timer_slack_ns": slack_ns})
 
 
 def wake_up(config: Config, cycles: int) -> Iterator[Finding]:
@@ -156,22 +156,24 @@ def wake_up(config: Config, cycles: int) -> Iterator[Finding]:
         numbers = {"rate_Hz": rate_Hz, "p50_us": float(p50), "p99_us": float(p99), "max_us": worst}
         good = worst <= min(_LATE_US, 0.5e6 / rate_Hz)
         text = f"late by {p50:.0f} / {p99:.0f} / {worst:.0f} us (p50/p99/max of {cycles} at {rate_Hz:g} Hz)"
-        cure = "" if good else "give loop.cpu a core of its own (isolcpus), set loop.priority, close other programs"
-        yield Finding(name, OK if good else NOTE, text, cure, numbers)
+        remedy = "" if good else "give loop.cpu a core of its own (isolcpus), set loop.priority, close other programs"
+        yield Finding(name, OK if good else NOTE, text, remedy, numbers)
 
 
 def kernel_cache(folder: Path | None, cold: bool) -> Iterator[Finding]:
     """Where it is, whether the loop is in it, and how long a start takes."""
     if folder is None:
-        cure = "set JOINTCTL_CACHE_DIR to a folder that can be written; else every start compiles"
-        yield Finding("kernel cache", PROBLEM, "no folder can be written", cure)
+        remedy = "set JOINTCTL_CACHE_DIR to a folder that can be written; else every start compiles"
+        yield Finding("kernel cache", PROBLEM, "no folder can be written", remedy)
         return
     files = [path for path in folder.rglob("*") if path.is_file()]
     size = sum(path.stat().st_size for path in files)
     warm = any(path.name.startswith("realtime.run_loop") and path.suffix == ".nbc" for path in files)
     text = f"{folder}, {len(files)} files, {size / 1e6:.1f} MB, {'warm' if warm else 'cold'}"
-    cure = "" if warm else "the first start compiles for about a minute: run `jointctl demo` once"
-    yield Finding("kernel cache", OK if warm else NOTE, text, cure, {"files": len(files), "bytes": size, "warm": warm})
+    remedy = "" if warm else "the first start compiles for about a minute: run `jointctl demo` once"
+    yield Finding(
+        "kernel cache", OK if warm else NOTE, text, remedy, {"files": len(files), "bytes": size, "warm": warm}
+    )
     if warm:
         yield _start("warm start", None)
     if cold:
@@ -204,23 +206,23 @@ def adapters(config: Config, root: Path = Path("/")) -> Iterator[Finding]:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
         yield Finding("SocketCAN", OK, "available")
     except (OSError, AttributeError) as error:
-        cure = "sudo modprobe can_raw"
-        yield Finding("SocketCAN", PROBLEM if needed else NOTE, f"not available: {error}", cure)
+        remedy = "sudo modprobe can_raw"
+        yield Finding("SocketCAN", PROBLEM if needed else NOTE, f"not available: {error}", remedy)
     found = [
         f"{path.name} ({file_text(path / 'operstate') or 'state unknown'})"
         for path in sorted((root / "sys/class/net").glob("*"))
         if file_text(path / "type") == _CAN_LINK
     ]
-    cure = "" if found else "plug in the adapter; slcan adapters need slcand"
+    remedy = "" if found else "plug in the adapter; slcan adapters need slcand"
     status = OK if found else PROBLEM if needed else NOTE
-    yield Finding("CAN interfaces", status, ", ".join(found) or "none", cure)
+    yield Finding("CAN interfaces", status, ", ".join(found) or "none", remedy)
     try:
         member = os.geteuid() == 0 or grp.getgrnam("dialout").gr_gid in os.getgroups()
     except KeyError:
         yield Finding("serial ports", NOTE, "this system has no group dialout", "see who owns the adapter's /dev/tty*")
         return
-    cure = "" if member else f"for serial adapters: sudo usermod -aG dialout {getpass.getuser()}; log in again"
-    yield Finding("serial ports", OK if member else NOTE, "may be used" if member else "not in group dialout", cure)
+    remedy = "" if member else f"for serial adapters: sudo usermod -aG dialout {getpass.getuser()}; log in again"
+    yield Finding("serial ports", OK if member else NOTE, "may be used" if member else "not in group dialout", remedy)
 
 
 def interface_state(config: Config) -> Iterator[Finding]:
@@ -235,8 +237,8 @@ def interface_state(config: Config) -> Iterator[Finding]:
                 "interface", NOTE, f"{name} exists, its state is unknown", "install iproute2 (the program ip)"
             )
         else:
-            cure = f"plug it in, then: {up_command(name)}"
-            yield Finding("interface", PROBLEM, f"there is no CAN interface {name}", cure)
+            remedy = f"plug it in, then: {up_command(name)}"
+            yield Finding("interface", PROBLEM, f"there is no CAN interface {name}", remedy)
         return
     problem = link_problem(link, config.bus.bitrate_bitps)
     text = f"{name} is {'up' if link.up else 'down'}"
@@ -252,12 +254,12 @@ def interface_state(config: Config) -> Iterator[Finding]:
         yield Finding("interface", PROBLEM, problem[0], problem[1], numbers)
         return
     bad = link.state == "ERROR-WARNING" or any(past.get(key) for key in ("error_passive", "bus_off"))
-    cure = "frames have been failing: wiring, termination (60 ohm between H and L), bit rate" if bad else ""
-    yield Finding("interface", NOTE if bad else OK, text, cure, numbers)
+    remedy = "frames have been failing: wiring, termination (60 ohm between H and L), bit rate" if bad else ""
+    yield Finding("interface", NOTE if bad else OK, text, remedy, numbers)
     queue = link.queue_frames
     if queue is not None and queue < SHORT_QUEUE:
-        cure = f"sudo ip link set {name} txqueuelen 1000"
-        yield Finding("transmit queue", NOTE, f"{queue} frames: overflows when several programs send", cure)
+        remedy = f"sudo ip link set {name} txqueuelen 1000"
+        yield Finding("transmit queue", NOTE, f"{queue} frames: overflows when several programs send", remedy)
 
 
 def bus_budget(config: Config) -> Finding:
@@ -276,7 +278,7 @@ def bus_budget(config: Config) -> Finding:
     return Finding("bus budget", OK if good else PROBLEM, text, "" if good else "lower loop.rate_Hz", numbers)
 
 
-def sdo_round_trips_us(bus: Any, node: int, reads: int = SDO_READS) -> list[float]:
+def sdo_round_trips_us(bus: can.BusABC, node: int, reads: int = SDO_READS) -> list[float]:
     """Times [us] to read 1000h of `node`, fewer than `reads` where answers stay away; writes nothing."""
     request = can.Message(
         arbitration_id=SDO_REQUEST_ID + node, is_extended_id=False, data=struct.pack("<BHB4x", 0x40, 0x1000, 0)
@@ -308,12 +310,12 @@ def drive_finding(config: Config) -> Finding:
     except BusError as error:
         return Finding("drive", NOTE, f"not asked: {error.message}", error.hint)
     try:
-        times = sdo_round_trips_us(bus, config.canopen.node)
+        times = sdo_round_trips_us(bus, canopen_section(config).node)
     except (can.CanError, OSError) as error:
         return Finding("drive", PROBLEM, f"{bus_name} failed: {error}", "wiring, termination, bit rate")
     finally:
         bus.shutdown()
-    name = f"node {config.canopen.node} on {bus_name}"
+    name = f"node {canopen_section(config).node} on {bus_name}"
     if not times:
         return Finding("drive", PROBLEM, f"{name} does not answer", "power, wiring, bit rate, drive.node")
     p50, worst = float(np.median(times)), max(times)
@@ -325,6 +327,8 @@ def drive_finding(config: Config) -> Finding:
     text += f", which allows {allowed_Hz:.0f} Hz at least"
     good = len(times) == SDO_READS
     if good and config.loop.rate_Hz > allowed_Hz:
-        cure = "drives may answer SDO later than SYNC: look at the round trip that a run reports, or lower loop.rate_Hz"
-        return Finding("drive", NOTE, text, cure, numbers)
+        remedy = (
+            "drives may answer SDO later than SYNC: look at the round trip that a run reports, or lower loop.rate_Hz"
+        )
+        return Finding("drive", NOTE, text, remedy, numbers)
     return Finding("drive", OK if good else NOTE, text, "" if good else "SDO is being lost: wiring, bus load", numbers)

@@ -31,7 +31,6 @@ from jointctl.drivers.canopen.identifiers import (
 from jointctl.tools.inspection.objects import Objects, device_type_text, nmt_state
 from jointctl.tools.inspection.subject import SdoReader
 
-LISTEN_S = 1.2  # a little more than the usual heartbeat period of one second
 PACE_S = 0.002  # between two questions; 127 of them take a quarter of a second
 ANSWER_S = 0.3
 ROUNDS = 2

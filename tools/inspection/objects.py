@@ -294,7 +294,7 @@ class Objects:
         value = self.value(index, sub, data)
         return self.value_text(index, sub, value, 8 * len(data))
 
-    def value_text(self, index: int, sub: int, value: Any, bits: int) -> str:
+    def value_text(self, index: int, sub: int, value: bytes | str | float, bits: int) -> str:
         """As `text`, of a value that has been decoded."""
         if isinstance(value, bytes):
             return value[:_LONGEST_SHOWN].hex(" ") + (" ..." if len(value) > _LONGEST_SHOWN else "")

@@ -158,7 +158,7 @@ def _place(text: str, path: Path) -> Place:
     return place
 
 
-def _from_toml(raw: Any, key: str, path: Path) -> Value:
+def _from_toml(raw: object, key: str, path: Path) -> Value:
     if isinstance(raw, dict) and set(raw) == {"hex"}:
         try:
             return bytes.fromhex(raw["hex"])

@@ -18,7 +18,9 @@ from jointctl.drivers.can.open import open_python_can
 from jointctl.drivers.can.socketcan import interface_blamed
 from jointctl.drivers.canopen.network import new_network
 from jointctl.drivers.errors import BusError, ConfigurationError, NoDeviceError
+from jointctl.tools.configuration.canopen import canopen_section, eds_path
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.drive_section import GivenPlace
 from jointctl.tools.inspection.objects import Objects, Place, read_dictionary
 
 
@@ -56,22 +58,16 @@ class Subject:
 
 
 def subject_of_config(config: Config, eds: Path | None = None) -> Subject:
-    """The CANopen drive of a configuration; `ConfigurationError` for a serial one."""
-    bus, drive = config.bus, config.canopen
-    return Subject(bus.interface, bus.channel, bus.bitrate_bitps, drive.node, eds or config.eds_path, config)
+    """The CANopen drive of a configuration; `ConfigurationError` for any other."""
+    bus, drive = config.bus, canopen_section(config)
+    return Subject(bus.interface, bus.channel, bus.bitrate_bitps, drive.node, eds or eds_path(config), config)
 
 
-def subject_of_flags(
-    interface: str | None,
-    channel: str | None,
-    bitrate: int | None,
-    node: int | None,
-    eds: Path | None,
-    environ: Mapping[str, str] = os.environ,
-) -> Subject:
+def subject_of_flags(given: GivenPlace, eds: Path | None, environ: Mapping[str, str] = os.environ) -> Subject:
     """Flag beats environment; interface and channel are needed."""
-    interface = interface or environ.get("CAN_INTERFACE")
-    channel = channel or environ.get("CAN_CHANNEL")
+    interface = given.interface or environ.get("CAN_INTERFACE")
+    channel = given.channel or environ.get("CAN_CHANNEL")
+    bitrate = given.bitrate
     if not interface or not channel:
         missing = "interface (-i)" if not interface else "channel (-c)"
         raise ConfigurationError(
@@ -84,7 +80,7 @@ def subject_of_flags(
         bitrate = int(text)
     if eds is not None and not eds.is_file():
         raise ConfigurationError(f"--eds (={eds}) must name a file")
-    return Subject(interface, channel, bitrate, node, eds)
+    return Subject(interface, channel, bitrate, given.node, eds)
 
 
 @contextmanager
@@ -98,7 +94,7 @@ def canopen_network(subject: Subject, *listeners: can.Listener) -> Iterator[cano
         except can.CanError as error:
             raise BusError(f"{subject.place} failed: {error}", "wiring, bit rate, and whether it is up") from None
         finally:
-            with suppress(Exception):  # what went wrong on the bus has been told
+            with suppress(Exception):  # what went wrong on the bus has been reported
                 network.disconnect()
 
 

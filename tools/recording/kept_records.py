@@ -1,7 +1,4 @@
-"""The log records of a run until its summary: a minute of them in memory, a longer run in a file without a name.
-
-An hour at 1 kHz is 1.2 GB; the supervisor's memory must not grow with the run.
-"""
+"""Records of a long run that are held: all of them for summary and picture, decimated ones for the log."""
 
 from __future__ import annotations
 
@@ -15,6 +12,7 @@ import numpy as np
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
 
+# an hour at 1 kHz is 1.2 GB; the supervisor's memory must not grow with the run
 IN_MEMORY = 60_000  # records: 20 MB
 
 
@@ -30,7 +28,7 @@ class KeptRecords:
     def __len__(self) -> int:
         return self._count
 
-    def append(self, records: Any) -> None:
+    def append(self, records: np.ndarray) -> None:
         """Keep `records` (array of LogRecord, shape (N,)); `OSError` if the disk is full."""
         self._count += len(records)
         self._parts.append(records)
@@ -60,3 +58,27 @@ class KeptRecords:
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, _: TracebackType | None) -> None:
         self.close()
+
+
+class ThinnedRecords:
+    """Holds the last `whole` records back; of what is older it gives every `every`-th one."""
+
+    def __init__(self, every: int, whole: int) -> None:
+        self._every, self._whole = every, whole
+        self._held: Any = np.zeros(0, dtype_of(LogRecord)).view(np.recarray)
+        self._seen = 0  # records that are no longer held
+
+    def take(self, records: np.ndarray) -> Any:
+        """New `records` (array of LogRecord, shape (N,)) in order of time; returns those to be written now."""
+        held = np.concatenate((self._held, records)).view(np.recarray)
+        old = held[: max(0, len(held) - self._whole)]
+        self._held = held[len(old) :]
+        chosen = old[-self._seen % self._every :: self._every]
+        self._seen += len(old)
+        return chosen
+
+    def last(self) -> Any:
+        """Those held back, all of them; nothing is held afterwards."""
+        held, self._held = self._held, self._held[:0]
+        self._seen += len(held)
+        return held

@@ -23,10 +23,10 @@ from jointctl.tools.recording.run_log_reader import RunLog, calendar_offset_ns
 _ROWS = 10_000  # turned into Python numbers at once
 
 
-def columns(records: Any) -> dict[str, np.ndarray]:
+def columns(records: np.ndarray) -> dict[str, np.ndarray]:
     """Name -> values, shape (N,), of every field of a record array."""
     found: dict[str, np.ndarray] = {}
-    for name in records.dtype.names:
+    for name in records.dtype.names or ():
         values = np.asarray(records[name])
         if values.ndim == 1:
             found[name] = values

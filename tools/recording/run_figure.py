@@ -7,13 +7,16 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jointctl.drivers.errors import DataError
 from jointctl.firmware_py.states import AxisPhase, fault_name
 from jointctl.tools.drawing import BLUE, COLOURS, GREEN, GREY, INK, ORANGE, RED, TEAL, VIOLET, canvas, save_png
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 POINTS = 4000  # a bucket of samples is drawn by its least and greatest value, so that no peak is lost
 _PARTS = {
@@ -36,31 +39,37 @@ def drawn_indices(values: np.ndarray, points: int = POINTS) -> np.ndarray:
     return np.unique(chosen)
 
 
-def save_run_figure(records: Any, path: Path, title: str) -> Path:
+def save_run_figure(records: np.ndarray, path: Path, title: str) -> Path:
     """Draw `records` (array of LogRecord, shape (N,)) into a PNG at `path`; returns the path.
 
     `DataError` if there are fewer than two, or if it cannot be written.
     """
     if len(records) < 2:
         raise DataError(f"{path}: nothing to draw, the run has {len(records)} records")
-    with_network = bool(np.any(records["network_torque_Nm"][_powered(records)] != 0.0))
+    with_network = bool(np.any(records["network_torque_Nm"][powered(records)] != 0.0))
     heights = (3.0, 3.0, 4.0, 2.4) if with_network else (3.0, 3.0, 4.0)
     with canvas(0.77 * sum(heights), title) as figure:
         _draw(figure.subplots(len(heights), 1, sharex=True, height_ratios=heights), records, with_network)
     return save_png(figure, path)
 
 
-def _powered(records: Any) -> np.ndarray:
-    """Where the law computes: while RELEASING it rests and its parts keep their last values."""
-    return (records["phase"] >= AxisPhase.APPROACH) & (records["phase"] <= AxisPhase.RAMPING)
+def seconds(records: np.ndarray) -> np.ndarray:
+    """float64[N] since the first record."""
+    since: np.ndarray = (records["time_ns"] - records["time_ns"][0]) * 1e-9
+    return since
 
 
-def _draw(axes: Any, records: Any, with_network: bool) -> None:
-    powered = _powered(records)
-    time_s = (records["time_ns"] - records["time_ns"][0]) * 1e-9
+def powered(records: np.ndarray) -> np.ndarray:
+    """bool[N]: the law is at work (while RELEASING its parts keep their last values)."""
+    at_work: np.ndarray = (records["phase"] >= AxisPhase.APPROACH) & (records["phase"] <= AxisPhase.RAMPING)
+    return at_work
 
-    def draw(axis: Any, values: np.ndarray, label: str, color: str, **style: Any) -> None:
-        values = np.where(powered, values, np.nan) if style.pop("powered", True) else values
+
+def _draw(axes: np.ndarray, records: np.ndarray, with_network: bool) -> None:
+    on, time_s = powered(records), seconds(records)
+
+    def draw(axis: Axes, values: np.ndarray, label: str, color: str, **style: Any) -> None:
+        values = np.where(on, values, np.nan) if style.pop("powered", True) else values
         keep = drawn_indices(values)
         axis.plot(time_s[keep], values[keep], color=color, label=label, **style)
 
@@ -72,7 +81,7 @@ def _draw(axes: Any, records: Any, with_network: bool) -> None:
     draw(axes[2], records["command_torque_Nm"], "command", INK, powered=False, linewidth=1.4)
     for name, color in _PARTS.items():
         values = records[f"{name}_torque_Nm"]
-        if np.any(values[powered] != 0.0):
+        if np.any(values[on] != 0.0):
             draw(axes[2], values, name, color, linewidth=0.9)
     axes[2].set_ylabel("joint torque [Nm]")
     if with_network:
@@ -88,7 +97,7 @@ def _draw(axes: Any, records: Any, with_network: bool) -> None:
     axes[0].figure.align_ylabels(axes)
 
 
-def _error_text(records: Any) -> str:
+def _error_text(records: np.ndarray) -> str:
     error = records["error_rad"][records["phase"] == AxisPhase.TRACKING] * 1e3
     error = error[np.isfinite(error)]
     if not len(error):
@@ -97,7 +106,7 @@ def _error_text(records: Any) -> str:
     return f"while tracking\nmin {error.min():.3g}\nmax {error.max():.3g}\nRMSE {rmse:.3g}"
 
 
-def _mark_phases(axes: Any, phase: np.ndarray, time_s: np.ndarray) -> None:
+def _mark_phases(axes: np.ndarray, phase: np.ndarray, time_s: np.ndarray) -> None:
     """Shade everything that is not tracking, with a word at the top."""
     edges = [0, *(np.flatnonzero(np.diff(phase)) + 1), len(phase)]
     stretches: list[tuple[str, int, int]] = []
@@ -121,7 +130,7 @@ def _mark_phases(axes: Any, phase: np.ndarray, time_s: np.ndarray) -> None:
             )  # fmt: skip
 
 
-def _mark_fault(axes: Any, fault: np.ndarray, time_s: np.ndarray) -> None:
+def _mark_fault(axes: np.ndarray, fault: np.ndarray, time_s: np.ndarray) -> None:
     found = np.flatnonzero(fault)
     if not len(found):
         return

@@ -230,7 +230,7 @@ class RunLogWriter:
         self._temperature_channel: int | None = None  # only where the drive reports one
         self._file.flush()
 
-    def _add(self, channel: int, times_ns: np.ndarray, records: np.ndarray, numbers: Any = 0) -> None:
+    def _add(self, channel: int, times_ns: np.ndarray, records: np.ndarray, numbers: np.ndarray | int = 0) -> None:
         """Messages of `records`, their bytes as they are."""
         rows = np.zeros(len(records), cdr_rows(np.dtype(f"V{records.dtype.itemsize}")))
         rows["sequence"] = numbers
@@ -238,7 +238,7 @@ class RunLogWriter:
         rows["record"] = records.view(np.ndarray).view(rows.dtype["record"])
         self._mcap.add_messages(channel, times_ns, rows)
 
-    def write_records(self, records: Any) -> None:
+    def write_records(self, records: np.ndarray) -> None:
         """Append log records, an array of shape (N,) of LogRecord in order of time."""
         records = np.ascontiguousarray(records)
         if records.dtype != dtype_of(LogRecord):

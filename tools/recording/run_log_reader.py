@@ -161,7 +161,7 @@ def _stream(data: bytes, at: int, length: int) -> ReadDataStream:
 _LEVELS = ((ERROR, "error"), (WARNING, "warning"), (20, "information"), (0, "debug"))
 
 
-def missing_records(records: Any) -> int:
+def missing_records(records: np.ndarray) -> int:
     """Cycles that the loop executed but the log does not hold: the cycle counter jumps by more than was skipped."""
     if len(records) < 2:
         return 0
@@ -175,7 +175,7 @@ def missing_in(log: RunLog) -> int | None:
 
 
 def kept_share(log: RunLog) -> str:
-    """Which records a thinned log holds, in words; "" for one that holds all."""
+    """Which records a decimated log holds, in words; "" for one that holds all."""
     thinning = log.metadata.get(THINNING)
     return f"every {thinning['every']}th, the last {thinning['whole_s']} s whole" if thinning else ""
 

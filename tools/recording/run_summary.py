@@ -80,8 +80,8 @@ class RunSummary:
 
 
 def summarise(
-    records: Any,
-    histograms: Any = None,
+    records: np.ndarray,
+    histograms: np.ndarray | None = None,
     *,
     late_from_s: float | None = None,
     temperatures_degC: Sequence[float] | np.ndarray = (),
@@ -90,7 +90,7 @@ def summarise(
 
     `histograms` int64[3, bins of 1 us], rows wake-up, round trip, work, the last bin open: where given, the deadline
     statistics come from it, because the loop counts every cycle there even if the log lost some.
-    `late_from_s` is a trajectory time, `temperatures_degC` what the drive has told.
+    `late_from_s` is a trajectory time, `temperatures_degC` what the drive has reported.
     """
     tracking = records[records["phase"] == AxisPhase.TRACKING]
     time_s = tracking_time_s(tracking)
@@ -116,7 +116,7 @@ def summarise(
     )
 
 
-def tracking_time_s(tracking: Any) -> np.ndarray:
+def tracking_time_s(tracking: np.ndarray) -> np.ndarray:
     """Trajectory time [s] of TRACKING records; goes on where a change of the motion has set the loop's own back."""
     time_s: np.ndarray = tracking["trajectory_s"]
     if len(time_s) < 2 or np.all(np.diff(time_s) >= 0.0):
@@ -125,12 +125,12 @@ def tracking_time_s(tracking: Any) -> np.ndarray:
     return since + time_s[0]
 
 
-def _range(values: Any) -> Range | None:
+def _range(values: np.ndarray) -> Range | None:
     values = values[np.isfinite(values)]
     return Range(float(values.min()), float(values.max())) if len(values) else None
 
 
-def _error(tracking: Any, time_s: np.ndarray) -> ErrorSummary | None:
+def _error(tracking: np.ndarray, time_s: np.ndarray) -> ErrorSummary | None:
     error = tracking["error_rad"]
     found = _range(error)
     if found is None:
@@ -139,14 +139,14 @@ def _error(tracking: Any, time_s: np.ndarray) -> ErrorSummary | None:
     return ErrorSummary(float(time_s[0]), float(time_s[-1]), found, rmse)
 
 
-def _settling_s(tracking: Any) -> float | None:
+def _settling_s(tracking: np.ndarray) -> float | None:
     outside = np.flatnonzero(~(np.abs(tracking["error_rad"]) <= SETTLED_RAD))
     if len(tracking) == 0 or (len(outside) and outside[-1] == len(tracking) - 1):
         return None
     return float(tracking_time_s(tracking)[outside[-1] + 1 if len(outside) else 0])
 
 
-def _times(records: Any, histograms: Any, row: int) -> TimeSummary | None:
+def _times(records: np.ndarray, histograms: np.ndarray | None, row: int) -> TimeSummary | None:
     if histograms is not None:
         found = histogram_times(histograms[row])
         # what lies beyond the histogram is in the records, unless they were lost
@@ -161,7 +161,7 @@ def _times(records: Any, histograms: Any, row: int) -> TimeSummary | None:
     return TimeSummary(len(values), float(p50), float(p99), float(p99_9), float(values.max()), 0)
 
 
-def histogram_times(histogram: Any) -> TimeSummary | None:
+def histogram_times(histogram: np.ndarray) -> TimeSummary | None:
     """Percentiles of one row of 1 us bins; bin i holds durations in [i, i + 1) us, the last one all beyond."""
     total = int(histogram.sum())
     if total == 0:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from nicegui import ui
 
 from jointctl.tools.scoping.history import SIGNALS, History, crossing_s
@@ -69,7 +70,7 @@ class Chart:
             self._drawn = now
             self._draw(rows, names)
 
-    def _look_for_trigger(self, rows: Any, span_s: float) -> None:
+    def _look_for_trigger(self, rows: np.ndarray, span_s: float) -> None:
         """Hold the picture when the newest crossing stands in its middle."""
         field, factor = SIGNALS[self._source.value]
         time_s = self._history.seconds(rows)
@@ -82,7 +83,7 @@ class Chart:
             self._armed.value = False
             self._pause.value = True
 
-    def _draw(self, rows: Any, names: list[str]) -> None:
+    def _draw(self, rows: np.ndarray, names: list[str]) -> None:
         units = list(dict.fromkeys(name[name.index("[") :] for name in names))
         options = self._chart.options
         options["yAxis"] = [

@@ -19,6 +19,7 @@ from typing import Any, Self
 from jointctl.drivers.errors import DataError, UsageError
 from jointctl.drivers.printable import printable
 from jointctl.firmware_py.states import StopRequest
+from jointctl.tools.configuration.drive_section import DEFAULT_KIND
 from jointctl.tools.recording.run_log import Event
 from jointctl.tools.session.display import LONGEST_BYTES, Snapshot, ViewerRequest, decoded
 
@@ -41,7 +42,7 @@ class ScopeOrder:
     host: str
     port: int
     token: str  # without it nothing is shown or taken
-    cia402: bool = True
+    drive: str = DEFAULT_KIND  # drive.kind
     feed_fd: int = -1  # -1: show `log` instead
     log: str = ""
 
@@ -76,7 +77,7 @@ class ScopeFeed:
     """A `Display` that passes everything on to the server; nothing in it raises or waits.
 
     `in_charge`: the run is led from the page, so it brakes when the server has ended.  `unwatched_s`: it brakes when no
-    page has been open for so long; None = it goes on.  In any case the terminal and the log are told.
+    page has been open for so long; None = it goes on.  In any case it is reported in the terminal and the log.
     """
 
     def __init__(self, end: socket.socket, *, in_charge: bool = False, unwatched_s: float | None = None) -> None:
@@ -89,7 +90,7 @@ class ScopeFeed:
         self._reason = ""
         self._requests: deque[ViewerRequest] = deque(maxlen=REQUESTS)
         self._viewers = 0
-        self._counted_s: float | None = None  # when the server told their number last
+        self._counted_s: float | None = None  # when the server reported their number last
         self._temperature_degC: float | None = None  # as it was passed on
         self._unwatched_since_s: float | None = None  # None: somebody watches, or nobody ever has
 
@@ -137,24 +138,24 @@ class ScopeFeed:
                 else:
                     self._requests.append(request)
 
-    def _ask_stop(self, strength: Any, reason: str) -> None:
+    def _ask_stop(self, strength: object, reason: str) -> None:
         if strength not in (1, 2):
             return
         if self._asked is StopRequest.NONE:
             self._reason = reason
         self._asked = max(self._asked, StopRequest(strength))
 
-    def _count_viewers(self, count: Any, text: str = "") -> None:
+    def _count_viewers(self, count: object, text: str = "") -> None:
         """A change between nobody and somebody is passed on as a request."""
         if not isinstance(count, int):
             return
         self._counted_s = time.monotonic()
         if count == self._viewers:
             return
-        told = (count > 0) is not (self._viewers > 0) and (count == 0 or self._unwatched_since_s is not None)
+        changed = (count > 0) is not (self._viewers > 0) and (count == 0 or self._unwatched_since_s is not None)
         self._viewers = count
         self._unwatched_since_s = None if count else time.monotonic()
-        if told:
+        if changed:
             self._requests.append(ViewerRequest("viewers", "", {"count": count, "text": text}))
 
     def _check_silence(self) -> None:
@@ -168,7 +169,7 @@ class ScopeFeed:
         if self.gone:
             return
         self.gone = True
-        self._viewers = max(self._viewers, 1)  # told whether or not a page was open
+        self._viewers = max(self._viewers, 1)  # reported whether or not a page was open
         self._count_viewers(
             0, SERVER_ENDED + (", braking" if self._in_charge else "; Ctrl-C or `jointctl stop` brakes")
         )

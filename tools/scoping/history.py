@@ -14,9 +14,8 @@ import numpy as np
 from jointctl.drivers.printable import printable
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of, new
-from jointctl.tools.recording.run_figure import drawn_indices
+from jointctl.tools.recording.run_figure import drawn_indices, powered
 from jointctl.tools.recording.run_log import Event
-from jointctl.tools.reporting.run_figures import powered
 
 RING_RECORDS = 1 << 16  # 65 s at 1 kHz
 EVENTS = 50
@@ -43,7 +42,7 @@ SIGNALS: dict[str, tuple[str, float]] = {
 _OF_THE_LAW = ("error_rad", "desired_position_rad", "desired_velocity_radps")
 
 
-def _printable(value: Any) -> Any:
+def _printable(value: object) -> Any:
     """Every text in a message of the supervisor as it may be shown."""
     if isinstance(value, str):
         return printable(value)
@@ -74,7 +73,7 @@ class History:
         """What the supervisor tells besides, likewise."""
         self.settings.update(_printable(found))
 
-    def take(self, records: Any) -> None:
+    def take(self, records: np.ndarray) -> None:
         """Append records, shape (N,), in order of time."""
         if not len(records):
             return
@@ -113,12 +112,12 @@ class History:
         """Seconds since the first record ever taken."""
         return (time_ns - self._start_ns) * 1e-9 if self._start_ns else 0.0
 
-    def seconds(self, records: Any) -> np.ndarray:
+    def seconds(self, records: np.ndarray) -> np.ndarray:
         """float64[N] since the first record ever taken."""
         since: np.ndarray = (records["time_ns"] - self._start_ns) * 1e-9
         return since
 
-    def series(self, records: Any, signal: str) -> list[list[float | None]]:
+    def series(self, records: np.ndarray, signal: str) -> list[list[float | None]]:
         """[seconds, value] of a signal, at most about POINTS of them, least and greatest of each stretch.
 
         Where records are missing for GAP_s the value is None: a line across them would show a motion that was not.
@@ -145,7 +144,7 @@ def crossing_s(time_s: np.ndarray, values: np.ndarray, level: float, *, rising: 
     return float(time_s[found[-1] + 1]) if len(found) else None
 
 
-def percentiles_us(records: Any) -> dict[str, str]:
+def percentiles_us(records: np.ndarray) -> dict[str, str]:
     """p50 / p99 / max of wake-up, round trip and work [us] in these records."""
     found = {}
     for name, field in (("wake-up late", "wake_late_ns"), ("round trip", "round_trip_ns"), ("work", "work_ns")):

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
+import numpy as np
 from nicegui import ui
 
 from jointctl.tools.recording.run_log import Event
@@ -13,7 +14,8 @@ from jointctl.tools.scoping.chart import Chart
 from jointctl.tools.scoping.feed import ScopeOrder
 from jointctl.tools.scoping.history import History, percentiles_us
 from jointctl.tools.session.display import ViewerRequest, viewer
-from jointctl.tools.session.events import drive_state_name, fault_words, phase_name
+from jointctl.tools.session.events import fault_words, phase_name
+from jointctl.tools.session.session_drive import drive_state_name, session_drive
 
 # --- STOP ---
 
@@ -151,7 +153,7 @@ UNITS = {"kp": "kp [1/s2]", "kv": "kv [1/s]", "ki": "ki [1/s3]", "observer_radps
 class Followed:
     """A field that shows what is in force until a viewer types into it, and again once that is in force."""
 
-    def __init__(self, field: Any, digits: str) -> None:
+    def __init__(self, field: ui.number, digits: str) -> None:
         self.field, self._digits = field, digits
         self._shown: float | None = _number(field)
 
@@ -251,7 +253,7 @@ class ChangePanels:
         self._recorded.text = str(settings.get("recording") or "the run log has everything in any case")
 
 
-def _number(field: Any) -> float | None:
+def _number(field: ui.number) -> float | None:
     return None if field.value is None else float(field.value)
 
 
@@ -376,9 +378,9 @@ class ScopePage:
     def _line(self, event: Event) -> str:
         return f"{max(0.0, self._history.second(event.time_ns)):7.1f} s  {event.source}: {event.text}"
 
-    def _words(self, rows: Any, stage: str) -> list[str]:
+    def _words(self, rows: np.ndarray, stage: str) -> list[str]:
         last = rows[-1]
-        drive = drive_state_name(int(last["status_word"]), int(last["drive_state"]), cia402=self._order.cia402)
+        drive = drive_state_name(session_drive(self._order.drive), int(last["status_word"]), int(last["drive_state"]))
         words = [phase_name(int(last["phase"])), f"drive: {drive}"]
         temperature_degC = self._history.settings.get("temperature_degC")
         if temperature_degC is not None and not self._history.ended and stage != "ended":

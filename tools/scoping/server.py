@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Awaitable, Callable, Iterator, MutableMapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
 from jointctl.tools.recording.run_log import Event
@@ -27,16 +27,22 @@ from jointctl.tools.scoping.feed import COUNT_AGAIN_S, EVENT, RECORDS, SETTINGS,
 from jointctl.tools.scoping.history import EVENTS, RING_RECORDS, History
 from jointctl.tools.session.display import ViewerRequest, viewer
 
+if TYPE_CHECKING:
+    from starlette.requests import Request
+
 _LONGEST = 1 << 20  # bytes of a message
 MESSAGES = 20  # that a page which was cut off for a moment gets again
 RECONNECT_S = 10.0  # a page that was cut off for less goes on where it was
 _AFTER_END_S = 1.5  # for the pages to show the end of the run
 COUNT_S = 0.5  # how often the open pages are counted
-NICE = 5  # whoever looks on comes after the supervisor, but STOP has to arrive on a busy computer
+NICE = 5  # a viewer comes after the supervisor, but STOP has to arrive on a busy computer
 RELOAD_S = 3.0  # nobody for so long: the last page is closed, not reloaded
 COOKIE = "jointctl_scope"  # how their names begin
 Scope = MutableMapping[str, Any]
-Application = Callable[[Scope, Any, Any], Awaitable[None]]
+Message = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[Message]]
+Send = Callable[[Message], Awaitable[None]]
+Application = Callable[[Scope, Receive, Send], Awaitable[None]]
 # the address holds the token: it goes to no other site, and into no cache
 _PRIVATE = ((b"referrer-policy", b"no-referrer"), (b"cache-control", b"no-store"))
 
@@ -83,7 +89,7 @@ class AccessControl:
         self._app = app
         self._token = token
 
-    async def __call__(self, scope: Scope, receive: Any, send: Any) -> None:
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
@@ -91,7 +97,7 @@ class AccessControl:
             await _refuse(scope, send)
             return
 
-        async def with_cookie(message: MutableMapping[str, Any]) -> None:
+        async def with_cookie(message: Message) -> None:
             if message["type"] == "http.response.start":
                 value = f"{cookie_name(self._token)}={self._token}; HttpOnly; SameSite=Strict; Path=/"
                 kept = [(key, found) for key, found in message.get("headers", []) if key.lower() != b"cache-control"]
@@ -101,7 +107,7 @@ class AccessControl:
         await self._app(scope, receive, with_cookie)
 
 
-async def _refuse(scope: Scope, send: Any) -> None:
+async def _refuse(scope: Scope, send: Send) -> None:
     if scope["type"] == "websocket":
         await send({"type": "websocket.close", "code": 1008})
         return
@@ -178,7 +184,7 @@ def stop_route(feed: Feed) -> Any:
     """The answer to a press of STOP."""
     from starlette.responses import PlainTextResponse
 
-    async def stop(request: Any) -> Any:
+    async def stop(request: Request) -> Any:
         strength = feed.stop(viewer(request.client.host if request.client else None))
         if not strength:
             return PlainTextResponse("not taken: jointctl does not listen", 503)
@@ -191,16 +197,16 @@ async def count_viewers(feed: Feed) -> None:
     """Tell the supervisor how many pages are open, again and again; a reload is no absence."""
     from nicegui import Client
 
-    told, told_s, seen_s = -1, 0.0, 0.0
+    sent, sent_s, seen_s = -1, 0.0, 0.0
     while True:
         count = sum(client.has_socket_connection for client in list(Client.instances.values()))
         now_s = time.monotonic()
         if count:
             seen_s = now_s
         if not count and now_s - seen_s <= RELOAD_S:
-            count = told
-        if count >= 0 and (count != told or now_s - told_s > COUNT_AGAIN_S):
-            told, told_s = count, now_s
+            count = sent
+        if count >= 0 and (count != sent or now_s - sent_s > COUNT_AGAIN_S):
+            sent, sent_s = count, now_s
             feed.ask(ViewerRequest("viewers", "server", {"count": count}))
         await asyncio.sleep(COUNT_S)
 

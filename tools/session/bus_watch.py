@@ -39,7 +39,7 @@ BUS_FAULTS = frozenset({
     Fault.BUS_ERROR, Fault.STALE_SAMPLE, Fault.NO_SAMPLES, Fault.SAMPLES_MISSING, Fault.DRIVE_FAULT,
     Fault.ENABLE_TIMEOUT,
 })  # fmt: skip
-_CURES = {
+_REMEDIES = {
     "bus-off": "a short, missing termination or a wrong bit rate",
     "error passive": "nobody acknowledges, or the bit rate is wrong: power of the drive, wiring, termination",
     "no acknowledge": "nobody else is on the bus: power of the drive, wiring, bit rate",
@@ -71,7 +71,7 @@ class BusWatch:
             kind = trouble(identifier, data)
             if kind and kind not in self._told:
                 self._told.add(kind)
-                news.append(f"{self._channel}: {error_frame_text(identifier, data)} ({_CURES[kind]})")
+                news.append(f"{self._channel}: {error_frame_text(identifier, data)} ({_REMEDIES[kind]})")
         return news
 
     def explained(self, fault: Fault, text: FaultText | None, last_errno: int) -> FaultText | None:
@@ -168,7 +168,7 @@ def recording(config: Config) -> Iterator[FrameRecorder | None]:
         yield None
         return
     bus = config.bus
-    if config.is_serial:
+    if not config.drive.sends_frames:
         raise ConfigurationError(f"{config.path}: log.frames (=true) must be false on a serial line, it has no frames")
     if bus.interface not in SHARED_INTERFACES:
         raise ConfigurationError(
@@ -183,7 +183,7 @@ def recording(config: Config) -> Iterator[FrameRecorder | None]:
         recorder.close()
 
 
-# --- The drive's temperature during a run: readings into the log, the newest one for whoever watches ---
+# --- The drive's temperature during a run: readings into the log, the newest one for a viewer ---
 
 
 STALE_S = 3.0  # three requests without a reading: what was read before is not the temperature any more

@@ -11,6 +11,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from jointctl.firmware_py.states import StopRequest
+from jointctl.tools.configuration.drive_section import DEFAULT_KIND
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import ERROR, Event
 
@@ -53,7 +54,7 @@ def decoded(message: bytes) -> ViewerRequest | None:
     return ViewerRequest(kind, " ".join(who.split())[:80], values)
 
 
-# --- What a run tells whoever watches it, and what it hears from them: the `Display` protocol and the `Snapshot` ---
+# --- What a run reports to its viewers, and what it hears from them: the `Display` protocol and the `Snapshot` ---
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Snapshot:
     skipped: int
     histograms: np.ndarray
     duration_s: float  # of the trajectory; 0 = until stopped
-    cia402: bool = True
+    drive: str = DEFAULT_KIND  # drive.kind
     records: Any = ()  # all new ones, array of LogRecord (N,)
     temperature_degC: float | None = None  # None: the drive tells none, or not now
 
@@ -85,7 +86,7 @@ class Display(Protocol):
         """Something that went into the log as an event."""
 
     def stop_request(self) -> StopRequest:
-        """What whoever watches asks for."""
+        """What a viewer asks for."""
         ...
 
     def stop_reason(self) -> str:
@@ -197,7 +198,7 @@ class PhaseLines(OnlyShows):
     phase = note
 
     def event(self, event: Event) -> None:
-        """A fault is told when it happens, not only at the end of the run; the other events are in the log."""
+        """A fault is reported when it happens, not only at the end of the run; the other events are in the log."""
         if event.level >= ERROR:
             self.note(event.text)
 

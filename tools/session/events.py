@@ -11,23 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.canopen.cia402 import State, state_of_word, state_text
-from jointctl.drivers.elmo.codes import motor_fault_text
 from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, fault_name, in_words
 from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, Event
-from jointctl.tools.session.fault_words import FAULT_TEXTS, emergency_text
+from jointctl.tools.session.fault_words import FAULT_TEXTS
+from jointctl.tools.session.session_drive import SessionDrive, drive_state_name
 
 OVERRUN_CYCLES = 10  # so many skipped slots in one go are worth a line
-_BAD = (State.FAULT, State.FAULT_REACTION_ACTIVE, State.UNDEFINED)
-
-
-def drive_state_name(status_word: int, drive_state: int, *, cia402: bool = True) -> str:
-    """`operation enabled` and so on; where there is no CiA 402 statusword, the loop's own name of the state."""
-    if drive_state == DriveState.UNKNOWN:
-        return "not heard yet"
-    if cia402:
-        return state_text(status_word)
-    return in_words(DriveState(drive_state))
 
 
 def phase_name(phase: int) -> str:
@@ -48,12 +37,12 @@ def _likely_cause(fault: Fault, _drive_error: int) -> str:
 class EventFinder:
     """Feed it the records of a run in order, in pieces of any size.
 
-    `cia402`: the status word is one of CiA 402, else a serial drive's.  `fault_words(fault, drive_error)` says more
-    about a fault than its name.
+    `drive` has the words for its states and errors.  `fault_words(fault, drive_error)` says more about a fault than its
+    name.
     """
 
-    def __init__(self, *, cia402: bool = True, fault_words: Callable[[Fault, int], str] = _likely_cause) -> None:
-        self._cia402 = cia402
+    def __init__(self, drive: SessionDrive, fault_words: Callable[[Fault, int], str] = _likely_cause) -> None:
+        self._drive = drive
         self._fault_words = fault_words
         self._last: tuple[int, ...] | None = None
 
@@ -78,15 +67,16 @@ class EventFinder:
         events = []
         if skipped >= OVERRUN_CYCLES:
             events.append(Event(time_ns, WARNING, "loop", f"held up: {skipped} cycles skipped"))
-        state = drive_state_name(word, drive, cia402=self._cia402)
-        state_before = drive_state_name(before[3], before[2], cia402=self._cia402) if before[2] >= 0 else ""
+        state = drive_state_name(self._drive, word, drive)
+        state_before = drive_state_name(self._drive, before[3], before[2]) if before[2] >= 0 else ""
         if error != before[4]:
             events.append(self._error_event(time_ns, error))
         if state != state_before:
             bad = drive in (DriveState.FAULT, DriveState.FAULT_BRAKING) or (
-                self._cia402 and drive != DriveState.UNKNOWN and state_of_word(word) in _BAD
+                drive != DriveState.UNKNOWN and self._drive.in_fault(word)
             )
-            word_text = f" (statusword {word:04X}h)" if self._cia402 and drive != DriveState.UNKNOWN else ""
+            shown = drive != DriveState.UNKNOWN and self._drive.state_text(word) is not None
+            word_text = f" (statusword {word:04X}h)" if shown else ""
             events.append(Event(time_ns, WARNING if bad else INFO, "drive", state + word_text))
         if fault != before[1] and fault:
             events.append(Event(time_ns, ERROR, "loop", self._fault_text(fault, error)))
@@ -97,9 +87,7 @@ class EventFinder:
     def _error_event(self, time_ns: int, error: int) -> Event:
         if not error:
             return Event(time_ns, INFO, "drive", "error code cleared")
-        if self._cia402:
-            return Event(time_ns, ERROR, "drive", f"EMCY {emergency_text(error)}")
-        return Event(time_ns, ERROR, "drive", f"motor fault: {motor_fault_text(error)}")
+        return Event(time_ns, ERROR, "drive", self._drive.error_text(error))
 
     def _fault_text(self, code: int, drive_error: int) -> str:
         if code not in list(Fault):

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from jointctl.drivers.canopen.cia402 import state_text
-from jointctl.drivers.elmo.codes import SERVO_ON
 from jointctl.firmware_py.records import ENCODER_RESTARTED
 from jointctl.firmware_py.states import Fault, Notice
 from jointctl.tools.recording.run_log import WARNING, Event
 
 # --- Error codes of CANopen drives (EMCY, object 603Fh) in words ---
 # Source: CiA 301 (classes), CiA 402 (codes), and the codes of the Elmo family from the project's facts sheet.  A code
-# that is not listed is told by its class: the upper byte, else the upper digit.
+# that is not listed is reported by its class: the upper byte, else the upper digit.
 
 
 _CODES = {
@@ -99,158 +97,228 @@ class FaultText:
         return f"likely cause: {self.cause}; next: {self.next_step}"
 
 
-FAULT_TEXTS: dict[Fault, FaultText] = {
-    Fault.POSITION_LIMIT: FaultText(
+@dataclass(frozen=True)
+class FaultWords(FaultText):
+    """A row of the table: the words on a CAN bus, and those that differ."""
+
+    two_encoders: FaultText | None = None  # with [joint_encoder] a sample counts only once both encoders have answered
+    serial: FaultText | None = None  # {word} is the status register (SR) there
+    follows_pause: bool = False  # a loop that stands still commands its last torque, and receives nothing
+
+
+FAULT_TEXTS: dict[Fault, FaultWords] = {
+    Fault.POSITION_LIMIT: FaultWords(
         "the joint left its position limits at {value:.4f} rad",
         "the joint was moved by hand, or limits and encoder zero do not belong together",
         "compare limits.position_* and encoder.zero_counts with where the joint stands",
+        follows_pause=True,
     ),
-    Fault.VELOCITY_LIMIT: FaultText(
+    Fault.VELOCITY_LIMIT: FaultWords(
         "the joint moved at {value:.3f} rad/s, faster than limits.velocity_max_radps",
         "wrong sign of encoder or torque, or gains that the loop delay does not allow",
         "check encoder.direction and drive.torque_direction before the next run",
+        follows_pause=True,
     ),
-    Fault.REFERENCE_LIMIT: FaultText(
+    Fault.REFERENCE_LIMIT: FaultWords(
         "the desired motion would leave the limits at {value:.4f} rad",
         "the trajectory, or its approach from where the joint stands, does not fit the limits",
         "change the trajectory, the start position or limits.*",
     ),
-    Fault.FOLLOWING_ERROR: FaultText(
+    Fault.FOLLOWING_ERROR: FaultWords(
         "the joint was {value:.4f} rad away from its reference",
         "blocked or overloaded joint, wrong sign of encoder or torque, or too little torque",
         "turn the joint by hand with the power off; check the directions and limits.torque_max_Nm",
+        follows_pause=True,
     ),
-    Fault.STALE_SAMPLE: FaultText(
+    Fault.STALE_SAMPLE: FaultWords(
         "no position came for {value:.0f} cycles",
         "frames lost, cable, bus load, or the drive went silent",
         "check wiring and termination; watch the bus with candump",
+        two_encoders=FaultText(
+            "no position of both encoders came for {value:.0f} cycles",
+            "frames lost, cable, bus load, or the drive or the joint's encoder went silent",
+            "check wiring and termination; watch the bus with candump: which of the two is missing?",
+        ),
+        serial=FaultText(
+            "no usable position reply came for {value:.0f} cycles",
+            # Linux hands over what a serial port received by a worker of ordinary priority, however urgent the loop is
+            "cable or drive went silent, noise garbles the replies, or a busy computer hands them over late",
+            "check the cable and its ground, and what else the computer does; the drive's own limits watched the joint "
+            "in the meantime",
+        ),
+        follows_pause=True,
     ),
-    Fault.NOT_FINITE: FaultText(
+    Fault.NOT_FINITE: FaultWords(
         "the law computed {value}, which is not a number to send",
         "gains or friction values that overflow",
         "report the run log: this should not happen with a checked configuration",
     ),
-    Fault.TORQUE_SATURATED: FaultText(
+    Fault.TORQUE_SATURATED: FaultWords(
         "the torque stayed at its limit ({value:.1f} Nm) for too long",
         "the joint is blocked, or limits.torque_max_Nm is too low for load and friction",
         "turn the joint by hand with the power off, then look at the friction values",
     ),
-    Fault.LIMIT_CYCLE: FaultText(
+    Fault.LIMIT_CYCLE: FaultWords(
         "torque or error swung back and forth at about {value:.1f} Hz instead of settling",
         "more loop delay than the gains allow, gains too high for a heavy or soft joint, learning that diverges, "
         "or an encoder of too little resolution",
         "run `jointctl check`; then lower the gains (kp, kv, observer_radps), switch learning off, "
         "or measure with more counts",
     ),
-    Fault.DRIVE_FAULT: FaultText(
+    Fault.DRIVE_FAULT: FaultWords(
         "the drive reported a fault (statusword {word})",
         "see the drive's error code",
         "remove the cause, then reset the drive's fault; jointctl never does it by itself",
+        serial=FaultText(
+            "the drive switched its motor off because of a fault (SR {word})",
+            "see the drive's motor fault",
+            "remove the cause; jointctl resets nothing by itself",
+        ),
+        follows_pause=True,
     ),
-    Fault.DRIVE_NOT_ENABLED: FaultText(
+    Fault.DRIVE_NOT_ENABLED: FaultWords(
         "the drive left Operation Enabled by itself (statusword {word})",
         "its enable input or STO was opened, a limit switch, or another master on the bus",
         "check the enable and STO wiring",
+        serial=FaultText(
+            "the motor was switched off without being asked (SR {word})",
+            "inhibit input or STO was opened, another program on the line, or a restart of the drive",
+            "check the inhibit and STO wiring and the supply",
+        ),
+        follows_pause=True,
     ),
-    Fault.DRIVE_RESTARTED: FaultText(
+    Fault.DRIVE_RESTARTED: FaultWords(
         "the drive restarted while the loop was running",
         "its supply dropped, or somebody reset it",
         "check the supply; the drive has lost its configuration, start again",
+        serial=FaultText(
+            "the drive restarted while the loop was running: its unit mode is another one (SR {word})",
+            "its supply dropped, or somebody reset it",
+            "check the supply; the drive has lost its limits, start again",
+        ),
     ),
-    Fault.ENABLE_TIMEOUT: FaultText(
+    Fault.ENABLE_TIMEOUT: FaultWords(
         "the drive did not reach Operation Enabled in time (statusword {word})",
         "no motor supply, STO open, or an interlock of the drive",
         "check voltage and STO; the statusword's bit 4 is the motor supply",
+        serial=FaultText(
+            "the drive did not switch its motor on in time (SR {word})",
+            "no motor supply, STO open, or inhibit input active",
+            "check voltage, STO and inhibit; MO=1 is refused until they are right",
+        ),
     ),
-    Fault.SUPERVISOR_LOST: FaultText(
+    Fault.SUPERVISOR_LOST: FaultWords(
         "the supervising process was silent for {value:.0f} cycles",
         "it was killed, stopped, or the computer was overloaded",
         "look for what blocked it: disk, memory, a debugger",
     ),
-    Fault.BUS_ERROR: FaultText(
+    Fault.BUS_ERROR: FaultWords(
         "{value:.0f} frames in a row could not be sent",
         "interface down, bus off, or nobody acknowledges: cable or bit rate",
         "ip -details link show, then bring the interface up again",
+        serial=FaultText(
+            "the serial port is gone or takes no characters any more",
+            "adapter or cable unplugged",
+            "make sure that the joint stands: nothing could be said to the drive; then plug it in again",
+        ),
     ),
-    Fault.STOP_TIMEOUT: FaultText(
+    Fault.STOP_TIMEOUT: FaultWords(
         "the joint did not come to rest ({value:.3f} rad/s)",
         "unstable gains or an outside torque",
         "lower the gains; look at the last seconds of the run log",
     ),
-    Fault.OFF_TIMEOUT: FaultText(
+    Fault.OFF_TIMEOUT: FaultWords(
         "the drive did not confirm that its power stage is off (statusword {word})",
         "the drive is unreachable",
         "use the emergency stop; then check the bus",
+        serial=FaultText(
+            "the drive did not confirm that its motor is off (SR {word})",
+            "the line is cut or the drive is silent",
+            "use the emergency stop; then check the line",
+        ),
     ),
-    Fault.NO_SAMPLES: FaultText(
+    Fault.NO_SAMPLES: FaultWords(
         "not one sample came from the drive",
         "the drive does not answer SYNC: PDOs disabled, or not operational",
         "look for SYNC (080) and the TPDO (180 + node) with candump",
+        two_encoders=FaultText(
+            "not one sample came from both encoders of the joint",
+            "the drive or the joint's encoder does not answer SYNC: PDOs disabled, or not operational",
+            "look for SYNC (080) and the TPDOs of both (180 + node, 280 + node of the drive) with candump",
+        ),
+        serial=FaultText(
+            "not one position reply came from the drive",
+            "the drive went silent after commissioning",
+            "check the cable; run again",
+        ),
     ),
-    Fault.SAMPLES_MISSING: FaultText(
+    Fault.SAMPLES_MISSING: FaultWords(
         "positions came, but never {value:.0f} of them in a row, as sequence.settle_s wants it before enabling",
         "a computer too busy for loop.rate_Hz, or a bus that loses a frame now and then",
         "run `jointctl doctor`, then `jointctl monitor`; set loop.priority, or lower loop.rate_Hz",
+        serial=FaultText(
+            "positions came, but never {value:.0f} of them in a row, as sequence.settle_s wants it before enabling",
+            "noise garbles replies, or a busy computer hands them over late",
+            "check the cable and its ground, and what else the computer does; or lower loop.rate_Hz",
+        ),
+        follows_pause=True,
     ),
-    Fault.NOT_AT_STANDSTILL: FaultText(
+    Fault.NOT_AT_STANDSTILL: FaultWords(
         "the joint moved at {value:.3f} rad/s before it was enabled",
         "somebody moves it, or the encoder is noisy",
         "let it rest, or raise limits.standstill_radps",
     ),
-    Fault.OVERRUN: FaultText(
+    Fault.OVERRUN: FaultWords(
         "the loop was held up for {value:.0f} cycles",
         "the computer was busy: no real-time priority, power saving, a debugger",
         "run `jointctl doctor`; set loop.priority and loop.cpu",
     ),
-    Fault.DRIVE_STAYS_ENABLED: FaultText(
+    Fault.DRIVE_STAYS_ENABLED: FaultWords(
         "the drive is enabled although nobody asked for it, and does not switch off (statusword {word})",
         "another master on the bus, or a drive that ignores the controlword",
         "use the emergency stop; check who else writes object 6040",
+        serial=FaultText(
+            "the motor is on although nobody asked for it, and does not switch off (SR {word})",
+            "another program on the line, or a drive that ignores MO=0",
+            "use the emergency stop; check who else uses the port",
+        ),
     ),
-    Fault.POSITION_FROZEN: FaultText(
+    Fault.POSITION_FROZEN: FaultWords(
         "the position reading stood still although the joint was driven (reference moved by {value:.4f} rad)",
         "the encoder or its cable is dead, or the joint is blocked",
         "turn the joint by hand with the power off and watch the position; check the encoder cable",
     ),
-    Fault.SUSPENDED: FaultText(
+    Fault.SUSPENDED: FaultWords(
         "the computer slept for {value:.1f} s while the loop was running",
         "standby or hibernation: lid, power button, energy saving",
-        "switch standby off (systemd-inhibit jointctl run ...); the drive's watchdog stopped the joint meanwhile",
+        "switch standby off (systemd-inhibit jointctl run ...); the drive's watchdog stopped the joint in the meantime",
+        serial=FaultText(
+            "the computer slept for {value:.1f} s while the loop was running; the drive held its last command "
+            "in the meantime",
+            "standby or hibernation: lid, power button, energy saving",
+            "make sure that the joint stands; switch standby off, or try systemd-inhibit --what=sleep jointctl ...",
+        ),
     ),
-    Fault.DRIVE_SILENT: FaultText(
+    Fault.DRIVE_SILENT: FaultWords(
         "the drive's own heartbeat stayed away for {value:.0f} cycles although its samples came",
         "the drive's communication is partly dead, or another program has set its object 1017",
         "watch 700h + node with candump; restart the drive",
     ),
-    Fault.POSITION_DISAGREEMENT: FaultText(
+    Fault.POSITION_DISAGREEMENT: FaultWords(
         "the two encoders of the joint differ by {value:.4f} rad (the other one minus the one that feeds the law)",
         "one encoder or its cable, a slipping coupling, or zero, counts, direction or reduction_ratio of one are wrong",
         "turn the joint by hand with the power off and compare both; see [encoder] and [joint_encoder]",
     ),
-    Fault.MOVED_BEFORE_START: FaultText(
+    Fault.MOVED_BEFORE_START: FaultWords(
         "the joint was moved by {value:.4f} rad since the motion was shown",
         "somebody turned it, or it sank under its load while the drive was off",
         "let it rest, then start again: the motion is planned anew from where it stands",
     ),
-    Fault.POSITION_JUMP: FaultText(
+    Fault.POSITION_JUMP: FaultWords(
         "the position jumped by {value:.4f} rad between two samples",
         "encoder or its cable, or counts_per_turn too small by a factor",
         "check the encoder cable and encoder.counts_per_turn",
-    ),
-}
-
-
-# with [joint_encoder] a sample counts only once both encoders have answered
-TWO_ENCODER_TEXTS: dict[Fault, FaultText] = {
-    Fault.STALE_SAMPLE: FaultText(
-        "no position of both encoders came for {value:.0f} cycles",
-        "frames lost, cable, bus load, or the drive or the joint's encoder went silent",
-        "check wiring and termination; watch the bus with candump: which of the two is missing?",
-    ),
-    Fault.NO_SAMPLES: FaultText(
-        "not one sample came from both encoders of the joint",
-        "the drive or the joint's encoder does not answer SYNC: PDOs disabled, or not operational",
-        "look for SYNC (080) and the TPDOs of both (180 + node, 280 + node of the drive) with candump",
+        follows_pause=True,
     ),
 }
 _ENCODER_CURE = "check the encoder's supply, cable and mounting; its manual tells the error code"
@@ -279,10 +347,9 @@ def fault_text(
 
     `encoder_error`: see `Sample.encoder_error`.  `two_encoders`: a sample is the answer of both.
     """
-    text = FAULT_TEXTS[fault]
-    if two_encoders:
-        text = TWO_ENCODER_TEXTS.get(fault, text)
-    if encoder_error and fault in TWO_ENCODER_TEXTS:
+    row = FAULT_TEXTS[fault]
+    text = row.two_encoders if two_encoders and row.two_encoders else row
+    if encoder_error and row.two_encoders:
         text = FaultText(text.happened, "an encoder with an error, or that restarted, is not believed", _ENCODER_CURE)
     happened = text.happened.format(value=value, word=_word_text(value))
     if drive_error:
@@ -299,85 +366,6 @@ def fault_text(
     return FaultText(happened, text.cause, text.next_step)
 
 
-# --- What those faults mean that have another cause on a serial line than on a CAN bus ---
-
-
-# {value}: the number that tripped the limit; {word}: the same as a hexadecimal status register (SR)
-SERIAL_FAULT_TEXTS: dict[Fault, FaultText] = {
-    Fault.STALE_SAMPLE: FaultText(
-        "no usable position reply came for {value:.0f} cycles",
-        # Linux hands over what a serial port received by a worker of ordinary priority, however urgent the loop is
-        "cable or drive went silent, noise garbles the replies, or a busy computer hands them over late",
-        "check the cable and its ground, and what else the computer does; the drive's own limits watched the joint "
-        "meanwhile",
-    ),
-    Fault.BUS_ERROR: FaultText(
-        "the serial port is gone or takes no characters any more",
-        "adapter or cable unplugged",
-        "make sure that the joint stands: nothing could be said to the drive; then plug it in again",
-    ),
-    Fault.NO_SAMPLES: FaultText(
-        "not one position reply came from the drive",
-        "the drive went silent after commissioning",
-        "check the cable; run again",
-    ),
-    Fault.SAMPLES_MISSING: replace(
-        FAULT_TEXTS[Fault.SAMPLES_MISSING],
-        cause="noise garbles replies, or a busy computer hands them over late",
-        next_step="check the cable and its ground, and what else the computer does; or lower loop.rate_Hz",
-    ),
-    Fault.DRIVE_RESTARTED: FaultText(
-        "the drive restarted while the loop was running: its unit mode is another one (SR {word})",
-        "its supply dropped, or somebody reset it",
-        "check the supply; the drive has lost its limits, start again",
-    ),
-    Fault.SUSPENDED: FaultText(
-        "the computer slept for {value:.1f} s while the loop was running; the drive held its last command meanwhile",
-        "standby or hibernation: lid, power button, energy saving",
-        "make sure that the joint stands; switch standby off, or try systemd-inhibit --what=sleep jointctl ...",
-    ),
-    Fault.DRIVE_FAULT: FaultText(
-        "the drive switched its motor off because of a fault (SR {word})",
-        "see the drive's motor fault",
-        "remove the cause; jointctl resets nothing by itself",
-    ),
-    Fault.DRIVE_NOT_ENABLED: FaultText(
-        "the motor was switched off without being asked (SR {word})",
-        "inhibit input or STO was opened, another program on the line, or a restart of the drive",
-        "check the inhibit and STO wiring and the supply",
-    ),
-    Fault.DRIVE_STAYS_ENABLED: FaultText(
-        "the motor is on although nobody asked for it, and does not switch off (SR {word})",
-        "another program on the line, or a drive that ignores MO=0",
-        "use the emergency stop; check who else uses the port",
-    ),
-    Fault.ENABLE_TIMEOUT: FaultText(
-        "the drive did not switch its motor on in time (SR {word})",
-        "no motor supply, STO open, or inhibit input active",
-        "check voltage, STO and inhibit; MO=1 is refused until they are right",
-    ),
-    Fault.OFF_TIMEOUT: FaultText(
-        "the drive did not confirm that its motor is off (SR {word})",
-        "the line is cut or the drive is silent",
-        "use the emergency stop; then check the line",
-    ),
-}
-
-# with the servo on in the last SR nothing says that the drive has switched off: the loop has given up believing it
-STATUS_LOST_TEXT = FaultText(
-    "the drive's status stayed away although positions came; the last one said that its motor is on (SR {word})",
-    "replies lost to noise, or a busy computer that hands them over late",
-    "check the cable and its ground, and what else the computer does",
-)
-
-
-def serial_fault_text(fault: Fault, value: float) -> FaultText | None:
-    """The text of a fault on a serial line; None where it is that of a bus.  `value` is SR where there is one."""
-    if fault is Fault.DRIVE_NOT_ENABLED and math.isfinite(value) and round(value) & SERVO_ON:
-        return STATUS_LOST_TEXT
-    return SERIAL_FAULT_TEXTS.get(fault)
-
-
 # --- A fault that follows a pause of the loop: the text says so, or its reader looks for a fault of cable or drive ---
 
 
@@ -385,11 +373,6 @@ BEFORE_s = 0.5  # a pause longer ago has shown what it could do
 LEAST_s = 0.005
 LEAST_CYCLES = 3
 SHARE_OF_AGE = 0.5  # of the time without a sample that a pause must have taken to be its cause
-# a loop that stands still commands its last torque, and hears nothing meanwhile
-FAULTS = frozenset({
-    Fault.STALE_SAMPLE, Fault.VELOCITY_LIMIT, Fault.POSITION_LIMIT, Fault.FOLLOWING_ERROR, Fault.POSITION_JUMP,
-    Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED, Fault.SAMPLES_MISSING,
-})  # fmt: skip
 
 
 def longest_pause_s(records: Any, period_s: float) -> float:
@@ -409,7 +392,7 @@ def longest_pause_s(records: Any, period_s: float) -> float:
 
 def held_up_text(fault: Fault, value: float, text: FaultText, records: Any, rate_Hz: float) -> FaultText:
     """`text`, with the pause that came before the fault, if there was one that can have caused it."""
-    if fault not in FAULTS:
+    if not FAULT_TEXTS[fault].follows_pause:
         return text
     pause_s = longest_pause_s(records, 1.0 / rate_Hz)
     age_s = value / rate_Hz if fault is Fault.STALE_SAMPLE else 0.0

@@ -23,11 +23,9 @@ from jointctl.tools.analysis.loop_settings import loop_settings
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.margins import phase_margin_deg
 from jointctl.tools.configuration.checks import extremes_problems, problems_between_sections
-from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.problems import problem_line
+from jointctl.tools.configuration.config import Config, problem_line
 from jointctl.tools.configuration.records import fill_trajectory
-from jointctl.tools.configuration.sections import Section
-from jointctl.tools.configuration.trajectory import Trajectory
+from jointctl.tools.configuration.sections import Section, Trajectory
 from jointctl.tools.recording.run_log import INFO, WARNING, Event, RunLogWriter
 from jointctl.tools.session.display import Display, ViewerRequest
 
@@ -152,7 +150,7 @@ def _what(record: Any, speed_radps: float) -> str:
     return f"{name} {ends[0]:+.4f} .. {ends[1]:+.4f} rad, up to {speed_radps:.3g} rad/s"
 
 
-# --- Changes that a viewer asks for, from the request to the loop and its answer; each one is told as an event ---
+# --- Changes that a viewer asks for, from the request to the loop and its answer; each one is reported as an event ---
 # One at a time.  Gains go through the stability gate in a thread of their own, since the supervisor must keep its
 # sign of life; the loop has the last word (`firmware_py.live_change`).
 
@@ -337,7 +335,7 @@ def settings_of(changes: LiveChanges, config: Config) -> dict[str, Any]:
 # --- What viewers may do with a run besides stopping it: change it, and have a stretch of it recorded on its own ---
 
 
-SETTINGS_s = 0.5  # how often the page is told how things stand
+SETTINGS_s = 0.5  # how often the page gets the state
 UNWATCHED = "no page is open any more; the joint goes on, Ctrl-C or `jointctl stop` brakes it"
 
 
@@ -381,7 +379,7 @@ class ViewerOrders:
             display.settings({"stage": "running", **settings_of(self._changes, self._config), "recording": recording})
 
     def _count_viewers(self, request: ViewerRequest, display: Display) -> None:
-        """Whether anybody can see the joint move: told in the terminal and in the log."""
+        """Whether anybody can see the joint move: reported in the terminal and in the log."""
         watched = bool(request.values.get("count"))
         text = "a page is open again" if watched else str(request.values.get("text") or UNWATCHED)
         self._tell(INFO if watched else WARNING, text)

@@ -18,13 +18,14 @@ from rich.table import Table
 from rich.text import Text
 
 from jointctl.drivers.printable import message_line, printable
-from jointctl.firmware_py.realtime import Histogram
+from jointctl.firmware_py.cycle import Histogram
 from jointctl.firmware_py.states import AxisPhase
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import ERROR, Event
 from jointctl.tools.session.display import Display, OnlyShows, PhaseLines, Snapshot
-from jointctl.tools.session.events import drive_state_name, fault_words, phase_name
+from jointctl.tools.session.events import fault_words, phase_name
 from jointctl.tools.session.loop_delay import quantile_s
+from jointctl.tools.session.session_drive import drive_state_name, session_drive
 
 # --- The panel of `run`: the picture of one moment, from the newest `Snapshot`; nothing here is drawn or waits ---
 
@@ -84,7 +85,7 @@ def _cells(phase: str, snapshot: Snapshot | None) -> list[tuple[str, str | Text]
     p99_s = quantile_s(snapshot.histograms[Histogram.WAKE], _QUANTILE)
     values: tuple[str | Text, ...] = (
         Text(phase_name(int(record.phase)), style="bold"),
-        drive_state_name(int(record.status_word), int(record.drive_state), cia402=snapshot.cia402),
+        drive_state_name(session_drive(snapshot.drive), int(record.status_word), int(record.drive_state)),
         f"{float(record.error_rad) * 1e3:+8.3f} mrad" if active else "-",
         Text(fault_words(fault), style="bold red") if fault else "none",
         f"{float(record.position_rad):+8.4f} rad",

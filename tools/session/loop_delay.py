@@ -11,7 +11,7 @@ import numpy as np
 
 from jointctl.drivers.can.frames import worst_frame_bits
 from jointctl.drivers.canopen.identifiers import EVENT_DRIVEN
-from jointctl.firmware_py.realtime import Histogram
+from jointctl.firmware_py.cycle import Histogram
 
 RPDO_BYTES = 4
 QUANTILE = 0.99

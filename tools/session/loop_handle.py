@@ -17,10 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.elmo.settings import SERIAL
 from jointctl.drivers.errors import MotionFault
+from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Histogram, Word
 from jointctl.firmware_py.libc import NANOSECONDS
-from jointctl.firmware_py.realtime import HISTOGRAM_BINS, WORDS, Histogram, Word
 from jointctl.firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import dtype_of
 from jointctl.firmware_py.sequence import reset_axis
@@ -36,26 +35,14 @@ RING_RECORDS = 1 << 14  # 16 s at 1 kHz
 _LINE = 64  # bytes; nothing of one array shares a cache line with another
 
 
-def _port_record(interface: str) -> type:
-    """Of the drive's cyclic exchange; the drives of the other kind are not loaded."""
-    if interface == SERIAL:
-        from jointctl.drivers.elmo.cyclic import ElmoPort
-
-        return ElmoPort
-    from jointctl.drivers.canopen.cyclic import CanopenPort
-
-    return CanopenPort
-
-
 class SharedBlock:
     """Arrays over the shared memory; `words`, `histograms`, `table` plain, the others record arrays."""
 
-    def __init__(self, fd: int, table_rows: int, interface: str = "") -> None:
-        """Map an existing block; every process gives the same `table_rows` and `interface`, which decides the port."""
+    def __init__(self, fd: int, table_rows: int, port: type) -> None:
+        """Map an existing block; every process gives the same `table_rows` and record of the drive's exchange."""
         self.fd = fd
         self.table_rows = table_rows
         self._offset = 0
-        port = _port_record(interface)
         size = self._size(table_rows, port)
         os.ftruncate(fd, max(os.fstat(fd).st_size, size))
         self._memory = mmap.mmap(fd, size)
@@ -70,14 +57,14 @@ class SharedBlock:
         self.ring = self._records(LogRecord, RING_RECORDS)
 
     @classmethod
-    def create(cls, table_rows: int, interface: str = "") -> SharedBlock:
+    def create(cls, table_rows: int, port: type) -> SharedBlock:
         """A new zeroed block."""
         if hasattr(os, "memfd_create"):
             fd = os.memfd_create("jointctl-loop")
         else:
             with tempfile.TemporaryFile() as file:
                 fd = os.dup(file.fileno())
-        return cls(fd, table_rows, interface)
+        return cls(fd, table_rows, port)
 
     @staticmethod
     def _size(table_rows: int, port: type) -> int:
@@ -94,11 +81,18 @@ class SharedBlock:
     def _records(self, cls: type, count: int) -> Any:
         return self._take(dtype_of(cls), count).view(np.recarray)
 
+    def memory(self) -> CycleMemory:
+        """What the loop works on."""
+        return CycleMemory(
+            self.constants, self.state, self.table[np.newaxis], self.sample, self.command, self.words, self.ring,
+            self.histograms, np.zeros(2, np.int64),
+        )  # fmt: skip
+
     def new_records(self, tail: int, head: int) -> tuple[Any, int]:
         """(copy of the log records from `tail` to `head`, how many of them had been overwritten before).
 
-        The loop goes on meanwhile: what it has written over while this was copying, and may be writing over now, counts
-        as lost too.
+        The loop goes on: what it has written over while this was copying, and may be writing over now, counts as lost
+        too.
         """
         lost = max(0, head - RING_RECORDS - tail)
         records = self.ring[np.arange(tail + lost, head) % RING_RECORDS]
@@ -112,21 +106,18 @@ class SharedBlock:
 
 KILL_S = 1.0  # how long a killed process may take to go
 SILENT_S = 2.0  # without a cycle for so long, the loop hangs
-OPENING_S = 6.0  # before its first cycle it may have to open an adapter; the drive is disabled meanwhile
+OPENING_S = 6.0  # before its first cycle it may have to open an adapter; the drive is disabled in the meantime
 RECEIVE_SHARE = 0.6  # of a period: how long a cycle waits for its sample
-
-# what happens to the joint when the loop has gone
-_ON_CAN = "its heartbeat on the bus has ended with it, so the drive stops the joint by itself"
-_ON_SERIAL = "a serial drive does not notice that: it has been told to switch off"
 
 
 @dataclass(frozen=True)
 class LoopOrder:
-    """What the loop process is told."""
+    """The orders of the loop process."""
 
     supervisor_pid: int
     block_fd: int
     table_rows: int
+    kind: str  # drive.kind
     interface: str
     channel: str
     period_ns: int
@@ -144,21 +135,24 @@ class LoopOrder:
 class LoopHandle:
     """Owns the process and the shared memory; a context manager that never leaves the process behind.
 
-    `tail_path` is where the loop itself saves the ring if this process has gone when it ends; `marker_fd` shows whose
-    loop it is (`drivers.bus_lock`).
+    `port`: record of the drive's exchange.  `tail_path`: where the loop itself saves the ring if this process has gone
+    when it ends.  `marker_fd` shows whose loop it is (`drivers.bus_lock`).
     """
 
-    def __init__(self, config: Config, table: Any, tail_path: Path | None = None, marker_fd: int | None = None) -> None:
-        self.block = SharedBlock.create(len(table), config.bus.interface)
+    def __init__(
+        self, config: Config, table: Any, port: type, tail_path: Path | None = None, marker_fd: int | None = None
+    ) -> None:
+        self.block = SharedBlock.create(len(table), port)
         self.block.table[:] = table
         self._tail = 0
         self.lost_records = 0
-        self._after_end = _ON_SERIAL if config.is_serial else _ON_CAN
+        self._after_end = config.drive.when_the_loop_ends
         self._period_ns = period_ns = round(NANOSECONDS / config.loop.rate_Hz)
         order = LoopOrder(
             supervisor_pid=os.getpid(),
             block_fd=self.block.fd,
             table_rows=len(table),
+            kind=config.drive.kind,
             interface=config.bus.interface,
             channel=config.bus.channel,
             period_ns=period_ns,
@@ -204,7 +198,7 @@ class LoopHandle:
         return AxisPhase(int(self.block.state[0].phase))
 
     def wait_ready(self, alive: Any = lambda: None, tell: Callable[[str], None] = lambda _: None) -> None:
-        """Until the loop is compiled and warm; `alive` is called meanwhile and may raise, `tell` gets what it does.
+        """Until the loop is compiled and warm; `alive` is called all the time and may raise; `tell` gets what it does.
 
         Raises `JointctlError` if it ends, or hangs, before that.
         """

@@ -19,14 +19,13 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from jointctl.drivers.errors import JointctlError
-from jointctl.firmware_py.realtime import Word
+from jointctl.firmware_py.cycle import Word
 from jointctl.tools.session.loop_handle import LoopOrder, SharedBlock
-from jointctl.tools.session.loops import ReadyLoop, compiled_loop, portable_loop, serial_loop
+from jointctl.tools.session.session_drive import session_drive
 from jointctl.tools.wake_up import cores_awake
 
 SLOW_START_S = 4.0
@@ -67,7 +66,7 @@ def become_realtime(cpu: int | None, priority: int | None, threads: Sequence[int
     if priority is not None:
         try:
             for thread in threads:
-                with contextlib.suppress(ProcessLookupError):  # a thread that has ended meanwhile
+                with contextlib.suppress(ProcessLookupError):  # a thread that has ended in the meantime
                     os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
         except (OSError, AttributeError) as error:
             refused.append(f"loop.priority (={priority}): {error}; see `jointctl doctor`")
@@ -78,19 +77,13 @@ def become_realtime(cpu: int | None, priority: int | None, threads: Sequence[int
 
 def run(order: LoopOrder) -> int:
     """Warm up, wait for GO, run the loop; returns the exit code."""
-    from jointctl.drivers.can.open import CYCLIC_INTERFACES
-    from jointctl.drivers.elmo.settings import SERIAL
-
-    block = SharedBlock(order.block_fd, order.table_rows, order.interface)
-    if order.interface == SERIAL:
-        loop: Callable[[LoopOrder, Any], AbstractContextManager[ReadyLoop]] = serial_loop
-    else:
-        loop = compiled_loop if order.interface in CYCLIC_INTERFACES else portable_loop
+    drive = session_drive(order.kind)
+    block = SharedBlock(order.block_fd, order.table_rows, drive.port_record())
 
     def tell(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
-    with slow_start(tell, "loop") as started, loop(order, block) as ready:
+    with slow_start(tell, "loop") as started, drive.loop(order, block) as ready:
         started()
         gc.freeze()
         gc.disable()
@@ -111,7 +104,7 @@ def run(order: LoopOrder) -> int:
     return 0
 
 
-def save_tail(block: Any, path: Path) -> None:
+def save_tail(block: SharedBlock, path: Path) -> None:
     """Write what the ring holds: the joint is off by now, and nobody else is left to keep the last seconds."""
     from jointctl.tools.recording.run_log import ERROR, RunLogWriter
 

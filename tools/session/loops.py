@@ -15,12 +15,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING
 
-import numpy as np
-
+from jointctl.firmware_py.cycle import Exchange
 from jointctl.firmware_py.libc import NANOSECONDS
 from jointctl.tools.session.loop_handle import LoopOrder, SharedBlock
+
+if TYPE_CHECKING:
+    import can
 
 PROBE_TIMEOUT_S = 600.0
 FOREVER = 1 << 62
@@ -38,29 +41,18 @@ class ReadyLoop:
     flush: Callable[[], None] = _nothing
 
 
-def loop_call(exchange: Any, block: Any, period_ns: int, receive_ns: int) -> Callable[[int], int]:
-    """`run_loop` on this memory with this module's exchange, as a function of the greatest number of cycles.
+def loop_call(driver: ModuleType, block: SharedBlock, period_ns: int, receive_ns: int) -> Callable[[int], int]:
+    """`run_loop` on this memory with this driver's exchange, as a function of the greatest number of cycles.
 
     0 only compiles, or loads from the cache.
     """
     from jointctl.firmware_py.realtime import run_loop
 
-    frames, scratch = exchange.exchange_memory()
-    timespec = np.zeros(2, np.int64)
-
-    def call(max_cycles: int) -> int:
-        return int(
-            run_loop(
-                exchange.receive, exchange.send, block.port, frames, scratch, block.constants, block.state, block.table,
-                block.sample, block.command, block.words, block.ring, block.histograms, timespec, period_ns,
-                receive_ns, max_cycles,
-            )
-        )  # fmt: skip
-
-    return call
+    memory, exchange = block.memory(), Exchange(driver.receive, driver.send, driver.link_of(block.port))
+    return lambda max_cycles: int(run_loop(memory, exchange, period_ns, receive_ns, max_cycles))
 
 
-def compiled_call(block: Any, period_ns: int, receive_ns: int) -> Callable[[int], int]:
+def compiled_call(block: SharedBlock, period_ns: int, receive_ns: int) -> Callable[[int], int]:
     """`loop_call` on a CAN bus that is a descriptor."""
     from jointctl.drivers.canopen import exchange
 
@@ -68,7 +60,7 @@ def compiled_call(block: Any, period_ns: int, receive_ns: int) -> Callable[[int]
 
 
 @contextmanager
-def compiled_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
+def compiled_loop(order: LoopOrder, block: SharedBlock) -> Iterator[ReadyLoop]:
     """The compiled loop, warm and attached to the bus."""
     from jointctl.drivers.can.frames import FRAME_BYTES
     from jointctl.drivers.can.open import open_cyclic_end
@@ -79,7 +71,6 @@ def compiled_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
 
         def go() -> None:
             block.port[0].fd = end.fileno()
-            block.port[0].stamped = order.interface == "jointctl"
             call(FOREVER)
 
         def flush() -> None:
@@ -90,14 +81,14 @@ def compiled_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
         yield ReadyLoop(go, flush)
 
 
-def _leave(bus: Any) -> None:
+def _leave(bus: can.BusABC) -> None:
     """Close it; of an adapter that is gone, what failed before counts."""
     with contextlib.suppress(Exception):
         bus.shutdown()
 
 
 @contextmanager
-def portable_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
+def portable_loop(order: LoopOrder, block: SharedBlock) -> Iterator[ReadyLoop]:
     """The plain Python loop in the same way, and a line that tells what it can hold.
 
     An adapter that serves one program at a time belongs to commissioning until the loop is let go, which opens it then
@@ -122,7 +113,7 @@ def portable_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
 
     with contextlib.ExitStack() as stack:
 
-        def opened() -> Any:
+        def opened() -> can.BusABC:
             bus = open_python_can(order.interface, order.channel, order.bitrate_bitps)
             stack.callback(_leave, bus)
             return bus
@@ -141,15 +132,15 @@ def portable_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
 # virtual machine, SCHED_FIFO: this loop 27 / 56 / 178 us, a bare Python sleep 43 / 84 / 221 us, and 123 / 155 / 3168
 # us without SCHED_FIFO.
 @contextmanager
-def serial_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
+def serial_loop(order: LoopOrder, block: SharedBlock) -> Iterator[ReadyLoop]:
     """The compiled loop on a serial line, warm.
 
     The port is opened when the loop is let go: by then the supervisor has locked and configured it.  However the
-    loop ends, the drive is told to switch off: it would keep its last torque command for ever.
+    loop ends, the drive is commanded to switch off: it would keep its last torque command for ever.
     """
     from jointctl.drivers.elmo import exchange
+    from jointctl.drivers.elmo.dialogue import SWITCH_OFF
     from jointctl.drivers.elmo.serial_port import open_descriptor
-    from jointctl.drivers.elmo.switch_off import SWITCH_OFF
 
     call = loop_call(exchange, block, order.period_ns, order.receive_ns)
     call(0)  # compiles, or loads from the cache
@@ -169,7 +160,9 @@ def serial_loop(order: LoopOrder, block: Any) -> Iterator[ReadyLoop]:
 
 def warm_up_compiled_loop() -> None:
     """Do what the loop process does before it is ready; no bus is opened, nothing is sent."""
-    block = SharedBlock.create(1)
+    from jointctl.drivers.canopen.cyclic import CanopenPort
+
+    block = SharedBlock.create(1, CanopenPort)
     compiled_call(block, 1_000_000, 0)(0)
     os.close(block.fd)
 

@@ -1,7 +1,7 @@
 """The loop in plain Python, for python-can interfaces that the compiled loop cannot read: same kernels, same memory.
 
-`drivers.canopen.cyclic` makes and takes the frames, `firmware_py.axis` decides, `firmware_py.realtime` writes the log;
-only waiting, sending and receiving are Python.  The supervisor cannot tell the two loops apart.
+`drivers.canopen.cyclic` makes and takes the frames, and the cycle is that of the compiled loop (`firmware_py.cycle`) as
+plain Python; only waiting, sending and receiving are written here.  The supervisor cannot tell the two loops apart.
 
 Limits; the figures are of a 2-core virtual machine over udp_multicast, virtual joint in a second Python process:
 * Round trip and work take about 0.5 ms of a cycle (p99 0.65 ms).  Idle, and with SCHED_FIFO also beside three busy
@@ -23,7 +23,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from typing import Any
+from typing import Protocol
 
 import can
 import numpy as np
@@ -35,17 +35,19 @@ from jointctl.drivers.canopen.cyclic import (
     SLOT_RECEIVED,
     SLOT_RPDO,
     SLOT_SYNC,
+    CanopenPort,
     accept_frame,
     answer_owed,
     begin_cycle,
     end_cycle,
+    note_wake,
 )
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.firmware_py.axis import step_axis
+from jointctl.firmware_py.cycle import Clock, Exchange, Histogram
 from jointctl.firmware_py.libc import NANOSECONDS, sleep_until_ns
-from jointctl.firmware_py.realtime import Histogram, Word, count, note_suspension, write_log
+from jointctl.firmware_py.realtime import run_cycles, slept_ns
 from jointctl.firmware_py.schema import INT32_MAX, new
-from jointctl.firmware_py.states import AxisPhase, DriveRequest
+from jointctl.firmware_py.states import DriveRequest
 from jointctl.tools.session.loop_delay import QUANTILE, quantile_s
 from jointctl.tools.session.loop_handle import SharedBlock
 
@@ -80,7 +82,7 @@ def held_rate_Hz(receive_share: float) -> float:
 
     Measured for a fifth of a second on a bus that takes everything; the adapter's own latency comes on top.
     """
-    block = SharedBlock.create(1)
+    block = SharedBlock.create(1, CanopenPort)
     try:
         run_portable_loop(_SilentBus(), block, PROBE_PERIOD_NS, 0, max_cycles=PROBE_CYCLES)
         busy_s = sum(quantile_s(block.histograms[row], QUANTILE) for row in (Histogram.WAKE, Histogram.WORK))
@@ -89,24 +91,32 @@ def held_rate_Hz(receive_share: float) -> float:
     return min(HIGHEST_RATE_HZ, (1.0 - receive_share) / busy_s)
 
 
+class FrameBus(Protocol):
+    """What the loop needs of a python-can bus."""
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None: ...
+    def recv(self, timeout: float | None = None) -> can.Message | None: ...
+
+
 class PortableExchange:
     """`drivers.canopen.exchange` on a python-can bus.  Nothing that the bus raises gets out: it counts as a bus error.
+    The link of its `receive` and `send` is None.
 
     A cycle fails if a frame could not be sent, receiving failed, or an error frame came; `port.consecutive_failures`
     and `sample.bus_errors` count failed cycles in a row.
     """
 
-    def __init__(self, bus: Any, block: SharedBlock, period_ns: int) -> None:
+    def __init__(self, bus: FrameBus, block: SharedBlock, period_ns: int, receive_ns: int) -> None:
         self._bus = bus
         self._port = block.port[0]
-        self._sample = block.sample[0]
-        self._command = block.command[0]
+        self._samples, self._commands = block.sample, block.command
+        self._sample = self._samples[0]
         self._frames = new(Frame, FRAME_SLOTS)
         self._received = self._frames[SLOT_RECEIVED]
         self._bytes = self._frames.view(np.uint8).reshape(FRAME_SLOTS, -1)
         self._send_timeout_s = 0.25 * period_ns / NANOSECONDS
+        self._least_wait_ns = receive_ns // 2
         self._failed = False
-        self.sync_ns = 0  # when the last SYNC was sent
         port = self._port
         # some interfaces echo a program's own frames; counted again, they would double the bus load
         self._own = frozenset((int(port.sync_id), int(port.rpdo_id), int(port.own_heartbeat_id)))
@@ -118,6 +128,7 @@ class PortableExchange:
 
     def _send(self, slot: int) -> None:
         message = decode(self._bytes[slot].tobytes(), 0.0, "")
+        assert message is not None  # what the codec makes is a frame
         try:
             self._bus.send(message, self._send_timeout_s)
         except Exception as error:  # a third-party interface may raise anything; with torque applied the loop goes on
@@ -148,126 +159,85 @@ class PortableExchange:
                 return False
         return bool(accept_frame(self._port, self._received, self._sample, now_ns))
 
-    def receive(self, budget_ns: int, least_wait_ns: int) -> int:
-        """Send SYNC and wait for the TPDO until `budget_ns`, `least_wait_ns` at least; returns the time waited [ns].
+    def receive(self, link: None, samples: np.ndarray, now_ns: int, until_ns: int) -> int:
+        """Send SYNC and wait for the TPDO until `until_ns`, half the window at least; returns the time waited [ns].
 
         Frames that came since the last cycle are taken first, so that a late TPDO is not mistaken for the answer.
         The least wait keeps a late wake-up from costing the sample as well.
         """
+        note_wake(self._port, now_ns)
         for _ in range(_FRAMES_AT_ONCE):
             message = self._receive(0.0)
             if message is None:
                 break
-            self._accept(message, time.monotonic_ns())
+            self._accept(message, now_ns)
         owed = answer_owed(self._port)  # as in `drivers.canopen.exchange`
         for slot in range(SLOT_SYNC, begin_cycle(self._port, self._frames)):
             self._send(slot)
-        self.sync_ns = started_ns = now_ns = time.monotonic_ns()
-        until_ns = max(budget_ns, started_ns + least_wait_ns)
-        while now_ns < until_ns:
-            message = self._receive((until_ns - now_ns) * 1e-9)
-            now_ns = time.monotonic_ns()
-            if message is None or (self._accept(message, now_ns) and not owed):
+        started_ns = arrived_ns = time.monotonic_ns()
+        until_ns = max(until_ns, started_ns + self._least_wait_ns)
+        while arrived_ns < until_ns:
+            answer = self._receive((until_ns - arrived_ns) * 1e-9)
+            arrived_ns = time.monotonic_ns()
+            if answer is None or (self._accept(answer, arrived_ns) and not owed):
                 break  # time-out, failure, or the sample
         self._note_cycle()
-        return now_ns - started_ns
+        return arrived_ns - started_ns
 
     def _note_cycle(self) -> None:
         self._port.consecutive_failures = self._port.consecutive_failures + 1 if self._failed else 0
         self._sample.bus_errors = self._port.consecutive_failures
         self._failed = False
 
-    def send(self) -> None:
+    def send(self, link: None, samples: np.ndarray, commands: np.ndarray) -> int:
         """Send the RPDO; a failure counts in the next cycle."""
-        end_cycle(self._port, self._frames, self._sample, self._command)
+        end_cycle(self._port, self._frames, samples[0], commands[0])
         self._send(SLOT_RPDO)
+        return 0
 
     def switch_off(self) -> None:
         """One RPDO with controlword 0 (disable voltage), and the SYNC at which a synchronous RPDO takes effect."""
-        self._command.request = DriveRequest.OFF
-        self._command.torque_Nm = 0.0
+        self._commands[0].request = DriveRequest.OFF
+        self._commands[0].torque_Nm = 0.0
         with contextlib.suppress(Exception):
-            self.send()
+            self.send(None, self._samples, self._commands)
             begin_cycle(self._port, self._frames)
             self._send(SLOT_SYNC)
 
 
-def throw_away(bus: Any) -> None:
-    """What waits at the bus; a bus that fails is told by the loop."""
+def throw_away(bus: FrameBus) -> None:
+    """What waits at the bus; a bus that fails is reported by the loop."""
     with contextlib.suppress(Exception):
         while bus.recv(0.0) is not None:
             pass
 
 
-def run_portable_loop(bus: Any, block: SharedBlock, period_ns: int, receive_ns: int, max_cycles: int = FOREVER) -> int:
-    """`firmware_py.realtime.run_loop` in Python on a python-can bus: until FINISHED or `max_cycles` slots.
+def run_portable_loop(
+    bus: FrameBus,
+    block: SharedBlock,
+    period_ns: int,
+    receive_ns: int,
+    max_cycles: int = FOREVER,
+) -> int:
+    """The compiled loop's `run_cycles` in plain Python on a python-can bus: until FINISHED or `max_cycles` slots.
 
-    `block.port` must have its identifiers by now.  Should anything raise, the drive is told to disable voltage once,
+    `block.port` must have its identifiers by now.  Should anything raise, the drive gets "disable voltage" once,
     no heartbeat follows, so that its consumer stops the joint even if it did not hear, and the exception goes on.
     """
-    exchange = PortableExchange(bus, block, period_ns)
+    can_exchange = PortableExchange(bus, block, period_ns, receive_ns)
+    exchange = Exchange(can_exchange.receive, can_exchange.send, None)
+    clock = Clock(lambda _: time.monotonic_ns(), slept_ns)
     try:
-        return _cycles(exchange, block, period_ns, receive_ns, max_cycles)
+        return run_cycles(block.memory(), exchange, clock, sleep_until_ns, period_ns, receive_ns, max_cycles)
     except BaseException:
-        exchange.switch_off()
+        can_exchange.switch_off()
         raise
-
-
-def _cycles(exchange: PortableExchange, block: SharedBlock, period_ns: int, receive_ns: int, max_cycles: int) -> int:
-    timespec = np.zeros(2, np.int64)
-    words, ring, histograms = block.words, block.ring, block.histograms
-    axis, state, sample, command = block.constants[0], block.state[0], block.sample[0], block.command[0]
-    executed = 0
-    last_slot_ns = time.monotonic_ns()
-    deadline_ns = last_slot_ns + period_ns
-    while executed < max_cycles:
-        sleep_until_ns(deadline_ns, timespec)
-        wake_ns = time.monotonic_ns()
-        late_ns = wake_ns - deadline_ns
-        if late_ns >= period_ns:
-            deadline_ns += late_ns // period_ns * period_ns
-        elapsed_cycles = (deadline_ns - last_slot_ns) // period_ns
-        last_slot_ns = deadline_ns
-        waited_ns = exchange.receive(deadline_ns + receive_ns, receive_ns // 2)
-        # as in `run_loop`: a sample that answers an earlier SYNC belongs to no slot that could be told
-        state.sample_late_s = (wake_ns - deadline_ns) * 1e-9 if sample.time_ns >= exchange.sync_ns else 0.0
-        stop_request = int(words[Word.STOP])
-        supervisor_age_cycles = (wake_ns - int(words[Word.SUPERVISOR_NS])) // period_ns
-        note_suspension(words, state, timespec)
-        step_axis(axis, state, block.table, sample, command, elapsed_cycles, stop_request, supervisor_age_cycles)
-        exchange.send()
-        end_ns = time.monotonic_ns()
-        fresh = state.sample_age_cycles == 0
-        round_trip_ns = waited_ns
-        if sample.time_ns < exchange.sync_ns:  # as in `run_loop`: it answers an earlier SYNC
-            round_trip_ns += elapsed_cycles * period_ns
-        work_ns = end_ns - wake_ns - waited_ns
-        head = int(words[Word.HEAD])
-        record = ring[head % len(ring)]
-        write_log(record, state, sample, command)
-        record.time_ns = deadline_ns
-        record.wake_late_ns = min(late_ns, INT32_MAX)
-        record.round_trip_ns = min(round_trip_ns, INT32_MAX) if fresh else 0
-        record.work_ns = min(work_ns, INT32_MAX)
-        record.skipped = min(elapsed_cycles - 1, INT32_MAX)
-        count(histograms, Histogram.WAKE, late_ns)
-        if fresh:
-            count(histograms, Histogram.ROUND_TRIP, round_trip_ns)
-        count(histograms, Histogram.WORK, work_ns)
-        words[Word.SKIPPED] += elapsed_cycles - 1
-        words[Word.HEAD] = head + 1
-        words[Word.LOOP_NS] = end_ns
-        executed += 1
-        if state.phase == AxisPhase.FINISHED:
-            break
-        deadline_ns += period_ns
-    return executed
 
 
 class _SilentBus:
     """Takes everything and has nothing to say."""
 
-    def send(self, message: can.Message, timeout: float | None = None) -> None:
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
         pass
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
@@ -276,7 +246,7 @@ class _SilentBus:
 
 def warm_up() -> None:
     """Compile or load every kernel of the loop, on memory of its own and without a bus."""
-    block = SharedBlock.create(1)
+    block = SharedBlock.create(1, CanopenPort)
     try:
         accept_frame(block.port[0], new(Frame)[0], block.sample[0], 0)
         block.sample[:] = np.zeros_like(block.sample)

@@ -18,7 +18,7 @@ from jointctl.tools.recording.run_figure import save_run_figure
 from jointctl.tools.recording.run_summary import RunSummary, summary_table
 from jointctl.tools.session.fault_words import FaultText
 
-# --- How a run leaves the drive: whoever tells the user that it is disabled asks here first ---
+# --- How a run leaves the drive: code that reports to the user that it is disabled asks here first ---
 
 
 ADVICE = "use the emergency stop"
@@ -67,7 +67,7 @@ class RunResult:
     stopped_by: str  # name of the signal, or ""
     drive_state: str  # in words, read after the run
     bus_load: float  # measured share: CAN with worst-case stuffing, a serial line in its busier direction
-    serial: bool
+    load_row: tuple[str, str]  # the same in words
     lost_records: int
     log_path: Path
     report: CommissioningReport
@@ -99,10 +99,7 @@ def report_run(result: RunResult, output: Output, config: Config) -> int:
             output.warning(error.message)
             drawn = None
     table = summary_table(result.summary)
-    if result.serial:
-        table.add_row("line load", f"{result.bus_load:.1%} of the characters from the drive")
-    else:
-        table.add_row("bus load", f"{result.bus_load:.1%} at worst-case stuffing")
+    table.add_row(*result.load_row)
     table.add_row("drive afterwards", result.drive_state)
     table.add_row("log", str(result.log_path))
     if drawn is not None:

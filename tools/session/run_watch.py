@@ -13,23 +13,22 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 from jointctl.drivers.drive import SettingsGuard
-from jointctl.firmware_py.realtime import Histogram, Word
+from jointctl.firmware_py.cycle import Histogram, Word
 from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, StopRequest, in_words
 from jointctl.tools.analysis.margin_gate import require_margin
-from jointctl.tools.recording.kept_records import KeptRecords
+from jointctl.tools.recording.kept_records import KeptRecords, ThinnedRecords
 from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter, frame_array
-from jointctl.tools.recording.thinned_records import ThinnedRecords
 from jointctl.tools.session.bus_watch import BusWatch, FrameRecorder, TemperatureWatch
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.display import Display, Snapshot
 from jointctl.tools.session.events import EventFinder, phase_name
 from jointctl.tools.session.fault_words import NoticeFinder
-from jointctl.tools.session.guard import GUARD_ENDED, GuardHandle
 from jointctl.tools.session.live_changes import ViewerOrders
 from jointctl.tools.session.loop_handle import LoopHandle
-from jointctl.tools.session.open_drive import drive_fault_text, loop_delay_s
 from jointctl.tools.session.plan import RunPlan
+from jointctl.tools.session.session_drive import Guard, session_drive
 
+GUARD_ENDED = "the guard of the line has ended: nobody switches the drive off if this program and the loop both die"
 DELAY_CYCLES = 300  # how many cycles with the drive off the loop delay is measured over
 
 
@@ -40,7 +39,7 @@ class Around:
     signals: StopSignals
     bus_watch: BusWatch
     recorder: FrameRecorder | None = None
-    guard: GuardHandle | None = None
+    guard: Guard | None = None
 
 
 @dataclass(frozen=True)
@@ -67,13 +66,14 @@ class RunWatch:
         self.settings_guard: SettingsGuard | None = None
         self._allowed = False  # whether the loop may enable
         self.delay_s: float | None = None  # of the loop, once it is measured
+        self._drive = session_drive(config.drive.kind)
         self._stopped_by_viewer = ""
         self._allow_low_margin = plan.allow_low_margin
         by_velocity = axis.command_kind == CommandKind.VELOCITY
         self._drives_loop_ps = float(axis.velocity_command.position_gain_ps) if by_velocity else None
         self._decimated = ThinnedRecords(plan.log_every, round(plan.log_full_rate_s * config.loop.rate_Hz))
         self._phase, self._asked = AxisPhase.WAITING, StopRequest.NONE
-        self._events = EventFinder(cia402=not config.is_serial, fault_words=self._fault_words)
+        self._events = EventFinder(self._drive, self._fault_words)
         self._notices = NoticeFinder()
         self._orders = ViewerOrders(
             config, self.loop.block, self.log.path, parts.metadata, self._tell_scope, lambda: self.delay_s,
@@ -163,9 +163,9 @@ class RunWatch:
             self._tell(event, shown=not (commanded and event.level == ERROR))
         skipped, histograms = int(self.loop.block.words[Word.SKIPPED]), self.loop.block.histograms
         duration_s = float(self.loop.block.constants[0].trajectory.duration_s)  # a viewer may have changed the motion
-        cia402 = not self.config.is_serial
+        drive = self.config.drive.kind
         degC = self.temperature.newest_degC
-        self.display.show(Snapshot(records[-1], skipped, histograms, duration_s, cia402, records, degC))
+        self.display.show(Snapshot(records[-1], skipped, histograms, duration_s, drive, records, degC))
 
     def _keep(self, records: Any) -> None:
         """Into the log, and kept for the summary at the end."""
@@ -180,7 +180,7 @@ class RunWatch:
         histograms = self.loop.block.histograms
         if not histograms[Histogram.ROUND_TRIP].any():
             return  # nothing has been heard: the loop ends that itself, and tells it
-        self.delay_s = loop_delay_s(self.config, histograms)
+        self.delay_s = self._drive.loop_delay_s(self.config, histograms)
         text = f"loop delay {self.delay_s * 1e3:.2f} ms measured, {self.margin_text(self.delay_s)}"
         self.log.write_event(INFO, "supervisor", text)
         self.display.note(text)
@@ -217,4 +217,4 @@ class RunWatch:
         """In the words that fit the drive, with the value that the loop has latched."""
         state = self.loop.block.state[0]
         value, encoder_error = float(state.fault_value), int(state.fault_encoder_error)
-        return drive_fault_text(self.config, fault, value, drive_error, encoder_error).happened
+        return self._drive.fault_text(self.config, fault, value, drive_error, encoder_error).happened

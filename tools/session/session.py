@@ -9,11 +9,14 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
+from jointctl.drivers.can.socketcan import interface_blamed
 from jointctl.drivers.drive import Approval, CommissioningReport, Declined, Drive
 from jointctl.drivers.errors import BusError, DataError, DeviceError, JointctlError, MotionFault, NoDeviceError
 from jointctl.firmware_py.states import Fault, StopRequest
+from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
 from jointctl.tools.recording.kept_records import KeptRecords
 from jointctl.tools.recording.run_log import ERROR, INFO, THINNING, WARNING, RunLogWriter, run_metadata
@@ -23,12 +26,12 @@ from jointctl.tools.session.consent import Consent, prepare_log, require_ready
 from jointctl.tools.session.control import Control, StopSignals
 from jointctl.tools.session.display import Display, PhaseLines
 from jointctl.tools.session.fault_words import held_up_text
-from jointctl.tools.session.guard import GuardHandle, kept_awake, start_guard
+from jointctl.tools.session.kept_awake import kept_awake
 from jointctl.tools.session.loop_handle import LoopHandle
-from jointctl.tools.session.open_drive import check_cyclic_rate, commission, drive_fault_text, open_drive
 from jointctl.tools.session.plan import Placed, RunPlan
 from jointctl.tools.session.result import RunResult, warn_unless_off
 from jointctl.tools.session.run_watch import Around, RunParts, RunWatch
+from jointctl.tools.session.session_drive import Guard, session_drive
 
 POLL_S = 0.02
 Answer = TypeVar("Answer")
@@ -59,26 +62,29 @@ class Session:
         self._consent, self._output, self._control = consent, output, control
         self.signals = control.signals
         self._make_display = display or (lambda _: PhaseLines(output))
+        self._kind = session_drive(plan.config.drive.kind)
         self.drive_state = ""  # in words, after the run
 
     def run(self) -> RunResult | None:
         """The whole run; None if it was declined.  Afterwards the drive is off, or `drive_state` says otherwise."""
         config, signals = self._config, self.signals
-        check_cyclic_rate(config)
+        self._kind.check_rate(config)
         tail_path = self.plan.log_path.with_suffix(".tail.mcap")
         with (
             signals.held(),
-            LoopHandle(config, self.plan.motion.table, tail_path, self._control.marker_fd) as loop,
+            LoopHandle(
+                config, self.plan.motion.table, self._kind.port_record(), tail_path, self._control.marker_fd
+            ) as loop,
             recording(config) as recorder,
             bus_watch(config) as bus_news,
             kept_awake(config, self._output),
         ):
-            drive = open_drive(config, signals.leave_if_asked)
-            guard: GuardHandle | None = None
+            drive = self._kind.open(config, signals.leave_if_asked)
+            guard: Guard | None = None
             try:
-                guard = start_guard(config, loop)
+                guard = self._kind.guard(config, loop)
                 try:
-                    report = commission(config, drive, self._may_brake())
+                    report = self.commissioned(config, drive, self._may_brake())
                 except Declined:
                     return None
                 signals.leave_if_asked()
@@ -103,6 +109,10 @@ class Session:
                     guard.release(self.drive_state)
                 warn_unless_off(self.drive_state, self._output)
 
+    def _loop(self, tail_path: Path) -> LoopHandle:
+        port, marker_fd = self._kind.port_record(), self._control.marker_fd
+        return LoopHandle(self._config, self.plan.motion.table, port, tail_path, marker_fd)
+
     def _ask(self, question: Callable[[], Answer]) -> Answer:
         """The answer of the user, whom a stop may interrupt."""
         self.signals.raising = True
@@ -110,6 +120,12 @@ class Session:
             return question()
         finally:
             self.signals.raising = False
+
+    @staticmethod
+    def commissioned(config: Config, drive: Drive, approve: Approval | None) -> CommissioningReport:
+        """`Drive.commission`; a failure also names what is wrong with the interface, if something is."""
+        with interface_blamed(config.bus.interface, config.bus.channel, config.bus.bitrate_bitps):
+            return drive.commission(approve)
 
     def _may_brake(self) -> Approval | None:
         brake = self._consent.brake
@@ -152,7 +168,7 @@ class Session:
         signals = watch.around.signals
         loop.listen()
         signals.on_command = loop.request_stop
-        if signals.commanded_ns:  # just before: the loop is told all the same, and never enables
+        if signals.commanded_ns:  # just before: the loop gets it all the same, and never enables
             loop.request_stop(signals.request)
         drive.start_cyclic()
         watch.temperature = TemperatureWatch(drive.thermometer(), watch.log)
@@ -234,9 +250,10 @@ class Session:
         text = None
         if fault is not Fault.NONE:
             errors = int(state.fault_drive_error), int(state.fault_encoder_error)
-            text = drive_fault_text(self._config, fault, value, *errors)
+            text = self._kind.fault_text(self._config, fault, value, *errors)
             text = held_up_text(fault, value, text, records, self._config.loop.rate_Hz)
             text = watch.around.bus_watch.explained(fault, text, int(loop.block.port[0].last_errno))
+        bus_load = float(loop.block.port[0].bits_sent) / (self._config.bus.bitrate_bitps * elapsed_s)
         return RunResult(
             summary=summarise(records, loop.block.histograms, temperatures_degC=watch.temperature.values_degC),
             records=records,
@@ -245,8 +262,8 @@ class Session:
             fault_text=text,
             stopped_by=watch.stopped_by or ("jointctl stop" if loop.stop_requested else ""),
             drive_state=drive_state,
-            bus_load=float(loop.block.port[0].bits_sent) / (self._config.bus.bitrate_bitps * elapsed_s),
-            serial=self._config.is_serial,
+            bus_load=bus_load,
+            load_row=self._kind.load_row(bus_load),
             lost_records=loop.lost_records,
             log_path=self.plan.log_path,
             report=report,

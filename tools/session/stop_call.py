@@ -18,7 +18,7 @@ from jointctl.drivers.bus_lock import STARTING, is_marked, lock_holders, lock_na
 
 LONGEST_S = 180.0  # that a program may ask for: two time-outs of a stop are at most 60 s each
 STARTING_S = 60.0  # how long a program that was just started may take until it controls its bus: it may compile first
-TOLD_S = 2.0  # after so long the user hears what is waited for
+NOTED_S = 2.0  # after so long the user hears what is waited for
 TERM_S = 1.0  # between SIGTERM and SIGKILL
 KILL_S = 2.0
 POLL_S = 0.02
@@ -62,16 +62,16 @@ class StopCall:
     @staticmethod
     def _wait_for_starting(pids: list[int], note: Callable[[str], None]) -> None:
         """Until each of them has its lock or has ended; which bus it is for shows only then."""
-        began_s, told = time.monotonic(), False
+        began_s, noted = time.monotonic(), False
         while pids := [pid for pid in pids if is_marked(pid, STARTING)]:
             which = f"process {', '.join(map(str, pids))}, which is starting and may be about to control the bus"
             waited_s = time.monotonic() - began_s
             if waited_s >= STARTING_S:
                 note(f"not waiting any longer for {which}: end it, or stop again when it runs")
                 return
-            if waited_s > TOLD_S and not told:
+            if waited_s > NOTED_S and not noted:
                 note(f"waiting for {which}")
-                told = True
+                noted = True
             time.sleep(POLL_S)
 
     def _end_controllers(self, note: Callable[[str], None]) -> bool:

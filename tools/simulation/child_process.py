@@ -17,7 +17,7 @@ from pathlib import Path
 
 from jointctl.drivers.errors import JointctlError
 
-TELL_S = 15.0  # how often it is told that it still compiles
+TELL_S = 15.0  # how often it is reported that it still compiles
 IDLE_S = 60.0  # alive, but at work for less than WORK_S in so long: it hangs
 WORK_S = 0.05
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
@@ -33,7 +33,7 @@ def processor_time_s(pid: int) -> float:
 
 
 def end_text(code: int) -> str:
-    """How a process ended, by its return code; one that ended by itself has told why on its stderr."""
+    """How a process ended, by its return code; one that ended by itself has said why on its stderr."""
     if code < 0:
         name = signal.Signals(-code).name if -code in list(signal.Signals) else str(-code)
         return f"was killed by signal {-code} ({name})"

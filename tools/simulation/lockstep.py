@@ -16,19 +16,20 @@ import numpy as np
 
 from jointctl.drivers.can.virtual_bus import decode, encode
 from jointctl.drivers.canopen.drive import CanopenDrive
-from jointctl.drivers.canopen.exchange import accept, begin, end, exchange_memory
+from jointctl.drivers.canopen.exchange import accept, begin, end, link_of
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Histogram
 from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.bus.virtual_bus import FRAME_SIZE
 from jointctl.hil.canopen.device import Cia402Device
-from jointctl.hil.faults.kinds import fault_memory
-from jointctl.hil.lockstep import TRUTHS, TRUE_POSITION_rad, run_lockstep
+from jointctl.hil.faults.kinds import fault_memory, no_faults
+from jointctl.hil.lockstep import TRUTHS, Codec, Scenario, TRUE_POSITION_rad, World, run_lockstep
+from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.drive_settings import canopen_settings
 from jointctl.tools.configuration.records import axis_constants, trajectory_table
 from jointctl.tools.simulation.virtual_joint import new_device
 
@@ -36,6 +37,7 @@ _COMMISSIONING_STEP_NS = 1000  # the device's clock goes on a little with every 
 _LISTENER_S = 5.0  # at most: it may have gone
 _START_GRID_NS = 5_000_000_000
 NO_STOP = -1
+NO_FAULTS = no_faults()
 
 
 class DirectBus(can.BusABC):
@@ -82,6 +84,13 @@ class DirectBus(can.BusABC):
             return None, False
         self._taken += 1
         return decode(frame, self.now_ns * 1e-9, self.channel_info), False
+
+
+def codec_of(port: Any) -> Codec:
+    """The CANopen driver's codec on this `CanopenPort` array."""
+    link = link_of(port)
+    frame_bytes = link.frames.view(np.ndarray).view(np.uint8).reshape(len(link.frames), FRAME_SIZE)
+    return Codec(begin, accept, end, link, frame_bytes)
 
 
 @dataclass(frozen=True)
@@ -158,8 +167,8 @@ class LockstepJoint:
             raise ConfigurationError(
                 "[[virtual.faults]] are carried out by run_with_faults(joint.faults), not by run()"
             )
-        if ideal_velocity and axis.law.matched_filter != 0:
-            raise ConfigurationError("control.matched_filter (=true) must be false with an ideal velocity")
+        if ideal_velocity and axis.law.filtered_error_rate != 0:
+            raise ConfigurationError("control.filtered_error_rate (=true) must be false with an ideal velocity")
         cycles = self._longest_cycles(axis, longest_s)
         records = cycles // log_every + 1 if log_every else 1
         return self._carry_out(
@@ -190,7 +199,7 @@ class LockstepJoint:
         return self._carry_out(
             constants, plant_constants, plant_state, new(LogRecord, cycles), np.zeros((cycles + tail_cycles, TRUTHS)),
             log_every=1, cycles=cycles, stop_cycle=stop_cycle, tail_cycles=tail_cycles,
-            faults=faults, memories=fault_memory(faults, -1 if epoch_at_start else 0),
+            faults=faults, epoch_ns=-1 if epoch_at_start else 0,
         )  # fmt: skip
 
     @staticmethod
@@ -201,20 +210,33 @@ class LockstepJoint:
         return int(longest_s / float(axis.law.period_s))
 
     def _carry_out(
-        self, constants: Any, plant_constants: Any, plant_state: Any, log: Any, truth: np.ndarray, **how: Any
+        self,
+        constants: Any,
+        plant_constants: Any,
+        plant_state: Any,
+        log: Any,
+        truth: np.ndarray,
+        faults: Any = NO_FAULTS,
+        epoch_ns: int = 0,
+        **how: Any,
     ) -> LockstepRun:
-        """A run from copies of device and plant; `how`: arguments of `run_lockstep` by their names."""
+        """A run from copies of device and plant; `how`: fields of `Scenario`."""
         axis = constants[0]
-        state, sample, command = new(AxisState), new(Sample), new(Command)
+        state = new(AxisState)
         reset_axis(axis, state[0])
-        device = self._virtual.device.copy()
-        plant_constants = self.plant_constants if plant_constants is None else plant_constants
         plant = (self.plant_state if plant_state is None else plant_state).copy()
-        frames, _ = exchange_memory()
-        frame_bytes = frames.view(np.ndarray).view(np.uint8).reshape(len(frames), FRAME_SIZE)
-        written, rows = run_lockstep(
-            begin, accept, end, self._port.copy(), frames, frame_bytes, constants, state, self.table, sample, command,
-            device, plant_constants, plant, self._virtual.queue.copy(), log,
-            start_ns=self.start_ns, period_ns=round(float(axis.law.period_s) * 1e9), truth=truth, **how,
+        world = World(
+            self._virtual.device.copy(),
+            self.plant_constants if plant_constants is None else plant_constants,
+            plant,
+            self._virtual.queue.copy(),
+            faults,
+            fault_memory(faults, epoch_ns),
+        )
+        memory = CycleMemory(
+            constants, state, self.table[np.newaxis], new(Sample), new(Command), np.zeros(WORDS, np.int64), log,
+            np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64), np.zeros(2, np.int64),
         )  # fmt: skip
-        return LockstepRun(log[:written], state[0], plant[0], device[0], Fault(int(state[0].fault)), truth[:rows])
+        scenario = Scenario(self.start_ns, round(float(axis.law.period_s) * 1e9), **how)
+        written, rows = run_lockstep(memory, codec_of(self._port.copy()), world, scenario, truth)
+        return LockstepRun(log[:written], state[0], plant[0], world.device[0], Fault(int(state[0].fault)), truth[:rows])

@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
 
 import can
 import numpy as np
@@ -26,6 +25,7 @@ from jointctl.hil.canopen.device import Cia402Device
 from jointctl.hil.device_loop import ENDED_WORD, SEND_ERRORS_WORD, STOP_WORD, WORDS
 from jointctl.hil.plant.joint import plant
 from jointctl.hil.realtime_device import RealtimeDevice
+from jointctl.tools.configuration.canopen import canopen_section, eds_path
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.plant_settings import device_settings, fault_constants, plant_settings
 from jointctl.tools.simulation.child_process import Starting
@@ -47,7 +47,7 @@ class PumpedDevice:
     them on a busy one; the compiled `hil.device_loop`, for buses that are file descriptors, within microseconds.
     """
 
-    def __init__(self, device: Cia402Device, bus: Any) -> None:
+    def __init__(self, device: Cia402Device, bus: can.BusABC) -> None:
         self._device = device
         self._bus = bus
         self.words = np.zeros(WORDS, np.int64)
@@ -56,6 +56,7 @@ class PumpedDevice:
     def _send(self, frames: list[bytes]) -> None:
         for frame in frames:
             message = decode(frame, 0.0, "")
+            assert message is not None
             try:
                 self._bus.send(message, _SEND_TIMEOUT_S)
             except (can.CanError, OSError):
@@ -122,9 +123,11 @@ def new_device(config: Config) -> Cia402Device:
     """The drive with its plant, as the configuration says that the joint truly is."""
     constants, state = plant(**plant_settings(config))
     try:
-        return Cia402Device(config.eds_path, device_settings(config), constants, state, fault_constants(config))
+        return Cia402Device(eds_path(config), device_settings(config), constants, state, fault_constants(config))
     except ValueError as error:  # what the EDS file must hold for a virtual drive
-        raise ConfigurationError(f"drive.eds (={config.canopen.eds}) does not make a virtual drive: {error}") from None
+        raise ConfigurationError(
+            f"drive.eds (={canopen_section(config).eds}) does not make a virtual drive: {error}"
+        ) from None
 
 
 @contextmanager
@@ -163,7 +166,7 @@ def separate_virtual_joint(
     `tell` gets a line now and then while it compiles.  Raises `BusError` if it ends, or hangs, before it is ready.
     """
     read_end, write_end = os.pipe()
-    command = [sys.executable, "-P", "-m", "jointctl.tools.cli", "hil", str(config_path), "--interface", "jointctl"]
+    command = [sys.executable, "-P", "-m", "jointctl.tools.verbs", "hil", str(config_path), "--interface", "jointctl"]
     command += ["--channel", channel, "--ready-fd", str(write_end), "--quiet"]
     process = subprocess.Popen(command, pass_fds=(write_end,), stdin=subprocess.DEVNULL, start_new_session=True)
     os.close(write_end)

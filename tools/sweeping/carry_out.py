@@ -15,14 +15,12 @@ from typing import Any, Self
 import numpy as np
 
 from jointctl.drivers.drive import CommissioningReport
-from jointctl.drivers.elmo.commissioning import SPEED_MODE
-from jointctl.drivers.errors import ConfigurationError, DeviceError, UsageError
+from jointctl.drivers.errors import ConfigurationError, UsageError
 from jointctl.firmware_py.records import Reference
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import CommandKind, Fault, TrajectoryKind
 from jointctl.firmware_py.trajectory import approach_duration_s
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.elmo import ElmoSerial, UnitModeChoice
 from jointctl.tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_constants
 from jointctl.tools.output import Advance, Output
 from jointctl.tools.recording.log_folder import log_path
@@ -35,9 +33,7 @@ from jointctl.tools.sweeping.grid import SweepPoint
 from jointctl.tools.sweeping.meter import SweepMeter
 from jointctl.tools.sweeping.plan import SweepMotion, shifted
 
-DRIVE_MODES = {"auto": "velocity or torque", "csv": "csv", "pv": "pv"}  # option: `CanopenSettings.mode`
-SERIAL_MODES: dict[str, UnitModeChoice] = {"auto": "auto", "speed": "speed", "torque": "torque"}
-VELOCITY_MODES = ("cyclic_sync_velocity", "profile_velocity", SPEED_MODE)  # as commissioning reports them
+MODES = ("auto", "csv", "pv", "speed", "torque")
 POSITION_GAIN_ps = 5.0  # slow: far below any drive's velocity loop, fast enough to keep the joint on the plan
 OBSERVER_radps = 30.0  # of the law that takes the place of one without an integral action
 ACCELERATION_SPARE = 3.0  # limit of the velocity command's slope over sequence.brake_radps2
@@ -51,18 +47,9 @@ Begin = Callable[[CommissioningReport], None]  # called when the joint is known 
 
 def with_mode(config: Config, mode: str) -> Config:
     """The configuration in the wanted mode: auto, csv, pv, speed (serial drive), or torque (as [drive] says)."""
-    if mode not in (*DRIVE_MODES, "speed", "torque"):
-        raise UsageError(f"--mode (={mode}) must be one of auto, csv, pv, speed, torque")
-    if isinstance(config.drive, ElmoSerial):
-        if mode not in SERIAL_MODES:
-            raise DeviceError(f"--mode (={mode}) must be auto, speed or torque: it is a serial drive")
-        return config.model_copy(update={"drive": config.drive.in_unit_mode(SERIAL_MODES[mode])})
-    if mode == "speed":
-        raise DeviceError("--mode (=speed) must be auto, csv, pv or torque: it is a CANopen drive")
-    if mode == "torque":
-        return config
-    drive = config.drive.model_copy(update={"mode": DRIVE_MODES[mode]})
-    return config.model_copy(update={"drive": drive})
+    if mode not in MODES:
+        raise UsageError(f"--mode (={mode}) must be one of {', '.join(MODES)}")
+    return config.model_copy(update={"drive": config.drive.in_sweep_mode(mode)})
 
 
 def config_of_sweep(config: Config, mode: str) -> Config:
@@ -113,7 +100,7 @@ def sweep_constants(config: Config, report: CommissioningReport, motion: SweepMo
     axis.trajectory.table_rows = len(motion.table)
     axis.trajectory.duration_s = motion.duration_s
     axis.sequence.approach_s = approach_time_s(config, report.start_position_rad, float(motion.table[0, 1]))
-    if report.mode in VELOCITY_MODES:
+    if report.commands_velocity:
         axis.command_kind = CommandKind.VELOCITY
         axis.velocity_command.position_gain_ps = POSITION_GAIN_ps
         axis.velocity_command.acceleration_max_radps2 = ACCELERATION_SPARE * config.sequence.brake_radps2
@@ -210,7 +197,7 @@ def sweep_in_lockstep(
 ) -> tuple[Fault, float] | None:
     """The whole motion on the virtual joint in simulated time; the fault and its value, None after a dry run."""
     config = swept.config
-    if config.is_serial:
+    if not config.drive.simulated:
         raise UsageError('--lockstep is for drive.kind = "canopen": the serial joint runs in real time only')
     joint = LockstepJoint(config)
     placed = swept.placed(joint.report)

@@ -12,34 +12,16 @@ from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError, DeviceError
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
-from jointctl.tools.configuration.elmo import ElmoSerial
 
 DOUBTFUL_FACTOR = 1.25  # motors are rated at a speed, where losses take part of the torque
 WRONG_FACTOR = 3.0
 
 
-def _factor(config: Config) -> float | None:
-    """Torque constant times rated current over rated torque; None if one of them is not given."""
-    drive = config.drive
-    if isinstance(drive, ElmoSerial) or drive.rated_torque_Nm is None or drive.rated_current_A is None:
-        return None
-    return torque_constant_NmpA(config) * drive.rated_current_A / drive.rated_torque_Nm
-
-
-def _text(config: Config, factor: float) -> str:
-    drive = config.canopen
-    return (
-        f"joint.torque_constant_NmpA (={torque_constant_NmpA(config):.4g} in the drive's ampere) times "
-        f"drive.rated_current_A (={drive.rated_current_A:g}) is {factor:.3g} times drive.rated_torque_Nm "
-        f"(={drive.rated_torque_Nm:g}): one of them is wrong, or rms and sine amplitude are mixed up"
-    )
-
-
 def refuse_constants(config: Config) -> None:
     """Raise `ConfigurationError` if no motor can have these constants."""
-    factor = _factor(config)
-    if factor is not None and not 1.0 / WRONG_FACTOR <= factor <= WRONG_FACTOR:
-        raise ConfigurationError(f"{config.path}: {_text(config, factor)}", "nothing was moved; see the data sheets")
+    found = config.drive.constants_factor(config)
+    if found is not None and not 1.0 / WRONG_FACTOR <= found[0] <= WRONG_FACTOR:
+        raise ConfigurationError(f"{config.path}: {found[1]}", "nothing was moved; see the data sheets")
 
 
 def require_torque(report: CommissioningReport) -> None:
@@ -54,10 +36,10 @@ def require_torque(report: CommissioningReport) -> None:
 
 def constant_remarks(config: Config) -> list[str]:
     """What the user should look at before the joint moves."""
-    factor = _factor(config)
-    if factor is None or 1.0 / DOUBTFUL_FACTOR <= factor <= DOUBTFUL_FACTOR:
+    found = config.drive.constants_factor(config)
+    if found is None or 1.0 / DOUBTFUL_FACTOR <= found[0] <= DOUBTFUL_FACTOR:
         return []
-    return [_text(config, factor) + "; friction would be wrong by that factor"]
+    return [found[1] + "; friction would be wrong by that factor"]
 
 
 def recorded_limits(config: Config) -> dict[str, float]:
@@ -70,21 +52,11 @@ def recorded_limits(config: Config) -> dict[str, float]:
 
 def measuring_constants(config: Config) -> dict[str, float]:
     """What turns readings into velocity and friction: points measured with other numbers are not one sweep."""
-    drive = config.drive
-    found = {
+    return {
         "torque_constant_NmpA": torque_constant_NmpA(config),
-        "torque_direction": float(drive.torque_direction),
+        "torque_direction": float(config.drive.torque_direction),
         "rad_per_count": joint_rad_per_count(config),
         "gravity_Nm": config.joint.gravity_Nm,
         "gravity_zero_rad": config.joint.gravity_zero_rad,
+        **config.drive.measuring_constants(),
     }
-    if not isinstance(drive, ElmoSerial):
-        found["rated_torque"] = float(drive.torque_reference == "rated_torque")
-    return found
-
-
-def torque_source(config: Config) -> str:
-    """For the sidecar: which reading of the drive the torque comes from."""
-    if config.is_serial:
-        return "current IQ as the drive measures it; motor_torque_Nm = current_A * torque_constant_NmpA"
-    return "object 6077 as the drive measures it; current_A = motor_torque_Nm / torque_constant_NmpA"

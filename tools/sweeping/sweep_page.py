@@ -12,7 +12,16 @@ from rich.table import Table as TerminalTable
 from jointctl.firmware_py.input_file import LARGEST_TABLE_BYTES, parse_json, read_input
 from jointctl.tools.drawing import BLUE, ORANGE, RED
 from jointctl.tools.output import Output
-from jointctl.tools.reporting.page import Block, Details, Figure, Section, Table, draw, from_terminal, write_verb_page
+from jointctl.tools.recording.report_page import (
+    Block,
+    Details,
+    Figure,
+    Section,
+    Table,
+    draw,
+    from_terminal,
+    write_verb_page,
+)
 
 
 def write_sweep_page(path: Path, data: Path, summary: TerminalTable, output: Output) -> None:

@@ -4,38 +4,40 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from rich.table import Table
 
-from jointctl.tools.analysis.linear_loop import LoopSettings
-from jointctl.tools.analysis.loop_settings import Assumption, loop_settings, not_modelled
-from jointctl.tools.analysis.margin_gate import Remedy, learning_of, meets, refusal, refuse_diverging_learning, remedies
-from jointctl.tools.analysis.margins import Margins, Theory, margins, theory
-from jointctl.tools.configuration.config import Config
-from jointctl.tools.drawing import require_png
-from jointctl.tools.output import Output
-from jointctl.tools.verbs.check_serial import line_text, refuse_rate
+from jointctl.tools.verbs.verb_options import JointOfFile, ResultOutput
+
+if TYPE_CHECKING:
+    from jointctl.tools.analysis.linear_loop import LoopSettings
+    from jointctl.tools.analysis.loop_settings import Assumption
+    from jointctl.tools.analysis.margin_gate import Remedy
+    from jointctl.tools.analysis.margins import Margins, Theory
 
 
 def check(
-    config: Config,
-    output: Output,
-    delay_s: float | None = None,
+    config: JointOfFile,
+    output: ResultOutput,
+    # from the sample to the torque command taking effect
+    delay_s: Annotated[float | None, typer.Option("--delay", help="measured loop delay (s)", min=0.0)] = None,
     *,
-    figure: Path | None = None,
-    allow_low_margin: bool = False,
+    figure: Annotated[Path | None, typer.Option("--figure", help="PNG to write: Bode, sensitivity, poles")] = None,
+    allow_low_margin: Annotated[bool, typer.Option("--allow-low-margin", help="accept a stable loop below it")] = False,
 ) -> int:
-    """Print the analysis; `MarginError` if the margin is too small.
+    """Is the control loop stable enough?  Margins, bounds and what would help."""
+    from jointctl.tools.analysis.loop_settings import loop_settings, not_modelled
+    from jointctl.tools.analysis.margin_gate import learning_of, meets, refusal, refuse_diverging_learning, remedies
+    from jointctl.tools.analysis.margins import margins, theory
+    from jointctl.tools.drawing import require_png
+    from jointctl.tools.verbs.bench_drive import bench_of
 
-    `delay_s` is a measured loop delay (sample to torque command taking effect); `figure` a PNG to write;
-    `allow_low_margin` accepts a stable loop below the minimum.
-    """
     if figure is not None:
         require_png(figure, (config.path,))
-    serial = config.is_serial
-    if serial:
-        refuse_rate(config)
+    drive = bench_of(config)
+    drive.require_rate(config)
     minimum_deg = config.margin.min_phase_margin_deg
     settings, assumptions = loop_settings(config, delay_s)
     found = margins(settings)
@@ -45,8 +47,8 @@ def check(
     verdict = "ok" if enough else "below the minimum, accepted" if accepted else "too small"
     analysis = _Analysis(settings, assumptions, found, theory(settings), minimum_deg, verdict, changes)
     table = _table(analysis)
-    if serial:
-        table.add_row("serial line", line_text(config), "characters of a cycle; measured before a run enables")
+    for row in drive.check_rows(config):
+        table.add_row(*row)
     learning = learning_of(config, settings)
     if learning is not None:
         value = f"factor {learning.worst_factor:.2f} at {learning.worst_Hz:.1f} Hz"

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from jointctl.drivers.can.socketcan import interface_blamed
+from typing import TYPE_CHECKING
+
 from jointctl.drivers.errors import INTERRUPTED
-from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.elmo import ElmoSerial
-from jointctl.tools.output import Output
-from jointctl.tools.session import result as drive_end
-from jointctl.tools.session.control import in_control
-from jointctl.tools.session.open_drive import open_drive
-from jointctl.tools.session.result import warn_unless_off
-from jointctl.tools.verbs.stop_serial import refuse_while_running
+from jointctl.tools.verbs.verb_options import JointOnBus, ResultOutput
+
+if TYPE_CHECKING:
+    pass
 
 
-def clear_fault(config: Config, output: Output) -> int:
+def clear_fault(config: JointOnBus, output: ResultOutput) -> int:
     """Reset the drive's fault; it stays disabled."""
-    if isinstance(config.drive, ElmoSerial):
-        refuse_while_running(config.drive)
+    from jointctl.drivers.can.socketcan import interface_blamed
+    from jointctl.tools.session import result as drive_end
+    from jointctl.tools.session.control import in_control
+    from jointctl.tools.session.result import warn_unless_off
+    from jointctl.tools.session.session_drive import session_drive
+
+    kind = session_drive(config.drive.kind)
+    kind.refuse_beside_run(config)
     with in_control(config, output) as control, control.signals.held():
-        drive = open_drive(config, control.signals.leave_if_asked)
+        drive = kind.open(config, control.signals.leave_if_asked)
         try:
             with interface_blamed(config.bus.interface, config.bus.channel, config.bus.bitrate_bitps):
                 done = drive.clear_fault()

@@ -4,38 +4,52 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.elmo_settings import refuse_serial
-from jointctl.tools.configuration.load import load_config, with_bus_overrides
-from jointctl.tools.output import Output
-from jointctl.tools.simulation.virtual_joint import separate_virtual_joint
-from jointctl.tools.verbs.run import run
+from jointctl.tools.verbs.verb_options import VerbOutput, config_path
+
+if TYPE_CHECKING:
+    from jointctl.tools.configuration.config import Config
 
 LONGEST_S = 86_400.0
 PATIENCE_S = 0.15  # a shared computer may stand still for so long; here only simulated metal waits for it
 
 
-def demo(config_path: Path, output: Output, *, duration_s: float | None = None) -> int:
-    """Start the virtual joint on a private bus, run the configuration on it, end it."""
-    config = load_config(config_path)
-    refuse_serial(config, "demo")
-    if config.virtual is None:
-        raise ConfigurationError(f"{config.path}: has no [virtual] section, so there is no virtual joint to move")
+def demo(
+    config: Annotated[Path, typer.Option("--config", help="configuration with a virtual joint")] = Path("virtual"),
+    *,
+    duration_s: Annotated[float | None, typer.Option("--duration", help="seconds of the trajectory", min=0.1)] = None,
+    output: VerbOutput,
+) -> int:
+    """Track a trajectory on the virtual joint: no hardware, no set-up."""
+    from jointctl.tools.configuration.drive_section import GivenPlace, require_simulated
+    from jointctl.tools.configuration.load import load_config, moved
+    from jointctl.tools.simulation.virtual_joint import separate_virtual_joint
+    from jointctl.tools.verbs.run import run
+
+    path = config_path(config)
+    joint = load_config(path)
+    require_simulated(joint, "demo")
+    if joint.virtual is None:
+        raise ConfigurationError(f"{joint.path}: has no [virtual] section, so there is no virtual joint to move")
     channel = f"demo-{os.getpid()}"
-    config = with_bus_overrides(config, interface="jointctl", channel=channel, environ={})
+    joint = moved(joint, GivenPlace("jointctl", channel), {})
     if duration_s is not None:
-        config = _with_duration(config, duration_s)
-    config = with_patience(config)
+        joint = _with_duration(joint, duration_s)
+    joint = with_patience(joint)
     output.note("starting the virtual joint")
-    with separate_virtual_joint(config_path, channel, output.note):
-        return run(config, output, assume_yes=True)
+    with separate_virtual_joint(path, channel, output.note):
+        return run(joint, output, assume_yes=True)
 
 
 def with_patience(config: Config) -> Config:
     """With limits on late samples and skipped periods that a busy computer keeps; less than the drive's own watch."""
-    longest_s = min(PATIENCE_S, 0.75 * config.canopen.heartbeat_s)
+    from jointctl.tools.configuration.canopen import canopen_section
+
+    longest_s = min(PATIENCE_S, 0.75 * canopen_section(config).heartbeat_s)
     limits = config.limits
     update = {key: max(getattr(limits, key), longest_s) for key in ("sample_age_max_s", "skipped_max_s")}
     return config.model_copy(update={"limits": limits.model_copy(update=update)})

@@ -1,56 +1,63 @@
-"""`jointctl doctor`: what this computer, its CAN adapter and the configuration allow, with a cure for what is amiss.
+"""`jointctl doctor`: what this computer, its CAN adapter and the configuration allow, with a remedy for what is amiss.
 
-Reads and measures only: nothing moves, no object of the drive is written; the one thing sent on the bus is the SDO
-request to read object 1000h (device type).
+Without --motion it reads and measures only: nothing moves, no object of the drive is written; the one thing sent on the
+bus is the SDO request to read object 1000h (device type).  With it: is torque and encoder the right way round, before
+the first run?
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated
 
+import typer
 from rich.table import Table
 from rich.text import Text
 
-from jointctl.firmware_py.kernel import cache_folder
-from jointctl.tools.configuration.config import Config
-from jointctl.tools.inspection.health import (
-    NOTE,
-    OK,
-    PROBLEM,
-    Finding,
-    adapters,
-    bus_budget,
-    drive_finding,
-    interface_state,
-    kernel_cache,
-    kernel_findings,
-    scheduling,
-    software,
-    wake_up,
-)
-from jointctl.tools.inspection.serial_health import serial_findings
+from jointctl.drivers.errors import DECLINED, INTERRUPTED
 from jointctl.tools.output import Output
+from jointctl.tools.verbs.verb_options import JointOrVirtual, VerbOutput, Yes
+
+if TYPE_CHECKING:
+    from jointctl.tools.configuration.config import Config
+    from jointctl.tools.inspection.health import Finding
+    from jointctl.tools.session.control import Control
 
 
 def findings(config: Config, *, cold: bool = False, wake_cycles: int | None = None) -> Iterator[Finding]:
     """All of them, each as soon as it is known; the wake-up is measured for a second each."""
+    from jointctl.firmware_py.kernel import cache_folder
+    from jointctl.tools.inspection.health import kernel_cache, kernel_findings, scheduling, software, wake_up
+    from jointctl.tools.verbs.bench_drive import bench_of
+
     yield from software()
     yield from kernel_findings()
     yield from scheduling()
     yield from wake_up(config, wake_cycles or max(1, round(config.loop.rate_Hz)))
     yield from kernel_cache(cache_folder, cold)
-    if config.is_serial:
-        yield from serial_findings(config)
-        return
-    yield from adapters(config)
-    yield bus_budget(config)
-    yield drive_finding(config)
-    yield from interface_state(config)  # last: a bus on which nobody acknowledges shows once something was sent
+    yield from bench_of(config).findings(config)
 
 
-def doctor(config: Config, output: Output, *, cold: bool = False) -> int:
-    """Examine and report; 0, or 1 if a run would fail.  `cold` also measures a start with an empty cache (a minute)."""
+def doctor(
+    config: JointOrVirtual,
+    output: VerbOutput,
+    *,
+    cold: Annotated[bool, typer.Option("--cold", help="measure the cold start as well (about a minute)")] = False,
+    motion: Annotated[
+        bool, typer.Option("--motion", help="instead: pull the joint a little; are torque and encoders right?")
+    ] = False,
+    torque_Nm: Annotated[
+        float | None, typer.Option("--torque", help="Nm at the joint at most, with --motion", min=0.0)
+    ] = None,
+    assume_yes: Yes = False,
+) -> int:
+    """What this computer and bus allow: real-time rights, wake-up times, kernel cache, bus budget.
+
+    Moves nothing; with --motion it asks first, then checks the directions of torque and encoders and their counts.
+    """
+    if motion:
+        return doctor_motion(config, output, assume_yes=assume_yes, torque_Nm=torque_Nm)
     found = []
     for finding in findings(config, cold=cold):
         output.note(f"  {finding.topic}")
@@ -59,14 +66,63 @@ def doctor(config: Config, output: Output, *, cold: bool = False) -> int:
 
 
 def report_findings(found: list[Finding], output: Output, title: str) -> int:
-    """The table, and 0 or 1 as for `doctor`."""
+    """The table, and 0, or 1 if a run would fail."""
+    from jointctl.tools.inspection.health import NOTE, OK, PROBLEM
+
     table = Table(title=title, title_justify="left")
-    for column in ("", "finding", "cure"):
+    for column in ("", "finding", "remedy"):
         table.add_column(column)
     colours = {OK: "green", NOTE: "yellow", PROBLEM: "red"}
     for finding in found:
         topic = Text.assemble((finding.status, colours[finding.status]), " ", finding.topic)
-        table.add_row(topic, finding.text, finding.cure)
+        table.add_row(topic, finding.text, finding.remedy)
     bad = any(finding.status == PROBLEM for finding in found)
     output.result(table, {"healthy": not bad, "findings": [asdict(finding) for finding in found]})
     return 1 if bad else 0
+
+
+def doctor_motion(config: Config, output: Output, *, assume_yes: bool, torque_Nm: float | None = None) -> int:
+    """Commission, tell, ask, pull, judge; 0, 1 if something is wrong, 12 if declined, 130 after an interruption."""
+    from jointctl.tools.session.consent import require_terminal
+    from jointctl.tools.session.control import in_control
+
+    if not assume_yes:
+        require_terminal()
+    with in_control(config, output) as control:
+        try:
+            return _pull(config, output, control, assume_yes=assume_yes, torque_Nm=torque_Nm)
+        except KeyboardInterrupt:
+            output.note(f"interrupted{control.signals.by_command}; nothing moved")
+            return INTERRUPTED
+
+
+def _pull(config: Config, output: Output, control: Control, *, assume_yes: bool, torque_Nm: float | None) -> int:
+    from jointctl.firmware_py.states import Fault
+    from jointctl.tools.inspection.motion_check import check_run, make_plan
+    from jointctl.tools.inspection.motion_verdict import ended_finding, judged, motion_findings
+    from jointctl.tools.session import result as drive_end
+    from jointctl.tools.session.consent import TerminalConsent
+    from jointctl.tools.session.result import require_off
+    from jointctl.tools.session.session import Session
+
+    plan = make_plan(config, torque_Nm)
+    session = Session(check_run(config, plan), TerminalConsent(output, assume_yes=assume_yes), output, control)
+    try:
+        result = session.run()
+    except KeyboardInterrupt:
+        require_off(session.drive_state)
+        raise
+    if result is None:
+        output.note(f"nothing moved; {drive_end.words(session.drive_state)}")
+        return DECLINED
+    require_off(result.drive_state)
+    if result.stopped_by:
+        output.note(f"stopped by {result.stopped_by}; the joint is {result.drive_state}; nothing was judged")
+        if result.fault is Fault.NONE:
+            return INTERRUPTED
+        return report_findings([ended_finding(result.records, result.fault, result.fault_text)], output, "Motion")
+    counts = result.report.counts_per_motor_turn
+    found = [judged(config, counts)] if counts else []
+    found += motion_findings(config, plan, result.records, result.fault, result.fault_text)
+    output.note(f"  drive afterwards: {result.drive_state}; log: {result.log_path}")
+    return report_findings(found, output, "Motion")

@@ -3,57 +3,60 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from jointctl.drivers.errors import INTERRUPTED
-from jointctl.tools.campaign.campaign import (
-    campaign_figure,
-    campaign_joint,
-    rows_by_kind,
-    run_campaign,
-    table,
-    violations,
-    write_json,
-)
-from jointctl.tools.campaign.fault_scenarios import draw_scenario
-from jointctl.tools.campaign.judge import Verdict, judge, require_fit
-from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.elmo_settings import refuse_serial
-from jointctl.tools.drawing import save_png
 from jointctl.tools.output import Output
-from jointctl.tools.reporting.page import (
-    Details,
-    Paragraph,
-    Section,
-    Table,
-    check_target,
-    from_terminal,
-    svg_figure,
-    write_verb_page,
-)
-from jointctl.tools.written_file import prepare_folder
+from jointctl.tools.verbs.verb_options import Report, VerbOutput, Workers, loaded
+
+if TYPE_CHECKING:
+    from jointctl.tools.configuration.config import Config
+    from jointctl.tools.experiments.judge import Verdict
 
 EXIT_VIOLATIONS = 10
+LARGEST = 2**31 - 1  # of a seed or of a scenario's number
 SHOWN = 20
 
 
-def fault_campaign(
-    config: Config,
-    output: Output,
-    *,
-    count: int = 10_000,
-    seed: int = 1,
-    scenario: int | None = None,
-    folder: Path = Path("fault-campaign"),
-    workers: int | None = None,
-    report: Path | None = None,
-    sweep: bool = False,
-) -> int:
-    """Run `count` scenarios, or replay one, of a run or of a `sweep`.
+def _joint(config: Annotated[Path, typer.Argument(metavar="CONFIG")] = Path("virtual")) -> Config:
+    return loaded(config)
 
-    0 if nothing was violated, 10 if something was, 130 after Ctrl-C.
-    """
-    refuse_serial(config, "fault-campaign")
+
+JointToBreak = Annotated["Config", _joint]
+
+
+def fault_campaign(
+    config: JointToBreak,
+    output: VerbOutput,
+    *,
+    count: Annotated[int, typer.Option("--count", help="how many random scenarios", min=1, max=LARGEST)] = 10_000,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=LARGEST)] = 1,
+    scenario: Annotated[
+        int | None, typer.Option("--scenario", help="replay this one alone", min=0, max=LARGEST)
+    ] = None,
+    sweep: Annotated[bool, typer.Option("--sweep", help="during a sweep, in its mode, instead of a run")] = False,
+    folder: Annotated[Path, typer.Option("--folder", help="for report, JSON and picture")] = Path("fault-campaign"),
+    workers: Workers = None,
+    report: Report = None,
+) -> int:
+    """Random faults on random joints in lockstep; every safety invariant is checked in every scenario."""
+    from jointctl.tools.configuration.drive_section import require_simulated
+    from jointctl.tools.drawing import save_png
+    from jointctl.tools.experiments.campaign import (
+        campaign_figure,
+        rows_by_kind,
+        run_campaign,
+        table,
+        violations,
+        write_json,
+    )
+    from jointctl.tools.experiments.judge import require_fit
+    from jointctl.tools.recording.report_page import check_target
+    from jointctl.tools.written_file import prepare_folder
+
+    require_simulated(config, "fault-campaign")
     require_fit(config)
     if scenario is not None:
         return _replay(config, output, seed, scenario, sweep)
@@ -92,6 +95,17 @@ def _write_page(
     path: Path, config: Config, verdicts: list[Verdict], found: list[dict[str, Any]], figure: Any, seed: int,
     output: Output,
 ) -> None:  # fmt: skip
+    from jointctl.tools.experiments.campaign import rows_by_kind, table
+    from jointctl.tools.recording.report_page import (
+        Details,
+        Paragraph,
+        Section,
+        Table,
+        from_terminal,
+        svg_figure,
+        write_verb_page,
+    )
+
     tone = "error" if found else "good"
     said = f"{len(found)} of {len(verdicts)} scenarios violate an invariant, seed {seed}."
     listed = Table(
@@ -111,11 +125,17 @@ def _write_page(
 
 def _replay(config: Config, output: Output, seed: int, number: int, sweep: bool) -> int:
     """One scenario, with all that it consists of."""
+    from jointctl.tools.experiments.campaign import campaign_joint
+    from jointctl.tools.experiments.fault_scenarios import draw_scenario
+    from jointctl.tools.experiments.judge import judge
+
     chosen = draw_scenario(seed, number, sweep=sweep)
     verdict = judge(*campaign_joint(config, sweep=sweep), chosen)
     described = chosen.describe()
     lines = [f"{key}: {value}" for key, value in described.items()]
-    lines += [f"told as {verdict.fault}, reaction {verdict.reaction}, greatest speed {verdict.peak_radps:.3f} rad/s"]
+    lines += [
+        f"reported as {verdict.fault}, reaction {verdict.reaction}, greatest speed {verdict.peak_radps:.3f} rad/s"
+    ]
     lines += [f"VIOLATION: {line}" for line in verdict.violations] or ["no invariant violated"]
     output.result("\n".join(lines), {"scenario": described, "verdict": vars(verdict)})
     return EXIT_VIOLATIONS if verdict.violations else 0

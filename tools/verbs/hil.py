@@ -8,20 +8,47 @@ import select
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-from jointctl.hil.bus.virtual_bus import default_socket_path
-from jointctl.hil.device_loop import ENDED_WORD
-from jointctl.tools.configuration.config import Config
+import typer
+
 from jointctl.tools.output import Output
-from jointctl.tools.session.control import StopSignals, stop_signals
-from jointctl.tools.session.loop_process import become_realtime, slow_start
-from jointctl.tools.simulation.virtual_joint import serve_virtual_joint
+from jointctl.tools.verbs.verb_options import BusOptions, ConfigPath, ProgressOutput, loaded
+
+if TYPE_CHECKING:
+    from jointctl.tools.configuration.config import Config
+    from jointctl.tools.session.control import StopSignals
 
 _POLL_S = 0.05
 
 
-def hil(config: Config, output: Output, *, timing: bool = False, ready_fd: int | None = None) -> int:
+def hil(
+    *,
+    config: ConfigPath = Path("virtual"),
+    bus: BusOptions,
+    serial: Annotated[bool, typer.Option("--serial", help="the virtual serial drive instead of the CAN bus")] = False,
+    link: Annotated[str | None, typer.Option("--link", help="serial drive: path of a link to its port")] = None,
+    timing: Annotated[bool, typer.Option("--timing", help="model bit times and arbitration")] = False,
+    ready_fd: Annotated[int | None, typer.Option("--ready-fd", hidden=True)] = None,
+    output: ProgressOutput,
+) -> int:
+    """Keep the virtual joint up, on a virtual bus or a pseudo-terminal, for other programs to attach to."""
+    from jointctl.tools.verbs.bench_drive import ServeOptions, bench_of
+
+    joint = loaded(Path("elmo_serial") if serial and config == Path("virtual") else config, bus)
+    return bench_of(joint).serve(joint, output, ServeOptions(timing, serial, bus.port, link, ready_fd))
+
+
+def serve_can(config: Config, output: Output, *, timing: bool = False, ready_fd: int | None = None) -> int:
     """Serve until a stop signal; `ready_fd` gets one byte once the bus can be used, and its reader's end ends us."""
+    from jointctl.hil.bus.virtual_bus import default_socket_path
+    from jointctl.hil.device_loop import ENDED_WORD
+    from jointctl.tools.configuration.canopen import canopen_section
+    from jointctl.tools.session.control import stop_signals
+    from jointctl.tools.session.loop_process import slow_start
+    from jointctl.tools.simulation.virtual_joint import serve_virtual_joint
+
     with (
         slow_start(output.note, "virtual joint") as started,
         stop_signals() as signals,
@@ -33,7 +60,7 @@ def hil(config: Config, output: Output, *, timing: bool = False, ready_fd: int |
         place = f"{bus.interface}:{bus.channel}"
         if bus.interface == "jointctl":
             place += f" ({default_socket_path(bus.channel)})"
-        output.note(f"virtual joint: node {config.canopen.node} on {place}; Ctrl-C ends it")
+        output.note(f"virtual joint: node {canopen_section(config).node} on {place}; Ctrl-C ends it")
         if bus.interface == "jointctl":
             output.note(f'attach with python-can: can.Bus(interface="jointctl", channel="{bus.channel}")')
         wait_for_end(signals, ready_fd, lambda: bool(joint.words[ENDED_WORD]))
@@ -42,6 +69,8 @@ def hil(config: Config, output: Output, *, timing: bool = False, ready_fd: int |
 
 def make_realtime(config: Config, output: Output) -> None:
     """Every thread of this process, once bus, drive and SDO server are compiled and run."""
+    from jointctl.tools.session.loop_process import become_realtime
+
     # the kernel's list may leave one out while others end; Python knows its own
     ours = {thread.native_id for thread in threading.enumerate() if thread.native_id is not None}
     all_threads = sorted(ours | {int(name) for name in os.listdir("/proc/self/task")})
@@ -60,7 +89,7 @@ def wait_for_end(signals: StopSignals, ready_fd: int | None, ended: Callable[[],
 
 
 def _reader_gone(ready_fd: int | None) -> bool:
-    """Whether whoever started us and waited on `ready_fd` has gone."""
+    """Whether the program that started us and waited on `ready_fd` has gone."""
     if ready_fd is None:
         return False
     poll = select.poll()

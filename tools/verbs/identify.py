@@ -6,46 +6,103 @@ Nothing is written unless the whole computation succeeds; every file is replaced
 from __future__ import annotations
 
 import json
+import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
+import typer
 
 from jointctl.drivers.errors import ConfigurationError, DataError
-from jointctl.tools.configuration.conversions import torque_constant_NmpA
-from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.drawing import png
-from jointctl.tools.identification.friction_data import ForeignFormat, read_friction_data
-from jointctl.tools.identification.identification import Identification, Options, identify_friction
-from jointctl.tools.identification.identification_report import (
-    convergence_figure,
-    error_table,
-    fit_figure,
-    identification_report,
-    model_table,
-    parameter_table,
-    section_values,
-    snippet,
-    write_into,
-)
-from jointctl.tools.identification.plausibility import JointLimits
 from jointctl.tools.output import Output
-from jointctl.tools.reporting.page import (
-    Block,
-    Details,
-    Section,
-    check_target,
-    from_terminal,
-    svg_figure,
-    write_verb_page,
-)
-from jointctl.tools.reporting.page import remarks as notes_of
-from jointctl.tools.written_file import replace_file, require_target
+from jointctl.tools.verbs.verb_options import Report, VerbOutput, config_path
+
+if TYPE_CHECKING:
+    from jointctl.tools.identification.friction_data import ForeignFormat
+    from jointctl.tools.identification.identification import Identification, Options
+    from jointctl.tools.identification.plausibility import JointLimits
+    from jointctl.tools.recording.report_page import Block
 
 
-def joint_limits(config_path: Path) -> JointLimits:
+Data = Annotated[Path, typer.Argument(metavar="DATA", help="CSV of velocity plateaus, from sweep or elsewhere")]
+Model = Annotated[str, typer.Option("--model", help="multi-stage, stribeck, coulomb-viscous, or auto (held-out error)")]
+
+
+@dataclass(frozen=True)
+class TableOptions:
+    """How to read a table that is not ours; a field of `ForeignFormat` each."""
+
+    velocity_column: Annotated[str | None, typer.Option("--velocity-column", help="name of the velocity column")] = None
+    torque_column: Annotated[str | None, typer.Option("--torque-column", help="name of the torque column (Nm)")] = None
+    current_column: Annotated[str | None, typer.Option("--current-column", help="name of the current column (A)")] = (
+        None
+    )
+    velocity_unit: Annotated[str | None, typer.Option("--velocity-unit", help="deg/s, rad/s or r/min")] = None
+    side: Annotated[str | None, typer.Option("--side", help="of the velocity: joint or motor")] = None
+    torque_side: Annotated[str | None, typer.Option("--torque-side", help="motor or joint")] = None
+    ratio: Annotated[float | None, typer.Option("--ratio", help="reduction ratio")] = None
+    torque_constant_NmpA: Annotated[float | None, typer.Option("--torque-constant", help="of the motor (Nm/A)")] = None
+    delimiter: Annotated[str, typer.Option("--delimiter", help="between columns: auto, or the character")] = "auto"
+
+
+def _given_format(table: TableOptions) -> ForeignFormat:
+    from jointctl.tools.identification.friction_data import ForeignFormat
+
+    return ForeignFormat(**vars(table))
+
+
+GivenFormat = Annotated["ForeignFormat | None", _given_format]
+
+
+def _fit(
+    model: Model = "multi-stage",
+    continuous: Annotated[bool, typer.Option("--continuous", help="let the two stages meet at the knees")] = False,
+    search_knee: Annotated[bool, typer.Option("--search-knee", help="search the knees as well")] = False,
+    knee: Annotated[float, typer.Option("--knee", help="speed at which the stages change (deg/s of the joint)")] = 40.0,
+    ws_min: Annotated[float | None, typer.Option("--ws-min", help="least Stribeck speed (deg/s)")] = None,
+    ws_max: Annotated[float, typer.Option("--ws-max", help="greatest Stribeck speed (deg/s)")] = 20.0,
+    static_max: Annotated[
+        float | None, typer.Option("--static-max", help="greatest static friction (Nm, motor)")
+    ] = None,
+    outlier_threshold: Annotated[float, typer.Option("--outlier-threshold", help="robust deviations; 0 = off")] = 5.0,
+    folds: Annotated[int, typer.Option("--folds", help="of the held-out error")] = 10,
+    particles: Annotated[int, typer.Option("--particles")] = 1000,
+    iterations: Annotated[int, typer.Option("--iterations")] = 5000,
+    inertia: Annotated[float, typer.Option("--inertia", help="of the swarm")] = 0.7298,
+    cognitive: Annotated[float, typer.Option("--cognitive")] = 1.49618,
+    social: Annotated[float, typer.Option("--social")] = 1.49618,
+    seed: Annotated[int, typer.Option("--seed")] = 1,
+    stall: Annotated[
+        int, typer.Option("--stall", help="stop after so many iterations without progress; 0 = never")
+    ] = 0,
+) -> Options:
+    from jointctl.tools.identification.identification import Options
+    from jointctl.tools.identification.swarm import SwarmSettings
+
+    return Options(
+        model=model,
+        continuous=continuous,
+        search_knee=search_knee,
+        knee_radps=math.radians(knee),
+        ws_min_radps=None if ws_min is None else math.radians(ws_min),
+        ws_max_radps=math.radians(ws_max),
+        static_max_Nm=static_max,
+        outlier_threshold=outlier_threshold,
+        folds=folds,
+        swarm=SwarmSettings(particles, iterations, inertia, cognitive, social, seed, stall),
+    )
+
+
+Fit = Annotated["Options | None", _fit]
+
+
+def joint_limits(path: Path) -> JointLimits:
     """What the checks of plausibility need of a configuration."""
-    config = load_config(config_path)
+    from jointctl.tools.configuration.conversions import torque_constant_NmpA
+    from jointctl.tools.configuration.load import load_config
+    from jointctl.tools.identification.plausibility import JointLimits
+
+    config = load_config(path)
     return JointLimits(
         config.limits.torque_max_Nm, config.limits.velocity_max_radps, config.joint.reduction_ratio,
         torque_constant_NmpA(config),
@@ -69,6 +126,8 @@ def _limits(into: Path | None, config: Path | None, output: Output) -> JointLimi
 
 def _not_compensated(path: Path) -> bool:
     """Whether the configuration has a friction section that its law does not use; False if it cannot be read yet."""
+    from jointctl.tools.configuration.load import load_config
+
     try:
         return load_config(path).control.feed_forward == "none"
     except ConfigurationError:
@@ -86,22 +145,36 @@ def remarks(found: Identification) -> list[str]:
 
 
 def identify(
-    data_path: Path,
-    output: Output,
+    data_path: Data,
+    output: VerbOutput,
     *,
-    into: Path | None = None,
-    out: Path | None = None,
-    config: Path | None = None,
-    told: ForeignFormat | None = None,
-    options: Options | None = None,
-    report: Path | None = None,
+    into: Annotated[Path | None, typer.Option("--into", help="configuration whose friction section to replace")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="TOML file to write instead")] = None,
+    config: Annotated[Path | None, typer.Option("--config", help="configuration to check plausibility against")] = None,
+    given: GivenFormat = None,
+    options: Fit = None,
+    report: Report = None,
 ) -> int:
-    """Identify, report, write; returns the exit code.
+    """Fit the friction model (11) to measured plateaus; writes TOML, figures and a report beside the data."""
+    # into: the section goes into it, figures and the JSON report beside the data.  Otherwise into `out`, default
+    # DATA.friction.toml, and they beside it.
+    import numpy as np
 
-    `into`: configuration whose [friction] is replaced; `out`: TOML file with the section alone (default, if `into` is
-    not given: DATA.friction.toml).  `config` only serves to compare with limits and constants of the joint.  Figures
-    and a JSON report go beside the TOML file, or beside the data with `into`.  `report`: HTML page to write as well.
-    """
+    from jointctl.tools.configuration.load import shipped_config
+    from jointctl.tools.drawing import png
+    from jointctl.tools.identification.friction_data import read_friction_data
+    from jointctl.tools.identification.identification import Options, identify_friction
+    from jointctl.tools.identification.identification_report import (
+        convergence_figure,
+        fit_figure,
+        identification_report,
+        section_values,
+        snippet,
+        write_into,
+    )
+    from jointctl.tools.recording.report_page import check_target
+    from jointctl.tools.written_file import replace_file, require_target
+
     options = options or Options()
     if out is not None and out.suffix != ".toml":
         raise DataError(f"{out}: the name of the section's file (-o) must end in .toml")
@@ -110,8 +183,9 @@ def identify(
     if into is not None and not into.exists() and shipped_config(into.name).exists():
         hint = f"`jointctl new FILE --from {into.stem}` makes one of your own"
         raise DataError(f"--into {into}: a shipped configuration is not written into", hint)
+    config = None if config is None else config_path(config)
     limits = _limits(into, config, output)
-    data = read_friction_data(data_path, told)
+    data = read_friction_data(data_path, given)
     if limits is None and data.recorded_limits is None:
         output.warning(
             f"{data_path}: no limits of the joint are known: sizes of torque and speed could not be checked, a wrong "
@@ -164,6 +238,10 @@ def identify(
 def _write_page(
     path: Path, found: Identification, fit: Any, convergence: Any | None, section: str, output: Output
 ) -> None:
+    from jointctl.tools.identification.identification_report import error_table, model_table, parameter_table
+    from jointctl.tools.recording.report_page import Details, Section, from_terminal, svg_figure, write_verb_page
+    from jointctl.tools.recording.report_page import remarks as notes_of
+
     errors = error_table(found.errors_Nm, found.measured_Nm, found.data.reduction_ratio)
     pictures: list[Block] = [svg_figure(fit, "Measured friction torque and the model, and the error between them")]
     if convergence is not None:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 from rich.text import Text
 
-from jointctl.tools.inspection.drive_info import drive_info
-from jointctl.tools.inspection.subject import SdoReader, Subject, canopen_network
 from jointctl.tools.output import Output
+from jointctl.tools.verbs.asked_drive import AskedDrive
+from jointctl.tools.verbs.verb_options import VerbOutput
+
+if TYPE_CHECKING:
+    from jointctl.tools.inspection.subject import Subject
 
 _TITLES = {
     "identity": "Identity", "errors": "Errors", "state": "State", "ratings": "Ratings", "limits": "Limits",
@@ -18,8 +21,18 @@ _TITLES = {
 }  # fmt: skip
 
 
-def info(subject: Subject, output: Output) -> int:
+def info(asked: AskedDrive, output: VerbOutput) -> int:
+    """What a drive tells about itself: identity, state, errors by name, limits, ratings, PDO mapping.  Reads only."""
+    from jointctl.tools.verbs.bench_drive import bench_of
+
+    return bench_of(asked.config).info(asked, output)
+
+
+def node_info(subject: Subject, output: Output) -> int:
     """Of the CANopen node that `subject` names."""
+    from jointctl.tools.inspection.drive_info import drive_info
+    from jointctl.tools.inspection.subject import SdoReader, canopen_network
+
     node = subject.required_node()
     objects = subject.objects()
     with canopen_network(subject) as network:

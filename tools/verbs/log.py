@@ -3,32 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from rich.console import Group
 from rich.table import Table
 
 from jointctl.drivers.errors import DataError
-from jointctl.tools.output import Output
-from jointctl.tools.recording.log_export import FORMATS
-from jointctl.tools.recording.run_figure import save_run_figure
-from jointctl.tools.recording.run_log_reader import (
-    RunLog,
-    began_at,
-    event_rows,
-    kept_share,
-    level_name,
-    missing_in,
-    read_run_log,
-)
-from jointctl.tools.recording.run_summary import summarise, summary_table
-from jointctl.tools.written_file import replace_file, require_target
+from jointctl.tools.verbs.verb_options import ResultOutput, grouped
+
+if TYPE_CHECKING:
+    from jointctl.tools.recording.run_log_reader import RunLog
 
 _SHOWN_EVENTS = 100
 
+LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="run log (MCAP)")]
 
-def log_info(path: Path, output: Output) -> int:
-    """What the log holds, what was run, the summary of the run, its events."""
+
+def log_info(path: LogPath, output: ResultOutput) -> int:
+    """What the log holds, the run in numbers, its events."""
+    from jointctl.tools.recording.run_log_reader import began_at, kept_share, level_name, missing_in, read_run_log
+    from jointctl.tools.recording.run_summary import summarise, summary_table
+
     log = read_run_log(path)
     summary = summarise(log.records, temperatures_degC=log.temperatures["temperature_degC"])
     drive = log.metadata.get("drive", {})
@@ -78,6 +74,8 @@ def _facts_table(facts: dict[str, Any], drive: dict[str, str]) -> Table:
 
 
 def _event_table(log: RunLog) -> Table:
+    from jointctl.tools.recording.run_log_reader import event_rows
+
     rows = event_rows(log)
     left_out = len(rows) - _SHOWN_EVENTS
     table = Table(title="Events", title_justify="left", caption=f"and {left_out} more" if left_out > 0 else None)
@@ -90,8 +88,15 @@ def _event_table(log: RunLog) -> Table:
     return table
 
 
-def log_plot(path: Path, output: Output, out: Path | None = None) -> int:
-    """The picture of the run as a PNG; by default beside the log."""
+def log_plot(
+    path: LogPath,
+    output: ResultOutput,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="PNG to write; default: beside the log")] = None,
+) -> int:
+    """The picture of the run."""
+    from jointctl.tools.recording.run_figure import save_run_figure
+    from jointctl.tools.recording.run_log_reader import read_run_log
+
     log = read_run_log(path)
     if not len(log.records):
         raise DataError(f"{path}: nothing to draw, the run has 0 records")
@@ -101,8 +106,17 @@ def log_plot(path: Path, output: Output, out: Path | None = None) -> int:
     return 0
 
 
-def log_export(path: Path, output: Output, format: str, out: Path | None = None) -> int:
-    """Write the log in another format (see `log_export.FORMATS`); by default beside the log."""
+def log_export(
+    path: LogPath,
+    output: ResultOutput,
+    format: Annotated[str, typer.Option("-f", "--format", help="csv, npz, parquet, or candump for the raw frames")],
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="file to write; default: beside the log")] = None,
+) -> int:
+    """The log in another format."""
+    from jointctl.tools.recording.log_export import FORMATS
+    from jointctl.tools.recording.run_log_reader import read_run_log
+    from jointctl.tools.written_file import replace_file
+
     if format not in FORMATS:
         raise DataError(f"format (={format!r}) must be one of {', '.join(FORMATS)}")
     ending, content = FORMATS[format]
@@ -117,6 +131,13 @@ def log_export(path: Path, output: Output, format: str, out: Path | None = None)
 
 
 def _target(path: Path, out: Path | None, ending: str) -> Path:
+    from jointctl.tools.written_file import require_target
+
     target = out if out is not None else path.with_suffix(ending)
     require_target(target, (path,))
     return target
+
+
+log_app = typer.Typer(help="Look at a run log: what it holds, a picture, other formats.", no_args_is_help=True)
+for _verb in (log_info, log_plot, log_export):
+    log_app.command(_verb.__name__.removeprefix("log_"))(grouped(_verb))

@@ -6,18 +6,21 @@ import json
 import time
 from collections import Counter
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import can
+import typer
 
 from jointctl.drivers.errors import BusError, ConfigurationError
-from jointctl.tools.configuration.drive_settings import TORQUE_MODES
-from jointctl.tools.inspection.drive_info import pdo_maps
-from jointctl.tools.inspection.frame_decoder import KINDS, Decoded, FrameDecoder, PdoMaps
-from jointctl.tools.inspection.objects import Objects
-from jointctl.tools.inspection.subject import SdoReader, Subject, canopen_network
 from jointctl.tools.output import Output
-from jointctl.tools.session.control import stop_signals
+from jointctl.tools.verbs.asked_drive import AskedDrive
+from jointctl.tools.verbs.verb_options import VerbOutput
+
+if TYPE_CHECKING:
+    import can
+
+    from jointctl.tools.inspection.frame_decoder import Decoded, FrameDecoder
+    from jointctl.tools.inspection.subject import Subject
+    from jointctl.tools.verbs.bench_drive import MonitorOptions
 
 POLL_S = 0.1
 
@@ -42,24 +45,31 @@ class Selection:
         )
 
 
-def selection_of(
-    cob_ids: list[str], kinds: list[str], nodes: list[int], count: int | None, duration_s: float | None, changes: bool
-) -> Selection:
+def selection_of(options: MonitorOptions) -> Selection:
     """From the texts of the command line; identifiers are hexadecimal, as candump writes them."""
+    from jointctl.tools.inspection.frame_decoder import KINDS
+
     identifiers = set()
-    for text in cob_ids:
+    for text in options.cob_ids:
         try:
             identifiers.add(int(text.lower().removesuffix("h").removeprefix("0x"), 16))
         except ValueError:
             raise ConfigurationError(f"--cob-id (={text}) must be a hexadecimal identifier, such as 181") from None
-    for kind in kinds:
+    for kind in options.kinds:
         if kind not in KINDS:
             raise ConfigurationError(f"--kind (={kind}) must be one of {', '.join(KINDS)}")
-    return Selection(frozenset(identifiers), frozenset(kinds), frozenset(nodes), count, duration_s, changes)
+    shown = frozenset(identifiers), frozenset(options.kinds), frozenset(options.nodes)
+    return Selection(*shown, options.count, options.duration_s, options.changes)
 
 
 def new_decoder(subject: Subject, *, ask: bool) -> FrameDecoder:
     """With what the subject tells about objects and PDOs; `ask` reads the mapping from the drive over SDO."""
+    from jointctl.tools.configuration.canopen import TORQUE_MODES, canopen_section
+    from jointctl.tools.inspection.drive_info import pdo_maps
+    from jointctl.tools.inspection.frame_decoder import FrameDecoder, PdoMaps
+    from jointctl.tools.inspection.objects import Objects
+    from jointctl.tools.inspection.subject import SdoReader, canopen_network
+
     maps, objects = PdoMaps(), {}
     if subject.eds is not None and subject.node is not None:
         known = subject.objects()
@@ -67,7 +77,7 @@ def new_decoder(subject: Subject, *, ask: bool) -> FrameDecoder:
         if known.dictionary is not None:
             maps.learn_from_eds(known.dictionary, subject.node)
     if subject.config is not None and subject.node is not None:
-        maps.learn_loop(subject.node, velocity=subject.config.canopen.mode not in TORQUE_MODES)
+        maps.learn_loop(subject.node, velocity=canopen_section(subject.config).mode not in TORQUE_MODES)
     if ask:
         node = subject.required_node()
         with canopen_network(subject) as network:
@@ -77,8 +87,34 @@ def new_decoder(subject: Subject, *, ask: bool) -> FrameDecoder:
     return FrameDecoder(objects, maps)
 
 
-def monitor(subject: Subject, output: Output, selection: Selection, *, ask: bool = False) -> int:
+def monitor(
+    asked: AskedDrive,
+    output: VerbOutput,
+    *,
+    cob_id: Annotated[list[str] | None, typer.Option("--cob-id", help="identifier (hex); may be repeated")] = None,
+    kind: Annotated[
+        list[str] | None, typer.Option("--kind", help="nmt, sync, time, emcy, pdo, sdo, heartbeat, lss, error, other")
+    ] = None,
+    node: Annotated[list[int] | None, typer.Option("--node", help="node number; may be repeated")] = None,
+    count: Annotated[int | None, typer.Option("--count", help="end after so many lines", min=1)] = None,
+    duration: Annotated[float | None, typer.Option("--duration", help="end after so many seconds", min=0.0)] = None,
+    changes: Annotated[bool, typer.Option("--changes", help="only frames that differ from the last of theirs")] = False,
+    ask: Annotated[bool, typer.Option("--ask", help="read the PDO mapping from the drive first (sends SDO)")] = False,
+) -> int:
+    """The traffic of a bus in words: NMT, SYNC, heartbeats, EMCY, SDO, PDO by their mapping.  Listens only."""
+    from jointctl.tools.verbs.bench_drive import MonitorOptions, bench_of
+
+    filters = tuple(cob_id or ()), tuple(kind or ()), tuple(node or ())
+    options = MonitorOptions(*filters, count, duration, changes, ask)
+    return bench_of(asked.config).monitor(asked, output, options)
+
+
+def monitor_bus(subject: Subject, output: Output, selection: Selection, *, ask: bool = False) -> int:
     """Show frames until the selection or a stop signal ends it; 0.  A dead bus is a `BusError`."""
+    import can
+
+    from jointctl.tools.session.control import stop_signals
+
     decoder = new_decoder(subject, ask=ask)
     bus = subject.open_bus()
     try:
@@ -116,8 +152,8 @@ def _show(bus: can.BusABC, decoder: FrameDecoder, output: Output, selection: Sel
         if not output.line(json_line(message, decoded) if output.json else text_line(message, decoded)):
             break
     elapsed_s = time.monotonic() - started_s
-    told = ", ".join(f"{kind} {number}" for kind, number in kinds.most_common())
-    output.note(f"{sum(kinds.values())} frames in {elapsed_s:.1f} s{': ' + told if told else ''}")
+    counted = ", ".join(f"{kind} {number}" for kind, number in kinds.most_common())
+    output.note(f"{sum(kinds.values())} frames in {elapsed_s:.1f} s{': ' + counted if counted else ''}")
 
 
 def text_line(message: can.Message, decoded: Decoded) -> str:

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from jointctl.drivers.errors import DataError
-from jointctl.tools.configuration.load import read_text, shipped_config
-from jointctl.tools.output import Output
+from jointctl.tools.verbs.verb_options import ProgressOutput
 
 
-def new(path: Path, output: Output, *, shipped: str) -> int:
-    """Copy the shipped configuration `shipped` to `path`, which must not exist."""
+def new(
+    path: Annotated[Path, typer.Argument(metavar="FILE", help="configuration to write (TOML)")],
+    output: ProgressOutput,
+    *,
+    shipped: Annotated[str, typer.Option("--from", help="name of the shipped configuration")] = "elmo_gold_can",
+) -> int:
+    """Write a configuration of your own, a copy of a shipped one to fill in."""
+    from jointctl.tools.configuration.load import read_text, shipped_config
+
     source = shipped_config(shipped)
     text = read_text(source)
     if path.suffix != ".toml":

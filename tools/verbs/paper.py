@@ -4,25 +4,15 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from rich.table import Table
 
-from jointctl.tools.drawing import save_png
-from jointctl.tools.experiments.paper_experiments import (
-    AFTER_s,
-    PaperIdentification,
-    PaperRow,
-    PaperRun,
-    experiments,
-    identification_figure,
-    identify_paper_friction,
-    paper_rows,
-)
-from jointctl.tools.experiments.scenarios import error_figures
-from jointctl.tools.output import Output
-from jointctl.tools.reporting.page import Section, check_target, from_terminal, svg_figure, write_verb_page
-from jointctl.tools.written_file import prepare_folder
+from jointctl.tools.verbs.verb_options import Report, VerbOutput
+
+if TYPE_CHECKING:
+    from jointctl.tools.experiments.paper_experiments import PaperIdentification, PaperRow, PaperRun
 
 PAPER = (
     "Shen, Zhou, Yu, Wang: Design of Adaptive RBFNN and Computed-torque Control for Manipulator Joint "
@@ -31,12 +21,27 @@ PAPER = (
 
 
 def paper(
-    output: Output, *, folder: Path | None = None, identification: bool = True, report: Path | None = None
+    output: VerbOutput,
+    *,
+    folder: Annotated[Path | None, typer.Option("--figures", help="folder for the figures; without it none")] = None,
+    no_identification: Annotated[
+        bool, typer.Option("--no-identification", help="leave the identification figures out")
+    ] = False,
+    report: Report = None,
 ) -> int:
-    """Run all experiments (some seconds), print one table, draw the figures into `folder` (None: no figures).
+    """Reproduce every experiment of the paper on the virtual joint, in lockstep: its figure beside ours."""
+    from jointctl.tools.drawing import save_png
+    from jointctl.tools.experiments.paper_experiments import (
+        AFTER_s,
+        PaperRun,
+        experiments,
+        identify_paper_friction,
+        paper_rows,
+    )
+    from jointctl.tools.experiments.scenarios import error_figures
+    from jointctl.tools.recording.report_page import Section, check_target, from_terminal, svg_figure, write_verb_page
+    from jointctl.tools.written_file import prepare_folder
 
-    `report`: HTML page to write as well, with the figures in it.
-    """
     if report is not None:
         check_target(report)
     if folder is not None:
@@ -48,7 +53,7 @@ def paper(
         for number, experiment in enumerate(listed, 1):
             runs[experiment.key] = PaperRun(experiment, experiment.run())
             advance(number)
-        if identification:
+        if not no_identification:
             identified = identify_paper_friction()
         advance(len(listed) + 1)
     figures = _figures(runs, identified) if folder is not None or report is not None else {}
@@ -74,6 +79,7 @@ def paper(
 
 def _figures(runs: dict[str, PaperRun], identified: PaperIdentification | None) -> dict[str, Any]:
     """By the name of the file, in the paper's order."""
+    from jointctl.tools.experiments.paper_experiments import identification_figure
     from jointctl.tools.experiments.paper_figures import draw_all
 
     found = {"fig07_identification": identification_figure(identified)} if identified is not None else {}
@@ -81,6 +87,8 @@ def _figures(runs: dict[str, PaperRun], identified: PaperIdentification | None) 
 
 
 def _table(rows: list[PaperRow]) -> Table:
+    from jointctl.tools.experiments.paper_experiments import AFTER_s
+
     table = Table(
         title=f"Errors in mrad after {AFTER_s:g} s: (least, greatest) RMSE",
         caption=f"paper: {PAPER}. reference: an independent simulation of the same equations. "

@@ -5,40 +5,24 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from rich.table import Table
 
-from jointctl.drivers.canopen.cia402 import State, state_of_word, state_text
-from jointctl.drivers.canopen.identifiers import NmtCommand
-from jointctl.drivers.canopen.network import OtherControllers, send_nmt
 from jointctl.drivers.errors import DECLINED, ConfigurationError, DataError, DeviceError
-from jointctl.tools.inspection.objects import Objects, Place
-from jointctl.tools.inspection.parameters import (
-    Difference,
-    ParameterSet,
-    Value,
-    Written,
-    dcf_text,
-    differences,
-    identity_of,
-    is_parameter,
-    load_parameters,
-    read_parameters,
-    restore,
-    shown,
-    variables,
-)
-from jointctl.tools.inspection.subject import Refusal, SdoReader, Subject, canopen_network
 from jointctl.tools.output import Output
-from jointctl.tools.session.consent import agreed, require_terminal
-from jointctl.tools.session.control import control_of
-from jointctl.tools.written_file import writing
+from jointctl.tools.verbs.asked_drive import Eds, MaybeConfig, subject_of
+from jointctl.tools.verbs.verb_options import CanOptions, VerbOutput, grouped
+
+if TYPE_CHECKING:
+    from jointctl.tools.inspection.objects import Objects
+    from jointctl.tools.inspection.parameters import Difference, ParameterSet, Value, Written
+    from jointctl.tools.inspection.subject import SdoReader, Subject
 
 DIFFERENT = 11  # exit code of diff
 MASTER_NODE = 126  # of jointctl, unless a configuration has another one
 _SETTLE_S = 0.02
-_UNDER_POWER = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
 
 
 def _known_objects(subject: Subject) -> Objects:
@@ -49,6 +33,9 @@ def _known_objects(subject: Subject) -> Objects:
 
 def parameters_of_drive(subject: Subject, output: Output) -> tuple[ParameterSet, Objects]:
     """All readable objects as the drive has them now."""
+    from jointctl.tools.inspection.parameters import read_parameters, variables
+    from jointctl.tools.inspection.subject import SdoReader, canopen_network
+
     node, objects = subject.required_node(), _known_objects(subject)
     total = len(list(variables(objects.required())))
     output.note(f"reading node {node} on {subject.place}")
@@ -58,6 +45,9 @@ def parameters_of_drive(subject: Subject, output: Output) -> tuple[ParameterSet,
 
 def dump(subject: Subject, output: Output, out: Path | None = None) -> int:
     """Write a DCF to stdout or to `out`."""
+    from jointctl.tools.inspection.parameters import dcf_text
+    from jointctl.tools.written_file import writing
+
     if out is not None and out.suffix.lower() != ".dcf":
         raise DataError(f"{out}: the name of a dump must end in .dcf: parameters are written as DCF only")
     if out is not None and out.exists():
@@ -92,6 +82,8 @@ def _plain(value: Value | None) -> Any:
 
 
 def _table(objects: Objects, found: Iterable[Difference], first: str, second: str) -> Table:
+    from jointctl.tools.inspection.parameters import shown
+
     table = Table(box=None, pad_edge=False)
     for title in ("object", "name", first, second):
         table.add_column(title, overflow="fold")
@@ -106,6 +98,8 @@ def _table(objects: Objects, found: Iterable[Difference], first: str, second: st
 
 def diff(first: ParameterSet, second: ParameterSet, objects: Objects, output: Output, *, readings: bool = False) -> int:
     """Show what differs; 0 if nothing does, else DIFFERENT."""
+    from jointctl.tools.inspection.parameters import differences
+
     found = differences(first, second, readings=readings)
     rows = [{"object": str(item.place), "name": objects.name(item.place.index, item.place.sub),
              "first": _plain(item.first), "second": _plain(item.second)} for item in found]  # fmt: skip
@@ -118,9 +112,19 @@ def restore_file(
     subject: Subject, path: Path, output: Output, *, assume_yes: bool, other_device: bool = False, skip: list[int]
 ) -> int:
     """Show what would change, ask, write, read back, report; `DeviceError` if something was not taken."""
+    from jointctl.drivers.canopen.identifiers import NmtCommand
+    from jointctl.drivers.canopen.network import OtherControllers, send_nmt
+    from jointctl.tools.configuration.canopen import canopen_section
+    from jointctl.tools.inspection.parameters import load_parameters, restore
+    from jointctl.tools.inspection.subject import SdoReader, canopen_network
+    from jointctl.tools.session.consent import agreed, require_terminal
+    from jointctl.tools.session.control import control_of
+
     node, objects = subject.required_node(), _known_objects(subject)
     wanted = load_parameters(path, node)
-    others = OtherControllers([node], MASTER_NODE if subject.config is None else subject.config.canopen.master_node)
+    others = OtherControllers(
+        [node], MASTER_NODE if subject.config is None else canopen_section(subject.config).master_node
+    )
     with control_of(subject.interface, subject.channel, output), canopen_network(subject, others) as network:
         time.sleep(others.to_listen_s)
         others.refuse()
@@ -151,8 +155,11 @@ def restore_file(
 
 
 def _require_off(reader: SdoReader) -> None:
+    from jointctl.drivers.canopen.cia402 import State, state_of_word, state_text
+
+    under_power = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
     word = reader.value(0x6041)
-    if word is not None and state_of_word(word) in _UNDER_POWER:
+    if word is not None and state_of_word(word) in under_power:
         raise DeviceError(
             f"node {reader.node} is in {state_text(word)}: nothing is written into a drive under power",
             "jointctl stop CONFIG",
@@ -160,6 +167,8 @@ def _require_off(reader: SdoReader) -> None:
 
 
 def _require_same_device(reader: SdoReader, wanted: ParameterSet, path: Path, other_device: bool) -> None:
+    from jointctl.tools.inspection.parameters import identity_of
+
     present = identity_of(reader)
     for key in ("vendor_id", "product_code", "node"):
         expected = wanted.device.get(key)
@@ -172,6 +181,9 @@ def _require_same_device(reader: SdoReader, wanted: ParameterSet, path: Path, ot
 
 def _changes(reader: SdoReader, wanted: ParameterSet, skip: list[int]) -> list[Difference]:
     """What the file has otherwise than the drive, of the objects that may be written."""
+    from jointctl.tools.inspection.parameters import Difference, is_parameter
+    from jointctl.tools.inspection.subject import Refusal
+
     found = []
     for place, value in wanted.parameters.items():
         variable = reader.objects.variable(place.index, place.sub)
@@ -189,6 +201,8 @@ def _changes(reader: SdoReader, wanted: ParameterSet, skip: list[int]) -> list[D
 
 
 def _report(done: list[Written], objects: Objects, output: Output) -> int:
+    from jointctl.tools.inspection.parameters import shown
+
     failed = [item for item in done if item.failure]
     table = Table(box=None, pad_edge=False)
     for title in ("object", "name", "value", ""):
@@ -208,6 +222,8 @@ def _report(done: list[Written], objects: Objects, output: Output) -> int:
 
 def place_index(text: str) -> int:
     """An index of the command line, hexadecimal; `ConfigurationError` for anything else."""
+    from jointctl.tools.inspection.objects import Place
+
     try:
         index = int(text, 16)
     except ValueError:
@@ -215,3 +231,69 @@ def place_index(text: str) -> int:
     if not 0 <= index <= 0xFFFF:
         raise ConfigurationError(f"--skip (={text}) must be the index of an object, such as 2012")
     return Place(index).index
+
+
+params_app = typer.Typer(help="All objects of a drive to a file and back.", no_args_is_help=True)
+
+
+@params_app.command("dump")
+@grouped
+def params_dump(
+    *,
+    config: MaybeConfig = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="DCF to write (.dcf); default: stdout")] = None,
+    bus: CanOptions,
+    eds: Eds = None,
+    output: VerbOutput,
+) -> int:
+    """Read every readable object of the EDS.  Reads only."""
+    subject = subject_of(config, bus, eds)
+    return dump(subject, output, out)
+
+
+@params_app.command("restore")
+@grouped
+def params_restore(
+    *,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="a DCF, or a TOML dump of an older version")],
+    config: MaybeConfig = None,
+    bus: CanOptions,
+    eds: Eds = None,
+    yes: Annotated[bool, typer.Option("-y", "--yes", help="write without asking")] = False,
+    other_device: Annotated[
+        bool, typer.Option("--other-device", help="write although maker, product or node differ")
+    ] = False,
+    skip: Annotated[list[str] | None, typer.Option("--skip", help="index to leave alone; may be repeated")] = None,
+    output: VerbOutput,
+) -> int:
+    """Write the parameters that differ, read each back, tell what was refused.  The drive must be off."""
+    subject = subject_of(config, bus, eds)
+    indices = [place_index(text) for text in skip or []]
+    return restore_file(subject, file, output, assume_yes=yes, other_device=other_device, skip=indices)
+
+
+@params_app.command("diff")
+@grouped
+def params_diff(
+    *,
+    first: Annotated[
+        Path, typer.Argument(metavar="FIRST", help="DCF, EDS, older dump; or configuration: its drive now")
+    ],
+    second: Annotated[Path, typer.Argument(metavar="SECOND", help="the same")],
+    bus: CanOptions,
+    readings: Annotated[bool, typer.Option("--readings", help="what is no parameter as well")] = False,
+    output: VerbOutput,
+) -> int:
+    """Compare two files, or a file and a drive.  Exit code 11 if they differ."""
+    from jointctl.tools.inspection.objects import Objects
+    from jointctl.tools.inspection.parameters import is_parameter_file, load_parameters
+
+    objects, sides = Objects(), []
+    for path in (first, second):
+        if is_parameter_file(path):
+            sides.append(load_parameters(path, bus.target or 1))
+        else:
+            subject = subject_of(path, bus)
+            found, objects = parameters_of_drive(subject, output)
+            sides.append(found)
+    return diff(sides[0], sides[1], objects, output, readings=readings)

@@ -4,22 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from jointctl.drivers.errors import DataError
-from jointctl.firmware_py.states import Fault
-from jointctl.tools.output import Output
-from jointctl.tools.recording.run_log_reader import RunLog, read_run_log
-from jointctl.tools.recording.run_summary import RunSummary, summarise
-from jointctl.tools.reporting.comparison import comparison
-from jointctl.tools.reporting.page import Block, Details, Paragraph, Section, check_target, page, write_page
-from jointctl.tools.reporting.run_figures import run_figures, temperature_figure
-from jointctl.tools.reporting.run_tables import events_table, figure_tables, what_ran
+from jointctl.tools.verbs.verb_options import ResultOutput
+
+if TYPE_CHECKING:
+    from jointctl.tools.recording.report_page import Block, Section
+    from jointctl.tools.recording.run_log_reader import RunLog
+    from jointctl.tools.recording.run_summary import RunSummary
 
 MOST_LOGS = 6  # columns that fit on a page
 
 
-def report(paths: Sequence[Path], output: Output, out: Path | None = None) -> int:
-    """Write the page, by default beside the first log; returns the exit code."""
+def report(
+    paths: Annotated[list[Path], typer.Argument(metavar="LOG...", help="run logs; several are compared")],
+    output: ResultOutput,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="HTML to write; default: beside the log")] = None,
+) -> int:
+    """One self-contained page about a run, or about several beside each other."""
+    from jointctl.tools.recording.report_page import check_target, page, write_page
+    from jointctl.tools.recording.run_log_reader import read_run_log
+
     if not 1 <= len(paths) <= MOST_LOGS:
         raise DataError(f"number of logs (={len(paths)}) must be in [1..{MOST_LOGS}]")
     target = out if out is not None else paths[0].with_suffix(".html" if len(paths) == 1 else ".comparison.html")
@@ -43,6 +51,13 @@ def log_names(paths: Sequence[Path]) -> list[str]:
 
 def report_sections(names: Sequence[str], logs: Sequence[RunLog]) -> list[Section]:
     """The body of the page."""
+    from jointctl.firmware_py.states import Fault
+    from jointctl.tools.recording.report_figures import run_figures, temperature_figure
+    from jointctl.tools.recording.report_page import Details, Paragraph, Section
+    from jointctl.tools.recording.report_tables import events_table, figure_tables, what_ran
+    from jointctl.tools.recording.run_comparison import comparison
+    from jointctl.tools.recording.run_summary import summarise
+
     summaries = [summarise(log.records, temperatures_degC=log.temperatures["temperature_degC"]) for log in logs]
     verdicts = [
         Paragraph(verdict(name, s), "" if s.fault == Fault.NONE.name else "error")
@@ -69,6 +84,8 @@ def report_sections(names: Sequence[str], logs: Sequence[RunLog]) -> list[Sectio
 
 def verdict(name: str, summary: RunSummary) -> str:
     """The run in one sentence."""
+    from jointctl.firmware_py.states import Fault
+
     if summary.fault != Fault.NONE.name:
         return f"{name} was ended by the fault {summary.fault} after {summary.tracked_s:.1f} s of tracking."
     if summary.error is None:

@@ -4,34 +4,45 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated
 
-from jointctl.drivers.drive import CommissioningReport
+import typer
+
 from jointctl.drivers.errors import DECLINED, INTERRUPTED
-from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
-from jointctl.tools.session import result as drive_end
-from jointctl.tools.session.consent import TerminalConsent, require_terminal
-from jointctl.tools.session.control import in_control
-from jointctl.tools.session.display import Display, Displays
-from jointctl.tools.session.live_panel import run_display
-from jointctl.tools.session.plan import resolve
-from jointctl.tools.session.result import report_run, require_off, run_title
-from jointctl.tools.session.session import Session
+from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOnBus, VerbOutput, Yes
+
+if TYPE_CHECKING:
+    from jointctl.drivers.drive import CommissioningReport
+    from jointctl.tools.configuration.config import Config
+    from jointctl.tools.session.display import Display
+
+
+def _page(
+    scope: Annotated[bool, typer.Option("--scope", help="live page in the browser (needs the extra scope)")] = False,
+    scope_host: Annotated[str, typer.Option("--scope-host", help="address to serve the page at")] = "127.0.0.1",
+    scope_port: Annotated[int, typer.Option("--scope-port", min=1, max=65535)] = 8642,
+) -> tuple[str, int] | None:
+    return (scope_host, scope_port) if scope else None
 
 
 def run(
-    config: Config,
-    output: Output,
+    config: JointOnBus,
+    output: VerbOutput,
     *,
-    assume_yes: bool,
-    dry_run: bool = False,
-    allow_low_margin: bool = False,
-    scope: tuple[str, int] | None = None,
+    assume_yes: Yes = False,
+    dry_run: DryRun = False,
+    allow_low_margin: AllowLowMargin = False,
+    scope: Annotated[tuple[str, int] | None, _page] = None,
 ) -> int:
-    """Commission, show the motion envelope, ask, track, report; returns the exit code.
+    """Track the configured trajectory on a real or virtual joint."""
+    from jointctl.tools.session import result as drive_end
+    from jointctl.tools.session.consent import TerminalConsent, require_terminal
+    from jointctl.tools.session.control import in_control
+    from jointctl.tools.session.plan import resolve
+    from jointctl.tools.session.result import report_run, require_off, run_title
+    from jointctl.tools.session.session import Session
 
-    `scope`: host and port at which a live page is to be served.
-    """
     if not (assume_yes or dry_run):
         require_terminal()
     plan = resolve(config, allow_low_margin=allow_low_margin)
@@ -58,13 +69,16 @@ def _displays(
     config: Config, output: Output, title: str, scope: tuple[str, int] | None
 ) -> Iterator[Callable[[CommissioningReport], Display]]:
     """What shows the run: the terminal, and the page if one is wanted."""
+    from jointctl.tools.session.display import Displays
+    from jointctl.tools.session.live_panel import run_display
+
     terminal = run_display(output, title)
     if scope is None:
         yield lambda _: terminal()
         return
     from jointctl.tools.scoping.feed import scope_order, scope_server
 
-    order = scope_order(title, *scope, cia402=not config.is_serial)
+    order = scope_order(title, *scope, drive=config.drive.kind)
     output.address(f"scope: {order.url}")
     with scope_server(order) as feed:
         feed.settings({"stage": "terminal"})

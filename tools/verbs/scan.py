@@ -3,20 +3,35 @@
 from __future__ import annotations
 
 import time
+from typing import TYPE_CHECKING, Annotated
 
+import typer
 from rich.table import Table
 
-from jointctl.drivers.canopen.identifiers import HIGHEST_NODE
 from jointctl.drivers.errors import NoDeviceError
-from jointctl.tools.inspection.node_scan import LISTEN_S, Ear, Heard, ask_everybody, describe
-from jointctl.tools.inspection.subject import Subject, canopen_network
-from jointctl.tools.output import Output
+from jointctl.tools.verbs.asked_drive import NodeOnBus
+from jointctl.tools.verbs.verb_options import VerbOutput
+
+if TYPE_CHECKING:
+    from jointctl.tools.inspection.node_scan import Heard
+    from jointctl.tools.inspection.subject import Subject
 
 _NOT_CANOPEN = "power the drives; check the bit rate of each (a drive that keeps silent may only send when asked)"
 
 
-def scan(subject: Subject, output: Output, *, listen_s: float = LISTEN_S, passive: bool = False) -> int:
-    """Listen, ask, describe; `NoDeviceError` with what is likely wrong if nobody is there.  `passive` only listens."""
+def scan(
+    subject: NodeOnBus,
+    output: VerbOutput,
+    *,
+    # a little more than the usual heartbeat period of one second
+    listen_s: Annotated[float, typer.Option("--listen", help="seconds to listen before asking", min=0.0)] = 1.2,
+    passive: Annotated[bool, typer.Option("--passive", help="only listen, ask nobody")] = False,
+) -> int:
+    """Which CANopen nodes are on the bus: identity, device type, NMT state, drive state.  Reads only."""
+    from jointctl.drivers.canopen.identifiers import HIGHEST_NODE
+    from jointctl.tools.inspection.node_scan import Ear, ask_everybody, describe
+    from jointctl.tools.inspection.subject import canopen_network
+
     ear = Ear()
     with canopen_network(subject, ear) as network:
         output.note(f"listening on {subject.place} for {listen_s:g} s")

@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-import secrets
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from jointctl.drivers.bus_lock import no_longer_starting
+import typer
+
 from jointctl.drivers.errors import DECLINED, INTERRUPTED, JointctlError
-from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.output import Output
-from jointctl.tools.recording.run_log_reader import read_run_log
-from jointctl.tools.scoping.feed import ScopeFeed, scope_order, scope_server
-from jointctl.tools.session.control import in_control
-from jointctl.tools.session.display import Displays
-from jointctl.tools.session.live_panel import run_display
-from jointctl.tools.session.plan import resolve
-from jointctl.tools.session.result import report_run, run_title, words
-from jointctl.tools.session.session import Session
+from jointctl.tools.verbs.verb_options import AS_CONFIGURED, AllowLowMargin, CanOptions, ProgressOutput, loaded
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.config import Config
+    from jointctl.tools.scoping.feed import ScopeFeed
 
 HOST, PORT = "127.0.0.1", 8642
 POLL_S = 0.05
@@ -30,10 +23,35 @@ TELL_AGAIN_S = 1.0
 PREPARED_S = 300.0  # what was found and shown holds for so long; then the run is to be prepared again
 
 
-def scope(path: Path, output: Output, *, host: str = HOST, port: int = PORT) -> int:
-    """Serve a run log; the page can zoom, but there is nothing to stop.  Returns the exit code."""
+def scope(
+    path: Annotated[Path, typer.Argument(metavar="LOG|CONFIG", help="run log (MCAP), or configuration of a joint")],
+    output: ProgressOutput,
+    *,
+    host: Annotated[str, typer.Option("--host", help="address to serve at")] = HOST,
+    port: Annotated[int, typer.Option("--port", help="of the page")] = PORT,
+    bus: CanOptions = AS_CONFIGURED,
+    allow_low_margin: AllowLowMargin = False,
+    stop_unwatched: Annotated[
+        float | None,
+        typer.Option("--stop-unwatched", metavar="S", min=1.0, help="brake when no page has been open for S seconds"),
+    ] = None,
+) -> int:
+    """A local web page: a run log to zoom into, or a joint to start, watch, change and stop from the browser."""
+    if path.suffix == ".mcap":
+        return _scope_of_log(path, output, host, port)
+    return live_scope(
+        loaded(path, bus), output, host=host, port=port, allow_low_margin=allow_low_margin, unwatched_s=stop_unwatched
+    )
+
+
+def _scope_of_log(path: Path, output: Output, host: str, port: int) -> int:
+    """Serve a run log; the page can zoom, but there is nothing to stop."""
+    from jointctl.drivers.bus_lock import no_longer_starting
+    from jointctl.tools.recording.run_log_reader import read_run_log
+    from jointctl.tools.scoping.feed import scope_order
+
     no_longer_starting()  # it never controls a bus, and `jointctl stop` need not wait for it
-    read_run_log(path)  # what is wrong with it is to be told here
+    read_run_log(path)  # what is wrong with it is to be reported here
     order = scope_order(path.stem, host, port, log=str(path))
     output.address(f"scope: {order.url}  (Ctrl-C ends it)")
     from jointctl.tools.scoping.server import serve
@@ -51,14 +69,17 @@ def live_scope(
     Nothing moves before a viewer has confirmed the motion envelope that the page shows.  `unwatched_s`: brake when no
     page has been open for so long; None = go on.
     """
+    from jointctl.tools.scoping.feed import scope_order, scope_server
+    from jointctl.tools.session.result import run_title, words
+
     title = run_title(config)
-    order = scope_order(title, host, port, cia402=not config.is_serial)
+    order = scope_order(title, host, port, drive=config.drive.kind)
     output.address(f"scope: {order.url}  (Ctrl-C ends it; nothing moves before Start on the page)")
     with scope_server(order, in_charge=True, unwatched_s=unwatched_s) as feed:
         runs = _Runs(config, output, feed, title, allow_low_margin=allow_low_margin)
         try:
             while not runs.one():
-                _wait_for_prepare(feed, runs.told)
+                _wait_for_prepare(feed, runs.last_end)
             return runs.code
         except KeyboardInterrupt:
             output.note(f"scope ended{runs.ended_by}; {words(runs.drive_state, interrupted=True)}")
@@ -75,14 +96,21 @@ class _Runs:
         self.drive_state = ""  # after the last one
         self.ended_by = ""  # in words, where `jointctl stop` has ended it
         self._ended = False  # whether a signal or `jointctl stop` has ended the program as well
-        self.told: dict[str, Any] = {}  # to the page, of how the last one ended
+        self.last_end: dict[str, Any] = {}  # to the page, of how the last one ended
 
     def _tell(self, stage: str, lines: list[str]) -> None:
-        self.told = {"stage": stage, "lines": lines}
-        self._feed.settings(self.told)
+        self.last_end = {"stage": stage, "lines": lines}
+        self._feed.settings(self.last_end)
 
     def one(self) -> bool:
         """Prepare, wait for Start, run, report; whether a signal has ended the program as well."""
+        from jointctl.tools.session.control import in_control
+        from jointctl.tools.session.display import Displays
+        from jointctl.tools.session.live_panel import run_display
+        from jointctl.tools.session.plan import resolve
+        from jointctl.tools.session.result import report_run, words
+        from jointctl.tools.session.session import Session
+
         output, feed, config = self._output, self._feed, self._config
         feed.forget()
         self._tell("preparing", [])
@@ -148,6 +176,10 @@ def confirmed(feed: ScopeFeed, lines: list[str], patience_s: float = PREPARED_S)
     The number goes to the page with the lines and comes back with Start: a page that still shows an older envelope
     starts nothing.
     """
+    import secrets
+
+    from jointctl.firmware_py.states import StopRequest
+
     number = secrets.randbelow(1 << 48)
     told_s, give_up_s = 0.0, time.monotonic() + patience_s
     while feed.stop_request() is StopRequest.NONE and time.monotonic() < give_up_s:
@@ -163,14 +195,14 @@ def confirmed(feed: ScopeFeed, lines: list[str], patience_s: float = PREPARED_S)
     return False
 
 
-def _wait_for_prepare(feed: ScopeFeed, told: dict[str, Any]) -> None:
+def _wait_for_prepare(feed: ScopeFeed, last_end: dict[str, Any]) -> None:
     """Until a viewer asks for the next run.  How the last one ended is said again: a full socket may drop it."""
     told_s = time.monotonic()
     while not any(request.kind == "prepare" for request in feed.requests()):
         _require_server(feed)
         if time.monotonic() - told_s > TELL_AGAIN_S:
             told_s = time.monotonic()
-            feed.settings(told)
+            feed.settings(last_end)
         time.sleep(POLL_S)
 
 

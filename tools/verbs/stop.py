@@ -4,35 +4,29 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jointctl.drivers.can.open import open_python_can
-from jointctl.drivers.canopen.switch_off import stop_node
 from jointctl.drivers.errors import ConfigurationError, JointctlError
-from jointctl.tools.configuration.stop_target import CanTarget, GivenTarget, SerialTarget, stop_target
 from jointctl.tools.output import Output
-from jointctl.tools.session.result import require_off
-from jointctl.tools.session.stop_call import StopCall
-from jointctl.tools.verbs.stop_serial import stop_serial
+from jointctl.tools.verbs.verb_options import AS_CONFIGURED, BusOptions, ConfigPath, ResultOutput, config_path, place
 
 
-def stop(path: Path, output: Output, given: GivenTarget | None = None) -> int:
-    """Stop and disable the drive, and end the program that controls it; `DeviceError` if it does not confirm.
+def stop(config: ConfigPath, output: ResultOutput, bus: BusOptions = AS_CONFIGURED) -> int:
+    """Stop and disable the drive now, also while another program controls it."""
+    # Nothing but the address is taken from the configuration, which need not hold; what is wrong with it comes after.
+    # The drive is stopped at once, and once more when that program has ended: it cannot enable it any more then.
+    from jointctl.tools.session.result import require_off
+    from jointctl.tools.session.stop_call import StopCall
+    from jointctl.tools.verbs.bench_drive import stop_target
 
-    Nothing but the address is taken from the configuration, which need not hold; what is wrong with it is told after.
-    The drive is stopped at once, and once more when that program has ended: it cannot enable it any more then.
-    """
-    target = stop_target(path, given)
-
-    def switch_off() -> str:
-        return stop_serial(target, output) if isinstance(target, SerialTarget) else _stop_canopen(target)
-
+    path = config_path(config)
+    target = stop_target(path, place(bus))
     with StopCall(*target.place) as call:
         failure: JointctlError | None = None
         try:
-            state = switch_off()
+            state = target.switch_off(output)
         except JointctlError as error:
             failure = error
         if call.end(output.note):
-            state = switch_off()
+            state = target.switch_off(output)
         elif failure is not None:
             raise failure
     try:
@@ -41,11 +35,6 @@ def stop(path: Path, output: Output, given: GivenTarget | None = None) -> int:
         _warn_of(path, output)
         require_off(state)
     return 0
-
-
-def _stop_canopen(target: CanTarget) -> str:
-    bus = open_python_can(target.interface, target.channel, target.bitrate_bitps, exclusive=False)
-    return stop_node(bus, target.node, encoder_node=target.encoder_node, sdo_timeout_s=target.sdo_timeout_s)
 
 
 def _warn_of(path: Path, output: Output) -> None:

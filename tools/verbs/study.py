@@ -4,27 +4,17 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from rich.table import Table
 
 from jointctl.drivers.errors import INTERRUPTED
-from jointctl.tools.configuration.elmo_settings import refuse_serial
-from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.drawing import require_png, save_png
-from jointctl.tools.experiments.controller_study import (
-    StudyResult,
-    StudySettings,
-    quantile,
-    run_study,
-    study_controllers,
-    study_figure,
-    write_csv,
-)
-from jointctl.tools.experiments.controllers import controller_config
 from jointctl.tools.output import Output
-from jointctl.tools.reporting.page import Details, Section, check_target, from_terminal, svg_figure, write_verb_page
-from jointctl.tools.written_file import prepare_target, refuse_overwriting
+from jointctl.tools.verbs.verb_options import Report, VerbOutput, Workers
+
+if TYPE_CHECKING:
+    from jointctl.tools.experiments.controller_study import StudyResult, StudySettings
 
 _COLUMNS = (
     ("peak_mrad", "peak [mrad]"),
@@ -53,9 +43,17 @@ def study(
     `file` is where the settings came from; like the configurations that they name, it is never overwritten.
     Ctrl-C keeps the plants that are done, says so, and gives exit code 130.
     """
+    from jointctl.tools.configuration.drive_section import require_simulated
+    from jointctl.tools.configuration.load import load_config, shipped_config
+    from jointctl.tools.drawing import require_png, save_png
+    from jointctl.tools.experiments.controller_study import run_study, study_controllers, write_csv
+    from jointctl.tools.experiments.controllers import controller_config
+    from jointctl.tools.recording.report_page import check_target
+    from jointctl.tools.written_file import prepare_target, refuse_overwriting
+
     base_path = Path(settings.base)
     base = load_config(base_path if base_path.exists() else shipped_config(settings.base))
-    refuse_serial(base, "study")
+    require_simulated(base, "study")
     inputs = [Path(name) for name in (settings.base, *settings.controllers)] + ([file] if file is not None else [])
     if csv is not None:
         refuse_overwriting(csv, inputs)
@@ -67,20 +65,10 @@ def study(
         prepare_target(target)
     controllers = study_controllers(settings)
     for controller in controllers:
-        controller_config(base, controller)  # a contradiction is to be told before an hour of simulation
+        controller_config(base, controller)  # a contradiction is to be reported before an hour of simulation
     title = f"{settings.plants} plants, seed {settings.seed}, {settings.scenario}"
     with output.progress(title, settings.plants) as advance:
-        result = run_study(
-            base,
-            controllers,
-            plants=settings.plants,
-            seed=settings.seed,
-            settings=settings.plant,
-            scenario=settings.scenario,
-            after_s=settings.after_s,
-            workers=workers,
-            progress=advance,
-        )
+        result = run_study(base, controllers, settings, workers=workers, progress=advance)
     done = len(result.plants)
     if result.interrupted:
         title = f"INTERRUPTED: {done} of {title}"
@@ -100,11 +88,14 @@ def study(
 
 
 def _figure(result: StudyResult, settings: StudySettings, title: str) -> Any:
+    from jointctl.tools.experiments.controller_study import study_figure
 
     return study_figure(result, f"{title}, after {settings.after_s:g} s")
 
 
 def _write_page(path: Path, result: StudyResult, settings: StudySettings, title: str, output: Output) -> None:
+    from jointctl.tools.recording.report_page import Details, Section, from_terminal, svg_figure, write_verb_page
+
     boxes = svg_figure(_figure(result, settings, title), "Errors of each controller over all plants, as boxes", _BOXES)
     sections = [
         Section("In numbers", [from_terminal(_table(result, title, settings.after_s))]),
@@ -142,6 +133,8 @@ def _table(result: StudyResult, title: str, after_s: float) -> Table:
 
 def spread(result: StudyResult, controller: str, figure: str) -> tuple[float, float, float]:
     """(median, 5 %, 95 %) over the plants; a run ended by a fault counts as infinitely bad."""
+    from jointctl.tools.experiments.controller_study import quantile
+
     values = result.values(controller, figure)
     return quantile(values, 0.5), quantile(values, 0.05), quantile(values, 0.95)
 
@@ -161,3 +154,37 @@ def study_data(result: StudyResult, settings: StudySettings) -> dict[str, Any]:
         "settings": settings.model_dump(),
         "controllers": rows,
     }
+
+
+def study_verb(
+    *,
+    file: Annotated[Path | None, typer.Option("--file", help="TOML with plants, seed and controllers")] = None,
+    plants: Annotated[int | None, typer.Option("--plants", help="how many random plants")] = None,
+    seed: Annotated[int | None, typer.Option("--seed")] = None,
+    after: Annotated[float | None, typer.Option("--after", help="errors are taken after this time (s)")] = None,
+    scenario: Annotated[str | None, typer.Option("--scenario", help="sine, frequency, amplitude or load")] = None,
+    controller: Annotated[
+        list[str] | None, typer.Option("--controller", help="name or configuration file; may be repeated")
+    ] = None,
+    base: Annotated[str | None, typer.Option("--base", help="configuration of the joint: name or file")] = None,
+    workers: Workers = None,
+    csv: Annotated[Path | None, typer.Option("--csv", help="file for all single results")] = None,
+    figure: Annotated[Path | None, typer.Option("--figure", help="PNG with a box plot")] = None,
+    report: Report = None,
+    output: VerbOutput,
+) -> int:
+    """Compare controllers on many random joints: medians and 5-95 % ranges of error, peak and settling time."""
+    from jointctl.tools.experiments.controller_study import StudySettings, checked, load_study
+
+    given: dict[str, Any] = {
+        "plants": plants,
+        "seed": seed,
+        "after_s": after,
+        "scenario": scenario,
+        "controllers": controller or None,
+        "base": base,
+    }
+    flags = {key: value for key, value in given.items() if value is not None}
+    settings = load_study(file) if file is not None else StudySettings()
+    settings = checked({**settings.model_dump(), **flags}, "command line")
+    return study(settings, output, file=file, workers=workers, csv=csv, figure=figure, report=report)

@@ -7,34 +7,28 @@ import math
 import sys
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from rich.table import Table
 
-from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import DECLINED, INTERRUPTED, MotionFault
-from jointctl.firmware_py.states import Fault
-from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
 from jointctl.tools.output import Output
-from jointctl.tools.reporting.page import check_target
-from jointctl.tools.session import result as drive_end
-from jointctl.tools.session.consent import TerminalConsent, require_terminal
-from jointctl.tools.session.control import Control, in_control
-from jointctl.tools.session.display import Display, Displays, PhaseLines
-from jointctl.tools.session.fault_words import FaultText, fault_text
-from jointctl.tools.session.session import Session
-from jointctl.tools.sweeping.carry_out import MeterDisplay, SweepPass, config_of_sweep, sweep_in_lockstep, sweep_run
-from jointctl.tools.sweeping.checks import recorded_limits, refuse_constants, torque_source
-from jointctl.tools.sweeping.data_file import SweepFile
-from jointctl.tools.sweeping.grid import SweepPoint
-from jointctl.tools.sweeping.meter import JointModel, MeasuredPoint, SweepMeter
-from jointctl.tools.sweeping.options import SweepOptions, check_files, make_plan
-from jointctl.tools.sweeping.plan import PlanSettings
-from jointctl.tools.sweeping.statistics import Tolerance
-from jointctl.tools.sweeping.sweep_page import write_sweep_page
+from jointctl.tools.verbs.verb_options import BusOptions, ConfigPath, DryRun, Report, VerbOutput, Yes, loaded
+
+if TYPE_CHECKING:
+    from jointctl.drivers.drive import CommissioningReport
+    from jointctl.firmware_py.states import Fault
+    from jointctl.tools.configuration.config import Config
+    from jointctl.tools.session.control import Control
+    from jointctl.tools.session.display import Display
+    from jointctl.tools.session.fault_words import FaultText
+    from jointctl.tools.sweeping.data_file import SweepFile
+    from jointctl.tools.sweeping.grid import SweepPoint
+    from jointctl.tools.sweeping.meter import JointModel, MeasuredPoint
+    from jointctl.tools.sweeping.options import SweepOptions
+    from jointctl.tools.sweeping.plan import PlanSettings
 
 RELATIVE_TOLERANCE = 0.01
 REVISITS = 1  # of points that did not settle, with REVISIT_DWELL times the dwell
@@ -42,6 +36,9 @@ REVISIT_DWELL = 3.0
 
 
 def joint_model(config: Config, settings: PlanSettings) -> JointModel:
+    from jointctl.tools.configuration.conversions import joint_rad_per_count
+    from jointctl.tools.sweeping.meter import JointModel
+
     return JointModel(
         config.joint.reduction_ratio, config.joint.gravity_Nm, config.joint.gravity_zero_rad,
         abs(joint_rad_per_count(config)),
@@ -55,6 +52,11 @@ class Sweep:
     """One `sweep` command: plan, ask, measure, report."""
 
     def __init__(self, config: Config, output: Output, out: Path, options: SweepOptions) -> None:
+        from jointctl.tools.session.consent import TerminalConsent
+        from jointctl.tools.sweeping.carry_out import config_of_sweep
+        from jointctl.tools.sweeping.checks import refuse_constants
+        from jointctl.tools.sweeping.options import make_plan
+
         refuse_constants(config)
         self.config = config_of_sweep(config, options.mode)
         self.output = output
@@ -72,6 +74,11 @@ class Sweep:
 
     def run(self) -> int:
         """The exit code: 0, 12 if declined, 130 after an interruption; raises `MotionFault` and the other errors."""
+        from jointctl.tools.configuration.conversions import torque_constant_NmpA
+        from jointctl.tools.recording.report_page import check_target
+        from jointctl.tools.sweeping.data_file import SweepFile
+        from jointctl.tools.sweeping.options import check_files
+
         options = self.options
         check_files(self.out, options.resume)
         if options.report is not None:
@@ -111,6 +118,16 @@ class Sweep:
 
     def _measure(self, points: list[SweepPoint], warm_up_turns: float, dwell_factor: float) -> str | None:
         """Visit the points; the name of the signal that stopped it or "", None if it was declined or a dry run."""
+        from jointctl.firmware_py.states import Fault
+        from jointctl.tools.configuration.conversions import torque_constant_NmpA
+        from jointctl.tools.session.display import Displays, PhaseLines
+        from jointctl.tools.session.fault_words import fault_text
+        from jointctl.tools.session.session import Session
+        from jointctl.tools.sweeping.carry_out import MeterDisplay, SweepPass, sweep_in_lockstep, sweep_run
+        from jointctl.tools.sweeping.data_file import SweepFile
+        from jointctl.tools.sweeping.meter import SweepMeter
+        from jointctl.tools.sweeping.statistics import Tolerance
+
         config, options = self.config, self.options
         motion = self.plan.motion(points, warm_up_turns, dwell_factor)
         self._time_offset_s = self.file.elapsed_s if self.file is not None else 0.0
@@ -156,13 +173,17 @@ class Sweep:
 
     def _about(self, report: CommissioningReport) -> dict[str, Any]:
         """What the sidecar tells besides the constants."""
+        from importlib.metadata import version
+
+        from jointctl.tools.sweeping.checks import recorded_limits
+
         options = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(self.options).items()}
         return {
             "started": datetime.now(UTC).isoformat(timespec="seconds"),
             "versions": {"jointctl": version("jointctl"), "python": sys.version.split()[0]},
             "drive": {**vars(report.identity), "mode": report.mode, **report.settings},
             "limits": recorded_limits(self.config),
-            "torque_source": torque_source(self.config),
+            "torque_source": self.config.drive.torque_source,
             "gravity_subtracted_Nm": self.config.joint.gravity_Nm,
             "points": len(self.plan.points),
             "options": options,
@@ -197,6 +218,8 @@ class Sweep:
         )
 
     def _report(self, stopped: str | None) -> int:
+        from jointctl.tools.session import result as drive_end
+
         if stopped is None:
             left = "nothing moved; " + drive_end.words(self.drive_state)
             self.output.note(f"dry run: {left}" if self.options.dry_run else left)
@@ -217,6 +240,8 @@ class Sweep:
         return 0
 
     def _write_page(self) -> None:
+        from jointctl.tools.sweeping.sweep_page import write_sweep_page
+
         if self.options.report is not None and self.file is not None and self.file.done:
             write_sweep_page(self.options.report, self.out, self._table(), self.output)
 
@@ -236,6 +261,11 @@ class Sweep:
 
 def sweep(config: Config, output: Output, out: Path, options: SweepOptions | None = None) -> int:
     """The whole command; returns the exit code."""
+    from jointctl.tools.session import result as drive_end
+    from jointctl.tools.session.consent import require_terminal
+    from jointctl.tools.session.control import in_control
+    from jointctl.tools.sweeping.options import SweepOptions
+
     options = options or SweepOptions()
     if not (options.assume_yes or options.dry_run or options.lockstep):
         require_terminal()
@@ -250,3 +280,58 @@ def sweep(config: Config, output: Output, out: Path, options: SweepOptions | Non
             output.note(f"interrupted{by}; nothing moved" + ("" if command.file is None else " any more"))
             drive_end.require_off(command.drive_state)
             return INTERRUPTED
+
+
+def sweep_verb(
+    *,
+    config: ConfigPath,
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="CSV file to write; its sidecar is the same name with .json")
+    ],
+    points: Annotated[int | None, typer.Option("--points", help="plateaus in both directions together (225)")] = None,
+    grid: Annotated[str, typer.Option("--grid", help="near-zero, linear, log, or list")] = "near-zero",
+    speeds: Annotated[
+        Path | None, typer.Option("--speeds", metavar="FILE", help="of --grid list: velocities in rad/s, one a line")
+    ] = None,
+    max_speed: Annotated[
+        float | None,
+        typer.Option("--max-speed", metavar="RAD/S", help="fastest plateau (what limits and travel allow)"),
+    ] = None,
+    min_speed: Annotated[
+        float | None, typer.Option("--min-speed", metavar="RAD/S", help="slowest plateau (a thousandth of the fastest)")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="as many points as fit into 8 minutes, 120 at most")] = False,
+    warm_up: Annotated[float, typer.Option("--warm-up", metavar="TURNS", help="of the joint, before measuring")] = 1.0,
+    shuffle: Annotated[
+        int | None, typer.Option("--shuffle", metavar="SEED", help="speeds in random order, against drift")
+    ] = None,
+    passes: Annotated[int, typer.Option("--passes", help="times that the whole grid is measured")] = 1,
+    dwell: Annotated[
+        float | None, typer.Option("--dwell", metavar="S", help="wanted measuring time per point (1, quick 0.5)")
+    ] = None,
+    mode: Annotated[
+        str, typer.Option("--mode", help="auto, csv, pv or speed (the drive's velocity loop), torque")
+    ] = "auto",
+    resume: Annotated[bool, typer.Option("--resume", help="measure what is missing in an interrupted sweep")] = False,
+    lockstep: Annotated[bool, typer.Option("--lockstep", help="virtual joint in simulated time: seconds")] = False,
+    bus: BusOptions,
+    yes: Yes = False,
+    dry_run: DryRun = False,
+    allow_low_margin: Annotated[
+        bool,
+        typer.Option("--allow-low-margin", help="torque mode: run a stable loop below the wanted phase margin"),
+    ] = False,
+    report: Report = None,
+    output: VerbOutput,
+) -> int:
+    """Measure friction: plateaus of constant speed in both directions, into a CSV file for `identify`."""
+    from jointctl.tools.sweeping.options import SweepOptions
+
+    configuration = loaded(config, bus)
+    options = SweepOptions(
+        points=points, grid=grid, speeds=speeds, max_speed_radps=max_speed, min_speed_radps=min_speed, quick=quick,
+        warm_up_turns=warm_up, shuffle_seed=shuffle, passes=passes, dwell_s=dwell, mode=mode, resume=resume,
+        dry_run=dry_run, assume_yes=yes, lockstep=lockstep, allow_low_margin=allow_low_margin,
+        report=report,
+    )  # fmt: skip
+    return sweep(configuration, output, out, options)

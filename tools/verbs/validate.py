@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
+import typer
 
 from jointctl.drivers.errors import ConfigurationError, DataError
-from jointctl.tools.configuration.conversions import friction_constants
-from jointctl.tools.configuration.load import load_config
-from jointctl.tools.drawing import png, require_png
-from jointctl.tools.identification.friction_data import (
-    ForeignFormat,
-    FrictionData,
-    read_friction_data,
-    relative_figures,
-)
-from jointctl.tools.identification.identification import DIRECTIONS
-from jointctl.tools.identification.identification_report import error_table, fit_figure
-from jointctl.tools.identification.models import Branch
-from jointctl.tools.identification.plausibility import check_data
-from jointctl.tools.output import Output
-from jointctl.tools.verbs.identify import joint_limits
-from jointctl.tools.written_file import replace_file
+from jointctl.tools.verbs.identify import Data, GivenFormat, joint_limits
+from jointctl.tools.verbs.verb_options import VerbOutput, config_path
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from jointctl.tools.identification.friction_data import FrictionData
+    from jointctl.tools.identification.models import Branch
 
 
 def _branch(record: Any) -> Branch:
+    from jointctl.tools.identification.models import Branch
+
     a = [float(c) for c in record.cubic]
     return Branch(
         float(record.coulomb_Nm), float(record.static_Nm), float(record.stribeck_speed_radps),
@@ -36,6 +30,10 @@ def _branch(record: Any) -> Branch:
 
 def model_errors_Nm(data: FrictionData, branches: dict[str, Branch]) -> tuple[np.ndarray, np.ndarray]:
     """(measured - model, measured) at the motor over the usable points, positive velocities first."""
+    import numpy as np
+
+    from jointctl.tools.identification.identification import DIRECTIONS
+
     errors, measured = [], []
     for word, sign in DIRECTIONS:
         chosen = data.direction(sign)
@@ -46,18 +44,33 @@ def model_errors_Nm(data: FrictionData, branches: dict[str, Branch]) -> tuple[np
 
 
 def validate(
-    config_path: Path, data_path: Path, output: Output, *, told: ForeignFormat | None = None, figure: Path | None = None
+    path: Annotated[Path, typer.Argument(metavar="CONFIG", help="configuration with the identified friction section")],
+    data_path: Data,
+    output: VerbOutput,
+    *,
+    figure: Annotated[Path | None, typer.Option("--figure", help="PNG to write")] = None,
+    given: GivenFormat = None,
 ) -> int:
-    """Compare, report, draw (default DATA.validation.png); returns the exit code."""
+    """An identified friction model against other data of the same joint."""
+    import numpy as np
+
+    from jointctl.tools.configuration.conversions import friction_constants
+    from jointctl.tools.configuration.load import load_config
+    from jointctl.tools.drawing import png, require_png
+    from jointctl.tools.identification.friction_data import read_friction_data, relative_figures
+    from jointctl.tools.identification.identification import DIRECTIONS
+    from jointctl.tools.identification.identification_report import error_table, fit_figure
+    from jointctl.tools.identification.plausibility import check_data
+    from jointctl.tools.written_file import replace_file
+
+    path = config_path(path)
     figure = figure or data_path.with_suffix(".validation.png")
-    require_png(figure, (data_path, data_path.with_suffix(".json"), config_path))
-    config = load_config(config_path)
+    require_png(figure, (data_path, data_path.with_suffix(".json"), path))
+    config = load_config(path)
     if config.friction is None:
-        raise ConfigurationError(
-            f"{config_path}: [friction] is missing: there is nothing to validate", "identify first"
-        )
-    data = read_friction_data(data_path, told, both=False)
-    verdict = check_data(data, joint_limits(config_path))
+        raise ConfigurationError(f"{path}: [friction] is missing: there is nothing to validate", "identify first")
+    data = read_friction_data(data_path, given, both=False)
+    verdict = check_data(data, joint_limits(path))
     if verdict.problems:
         raise DataError(f"{data_path}: {'; '.join(verdict.problems)}")
     record = friction_constants(config.friction, config.joint.reduction_ratio)[0]
@@ -72,7 +85,7 @@ def validate(
                 f"({branches[word].max_radps:.4g} rad/s), where its end slope is held"
             )
     used = {word: data.direction(sign) for word, sign in DIRECTIONS}
-    picture = png(fit_figure(data, branches, used, f"{config_path.name} against {data_path.name}"))
+    picture = png(fit_figure(data, branches, used, f"{path.name} against {data_path.name}"))
     replace_file(figure, picture)
     for note in data.notes:
         output.note(f"{data_path}: {note}")
@@ -82,7 +95,7 @@ def validate(
     output.result(
         error_table(errors, measured, data.reduction_ratio),
         {
-            "config": str(config_path), "data": str(data_path), "data_sha256": data.sha256, "points": len(errors),
+            "config": str(path), "data": str(data_path), "data_sha256": data.sha256, "points": len(errors),
             "rmse_Nm": float(np.sqrt(np.mean(errors**2))), "max_error_Nm": float(np.max(np.abs(errors))),
             "mean_error_Nm": float(np.mean(errors)), "relative_rmse": relative_rmse,
             "relative_max_error": relative_worst, "warnings": warnings, "notes": list(data.notes),

@@ -1,9 +1,10 @@
-"""`check`: table, JSON, verdict, remedies and picture; where each assumption comes from."""
+"""`check`: table, JSON, verdict, remedies and picture; where each assumption comes from; what a serial line carries."""
 
 from __future__ import annotations
 
 import io
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,15 @@ from jointctl.tools.analysis.loop_settings import loop_settings, not_modelled
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.margins import phase_margin_deg
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.drive_section import require_simulated
 from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.experiments.controllers import from_file
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.check import check
+from jointctl.tools.verbs.fault_campaign import fault_campaign
 
 
+# --- `check`: table, JSON, verdict, remedies and picture; where each assumption comes from ---
 @pytest.fixture(autouse=True)
 def wide_table(monkeypatch: pytest.MonkeyPatch) -> None:
     """So that no cell is folded."""
@@ -33,7 +38,7 @@ def changed(section: str, config: Config | None = None, **values: Any) -> Config
     return config.model_copy(update={section: getattr(config, section).model_copy(update=values)})
 
 
-PAPER_SIMULATION = {"q": (2500.0,)}
+PAPER_SIMULATION = {"lyapunov_q": (2500.0,)}
 
 
 def run_check(config: Config, delay_s: float | None = None, **options: Any) -> tuple[str, str, int]:
@@ -68,7 +73,11 @@ def test_too_small_a_margin_is_refused_with_numbers() -> None:
     assert "too small" in shown
     assert "16.8 deg" in shown
     assert "phase margin (=16.8 deg) must be at least 20 deg: at 1000 Hz with 1 ms loop delay" in messages
-    for remedy in ("control.q = 2170 (now 2500", "control.velocity_cutoff_Hz = ", "control.learning_rate = 69.5"):
+    for remedy in (
+        "control.lyapunov_q = 2170 (now 2500",
+        "control.velocity_cutoff_Hz = ",
+        "control.learning_rate = 69.5",
+    ):
         assert remedy in messages
 
 
@@ -208,7 +217,7 @@ def test_remedies_of_the_other_kinds_name_their_own_settings() -> None:
 
 def test_widths_and_q_pairs_arrive() -> None:
     widths = tuple(0.01 * (i + 1) for i in range(15))
-    settings, _ = loop_settings(changed("control", widths=widths, q=(1000.0, 20.0)))
+    settings, _ = loop_settings(changed("control", widths=widths, lyapunov_q=(1000.0, 20.0)))
     assert settings.widths == widths
     assert settings.q == (1000.0, 20.0)
     assert len(settings.centres) == 15
@@ -254,3 +263,59 @@ def test_a_soft_reducer_is_told_with_its_resonance() -> None:
 def test_of_a_real_joint_nobody_knows_the_reducer() -> None:
     config = load_config(shipped_config("precise")).model_copy(update={"virtual": None})
     assert [text for text in not_modelled(config) if "flexibility of the reducer" in text]
+
+
+# --- `jointctl check` on a serial line: a rate that the line cannot carry is refused, and the advice passes ---
+SHIPPED = shipped_config("elmo_serial").read_text()
+
+
+def checked(tmp_path: Path, **changes: float) -> str:
+    """What `check` prints for the shipped configuration with other values."""
+    text = SHIPPED
+    for key, value in changes.items():
+        text, count = re.subn(rf"^{key} = [^#\n]*", f"{key} = {value:g} ", text, count=1, flags=re.MULTILINE)
+        assert count == 1, key
+    path = tmp_path / "joint.toml"
+    path.write_text(re.sub(r"^rate_Hz = (\d+) ", r"rate_Hz = \1.0 ", text, flags=re.MULTILINE))
+    out = io.StringIO()
+    check(load_config(path), Output(stdout=out, stderr=io.StringIO()))
+    return out.getvalue()
+
+
+def test_the_shipped_one_passes_and_tells_what_the_line_carries(tmp_path: Path) -> None:
+    told = checked(tmp_path)
+    assert "62% of the line; up to 202 Hz at 115200 baud" in told
+
+
+@pytest.mark.parametrize(("baud_rate", "refused"), [(57_600, True), (115_200, False), (230_400, False)])
+def test_another_baud_rate_may_not_carry_the_rate(tmp_path: Path, baud_rate: int, refused: bool) -> None:
+    if not refused:
+        assert f"at {baud_rate} baud" in checked(tmp_path, baud_rate_bitps=baud_rate)
+        return
+    with pytest.raises(ConfigurationError, match=r"loop.rate_Hz \(=125\) must be at most 101 at") as caught:
+        checked(tmp_path, baud_rate_bitps=baud_rate)
+    hint = caught.value.hint
+    assert hint.startswith("with loop.rate_Hz = 90 and control.velocity_cutoff_Hz = 43 the gains need a slower loop")
+    advice = {key: float(value) for key, value in re.findall(r"(\w+) = ([\d.]+)", hint)}
+    told = checked(tmp_path, baud_rate_bitps=baud_rate, position_jump_max_rad=0.04, **advice)
+    assert "verdict" in told
+    with pytest.raises(MarginError, match="phase margin"):  # the twin: the rate alone is not enough
+        checked(
+            tmp_path, baud_rate_bitps=baud_rate, position_jump_max_rad=0.04,
+            rate_Hz=advice["rate_Hz"], velocity_cutoff_Hz=advice["velocity_cutoff_Hz"],
+        )  # fmt: skip
+
+
+def test_a_rate_that_leaves_the_gains_as_they_are(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        checked(tmp_path, rate_Hz=203)
+    assert re.match(r"with loop.rate_Hz = 181 the gains keep \d\d deg", caught.value.hint)
+
+
+def test_what_is_simulated_in_lockstep_is_refused_in_one_line() -> None:
+    config = load_config(shipped_config("elmo_serial"))
+    with pytest.raises(ConfigurationError, match=r'drive.kind \(=elmo_serial\) must be "canopen" for fault-campaign'):
+        fault_campaign(config, Output())
+    with pytest.raises(ConfigurationError, match=r'drive.kind \(=elmo_serial\) must be "canopen" for study'):
+        from_file("elmo_serial")
+    require_simulated(load_config(shipped_config("virtual")), "fault-campaign")  # the twin

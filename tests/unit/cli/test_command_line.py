@@ -1,26 +1,36 @@
-"""What the command line says about itself, and `jointctl new`."""
+"""What the command line says about itself, what it does not understand, and what each verb does with `-p PORT`."""
 
 from __future__ import annotations
 
 import io
+import os
 import re
 import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pytest
 import typer
+from typer.testing import CliRunner
 
 from jointctl.drivers.errors import ConfigurationError, DataError
-from jointctl.tools.cli.main import EPILOG, app
+from jointctl.tools.configuration.canopen import canopen_section
+from jointctl.tools.configuration.elmo import elmo_section
 from jointctl.tools.configuration.load import SHIPPED_FOLDER, load_config
+from jointctl.tools.experiments.paper_experiments import synthetic_sweep
 from jointctl.tools.output import Output
+from jointctl.tools.verbs.bench_drive import ServeOptions
+from jointctl.tools.verbs.elmo_bench import ElmoBench
+from jointctl.tools.verbs.main import EPILOG, app
 from jointctl.tools.verbs.new import new
+from jointctl.tools.verbs.verb_options import BusOptions, CanOptions, grouped, loaded
 
+# --- What the command line says about itself, and `jointctl new` ---
 QUIET = Output(stdout=io.StringIO(), stderr=io.StringIO())
 MARKUP = re.compile(r"\[[a-z#/@]")  # what the help's formatter takes for a style, and swallows
 
@@ -51,21 +61,21 @@ def test_the_help_names_every_shipped_configuration() -> None:
 
 def test_the_version_is_that_of_the_package() -> None:
     shown = subprocess.run(
-        [sys.executable, "-m", "jointctl.tools.cli", "--version"], capture_output=True, text=True, check=True
+        [sys.executable, "-m", "jointctl.tools.verbs", "--version"], capture_output=True, text=True, check=True
     )
     assert shown.stdout == f"jointctl {version('jointctl')}\n"
 
 
-def test_nothing_heavy_is_imported_for_the_help() -> None:
-    heavy = "{'numba', 'numpy', 'scipy', 'can', 'canopen', 'pydantic', 'matplotlib', 'tomlkit', 'mcap'}"
-    code = f"import sys, tools.cli.main; print(sorted({heavy} & set(sys.modules)))"
-    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert shown.stdout == "[]\n"
-
-
-def test_what_starts_a_motion_waits_for_no_slow_import() -> None:
-    slow = "{'scipy.optimize', 'scipy.interpolate', 'scipy.stats', 'matplotlib'}"
-    code = f"import sys, tools.verbs.run, tools.verbs.sweep; print(sorted({slow} & set(sys.modules)))"
+@pytest.mark.parametrize(
+    ("modules", "slow"),
+    [
+        ("jointctl.tools.verbs.main", "numba numpy scipy can canopen pydantic matplotlib tomlkit mcap"),  # for the help
+        ("jointctl.tools.verbs.run, jointctl.tools.verbs.sweep",  # before a motion starts
+         "scipy.optimize scipy.interpolate scipy.stats matplotlib"),
+    ],
+)  # fmt: skip
+def test_what_is_waited_for_imports_nothing_heavy(modules: str, slow: str) -> None:
+    code = f"import sys, {modules}; print(sorted({set(slow.split())} & set(sys.modules)))"
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert shown.stdout == "[]\n"
 
@@ -98,3 +108,188 @@ def test_new_refuses(tmp_path: Path, name: str, shipped: str, error: type[Except
     with pytest.raises(error, match=match):
         new(tmp_path / name, QUIET, shipped=shipped)
     assert (tmp_path / "there.toml").read_text() == "mine"
+
+
+# --- Every help page in a terminal of 80 columns, and names of shipped configurations wherever one is asked for ---
+def pages() -> list[tuple[str, ...]]:
+    """The arguments that lead to each help page."""
+    top: Any = typer.main.get_command(app)
+    found: list[tuple[str, ...]] = [()]
+    for name, command in top.commands.items():
+        found += [(name,), *((name, inner) for inner in getattr(command, "commands", ()))]
+    return found
+
+
+@pytest.mark.parametrize("words", pages(), ids="-".join)
+def test_nothing_is_cut_off_in_a_help_page_of_80_columns(words: tuple[str, ...]) -> None:
+    shown = CliRunner().invoke(app, [*words, "--help"], env={"COLUMNS": "80"})
+    assert shown.exit_code == 0
+    assert "…" not in shown.output
+    assert max(len(line) for line in shown.output.splitlines()) <= 80
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    sweep = synthetic_sweep()
+    path = tmp_path / "sweep.csv"
+    rows = zip(sweep.velocity_radps, sweep.motor_torque_Nm, strict=True)
+    path.write_text("velocity,torque\n" + "".join(f"{velocity},{torque}\n" for velocity, torque in rows))
+    return path
+
+
+FOREIGN = ("--velocity-column", "velocity", "--torque-column", "torque", "--velocity-unit", "rad/s", "--side", "joint",
+           "--torque-side", "motor", "--ratio", "121")  # fmt: skip
+
+
+def test_validate_and_identify_take_the_name_of_a_shipped_configuration(data: Path) -> None:
+    found = CliRunner().invoke(app, ["validate", "paper", str(data), *FOREIGN])
+    assert found.exception is None or isinstance(found.exception, SystemExit)
+    assert found.exit_code == 0
+    assert data.with_suffix(".validation.png").exists()
+    swarm = ("--particles", "40", "--iterations", "40", "--folds", "2")
+    assert CliRunner().invoke(app, ["identify", str(data), "--config", "paper", *FOREIGN, *swarm]).exit_code == 0
+
+
+# --- What the parser of the command line does not understand: one line and a hint, exit code 2 ---
+def run(*words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "jointctl.tools.verbs", *words]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60.0, env={**os.environ, "COLUMNS": "40"})
+
+
+@pytest.mark.parametrize(
+    ("words", "parts", "verb"),
+    [
+        (["rum", "virtual"], ["rum"], ""),
+        (["run"], ["CONFIG"], "run "),
+        (["run", "virtual", "-t", "200"], ["--target", "127"], "run "),
+        (["run", "virtual", "--frobnicate"], ["--frobnicate"], "run "),
+        (["run", "virtual", "extra"], ["extra"], "run "),
+        (["demo", "--duration", "x"], ["--duration"], "demo "),
+        (["log", "foo"], ["foo"], "log "),
+        (["fault-campaign", "--scenario", "-1"], ["--scenario", "0"], "fault-campaign "),
+        (["fault-campaign", "--scenario", str(2**31)], ["--scenario", str(2**31 - 1)], "fault-campaign "),
+        (["fault-campaign", "--seed", "-1"], ["--seed", "0"], "fault-campaign "),
+    ],
+)
+def test_it_is_one_line_and_a_hint(words: list[str], parts: list[str], verb: str) -> None:
+    done = run(*words)
+    assert done.returncode == 2
+    error, hint = done.stderr.splitlines()
+    assert error.startswith("error: ")
+    assert all(part in error for part in parts), error
+    assert hint.startswith("hint: `")
+    assert f"{verb}--help` shows what there is" in hint
+
+
+@pytest.mark.parametrize("words", [[], ["log"], ["params"]])
+def test_without_a_verb_the_help_is_shown(words: list[str]) -> None:
+    done = run(*words)
+    assert done.returncode == 2
+    assert "Usage:" in done.stdout
+    assert done.stderr == ""
+
+
+def test_help_is_no_error() -> None:
+    assert run("run", "--help").returncode == 0
+
+
+# --- Options that stand in a dataclass reach the verb as one object; the command line shows them one by one ---
+@dataclass(frozen=True)
+class Place:
+    name: Annotated[str | None, typer.Option("-n", "--name")] = None
+    number: Annotated[int, typer.Option("--number", min=1)] = 3
+
+
+taken: list[Any] = []
+two_verbs = typer.Typer(add_completion=False)
+
+
+@two_verbs.command()
+@grouped
+def verb(*, first: Annotated[str, typer.Argument()] = "a", place: Place, last: bool = False) -> None:
+    """What it does."""
+    taken.append((first, place, last))
+
+
+@pytest.mark.parametrize(("arguments", "expected"), [
+    ([], ("a", Place(None, 3), False)),
+    (["b", "-n", "here", "--last"], ("b", Place("here", 3), True)),
+    (["--number", "7"], ("a", Place(None, 7), False)),
+])  # fmt: skip
+def test_a_group_reaches_the_verb_as_one_object(arguments: list[str], expected: tuple[str, Place, bool]) -> None:
+    taken.clear()
+    assert CliRunner().invoke(two_verbs, arguments).exit_code == 0
+    assert taken == [expected]
+
+
+def test_the_command_line_shows_the_options_of_a_group_in_their_place() -> None:
+    command = typer.main.get_command(two_verbs)
+    assert [parameter.name for parameter in command.params] == ["first", "name", "number", "last"]
+    assert command.help == "What it does."
+
+
+def test_limits_of_an_option_hold_in_a_group() -> None:
+    assert CliRunner().invoke(two_verbs, ["--number", "0"]).exit_code == 2
+
+
+# --- What each verb does with `-p PORT`, and with options and configurations of the other kind of drive ---
+SERIAL, CAN = Path("elmo_serial"), Path("virtual")
+
+
+@pytest.mark.parametrize("verb", ["doctor", "info", "monitor", "sweep", "run", "stop", "clear-fault"])
+def test_these_verbs_take_a_port(verb: str) -> None:
+    commands: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    assert "-p" in [name for parameter in commands[verb].params for name in parameter.opts]
+
+
+def test_the_port_replaces_the_one_of_the_file() -> None:
+    assert elmo_section(loaded(SERIAL, BusOptions(port="/dev/ttyUSB7"))).port == "/dev/ttyUSB7"
+    assert canopen_section(loaded(CAN, CanOptions(target=9))).node == 9
+
+
+@pytest.mark.parametrize(
+    ("path", "options", "words"),
+    [
+        (SERIAL, {"interface": "socketcan"}, "socketcan names a CAN bus, the drive is on a serial port: use -p"),
+        (SERIAL, {"channel": "can0"}, "can0 names a CAN bus, the drive is on a serial port: use -p"),
+        (SERIAL, {"bitrate": 500_000}, "500000 names a CAN bus, the drive is on a serial port: use -p"),
+        (SERIAL, {"target": 3}, 'drive.kind (=elmo_serial) must be "canopen" here'),
+        (CAN, {"port": "/dev/ttyUSB7"}, 'drive.kind (=canopen) must be "elmo_serial" for a serial port'),
+    ],
+)
+def test_options_of_the_other_kind_are_refused(path: Path, options: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        loaded(path, BusOptions(**options))
+    assert words in caught.value.message
+
+
+def refused_by_hil(*arguments: str) -> str:
+    error = CliRunner().invoke(app, ["hil", *arguments]).exception
+    assert isinstance(error, ConfigurationError)
+    return error.message
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("elmo_serial", "-p", "/dev/ttyUSB0"), "--port (=/dev/ttyUSB0) must be absent for hil"),
+        (("elmo_serial", "--timing"), "--timing is for a CAN bus"),
+        (("elmo_serial", "-c", "vcan"), "vcan names a CAN bus"),
+        (("paper", "--serial"), 'drive.kind (=canopen) must be "elmo_serial"'),
+        (("virtual", "--link", "tty"), 'drive.kind (=canopen) must be "elmo_serial"'),
+    ],
+)
+def test_hil_refuses_what_it_would_not_do(arguments: tuple[str, ...], words: str) -> None:
+    assert words in refused_by_hil(*arguments)
+
+
+def test_its_twin_serves(monkeypatch: pytest.MonkeyPatch) -> None:
+    served: list[Any] = []
+
+    def stand_in(_: Any, config: Any, output: Any, options: ServeOptions) -> int:
+        served.append((config.drive.kind, options))
+        return 0
+
+    monkeypatch.setattr(ElmoBench, "serve", stand_in)
+    assert CliRunner().invoke(app, ["hil", "--serial", "--link", "tty"]).exit_code == 0
+    assert served == [("elmo_serial", ServeOptions(serial=True, link="tty"))]

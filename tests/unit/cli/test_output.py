@@ -1,19 +1,37 @@
-"""What reaches a terminal, however narrow."""
+"""What reaches a terminal, a page or a file: safe, however narrow, and never a traceback."""
 
 from __future__ import annotations
 
 import io
+import json
+import os
 import re
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
 
 import pytest
 from rich.console import Group, RenderableType
+from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from jointctl.tools.narrow_table import width_of
-from jointctl.tools.output import Output
+from jointctl.drivers.errors import DataError
+from jointctl.tools.experiments.controller_study import StudySettings
+from jointctl.tools.output import Output, width_of
+from jointctl.tools.recording.report_page import Details, Paragraph, Section, draw, page
+from jointctl.tools.recording.report_page import Table as PageTable
+from jointctl.tools.recording.run_log import INFO, Event
+from jointctl.tools.scoping.history import History
+from jointctl.tools.session.live_panel import LivePanel
+from jointctl.tools.verbs import study as study_module
 from jointctl.tools.verbs.info import info_table
+from jointctl.tools.written_file import prepare_folder, prepare_target, replace_file, require_target
 
+# --- What reaches a terminal, however narrow ---
 NUMBERS = ["0.0949 .. 0.358", "0.00788 .. 0.0162", "0.00762 .. 0.00944"]
 PATH = "runs/a_joint_with_a_long_name-20260101-120000.mcap"
 
@@ -116,3 +134,267 @@ def test_what_rich_would_take_for_markup_is_shown_as_it_is(path: str) -> None:
     assert out.getvalue().startswith(path)
     assert out.getvalue().count(path) == 3
     assert err.getvalue().count(path) == 3
+
+
+# --- Nothing that comes from a file, a name or a device is obeyed by a terminal, a page or a reader of JSON ---
+EVIL = "a\x1b]0;owned\x07\x1b[2J\x9b31m\u202eb\rc\x7f[red]x[/]<script>alert(1)</script>"
+OBEYED = "\x1b\x07\x9b\u202e\r\x7f"
+
+
+def said(*, json_wanted: bool = False, terminal: bool = False) -> tuple[Output, io.StringIO, io.StringIO]:
+    class Stream(io.StringIO):
+        def isatty(self) -> bool:
+            return terminal
+
+    out, err = Stream(), Stream()
+    return Output(json=json_wanted, stdout=out, stderr=err), out, err
+
+
+def assert_shown(text: str, times: int) -> None:
+    assert not any(c in text for c in OBEYED), ascii(text)
+    assert text.count("[red]x[/]") == times
+    assert text.count("\\u001b[2J") == times
+
+
+def test_every_kind_of_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NO_COLOR", "1")
+    output, _, err = said()
+    output.note(EVIL)
+    output.fact(EVIL)
+    output.warning(EVIL)
+    output.error(EVIL, EVIL)
+    output.error(f"{EVIL}\n{EVIL}")
+    output.address(EVIL)
+    assert_shown(err.getvalue(), 8)
+    assert len(err.getvalue().splitlines()) == 8
+
+
+def test_a_name_makes_no_second_line() -> None:
+    output, _, err = said()
+    output.note("evil\nerror: all is well")
+    assert err.getvalue() == "evil\\nerror: all is well\n"
+
+
+def test_every_kind_of_result() -> None:
+    def table() -> Table:
+        made = Table(EVIL, "name", title=EVIL, caption=EVIL)
+        made.add_row(EVIL, Text(EVIL, "red"))
+        return made
+
+    for shown, times in (
+        (EVIL, 1), (Text(EVIL), 1), (table(), 5), (Group(table(), EVIL, Text(EVIL), Padding(EVIL, 1)), 8),
+    ):  # fmt: skip
+        output, out, _ = said()
+        output.result(shown)
+        assert_shown(out.getvalue(), times)
+    output, out, _ = said()
+    output.line(f"{EVIL}\n{EVIL}")
+    assert_shown(out.getvalue(), 2)
+
+
+def test_a_table_that_a_narrow_terminal_shows_as_a_list(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    monkeypatch.setenv("NO_COLOR", "1")
+    made = Table("first", "second", "third")
+    made.add_row("\x1b[2Jlong" * 6, "a\nb", "\x9bc")
+    output, out, _ = said(terminal=True)
+    output.result(made)
+    assert "\x1b[2J" not in out.getvalue()
+    assert "\x9b" not in out.getvalue()
+
+
+def test_json_stays_json_and_toml_stays_toml() -> None:
+    output, out, _ = said(json_wanted=True)
+    output.result("", {EVIL: [EVIL, 1.0]})
+    assert not any(c in out.getvalue() for c in OBEYED)
+    assert json.loads(out.getvalue()) == {EVIL: [EVIL, 1.0]}
+    output, out, _ = said()
+    output.line('key = "a\u202e\x7fb"')
+    assert tomllib.loads(out.getvalue()) == {"key": "a\u202e\x7fb"}
+
+
+def test_a_report_page() -> None:
+    def paint(figure: Any) -> None:
+        axes = figure.add_subplot()
+        axes.set_title(EVIL)
+
+    blocks = [
+        Paragraph(EVIL),
+        PageTable([EVIL], [[EVIL]], EVIL),
+        Details(EVIL, "first\n\tsecond"),
+        draw(1.0, paint, ""),
+    ]
+    text = page(EVIL, [Section(EVIL, blocks)], subtitle=EVIL)
+    assert_shown(text, text.count("[red]x[/]"))
+    assert text.count("[red]x[/]") >= 8
+    assert "<script>alert" not in text
+    assert "first\n\tsecond" in text
+
+
+def test_a_name_with_dollar_signs_is_drawn() -> None:
+    draw(1.0, lambda figure: figure.suptitle(r"$\frac{ and a$b"), "")
+
+
+def test_the_scope_and_the_live_panel() -> None:
+    history = History()
+    history.take_event(Event(0, INFO, EVIL, EVIL))
+    history.take_settings({"lines": [EVIL], "motion": EVIL, "gains": {EVIL: [0.0, 1.0, 2.0]}, "number": 3})
+    event = history.events[0]
+    shown = (event.source, event.text, history.settings["lines"][0], *history.settings["gains"])
+    assert_shown(" ".join((*shown, history.settings["motion"])), 5)
+    assert history.settings["number"] == 3
+
+    panel = LivePanel(2, "[/nothing]\x1b[2J")
+    panel.note(EVIL)
+    panel._console.file = drawn = io.StringIO()
+    panel._console.print(panel._panel())
+    assert "[/nothing]\\u001b[2J" in drawn.getvalue()
+    assert not any(c in drawn.getvalue() for c in "\x07\x9b\u202e\r")
+
+
+# Output that nobody reads, that does not fit, or whose stream is closed: never a traceback, never the end of a run.
+JOINTCTL = f"{sys.executable} -m jointctl.tools.verbs"
+
+
+def shell(line: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(["sh", "-c", line], capture_output=True, text=True, timeout=60.0)
+
+
+@pytest.fixture
+def unread() -> Iterator[IO[str]]:
+    """The end of a pipe whose reader has gone."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    stream = os.fdopen(writing, "w")
+    yield stream
+    stream.close()
+
+
+def test_a_result_that_nobody_reads_is_thrown_away(unread: IO[str]) -> None:
+    output = Output(stdout=unread, stderr=io.StringIO())
+    output.result("a table")
+    output.result("another one")
+
+
+def test_one_that_comes_bit_by_bit_ends_when_nobody_reads_it(unread: IO[str]) -> None:
+    assert not Output(stdout=unread, stderr=io.StringIO()).line("a frame")
+    assert Output(stdout=io.StringIO(), stderr=io.StringIO()).line("a frame")
+
+
+def test_json_that_nobody_reads_is_thrown_away(unread: IO[str]) -> None:
+    Output(json=True, stdout=unread, stderr=io.StringIO()).result("", {"a": 1})
+
+
+def test_what_stderr_does_not_take_is_no_reason_to_end(unread: IO[str]) -> None:
+    output = Output(stdout=io.StringIO(), stderr=unread)
+    output.note("one")
+    output.note("two")
+    output.warning("three")
+    output.error("four", "five")
+
+
+def test_a_slow_reader_of_stderr_hears_what_is_said_when_it_has_caught_up() -> None:
+    reading, writing = os.pipe()
+    os.set_blocking(reading, False)
+    os.set_blocking(writing, False)
+    with os.fdopen(reading, "rb", buffering=0) as reader, os.fdopen(writing, "w") as stream:
+        output = Output(stdout=io.StringIO(), stderr=stream)
+        for number in range(3000):
+            output.note(f"note {number:050d}")
+        while reader.read(1 << 16):
+            pass
+        output.error("the drive did not confirm that it is off")
+        assert (reader.read(1 << 16) or b"").endswith(b"error: the drive did not confirm that it is off\n")
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_one_that_never_catches_up_does_not_change_the_exit_code(unbuffered: str) -> None:
+    code = (
+        "import os, sys; os.set_blocking(2, False); sys.argv = ['jointctl', 'check', 'absent.toml']\n"
+        "try:\n    os.write(2, bytes(1 << 20))\nexcept BlockingIOError:\n    pass\n"
+        "import jointctl.tools.verbs.start as start; start.main()"
+    )
+    reading, writing = os.pipe()
+    try:
+        environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+        done = subprocess.run([sys.executable, "-c", code], stderr=writing, env=environment, timeout=60.0)
+    finally:
+        os.close(reading)
+        os.close(writing)
+    assert done.returncode == 3
+
+
+@pytest.mark.parametrize("json", [False, True])
+def test_a_result_that_does_not_fit_is_an_error(json: bool) -> None:
+    with Path("/dev/full").open("w") as full, pytest.raises(DataError, match="standard output: cannot be written: No"):
+        Output(json=json, stdout=full, stderr=io.StringIO()).result("a table", {"a": 1})
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_disk_without_room_is_one_line_of_any_verb(unbuffered: str) -> None:
+    done = shell(f"PYTHONUNBUFFERED={unbuffered} {JOINTCTL} --version >/dev/full")
+    assert (done.returncode, done.stderr.count("\n")) == (8, 1)
+    assert done.stderr.startswith("error: ")
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-", "<&- >&- 2>&-"])
+def test_a_verb_works_with_closed_streams(closed: str) -> None:
+    assert shell(f"{JOINTCTL} --version {closed}").returncode == 0
+
+
+def test_nothing_else_gets_the_number_of_a_closed_stream() -> None:
+    code = (
+        "from jointctl.tools.verbs.start import occupy_standard_streams as occupy; occupy(); import os;"
+        "assert all(os.readlink(f'/proc/self/fd/{n}') == os.devnull and os.get_inheritable(n) for n in (0, 1, 2));"
+        "print('no harm')"
+    )
+    done = shell(f'{sys.executable} -c "{code}" <&- >&- 2>&-')
+    assert done.returncode == 0
+
+
+# --- Where results go is tried before the work that makes them ---
+def test_a_folder_is_made_and_one_that_is_there_stays(tmp_path: Path) -> None:
+    prepare_folder(tmp_path / "a" / "b")
+    prepare_folder(tmp_path / "a" / "b")
+    prepare_target(tmp_path / "c" / "file.csv")
+    prepare_target(None)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "c"]
+
+
+def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match="file: cannot be made: File exists"):
+        prepare_folder(tmp_path / "file")
+    with pytest.raises(DataError, match="is a folder, not a file to write"):
+        prepare_target(tmp_path)
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everywhere
+    with pytest.raises(DataError, match="no permission"):
+        prepare_folder(tmp_path)
+
+
+@pytest.mark.parametrize("key", ["csv", "figure"])
+def test_a_study_is_not_begun(key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "jointctl.tools.experiments.controller_study.run_study", lambda *_, **__: pytest.fail("hours of simulation")
+    )
+    output = Output(stdout=io.StringIO(), stderr=io.StringIO())
+    folder = tmp_path / "folder.png"
+    folder.mkdir()
+    with pytest.raises(DataError, match="is a folder"):
+        study_module.study(StudySettings(), output, **{key: folder})
+
+
+@pytest.mark.parametrize("kind", ["fifo", "device"])
+def test_what_is_no_file_is_not_replaced_by_one(tmp_path: Path, kind: str) -> None:
+    """As root, a new /dev/null would be an ordinary file."""
+    path = tmp_path / "out.png"
+    if kind == "fifo":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/null")
+    before = os.stat(path)
+    for refused in (require_target, prepare_target, lambda target: replace_file(target, b"x")):
+        with pytest.raises(DataError, match="is a device, a FIFO or a socket, and only files are written"):
+            refused(path)
+    after = os.stat(path)
+    assert (after.st_ino, after.st_mode) == (before.st_ino, before.st_mode)

@@ -1,21 +1,34 @@
-"""What no verb has foreseen, and a computer that has too little of something: one line and a documented code."""
+"""How a verb ends that does not end well: Ctrl-C, a no, an error of each class, and what no verb has foreseen."""
 
 from __future__ import annotations
 
+import io
+import multiprocessing
 import os
 import resource
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from jointctl.tools.cli import main as main_module
-from jointctl.tools.cli.start import FREE_DESCRIPTORS
-from jointctl.tools.cli.unexpected_end import TRACEBACK
+from jointctl.drivers import errors
+from jointctl.drivers.drive import CommissioningReport, DriveIdentity
+from jointctl.drivers.errors import DECLINED
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.output import Output
+from jointctl.tools.simulation.child_process import interrupts_left_to_the_parent
+from jointctl.tools.sweeping.options import SweepOptions
+from jointctl.tools.verbs import doctor, run, sweep
+from jointctl.tools.verbs import main as main_module
+from jointctl.tools.verbs.main import TRACEBACK
+from jointctl.tools.verbs.start import FREE_DESCRIPTORS
 
-COMMAND = [sys.executable, "-P", "-m", "jointctl.tools.cli"]
+# --- What no verb has foreseen, and a computer that has too little of something: one line and a documented code ---
+COMMAND = [sys.executable, "-P", "-m", "jointctl.tools.verbs"]
 
 
 def ended(*arguments: str, files: int | None = None, **options: Any) -> subprocess.CompletedProcess[str]:
@@ -117,3 +130,136 @@ def test_every_reader_refuses_what_is_no_file(tmp_path: Path, arguments: tuple[s
 
 
 _ROOT = str(Path(__file__).parents[3])
+
+
+# --- Ctrl-C before a verb has begun, and in the worker processes of one ---
+STUCK = (
+    "import sys, time, types; sys.modules['typer'] = slow = types.ModuleType('typer');"
+    "slow.__getattr__ = lambda name: (print('importing', flush=True), time.sleep(60));"
+    "import jointctl.tools.verbs.start as start; start.main()"
+)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, -signal.SIGINT), (signal.SIGTERM, -signal.SIGTERM)])
+def test_during_the_imports_it_ends_without_a_traceback(number: signal.Signals, code: int) -> None:
+    started = subprocess.Popen([sys.executable, "-c", STUCK], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert started.stdout is not None
+    assert started.stdout.readline() == "importing\n"
+    started.send_signal(number)
+    assert started.communicate(timeout=20.0)[1] == ""
+    assert started.returncode == code
+
+
+@pytest.mark.parametrize(
+    ("before", "shown", "expected"),
+    [
+        ("signal.signal(signal.SIGINT, signal.SIG_IGN);", "signal.getsignal(signal.SIGINT).name", "SIG_IGN"),
+        ("", "signal.getsignal(signal.SIGINT) is signal.default_int_handler", "True"),
+    ],
+)
+def test_where_it_is_ignored_it_stays_so_and_else_a_verb_has_the_handler_of_python_again(
+    before: str, shown: str, expected: str
+) -> None:
+    code = (
+        f"import signal; {before} import sys; sys.argv = ['jointctl', '--version'];"
+        "import jointctl.tools.verbs.start as start, atexit;"
+        f"atexit.register(lambda: print({shown})); start.main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60.0)
+    assert done.stdout.splitlines()[-1] == expected, done.stderr
+
+
+def _held_back() -> bool:
+    os.kill(os.getpid(), signal.SIGINT)
+    return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+def test_workers_hold_it_back_and_the_parent_gets_it() -> None:
+    context = multiprocessing.get_context("spawn")
+    with interrupts_left_to_the_parent():
+        pool = context.Pool(1)
+    with pool:
+        assert pool.apply(_held_back)
+    with pytest.raises(KeyboardInterrupt):  # noqa: PT012
+        with interrupts_left_to_the_parent():
+            os.kill(os.getpid(), signal.SIGINT)
+            held = True
+        assert held
+        time.sleep(1.0)
+
+
+# --- The exit code of each error class is a promise to scripts ---
+@pytest.mark.parametrize(
+    ("name", "code"),
+    [
+        ("UsageError", 2), ("ConfigurationError", 3), ("BusError", 4), ("NoDeviceError", 5), ("DeviceError", 6),
+        ("MotionFault", 7), ("DataError", 8), ("MarginError", 9),
+    ],
+)  # fmt: skip
+def test_exit_codes(name: str, code: int) -> None:
+    error = getattr(errors, name)("rate_Hz (=0) must be above 0", "set rate_Hz")
+    assert isinstance(error, errors.JointctlError)
+    assert error.exit_code == code
+    assert (error.message, error.hint) == ("rate_Hz (=0) must be above 0", "set rate_Hz")
+    assert str(error) == "rate_Hz (=0) must be above 0 (set rate_Hz)"
+
+
+def test_message_is_one_line_and_hint_may_be_empty() -> None:
+    error = errors.BusError("first\n   second")
+    assert error.message == "first second"
+    assert error.hint == ""
+    assert str(error) == "first second"
+
+
+# --- A question that is answered with no: nothing is done, and that is no success ---
+REPORT = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.0, 0.1, 1e-5)
+
+
+class Asking:
+    """A session that asks, and does no more."""
+
+    drive_state = "switch on disabled"
+
+    def __init__(self, plan: Any, consent: Any, *_: Any) -> None:
+        self._plan, self._consent = plan, consent
+
+    def run(self) -> None:
+        placed = self._plan.motion.placed(REPORT)
+        self._consent.show(placed.lines)
+        assert self._consent.dry_run or not self._consent.agreed(placed.lines)
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("answer", ["n\n", "\n", "", "no\n", "maybe\n"])
+@pytest.mark.parametrize("verb", ["run", "sweep", "doctor --motion"])
+def test_no_is_a_code_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str, answer: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "stdin", Terminal(answer))
+    monkeypatch.setattr("jointctl.tools.session.session.Session", Asking)
+    output = Output(stdout=io.StringIO(), stderr=io.StringIO())
+    if verb == "run":
+        code = run.run(load_config(shipped_config("virtual")), output, assume_yes=False)
+    elif verb == "sweep":
+        options = SweepOptions(points=24)
+        code = sweep.sweep(load_config(shipped_config("sweep_virtual")), output, tmp_path / "data.csv", options)
+    else:
+        code = doctor.doctor_motion(load_config(shipped_config("virtual")), output, assume_yes=False)
+    assert code == DECLINED == 12
+    assert not list(tmp_path.glob("*.csv"))
+
+
+@pytest.mark.parametrize("verb", ["run", "sweep"])
+def test_a_dry_run_is_a_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("jointctl.tools.session.session.Session", Asking)
+    output = Output(stdout=io.StringIO(), stderr=io.StringIO())
+    if verb == "run":
+        code = run.run(load_config(shipped_config("virtual")), output, assume_yes=False, dry_run=True)
+    else:
+        options = SweepOptions(points=24, dry_run=True)
+        code = sweep.sweep(load_config(shipped_config("sweep_virtual")), output, tmp_path / "data.csv", options)
+    assert code == 0

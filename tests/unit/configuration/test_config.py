@@ -1,23 +1,47 @@
-"""Configuration files: what is shipped loads, what is wrong is named in one line."""
+"""Configuration files: what is shipped loads, what is wrong is named in one line; wrong constants, serial drives."""
 
 from __future__ import annotations
 
+import json
 import re
+from io import StringIO
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
-from jointctl.drivers.errors import ConfigurationError
-from jointctl.tools.configuration.load import load_config, shipped_config, with_bus_overrides
-from tests.unit.configuration.edited_config import VIRTUAL, load, problems, replaced
+from jointctl.drivers.elmo.codes import motor_fault_text
+from jointctl.drivers.errors import ConfigurationError, DataError, MarginError
+from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.analysis.margin_gate import require_margin
+from jointctl.tools.configuration.canopen import canopen_section, eds_path
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.drive_section import GivenPlace
+from jointctl.tools.configuration.elmo import elmo_section, serial_line_share
+from jointctl.tools.configuration.load import load_config, moved, shipped_config
+from jointctl.tools.identification.friction_data import SWEEP_COLUMNS, ForeignFormat, sidecar_contents
+from jointctl.tools.identification.identification import Options
+from jointctl.tools.identification.swarm import SwarmSettings
+from jointctl.tools.output import Output
+from jointctl.tools.session.fault_words import FAULT_TEXTS
+from jointctl.tools.session.session_drive import session_drive
+from jointctl.tools.sweeping.checks import constant_remarks, recorded_limits, refuse_constants
+from jointctl.tools.sweeping.options import SweepOptions
+from jointctl.tools.verbs.identify import identify
+from jointctl.tools.verbs.sweep import sweep
+from tests.configurations import VIRTUAL, edited_file, load, problems, replaced, shipped
+from tests.sessions import constants_of
 
+# --- Configuration files: what is shipped loads, what is wrong is named in one line ---
 UNIT = " (the unit is part of the key)"
 
 
 @pytest.mark.parametrize("name", ["virtual", "paper"])
 def test_the_shipped_virtual_configurations_load(name: str) -> None:
     config = load_config(shipped_config(name))
-    assert config.eds_path.name == "virtual_joint.eds"
+    assert eds_path(config).name == "virtual_joint.eds"
     assert config.text == shipped_config(name).read_text()
 
 
@@ -30,7 +54,7 @@ def test_the_elmo_configuration_refuses_to_load_until_it_is_filled_in(tmp_path: 
     filled = re.sub(r"^# (\w+ = .*# FILL IN)", r"\1", text, flags=re.M)
     config = load(tmp_path, text=filled)
     assert config.bus.interface == "socketcan"
-    assert config.eds_path == tmp_path / "elmo_gold.eds"
+    assert eds_path(config) == tmp_path / "elmo_gold.eds"
 
 
 @pytest.mark.parametrize(
@@ -48,7 +72,8 @@ def test_the_elmo_configuration_refuses_to_load_until_it_is_filled_in(tmp_path: 
         ("direction = .*", "direction = 0", "encoder.direction (=0) must be 1 or -1"),
         ("mode = .*", 'mode = "csp"', "drive.mode (=csp) must be one of 'cst', 'tq' or 'auto'"),
         ("approach_s = .*", 'approach_s = "slow"', 'sequence.approach_s (=slow) must be "auto" or in [0..600]'),
-        ("q = .*", "q = [1.0, 2.0, 3.0]", "control.q (=[1.0, 2.0, 3.0]) must be 1 or 2 numbers, each in (0..1e+12]"),
+        ("lyapunov_q = .*", "lyapunov_q = [1.0, 2.0, 3.0]",
+         "control.lyapunov_q (=[1.0, 2.0, 3.0]) must be 1 or 2 numbers, each in (0..1e+12]"),
         ("widths = .*", "widths = 0.0", "control.widths (=0) must be 1 or 15 widths, each in (0..10000]"),
         ("rate_Hz = .*", "rate_kHz = 1.0", f"loop.rate_kHz is not a known key: use rate_Hz{UNIT}"),
         ("inertia_kgm2", "inertia", "joint.inertia is not a known key: use inertia_kgm2 (the unit is part of the key)"),
@@ -96,10 +121,13 @@ def test_several_problems_are_told_at_once(tmp_path: Path) -> None:
         ("torque_max_Nm = .*", "torque_max_Nm = 60.51", "limits.torque_max_Nm (=60.51) must be in (0..60.5]"),
         ("stop_timeout_s = .*", "stop_timeout_s = 0.5", "sequence.stop_timeout_s (=0.5)"),
         ("node = .*", "node = 126", "drive.master_node (=126) must differ"),
-        ("command_delay_s = .*", "command_delay_s = 0.06", "virtual.command_delay_s (=0.06)"),
+        # a key in the wrong unit, or misspelt, is not reported as missing besides
+        ("rate_Hz = .*", "rate_kHz = 1.0", "loop.rate_kHz is not a known key"),
+        ("amplitude_rad = .*", "amplitude_deg = 20.0", "trajectory.amplitude_deg is not a known key"),
+        ("feed_forward = .*", 'feed_foward = "none"', "control.feed_foward is not a known key"),
     ],
 )
-def test_contradictions_between_values_are_named(tmp_path: Path, pattern: str, line: str, expected: str) -> None:
+def test_a_contradiction_or_an_unknown_key_is_one_line(tmp_path: Path, pattern: str, line: str, expected: str) -> None:
     found = problems(tmp_path, pattern, line)
     assert len(found) == 1
     assert found[0].startswith(expected)
@@ -108,20 +136,15 @@ def test_contradictions_between_values_are_named(tmp_path: Path, pattern: str, l
 @pytest.mark.parametrize(
     ("pattern", "line"),
     [
-        ("position_max_rad = .*", "position_max_rad = 0.35"),
-        ("position_min_rad = .*", "position_min_rad = -0.35"),
+        ("position_max_rad = .*", "position_max_rad = 0.35"), ("position_min_rad = .*", "position_min_rad = -0.35"),
         ("velocity_max_radps = .*", "velocity_max_radps = 0.21992"),
         ("position_jump_max_rad = .*", "position_jump_max_rad = 0.001"),
-        ("counts_per_turn = .*", "counts_per_turn = 2932"),
-        ("sample_age_max_s = .*", "sample_age_max_s = 0.001"),
-        ("velocity_cutoff_Hz = .*", "velocity_cutoff_Hz = 499.9"),
-        ("knee = 40.0", "knee = 200.0"),
-        ("torque_max_Nm = .*", "torque_max_Nm = 60.5"),
-        ("stop_timeout_s = .*", "stop_timeout_s = 0.501"),
-        ("node = .*", "node = 127"),
-        ("command_delay_s = .*", "command_delay_s = 0.05"),
+        ("counts_per_turn = .*", "counts_per_turn = 2932"), ("sample_age_max_s = .*", "sample_age_max_s = 0.001"),
+        ("velocity_cutoff_Hz = .*", "velocity_cutoff_Hz = 499.9"), ("knee = 40.0", "knee = 200.0"),
+        ("torque_max_Nm = .*", "torque_max_Nm = 60.5"), ("stop_timeout_s = .*", "stop_timeout_s = 0.501"),
+        ("node = .*", "node = 127"), ("command_delay_s = .*", "command_delay_s = 0.05"),
     ],
-)
+)  # fmt: skip
 def test_values_just_inside_are_accepted(tmp_path: Path, pattern: str, line: str) -> None:
     load(tmp_path, pattern, line)
 
@@ -153,19 +176,19 @@ def test_files_that_are_no_configuration_give_one_line(tmp_path: Path) -> None:
 def test_flag_beats_environment_beats_file() -> None:
     config = load_config(shipped_config("virtual"))
     environ = {"CAN_INTERFACE": "socketcan", "CAN_CHANNEL": "can7", "CAN_BITRATE": "500000"}
-    assert with_bus_overrides(config, environ={}).bus == config.bus
-    bus = with_bus_overrides(config, environ=environ).bus
+    assert moved(config, GivenPlace(), {}).bus == config.bus
+    bus = moved(config, GivenPlace(), environ).bus
     assert (bus.interface, bus.channel, bus.bitrate_bitps) == ("socketcan", "can7", 500_000)
-    bus = with_bus_overrides(config, "pcan", "usb1", 250_000, environ).bus
+    bus = moved(config, GivenPlace("pcan", "usb1", 250_000), environ).bus
     assert (bus.interface, bus.channel, bus.bitrate_bitps) == ("pcan", "usb1", 250_000)
-    changed = with_bus_overrides(config, environ=environ)
+    changed = moved(config, GivenPlace(), environ)
     assert changed.path == config.path
     with pytest.raises(ConfigurationError, match=r"environment: CAN_BITRATE \(=fast\)"):
-        with_bus_overrides(config, environ={"CAN_BITRATE": "fast"})
+        moved(config, GivenPlace(), {"CAN_BITRATE": "fast"})
     with pytest.raises(
         ConfigurationError, match=r"command line: bus.bitrate_bitps \(=1\) must be in \[10000..1e\+06\]"
     ):
-        with_bus_overrides(config, bitrate=1, environ={})
+        moved(config, GivenPlace(bitrate=1), {})
 
 
 def test_a_configuration_cannot_be_changed() -> None:
@@ -174,19 +197,337 @@ def test_a_configuration_cannot_be_changed() -> None:
         config.limits.torque_max_Nm = 1000.0  # type: ignore[misc]
 
 
-@pytest.mark.parametrize(
-    ("pattern", "line", "told"),
-    [
-        ("rate_Hz = .*", "rate_kHz = 1.0", "loop.rate_kHz is not a known key"),
-        ("amplitude_rad = .*", "amplitude_deg = 20.0", "trajectory.amplitude_deg is not a known key"),
-        ("feed_forward = .*", 'feed_foward = "none"', "control.feed_foward is not a known key"),
-    ],
-)
-def test_a_key_in_the_wrong_unit_is_one_line_and_not_two(tmp_path: Path, pattern: str, line: str, told: str) -> None:
-    found = problems(tmp_path, pattern, line)
-    assert len(found) == 1
-    assert told in found[0]
-
-
 def test_a_key_that_is_missing_beside_an_unknown_one_is_still_told(tmp_path: Path) -> None:
     assert len(problems(tmp_path, "node = .*", "colour = 1")) == 2
+
+
+# --- The keys of the limit-cycle monitor: defaults, what they become in the records, what is refused ---
+ANCHOR = "standstill_radps = .*"
+
+
+def added(line: str) -> str:
+    return f"standstill_radps = 0.02\n{line}"
+
+
+@pytest.mark.parametrize("name", ["virtual", "paper", "precise", "sweep_virtual"])
+def test_the_monitor_is_on_in_every_file_that_does_not_name_it(name: str) -> None:
+    config = load_config(shipped_config(name))
+    axis = constants_of(config)[0]
+    swing = axis.limits.swing
+    assert swing.torque_Nm == 60.0  # half of -60..60
+    assert swing.error_rad == pytest.approx(0.05 * config.limits.following_error_max_rad)
+    assert swing.slowest_cycles == 300
+    assert swing.noise_Nm == pytest.approx(12.0)
+    assert swing.noise_gain == pytest.approx(1.0 / 250.0)
+    assert axis.law.learning.growth == (1.05 if config.control.learning is not None else 0.0)
+
+
+def test_each_key_reaches_its_record(tmp_path: Path) -> None:
+    keys = ("swing_torque_share = 0.75", "swing_error_share = 0.1", "swing_slowest_s = 0.5", "torque_noise_share = 0.1")
+    axis = constants_of(load(tmp_path, ANCHOR, added("\n".join(keys))))[0]
+    swing = axis.limits.swing
+    assert (swing.torque_Nm, swing.slowest_cycles) == (90.0, 500)
+    assert (swing.error_rad, swing.noise_Nm) == (pytest.approx(0.005), pytest.approx(6.0))
+    text = shipped_config("precise").read_text()
+    axis = constants_of(load(tmp_path, ANCHOR, added("learning_growth = 1.5"), text))[0]
+    assert axis.law.learning.growth == 1.5
+
+
+def test_noise_is_also_what_comes_near_the_rate_limit(tmp_path: Path) -> None:
+    """2 Nm in a cycle are allowed: 12 Nm would never come."""
+    axis = constants_of(load(tmp_path, "torque_rate_max_Nmps = .*", "torque_rate_max_Nmps = 2000.0"))[0]
+    assert axis.limits.swing.noise_Nm == pytest.approx(1.2)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "allowed"),
+    [
+        ("swing_torque_share", 0.19, "[0.2..1]"), ("swing_torque_share", 1.01, "[0.2..1]"),
+        ("swing_error_share", 0.0, "[0.01..1]"), ("swing_slowest_s", 2.1, "[0.01..2]"),
+        ("torque_noise_share", 1.1, "[0.01..1]"), ("learning_growth", 0.99, "[1..10]"),
+    ],
+)  # fmt: skip
+def test_what_is_out_of_range_is_refused(tmp_path: Path, key: str, value: float, allowed: str) -> None:
+    (line,) = problems(tmp_path, ANCHOR, added(f"{key} = {value}"))
+    assert line == f"limits.{key} (={value:g}) must be in {allowed}"
+
+
+@pytest.mark.parametrize(("rate_Hz", "refused"), [(399.0, True), (400.0, False)])
+def test_half_a_swing_is_at_least_four_periods(tmp_path: Path, rate_Hz: float, refused: bool) -> None:
+    text = VIRTUAL.replace("rate_Hz = 1000.0", f"rate_Hz = {rate_Hz}")
+    if refused:
+        (line,) = problems(tmp_path, ANCHOR, added("swing_slowest_s = 0.01"), text)
+        assert line.startswith("limits.swing_slowest_s (=0.01) must be at least 4 periods, 0.0100251 s")
+    else:
+        load(tmp_path, ANCHOR, added("swing_slowest_s = 0.01"), text)
+
+
+# --- Torque constant, ratio, units and sides that are wrong on purpose: refused, or said ---
+QUICK = Options(folds=3, swarm=SwarmSettings(particles=40, iterations=40))
+CONFIG = shipped_config("sweep_virtual")
+VELOCITY = np.linspace(-200.0, 200.0, 120)  # deg/s of the joint
+TORQUE_Nm = friction_curve_Nm(paper_friction(), VELOCITY * DEGREE)  # motor
+LIMITS = {"torque_max_Nm": 60.0, "velocity_max_radps": 3.88}
+
+
+def own_file(folder: Path, torque_Nm: Any = TORQUE_Nm, ratio: float = 121.0, **sidecar: Any) -> Path:
+    path = folder / "own.csv"
+    lines = [",".join(SWEEP_COLUMNS)]
+    for v, t in zip(VELOCITY * DEGREE, torque_Nm, strict=True):
+        lines.append(f"{v:.9g},{t / 0.1:.9g},{t:.9g},0.01,0.05,500,1,-0.5,0.5,1.0,,{1 if v > 0 else -1},0")
+    path.write_text("\n".join(lines) + "\n")
+    path.with_suffix(".json").write_text(json.dumps(sidecar_contents(ratio, 0.1, **sidecar)))
+    return path
+
+
+def foreign_file(folder: Path) -> Path:
+    """Velocity in r/min of the motor, torque of the motor [Nm] and current [A] for 0.1 Nm/A."""
+    path = folder / "theirs.csv"
+    rows = zip(VELOCITY * 121.0 / 6.0, TORQUE_Nm, TORQUE_Nm / 0.1, strict=True)
+    path.write_text("speed,torque,current\n" + "".join(f"{v:.9g},{t:.9g},{i:.9g}\n" for v, t, i in rows))
+    return path
+
+
+RIGHT: dict[str, Any] = {"velocity_column": "speed", "torque_column": "torque", "velocity_unit": "r/min",
+                         "side": "motor", "torque_side": "motor", "ratio": 121.0}  # fmt: skip
+
+
+def identified(path: Path, told: ForeignFormat | None = None, config: Path | None = None) -> str:
+    """What was said on stderr."""
+    output = Output(stdout=StringIO(), stderr=StringIO())
+    assert identify(path, output, config=config, given=told, options=QUICK) == 0
+    return output.stderr.getvalue().replace("\n", " ")  # type: ignore[attr-defined, no-any-return]
+
+
+def test_the_right_constants_raise_no_question(tmp_path: Path) -> None:
+    assert "warning" not in identified(foreign_file(tmp_path), ForeignFormat(**RIGHT), CONFIG)
+    assert "warning" not in identified(own_file(tmp_path, limits=LIMITS))
+    assert "warning" not in identified(own_file(tmp_path, limits=LIMITS), config=CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"torque_column": None, "torque_side": None, "current_column": "current", "torque_constant_NmpA": 1.0},
+         r"torque constant of the data \(=1 Nm/A\) differs from the configured one \(=0.1 in the drive's ampere"),
+        ({"ratio": 100.0},
+         r"reduction ratio of the data \(=100\) differs from joint.reduction_ratio \(=121\)"),
+        ({"side": "joint"}, r"highest joint speed \(=422.4 rad/s\) is 109 times limits.velocity_max_radps"),
+        ({"velocity_unit": "rad/s"}, r"highest joint speed \(=33.33 rad/s\) is 8.59 times limits"),
+        ({"velocity_unit": "deg/s"}, r"at positive velocity: .* and 0 beyond; at least"),
+    ],
+)  # fmt: skip
+def test_wrong_flags_are_refused_or_said_with_a_configuration(tmp_path: Path, wrong: dict[str, Any], said: str) -> None:
+    try:
+        text = identified(foreign_file(tmp_path), ForeignFormat(**{**RIGHT, **wrong}), CONFIG)
+    except DataError as error:
+        text = error.message
+    assert re.search(said, text), text
+
+
+def test_torque_of_the_joint_taken_for_the_motors_and_the_reverse(tmp_path: Path) -> None:
+    path = foreign_file(tmp_path)
+    told = ForeignFormat(**{**RIGHT, "torque_side": "joint"})
+    assert "times limits.torque_max_Nm: check torque constant, ratio, units and sides" in identified(path, told, CONFIG)
+    rows = path.read_text().splitlines()
+    joint = [rows[0]] + [f"{r.split(',')[0]},{float(r.split(',')[1]) * 121.0:.9g},0" for r in rows[1:]]
+    path.write_text("\n".join(joint) + "\n")
+    with pytest.raises(DataError, match=r"friction at the joint reaches 4954 Nm, 82.6 times limits.torque_max_Nm"):
+        identified(path, ForeignFormat(**RIGHT), CONFIG)
+
+
+def test_without_any_limits_it_is_said_that_nothing_was_checked(tmp_path: Path) -> None:
+    wrong = ForeignFormat(**{**RIGHT, "torque_column": None, "torque_side": None, "current_column": "current",
+                             "torque_constant_NmpA": 10.0})  # fmt: skip
+    text = identified(foreign_file(tmp_path), wrong)
+    assert "no limits of the joint are known: sizes of torque and speed could not be checked" in text
+    assert "no limits of the joint are known" in identified(own_file(tmp_path))
+
+
+@pytest.mark.parametrize(("factor", "refused"), [(1.7, False), (1.9, True), (10.0, True)])
+def test_the_sidecars_limits_serve_where_no_configuration_is_given(
+    tmp_path: Path, factor: float, refused: bool
+) -> None:
+    # 95 % of the points are below 41 Nm at the joint; 1.2 times the 60 Nm of the sidecar are allowed
+    path = own_file(tmp_path, factor * TORQUE_Nm, limits=LIMITS)
+    if refused:
+        with pytest.raises(DataError, match=r"friction at the joint reaches .* times limits.torque_max_Nm"):
+            identified(path)
+    else:
+        assert "times limits.torque_max_Nm" in identified(path)  # near the limit
+
+
+def test_a_ratio_that_contradicts_the_sidecar_is_refused(tmp_path: Path) -> None:
+    path = own_file(tmp_path, limits=LIMITS)
+    with pytest.raises(DataError, match=r"--ratio \(=100\) differs from reduction_ratio \(=121\)"):
+        identified(path, ForeignFormat(ratio=100.0))
+    assert "warning" not in identified(path, ForeignFormat(ratio=121.0))
+
+
+@pytest.mark.parametrize("limits", [3, {"torque_max_Nm": -1.0, "velocity_max_radps": 1.0}, {"torque_max_Nm": 60.0}])
+def test_damaged_limits_of_a_sidecar_are_named(tmp_path: Path, limits: Any) -> None:
+    with pytest.raises(DataError, match=r"own.json: limits\.\w+ \(=.*\) must be a number"):
+        identified(own_file(tmp_path, limits=limits))
+
+
+def with_constant(torque_constant_NmpA: float) -> Config:
+    return shipped("sweep_virtual", joint__torque_constant_NmpA=torque_constant_NmpA)
+
+
+@pytest.mark.parametrize("constant", [0.1, 0.0801, 0.1249])
+def test_constants_that_agree_need_no_remark(constant: float) -> None:
+    refuse_constants(with_constant(constant))
+    assert constant_remarks(with_constant(constant)) == []
+
+
+@pytest.mark.parametrize(
+    ("constant", "factor"), [(0.0799, "0.799"), (0.1251, "1.25"), (0.141, "1.41"), (0.299, "2.99")]
+)
+def test_doubtful_constants_are_shown_before_the_joint_moves(constant: float, factor: str) -> None:
+    config = with_constant(constant)
+    refuse_constants(config)
+    (remark,) = constant_remarks(config)
+    assert f"is {factor} times drive.rated_torque_Nm (=0.5)" in remark
+    assert "rms and sine amplitude" in remark
+
+
+@pytest.mark.parametrize("constant", [0.033, 0.301, 1.0])
+def test_impossible_constants_are_refused_before_anything_moves(tmp_path: Path, constant: float) -> None:
+    output = Output(stdout=StringIO(), stderr=StringIO())
+    with pytest.raises(ConfigurationError, match=r"joint.torque_constant_NmpA \(=.* times drive.rated_torque_Nm"):
+        sweep(with_constant(constant), output, tmp_path / "data.csv", SweepOptions(lockstep=True, points=4))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_serial_drive_has_no_rated_torque_to_compare_with() -> None:
+    config = load_config(shipped_config("elmo_serial"))
+    refuse_constants(config)
+    assert constant_remarks(config) == []
+    assert recorded_limits(config) == {"torque_max_Nm": 60.0, "velocity_max_radps": 1.0}
+
+
+# The configuration of a serial drive: what is shipped loads and tracks within its margins, what is wrong is named.
+SHIPPED = shipped_config("elmo_serial").read_text()
+
+
+@pytest.fixture
+def config() -> Config:
+    return load_config(shipped_config("elmo_serial"))
+
+
+def problem(tmp_path: Path, pattern: str, line: str) -> str:
+    with pytest.raises(ConfigurationError) as caught:
+        session_drive("elmo_serial").check_rate(load(tmp_path, pattern, line, SHIPPED))
+    return caught.value.message
+
+
+def test_the_shipped_one_loads_and_its_port_is_its_bus(config: Config) -> None:
+    drive = elmo_section(config)
+    assert (config.bus.interface, config.bus.channel, config.bus.bitrate_bitps) == ("serial", drive.port, 115_200)
+    assert 0.5 < serial_line_share(config) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("pattern", "line", "words"),
+    [
+        ("kind = .*", 'kind = "elmo"', "drive.kind (=elmo) must be one of 'canopen', 'elmo_serial'"),
+        ("kind = .*", "", "drive.kind must be one of 'canopen', 'elmo_serial'"),
+        ("port = .*", "", "drive.port is missing"),
+        ("port = .*", "port = 3", "drive.port (=3) must be a text in quotes"),
+        ("baud_rate_bitps = .*", "baud_rate_bitps = 100000", "drive.baud_rate_bitps (=100000) must be one of 9600,"),
+        ("baud_rate_bitps = .*", "baud_rate_bitps = 57600", "loop.rate_Hz (=125) must be at most 101 at"),
+        ("port = .*", 'prot = "x"', "drive.prot is not a known key: did you mean port?"),
+        ("echo = .*", "node = 1", "drive.node is not a known key"),
+        ("continuous_current_A = .*", "continuous_current_A = 5.1", "must be at most drive.peak_current_A (=5)"),
+        ("torque_max_Nm = .*", "torque_max_Nm = 61", "limits.torque_max_Nm (=61) must be in (0..60.5]"),
+        ("dead_man_s = .*", "dead_man_s = 0.11", "must be at most limits.sample_age_max_s (=0.1)"),
+        ("dead_man_s = .*", "dead_man_s = 0.006", "must be at least one period"),
+        ("counts_parameter = .*", 'counts_parameter = "CA"', 'such as "CA[18]"'),
+        ("rate_Hz = .*", "rate_Hz = 9.9", "loop.rate_Hz (=9.9) must be in [10..10000]"),
+        (r"\[drive\]", '[bus]\ninterface = "a"\nchannel = "b"\nbitrate_bitps = 20000\n[drive]', "[bus] must be absent"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_named(tmp_path: Path, pattern: str, line: str, words: str) -> None:
+    assert words in problem(tmp_path, pattern, line)
+
+
+def test_the_port_can_be_overridden_and_can_options_cannot(config: Config) -> None:
+    other = moved(config, GivenPlace(port="COM7"))
+    assert (elmo_section(other).port, other.bus.channel) == ("COM7", "COM7")
+    assert moved(config, GivenPlace()) is config
+    assert moved(config, GivenPlace(), {"CAN_CHANNEL": "can3"}) is config
+    for option in ({"channel": "can3"}, {"interface": "socketcan"}, {"bitrate": 0}):
+        with pytest.raises(ConfigurationError, match="use -p"):
+            moved(config, GivenPlace(**option))
+    with pytest.raises(ConfigurationError, match="for a serial port"):
+        moved(load_config(shipped_config("virtual")), GivenPlace(port="COM7"))
+
+
+def test_can_parts_say_that_they_are_not_for_a_serial_drive(config: Config) -> None:
+    with pytest.raises(ConfigurationError, match='must be "canopen" here'):
+        canopen_section(config)
+
+
+@pytest.mark.parametrize("delay_s", [0.002, 0.004, 0.006])
+def test_the_shipped_gains_are_carried_by_the_rate(config: Config, delay_s: float) -> None:
+    assert require_margin(config, delay_s).phase_margin_deg > 25.0
+
+
+def test_gains_of_a_fast_bus_are_refused_naming_some_that_are_carried(config: Config) -> None:
+    control = config.control.model_copy(update={"kp": 784.0, "kv": 56.0, "lyapunov_q": (1800.0,)})
+    fast = config.model_copy(update={"control": control})
+    with pytest.raises(MarginError) as caught:
+        require_margin(fast, 0.003)
+    found = re.search(r"a slower loop: control.kp = ([\d.]+), kv = ([\d.]+), lyapunov_q = ([\d.]+)", caught.value.hint)
+    assert found is not None
+    kp, kv, q = map(float, found.groups())
+    named = control.model_copy(update={"kp": kp, "kv": kv, "lyapunov_q": (q,)})
+    # the printed gains are rounded to four digits, which may cost some hundredths of a degree
+    margin = config.margin.model_copy(update={"min_phase_margin_deg": config.margin.min_phase_margin_deg - 0.2})
+    assert require_margin(config.model_copy(update={"control": named, "margin": margin}), 0.003).stable
+
+
+@pytest.mark.parametrize("fault", [fault for fault in FAULT_TEXTS if FAULT_TEXTS[fault].serial])
+def test_every_fault_text_takes_its_value(config: Config, fault: Fault) -> None:
+    text = session_drive("elmo_serial").fault_text(config, fault, 144.0, 0x20000)
+    assert "{" not in text.happened
+    assert motor_fault_text(0x20000) in text.happened
+
+
+@pytest.mark.parametrize("fault", [fault for fault in Fault if fault is not Fault.NONE])
+def test_no_fault_speaks_of_a_watchdog_that_a_serial_drive_has_not(config: Config, fault: Fault) -> None:
+    text = session_drive("elmo_serial").fault_text(config, fault, 5.0, 0)
+    assert "watchdog" not in f"{text.happened} {text.cause} {text.next_step}"
+
+
+def test_after_standby_the_user_hears_that_the_drive_held_its_torque(config: Config) -> None:
+    text = session_drive("elmo_serial").fault_text(config, Fault.SUSPENDED, 3600.0, 0)
+    assert "slept for 3600.0 s" in text.happened
+    assert "the drive held its last command in the meantime" in text.happened
+    assert "systemd-inhibit" in text.next_step
+    canopen = session_drive("canopen").fault_text(load_config(shipped_config("virtual")), Fault.SUSPENDED, 3600.0, 0)
+    assert "the drive's watchdog stopped the joint" in canopen.next_step
+
+
+def test_a_text_with_a_status_shows_it_in_hexadecimal(config: Config) -> None:
+    assert "(SR 90h)" in session_drive("elmo_serial").fault_text(config, Fault.DRIVE_FAULT, 144.0, 0).happened
+    assert "CANopen" not in session_drive("elmo_serial").fault_text(config, Fault.POSITION_LIMIT, 0.5, 0).happened
+
+
+def test_an_old_key_is_read_with_a_remark_that_names_the_new_one(tmp_path: Path) -> None:
+    old = edited_file(
+        tmp_path, ("lyapunov_q = 1800.0", "q = 1800.0"), ("filtered_error_rate = true", "matched_filter = true")
+    )
+    config, shipped_one = load_config(old), load_config(shipped_config("virtual"))
+    assert config.control == shipped_one.control
+    assert [remark.split(";")[0] for remark in config.remarks] == [
+        "control.q is called control.lyapunov_q now",
+        "control.matched_filter is called control.filtered_error_rate now",
+    ]
+    assert shipped_one.remarks == ()
+
+
+def test_an_old_key_beside_its_new_one_is_refused(tmp_path: Path) -> None:
+    both = edited_file(tmp_path, ("lyapunov_q = 1800.0", "lyapunov_q = 1800.0\nq = 1800.0"))
+    with pytest.raises(ConfigurationError, match=r"control\.q is not a known key"):
+        load_config(both)

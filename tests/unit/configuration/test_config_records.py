@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +26,8 @@ from jointctl.tools.configuration.conversions import (
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.plant_settings import plant_settings
 from jointctl.tools.configuration.records import approach_s, trajectory_table
+from tests.configurations import VIRTUAL, load, problems
 from tests.sessions import constants_of
-from tests.unit.configuration.edited_config import VIRTUAL, load, problems
 
 NO_TABLE = np.zeros((1, 5))
 
@@ -124,6 +125,13 @@ def test_shipped_checks_agree_with_the_trajectory_itself(tmp_path: Path) -> None
         config = load(tmp_path, text=text)
         peak = peak_of(constants_of(config)[0].trajectory)
         assert trajectory_extremes(config.trajectory) == pytest.approx(peak[:3]), keys
+
+
+def test_what_only_the_plant_refuses_is_named_where_it_is_made(tmp_path: Path) -> None:
+    path = tmp_path / "joint.toml"
+    path.write_text(re.sub("command_delay_s = .*", "command_delay_s = 0.06", VIRTUAL))
+    with pytest.raises(ConfigurationError, match=r"joint\.toml: virtual\.command_delay_s \(=0\.06\)"):
+        plant_settings(load_config(path))
 
 
 def test_plant_settings_are_accepted_by_the_plant() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jointctl.drivers.errors import ConfigurationError, DataError
@@ -25,8 +25,8 @@ from tests.places import CONFIGS
 
 TOML = (CONFIGS / "virtual.toml").read_text()
 EDS = (CONFIGS / "virtual_joint.eds").read_text()
-quick = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-slow = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+quick = settings(max_examples=150)
+slow = settings(max_examples=25)
 numbers = st.one_of(st.floats().map(str), st.integers().map(str), st.sampled_from(["", "x", "1e999", "-", "0x10"]))
 
 
@@ -60,21 +60,8 @@ def test_any_configuration_file(tmp_path: Path, content: bytes) -> None:
 
 
 ODD_VALUES = [
-    "nan",
-    "inf",
-    "-1e308",
-    "0",
-    "-1",
-    "1e9",
-    "true",
-    '"text"',
-    "[]",
-    "[1, 2]",
-    "{}",
-    "2020-01-01",
-    '""',
-    "9" * 20,
-]
+    "nan", "inf", "-1e308", "0", "-1", "1e9", "true", '"text"', "[]", "[1, 2]", "{}", "2020-01-01", '""', "9" * 20,
+]  # fmt: skip
 VALUES = re.compile(r"(?m)^([a-z_A-Z0-9]+) = [^#\n]+")
 
 
@@ -166,7 +153,7 @@ def good_log(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return path.read_bytes()
 
 
-@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=200)
 @given(data=st.data())
 def test_any_mcap_bytes(tmp_path: Path, good_log: bytes, data: Any) -> None:
     content = bytearray(good_log)

@@ -8,25 +8,20 @@ from typing import Any
 import pytest
 
 from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.configuration.canopen import canopen_section
+from jointctl.tools.configuration.drive_section import GivenPlace
 from jointctl.tools.configuration.load import load_config
-from jointctl.tools.configuration.stop_target import CanTarget, GivenTarget, SerialTarget, stop_target
+from jointctl.tools.verbs.bench_drive import stop_target
+from jointctl.tools.verbs.canopen_bench import CanTarget
+from jointctl.tools.verbs.elmo_bench import PortTarget
+from tests.configurations import edited_file
 from tests.places import CONFIGS
 
 NOTHING: dict[str, str] = {}
 
 
-def changed(folder: Path, base: str, *changes: tuple[str, str]) -> Path:
-    text = (CONFIGS / f"{base}.toml").read_text()
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new, 1)
-    path = folder / "joint.toml"
-    path.write_text(text)
-    return path
-
-
 def test_the_mark_that_an_editor_begins_a_file_with_does_not_matter(tmp_path: Path) -> None:
-    path = changed(tmp_path, "virtual", ("[control]", "[contr"))
+    path = edited_file(tmp_path, ("[control]", "[contr"))
     text = path.read_text()
     path.write_text("\ufeff" + text[text.index("[bus]") :], encoding="utf-8")
     assert stop_target(path, environ=NOTHING) == stop_target(CONFIGS / "virtual.toml", environ=NOTHING)
@@ -45,32 +40,32 @@ def test_the_mark_that_an_editor_begins_a_file_with_does_not_matter(tmp_path: Pa
     ],
 )
 def test_what_is_wrong_elsewhere_does_not_matter(tmp_path: Path, changes: tuple[tuple[str, str], ...]) -> None:
-    path = changed(tmp_path, "virtual", *changes)
+    path = edited_file(tmp_path, *changes)
     if changes:
         with pytest.raises(ConfigurationError):
             load_config(path)
     shipped = load_config(CONFIGS / "virtual.toml")
     assert stop_target(path, environ=NOTHING) == CanTarget(
-        shipped.bus.interface, shipped.bus.channel, None, shipped.canopen.node
+        shipped.bus.interface, shipped.bus.channel, None, canopen_section(shipped).node
     )
 
 
-@pytest.mark.parametrize("changes", [(), (("[control]", "[control]\nkp ="),), (("[limits]", "[limts]"),)])
+@pytest.mark.parametrize("changes", [(), (("[control]", "[control]\nkp ="),), (("\n[limits]", "\n[limts]"),)])
 def test_the_same_on_a_serial_line(tmp_path: Path, changes: tuple[tuple[str, str], ...]) -> None:
-    path = changed(tmp_path, "elmo_serial", *changes)
+    path = edited_file(tmp_path, *changes, base="elmo_serial")
     drive: Any = load_config(CONFIGS / "elmo_serial.toml").drive
-    expected = SerialTarget(drive.port, drive.baud_rate_bitps, drive.reply_timeout_s)
+    expected = PortTarget(drive.port, drive.baud_rate_bitps, drive.reply_timeout_s)
     assert stop_target(path, environ=NOTHING) == expected
-    other = stop_target(path, GivenTarget(port="/dev/ttyUSB9"), NOTHING)
-    assert other == SerialTarget("/dev/ttyUSB9", drive.baud_rate_bitps, drive.reply_timeout_s)
+    other = stop_target(path, GivenPlace(port="/dev/ttyUSB9"), NOTHING)
+    assert other == PortTarget("/dev/ttyUSB9", drive.baud_rate_bitps, drive.reply_timeout_s)
 
 
 @pytest.mark.parametrize("node", ["0", "128", "true", '"1"', "1.5"])
 def test_a_node_that_is_none_is_told_and_can_be_given(tmp_path: Path, node: str) -> None:
-    path = changed(tmp_path, "virtual", ("\nnode = 1\n", f"\nnode = {node}\n"))
+    path = edited_file(tmp_path, ("\nnode = 1\n", f"\nnode = {node}\n"))
     with pytest.raises(ConfigurationError, match=r"drive.node \(=.*\) must be in \[1..127\] \(it can be given"):
         stop_target(path, environ=NOTHING)
-    target = stop_target(path, GivenTarget(node=1), NOTHING)
+    target = stop_target(path, GivenPlace(node=1), NOTHING)
     assert isinstance(target, CanTarget)
     assert target.node == 1
 
@@ -78,18 +73,18 @@ def test_a_node_that_is_none_is_told_and_can_be_given(tmp_path: Path, node: str)
 def test_without_any_file_the_command_line_is_enough(tmp_path: Path) -> None:
     path = tmp_path / "gone.toml"
     given = {"interface": "socketcan", "channel": "can0", "node": 7}
-    assert stop_target(path, GivenTarget(**given), NOTHING) == CanTarget("socketcan", "can0", None, 7)  # type: ignore[arg-type]
+    assert stop_target(path, GivenPlace(**given), NOTHING) == CanTarget("socketcan", "can0", None, 7)  # type: ignore[arg-type]
     for left_out in given:
         less: Any = {key: value for key, value in given.items() if key != left_out}
         with pytest.raises(ConfigurationError, match=f"cannot be read.*{left_out} is missing"):
-            stop_target(path, GivenTarget(**less), NOTHING)
+            stop_target(path, GivenPlace(**less), NOTHING)
 
 
 def test_flag_beats_environment_beats_file(tmp_path: Path) -> None:
-    path = changed(tmp_path, "virtual")
+    path = edited_file(tmp_path)
     environ = {"CAN_INTERFACE": "slcan", "CAN_CHANNEL": "/dev/ttyACM0", "CAN_BITRATE": "250000"}
     assert stop_target(path, environ=environ) == CanTarget("slcan", "/dev/ttyACM0", 250_000, 1)
-    assert stop_target(path, GivenTarget(channel="x", bitrate=125_000), environ) == CanTarget("slcan", "x", 125_000, 1)
+    assert stop_target(path, GivenPlace(channel="x", bitrate=125_000), environ) == CanTarget("slcan", "x", 125_000, 1)
     file_rate = load_config(path).bus.bitrate_bitps
     assert stop_target(path, environ={**environ, "CAN_BITRATE": "fast"}) == CanTarget(
         "slcan", "/dev/ttyACM0", file_rate, 1
@@ -97,7 +92,7 @@ def test_flag_beats_environment_beats_file(tmp_path: Path) -> None:
 
 
 def test_an_encoder_node_is_told_as_well(tmp_path: Path) -> None:
-    path = changed(tmp_path, "virtual", ("[joint]", '[joint_encoder]\nsource = "node"\nnode = 2\n\n[joint]'))
+    path = edited_file(tmp_path, ("[joint]", '[joint_encoder]\nsource = "node"\nnode = 2\n\n[joint]'))
     target = stop_target(path, environ=NOTHING)
     assert isinstance(target, CanTarget)
     assert target.encoder_node == 2
@@ -106,10 +101,10 @@ def test_an_encoder_node_is_told_as_well(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("base", "given", "words"),
     [
-        ("elmo_serial", GivenTarget(channel="can0"), "the drive is on a serial port: use -p"),
-        ("virtual", GivenTarget(port="/dev/ttyUSB7"), r"drive.kind \(=canopen\) must be \"elmo_serial\""),
+        ("elmo_serial", GivenPlace(channel="can0"), "the drive is on a serial port: use -p"),
+        ("virtual", GivenPlace(port="/dev/ttyUSB7"), r"drive.kind \(=canopen\) must be \"elmo_serial\""),
     ],
 )
-def test_options_of_the_other_kind_are_refused(tmp_path: Path, base: str, given: GivenTarget, words: str) -> None:
+def test_options_of_the_other_kind_are_refused(tmp_path: Path, base: str, given: GivenPlace, words: str) -> None:
     with pytest.raises(ConfigurationError, match=words):
-        stop_target(changed(tmp_path, base), given, NOTHING)
+        stop_target(edited_file(tmp_path, base=base), given, NOTHING)

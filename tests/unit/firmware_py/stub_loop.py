@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numba.core import types
 
+from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Exchange, Word
 from jointctl.firmware_py.kernel import exported, record_array_type
 from jointctl.firmware_py.libc import monotonic_ns, store_release
-from jointctl.firmware_py.realtime import HISTOGRAM_BINS, WORDS, Word, run_loop
+from jointctl.firmware_py.realtime import run_loop
 from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.sequence import reset_axis
@@ -25,24 +26,30 @@ CYCLE, BUSY_CYCLE, BUSY_ns, STOP_CYCLE, STOP, REQUEST, SENT, HEARD_AT_ns, LATEST
 
 ANSWER_ns = 9
 STUB_WORDS = 10
-_I64 = types.Array(types.int64, 1, "C")
+
+
+# Words of the stub drive, words of the loop, scratch; a plain tuple: compiled callers are cached under its type, which
+# a program that shares the cache must be able to load.
+StubLink = tuple[np.ndarray, np.ndarray, np.ndarray]
+_LINK = types.UniTuple(types.Array(types.int64, 1, "C"), 3)
 _SAMPLES = record_array_type(dtype_of(Sample))
 _COMMANDS = record_array_type(dtype_of(Command))
 
 
-@exported(types.int64(_I64, _I64, _I64, _SAMPLES, types.int64, types.int64))
-def stub_receive(stub: Any, words: Any, scratch: Any, samples: Any, now_ns: int, deadline_ns: int) -> int:
+@exported(types.int64(_LINK, _SAMPLES, types.int64, types.int64))
+def stub_receive(link: StubLink, samples: Any, now_ns: int, until_ns: int) -> int:
     """A drive that obeys at once; busy for a while in one cycle, writes the stop word in another."""
+    stub = link[0]
     cycle = stub[CYCLE]
     stub[CYCLE] += 1
     stub[HEARD_AT_ns] = now_ns
-    stub[LATEST_ns] = deadline_ns
+    stub[LATEST_ns] = until_ns
     if cycle == stub[BUSY_CYCLE]:
-        end_ns = monotonic_ns(scratch) + stub[BUSY_ns]
-        while monotonic_ns(scratch) < end_ns:
+        end_ns = monotonic_ns(link[2]) + stub[BUSY_ns]
+        while monotonic_ns(link[2]) < end_ns:
             pass
     if cycle == stub[STOP_CYCLE]:
-        store_release(words, Word.STOP, stub[STOP])
+        store_release(link[1], Word.STOP, stub[STOP])
     sample = samples[0]
     sample.count += 1
     sample.time_ns = now_ns + stub[ANSWER_ns] if stub[ANSWER_ns] != 0 else 0
@@ -50,10 +57,10 @@ def stub_receive(stub: Any, words: Any, scratch: Any, samples: Any, now_ns: int,
     return np.int64(1500)  # type: ignore[return-value]
 
 
-@exported(types.int32(_I64, _I64, _SAMPLES, _COMMANDS))
-def stub_send(stub: Any, words: Any, samples: Any, commands: Any) -> int:
-    stub[REQUEST] = commands[0].request
-    stub[SENT] += 1
+@exported(types.int32(_LINK, _SAMPLES, _COMMANDS))
+def stub_send(link: StubLink, samples: Any, commands: Any) -> int:
+    link[0][REQUEST] = commands[0].request
+    link[0][SENT] += 1
     return np.int32(0)  # type: ignore[return-value]
 
 
@@ -80,11 +87,12 @@ class Loop:
         self.period_ns = period_ns
         self.words[Word.SUPERVISOR_NS] = time.monotonic_ns()
 
-    def run(self, cycles: int, receive_ns: int = 0) -> int:
-        return int(
-            run_loop(
-                stub_receive, stub_send, self.stub, self.words, np.zeros(2, np.int64), self.constants, self.state,
-                np.zeros((1, 5)), self.sample, self.command, self.words, self.ring, self.histograms,
-                np.zeros(2, np.int64), self.period_ns, receive_ns, cycles,
-            )
+    def memory(self) -> CycleMemory:
+        return CycleMemory(
+            self.constants, self.state, np.zeros((1, 1, 5)), self.sample, self.command, self.words, self.ring,
+            self.histograms, np.zeros(2, np.int64),
         )  # fmt: skip
+
+    def run(self, cycles: int, receive_ns: int = 0) -> int:
+        exchange = Exchange(stub_receive, stub_send, (self.stub, self.words, np.zeros(2, np.int64)))
+        return int(run_loop(self.memory(), exchange, self.period_ns, receive_ns, cycles))

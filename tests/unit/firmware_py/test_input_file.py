@@ -40,19 +40,13 @@ def odd(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("fifo", "is a FIFO, not a regular file"),
-        ("folder", "is a folder"),
-        ("to_zero", "is a device, not a regular file"),
-        ("/dev/full", "is a device, not a regular file"),
-        ("socket", "is a socket, not a regular file"),
-        ("dangling", "No such file"),
-        ("loop", "symbolic links"),
-        ("a" * 5000, "too long"),
-        ("a\0b", "is no name of a file"),
-        ("a\ud800b", "is no name of a file"),
+        ("fifo", "is a FIFO, not a regular file"), ("folder", "is a folder"),
+        ("to_zero", "is a device, not a regular file"), ("/dev/full", "is a device, not a regular file"),
+        ("socket", "is a socket, not a regular file"), ("dangling", "No such file"), ("loop", "symbolic links"),
+        ("a" * 5000, "too long"), ("a\0b", "is no name of a file"), ("a\ud800b", "is no name of a file"),
     ],
     ids=lambda text: ascii(text)[:20],
-)
+)  # fmt: skip
 def test_what_is_no_file_is_refused_at_once(odd: Path, name: str, words: str) -> None:
     for refused in (read_input, require_input):
         with pytest.raises(OSError, match=r".") as raised:
@@ -90,8 +84,7 @@ def test_a_link_to_a_file_is_a_file_and_nothing_stays_open(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["1_0", "1_000.5", "٣", "\uff11", "nan", "inf", "-Infinity", "1e", "", " ", ".", "0x10", "1 0", "1\n"],
+    "text", ["1_0", "1_000.5", "٣", "\uff11", "nan", "inf", "-Infinity", "1e", "", " ", ".", "0x10", "1 0", "1\n"]
 )
 def test_what_python_takes_for_a_number_and_csv_does_not(text: str) -> None:
     with pytest.raises(ValueError, match="is not a number"):
@@ -112,15 +105,11 @@ def test_every_number_that_is_written_is_read(value: float) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "a = " + "[" * 20_000 + "]" * 20_000,
-        "a = " + "{a=" * 20_000 + "1" + "}" * 20_000,
-        ".".join("a" * 20_000) + " = 1",
-        f"[{'.'.join('a' * 20_000)}]",
-        "a = " + "9" * 5_000,
-        "a = 0x" + "f" * 5_000,
+        "a = " + "[" * 20_000 + "]" * 20_000, "a = " + "{a=" * 20_000 + "1" + "}" * 20_000,
+        ".".join("a" * 20_000) + " = 1", f"[{'.'.join('a' * 20_000)}]", "a = " + "9" * 5_000, "a = 0x" + "f" * 5_000,
     ],
     ids=["lists", "tables", "dotted key", "dotted section", "digits", "hexadecimal digits"],
-)
+)  # fmt: skip
 def test_toml_of_any_depth_and_length_is_an_error_of_toml(text: str) -> None:
     with pytest.raises(tomllib.TOMLDecodeError, match="too"):
         parse_toml(text)

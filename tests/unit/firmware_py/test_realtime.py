@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointctl.firmware_py.realtime import HISTOGRAM_BINS, Histogram, Word, count
+from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram, Word, count
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault
 from tests.unit.firmware_py.stub_loop import (
     BUSY_CYCLE,
@@ -189,18 +189,18 @@ ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
 ours.setblocking(False)
 
 def driver_run(cycles):
-    from jointctl.drivers.canopen.exchange import exchange_memory, receive, send
+    from jointctl.drivers.canopen.exchange import link_of, receive, send
     from jointctl.drivers.canopen.cyclic import CanopenPort
+    from jointctl.firmware_py.cycle import Exchange
     from jointctl.firmware_py.schema import new
     from jointctl.firmware_py.realtime import run_loop
-    global port, frames, scratch
-    if "port" not in globals():
+    global link, memory
+    if "link" not in globals():
         port = new(CanopenPort)
         port[0].fd, port[0].heartbeat_cycles, port[0].tpdo_length = ours.fileno(), 3, 8
         port[0].torque_Nmppermille = 0.06
-        frames, scratch = exchange_memory()
-    return run_loop(receive, send, port, frames, scratch, loop.constants, loop.state, np.zeros((1, 5)), loop.sample,
-                    loop.command, loop.words, loop.ring, loop.histograms, np.zeros(2, np.int64), 10_000, 0, cycles)
+        link, memory = link_of(port), loop.memory()
+    return run_loop(memory, Exchange(receive, send, link), 10_000, 0, cycles)
 
 run = {"stub": stub_run, "driver": driver_run}[sys.argv[1]]
 

@@ -36,13 +36,9 @@ def test_layout_is_that_of_a_c_structure() -> None:
 
     class COuter(ctypes.Structure):
         _fields_ = (
-            ("small", ctypes.c_uint8),
-            ("wide", ctypes.c_int64),
-            ("inner", CInner),
-            ("pairs", ctypes.c_double * 6),
-            ("inners", CInner * 2),
-            ("last", ctypes.c_int16),
-        )
+            ("small", ctypes.c_uint8), ("wide", ctypes.c_int64), ("inner", CInner), ("pairs", ctypes.c_double * 6),
+            ("inners", CInner * 2), ("last", ctypes.c_int16),
+        )  # fmt: skip
 
     dtype = dtype_of(Outer)
     assert dtype.itemsize == ctypes.sizeof(COuter)

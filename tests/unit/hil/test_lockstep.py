@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from typing import Any
 
@@ -10,17 +9,18 @@ import can
 import numpy as np
 import pytest
 
-from jointctl.drivers.canopen.exchange import accept, begin, end, exchange_memory
 from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Word
 from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault
 from jointctl.hil.bus.virtual_bus import FrameQueue
-from jointctl.hil.lockstep import RECEIVED_SLOT, RPDO_SLOT, run_lockstep
-from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.simulation.lockstep import DirectBus, LockstepJoint
+from jointctl.hil.faults.kinds import fault_memory, no_faults
+from jointctl.hil.lockstep import RECEIVED_SLOT, RPDO_SLOT, Scenario, World, run_lockstep
+from jointctl.tools.simulation.lockstep import DirectBus, LockstepJoint, codec_of
 from jointctl.tools.simulation.virtual_joint import new_device
+from tests.configurations import shipped
 from tests.sessions import constants_of
 
 PERIOD_ns = 1_000_000
@@ -29,38 +29,41 @@ PERIOD_ns = 1_000_000
 class Lockstep:
     """The virtual joint after commissioning, and everything that `run_lockstep` works on."""
 
-    def __init__(self, bus: Any, settings: CanopenSettings, config: Any) -> None:
-        drive = bus.drive(settings)
-        try:
+    def __init__(self, bus: Any, config: Any, **changes: Any) -> None:
+        with bus.opened(**changes) as drive:
             report = drive.commission()
             drive.start_cyclic()
             drive._objects.read(0x1000, what="device type")  # answered after the NMT command was taken
             self.port = drive.port()
-        finally:
-            drive.close()
         bus.stop()
         self.device = bus.device
         self.start_ns = (bus.now_ns // PERIOD_ns + 1) * PERIOD_ns
         self.constants = constants_of(config, start_position_rad=report.start_position_rad)
         self.state, self.sample, self.command = new(AxisState), new(Sample), new(Command)
         reset_axis(self.constants[0], self.state[0])
-        self.frames, _ = exchange_memory()
+        self.codec = codec_of(self.port)
         self.log = new(LogRecord, 20_000)
 
     def run(self, cycles: int, stop_cycle: int = -1, log_every: int = 1) -> Any:
-        """The log records of up to `cycles` cycles."""
-        device = self.device
-        written, _ = run_lockstep(
-            begin, accept, end, self.port, self.frames, self.frames.view(np.uint8).reshape(-1, 16), self.constants,
-            self.state, np.zeros((1, 5)), self.sample, self.command, device.device, device.plant_constants,
-            device.plant_state, new(FrameQueue), self.log, log_every, self.start_ns, PERIOD_ns, cycles, stop_cycle,
+        """The log records of up to `cycles` cycles; `self.words` as they are at the end."""
+        device, self.words = self.device, np.zeros(WORDS, np.int64)
+        memory = CycleMemory(
+            self.constants, self.state, np.zeros((1, 1, 5)), self.sample, self.command, self.words, self.log,
+            np.zeros((3, HISTOGRAM_BINS), np.int64), np.zeros(2, np.int64),
         )  # fmt: skip
+        world = World(
+            device.device, device.plant_constants, device.plant_state, new(FrameQueue), no_faults(),
+            fault_memory(no_faults()),
+        )  # fmt: skip
+        scenario = Scenario(self.start_ns, PERIOD_ns, cycles, stop_cycle, log_every=log_every)
+        written, _ = run_lockstep(memory, self.codec, world, scenario)
+        assert written == self.words[Word.HEAD]
         return self.log[:written]
 
 
 @pytest.fixture
-def lockstep(device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, virtual_config: Any) -> Lockstep:
-    return Lockstep(device_on_bus, settings_of_virtual_joint, virtual_config)
+def lockstep(joint: Any, virtual_config: Any) -> Lockstep:
+    return Lockstep(joint, virtual_config)
 
 
 def test_slots_agree_with_the_driver() -> None:
@@ -114,7 +117,8 @@ def test_log_every_and_room(lockstep: Lockstep) -> None:
     assert np.all(np.diff(log.time_ns) == 10 * PERIOD_ns)
     lockstep.log = new(LogRecord, 3)
     lockstep.start_ns += 1000 * PERIOD_ns
-    assert len(lockstep.run(100)) == 3
+    lockstep.run(100)  # record k is at k % 3, as in the loop's ring
+    assert list((lockstep.log.time_ns - lockstep.start_ns) // PERIOD_ns) == [99, 97, 98]
     lockstep.start_ns += 100 * PERIOD_ns
     assert len(lockstep.run(100, log_every=0)) == 0
 
@@ -125,8 +129,8 @@ def test_bit_identical_on_repeat(
     """The same state of everything, run twice."""
     device = lockstep.device
     memory = (
-        device.device, device.plant_constants, device.plant_state, lockstep.port, lockstep.frames, lockstep.state,
-        lockstep.sample, lockstep.command,
+        device.device, device.plant_constants, device.plant_state, lockstep.port, lockstep.codec.link.frames,
+        lockstep.state, lockstep.sample, lockstep.command,
     )  # fmt: skip
     saved = [array.copy() for array in memory]
     first = lockstep.run(4000).tobytes()
@@ -144,11 +148,8 @@ def test_a_drive_that_is_not_operational_ends_the_run_without_power(lockstep: Lo
     assert np.all(lockstep.log.request == DriveRequest.OFF)
 
 
-def test_a_wrong_direction_of_the_torque_is_caught(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, virtual_config: Any
-) -> None:
-    settings = dataclasses.replace(settings_of_virtual_joint, torque_direction=-1)
-    run = Lockstep(device_on_bus, settings, virtual_config)
+def test_a_wrong_direction_of_the_torque_is_caught(joint: Any, virtual_config: Any) -> None:
+    run = Lockstep(joint, virtual_config, torque_direction=-1)
     log = run.run(20_000)
     assert run.state[0].phase == AxisPhase.FINISHED
     assert run.state[0].fault in (Fault.FOLLOWING_ERROR, Fault.VELOCITY_LIMIT, Fault.TORQUE_SATURATED)
@@ -157,14 +158,10 @@ def test_a_wrong_direction_of_the_torque_is_caught(
 
 def test_a_motor_that_turns_the_other_way_can_be_tried() -> None:
     """The virtual drive is mounted as the configuration says: every figure of the joint is the same, to the bit."""
-    config = load_config(shipped_config("virtual"))
-    trajectory = config.trajectory.model_copy(update={"duration_s": 2.0})
     logs = {}
     for torque, encoder in ((1, 1), (-1, 1), (1, -1), (-1, -1)):
-        drive = config.drive.model_copy(update={"torque_direction": torque})
-        sensor = config.encoder.model_copy(update={"direction": encoder})
-        turned = config.model_copy(update={"drive": drive, "encoder": sensor, "trajectory": trajectory})
-        run = LockstepJoint(turned).run()
+        turned = {"drive__torque_direction": torque, "encoder__direction": encoder}
+        run = LockstepJoint(shipped(trajectory__duration_s=2.0, **turned)).run()
         assert run.fault is Fault.NONE
         logs[torque, encoder] = run.log
     for key, log in logs.items():

@@ -1,26 +1,31 @@
-"""The verb identify: what it writes, what it leaves alone, what it says."""
+"""The verbs identify and validate: what they write, what they leave alone, what they say."""
+
+from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tomlkit
 
-from jointctl.drivers.errors import ConfigurationError, DataError
+from jointctl.drivers.errors import ConfigurationError, DataError, UsageError
 from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
 from jointctl.tools.configuration.conversions import friction_constants
-from jointctl.tools.configuration.load import load_config
+from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.identification import identification
 from jointctl.tools.identification.friction_data import ForeignFormat
 from jointctl.tools.identification.identification import Options
 from jointctl.tools.identification.identification_report import MARK, snippet, with_section
 from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.verbs.identify import identify
+from jointctl.tools.verbs.validate import validate
 from tests.page_figures import foreign_colours, svgs
-from tests.unit.identification.sweep_files import output, write_sweep
+from tests.unit.identification.synthetic_friction import output, write_sweep
 
+# --- The verb identify: what it writes, what it leaves alone, what it says ---
 QUICK = Options(folds=3, swarm=SwarmSettings(particles=80, iterations=120))
 VALUES = {
     "velocity_unit": "deg/s", "velocity_side": "joint", "torque_side": "motor",
@@ -38,6 +43,13 @@ def sweep(tmp_path):
 
 def contents(folder):
     return {p.name: p.read_bytes() for p in folder.iterdir()}
+
+
+@pytest.fixture
+def config(tmp_path):
+    path = tmp_path / "joint.toml"
+    shutil.copy(shipped_config("virtual"), path)
+    return path
 
 
 def test_the_report_of_an_identification_holds_tables_pictures_and_section(sweep):
@@ -187,7 +199,8 @@ def test_nothing_is_written_after_an_error(sweep, config, spoil, error):
 
 def test_a_result_that_the_configuration_refuses_leaves_it_alone(sweep, config, monkeypatch):
     monkeypatch.setattr(
-        "jointctl.tools.verbs.identify.section_values", lambda p, n: {**VALUES, "velocity_unit": "furlong"}
+        "jointctl.tools.identification.identification_report.section_values",
+        lambda p, n: {**VALUES, "velocity_unit": "furlong"},
     )
     before = contents(sweep.parent)
     with pytest.raises(ConfigurationError, match=r"joint.toml: friction.velocity_unit \(=furlong\)") as caught:
@@ -248,6 +261,45 @@ def test_other_peoples_table_gives_the_same_model_as_our_own(sweep, tmp_path):
                                           zip(speed_rpm, rows["current_A"], strict=True)))  # fmt: skip
     told = ForeignFormat(velocity_column="rpm", current_column="A", velocity_unit="r/min", side="motor", ratio=121.0,
                          torque_constant_NmpA=0.1)  # fmt: skip
-    identify(theirs, output(), out=tmp_path / "theirs.toml", told=told, options=QUICK)
+    identify(theirs, output(), out=tmp_path / "theirs.toml", given=told, options=QUICK)
     ours, other = (tomlkit.parse((tmp_path / f"{n}.toml").read_text()).unwrap()["friction"] for n in ("ours", "theirs"))
     assert other["positive"] == pytest.approx(ours["positive"], rel=1e-3, abs=1e-10)
+
+
+# --- The verb validate: the error of a model on other data, and friction that has grown ---
+def test_validate_reports_the_error_on_other_data(config, tmp_path):
+    other = write_sweep(tmp_path / "other.csv", seed=9)
+    out = output(json=True)
+    assert validate(config, other, out) == 0
+    result = json.loads(out.stdout.getvalue())
+    assert result["rmse_Nm"] == pytest.approx(0.0046, rel=0.12)
+    assert result["points"] == 224
+    assert Path(result["picture"]).read_bytes().startswith(b"\x89PNG")
+
+
+def test_validate_shows_a_joint_whose_friction_has_grown(config, tmp_path):
+    out = output(json=True)
+    validate(config, write_sweep(tmp_path / "other.csv", factor=1.1, noise_Nm=0.0), out)
+    result = json.loads(out.stdout.getvalue())
+    assert result["relative_rmse"] == pytest.approx(0.1 / 1.1, rel=1e-3)
+    assert result["max_error_Nm"] == pytest.approx(0.035398, rel=1e-3)
+
+
+def test_validate_needs_friction_and_believable_data(config, tmp_path):
+    with pytest.raises(DataError, match="does not oppose the motion"):
+        validate(config, write_sweep(tmp_path / "wrong.csv", factor=-1.0), output())
+    assert not (tmp_path / "wrong.validation.png").exists()
+    good = write_sweep(tmp_path / "data named.png")
+    with pytest.raises(DataError, match="is an input"):
+        validate(config, good, output(), figure=good)
+    with pytest.raises(UsageError, match=r"x\.jpg\) must end in \.png"):
+        validate(config, good, output(), figure=tmp_path / "x.jpg")
+
+
+def test_validate_takes_data_of_one_direction(config, tmp_path):
+    path = write_sweep(tmp_path / "half.csv")
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([lines[0], *lines[113:]]) + "\n")
+    out = output(json=True)
+    assert validate(config, path, out) == 0
+    assert json.loads(out.stdout.getvalue())["points"] == 112

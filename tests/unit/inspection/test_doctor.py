@@ -1,10 +1,12 @@
-"""`jointctl doctor` on a bus: what it finds, what it says about it, and that it only ever reads."""
+"""`jointctl doctor`: what it finds on a bus and about the computer, and that it only ever reads."""
 
 from __future__ import annotations
 
 import io
 import json
+import os
 import struct
+import subprocess
 from collections import deque
 from pathlib import Path
 from typing import Any
@@ -28,14 +30,27 @@ from jointctl.tools.inspection.health import (
     bus_budget,
     drive_finding,
     interface_state,
+    kernel_cache,
+    kernel_findings,
     sdo_round_trips_us,
+    wake_up,
 )
 from jointctl.tools.output import Output
+from jointctl.tools.session import loops as start_time
 from jointctl.tools.verbs import doctor as doctor_module
 from jointctl.tools.verbs.doctor import doctor, findings
-from tests.unit.inspection.system_files import write
+from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
 
 
+# --- A folder with files as /sys and /proc have them ---
+def write(root: Path, name: str, text: str) -> None:
+    path = root / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+# --- `jointctl doctor`: what it finds on a bus and about the computer, and that it only ever reads ---
+# --- `jointctl doctor` on a bus: what it finds, what it says about it, and that it only ever reads ---
 @pytest.fixture(scope="module")
 def config() -> Config:
     return load_config(shipped_config("virtual"))
@@ -168,13 +183,13 @@ class TestBus:
         monkeypatch.setattr(health, "link_state", lambda name: parse_link(link))
         told = list(interface_state(changed(config, interface="socketcan", channel="can0")))
         assert [(finding.topic, finding.status) for finding in told] == found
-        assert all(finding.cure for finding in told if finding.status != OK)
+        assert all(finding.remedy for finding in told if finding.status != OK)
         assert list(interface_state(config)) == []  # another kind of bus
 
     def test_a_missing_interface(self, config: Config) -> None:
         (found,) = interface_state(changed(config, interface="socketcan", channel="jc_none0"))
         assert found.status == PROBLEM
-        assert "ip link set jc_none0 up" in found.cure
+        assert "ip link set jc_none0 up" in found.remedy
 
     @pytest.mark.parametrize(("rate_Hz", "status"), [(100.0, OK), (4000.0, NOTE)])
     def test_a_slow_answer_limits_the_rate(
@@ -203,12 +218,12 @@ class TestReport:
         assert "Python" in stderr
 
     def test_json(self, config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-        found = [Finding("x", PROBLEM, "bad", "cure", {"p50_us": np.float64(1.5)})]
+        found = [Finding("x", PROBLEM, "bad", "remedy", {"p50_us": np.float64(1.5)})]
         code, stdout, stderr = self.report(config, found, monkeypatch, json=True, quiet=True)
         data = json.loads(stdout)
         assert (code, stderr, data["healthy"]) == (1, "", False)
         assert data["findings"] == [
-            {"topic": "x", "status": "problem", "text": "bad", "cure": "cure", "numbers": {"p50_us": 1.5}}
+            {"topic": "x", "status": "problem", "text": "bad", "remedy": "remedy", "numbers": {"p50_us": 1.5}}
         ]
 
     def test_on_this_computer(self, config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -219,4 +234,157 @@ class TestReport:
         assert len(set(topics)) == len(topics) >= 15
         assert {"Python", "SCHED_FIFO", "memory lock", "timer slack", "bus budget", "drive"} <= set(topics)
         assert all(f.text for f in found)
-        assert all(f.cure for f in found if f.status == PROBLEM)
+        assert all(f.remedy for f in found if f.status == PROBLEM)
+
+
+# --- What `jointctl doctor` finds out about the computer: scheduling, wake-ups, the compile cache ---
+class TestComputer:
+    @pytest.mark.parametrize(("text", "status"), [("1\n", OK), ("0\n", NOTE), (None, NOTE)])
+    def test_preempt_rt(self, tmp_path: Path, text: str | None, status: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(health.platform, "version", lambda: "#1 SMP PREEMPT_DYNAMIC")
+        if text is not None:
+            write(tmp_path, "sys/kernel/realtime", text)
+        kernel = next(kernel_findings(tmp_path))
+        assert kernel.status == status
+        assert ("not PREEMPT_RT" in kernel.text) == (status == NOTE)
+        assert bool(kernel.remedy) == (status == NOTE)
+
+    @pytest.mark.parametrize(
+        ("version", "options", "advised"),
+        [
+            ("#1 SMP PREEMPT_DYNAMIC Debian", "quiet preempt=voluntary", True),
+            ("#1 SMP PREEMPT_DYNAMIC Debian", "quiet preempt=full", False),
+            ("#1 SMP Debian", "quiet", False),  # could not
+        ],
+    )
+    def test_full_preemption_is_advised_where_the_kernel_can(
+        self, tmp_path: Path, version: str, options: str, advised: bool, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(health.platform, "version", lambda: version)
+        write(tmp_path, "proc/cmdline", options + "\n")
+        kernel = next(kernel_findings(tmp_path))
+        assert ("preempt=full" in kernel.remedy) is advised
+        assert ("preempt=full" in kernel.text) is ("preempt=full" in options)
+
+    @pytest.mark.parametrize(("clock", "status"), [("tsc", OK), ("hpet", NOTE), ("acpi_pm", NOTE)])
+    def test_clock_source(self, tmp_path: Path, clock: str, status: str) -> None:
+        write(tmp_path, "sys/devices/system/clocksource/clocksource0/current_clocksource", clock + "\n")
+        found = {f.topic: f for f in kernel_findings(tmp_path)}["clock source"]
+        assert (found.status, found.text, bool(found.remedy)) == (status, clock, status == NOTE)
+
+    @pytest.mark.parametrize(
+        ("governors", "status"), [([], OK), (["performance"] * 2, OK), (["performance", "powersave"], NOTE)]
+    )
+    def test_governor(self, tmp_path: Path, governors: list[str], status: str) -> None:
+        for core, governor in enumerate(governors):
+            write(tmp_path, f"sys/devices/system/cpu/cpu{core}/cpufreq/scaling_governor", governor)
+        found = {f.topic: f for f in kernel_findings(tmp_path)}["CPU governor"]
+        assert found.status == status
+        assert ("cpupower" in found.remedy) == (status == NOTE)
+
+    def test_fifo_is_left_again(self) -> None:
+        before = os.sched_getscheduler(0)
+        with fifo(1) as refused:
+            assert refused or os.sched_getscheduler(0) == os.SCHED_FIFO
+        assert os.sched_getscheduler(0) == before
+
+    def test_a_refused_priority_is_told_and_not_raised(self) -> None:
+        with fifo(1000) as refused:
+            assert refused
+
+
+class TestWakeUp:
+    def test_one_value_a_cycle_and_none_early(self) -> None:
+        late_ns = wake_up_lateness_ns(1000.0, 20)
+        assert late_ns.shape == (20,)
+        assert (late_ns >= 0).all()
+
+    @pytest.mark.parametrize(("rate_Hz", "cycles"), [(0.0, 1), (-1.0, 1), (float("nan"), 1), (1000.0, 0)])
+    def test_bad_input(self, rate_Hz: float, cycles: int) -> None:
+        with pytest.raises(ValueError, match=r"\(=.*\) must be"):
+            wake_up_lateness_ns(rate_Hz, cycles)
+
+    @pytest.mark.parametrize(("worst_us", "status"), [(499, OK), (500, OK), (501, NOTE), (3000, NOTE)])
+    def test_the_worst_decides(
+        self, virtual_config: Config, worst_us: int, status: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        late = np.array([10_000] * 99 + [worst_us * 1000])
+        monkeypatch.setattr(health, "wake_up_lateness_ns", lambda rate, cycles: late)
+        found = next(wake_up(virtual_config, 100))
+        assert found.status == status
+        assert (found.numbers["p50_us"], found.numbers["max_us"]) == (10.0, worst_us)
+        assert bool(found.remedy) == (status == NOTE)
+
+
+class TestCache:
+    def test_no_folder(self) -> None:
+        (found,) = kernel_cache(None, False)
+        assert found.status == PROBLEM
+        assert "JOINTCTL_CACHE_DIR" in found.remedy
+
+    def test_cold_is_not_started_unless_asked(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        started: list[Path | None] = []
+        monkeypatch.setattr(health, "start_time_s", lambda cache: float(not started.append(cache)))
+        (found,) = kernel_cache(tmp_path, False)
+        assert (found.status, found.numbers["warm"], started) == (NOTE, False, [])
+        write(tmp_path, "firmware_py_1/realtime.run_loop-86.py311.1.nbc", "12345678")
+        found, warm = kernel_cache(tmp_path, False)
+        assert (found.status, found.numbers) == (OK, {"files": 1, "bytes": 8, "warm": True})
+        assert (warm.topic, warm.numbers, started) == ("warm start", {"start_s": 1.0}, [None])
+        assert [f.topic for f in kernel_cache(tmp_path, True)] == ["kernel cache", "warm start", "cold start"]
+        assert isinstance(started[-1], Path)
+        assert started[-1] != tmp_path
+        found = list(kernel_cache(tmp_path / "firmware_py_2", True))
+        assert [f.topic for f in found] == ["kernel cache", "cold start", "warm start"]
+        assert started[-1] == started[-2]  # warm, because the cold start has just filled it
+
+    def test_a_start_that_fails_is_a_problem(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def failing(cache: Path | None) -> float:
+            raise subprocess.CalledProcessError(1, "python", stderr=b"Traceback\nImportError: no numba\n")
+
+        monkeypatch.setattr(health, "start_time_s", failing)
+        write(tmp_path, "x/realtime.run_loop-86.py311.1.nbc", "1")
+        assert list(kernel_cache(tmp_path, False))[1].text == "the loop cannot be started: ImportError: no numba"
+
+    def test_the_probe_gets_the_other_cache(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        calls: list[dict[str, Any]] = []
+        monkeypatch.setattr(start_time.subprocess, "run", lambda command, **rest: calls.append(rest))
+        monkeypatch.setenv("JOINTCTL_CACHE_DIR", "unchanged")
+        assert start_time.start_time_s() >= 0.0
+        assert start_time.start_time_s(tmp_path) >= 0.0
+        assert [call["env"]["JOINTCTL_CACHE_DIR"] for call in calls] == ["unchanged", str(tmp_path)]
+        assert calls[0]["check"]
+
+
+# Cores are kept awake only while the block lasts; without the right, the refusal is told and nothing else happens.
+def open_files() -> set[str]:
+    return {
+        os.readlink(f"/proc/self/fd/{fd}")
+        for fd in os.listdir("/proc/self/fd")
+        if os.path.exists(f"/proc/self/fd/{fd}")
+    }
+
+
+def test_zero_latency_is_asked_for_and_held(tmp_path: Path) -> None:
+    device = tmp_path / "latency"
+    device.touch()
+    with cores_awake(device) as refused:
+        assert refused == ""
+        assert device.read_bytes() == b"\0\0\0\0"
+        assert str(device) in open_files()
+    assert str(device) not in open_files()
+
+
+def test_it_is_given_back_when_the_block_fails(tmp_path: Path) -> None:
+    device = tmp_path / "latency"
+    device.touch()
+    with pytest.raises(RuntimeError), cores_awake(device):
+        raise RuntimeError
+    assert str(device) not in open_files()
+
+
+def test_a_refusal_is_told(tmp_path: Path) -> None:
+    with cores_awake(tmp_path / "absent") as refused:
+        assert refused == f"{tmp_path / 'absent'}: No such file or directory"
+    with cores_awake(Path("/dev/full")) as refused:
+        assert refused == "/dev/full: No space left on device"

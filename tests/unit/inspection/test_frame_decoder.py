@@ -31,20 +31,14 @@ def decoder() -> FrameDecoder:
     ("cob_id", "data", "kind", "node", "text"),
     [
         (0x000, b"\x01\x05", "nmt", 5, "start (operational), node 5"),
-        (0x000, b"\x80\x00", "nmt", 0, "enter pre-operational, all nodes"),
-        (0x000, b"\x01", "nmt", 0, "malformed"),
-        (0x080, b"", "sync", 0, "SYNC"),
-        (0x080, b"\x07", "sync", 0, "SYNC 7"),
-        (0x100, bytes(6), "time", 0, "TIME"),
-        (0x705, b"\x00", "heartbeat", 5, "boot-up"),
-        (0x705, b"\x05", "heartbeat", 5, "operational"),
-        (0x705, b"\x7f", "heartbeat", 5, "pre-operational"),
-        (0x705, b"", "heartbeat", 5, "malformed: "),
-        (0x7E5, b"\x04\x01" + bytes(6), "lss", 0, "LSS request 04h"),
-        (0x7FF, b"", "other", 0, ""),
+        (0x000, b"\x80\x00", "nmt", 0, "enter pre-operational, all nodes"), (0x000, b"\x01", "nmt", 0, "malformed"),
+        (0x080, b"", "sync", 0, "SYNC"), (0x080, b"\x07", "sync", 0, "SYNC 7"), (0x100, bytes(6), "time", 0, "TIME"),
+        (0x705, b"\x00", "heartbeat", 5, "boot-up"), (0x705, b"\x05", "heartbeat", 5, "operational"),
+        (0x705, b"\x7f", "heartbeat", 5, "pre-operational"), (0x705, b"", "heartbeat", 5, "malformed: "),
+        (0x7E5, b"\x04\x01" + bytes(6), "lss", 0, "LSS request 04h"), (0x7FF, b"", "other", 0, ""),
         (0x680, b"", "other", 0, ""),
     ],
-)
+)  # fmt: skip
 def test_services(decoder: FrameDecoder, cob_id: int, data: bytes, kind: str, node: int, text: str) -> None:
     found = decoder.decode(frame(cob_id, data))
     assert (found.kind, found.node, found.text) == (kind, node, text)

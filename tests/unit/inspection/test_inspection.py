@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import re
 import threading
@@ -14,16 +13,20 @@ import pytest
 
 from jointctl.drivers.canopen.eds import standard_type
 from jointctl.drivers.errors import ConfigurationError, NoDeviceError
+from jointctl.tools.configuration.canopen import eds_path
+from jointctl.tools.configuration.drive_section import GivenPlace
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.inspection import node_scan
 from jointctl.tools.inspection.drive_info import drive_info, pdo_maps
 from jointctl.tools.inspection.node_scan import Ear
 from jointctl.tools.inspection.objects import Objects, standard_variable
 from jointctl.tools.inspection.subject import SdoReader, Subject, canopen_network, subject_of_config, subject_of_flags
-from jointctl.tools.output import Output
-from jointctl.tools.verbs.info import info
-from jointctl.tools.verbs.monitor import Selection, monitor, selection_of
+from jointctl.tools.verbs.bench_drive import MonitorOptions
+from jointctl.tools.verbs.info import node_info as info
+from jointctl.tools.verbs.monitor import Selection, selection_of
+from jointctl.tools.verbs.monitor import monitor_bus as monitor
 from jointctl.tools.verbs.scan import scan
+from tests.sessions import output
 
 SDO_READ = (0x40, 0x60, 0x70)  # initiate upload, upload segment with either toggle bit
 
@@ -37,48 +40,43 @@ def quick_scan(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(node_scan, "PACE_S", 0.0)
 
 
-def output(**how: Any) -> tuple[Output, io.StringIO, io.StringIO]:
-    out, err = io.StringIO(), io.StringIO()
-    return Output(stdout=out, stderr=err, **how), out, err
-
-
 def only_reads(device: Any) -> bool:
     return all(identifier & 0x780 == 0x600 and data[0] in SDO_READ for identifier, data in device.requests)
 
 
 @pytest.mark.usefixtures("quick_scan")
 class TestScan:
-    def test_finds_the_one_node(self, device_on_bus: Any) -> None:
+    def test_finds_the_one_node(self, joint: Any) -> None:
         told, out, _ = output(json=True)
-        assert scan(subject(device_on_bus, None), told, listen_s=0.0) == 0
+        assert scan(subject(joint, None), told, listen_s=0.0) == 0
         found = json.loads(out.getvalue())
         (node,) = found["nodes"]
         assert (node["node"], node["answers_sdo"], node["drive_state"]) == (1, True, "switch on disabled")
         assert node["name"] == "jointctl virtual joint"
         assert node["device_type"] == "00020192h, CiA 402 (drives)"
         assert found["controller_active"] is False
-        assert only_reads(device_on_bus)
-        assert {identifier for identifier, _ in device_on_bus.requests} == set(range(0x601, 0x680))
+        assert only_reads(joint)
+        assert {identifier for identifier, _ in joint.requests} == set(range(0x601, 0x680))
 
-    def test_asks_one_node_only_if_told_so(self, device_on_bus: Any) -> None:
+    def test_asks_one_node_only_if_told_so(self, joint: Any) -> None:
         told, out, _ = output()
-        assert scan(subject(device_on_bus, 1), told, listen_s=0.0) == 0
+        assert scan(subject(joint, 1), told, listen_s=0.0) == 0
         assert "jointctl virtual joint" in out.getvalue()
-        assert {identifier for identifier, _ in device_on_bus.requests} == {0x601}
+        assert {identifier for identifier, _ in joint.requests} == {0x601}
 
     @pytest.mark.parametrize("active", [True, False])
-    def test_beside_a_controller_its_heartbeat_is_explained(self, device_on_bus: Any, active: bool) -> None:
+    def test_beside_a_controller_its_heartbeat_is_explained(self, joint: Any, active: bool) -> None:
         told, _, err = output()
-        with can.Bus(interface="virtual", channel=device_on_bus.channel) as bus:
+        with can.Bus(interface="virtual", channel=joint.channel) as bus:
             identifier = 0x80 if active else 0x7E5
             sender = bus.send_periodic(can.Message(arbitration_id=identifier, is_extended_id=False), 0.01)
-            assert scan(subject(device_on_bus, 1), told, listen_s=0.3) == 0
+            assert scan(subject(joint, 1), told, listen_s=0.3) == 0
             sender.stop()
         assert ("may be the heartbeat of that controller" in err.getvalue()) is active
 
-    def test_passive_sends_nothing_and_hears_heartbeats(self, device_on_bus: Any) -> None:
+    def test_passive_sends_nothing_and_hears_heartbeats(self, joint: Any) -> None:
         def beat() -> None:
-            with can.Bus(interface="virtual", channel=device_on_bus.channel) as bus:
+            with can.Bus(interface="virtual", channel=joint.channel) as bus:
                 for _ in range(20):
                     bus.send(can.Message(arbitration_id=0x709, data=[4], is_extended_id=False))
                     time.sleep(0.02)
@@ -86,11 +84,11 @@ class TestScan:
         thread = threading.Thread(target=beat)
         thread.start()
         told, out, _ = output(json=True)
-        assert scan(subject(device_on_bus, None), told, listen_s=0.2, passive=True) == 0
+        assert scan(subject(joint, None), told, listen_s=0.2, passive=True) == 0
         thread.join()
         (node,) = json.loads(out.getvalue())["nodes"]
         assert (node["node"], node["nmt_state"], node["answers_sdo"]) == (9, "stopped", False)
-        assert {identifier for identifier, _ in device_on_bus.requests} == {0x709}
+        assert {identifier for identifier, _ in joint.requests} == {0x709}
 
     def test_nobody_there(self, empty_bus: Any) -> None:
         with pytest.raises(NoDeviceError, match="no frame came, no node answered") as caught:
@@ -126,10 +124,10 @@ class TestScan:
 
 
 class TestInfo:
-    def test_everything_by_name_and_nothing_written(self, device_on_bus: Any) -> None:
+    def test_everything_by_name_and_nothing_written(self, joint: Any) -> None:
         told, out, _ = output(json=True)
         config = load_config(shipped_config("virtual"))
-        assert info(subject(device_on_bus, eds=config.eds_path), told) == 0
+        assert info(subject(joint, eds=eds_path(config)), told) == 0
         found = json.loads(out.getvalue())
         assert found["identity"]["name"] == "jointctl virtual joint"
         assert found["state"]["drive_state"] == "switch on disabled"
@@ -142,45 +140,45 @@ class TestInfo:
         (tpdo,) = [row for row in found["pdos"] if row["pdo"] == "TPDO2"]
         assert (tpdo["cob_id"], tpdo["enabled"], tpdo["transmission"]) == ("281h", False, "every SYNC")
         assert tpdo["objects"][1] == "6064 Position actual value (32 bit)"
-        assert only_reads(device_on_bus)
+        assert only_reads(joint)
 
-    def test_without_an_eds_the_standard_names_do(self, device_on_bus: Any) -> None:
+    def test_without_an_eds_the_standard_names_do(self, joint: Any) -> None:
         told, out, _ = output()
-        assert info(subject(device_on_bus), told) == 0
+        assert info(subject(joint), told) == 0
         assert "Max torque" in out.getvalue()
         assert "6041 Statusword (16 bit)" in out.getvalue()
 
-    def test_the_heartbeats_that_it_watches(self, device_on_bus: Any) -> None:
-        device_on_bus.device.objects.store(0x1016, 1, (126 << 16 | 200).to_bytes(4, "little"))
+    def test_the_heartbeats_that_it_watches(self, joint: Any) -> None:
+        joint.device.objects.store(0x1016, 1, (126 << 16 | 200).to_bytes(4, "little"))
         told, out, _ = output()
-        assert info(subject(device_on_bus), told) == 0
+        assert info(subject(joint), told) == 0
         assert re.search(r"watched heartbeats +node 126, 200 ms", out.getvalue())
 
-    def test_the_error_history(self, device_on_bus: Any) -> None:
-        device_on_bus.stop()
-        device_on_bus.device.device[0].inject_fault_code = 0x2310
+    def test_the_error_history(self, joint: Any) -> None:
+        joint.stop()
+        joint.device.device[0].inject_fault_code = 0x2310
         for _ in range(20):
-            device_on_bus.now_ns += 1_000_000
-            device_on_bus.device.advance(device_on_bus.now_ns)
-        device_on_bus._ended.clear()
-        device_on_bus._thread = threading.Thread(target=device_on_bus._run, daemon=True)
-        device_on_bus._thread.start()
-        with canopen_network(subject(device_on_bus)) as network:
+            joint.now_ns += 1_000_000
+            joint.device.advance(joint.now_ns)
+        joint._ended.clear()
+        joint._thread = threading.Thread(target=joint._run, daemon=True)
+        joint._thread.start()
+        with canopen_network(subject(joint)) as network:
             found = drive_info(SdoReader(network, 1, Objects()))
         assert found["state"]["drive_state"] == "fault"
         assert found["errors"]["error_code"] == "2310h, continuous overcurrent"
         assert found["errors"]["history"][0].startswith("2310h, continuous overcurrent")
 
-    def test_a_silent_node(self, device_on_bus: Any) -> None:
+    def test_a_silent_node(self, joint: Any) -> None:
         with pytest.raises(NoDeviceError, match="node 7 does not answer"):
-            info(subject(device_on_bus, 7), output()[0])
+            info(subject(joint, 7), output()[0])
 
-    def test_no_node_is_named(self, device_on_bus: Any) -> None:
+    def test_no_node_is_named(self, joint: Any) -> None:
         with pytest.raises(ConfigurationError, match="which node"):
-            info(subject(device_on_bus, None), output()[0])
+            info(subject(joint, None), output()[0])
 
-    def test_an_absent_object_is_left_out(self, device_on_bus: Any) -> None:
-        with canopen_network(subject(device_on_bus)) as network:
+    def test_an_absent_object_is_left_out(self, joint: Any) -> None:
+        with canopen_network(subject(joint)) as network:
             reader = SdoReader(network, 1)
             assert reader.value(0x2345) is None
             refusal: Any = reader.upload(0x2345)
@@ -190,22 +188,22 @@ class TestInfo:
 
 
 class TestMonitor:
-    def test_listens_only(self, device_on_bus: Any) -> None:
+    def test_listens_only(self, joint: Any) -> None:
         told, out, err = output(json=True)
-        with can.Bus(interface="virtual", channel=device_on_bus.channel) as bus:
+        with can.Bus(interface="virtual", channel=joint.channel) as bus:
             sender = bus.send_periodic(can.Message(arbitration_id=0x80, is_extended_id=False), 0.01)
-            assert monitor(subject(device_on_bus), told, Selection(count=3, kinds=frozenset({"sync"}))) == 0
+            assert monitor(subject(joint), told, Selection(count=3, kinds=frozenset({"sync"}))) == 0
             sender.stop()
         lines = [json.loads(line) for line in out.getvalue().splitlines()]
         assert [line["kind"] for line in lines] == ["sync"] * 3
-        assert {identifier for identifier, _ in device_on_bus.requests} == {0x80}
+        assert {identifier for identifier, _ in joint.requests} == {0x80}
         assert "frames in" in err.getvalue()
 
-    def test_asks_for_the_mapping_if_told_so(self, device_on_bus: Any) -> None:
+    def test_asks_for_the_mapping_if_told_so(self, joint: Any) -> None:
         told, _, _ = output()
-        assert monitor(subject(device_on_bus), told, Selection(duration_s=0.0), ask=True) == 0
-        assert device_on_bus.requests
-        assert only_reads(device_on_bus)
+        assert monitor(subject(joint), told, Selection(duration_s=0.0), ask=True) == 0
+        assert joint.requests
+        assert only_reads(joint)
 
     def test_ends_in_time_on_a_silent_bus(self, empty_bus: Any) -> None:
         told, out, err = output()
@@ -214,29 +212,29 @@ class TestMonitor:
 
     @pytest.mark.parametrize(
         ("arguments", "words"),
-        [((["xyz"], [], []), r"--cob-id \(=xyz\)"), (([], ["pdos"], []), r"--kind \(=pdos\) must be one of nmt")],
+        [((("xyz",),), r"--cob-id \(=xyz\)"), (((), ("pdos",)), r"--kind \(=pdos\) must be one of nmt")],
     )
     def test_bad_filters(self, arguments: Any, words: str) -> None:
         with pytest.raises(ConfigurationError, match=words):
-            selection_of(*arguments, None, None, False)
+            selection_of(MonitorOptions(*arguments))
 
     def test_filters(self) -> None:
-        chosen = selection_of(["0x181", "80h"], [], [], None, None, False)
+        chosen = selection_of(MonitorOptions(("0x181", "80h")))
         assert chosen.cob_ids == {0x181, 0x80}
 
 
 class TestSubject:
     def test_flags_beat_the_environment(self) -> None:
         environ = {"CAN_INTERFACE": "socketcan", "CAN_CHANNEL": "can0", "CAN_BITRATE": "250000"}
-        found = subject_of_flags(None, None, None, None, None, environ)
+        found = subject_of_flags(GivenPlace(), None, environ)
         assert (found.interface, found.channel, found.bitrate_bitps) == ("socketcan", "can0", 250_000)
-        found = subject_of_flags("slcan", "x", 500_000, 3, None, environ)
+        found = subject_of_flags(GivenPlace("slcan", "x", 500_000, node=3), None, environ)
         assert (found.interface, found.channel, found.bitrate_bitps, found.node) == ("slcan", "x", 500_000, 3)
 
     @pytest.mark.parametrize(("interface", "channel", "missing"), [(None, "x", "-i"), ("x", None, "-c")])
     def test_a_bus_must_be_named(self, interface: str | None, channel: str | None, missing: str) -> None:
         with pytest.raises(ConfigurationError, match=missing):
-            subject_of_flags(interface, channel, None, None, None, {})
+            subject_of_flags(GivenPlace(interface, channel), None, {})
 
     def test_a_serial_drive_has_no_bus(self) -> None:
         with pytest.raises(ConfigurationError, match=r"drive\.kind"):

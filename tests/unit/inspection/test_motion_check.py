@@ -1,25 +1,238 @@
-"""`doctor --motion`: what it says to a joint that is right, and to each thing that may be the wrong way round."""
+"""`doctor --motion`: its plan, its verdict, and what it says to each thing that may be the wrong way round."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
+import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from jointctl.drivers.drive import CommissioningReport, DriveIdentity
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.faults.kinds import FaultConstants, FaultKind
+from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.inspection.health import OK, PROBLEM
-from jointctl.tools.motion_check.plan import CheckMotion, config_of_check, make_plan, motion_table
-from jointctl.tools.motion_check.verdict import motion_findings
+from jointctl.tools.configuration.conversions import velocity_of_a_count_radps
+from jointctl.tools.configuration.records import APPROACH_MIN_S
+from jointctl.tools.inspection.health import NOTE, OK, PROBLEM, Finding
+from jointctl.tools.inspection.motion_check import CheckMotion, CheckPlan, config_of_check, make_plan, motion_table
+from jointctl.tools.inspection.motion_verdict import judged, motion_findings
+from jointctl.tools.output import Output
 from jointctl.tools.session.fault_words import fault_text
 from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.verbs import doctor as doctor_motion_module
 from tests.two_encoders import NODE, config_with
-from tests.unit.inspection.checked_joint import checked
 
+
+# --- The motion check on a virtual joint in simulated time ---
+def check_in_lockstep(joint: LockstepJoint, config: Config, plan: CheckPlan, faults: Any = None) -> tuple[Any, Fault]:
+    """The same motion on a virtual joint in simulated time: its records and the fault."""
+    table = motion_table(plan, joint.report.start_position_rad)
+    constants = CheckMotion(config_of_check(config, plan), plan).constants(joint.report, table)
+    constants[0].sequence.supervisor_max_cycles = 0  # nobody watches in simulated time
+    joint.table = table
+    run = joint.run(constants) if faults is None else joint.run_with_faults(faults, constants)
+    return run.log, run.fault
+
+
+def checked(config: Config, change: Any = None, faults: Any = None) -> tuple[dict[str, Finding], Any, Fault]:
+    """Findings by topic, records and fault; `change` may spoil the joint."""
+    plan = make_plan(config, None)
+    joint = LockstepJoint(config)
+    if change is not None:
+        change(joint)
+    records, fault = check_in_lockstep(joint, config, plan, faults)
+    text = fault_text(fault, 0.0, 0) if fault is not Fault.NONE else None
+    return {f.topic: f for f in motion_findings(config, plan, records, fault, text)}, records, fault
+
+
+# --- The plan of a motion check: torque, speed and travel, smooth and never wider than the configuration ---
+def test_the_torque_is_that_of_friction_and_gravity_and_never_above_the_limit(tmp_path: Path) -> None:
+    static_Nm = 0.1575 * 121.0
+    assert make_plan(config_with(tmp_path), None).torque_Nm == pytest.approx(2.0 * static_Nm)
+    assert make_plan(config_with(tmp_path, joint__gravity_Nm=5.0), None).torque_Nm == pytest.approx(2.0 * static_Nm + 5)
+    assert make_plan(config_with(tmp_path, limits__torque_max_Nm=25.0), None).torque_Nm == 25.0
+    assert make_plan(config_with(tmp_path), 12.0).torque_Nm == 12.0
+    with pytest.raises(ConfigurationError, match=re.escape("--torque (=60.1) must be in (0..60]")):
+        make_plan(config_with(tmp_path), 60.1)
+
+
+def test_the_check_only_narrows_torque_speed_and_travel(tmp_path: Path) -> None:
+    config = config_with(tmp_path)
+    plan = make_plan(config, None)
+    report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.1, 0.06, 1e-5)
+    made = CheckMotion(config_of_check(config, plan), plan).constants(report, motion_table(plan, 0.1))[0].limits
+    assert made.torque_max_Nm == plan.torque_Nm < config.limits.torque_max_Nm
+    assert made.velocity_max_radps == 0.5 < config.limits.velocity_max_radps
+    assert (made.position_min_rad, made.position_max_rad) == pytest.approx((0.0, 0.2))
+    assert made.sample_age_max_cycles == round(config.limits.sample_age_max_s * config.loop.rate_Hz)
+    assert canopen_section(config_of_check(config, plan)).max_torque_permille is None
+
+
+@pytest.mark.parametrize(("torque_Nm", "watched_Nm"), [(None, 0.75 * 38.115), (5.0, 4.75)])
+def test_a_standing_joint_is_never_pushed_unwatched(tmp_path: Path, torque_Nm: float | None, watched_Nm: float) -> None:
+    """Also where gravity takes more than the torque that is allowed."""
+    gravity_Nm = 0.0 if torque_Nm is None else 10.0
+    config = config_with(tmp_path, joint__gravity_Nm=gravity_Nm, virtual__gravity_Nm=gravity_Nm)
+    plan = make_plan(config, torque_Nm)
+    report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.1, 0.06, 1e-5)
+    made = CheckMotion(config_of_check(config, plan), plan).constants(report, motion_table(plan, 0.1))[0].limits
+    assert made.frozen_torque_Nm == pytest.approx(watched_Nm)
+    assert made.frozen_torque_Nm < plan.torque_Nm
+
+
+def test_the_motion_is_smooth_and_ends_where_it_begins(tmp_path: Path) -> None:
+    plan = make_plan(config_with(tmp_path), None)
+    table = motion_table(plan, 0.3)
+    assert table[0, 1] == table[-1, 1] == pytest.approx(0.3)
+    assert np.ptp(table[:, 1]) == pytest.approx(2.0 * plan.travel_rad)
+    assert np.abs(table[:, 2]).max() < plan.velocity_radps / 2.0
+    assert np.all(np.diff(table[:, 0]) > 0.0)
+
+
+@pytest.mark.parametrize(("start_rad", "refused"), [(0.659, False), (0.661, True), (-0.659, False), (-0.661, True)])
+def test_room_on_both_sides_is_needed(tmp_path: Path, start_rad: float, refused: bool) -> None:
+    config = config_with(tmp_path)
+    plan = make_plan(config, None)
+    if not refused:
+        CheckMotion(config, plan).require_start(start_rad)
+        return
+    with pytest.raises(ConfigurationError, match=r"needs \[-0\.66\.\.0\.66\]"):
+        CheckMotion(config, plan).require_start(start_rad)
+
+
+def test_a_coarse_encoder_takes_more_travel_and_time_and_is_told_so(tmp_path: Path) -> None:
+    fine = make_plan(config_with(tmp_path), None)
+    config = config_with(tmp_path, encoder__counts_per_turn=4096)
+    plan = make_plan(config, None)
+    assert plan.travel_rad == pytest.approx(60.0 * math.tau / 4096)
+    assert np.abs(motion_table(plan, 0.1)[:, 2]).max() == pytest.approx(np.abs(motion_table(fine, 0.1)[:, 2]).max())
+    assert plan.duration_s == pytest.approx(motion_table(plan, 0.1)[-1, 0] + APPROACH_MIN_S)
+    assert plan.velocity_radps == config.limits.velocity_max_radps == 1.0  # never more than the user's
+    config = config_with(tmp_path, encoder__counts_per_turn=8192)
+    assert make_plan(config, None).velocity_radps > 2.0 * velocity_of_a_count_radps(config) > fine.velocity_radps
+    report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.1, 0.06, 1e-5)
+    assert "braked beyond 0.23 rad to either side" in " ".join(CheckMotion(config, plan).placed(report).lines)
+    coarsest = config_with(tmp_path, encoder__counts_per_turn=512, control__velocity_cutoff_Hz=10.0)
+    assert make_plan(coarsest, None).travel_rad == 0.3
+
+
+@pytest.mark.parametrize(
+    ("side", "own", "per_motor_turn", "status"),
+    [
+        ("motor", 65536, 65536.0, OK), ("motor", 131072, 65536.0, NOTE), ("joint", 524288, 524288.0, OK),
+        ("joint", 524288, 524288.0 / 121.0, OK), ("joint", 262144, 524288.0, NOTE),
+    ],
+)  # fmt: skip
+def test_the_drives_own_counts(tmp_path: Path, side: str, own: int, per_motor_turn: float, status: str) -> None:
+    config = config_with(tmp_path, encoder__side=side, encoder__counts_per_turn=own)
+    found = judged(config, per_motor_turn)
+    assert found.status == status
+    assert (found.remedy == "") is (status == OK)
+
+
+# --- The verdict of a motion check about its records and about the fault that ended it ---
+WAY_FAULTS = (Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR, Fault.POSITION_LIMIT, Fault.POSITION_DISAGREEMENT)
+
+
+def sound_records(config: Config) -> Any:
+    """Of a joint that moves with the torque, by both encoders nearly alike, until a fault stops it."""
+    records = new(LogRecord, 400)
+    records.phase[:380], records.phase[380:] = AxisPhase.TRACKING, AxisPhase.QUICK_STOPPING
+    records.position_rad[:] = np.linspace(0.0, 0.04, 400)
+    records.second_position_rad[:] = 0.86 * records.position_rad
+    records.command_torque_Nm[:] = make_plan(config, None).static_friction_Nm
+    return records
+
+
+def judged_records(config: Config, records: Any, fault: Fault) -> tuple[set[str], str]:
+    """Topics of the problems, and all that is said of the check as a whole."""
+    text = fault_text(fault, 0.1, 0) if fault is not Fault.NONE else None
+    found = list(motion_findings(config, make_plan(config, None), records, fault, text))
+    said = " ".join(finding.text for finding in found if finding.topic == "check")
+    return {finding.topic for finding in found if finding.status == PROBLEM}, said
+
+
+@pytest.mark.parametrize("second", [None, NODE])
+@pytest.mark.parametrize("fault", [*WAY_FAULTS, Fault.NONE])
+def test_a_fault_that_no_finding_explains_is_told(tmp_path: Path, second: dict[str, Any] | None, fault: Fault) -> None:
+    """With a second encoder these were dropped: everything was right, exit code 0."""
+    config = config_with(tmp_path, second)
+    problems, said = judged_records(config, sound_records(config), fault)
+    assert problems == (set() if fault is Fault.NONE else {"check"})
+    assert (f"ended while the joint moved: {fault.name}" in said) is (fault is not Fault.NONE)
+
+
+@pytest.mark.parametrize("fault", [*WAY_FAULTS, Fault.DRIVE_FAULT])
+def test_a_fault_that_another_problem_explains_is_not_told_twice(tmp_path: Path, fault: Fault) -> None:
+    config = config_with(tmp_path, NODE)
+    against = sound_records(config)
+    against.command_torque_Nm *= -1.0
+    problems, _ = judged_records(config, against, fault)
+    assert problems == ({"direction"} if fault in WAY_FAULTS else {"direction", "check"})
+    scaled = sound_records(config)
+    scaled.second_position_rad[:] = 0.5 * scaled.position_rad
+    problems, _ = judged_records(config, scaled, fault)
+    assert problems == ({"scale"} if fault is Fault.POSITION_DISAGREEMENT else {"scale", "check"})
+
+
+@pytest.mark.parametrize("fault", [Fault.POSITION_FROZEN, Fault.TORQUE_SATURATED, Fault.DRIVE_FAULT])
+def test_what_stopped_a_standing_joint_is_told_unless_standing_explains_it(tmp_path: Path, fault: Fault) -> None:
+    config = config_with(tmp_path)
+    still = sound_records(config)
+    still.position_rad[:] = 0.0
+    problems, _ = judged_records(config, still, fault)
+    assert problems == ({"motion", "check"} if fault is Fault.DRIVE_FAULT else {"motion"})
+
+
+@pytest.mark.parametrize("second", [None, NODE])
+@pytest.mark.parametrize("load_Nm", [-60.0, -1.0])
+def test_a_push_from_outside(tmp_path: Path, second: dict[str, Any] | None, load_Nm: float) -> None:
+    faults = new(FaultConstants, 1)
+    faults[0].kind, faults[0].start_s, faults[0].duration_s = FaultKind.LOAD_JUMP, 1.5, 10.0
+    faults[0].magnitude = load_Nm
+    found, _, fault = checked(config_with(tmp_path, second), None, faults)
+    pushed = load_Nm == -60.0
+    assert fault is (Fault.VELOCITY_LIMIT if pushed else Fault.NONE)
+    assert ("check" in found) is pushed
+    assert any(finding.status == PROBLEM for finding in found.values()) is pushed
+
+
+@pytest.mark.parametrize("fault", [Fault.VELOCITY_LIMIT, Fault.NONE])
+def test_an_interruption_does_not_hide_the_fault(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], fault: Fault
+) -> None:
+    config = config_with(tmp_path, log__folder=str(tmp_path))
+    text = fault_text(fault, 0.6, 0) if fault is not Fault.NONE else None
+    result = SimpleNamespace(
+        stopped_by="SIGINT", drive_state="switch on disabled", records=sound_records(config), fault=fault,
+        fault_text=text, log_path=tmp_path / "run.mcap", report=SimpleNamespace(counts_per_motor_turn=0.0),
+    )  # fmt: skip
+    stub = lambda *_: SimpleNamespace(run=lambda: result)  # noqa: E731
+    monkeypatch.setattr("jointctl.tools.session.session.Session", stub)
+    code = doctor_motion_module.doctor_motion(config, Output(), assume_yes=True)
+    told = capsys.readouterr()
+    assert code == (130 if fault is Fault.NONE else 1)
+    assert "stopped by SIGINT" in told.err
+    assert ("VELOCITY_LIMIT" in told.out) is (fault is not Fault.NONE)
+
+
+# --- the plan ---
+def test_figures_of_a_finding_are_plain_numbers(tmp_path: Path) -> None:
+    found, _, _ = checked(config_with(tmp_path))
+    for finding in found.values():
+        assert all(isinstance(value, float) for value in dataclasses.asdict(finding)["numbers"].values())
+
+
+# --- `doctor --motion`: what it says to a joint that is right, and to each thing that may be the wrong way round ---
 WAYS = ("positive", "negative")
 
 
@@ -61,7 +274,7 @@ def test_a_wrong_sign(tmp_path: Path, change: Any) -> None:
     found, records, fault = checked(config, change)
     assert fault in (Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR)
     assert found["direction"].status == PROBLEM
-    assert "encoder.direction; else drive.torque_direction" in found["direction"].cure
+    assert "encoder.direction; else drive.torque_direction" in found["direction"].remedy
     assert_gentle(config, records)
 
 
@@ -70,7 +283,7 @@ def test_with_two_encoders_the_wrong_one_is_named(tmp_path: Path, law: str, wron
     config = config_with(tmp_path, {**NODE, "law": law}, virtual__initial_position_rad=0.0)
     found, records, _ = checked(config, reverse_encoder)
     assert found["two encoders"].status == PROBLEM
-    assert found["two encoders"].cure.startswith(f"{wrong}.direction")
+    assert found["two encoders"].remedy.startswith(f"{wrong}.direction")
     assert_gentle(config, records)
 
 
@@ -159,7 +372,7 @@ def test_the_records_name_the_encoder_that_stood(tmp_path: Path) -> None:
     still = records.copy()
     still.position_rad[:] = still.position_rad[0]
     (found,) = motion_findings(config, make_plan(config, None), still, Fault.POSITION_DISAGREEMENT, None)
-    assert (found.status, found.cure.startswith("[encoder] is dead")) == (PROBLEM, True)
+    assert (found.status, found.remedy.startswith("[encoder] is dead")) == (PROBLEM, True)
     still = records.copy()
     still.second_position_rad[:] = 0.0
     topics = {f.topic: f for f in motion_findings(config, make_plan(config, None), still, Fault.NONE, None)}

@@ -1,19 +1,23 @@
-"""params dump and diff on the virtual drive of this process, and the files that they write and read."""
+"""params dump, diff and restore on the virtual drive of this process: read back, refused, or nothing written."""
 
 from __future__ import annotations
 
+import io
 import json
 import re
+import struct
+import sys
 from pathlib import Path
 from typing import Any
 
+import can
 import canopen
 import pytest
 from canopen.objectdictionary import ODVariable, datatypes
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointctl.drivers.errors import ConfigurationError, DataError
+from jointctl.drivers.errors import DECLINED, BusError, ConfigurationError, DataError, DeviceError, UsageError
 from jointctl.tools.configuration.load import shipped_config
 from jointctl.tools.inspection.objects import Objects, Place, read_dictionary
 from jointctl.tools.inspection.parameters import (
@@ -24,25 +28,57 @@ from jointctl.tools.inspection.parameters import (
     is_parameter,
     is_parameter_file,
     load_parameters,
+    read_parameters,
     variables,
 )
-from jointctl.tools.inspection.subject import ATTEMPTS, Subject, new_dictionary
-from jointctl.tools.verbs.params import DIFFERENT, diff, dump
-from tests.unit.inspection.parameter_verbs import EDS, OLDER_DUMP, change, output, read, subject
+from jointctl.tools.inspection.subject import ATTEMPTS, SdoReader, Subject, canopen_network, new_dictionary
+from jointctl.tools.verbs.params import DIFFERENT, diff, dump, place_index, restore_file
+from tests.sessions import output
 
+# --- Subject and output of the verb params, and a DCF that is changed ---
+OLDER_DUMP = Path(__file__).with_name("older_dump.toml")
+EDS = shipped_config("virtual").with_name("virtual_joint.eds")
+
+
+def subject(device: Any) -> Subject:
+    return Subject("virtual", device.channel, None, 1, EDS)
+
+
+def read(device: Any) -> ParameterSet:
+    with canopen_network(subject(device)) as network:
+        return read_parameters(SdoReader(network, 1, subject(device).objects()))
+
+
+def writes(device: Any) -> list[tuple[int, int]]:
+    """(index, sub-index) of every SDO download."""
+    return [struct.unpack_from("<HB", data, 1) for identifier, data in device.requests
+            if identifier == 0x601 and data[0] >> 5 == 1]  # fmt: skip
+
+
+def change(file: Path, **values: str) -> None:
+    """Replace the values of objects in a DCF, `o6072="500"`, `o1018_2="9"`."""
+    text = file.read_text()
+    for name, value in values.items():
+        index, _, sub = name.removeprefix("o").partition("_")
+        section = rf"\[{index}(?:sub{sub})?\]\n" if sub in ("", "0") else rf"\[{index}sub{sub}\]\n"
+        pattern = rf"({section}(?:[^\[\n].*\n)*?ParameterValue=).*"
+        if sub == "" and not re.search(pattern, text):
+            pattern = pattern.replace(section, rf"\[{index}sub0\]\n")
+        text, count = re.subn(pattern, rf"\g<1>{value}", text)
+        assert count == 1, f"{name}: {count} times"
+    file.write_text(text)
+
+
+# --- params dump and diff on the virtual drive of this process, and the files that they write and read ---
 KINDS: list[tuple[int, st.SearchStrategy[Any]]] = [
-    (datatypes.BOOLEAN, st.sampled_from([b"\0", b"\1"])),
-    (datatypes.INTEGER8, st.integers(-128, 127)),
-    (datatypes.INTEGER32, st.integers(-(2**31), 2**31 - 1)),
-    (datatypes.UNSIGNED32, st.integers(0, 2**32 - 1)),
-    (datatypes.INTEGER64, st.integers(-(2**63), 2**63 - 1)),
-    (datatypes.REAL32, st.floats(width=32, allow_nan=False)),
+    (datatypes.BOOLEAN, st.sampled_from([b"\0", b"\1"])), (datatypes.INTEGER8, st.integers(-128, 127)),
+    (datatypes.INTEGER32, st.integers(-(2**31), 2**31 - 1)), (datatypes.UNSIGNED32, st.integers(0, 2**32 - 1)),
+    (datatypes.INTEGER64, st.integers(-(2**63), 2**63 - 1)), (datatypes.REAL32, st.floats(width=32, allow_nan=False)),
     (datatypes.REAL64, st.floats(allow_nan=False)),
     (datatypes.VISIBLE_STRING, st.text(st.characters(max_codepoint=255), max_size=30)),
-    (datatypes.OCTET_STRING, st.binary(max_size=30)),
-    (datatypes.DOMAIN, st.binary(max_size=30)),
+    (datatypes.OCTET_STRING, st.binary(max_size=30)), (datatypes.DOMAIN, st.binary(max_size=30)),
     (datatypes.TIME_OF_DAY, st.binary(min_size=6, max_size=6)),
-]
+]  # fmt: skip
 
 
 def dictionary_of_all_kinds() -> Any:
@@ -56,7 +92,7 @@ def dictionary_of_all_kinds() -> Any:
 
 
 class TestDump:
-    def test_every_readable_object_is_in_one_of_the_groups(self, device_on_bus: Any, file: Path) -> None:
+    def test_every_readable_object_is_in_one_of_the_groups(self, joint: Any, file: Path) -> None:
         found = load_parameters(file)
         readable = {
             Place(v.index, v.subindex) for v in variables(read_dictionary(EDS, 1)) if v.readable and v.index != 0x1003
@@ -66,7 +102,7 @@ class TestDump:
         assert found.readings[Place(0x1008)] == "jointctl virtual joint"
         assert found.device["product_code"] == 1
         assert not {place.index for place in found.parameters} & COMMANDS
-        assert read(device_on_bus).parameters == found.parameters
+        assert read(joint).parameters == found.parameters
 
     def test_a_dcf_names_what_it_holds(self, file: Path) -> None:
         text = file.read_text()
@@ -78,40 +114,38 @@ class TestDump:
         assert dictionary[0x6072].value == 1000
         assert dictionary.node_id == 1
 
-    def test_stdout_and_json(self, device_on_bus: Any, file: Path, tmp_path: Path) -> None:
-        told, out = output()
-        assert dump(subject(device_on_bus), told) == 0
+    def test_stdout_and_json(self, joint: Any, file: Path, tmp_path: Path) -> None:
+        told, out, _ = output()
+        assert dump(subject(joint), told) == 0
         (tmp_path / "stdout.dcf").write_text(out.getvalue())
         assert load_parameters(tmp_path / "stdout.dcf").parameters == load_parameters(file).parameters
-        told, out = output(json=True)
-        assert dump(subject(device_on_bus), told) == 0
+        told, out, _ = output(json=True)
+        assert dump(subject(joint), told) == 0
         assert json.loads(out.getvalue())["parameters"]["6072"] == 1000
 
     @pytest.mark.parametrize("name", ["drive.toml", "drive", "drive.dcf.txt"])
-    def test_another_format_is_refused_before_anything_is_read(
-        self, device_on_bus: Any, tmp_path: Path, name: str
-    ) -> None:
+    def test_another_format_is_refused_before_anything_is_read(self, joint: Any, tmp_path: Path, name: str) -> None:
         with pytest.raises(DataError, match=r"must end in \.dcf: parameters are written as DCF only"):
-            dump(subject(device_on_bus), output()[0], tmp_path / name)
-        assert not device_on_bus.requests
+            dump(subject(joint), output()[0], tmp_path / name)
+        assert not joint.requests
         assert not list(tmp_path.iterdir())
 
-    def test_what_the_drive_does_not_report_is_not_in_the_file(self, device_on_bus: Any, tmp_path: Path) -> None:
+    def test_what_the_drive_does_not_report_is_not_in_the_file(self, joint: Any, tmp_path: Path) -> None:
         """The default of the EDS in its place would be written by a restore."""
-        device_on_bus.mute += [(0x6072, 0)] * ATTEMPTS
+        joint.mute += [(0x6072, 0)] * ATTEMPTS
         path = tmp_path / "drive.dcf"
-        assert dump(subject(device_on_bus), output()[0], path) == 0
-        assert not device_on_bus.mute
-        present = read(device_on_bus).parameters
+        assert dump(subject(joint), output()[0], path) == 0
+        assert not joint.mute
+        present = read(joint).parameters
         assert load_parameters(path).parameters == {p: v for p, v in present.items() if p != Place(0x6072)}
 
-    def test_a_file_is_never_overwritten(self, device_on_bus: Any, file: Path) -> None:
+    def test_a_file_is_never_overwritten(self, joint: Any, file: Path) -> None:
         with pytest.raises(DataError, match="exists already"):
-            dump(subject(device_on_bus), output()[0], file)
+            dump(subject(joint), output()[0], file)
 
-    def test_an_eds_is_needed(self, device_on_bus: Any) -> None:
+    def test_an_eds_is_needed(self, joint: Any) -> None:
         with pytest.raises(ConfigurationError, match="which objects"):
-            dump(Subject("virtual", device_on_bus.channel, None, 1), output()[0])
+            dump(Subject("virtual", joint.channel, None, 1), output()[0])
 
 
 class TestDiff:
@@ -119,11 +153,11 @@ class TestDiff:
         other = tmp_path / "other.dcf"
         other.write_text(file.read_text())
         first, objects = load_parameters(file), Objects()
-        told, out = output()
+        told, out, _ = output()
         assert diff(first, load_parameters(other), objects, told) == 0
         assert "no difference" in out.getvalue()
         change(other, o6072="700", o6064="5")
-        told, out = output(json=True)
+        told, out, _ = output(json=True)
         assert diff(first, load_parameters(other), objects, told) == DIFFERENT
         (found,) = json.loads(out.getvalue())["differences"]
         assert (found["object"], found["first"], found["second"]) == ("6072", 1000, 700)
@@ -213,7 +247,156 @@ class TestOlderDump:
         }  # fmt: skip
 
 
+@pytest.fixture
+def file(joint: Any, tmp_path: Path) -> Path:
+    """A dump of the drive as it is."""
+    path = tmp_path / "drive.dcf"
+    assert dump(subject(joint), output()[0], path) == 0
+    assert not writes(joint)
+    joint.requests.clear()
+    return path
+
+
 def test_what_moves_or_acts_is_no_parameter() -> None:
     chosen = {v.index for v in variables(read_dictionary(EDS, 1)) if is_parameter(v)}
     assert {0x6072, 0x605A, 0x1017, 0x1016, 0x1A00, 0x1800} <= chosen
     assert not chosen & COMMANDS
+
+
+# --- params restore on the virtual drive of this process: read back, refused, or nothing written at all ---
+def restored(device: Any, file: Path, **how: Any) -> int:
+    return restore_file(subject(device), file, output()[0], **{"assume_yes": True, "skip": [], **how})
+
+
+class TestRestore:
+    def test_only_what_differs_is_written_and_read_back(self, joint: Any, file: Path) -> None:
+        change(file, o6072="700", o6065="12345")
+        assert restored(joint, file) == 0
+        assert sorted(writes(joint)) == [(0x6065, 0), (0x6072, 0)]
+        found = read(joint)
+        assert (found.parameters[Place(0x6072)], found.parameters[Place(0x6065)]) == (700, 12345)
+
+    def test_nothing_differs_nothing_is_sent_but_reads(self, joint: Any, file: Path) -> None:
+        assert restored(joint, file) == 0
+        assert not writes(joint)
+        assert {identifier for identifier, _ in joint.requests} == {0x601}
+
+    def test_readings_and_commands_are_never_written(self, joint: Any, file: Path) -> None:
+        change(file, o6071="300", o6040="15", o6064="5", o60FF="99", o6072="700")
+        assert restored(joint, file) == 0
+        assert writes(joint) == [(0x6072, 0)]
+
+    def test_a_toml_dump_of_an_older_version_is_restored(self, joint: Any, tmp_path: Path) -> None:
+        path = tmp_path / "older.toml"
+        text = OLDER_DUMP.read_text().replace("6072 = 1000 ", "6072 = 700 ")
+        path.write_text(text.replace("[parameters]", "[parameters]\n6071 = 300\n60C1 = 5"))  # commands, not settings
+        assert restored(joint, path) == 0
+        assert (0x6072, 0) in writes(joint)
+        assert not {index for index, _ in writes(joint)} & {0x6071, 0x60C1}
+        assert read(joint).parameters[Place(0x6072)] == 700
+
+    def test_a_mapping_is_restored_in_the_order_of_cia_301(self, joint: Any, file: Path) -> None:
+        change(file, o1A01="1", o1A01_1="0x606C0020", o1801_2="255", o1801_1="0x281")
+        assert restored(joint, file) == 0
+        order = writes(joint)
+        assert order == [(0x1801, 2), (0x1A01, 0), (0x1A01, 1), (0x1A01, 0), (0x1801, 1)]
+        found = read(joint).parameters
+        assert (found[Place(0x1A01, 0)], found[Place(0x1A01, 1)], found[Place(0x1801, 1)]) == (1, 0x606C0020, 0x281)
+
+    def test_a_refused_value_is_told_and_the_others_are_written(self, joint: Any, file: Path) -> None:
+        change(file, o605A="77", o6072="700")
+        told, out, _ = output(json=True)
+        with pytest.raises(DeviceError, match="1 of 2 parameters were not taken"):
+            restore_file(subject(joint), file, told, assume_yes=True, skip=[])
+        report = json.loads(out.getvalue())
+        assert report["restored"] == ["6072"]
+        assert report["failed"][0]["object"] == "605A"
+        assert "0609" in report["failed"][0]["reason"]
+
+    @pytest.mark.parametrize(("word", "refused"), [(0x0237, True), (0x0217, True), (0x0233, False), (0x0250, False)])
+    def test_a_drive_under_power_is_left_alone(self, joint: Any, file: Path, word: int, refused: bool) -> None:
+        change(file, o6072="700")
+        joint.answers[0x6041, 0] = word
+        if refused:
+            with pytest.raises(DeviceError, match="nothing is written into a drive under power"):
+                restored(joint, file)
+        else:
+            assert restored(joint, file) == 0
+        assert bool(writes(joint)) != refused
+
+    def test_another_controller_is_left_alone(self, joint: Any, file: Path) -> None:
+        change(file, o6072="700")
+        with can.Bus(interface="virtual", channel=joint.channel) as bus:
+            sender = bus.send_periodic(can.Message(arbitration_id=0x80, is_extended_id=False), 0.01)
+            with pytest.raises(BusError, match="another controller"):
+                restored(joint, file)
+            sender.stop()
+        assert not writes(joint)
+
+    @pytest.mark.parametrize("other", [True, False])
+    @pytest.mark.parametrize("differs", ["product_code", "node"])
+    def test_another_device_or_node_only_if_told_so(self, joint: Any, file: Path, differs: str, other: bool) -> None:
+        change(file, o6072="700", **({"o1018_2": "9"} if differs == "product_code" else {}))
+        if differs == "node":
+            file.write_text(file.read_text().replace("NodeID=1\n", "NodeID=9\n"))
+        if other:
+            assert restored(joint, file, other_device=True) == 0
+        else:
+            with pytest.raises(DeviceError, match=rf"{differs} \(=9\) is not that of the drive \(=1\)"):
+                restored(joint, file)
+        assert bool(writes(joint)) == other
+
+    @pytest.mark.parametrize(("answer", "written"), [("y\n", True), ("n\n", False), ("", False)])
+    def test_it_asks(self, joint: Any, file: Path, answer: str, written: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+        class Terminal(io.StringIO):
+            def isatty(self) -> bool:
+                return True
+
+        change(file, o6072="700")
+        monkeypatch.setattr(sys, "stdin", Terminal(answer))
+        assert restored(joint, file, assume_yes=False) == (0 if written else DECLINED)
+        assert bool(writes(joint)) == written
+
+    @pytest.mark.parametrize("what", ["SYNC", "under power", "nothing"])
+    def test_what_came_while_the_question_was_open_is_seen(
+        self, joint: Any, file: Path, what: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """A joint that moves by now must not lose its controller: not even pre-operational is said."""
+
+        class Terminal(io.StringIO):
+            def isatty(self) -> bool:
+                return True
+
+            def readline(self, *_: Any) -> str:
+                if what == "SYNC":
+                    with can.Bus(interface="virtual", channel=joint.channel) as bus:
+                        bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+                elif what == "under power":
+                    joint.answers[0x6041, 0] = 0x0237
+                return "y\n"
+
+        change(file, o6072="700")
+        monkeypatch.setattr(sys, "stdin", Terminal())
+        if what == "nothing":
+            assert restored(joint, file, assume_yes=False) == 0
+        else:
+            with pytest.raises((BusError, DeviceError), match=r"another controller|under power"):
+                restored(joint, file, assume_yes=False)
+        pre_operational = (0, b"\x80\x01") in joint.requests
+        assert (bool(writes(joint)), pre_operational) == ((True, True) if what == "nothing" else (False, False))
+
+    def test_without_a_terminal_it_does_not_write(
+        self, joint: Any, file: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        change(file, o6072="700")
+        monkeypatch.setattr(sys, "stdin", io.StringIO("y\n"))
+        with pytest.raises(UsageError):
+            restored(joint, file, assume_yes=False)
+        assert not writes(joint)
+
+    def test_skipped_objects(self, joint: Any, file: Path) -> None:
+        change(file, o6072="700", o6065="12345")
+        assert restored(joint, file, skip=[place_index("6072")]) == 0
+        assert writes(joint) == [(0x6065, 0)]
+        with pytest.raises(ConfigurationError, match="--skip"):
+            place_index("12345")

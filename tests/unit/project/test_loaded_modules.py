@@ -11,20 +11,26 @@ import pytest
 
 from jointctl.hil.faults.kinds import LOCKSTEP_ONLY, FaultKind
 from jointctl.hil.faults.kinds import MAX_FAULTS as MAX_FAULTS_OF_THE_JOINT
-from jointctl.tools.configuration.plant import FAULT_KINDS, MAX_FAULTS
+from jointctl.tools.configuration.sections import FAULT_KINDS, MAX_FAULTS
 from tests.places import CONFIGS
 
 SUPERVISOR = """
 import json, sys
+from contextlib import suppress
 from pathlib import Path
-from jointctl.tools.cli import main, start
+from jointctl.drivers.errors import BusError
+from jointctl.tools.verbs import main, start
 from jointctl.tools.configuration.load import load_config
-from jointctl.tools.session.open_drive import check_cyclic_rate
+from jointctl.tools.session.session_drive import session_drive
 from jointctl.tools.session.plan import resolve
 from jointctl.tools.verbs.run import run
 config = load_config(Path(sys.argv[1]))
 resolve(config)
-check_cyclic_rate(config)
+drive = session_drive(config.drive.kind)
+drive.check_rate(config)
+drive.port_record()
+with suppress(BusError):  # there is no such interface
+    drive.open(config)
 print(json.dumps(sorted(sys.modules)))
 """
 LOOP = """
@@ -32,13 +38,14 @@ import json, sys
 from jointctl.tools.session import loop_process, loops
 from jointctl.tools.session.loop_handle import SharedBlock
 from jointctl.drivers.canopen import exchange
-loops.compiled_call(SharedBlock.create(1), 1_000_000, 0)
+from jointctl.drivers.canopen.cyclic import CanopenPort
+loops.compiled_call(SharedBlock.create(1, CanopenPort), 1_000_000, 0)
 print(json.dumps(sorted(sys.modules)))
 """
 
 
 @pytest.mark.parametrize("program", [SUPERVISOR, LOOP], ids=["supervisor", "loop"])
-def test_a_run_on_hardware_loads_nothing_of_the_virtual_joint(tmp_path: Path, program: str) -> None:
+def test_a_canopen_run_on_hardware_loads_nothing_of_the_virtual_joint_and_of_elmo(tmp_path: Path, program: str) -> None:
     text = (CONFIGS / "virtual.toml").read_text().replace('"jointctl"', '"socketcan"', 1)
     head, _, rest = text.partition("[virtual]")
     path = tmp_path / "joint.toml"
@@ -46,7 +53,7 @@ def test_a_run_on_hardware_loads_nothing_of_the_virtual_joint(tmp_path: Path, pr
     command = [sys.executable, "-P", "-c", program, str(path)]
     found = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
     assert "jointctl.drivers.canopen.cyclic" in found
-    assert [name for name in found if name.startswith("jointctl.hil")] == []
+    assert [name for name in found if name.startswith("jointctl.hil") or "elmo" in name] == []
 
 
 def test_the_section_knows_the_faults_of_the_joint() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.configuration.canopen import eds_path
 from jointctl.tools.configuration.load import SHIPPED_FOLDER, load_config
 from tests.places import ROOT
 
@@ -56,4 +57,4 @@ def test_every_configuration_names_an_eds_that_is_shipped_or_marked() -> None:
         except ConfigurationError:
             assert "FILL IN" in file.read_text()
             continue
-        assert config.drive.kind != "canopen" or config.eds_path.parent == SHIPPED_FOLDER
+        assert config.drive.kind != "canopen" or eds_path(config).parent == SHIPPED_FOLDER

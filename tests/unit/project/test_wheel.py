@@ -23,16 +23,9 @@ from tests.places import ROOT
 TOP = ("firmware_py", "drivers", "hil", "tools", "configs")
 FACE = "interface"
 READ = (
-    "docs",
-    "tests",
-    "pyproject.toml",
-    "README.md",
-    "CHANGELOG.md",
-    "CONTRIBUTING.md",
-    "LICENSE",
-    "MANIFEST.in",
+    "docs", "tests", "pyproject.toml", "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "MANIFEST.in",
     "check",
-)
+)  # fmt: skip
 BUILD = "import sys, setuptools.build_meta as b; getattr(b, 'build_' + sys.argv[1])(sys.argv[2])"
 
 
@@ -112,7 +105,7 @@ def test_it_works_from_an_empty_folder(unpacked: Path, tmp_path: Path) -> None:
 
     shown = python("-c", "import jointctl.tools, jointctl.configs as c; print(jointctl.tools.__file__, c.__file__)")
     assert shown.count(str(unpacked)) == 2
-    python("-m", "jointctl.tools.cli", "new", "joint.toml", "--from", "virtual")
+    python("-m", "jointctl.tools.verbs", "new", "joint.toml", "--from", "virtual")
     assert (tmp_path / "joint.toml").read_text() == (ROOT / "configs" / "virtual.toml").read_text()
 
 
@@ -122,7 +115,7 @@ def test_folders_of_the_user_with_our_names_do_not_matter(unpacked: Path, tmp_pa
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text("raise ImportError('the wrong package')\n")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(unpacked)])}
-    command = [sys.executable, "-P", "-m", "jointctl.tools.cli", "--version"]
+    command = [sys.executable, "-P", "-m", "jointctl.tools.verbs", "--version"]
     shown = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, env=environment)
     assert shown.stdout.startswith("jointctl ")
     environment["PYTHONPATH"] = str(unpacked)

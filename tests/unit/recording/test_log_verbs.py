@@ -1,14 +1,19 @@
-"""`jointctl log`: what is told, what is exported, and that foreign readers read it back; raw frames."""
+"""The folder of run logs and `jointctl log`: what is kept, told and exported, and that others read it back."""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
+import os
+import shutil
 import sys
 import threading
+from collections.abc import Callable
+from io import StringIO
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import can
 import numpy as np
@@ -16,18 +21,148 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from jointctl.drivers.errors import ConfigurationError, DataError
+from jointctl.drivers.errors import ConfigurationError, DataError, MotionFault
 from jointctl.firmware_py.records import LogRecord
-from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.states import AxisPhase, DriveState
+from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
 from jointctl.tools.recording.log_export import FORMATS, columns, parquet_bytes
+from jointctl.tools.recording.log_folder import log_path, remove_oldest, require_room
 from jointctl.tools.recording.run_log import THINNING, RunLogWriter, frame_array, frame_times_ns
 from jointctl.tools.recording.run_log_reader import missing_records, read_run_log
 from jointctl.tools.session.bus_watch import FrameRecorder, recording
+from jointctl.tools.session.consent import prepare_log, require_ready
 from jointctl.tools.session.events import EventFinder
+from jointctl.tools.session.session_drive import session_drive
 from jointctl.tools.verbs.log import log_export, log_info, log_plot
+from tests.configurations import changed
 
+
+# --- Name, room and age of run logs, and what is refused before the user is asked ---
+class Usage(NamedTuple):
+    total: int
+    used: int
+    free: int
+
+
+@pytest.fixture
+def in_folder(virtual_config: Config, tmp_path: Path) -> Callable[..., Config]:
+    """configs/virtual.toml with its logs in the test's folder."""
+
+    def build(**log: Any) -> Config:
+        config = changed(
+            virtual_config, **{f"log__{key}": value for key, value in {"folder": str(tmp_path), **log}.items()}
+        )
+        config._path = virtual_config.path
+        return config
+
+    return build
+
+
+def report(start_rad: float) -> Any:
+    return SimpleNamespace(start_position_rad=start_rad)
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(file.name for file in folder.iterdir())
+
+
+def aged(folder: Path, count: int) -> None:
+    for i in range(count):
+        for end in (".mcap", ".png", ".tail.mcap"):
+            file = folder / f"virtual-2026010{i}-120000{end}"
+            file.write_text("a log")
+            os.utime(file, (1000.0 + i, 1000.0 + i))
+
+
+def test_a_name_that_is_taken_is_not_given_again(in_folder: Callable[..., Config]) -> None:
+    config = in_folder()
+    paths = []
+    for _ in range(3):
+        paths.append(log_path(config))
+        paths[-1].write_text("")
+    assert len(set(paths)) == 3
+
+
+@pytest.mark.parametrize(
+    ("files", "words"), [(0, ""), (1, ": 1 file of older runs removed"), (3, ": 3 files of older")]
+)
+def test_what_is_removed_is_told(in_folder: Callable[..., Config], tmp_path: Path, files: int, words: str) -> None:
+    for end in (".mcap", ".png", ".tail.mcap")[:files]:
+        (tmp_path / f"virtual-20260101-120000{end}").write_text("a log")
+    config, said = in_folder(keep=1), StringIO()
+    prepare_log(config, log_path(config), Output(stdout=StringIO(), stderr=said))
+    assert words in said.getvalue()
+    assert bool(said.getvalue()) == bool(files)
+
+
+@pytest.mark.parametrize(("keep", "left"), [(1, 0), (2, 1), (4, 3), (5, 4), (6, 4), (0, 4)])
+def test_only_the_newest_runs_are_kept_with_the_new_one(
+    in_folder: Callable[..., Config], tmp_path: Path, keep: int, left: int
+) -> None:
+    aged(tmp_path, 4)
+    config = in_folder(keep=keep)
+    removed = remove_oldest(config, log_path(config))
+    assert len(removed) == 3 * (4 - left)
+    expected = [
+        f"virtual-2026010{i}-120000{end}" for i in range(4 - left, 4) for end in (".mcap", ".png", ".tail.mcap")
+    ]
+    assert names(tmp_path) == sorted(expected)
+
+
+def test_files_that_are_not_runs_of_this_configuration_stay(in_folder: Callable[..., Config], tmp_path: Path) -> None:
+    others = [
+        "virtual-notes.mcap",
+        "other-20260101-120000.mcap",
+        "virtual-20260101-120000.csv",
+        "my-virtual-20260101-120000.png",
+    ]
+    for name in others:
+        (tmp_path / name).write_text("mine")
+    config = in_folder(keep=1)
+    assert remove_oldest(config, log_path(config)) == []
+    assert names(tmp_path) == sorted(others)
+
+
+@pytest.mark.parametrize(("factor", "refused"), [(0.99, True), (1.01, False)])
+def test_a_disk_without_room_for_the_run_is_told(
+    in_folder: Callable[..., Config], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factor: float, refused: bool
+) -> None:
+    config = in_folder()
+    needed = 10.0 * 1000.0 * (dtype_of(LogRecord).itemsize + 40)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, int(needed * factor)))
+    if refused:
+        with pytest.raises(DataError, match="MB are free, the log of this run takes about 4 MB"):
+            require_room(config, log_path(config))
+    else:
+        require_room(config, log_path(config))
+    assert names(tmp_path) == []
+
+
+def test_a_folder_that_cannot_be_made_is_told(in_folder: Callable[..., Config], tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    config = in_folder(folder=str(tmp_path / "file" / "runs"))
+    with pytest.raises(DataError, match=r"file/runs/.*cannot be written"):
+        require_room(config, log_path(config))
+
+
+@pytest.mark.parametrize("start_rad", [-0.7001, 0.7001])
+def test_a_joint_outside_its_limits_is_told_before_anybody_is_asked(
+    in_folder: Callable[..., Config], start_rad: float
+) -> None:
+    config = in_folder()
+    with pytest.raises(MotionFault, match=r"POSITION_LIMIT \(1\): the joint stands at .0?.7001 rad, .*\[-0.7..0.7\]"):
+        require_ready(config, report(start_rad), log_path(config))
+
+
+@pytest.mark.parametrize("start_rad", [-0.7, 0.0, 0.7])
+def test_a_joint_at_its_limits_is_ready(in_folder: Callable[..., Config], start_rad: float) -> None:
+    config = in_folder()
+    require_ready(config, report(start_rad), log_path(config))
+
+
+# --- `jointctl log`: what is told, what is exported, and that foreign readers read it back; raw frames ---
 START_NS = 5_000_000_000
 WORDS = {DriveState.OFF: 0x0250, DriveState.STARTING: 0x0233, DriveState.ENABLED: 0x1237, DriveState.FAULT: 0x0218}
 
@@ -65,13 +200,13 @@ def some_frames() -> np.ndarray:
 
 
 @pytest.fixture
-def log_path(tmp_path: Path) -> Path:
+def made_log(tmp_path: Path) -> Path:
     path = tmp_path / "run.mcap"
     with RunLogWriter(path, {"run": {"configuration": "", "path": "joint.toml"}, "drive": {"serial": "7"}}) as log:
         records = run_records()
         log.write_frames(some_frames()[:2])
         log.write_records(records[:300])
-        for event in EventFinder().take(records):
+        for event in EventFinder(session_drive("canopen")).take(records):
             log.write_event(event.level, event.source, event.text, event.time_ns)
         log.write_frames(some_frames()[2:])
         log.write_records(records[300:])
@@ -85,8 +220,8 @@ def spoken(verb: Any, *arguments: Any, **options: Any) -> Any:
     return json.loads(out.getvalue())
 
 
-def test_info_tells_what_the_log_holds(log_path: Path) -> None:
-    data = spoken(log_info, log_path)
+def test_info_tells_what_the_log_holds(made_log: Path) -> None:
+    data = spoken(log_info, made_log)
     assert (data["records"], data["missing_records"], data["can_frames"], data["complete"]) == (400, 0, 5, True)
     assert data["configuration"] == "joint.toml"
     assert data["drive"]["serial"] == "7"
@@ -95,7 +230,7 @@ def test_info_tells_what_the_log_holds(log_path: Path) -> None:
         "waiting", "enabling", "tracking", "finished",
     ]  # fmt: skip
     out = io.StringIO()
-    assert log_info(log_path, Output(stdout=out, stderr=io.StringIO())) == 0
+    assert log_info(made_log, Output(stdout=out, stderr=io.StringIO())) == 0
     for text in ("missing records", "operation enabled", "joint.toml", "RMSE"):
         assert text in out.getvalue()
 
@@ -112,10 +247,10 @@ def test_a_log_that_is_thinned_on_purpose_misses_nothing(tmp_path: Path) -> None
     assert "missing" not in out.getvalue()
 
 
-def test_info_of_a_log_that_was_cut_off_says_so(log_path: Path) -> None:
-    log_path.write_bytes(log_path.read_bytes()[:-400])
+def test_info_of_a_log_that_was_cut_off_says_so(made_log: Path) -> None:
+    made_log.write_bytes(made_log.read_bytes()[:-400])
     err = io.StringIO()
-    assert log_info(log_path, Output(json=True, stdout=io.StringIO(), stderr=err)) == 0
+    assert log_info(made_log, Output(json=True, stdout=io.StringIO(), stderr=err)) == 0
     assert "cut off" in err.getvalue()
 
 
@@ -131,8 +266,8 @@ def test_missing_records_are_jumps_of_the_cycle_that_were_not_skipped() -> None:
     assert missing_records(records[:1]) == 0
 
 
-def test_csv_has_every_digit_of_every_field(log_path: Path) -> None:
-    target = Path(spoken(log_export, log_path, "csv")["file"])
+def test_csv_has_every_digit_of_every_field(made_log: Path) -> None:
+    target = Path(spoken(log_export, made_log, "csv")["file"])
     with target.open(newline="") as file:
         rows = list(csv.DictReader(file))
     records = run_records()
@@ -143,16 +278,16 @@ def test_csv_has_every_digit_of_every_field(log_path: Path) -> None:
     np.testing.assert_array_equal([float(row["weights_14"]) for row in rows], records.weights[:, 14])
 
 
-def test_npz_holds_the_records_and_the_events(log_path: Path) -> None:
-    target = Path(spoken(log_export, log_path, "npz")["file"])
+def test_npz_holds_the_records_and_the_events(made_log: Path) -> None:
+    target = Path(spoken(log_export, made_log, "npz")["file"])
     with np.load(target) as arrays:
         for name in LogRecord.__annotations__:
             np.testing.assert_array_equal(arrays[name], run_records()[name], err_msg=name)
         assert "loop: tracking" in arrays["event_text"].tolist()
 
 
-def test_candump_is_read_by_python_can(log_path: Path) -> None:
-    answer = spoken(log_export, log_path, "candump")
+def test_candump_is_read_by_python_can(made_log: Path) -> None:
+    answer = spoken(log_export, made_log, "candump")
     assert answer["rows"] == 5
     with can.CanutilsLogReader(answer["file"]) as reader:
         read = list(reader)
@@ -166,8 +301,8 @@ def test_candump_is_read_by_python_can(log_path: Path) -> None:
     np.testing.assert_allclose(steps_s, 1e-3, atol=2e-6)
 
 
-def test_a_ros_2_decoder_reads_the_frames(log_path: Path) -> None:
-    with log_path.open("rb") as file:
+def test_a_ros_2_decoder_reads_the_frames(made_log: Path) -> None:
+    with made_log.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         messages = [m for _, channel, _, m in reader.iter_decoded_messages() if channel.topic == "/can"]
     assert [(m.id, m.is_extended, m.is_rtr, m.is_error, m.dlc) for m in messages] == [
@@ -176,14 +311,14 @@ def test_a_ros_2_decoder_reads_the_frames(log_path: Path) -> None:
     ]  # fmt: skip
     assert bytes(messages[4].data) == bytes(range(0xF8, 0x100))
     assert (messages[4].header.stamp.sec, messages[4].header.stamp.nanosec) == (5, 4_000_000)
-    np.testing.assert_array_equal(read_run_log(log_path).frames, some_frames())
+    np.testing.assert_array_equal(read_run_log(made_log).frames, some_frames())
 
 
-def test_parquet_holds_every_column_and_the_metadata(log_path: Path) -> None:
+def test_parquet_holds_every_column_and_the_metadata(made_log: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
-    log = read_run_log(log_path)
-    target = log_path.with_suffix(".parquet")
-    target.write_bytes(parquet_bytes(log, log_path))
+    log = read_run_log(made_log)
+    target = made_log.with_suffix(".parquet")
+    target.write_bytes(parquet_bytes(log, made_log))
     table = parquet.read_table(target)
     found = columns(log.records)
     assert table.column_names == list(found)
@@ -193,30 +328,30 @@ def test_parquet_holds_every_column_and_the_metadata(log_path: Path) -> None:
     assert {key.decode(): value.decode() for key, value in table.schema.metadata.items()} == expected
 
 
-def test_parquet_without_pyarrow_says_what_to_install(log_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parquet_without_pyarrow_says_what_to_install(made_log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(DataError, match="needs the package pyarrow") as caught:
-        log_export(log_path, Output(stdout=io.StringIO()), "parquet")
+        log_export(made_log, Output(stdout=io.StringIO()), "parquet")
     assert "npz" in caught.value.hint
-    assert not log_path.with_suffix(".parquet").exists()
+    assert not made_log.with_suffix(".parquet").exists()
 
 
 @pytest.mark.parametrize("format", ["", "xlsx", "CSV"])
-def test_a_format_that_is_none_is_refused(log_path: Path, format: str) -> None:
+def test_a_format_that_is_none_is_refused(made_log: Path, format: str) -> None:
     with pytest.raises(DataError, match=r"format .* must be one of csv, npz, parquet, candump"):
-        log_export(log_path, Output(), format)
+        log_export(made_log, Output(), format)
 
 
 @pytest.mark.parametrize("format", ["csv", "npz", "candump"])
-def test_the_log_itself_is_never_overwritten(log_path: Path, format: str) -> None:
-    before = log_path.read_bytes()
+def test_the_log_itself_is_never_overwritten(made_log: Path, format: str) -> None:
+    before = made_log.read_bytes()
     with pytest.raises(DataError, match="is an input of this command"):
-        log_export(log_path, Output(), format, log_path.parent / "." / "run.mcap")
+        log_export(made_log, Output(), format, made_log.parent / "." / "run.mcap")
     with pytest.raises(DataError, match="no folder"):
-        log_export(log_path, Output(), format, log_path.parent / "none" / "x")
+        log_export(made_log, Output(), format, made_log.parent / "none" / "x")
     with pytest.raises(DataError, match="is an input of this command"):
-        log_plot(log_path, Output(), log_path)
-    assert log_path.read_bytes() == before
+        log_plot(made_log, Output(), made_log)
+    assert made_log.read_bytes() == before
     assert format in FORMATS
 
 
@@ -228,8 +363,8 @@ def test_candump_of_a_log_without_frames_tells_how_to_get_them(tmp_path: Path) -
     assert "log.frames" in caught.value.hint
 
 
-def test_plot_writes_a_png(log_path: Path) -> None:
-    assert Path(spoken(log_plot, log_path)["picture"]).read_bytes().startswith(b"\x89PNG")
+def test_plot_writes_a_png(made_log: Path) -> None:
+    assert Path(spoken(log_plot, made_log)["picture"]).read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_hundred_thousand_records_with_frames_between_them_all_come_back(tmp_path: Path) -> None:
@@ -270,9 +405,7 @@ def test_a_recorder_that_nobody_fetches_from_drops_and_counts(queue: int, kept: 
 
 
 def test_frames_of_a_serial_line_are_refused(virtual_config: Any) -> None:
-    bus = virtual_config.bus.model_copy(update={"interface": "serial"})
-    log = virtual_config.log.model_copy(update={"frames": True})
-    serial = virtual_config.model_copy(update={"bus": bus, "log": log})
+    serial = changed(virtual_config, bus__interface="serial", log__frames=True)
     with pytest.raises(ConfigurationError, match=r"log.frames \(=true\)"), recording(serial):
         pass
     with recording(virtual_config) as recorder:

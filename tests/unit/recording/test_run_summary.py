@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from jointctl.drivers.errors import DataError
-from jointctl.firmware_py.realtime import HISTOGRAM_BINS, Histogram
+from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_figure import drawn_indices, save_run_figure

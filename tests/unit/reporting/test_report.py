@@ -1,4 +1,4 @@
-"""Reports: self-contained, escaped, well-formed; two runs are compared at the same trajectory time."""
+"""Reports, their tables and drawings: self-contained, escaped, well-formed, in the colours of the page."""
 
 from __future__ import annotations
 
@@ -11,20 +11,155 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.table import Table
+from rich.text import Text
 
 from jointctl.drivers.errors import DataError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, DriveState, Fault
-from jointctl.tools.drawing import COLOURS
+from jointctl.tools.drawing import BLUE, COLOURS, canvas, png, save_png
+from jointctl.tools.experiments.campaign import MANY, campaign_figure, rows_by_kind, table
+from jointctl.tools.experiments.controller_study import PlantResult, StudyResult, study_figure
+from jointctl.tools.experiments.judge import Verdict
+from jointctl.tools.experiments.scenarios import ErrorFigures
 from jointctl.tools.output import Output
+from jointctl.tools.recording.report_figures import binned, friction_points, run_figures
+from jointctl.tools.recording.report_page import (
+    Details,
+    Figure,
+    Paragraph,
+    Section,
+    draw,
+    from_terminal,
+    page,
+    remarks,
+    svg_figure,
+    write_page,
+    write_verb_page,
+)
+from jointctl.tools.recording.report_page import Table as PageTable
+from jointctl.tools.recording.run_comparison import aligned, at_times
 from jointctl.tools.recording.run_log import INFO, RunLogWriter
 from jointctl.tools.recording.run_summary import summarise
-from jointctl.tools.reporting.comparison import aligned, at_times
-from jointctl.tools.reporting.page import Details, Figure, Paragraph, Section, Table, draw, page, write_page
-from jointctl.tools.reporting.run_figures import binned, friction_points, run_figures
 from jointctl.tools.verbs.report import MOST_LOGS, log_names, report, verdict
+from tests.page_figures import foreign_colours, svgs
 
+
+# --- One style for files and pages: PNG on white, SVG in the colours of the page ---
+def a_verdict(number: int) -> Verdict:
+    """Harmful, harmless and a violation in turn, of three kinds."""
+    violations = ("late",) if number % 5 == 0 else ()
+    return Verdict(number, f"kind_{number % 3}", number % 2 == 0, "NONE", "none", violations, 0.1 * number, 0.0, 0.1,
+                   0.01 if number % 4 else None)  # fmt: skip
+
+
+def small() -> Any:
+    with canvas(2.0, "title") as figure:
+        axes = figure.subplots()
+        axes.plot([0.0, 1.0], [0.0, 1.0], color=BLUE, label="line")
+        axes.set_ylabel("torque [Nm]")
+        axes.legend()
+        return figure
+
+
+def test_one_figure_is_a_png_on_white_and_an_svg_in_the_colours_of_the_page(tmp_path: Path) -> None:
+    import matplotlib.image
+
+    figure = small()
+    corner = matplotlib.image.imread(io.BytesIO(png(figure)))[0, 0]
+    assert corner.tolist() == [1.0, 1.0, 1.0, 1.0]
+    svg = svg_figure(figure, "a line").svg
+    assert svgs(svg) == [svg.strip()]
+    assert foreign_colours(svg) == set()
+    assert "stroke: var(--blue)" in svg
+    assert "torque [Nm]</text>" in svg
+    assert save_png(figure, tmp_path / "new" / "a.png").read_bytes() == png(figure)
+
+
+def test_a_colour_of_its_own_or_black_text_would_be_found() -> None:
+    figure = small()
+    figure.axes[0].set_xlabel("here", color="#000000")
+    figure.axes[0].axhline(0.5, color="#123456")
+    found = foreign_colours(svg_figure(figure, "a line").svg)
+    assert "#123456" in found
+    assert len(found) == 2
+
+
+def test_a_picture_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match=r"a\.png: cannot be written"):
+        save_png(small(), tmp_path / "file" / "a.png")
+
+
+def test_the_boxes_of_a_study_follow_the_page() -> None:
+    plants = tuple(
+        PlantResult(i, "lugre", 19, tuple(ErrorFigures("", *(0.1 * (i + k + 1),) * 8) for k in range(2)))
+        for i in range(8)
+    )
+    figure = study_figure(StudyResult(("paper", "precise"), plants, False), "eight plants")
+    assert foreign_colours(svg_figure(figure, "boxes").svg) == set()
+
+
+@pytest.mark.parametrize("count", [12, MANY + 1])
+def test_the_points_of_a_campaign_follow_the_page_or_are_legible_on_it(count: int) -> None:
+    found = [a_verdict(number) for number in range(count)]
+    svg = svg_figure(campaign_figure(found, 1.0), "points").svg
+    assert foreign_colours(svg) == set()
+    assert ("data:image/png" in svg) is (count > MANY)
+
+
+def test_the_heading_of_a_campaigns_table_keeps_its_units() -> None:
+    shown = io.StringIO()
+    Output(stdout=shown).result(table(rows_by_kind([a_verdict(1)])))
+    for heading in ("speed [rad/s]", "beyond limit [rad]", "allowed [rad]", "off after [s]"):
+        assert heading in shown.getvalue()
+    assert "no fault 1" in shown.getvalue()
+
+
+# --- Tables of the terminal on a page: the same words, without styles ---
+def test_a_table_of_the_terminal_keeps_its_words() -> None:
+    table = Table(title="errors [mrad]", caption="after 5 s")
+    table.add_column("name")
+    table.add_column("peak [mrad]", justify="right")
+    table.add_row(Text.assemble("a ", ("red", "red"), " one"), "1.5", style="red")
+    table.add_section()
+    table.add_row("[b]", Text("<2>"))
+    found = from_terminal(table)
+    assert list(found.headings) == ["name", "peak [mrad]"]
+    assert [tuple(row) for row in found.rows] == [("a red one", "1.5"), ("[b]", "<2>")]
+    assert found.caption == "errors [mrad]. after 5 s"
+
+
+def test_a_table_without_rows_or_header_is_one_as_well() -> None:
+    table = Table(show_header=False)
+    table.add_column("hidden")
+    assert list(from_terminal(table).headings) == [""]
+    assert list(from_terminal(table).rows) == []
+
+
+def test_a_column_that_says_nothing_is_left_out_and_ranges_stay_in_one_piece() -> None:
+    table = Table("name", "range", "weak", "pair")
+    table.add_row("a", "1 .. 2", "", "(-0.1, 0.2) 0.3")
+    table.add_row("b", "", "", "least, greatest")
+    found = from_terminal(table)
+    assert list(found.headings) == ["name", "range", "pair"]
+    space = "\N{NO-BREAK SPACE}"
+    assert found.rows[0] == ("a", f"1{space}..{space}2", f"(-0.1,{space}0.2) 0.3")
+    assert found.rows[1] == ("b", "", "least, greatest")
+
+
+def test_sections_without_content_are_left_out_and_text_is_escaped(tmp_path: Path) -> None:
+    err, path = io.StringIO(), tmp_path / "a.html"
+    sections = [Section("Full", remarks(["<b>"])), Section("Empty", [])]
+    write_verb_page(path, "T", sections, Output(stderr=err), subtitle="what")
+    html = path.read_text()
+    assert "&lt;b&gt;" in html
+    assert "Empty" not in html
+    assert err.getvalue() == f"written: {path}\n"
+
+
+# --- Reports: self-contained, escaped, well-formed; two runs are compared at the same trajectory time ---
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 
 
@@ -245,19 +380,12 @@ def test_logs_of_one_name_are_told_apart() -> None:
 
 
 def test_the_page_takes_every_block(tmp_path: Path) -> None:
-    table = Table(["<name>", "value"], [["a", "1.5"], ["b", "-2 %"]], "caption", {1: "error"})
+    table = PageTable(["<name>", "value"], [["a", "1.5"], ["b", "-2 %"]], "caption", {1: "error"})
     picture = Figure("a dot", '<svg><circle r="1"/></svg>')
     blocks = [Paragraph("5 < 6"), table, picture, Details("more", "<x>"), draw(1.0, lambda f: f.subplots(), "axes")]
     html = page("T & T", [Section("One", blocks), Section("Two", [draw(1.0, lambda f: f.subplots(), "again")])])
     check(html)
-    for text in (
-        "T &amp; T",
-        "5 &lt; 6",
-        "&lt;name&gt;",
-        'class="error"',
-        '<svg><circle r="1"/></svg>',
-        "&lt;x&gt;",
-    ):
+    for text in ("T &amp; T", "5 &lt; 6", "&lt;name&gt;", 'class="error"', '<svg><circle r="1"/></svg>', "&lt;x&gt;"):
         assert text in html
     assert write_page(tmp_path / "p.html", html).read_text() == html
 
@@ -267,4 +395,4 @@ def test_the_page_takes_every_block(tmp_path: Path) -> None:
     [(["1", "-2.5"], True), (["1e-3", "-"], True), (["5 %"], True), (["-"], False), (["1", "a"], False), ([], False)],
 )
 def test_columns_of_numbers_stand_right(cells: list[str], number: bool) -> None:
-    assert Table(["x"], [[cell] for cell in cells]).is_number(0) is number
+    assert PageTable(["x"], [[cell] for cell in cells]).is_number(0) is number

@@ -1,18 +1,25 @@
-"""A program's right to a joint: what its stops ask for, and how long it may take to end."""
+"""A program's right to a joint, stop signals, and how `jointctl stop` ends the program that controls a bus."""
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from jointctl.drivers.bus_lock import BusLock
+from jointctl.drivers.bus_lock import BusLock, lock_name
 from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.output import Output
-from jointctl.tools.session import control
+from jointctl.tools.session import control, stop_call
 from jointctl.tools.session.control import (
+    AGAIN_S,
     FILES_S,
     STOP_COMMAND,
     STOP_SIGNALS,
@@ -22,8 +29,10 @@ from jointctl.tools.session.control import (
     stop_signals,
     stop_within_s,
 )
+from jointctl.tools.session.stop_call import StopCall
 
 
+# --- A program's right to a joint: what its stops ask for, and how long it may take to end ---
 @pytest.mark.parametrize(
     ("count", "commanded", "request_"),
     [
@@ -109,3 +118,239 @@ def test_in_control_the_lock_is_held_and_its_remarks_are_told(
             signal.raise_signal(signal.SIGTERM)
     assert times_s == [stop_within_s(virtual_config) if configured else 3.0]
     assert "a remark" in capsys.readouterr().err
+
+
+# --- Stop signals that come where an exception does not get through ---
+@ctypes.CFUNCTYPE(None)
+def stopped_in_a_callback() -> None:
+    """As the compiler's, while it runs."""
+    signal.raise_signal(signal.SIGINT)
+
+
+class StoppedAtItsEnd:
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+
+@pytest.fixture
+def terminated() -> Iterator[list[int]]:
+    """SIGTERM that comes when nobody collects stop signals; it would end the program."""
+    came: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda number, _: came.append(number))
+    yield came
+    signal.signal(signal.SIGTERM, before)
+
+
+@pytest.mark.parametrize("stopped", [stopped_in_a_callback, lambda: StoppedAtItsEnd() and None])
+def test_a_stop_that_a_library_swallows_is_raised_again(stopped: Any, capsys: Any) -> None:
+    with stop_signals(raising=True) as signals:
+        with pytest.raises(KeyboardInterrupt):  # noqa: PT012  (it is raised by the second line)
+            stopped()
+            time.sleep(5.0)
+        assert (signals.count, signals.name) == (1, "SIGINT")
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_it_is_raised_neither_while_signals_are_held_nor_afterwards(terminated: list[int]) -> None:
+    hook = sys.unraisablehook
+    with stop_signals(raising=True) as signals:
+        stopped_in_a_callback()
+        with signals.held():
+            time.sleep(2.0 * AGAIN_S)
+        stopped_in_a_callback()
+    time.sleep(2.0 * AGAIN_S)
+    assert signals.count == 2
+    assert terminated == []
+    assert sys.unraisablehook is hook
+
+
+def test_what_else_goes_wrong_there_is_shown_as_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[Any] = []
+    monkeypatch.setattr(sys, "unraisablehook", shown.append)
+
+    @ctypes.CFUNCTYPE(None)
+    def wrong() -> None:
+        raise ValueError
+
+    with stop_signals(raising=True) as signals:
+        wrong()
+    assert [lost.exc_type for lost in shown] == [ValueError]
+    assert signals.count == 0
+    shown.clear()
+
+
+# --- How `jointctl stop` ends the program that controls a bus, step by step in simulated time ---
+FOR_EVER = 1e9
+
+
+class Program:
+    """As `Holder`: a program that holds a name of the lock, until `leaves_s`."""
+
+    def __init__(self, pid: int = 7, *, leaves_s: float = FOR_EVER, **said: Any) -> None:
+        self.pid, self._leaves_s = pid, leaves_s
+        self.is_controller: bool = said.get("is_controller", True)
+        self.within_s: float | None = said.get("within_s")
+        self.refused: str = said.get("refused", "")
+        self.log: list[str] = []
+        self.computer: Computer | None = None
+
+    def send(self, ask: str) -> None:
+        self.log.append(ask)
+
+    def close(self) -> None:
+        self.log.append("closed")
+
+    @property
+    def left(self) -> bool:
+        assert self.computer is not None
+        return self.computer.now_s >= self._leaves_s
+
+
+class Computer:
+    """`holders`: who has the lock at each further look.  `starting`, `marked`: process -> when it loses its mark."""
+
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, *holders: list[Program], marked: dict[int, float] | None = None,
+        starting: dict[int, float] | None = None, deaf_to: tuple[signal.Signals, ...] = (),
+    ) -> None:  # fmt: skip
+        self.now_s = 0.0
+        self.holders = [*holders]
+        self.marks = {stop_call.STARTING: starting or {}, lock_name("socketcan", "x"): marked or {}}
+        self.deaf_to = deaf_to
+        self.signals: list[tuple[list[int], str, float]] = []
+        self.notes: list[str] = []
+        for program in (program for look in holders for program in look):
+            program.computer = self
+        monkeypatch.setattr(stop_call, "time", SimpleNamespace(monotonic=lambda: self.now_s, sleep=self.sleep))
+        monkeypatch.setattr(stop_call, "lock_holders", lambda *_: self.holders.pop(0) if self.holders else [])
+        monkeypatch.setattr(stop_call, "wait_for_answers", lambda _: None)
+        monkeypatch.setattr(stop_call, "is_marked", self.is_marked)
+        monkeypatch.setattr(
+            stop_call, "marked_processes", lambda name: [pid for pid in self.marks[name] if self.is_marked(pid, name)]
+        )
+        monkeypatch.setattr(stop_call, "_signalled", self.signalled)
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s = round(self.now_s + seconds, 6)
+
+    def is_marked(self, pid: int, name: str) -> bool:
+        return self.now_s < self.marks[name][pid]
+
+    def signalled(self, pids: list[int], name: str, number: signal.Signals, wait_s: float) -> list[int]:
+        self.signals.append((pids, number.name, wait_s))
+        if number in self.deaf_to:
+            return pids
+        for pid in pids:
+            self.marks[name][pid] = self.now_s
+        return []
+
+    def stopped(self) -> bool:
+        with StopCall("socketcan", "x") as call:
+            return call.end(self.notes.append)
+
+
+def test_where_no_one_has_the_bus_nothing_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    computer = Computer(monkeypatch)
+    assert not computer.stopped()
+    assert (computer.now_s, computer.notes, computer.signals) == (0.0, [], [])
+
+
+@pytest.mark.parametrize(
+    ("leaves_s", "unmarked_s", "within_s", "waited_s", "forced"),
+    [
+        (1.0, 0.5, 8.0, 1.0, False),
+        (0.5, 2.0, 8.0, 2.0, False),  # one of its processes takes longer
+        (FOR_EVER, 0.0, 3.0, 3.0, False),
+        (FOR_EVER, FOR_EVER, 3.0, 3.0, True),
+        (FOR_EVER, FOR_EVER, 0.0, 0.0, True),
+        (FOR_EVER, FOR_EVER, 1000.0, stop_call.LONGEST_S, True),
+    ],
+)
+def test_one_that_acknowledges_has_its_own_time(
+    monkeypatch: pytest.MonkeyPatch, leaves_s: float, unmarked_s: float, within_s: float, waited_s: float, forced: bool
+) -> None:
+    program = Program(leaves_s=leaves_s, within_s=within_s)
+    computer = Computer(monkeypatch, [program], marked={7: unmarked_s})
+    assert computer.stopped()
+    assert computer.now_s == waited_s
+    assert computer.notes[0] == "stopping the program that controls the bus (pid 7)"
+    assert (len(computer.notes), bool(computer.signals)) == (1 + forced, forced)
+    assert program.log == ["stop", "closed"]
+
+
+def test_of_two_controllers_the_slower_one_decides(monkeypatch: pytest.MonkeyPatch) -> None:
+    computer = Computer(monkeypatch, [Program(7, within_s=2.0, leaves_s=1.0), Program(8, within_s=5.0)])
+    assert computer.stopped()
+    assert computer.now_s == 5.0
+
+
+@pytest.mark.parametrize("said", [{}, {"refused": "it is another's"}, {"is_controller": False, "within_s": 8.0}])
+def test_no_time_is_given_to_one_that_does_not_acknowledge(
+    monkeypatch: pytest.MonkeyPatch, said: dict[str, Any]
+) -> None:
+    computer = Computer(monkeypatch, [Program(**said)])
+    assert computer.stopped() is said.get("is_controller", True)
+    refused = "the program that controls the bus (pid 7) cannot be ended: it is another's"
+    assert computer.notes == ([refused] if "refused" in said else [])
+    assert computer.now_s == 0.0
+
+
+@pytest.mark.parametrize("first", [[], [Program(6, is_controller=False)]])
+def test_a_controller_that_came_after_the_request_gets_one_of_its_own(
+    monkeypatch: pytest.MonkeyPatch, first: list[Program]
+) -> None:
+    later = Program(leaves_s=0.1, within_s=8.0)
+    computer = Computer(monkeypatch, first, [later], marked={7: 0.1})
+    assert computer.stopped()
+    assert later.log == ["stop", "closed"]
+    assert all(program.log == ["stop", "closed"] for program in first)
+    assert computer.signals == []
+
+
+def test_a_controller_that_was_asked_is_not_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    computer = Computer(monkeypatch, [Program(within_s=8.0, leaves_s=0.1)], marked={7: 0.1})
+    computer.stopped()
+    assert computer.notes == ["stopping the program that controls the bus (pid 7)"]
+
+
+@pytest.mark.parametrize(("started_s", "waited_s"), [(0.0, 0.0), (3.0, 3.0), (FOR_EVER, stop_call.STARTING_S)])
+def test_one_that_starts_is_waited_for_and_ended_as_well(
+    monkeypatch: pytest.MonkeyPatch, started_s: float, waited_s: float
+) -> None:
+    later = Program(leaves_s=0.0, within_s=8.0)
+    computer = Computer(monkeypatch, [], [later], starting={7: started_s, 8: 0.0})
+    assert computer.stopped()
+    assert computer.now_s == waited_s
+    assert later.log == ["stop", "closed"]
+
+
+@pytest.mark.parametrize("deaf_to", [(), (signal.SIGTERM,), (signal.SIGTERM, signal.SIGKILL)])
+def test_what_is_left_is_ended_by_force(monkeypatch: pytest.MonkeyPatch, deaf_to: tuple[signal.Signals, ...]) -> None:
+    computer = Computer(monkeypatch, [], [], marked={7: FOR_EVER, 9: FOR_EVER}, deaf_to=deaf_to)
+    computer.stopped()
+    left = [7, 9] if deaf_to else []
+    assert computer.signals[:2] == [([7, 9], "SIGTERM", stop_call.TERM_S), (left, "SIGKILL", stop_call.KILL_S)]
+    assert computer.notes[0] == f"it does not end by itself: ending process 7, 9; {stop_call.ARMED}"
+    cannot = "process 7, 9 cannot be ended; the drive may be enabled again"
+    assert (cannot in computer.notes) is (signal.SIGKILL in deaf_to)
+
+
+@pytest.mark.parametrize("marked", [True, False])
+def test_only_what_acts_for_the_controller_gets_the_signal(monkeypatch: pytest.MonkeyPatch, marked: bool) -> None:
+    monkeypatch.setattr(stop_call, "is_marked", lambda pid, name: marked and name == "its name")
+    monkeypatch.setattr(stop_call, "time", SimpleNamespace(monotonic=lambda: 0.0))
+    open_before = len(os.listdir("/proc/self/fd"))
+    with subprocess.Popen(["sleep", "60"]) as process, subprocess.Popen(["true"]) as gone:
+        gone.wait()
+        assert stop_call._signalled([gone.pid, process.pid], "its name", signal.SIGTERM, 0.5) == []
+        if not marked:
+            process.kill()
+        assert process.wait() == (-signal.SIGTERM if marked else -signal.SIGKILL)
+    assert len(os.listdir("/proc/self/fd")) == open_before
+
+
+def test_those_that_live_on_after_a_signal_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stop_call, "is_marked", lambda *_: True)
+    with subprocess.Popen(["sleep", "60"]) as process:
+        assert stop_call._signalled([process.pid], "its name", signal.SIGCONT, 0.01) == [process.pid]
+        process.kill()

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from jointctl.drivers.elmo.switch_off import SWITCH_OFF
+from jointctl.drivers.elmo.dialogue import SWITCH_OFF
 from jointctl.drivers.errors import MotionFault
-from jointctl.firmware_py.realtime import WORDS, Word
+from jointctl.firmware_py.cycle import WORDS, Word
 from jointctl.firmware_py.states import Fault, StopRequest
-from jointctl.tools.session import line_guard, loop_handle
-from jointctl.tools.session.guard import SPARE_S
-from jointctl.tools.session.line_guard import LATE_S, OBEY_S, GuardOrder, LineGuard
+from jointctl.tools.session import elmo_guard, loop_handle
+from jointctl.tools.session.elmo_drive import SPARE_S
+from jointctl.tools.session.elmo_guard import LATE_S, OBEY_S, GuardOrder, LineGuard
 from jointctl.tools.session.loop_handle import OPENING_S, SILENT_S, LoopHandle
 
 NOW_ns = 10_000_000_000_000
@@ -43,6 +43,9 @@ class LivingProcess:
         return -9
 
 
+@pytest.mark.trips("supervisor: the loop process", "(MICROSECOND_ns, True)")
+@pytest.mark.stays("supervisor: the loop process", "(0, False)")
+@pytest.mark.stays("serial supervisor: the loop process", "(0, False)")
 @pytest.mark.parametrize(("cycles", "limit_s"), [(0, OPENING_S), (1, SILENT_S), (100_000, SILENT_S)])
 @pytest.mark.parametrize(("past_ns", "hangs"), [(-MICROSECOND_ns, False), (0, False), (MICROSECOND_ns, True)])
 def test_the_supervisor_ends_a_loop_that_hangs_and_no_other(
@@ -66,7 +69,7 @@ class Guard:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         clock = SimpleNamespace(monotonic_ns=lambda: NOW_ns, monotonic=lambda: NOW_ns * 1e-9)
-        monkeypatch.setattr(line_guard, "time", clock)
+        monkeypatch.setattr(elmo_guard, "time", clock)
         monkeypatch.setattr(LineGuard, "_end_both", lambda _: setattr(self, "ended_both", True))
         self.ended_both = False
         self.read_fd, write_fd = os.pipe()
@@ -103,6 +106,8 @@ def guard(monkeypatch: pytest.MonkeyPatch) -> Any:
     guard.close()
 
 
+@pytest.mark.trips("serial guard: a loop that hangs", "(MICROSECOND_ns, True)")
+@pytest.mark.stays("serial guard: a loop that hangs", "(-MICROSECOND_ns, False)")
 @pytest.mark.parametrize(("past_ns", "hangs"), [(-MICROSECOND_ns, False), (MICROSECOND_ns, True)])
 @pytest.mark.parametrize("over", [None, Word.ENDED, Word.GO])
 def test_the_guard_switches_off_behind_a_loop_that_hangs_and_behind_no_other(
@@ -129,6 +134,8 @@ def test_after_a_stop_was_asked_for_the_guard_waits_less_for_the_loop(
     assert guard.looks() == (SWITCH_OFF if late and asked else b"")
 
 
+@pytest.mark.trips("serial user: everything", "(OBEY_S + 0.01, True, True)")
+@pytest.mark.stays("serial user: everything", "(OBEY_S - 0.01, True, False)")
 @pytest.mark.parametrize(("asked_for_s", "told", "ended"), [
     (0.99, False, False), (1.01, True, False), (OBEY_S - 0.01, True, False), (OBEY_S + 0.01, True, True),
 ])  # fmt: skip

@@ -2,18 +2,147 @@
 
 from __future__ import annotations
 
+import json
+import os
+import struct
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import can
 import pytest
 
-from jointctl.firmware_py.realtime import Histogram, Word
-from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest
-from jointctl.tools.session import portable_loop
+from jointctl.drivers.canopen.cyclic import CanopenPort
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py import cycle
+from jointctl.firmware_py.cycle import Histogram, Word
+from jointctl.firmware_py.sequence import reset_axis
+from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest, TrajectoryKind
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.session import loop_process, loops, portable_loop
 from jointctl.tools.session.loop_handle import SharedBlock
-from tests.unit.session.portable_bus import OWN_HEARTBEAT, PERIOD_NS, RPDO, SYNC, Clock, DriveBus, run
+from jointctl.tools.session.portable_loop import (
+    HIGHEST_RATE_HZ,
+    check_portable_rate,
+    held_rate_Hz,
+    portable_note,
+    run_portable_loop,
+)
+from tests.sessions import constants_of
+
+# --- A small drive that is the bus itself, and a clock that only moves when it is asked ---
+PERIOD_NS = 1_000_000
+RECEIVE_NS = 600_000
+SYNC, RPDO, TPDO, OWN_HEARTBEAT = 0x80, 0x201, 0x181, 0x77E
+LIMIT = 8  # failed cycles in a row that are allowed
+NEXT_STATUS = {(0x40, 6): 0x21, (0x21, 7): 0x23, (0x23, 0x0F): 0x27, (0x27, 0x0F): 0x27, (0x27, 2): 0x40}
 
 
+class DriveBus:
+    """A bus with one drive at rest: RPDOs take effect at the SYNC, which it answers with its TPDO."""
+
+    def __init__(self, echo: bool = False) -> None:
+        self.sent: list[tuple[int, bytes]] = []
+        self.waiting: deque[can.Message] = deque()
+        self.status = 0x40
+        self.control = 0
+        self.syncs = 0
+        self.powered_syncs = 0
+        self.echo = echo
+        self.on_send: Callable[[DriveBus, int], None] = lambda bus, identifier: None
+        self.on_recv: Callable[[DriveBus], None] = lambda bus: None
+
+    def send(self, message: can.Message, timeout: float | None = None) -> None:
+        identifier, data = message.arbitration_id, bytes(message.data)
+        if identifier == SYNC:
+            self.syncs += 1
+            self.powered_syncs += self.status == 0x27
+        self.on_send(self, identifier)
+        self.sent.append((identifier, data))
+        if self.echo:
+            self.waiting.append(message)
+        if identifier == RPDO:
+            self.control = struct.unpack_from("<H", data)[0]
+        elif identifier == SYNC:
+            self.status = NEXT_STATUS.get((self.status, self.control), 0x40 if self.control == 0 else self.status)
+            self.waiting.append(frame(TPDO, struct.pack("<Hih", self.status, 0, 0)))
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        self.on_recv(self)
+        return self.waiting.popleft() if self.waiting else None
+
+    def count(self, identifier: int) -> int:
+        return sum(sent == identifier for sent, _ in self.sent)
+
+
+def frame(identifier: int, data: bytes = b"") -> can.Message:
+    return can.Message(arbitration_id=identifier, is_extended_id=False, data=data)
+
+
+class Clock:
+    """Time that passes while the loop sleeps, and a little with every look at it: a busy computer changes nothing."""
+
+    def __init__(self) -> None:
+        self.now_ns = 1_000_000_000
+
+    def monotonic_ns(self) -> int:
+        self.now_ns += 1000
+        return self.now_ns
+
+    def sleep(self, duration_s: float) -> None:
+        self.now_ns += round(duration_s * 1e9)
+
+    def sleep_until_ns(self, deadline_ns: int, _: Any) -> None:
+        self.now_ns = max(self.now_ns, deadline_ns)
+
+
+def run(bus: DriveBus, block: SharedBlock, max_cycles: int = 5000) -> int:
+    return run_portable_loop(bus, block, PERIOD_NS, RECEIVE_NS, max_cycles)
+
+
+@pytest.fixture(scope="module")
+def warm() -> None:
+    """Compiling in the middle of a run would be an overrun of seconds."""
+    portable_loop.warm_up()
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """The clock of the loop."""
+    clock = Clock()
+    monkeypatch.setattr(portable_loop, "time", clock)
+    monkeypatch.setattr(portable_loop, "sleep_until_ns", clock.sleep_until_ns)
+    return clock
+
+
+@pytest.fixture
+def block(clock: Clock, warm: None) -> Iterator[SharedBlock]:
+    """Holds position 0 for 50 ms; no limit of the schedule or of the supervisor is at work."""
+    block = SharedBlock.create(1, CanopenPort)
+    block.constants[:] = constants_of(load_config(shipped_config("virtual")), start_position_rad=0.0)
+    axis = block.constants[0]
+    axis.trajectory.kind = TrajectoryKind.HOLD
+    axis.trajectory.duration_s = 0.05
+    axis.sequence.approach_s = 0.0
+    axis.sequence.settle_cycles = 5
+    axis.sequence.release_s = 0.005
+    axis.sequence.supervisor_max_cycles = 0
+    axis.limits.skipped_max_cycles = 1 << 40
+    axis.limits.sample_age_max_cycles = LIMIT
+    reset_axis(axis, block.state[0])
+    port = block.port[0]
+    port.sync_id, port.tpdo_id, port.rpdo_id = SYNC, TPDO, RPDO
+    port.emergency_id, port.heartbeat_id, port.own_heartbeat_id = 0x81, 0x701, OWN_HEARTBEAT
+    port.heartbeat_cycles = 5
+    port.tpdo_length, port.rpdo_length = 8, 4
+    port.position_at, port.torque_at, port.target_at = 2, 6, 2
+    port.position_radpcount, port.torque_Nmppermille, port.max_permille = 1e-4, 0.06, 1000
+    yield block
+    os.close(block.fd)
+
+
+# --- The plain Python loop against a small drive that is the bus itself: no threads, no processes, no real time ---
 def test_a_regular_run_ends_disabled_and_is_logged(block: SharedBlock) -> None:
     bus = DriveBus()
     executed = run(bus, block)
@@ -31,7 +160,7 @@ def test_a_regular_run_ends_disabled_and_is_logged(block: SharedBlock) -> None:
 
 def test_an_exception_sends_controlword_0_and_a_sync_once(block: SharedBlock, monkeypatch: pytest.MonkeyPatch) -> None:
     bus = DriveBus()
-    step_axis = portable_loop.step_axis
+    step_axis = cycle.step_axis
     frames_before = []
 
     def failing(*arguments: Any) -> None:
@@ -40,7 +169,7 @@ def test_an_exception_sends_controlword_0_and_a_sync_once(block: SharedBlock, mo
             raise MemoryError("no more")
         step_axis(*arguments)
 
-    monkeypatch.setattr(portable_loop, "step_axis", failing)
+    monkeypatch.setattr(cycle, "step_axis", failing)
     with pytest.raises(MemoryError, match="no more"):
         run(bus, block)
     assert bus.sent[frames_before[0] :] == [(RPDO, bytes(4)), (SYNC, b"")]
@@ -56,7 +185,7 @@ def test_an_exception_on_a_dead_bus_is_still_the_exception(block: SharedBlock, m
 
     bus = DriveBus()
     bus.on_send = dead
-    monkeypatch.setattr(portable_loop, "step_axis", failing)
+    monkeypatch.setattr(cycle, "step_axis", failing)
     with pytest.raises(MemoryError, match="no more"):
         run(bus, block)
 
@@ -122,3 +251,157 @@ def test_a_sample_of_an_earlier_sync_belongs_to_no_slot(block: SharedBlock, late
     run(LateBus(), block, 4)
     assert block.state[0].sample_age_cycles == 0
     assert bool(block.state[0].sample_late_s == 0.0) == late
+
+
+# --- What a bus may do to the plain Python loop: failed sends, error frames, a receive that raises, foreign frames ---
+def lose_rpdo(bus: DriveBus, identifier: int, error: Exception) -> None:
+    if identifier == RPDO:
+        raise error
+
+
+@pytest.mark.parametrize(
+    "error", [can.CanOperationError("queue full"), OSError(105, "ENOBUFS"), RuntimeError("vendor")]
+)
+@pytest.mark.parametrize("failing_cycles", [1, LIMIT - 1, LIMIT, LIMIT + 1, LIMIT + 2])
+def test_failed_sends_trip_only_beyond_the_limit(block: SharedBlock, failing_cycles: int, error: Exception) -> None:
+    bus = DriveBus()
+
+    def on_send(bus: DriveBus, identifier: int) -> None:
+        if 10 <= bus.powered_syncs < 10 + failing_cycles:
+            lose_rpdo(bus, identifier, error)
+
+    bus.on_send = on_send
+    run(bus, block)
+    tripped = failing_cycles > LIMIT
+    assert block.state[0].fault == (Fault.BUS_ERROR if tripped else Fault.NONE)
+    assert block.state[0].phase == AxisPhase.FINISHED
+    assert block.port[0].send_failures == failing_cycles
+    assert block.port[0].consecutive_failures == 0
+
+
+@pytest.mark.parametrize("failing_cycles", [1, LIMIT - 1, LIMIT, LIMIT + 1, LIMIT + 2])
+def test_error_frames_trip_only_beyond_the_limit(block: SharedBlock, failing_cycles: int) -> None:
+    bus = DriveBus()
+
+    def on_send(bus: DriveBus, identifier: int) -> None:
+        if identifier == SYNC and bus.status == 0x27 and 10 <= bus.powered_syncs < 10 + failing_cycles:
+            bus.waiting.append(can.Message(is_error_frame=True))
+
+    bus.on_send = on_send
+    run(bus, block)
+    assert block.state[0].fault == (Fault.BUS_ERROR if failing_cycles > LIMIT else Fault.NONE)
+    assert block.port[0].error_frames == failing_cycles
+
+
+@pytest.mark.parametrize("for_good", [True, False])
+def test_a_receive_that_raises_does_not_leave_the_loop(block: SharedBlock, for_good: bool) -> None:
+    bus = DriveBus()
+
+    def on_recv(bus: DriveBus) -> None:
+        if bus.powered_syncs >= 10 and (for_good or bus.powered_syncs < 13):
+            raise can.CanOperationError("could not unpack received message")
+
+    bus.on_recv = on_recv
+    block.constants[0].sequence.stop_max_cycles = block.constants[0].sequence.off_max_cycles = 20
+    run(bus, block)
+    assert block.state[0].phase == AxisPhase.FINISHED
+    found = block.state[0].fault
+    assert found in (Fault.BUS_ERROR, Fault.STALE_SAMPLE) if for_good else found == Fault.NONE
+    assert bus.sent[-1] == (RPDO, bytes(4))
+
+
+def test_own_echoes_are_not_counted(block: SharedBlock) -> None:
+    bits = []
+    for echo in (False, True):
+        block.port[0].bits_sent = block.port[0].cycle = 0
+        reset_axis(block.constants[0], block.state[0])
+        run(DriveBus(echo), block, max_cycles=20)
+        bits.append(int(block.port[0].bits_sent))
+    # the first TPDO behind an echo may be left for the next cycle, so that one may be missing at the end
+    assert 0 <= bits[0] - bits[1] <= 135
+
+
+def test_foreign_frames_do_no_harm(block: SharedBlock) -> None:
+    bus = DriveBus()
+    foreign = [
+        can.Message(arbitration_id=TPDO, is_extended_id=True, data=bytes(8)),
+        can.Message(arbitration_id=TPDO, is_extended_id=False, is_fd=True, data=bytes(12)),
+        can.Message(arbitration_id=TPDO, is_extended_id=False, is_remote_frame=True, dlc=8),
+        frame(TPDO, b"\x27\x00"),
+        frame(0x701, b""),
+    ]
+
+    def on_send(bus: DriveBus, identifier: int) -> None:
+        if identifier == SYNC:
+            bus.waiting.extend(foreign)
+
+    bus.on_send = on_send
+    executed = run(bus, block)
+    assert (block.state[0].phase, block.state[0].fault) == (AxisPhase.FINISHED, Fault.NONE)
+    assert block.port[0].malformed == executed
+
+
+# --- The process of the plain Python loop: which rates it takes, and that it ends with one line ---
+@pytest.mark.parametrize("rate_Hz", [1.0, 499.0, 500.0])
+def test_rates_that_are_allowed(rate_Hz: float) -> None:
+    check_portable_rate("slcan", rate_Hz)
+
+
+@pytest.mark.parametrize("rate_Hz", [500.001, 501.0, 1000.0])
+def test_rates_that_are_refused(rate_Hz: float) -> None:
+    with pytest.raises(ConfigurationError, match=r"loop\.rate_Hz .*must be at most 500 .*slcan"):
+        check_portable_rate("slcan", rate_Hz)
+
+
+def order(interface: str, period_ns: int, block: SharedBlock) -> str:
+    channel = "no-such-bus"
+    fd = os.dup(block.fd)
+    timing = period_ns, 600_000, None, None
+    return loop_process.LoopOrder(os.getpid(), fd, 1, "canopen", interface, channel, *timing).argument()
+
+
+@pytest.mark.parametrize(
+    ("interface", "period_ns", "code", "text"),
+    [
+        ("nonsense", 10_000_000, 4, "interface (='nonsense') must be one of"),
+        ("udp_multicast", 1_000_000, 3, "loop.rate_Hz (=1000) must be at most 500"),
+        ("jointctl", 1_000_000, 4, "no virtual bus at"),
+    ],
+)
+def test_the_process_ends_with_one_line(
+    interface: str,
+    period_ns: int,
+    code: int,
+    text: str,
+    block: SharedBlock,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(loop_process, "_block_signals", lambda: None)
+    monkeypatch.setattr(loops, "compiled_call", lambda *_: lambda cycles: cycles)
+    monkeypatch.setattr(sys, "argv", ["loop", order(interface, period_ns, block)])
+    assert loop_process.main() == code
+    lines = capsys.readouterr().err.splitlines()
+    assert text in lines[-1]
+    assert sum("plain Python loop over" in line for line in lines[:-1]) == len(lines) - 1
+
+
+def test_an_unexpected_exception_is_one_line_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(loop_process, "_block_signals", lambda: None)
+    monkeypatch.setattr(sys, "argv", ["loop", json.dumps({"surprise": 1})])
+    assert loop_process.main() == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("loop: TypeError at loop_process.py:")
+    assert "surprise" in line
+
+
+def test_the_rate_that_is_held_is_told_and_one_beyond_it_warned_of() -> None:
+    assert "holds about 400 Hz now; expect" in portable_note("slcan", 400.0, 400.0)
+    assert "holds about 400 Hz now, LESS than loop.rate_Hz (=401)" in portable_note("slcan", 401.0, 400.0)
+
+
+def test_the_rate_that_is_held_follows_from_wake_up_and_work() -> None:
+    assert 0.0 < held_rate_Hz(0.6) <= HIGHEST_RATE_HZ
+    assert held_rate_Hz(0.999) < 100.0  # of a period, 10 us and less are left for both

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,13 +14,16 @@ import pytest
 from jointctl.drivers.canopen.commissioning import disable
 from jointctl.drivers.drive import UNTOUCHED, CommissioningReport, DriveIdentity
 from jointctl.drivers.errors import ConfigurationError, DeviceError, MotionFault
+from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram
 from jointctl.firmware_py.friction import branch_torque_Nm
-from jointctl.firmware_py.realtime import HISTOGRAM_BINS, Histogram
-from jointctl.firmware_py.states import CommandKind, Fault
+from jointctl.firmware_py.states import AxisPhase, CommandKind, DriveState, Fault
 from jointctl.tools.configuration import checks
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import RADPS_PER_UNIT, friction_constants
 from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.records import MOVED_COUNTS
+from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check, motion_table
+from jointctl.tools.inspection.motion_check import make_plan as check_plan
 from jointctl.tools.output import Output
 from jointctl.tools.session.bus_watch import BusWatch
 from jointctl.tools.session.control import StopSignals
@@ -27,46 +31,41 @@ from jointctl.tools.session.display import PhaseLines
 from jointctl.tools.session.plan import resolve
 from jointctl.tools.session.run_watch import Around, RunParts, RunWatch
 from jointctl.tools.simulation.lockstep import LockstepJoint
-from jointctl.tools.sweeping.carry_out import POSITION_GAIN_ps
+from jointctl.tools.sweeping.carry_out import POSITION_GAIN_ps, middle_rad, sweep_constants
 from jointctl.tools.sweeping.checks import require_torque
+from jointctl.tools.sweeping.grid import both_directions, ordered_points
 from jointctl.tools.sweeping.options import SweepOptions, make_plan
+from jointctl.tools.sweeping.plan import PlanSettings, plan_motion, shifted
 from jointctl.tools.verbs import scope as scope_module
+from tests.configurations import VIRTUAL, edited, written
+from tests.places import CONFIGS
+from tests.sessions import constants_of
 
-VIRTUAL = shipped_config("virtual").read_text()
+# --- Between what the user was shown and what the joint does nothing may change, and nothing may jump ---
+SHORT = ("duration_s = 10.0", "duration_s = 1.0")
+COARSE = {"encoder__counts_per_turn": 256, "limits__following_error_max_rad": 0.05, "control__velocity_cutoff_Hz": 5.0}
 AT_ONCE = ('approach_s = "auto"', "approach_s = 0")
-
-
-def config_of(tmp_path: Path, *changes: tuple[str, str]) -> Config:
-    text = VIRTUAL
-    for old, new in changes:
-        assert text.count(old) == 1
-        text = text.replace(old, new)
-    path = tmp_path / "joint.toml"
-    path.write_text(text)
-    return load_config(path)
 
 
 def report(start_rad: float = 0.1, **more: Any) -> CommissioningReport:
     return CommissioningReport(DriveIdentity("", "", "", ""), "cyclic_sync_torque", start_rad, 0.06, 1e-5, **more)
 
 
-# --- no approach ---------------------------------------------------------------------------------------------------
-
-
+# --- no approach ---
 @pytest.mark.parametrize(("start_rad", "refused"), [(0.0, False), (0.005, False), (0.0051, True), (-0.04, True)])
 def test_without_an_approach_the_joint_must_stand_where_the_trajectory_begins(
     tmp_path: Path, start_rad: float, refused: bool
 ) -> None:
-    config = config_of(tmp_path, AT_ONCE)
+    config = edited(tmp_path, AT_ONCE)
     with pytest.raises(MotionFault, match="approach_s") if refused else contextlib.nullcontext():
         resolve(config).motion.require_start(start_rad)
-    resolve(config_of(tmp_path)).motion.require_start(start_rad)  # with one it may stand elsewhere
+    resolve(edited(tmp_path)).motion.require_start(start_rad)  # with one it may stand elsewhere
     lines = resolve(config).motion.placed(report(start_rad)).lines
     assert "approach   none: at once to +0.0000 rad" in lines
 
 
 def test_that_is_why_it_would_be_pulled_there_with_all_its_torque(tmp_path: Path) -> None:
-    config = config_of(tmp_path, AT_ONCE, ("frequency_Hz = 0.1", "frequency_Hz = 0.1\noffset_rad = 0.14"))
+    config = edited(tmp_path, AT_ONCE, ("frequency_Hz = 0.1", "frequency_Hz = 0.1\noffset_rad = 0.14"))
     joint = LockstepJoint(config)
     run = joint.run()
     assert run.fault is Fault.NONE  # 0.04 rad are less than the following error that is allowed
@@ -75,8 +74,7 @@ def test_that_is_why_it_would_be_pulled_there_with_all_its_torque(tmp_path: Path
         resolve(config).motion.require_start(joint.report.start_position_rad)
 
 
-# --- the second sine -----------------------------------------------------------------------------------------------
-
+# --- the second sine ---
 CREST_s = 2.5
 
 
@@ -94,15 +92,13 @@ CREST_s = 2.5
 def test_the_reference_does_not_jump_at_a_switch(tmp_path: Path, switch: str, told: str) -> None:
     change = ("frequency_Hz = 0.1", f"frequency_Hz = 0.1\n[trajectory.switch]\n{switch}")
     if not told:
-        config_of(tmp_path, change)
+        edited(tmp_path, change)
         return
     with pytest.raises(ConfigurationError, match=rf"trajectory.switch.at_s .* the {told} would jump"):
-        config_of(tmp_path, change)
+        edited(tmp_path, change)
 
 
-# --- a table that is edited while the question is open -------------------------------------------------------------
-
-
+# --- a table that is edited while the question is open ---
 def with_table(tmp_path: Path) -> tuple[Config, Path]:
     way = tmp_path / "way.csv"
     way.write_text("time_s,position_rad\n0,0\n1,0.1\n2,0.2\n3,0.2\n")
@@ -129,9 +125,7 @@ def test_a_table_that_was_edited_meanwhile_changes_nothing(tmp_path: Path, text:
     assert placed.lines == before.lines
 
 
-# --- what the user is told -----------------------------------------------------------------------------------------
-
-
+# --- what the user is told ---
 class SilentLoop:
     """300 cycles without one sample."""
 
@@ -152,7 +146,7 @@ class SilentLoop:
 def test_a_drive_that_says_nothing_is_told_by_the_loop_and_not_as_a_delay(
     tmp_path: Path, samples: int, velocity: bool
 ) -> None:
-    config = config_of(tmp_path)
+    config = edited(tmp_path)
     log: Any = SimpleNamespace(path=tmp_path / "log.mcap", write_event=lambda *_: None)
     loop: Any = SilentLoop(samples)
     nothing: Any = None
@@ -184,8 +178,8 @@ def test_the_end_of_the_scope_tells_how_the_drive_is(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(scope_module, "_Runs", Runs)
-    monkeypatch.setattr(scope_module, "scope_order", lambda *_, **__: SimpleNamespace(url=""))
-    monkeypatch.setattr(scope_module, "scope_server", lambda *_, **__: contextlib.nullcontext())
+    monkeypatch.setattr("jointctl.tools.scoping.feed.scope_order", lambda *_, **__: SimpleNamespace(url=""))
+    monkeypatch.setattr("jointctl.tools.scoping.feed.scope_server", lambda *_, **__: contextlib.nullcontext())
     scope_module.live_scope(virtual_config, Output())
     told = capsys.readouterr().err
     assert said in told
@@ -198,9 +192,7 @@ def test_a_sweep_on_a_drive_that_does_not_tell_its_torque_is_refused() -> None:
     require_torque(report())
 
 
-# --- feed-forward beyond what was measured -------------------------------------------------------------------------
-
-
+# --- feed-forward beyond what was measured ---
 @pytest.mark.parametrize(
     ("more", "refused"),
     [
@@ -219,14 +211,12 @@ def test_a_friction_curve_that_pushes_with_the_motion_below_the_velocity_limit_i
     )  # fmt: skip
     if refused:
         with pytest.raises(ConfigurationError, match=r"friction.positive: .* oppose .* at 50\.\d+ deg/s it does not"):
-            config_of(tmp_path, *curve, *more)
+            edited(tmp_path, *curve, *more)
     else:
-        config_of(tmp_path, *curve, *more)
+        edited(tmp_path, *curve, *more)
 
 
-# --- a sweep that is resumed with another configuration ------------------------------------------------------------
-
-
+# --- a sweep that is resumed with another configuration ---
 @pytest.mark.parametrize(
     ("change", "same"),
     [
@@ -240,13 +230,11 @@ def test_points_that_were_measured_with_other_constants_are_another_plan(
     tmp_path: Path, change: tuple[str, str], same: bool
 ) -> None:
     options = SweepOptions(points=4)
-    first = make_plan(config_of(tmp_path), options).hash
-    assert (make_plan(config_of(tmp_path, change), options).hash == first) is same
+    first = make_plan(edited(tmp_path), options).hash
+    assert (make_plan(edited(tmp_path, change), options).hash == first) is same
 
 
-# --- what a drive adds to its target by itself ---------------------------------------------------------------------
-
-
+# --- what a drive adds to its target by itself ---
 class Offsets:
     """Objects of a drive that is off."""
 
@@ -287,3 +275,63 @@ def test_the_check_judges_the_curve_that_the_law_computes(velocity_side: str) ->
         for speed in (0.01 * knee, 0.5 * knee, 0.999 * knee, 1.001 * knee, 0.6 * greatest, greatest, 1.7 * greatest):
             computed_Nm = branch_torque_Nm(branch, speed * radps_per_unit)
             assert scale * checks._sliding_Nm(direction, sign, speed) == pytest.approx(computed_Nm, rel=1e-12)
+
+
+# --- A joint that is moved while the question is open: the motion would not be the one that was shown ---
+def moved(joint: LockstepJoint, by_rad: float) -> Any:
+    state = joint.plant_state.copy()
+    state.joint_position_rad += by_rad
+    return state
+
+
+@pytest.mark.parametrize("by_rad", [0.6, 0.051, -0.051])
+def test_a_joint_that_was_moved_is_not_enabled(tmp_path: Path, by_rad: float) -> None:
+    """It was driven the longer way in the time of the shorter one: 0.99 rad/s where 0.26 rad/s were shown."""
+    joint = LockstepJoint(edited(tmp_path, SHORT))
+    run = joint.run(plant_state=moved(joint, by_rad))
+    assert run.fault is Fault.MOVED_BEFORE_START
+    assert run.state.fault_value == pytest.approx(by_rad, abs=1e-4)
+    assert not np.isin(run.log.drive_state, (DriveState.STARTING, DriveState.ENABLED)).any()
+    assert not run.log.command_torque_Nm.any()
+
+
+@pytest.mark.parametrize("by_rad", [0.049, -0.049, 0.0])
+def test_within_the_following_error_it_is_driven(tmp_path: Path, by_rad: float) -> None:
+    joint = LockstepJoint(edited(tmp_path, SHORT))
+    run = joint.run(plant_state=moved(joint, by_rad))
+    assert run.fault is Fault.NONE
+    assert AxisPhase.TRACKING in run.log.phase
+
+
+def test_the_tolerance(tmp_path: Path) -> None:
+    config = edited(tmp_path, SHORT)
+    sequence = constants_of(config, start_position_rad=0.25)[0].sequence
+    assert (sequence.start_rad, sequence.moved_max_rad) == (0.25, config.limits.following_error_max_rad)
+    assert constants_of(config)[0].sequence.moved_max_rad == 0.0  # not known where it stands: not checked
+    coarse = load_config(written(tmp_path / "coarse.toml", **COARSE))
+    sequence = constants_of(coarse, start_position_rad=0.25)[0].sequence
+    assert sequence.moved_max_rad == pytest.approx(MOVED_COUNTS * math.tau / 256)
+
+
+@pytest.mark.parametrize(("by_rad", "fault"), [(0.6, Fault.MOVED_BEFORE_START), (0.04, Fault.NONE)])
+def test_a_sweep_is_not_begun_elsewhere(by_rad: float, fault: Fault) -> None:
+    joint = LockstepJoint(load_config(CONFIGS / "sweep_virtual.toml"))
+    settings = PlanSettings(
+        width_rad=0.2, acceleration_radps2=4.0, transit_radps=0.5, dwell_s=0.3, settle_s=0.1, reduction_ratio=121.0
+    )
+    motion = plan_motion(ordered_points(both_directions([0.2], 2), 1, None), settings)
+    placed = shifted(motion, middle_rad(joint.config, motion, joint.report.start_position_rad))
+    joint.table = placed.table
+    constants = sweep_constants(joint.config, joint.report, placed)
+    constants[0].sequence.supervisor_max_cycles = 0
+    run = joint.run(constants, plant_state=moved(joint, by_rad))
+    assert run.fault is fault
+    assert (run.log.drive_state == DriveState.ENABLED).any() is np.bool_(fault is Fault.NONE)
+
+
+def test_the_motion_check_looks_as_well(tmp_path: Path) -> None:
+    config = edited(tmp_path, SHORT)
+    plan = check_plan(config, None)
+    report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.1, 0.06, 1e-5)
+    check = CheckMotion(config_of_check(config, plan), plan).constants(report, motion_table(plan, 0.1))[0].sequence
+    assert (check.start_rad, check.moved_max_rad) == (0.1, pytest.approx(1.25 * plan.travel_rad))

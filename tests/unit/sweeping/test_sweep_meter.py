@@ -1,4 +1,4 @@
-"""From log records to rows: windows, stale samples, gravity, files that survive a crash."""
+"""From log records to rows: windows, means, spreads, files that survive a crash, and the bar that is drawn."""
 
 from __future__ import annotations
 
@@ -7,23 +7,150 @@ import json
 import math
 import os
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from jointctl.drivers.errors import DataError
+from jointctl.drivers.drive import CommissioningReport, DriveIdentity
+from jointctl.drivers.errors import DECLINED, DataError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase
+from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.identification.friction_data import SWEEP_COLUMNS, read_friction_data
+from jointctl.tools.output import Advance, Output
+from jointctl.tools.session.display import Snapshot
 from jointctl.tools.sweeping.data_file import HEADING, SweepFile
 from jointctl.tools.sweeping.grid import SweepPoint
 from jointctl.tools.sweeping.meter import JointModel, MeasuredPoint, SweepMeter
+from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.sweeping.plan import Window
-from jointctl.tools.sweeping.statistics import LEAST_SAMPLES, PlateauResult, Tolerance
+from jointctl.tools.sweeping.statistics import (
+    BATCHES,
+    LEAST_SAMPLES,
+    PlateauResult,
+    Samples,
+    Tolerance,
+    half_interval,
+    plateau,
+    sticking_share,
+    without_ripple,
+)
+from jointctl.tools.verbs import sweep as verb
 
+# --- Means, spreads and confidence of plateaus of a known signal ---
+JOINT_ORDER = 18.0 / math.tau
+MOTOR_ORDER = 2.0 * 121.0 / math.tau
+TIGHT = Tolerance(0.01, 0.0)
+
+
+def window(
+    velocity: float = 0.5, periods: float = 2.0, noise_Nm: float = 0.0, ripple_Nm: float = 0.0, seed: int = 1
+) -> Samples:
+    """`periods` of the joint ripple at 1 kHz; torque 0.2 Nm and ripples of both orders."""
+    length = periods * math.tau / 18.0
+    count = round(length / abs(velocity) * 1000.0)
+    time_s = 10.0 + np.arange(count) * 1e-3
+    position = 0.3 + velocity * (time_s - 10.0)
+    noise = np.random.default_rng(seed).normal(0.0, 1.0, (2, count))
+    torque = 0.2 + noise_Nm * noise[0] + ripple_Nm * (np.sin(18.0 * position) + np.cos(242.0 * position))
+    return Samples(time_s, position, velocity + 0.01 * noise[1], torque)
+
+
+def result(windows: list[Samples], planned: float = 0.5, tolerance: Tolerance = TIGHT) -> Any:
+    return plateau(windows, planned, (JOINT_ORDER, MOTOR_ORDER), tolerance, 1.2e-5)
+
+
+def test_mean_and_spread_of_a_known_signal() -> None:
+    found = result([window(noise_Nm=0.002, ripple_Nm=0.01)])
+    assert found.velocity_radps == pytest.approx(0.5, rel=1e-9)
+    assert found.motor_torque_Nm == pytest.approx(0.2, abs=3e-4)
+    assert found.motor_torque_std_Nm == pytest.approx(math.sqrt(0.01**2 + 0.002**2), rel=0.05)
+    assert found.velocity_std_radps == pytest.approx(0.01, rel=0.1)
+    assert found.samples == len(window().time_s)
+    assert found.position_min_rad == pytest.approx(0.3)
+    assert found.settled
+
+
+def test_ripple_is_not_mistaken_for_chance() -> None:
+    w = window(noise_Nm=1e-4, ripple_Nm=0.02)
+    residual = without_ripple(w.position_rad, w.motor_torque_Nm, (JOINT_ORDER, MOTOR_ORDER))
+    assert np.std(residual) == pytest.approx(1e-4, rel=0.1)
+    untouched = without_ripple(w.position_rad, w.motor_torque_Nm, ())
+    assert np.std(untouched) > 0.015
+
+
+def test_a_ripple_of_which_too_little_was_seen_is_not_fitted() -> None:
+    w = window(periods=0.5, ripple_Nm=0.02)
+    only_motor = without_ripple(w.position_rad, w.motor_torque_Nm, (MOTOR_ORDER,))
+    assert np.array_equal(without_ripple(w.position_rad, w.motor_torque_Nm, (JOINT_ORDER, MOTOR_ORDER)), only_motor)
+
+
+def test_half_interval_covers_the_truth_about_nineteen_times_in_twenty() -> None:
+    generator = np.random.default_rng(5)
+    white = generator.normal(0.0, 1.0, (400, 1600))
+    covered = sum(abs(np.mean(x)) <= half_interval(x) for x in white)
+    assert 360 <= covered <= 396
+
+
+def test_correlated_samples_give_a_wider_interval_than_independent_ones() -> None:
+    white = np.random.default_rng(6).normal(0.0, 1.0, 16_000)
+    red = np.empty_like(white)
+    value = 0.0
+    for i, x in enumerate(white):
+        value = 0.95 * value + x
+        red[i] = value
+    red /= np.std(red)
+    assert half_interval(red) > 3.0 * half_interval(white / np.std(white))
+
+
+@pytest.mark.parametrize("count", [0, BATCHES, LEAST_SAMPLES - 1])
+def test_too_few_samples_are_never_enough(count: int) -> None:
+    assert half_interval(np.zeros(count)) == math.inf
+    assert half_interval(np.zeros(LEAST_SAMPLES)) == 0.0
+
+
+def test_noise_decides_whether_a_point_is_settled() -> None:
+    assert result([window(noise_Nm=0.005)]).settled
+    noisy = result([window(noise_Nm=0.1)])
+    assert not noisy.settled
+    assert "known to" in noisy.problem
+    assert result([window(noise_Nm=0.1)], tolerance=Tolerance(0.01, 0.05)).settled
+
+
+@pytest.mark.parametrize(
+    ("share", "settled"), [(0.94, False), (0.951, True), (1.0, True), (1.049, True), (1.06, False)]
+)
+def test_the_planned_speed_must_be_held(share: float, settled: bool) -> None:
+    found = result([window(velocity=0.5 * share)])
+    assert found.settled is settled
+    assert settled or "planned" in found.problem
+
+
+def test_stick_slip_is_seen_and_even_motion_is_not() -> None:
+    even = window(velocity=0.05, periods=1.0)
+    jerky = window(velocity=0.05, periods=1.0)
+    # the same way in steps of 0.02 rad: at rest for most of the time
+    steps = np.floor((jerky.position_rad - 0.3) / 0.02) * 0.02
+    jerky.position_rad = 0.3 + steps + np.clip((jerky.position_rad - 0.3 - steps) * 5.0, 0.0, 0.02)
+    assert sticking_share([even], 0.05, 1.2e-5) == 0.0
+    assert sticking_share([jerky], 0.05, 1.2e-5) > 0.5
+    assert result([even], 0.05).settled
+    assert result([jerky], 0.05).problem == "the joint stuck and slipped"
+
+
+def test_windows_of_one_point_are_taken_together() -> None:
+    found = result([window(noise_Nm=0.002, seed=1), window(noise_Nm=0.002, seed=2)])
+    assert found.samples == 2 * len(window().time_s)
+    assert found.velocity_radps == pytest.approx(0.5, rel=1e-9)
+
+
+# --- From log records to rows: windows, stale samples, gravity, files that survive a crash ---
 MODEL = JointModel(100.0, 0.0, 0.0, 1.2e-5, (18.0 / math.tau,))
 FAST, BACK = SweepPoint(0, 0.5, 0), SweepPoint(1, -0.5, 0)
 
@@ -112,8 +239,6 @@ def test_gravity_is_subtracted() -> None:
 
 
 # --- files ---
-
-
 def measured(point: SweepPoint, torque_Nm: float = 0.2, problem: str = "") -> MeasuredPoint:
     velocity = point.velocity_radps
     result = PlateauResult(velocity, math.copysign(torque_Nm, velocity), 0.01, 0.002, 900, -0.1, 0.4, 1e-4, problem)
@@ -254,3 +379,44 @@ def test_a_slow_disk_does_not_hold_the_sweep_up(path: Path, monkeypatch: pytest.
     confirmed.set()
     file.close()
     assert json.loads(path.with_suffix(".json").read_text())["measured"] == [0, 1]
+
+
+# --- When the bar of a sweep is drawn: not before the loop runs, or it paints over what is said until then ---
+class Bars(Output):
+    """Notes what the bar was told."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.told: list[float | str] = []
+
+    @contextmanager
+    def progress(self, title: str, total: float) -> Iterator[Advance]:
+        self.told.append(title)
+        yield self.told.append
+        self.told.append("end")
+
+
+def test_the_bar_comes_with_the_first_record_of_the_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    output = Bars(stdout=StringIO(), stderr=StringIO())
+    seen: list[list[float | str]] = []
+
+    class Loop:
+        drive_state = "off"
+
+        def __init__(self, plan: Any, consent: Any, output: Any, control: Any, display: Any) -> None:
+            self._display = display
+
+        def run(self) -> None:
+            report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.0, 0.1, 1e-5)
+            with self._display(report) as display:
+                seen.append(output.told[:])
+                for time_s in (-1.0, 2.0):
+                    records: Any = new(LogRecord, 1).view(np.recarray)
+                    records.trajectory_s = time_s
+                    display.show(Snapshot(records[-1], 0, np.zeros(0), 0.0, records=records))
+
+    monkeypatch.setattr("jointctl.tools.session.session.Session", Loop)
+    options = SweepOptions(points=24, assume_yes=True)
+    assert verb.sweep(load_config(shipped_config("sweep_virtual")), output, tmp_path / "data.csv", options) == DECLINED
+    assert seen == [[]]
+    assert output.told == ["24 points", 0.0, 2.0, "end"]

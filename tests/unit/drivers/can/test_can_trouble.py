@@ -28,10 +28,12 @@ from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.drivers.errors import BusError, JointctlError, NoDeviceError
 from jointctl.tools.inspection.subject import Subject
 from jointctl.tools.output import Output
-from jointctl.tools.session.open_drive import commission
+from jointctl.tools.session.canopen_drive import CanopenSession
+from jointctl.tools.session.session import Session
 from jointctl.tools.verbs.clear_fault import clear_fault
-from jointctl.tools.verbs.info import info
+from jointctl.tools.verbs.info import node_info as info
 from jointctl.tools.verbs.scan import scan
+from tests.configurations import shipped
 
 
 @pytest.mark.parametrize(
@@ -79,7 +81,7 @@ def test_error_warning_is_no_problem_yet() -> None:
 
 
 @pytest.mark.parametrize(
-    ("data", "words", "cure"),
+    ("data", "words", "remedy"),
     [
         ({"state": "ERROR-PASSIVE", "berr_counter": {"tx": 128, "rx": 0}}, "passive (transmit errors 128", "60 ohm"),
         ({"state": "BUS-OFF"}, "bus-off", "up type can bitrate 1000000 restart-ms 100"),
@@ -87,11 +89,11 @@ def test_error_warning_is_no_problem_yet() -> None:
         ({"bittiming": {"bitrate": 500000}}, "runs at 500000 bit/s, the configuration says 1000000", "bitrate 1000000"),
     ],
 )  # fmt: skip
-def test_problems_come_with_their_cure(data: dict[str, Any], words: str, cure: str) -> None:
+def test_problems_come_with_their_cure(data: dict[str, Any], words: str, remedy: str) -> None:
     found = link_problem(parse_link(real_interface(**data)), 1_000_000)
     assert found is not None
     assert words in found[0]
-    assert cure in found[1]
+    assert remedy in found[1]
 
 
 def test_a_virtual_interface_tells_less() -> None:
@@ -110,7 +112,7 @@ SILENCE = NoDeviceError("node 1 does not answer", hint="power, wiring")
 
 
 @pytest.mark.parametrize(
-    ("data", "words", "cure"),
+    ("data", "words", "remedy"),
     [
         ({"bittiming": {"bitrate": 500000}}, "runs at 500000 bit/s, the configuration says 1000000", "bitrate 1000000"),
         ({"state": "BUS-OFF"}, "can0 is bus-off", "restart-ms 100"),
@@ -119,14 +121,14 @@ SILENCE = NoDeviceError("node 1 does not answer", hint="power, wiring")
 )  # fmt: skip
 @pytest.mark.parametrize("failure", [SILENCE, BusError("the bus failed during commissioning")])
 def test_silence_on_a_sick_interface_tells_its_trouble_and_the_cure(
-    data: dict[str, Any], words: str, cure: str, failure: JointctlError, monkeypatch: pytest.MonkeyPatch
+    data: dict[str, Any], words: str, remedy: str, failure: JointctlError, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("jointctl.drivers.can.socketcan.link_state", lambda channel: parse_link(real_interface(**data)))
     with pytest.raises(type(failure)) as caught, interface_blamed("socketcan", "can0", 1_000_000):
         raise failure
     assert caught.value.message.startswith(f"{failure.message}; CAN interface can0 ")
     assert words in caught.value.message
-    assert cure in caught.value.hint
+    assert remedy in caught.value.hint
     assert caught.value.hint.endswith(failure.hint)
 
 
@@ -145,7 +147,7 @@ def test_silence_on_a_sound_interface_or_another_bus_stays_as_it_is(
 
 @pytest.mark.parametrize("verb", ["scan", "info", "commission", "clear_fault"])
 def test_who_hears_nobody_on_an_interface_of_another_bit_rate_says_so(
-    empty_bus: Any, virtual_config: Any, settings_of_virtual_joint: CanopenSettings, verb: str,
+    empty_bus: Any, settings_of_virtual_joint: CanopenSettings, verb: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     link = parse_link(real_interface(bittiming={"bitrate": 500000}))
@@ -154,16 +156,13 @@ def test_who_hears_nobody_on_an_interface_of_another_bit_rate_says_so(
         "jointctl.tools.inspection.subject.open_python_can",
         lambda *_: can.Bus(interface="virtual", channel=empty_bus.channel),
     )
-    monkeypatch.setattr(
-        "jointctl.tools.verbs.clear_fault.open_drive", lambda config, gate: empty_bus.drive(settings_of_virtual_joint)
-    )
-    bus = virtual_config.bus.model_copy(update={"interface": "socketcan", "channel": "can0"})
-    config, output = virtual_config.model_copy(update={"bus": bus}), Output(quiet=True)
+    monkeypatch.setattr(CanopenSession, "open", lambda *_: empty_bus.drive(settings_of_virtual_joint))
+    config, output = shipped(bus__interface="socketcan", bus__channel="can0"), Output(quiet=True)
     subject = Subject("socketcan", "can0", 1_000_000, 1)
     verbs: dict[str, Callable[[], Any]] = {
         "scan": lambda: scan(subject, output, listen_s=0.0),
         "info": lambda: info(subject, output),
-        "commission": lambda: commission(config, drive),
+        "commission": lambda: Session.commissioned(config, drive, None),
         "clear_fault": lambda: clear_fault(config, output),
     }
     drive = empty_bus.drive(settings_of_virtual_joint)
@@ -174,13 +173,13 @@ def test_who_hears_nobody_on_an_interface_of_another_bit_rate_says_so(
 
 
 @pytest.mark.parametrize(
-    ("code", "words", "cure"),
+    ("code", "words", "remedy"),
     [(errno.ENOBUFS, "queue of can0 is full", "txqueuelen 1000"), (errno.ENETDOWN, "went down", "ip link set can0 up"),
      (errno.ENODEV, "has gone", "plug the adapter")],
 )  # fmt: skip
-def test_failed_sends(code: int, words: str, cure: str) -> None:
+def test_failed_sends(code: int, words: str, remedy: str) -> None:
     found = send_problem("can0", code)
     assert found is not None
     assert words in found[0]
-    assert cure in found[1]
+    assert remedy in found[1]
     assert send_problem("can0", errno.EAGAIN) is None

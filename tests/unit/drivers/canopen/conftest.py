@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.drivers.drive import CommissioningReport
-from tests.unit.drivers.canopen.odd_drive import opened
+from tests.device_on_bus import DeviceOnBus
 from tests.unit.drivers.canopen.wire import Wire
 
 
@@ -22,20 +19,18 @@ def wire() -> Wire:
 
 
 @pytest.fixture
-def commission(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, tmp_path: Path
-) -> Callable[..., CommissioningReport]:
-    """Commissions with settings changed and sections removed from the EDS."""
+def commission(joint: DeviceOnBus, tmp_path: Path) -> Callable[..., CommissioningReport]:
+    """Commissions with settings changed and objects (`6007`, `1400sub5`) removed from the EDS, or with another one."""
 
-    def run(*, without: tuple[str, ...] = (), **changes: Any) -> CommissioningReport:
-        text = settings_of_virtual_joint.eds_path.read_text()
+    def run(*, without: tuple[str, ...] = (), eds: str = "", **changes: object) -> CommissioningReport:
+        assert joint.settings is not None
+        text = eds or joint.settings.eds_path.read_text()
         for section in without:
             text, count = re.subn(rf"(?ims)^\[{section}(sub[0-9A-F]+)?\].*?(?=^\[|\Z)", "", text)
             assert count
         path = tmp_path / "edited.eds"
-        path.write_text(text)
-        settings = dataclasses.replace(settings_of_virtual_joint, eds_path=path, **changes)
-        with opened(device_on_bus, settings) as drive:
+        path.write_text(text, encoding="latin-1")
+        with joint.opened(**{"eds_path": path, **changes}) as drive:
             report = drive.commission()
             run.port = drive.port()  # type: ignore[attr-defined]
         return report

@@ -19,15 +19,10 @@ from jointctl.firmware_py.states import DriveRequest, DriveState
 
 # mask, value: CiA 402-2, table "state coding"
 TABLE = {
-    State.NOT_READY_TO_SWITCH_ON: (0x4F, 0x00),
-    State.SWITCH_ON_DISABLED: (0x4F, 0x40),
-    State.READY_TO_SWITCH_ON: (0x6F, 0x21),
-    State.SWITCHED_ON: (0x6F, 0x23),
-    State.OPERATION_ENABLED: (0x6F, 0x27),
-    State.QUICK_STOP_ACTIVE: (0x6F, 0x07),
-    State.FAULT_REACTION_ACTIVE: (0x4F, 0x0F),
-    State.FAULT: (0x4F, 0x08),
-}
+    State.NOT_READY_TO_SWITCH_ON: (0x4F, 0x00), State.SWITCH_ON_DISABLED: (0x4F, 0x40),
+    State.READY_TO_SWITCH_ON: (0x6F, 0x21), State.SWITCHED_ON: (0x6F, 0x23), State.OPERATION_ENABLED: (0x6F, 0x27),
+    State.QUICK_STOP_ACTIVE: (0x6F, 0x07), State.FAULT_REACTION_ACTIVE: (0x4F, 0x0F), State.FAULT: (0x4F, 0x08),
+}  # fmt: skip
 
 
 def test_every_statusword_decodes_as_the_table_says() -> None:
@@ -50,17 +45,13 @@ def test_every_state_is_reached() -> None:
 @pytest.mark.parametrize(
     ("state", "expected"),
     [
-        (State.NOT_READY_TO_SWITCH_ON, DriveState.UNKNOWN),
-        (State.SWITCH_ON_DISABLED, DriveState.OFF),
-        (State.READY_TO_SWITCH_ON, DriveState.STARTING),
-        (State.SWITCHED_ON, DriveState.STARTING),
-        (State.OPERATION_ENABLED, DriveState.ENABLED),
-        (State.QUICK_STOP_ACTIVE, DriveState.STOPPING),
-        (State.FAULT_REACTION_ACTIVE, DriveState.FAULT_BRAKING),
-        (State.FAULT, DriveState.FAULT),
+        (State.NOT_READY_TO_SWITCH_ON, DriveState.UNKNOWN), (State.SWITCH_ON_DISABLED, DriveState.OFF),
+        (State.READY_TO_SWITCH_ON, DriveState.STARTING), (State.SWITCHED_ON, DriveState.STARTING),
+        (State.OPERATION_ENABLED, DriveState.ENABLED), (State.QUICK_STOP_ACTIVE, DriveState.STOPPING),
+        (State.FAULT_REACTION_ACTIVE, DriveState.FAULT_BRAKING), (State.FAULT, DriveState.FAULT),
         (State.UNDEFINED, DriveState.UNKNOWN),
     ],
-)
+)  # fmt: skip
 def test_the_loops_view(state: State, expected: DriveState) -> None:
     assert drive_state(int(state)) == expected
 

@@ -13,32 +13,30 @@ from typing import Any
 import can
 import pytest
 
+from jointctl.drivers.canopen.cia402 import Mode
+from jointctl.drivers.canopen.commissioning import LARGEST_PERMILLE, STEEP_RADPS2
 from jointctl.drivers.canopen.drive import GATE_S, REOPEN_ATTEMPTS, REOPEN_PAUSE_S, CanopenDrive
-from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
-from tests.unit.drivers.canopen.odd_drive import opened, store, value
 
 pytestmark = pytest.mark.usefixtures("short_timeout")
 
 
-def refusal(bus: Any, settings: CanopenSettings, kind: type[JointctlError]) -> str:
+def refusal(joint: Any, kind: type[JointctlError] = DeviceError, **changes: Any) -> str:
     """The message of a commissioning that must fail with exactly this class, in one line, drive left disabled."""
-    with opened(bus, settings) as drive, pytest.raises(JointctlError) as caught:
+    with joint.opened(**changes) as drive, pytest.raises(JointctlError) as caught:
         drive.commission()
     assert type(caught.value) is kind
     assert "\n" not in str(caught.value)
-    if bus.device is not None:
-        assert value(bus, 0x6041) & 0x6F != 0x27
+    if joint.device is not None:
+        assert joint.value(0x6041) & 0x6F != 0x27
     return str(caught.value)
 
 
-# --- the way that works ----------------------------------------------------------------------------------------
-
-
+# --- the way that works ---
 @pytest.fixture
-def commissioned(device_on_bus: Any, settings_of_virtual_joint: CanopenSettings) -> Iterator[Any]:
-    with opened(device_on_bus, settings_of_virtual_joint) as drive:
-        yield device_on_bus, drive, drive.commission()
+def commissioned(joint: Any) -> Iterator[Any]:
+    with joint.opened() as drive:
+        yield joint, drive, drive.commission()
 
 
 def test_the_report(commissioned: Any) -> None:
@@ -55,19 +53,19 @@ def test_the_report(commissioned: Any) -> None:
 
 def test_what_is_in_the_drive_afterwards(commissioned: Any) -> None:
     bus, drive, _ = commissioned
-    assert value(bus, 0x6060) == value(bus, 0x6061) == 10
-    assert value(bus, 0x6072) == 1000
-    assert value(bus, 0x6071) == 0
-    assert (value(bus, 0x60C2, 1), value(bus, 0x60C2, 2)) in ((1, -3), (1, 253))
-    assert value(bus, 0x1016, 1) == 126 << 16 | 200
-    assert value(bus, 0x1017) == 200
-    assert (value(bus, 0x6007), value(bus, 0x605A), value(bus, 0x1029, 1)) == (3, 2, 2)
-    assert [value(bus, 0x1A00, k) for k in range(4)] == [3, 0x60410010, 0x60640020, 0x60770010]
-    assert [value(bus, 0x1600, k) for k in range(3)] == [2, 0x60400010, 0x60710010]
-    assert (value(bus, 0x1800, 1), value(bus, 0x1800, 2)) == (0x40000181, 1)  # bit 30 as the drive had it
-    assert (value(bus, 0x1400, 1), value(bus, 0x1400, 2)) == (0x201, 1)
+    assert bus.value(0x6060) == bus.value(0x6061) == 10
+    assert bus.value(0x6072) == 1000
+    assert bus.value(0x6071) == 0
+    assert (bus.value(0x60C2, 1), bus.value(0x60C2, 2)) in ((1, -3), (1, 253))
+    assert bus.value(0x1016, 1) == 126 << 16 | 200
+    assert bus.value(0x1017) == 200
+    assert (bus.value(0x6007), bus.value(0x605A), bus.value(0x1029, 1)) == (3, 2, 2)
+    assert [bus.value(0x1A00, k) for k in range(4)] == [3, 0x60410010, 0x60640020, 0x60770010]
+    assert [bus.value(0x1600, k) for k in range(3)] == [2, 0x60400010, 0x60710010]
+    assert (bus.value(0x1800, 1), bus.value(0x1800, 2)) == (0x40000181, 1)  # bit 30 as the drive had it
+    assert (bus.value(0x1400, 1), bus.value(0x1400, 2)) == (0x201, 1)
     for base in (0x1400, 0x1800):
-        assert all(value(bus, base + k, 1) & 0x80000000 for k in (1, 2, 3))
+        assert all(bus.value(base + k, 1) & 0x80000000 for k in (1, 2, 3))
     assert bus.device.device[0].nmt == 127
     port = drive.port()[0]
     assert (port.max_permille, port.node, port.heartbeat_cycles) == (1000, 1, 66)
@@ -105,286 +103,289 @@ def test_cyclic_start_and_make_safe(commissioned: Any) -> None:
     drive.start_cyclic()
     assert drive.make_safe() == "switch on disabled"
     assert bus.device.device[0].nmt == 127
-    assert value(bus, 0x1016, 1) == 0
+    assert bus.value(0x1016, 1) == 0
     assert (0x000, b"\x01\x01") in bus.requests
 
 
-def test_torque_mode_where_the_drive_has_no_cyclic_one(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings
-) -> None:
-    device_on_bus.answers[(0x6502, 0)] = 1 << 3
-    with opened(device_on_bus, dataclasses.replace(settings_of_virtual_joint, mode="auto")) as drive:
+def test_torque_mode_where_the_drive_has_no_cyclic_one(joint: Any) -> None:
+    joint.answers[(0x6502, 0)] = 1 << 3
+    with joint.opened(mode="auto") as drive:
         report = drive.commission()
     assert report.mode == "torque"
-    assert value(device_on_bus, 0x6060) == 4
-    assert value(device_on_bus, 0x6087) == 1_000_000
+    assert joint.value(0x6060) == 4
+    assert joint.value(0x6087) == 1_000_000
     assert any("TQ" in remark for remark in report.remarks)
 
 
-def test_an_unanswered_request_is_repeated(device_on_bus: Any, settings_of_virtual_joint: CanopenSettings) -> None:
-    device_on_bus.mute += [(0x6072, 0), (0x6072, 0), (0x6064, 0)]
-    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+def downloads(bus: Any, index: int, sub: int = 0) -> list[int]:
+    """What was written to an object, in order: expedited downloads."""
+    found = []
+    for cob, data in bus.requests:
+        if cob == 0x601 and data[0] & 0xE2 == 0x22 and struct.unpack_from("<HB", data, 1) == (index, sub):
+            size = 4 - (data[0] >> 2 & 3)
+            found.append(int.from_bytes(data[4 : 4 + size], "little"))
+    return found
+
+
+@pytest.mark.parametrize(("mode", "shown"), [("csv", Mode.CYCLIC_SYNC_VELOCITY), ("pv", Mode.PROFILE_VELOCITY)])
+def test_a_velocity_mode_begins_with_no_target_and_the_drives_own_limit(joint: Any, mode: str, shown: Mode) -> None:
+    with joint.opened(mode=mode) as drive:
+        report = drive.commission()
+    assert report.commands_velocity
+    assert joint.value(0x6060) == shown
+    assert downloads(joint, 0x60FF)[-1] == 0
+    unit_radps = 2.0 * math.pi / 2**19  # counts/s at the joint
+    assert joint.value(0x607F) == math.ceil(1.0 / unit_radps)
+    assert report.settings["max velocity"] == f"{joint.value(0x607F)} counts/s = 1.00 rad/s"
+    steep = [round(STEEP_RADPS2 / unit_radps)] if shown is Mode.PROFILE_VELOCITY else []
+    assert (downloads(joint, 0x6083), downloads(joint, 0x6084)) == (steep, steep)
+    assert any("profile velocity mode (PV)" in remark for remark in report.remarks) == bool(steep)
+
+
+def test_a_torque_mode_has_nothing_to_do_with_the_velocity(commissioned: Any) -> None:
+    bus, _, report = commissioned
+    assert not report.commands_velocity
+    assert "max velocity" not in report.settings
+    assert downloads(bus, 0x607F) == downloads(bus, 0x6083) == []
+
+
+@pytest.mark.parametrize(("torque_max_Nm", "cut"), [(60.0, False), (3000.0, True)])
+def test_a_torque_beyond_what_6072_holds_is_reported(joint: Any, torque_max_Nm: float, cut: bool) -> None:
+    with joint.opened(torque_max_Nm=torque_max_Nm, max_torque_permille=None) as drive:
+        report = drive.commission()
+    assert any(f"6072 holds at most {LARGEST_PERMILLE}" in remark for remark in report.remarks) is cut
+    assert (joint.value(0x6072) == LARGEST_PERMILLE) is cut
+
+
+@pytest.mark.parametrize(("rate_Hz", "period"), [(1000.0, (1, -3)), (2000.0, (5, -4)), (500.0, (2, -3))])
+def test_the_period_is_written_with_its_exponent(joint: Any, rate_Hz: float, period: tuple[int, int]) -> None:
+    with joint.opened(rate_Hz=rate_Hz) as drive:
         drive.commission()
-    assert device_on_bus.mute == []
+    assert (downloads(joint, 0x60C2, 1), downloads(joint, 0x60C2, 2)) == ([period[0]], [period[1] & 0xFF])
 
 
-# --- refusals --------------------------------------------------------------------------------------------------
+def test_the_drive_listens_to_our_sync(joint: Any) -> None:
+    joint.sequences[(0x1005, 0)] = [0x40000081]  # at first it is to produce SYNC itself
+    with joint.opened() as drive:
+        report = drive.commission()
+    assert downloads(joint, 0x1005) == [0x80]
+    assert "1005 was 40000081h, it is now 00000080h" in report.remarks
 
 
-def test_wrong_node_names_those_that_answer(device_on_bus: Any, settings_of_virtual_joint: CanopenSettings) -> None:
-    settings = dataclasses.replace(settings_of_virtual_joint, node=7)
-    message = refusal(device_on_bus, settings, NoDeviceError)
+@pytest.mark.parametrize("left", [0, 126 << 16 | 500])
+def test_a_watchdog_that_was_left_armed_is_ended_first(joint: Any, left: int) -> None:
+    joint.send(0x601, struct.pack("<BHBI", 0x23, 0x1016, 1, left))
+    joint.requests.clear()
+    with joint.opened() as drive:
+        drive.commission()
+    assert downloads(joint, 0x1016, 1) == [*([0] if left else []), 126 << 16 | 200]
+
+
+def test_an_unanswered_request_is_repeated(joint: Any) -> None:
+    joint.mute += [(0x6072, 0), (0x6072, 0), (0x6064, 0)]
+    with joint.opened() as drive:
+        drive.commission()
+    assert joint.mute == []
+
+
+# --- refusals ---
+def test_wrong_node_names_those_that_answer(joint: Any) -> None:
+    message = refusal(joint, NoDeviceError, node=7)
     assert "node 7 does not answer; these do: 1" in message
     assert "drive.node" in message
 
 
-def test_nobody_answers(empty_bus: Any, settings_of_virtual_joint: CanopenSettings) -> None:
-    message = refusal(empty_bus, settings_of_virtual_joint, NoDeviceError)
-    assert "node 1 does not answer, and neither does any other" in message
+def test_nobody_answers(empty_bus: Any) -> None:
+    assert "node 1 does not answer, and neither does any other" in refusal(empty_bus, NoDeviceError)
 
 
-def test_a_drive_that_falls_silent(device_on_bus: Any, settings_of_virtual_joint: CanopenSettings) -> None:
-    device_on_bus.mute += [(0x6076, 0)] * 3
-    message = refusal(device_on_bus, settings_of_virtual_joint, NoDeviceError)
+def test_a_drive_that_falls_silent(joint: Any) -> None:
+    joint.mute += [(0x6076, 0)] * 3
+    message = refusal(joint, NoDeviceError)
     assert "reading object 6076 (motor rated torque) got no answer in 3 attempts" in message
 
 
+UNRATED = {"rated_torque_Nm": None, "rated_current_A": None}
+
+
 @pytest.mark.parametrize(
-    ("change", "pattern"),
+    ("changes", "answers", "pattern"),
     [
-        ({"vendor_id": 0x9A}, r"drive\.vendor_id is 0x0, the configuration says 0x9a"),
-        ({"product_code": 0x30924}, r"drive\.product_code is 0x1, the configuration says 0x30924"),
-        ({"rated_torque_Nm": 0.506}, r"drive\.rated_torque_Nm \(=0\.506\) does not agree with the drive's 0\.5 Nm"),
-        ({"rated_current_A": 4.9}, r"drive\.rated_current_A \(=4\.9\) does not agree with the drive's 5 A"),
-        ({"rate_Hz": 3000.0}, r"loop\.rate_Hz \(=3000\)"),
+        # what differs from the configuration
+        ({"vendor_id": 0x9A}, {}, r"drive\.vendor_id is 0x0, the configuration says 0x9a"),
+        ({"product_code": 0x30924}, {}, r"drive\.product_code is 0x1, the configuration says 0x30924"),
+        ({"rated_torque_Nm": 0.506}, {}, r"drive\.rated_torque_Nm \(=0\.506\) does not agree with the drive's 0\.5 Nm"),
+        ({"rated_current_A": 4.9}, {}, r"drive\.rated_current_A \(=4\.9\) does not agree with the drive's 5 A"),
+        ({"rate_Hz": 3000.0}, {}, r"loop\.rate_Hz \(=3000\)"),
+        ({"quick_stop_option": 4}, {},
+         r"writing 4 to object 605A \(quick stop option\) was refused: .* \(SDO abort 06090030h\)"),
+        ({"torque_reference": "rated_torque", **UNRATED}, {(0x6076, 0): 0}, "object 6076 is 0"),
+        ({"torque_reference": "rated_current", **UNRATED}, {(0x6075, 0): 0}, "object 6075 is 0"),
+        # a drive that does not do what it must
+        ({}, {(0x1000, 0): 401}, r"node 1 has device profile 401, a drive has 402"),
+        ({}, {(0x6502, 0): 5}, r"does not support cyclic_sync_torque \(6502 = 00000005h\); drive\.mode is cst"),
+        ({}, {(0x6061, 0): 8}, r"6061 shows mode 8, mode 10 was selected"),
+        ({}, {(0x6072, 0): 3000}, r"object 6072 \(max torque\) reads back 3000, 1000 was written"),
+        ({}, {(0x60C2, 1): 4}, r"object 60C2:1 \(interpolation time period\) reads back 4, 1 was written"),
+        ({}, {(0x1016, 1): 0}, r"object 1016:1 \(consumer heartbeat time\) reads back 0, 8257736 was written"),
+        ({}, {(0x1A00, 2): 0x606C0020}, r"1A00:2 \(PDO 1800 mapping of position actual value\) reads back"),
+        ({}, {(0x6041, 0): 0x0218}, r"node 1 is in fault \(error code 0000h\) .*never resets one by itself"),
+        ({}, {(0x6041, 0): 0x021F}, r"node 1 is in fault"),
+        ({}, {(0x6071, 0): 5}, r"object 6071 \(target torque\) reads back 5, 0 was written"),
     ],
-)
-def test_what_differs_from_the_configuration(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, change: dict[str, Any], pattern: str
+)  # fmt: skip
+def test_what_is_not_as_it_must_be_is_refused(
+    joint: Any, changes: dict[str, Any], answers: dict[tuple[int, int], int], pattern: str
 ) -> None:
-    settings = dataclasses.replace(settings_of_virtual_joint, **change)
-    assert re.search(pattern, refusal(device_on_bus, settings, DeviceError))
+    joint.answers.update(answers)
+    assert re.search(pattern, refusal(joint, **changes))
 
 
 @pytest.mark.parametrize("change", [{"vendor_id": 0}, {"product_code": 1}, {"rated_torque_Nm": 0.5049}])
-def test_the_twins_that_agree(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, change: dict[str, Any]
-) -> None:
-    with opened(device_on_bus, dataclasses.replace(settings_of_virtual_joint, **change)) as drive:
+def test_the_twins_that_agree(joint: Any, change: dict[str, Any]) -> None:
+    with joint.opened(**change) as drive:
         drive.commission()
-
-
-@pytest.mark.parametrize(
-    ("place", "answer", "pattern"),
-    [
-        ((0x1000, 0), 401, r"node 1 has device profile 401, a drive has 402"),
-        ((0x6502, 0), 0x05, r"node 1 does not support cyclic_sync_torque \(6502 = 00000005h\); drive\.mode is cst"),
-        ((0x6061, 0), 8, r"6061 shows mode 8, mode 10 was selected"),
-        ((0x6072, 0), 3000, r"object 6072 \(max torque\) reads back 3000, 1000 was written"),
-        ((0x60C2, 1), 4, r"object 60C2:1 \(interpolation time period\) reads back 4, 1 was written"),
-        ((0x1016, 1), 0, r"object 1016:1 \(consumer heartbeat time\) reads back 0, 8257736 was written"),
-        ((0x1A00, 2), 0x606C0020, r"object 1A00:2 \(PDO 1800 mapping of position actual value\) reads back"),
-        ((0x6041, 0), 0x0218, r"node 1 is in fault \(error code 0000h\) .*never resets one by itself"),
-        ((0x6041, 0), 0x021F, r"node 1 is in fault"),
-        ((0x6071, 0), 5, r"object 6071 \(target torque\) reads back 5, 0 was written"),
-    ],
-)
-def test_a_drive_that_does_not_do_what_it_must(
-    device_on_bus: Any,
-    settings_of_virtual_joint: CanopenSettings,
-    place: tuple[int, int],
-    answer: int,
-    pattern: str,
-) -> None:
-    device_on_bus.answers[place] = answer
-    assert re.search(pattern, refusal(device_on_bus, settings_of_virtual_joint, DeviceError))
 
 
 @pytest.mark.parametrize(
     ("off_for", "pattern"),
     [(1, "node 1 is operation enabled, and was off a moment ago"), (2, "node 1 stays enabled although controlword 0")],
 )
-def test_a_drive_that_gets_power_while_it_is_commissioned(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, off_for: int, pattern: str
-) -> None:
-    device_on_bus.sequences[0x6041, 0] = [0x1250] * off_for
-    device_on_bus.answers[0x6041, 0] = 0x1637
-    assert re.search(pattern, refusal(device_on_bus, settings_of_virtual_joint, DeviceError))
+def test_a_drive_that_gets_power_while_it_is_commissioned(joint: Any, off_for: int, pattern: str) -> None:
+    joint.sequences[0x6041, 0] = [0x1250] * off_for
+    joint.answers[0x6041, 0] = 0x1637
+    assert re.search(pattern, refusal(joint))
 
 
 @pytest.mark.parametrize(("name", "drives"), [("rated_torque_Nm", "0.5 Nm"), ("rated_current_A", "5 A")])
-def test_a_rated_value_that_is_not_compared_is_told(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, name: str, drives: str
-) -> None:
+def test_a_rated_value_that_is_not_compared_is_told(joint: Any, name: str, drives: str) -> None:
     remark = f"drive.{name} is not given: nothing to compare the drive's {drives} with"
-    for settings in (settings_of_virtual_joint, dataclasses.replace(settings_of_virtual_joint, **{name: None})):
-        with opened(device_on_bus, settings) as drive:
-            assert (remark in drive.commission().remarks) is (settings is not settings_of_virtual_joint)
-
-
-@pytest.mark.parametrize(("reference", "index"), [("rated_torque", 0x6076), ("rated_current", 0x6075)])
-def test_no_scale_without_a_rated_value(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, reference: str, index: int
-) -> None:
-    device_on_bus.answers[(index, 0)] = 0
-    settings = dataclasses.replace(
-        settings_of_virtual_joint, torque_reference=reference, rated_torque_Nm=None, rated_current_A=None
-    )
-    assert f"object {index:04X} is 0" in refusal(device_on_bus, settings, DeviceError)
-
-
-def test_an_aborted_write_says_why(device_on_bus: Any, settings_of_virtual_joint: CanopenSettings) -> None:
-    settings = dataclasses.replace(settings_of_virtual_joint, quick_stop_option=4)
-    message = refusal(device_on_bus, settings, DeviceError)
-    assert re.search(r"writing 4 to object 605A \(quick stop option\) was refused: .* \(SDO abort 06090030h\)", message)
+    for change in ({}, {name: None}):
+        with joint.opened(**change) as drive:
+            assert (remark in drive.commission().remarks) is bool(change)
 
 
 @pytest.mark.parametrize("index", [0x1000, 0x6040, 0x6041, 0x6060, 0x6061, 0x6064, 0x6071, 0x6072, 0x60C2, 0x1016])
-def test_an_object_that_the_eds_does_not_have(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, tmp_path: Path, index: int
-) -> None:
-    eds = tmp_path / "edited.eds"
-    text = settings_of_virtual_joint.eds_path.read_text()
-    eds.write_text(re.sub(rf"(?ims)^\[{index:04X}(sub[0-9A-F]+)?\].*?(?=^\[)", "", text))
-    settings = dataclasses.replace(settings_of_virtual_joint, eds_path=eds)
-    message = refusal(device_on_bus, settings, DeviceError)
-    assert re.search(rf"EDS edited\.eds has no object {index:04X}.*which jointctl needs", message)
+def test_an_object_that_the_eds_does_not_have(commission: Any, joint: Any, index: int) -> None:
+    with pytest.raises(
+        DeviceError, match=rf"EDS edited\.eds has no object {index:04X}.*which jointctl needs"
+    ) as caught:
+        commission(without=(f"{index:04X}",))
+    assert "\n" not in str(caught.value)
+    assert joint.value(0x6041) & 0x6F != 0x27
 
 
 @pytest.mark.parametrize("content", [None, "this is no EDS file"])
-def test_an_eds_file_that_cannot_be_read(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, tmp_path: Path, content: str | None
-) -> None:
+def test_an_eds_file_that_cannot_be_read(joint: Any, tmp_path: Path, content: str | None) -> None:
     eds = tmp_path / "broken.eds"
     if content is not None:
         eds.write_text(content)
     with pytest.raises(ConfigurationError, match=r"drive\.eds \(=.*broken\.eds\) is not a readable EDS file") as caught:
-        device_on_bus.drive(dataclasses.replace(settings_of_virtual_joint, eds_path=eds))
+        joint.opened(eds_path=eds).__enter__()
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("step", ["port", "start_cyclic"])
-def test_nothing_goes_on_before_commissioning(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, step: str
-) -> None:
-    with (
-        opened(device_on_bus, settings_of_virtual_joint) as drive,
-        pytest.raises(DeviceError, match="not been commissioned"),
-    ):
+def test_nothing_goes_on_before_commissioning(joint: Any, step: str) -> None:
+    with joint.opened() as drive, pytest.raises(DeviceError, match="not been commissioned"):
         getattr(drive, step)()
 
 
-# --- the user's stop, other controllers, a bus that fails ------------------------------------------------------------
-
-
+# --- the user's stop, other controllers, a bus that fails ---
 class Stop(Exception):
     """What the gate raises."""
 
 
 @pytest.mark.parametrize(("wait_s", "slices_s"), [(0.0, []), (GATE_S, [GATE_S]), (0.12, [GATE_S, GATE_S, 0.02])])
 def test_a_wait_looks_for_a_stop_before_each_of_its_parts_and_at_its_end(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, wait_s: float, slices_s: list[float]
+    joint: Any, wait_s: float, slices_s: list[float]
 ) -> None:
-    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+    with joint.opened() as drive:
         log: list[float] = []
         drive._sleep, drive._gate = log.append, lambda: log.append(-1.0)
         drive._pause(wait_s)
     assert log == pytest.approx([number for part in slices_s for number in (-1.0, part)] + [-1.0])
 
 
-def test_once_a_stop_was_asked_for_the_drive_is_only_made_safe(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings
-) -> None:
+def test_once_a_stop_was_asked_for_the_drive_is_only_made_safe(joint: Any) -> None:
     def gate() -> None:
         if asked:
             raise Stop
 
     asked: list[bool] = []
-    drive = device_on_bus.drive(settings_of_virtual_joint, gate=gate)
+    drive = joint.drive(joint.settings, gate=gate)
     try:
         drive.commission()
         asked.append(True)
-        device_on_bus.requests.clear()
+        joint.requests.clear()
         for step in (drive.commission, drive.start_cyclic, lambda: drive._objects.read(0x1000, what="device type")):
             with pytest.raises(Stop):
                 step()
-        assert device_on_bus.requests == []
+        assert joint.requests == []
         assert drive.make_safe() == "switch on disabled"
     finally:
         drive.close()
 
 
 @pytest.mark.parametrize(("configured_s", "used_s"), [(None, 0.15), (0.7, 0.7)])
-def test_answers_are_waited_for_as_configured(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, configured_s: float | None, used_s: float
-) -> None:
-    with opened(device_on_bus, dataclasses.replace(settings_of_virtual_joint, sdo_timeout_s=configured_s)) as drive:
+def test_answers_are_waited_for_as_configured(joint: Any, configured_s: float | None, used_s: float) -> None:
+    with joint.opened(sdo_timeout_s=configured_s) as drive:
         waits_s: float = drive._node.sdo.RESPONSE_TIMEOUT
     assert waits_s == used_s
 
 
-def test_a_drive_that_cannot_be_made_leaves_no_bus_open(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, tmp_path: Path
-) -> None:
-    bus: Any = can.Bus(interface="virtual", channel=device_on_bus.channel)
+def test_a_drive_that_cannot_be_made_leaves_no_bus_open(joint: Any, tmp_path: Path) -> None:
+    bus: Any = can.Bus(interface="virtual", channel=joint.channel)
     with pytest.raises(ConfigurationError):
-        CanopenDrive(bus, dataclasses.replace(settings_of_virtual_joint, eds_path=tmp_path / "none.eds"))
+        CanopenDrive(bus, dataclasses.replace(joint.settings, eds_path=tmp_path / "none.eds"))
     assert bus._is_shutdown
 
 
 @pytest.mark.parametrize(("heartbeat_of", "anothers"), [(42, True), (43, False)])
-def test_a_drive_that_watches_a_node_on_the_bus_is_anothers(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, heartbeat_of: int, anothers: bool
-) -> None:
-    store(device_on_bus, 0x1016, 1, 42 << 16 | 500)
-    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+def test_a_drive_that_watches_a_node_on_the_bus_is_anothers(joint: Any, heartbeat_of: int, anothers: bool) -> None:
+    joint.store(0x1016, 1, 42 << 16 | 500)
+    with joint.opened() as drive:
         for node in (heartbeat_of, 9):
-            device_on_bus.send(0x700 + node, b"\x05")
+            joint.send(0x700 + node, b"\x05")
         if anothers:
             with pytest.raises(BusError, match=r"node 1 watches the heartbeat of node 42 \(1016\)"):
                 drive.commission()
-            assert not any(cob == 0 for cob, _ in device_on_bus.requests)
+            assert not any(cob == 0 for cob, _ in joint.requests)
         else:
             assert "other nodes are on the bus: heartbeats of 9, 43" in drive.commission().remarks
 
 
-def test_an_rpdo_that_only_the_drive_knows_of_is_anothers_command(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings
-) -> None:
-    device_on_bus.answers[0x1401, 1] = 0x333
-    with opened(device_on_bus, settings_of_virtual_joint) as drive:
-        device_on_bus.send(0x333, bytes(8))
+def test_an_rpdo_that_only_the_drive_knows_of_is_anothers_command(joint: Any) -> None:
+    joint.answers[0x1401, 1] = 0x333
+    with joint.opened() as drive:
+        joint.send(0x333, bytes(8))
         with pytest.raises(BusError, match=r"another controller is active on this bus: 1 x RPDO of the drive \(333h\)"):
             drive.commission()
 
 
 @pytest.mark.parametrize("step", ["commission", "start_cyclic"])
 @pytest.mark.parametrize("seen", [True, False])
-def test_what_another_controller_has_spoilt_is_told_as_its_doing(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, seen: bool, step: str
-) -> None:
+def test_what_another_controller_has_spoilt_is_told_as_its_doing(joint: Any, seen: bool, step: str) -> None:
     def gate() -> None:
-        written = device_on_bus.requests and device_on_bus.requests[-1][1][1:3] == b"\x72\x60"
+        written = joint.requests and joint.requests[-1][1][1:3] == b"\x72\x60"
         if written or step == "start_cyclic":
-            device_on_bus.send(0x080, b"")
+            joint.send(0x080, b"")
 
-    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+    with joint.opened() as drive:
         if step == "start_cyclic":
             drive.commission()
-        device_on_bus.answers[0x6072, 0] = 3000
+        joint.answers[0x6072, 0] = 3000
         drive._objects.gate = gate if seen else lambda: None
         with pytest.raises(BusError if seen else DeviceError, match="SYNC" if seen else "6072"):
             getattr(drive, step)()
 
 
 @pytest.mark.parametrize(("step", "when"), [("commission", "during commissioning"), ("start_cyclic", "before the run")])
-def test_a_bus_that_fails_is_told_with_the_step(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, step: str, when: str
-) -> None:
+def test_a_bus_that_fails_is_told_with_the_step(joint: Any, step: str, when: str) -> None:
     def dead(*_: Any) -> None:
         raise can.CanOperationError("no buffer space")
 
-    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+    with joint.opened() as drive:
         if step == "start_cyclic":
             drive.commission()
         drive._network.send_message = dead  # type: ignore[method-assign]
@@ -393,21 +394,17 @@ def test_a_bus_that_fails_is_told_with_the_step(
         del drive._network.send_message
 
 
-def test_a_drive_that_has_lost_its_mode_is_not_started(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings
-) -> None:
-    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+def test_a_drive_that_has_lost_its_mode_is_not_started(joint: Any) -> None:
+    with joint.opened() as drive:
         drive.commission()
-        device_on_bus.requests.clear()
-        device_on_bus.answers[0x6061, 0] = 8
+        joint.requests.clear()
+        joint.answers[0x6061, 0] = 8
         with pytest.raises(DeviceError, match="node 1: 6061 shows mode 8, it was 10"):
             drive.start_cyclic()
-        assert (0x000, b"\x01\x01") not in device_on_bus.requests
+        assert (0x000, b"\x01\x01") not in joint.requests
 
 
-# --- an adapter that serves one program at a time --------------------------------------------------------------------
-
-
+# --- an adapter that serves one program at a time ---
 class Adapter:
     """Opens the bus of a test again, at the n-th attempt."""
 
@@ -424,12 +421,10 @@ class Adapter:
 
 
 @pytest.mark.parametrize("at_attempt", [1, 3, REOPEN_ATTEMPTS])
-def test_an_adapter_is_lent_to_the_loop_and_taken_back(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, at_attempt: int
-) -> None:
-    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+def test_an_adapter_is_lent_to_the_loop_and_taken_back(joint: Any, at_attempt: int) -> None:
+    with joint.opened() as drive:
         drive.commission()
-        adapter = Adapter(device_on_bus, drive, at_attempt)
+        adapter = Adapter(joint, drive, at_attempt)
         lent: Any = drive._network.bus
         drive.start_cyclic()
         assert lent._is_shutdown
@@ -441,12 +436,10 @@ def test_an_adapter_is_lent_to_the_loop_and_taken_back(
         assert adapter.attempts == at_attempt  # it has it
 
 
-def test_an_adapter_that_does_not_come_back_leaves_the_watchdog_to_stop_the_joint(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings
-) -> None:
-    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+def test_an_adapter_that_does_not_come_back_leaves_the_watchdog_to_stop_the_joint(joint: Any) -> None:
+    with joint.opened() as drive:
         drive.commission()
-        adapter = Adapter(device_on_bus, drive, REOPEN_ATTEMPTS + 1)
+        adapter = Adapter(joint, drive, REOPEN_ATTEMPTS + 1)
         drive.start_cyclic()
         state = drive.make_safe()
     assert state.startswith("unknown: the bus cannot be opened again (still in use)")
@@ -455,19 +448,17 @@ def test_an_adapter_that_does_not_come_back_leaves_the_watchdog_to_stop_the_join
 
 
 @pytest.mark.parametrize("change", ["mode", "deadline", "another"])
-def test_a_drive_that_changes_at_its_start_is_not_handed_over(
-    device_on_bus: Any, settings_of_virtual_joint: CanopenSettings, change: str
-) -> None:
-    with opened(device_on_bus, settings_of_virtual_joint) as drive:
+def test_a_drive_that_changes_at_its_start_is_not_handed_over(joint: Any, change: str) -> None:
+    with joint.opened() as drive:
         drive.commission()
-        Adapter(device_on_bus, drive, 1)
+        Adapter(joint, drive, 1)
 
         def gate() -> None:
-            if (0x000, b"\x01\x01") in device_on_bus.requests:
-                device_on_bus.answers.update({(0x6061, 0): 8} if change == "mode" else {})
-                device_on_bus.answers.update({(0x1400, 5): 0} if change == "deadline" else {})
+            if (0x000, b"\x01\x01") in joint.requests:
+                joint.answers.update({(0x6061, 0): 8} if change == "mode" else {})
+                joint.answers.update({(0x1400, 5): 0} if change == "deadline" else {})
                 if change == "another":
-                    device_on_bus.send(0x000, b"\x80\x01")
+                    joint.send(0x000, b"\x80\x01")
 
         drive._objects.gate = gate
         with pytest.raises(BusError if change == "another" else DeviceError):

@@ -1,93 +1,175 @@
-"""Drives as they are met: objects they lack, limits and delays of their own (docs/hardware.md)."""
+"""Drives as they are met: objects they lack, limits and delays of their own, PDOs on any identifier."""
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
 import pytest
 
+from jointctl.drivers.can.frames import Frame
+from jointctl.drivers.canopen.cyclic import accept_frame, end_cycle
+from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import DeviceError, NoDeviceError
-from tests.unit.drivers.canopen.odd_drive import OUT_OF_RANGE, READ_ONLY, store, value
+from jointctl.firmware_py.records import Command, Sample
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import DriveRequest
 
+# --- Drives as they are met: objects they lack, limits and delays of their own (docs/hardware.md) ---
 pytestmark = pytest.mark.usefixtures("short_timeout")
+NO_ACCESS, READ_ONLY, OUT_OF_RANGE = 0x06010000, 0x06010002, 0x06090030
+NO_OBJECT, NO_SUB_INDEX = "06020000", "06090011"
+STATUS, POSITION, TORQUE, VELOCITY = 0x60410010, 0x60640020, 0x60770010, 0x606C0020
+CONTROL, TARGET, MODE, LIMIT, TARGET_VELOCITY, SPEED_LIMIT = (
+    0x60400010, 0x60710010, 0x60600008, 0x60720010, 0x60FF0020, 0x607F0020,
+)  # fmt: skip
 
 
-# --- objects that a drive does not have ------------------------------------------------------------------------
+# --- objects that a drive does not have: the EDS does not list them, or lists them all the same ---
+def take_away(bus: Any, index: int, sub: int | None = None) -> None:
+    """The drive's dictionary loses an object, or one of its entries; our EDS still lists it."""
+    objects = bus.device.objects
+    for key in [key for key in objects.entries if key[0] == index and sub in (None, key[1])]:
+        del objects.entries[key]
+    if sub is None:
+        objects._indices.discard(index)
 
 
-def test_without_6502_the_mode_is_tried(commission: Any) -> None:
-    report = commission(without=("6502",))
+@pytest.fixture(params=["EDS", "drive"])
+def lacking(request: pytest.FixtureRequest, commission: Any, joint: Any) -> Any:
+    """Commissions a drive without some objects, (index, sub): the EDS has not got them either, or only the drive."""
+
+    def run(*places: tuple[int, int | None], **changes: Any) -> CommissioningReport:
+        if request.param == "EDS":
+            names = (f"{index:04X}" + ("" if sub is None else f"sub{sub:X}") for index, sub in places)
+            return commission(without=tuple(names), **changes)
+        for place in places:
+            take_away(joint, *place)
+        return commission(**changes)
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("index", "sub", "remark"),
+    [
+        (0x6502, None, "no object 6502"), (0x603F, None, ""), (0x1017, None, "no object 1017"),
+        (0x6007, None, "no object 6007"), (0x1029, None, ""), (0x605A, None, ""), (0x60B2, None, ""),
+        (0x60FF, None, ""), (0x1005, None, ""), (0x1006, None, ""), (0x1019, None, ""),
+        (0x1400, 5, "no object 1400:5"), (0x1800, 3, ""), (0x1800, 5, ""), (0x1018, 4, ""), (0x1008, None, ""),
+    ],
+)  # fmt: skip
+def test_what_may_be_absent_is(lacking: Any, joint: Any, index: int, sub: int | None, remark: str) -> None:
+    report = lacking((index, sub))
     assert report.mode == "cyclic_sync_torque"
-    assert any("no object 6502" in remark for remark in report.remarks)
+    assert not remark or any(remark in line for line in report.remarks)
+    assert joint.value(0x1016, 1) != 0
 
 
-def test_without_6502_a_mode_that_is_not_taken_is_refused(commission: Any, device_on_bus: Any) -> None:
-    device_on_bus.answers[(0x6061, 0)] = 0
-    with pytest.raises(DeviceError, match="6061 shows mode 0, mode 10 was selected"):
-        commission(without=("6502",))
-
-
-def test_without_603f_a_fault_has_no_code(commission: Any, device_on_bus: Any) -> None:
-    assert commission(without=("603F",)).mode == "cyclic_sync_torque"
-    device_on_bus.answers[(0x6041, 0)] = 0x0218
-    with pytest.raises(DeviceError, match=r"is in fault \(error code 0000h\)"):
-        commission(without=("603F",))
-
-
-def test_without_1017_the_drive_is_watched_by_its_boot_up_and_its_samples(commission: Any) -> None:
-    assert any("no object 1017" in remark for remark in commission(without=("1017",)).remarks)
-
-
-def test_without_1016_the_drive_is_not_enabled(commission: Any) -> None:
-    with pytest.raises(DeviceError, match=r"no object 1016:1 .* which jointctl needs: without it the drive cannot"):
-        commission(without=("1016",))
-
-
-def test_without_6077_the_torque_is_not_measured(commission: Any, device_on_bus: Any) -> None:
-    assert not commission(without=("6077",)).measures_torque
+def test_a_torque_that_is_not_measured_is_not_mapped(lacking: Any, commission: Any, joint: Any) -> None:
+    assert not lacking((0x6077, None)).measures_torque
     port = commission.port[0]
     assert (port.torque_at, port.tpdo_length) == (-1, 6)
-    assert [value(device_on_bus, 0x1A00, k) for k in range(3)] == [2, 0x60410010, 0x60640020]
+    assert [joint.value(0x1A00, k) for k in range(3)] == [2, STATUS, POSITION]
 
 
-def test_60c2_is_not_needed_in_a_profile_mode(commission: Any) -> None:
-    assert "60C2" not in commission(without=("60C2",), mode="tq").settings
+def test_a_torque_slope_that_is_not_there_is_a_remark(lacking: Any) -> None:
+    report = lacking((0x6087, None), (0x60C2, None), mode="tq")
+    assert any("no object 6087" in line for line in report.remarks)
+    assert "60C2" not in report.settings
 
 
-def test_an_object_that_cannot_be_written_but_holds_the_value(commission: Any, device_on_bus: Any) -> None:
-    device_on_bus.refused[(0x60C2, 1)] = device_on_bus.refused[(0x60C2, 2)] = READ_ONLY
+@pytest.mark.parametrize("sub", [None, 1])
+def test_without_a_consumer_heartbeat_it_is_never_used(lacking: Any, sub: int | None) -> None:
+    with pytest.raises(DeviceError, match=r"no object 1016:1 .* which jointctl needs: without it the drive cannot"):
+        lacking((0x1016, sub))
+
+
+def test_neither_reaction_to_a_lost_connection_is_refused(lacking: Any) -> None:
+    with pytest.raises(DeviceError, match=r"neither object 6007 .* nor 1029:1"):
+        lacking((0x6007, None), (0x1029, None))
+
+
+def test_without_6502_a_mode_that_is_not_taken_is_refused(lacking: Any, joint: Any) -> None:
+    joint.answers[(0x6061, 0)] = 0
+    with pytest.raises(DeviceError, match="6061 shows mode 0, mode 10 was selected"):
+        lacking((0x6502, None))
+
+
+def test_without_603f_a_fault_has_no_code(lacking: Any, joint: Any) -> None:
+    joint.answers[(0x6041, 0)] = 0x0218
+    with pytest.raises(DeviceError, match=r"is in fault \(error code 0000h\)"):
+        lacking((0x603F, None))
+
+
+@pytest.mark.parametrize(
+    ("index", "sub", "name", "code"),
+    [
+        (0x6064, None, r"6064 \(position actual value\)", NO_OBJECT),
+        (0x6072, None, r"6072 \(max torque\)", NO_OBJECT),
+        (0x6071, None, r"6071 \(target torque\)", NO_OBJECT),
+        (0x60C2, 1, r"60C2:1 \(interpolation time period\)", NO_SUB_INDEX),
+    ],
+)
+def test_what_must_be_there_is_refused_by_name(
+    commission: Any, joint: Any, index: int, sub: int | None, name: str, code: str
+) -> None:
+    take_away(joint, index, sub)
+    words = rf"object {name} was refused: .* does not exist \(SDO abort {code}h\)"
+    with pytest.raises(DeviceError, match=words) as was:
+        commission()
+    assert "EDS edited.eds lists it" in was.value.hint
+
+
+def test_an_object_is_asked_for_once_and_anew_with_each_commissioning(joint: Any) -> None:
+    with joint.opened() as drive:
+        drive.commission()
+        objects = drive._objects
+        before = len(joint.requests)
+        assert [objects.has(0x6077) for _ in range(5)] == [True] * 5
+        assert len(joint.requests) == before
+        take_away(joint, 0x6077)
+        assert objects.has(0x6077)
+        assert not drive.commission().measures_torque
+
+
+def test_other_refusals_do_not_make_an_object_absent(commission: Any, joint: Any) -> None:
+    """A drive that will not take 6007 now has it all the same: not the same as a drive without."""
+    joint.refused[(0x6007, 0)] = 0x08000022
+    with pytest.raises(DeviceError, match=r"6007 .* not in the present device state"):
+        commission()
+
+
+def test_a_drive_without_a_target_velocity_is_switched_off(joint: Any) -> None:
+    for index in (0x60FF, 0x1016):
+        take_away(joint, index)
+    assert joint.stop_drive() == "switch on disabled"
+
+
+def test_an_object_that_cannot_be_written_but_holds_the_value(commission: Any, joint: Any) -> None:
+    joint.refused[(0x60C2, 1)] = joint.refused[(0x60C2, 2)] = READ_ONLY
     report = commission()
     assert "60C2:1 (interpolation time period) cannot be written; it is 1, as it must be" in report.remarks
     with pytest.raises(DeviceError, match=r"60C2:1 .* was refused: object is read only"):
         commission(rate_Hz=500.0)
 
 
-# --- torque mode with a slope ----------------------------------------------------------------------------------
-
-
+# --- torque mode with a slope ---
+@pytest.mark.parametrize("rate_Nmps", [1209.0, 1211.0])
 def test_a_torque_slope_that_the_drive_limits_is_used_where_the_loop_is_slower(
-    commission: Any, device_on_bus: Any
+    commission: Any, joint: Any, rate_Nmps: float
 ) -> None:
-    device_on_bus.refused[(0x6087, 0)] = OUT_OF_RANGE
-    store(device_on_bus, 0x6087, 0, 20_000)  # 0.0605 Nm per permille: 1210 Nm/s
-    report = commission(mode="tq", torque_rate_max_Nmps=1209.0)
+    joint.refused[(0x6087, 0)] = OUT_OF_RANGE
+    joint.store(0x6087, 0, 20_000)  # 0.0605 Nm per permille: 1210 Nm/s
+    if rate_Nmps > 1210.0:
+        with pytest.raises(DeviceError, match=r"at most 1210 Nm/s .*set limits\.torque_rate_max_Nmps to 1210 or less"):
+            commission(mode="tq", torque_rate_max_Nmps=rate_Nmps)
+        return
+    report = commission(mode="tq", torque_rate_max_Nmps=rate_Nmps)
     assert any("6087 = 20000 permille/s" in remark for remark in report.remarks)
 
 
-def test_a_torque_slope_below_the_rate_of_the_loop_is_refused(commission: Any, device_on_bus: Any) -> None:
-    device_on_bus.refused[(0x6087, 0)] = OUT_OF_RANGE
-    store(device_on_bus, 0x6087, 0, 20_000)
-    with pytest.raises(DeviceError, match=r"at most 1210 Nm/s .*set limits\.torque_rate_max_Nmps to 1210 or less"):
-        commission(mode="tq", torque_rate_max_Nmps=1211.0)
-
-
-def test_without_6087_torque_mode_is_warned_about(commission: Any) -> None:
-    assert any("no object 6087" in remark for remark in commission(without=("6087",), mode="tq").remarks)
-
-
-# --- torque in per mille of what -------------------------------------------------------------------------------
-
-
+# --- torque in per mille of what ---
 @pytest.mark.parametrize(("reference", "resolution_Nm"), [("rated_torque", 0.0605), ("rated_current", 0.0484)])
 def test_permille_of_rated_torque_or_of_rated_current(commission: Any, reference: str, resolution_Nm: float) -> None:
     report = commission(torque_reference=reference, torque_constant_NmpA=0.08, max_torque_permille=None)
@@ -95,53 +177,43 @@ def test_permille_of_rated_torque_or_of_rated_current(commission: Any, reference
     assert report.settings["max torque"].endswith("= 60.0 Nm")
 
 
-# --- time ------------------------------------------------------------------------------------------------------
-
-
-def test_a_drive_that_boots_for_seconds(commission: Any, device_on_bus: Any) -> None:
+# --- time ---
+def test_a_drive_that_boots_for_seconds_and_one_for_longer_than_allowed(commission: Any, joint: Any) -> None:
     # each attempt: a request and an abort of the library
-    device_on_bus.deaf_frames = 10
+    joint.deaf_frames = 10
     commission(boot_timeout_s=1.5)
-    assert device_on_bus.deaf_frames == 0
-
-
-def test_a_drive_that_boots_for_longer_than_allowed(commission: Any, device_on_bus: Any) -> None:
-    device_on_bus.deaf_frames = 1000
+    assert joint.deaf_frames == 0
+    joint.deaf_frames = 1000
     with pytest.raises(NoDeviceError, match="node 1 does not answer"):
         commission(boot_timeout_s=0.5)
 
 
-def test_not_ready_to_switch_on_for_a_while(commission: Any, device_on_bus: Any) -> None:
-    device_on_bus.sequences[(0x6041, 0)] = [0x0200] * 20
+def test_not_ready_to_switch_on_for_a_while_and_for_too_long(commission: Any, joint: Any) -> None:
+    joint.sequences[(0x6041, 0)] = [0x0200] * 20
     commission(boot_timeout_s=2.0)
-
-
-def test_not_ready_to_switch_on_for_too_long(commission: Any, device_on_bus: Any) -> None:
-    device_on_bus.answers[(0x6041, 0)] = 0x0200
+    joint.answers[(0x6041, 0)] = 0x0200
     message = r"node 1 is not ready to switch on \(statusword 0200h\) after 0\.3 s \(motor supply, .*boot_timeout_s\)"
     with pytest.raises(DeviceError, match=message):
         commission(boot_timeout_s=0.3)
 
 
-def test_no_statusword_until_the_first_controlword_that_is_not_zero(commission: Any, device_on_bus: Any) -> None:
-    device_on_bus.sequences[(0x6041, 0)] = [0, 0, 0, 0]
+def test_no_statusword_until_the_first_controlword_that_is_not_zero(commission: Any, joint: Any) -> None:
+    joint.sequences[(0x6041, 0)] = [0, 0, 0, 0]
     commission(boot_timeout_s=1.0)
-    words = [data[4] for cob, data in device_on_bus.requests if cob == 0x601 and data[:3] == b"\x2b\x40\x60"]
+    words = [data[4] for cob, data in joint.requests if cob == 0x601 and data[:3] == b"\x2b\x40\x60"]
     assert words[:2] == [0x00, 0x06]
     assert 0x07 not in words
     assert 0x0F not in words
-    assert value(device_on_bus, 0x6041) & 0x6F == 0x40
+    assert joint.value(0x6041) & 0x6F == 0x40
 
 
-def test_answers_that_stay_away_now_and_then(commission: Any, device_on_bus: Any) -> None:
-    device_on_bus.mute += [(0x1018, 2), (0x6060, 0), (0x1A00, 3), (0x1A00, 3), (0x1016, 1)]
+def test_answers_that_stay_away_now_and_then(commission: Any, joint: Any) -> None:
+    joint.mute += [(0x1018, 2), (0x6060, 0), (0x1A00, 3), (0x1A00, 3), (0x1016, 1)]
     commission()
-    assert device_on_bus.mute == []
+    assert joint.mute == []
 
 
-# --- EDS files that are wrong where it matters, and elsewhere ---------------------------------------------------
-
-
+# --- limits of torque ---
 @pytest.mark.parametrize(("torque_Nm", "refused"), [(48.4, False), (49.0, True)])
 def test_a_torque_limit_that_6072_would_cut_unseen_is_refused(commission: Any, torque_Nm: float, refused: bool) -> None:
     """1000 permille of 5 A and 0.08 Nm/A at 121:1 are 48.4 Nm; the configuration alone cannot know it."""
@@ -151,3 +223,182 @@ def test_a_torque_limit_that_6072_would_cut_unseen_is_refused(commission: Any, t
             commission(torque_max_Nm=torque_Nm, **how)
     else:
         assert commission(torque_max_Nm=torque_Nm, **how).settings["max torque"] == "1000 permille = 48.4 Nm"
+
+
+# --- PDOs as drives have them: on any identifier, fixed, half writable; used, restored or refused with the reason ---
+def fixed_map(bus: Any, base: int, cob_id: int, kind: int, *entries: int) -> None:
+    """A PDO whose map cannot be changed."""
+    bus.store(base, 1, cob_id)
+    bus.store(base, 2, kind)
+    bus.store(base + 0x200, 0, len(entries))
+    for sub, entry in enumerate(entries, start=1):
+        bus.store(base + 0x200, sub, entry)
+
+
+def refuse_maps(bus: Any, first: int) -> None:
+    """Abort every change of the mapping of the four PDOs from `first` (1400 or 1800)."""
+    bus.refused.update({(base + 0x200, sub): NO_ACCESS for base in range(first, first + 4) for sub in range(9)})
+
+
+# --- PDOs ---
+@pytest.mark.parametrize("cob_id", [0x181, 0x1A5, 0x80000181, 0xC00001F0, 0x40000181])
+def test_defaults_on_any_identifier_are_replaced(commission: Any, joint: Any, cob_id: int) -> None:
+    joint.store(0x1800, 1, cob_id)
+    joint.store(0x1400, 1, cob_id + 0x80)
+    joint.store(0x1800, 2, 255)
+    joint.store(0x1800, 3, 500)
+    joint.store(0x1800, 5, 100)
+    commission()
+    assert joint.value(0x1800, 1) & ~0x40000000 == 0x181
+    assert joint.value(0x1400, 1) & ~0x40000000 == 0x201
+    assert [joint.value(0x1800, sub) for sub in (2, 3, 5)] == [1, 0, 0]
+    assert (commission.port[0].tpdo_id, commission.port[0].rpdo_id) == (0x181, 0x201)
+
+
+def test_a_pdo_that_cannot_be_switched_off_is_told(commission: Any, joint: Any) -> None:
+    joint.store(0x1802, 1, 0x381)
+    joint.refused[(0x1802, 1)] = NO_ACCESS
+    assert any("1802:1" in r and "it stays enabled on 381h" in r for r in commission().remarks)
+
+
+def test_a_drive_that_makes_sync_itself_is_told_not_to(commission: Any, joint: Any) -> None:
+    joint.store(0x1005, 0, 0x40000080)
+    joint.store(0x1006, 0, 2000)
+    assert "1005 was 40000080h, it is now 00000080h" in commission().remarks
+    assert (joint.value(0x1005), joint.value(0x1006)) == (0x80, 1000)
+
+
+@pytest.mark.parametrize(("asked", "taken"), [(1, True), (255, False)])
+def test_a_drive_that_only_answers_to_sync(commission: Any, joint: Any, asked: int, taken: bool) -> None:
+    """Its PDOs are synchronous and stay so; between two SYNCs it says nothing."""
+    for base in (*range(0x1400, 0x1404), *range(0x1800, 0x1804)):
+        joint.store(base, 2, 1)
+        joint.refused[base, 2] = OUT_OF_RANGE
+    if not taken:
+        with pytest.raises(DeviceError, match=r"transmission type 1, .*set drive\.rpdo_transmission_type = 1,"):
+            commission(rpdo_transmission_type=asked)
+        return
+    report = commission(rpdo_transmission_type=asked)
+    for base in (0x1400, 0x1800):
+        told = f"{base:04X}:2 (PDO {base:04X} transmission type) cannot be written; it is 1, as it must be"
+        assert told in report.remarks
+    joint.stop()
+    device, now_ns = joint.device, joint.now_ns
+
+    def tpdos(frames: list[bytes]) -> int:
+        return sum(struct.unpack_from("<I", frame)[0] == commission.port[0].tpdo_id for frame in frames)
+
+    device.handle(struct.pack("<IB3x8s", 0, 2, b"\x01\x01"), now_ns)
+    sync = struct.pack("<IB3x8s", commission.port[0].sync_id, 0, b"")
+    heard = []
+    for cycle in range(1, 4):
+        at_ns = now_ns + cycle * 20_000_000
+        heard.append((tpdos(device.advance(at_ns)), tpdos(device.handle(sync, at_ns))))
+    assert heard == [(0, 1)] * 3
+
+
+@pytest.mark.parametrize("asked", [1, 255])
+def test_a_drive_that_refuses_an_asynchronous_command_and_can_be_mapped(
+    commission: Any, joint: Any, asked: int
+) -> None:
+    """None of its own maps would do: not the map has to be changed, but what is asked for."""
+    for base in range(0x1400, 0x1404):
+        fixed_map(joint, base, 0x80000201, 1, CONTROL)
+        joint.refused[base, 2] = OUT_OF_RANGE
+    if asked == 1:
+        assert commission(rpdo_transmission_type=asked).settings["mode"]
+        return
+    with pytest.raises(DeviceError, match=r"1400:2 .*was refused: value out of range") as caught:
+        commission(rpdo_transmission_type=asked)
+    assert caught.value.hint == "set drive.rpdo_transmission_type = 1"
+
+
+def test_a_fixed_feedback_map_is_used_by_its_offsets(commission: Any, joint: Any) -> None:
+    refuse_maps(joint, 0x1800)
+    fixed_map(joint, 0x1800, 0x181, 1, STATUS, TORQUE)
+    fixed_map(joint, 0x1801, 0x281, 1, STATUS, VELOCITY)
+    fixed_map(joint, 0x1802, 0x3A5, 1, TORQUE, POSITION, STATUS)
+    report = commission()
+    port = commission.port[0]
+    assert (port.tpdo_id, port.tpdo_length) == (0x3A5, 8)
+    assert (port.torque_at, port.position_at, port.status_at) == (0, 2, 6)
+    assert any("PDO 1802 is used as it is, on 3A5h" in remark for remark in report.remarks)
+    assert joint.value(0x1800, 1) & 0x80000000
+    assert not joint.value(0x1802, 1) & 0x80000000
+    frame, sample = new(Frame)[0], new(Sample)[0]
+    frame.can_id, frame.length = 0x3A5, 8
+    for at, byte in enumerate(struct.pack("<hiH", -100, 1234, 0x1637)):
+        frame.payload[at] = byte
+    assert accept_frame(port, frame, sample, 1)
+    assert sample.status_word == 0x1637
+    assert sample.torque_Nm == pytest.approx(-6.05)
+    assert sample.position_rad == pytest.approx(1234 * report.position_resolution_rad)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "entries", "refused", "message"),
+    [
+        (range(4), (STATUS, VELOCITY), False,
+         r"none of the drive's own TPDOs holds statusword \(6041\), position actual value \(6064\) together"),
+        (range(1), (STATUS, POSITION), True, r"PDO 1800 .*transmission type 255: it does not answer every SYNC"),
+    ],
+)  # fmt: skip
+def test_a_fixed_feedback_map_without_the_position_or_without_sync_is_refused(
+    commission: Any, joint: Any, kinds: range, entries: tuple[int, int], refused: bool, message: str
+) -> None:
+    refuse_maps(joint, 0x1800)
+    for k in kinds:
+        fixed_map(joint, 0x1800 + k, 0x181 + k * 0x100, 255 if refused else 1, *entries)
+    if refused:
+        joint.refused[(0x1800, 2)] = READ_ONLY
+    with pytest.raises(DeviceError, match=message):
+        commission()
+
+
+def test_a_fixed_command_map_is_filled_where_the_loop_writes_nothing(commission: Any, joint: Any) -> None:
+    refuse_maps(joint, 0x1400)
+    fixed_map(joint, 0x1400, 0x80000201, 255, CONTROL, MODE)
+    fixed_map(joint, 0x1401, 0x80000301, 255, LIMIT, CONTROL, MODE, TARGET)
+    report = commission()
+    port = commission.port[0]
+    assert (port.rpdo_id, port.rpdo_length, port.control_at, port.target_at) == (0x301, 7, 2, 5)
+    assert any("PDO 1401 is used as it is" in remark for remark in report.remarks)
+    frames, sample, command = new(Frame, 4), new(Sample)[0], new(Command)[0]
+    port.state, command.request, command.torque_Nm = 4, DriveRequest.ENABLE, 6.05
+    end_cycle(port, frames, sample, command)
+    assert bytes(frames[2].payload)[:7] == struct.pack("<HHbh", 1000, 0x0F, 10, 100)
+    assert frames[2].length == 7
+
+
+def test_a_fixed_command_map_with_an_object_that_zero_could_harm_is_refused(commission: Any, joint: Any) -> None:
+    refuse_maps(joint, 0x1400)
+    for base in range(0x1400, 0x1404):
+        fixed_map(joint, base, 0x201 + (base & 3) * 0x100, 1, CONTROL, TARGET, SPEED_LIMIT)
+    with pytest.raises(DeviceError, match="also carries object 607F: jointctl does not know what to send there"):
+        commission()
+
+
+def test_dummies_and_target_velocity_in_a_fixed_command_map_are_zero(commission: Any, joint: Any) -> None:
+    refuse_maps(joint, 0x1400)
+    fixed_map(joint, 0x1400, 0x201, 1, 0x00050008, CONTROL, 0x00050008, TARGET)
+    commission()
+    port = commission.port[0]
+    assert (port.rpdo_length, port.control_at, port.target_at) == (6, 1, 4)
+    assert bytes(port.rpdo_filler) == bytes(8)
+
+
+def test_a_fixed_command_map_of_another_transmission_type_is_refused(commission: Any, joint: Any) -> None:
+    refuse_maps(joint, 0x1400)
+    fixed_map(joint, 0x1400, 0x201, 255, CONTROL, TARGET)
+    joint.refused[(0x1400, 2)] = READ_ONLY
+    with pytest.raises(DeviceError, match=r"transmission type 255, .*set drive\.rpdo_transmission_type = 255"):
+        commission()
+    commission(rpdo_transmission_type=255)
+
+
+def test_a_map_of_which_only_some_steps_are_refused_is_restored(commission: Any, joint: Any) -> None:
+    fixed_map(joint, 0x1800, 0x181, 1, POSITION, STATUS)
+    joint.refused[(0x1A00, 1)] = NO_ACCESS
+    commission()
+    assert [joint.value(0x1A00, k) for k in range(3)] == [2, POSITION, STATUS]
+    assert (commission.port[0].position_at, commission.port[0].status_at) == (0, 4)

@@ -23,7 +23,9 @@ from jointctl.drivers.errors import BusError, DataError, DeviceError, NoDeviceEr
 from jointctl.hil.canopen.records import PowerState
 from jointctl.tools.output import Output
 from jointctl.tools.session import session as session_module
+from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.result import require_off, words
+from jointctl.tools.verbs import canopen_bench
 from jointctl.tools.verbs import run as run_module
 from jointctl.tools.verbs import stop as stop_module
 from tests.places import CONFIGS
@@ -33,45 +35,45 @@ ENABLED, SWITCHED_ON = 0x27, 0x23
 NMT_STOP = (0x000, b"\x02\x01")
 
 
-def bus_of(device_on_bus: Any) -> can.BusABC:
-    return can.Bus(interface="virtual", channel=device_on_bus.channel)
+def bus_of(joint: Any) -> can.BusABC:
+    return can.Bus(interface="virtual", channel=joint.channel)
 
 
-def power_up(device_on_bus: Any) -> None:
-    with bus_of(device_on_bus) as bus:
+def power_up(joint: Any) -> None:
+    with bus_of(joint) as bus:
         for control in (0x06, 0x07, 0x0F, 0x0F):
             data = bytes((0x2B, 0x40, 0x60, 0x00, control, 0, 0, 0))
             bus.send(can.Message(arbitration_id=0x601, data=data, is_extended_id=False))
             time.sleep(0.05)
-    assert powered(device_on_bus)
+    assert powered(joint)
 
 
-def powered(device_on_bus: Any) -> bool:
-    return int(device_on_bus.device.device[0].state) == PowerState.OPERATION_ENABLED
+def powered(joint: Any) -> bool:
+    return int(joint.device.device[0].state) == PowerState.OPERATION_ENABLED
 
 
-def test_no_eds_is_needed(device_on_bus: Any) -> None:
-    power_up(device_on_bus)
-    assert device_on_bus.stop_drive() == "switch on disabled"
-    assert not powered(device_on_bus)
-    words_ = [data[4] for cob, data in device_on_bus.requests if cob == 0x601 and data[:3] == b"\x2b\x40\x60"]
+def test_no_eds_is_needed(joint: Any) -> None:
+    power_up(joint)
+    assert joint.stop_drive() == "switch on disabled"
+    assert not powered(joint)
+    words_ = [data[4] for cob, data in joint.requests if cob == 0x601 and data[:3] == b"\x2b\x40\x60"]
     assert (words_[4], words_[-1]) == (2, 0)  # after the four of power_up: quick stop, then disable voltage
-    assert NMT_STOP not in device_on_bus.requests
+    assert NMT_STOP not in joint.requests
 
 
-def test_a_drive_that_stays_enabled_is_told_so_and_gets_nmt_stop(device_on_bus: Any) -> None:
-    device_on_bus.answers[0x6041, 0] = ENABLED
-    state = device_on_bus.stop_drive()
+def test_a_drive_that_stays_enabled_is_told_so_and_gets_nmt_stop(joint: Any) -> None:
+    joint.answers[0x6041, 0] = ENABLED
+    state = joint.stop_drive()
     assert state.startswith("operation enabled,")
     assert "NMT stop was sent" in state
     assert not is_safe(state)
-    assert NMT_STOP in device_on_bus.requests
+    assert NMT_STOP in joint.requests
 
 
-def test_a_drive_that_takes_its_time_is_waited_for(device_on_bus: Any) -> None:
-    device_on_bus.sequences[0x6041, 0] = [SWITCHED_ON] * 20
-    assert device_on_bus.stop_drive() == "switch on disabled"
-    assert NMT_STOP not in device_on_bus.requests
+def test_a_drive_that_takes_its_time_is_waited_for(joint: Any) -> None:
+    joint.sequences[0x6041, 0] = [SWITCHED_ON] * 20
+    assert joint.stop_drive() == "switch on disabled"
+    assert NMT_STOP not in joint.requests
 
 
 def test_nobody_answers(empty_bus: Any) -> None:
@@ -82,7 +84,7 @@ def test_nobody_answers(empty_bus: Any) -> None:
 
 @pytest.mark.parametrize(("configured_s", "used_s"), [(None, SDO_TIMEOUT_S), (0.15, 0.15)])
 def test_a_stop_brakes_first_waits_for_answers_as_configured_and_closes_its_bus(
-    device_on_bus: Any, monkeypatch: pytest.MonkeyPatch, configured_s: float | None, used_s: float
+    joint: Any, monkeypatch: pytest.MonkeyPatch, configured_s: float | None, used_s: float
 ) -> None:
     calls: list[tuple[float, bool]] = []
 
@@ -91,13 +93,12 @@ def test_a_stop_brakes_first_waits_for_answers_as_configured_and_closes_its_bus(
         return "switch on disabled"
 
     monkeypatch.setattr(SwitchOff, "make_safe", make_safe)
-    bus: Any = bus_of(device_on_bus)
+    bus: Any = bus_of(joint)
     switch_off_module.stop_node(bus, 1, sdo_timeout_s=configured_s)
     assert (calls, bus._is_shutdown) == ([(used_s, True)], True)
 
 
-# --- step by step, on a drive in memory ------------------------------------------------------------------------------
-
+# --- step by step, on a drive in memory ---
 ON, BRAKING, SWITCHED, OFF = (
     State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.SWITCHED_ON, State.SWITCH_ON_DISABLED,
 )  # fmt: skip
@@ -165,20 +166,27 @@ def test_the_quick_stop_is_asked_for_once_and_waited_for(states: list[State], lo
 
 
 @pytest.mark.parametrize(
-    ("states", "state", "log"),
+    ("states", "deaf_to", "state", "log"),
     [
-        ([OFF], "switch on disabled", [NO_VOLTAGE, *NO_TARGETS]),
-        ([State.FAULT], "fault", [NO_VOLTAGE, *NO_TARGETS]),
-        ([SWITCHED, SWITCHED, OFF], "switch on disabled", [NO_VOLTAGE, POLL_S, NO_VOLTAGE, *NO_TARGETS]),
-        ([SWITCHED], "switched on", [*[NO_VOLTAGE, POLL_S] * 50, *NO_TARGETS]),
+        ([OFF], b"", "switch on disabled", [NO_VOLTAGE, *NO_TARGETS]),
+        ([State.FAULT], b"", "fault", [NO_VOLTAGE, *NO_TARGETS]),
+        ([SWITCHED, SWITCHED, OFF], b"", "switch on disabled", [NO_VOLTAGE, POLL_S, NO_VOLTAGE, *NO_TARGETS]),
+        ([SWITCHED], b"", "switched on", [*[NO_VOLTAGE, POLL_S] * 50, *NO_TARGETS]),
         (
-            [BRAKING], "quick stop active, it did not obey; NMT stop was sent",
+            [BRAKING], b"", "quick stop active, it did not obey; NMT stop was sent",
             [*[POLL_S] * 50, *[NO_VOLTAGE, POLL_S] * 50, *NO_TARGETS, STOPPED],
         ),
+        # silence is tried once more
+        ([SILENCE, OFF], b"", "switch on disabled", [*TO_PRE_OPERATIONAL, NO_VOLTAGE, *NO_TARGETS]),
+        ([SILENCE], b"", "unknown: no answer; NMT stop was sent", [*TO_PRE_OPERATIONAL, STOPPED]),
+        ([SILENCE], STOPPED[1], "unknown: no answer; the bus does not take frames any more", TO_PRE_OPERATIONAL),
+        ([SILENCE, DEAD_BUS], b"", "unknown: the bus does not take frames any more (dead)", TO_PRE_OPERATIONAL),
     ],
 )  # fmt: skip
-def test_out_of_operational_before_the_controlword_is_ours(states: list[State], state: str, log: list[Any]) -> None:
-    drive = DriveInMemory(*states)
+def test_out_of_operational_before_the_controlword_is_ours(
+    states: list[Any], deaf_to: bytes, state: str, log: list[Any]
+) -> None:
+    drive = DriveInMemory(*states, deaf_to=deaf_to)
     assert drive.made_safe() == state
     assert drive.log == [*TO_PRE_OPERATIONAL, *log]
 
@@ -208,56 +216,31 @@ def test_a_drive_without_a_target_is_switched_off_all_the_same(refused: int) -> 
     assert drive.log == [*TO_PRE_OPERATIONAL, NO_VOLTAGE, *NO_TARGETS]
 
 
-@pytest.mark.parametrize(
-    ("states", "deaf_to", "state", "log"),
-    [
-        ([SILENCE, OFF], b"", "switch on disabled", [*TO_PRE_OPERATIONAL, NO_VOLTAGE, *NO_TARGETS]),
-        ([SILENCE], b"", "unknown: no answer; NMT stop was sent", [*TO_PRE_OPERATIONAL, STOPPED]),
-        (
-            [SILENCE], STOPPED[1], "unknown: no answer; the bus does not take frames any more",
-            TO_PRE_OPERATIONAL,
-        ),
-        (
-            [SILENCE, DEAD_BUS], b"", "unknown: the bus does not take frames any more (dead)",
-            TO_PRE_OPERATIONAL,
-        ),
-    ],
-)  # fmt: skip
-def test_silence_is_tried_once_more(states: list[Any], deaf_to: bytes, state: str, log: list[Any]) -> None:
-    drive = DriveInMemory(*states, deaf_to=deaf_to)
-    assert drive.made_safe() == state
-    assert drive.log == [*TO_PRE_OPERATIONAL, *log]
-
-
 def test_on_a_dead_bus_the_state_is_unknown() -> None:
     drive = DriveInMemory(OFF, deaf_to=TO_PRE_OPERATIONAL[0][1])
     assert drive.made_safe() == "unknown: the bus does not take frames any more (dead)"
 
 
-# --- the verb ------------------------------------------------------------------------------------------------------
-
-
+# --- the verb ---
 @pytest.mark.parametrize("spoilt", [True, False])
 def test_stop_is_sent_whatever_the_file_says_elsewhere(
-    device_on_bus: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoilt: bool, capsys: Any
+    joint: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoilt: bool, capsys: Any
 ) -> None:
     text = (CONFIGS / "virtual.toml").read_text()
     path = tmp_path / "joint.toml"
     path.write_text(text.replace("[control]", "[control]\nkp = -3", 1) if spoilt else text)
-    monkeypatch.setattr(stop_module, "open_python_can", lambda *_, **__: bus_of(device_on_bus))
-    power_up(device_on_bus)
+    monkeypatch.setattr(canopen_bench, "open_python_can", lambda *_, **__: bus_of(joint))
+    power_up(joint)
     assert stop_module.stop(path, Output()) == 0
-    assert not powered(device_on_bus)
+    assert not powered(joint)
     told = capsys.readouterr()
     assert "the drive is switch on disabled" in told.out
     assert ("warning: the stop was sent, but the configuration does not hold" in told.err) is spoilt
 
 
-def test_a_stop_that_is_not_confirmed_is_an_error(
-    device_on_bus: Any, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
-    monkeypatch.setattr(stop_module, "open_python_can", lambda *_, **__: bus_of(device_on_bus))
-    device_on_bus.answers[0x6041, 0] = ENABLED
+def test_a_stop_that_is_not_confirmed_is_an_error(joint: Any, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    monkeypatch.setattr(canopen_bench, "open_python_can", lambda *_, **__: bus_of(joint))
+    joint.answers[0x6041, 0] = ENABLED
     with pytest.raises(DeviceError, match="use the emergency stop"):
         stop_module.stop(CONFIGS / "virtual.toml", Output())
     assert "operation enabled" in capsys.readouterr().out
@@ -267,49 +250,39 @@ def test_a_stop_that_is_not_confirmed_is_an_error(
 def test_a_full_disk_behind_its_output_does_not_hide_it(
     monkeypatch: pytest.MonkeyPatch, state: str, error: type[Exception]
 ) -> None:
-    monkeypatch.setattr(stop_module, "_stop_canopen", lambda _: state)
+    monkeypatch.setattr(canopen_bench.CanTarget, "switch_off", lambda *_: state)
     with Path("/dev/full").open("w") as full, pytest.raises(error):
         stop_module.stop(CONFIGS / "virtual.toml", Output(stdout=full))
 
 
-# --- the watchdog ----------------------------------------------------------------------------------------------------
+# --- the watchdog ---
+def test_stop_leaves_the_watchdog_as_it_is(joint: Any) -> None:
+    with joint.opened() as drive:
+        drive.commission()
+        armed, deadline = joint.value(0x1016, 1), joint.value(0x1400, 5)
+        assert (armed & 0xFFFF, deadline) > (0, 0)
+        assert joint.stop_drive() == "switch on disabled"
+        assert (joint.value(0x1016, 1), joint.value(0x1400, 5)) == (armed, deadline)
+        drive.make_safe(asked=True)
+        assert joint.value(0x1016, 1) == 0  # the one that armed it takes it away
 
 
-def consumer(device_on_bus: Any) -> int:
-    return int(device_on_bus.device.objects.value(0x1016, 1))
+def test_only_its_own_watchdog_is_taken_away(joint: Any) -> None:
+    with joint.opened() as drive:
+        drive.commission()
+        other = 42 << 16 | 500
+        drive._objects.write(0x1016, 1, other, what="another program's consumer heartbeat time")
+        assert drive.make_safe() == "switch on disabled"
+        assert joint.value(0x1016, 1) == other
 
 
-def test_stop_leaves_the_watchdog_as_it_is(device_on_bus: Any, settings_of_virtual_joint: Any) -> None:
-    drive = device_on_bus.drive(settings_of_virtual_joint)
-    drive.commission()
-    armed, deadline = consumer(device_on_bus), int(device_on_bus.device.objects.value(0x1400, 5))
-    assert (armed & 0xFFFF, deadline) > (0, 0)
-    assert device_on_bus.stop_drive() == "switch on disabled"
-    assert (consumer(device_on_bus), int(device_on_bus.device.objects.value(0x1400, 5))) == (armed, deadline)
-    drive.make_safe(asked=True)
-    assert consumer(device_on_bus) == 0  # the one that armed it takes it away
-    drive.close()
-
-
-def test_only_its_own_watchdog_is_taken_away(device_on_bus: Any, settings_of_virtual_joint: Any) -> None:
-    drive = device_on_bus.drive(settings_of_virtual_joint)
-    drive.commission()
-    other = 42 << 16 | 500
-    drive._objects.write(0x1016, 1, other, what="another program's consumer heartbeat time")
-    assert drive.make_safe() == "switch on disabled"
-    assert consumer(device_on_bus) == other
-    drive.close()
-
-
-# --- another controller, after ours has commissioned ---------------------------------------------------------------
-
-
+# --- another controller, after ours has commissioned ---
 @contextmanager
-def another_controller(device_on_bus: Any) -> Iterator[None]:
+def another_controller(joint: Any) -> Iterator[None]:
     ended = threading.Event()
 
     def send() -> None:
-        with bus_of(device_on_bus) as bus:
+        with bus_of(joint) as bus:
             while not ended.wait(0.002):
                 bus.send(can.Message(arbitration_id=0x80, data=b"", is_extended_id=False))
 
@@ -323,76 +296,68 @@ def another_controller(device_on_bus: Any) -> Iterator[None]:
 
 
 @pytest.fixture
-def waiting(device_on_bus: Any, settings_of_virtual_joint: Any) -> Iterator[Any]:
+def waiting(joint: Any) -> Iterator[Any]:
     """Commissioned; the user is being asked."""
-    drive = device_on_bus.drive(settings_of_virtual_joint)
-    drive.commission()
-    device_on_bus.requests.clear()
-    yield drive
-    drive.close()
+    with joint.opened() as drive:
+        drive.commission()
+        joint.requests.clear()
+        yield drive
 
 
-def commands(device_on_bus: Any) -> list[tuple[int, bytes]]:
+def commands(joint: Any) -> list[tuple[int, bytes]]:
     """NMT commands and SDO downloads to the drive."""
-    return [(cob, data) for cob, data in device_on_bus.requests if cob == 0 or (cob == 0x601 and data[0] != 0x40)]
+    return [(cob, data) for cob, data in joint.requests if cob == 0 or (cob == 0x601 and data[0] != 0x40)]
 
 
-def test_a_yes_that_comes_after_another_controller_is_refused(device_on_bus: Any, waiting: Any) -> None:
-    with another_controller(device_on_bus):
+def test_a_yes_that_comes_after_another_controller_is_refused(joint: Any, waiting: Any) -> None:
+    with another_controller(joint):
         with pytest.raises(BusError, match="another controller is active"):
             waiting.start_cyclic()
         assert waiting.make_safe() == UNTOUCHED  # its motion is not ours to end
-        assert commands(device_on_bus) == []
-        assert device_on_bus.stop_drive() == "switch on disabled"  # the user's own word is another matter
+        assert commands(joint) == []
+        assert joint.stop_drive() == "switch on disabled"  # the user's own word is another matter
 
 
-def test_its_twin_starts_and_is_made_safe_beside_its_own_loop(device_on_bus: Any, waiting: Any) -> None:
+def test_its_twin_starts_and_is_made_safe_beside_its_own_loop(joint: Any, waiting: Any) -> None:
     waiting.start_cyclic()
-    with another_controller(device_on_bus):  # now it may be our own loop that still sends
+    with another_controller(joint):  # now it may be our own loop that still sends
         assert waiting.make_safe() == "switch on disabled"
-    assert (0x000, b"\x01\x01") in device_on_bus.requests
+    assert (0x000, b"\x01\x01") in joint.requests
 
 
-def test_a_no_leaves_the_drive_to_the_other_controller(device_on_bus: Any, waiting: Any) -> None:
-    with another_controller(device_on_bus):
+def test_a_no_leaves_the_drive_to_the_other_controller(joint: Any, waiting: Any) -> None:
+    with another_controller(joint):
         waiting._pause(0.1)
     assert waiting.make_safe() == UNTOUCHED
-    assert commands(device_on_bus) == []
+    assert commands(joint) == []
 
 
-def test_its_twins_where_no_one_came_or_the_user_has_asked_for_a_stop(device_on_bus: Any, waiting: Any) -> None:
+def test_its_twins_where_no_one_came_or_the_user_has_asked_for_a_stop(joint: Any, waiting: Any) -> None:
     assert waiting.make_safe() == "switch on disabled"
-    with another_controller(device_on_bus):
+    with another_controller(joint):
         waiting._pause(0.1)
     assert waiting.make_safe(asked=True) == "switch on disabled"  # the frames may have been those of that stop
 
 
-# --- clear-fault ---------------------------------------------------------------------------------------------------
-
-
-def test_clear_fault_takes_every_rpdo_timer_away(device_on_bus: Any, settings_of_virtual_joint: Any) -> None:
-    drive = device_on_bus.drive(settings_of_virtual_joint)
-    try:
+# --- clear-fault ---
+def test_clear_fault_takes_every_rpdo_timer_away(joint: Any) -> None:
+    with joint.opened() as drive:
         objects = drive._objects
         before = {}
         for base, milliseconds in ((0x1400, 100), (0x1402, 70)):
             before[base] = objects.read(base, 1, what="COB-ID")
             objects.write(base, 5, milliseconds, what="event timer")
-        device_on_bus.requests.clear()
+        joint.requests.clear()
         drive.clear_fault()
         for base, cob_id in before.items():
             assert objects.read(base, 5, what="event timer") == 0
             assert objects.read(base, 1, what="COB-ID") == cob_id
-        written = {data[1] | data[2] << 8 for cob, data in commands(device_on_bus) if cob == 0x601}
+        written = {data[1] | data[2] << 8 for cob, data in commands(joint) if cob == 0x601}
         assert {0x1400, 0x1402} <= written
         assert 0x1401 not in written  # it had none
-    finally:
-        drive.close()
 
 
-# --- what a run says at its end ------------------------------------------------------------------------------------
-
-
+# --- what a run says at its end ---
 class NoLoop:
     def __init__(self, *_: Any) -> None: ...
     def __enter__(self) -> NoLoop:
@@ -405,8 +370,7 @@ def left_by_a_dry_run(monkeypatch: pytest.MonkeyPatch, config: Any, state: str) 
     report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.0, 0.1, 1e-5)
     drive = SimpleNamespace(commission=lambda _: report, make_safe=lambda *, asked: state, close=lambda: None)
     monkeypatch.setattr(session_module, "LoopHandle", NoLoop)
-    monkeypatch.setattr(session_module, "open_drive", lambda *_: drive)
-    monkeypatch.setattr(session_module, "start_guard", lambda *_: None)
+    monkeypatch.setattr(CanopenSession, "open", lambda *_: drive)
     return run_module.run(config, Output(), assume_yes=True, dry_run=True)
 
 
@@ -438,65 +402,46 @@ def test_the_words_for_a_run_that_was_not_begun(state: str, said: str) -> None:
     assert words(state, interrupted=True) == ("the drive was left as it is" if state == UNTOUCHED else words(state))
 
 
-# --- a drive that somebody else has enabled, without SYNC ----------------------------------------------------------
+# --- a drive that somebody else has enabled, without SYNC ---
+def control_words(joint: Any) -> list[int]:
+    return [data[4] for cob, data in joint.requests if cob == 0x601 and data[:3] == b"\x2b\x40\x60"]
 
 
-def control_words(device_on_bus: Any) -> list[int]:
-    return [data[4] for cob, data in device_on_bus.requests if cob == 0x601 and data[:3] == b"\x2b\x40\x60"]
-
-
-def test_a_drive_that_is_found_enabled_brakes_before_its_power_goes_off(
-    device_on_bus: Any, settings_of_virtual_joint: Any
-) -> None:
-    power_up(device_on_bus)
-    device_on_bus.requests.clear()
-    drive = device_on_bus.drive(settings_of_virtual_joint)
-    try:
+def test_a_drive_that_is_found_enabled_brakes_before_its_power_goes_off(joint: Any) -> None:
+    power_up(joint)
+    joint.requests.clear()
+    with joint.opened() as drive:
         report = drive.commission(lambda _: True)
-    finally:
-        drive.close()
-    assert control_words(device_on_bus)[:2] == [2, 0]  # quick stop, then disable voltage
-    first_nmt = next(at for at, (cob, _) in enumerate(device_on_bus.requests) if cob == 0)
-    quick_stop = next(
-        at for at, (cob, data) in enumerate(device_on_bus.requests) if data[:5] == b"\x2b\x40\x60\x00\x02"
-    )
+    assert control_words(joint)[:2] == [2, 0]  # quick stop, then disable voltage
+    first_nmt = next(at for at, (cob, _) in enumerate(joint.requests) if cob == 0)
+    quick_stop = next(at for at, (cob, data) in enumerate(joint.requests) if data[:5] == b"\x2b\x40\x60\x00\x02")
     assert quick_stop < first_nmt
     assert any("the drive was enabled" in remark for remark in report.remarks)
 
 
 @pytest.mark.parametrize("approve", [None, lambda _: False])
-def test_without_the_users_word_it_is_left_as_it_is(
-    device_on_bus: Any, settings_of_virtual_joint: Any, approve: Any
-) -> None:
-    power_up(device_on_bus)
-    device_on_bus.requests.clear()
-    drive = device_on_bus.drive(settings_of_virtual_joint)
-    try:
+def test_without_the_users_word_it_is_left_as_it_is(joint: Any, approve: Any) -> None:
+    power_up(joint)
+    joint.requests.clear()
+    with joint.opened() as drive:
         with pytest.raises(DeviceError if approve is None else Declined):
             drive.commission(approve)
         assert drive.make_safe() == UNTOUCHED
-    finally:
-        drive.close()
-    assert powered(device_on_bus)
-    assert commands(device_on_bus) == []
+    assert powered(joint)
+    assert commands(joint) == []
 
 
 @pytest.mark.parametrize(("step", "turns"), [(0, False), (2, False), (40, True), (-40, True)])
-def test_an_enabled_drive_that_turns_is_left_alone(
-    device_on_bus: Any, settings_of_virtual_joint: Any, step: int, turns: bool
-) -> None:
-    power_up(device_on_bus)
-    device_on_bus.requests.clear()
-    device_on_bus.sequences[0x6064, 0] = [1000 + step * (at % 2 if step == 2 else at) for at in range(40)]
-    drive = device_on_bus.drive(settings_of_virtual_joint)
+def test_an_enabled_drive_that_turns_is_left_alone(joint: Any, step: int, turns: bool) -> None:
+    power_up(joint)
+    joint.requests.clear()
+    joint.sequences[0x6064, 0] = [1000 + step * (at % 2 if step == 2 else at) for at in range(40)]
     asked: list[str] = []
-    try:
+    with joint.opened() as drive:
         with pytest.raises(DeviceError, match="turns") if turns else contextlib.nullcontext():
             drive.commission(lambda question: asked.append(question) is None)
         assert (drive.make_safe() == UNTOUCHED) is turns
-    finally:
-        drive.close()
-    assert (powered(device_on_bus), len(asked)) == ((True, 0) if turns else (False, 1))
+    assert (powered(joint), len(asked)) == ((True, 0) if turns else (False, 1))
 
 
 @pytest.mark.parametrize(
@@ -548,32 +493,23 @@ def test_one_that_is_enabled_again_after_its_quick_stop_is_anothers(afterwards: 
     assert drive.log == [QUICK_STOP]
 
 
-def test_its_twin_that_is_off_is_not_braked(device_on_bus: Any, settings_of_virtual_joint: Any) -> None:
-    drive = device_on_bus.drive(settings_of_virtual_joint)
-    try:
+def test_its_twin_that_is_off_is_not_braked(joint: Any) -> None:
+    with joint.opened() as drive:
         report = drive.commission()
-    finally:
-        drive.close()
-    assert 2 not in control_words(device_on_bus)
+    assert 2 not in control_words(joint)
     assert not any("the drive was enabled" in remark for remark in report.remarks)
 
 
-def test_clear_fault_leaves_an_enabled_drive_alone(device_on_bus: Any, settings_of_virtual_joint: Any) -> None:
-    power_up(device_on_bus)
-    device_on_bus.requests.clear()
-    drive = device_on_bus.drive(settings_of_virtual_joint)
-    try:
+def test_clear_fault_leaves_an_enabled_drive_alone(joint: Any) -> None:
+    power_up(joint)
+    joint.requests.clear()
+    with joint.opened() as drive:
         with pytest.raises(DeviceError, match="operation enabled: there is no fault, and it was left as it is"):
             drive.clear_fault()
-        assert powered(device_on_bus)
-        assert commands(device_on_bus) == []
-        assert device_on_bus.stop_drive() == "switch on disabled"
+        assert powered(joint)
+        assert commands(joint) == []
+        assert joint.stop_drive() == "switch on disabled"
         with pytest.raises(BusError, match="another controller"):  # it has received the frames of that stop
             drive.clear_fault()
-    finally:
-        drive.close()
-    later = device_on_bus.drive(settings_of_virtual_joint)
-    try:
+    with joint.opened() as later:
         assert later.clear_fault() == "no fault: the drive is switch on disabled"  # the twin
-    finally:
-        later.close()

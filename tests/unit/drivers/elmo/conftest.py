@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.unit.drivers.elmo.memory_port import MemoryPort
-from tests.unit.drivers.elmo.talk import Talk
+from tests.unit.drivers.elmo.virtual_line import MemoryPort, Talk
 
 
 @pytest.fixture(params=[True, False], ids=["echo", "no echo"])

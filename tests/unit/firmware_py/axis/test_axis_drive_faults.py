@@ -10,6 +10,7 @@ from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fau
 from tests.axis_on_stub_joint import NewRig, assert_fault, assert_well
 
 
+@pytest.mark.trips(Fault.DRIVE_FAULT, "Fault.DRIVE_FAULT")
 @pytest.mark.parametrize("drive_state", [DriveState.FAULT, DriveState.FAULT_BRAKING])
 @pytest.mark.parametrize("phase", [p for p in AxisPhase if p < AxisPhase.DISABLING and p != AxisPhase.QUICK_STOPPING])
 def test_drive_fault_in_each_phase(rig: NewRig, phase: AxisPhase, drive_state: DriveState) -> None:
@@ -27,6 +28,7 @@ def test_drive_fault_in_each_phase(rig: NewRig, phase: AxisPhase, drive_state: D
     assert_fault(run, Fault.DRIVE_FAULT, Reaction.OFF)
 
 
+@pytest.mark.stays(Fault.DRIVE_FAULT)
 def test_its_twin_a_warning_of_the_drive_is_no_fault(rig: NewRig) -> None:
     """An EMCY code and the warning bit (7) of the statusword, while the drive stays enabled."""
     run = rig(0.05).until(AxisPhase.TRACKING)
@@ -53,6 +55,8 @@ def test_the_encoders_error_of_the_first_fault_is_kept(rig: NewRig, cleared_befo
     assert run.state.fault_encoder_error == 0
 
 
+@pytest.mark.trips(Fault.DRIVE_RESTARTED, "Fault.DRIVE_RESTARTED")
+@pytest.mark.stays(Fault.DRIVE_RESTARTED, "twin.until(AxisPhase.TRACKING)")
 def test_a_restart_before_the_first_cycle_ends_the_run_without_power(rig: NewRig) -> None:
     """It was taken for one from before the run: a drive without its limits would have been enabled."""
     run, twin = rig(0.0), rig(0.0)
@@ -116,6 +120,8 @@ def test_drive_restart(rig: NewRig, phase: AxisPhase) -> None:
     assert_fault(run, Fault.DRIVE_RESTARTED, Reaction.OFF)
 
 
+@pytest.mark.trips(Fault.BUS_ERROR, "(6, True)")
+@pytest.mark.stays(Fault.BUS_ERROR, "(5, False)")
 @pytest.mark.parametrize(("errors", "trips"), [(5, False), (6, True)])
 def test_bus_errors(rig: NewRig, errors: int, trips: bool) -> None:
     run = rig(0.0).until(AxisPhase.TRACKING)

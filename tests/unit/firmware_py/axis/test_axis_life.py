@@ -17,14 +17,13 @@ from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, FeedForward, Reaction, StopRequest
 from tests.axis_on_stub_joint import POWERED, NewRig, finish
 
-# --- the regular life of a run ---------------------------------------------------------------------------------
 
-
+# --- the regular life of a run ---
 @pytest.mark.parametrize("start_rad", [-0.9, -0.3, 0.0, 0.31, 0.95])
 @pytest.mark.parametrize("matched", [0, 1])
 def test_a_whole_run_wherever_the_joint_stands(rig: NewRig, start_rad: float, matched: int) -> None:
     run = rig(start_rad)
-    run.axis.law.matched_filter = matched
+    run.axis.law.filtered_error_rate = matched
     run.axis.trajectory.duration_s = 0.3
     run.axis.sequence.approach_s = 0.5
     run.until(AxisPhase.APPROACH)
@@ -119,9 +118,7 @@ def test_every_feed_forward_runs(rig: NewRig, feed_forward: FeedForward) -> None
     assert abs(run.state.law.friction_torque_Nm) > 10.0 or feed_forward is FeedForward.NONE
 
 
-# --- stop requests ---------------------------------------------------------------------------------------------
-
-
+# --- stop requests ---
 @pytest.mark.parametrize("phase", [p for p in AxisPhase if p < AxisPhase.DISABLING])
 @pytest.mark.parametrize("request_", [StopRequest.RAMP, StopRequest.QUICK_STOP, StopRequest.OFF])
 def test_stop_request_in_each_phase(rig: NewRig, phase: AxisPhase, request_: StopRequest) -> None:
@@ -155,9 +152,7 @@ def test_a_stop_request_that_is_withdrawn_is_still_carried_out(rig: NewRig) -> N
     finish(run)
 
 
-# --- properties over anything that a bus may deliver -----------------------------------------------------------
-
-
+# --- properties over anything that a bus may deliver ---
 one_cycle = st.tuples(
     st.integers(0, 9).map(lambda n: max(n, 1) if n < 9 else 12),  # elapsed cycles
     st.booleans(),  # a new sample?

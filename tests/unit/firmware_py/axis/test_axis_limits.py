@@ -11,6 +11,8 @@ from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault, Reaction
 from tests.axis_on_stub_joint import NewRig, assert_fault, assert_well
 
 
+@pytest.mark.trips(Fault.POSITION_LIMIT, "(1.001, Fault.POSITION_LIMIT)")
+@pytest.mark.stays(Fault.POSITION_LIMIT, "(0.999, Fault.NONE)")
 @pytest.mark.parametrize(("position_rad", "fault"), [(0.999, Fault.NONE), (1.001, Fault.POSITION_LIMIT)])
 def test_position_limit(rig: NewRig, position_rad: float, fault: Fault) -> None:
     run = rig(0.9)
@@ -59,6 +61,10 @@ def disturbed(rig: NewRig) -> Any:
     return rig(0.0).until(AxisPhase.TRACKING).run(20)
 
 
+@pytest.mark.trips(Fault.VELOCITY_LIMIT, "(1e-9, True)")
+@pytest.mark.stays(Fault.VELOCITY_LIMIT, "(0.0, False)")
+@pytest.mark.trips(Fault.FOLLOWING_ERROR, "(1e-9, True)")
+@pytest.mark.stays(Fault.FOLLOWING_ERROR, "(0.0, False)")
 @pytest.mark.parametrize("offset_rad", [-0.005, 0.005])
 @pytest.mark.parametrize(("past", "trips"), [(-1e-9, False), (0.0, False), (1e-9, True)])
 @pytest.mark.parametrize("fault", [Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR])
@@ -85,6 +91,8 @@ def test_velocity_and_following_error_are_dense_at_their_limits(
         assert_well(run)
 
 
+@pytest.mark.trips(Fault.TORQUE_SATURATED, "(21, True)")
+@pytest.mark.stays(Fault.TORQUE_SATURATED, "(20, False)")
 @pytest.mark.parametrize(("blocked_cycles", "trips"), [(20, False), (21, True)])
 def test_saturation(rig: NewRig, blocked_cycles: int, trips: bool) -> None:
     run = rig(0.0)
@@ -125,6 +133,7 @@ def test_a_torque_that_jumps_from_limit_to_limit_is_saturated_all_the_same(
     assert run.state.fault in (Fault.NONE, Fault.TORQUE_SATURATED)
 
 
+@pytest.mark.trips(Fault.NOT_FINITE, "Fault.NOT_FINITE")
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_law_that_is_not_finite_sends_zero_and_stops(rig: NewRig, value: float) -> None:
     run = rig(0.0).until(AxisPhase.TRACKING).run(20)
@@ -134,6 +143,7 @@ def test_a_law_that_is_not_finite_sends_zero_and_stops(rig: NewRig, value: float
     assert_fault(run, Fault.NOT_FINITE, Reaction.QUICK_STOP)
 
 
+@pytest.mark.stays(Fault.NOT_FINITE, "1e300")
 def test_its_twin_a_law_of_an_enormous_but_finite_torque_is_limited(rig: NewRig) -> None:
     run = rig(0.0).until(AxisPhase.TRACKING).run(20)
     before_Nm = run.torques_Nm[-1]

@@ -11,6 +11,8 @@ from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault, Reaction
 from tests.axis_on_stub_joint import NewRig, assert_fault, assert_well
 
 
+@pytest.mark.trips(Fault.STALE_SAMPLE, "(6, True)")
+@pytest.mark.stays(Fault.STALE_SAMPLE, "(5, False)")
 @pytest.mark.parametrize(("missing", "trips"), [(1, False), (5, False), (6, True)])
 def test_stale_sample(rig: NewRig, missing: int, trips: bool) -> None:
     run = rig(0.0).until(AxisPhase.TRACKING).run(20)
@@ -36,6 +38,8 @@ def test_missing_samples_are_bridged_by_the_velocity(rig: NewRig) -> None:
     assert_well(run)
 
 
+@pytest.mark.trips(Fault.POSITION_JUMP, "1.001 if trips")
+@pytest.mark.stays(Fault.POSITION_JUMP, "else 0.999")
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("gap_cycles", [1, 2, 4])
 @pytest.mark.parametrize("trips", [False, True])
@@ -64,6 +68,8 @@ def test_a_jump_after_an_overrun_is_measured_per_period_too(rig: NewRig) -> None
     assert run.state.fault == Fault.NONE
 
 
+@pytest.mark.trips(Fault.POSITION_DISAGREEMENT, "(0.0101, True)")
+@pytest.mark.stays(Fault.POSITION_DISAGREEMENT, "(0.0099, False)")
 @pytest.mark.parametrize(("apart_rad", "trips"), [(0.0101, True), (-0.0101, True), (0.0099, False), (-0.0099, False)])
 @pytest.mark.parametrize("phase", [AxisPhase.WAITING, AxisPhase.APPROACH, AxisPhase.TRACKING])
 def test_the_other_encoder(rig: NewRig, phase: AxisPhase, apart_rad: float, trips: bool) -> None:

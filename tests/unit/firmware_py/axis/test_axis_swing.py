@@ -34,9 +34,7 @@ def swung(values: Iterable[float], least: float = 1.0, every: int = 10) -> Any:
     return swing
 
 
-# --- one quantity ---------------------------------------------------------------------------------------------
-
-
+# --- one quantity ---
 @pytest.mark.parametrize(("top", "counts"), [(1.0, 0), (1.0 + 2.0**-40, 1), (4.0, 1)])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_turn_is_a_way_back_by_more_than_the_least(top: float, counts: int, sign: float) -> None:
@@ -105,9 +103,7 @@ def test_a_value_that_is_no_number_does_not_count() -> None:
     assert swung([math.nan] * 9).count == 0
 
 
-# --- torque and error -----------------------------------------------------------------------------------------
-
-
+# --- torque and error ---
 def limits() -> Any:
     found = new(LimitConstants)[0]
     found.standstill_radps = 0.02
@@ -131,6 +127,8 @@ def run_swing(
     return state, faults
 
 
+@pytest.mark.trips(Fault.LIMIT_CYCLE, "(30.0 + 1e-9, Fault.LIMIT_CYCLE)")
+@pytest.mark.stays(Fault.LIMIT_CYCLE, "(30.0, Fault.NONE)")
 @pytest.mark.parametrize(("peak_Nm", "fault"), [(30.0, Fault.NONE), (30.0 + 1e-9, Fault.LIMIT_CYCLE)])
 def test_torque_that_reverses_between_its_shares(peak_Nm: float, fault: Fault) -> None:
     """The limit is 60 Nm from peak to peak: 30 Nm to either side is just inside."""

@@ -26,9 +26,7 @@ from tests.axis_on_stub_joint import NewRig, assert_fault, assert_well
 SLOWEST = 300
 
 
-# --- rest and noise -------------------------------------------------------------------------------------------
-
-
+# --- rest and noise ---
 def test_the_greatest_step_at_rest_is_kept_until_the_joint_moves() -> None:
     state = new(SwingState)[0]
     note_rest(state, 1.0, True)
@@ -72,9 +70,7 @@ def test_a_run_begins_without_a_notice(axis: Any) -> None:
     assert (state.notices, state.swing.torque.count, state.law.learning.stopped) == (0, 0, 0)
 
 
-# --- in the axis ----------------------------------------------------------------------------------------------
-
-
+# --- in the axis ---
 @pytest.mark.parametrize("phase", list(AxisPhase))
 def test_a_swing_counts_while_the_law_is_active(axis: Any, state: Any, phase: AxisPhase) -> None:
     axis.limits.swing.torque_Nm, axis.limits.swing.slowest_cycles = 60.0, SLOWEST

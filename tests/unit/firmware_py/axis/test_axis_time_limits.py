@@ -8,6 +8,8 @@ from jointctl.firmware_py.states import AxisPhase, Fault, Reaction, StopRequest
 from tests.axis_on_stub_joint import NewRig, assert_fault, assert_well, finish
 
 
+@pytest.mark.trips(Fault.SUPERVISOR_LOST, "(11, True)")
+@pytest.mark.stays(Fault.SUPERVISOR_LOST, "(10, False)")
 @pytest.mark.parametrize("phase", [AxisPhase.ENABLING, AxisPhase.APPROACH, AxisPhase.TRACKING])
 @pytest.mark.parametrize(("age_cycles", "trips"), [(10, False), (11, True)])
 def test_supervisor_lost(rig: NewRig, phase: AxisPhase, age_cycles: int, trips: bool) -> None:
@@ -30,6 +32,8 @@ def test_a_run_without_supervision_does_not_look_for_it(rig: NewRig) -> None:
     assert_well(run.until(AxisPhase.TRACKING).run(5))
 
 
+@pytest.mark.trips(Fault.OVERRUN, "(9, True)")
+@pytest.mark.stays(Fault.OVERRUN, "(8, False)")
 @pytest.mark.parametrize(("skipped", "trips"), [(1, False), (8, False), (9, True)])
 def test_overrun(rig: NewRig, skipped: int, trips: bool) -> None:
     run = rig(0.0).until(AxisPhase.TRACKING).run(20)
@@ -48,7 +52,7 @@ def test_after_an_overrun_the_reference_is_that_of_now(rig: NewRig, matched: int
     """The twin without an overrun has the same reference at the same time, and the torque does not kick."""
     run, twin = rig(0.0), rig(0.0)
     for one in (run, twin):
-        one.axis.law.matched_filter = matched
+        one.axis.law.filtered_error_rate = matched
         one.until(AxisPhase.TRACKING).run(50)
     run.tick(8)
     twin.run(8)
@@ -111,6 +115,8 @@ def test_stop_timeout(rig: NewRig, moves: bool) -> None:
         assert run.state.fault == Fault.NONE
 
 
+@pytest.mark.trips(Fault.STOP_TIMEOUT, "Fault.STOP_TIMEOUT")
+@pytest.mark.stays(Fault.STOP_TIMEOUT, "(AxisPhase.RELEASING, Fault.NONE)")
 @pytest.mark.parametrize("missing_cycles", [0, 1])
 def test_standstill_is_complete_in_the_last_cycle_or_one_too_late(rig: NewRig, missing_cycles: int) -> None:
     run = rig(0.0).until(AxisPhase.TRACKING).run(5)

@@ -190,6 +190,8 @@ def test_within_is_the_closed_interval(value: float, low: float, high: float) ->
     assert within(value, low, high) is (low <= value <= high)
 
 
+@pytest.mark.trips(Fault.REFERENCE_LIMIT, "(1e-9, Fault.REFERENCE_LIMIT)")
+@pytest.mark.stays(Fault.REFERENCE_LIMIT, "(-1e-9, Fault.NONE)")
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(("past_rad", "fault"), [(-1e-9, Fault.NONE), (1e-9, Fault.REFERENCE_LIMIT)])
 def test_a_reference_must_be_able_to_brake_inside_the_limits(sign: float, past_rad: float, fault: Fault) -> None:
@@ -201,9 +203,7 @@ def test_a_reference_must_be_able_to_brake_inside_the_limits(sign: float, past_r
     assert reference_fault(LIMITS, position, -sign * 0.1, brake, ahead) == Fault.NONE
 
 
-# --- two encoders ----------------------------------------------------------------------------------------------
-
-
+# --- two encoders ---
 def limits_of_two_encoders() -> Any:
     limits = new(LimitConstants)[0]
     limits.position_min_rad, limits.position_max_rad = -1.0, 3.0

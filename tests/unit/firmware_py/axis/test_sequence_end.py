@@ -33,8 +33,7 @@ def test_the_torque_is_released_along_a_straight_line(
 @pytest.mark.parametrize("age_cycles", [0, 1])
 @pytest.mark.parametrize("phase_cycle", [ANSWER_CYCLES, ANSWER_CYCLES + 1])
 @pytest.mark.parametrize(
-    ("phase", "following"),
-    [(AxisPhase.QUICK_STOPPING, AxisPhase.DISABLING), (AxisPhase.DISABLING, AxisPhase.FINISHED)],
+    ("phase", "following"), [(AxisPhase.QUICK_STOPPING, AxisPhase.DISABLING), (AxisPhase.DISABLING, AxisPhase.FINISHED)]
 )
 def test_only_a_fresh_answer_of_the_drive_ends_the_stop(
     axis: Any, state: Any, drive_state: DriveState, age_cycles: int, phase_cycle: int, phase: int, following: int
@@ -72,6 +71,8 @@ def test_a_quick_stop_that_does_not_end_is_cut_off(axis: Any, state: Any, phase_
     assert state.phase == phase
 
 
+@pytest.mark.trips(Fault.OFF_TIMEOUT, "(21, AxisPhase.FINISHED, Fault.OFF_TIMEOUT)")
+@pytest.mark.stays(Fault.OFF_TIMEOUT, "(20, AxisPhase.DISABLING, Fault.NONE)")
 @pytest.mark.parametrize(
     ("phase_cycle", "phase", "fault"),
     [(20, AxisPhase.DISABLING, Fault.NONE), (21, AxisPhase.FINISHED, Fault.OFF_TIMEOUT)],

@@ -28,20 +28,18 @@ def settled(state: Any, position_rad: float = 0.0, velocity_radps: float = 0.0, 
     state.velocity.velocity_radps = velocity_radps
 
 
+@pytest.mark.stays(Fault.NOT_AT_STANDSTILL, "(1.0, 0.02, 4, AxisPhase.ENABLING")
 @pytest.mark.parametrize(
     ("position_rad", "velocity_radps", "good_samples", "phase", "fault"),
     [
-        (0.0, 0.0, 3, AxisPhase.WAITING, Fault.NONE),
-        (0.0, 0.0, 4, AxisPhase.ENABLING, Fault.NONE),
-        (1.0, 0.02, 4, AxisPhase.ENABLING, Fault.NONE),
-        (-1.0, -0.02, 4, AxisPhase.ENABLING, Fault.NONE),
+        (0.0, 0.0, 3, AxisPhase.WAITING, Fault.NONE), (0.0, 0.0, 4, AxisPhase.ENABLING, Fault.NONE),
+        (1.0, 0.02, 4, AxisPhase.ENABLING, Fault.NONE), (-1.0, -0.02, 4, AxisPhase.ENABLING, Fault.NONE),
         (1.0 + 1e-12, 0.0, 4, AxisPhase.DISABLING, Fault.POSITION_LIMIT),
         (-1.0 - 1e-12, 0.0, 4, AxisPhase.DISABLING, Fault.POSITION_LIMIT),
         (float("nan"), 0.0, 4, AxisPhase.DISABLING, Fault.POSITION_LIMIT),
-        (0.0, 0.02 + 1e-12, 4, AxisPhase.WAITING, Fault.NONE),
-        (0.0, float("nan"), 4, AxisPhase.WAITING, Fault.NONE),
+        (0.0, 0.02 + 1e-12, 4, AxisPhase.WAITING, Fault.NONE), (0.0, float("nan"), 4, AxisPhase.WAITING, Fault.NONE),
     ],
-)
+)  # fmt: skip
 def test_enabling_is_only_asked_at_standstill_inside_the_limits(
     axis: Any, state: Any, position_rad: float, velocity_radps: float, good_samples: int, phase: int, fault: int
 ) -> None:
@@ -52,6 +50,8 @@ def test_enabling_is_only_asked_at_standstill_inside_the_limits(
     assert state.fault_value == pytest.approx(position_rad if fault else 0.0, nan_ok=True)
 
 
+@pytest.mark.trips(Fault.MOVED_BEFORE_START, "0.375 + 1e-12, True")
+@pytest.mark.stays(Fault.MOVED_BEFORE_START, "0.375, False")
 @pytest.mark.parametrize("phase", [AxisPhase.WAITING, AxisPhase.ENABLING])
 @pytest.mark.parametrize(
     ("start_rad", "max_rad", "position_rad", "moved"),
@@ -79,6 +79,8 @@ def test_a_joint_that_was_moved_since_the_motion_was_shown_is_not_driven(
         assert (state.phase, state.fault) == (phase + 1, Fault.NONE)
 
 
+@pytest.mark.trips(Fault.DRIVE_STAYS_ENABLED, "Fault.DRIVE_STAYS_ENABLED")
+@pytest.mark.stays(Fault.DRIVE_STAYS_ENABLED, "(AxisPhase.WAITING, Fault.NONE)")
 @pytest.mark.parametrize("drive_state", [DriveState.OFF, DriveState.STARTING, DriveState.ENABLED])
 def test_a_drive_that_is_enabled_already_is_not_taken_over(axis: Any, state: Any, drive_state: DriveState) -> None:
     settled(state)
@@ -105,6 +107,8 @@ def test_the_run_waits_until_it_may_enable(axis: Any, state: Any) -> None:
     assert state.phase == AxisPhase.ENABLING
 
 
+@pytest.mark.trips(Fault.SAMPLES_MISSING, "(5, Fault.SAMPLES_MISSING)")
+@pytest.mark.stays(Fault.SAMPLES_MISSING, "(4, Fault.SUPERVISOR_LOST)")
 @pytest.mark.parametrize(("settle_cycles", "fault"), [(4, Fault.SUPERVISOR_LOST), (5, Fault.SAMPLES_MISSING)])
 def test_the_wait_for_the_supervisors_word_ends(axis: Any, state: Any, settle_cycles: int, fault: Fault) -> None:
     axis.sequence.may_enable, axis.sequence.settle_cycles = 0, settle_cycles
@@ -119,6 +123,9 @@ def test_the_wait_for_the_supervisors_word_ends(axis: Any, state: Any, settle_cy
     assert state.fault_drive_error == (0 if fault is Fault.SUPERVISOR_LOST else 0x3310)
 
 
+@pytest.mark.trips(Fault.NO_SAMPLES, "(0, 0.0, 1, Fault.NO_SAMPLES, 0.0)")
+@pytest.mark.stays(Fault.NO_SAMPLES, "(AxisPhase.WAITING, Fault.NONE)")
+@pytest.mark.trips(Fault.NOT_AT_STANDSTILL, "(4, 0.5, 0, Fault.NOT_AT_STANDSTILL, 0.5)")
 @pytest.mark.parametrize(
     ("samples", "velocity_radps", "too_old_cycles", "fault", "value"),
     [
@@ -145,7 +152,7 @@ def test_waiting_ends(
 def test_a_wait_that_is_over_only_because_the_loop_was_held_up_says_so(
     axis: Any, state: Any, phase: AxisPhase, wait_cycles: int, samples: int
 ) -> None:
-    """Campaign 915311, scenarios 1269 and 4927: told as SAMPLES_MISSING, for which the bus was then searched."""
+    """Campaign 915311, scenarios 1269 and 4927: reported as SAMPLES_MISSING, for which the bus was then searched."""
     axis.sequence.wait_max_cycles, axis.sequence.enable_max_cycles = 40, 30
     for held_up_cycles, fault in ((wait_cycles, Fault.OVERRUN), (1, Fault.OVERRUN), (0, None)):
         settled(state, good_samples=samples)
@@ -205,6 +212,8 @@ def test_without_an_approach_the_trajectory_begins_at_once(axis: Any, state: Any
     assert state.reference.velocity_radps == pytest.approx(0.35 * 0.2 * 3.14159265, rel=1e-6)
 
 
+@pytest.mark.trips(Fault.ENABLE_TIMEOUT, "(31, Fault.ENABLE_TIMEOUT)")
+@pytest.mark.stays(Fault.ENABLE_TIMEOUT, "(30, Fault.NONE)")
 @pytest.mark.parametrize(("phase_cycle", "fault"), [(30, Fault.NONE), (31, Fault.ENABLE_TIMEOUT)])
 def test_enable_timeout(axis: Any, state: Any, phase_cycle: int, fault: Fault) -> None:
     state.phase, state.phase_cycle = AxisPhase.ENABLING, phase_cycle

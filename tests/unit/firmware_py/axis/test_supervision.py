@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointctl.firmware_py.realtime import SUSPENDED_MIN_NS, WORDS, Word, note_suspension
+from jointctl.firmware_py.cycle import SUSPENDED_MIN_NS, WORDS, Word
+from jointctl.firmware_py.realtime import slept_ns
 from jointctl.firmware_py.records import AxisState
 from jointctl.firmware_py.safety import PUSHED_CYCLES, check_suspension
 from jointctl.firmware_py.schema import new
@@ -85,6 +86,8 @@ def asleep_so_far_ns() -> int:
     return min(tried)[1]
 
 
+@pytest.mark.trips(Fault.SUSPENDED, "(100_000, True)")
+@pytest.mark.stays(Fault.SUSPENDED, "(-100_000, False)")
 @pytest.mark.parametrize(("past_ns", "trips"), [(-100_000, False), (100_000, True)])
 def test_standby_just_shorter_and_just_longer_than_it_can_be_measured(
     axis_constants: Any, past_ns: int, trips: bool
@@ -94,13 +97,16 @@ def test_standby_just_shorter_and_just_longer_than_it_can_be_measured(
     reset_axis(axis_constants[0], state)
     words[Word.ASLEEP_NS] = asleep_so_far_ns() - SUSPENDED_MIN_NS - past_ns
     for _ in range(200):
-        note_suspension(words, state, timespec)
+        if slept_ns(words, timespec) > SUSPENDED_MIN_NS:
+            check_suspension(state, 1.0)
     assert state.fault == (Fault.SUSPENDED if trips else Fault.NONE)
 
 
 # --- the drive's own heartbeat ---------------------------------------------------------------------------------
 
 
+@pytest.mark.trips(Fault.DRIVE_SILENT, "(600, 601, True)")
+@pytest.mark.stays(Fault.DRIVE_SILENT, "(600, 600, False)")
 @pytest.mark.parametrize(("limit", "age", "trips"), [(600, 600, False), (600, 601, True), (0, 10**6, False)])
 @pytest.mark.parametrize("phase", [AxisPhase.ENABLING, AxisPhase.TRACKING, AxisPhase.RAMPING])
 def test_a_drive_whose_heartbeat_stays_away(rig: NewRig, limit: int, age: int, trips: bool, phase: AxisPhase) -> None:
@@ -132,7 +138,7 @@ def test_samples_that_stay_away_as_well_are_the_cause_that_is_told(rig: NewRig) 
 
 @pytest.mark.parametrize("allowed_at", [None, 30])
 def test_without_the_supervisors_word_nothing_is_enabled_and_that_is_told(rig: NewRig, allowed_at: int | None) -> None:
-    """It was told as samples that are 0 cycles old."""
+    """It was reported as samples that are 0 cycles old."""
     run = rig(0.0)
     run.axis.sequence.may_enable = 0
     for cycle in range(60):

@@ -23,6 +23,10 @@ def after(fault: Fault, phase: AxisPhase) -> AxisPhase:
     return max(phase, goal[Reaction(reaction_to(fault, phase))])
 
 
+@pytest.mark.trips(
+    Fault.DRIVE_NOT_ENABLED, '("drive_state", DriveState.ENABLED, DriveState.STOPPING, Fault.DRIVE_NOT_ENABLED)'
+)
+@pytest.mark.stays(Fault.DRIVE_NOT_ENABLED, "((within, False), (beyond, counts))")
 @pytest.mark.parametrize(
     ("what", "within", "beyond", "fault"),
     [
@@ -104,6 +108,8 @@ def stuck(axis_constants: Any) -> tuple[Any, Any]:
     return axis, state
 
 
+@pytest.mark.trips(Fault.POSITION_FROZEN, "(0.501, True)")
+@pytest.mark.stays(Fault.POSITION_FROZEN, "(0.5, False)")
 @pytest.mark.parametrize(("way_rad", "trips"), [(0.5, False), (0.501, True), (-0.5, False), (-0.501, True)])
 @pytest.mark.parametrize("how", ["stands", "moves", "no sample", "not watched"])
 def test_the_way_behind_a_reading_that_stands_still(
@@ -189,14 +195,11 @@ def test_pushing_counts_from_the_beginning_again(stuck: tuple[Any, Any], by: str
 @pytest.mark.parametrize(
     ("what", "fault", "told"),
     [
-        ("bus_errors", Fault.BUS_ERROR, False),
-        ("supervisor", Fault.SUPERVISOR_LOST, False),
-        ("skipped", Fault.OVERRUN, False),
-        ("suspended", Fault.SUSPENDED, False),
-        ("sample_age_cycles", Fault.STALE_SAMPLE, True),
-        ("heartbeat_age_cycles", Fault.DRIVE_SILENT, True),
+        ("bus_errors", Fault.BUS_ERROR, False), ("supervisor", Fault.SUPERVISOR_LOST, False),
+        ("skipped", Fault.OVERRUN, False), ("suspended", Fault.SUSPENDED, False),
+        ("sample_age_cycles", Fault.STALE_SAMPLE, True), ("heartbeat_age_cycles", Fault.DRIVE_SILENT, True),
     ],
-)
+)  # fmt: skip
 def test_the_error_code_of_the_drive_belongs_to_faults_that_the_drive_has_a_part_in(
     axis_constants: Any, what: str, fault: Fault, told: bool
 ) -> None:

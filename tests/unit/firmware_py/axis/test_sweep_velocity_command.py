@@ -169,8 +169,6 @@ def test_a_joint_that_does_not_follow_trips(velocity: VelocityRig, limit_share: 
 
 
 # --- 60FF ---
-
-
 @pytest.fixture
 def port(settings_of_virtual_joint: Any) -> Any:
     ports = new_port(settings_of_virtual_joint, 0.0605, 1000, velocity=True)
@@ -202,8 +200,7 @@ def test_the_target_is_zero_unless_enabled_and_asked_for(port: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("velocity", "units"),
-    [(1e9, 2147483647), (-1e9, -2147483647), (math.nan, 0), (math.inf, 0), (-math.inf, 0)],
+    ("velocity", "units"), [(1e9, 2147483647), (-1e9, -2147483647), (math.nan, 0), (math.inf, 0), (-math.inf, 0)]
 )
 def test_saturation_comes_before_the_cast(port: Any, velocity: float, units: int) -> None:
     assert velocity_units(port, velocity) == units

@@ -1,35 +1,36 @@
-"""The EDS describes the virtual drive exactly: a walk over every object, through SDO, by what the EDS says alone."""
+"""The EDS describes the virtual drive and the CiA 406 node exactly; what is stored comes back."""
 
 from __future__ import annotations
 
+import json
+import math
 import struct
+from pathlib import Path
 from typing import Any
 
 import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
 
+from jointctl.drivers.canopen.eds import read_eds
 from jointctl.drivers.canopen.sdo import download
 from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
 from jointctl.hil.plant.joint import plant
-from tests.places import EDS
-from tests.virtual_drive import NODE, Network
+from jointctl.tools.simulation.virtual_joint import new_device
+from tests.places import CONFIGS, EDS
+from tests.two_encoders import NODE as TWO_NODES
+from tests.two_encoders import short_run
+from tests.virtual_drive import NODE, Network, Rig
 
+# --- The EDS describes the virtual drive exactly: a walk over every object, through SDO, by what the EDS says alone ---
 FORMATS = {1: "<B", 2: "<b", 3: "<h", 4: "<i", 5: "<B", 6: "<H", 7: "<I"}
 TEXT = 9
 # What the EDS cannot say in limits: values of these objects must be of a set (named in its comments), or an
 # identifier.  In every other writable number each value between the limits is accepted.
 CHOICES: dict[int, tuple[int, ...]] = {
-    0x1003: (0,),
-    0x1010: (0x65766173,),
-    0x1011: (0x64616F6C,),
-    0x1019: (0, *range(2, 241)),
-    0x605A: (0, 1, 2, 5, 6),
-    0x6060: (0, 1, 3, 4, 6, 8, 9, 10),
-    0x6086: (0,),
-    0x6088: (0,),
-    0x6098: (0, 33, 34, 35, 37),
-}
+    0x1003: (0,), 0x1010: (0x65766173,), 0x1011: (0x64616F6C,), 0x1019: (0, *range(2, 241)), 0x605A: (0, 1, 2, 5, 6),
+    0x6060: (0, 1, 3, 4, 6, 8, 9, 10), 0x6086: (0,), 0x6088: (0,), 0x6098: (0, 33, 34, 35, 37),
+}  # fmt: skip
 IDENTIFIERS = (0x1005, 0x1014, *range(0x1400, 0x1404), *range(0x1800, 0x1804))
 # Fixed while the PDO is valid, as the first ones are at the start: a mapping 0601 0000, others 0800 0022.
 WITH_PDO = (
@@ -167,3 +168,170 @@ def test_supported_homing_methods_are_those_that_6098_takes(node: Any) -> None:
     for method in range(-128, 128):
         code = code_of(node, node.object_dictionary[0x6098], struct.pack("<b", method))
         assert (code == 0) is (method == 0 or method in methods), method
+
+
+# --- The virtual CiA 406 node, frame by frame and by its EDS ---
+def frame(identifier: int, data: bytes) -> bytes:
+    return struct.pack("<IB3x8s", identifier, len(data), data)
+
+
+def words(frames: list[bytes]) -> list[tuple[int, bytes]]:
+    return [(struct.unpack_from("<I", f)[0], f[8 : 8 + f[4]]) for f in frames]
+
+
+@pytest.fixture
+def device(tmp_path: Path) -> Any:
+    return new_device(short_run(tmp_path, TWO_NODES, virtual__initial_position_rad=0.25))
+
+
+def test_the_eds_is_read_by_the_library_and_is_that_of_an_encoder() -> None:
+    dictionary = canopen.import_od(str(CONFIGS / "joint_encoder.eds"), 2)
+    assert dictionary[0x1000].default & 0xFFFF == 406
+    assert dictionary[0x6004].pdo_mappable
+    assert dictionary[0x1800][1].default == 0x40000182
+
+
+def test_the_eds_needs_no_remark_and_is_not_measured_as_that_of_a_drive() -> None:
+    assert read_eds(CONFIGS / "joint_encoder.eds", 2, encoder=True).all_remarks() == []
+    assert "[6502]" in "".join(read_eds(CONFIGS / "joint_encoder.eds", 2).all_remarks())
+
+
+def test_boot_up_heartbeat_and_nmt_of_its_own(device: Any) -> None:
+    assert (0x702, b"\0") in words(device.advance(1_000_000))
+    sent = device.handle(frame(0x602, struct.pack("<BHBI", 0x2B, 0x1017, 0, 100)), 2_000_000)
+    assert (0x702, b"\x7f") in words(sent + device.advance(3_000_000))
+    device.handle(frame(0, b"\x01\x02"), 4_000_000)
+    assert (0x702, b"\x05") in words(device.advance(110_000_000))
+    assert device.device[0].nmt == 127  # the drive was not meant
+    device.handle(frame(0, b"\x81\x02"), 111_000_000)
+    assert (0x702, b"\0") in words(device.advance(112_000_000))
+
+
+def test_its_position_at_every_sync(device: Any) -> None:
+    device.advance(1_000_000)
+    device.handle(frame(0x602, struct.pack("<BHBI", 0x2F, 0x1800, 2, 1)), 2_000_000)
+    assert not [f for f in words(device.handle(frame(0x80, b""), 3_000_000)) if f[0] == 0x182]
+    device.handle(frame(0, b"\x01\x02"), 4_000_000)
+    sent = dict(words(device.handle(frame(0x80, b""), 5_000_000)))
+    assert int.from_bytes(sent[0x182], "little") == round(0.25 / math.tau * 524288) + 100_000
+
+
+def test_an_error_is_an_emergency_and_an_alarm(device: Any) -> None:
+    device.advance(1_000_000)
+    device.device[0].encoder.error_code = 0x5000
+    assert (0x82, b"\x00\x50\x21\0\0\0\0\0") in words(device.advance(2_000_000))
+    answer = words(device.handle(frame(0x602, struct.pack("<BHB4x", 0x40, 0x6503, 0)), 3_000_000))[-1]
+    assert (answer[0], answer[1][4]) == (0x582, 1)
+    device.device[0].encoder.error_code = 0
+    assert (0x82, bytes(8)) in words(device.advance(4_000_000))
+
+
+def test_every_object_of_the_node_can_be_read(device: Any) -> None:
+    device.advance(1_000_000)
+    for entry in device.encoder.objects:
+        request = struct.pack("<BHB4x", 0x40, entry.index, entry.sub)
+        answer = words(device.handle(frame(0x602, request), 2_000_000))[-1][1]
+        assert answer[0] & 0xE0 == 0x40, f"{entry.index:04X}:{entry.sub}"
+
+
+# Objects 1010 and 1011 of the virtual drive: saved values come back after a reset, and after a restart with a file.
+SAVE = int.from_bytes(b"save", "little")
+LOAD = int.from_bytes(b"load", "little")
+
+
+def restart(rig: Rig, command: int = 0x81) -> None:
+    rig.send(0, bytes([command, NODE]))
+    rig.run(1)
+
+
+def changed_rig(path: Path | None = None) -> Rig:
+    rig = Rig(DeviceSettings(node_id=NODE, parameter_file=path), step_s=1e-3)
+    rig.set(0x1017, 0, 500, 2)
+    rig.set(0x6072, 0, 800, 2)
+    rig.set(0x6071, 0, 55, 2)
+    rig.device._write(0x2100, 0, b"elbow")
+    return rig
+
+
+def values(rig: Rig) -> tuple[int, int, int, bytes]:
+    rig.device.answer_sdo(bytes(16), rig.now_ns)  # the strings of a reset are restored with the next request
+    return rig.get(0x1017), rig.get(0x6072), rig.get(0x6071), rig.device.objects.read(0x2100, 0)
+
+
+@pytest.mark.parametrize(
+    ("sub", "after"), [(1, (500, 800, 0, b"elbow")), (2, (500, 1000, 0, b"joint")), (3, (0, 800, 0, b"elbow"))]
+)
+def test_what_was_saved_comes_back_after_a_reset(sub: int, after: tuple[int, int, int, bytes]) -> None:
+    rig = changed_rig()
+    rig.set(0x1010, sub, SAVE, 4)
+    assert rig.get(0x1010, sub) == 1
+    restart(rig)
+    assert values(rig) == after
+    for part in (1, 2, 3):
+        rig.set(0x1011, part, LOAD, 4)
+    assert rig.get(0x6072) == after[1]  # not before the next reset
+    restart(rig)
+    assert values(rig) == (0, 1000, 0, b"joint")
+
+
+@pytest.mark.parametrize(
+    ("saved", "then", "command", "expected"),
+    [
+        (1, (0x1011, 2, LOAD, 4), 0x81, (0, 800, 0, b"elbow")),  # restoring a part leaves the other
+        (2, (0x1017, 0, 100, 2), 0x82, (500, 800, 55, b"elbow")),  # what is saved of the communication
+    ],
+)
+def test_a_part_is_saved_or_restored_by_itself(
+    saved: int, then: tuple[int, int, int, int], command: int, expected: tuple[object, ...]
+) -> None:
+    rig = changed_rig()
+    rig.set(0x1010, saved, SAVE, 4)
+    rig.set(*then)
+    restart(rig, command)
+    assert values(rig) == expected
+
+
+@pytest.mark.parametrize("index", [0x1010, 0x1011])
+@pytest.mark.parametrize("signature", [0, 1, SAVE ^ LOAD, int.from_bytes(b"evas", "little"), 0xFFFFFFFF])
+def test_another_signature_is_refused(index: int, signature: int) -> None:
+    rig = changed_rig()
+    assert rig.write(index, 1, signature, 4) == 0x08000020
+    assert rig.write(index, 1, SAVE if index == 0x1011 else LOAD, 4) == 0x08000020
+    restart(rig)
+    assert values(rig)[1] == 1000
+
+
+@pytest.mark.parametrize(("words", "code"), [((0x06, 0x07), 0), ((0x06, 0x07, 0x0F), 0x08000022)])
+def test_nothing_is_saved_while_the_motor_has_torque(words: tuple[int, ...], code: int) -> None:
+    rig = changed_rig()
+    rig.control(*words)
+    assert rig.write(0x1010, 1, SAVE, 4) == code
+    assert rig.write(0x1011, 1, LOAD, 4) == code
+
+
+def test_a_file_outlives_the_drive(tmp_path: Path) -> None:
+    path = tmp_path / "joint.json"
+    rig = changed_rig(path)
+    assert not path.exists()
+    rig.set(0x1010, 1, SAVE, 4)
+    again = Rig(DeviceSettings(node_id=NODE, parameter_file=path), step_s=1e-3)
+    assert values(again) == (500, 800, 0, b"elbow")
+    again.set(0x1011, 1, LOAD, 4)
+    assert json.loads(path.read_text()) == {}
+    third = Rig(DeviceSettings(node_id=NODE, parameter_file=path), step_s=1e-3)
+    assert values(third) == (0, 1000, 0, b"joint")
+
+
+def test_a_file_that_cannot_be_written_is_a_hardware_error(tmp_path: Path) -> None:
+    rig = changed_rig(tmp_path / "gone" / "joint.json")
+    assert rig.write(0x1010, 1, SAVE, 4) == 0x06060000
+    restart(rig)
+    assert values(rig)[0] == 0
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"6041:0": 1}', '{"1017:0": "x"}', '{"1017:0": 70000}', '{"nonsense": 1}'])
+def test_a_bad_file_is_named(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "joint.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"parameter file joint\.json: "):
+        Rig(DeviceSettings(node_id=NODE, parameter_file=path))

@@ -1,0 +1,225 @@
+"""One cycle of the control loop, for all axes at once: the same function in real time, in plain Python and in lockstep.
+
+    receive -> samples -> suspension, stop word, sign of life -> step_axis for each axis -> send -> log records
+
+What differs is handed in: an `Exchange` moves frames or bytes, a `Clock` gives the time, and the front end decides when
+a cycle begins (`Slot`).  Front ends: `firmware_py.realtime` on a descriptor, the same loop in plain Python over
+python-can (`tools.session.portable_loop`), and simulated time (`hil.lockstep`).
+
+Every array of records has one element an axis.  The axes share SYNC, stop word and end: a fault of one ramps the
+others down, and the loop goes on until the last one is FINISHED.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jointctl.firmware_py.axis import step_axis
+from jointctl.firmware_py.kernel import inlined, kernel, shared
+from jointctl.firmware_py.libc import load_acquire, store_release
+from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
+from jointctl.firmware_py.safety import check_suspension
+from jointctl.firmware_py.schema import INT32_MAX
+from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest
+
+HISTOGRAM_BINS = 4097  # 1 us each; the last one holds everything later
+
+
+class Word(IntEnum):
+    """Index of a shared int64 word; eight apart, so that no two lie in one cache line."""
+
+    GO = 0  # the supervisor lets the loop begin
+    STOP = 8  # a StopRequest
+    SUPERVISOR_NS = 16  # CLOCK_MONOTONIC of the supervisor's last sign of life
+    HEAD = 24  # log records written since the start
+    LOOP_NS = 32  # CLOCK_MONOTONIC of the last finished cycle
+    READY = 40  # the loop is compiled and warm
+    SKIPPED = 48  # slots skipped so far
+    ENDED = 56  # the loop has returned
+    LISTEN = 64  # the supervisor: what the bus says from now on is for the run
+    ASLEEP_NS = 72  # CLOCK_BOOTTIME - CLOCK_MONOTONIC when the run began: how long the computer has been suspended
+    HELD_UP_NS = 80  # how long the guard of a serial line saw the loop do nothing, when it switched the drive off
+
+
+WORDS = 88
+_RAMP = int(StopRequest.RAMP)
+SUSPENDED_MIN_NS = 1_000_000  # shorter is how far apart two clocks can be read
+
+
+class Histogram(IntEnum):
+    """Row of the histogram array int64[3, HISTOGRAM_BINS]."""
+
+    WAKE = 0
+    ROUND_TRIP = 1
+    WORK = 2
+
+
+@kernel
+def count(histogram: np.ndarray, row: int, duration_ns: int) -> None:
+    """Add one duration to a row."""
+    bin_us = duration_ns // 1000
+    histogram[row, min(max(bin_us, 0), HISTOGRAM_BINS - 1)] += 1
+
+
+@kernel
+def write_log(record: LogRecord, state: AxisState, sample: Sample, command: Command) -> None:
+    """Copy one cycle into a log record; the loop adds the times."""
+    record.cycle = state.cycle
+    record.trajectory_s = state.trajectory_s
+    record.position_rad = state.measured_position_rad
+    record.second_position_rad = state.second_position_rad
+    record.velocity_radps = state.velocity.velocity_radps
+    record.desired_position_rad = state.reference.position_rad
+    record.desired_velocity_radps = state.reference.velocity_radps
+    record.desired_acceleration_radps2 = state.reference.acceleration_radps2
+    record.error_rad = state.measured_position_rad - state.reference.position_rad
+    record.error_rate_radps = state.velocity.velocity_radps - state.reference.velocity_radps
+    record.command_torque_Nm = state.command_torque_Nm
+    record.unlimited_torque_Nm = state.unlimited_torque_Nm
+    record.measured_torque_Nm = state.measured_torque_Nm
+    record.command_velocity_radps = state.command_velocity_radps
+    record.inertia_torque_Nm = state.law.inertia_torque_Nm
+    record.feedback_torque_Nm = state.law.feedback_torque_Nm
+    record.friction_torque_Nm = state.law.friction_torque_Nm
+    record.gravity_torque_Nm = state.law.gravity_torque_Nm
+    record.network_torque_Nm = state.law.network_torque_Nm
+    record.observer_torque_Nm = state.law.observer_torque_Nm
+    record.learned_torque_Nm = state.law.learned_torque_Nm
+    for i in range(len(record.weights)):
+        record.weights[i] = state.law.network.weights[i]
+    record.sample_age_cycles = state.sample_age_cycles
+    record.phase = state.phase
+    record.fault = state.fault
+    record.request = command.request
+    record.drive_state = sample.drive_state
+    record.status_word = sample.status_word
+    record.drive_error = sample.drive_error
+
+
+# --- What a cycle works on, and what its front end hands in ---
+
+
+class CycleMemory(NamedTuple):
+    """The memory of a loop; arrays of records have one element an axis, and nothing here is allocated in a cycle."""
+
+    constants: np.ndarray  # AxisConstants
+    state: np.ndarray  # AxisState, reset
+    tables: np.ndarray  # float64[axes, rows, 5]: the rows of a table trajectory
+    sample: np.ndarray  # Sample
+    command: np.ndarray  # Command
+    words: np.ndarray  # int64[WORDS]
+    ring: np.ndarray  # LogRecord[R]; record k is at k % R once HEAD > k
+    histograms: np.ndarray  # int64[3, HISTOGRAM_BINS]
+    timespec: np.ndarray  # int64[2]: scratch of the clock
+
+
+class Exchange(NamedTuple):
+    """How frames or bytes are moved; `link` is the driver's memory and is only passed through.
+
+    `receive` asks for samples and waits for them until `until_ns`; it returns how long it waited [ns].  A sample that
+    answers an earlier request gets `now_ns` as its time, one that answers this one a later time.
+    """
+
+    receive: Callable[[Any, np.ndarray, int, int], int]  # (link, samples, now_ns, until_ns)
+    send: Callable[[Any, np.ndarray, np.ndarray], int]  # (link, samples, commands)
+    link: Any
+
+
+class Clock(NamedTuple):
+    """The loop's time [ns]; `timespec` is int64[2] scratch."""
+
+    now_ns: Callable[[np.ndarray], int]
+    slept_ns: Callable[[np.ndarray, np.ndarray], int]  # (words, timespec): the computer since the run began
+
+
+class Slot(NamedTuple):
+    """When a cycle runs."""
+
+    period_ns: int
+    deadline_ns: int  # a whole number of periods after the last one
+    wake_ns: int
+    late_ns: int  # from the deadline that was slept for, which an overrun leaves behind
+    elapsed_cycles: int  # periods since the last cycle, 1 without an overrun
+    until_ns: int  # until then a sample may come
+
+
+@inlined
+def load_word(words: np.ndarray, index: int) -> int:
+    """`load_acquire`, also for callers in Python."""
+    return load_acquire(words, index)
+
+
+@inlined
+def store_word(words: np.ndarray, index: int, value: int) -> None:
+    """`store_release`, also for callers in Python."""
+    store_release(words, index, value)
+
+
+# --- The cycle ---
+
+
+@kernel
+def stop_of(states: np.ndarray, axis: int, stop_request: int) -> int:
+    """The StopRequest for one axis: the stop word, or RAMP at least once another axis has tripped."""
+    for other in range(len(states)):
+        if other != axis and states[other].fault != Fault.NONE:
+            return max(stop_request, _RAMP)
+    return stop_request
+
+
+@shared
+def log_cycle(memory: CycleMemory, slot: Slot, waited_ns: int, end_ns: int) -> bool:
+    """A record of each axis, the histograms and the words; True once every axis is FINISHED."""
+    words, ring, histograms = memory.words, memory.ring, memory.histograms
+    head = load_word(words, Word.HEAD)
+    work_ns = end_ns - slot.wake_ns - waited_ns
+    finished = True
+    for axis in range(len(memory.state)):
+        state, sample = memory.state[axis], memory.sample[axis]
+        fresh = state.sample_age_cycles == 0
+        round_trip_ns = waited_ns
+        if 0 < sample.time_ns <= slot.wake_ns:
+            # it answers an earlier SYNC and came between the cycles: without this the delay would look shorter
+            round_trip_ns += slot.elapsed_cycles * slot.period_ns
+        record = ring[(head + axis) % len(ring)]
+        write_log(record, state, sample, memory.command[axis])
+        record.time_ns = slot.deadline_ns
+        record.wake_late_ns = min(slot.late_ns, INT32_MAX)
+        record.round_trip_ns = min(round_trip_ns, INT32_MAX) if fresh else 0
+        record.work_ns = min(work_ns, INT32_MAX)
+        record.skipped = min(slot.elapsed_cycles - 1, INT32_MAX)
+        if fresh:
+            count(histograms, Histogram.ROUND_TRIP, round_trip_ns)
+        finished = finished and state.phase == AxisPhase.FINISHED
+    count(histograms, Histogram.WAKE, slot.late_ns)
+    count(histograms, Histogram.WORK, work_ns)
+    store_word(words, Word.SKIPPED, load_word(words, Word.SKIPPED) + slot.elapsed_cycles - 1)
+    store_word(words, Word.HEAD, head + len(memory.state))
+    store_word(words, Word.LOOP_NS, end_ns)
+    return finished
+
+
+@shared
+def step_cycle(memory: CycleMemory, exchange: Exchange, clock: Clock, slot: Slot) -> bool:
+    """One cycle of every axis; True once every axis is FINISHED."""
+    words, samples, commands = memory.words, memory.sample, memory.command
+    waited_ns = exchange.receive(exchange.link, samples, slot.wake_ns, slot.until_ns)
+    stop_request = load_word(words, Word.STOP)
+    supervisor_age_cycles = (slot.wake_ns - load_word(words, Word.SUPERVISOR_NS)) // slot.period_ns
+    slept_ns = clock.slept_ns(words, memory.timespec)
+    for axis in range(len(memory.state)):
+        state, sample = memory.state[axis], samples[axis]
+        # a sample that answers an earlier SYNC belongs to no slot that could be named
+        state.sample_late_s = (slot.wake_ns - slot.deadline_ns) * 1e-9 if sample.time_ns > slot.wake_ns else 0.0
+        if slept_ns > SUSPENDED_MIN_NS:
+            check_suspension(state, slept_ns * 1e-9)
+        step_axis(
+            memory.constants[axis], state, memory.tables[axis], sample, commands[axis], slot.elapsed_cycles,
+            stop_of(memory.state, axis, stop_request), supervisor_age_cycles,
+        )  # fmt: skip
+    exchange.send(exchange.link, samples, commands)
+    return log_cycle(memory, slot, waited_ns, clock.now_ns(memory.timespec))

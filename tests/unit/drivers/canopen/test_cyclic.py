@@ -1,0 +1,585 @@
+"""The cyclic exchange: what it sends byte by byte, what it receives, old values, and whatever a bus may deliver."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import socket
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jointctl.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Frame
+from jointctl.drivers.canopen import exchange
+from jointctl.drivers.canopen.cia402 import State
+from jointctl.drivers.canopen.cyclic import (
+    ERROR_SHOWN_CYCLES,
+    FRAME_SLOTS,
+    IGNORED_MAX_CYCLES,
+    SCRATCH_WORDS,
+    SLOT_RECEIVED,
+    SLOT_RPDO,
+    accept_frame,
+    answer_owed,
+    begin_cycle,
+    end_cycle,
+    get_i16,
+    get_i32,
+    get_u16,
+    note_wake,
+    put_u16,
+    torque_permille,
+)
+from jointctl.drivers.canopen.pdo import joint_angle_per_count_rad, joint_torque_per_permille_Nm, new_port
+from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.firmware_py.records import Command, Sample
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import DriveRequest, DriveState
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.simulation.virtual_joint import new_device
+from tests.places import CONFIGS
+from tests.unit.drivers.canopen.wire import RAD_PER_COUNT, STATUSWORDS, Wire
+
+# --- Counts and per mille of the drive against radians and newton metres of the joint ---
+SETTINGS = CanopenSettings(
+    node=5, eds_path=Path("drive.eds"), mode="cst", rate_Hz=1000.0, heartbeat_s=0.2, master_node=127,
+    quick_stop_option=2, rpdo_transmission_type=1, torque_reference="rated_torque", torque_direction=1,
+    torque_max_Nm=60.0, torque_constant_NmpA=0.1, reduction_ratio=121.0, counts_per_turn=2**19,
+    encoder_on_motor=False, encoder_direction=1, zero_counts=0,
+)  # fmt: skip
+
+
+def test_torque_by_rated_torque() -> None:
+    """500 mNm at the motor are 60.5 Nm at the joint, so a thousandth is 60.5 mNm."""
+    assert joint_torque_per_permille_Nm(SETTINGS, 500, 9999) == pytest.approx(0.0605)
+
+
+def test_torque_by_rated_current() -> None:
+    """5 A at 0.1 Nm/A are 0.5 Nm at the motor."""
+    settings = dataclasses.replace(SETTINGS, torque_reference="rated_current")
+    assert joint_torque_per_permille_Nm(settings, 9999, 5000) == pytest.approx(0.0605)
+
+
+@pytest.mark.parametrize(("on_motor", "turns"), [(False, 1.0), (True, 121.0)])
+def test_angle_of_a_count(on_motor: bool, turns: float) -> None:
+    settings = dataclasses.replace(SETTINGS, encoder_on_motor=on_motor)
+    assert joint_angle_per_count_rad(settings) * 2**19 * turns == pytest.approx(2.0 * math.pi)
+
+
+@pytest.mark.parametrize("node", [1, 5, 127])
+def test_the_port_has_the_standard_identifiers_and_layout(node: int) -> None:
+    port = new_port(dataclasses.replace(SETTINGS, node=node), 0.0605, 1000)[0]
+    identifiers = (port.sync_id, port.emergency_id, port.tpdo_id, port.rpdo_id, port.heartbeat_id)
+    assert identifiers == (0x80, 0x80 + node, 0x180 + node, 0x200 + node, 0x700 + node)
+    assert port.own_heartbeat_id == 0x77F
+    assert (port.tpdo_length, port.status_at, port.position_at, port.torque_at) == (8, 0, 2, 6)
+    assert (port.rpdo_length, port.control_at, port.target_at) == (4, 0, 2)
+    assert (port.fd, port.state, port.primed, port.max_permille) == (-1, State.UNDEFINED, 0, 1000)
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_directions_are_in_the_scale(direction: int) -> None:
+    settings = dataclasses.replace(SETTINGS, encoder_direction=direction, torque_direction=-direction)
+    port = new_port(settings, 0.0605, 1000)[0]
+    assert port.position_radpcount == direction * joint_angle_per_count_rad(settings)
+    assert port.torque_Nmppermille == -direction * 0.0605
+
+
+@pytest.mark.parametrize(
+    ("heartbeat_s", "rate_Hz", "cycles"), [(0.2, 1000.0, 66), (0.003, 1000.0, 1), (0.001, 500.0, 1), (1.0, 250.0, 83)]
+)
+def test_three_heartbeats_fit_into_the_time_out(heartbeat_s: float, rate_Hz: float, cycles: int) -> None:
+    port = new_port(dataclasses.replace(SETTINGS, heartbeat_s=heartbeat_s, rate_Hz=rate_Hz), 0.06, 1000)[0]
+    assert port.heartbeat_cycles == cycles
+
+
+# --- What the cyclic exchange sends, byte by byte as CiA 301 and CiA 402 lay it out; every frame is written by hand ---
+@pytest.fixture
+def enabled(wire: Wire) -> Wire:
+    wire.tpdo(STATUSWORDS[State.OPERATION_ENABLED])
+    return wire
+
+
+# --- what is sent ---
+def test_sync_has_no_data(wire: Wire) -> None:
+    wire.port.cycle = 1
+    assert begin_cycle(wire.port, wire.frames) == 1
+    assert wire.frames[0].tobytes() == bytes.fromhex("80000000 00000000 0000000000000000")
+
+
+def test_heartbeat_says_operational(wire: Wire) -> None:
+    assert begin_cycle(wire.port, wire.frames) == 2
+    assert wire.frames[1].tobytes() == bytes.fromhex("7f070000 01000000 0500000000000000")
+
+
+@pytest.mark.parametrize(
+    ("every", "expected"), [(3, [2, 1, 1, 2, 1, 1, 2]), (1, [2] * 7), (0, [1] * 7), (66, [2] + [1] * 6)]
+)
+def test_heartbeat_schedule(wire: Wire, every: int, expected: list[int]) -> None:
+    wire.port.heartbeat_cycles = every
+    assert [begin_cycle(wire.port, wire.frames) for _ in range(7)] == expected
+
+
+@pytest.mark.trips("loop: that it is heard", "(IGNORED_MAX_CYCLES + 1, 1)")
+@pytest.mark.stays("loop: that it is heard", "(IGNORED_MAX_CYCLES, 2)")
+@pytest.mark.parametrize(("cycles", "frames"), [(IGNORED_MAX_CYCLES, 2), (IGNORED_MAX_CYCLES + 1, 1)])
+def test_a_drive_that_stays_enabled_loses_the_heartbeat(enabled: Wire, cycles: int, frames: int) -> None:
+    enabled.port.heartbeat_cycles = 1
+    for _ in range(cycles):
+        assert begin_cycle(enabled.port, enabled.frames) == 2
+        enabled.rpdo(0.0, DriveRequest.QUICK_STOP)
+    assert begin_cycle(enabled.port, enabled.frames) == frames
+    # a drive that obeys in the end: within the limit all is forgotten, beyond it its watchdog stays without a heartbeat
+    enabled.tpdo(STATUSWORDS[State.SWITCH_ON_DISABLED])
+    enabled.rpdo(0.0, DriveRequest.QUICK_STOP)
+    assert enabled.port.ignored_cycles == (0 if frames == 2 else cycles)
+    assert begin_cycle(enabled.port, enabled.frames) == frames
+
+
+def test_rpdo_of_an_enabled_drive(enabled: Wire) -> None:
+    # 12.1 Nm = 200 permille = 0x00C8; controlword 0x000F; node 5 listens at 0x205
+    assert enabled.rpdo(12.1) == bytes.fromhex("05020000 04000000 0f00c80000000000")
+
+
+def test_rpdo_of_a_negative_torque_is_twos_complement(enabled: Wire) -> None:
+    assert enabled.rpdo(-12.1) == bytes.fromhex("05020000 04000000 0f0038ff00000000")
+    assert enabled.rpdo(-0.0605) == bytes.fromhex("05020000 04000000 0f00ffff00000000")
+
+
+def test_a_motor_mounted_the_other_way_round(enabled: Wire) -> None:
+    enabled.port.torque_Nmppermille = -0.0605
+    assert enabled.rpdo(12.1)[8:12] == bytes.fromhex("0f0038ff")
+    enabled.tpdo(torque=-200)
+    assert enabled.sample.torque_Nm == pytest.approx(12.1)
+
+
+@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("request_", DriveRequest)
+def test_torque_is_zero_unless_asked_and_operation_enabled(wire: Wire, state: State, request_: DriveRequest) -> None:
+    wire.tpdo(STATUSWORDS.get(state, 0x0001))
+    assert wire.port.state == state
+    frame = wire.rpdo(12.1, request_)
+    may = state is State.OPERATION_ENABLED and request_ is DriveRequest.ENABLE
+    assert frame[10:12] == (b"\xc8\x00" if may else b"\x00\x00")
+    assert frame[12:] == b"\0\0\0\0"
+    assert not frame[8] & 0x80
+
+
+@pytest.mark.parametrize("limit", [1000, 32767])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_torque_saturates_and_never_wraps(enabled: Wire, limit: int, sign: int) -> None:
+    enabled.port.max_permille = limit
+    for k in range(-20, 21):
+        value = sign * (limit + k)
+        expected = sign * min(limit + k, limit)
+        sent = struct.unpack("<h", enabled.rpdo(value * 0.0605)[10:12])[0]
+        assert sent == expected
+    for far in (40_000.0, 65_536.0, 1e9, 1e30, 1e300):
+        assert struct.unpack("<h", enabled.rpdo(sign * far * 0.0605)[10:12])[0] == sign * limit
+
+
+@pytest.mark.parametrize("torque_Nm", [math.nan, math.inf, -math.inf])
+def test_a_torque_that_is_not_finite_is_zero(enabled: Wire, torque_Nm: float) -> None:
+    assert enabled.rpdo(torque_Nm)[8:12] == bytes.fromhex("0f000000")
+
+
+@pytest.mark.filterwarnings("ignore:.*encountered in scalar:RuntimeWarning")  # plain Python tells of inf - inf
+@given(torque_Nm=st.floats(allow_nan=True, allow_infinity=True), limit=st.integers(0, 32767))
+def test_whatever_the_torque_the_object_stays_in_its_limit(torque_Nm: float, limit: int) -> None:
+    wire = Wire()
+    wire.port.max_permille = limit
+    permille = torque_permille(wire.port, torque_Nm)
+    assert abs(permille) <= limit
+    if math.isfinite(torque_Nm) and abs(torque_Nm) < 0.0605 * limit:
+        assert abs(permille * 0.0605 - torque_Nm) <= 0.5001 * 0.0605
+
+
+def test_no_byte_of_an_earlier_frame_stays(enabled: Wire) -> None:
+    enabled.frames[2].payload[:] = 0xFF
+    assert enabled.rpdo(0.0) == bytes.fromhex("05020000 04000000 0f00000000000000")
+
+
+# --- the exported half of the lockstep simulation ---
+def test_exchange_memory_has_room_for_every_slot(wire: Wire) -> None:
+    _, frames, scratch = exchange.link_of(wire.ports)
+    assert (len(frames), frames.dtype.itemsize, len(scratch)) == (FRAME_SLOTS, 16, SCRATCH_WORDS)
+    assert scratch.dtype == np.int64
+
+
+def test_one_whole_enable_by_statuswords(wire: Wire) -> None:
+    words = []
+    for status in (0x0250, 0x0231, 0x0233, 0x1637):
+        wire.tpdo(status)
+        frame = wire.rpdo(12.1)
+        words.append(frame[8:12].hex())
+    assert words == ["06000000", "07000000", "0f000000", "0f00c800"]
+
+
+# --- What the cyclic exchange receives: TPDO, emergencies, errors of the bus, the drive's own heartbeat ---
+# --- what is received ------------------------------------------------------------------------------------------
+def test_tpdo_by_hand(wire: Wire) -> None:
+    # statusword 0x1637, position 0x00012345 = 74565 counts, torque 0xFF38 = -200 permille
+    assert wire.receive(0x185, bytes.fromhex("3716 45230100 38ff"), now_ns=77)
+    sample = wire.sample
+    assert (sample.status_word, sample.drive_state, sample.count) == (0x1637, DriveState.ENABLED, 1)
+    assert sample.position_rad == pytest.approx(74565 * RAD_PER_COUNT)
+    assert sample.torque_Nm == pytest.approx(-12.1)
+    assert sample.time_ns == 77
+
+
+@pytest.mark.parametrize(
+    ("data", "counts"),
+    [("ffffffff", -1), ("00000080", -(2**31)), ("ffffff7f", 2**31 - 1), ("0000ffff", -65536), ("01000000", 1)],
+)
+def test_position_is_signed(wire: Wire, data: str, counts: int) -> None:
+    wire.receive(0x185, bytes.fromhex("5002" + data + "0000"))
+    assert wire.sample.position_rad == pytest.approx(counts * RAD_PER_COUNT)
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("step", [1, 100_000, 2**31 - 1])
+def test_position_wraps_both_ways_without_a_jump(wire: Wire, direction: int, step: int) -> None:
+    """Several turns of the 32 bit counter in one direction, and all the way back."""
+    start = direction * (2**31 - 1 - 2 * min(step, 1000))
+    true = start
+    wire.tpdo(counts=start)
+    for k in range(12):
+        true += direction * step * (1 if k < 6 else -1)
+        wire.tpdo(counts=(true + 2**31) % 2**32 - 2**31)
+        assert wire.port.counts == true
+        assert wire.sample.position_rad == pytest.approx(true * RAD_PER_COUNT)
+    assert wire.port.counts == start
+
+
+def test_zero_and_direction_of_the_encoder(wire: Wire) -> None:
+    wire.port.zero_counts, wire.port.position_radpcount = 1000, -RAD_PER_COUNT
+    wire.tpdo(counts=1500)
+    assert wire.sample.position_rad == pytest.approx(-500 * RAD_PER_COUNT)
+
+
+@pytest.mark.parametrize(
+    ("identifier", "length"),
+    [
+        *((0x185, length) for length in range(8)),
+        *((identifier, 8) for identifier in (
+            0x184, 0x186, 0x285, 0x205, 0x80, 0x85 | EXTENDED_FLAG, 0x185 | EXTENDED_FLAG, 0x185 | REMOTE_FLAG, 0x585,
+            0x701,
+        )),
+    ],
+)  # fmt: skip
+def test_a_short_tpdo_is_counted_and_ignored_and_what_is_not_ours_is_ignored(
+    wire: Wire, identifier: int, length: int
+) -> None:
+    wire.tpdo(0x0250, 1000, 5)
+    before = wire.sample.tobytes()
+    assert not wire.receive(identifier, struct.pack("<Hih", 0x1637, 9999, 99)[:length])
+    assert wire.sample.tobytes() == before
+    assert (wire.port.malformed, wire.port.error_frames) == (length < 8, 0)
+    assert wire.port.state == State.SWITCH_ON_DISABLED
+    assert wire.tpdo(0x0250, 1001)  # the twin of full length
+
+
+def test_error_frames_of_the_bus_are_counted(wire: Wire) -> None:
+    assert not wire.receive(0x185 | ERROR_FLAG, bytes(8))
+    assert (wire.port.error_frames, wire.sample.count) == (1, 0)
+
+
+def test_an_emergency_is_latched(wire: Wire) -> None:
+    wire.receive(0x85, bytes.fromhex("1033 01 0000000000"))
+    assert wire.sample.drive_error == 0x3310
+    wire.receive(0x85, b"\x30")
+    assert wire.sample.drive_error == 0x3310
+    for _ in range(100):
+        begin_cycle(wire.port, wire.frames)
+        wire.tpdo()
+    assert wire.sample.drive_error == 0x3310
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_an_error_that_the_drive_has_reset_is_shown_for_a_while_and_then_cleared(wire: Wire, again: bool) -> None:
+    """At once it would be forgotten as the cause of the stop; never, a run later would be told an old one."""
+    wire.receive(0x85, bytes.fromhex("3081 11 0000000000"))
+    wire.receive(0x85, bytes(8))
+    for cycle in range(1, ERROR_SHOWN_CYCLES + 3):
+        begin_cycle(wire.port, wire.frames)
+        if again and cycle == 5:
+            wire.receive(0x85, bytes.fromhex("3081 11 0000000000"))
+        wire.tpdo()
+        expected = 0x8130 if again or cycle <= ERROR_SHOWN_CYCLES else 0
+        assert wire.sample.drive_error == expected, cycle
+
+
+# --- the drive's own heartbeat ---
+@pytest.mark.parametrize("watched", [0, 1])
+def test_the_age_of_the_drives_heartbeat(wire: Wire, watched: int) -> None:
+    wire.port.heartbeat_watched = watched
+    for cycle in range(1, 50):
+        begin_cycle(wire.port, wire.frames)
+        if cycle in (10, 30):
+            wire.receive(0x705, b"\x05")
+        wire.rpdo(0.0)
+        heard = 30 if cycle >= 30 else 10 if cycle >= 10 else 0
+        assert wire.sample.heartbeat_age_cycles == watched * (cycle - heard)
+    assert wire.sample.count == 0
+
+
+def test_a_boot_up_is_a_restart_and_a_heartbeat_is_not(wire: Wire) -> None:
+    for data, restarts in (
+        (b"\x05", 0),
+        (b"\x85", 0),
+        (b"\x7f", 0),
+        (b"", 0),
+        (b"\x00", 1),
+        (b"\x05", 1),
+        (b"\x80", 2),
+    ):
+        wire.receive(0x705, data)
+        assert wire.sample.restarts == restarts
+    wire.receive(0x706, b"\x00")
+    assert wire.sample.restarts == 2
+
+
+def test_bus_load_counts_both_directions_at_worst_stuffing(wire: Wire) -> None:
+    """SYNC 55, TPDO 135 and RPDO 95 bits are the 285 of the bus budget."""
+    wire.port.cycle = 1
+    begin_cycle(wire.port, wire.frames)
+    wire.tpdo()
+    wire.rpdo(0.0)
+    assert wire.port.bits_sent == 285
+    wire.port.cycle = 0
+    begin_cycle(wire.port, wire.frames)  # SYNC 55 and heartbeat 65
+    assert wire.port.bits_sent == 285 + 55 + 65
+
+
+@given(data=st.binary(min_size=8, max_size=8))
+def test_integers_are_little_endian(data: bytes) -> None:
+    array = np.frombuffer(data, np.uint8)
+    assert get_u16(array, 1) == struct.unpack_from("<H", data, 1)[0]
+    assert get_i16(array, 3) == struct.unpack_from("<h", data, 3)[0]
+    assert get_i32(array, 4) == struct.unpack_from("<i", data, 4)[0]
+
+
+@given(value=st.integers(-32768, 65535))
+def test_put_is_the_inverse_of_get(value: int) -> None:
+    array = np.zeros(4, np.uint8)
+    put_u16(array, 1, value)
+    assert get_u16(array, 1) == value % 65536
+    assert (array[0], array[3]) == (0, 0)
+
+
+# --- A TPDO that repeats or delays an old value is not taken for a new sample ---
+def test_a_tpdo_after_the_answer_is_not_a_new_sample(wire: Wire) -> None:
+    """Doubled or late, it would make an old position look fresh."""
+    begin_cycle(wire.port, wire.frames)
+    assert wire.tpdo(counts=100)
+    wire.rpdo(0.0)
+    assert not wire.tpdo(STATUSWORDS[State.OPERATION_ENABLED], counts=50)
+    assert (wire.sample.count, wire.port.surplus, wire.port.state) == (1, 1, State.SWITCH_ON_DISABLED)
+    assert wire.sample.position_rad == pytest.approx(100 * RAD_PER_COUNT)
+    begin_cycle(wire.port, wire.frames)
+    assert wire.sample.count == 1  # the age goes on
+    assert wire.tpdo(counts=101)
+
+
+def test_a_tpdo_that_comes_after_its_cycle_but_is_the_first_answer_is_one(wire: Wire) -> None:
+    begin_cycle(wire.port, wire.frames)
+    wire.rpdo(0.0)
+    assert wire.tpdo(counts=7)
+    begin_cycle(wire.port, wire.frames)
+    wire.rpdo(0.0)
+    assert wire.tpdo(counts=8)
+    assert (wire.sample.count, wire.port.surplus) == (2, 0)
+
+
+def test_of_a_burst_the_last_one_counts(wire: Wire) -> None:
+    for _ in range(3):
+        begin_cycle(wire.port, wire.frames)
+        wire.rpdo(0.0)
+    for counts in (1, 2, 3):
+        assert wire.tpdo(counts=counts)
+    assert wire.sample.position_rad == pytest.approx(3 * RAD_PER_COUNT)
+
+
+class Line:
+    """`exchange.receive` on a bus, with a drive whose answers come when the test says."""
+
+    def __init__(self, wire: Wire) -> None:
+        self.wire = wire
+        self.drive, self.ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        wire.port.fd = self.ours.fileno()
+        self.link = exchange.link_of(wire.ports)._replace(frames=wire.frames)
+
+    def cycle(self, *answers: tuple[float, int], window_s: float) -> float:
+        """One cycle with the drive's (pause [s], counts) after SYNC; returns the counts that it ends with."""
+        thread = threading.Thread(target=self._answer, args=(answers,))
+        thread.start()
+        wire, now_ns = self.wire, time.monotonic_ns()
+        exchange.receive(self.link, wire.samples, np.int64(now_ns), np.int64(now_ns + window_s * 1e9))
+        taken = float(wire.sample.position_rad) / RAD_PER_COUNT
+        thread.join()
+        wire.rpdo(0.0)
+        return taken
+
+    def _answer(self, answers: tuple[tuple[float, int], ...]) -> None:
+        while struct.unpack_from("<I", self.drive.recv(16))[0] != 0x80:
+            pass
+        for pause_s, counts in answers:
+            time.sleep(pause_s)
+            self.drive.send(struct.pack("<IB3xHih", 0x185, 8, 0x0250, counts, 0))
+
+
+@pytest.fixture
+def line(wire: Wire) -> Iterator[Line]:
+    made = Line(wire)
+    yield made
+    made.drive.close()
+    made.ours.close()
+
+
+def test_after_a_cycle_without_answer_the_last_tpdo_counts(line: Line) -> None:
+    """Its answer may come behind the next SYNC, and then in front of the next answer: a position one period old."""
+    assert line.cycle((0.0, 10), window_s=30.0) == pytest.approx(10)
+    assert line.cycle(window_s=0.01) == pytest.approx(10)
+    assert line.cycle((0.0, 20), (0.05, 30), window_s=1.0) == pytest.approx(30)
+    assert line.wire.port.surplus == 0
+    assert line.cycle((0.0, 40), window_s=30.0) == pytest.approx(40)  # no need to wait any more
+
+
+def test_after_an_answered_cycle_the_first_tpdo_ends_the_wait(line: Line) -> None:
+    assert line.cycle((0.0, 10), window_s=30.0) == pytest.approx(10)
+    assert line.cycle((0.0, 20), (0.1, 30), window_s=30.0) == pytest.approx(20)
+    assert line.cycle((0.0, 40), window_s=30.0) == pytest.approx(40)
+    assert line.wire.port.surplus == 1
+
+
+def test_an_answer_that_comes_between_the_cycles_is_not_owed(line: Line) -> None:
+    line.cycle(window_s=0.01)
+    line.wire.tpdo(counts=20)
+    assert line.cycle((0.0, 30), window_s=30.0) == pytest.approx(30)
+
+
+@pytest.mark.parametrize(
+    ("cycle", "second_id", "seen", "owed"),
+    [(0, 0, 0, 0), (1, 0, 0, 1), (1, 0, 1, 0), (1, 0x186, 1, 1), (1, 0x186, 2, 1), (1, 0x186, 3, 0)],
+)
+def test_when_an_answer_is_owed(wire: Wire, cycle: int, second_id: int, seen: int, owed: int) -> None:
+    wire.port.cycle, wire.port.seen, wire.port.second.tpdo_id = cycle, seen, second_id
+    assert answer_owed(wire.port) == owed
+
+
+@pytest.mark.parametrize(("later_ns", "taken"), [(1_000_000, True), (1_500_000, True), (1_500_001, False)])
+def test_an_answer_that_has_waited_through_a_pause_is_no_sample(wire: Wire, later_ns: int, taken: bool) -> None:
+    """The loop got no processor while it waited; 10 ms later the answer passed for a sample of that slot."""
+    wire.port.period_ns = 1_000_000
+    note_wake(wire.port, 7_000_000)
+    begin_cycle(wire.port, wire.frames)
+    wire.rpdo(0.0)
+    note_wake(wire.port, 7_000_000 + later_ns)
+    assert wire.tpdo(STATUSWORDS[State.FAULT], counts=100) == taken
+    assert (wire.sample.count, wire.port.surplus) == ((1, 0) if taken else (0, 1))
+    assert wire.port.state == State.FAULT  # what the drive says of itself is taken all the same
+    begin_cycle(wire.port, wire.frames)
+    assert wire.tpdo(counts=101)  # that of this slot
+
+
+def test_without_a_period_an_answer_of_any_age_is_a_sample(wire: Wire) -> None:
+    note_wake(wire.port, 10**12)
+    assert wire.tpdo(counts=100)
+
+
+# Whatever a bus may deliver: the cyclic protocol, the virtual drive and its SDO server never fail, and stay sane.
+quick = settings(max_examples=200)
+identifiers = st.one_of(
+    st.sampled_from([0x000, 0x080, 0x081, 0x181, 0x201, 0x581, 0x601, 0x701, 0x77E]),
+    st.integers(0, 0x7FF),
+    st.integers(0, 0xFFFFFFFF),
+)
+frames = st.tuples(identifiers, st.integers(0, 255), st.binary(min_size=8, max_size=8))
+
+
+@quick
+@given(received=st.lists(frames, min_size=1, max_size=40), torque=st.floats(allow_nan=True, allow_infinity=True))
+def test_any_frames_into_the_cyclic_protocol(
+    received: list[tuple[int, int, bytes]], torque: float, settings_of_virtual_joint: Any
+) -> None:
+    port = new_port(settings_of_virtual_joint, 0.0605, 1000)[0]
+    memory, sample, command = new(Frame, FRAME_SLOTS), new(Sample)[0], new(Command)[0]
+    for now_ns, (identifier, length, data) in enumerate(received):
+        begin_cycle(port, memory)
+        frame = memory[SLOT_RECEIVED]
+        frame.can_id, frame.length = identifier, length
+        frame.payload[:] = np.frombuffer(data, np.uint8)
+        before = int(sample.count)
+        taken = accept_frame(port, frame, sample, now_ns)
+        assert taken == (sample.count == before + 1)
+        if taken:
+            assert identifier == port.tpdo_id
+            assert length >= port.tpdo_length
+        assert math.isfinite(sample.position_rad)
+        assert math.isfinite(sample.torque_Nm)
+        assert 0 <= sample.status_word <= 0xFFFF
+        assert int(sample.drive_state) in list(DriveState)
+        command.torque_Nm, command.request = torque, DriveRequest.ENABLE
+        end_cycle(port, memory, sample, command)
+        sent = memory[SLOT_RPDO]
+        permille = struct.unpack_from("<h", bytes(sent.payload), int(port.target_at))[0]
+        assert abs(permille) <= port.max_permille
+        if sample.drive_state != DriveState.ENABLED:
+            assert permille == 0
+
+
+@quick
+@given(low=st.binary(min_size=8, max_size=8), length=st.integers(0, 8))
+def test_a_tpdo_is_decoded_or_counted_as_malformed(low: bytes, length: int, settings_of_virtual_joint: Any) -> None:
+    port = new_port(settings_of_virtual_joint, 0.0605, 1000)[0]
+    memory, sample = new(Frame, FRAME_SLOTS), new(Sample)[0]
+    frame = memory[SLOT_RECEIVED]
+    frame.can_id, frame.length = port.tpdo_id, length
+    frame.payload[:] = np.frombuffer(low, np.uint8)
+    assert accept_frame(port, frame, sample, 5) is (length >= 8)
+    if length < 8:
+        assert (port.malformed, sample.count) == (1, 0)
+        return
+    status, counts, torque = struct.unpack("<Hih", low)
+    assert sample.status_word == status
+    assert port.counts == counts
+    assert sample.torque_Nm == pytest.approx(torque * port.torque_Nmppermille)
+
+
+@pytest.fixture(scope="module")
+def device() -> Any:
+
+    return new_device(load_config(CONFIGS / "virtual.toml"))
+
+
+@quick
+@given(received=st.lists(st.tuples(identifiers, st.integers(0, 8), st.binary(min_size=8, max_size=8)), max_size=20))
+def test_any_frames_into_the_virtual_drive(device: Any, received: list[tuple[int, int, bytes]]) -> None:
+    now_ns = max(int(device.device[0].time_ns), 1)
+    for identifier, length, data in received:
+        now_ns += 1000
+        for frame in device.handle(struct.pack("<IB3x8s", identifier, length, data), now_ns):
+            assert len(frame) == 16
+            assert frame[4] <= 8
+            assert struct.unpack_from("<I", frame)[0] <= 0x7FF
+    assert math.isfinite(device.plant_state[0].joint_position_rad)
+
+
+@quick
+@given(requests=st.lists(st.binary(min_size=0, max_size=8), min_size=1, max_size=20))
+def test_any_sdo_requests_are_answered_by_eight_bytes_or_not_at_all(device: Any, requests: list[bytes]) -> None:
+    for request in requests:
+        for response in device.sdo.handle(request):
+            assert len(response) == 8
+    # and afterwards a good request is answered: an abort, then the device type
+    device.sdo.handle(bytes([0x80, 0, 0, 0, 0, 0, 0, 0]))
+    (answer,) = device.sdo.handle(bytes([0x40, 0x00, 0x10, 0, 0, 0, 0, 0]))
+    assert answer[:4] == bytes([0x43, 0x00, 0x10, 0x00])

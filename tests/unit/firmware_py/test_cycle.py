@@ -1,0 +1,205 @@
+"""One cycle for every front end, and for any number of axes."""
+
+from __future__ import annotations
+
+import ast
+import os
+from collections import deque
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+from jointctl.drivers.can.virtual_bus import decode, encode
+from jointctl.drivers.canopen.cyclic import CanopenPort
+from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, Clock, CycleMemory, Exchange, Slot, Word, step_cycle
+from jointctl.firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.sequence import reset_axis
+from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, StopRequest
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.session import portable_loop
+from jointctl.tools.session.loop_handle import SharedBlock
+from jointctl.tools.simulation.lockstep import LockstepJoint
+from tests.axis_on_stub_joint import small_axis_constants
+from tests.places import ROOT
+
+PERIOD_NS = 1_000_000
+RING = 7  # no multiple of the axes
+
+
+class Arm:
+    """Two axes at rest on drives that obey at once, on an idle computer; stepped in plain Python."""
+
+    def __init__(self) -> None:
+        self.constants, self.state = new(AxisConstants, 2), new(AxisState, 2)
+        self.constants[:] = small_axis_constants()[0]
+        for axis in range(2):
+            self.constants[axis].sequence.supervisor_max_cycles = 10
+            self.constants[axis].trajectory.amplitude_rad = 0.0
+            reset_axis(self.constants[axis], self.state[axis])
+        self.memory = CycleMemory(
+            self.constants, self.state, np.zeros((2, 1, 5)), new(Sample, 2), new(Command, 2), np.zeros(WORDS, np.int64),
+            new(LogRecord, RING), np.zeros((3, HISTOGRAM_BINS), np.int64), np.zeros(2, np.int64),
+        )  # fmt: skip
+        self.slept_ns = 0
+        self.now_ns = 0
+        self.sends = 0
+        self.ended = False
+        self.cycles = 0
+
+    def _receive(self, _: None, samples: Any, now_ns: int, until_ns: int) -> int:
+        for sample, command in zip(samples, self.memory.command, strict=True):
+            sample.count += 1
+            sample.time_ns = now_ns + 1500
+            sample.drive_state = DriveState.ENABLED if command.request == DriveRequest.ENABLE else DriveState.OFF
+        return 1500
+
+    def _send(self, _: None, samples: Any, commands: Any) -> int:
+        self.sends += 1
+        return 0
+
+    def run(self, cycles: int) -> Arm:
+        exchange = Exchange(self._receive, self._send, None)
+        clock = Clock(lambda _: self.now_ns + 2000, lambda *_: self.slept_ns)
+        for _ in range(cycles):
+            self.now_ns += PERIOD_NS
+            self.memory.words[Word.SUPERVISOR_NS] = self.now_ns
+            slot = Slot(PERIOD_NS, self.now_ns, self.now_ns, 0, 1, self.now_ns + 600_000)
+            self.cycles += 1
+            self.ended = step_cycle(self.memory, exchange, clock, slot)
+            if self.ended:
+                break
+        return self
+
+    @property
+    def phases(self) -> list[AxisPhase]:
+        return [AxisPhase(int(phase)) for phase in self.state.phase]
+
+    @property
+    def faults(self) -> list[Fault]:
+        return [Fault(int(fault)) for fault in self.state.fault]
+
+
+def test_two_axes_run_in_one_cycle_and_both_are_logged() -> None:
+    arm = Arm().run(300)
+    assert arm.phases == [AxisPhase.TRACKING] * 2
+    words, memory = arm.memory.words, arm.memory
+    assert (words[Word.HEAD], arm.sends) == (600, 300)  # two records, one exchange
+    assert words[Word.LOOP_NS] == arm.now_ns + 2000
+    newest = [memory.ring[record % RING] for record in (598, 599)]
+    assert [int(record.time_ns) for record in newest] == [arm.now_ns] * 2
+    assert [int(record.cycle) for record in newest] == [300, 300]
+    assert list(memory.histograms.sum(axis=1)) == [300, 600, 300]  # of each axis a round trip
+    assert memory.histograms[1, 1] == 600
+
+
+def test_the_loop_ends_with_the_last_axis() -> None:
+    arm = Arm().run(100)
+    arm.constants[1].trajectory.duration_s = 0.5  # it is over there; the other axis goes on
+    arm.run(900)
+    assert arm.phases == [AxisPhase.TRACKING, AxisPhase.FINISHED]
+    assert not arm.ended
+    arm.memory.words[Word.STOP] = StopRequest.RAMP
+    arm.run(500)
+    assert arm.ended
+    assert (arm.phases, arm.faults) == ([AxisPhase.FINISHED] * 2, [Fault.NONE] * 2)
+
+
+@pytest.mark.parametrize("tripped", [0, 1])
+def test_a_fault_of_one_axis_ramps_the_other_down(tripped: int) -> None:
+    arm = Arm().run(300)
+    arm.memory.sample[tripped].drive_error = 0x2310
+    arm.memory.sample[tripped].restarts = 1
+    arm.run(2)
+    other = 1 - tripped
+    assert (arm.faults[tripped], arm.faults[other]) == (Fault.DRIVE_RESTARTED, Fault.NONE)
+    assert arm.phases[other] in (AxisPhase.RAMPING, AxisPhase.RELEASING)
+    arm.run(500)
+    assert arm.ended
+    assert arm.faults[other] == Fault.NONE
+
+
+@pytest.mark.parametrize(("slept_ns", "faults"), [(1_000_000, Fault.NONE), (1_000_001, Fault.SUSPENDED)])
+def test_standby_stops_every_axis(slept_ns: int, faults: Fault) -> None:
+    arm = Arm().run(300)
+    arm.slept_ns = slept_ns
+    assert arm.run(1).faults == [faults] * 2
+
+
+# --- the front ends --------------------------------------------------------------------------------------------
+
+
+def callers(name: str) -> set[str]:
+    """Files of the program in which a function of that name is called."""
+    found = set()
+    for layer in ("firmware_py", "drivers", "hil", "tools"):
+        for path in (ROOT / layer).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == name:
+                    found.add(str(path.relative_to(ROOT)))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "where"),
+    [
+        ("step_axis", {"firmware_py/cycle.py"}),
+        ("write_log", {"firmware_py/cycle.py"}),
+        ("check_suspension", {"firmware_py/cycle.py"}),
+        ("step_cycle", {"firmware_py/realtime.py", "hil/lockstep.py"}),
+        ("run_cycles", {"firmware_py/realtime.py", "tools/session/portable_loop.py"}),
+    ],
+)
+def test_there_is_one_cycle(name: str, where: set[str]) -> None:
+    assert callers(name) == where
+
+
+class MemoryBus:
+    """A python-can bus without a wire to a virtual drive, and the clock of the loop: it stands still in a cycle."""
+
+    def __init__(self, joint: LockstepJoint) -> None:
+        self._device = joint._virtual
+        self.now_ns = joint.start_ns - PERIOD_NS
+        self._looked = 0
+        self._waiting: deque[bytes] = deque()
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        self._waiting.extend(self._device.handle(encode(msg), self.now_ns))
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        return decode(self._waiting.popleft(), 0.0, "") if self._waiting else None
+
+    def monotonic_ns(self) -> int:
+        self._looked += 1
+        return self.now_ns + self._looked - 1
+
+    def sleep_until_ns(self, deadline_ns: int, _: Any) -> None:
+        self.now_ns, self._looked = deadline_ns, 0
+        self._waiting.extend(self._device.advance(deadline_ns))
+
+
+def test_the_portable_loop_and_lockstep_do_the_same_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compiled and in plain Python, frames moved in memory and over a python-can bus: one and the same cycle."""
+    config = load_config(shipped_config("virtual"))
+    joint = LockstepJoint(
+        config.model_copy(update={"trajectory": config.trajectory.model_copy(update={"duration_s": 0.5})})
+    )
+    expected = joint.run().log
+    bus, block = MemoryBus(joint), SharedBlock.create(len(joint.table), CanopenPort)
+    try:
+        portable_loop.warm_up()
+        monkeypatch.setattr(portable_loop, "time", bus)
+        monkeypatch.setattr(portable_loop, "sleep_until_ns", bus.sleep_until_ns)
+        block.table[:], block.constants[:], block.port[:] = joint.table, joint.constants(), joint._port
+        reset_axis(block.constants[0], block.state[0])
+        executed = portable_loop.run_portable_loop(bus, block, PERIOD_NS, 600_000, len(expected) + 10)
+        found = block.ring[:executed].copy()
+    finally:
+        os.close(block.fd)
+    assert executed == len(expected) > 2000
+    assert found.phase[-1] == AxisPhase.FINISHED
+    for name in expected.dtype.names:
+        if name not in ("round_trip_ns", "work_ns"):  # looking at the clock takes 1 ns there
+            assert np.array_equal(found[name], expected[name]), name

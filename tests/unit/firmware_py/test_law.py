@@ -1,0 +1,467 @@
+"""The control law (29) and its parts: velocity, Lyapunov equation (21), network (14), growth of what is learnt."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jointctl.firmware_py.axis import low_pass_gain, step_velocity
+from jointctl.firmware_py.friction import friction_motor_torque_Nm, step_lugre
+from jointctl.firmware_py.law import (
+    GROWN,
+    adapt_network,
+    eigenvalues,
+    friction_feed_forward_Nm,
+    learning_torque_Nm,
+    network_torque_Nm,
+    record_correction,
+    reset_law,
+    reset_learning,
+    reset_network,
+    solve_lyapunov_p,
+    step_law,
+    ultimate_bounds,
+    watch_learning,
+)
+from jointctl.firmware_py.records import (
+    NEURONS,
+    LawState,
+    LearningConstants,
+    LearningState,
+    NetworkConstants,
+    NetworkState,
+    Reference,
+    VelocityConstants,
+    VelocityState,
+)
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import ControllerKind, FeedForward, ZeroSpeedRule
+from jointctl.firmware_py.trajectory import NO_REPETITION
+
+# --- Velocity from position differences ---
+PERIOD_s = 1e-3
+
+
+def velocity_blocks(cutoff_Hz: float = 100.0) -> tuple[Any, Any]:
+    constants, state = new(VelocityConstants)[0], new(VelocityState)[0]
+    constants.period_s, constants.cutoff_Hz = PERIOD_s, cutoff_Hz
+    constants.period_gain = low_pass_gain(cutoff_Hz, PERIOD_s)
+    return constants, state
+
+
+def test_the_gain_is_that_of_the_exact_discretisation() -> None:
+    assert low_pass_gain(100.0, 1e-3) == pytest.approx(1.0 - math.exp(-0.2 * math.pi))
+    assert low_pass_gain(0.0, 1e-3) == 1.0
+    once, twice = low_pass_gain(30.0, 1e-3), low_pass_gain(30.0, 2e-3)
+    assert 1.0 - twice == pytest.approx((1.0 - once) ** 2)
+
+
+def test_the_first_sample_only_primes() -> None:
+    constants, state = velocity_blocks(cutoff_Hz=0.0)
+    step_velocity(constants, state, 0.7, 0.7, 1)
+    assert (state.velocity_radps, state.error_rate_radps, state.primed) == (0.0, 0.0, 1)
+    step_velocity(constants, state, 0.701, 0.7005, 1)
+    assert state.velocity_radps == pytest.approx(1.0)
+    assert state.error_rate_radps == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("gap_cycles", [1, 2, 5])
+def test_a_gap_between_samples_is_counted(gap_cycles: int) -> None:
+    constants, state = velocity_blocks(cutoff_Hz=0.0)
+    step_velocity(constants, state, 0.0, 0.0, 1)
+    step_velocity(constants, state, 0.002 * gap_cycles, 0.001 * gap_cycles, gap_cycles)
+    assert state.velocity_radps == pytest.approx(2.0)
+    assert state.error_rate_radps == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("gap_cycles", [1, 3])
+def test_step_response_of_the_filter_depends_on_time_and_not_on_the_number_of_samples(gap_cycles: int) -> None:
+    constants, state = velocity_blocks(cutoff_Hz=10.0)
+    step_velocity(constants, state, 0.0, 0.0, 1)
+    for k in range(gap_cycles, 31, gap_cycles):
+        step_velocity(constants, state, 1.5 * k * PERIOD_s, 0.0, gap_cycles)
+    assert state.velocity_radps == pytest.approx(1.5 * (1.0 - math.exp(-2.0 * math.pi * 10.0 * 0.030)))
+
+
+def test_the_matched_filter_has_no_bias_where_the_plain_difference_has() -> None:
+    """Perfect tracking of an accelerating reference: e' is zero, filtered velocity minus desired velocity is not."""
+    constants, state = velocity_blocks(cutoff_Hz=30.0)
+    for k in range(500):
+        position = 0.5 * 2.0 * (k * PERIOD_s) ** 2
+        step_velocity(constants, state, position, 0.0, 1)
+    assert state.error_rate_radps == 0.0
+    lag_radps = 2.0 * 499 * PERIOD_s - state.velocity_radps
+    assert lag_radps == pytest.approx(2.0 / (2.0 * math.pi * 30.0), rel=0.2)
+
+
+# --- The Lyapunov equation (21) and the ultimate bounds (30) ---
+KP, KV = 784.0, 56.0
+
+
+@pytest.mark.parametrize(
+    ("q", "expected"), [(2500.0, (17611.607, 1.594388, 22.349900)), (1800.0, (12680.357, 1.147959, 16.091928))]
+)
+def test_both_matrices_of_the_paper(q: float, expected: tuple[float, ...]) -> None:
+    p11, p12, p22 = solve_lyapunov_p(KP, KV, q, q)
+    assert p11 == pytest.approx(expected[0], abs=5e-4)
+    assert (p12, p22) == pytest.approx(expected[1:], abs=5e-7)
+
+
+@pytest.mark.parametrize(
+    ("kp", "kv", "q1", "q2"), [(784.0, 56.0, 2500.0, 2500.0), (2500.0, 130.0, 2.756e6, 4630.0), (1.0, 0.1, 3.0, 7.0)]
+)
+def test_the_equation_holds(kp: float, kv: float, q1: float, q2: float) -> None:
+    p11, p12, p22 = solve_lyapunov_p(kp, kv, q1, q2)
+    p = np.array([[p11, p12], [p12, p22]])
+    a = np.array([[0.0, 1.0], [-kp, -kv]])
+    np.testing.assert_allclose(p @ a + a.T @ p, -np.diag([q1, q2]), atol=1e-9 * max(q1, q2, p11 * kv))
+    np.testing.assert_allclose(eigenvalues(p11, p12, p22), np.linalg.eigvalsh(p), rtol=1e-9)
+    assert np.all(np.linalg.eigvalsh(p) > 0.0)
+
+
+@pytest.mark.parametrize("q", [1800.0, 2500.0])
+def test_ultimate_bounds(q: float) -> None:
+    """Both scale with eps0 and neither depends on q for Q = q I."""
+    loose, tight = ultimate_bounds(*solve_lyapunov_p(KP, KV, q, q), q, q, 2.1, 1.0)
+    assert loose == pytest.approx(6.71, abs=5e-3)
+    assert tight == pytest.approx(0.0085, abs=5e-5)
+    twice = ultimate_bounds(*solve_lyapunov_p(KP, KV, q, q), q, q, 2.1, 2.0)
+    assert twice == pytest.approx((2.0 * loose, 2.0 * tight))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ((0.0, 56.0, 1.0, 1.0), r"kp \(=0\)"),
+        ((784.0, -1.0, 1.0, 1.0), r"kv \(=-1\)"),
+        ((float("nan"), 56.0, 1.0, 1.0), r"kp \(=nan\)"),
+        ((784.0, 56.0, 0.0, 1.0), r"Q \(=diag\(0, 1\)\)"),
+        ((784.0, 56.0, 1.0, -1.0), r"Q \(=diag\(1, -1\)\)"),
+    ],
+)
+def test_what_has_no_positive_solution_is_refused(arguments: tuple[float, ...], named: str) -> None:
+    with pytest.raises(ValueError, match=named) as caught:
+        solve_lyapunov_p(*arguments)
+    assert "\n" not in str(caught.value)
+
+
+# --- The network (14) and its adaptation law (24) ---
+INERTIA_kgm2 = 2.1
+HALF = (0.05, 0.03, 0.01, 0.008, 0.004, 0.001, 0.0005)
+CENTRES = (*(-c for c in HALF), 0.0, *HALF)
+
+
+def network(width: float = 5.0) -> tuple[Any, Any]:
+    constants, state = new(NetworkConstants)[0], new(NetworkState)[0]
+    for i, centre in enumerate(CENTRES):
+        constants.centres[i, 0] = constants.centres[i, 1] = centre
+        constants.inverse_width[i] = 1.0 / (2.0 * width**2)
+    _, p12, p22 = solve_lyapunov_p(784.0, 56.0, 2500.0, 2500.0)
+    constants.p_b[0], constants.p_b[1] = p12 / INERTIA_kgm2, p22 / INERTIA_kgm2
+    constants.learning_rate, constants.initial_weight = 80.0, 0.01
+    reset_network(constants, state)
+    return constants, state
+
+
+def test_output_is_the_weighted_sum_of_gaussians() -> None:
+    constants, state = network(width=0.02)
+    state.weights[:] = np.linspace(-1.0, 2.0, NEURONS)
+    e, rate = 0.012, -0.007
+    hidden = [math.exp(-((e - c) ** 2 + (rate - c) ** 2) / (2.0 * 0.02**2)) for c in CENTRES]
+    expected = float(np.dot(np.linspace(-1.0, 2.0, NEURONS), hidden))
+    assert network_torque_Nm(constants, state, e, rate) == pytest.approx(expected, rel=1e-12)
+    np.testing.assert_allclose(state.hidden, hidden, rtol=1e-12)
+
+
+def test_initial_weights() -> None:
+    constants, state = network()
+    assert list(state.weights) == [0.01] * NEURONS
+    assert network_torque_Nm(constants, state, 0.0, 0.0) == pytest.approx(0.15, rel=1e-3)
+
+
+@pytest.mark.parametrize(("e", "rate"), [(0.001, 0.0), (0.0, 0.03), (-0.2, 0.1)])
+def test_one_step_of_the_adaptation_law(e: float, rate: float) -> None:
+    constants, state = network()
+    network_torque_Nm(constants, state, e, rate)
+    adapt_network(constants, state, e, rate, 1e-3)
+    x_p_b = (1.594388 * e + 22.349900 * rate) / INERTIA_kgm2
+    np.testing.assert_allclose(state.weights, 0.01 + 80.0 * np.array(state.hidden) * x_p_b * 1e-3, rtol=1e-6)
+
+
+def test_with_the_papers_width_the_network_is_one_integrator() -> None:
+    """fhat' = (15 beta / J) (P12 e + P22 e') for a second of a decaying oscillation of the error."""
+    constants, state = network(width=5.0)
+    period_s, integral_Nm = 1e-3, 0.15
+    hidden_min, hidden_max, largest = 1.0, 0.0, 0.0
+    for k in range(1000):
+        t = k * period_s
+        e = 0.01 * math.exp(-t) * math.sin(20.0 * t)
+        rate = 0.01 * math.exp(-t) * (20.0 * math.cos(20.0 * t) - math.sin(20.0 * t))
+        output = network_torque_Nm(constants, state, e, rate)
+        assert output == pytest.approx(integral_Nm, abs=0.0015 * 130.0)  # 1 - h, of the largest swing
+        largest = max(largest, abs(integral_Nm))
+        adapt_network(constants, state, e, rate, period_s)
+        integral_Nm += 15.0 * 80.0 / INERTIA_kgm2 * (1.594388 * e + 22.349900 * rate) * period_s
+        hidden_min, hidden_max = min(hidden_min, *state.hidden), max(hidden_max, *state.hidden)
+    assert largest > 100.0
+    assert hidden_min >= 0.9985
+    assert hidden_max <= 1.0
+
+
+def test_leakage_forgets_exponentially() -> None:
+    constants, state = network()
+    constants.leakage = 0.5
+    state.weights[:] = 2.0
+    for _ in range(1000):
+        network_torque_Nm(constants, state, 0.0, 0.0)
+        adapt_network(constants, state, 0.0, 0.0, 1e-3)
+    np.testing.assert_allclose(state.weights, 2.0 * math.exp(-0.5), rtol=1e-3)
+
+
+def test_without_leakage_nothing_is_forgotten() -> None:
+    constants, state = network()
+    for _ in range(1000):
+        network_torque_Nm(constants, state, 0.0, 0.0)
+        adapt_network(constants, state, 0.0, 0.0, 1e-3)
+    assert list(state.weights) == [0.01] * NEURONS
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_projection_bounds_every_weight(sign: float) -> None:
+    constants, state = network()
+    constants.weight_limit = 0.05
+    for _ in range(200):
+        network_torque_Nm(constants, state, sign * 0.01, sign * 0.1)
+        adapt_network(constants, state, sign * 0.01, sign * 0.1, 1e-3)
+    assert list(state.weights) == [sign * 0.05] * NEURONS
+
+
+@pytest.mark.parametrize(("e", "adapts"), [(0.00099, False), (-0.00099, False), (0.001, True), (-0.001, True)])
+def test_dead_zone(e: float, adapts: bool) -> None:
+    constants, state = network()
+    constants.dead_zone_rad = 0.001
+    network_torque_Nm(constants, state, e, 0.1)
+    adapt_network(constants, state, e, 0.1, 1e-3)
+    assert bool(state.weights[0] != 0.01) is adapts
+
+
+# --- The control law (29), term by term and as a closed loop ---
+@pytest.fixture
+def law(axis_constants: Any) -> Any:
+    return axis_constants[0].law
+
+
+def blocks(law: Any) -> tuple[Any, Any, Any]:
+    state, velocity, reference = new(LawState)[0], new(VelocityState)[0], new(Reference)[0]
+    reset_law(law, state)
+    return state, velocity, reference
+
+
+def step(law: Any, state: Any, position_rad: float, velocity: Any, reference: Any) -> float:
+    """`step_law` of a trajectory that does not repeat, the torque sent before being 0."""
+    return step_law(law, state, position_rad, velocity, reference, 0.0, NO_REPETITION)
+
+
+def test_every_term_has_the_sign_of_the_equation(law: Any) -> None:
+    law.coriolis_Nmspr, law.gravity_Nm, law.gravity_zero_rad = 0.5, 3.0, 0.1
+    law.feed_forward = FeedForward.DESIRED
+    state, velocity, reference = blocks(law)
+    velocity.velocity_radps = 0.25
+    reference.position_rad, reference.velocity_radps, reference.acceleration_radps2 = 0.30, 0.20, -0.7
+    position_rad = 0.31
+    torque = step(law, state, position_rad, velocity, reference)
+    e, rate = 0.01, 0.05
+    assert state.inertia_torque_Nm == pytest.approx(2.1 * -0.7)
+    assert state.feedback_torque_Nm == pytest.approx(-2.1 * (56.0 * rate + 784.0 * e))
+    assert state.gravity_torque_Nm == pytest.approx(0.5 * 0.25 + 3.0 * math.sin(0.21))
+    assert state.friction_torque_Nm == pytest.approx(121.0 * friction_motor_torque_Nm(law.friction, 0.20))
+    assert state.network_torque_Nm == pytest.approx(0.15, rel=1e-3)
+    parts = state.inertia_torque_Nm + state.feedback_torque_Nm + state.gravity_torque_Nm + state.friction_torque_Nm
+    assert torque == pytest.approx(parts - state.network_torque_Nm)
+    # a positive error must be pushed back by the network too: fhat, which is subtracted, grows
+    assert np.all(state.network.weights > 0.01)
+
+
+def test_the_output_is_that_of_the_old_weights(law: Any) -> None:
+    state, velocity, reference = blocks(law)
+    before = float(np.sum(state.network.weights))
+    step(law, state, 0.1, velocity, reference)
+    assert state.network_torque_Nm == pytest.approx(before, rel=2e-3)
+    assert float(np.sum(state.network.weights)) > before * 1.01
+
+
+def test_without_the_network_it_neither_acts_nor_learns(law: Any) -> None:
+    law.kind = ControllerKind.COMPUTED_TORQUE
+    state, velocity, reference = blocks(law)
+    assert step(law, state, 0.1, velocity, reference) == pytest.approx(-2.1 * 784.0 * 0.1)
+    assert state.network_torque_Nm == 0.0
+    assert list(state.network.weights) == [0.01] * 15
+
+
+@pytest.mark.parametrize(("matched", "rate_radps"), [(0, 0.3), (1, 0.07)])
+def test_which_error_rate_is_used(law: Any, matched: int, rate_radps: float) -> None:
+    law.kind, law.filtered_error_rate = ControllerKind.COMPUTED_TORQUE, matched
+    state, velocity, reference = blocks(law)
+    velocity.velocity_radps, velocity.error_rate_radps, reference.velocity_radps = 0.5, 0.07, 0.2
+    step(law, state, 0.0, velocity, reference)
+    assert state.feedback_torque_Nm == pytest.approx(-2.1 * 56.0 * rate_radps)
+
+
+@pytest.mark.parametrize(
+    ("rule", "speed_radps"), [(FeedForward.NONE, 0.0), (FeedForward.MEASURED, 0.3), (FeedForward.DESIRED, -0.2)]
+)
+def test_feed_forward_velocity(law: Any, rule: int, speed_radps: float) -> None:
+    law.feed_forward = rule
+    state, _, _ = blocks(law)
+    expected = 121.0 * friction_motor_torque_Nm(law.friction, speed_radps)
+    assert friction_feed_forward_Nm(law, state, 0.3, -0.2) == pytest.approx(expected)
+
+
+def test_feed_forward_by_lugre_keeps_its_deflection(law: Any) -> None:
+    law.feed_forward = FeedForward.LUGRE_DESIRED
+    state, _, _ = blocks(law)
+    deflection = 0.0
+    for _ in range(5):
+        deflection, torque = step_lugre(law.lugre, law.friction, 121.0, deflection, -0.2, law.period_s)
+        assert friction_feed_forward_Nm(law, state, 0.9, -0.2) == torque
+        assert state.lugre_deflection_rad == deflection
+    reset_law(law, state)
+    assert state.lugre_deflection_rad == 0.0
+
+
+def test_the_trap_of_the_paper_at_rest_is_the_users_choice(law: Any) -> None:
+    law.feed_forward = FeedForward.MEASURED
+    state, _, _ = blocks(law)
+    law.zero_rule = ZeroSpeedRule.PAPER
+    assert friction_feed_forward_Nm(law, state, 0.0, 0.1) == pytest.approx(121.0 * 0.14537)
+    law.zero_rule = ZeroSpeedRule.ZERO
+    assert friction_feed_forward_Nm(law, state, 0.0, 0.1) == 0.0
+
+
+@pytest.mark.parametrize("kind", [ControllerKind.COMPUTED_TORQUE, ControllerKind.COMPUTED_TORQUE_RBF])
+def test_closed_loop_on_the_exact_model(law: Any, kind: int) -> None:
+    """Computed torque: the error of a constant load stays; with the network it goes."""
+    law.kind = kind
+    state, velocity, reference = blocks(law)
+    position, speed, load_Nm = 0.0, 0.0, 5.0
+    for _ in range(2000):
+        velocity.velocity_radps = speed
+        torque = step(law, state, position, velocity, reference)
+        speed += (torque + load_Nm) / 2.1 * 1e-3
+        position += speed * 1e-3
+    alone_rad = load_Nm / (2.1 * 784.0)
+    if kind == ControllerKind.COMPUTED_TORQUE:
+        assert position == pytest.approx(alone_rad, rel=1e-3)
+    else:
+        # the slow mode of 16.5 s starts at a small fraction of what computed torque alone leaves
+        assert 0.0 < position < 0.2 * alone_rad
+        assert state.network_torque_Nm == pytest.approx(load_Nm, rel=0.15)
+
+
+# --- Iterative learning that makes the error grow is switched off; its twin goes on learning ---
+BINS = 40
+CYCLE_s = 1e-3
+
+
+def learning() -> tuple[Any, Any]:
+    """(`LearningConstants`, `LearningState`) of a repetition of 40 cycles."""
+    constants, state = new(LearningConstants)[0], new(LearningState)[0]
+    constants.gain, constants.blend_s, constants.growth = 0.5, 0.01, 1.05
+    constants.half_width, constants.lead_cycles = 1, 1
+    reset_learning(state)
+    return constants, state
+
+
+def repeat(constants: Any, state: Any, errors_rad: Sequence[float], *, epoch: int = 0, more: int = 1) -> list[float]:
+    """A repetition with each of these errors, of changing sign, and `more` cycles; the torques [Nm]."""
+    torques = []
+    for cycle in range(BINS * len(errors_rad) + more):
+        place = cycle % BINS
+        torques.append(learning_torque_Nm(constants, state, epoch, BINS * CYCLE_s, (place + 0.5) * CYCLE_s, CYCLE_s))
+        error = errors_rad[min(cycle // BINS, len(errors_rad) - 1)] * (-1.0) ** cycle
+        watch_learning(constants, state, error)
+        record_correction(constants, state, 10.0)
+    return torques
+
+
+@pytest.mark.trips("loop: what it learns", "(1.05 + 1e-9, True)")
+@pytest.mark.stays("loop: what it learns", "(1.05 - 1e-9, False)")
+@pytest.mark.parametrize(("growth", "stops"), [(1.05 + 1e-9, True), (1.05 - 1e-9, False)])
+def test_an_error_that_grows_in_three_repetitions_switches_learning_off(growth: float, stops: bool) -> None:
+    constants, state = learning()
+    errors = [1e-3 * growth**i for i in range(GROWN + 1)]
+    repeat(constants, state, errors)
+    assert bool(state.stopped) is stops
+    assert state.error_rad == pytest.approx(errors[-1], rel=1e-12)
+    assert state.grown == (GROWN if stops else 0)
+
+
+def test_two_repetitions_that_grow_do_not_and_a_better_one_begins_anew() -> None:
+    constants, state = learning()
+    repeat(constants, state, [1e-3, 2e-3, 4e-3])
+    assert (state.grown, state.stopped) == (GROWN - 1, 0)
+    constants, state = learning()
+    repeat(constants, state, [1e-3, 2e-3, 4e-3, 3e-3, 5e-3, 9e-3])
+    assert (state.grown, state.stopped) == (2, 0)
+
+
+def test_the_first_repetition_is_compared_with_nothing() -> None:
+    constants, state = learning()
+    repeat(constants, state, [1e-3])
+    assert (state.error_rad, state.grown, state.samples) == (pytest.approx(1e-3), 0, 1)
+    constants, state = learning()
+    repeat(constants, state, [0.0, 1e-3, 2e-3, 3e-3])  # and nothing has grown from no error at all
+    assert (state.grown, state.stopped) == (2, 0)
+
+
+def test_what_was_learned_fades_out_over_the_blend_time_and_stays_off() -> None:
+    constants, state = learning()
+    torques = repeat(constants, state, [1e-3, 1e-3, 1e-3, 1e-3])
+    assert torques[-1] > 4.9
+    before = float(state.torque_Nm)
+    state.stopped = 1
+    learned = state.learned_Nm[:BINS].copy()
+    faded = repeat(constants, state, [1e-3, 1e-3], more=0)
+    steps = [a - b for a, b in zip([before, *faded], faded, strict=False)]
+    assert faded[0] < before
+    assert max(abs(step) for step in steps) < 0.2 * before  # 10 cycles
+    assert faded[12:] == [0.0] * (2 * BINS - 12)
+    assert state.weight == 0.0
+    assert (state.learned_Nm[:BINS] == learned).all()  # nothing is learned any more
+    assert state.samples < BINS  # nor watched
+
+
+def test_a_change_of_trajectory_does_not_switch_it_on_again() -> None:
+    constants, state = learning()
+    repeat(constants, state, [1e-3, 2e-3, 4e-3, 8e-3])
+    assert state.stopped == 1
+    reset_learning(state)
+    torques = repeat(constants, state, [1e-3] * 4, epoch=1)
+    assert (state.stopped, torques) == (1, [0.0] * len(torques))
+
+
+def test_a_change_of_trajectory_begins_the_comparison_anew() -> None:
+    constants, state = learning()
+    repeat(constants, state, [1e-3, 2e-3, 4e-3])
+    repeat(constants, state, [9e-3, 9e-3], epoch=1)
+    assert (state.grown, state.stopped, state.error_rad) == (0, 0, pytest.approx(9e-3))
+
+
+@pytest.mark.parametrize("watched", [True, False])
+def test_without_a_limit_it_is_not_watched(watched: bool) -> None:
+    constants, state = learning()
+    constants.growth = 1.05 if watched else 0.0
+    repeat(constants, state, [1e-3, 2e-3, 4e-3, 8e-3])
+    assert bool(state.stopped) is watched
+    assert bool(state.samples > 0) is watched
+
+
+def test_what_does_not_repeat_is_not_watched() -> None:
+    constants, state = learning()
+    learning_torque_Nm(constants, state, 0, 0.0, 0.0, CYCLE_s)
+    watch_learning(constants, state, 1.0)
+    assert (state.samples, state.squares_rad2) == (0, 0.0)

@@ -1,0 +1,398 @@
+"""What the user reads of a run: each fault and notice, its events, a pause before its end, and the exit code."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jointctl.drivers.drive import CommissioningReport, DriveIdentity
+from jointctl.drivers.errors import DataError, DeviceError
+from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram
+from jointctl.firmware_py.records import ENCODER_RESTARTED, AxisState, LogRecord
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, Notice
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.output import Output
+from jointctl.tools.recording.run_log import ERROR, WARNING, Event
+from jointctl.tools.recording.run_summary import summarise
+from jointctl.tools.session import result as run_report
+from jointctl.tools.session.control import StopSignals
+from jointctl.tools.session.display import PhaseLines
+from jointctl.tools.session.elmo_drive import serial_fault_text
+from jointctl.tools.session.events import OVERRUN_CYCLES, EventFinder
+from jointctl.tools.session.fault_words import (
+    FAULT_TEXTS,
+    FaultText,
+    NoticeFinder,
+    emergency_text,
+    fault_text,
+    held_up_text,
+    longest_pause_s,
+)
+from jointctl.tools.session.result import RunResult
+from jointctl.tools.session.run_watch import RunWatch
+from jointctl.tools.session.session_drive import session_drive
+from tests.configurations import changed
+from tests.run_records import run_records
+
+# --- What the user is told of each fault: what happened with numbers, code and name, likely cause, next step ---
+FAULTS = [fault for fault in Fault if fault is not Fault.NONE]
+WITH_STATUSWORD = (
+    Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED, Fault.ENABLE_TIMEOUT, Fault.OFF_TIMEOUT, Fault.DRIVE_STAYS_ENABLED,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("value", [0.0, -1.5, 663.0, 1e9, math.nan, math.inf])
+def test_every_fault_tells_what_happened_why_and_what_to_do(fault: Fault, value: float) -> None:
+    text = fault_text(fault, value, 0)
+    for part in (text.happened, text.cause, text.next_step):
+        assert part.strip() == part != ""
+        assert "{" not in part
+        assert "\n" not in part
+    assert "error code" not in text.happened
+    assert "error code is 2310h, continuous overcurrent" in fault_text(fault, value, 0x2310).happened
+
+
+@pytest.mark.parametrize("fault", WITH_STATUSWORD)
+def test_a_statusword_is_told_as_such_and_with_its_state(fault: Fault) -> None:
+    """It was reported as a decimal number."""
+    assert "(statusword 0297h, quick stop active)" in fault_text(fault, float(0x0297), 0).happened
+    assert "(statusword 0218h, fault)" in fault_text(fault, float(0x0218), 0).happened
+
+
+@pytest.mark.parametrize("fault", WITH_STATUSWORD)
+def test_a_serial_line_has_no_statusword(fault: Fault) -> None:
+    text = serial_fault_text(fault, 0.0)
+    assert text is not None
+    assert "(SR {word})" in text.happened
+
+
+@pytest.mark.parametrize("fault", [Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED])
+@pytest.mark.parametrize(
+    ("code", "communication"),
+    [(0, False), (0x80FF, False), (0x8110, True), (0x8130, True), (0x8250, True), (0x8300, False), (0x7300, False)],
+)
+def test_a_drive_that_did_not_hear_us_does_not_send_the_user_to_its_sto_wiring(
+    fault: Fault, code: int, communication: bool
+) -> None:
+    text = fault_text(fault, float(0x0297), code)
+    assert ("heard our frames too seldom" in text.cause) is communication
+    assert (text.cause == FAULT_TEXTS[fault].cause) is not communication
+    assert fault_text(Fault.STALE_SAMPLE, 51.0, code).cause == FAULT_TEXTS[Fault.STALE_SAMPLE].cause
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_an_error_is_told_as_that_of_the_node_that_has_it(fault: Fault) -> None:
+    """The encoder's EMCY was reported as the drive's."""
+    told = fault_text(fault, 6.0, 0, 0x5000, two_encoders=True).happened
+    assert "the encoder node's error code is 5000h" in told
+    assert "drive's error code" not in told
+    assert "encoder node restarted" in fault_text(fault, 6.0, 0, ENCODER_RESTARTED, two_encoders=True).happened
+    told = fault_text(fault, 6.0, 0x5000, two_encoders=True).happened
+    assert "the drive's error code is 5000h" in told
+    assert "encoder node" not in told
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_missing_sample_of_two_encoders_may_be_that_of_either(fault: Fault) -> None:
+    two, one = fault_text(fault, 6.0, 0, two_encoders=True), fault_text(fault, 6.0, 0)
+    assert (
+        (two != one)
+        is (FAULT_TEXTS[fault].two_encoders is not None)
+        is (fault in (Fault.STALE_SAMPLE, Fault.NO_SAMPLES))
+    )
+    if two != one:
+        assert "encoder" in two.happened
+        assert "the joint's encoder" in two.cause
+        assert "not believed" in fault_text(fault, 6.0, 0, 0x5000, two_encoders=True).cause
+
+
+@pytest.mark.parametrize(("status", "words"), [(0x8110, "stayed away"), (0x8100, "switched off without being asked")])
+def test_a_status_with_the_servo_on_does_not_pass_for_a_motor_that_was_switched_off(status: int, words: str) -> None:
+    text = serial_fault_text(Fault.DRIVE_NOT_ENABLED, float(status))
+    assert text is not None
+    assert words in text.happened
+
+
+# --- What the loop reports without ending the run: each once, with its numbers and what to do about it ---
+def state_with(notices: int) -> Any:
+    state = new(AxisState)[0]
+    state.notices, state.swing.noise_told_Nm, state.law.learning.error_rad = notices, 12.04, 3.21e-5
+    return state
+
+
+@pytest.mark.parametrize(
+    ("notice", "words"),
+    [
+        (Notice.TORQUE_NOISE, ("12.0 Nm", "encoder", "velocity_cutoff_Hz", "observer_radps")),
+        (Notice.LEARNING_OFF, ("0.032 mrad", "control.learning.gain", "loop delay", "off")),
+    ],
+)
+def test_each_notice_is_told_once_in_a_run(notice: Notice, words: tuple[str, ...]) -> None:
+    finder = NoticeFinder()
+    assert finder.take(state_with(0), 5) == []
+    (event,) = finder.take(state_with(notice), 7)
+    assert (event.time_ns, event.level, event.source) == (7, WARNING, "loop")
+    assert all(word in event.text for word in words)
+    assert finder.take(state_with(notice), 8) == []
+    both = Notice.TORQUE_NOISE | Notice.LEARNING_OFF
+    assert len(finder.take(state_with(both), 9)) == 1  # the other one
+    assert finder.take(state_with(both), 10) == []
+
+
+def test_both_at_once_are_two_events() -> None:
+    texts = [event.text for event in NoticeFinder().take(state_with(3), 0)]
+    assert len(texts) == 2
+    assert texts[0].startswith("torque noise")
+
+
+def test_a_run_tells_them_to_log_display_and_viewers_before_the_fault() -> None:
+    """They may explain it."""
+    told: list[Any] = []
+    noted: list[str] = []
+    fault = SimpleNamespace(text="LIMIT_CYCLE", time_ns=1, level=ERROR)
+    watch: Any = RunWatch.__new__(RunWatch)
+
+    class Records(list[Any]):
+        pass
+
+    records: Any = Records([SimpleNamespace(time_ns=41)])
+    block = SimpleNamespace(
+        state=[state_with(Notice.LEARNING_OFF)], words=[0] * 64, histograms=None,
+        constants=[SimpleNamespace(trajectory=SimpleNamespace(duration_s=1.0))],
+    )  # fmt: skip
+    watch.loop = SimpleNamespace(block=block, new_records=lambda: records)
+    watch.around = SimpleNamespace(recorder=None, signals=StopSignals())
+    watch._keep, watch._decimated = lambda _: None, SimpleNamespace(take=lambda new: new)
+    watch._orders = SimpleNamespace(keep=lambda _: None)
+    watch._notices, watch._events = NoticeFinder(), SimpleNamespace(take=lambda _: [fault])
+    watch._tell = lambda event, shown=True: told.append(event)
+    watch.config, watch.temperature = (
+        SimpleNamespace(drive=SimpleNamespace(kind="canopen")),
+        SimpleNamespace(newest_degC=None),
+    )
+    watch.display = SimpleNamespace(show=lambda _: None, note=noted.append)
+    watch.take_records()
+    assert [event.text.split()[0] for event in told] == ["iterative", "LIMIT_CYCLE"]
+    assert told[0].time_ns == 41
+    assert noted == [told[0].text]
+
+
+def test_the_advice_of_a_limit_cycle_names_delay_gains_learning_and_resolution() -> None:
+    text = fault_text(Fault.LIMIT_CYCLE, 13.94, 0)
+    assert "13.9 Hz" in text.happened
+    for word in ("loop delay", "gains", "learning", "resolution"):
+        assert word in FAULT_TEXTS[Fault.LIMIT_CYCLE].advice
+
+
+# --- A pause of the loop just before a fault is told with it, and only then ---
+RATE_Hz = 125.0
+TEXT = FaultText("it happened", "the cable", "check it")
+FAULTY = 180
+
+
+def paused_records(fault: Fault = Fault.STALE_SAMPLE, **at: tuple[int, int]) -> np.recarray[Any, Any]:
+    """200 cycles of 8 ms, the fault in the 181st and after; `at`: field = (index, value)."""
+    records = new(LogRecord, 200)
+    records.time_ns = 10**15 + np.arange(200) * 8_000_000
+    records.fault[FAULTY:] = fault
+    records.round_trip_ns = 1_200_000
+    for field, (index, value) in at.items():
+        records[field][index] = value
+    return records
+
+
+def told(fault: Fault, value: float, records: Any) -> bool:
+    text = held_up_text(fault, value, TEXT, records, RATE_Hz)
+    assert ("held up" in text.happened) == (text != TEXT)
+    return text != TEXT
+
+
+@pytest.mark.parametrize(("skipped", "expected"), [(19, True), (10, True), (9, False)])
+def test_a_pause_of_half_the_time_without_samples_is_told(skipped: int, expected: bool) -> None:
+    assert told(Fault.STALE_SAMPLE, 20.0, paused_records(skipped=(FAULTY, skipped))) is expected
+
+
+@pytest.mark.parametrize("field", ["round_trip_ns", "wake_late_ns", "work_ns"])
+@pytest.mark.parametrize(("pause_ns", "expected"), [(24_100_000, True), (23_900_000, False)])
+def test_a_long_cycle_before_a_leap_is_told(field: str, pause_ns: int, expected: bool) -> None:
+    assert told(Fault.VELOCITY_LIMIT, 1.9, paused_records(Fault.VELOCITY_LIMIT, **{field: (178, pause_ns)})) is expected
+
+
+def test_at_a_high_rate_three_cycles_are_no_pause() -> None:
+    records = paused_records(Fault.VELOCITY_LIMIT, skipped=(FAULTY, 4))
+    assert held_up_text(Fault.VELOCITY_LIMIT, 1.9, TEXT, records, 1000.0) == TEXT
+    records = paused_records(Fault.VELOCITY_LIMIT, skipped=(FAULTY, 5))
+    assert "for 5 ms" in held_up_text(Fault.VELOCITY_LIMIT, 1.9, TEXT, records, 1000.0).happened
+
+
+@pytest.mark.parametrize(("index", "expected"), [(117, False), (118, True), (FAULTY, True), (FAULTY + 1, False)])
+def test_only_a_pause_just_before_counts(index: int, expected: bool) -> None:
+    assert told(Fault.VELOCITY_LIMIT, 1.9, paused_records(Fault.VELOCITY_LIMIT, skipped=(index, 40))) is expected
+
+
+def test_the_text_keeps_the_other_cause_and_what_to_do() -> None:
+    text = held_up_text(Fault.STALE_SAMPLE, 20.0, TEXT, paused_records(skipped=(FAULTY, 19)), RATE_Hz)
+    assert text.happened == "it happened, after the loop had been held up for 152 ms"
+    assert text.cause.endswith("if that pause was not the cause, the cable")
+    assert text.next_step == "run `jointctl doctor`; check it"
+
+
+def test_faults_that_no_pause_causes_are_left_alone() -> None:
+    assert not told(Fault.POSITION_DISAGREEMENT, 0.1, paused_records(Fault.POSITION_DISAGREEMENT, skipped=(FAULTY, 90)))
+    assert longest_pause_s(paused_records(Fault.NONE, skipped=(FAULTY, 90)), 0.008) == 0.0
+
+
+# --- Events: what happened in a run, found in its records; error codes in words ---
+START_NS = 5_000_000_000
+WORDS = {DriveState.OFF: 0x0250, DriveState.STARTING: 0x0233, DriveState.ENABLED: 0x1237, DriveState.FAULT: 0x0218}
+
+
+def eventful_records() -> Any:
+    """A run of 1 kHz that waits, enables, tracks, and is switched off in its last 50 cycles."""
+    records = new(LogRecord, 400)
+    index = np.arange(400)
+    records.cycle = index + 1
+    records.time_ns = START_NS + index * 1_000_000
+    records.phase = AxisPhase.TRACKING
+    records.drive_state = DriveState.ENABLED
+    records.phase[:20], records.drive_state[:20] = AxisPhase.WAITING, DriveState.OFF
+    records.phase[20:30], records.drive_state[20:30] = AxisPhase.ENABLING, DriveState.STARTING
+    records.phase[-50:], records.drive_state[-50:] = AxisPhase.FINISHED, DriveState.OFF
+    records.status_word = [WORDS[DriveState(state)] for state in records.drive_state]
+    return records
+
+
+@pytest.mark.parametrize("size", [1, 7, 20, 400])
+def test_events_are_the_same_whatever_the_pieces(size: int) -> None:
+    finder, records = EventFinder(session_drive("canopen")), eventful_records()
+    found = [event for at in range(0, 400, size) for event in finder.take(records[at : at + size])]
+    assert [(event.time_ns - START_NS, event.source, event.text) for event in found] == [
+        (0, "drive", "switch on disabled (statusword 0250h)"),
+        (0, "loop", "waiting"),
+        (20_000_000, "drive", "switched on (statusword 0233h)"),
+        (20_000_000, "loop", "enabling"),
+        (30_000_000, "drive", "operation enabled (statusword 1237h)"),
+        (30_000_000, "loop", "tracking"),
+        (350_000_000, "drive", "switch on disabled (statusword 0250h)"),
+        (350_000_000, "loop", "finished"),
+    ]
+
+
+def test_a_bit_that_changes_no_state_is_no_event() -> None:
+    records = eventful_records()
+    records.status_word[100:200] ^= 0x0400  # target reached
+    assert len(EventFinder(session_drive("canopen")).take(records)) == 8
+
+
+def test_a_fault_is_told_with_code_cause_and_state() -> None:
+    records = eventful_records()
+    records.fault[200:] = Fault.DRIVE_FAULT
+    records.drive_error[200:] = 0x8130
+    records.drive_state[200:] = DriveState.FAULT
+    records.status_word[200:] = WORDS[DriveState.FAULT]
+    finder = EventFinder(session_drive("canopen"), fault_words=lambda fault, error: f"{fault.name} and {error:x}")
+    texts = [(event.level, event.text) for event in finder.take(records) if event.time_ns == START_NS + 200_000_000]
+    assert texts == [
+        (40, "EMCY 8130h, heartbeat lost"),
+        (30, "fault (statusword 0218h)"),
+        (40, "DRIVE_FAULT (8): DRIVE_FAULT and 8130"),
+    ]
+
+
+@pytest.mark.parametrize(("skipped", "told"), [(0, 0), (OVERRUN_CYCLES - 1, 0), (OVERRUN_CYCLES, 1), (500, 1)])
+def test_a_long_overrun_is_an_event(skipped: int, told: int) -> None:
+    records = eventful_records()
+    records.skipped[100] = skipped
+    assert sum("skipped" in event.text for event in EventFinder(session_drive("canopen")).take(records)) == told
+
+
+@pytest.mark.parametrize(
+    ("code", "name"),
+    [(0x8130, "heartbeat lost"), (0x8199, "communication"), (0x2FFF, "current"), (0xFF77, "maker"), (0x00FF, "not in")],
+)
+def test_an_unknown_emergency_code_is_told_by_its_class(code: int, name: str) -> None:
+    assert name in emergency_text(code)
+    assert f"{code:04X}h" in emergency_text(code)
+
+
+# --- The end of a run: what is told first, and the exit code ---
+CONFIG = load_config(shipped_config("virtual"))
+WITHOUT_PICTURE = changed(CONFIG, log__picture=False)
+
+REPORT = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.0, 0.1, 1e-5)
+
+
+def result(folder: Path, fault: Fault) -> RunResult:
+    records = run_records()
+    histograms = np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64)
+    return RunResult(
+        summary=summarise(records, histograms), records=records, histograms=histograms, fault=fault,
+        fault_text=fault_text(fault, 5.0, 0) if fault is not Fault.NONE else None, stopped_by="", drive_state="off",
+        bus_load=0.3, load_row=("line load", "30%"), lost_records=0, log_path=folder / "run.mcap", report=REPORT,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("fault", "code"), [(Fault.BUS_ERROR, 7), (Fault.NONE, 0)])
+def test_the_cause_is_told_before_the_picture_is_drawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: Fault, code: int
+) -> None:
+    out, err = io.StringIO(), io.StringIO()
+    told: list[str] = []
+    monkeypatch.setattr(run_report, "save_run_figure", lambda *_: told.append(err.getvalue()))
+    assert run_report.report_run(result(tmp_path, fault), Output(stdout=out, stderr=err), CONFIG) == code
+    assert err.getvalue() == told[0]  # nothing more comes after it
+    assert told[0].startswith("error: BUS_ERROR") == (fault is Fault.BUS_ERROR)
+    assert ("hint: likely cause" in told[0]) == (fault is Fault.BUS_ERROR)
+    assert "picture" in out.getvalue()
+
+
+@pytest.mark.parametrize("fault", [Fault.NONE, Fault.BUS_ERROR])
+def test_a_picture_that_cannot_be_written_does_not_hide_the_result(tmp_path: Path, fault: Fault) -> None:
+    (tmp_path / "run.png").mkdir()
+    out, err = io.StringIO(), io.StringIO()
+    code = run_report.report_run(result(tmp_path, fault), Output(stdout=out, stderr=err), CONFIG)
+    assert code == (0 if fault is Fault.NONE else 7)
+    assert "run.png: cannot be written: Is a directory" in err.getvalue().replace("\n", " ")
+    assert "run.mcap" in out.getvalue()
+    assert "│ picture" not in out.getvalue()
+
+
+def reported_to_a_full_disk(found: RunResult) -> int:
+    with Path("/dev/full").open("w") as full:
+        return run_report.report_run(found, Output(stdout=full, stderr=io.StringIO()), WITHOUT_PICTURE)
+
+
+def test_a_fault_or_a_drive_that_is_not_off_outweighs_a_result_that_cannot_be_written(tmp_path: Path) -> None:
+    assert reported_to_a_full_disk(result(tmp_path, Fault.BUS_ERROR)) == 7
+    with pytest.raises(DeviceError, match="did not confirm"):
+        reported_to_a_full_disk(replace(result(tmp_path, Fault.NONE), drive_state="operation enabled"))
+    with pytest.raises(DataError, match="standard output"):
+        reported_to_a_full_disk(result(tmp_path, Fault.NONE))
+
+
+def test_without_a_picture_none_is_drawn_or_told(tmp_path: Path) -> None:
+    out = io.StringIO()
+    assert run_report.report_run(result(tmp_path, Fault.NONE), Output(stdout=out), WITHOUT_PICTURE) == 0
+    assert ".png" not in out.getvalue()
+    assert list(tmp_path.iterdir()) == []
+    out = io.StringIO()
+    run_report.report_run(result(tmp_path, Fault.NONE), Output(json=True, stdout=out), WITHOUT_PICTURE)
+    assert json.loads(out.getvalue())["picture"] is None
+
+
+@pytest.mark.parametrize(("level", "told"), [(ERROR, True), (WARNING, False)])
+def test_a_fault_is_told_when_it_happens(level: int, told: bool) -> None:
+    err = io.StringIO()
+    lines: Any = PhaseLines(Output(stderr=err))
+    lines.event(Event(0, level, "loop", "BUS_ERROR (13): the serial port is gone"))
+    assert ("BUS_ERROR (13)" in err.getvalue()) == told

@@ -1,0 +1,219 @@
+"""The process of the loop: its slow start and its end before that, a drive that cannot be opened, no standby."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from jointctl.drivers.errors import BusError
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.output import Output
+from jointctl.tools.session import kept_awake as module
+from jointctl.tools.session.canopen_drive import CanopenSession
+from jointctl.tools.session.control import in_control
+from jointctl.tools.session.kept_awake import kept_awake
+from jointctl.tools.session.loop_process import slow_start
+from jointctl.tools.simulation.child_process import IDLE_S, TELL_S, Starting, processor_time_s
+from tests.places import CONFIGS, ROOT
+
+
+# --- The word about a slow start comes when it is slow, and never after its end ---
+def test_a_slow_start_is_told_once() -> None:
+    told = threading.Event()
+    with slow_start(lambda _: told.set(), "loop", 0.01):
+        assert told.wait(10.0)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_quick_one_is_not_nor_one_that_fails(fails: bool) -> None:
+    told = threading.Event()
+    with contextlib.suppress(ValueError), slow_start(lambda _: told.set(), "loop", 0.2) as started:
+        if fails:
+            raise ValueError
+        started()
+        assert not told.wait(0.4)
+    assert not told.wait(0.4)
+
+
+# --- Waiting for a process that compiles: as long as it works, and in words when it ends or hangs ---
+class Waiting:
+    """A process that sleeps behind a clock and a processor time that the test moves."""
+
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+        self.now_s, self.used_s = 0.0, 0.0
+        self.told: list[str] = []
+        self.starting = Starting(
+            "the virtual joint", process, self.told.append, BusError, clock=lambda: self.now_s,
+            used=lambda pid: self.used_s,
+        )  # fmt: skip
+
+    def go(self, time_s: float, share: float) -> None:
+        """Seconds in which the process gets this share of a processor."""
+        for _ in range(int(time_s)):
+            self.now_s += 1.0
+            self.used_s += share
+            self.starting.check()
+
+
+@pytest.fixture
+def process() -> subprocess.Popen[bytes]:
+    return subprocess.Popen(["/bin/sleep", "600"])
+
+
+@pytest.fixture
+def waiting(process: subprocess.Popen[bytes]) -> Iterator[Waiting]:
+    yield Waiting(process)
+    process.kill()
+    process.wait()
+
+
+def test_it_is_waited_for_as_long_as_it_works_and_told_meanwhile(waiting: Waiting) -> None:
+    waiting.go(1000.0, 0.01)  # a hundredth of a processor: a computer that is very busy
+    assert len(waiting.told) == int(1000.0 / TELL_S)
+    assert waiting.told[1] == "the virtual joint is compiling: 30 s so far, 0 s of processor time"
+
+
+def test_one_that_does_not_work_any_more_hangs_and_its_twin_does_not(waiting: Waiting) -> None:
+    waiting.go(100.0, 0.5)
+    waiting.go(IDLE_S, 0.0)
+    waiting.go(1.0, 0.5)
+    waiting.go(IDLE_S, 0.0)
+    with pytest.raises(BusError, match=r"after 222 s it has not worked for 60 s \(50 s of processor time before\)"):
+        waiting.go(1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("end", "words"),
+    [
+        ("import os; os.kill(os.getpid(), 9)", r"was killed by signal 9 \(SIGKILL\); it was starting, for 7 s"),
+        ("raise SystemExit(4)", "ended with exit code 4, see its message above; it was"),
+        ("", "ended without a message"),
+    ],
+)
+def test_its_end_is_told(end: str, words: str) -> None:
+    process = subprocess.Popen([sys.executable, "-c", end])
+    waiting = Waiting(process)
+    process.wait()
+    waiting.now_s = 7.0
+    with pytest.raises(BusError, match=words):
+        waiting.starting.check()
+
+
+def test_the_processor_time_of_a_process_grows_with_its_work() -> None:
+    process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    give_up_s = time.monotonic() + 30.0
+    while processor_time_s(process.pid) < 0.1:
+        assert time.monotonic() < give_up_s
+        time.sleep(0.05)
+    process.kill()
+    process.wait()
+    assert processor_time_s(process.pid) == 0.0
+
+
+# --- The lock against standby during a run on a serial line, with a stand-in for systemd-inhibit ---
+GRANTS = """#!/bin/sh
+echo "asked $*" >>"$0.log"
+while [ "${1#--}" != "$1" ]; do shift; done
+"$@"
+echo released >>"$0.log"
+"""
+REFUSES = "#!/bin/sh\necho 'Failed to inhibit: Access denied' >&2\nexit 1\n"
+HANGS = "#!/bin/sh\nexec sleep 60\n"
+
+
+@pytest.fixture
+def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    path = tmp_path / "systemd-inhibit"
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    return path
+
+
+def install(path: Path, text: str) -> None:
+    path.write_text(text)
+    path.chmod(0o755)
+
+
+def log_of(stand_in: Path) -> list[str]:
+    path = Path(f"{stand_in}.log")
+    return path.read_text().splitlines() if path.exists() else []
+
+
+def serial() -> Config:
+    return load_config(shipped_config("elmo_serial"))
+
+
+def test_the_lock_is_held_for_the_run_and_told(stand_in: Path) -> None:
+    install(stand_in, GRANTS)
+    err = io.StringIO()
+    with kept_awake(serial(), Output(stderr=err)) as held:
+        assert held
+        assert len(log_of(stand_in)) == 1
+        assert "--what=sleep:handle-lid-switch" in log_of(stand_in)[0]
+        assert "--mode=block" in log_of(stand_in)[0]
+    assert log_of(stand_in)[1:] == ["released"]
+    assert "kept from falling asleep until the end of the run" in err.getvalue()
+
+
+def test_its_twin_a_drive_with_a_watchdog_needs_none(stand_in: Path) -> None:
+    install(stand_in, GRANTS)
+    err = io.StringIO()
+    with kept_awake(load_config(shipped_config("virtual")), Output(stderr=err)) as held:
+        assert not held
+    assert (log_of(stand_in), err.getvalue()) == ([], "")
+
+
+@pytest.mark.parametrize("text", [REFUSES, HANGS, None], ids=["refused", "no answer", "not there"])
+def test_without_the_lock_the_run_goes_on_and_the_user_is_told(
+    stand_in: Path, text: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if text is None:
+        monkeypatch.setenv("PATH", str(stand_in.parent))
+    else:
+        install(stand_in, text)
+    monkeypatch.setattr(module, "HELD_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(module, "ENDED_S", 0.1)
+    err = io.StringIO()
+    with kept_awake(serial(), Output(stderr=err)) as held:
+        assert not held
+    assert "not kept from falling asleep" in " ".join(err.getvalue().split())
+
+
+def test_a_run_that_is_killed_releases_it(stand_in: Path) -> None:
+    install(stand_in, GRANTS)
+    code = (
+        "import sys, time\nfrom tests.unit.session.test_loops import Output, kept_awake, serial\n"
+        "with kept_awake(serial(), Output()):\n    print('held', flush=True)\n    time.sleep(60)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as run:
+        assert run.stdout is not None
+        assert run.stdout.readline() == b"held\n"
+        assert "released" not in log_of(stand_in)
+        run.send_signal(signal.SIGKILL)
+        run.wait()
+    until_s = time.monotonic() + 10.0
+    while "released" not in log_of(stand_in):
+        assert time.monotonic() < until_s
+        time.sleep(0.02)
+
+
+# --- Opening the drive of a configuration: what fails leaves the bus to the next one that tries ---
+def test_a_bus_that_cannot_be_opened_can_be_tried_again(tmp_path: Path) -> None:
+    text = (CONFIGS / "virtual.toml").read_text().replace('"virtual0"', f'"{tmp_path}/none.sock"')
+    (tmp_path / "joint.toml").write_text(text)
+    config = load_config(tmp_path / "joint.toml")
+    for _ in range(2):
+        with in_control(config, Output()), pytest.raises(BusError, match="no virtual bus at"):
+            CanopenSession().open(config)

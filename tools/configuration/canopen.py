@@ -1,0 +1,305 @@
+"""[drive], kind = "canopen": the section, what the CANopen driver gets of it, and the arithmetic of the bus."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field, ValidationError
+from pydantic_core import PydanticCustomError
+
+from jointctl.drivers.can.channel import split_channel
+from jointctl.drivers.can.frames import bus_load, highest_rate_Hz
+from jointctl.drivers.canopen.identifiers import EVENT_DRIVEN, LAST_SYNCHRONOUS
+from jointctl.drivers.canopen.settings import CanopenSettings, JointEncoderSettings, TemperatureObject
+from jointctl.drivers.errors import ConfigurationError, DeviceError
+from jointctl.tools.configuration.config import Config, ConfigurationProblems, beside, problem_line
+from jointctl.tools.configuration.conversions import torque_constant_NmpA
+from jointctl.tools.configuration.drive_section import FOR_A_NODE, FOR_A_PORT, DriveSection, GivenPlace, wrong_kind
+from jointctl.tools.configuration.sections import (
+    Bus,
+    Identity,
+    Node,
+    ObjectPlace,
+    between,
+    index_and_sub,
+    whole_channel,
+)
+
+TPDO_BYTES, RPDO_BYTES = 8, 4
+VELOCITY_RPDO_BYTES = 6  # 60FF is longer than 6071
+SECOND_POSITION_BYTES = 4
+_FRAMES = ("TPDO", "RPDO", "second encoder")
+TORQUE_MODES = ("cst", "tq", "auto")  # of `CanopenSettings.mode`; the others may end in a velocity mode
+HIGHEST_LOAD = 0.8  # of the bus by the cyclic frames; the rest is for heartbeats, SDO and EMCY
+CAN_RATE_HZ = (100.0, 4000.0)
+DRIVE_MODES = {"auto": "velocity or torque", "csv": "csv", "pv": "pv"}  # `sweep --mode`: `CanopenSettings.mode`
+
+
+class CanopenSection(DriveSection):
+    kind: Literal["canopen"]  # a CiA 402 drive on CANopen
+    node: Node  # CANopen node of the drive
+    eds: Annotated[str, Field(min_length=1)]  # beside the configuration file, or the name of a shipped one
+    mode: Literal["cst", "tq", "auto"]  # torque mode: cyclic synchronous, profile, or what 6502 offers
+    vendor_id: Identity | None = None  # expected in 1018:1; none = any
+    product_code: Identity | None = None  # expected in 1018:2; none = any
+    rated_current_A: Annotated[float, between(0.0, 1000.0, open_low=True)] | None = None  # compared with 6075
+    rated_torque_Nm: Annotated[float, between(0.0, 10_000.0, open_low=True)] | None = None  # motor; compared with 6076
+    rated_tolerance: Annotated[float, between(0.0, 0.2)] = 0.01  # of the comparisons with 6075 and 6076, relative
+    torque_reference: Literal["rated_torque", "rated_current"]  # what 1000 permille of 6071 and 6077 mean
+    max_torque_permille: Annotated[int, between(1, 10_000)] | None = None  # 6072; none = derived from torque_max_Nm
+    velocity_unit: Literal["counts/s", "r/min", "0.1 r/min"] = "counts/s"  # of 60FF; counts of 6064, r/min of the motor
+    heartbeat_s: Annotated[float, between(0.01, 2.0)]  # the drive stops itself when our heartbeat is older
+    master_node: Node = 126  # whose heartbeat the drive watches
+    boot_timeout_s: Annotated[float, between(0.0, 60.0)] = 3.0  # for the first answer, and for leaving Not Ready
+    sdo_timeout_s: Annotated[float, between(0.02, 10.0)] | None = None  # of one SDO request (three times); None = 0.3 s
+    quick_stop_option: Annotated[int, between(0, 8)] = 2  # 605A: 2 = brake on the quick stop ramp, then power off
+    # 1 = the torque is taken over at the next SYNC, 254/255 = at once
+    rpdo_transmission_type: Annotated[int, between(0, 255)] = 1
+    temperature_object: ObjectPlace | None = None  # the drive's own, "2103"; read once a second, to be shown and logged
+    temperature_unit_degC: Annotated[float, between(0.0, 1000.0, open_low=True)] = 1.0  # of one count of it
+    temperature_offset_degC: Annotated[float, between(-1000.0, 1000.0)] = 0.0  # at 0 counts; -273.15 for kelvin
+
+    simulated: ClassVar[bool] = True
+    sends_frames: ClassVar[bool] = True
+    when_the_loop_ends: ClassVar[str] = (
+        "its heartbeat on the bus has ended with it, so the drive stops the joint by itself"
+    )
+    torque_source: ClassVar[str] = (
+        "object 6077 as the drive measures it; current_A = motor_torque_Nm / torque_constant_NmpA"
+    )
+
+    def problems(self, config: Config) -> list[str]:
+        """See `DriveSection`."""
+        return joint_encoder_problems(config) + canopen_problems(config)
+
+    def files(self, config: Config) -> tuple[tuple[str, Path], ...]:
+        """See `DriveSection`."""
+        found = (("drive.eds", eds_path(config)), ("joint_encoder.eds", encoder_eds_path(config)))
+        return tuple((key, path) for key, path in found if path is not None)
+
+    def moved(self, config: Config, given: GivenPlace, environ: Mapping[str, str]) -> Config:
+        """Flag beats environment (CAN_INTERFACE, CAN_CHANNEL, CAN_BITRATE) beats file."""
+        if given.port is not None:
+            raise wrong_kind(config.path, self.kind, FOR_A_PORT)
+        config = config.model_copy(update={"bus": _moved_bus(config.bus, given, environ)})
+        if given.node is None:
+            return config
+        return config.model_copy(update={"drive": self.model_copy(update={"node": given.node})})
+
+    def silence_s(self) -> float:
+        """See `DriveSection`: it is asked to send as often as we do."""
+        return self.heartbeat_s
+
+    def assumed_delay(self, config: Config) -> tuple[float, str]:
+        """See `DriveSection`."""
+        period_s, kind = 1.0 / config.loop.rate_Hz, self.rpdo_transmission_type
+        if kind > LAST_SYNCHRONOUS:
+            return period_s, f"assumed: at most one period (drive.rpdo_transmission_type = {kind}, asynchronous)"
+        periods = max(kind, 1)
+        count = "one period" if periods == 1 else f"at most {periods} periods"
+        return periods * period_s, f"assumed: {count} (drive.rpdo_transmission_type = {kind}, synchronous)"
+
+    def in_sweep_mode(self, mode: str) -> CanopenSection:
+        """See `DriveSection`."""
+        if mode == "speed":
+            raise DeviceError("--mode (=speed) must be auto, csv, pv or torque: it is a CANopen drive")
+        return self if mode == "torque" else self.model_copy(update={"mode": DRIVE_MODES[mode]})
+
+    def free_of_torque_limit(self) -> CanopenSection:
+        """See `DriveSection`."""
+        return self.model_copy(update={"max_torque_permille": None})
+
+    def constants_factor(self, config: Config) -> tuple[float, str] | None:
+        """Torque constant times rated current over rated torque."""
+        if self.rated_torque_Nm is None or self.rated_current_A is None:
+            return None
+        constant = torque_constant_NmpA(config)
+        factor = constant * self.rated_current_A / self.rated_torque_Nm
+        return factor, (
+            f"joint.torque_constant_NmpA (={constant:.4g} in the drive's ampere) times "
+            f"drive.rated_current_A (={self.rated_current_A:g}) is {factor:.3g} times drive.rated_torque_Nm "
+            f"(={self.rated_torque_Nm:g}): one of them is wrong, or rms and sine amplitude are mixed up"
+        )
+
+    def measuring_constants(self) -> dict[str, float]:
+        """See `DriveSection`."""
+        return {"rated_torque": float(self.torque_reference == "rated_torque")}
+
+
+def canopen_section(config: Config) -> CanopenSection:
+    """[drive] of a CANopen drive; `ConfigurationError` for any other."""
+    if not isinstance(config.drive, CanopenSection):
+        raise wrong_kind(config.path, config.drive.kind, FOR_A_NODE)
+    return config.drive
+
+
+def eds_path(config: Config) -> Path:
+    """The EDS file: beside the configuration, else a shipped one."""
+    return beside(config.path, canopen_section(config).eds)
+
+
+def encoder_eds_path(config: Config) -> Path | None:
+    """The EDS file of the joint's encoder node."""
+    encoder = config.joint_encoder
+    return beside(config.path, encoder.eds) if encoder is not None and encoder.source == "node" else None
+
+
+def canopen_settings(config: Config) -> CanopenSettings:
+    """Sections [drive], [encoder], [joint], [limits] and [loop] for commissioning."""
+    drive = canopen_section(config)
+    return CanopenSettings(
+        node=drive.node,
+        eds_path=eds_path(config),
+        mode=drive.mode,
+        rate_Hz=config.loop.rate_Hz,
+        heartbeat_s=drive.heartbeat_s,
+        master_node=drive.master_node,
+        quick_stop_option=drive.quick_stop_option,
+        rpdo_transmission_type=drive.rpdo_transmission_type,
+        torque_reference=drive.torque_reference,
+        torque_direction=drive.torque_direction,
+        torque_max_Nm=config.limits.torque_max_Nm,
+        torque_constant_NmpA=torque_constant_NmpA(config),
+        reduction_ratio=config.joint.reduction_ratio,
+        counts_per_turn=config.encoder.counts_per_turn,
+        encoder_on_motor=config.encoder.side == "motor",
+        encoder_direction=config.encoder.direction,
+        zero_counts=config.encoder.zero_counts,
+        vendor_id=drive.vendor_id,
+        product_code=drive.product_code,
+        rated_current_A=drive.rated_current_A,
+        rated_torque_Nm=drive.rated_torque_Nm,
+        rated_tolerance=drive.rated_tolerance,
+        max_torque_permille=drive.max_torque_permille,
+        velocity_unit=drive.velocity_unit,
+        torque_rate_max_Nmps=config.limits.torque_rate_max_Nmps,
+        boot_timeout_s=drive.boot_timeout_s,
+        joint_encoder=joint_encoder_settings(config),
+        encoder_incremental=config.encoder.kind == "incremental",
+        sdo_timeout_s=drive.sdo_timeout_s,
+        velocity_max_radps=config.limits.velocity_max_radps,
+        temperature=temperature_object(config),
+    )
+
+
+def temperature_object(config: Config) -> TemperatureObject | None:
+    """Which object of the drive tells its temperature."""
+    drive = canopen_section(config)
+    if drive.temperature_object is None:
+        return None
+    place = index_and_sub(drive.temperature_object)
+    return TemperatureObject(*place, drive.temperature_unit_degC, drive.temperature_offset_degC)
+
+
+def joint_encoder_settings(config: Config) -> JointEncoderSettings | None:
+    """Section [joint_encoder] for commissioning."""
+    encoder = config.joint_encoder
+    if encoder is None:
+        return None
+    index, sub = index_and_sub(encoder.object)
+    return JointEncoderSettings(
+        counts_per_turn=encoder.counts_per_turn,
+        direction=encoder.direction,
+        zero_counts=encoder.zero_counts,
+        incremental=encoder.kind == "incremental",
+        feeds_law=encoder.law == "joint_encoder",
+        node=encoder.node if encoder.source == "node" else None,
+        eds_path=encoder_eds_path(config),
+        index=index,
+        sub=sub,
+    )
+
+
+def cycle_bytes(config: Config) -> tuple[int, ...]:
+    """Data bytes of the frames of one cycle: SYNC, TPDO, RPDO, and the TPDO of a second encoder."""
+    rpdo = RPDO_BYTES if canopen_section(config).mode in TORQUE_MODES else VELOCITY_RPDO_BYTES
+    second = () if config.joint_encoder is None else (SECOND_POSITION_BYTES,)
+    return (0, TPDO_BYTES, rpdo, *second)
+
+
+def cyclic_bus_load(config: Config) -> float:
+    """Share of the bus that the cyclic frames take at worst-case stuffing; refuses more than HIGHEST_LOAD."""
+    rate_Hz, bitrate = config.loop.rate_Hz, config.bus.bitrate_bitps
+    lengths = cycle_bytes(config)
+    load = bus_load(lengths, rate_Hz, bitrate)
+    if load > HIGHEST_LOAD:
+        highest = highest_rate_Hz(lengths, bitrate, HIGHEST_LOAD)
+        frames = " + ".join(("SYNC", *(f"{name}({n})" for name, n in zip(_FRAMES, lengths[1:], strict=False))))
+        raise ConfigurationError(
+            f"loop.rate_Hz (={rate_Hz:g}) must be at most {highest:.0f} at bus.bitrate_bitps (={bitrate}): "
+            f"{frames} = {load * bitrate / rate_Hz:.0f} bits a cycle, "
+            f"{load:.0%} of the bus, {HIGHEST_LOAD:.0%} allowed"
+        )
+    return load
+
+
+def _moved_bus(own: Bus, given: GivenPlace, environ: Mapping[str, str]) -> Bus:
+    bus: dict[str, Any] = own.model_dump()
+    bitrate, origin = given.bitrate, "command line"
+    if bitrate is None and environ.get("CAN_BITRATE"):
+        origin = "environment"
+        try:
+            bitrate = int(environ["CAN_BITRATE"])
+        except ValueError:
+            value = environ["CAN_BITRATE"]
+            raise ConfigurationError(f"environment: CAN_BITRATE (={value}) must be a whole number of bit/s") from None
+    bus["interface"] = given.interface or environ.get("CAN_INTERFACE") or own.interface
+    if bus["interface"] != own.interface:  # what the file says besides is for the interface of the file
+        bus["channel"], bus["options"] = split_channel(bus["channel"])[0], None
+    bus["channel"] = given.channel or environ.get("CAN_CHANNEL") or bus["channel"]
+    bus["bitrate_bitps"] = bus["bitrate_bitps"] if bitrate is None else bitrate
+    try:
+        return whole_channel(Bus.model_validate(bus))
+    except PydanticCustomError as error:
+        raise ConfigurationProblems([f"{origin}: bus.{error.message()}"]) from None
+    except ValidationError as error:
+        lines = [problem_line(e, bus, ("bus",)) for e in error.errors(include_url=False)]
+        raise ConfigurationProblems([f"{origin}: {line}" for line in lines]) from None
+
+
+def joint_encoder_problems(config: Config) -> list[str]:
+    """[joint_encoder] against the rest."""
+    drive, encoder, found = canopen_section(config), config.joint_encoder, []
+    if encoder is None:
+        return []
+    if (encoder.source == "node") != (encoder.node is not None):
+        found.append('joint_encoder.node must be given with source = "node", and only then')
+    if encoder.node is not None and encoder.node in (drive.node, drive.master_node):
+        found.append(f"joint_encoder.node (={encoder.node}) must differ from drive.node and drive.master_node")
+    if encoder.kind == "incremental" and config.encoder.kind == "incremental":
+        found.append("joint_encoder.kind and encoder.kind are both incremental: one of them must know its angle")
+    if encoder.disagreement_max_rad >= config.limits.following_error_max_rad * 10.0:
+        found.append(
+            f"joint_encoder.disagreement_max_rad (={encoder.disagreement_max_rad:g}) must be less than ten times "
+            "limits.following_error_max_rad"
+        )
+    return found
+
+
+def canopen_problems(config: Config) -> list[str]:
+    """[drive] against the rest."""
+    drive, limits, found = canopen_section(config), config.limits, []
+    if not CAN_RATE_HZ[0] <= config.loop.rate_Hz <= CAN_RATE_HZ[1]:
+        found.append(f"loop.rate_Hz (={config.loop.rate_Hz:g}) must be in [{CAN_RATE_HZ[0]:g}..{CAN_RATE_HZ[1]:g}]")
+    if drive.node == drive.master_node:
+        found.append(f"drive.master_node (={drive.master_node}) must differ from drive.node")
+    if LAST_SYNCHRONOUS < drive.rpdo_transmission_type < EVENT_DRIVEN:
+        kind = drive.rpdo_transmission_type
+        found.append(
+            f"drive.rpdo_transmission_type (={kind}) must be in [0..{LAST_SYNCHRONOUS}] or in [{EVENT_DRIVEN}..255]"
+        )
+    if drive.rated_torque_Nm is not None and drive.max_torque_permille is not None:
+        if drive.torque_reference == "rated_torque":
+            reach = drive.rated_torque_Nm * config.joint.reduction_ratio * drive.max_torque_permille / 1000.0
+            if limits.torque_max_Nm > reach * (1.0 + 1e-9):
+                found.append(
+                    f"limits.torque_max_Nm (={limits.torque_max_Nm:g}) must be in (0..{reach:g}], "
+                    "what drive.max_torque_permille allows"
+                )
+    if config.virtual is not None and drive.rated_current_A is None:
+        found.append("drive.rated_current_A is missing: the virtual drive needs it")
+    if config.virtual is not None and drive.rated_torque_Nm is None:
+        found.append("drive.rated_torque_Nm is missing: the virtual drive needs it")
+    return found

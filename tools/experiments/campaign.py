@@ -1,0 +1,208 @@
+"""A campaign: many scenarios on all cores, and what they showed as a table, JSON with every violation, and a figure.
+
+What is done is kept whatever ends the campaign.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import multiprocessing
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.drawing import INK, MID_BLUE, MID_GREEN, MID_RED, canvas
+from jointctl.tools.experiments.fault_scenarios import draw_scenario
+from jointctl.tools.experiments.judge import Verdict, judge
+from jointctl.tools.simulation.child_process import interrupts_left_to_the_parent
+from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.sweeping.carry_out import with_mode
+
+# --- the runs ---
+
+AT_ONCE = 16  # scenarios that a worker takes at a time
+_worker: dict[str, object] = {}
+
+
+def campaign_joint(config: Config, *, sweep: bool) -> tuple[Config, LockstepJoint]:
+    """The configuration in the mode of the drive that a run, or a sweep, uses, and its joint, commissioned."""
+    config = with_mode(config, "auto") if sweep else config
+    return config, LockstepJoint(config)
+
+
+def _begin(path: str, seed: int, sweep: bool) -> None:
+    """In each worker: commission a joint of its own."""
+    config, joint = campaign_joint(load_config(path), sweep=sweep)
+    _worker.update(config=config, joint=joint, seed=seed, sweep=sweep)
+
+
+def _work(number: int) -> Verdict:
+    config, joint, seed = _worker["config"], _worker["joint"], _worker["seed"]
+    assert isinstance(config, Config)
+    assert isinstance(joint, LockstepJoint)
+    assert isinstance(seed, int)
+    return judge(config, joint, draw_scenario(seed, number, sweep=bool(_worker["sweep"])))
+
+
+def _verdicts(path: Path, seed: int, count: int, workers: int, sweep: bool) -> Iterator[Verdict]:
+    if workers == 1:
+        config, joint = campaign_joint(load_config(path), sweep=sweep)
+        for number in range(count):
+            yield judge(config, joint, draw_scenario(seed, number, sweep=sweep))
+        return
+    context = multiprocessing.get_context("spawn")
+    with interrupts_left_to_the_parent():
+        started = context.Pool(workers, _begin, (str(path), seed, sweep))
+    with started as pool:
+        yield from pool.imap_unordered(_work, range(count), AT_ONCE)
+
+
+def run_campaign(
+    path: Path,
+    seed: int,
+    count: int,
+    advance: Callable[[float], None],
+    workers: int | None = None,
+    *,
+    sweep: bool = False,
+) -> tuple[list[Verdict], float, bool]:
+    """(verdicts in order of their numbers, time taken [s], whether Ctrl-C ended it early)."""
+    started_s = time.monotonic()
+    found: list[Verdict] = []
+    interrupted = False
+    try:
+        for verdict in _verdicts(path, seed, count, workers or os.cpu_count() or 1, sweep):
+            found.append(verdict)
+            advance(float(len(found)))
+    except KeyboardInterrupt:
+        interrupted = True
+    return sorted(found, key=lambda verdict: verdict.number), time.monotonic() - started_s, interrupted
+
+
+# --- what they showed ---
+
+MANY = 1000  # scenarios: more are drawn as specks
+
+
+@dataclass(frozen=True)
+class KindRow:
+    """All scenarios of one kind of fault."""
+
+    kind: str
+    scenarios: int
+    harmless: int
+    violations: int
+    causes: dict[str, int]  # reported by the loop, without the harmless twins
+    peak_radps: float
+    beyond_rad: float
+    allowed_rad: float
+    longest_off_s: float
+
+
+def rows_by_kind(verdicts: Sequence[Verdict]) -> list[KindRow]:
+    """One row a kind, in order of the first scenario."""
+    rows = []
+    for kind in dict.fromkeys(verdict.kind for verdict in verdicts):
+        mine = [verdict for verdict in verdicts if verdict.kind == kind]
+        off = [verdict.off_s for verdict in mine if verdict.off_s is not None]
+        rows.append(
+            KindRow(
+                kind=kind,
+                scenarios=len(mine),
+                harmless=sum(verdict.harmless for verdict in mine),
+                violations=sum(bool(verdict.violations) for verdict in mine),
+                causes=dict(Counter(verdict.fault for verdict in mine if not verdict.harmless).most_common()),
+                peak_radps=max(verdict.peak_radps for verdict in mine),
+                beyond_rad=max(verdict.beyond_rad for verdict in mine),
+                allowed_rad=max(verdict.allowed_rad for verdict in mine),
+                longest_off_s=max(off, default=0.0),
+            )
+        )
+    return rows
+
+
+def _told(fault: str) -> str:
+    """In words, which a table may wrap."""
+    return "no fault" if fault == Fault.NONE.name else fault.lower().replace("_", " ")
+
+
+def table(rows: Sequence[KindRow]) -> Table:
+    """For people."""
+    shown = Table(title="fault campaign")
+    for name, justify in (
+        ("fault", "left"), ("runs", "right"), ("harmless", "right"), ("violations", "right"),
+        ("speed [rad/s]", "right"), ("beyond limit [rad]", "right"), ("allowed [rad]", "right"),
+        ("off after [s]", "right"), ("reported as", "left"),
+    ):  # fmt: skip
+        shown.add_column(name, justify=justify)  # type: ignore[arg-type]
+    for row in rows:
+        causes = ", ".join(f"{_told(name)} {count}" for name, count in row.causes.items())
+        shown.add_row(
+            row.kind, str(row.scenarios), str(row.harmless), str(row.violations), f"{row.peak_radps:.2f}",
+            f"{row.beyond_rad:.3f}", f"{row.allowed_rad:.2f}", f"{row.longest_off_s:.3f}", causes,
+        )  # fmt: skip
+    return shown
+
+
+def violations(verdicts: Sequence[Verdict], seed: int, *, sweep: bool = False) -> list[dict[str, Any]]:
+    """Everything that is needed to look at each violation again."""
+    return [
+        {**asdict(verdict), "scenario": draw_scenario(seed, verdict.number, sweep=sweep).describe()}
+        for verdict in verdicts
+        if verdict.violations
+    ]
+
+
+def write_json(path: Path, seed: int, verdicts: Sequence[Verdict], elapsed_s: float, *, sweep: bool = False) -> None:
+    """Rows and violations."""
+    content = {
+        "seed": seed,
+        "sweep": sweep,
+        "scenarios": len(verdicts),
+        "elapsed_s": round(elapsed_s, 1),
+        "kinds": [asdict(row) for row in rows_by_kind(verdicts)],
+        "violations": violations(verdicts, seed, sweep=sweep),
+    }
+    text = json.dumps(content, indent=1, allow_nan=False)
+    path.write_text(text + "\n")
+
+
+def campaign_figure(verdicts: Sequence[Verdict], velocity_max_radps: float) -> Any:
+    """Speed reached and time until off, a column of points for each kind; violations in red."""
+    kinds = list(dict.fromkeys(verdict.kind for verdict in verdicts))
+    many = len(verdicts) > MANY
+    points: dict[str, list[tuple[float, float, float]]] = {MID_BLUE: [], MID_GREEN: [], MID_RED: []}
+    for place, kind in enumerate(kinds):
+        mine = [verdict for verdict in verdicts if verdict.kind == kind]
+        for i, verdict in enumerate(mine):
+            across = place - 0.3 + 0.6 * i / max(len(mine) - 1, 1)
+            colour = MID_RED if verdict.violations else MID_GREEN if verdict.harmless else MID_BLUE
+            off_s = math.nan if verdict.off_s is None else max(verdict.off_s, 1e-3)
+            points[colour].append((across, verdict.peak_radps, off_s))
+    with canvas(8.0) as figure:
+        speed, off = figure.subplots(2, 1, sharex=True)
+        for colour, some in points.items():  # a line object for each point would take a minute
+            if some:
+                across_all, speeds_radps, offs_s = zip(*some, strict=True)
+                style: Any = {"color": colour, "markersize": 2.5 if many else 6.0, "rasterized": many}
+                speed.plot(across_all, speeds_radps, ".", **style)
+                off.plot(across_all, offs_s, ".", **style)
+        speed.axhline(velocity_max_radps, color=INK, linewidth=0.8, linestyle="--", label="velocity limit")
+        speed.set_ylabel("greatest speed [rad/s]")
+        speed.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))
+        speed.set_xlim(-0.6, len(kinds) - 0.4)
+        off.set_ylabel("off and at rest after the fault [s]")
+        off.set_yscale("log")
+        off.set_xticks(range(len(kinds)), kinds, rotation=70, ha="right", rotation_mode="anchor", fontsize=8)
+        speed.set_title("harmful faults blue, harmless twins green, violations red")
+        return figure

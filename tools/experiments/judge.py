@@ -1,0 +1,434 @@
+"""One scenario run and judged: the invariants that hold whatever happens, as lines that name what was violated.
+
+How far and how fast the joint may get is limits plus a derived stopping distance.  The loop reacts when a measured
+value passes its limit.  Until the reaction has begun, `t` later, the motor may push with all that the drive allows in
+the worst direction, and friction is not counted on:
+
+    a = (torque limit of the drive + ripple + loads) / J
+    v1 = v_max + a t                     the greatest speed
+    x1 = v_max t + a t^2 / 2             the way until then
+
+From then on the joint is braked by at least its own Coulomb friction F, the weakest of the reactions (power off), less
+the ripple and the load L of the configuration (gravity with its whole lever), or, under an added load, by the drive's
+quick stop with what the load leaves of it:
+
+    d = (F - ripple - L) / J,   x2 = v1^2 / (2 d)
+
+`t` is `REACTION_s` where the loop measures and the drive receives, or more where these take longer: one period each for
+sample and command, the velocity filter (three time constants, 5 ms at 100 Hz) and the motor's delay and lag.  Where the
+drive does not receive from the loop it holds the last torque, or in a sweep the last velocity, until its own watchdog
+acts: age limit of the samples + IGNORED_MAX_CYCLES + drive.heartbeat_s.
+
+A reading that is wrong by w (jump, drift) shifts the true position by w.  Behind a stuck encoder the joint is blind
+until POSITION_FROZEN: it is pushed with at most frozen_torque_Nm for longer than PUSHED_CYCLES, 16 Nm more than the
+Coulomb friction, which the viscous part (18 Nm s/rad below the knee) balances at 0.9 rad/s; the pushed cycles with
+full torque add (60 - 13) Nm / J x 20 ms = 0.5 rad/s.  `BLIND_RADPS` is that and a quarter.
+Not covered: more than one fault at a time, a drive that applies torque by itself, a load greater than the friction
+for good (it needs a brake).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from jointctl.drivers.canopen.cyclic import IGNORED_MAX_CYCLES
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.records import AxisConstants, Reference
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault, Reaction
+from jointctl.firmware_py.trajectory import reference_at
+from jointctl.hil.canopen.records import PowerState
+from jointctl.hil.faults.kinds import FaultKind
+from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_POSITION_rad, TRUE_VELOCITY_radps
+from jointctl.tools.configuration.canopen import canopen_section
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.experiments.fault_scenarios import (
+    FAULT_CLASSES,
+    LATE_CAUSES,
+    BEFORE_s,
+    LONGEST_s,
+    Scenario,
+    SweepStrokes,
+    fitted,
+    placed_sweep,
+    plant_of,
+)
+from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
+
+# --- the envelope ---
+
+REACTION_s = 0.010
+FILTER_CONSTANTS = 3.0
+MOTOR_s = 0.0013  # the longest delay and lag that a scenario draws
+BLIND_RADPS = 1.8
+BLIND_RAD = 1.0
+BRAKE_SPARE_s = 1.0  # a quick stop of the virtual drive may end so much late
+STANDSTILL_RADPS = 0.02
+_UNHEARD = frozenset(
+    {
+        FaultKind.FRAMES_LOST, FaultKind.SYNC_LOST, FaultKind.RPDO_LOST, FaultKind.BUS_OFF, FaultKind.RPDO_LENGTH,
+        FaultKind.RPDO_DELAYED, FaultKind.TPDO_DELAYED, FaultKind.LOOP_HELD_UP,
+    }
+)  # fmt: skip
+_BLIND_FOR_A_WHILE = frozenset({FaultKind.TPDO_LOST, FaultKind.TPDO_LENGTH})
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """What must hold in every period of a scenario."""
+
+    position_min_rad: float
+    position_max_rad: float
+    velocity_max_radps: float
+    command_max_Nm: float
+    command_step_Nm: float
+    stop_s: float  # from the latched fault to power off and standstill, by quick stop or power off
+    ramp_s: float  # the same by a controlled ramp
+    command_max_radps: float = math.inf  # of the velocity command, where there is one
+    command_step_radps: float = math.inf  # in one period
+
+
+def _measuring_s(config: Config) -> float:
+    """Longest time from passing a limit to a reaction, with samples and a drive that hears."""
+    cutoff_Hz = config.control.velocity_cutoff_Hz
+    filter_s = FILTER_CONSTANTS / (math.tau * cutoff_Hz) if cutoff_Hz else 0.0
+    return max(REACTION_s, 2.0 / config.loop.rate_Hz + filter_s + MOTOR_s)
+
+
+def reaction_s(config: Config, kind: FaultKind) -> float:
+    """Longest time from passing a limit to the beginning of the reaction."""
+    age_s, measuring_s = config.limits.sample_age_max_s, _measuring_s(config)
+    if kind in _UNHEARD:
+        ignored_s = IGNORED_MAX_CYCLES / config.loop.rate_Hz
+        return measuring_s + age_s + ignored_s + canopen_section(config).heartbeat_s
+    if kind in _BLIND_FOR_A_WHILE:
+        return measuring_s + age_s
+    return measuring_s
+
+
+def load_Nm(config: Config) -> float:
+    """The greatest load at the joint that is there without a fault."""
+    virtual = config.virtual
+    assert virtual is not None
+    return abs(virtual.gravity_Nm) + abs(virtual.load_torque_Nm) + abs(virtual.load_step_Nm)
+
+
+def _friction_floor_Nm(config: Config, scenario: Scenario) -> float:
+    """The least Coulomb friction at the joint, of the slower direction and with its ripple."""
+    virtual = config.virtual
+    assert virtual is not None
+    friction = virtual.friction or config.friction
+    assert friction is not None
+    curves = (
+        abs(friction.positive.tc_Nm) * scenario.plant["friction_positive_scale"],
+        abs(friction.negative.tc_Nm) * scenario.plant["friction_negative_scale"],
+    )
+    return config.joint.reduction_ratio * min(curves) * (1.0 - virtual.friction_ripple)
+
+
+def envelope(config: Config, scenario: Scenario, constants: AxisConstants) -> Envelope:
+    """See the module; `constants` is the AxisConstants record of the scenario."""
+    limits, kind = constants.limits, scenario.kind
+    inertia = scenario.plant["inertia_kgm2"]
+    ripple = sum(scenario.plant["torque_ripple_Nm"])
+    load = abs(scenario.magnitude) if kind is FaultKind.LOAD_JUMP else 0.0
+    share = 1e-3 * (canopen_section(config).max_torque_permille or 1000)
+    drive_Nm = share * (canopen_section(config).rated_torque_Nm or 0.0) * config.joint.reduction_ratio
+    constant_Nm = load_Nm(config)
+    floor = _friction_floor_Nm(config, scenario) - ripple - constant_Nm
+    wait_s = reaction_s(config, kind)
+    push = (drive_Nm + ripple + load + constant_Nm) / inertia
+    speed = limits.velocity_max_radps + push * wait_s
+    brake = (min(floor, drive_Nm + floor - load) if load else floor) / inertia
+    way = limits.velocity_max_radps * wait_s + 0.5 * push * wait_s**2 + speed**2 / (2.0 * brake)
+    stop_s = wait_s + speed / brake + BRAKE_SPARE_s
+    if load > floor:  # after power off it moves the joint for the rest of its time
+        pushed = (load - floor) / inertia * scenario.duration_s
+        way += 0.5 * pushed * scenario.duration_s + pushed**2 / (2.0 * brake)
+        speed = max(speed, pushed)
+        stop_s += scenario.duration_s + pushed / brake
+    shift = 0.0
+    if kind is FaultKind.ENCODER_JUMP:
+        shift = abs(scenario.magnitude)
+    elif kind is FaultKind.ENCODER_DRIFT:
+        run_s = constants.sequence.approach_s + constants.trajectory.duration_s + config.sequence.stop_timeout_s
+        shift = abs(scenario.magnitude) * min(scenario.duration_s, run_s + 1.0)
+        speed += abs(scenario.magnitude)
+    elif kind is FaultKind.ENCODER_STUCK:
+        shift, speed = BLIND_RAD, max(speed, BLIND_RADPS)
+        stop_s += speed / brake
+    elif kind is FaultKind.ENCODER_REVERSED:
+        shift = 2.0 * limits.following_error_max_rad + way
+    return Envelope(
+        position_min_rad=limits.position_min_rad - way - shift,
+        position_max_rad=limits.position_max_rad + way + shift,
+        velocity_max_radps=speed,
+        command_max_Nm=limits.torque_max_Nm,
+        command_step_Nm=limits.torque_rate_max_Nmps * constants.law.period_s,
+        stop_s=stop_s,
+        ramp_s=config.sequence.stop_timeout_s + config.sequence.release_s + stop_s,
+        command_max_radps=limits.velocity_max_radps,
+        command_step_radps=constants.velocity_command.acceleration_max_radps2 * constants.law.period_s,
+    )
+
+
+# --- configurations that a campaign can judge: what its sizes and its envelope assume ---
+
+LEAST_SCALE = 0.9  # of the friction, RIPPLE_Nm the most of the motor: what a scenario draws
+RIPPLE_Nm = 1.4
+
+
+def _demands(config: Config) -> list[tuple[str, float, float]]:
+    """(key, value, least value): harmless sizes are just inside these limits, trajectories use that much room."""
+    limits, sequence = config.limits, config.sequence
+    return [
+        ("limits.position_max_rad", limits.position_max_rad, 0.7),
+        ("-limits.position_min_rad", -limits.position_min_rad, 0.7),
+        ("limits.velocity_max_radps", limits.velocity_max_radps, 1.0),
+        ("limits.torque_max_Nm", limits.torque_max_Nm, 60.0),
+        ("limits.following_error_max_rad", limits.following_error_max_rad, 0.05),
+        ("limits.position_jump_max_rad", limits.position_jump_max_rad, 0.02),
+        ("limits.sample_age_max_s", limits.sample_age_max_s, 0.05),
+        ("limits.skipped_max_s", limits.skipped_max_s, 0.05),
+        ("sequence.supervisor_timeout_s", sequence.supervisor_timeout_s, 1.0),
+        ("drive.heartbeat_s", canopen_section(config).heartbeat_s, 0.2),
+    ]
+
+
+def require_fit(config: Config) -> None:
+    """`ConfigurationError` for a configuration whose campaign would prove nothing, or find what is no violation."""
+    virtual = config.virtual
+    if virtual is None:
+        raise ConfigurationError(f"{config.path}: [virtual] is missing: the campaign needs a virtual joint")
+    friction = virtual.friction or config.friction
+    if friction is None:
+        raise ConfigurationError(f"{config.path}: [friction] is missing, and so is [virtual.friction]")
+    if virtual.faults:
+        raise ConfigurationError(f"{config.path}: [[virtual.faults]] must be empty: the campaign brings its own")
+    for key, value, least in _demands(config):
+        if value < least:
+            raise ConfigurationError(
+                f"{config.path}: {key} (={value:g}) must be at least {least:g}: the campaign's harmless faults and its "
+                "trajectories are made for the limits of configs/virtual.toml"
+            )
+    weakest_Nm = config.joint.reduction_ratio * min(abs(friction.positive.tc_Nm), abs(friction.negative.tc_Nm))
+    held_Nm = LEAST_SCALE * weakest_Nm * (1.0 - virtual.friction_ripple) - RIPPLE_Nm
+    if load_Nm(config) >= held_Nm:
+        raise ConfigurationError(
+            f"{config.path}: the loads of [virtual] (={load_Nm(config):g} Nm) must be less than {held_Nm:.2f} Nm, what "
+            "friction holds in the worst scenario: beyond, the joint needs a brake, and no envelope can be derived"
+        )
+
+
+# --- the invariants ---
+
+APPROACH_s = 1.0
+SPARE_s = 14.0  # for waiting, enabling and stopping
+TAIL_s = 2.5  # watched after the controller has ended
+NOTICED_s = 0.35  # a certain fault that begins so long before the end of the trajectory must be noticed
+POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What one scenario showed; plain values, for other processes and for JSON."""
+
+    number: int
+    kind: str
+    harmless: bool
+    fault: str
+    reaction: str
+    violations: tuple[str, ...]
+    peak_radps: float
+    beyond_rad: float  # how far the joint got beyond its position limits
+    allowed_rad: float  # how far it may
+    off_s: float | None  # from the latched fault to power off and standstill; None without a fault
+
+
+def run_scenario(config: Config, joint: LockstepJoint, scenario: Scenario) -> tuple[LockstepRun, Any]:
+    """The run, and the AxisConstants record array that it used; the joint's table is the scenario's afterwards."""
+    if isinstance(scenario.trajectory, SweepStrokes):
+        placed = placed_sweep(config, joint, scenario.trajectory, scenario.start_offset_rad)
+        joint.table = placed.table
+        return _carry_out(config, joint, scenario, placed.constants, placed.start_rad, placed.duration_s)
+    sequence = config.sequence.model_copy(update={"approach_s": APPROACH_s})
+    shown = config.model_copy(update={"trajectory": scenario.trajectory, "sequence": sequence})
+    first = new(Reference)
+    reference_at(axis_constants(shown, joint.table)[0].trajectory, joint.table, 0, 0.0, first[0])
+    limits = config.limits
+    start = float(first[0].position_rad) + scenario.start_offset_rad
+    start = min(max(start, limits.position_min_rad + 0.05), limits.position_max_rad - 0.05)
+    constants = axis_constants(shown, joint.table, start_position_rad=start)
+    return _carry_out(shown, joint, scenario, constants, start, scenario.trajectory.duration_s)
+
+
+def in_time(config: Config, joint: LockstepJoint, scenario: Scenario) -> Scenario:
+    """A sweep's fault, drawn for the longest one, begins as early in this one: after its end it would prove nothing."""
+    if not isinstance(scenario.trajectory, SweepStrokes):
+        return scenario
+    duration_s = placed_sweep(config, joint, scenario.trajectory, scenario.start_offset_rad).duration_s
+    return replace(scenario, at_s=scenario.at_s * (BEFORE_s + duration_s) / (BEFORE_s + LONGEST_s))
+
+
+def _carry_out(
+    config: Config,
+    joint: LockstepJoint,
+    scenario: Scenario,
+    constants: np.recarray,
+    start_rad: float,
+    duration_s: float,
+) -> tuple[LockstepRun, Any]:
+    plant_constants, plant_state = plant_of(config, scenario, start_rad)
+    run = joint.run_with_faults(
+        scenario.fault(), constants,
+        plant_constants=plant_constants, plant_state=plant_state, epoch_at_start=True,
+        longest_s=float(constants[0].sequence.approach_s) + duration_s + SPARE_s, tail_s=TAIL_s,
+    )  # fmt: skip
+    return run, constants
+
+
+def _commands(run: LockstepRun, allowed: Envelope) -> list[str]:
+    log, found = run.log, []
+    torque = np.asarray(log.command_torque_Nm)
+    powered = (log.phase >= AxisPhase.APPROACH) & (log.phase <= AxisPhase.RELEASING)
+    if not np.isfinite(torque).all() or np.abs(torque).max() > allowed.command_max_Nm:
+        found.append(f"torque command {np.abs(torque).max():.2f} Nm exceeds {allowed.command_max_Nm:g}")
+    steps = np.abs(np.diff(torque))[powered[1:]]
+    if len(steps) and steps.max() > allowed.command_step_Nm * (1.0 + 1e-9):
+        found.append(f"torque command steps by {steps.max():.2f} Nm, allowed {allowed.command_step_Nm:g}")
+    if torque[~powered].any():
+        found.append("torque commanded in a phase without power")
+    speed = np.asarray(log.command_velocity_radps)
+    if not np.isfinite(speed).all() or np.abs(speed).max() > allowed.command_max_radps:
+        found.append(f"velocity command {np.abs(speed).max():.3f} rad/s exceeds {allowed.command_max_radps:g}")
+    steps = (np.abs(np.diff(speed)) / (1.0 + np.asarray(log.skipped)[1:]))[powered[1:]]
+    if len(steps) and steps.max() > allowed.command_step_radps * (1.0 + 1e-9):
+        found.append(f"velocity command steps by {steps.max():.4f} rad/s, allowed {allowed.command_step_radps:g}")
+    if speed[~powered].any():
+        found.append("a velocity commanded in a phase without power")
+    return found
+
+
+def _motion(run: LockstepRun, allowed: Envelope) -> list[str]:
+    found = []
+    position, velocity = run.truth[:, TRUE_POSITION_rad], run.truth[:, TRUE_VELOCITY_radps]
+    if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
+        return ["the plant's state is not finite"]
+    if position.min() < allowed.position_min_rad or position.max() > allowed.position_max_rad:
+        found.append(
+            f"position {position.min():.3f}..{position.max():.3f} rad leaves "
+            f"{allowed.position_min_rad:.3f}..{allowed.position_max_rad:.3f}"
+        )
+    peak = np.abs(velocity).max()
+    if peak > allowed.velocity_max_radps:
+        found.append(f"speed {peak:.2f} rad/s exceeds {allowed.velocity_max_radps:.2f}")
+    return found
+
+
+def _off_row(run: LockstepRun) -> int:
+    """The first row from which on the power stage is off and the joint stands."""
+    busy = np.isin(run.truth[:, TRUE_POWER_STATE], POWERED)
+    busy |= np.abs(run.truth[:, TRUE_VELOCITY_radps]) > STANDSTILL_RADPS
+    rows = np.flatnonzero(busy)
+    return int(rows[-1]) + 1 if len(rows) else 0
+
+
+def _ending(run: LockstepRun, allowed: Envelope, fault_row: int, period_s: float) -> tuple[list[str], float | None]:
+    found = []
+    if run.state.phase != AxisPhase.FINISHED:
+        found.append(f"the axis did not finish, phase {AxisPhase(int(run.state.phase)).name}")
+    off_row = _off_row(run)
+    if off_row >= len(run.truth):
+        found.append("the joint is not off and at rest in the end")
+    off_s = None
+    if fault_row >= 0:
+        off_s = max(off_row - fault_row, 0) * period_s
+        longest = allowed.ramp_s if (run.log.phase == AxisPhase.RAMPING).any() else allowed.stop_s
+        if off_s > longest:
+            found.append(f"off and at rest {off_s:.3f} s after the fault, allowed {longest:.3f}")
+    requests = np.asarray(run.log.request)
+    asked = np.flatnonzero(requests == DriveRequest.ENABLE)
+    if len(asked) and (np.diff(asked) != 1).any():
+        found.append("the loop asked to enable again after it had asked to stop")
+    return found, off_s
+
+
+def _enabled_again(run: LockstepRun, scenario: Scenario, start_ns: int, period_ns: int) -> list[str]:
+    """The power stage comes on at most once, but for what the wire does by itself.
+
+    A frame may have been under way when the loop gave up; a corrupted one may say "enable", until a sound one comes.
+    """
+    enabled = run.truth[:, TRUE_POWER_STATE] == PowerState.OPERATION_ENABLED
+    rises = np.flatnonzero(enabled[1:] & ~enabled[:-1]) + 1
+    asked = np.flatnonzero(np.asarray(run.log.request) == DriveRequest.ENABLE)
+    if not len(rises):
+        return []
+    if not len(asked):
+        return [f"enabled although the loop never asked ({len(rises)} times)"]
+    last_row = (int(run.log.time_ns[asked[-1]]) - start_ns) // period_ns
+    wire_s = {FaultKind.RPDO_DELAYED: scenario.magnitude, FaultKind.RPDO_CORRUPTED: scenario.duration_s}
+    late = 2 + int(wire_s.get(scenario.kind, 0.0) * 1e9 / period_ns)
+    if rises[-1] > last_row + late:
+        return [f"enabled again {(rises[-1] - last_row) * period_ns * 1e-6:.0f} ms after the loop had stopped asking"]
+    return []
+
+
+def _cause(run: LockstepRun, scenario: Scenario, period_s: float, start_ns: int) -> list[str]:
+    fault, expected = run.fault, FAULT_CLASSES[scenario.kind]
+    if scenario.harmless:
+        return [] if fault is Fault.NONE else [f"a harmless fault tripped {fault.name} (={run.state.fault_value:.4f})"]
+    if fault is Fault.NONE:
+        times = (np.asarray(run.log.time_ns) - start_ns) * 1e-9
+        moving = (run.log.phase >= AxisPhase.APPROACH) & (run.log.phase <= AxisPhase.TRACKING)
+        tracked = times[moving]
+        noticed_s = NOTICED_s + (scenario.duration_s if scenario.kind is FaultKind.LOOP_HELD_UP else 0.0)
+        due = len(tracked) and tracked[0] < scenario.at_s - period_s and scenario.at_s + noticed_s < tracked[-1]
+        return ["the fault was not noticed"] if expected.certain and due else []
+    causes = expected.causes | LATE_CAUSES if expected.on_wire else expected.causes
+    if fault not in causes:
+        return [f"the cause is reported as {fault.name} (={run.state.fault_value:.4f})"]
+    code = int(run.state.fault_drive_error)
+    if fault is Fault.DRIVE_NOT_ENABLED and expected.emergency not in (0, code):
+        return [f"the drive's error code is reported as {code:04X}h, not {expected.emergency:04X}h"]
+    if scenario.kind is FaultKind.DRIVE_FAULT and run.state.fault_drive_error != scenario.magnitude:
+        return [f"the drive's error code is reported as {int(run.state.fault_drive_error):04X}h"]
+    return []
+
+
+def judge(config: Config, joint: LockstepJoint, scenario: Scenario) -> Verdict:
+    """Run a scenario and check every invariant."""
+    scenario = in_time(config, joint, fitted(config, scenario))
+    run, constants = run_scenario(config, joint, scenario)
+    axis = constants[0]
+    period_s = float(axis.law.period_s)
+    period_ns = round(period_s * 1e9)
+    start_ns = int(joint.start_ns)
+    allowed = envelope(config, scenario, axis)
+    tripped = np.flatnonzero(run.log.fault != Fault.NONE)
+    fault_row = (int(run.log.time_ns[tripped[0]]) - start_ns) // period_ns if len(tripped) else -1
+    ending, off_s = _ending(run, allowed, fault_row, period_s)
+    position = run.truth[:, TRUE_POSITION_rad]
+    limits = axis.limits
+    return Verdict(
+        number=scenario.number,
+        kind=scenario.kind.name.lower(),
+        harmless=scenario.harmless,
+        fault=run.fault.name,
+        reaction=Reaction(int(run.state.reaction)).name,
+        violations=tuple(
+            _commands(run, allowed)
+            + _motion(run, allowed)
+            + ending
+            + _enabled_again(run, scenario, start_ns, period_ns)
+            + _cause(run, scenario, period_s, start_ns)
+        ),
+        peak_radps=float(np.abs(run.truth[:, TRUE_VELOCITY_radps]).max()),
+        beyond_rad=float(max(position.max() - limits.position_max_rad, limits.position_min_rad - position.min(), 0.0)),
+        allowed_rad=allowed.position_max_rad - float(limits.position_max_rad),
+        off_s=off_s,
+    )

@@ -1,0 +1,293 @@
+"""The figures of one run: trajectory, error, torque in its parts, network, observer, friction map, times, temperature.
+
+`records` is an array of LogRecord, shape (N,), everywhere.  Times are seconds since the first record.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jointctl.firmware_py.states import AxisPhase, fault_name
+from jointctl.tools.drawing import BLUE, COLOURS, GREEN, GREY, INK, MID_BLUE, ORANGE, RED, SOFT, TEAL, VIOLET
+from jointctl.tools.recording.report_page import Figure, draw
+from jointctl.tools.recording.run_figure import drawn_indices, powered, seconds
+from jointctl.tools.recording.run_log_reader import RunLog
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Picture
+
+LEAST_READINGS = 10  # of the temperature; fewer are in the table only
+POINTS = 1600  # more than the page is wide; least and greatest of each bucket, so that no peak is lost
+_PARTS = (
+    ("friction", "friction", ORANGE),
+    ("inertia", "inertia", GREEN),
+    ("feedback", "feedback", BLUE),
+    ("gravity", "gravity", GREY),
+    ("network", "network (subtracted)", RED),
+    ("observer", "observer", VIOLET),
+    ("learned", "learned", TEAL),
+)
+_CLOUD_POINTS = 20_000
+_LEAST_SPEED_radps = 1e-3
+_BINS = 25  # of speed, in each direction
+_LEAST_IN_BIN = 10
+
+
+def line(axes: Axes, time_s: np.ndarray, values: np.ndarray, color: str, label: str = "", **style: Any) -> None:
+    """A line with at most POINTS points."""
+    keep = drawn_indices(values, POINTS)
+    axes.plot(time_s[keep], values[keep], color=color, label=label or None, **style)
+
+
+def _finish(axes: Axes, records: np.ndarray, ylabel: str, *, legend: bool = True, xlabel: bool = True) -> None:
+    axes.set_ylabel(ylabel)
+    if xlabel:
+        axes.set_xlabel("time [s]")
+    _mark(axes, records)
+    if legend:
+        legend_above(axes)
+
+
+def legend_above(axes: Axes) -> None:
+    """Outside, and not at the side: the time axes of all figures are then equally wide."""
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="lower left", bbox_to_anchor=(-0.01, 1.0), ncols=8, columnspacing=1.4, handlelength=1.6)
+
+
+def _mark(axes: Axes, records: np.ndarray) -> None:
+    """Shade what is not tracking; a red line where the fault came."""
+    phase, time_s = records["phase"], seconds(records)
+    edges = [0, *(np.flatnonzero(np.diff(phase)) + 1).tolist(), len(phase) - 1]
+    for begin, end in pairwise(edges):
+        value = int(phase[begin])
+        if value == AxisPhase.TRACKING or end <= begin:
+            continue
+        tone = "wash-1" if value == AxisPhase.APPROACH else "wash-2" if value > AxisPhase.TRACKING else "wash-3"
+        axes.axvspan(time_s[begin], time_s[end], color=COLOURS[tone], linewidth=0.0, zorder=0)
+    found = np.flatnonzero(records["fault"])
+    if len(found):
+        axes.axvline(time_s[found[0]], color=RED, linewidth=1.4)
+
+
+def trajectory_figure(records: np.ndarray) -> Figure:
+    """Measured and desired angle."""
+    time_s, on = seconds(records), powered(records)
+
+    def paint(figure: Picture) -> None:
+        axes = figure.subplots()
+        line(axes, time_s, records["position_rad"], BLUE, "measured", linewidth=1.8)
+        desired = np.where(on, records["desired_position_rad"], np.nan)
+        line(axes, time_s, desired, ORANGE, "desired", linestyle="--")
+        _finish(axes, records, "joint angle [rad]")
+
+    caption = "Shaded: blue approach, amber stopping, grey power off; red line: fault." + _fault_words(records)
+    return draw(2.9, paint, "Measured and desired joint angle over time", caption)
+
+
+def _fault_words(records: np.ndarray) -> str:
+    found = np.flatnonzero(records["fault"])
+    if not len(found):
+        return ""
+    return f" {fault_name(int(records['fault'][found[0]]))} at {float(seconds(records)[found[0]]):.3f} s."
+
+
+def error_figure(records: np.ndarray) -> Figure:
+    """e = q - q_d while the law is at work."""
+
+    def paint(figure: Picture) -> None:
+        axes = figure.subplots()
+        error = np.where(powered(records), records["error_rad"] * 1e3, np.nan)
+        line(axes, seconds(records), error, BLUE)
+        axes.axhline(0.0, color=SOFT, linewidth=0.7)
+        _finish(axes, records, "error [mrad]", legend=False)
+
+    return draw(2.6, paint, "Tracking error over time", "Tracking error e = q - q_d at the joint.")
+
+
+def torque_figure(records: np.ndarray) -> Figure:
+    """The command and the parts that the law adds up."""
+    time_s, on = seconds(records), powered(records)
+
+    def paint(figure: Picture) -> None:
+        above, below = figure.subplots(2, 1, sharex=True)
+        line(above, time_s, records["measured_torque_Nm"], ORANGE, "measured", linewidth=0.8)
+        line(above, time_s, records["command_torque_Nm"], INK, "command")
+        _finish(above, records, "torque [Nm]", xlabel=False)
+        for name, label, color in _PARTS:
+            values = records[f"{name}_torque_Nm"]
+            if np.any(values[on] != 0.0):
+                line(below, time_s, np.where(on, values, np.nan), color, label, linewidth=0.9)
+        _finish(below, records, "its parts [Nm]", legend=bool(below.get_lines()))
+
+    caption = "At the joint. Above: commanded and measured; below: the parts of the command that are not zero."
+    return draw(4.6, paint, "Torque over time, whole and in its parts", caption)
+
+
+def network_figure(records: np.ndarray) -> Figure | None:
+    """Output and weights of the RBF network; None if it was not at work."""
+    on, time_s = powered(records), seconds(records)
+    if not np.any(records["network_torque_Nm"][on]):
+        return None
+
+    def paint(figure: Picture) -> None:
+        above, below = figure.subplots(2, 1, sharex=True)
+        line(above, time_s, np.where(on, records["network_torque_Nm"], np.nan), RED)
+        _finish(above, records, "output [Nm]", legend=False, xlabel=False)
+        weights = records["weights"]
+        for i in range(weights.shape[1]):
+            line(below, time_s, np.where(on, weights[:, i], np.nan), BLUE, linewidth=0.7, alpha=0.6)
+        _finish(below, records, "weights [Nm]", legend=False)
+
+    spread = float(np.ptp(records["weights"][on][-1]))
+    caption = (
+        f"Network output, subtracted from the command, and its 15 weights; at the end they differ by {spread:.3g} Nm."
+    )
+    return draw(4.0, paint, "Network output and weights over time", caption)
+
+
+def estimator_figure(records: np.ndarray) -> Figure | None:
+    """Disturbance observer and iterative learning; None if neither was at work."""
+    on, time_s = powered(records), seconds(records)
+    used = [
+        part for part in _PARTS if part[0] in ("observer", "learned") and np.any(records[f"{part[0]}_torque_Nm"][on])
+    ]
+    if not used:
+        return None
+
+    def paint(figure: Picture) -> None:
+        axes = figure.subplots()
+        for name, label, color in used:
+            line(axes, time_s, np.where(on, records[f"{name}_torque_Nm"], np.nan), color, label)
+        _finish(axes, records, "torque [Nm]")
+
+    caption = "What the disturbance observer and the iterative learning add to the command."
+    return draw(2.6, paint, "Observer and learned torque over time", caption)
+
+
+def friction_points(records: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(velocity [rad/s], friction [Nm]) at the joint, in motion while TRACKING.
+
+    Friction = measured torque - inertia x desired acceleration - gravity: as good as the drive's torque reading, the
+    believed inertia, and the tracking; load torques count as friction.
+    """
+    moving = (records["phase"] == AxisPhase.TRACKING) & (np.abs(records["desired_velocity_radps"]) > _LEAST_SPEED_radps)
+    rows = records[moving]
+    friction = rows["measured_torque_Nm"] - rows["inertia_torque_Nm"] - rows["gravity_torque_Nm"]
+    return np.asarray(rows["velocity_radps"]), np.asarray(friction)
+
+
+def binned(velocity: np.ndarray, torque: np.ndarray) -> list[np.ndarray]:
+    """One array a direction, of the bins of speed that hold enough points: (velocity, 5 %, median, 95 %), (M, 4)."""
+    found = []
+    for sign in (-1.0, 1.0):
+        inside = sign * velocity > 0.0
+        speed, friction = np.abs(velocity[inside]), torque[inside]
+        if not len(speed):
+            continue
+        edges = np.linspace(0.0, speed.max(), _BINS + 1)
+        at = np.clip(np.digitize(speed, edges) - 1, 0, _BINS - 1)
+        rows = [
+            (sign * 0.5 * (edges[i] + edges[i + 1]), *np.percentile(friction[at == i], (5.0, 50.0, 95.0)))
+            for i in range(_BINS)
+            if np.count_nonzero(at == i) >= _LEAST_IN_BIN
+        ]
+        if rows:
+            found.append(np.array(rows))
+    return found
+
+
+def friction_figure(records: np.ndarray) -> Figure | None:
+    """Friction over velocity, measured and believed; None without motion."""
+    velocity, torque = friction_points(records)
+    if len(velocity) < 100:
+        return None
+    directions = binned(velocity, torque)
+    model = records[(records["phase"] == AxisPhase.TRACKING) & (records["friction_torque_Nm"] != 0.0)]
+
+    def paint(figure: Picture) -> None:
+        axes = figure.subplots()
+        axes.set_xmargin(0.02)
+        step = -(-len(velocity) // _CLOUD_POINTS)
+        axes.plot(velocity[::step], torque[::step], ".", color=MID_BLUE, markersize=1.5, alpha=0.25, rasterized=True)
+        for i, rows in enumerate(directions):
+            label = "median" if i == 0 else None
+            axes.plot(rows[:, 0], rows[:, 2], color=BLUE, label=label, linewidth=1.6)
+            band = "5 to 95 %" if i == 0 else None
+            axes.fill_between(rows[:, 0], rows[:, 1], rows[:, 3], color=BLUE, alpha=0.18, linewidth=0.0, label=band)
+        if len(model):
+            order = np.argsort(model["desired_velocity_radps"], kind="stable")
+            order = order[:: -(-len(order) // POINTS)]
+            axes.plot(
+                model["desired_velocity_radps"][order], model["friction_torque_Nm"][order], ".",
+                color=ORANGE, markersize=2.0, label="feed-forward",
+            )  # fmt: skip
+        axes.set_xlabel("joint velocity [rad/s]")
+        axes.set_ylabel("friction at the joint [Nm]")
+        legend_above(axes)
+
+    caption = (
+        "Friction map: measured torque less the believed inertia and gravity, over the measured velocity; "
+        "a load torque counts as friction. Feed-forward: what the controller compensates, over the desired velocity."
+    )
+    return draw(3.6, paint, "Friction torque over velocity", caption)
+
+
+def times_figure(records: np.ndarray) -> Figure:
+    """How late the loop woke up, how long a round trip and the work took."""
+
+    def paint(figure: Picture) -> None:
+        axes = figure.subplots()
+        axes.set_xmargin(0.02)
+        for name, label, color in (
+            ("wake_late_ns", "wake-up late", BLUE),
+            ("round_trip_ns", "round trip", ORANGE),
+            ("work_ns", "work", GREEN),
+        ):
+            values = records[name] / 1000.0
+            values = values[values > 0.0]
+            if len(values):
+                edges = np.geomspace(max(values.min(), 0.5), max(values.max(), 1.0) * 1.001, 80).tolist()
+                axes.hist(values, edges, histtype="step", color=color, label=label, linewidth=1.3)
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_xlabel("duration [us]")
+        axes.set_ylabel("cycles")
+        legend_above(axes)
+
+    caption = (
+        "Histogram of every logged cycle, both axes logarithmic. The right end of the blue line is the worst wake-up."
+    )
+    return draw(2.9, paint, "Histogram of wake-up delay, round trip and work", caption)
+
+
+def run_figures(records: np.ndarray) -> list[Figure]:
+    """All that apply, in the order of the report."""
+    found = (
+        trajectory_figure(records),
+        error_figure(records),
+        torque_figure(records),
+        network_figure(records),
+        estimator_figure(records),
+        friction_figure(records),
+        times_figure(records),
+    )
+    return [figure for figure in found if figure is not None]
+
+
+def temperature_figure(log: RunLog) -> list[Figure]:
+    """The drive's temperature over the run, where it reports one: one figure, or none."""
+    if len(log.temperatures) < LEAST_READINGS:
+        return []
+    time_s = (log.temperatures["time_ns"] - log.records["time_ns"][0]) * 1e-9
+
+    def paint(figure: Picture) -> None:
+        axes = figure.subplots()
+        axes.plot(time_s, log.temperatures["temperature_degC"], color=RED, drawstyle="steps-post")
+        axes.set_ylabel("temperature [°C]")
+        axes.set_xlabel("time [s]")
+
+    return [draw(2.2, paint, "Temperature of the drive over time", "As the drive tells it, once a second.")]

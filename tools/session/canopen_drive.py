@@ -1,0 +1,94 @@
+"""A CANopen drive in a session."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointctl.drivers.can.open import CYCLIC_INTERFACES, SHARED_INTERFACES
+from jointctl.drivers.canopen.cia402 import State, state_of_word, state_text
+from jointctl.drivers.drive import Drive
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.configuration.canopen import canopen_section, canopen_settings, cyclic_bus_load
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.session.fault_words import FaultText, emergency_text, fault_text
+from jointctl.tools.session.loop_delay import measured_delay_s
+from jointctl.tools.session.session_drive import SessionDrive
+
+if TYPE_CHECKING:
+    import can
+
+    from jointctl.tools.session.loop_handle import LoopOrder, SharedBlock
+    from jointctl.tools.session.loops import ReadyLoop
+
+_BAD = (State.FAULT, State.FAULT_REACTION_ACTIVE, State.UNDEFINED)
+
+
+class CanopenSession(SessionDrive):
+    """See `SessionDrive`.  The drive watches the loop's heartbeat by itself: no guard."""
+
+    def check_rate(self, config: Config) -> None:
+        """See `SessionDrive`."""
+        import can
+
+        cyclic_bus_load(config)
+        # a name that python-can does not know is reported when the bus is opened
+        if config.bus.interface not in CYCLIC_INTERFACES and config.bus.interface in can.VALID_INTERFACES:
+            from jointctl.tools.session.portable_loop import check_portable_rate
+
+            check_portable_rate(config.bus.interface, config.loop.rate_Hz)
+
+    def open(self, config: Config, gate: Callable[[], None] = lambda: None) -> Drive:
+        """See `SessionDrive`."""
+        from jointctl.drivers.can.open import open_python_can
+        from jointctl.drivers.canopen.drive import CanopenDrive
+
+        def open_bus() -> can.BusABC:
+            bus = config.bus
+            return open_python_can(bus.interface, bus.channel, bus.bitrate_bitps)
+
+        reopen = None if config.bus.interface in SHARED_INTERFACES else open_bus
+        return CanopenDrive(open_bus(), canopen_settings(config), reopen=reopen, gate=gate)
+
+    def port_record(self) -> type:
+        """See `SessionDrive`."""
+        from jointctl.drivers.canopen.cyclic import CanopenPort
+
+        return CanopenPort
+
+    def loop(self, order: LoopOrder, block: SharedBlock) -> AbstractContextManager[ReadyLoop]:
+        """Compiled on a bus that is a descriptor, in plain Python over any other."""
+        from jointctl.tools.session.loops import compiled_loop, portable_loop
+
+        return (compiled_loop if order.interface in CYCLIC_INTERFACES else portable_loop)(order, block)
+
+    def loop_delay_s(self, config: Config, histograms: np.ndarray) -> float:
+        """See `SessionDrive`."""
+        kind, rate_Hz = canopen_section(config).rpdo_transmission_type, config.loop.rate_Hz
+        return measured_delay_s(histograms, kind, 1.0 / rate_Hz, 1.0 / config.bus.bitrate_bitps)
+
+    def fault_text(
+        self, config: Config, fault: Fault, value: float, drive_error: int, encoder_error: int = 0
+    ) -> FaultText:
+        """See `SessionDrive`."""
+        two_encoders = config.joint_encoder is not None
+        return fault_text(fault, value, drive_error, encoder_error, two_encoders=two_encoders)
+
+    def error_text(self, code: int) -> str:
+        """See `SessionDrive`."""
+        return f"EMCY {emergency_text(code)}"
+
+    def state_text(self, status_word: int) -> str:
+        """Of CiA 402."""
+        return state_text(status_word)
+
+    def in_fault(self, status_word: int) -> bool:
+        """See `SessionDrive`."""
+        return state_of_word(status_word) in _BAD
+
+    def load_row(self, share: float) -> tuple[str, str]:
+        """See `SessionDrive`."""
+        return "bus load", f"{share:.1%} at worst-case stuffing"

@@ -1,0 +1,124 @@
+"""What a session does with a drive, whatever its kind: the second part of a drive's plug-in (see `DriveSection`)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from jointctl.drivers.drive import Drive
+from jointctl.firmware_py.states import DriveState, Fault, in_words
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.session.fault_words import FaultText
+
+if TYPE_CHECKING:
+    from jointctl.tools.session.loop_handle import LoopHandle, LoopOrder, SharedBlock
+    from jointctl.tools.session.loops import ReadyLoop
+
+
+class Guard(Protocol):
+    """A process that switches the drive off when this program and the loop have both died."""
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        ...
+
+    def wait_ready(self) -> None:
+        """Until it watches; without it nothing may be enabled."""
+        ...
+
+    def just_ended(self) -> bool:
+        """True once, if it has gone before it was released."""
+        ...
+
+    def release(self, state: str) -> None:
+        """The drive's state as the supervisor knows it; the guard ends, or tries on by itself where it is unknown."""
+        ...
+
+
+class SessionDrive(ABC):
+    """One for each kind of drive; `session_drive` gives it."""
+
+    @abstractmethod
+    def check_rate(self, config: Config) -> None:
+        """`ConfigurationError` if bus or line do not carry the rate; before anything is opened."""
+
+    @abstractmethod
+    def open(self, config: Config, gate: Callable[[], None] = lambda: None) -> Drive:
+        """The drive of the configuration, its bus or port open; nothing has been sent to it.
+
+        `gate` is called before each step until the loop runs, and raises where none may follow.  The caller holds the
+        lock.
+        """
+
+    @abstractmethod
+    def port_record(self) -> type:
+        """The record of the cyclic exchange, which the loop and `Drive.port` share."""
+
+    @abstractmethod
+    def loop(self, order: LoopOrder, block: SharedBlock) -> AbstractContextManager[ReadyLoop]:
+        """In the loop's own process: the loop, warm."""
+
+    @abstractmethod
+    def loop_delay_s(self, config: Config, histograms: np.ndarray) -> float:
+        """The loop delay as measured in the first cycles, with the drive off."""
+
+    def guard(self, config: Config, loop: LoopHandle) -> Guard | None:
+        """Started; None where the drive itself watches over the loop."""
+        return None
+
+    def refuse_beside_run(self, config: Config) -> None:  # noqa: B027  (most need nothing)
+        """`BusError` while a run has the line, where the lock of the bus does not tell."""
+
+    @abstractmethod
+    def fault_text(
+        self, config: Config, fault: Fault, value: float, drive_error: int, encoder_error: int = 0
+    ) -> FaultText:
+        """A fault in the words that fit the drive, its line and the joint's encoders."""
+
+    @abstractmethod
+    def error_text(self, code: int) -> str:
+        """An error that the drive reports by itself."""
+
+    def state_text(self, status_word: int) -> str | None:
+        """The state that a status word tells, with more detail than the loop's own; None: it tells no more."""
+        return None
+
+    def in_fault(self, status_word: int) -> bool:
+        """Whether the status word alone tells of a fault."""
+        return False
+
+    @abstractmethod
+    def load_row(self, share: float) -> tuple[str, str]:
+        """Name and text of the measured load of bus or line, for the summary of a run."""
+
+
+def drive_state_name(drive: SessionDrive, status_word: int, drive_state: int) -> str:
+    """`operation enabled` and so on; where the status word tells no more, the loop's own name of the state."""
+    if drive_state == DriveState.UNKNOWN:
+        return "not heard yet"
+    return drive.state_text(status_word) or in_words(DriveState(drive_state))
+
+
+def _canopen() -> SessionDrive:
+    from jointctl.tools.session.canopen_drive import CanopenSession
+
+    return CanopenSession()
+
+
+def _elmo_serial() -> SessionDrive:
+    from jointctl.tools.session.elmo_drive import ElmoSession
+
+    return ElmoSession()
+
+
+_DRIVES: dict[str, Callable[[], SessionDrive]] = {"canopen": _canopen, "elmo_serial": _elmo_serial}
+
+
+def session_drive(kind: str) -> SessionDrive:
+    """For drive.kind; only that drive's modules are loaded."""
+    return _DRIVES[kind]()

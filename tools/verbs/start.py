@@ -1,0 +1,84 @@
+"""The first code of `jointctl`: Ctrl-C during the imports of the command line ends it without a traceback."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import os
+import signal
+import sys
+
+STARTING = "jointctl-starting"  # as in `drivers.bus_lock`, whose imports take their time
+_CONTROLLING = {"run", "sweep", "clear-fault", "scope", "demo"}  # verbs
+_CONTROLLING_WITH = {("doctor", "--motion"), ("params", "restore")}
+
+
+def _mark_as_starting() -> None:
+    """`jointctl stop` waits for a program that was started before it, and ends it when it has the lock of its bus.
+
+    A memory file with that name, which the kernel lists; it is closed when the lock is held, or with the process.
+    """
+    words = set(sys.argv[1:])
+    controlling = bool(words & _CONTROLLING) or any(words.issuperset(both) for both in _CONTROLLING_WITH)
+    if controlling and "--lockstep" not in words and hasattr(os, "memfd_create"):
+        with contextlib.suppress(OSError):  # a system without it has no lock either
+            os.memfd_create(STARTING)
+
+
+FREE_DESCRIPTORS = 32  # that must be left: a run takes about 20, a library that gets none fails or hangs where it likes
+
+
+def main() -> None:
+    """Nothing is open yet that would have to be closed: the signal may simply end the process (130 in a shell)."""
+    _mark_as_starting()
+    ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # a script's background job ignores it
+    if ours:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    _require_descriptors()
+    from jointctl.tools.verbs.main import main as run
+
+    if ours:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    run()
+
+
+def _require_descriptors() -> None:
+    """Ends the program where too few files can be opened; a stop is tried all the same."""
+    if sys.argv[1:2] == ["stop"]:
+        return
+    opened: list[int] = []
+    try:
+        while len(opened) < FREE_DESCRIPTORS:
+            opened.append(os.open("/dev/null", os.O_RDONLY | os.O_CLOEXEC))
+    except OSError as error:
+        if error.errno in (errno.EMFILE, errno.ENFILE):
+            sys.stderr.write(
+                f"error: open files: {len(opened)} more may be opened, at least {FREE_DESCRIPTORS} are needed\n"
+                "hint: raise the limit, such as `ulimit -n 1024`\n"
+            )
+            sys.exit(1)
+    finally:
+        for descriptor in opened:
+            os.close(descriptor)
+
+
+def never_refuse_a_character() -> None:
+    """What the encoding of a terminal lacks (`LANG=C`) is escaped instead of ending the program."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def occupy_standard_streams() -> None:
+    """Put the null device in the place of each that is closed, for this process and its children.
+
+    Behind a closed one the next file or socket that is opened gets its number, and what is printed, by a child as well,
+    lands in it: in a CAN socket or a log.
+    """
+    while (fd := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(fd, True)
+    os.close(fd)
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w", encoding="utf-8"))  # noqa: SIM115

@@ -1,0 +1,172 @@
+"""Options and arguments that several verbs share, and how a verb's signature becomes its command line.
+
+A verb is one function, for Typer and for Python: `run(config, output, assume_yes=True)`.  A parameter may stand for
+several options: its type is then a dataclass, whose fields they are, or `Annotated["Type", function]` with the function
+that builds it, whose parameters they are.
+
+Every module of this package is loaded for `--help` and before `stop`: what takes its time is imported in functions.
+"""
+
+from __future__ import annotations
+
+import inspect
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, is_dataclass
+from functools import wraps
+from operator import itemgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_args
+
+import typer
+
+from jointctl.tools.output import Output
+
+if TYPE_CHECKING:
+    from jointctl.tools.configuration.config import Config
+    from jointctl.tools.configuration.drive_section import GivenPlace
+
+# headings of `jointctl --help`
+BEGIN, MOVE, INSPECT, FRICTION = "Begin", "Move a joint", "Look at a bus and a drive", "Friction"
+LOOK, COMPARE = "Look at a run", "Compare and measure"
+
+Interface = Annotated[str | None, typer.Option("-i", "--interface", help="python-can interface (env CAN_INTERFACE)")]
+Channel = Annotated[
+    str | None,
+    typer.Option("-c", "--channel", help="bus channel, with options: can0,host=...,port=... (env CAN_CHANNEL)"),
+]
+Bitrate = Annotated[int | None, typer.Option("-b", "--bitrate", help="bit/s (env CAN_BITRATE)")]
+Port = Annotated[str | None, typer.Option("-p", "--port", help="serial port of an elmo_serial drive")]
+Target = Annotated[
+    int | None, typer.Option("-t", "--target", help="CANopen node instead of drive.node", min=1, max=127)
+]
+Json = Annotated[bool, typer.Option("--json", help="result as one JSON document on stdout")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="no progress on stderr")]
+Report = Annotated[
+    Path | None, typer.Option("--report", metavar="FILE.html", help="the result as one self-contained page as well")
+]
+ConfigPath = Annotated[
+    Path, typer.Argument(metavar="CONFIG", help="configuration file (TOML), or the name of a shipped one")
+]
+Yes = Annotated[bool, typer.Option("-y", "--yes", help="move without asking")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="commission, show the motion envelope, move nothing")]
+AllowLowMargin = Annotated[
+    bool, typer.Option("--allow-low-margin", help="run a stable loop below the wanted phase margin")
+]
+Workers = Annotated[int | None, typer.Option("--workers", help="processes; default: one a core")]
+
+
+@dataclass(frozen=True)
+class CanOptions:
+    """Which CAN bus and node; None = as configured."""
+
+    interface: Interface = None
+    channel: Channel = None
+    bitrate: Bitrate = None
+    target: Target = None
+
+
+@dataclass(frozen=True)
+class BusOptions(CanOptions):
+    """Which bus or port, and which node; None = as configured."""
+
+    port: Port = None
+
+
+AS_CONFIGURED = BusOptions()
+
+
+def config_path(path: Path) -> Path:
+    """The file itself, or a shipped configuration of that name."""
+    from jointctl.tools.configuration.load import shipped_config
+
+    shipped = shipped_config(str(path))
+    return shipped if not os.path.exists(path) and os.path.exists(shipped) else path
+
+
+def place(bus: CanOptions) -> GivenPlace:
+    """What the command line says of bus, port and node."""
+    from jointctl.tools.configuration.drive_section import GivenPlace
+
+    port = bus.port if isinstance(bus, BusOptions) else None
+    return GivenPlace(bus.interface, bus.channel, bus.bitrate, port, bus.target)
+
+
+def loaded(config: Path, bus: CanOptions = AS_CONFIGURED) -> Config:
+    """The configuration with what the command line and the environment say about bus, port and node."""
+    from jointctl.tools.configuration.load import load_config, moved
+
+    found = load_config(config_path(config))
+    for remark in found.remarks:
+        Output().warning(f"{found.path}: {remark}")
+    return moved(found, place(bus))
+
+
+# --- Parameters that several options build ---
+
+
+def _loaded(*, config: ConfigPath, bus: BusOptions) -> Config:
+    return loaded(config, bus)
+
+
+def _loaded_file(config: ConfigPath) -> Config:
+    return loaded(config)
+
+
+def _loaded_or_virtual(*, config: ConfigPath = Path("virtual"), bus: BusOptions) -> Config:
+    return loaded(config, bus)
+
+
+def _json_output(json: Json = False) -> Output:
+    return Output(json=json)
+
+
+def _quiet_output(quiet: Quiet = False) -> Output:
+    return Output(quiet=quiet)
+
+
+def _output(json: Json = False, quiet: Quiet = False) -> Output:
+    return Output(json=json, quiet=quiet)
+
+
+JointOnBus = Annotated["Config", _loaded]
+JointOfFile = Annotated["Config", _loaded_file]
+JointOrVirtual = Annotated["Config", _loaded_or_virtual]
+ResultOutput = Annotated[Output, _json_output]  # of a verb that is done at once
+ProgressOutput = Annotated[Output, _quiet_output]  # of a verb without a result
+VerbOutput = Annotated[Output, _output]
+
+
+def grouped(verb: Callable[..., int | None]) -> Callable[..., None]:
+    """The verb for Typer, which ends the program with the verb's exit code; the options of its output come last."""
+    options: list[inspect.Parameter] = []
+    last: list[inspect.Parameter] = []
+    call = _collect(verb, options, last)
+
+    @wraps(verb)
+    def command(**given: Any) -> None:
+        raise typer.Exit(call(given) or 0)
+
+    del vars(command)["__wrapped__"]  # Typer would look through it
+    vars(command)["__signature__"] = inspect.Signature([*options, *last])
+    command.__annotations__ = {option.name: option.annotation for option in [*options, *last]}
+    return command
+
+
+def _collect(
+    function: Callable[..., Any], options: list[inspect.Parameter], last: list[inspect.Parameter]
+) -> Callable[[dict[str, Any]], Any]:
+    """Appends the options for which the function's parameters stand; what calls it with the values of all options."""
+    values: dict[str, Callable[[dict[str, Any]], Any]] = {}
+    names = vars(sys.modules[function.__module__])
+    for parameter in inspect.signature(function).parameters.values():
+        annotation = eval(parameter.annotation, names)  # not that of the return, which may not be loaded
+        parts = get_args(annotation) or (annotation,)
+        several = inspect.isfunction(parts[-1]) or is_dataclass(parts[-1])
+        if several:
+            values[parameter.name] = _collect(parts[-1], last if parts[0] is Output else options, last)
+        else:
+            options.append(parameter.replace(annotation=annotation, kind=inspect.Parameter.KEYWORD_ONLY))
+            values[parameter.name] = itemgetter(parameter.name)
+    return lambda given: function(**{name: value(given) for name, value in values.items()})
