@@ -23,14 +23,15 @@ from tests.configurations import written
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "virtual.toml"
 ON_VCAN = ("-i", "socketcan", "-c", "vcan0")
 # A slow guest may need some periods for a cycle, and now and then stand still: gains that do not mind a late command,
-# and limits that do not mind a pause.  This is about the bus; timing is measured elsewhere.
+# and limits that do not mind a pause.  This is about the bus; timing is measured elsewhere.  Its only processor is
+# shared fairly: a loop with SCHED_FIFO that takes all of it starves its supervisor, which the loop then stops for.
 GENTLE = {
     "control.kp": 64.0, "control.kv": 16.0, "control.lyapunov_q": 20.0,
     "limits.sample_age_max_s": 0.5, "limits.skipped_max_s": 0.5, "limits.following_error_max_rad": 0.3,
     # the guest has one processor: an answer that waited while it stood still seems to belong to the next SYNC
     "limits.position_jump_max_rad": 0.1, "limits.velocity_max_radps": 5.0,
     "sequence.supervisor_timeout_s": 5.0, "sequence.wait_timeout_s": 30.0, "drive.heartbeat_s": 0.6,
-    "log.picture": False,
+    "log.picture": False, "loop.priority": None,
 }  # fmt: skip
 # as the driver of a controller makes it
 ERROR_PASSIVE = "20000004#0020000000008000"
