@@ -162,6 +162,13 @@ class Rig:
         assert self.phase == phase
         return self
 
+    def reach(self, phase: AxisPhase) -> Rig:
+        """The same, by a stop where it takes one."""
+        if AxisPhase.RAMPING <= phase <= AxisPhase.QUICK_STOPPING:
+            self.until(AxisPhase.TRACKING).run(5)
+            self.stop = StopRequest.QUICK_STOP if phase is AxisPhase.QUICK_STOPPING else StopRequest.RAMP
+        return self.until(phase)
+
 
 NewRig = Callable[..., Any]
 POWERED = (AxisPhase.APPROACH, AxisPhase.TRACKING, AxisPhase.RAMPING, AxisPhase.RELEASING)

@@ -115,6 +115,14 @@ class DeviceOnBus:
                 payload = payload[:4] + struct.pack("<I", value)
         self._bus.send(can.Message(arbitration_id=identifier, data=payload[:size], is_extended_id=False))
 
+    def downloads(self, index: int, sub: int = 0) -> list[int]:
+        """What was written to an object, in order: expedited downloads."""
+        found = []
+        for cob_id, data in self.requests:
+            if cob_id == 0x601 and data[0] & 0xE2 == 0x22 and struct.unpack_from("<HB", data, 1) == (index, sub):
+                found.append(int.from_bytes(data[4 : 8 - (data[0] >> 2 & 3)], "little"))
+        return found
+
     def send(self, identifier: int, data: bytes) -> None:
         """A frame of someone else, which the drive takes as well."""
         with can.Bus(interface="virtual", channel=self.channel) as bus:

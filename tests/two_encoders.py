@@ -6,6 +6,8 @@ import struct
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from jointctl.drivers.can.frames import Frame
 from jointctl.drivers.canopen.cyclic import accept_frame, begin_cycle
 from jointctl.firmware_py.schema import new
@@ -47,13 +49,15 @@ def cycle(port: Any, sample: Any, first: int | None, second: int | None) -> None
 
 def tell(port: Any, sample: Any, first: int | None, second: int | None) -> None:
     """The TPDOs of drive and encoder."""
-    frames = new(Frame, 4)
-    for identifier, data in (
-        (0x181, None if first is None else struct.pack("<HiH", 0x1237, first, 0)),
-        (0x182, None if second is None else struct.pack("<I", second)),
-    ):
-        if data is not None:
-            frames[3].can_id, frames[3].length = identifier, len(data)
-            for at, byte in enumerate(data):
-                frames[3].payload[at] = byte
-            accept_frame(port[0], frames[3], sample, 1)
+    if first is not None:
+        hear(port, sample, 0x181, struct.pack("<HiH", 0x1237, first, 0))
+    if second is not None:
+        hear(port, sample, 0x182, struct.pack("<I", second))
+
+
+def hear(port: Any, sample: Any, identifier: int, data: bytes) -> None:
+    """One frame of drive or encoder."""
+    frame = new(Frame)[0]
+    frame.can_id, frame.length = identifier, len(data)
+    frame.payload[: len(data)] = np.frombuffer(data, np.uint8)
+    accept_frame(port[0], frame, sample, 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from typing import Any
 
 import canopen
@@ -14,21 +15,33 @@ from tests.places import EDS
 NODE = 5
 MS = 1_000_000
 REMOTE = 0x40000000
+_FRAME = struct.Struct("<IB3x8s")
+
+
+def virtual_drive(device_settings: DeviceSettings | None = None, **settings: Any) -> Cia402Device:
+    """The drive of the shipped EDS, with settings of the plant."""
+    return Cia402Device(EDS, device_settings or DeviceSettings(node_id=NODE), *plant(**settings))
+
+
+def frame(identifier: int, data: bytes) -> bytes:
+    """A `struct can_frame`."""
+    return _FRAME.pack(identifier, len(data), data)
 
 
 class Rig:
     """A device and a clock; `send` and `run` collect what it sends."""
 
-    def __init__(self, device_settings: DeviceSettings | None = None, **settings: Any) -> None:
-        self.device = Cia402Device(EDS, device_settings or DeviceSettings(node_id=NODE), *plant(**settings))
+    def __init__(
+        self, device_settings: DeviceSettings | None = None, *, device: Cia402Device | None = None, **settings: Any
+    ) -> None:
+        self.device = device or virtual_drive(device_settings, **settings)
         self.now_ns = 1000 * MS
         self.sent: list[tuple[int, bytes]] = []
         self._collect(self.device.advance(self.now_ns))
 
     def _collect(self, frames: list[bytes]) -> list[tuple[int, bytes]]:
         got = []
-        for frame in frames:
-            identifier, size, data = struct.unpack("<IB3x8s", frame)
+        for identifier, size, data in map(_FRAME.unpack, frames):
             got.append((identifier, data[:size]))
         self.sent += got
         return got
@@ -43,8 +56,7 @@ class Rig:
         return got
 
     def send(self, identifier: int, data: bytes) -> list[tuple[int, bytes]]:
-        frame = struct.pack("<IB3x8s", identifier, len(data), data)
-        return self._collect(self.device.handle(frame, self.now_ns))
+        return self._collect(self.device.handle(frame(identifier, data), self.now_ns))
 
     def write(self, index: int, sub: int, value: int, size: int) -> int:
         """SDO download; the abort code, 0 = accepted."""
@@ -84,24 +96,33 @@ class Rig:
 
 
 class Network(canopen.Network):
-    """A network whose only other member is the device, at injected time."""
+    """A network whose only other member is the device, at injected time; `lose` may swallow frames of either way."""
 
-    def __init__(self, device: Cia402Device) -> None:
+    def __init__(
+        self, device: Cia402Device, lose: Callable[[int, bytes], bool] = lambda identifier, data: False
+    ) -> None:
         super().__init__()
-        self.device = device
+        self.device, self.lose = device, lose
         self.now_ns = 1_000_000
 
     def _notify(self, frames: list[bytes]) -> None:
-        for frame in frames:
-            identifier, size, data = struct.unpack("<IB3x8s", frame)
-            self.notify(identifier, bytearray(data[:size]), self.now_ns * 1e-9)
+        for identifier, size, data in map(_FRAME.unpack, frames):
+            if not self.lose(identifier, data):
+                self.notify(identifier, bytearray(data[:size]), self.now_ns * 1e-9)
 
     def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
-        word = can_id | (REMOTE if remote else 0)
-        frame = struct.pack("<IB3x8s", word, len(data), bytes(data))
-        self._notify(self.device.handle(frame, self.now_ns))
+        if not self.lose(can_id, bytes(data)):
+            self._notify(self.device.handle(frame(can_id | (REMOTE if remote else 0), bytes(data)), self.now_ns))
 
     def run(self, ms: int) -> None:
         for _ in range(ms):
             self.now_ns += 1_000_000
             self._notify(self.device.advance(self.now_ns))
+
+
+def network_node(network: Network, timeout_s: float) -> Any:
+    """The device as a node of the library, booted."""
+    remote = network.add_node(NODE, str(EDS))
+    remote.sdo.RESPONSE_TIMEOUT = timeout_s
+    network.run(1)
+    return remote

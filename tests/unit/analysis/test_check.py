@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from jointctl.tools.experiments.controllers import from_file
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.check import check
 from jointctl.tools.verbs.fault_campaign import fault_campaign
+from tests.configurations import shipped
 
 
 # --- `check`: table, JSON, verdict, remedies and picture; where each assumption comes from ---
@@ -32,13 +34,7 @@ def wide_table(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "250")
 
 
-def changed(section: str, config: Config | None = None, **values: Any) -> Config:
-    """The paper's configuration with these values in one section."""
-    config = load_config(shipped_config("paper")) if config is None else config
-    return config.model_copy(update={section: getattr(config, section).model_copy(update=values)})
-
-
-PAPER_SIMULATION = {"lyapunov_q": (2500.0,)}
+PAPER_SIMULATION = {"control__lyapunov_q": (2500.0,)}
 
 
 def run_check(config: Config, delay_s: float | None = None, **options: Any) -> tuple[str, str, int]:
@@ -53,7 +49,7 @@ def run_check(config: Config, delay_s: float | None = None, **options: Any) -> t
 
 
 def test_the_paper_on_its_platform_passes_and_everything_is_printed() -> None:
-    shown, messages, code = run_check(load_config(shipped_config("paper")))
+    shown, messages, code = run_check(shipped("paper"))
     assert code == 0
     for text in ("12680.357", "16.092", "6.709", "0.008536", "24.2 deg", "5.11 ms", "16.5 s", "2.40", "verdict", "ok"):
         assert text in shown
@@ -63,12 +59,12 @@ def test_the_paper_on_its_platform_passes_and_everything_is_printed() -> None:
 
 @pytest.mark.parametrize("name", ["virtual", "paper"])
 def test_every_shipped_virtual_configuration_has_its_margin(name: str) -> None:
-    found = require_margin(load_config(shipped_config(name)))
+    found = require_margin(shipped(name))
     assert found.phase_margin_deg >= 20.0
 
 
 def test_too_small_a_margin_is_refused_with_numbers() -> None:
-    shown, messages, code = run_check(changed("control", **PAPER_SIMULATION))
+    shown, messages, code = run_check(shipped("paper", **PAPER_SIMULATION))
     assert code == 9
     assert "too small" in shown
     assert "16.8 deg" in shown
@@ -81,29 +77,28 @@ def test_too_small_a_margin_is_refused_with_numbers() -> None:
         assert remedy in messages
 
 
-def test_an_unstable_loop_is_called_so() -> None:
-    shown, messages, code = run_check(load_config(shipped_config("paper")), 8e-3)
+def test_an_unstable_loop_is_called_so_and_its_json_is_valid() -> None:
+    shown, messages, code = run_check(shipped("paper"), 8e-3)
     assert code == 9
     assert "NO" in shown
     assert "the control loop is unstable" in messages
+    margins = json.loads(run_check(shipped("paper"), 8e-3, json=True)[0])["margins"]
+    assert (margins["stable"], margins["sensitivity_peak"]) == (False, None)  # infinite
 
 
 def test_the_limit_is_met_exactly_at_the_boundary() -> None:
-    config = load_config(shipped_config("paper"))
-    margin_deg = require_margin(config).phase_margin_deg
+    margin_deg = require_margin(shipped("paper")).phase_margin_deg
     for above_deg, refused in ((-1e-9, False), (0.0, False), (1e-9, True), (0.1, True)):
-        wanted = changed("margin", min_phase_margin_deg=margin_deg + above_deg)
-        if refused:
-            with pytest.raises(MarginError):
-                require_margin(wanted)
-        else:
+        wanted = shipped("paper", margin__min_phase_margin_deg=margin_deg + above_deg)
+        with pytest.raises(MarginError) if refused else nullcontext():
             require_margin(wanted)
 
 
-def test_the_override_accepts_a_small_margin_but_never_an_unstable_loop() -> None:
-    config = changed("control", **PAPER_SIMULATION)
-    with pytest.raises(MarginError):
-        require_margin(config)
+def test_the_override_accepts_a_small_margin_but_never_an_unstable_loop_and_the_measured_delay_decides() -> None:
+    config = shipped("paper", **PAPER_SIMULATION)
+    with pytest.raises(MarginError, match=r"1\.5 ms loop delay"):
+        require_margin(config, 1.5e-3)
+    assert require_margin(config, 0.3e-3).phase_margin_deg > 20.0
     assert require_margin(config, allow_low_margin=True).stable
     shown, _, code = run_check(config, allow_low_margin=True)
     assert code == 0
@@ -112,15 +107,8 @@ def test_the_override_accepts_a_small_margin_but_never_an_unstable_loop() -> Non
         require_margin(config, 8e-3, allow_low_margin=True)
 
 
-def test_the_measured_delay_decides() -> None:
-    config = changed("control", **PAPER_SIMULATION)
-    assert require_margin(config, 0.3e-3).phase_margin_deg > 20.0
-    with pytest.raises(MarginError, match=r"1\.5 ms loop delay"):
-        require_margin(config, 1.5e-3)
-
-
 def test_json_holds_the_same_numbers() -> None:
-    shown, _, code = run_check(changed("control", **PAPER_SIMULATION), json=True)
+    shown, _, code = run_check(shipped("paper", **PAPER_SIMULATION), json=True)
     data = json.loads(shown)
     assert code == 9
     assert data["verdict"] == "too small"
@@ -132,13 +120,6 @@ def test_json_holds_the_same_numbers() -> None:
     assert delay == {"name": "loop delay", "value": 1e-3, "unit": "s", "origin": delay["origin"]}
     assert all(remedy["phase_margin_deg"] >= 20.0 for remedy in data["remedies"])
     assert data["remedies"]
-
-
-def test_json_of_an_unstable_loop_is_valid() -> None:
-    shown, _, _ = run_check(load_config(shipped_config("paper")), 8e-3, json=True)
-    data = json.loads(shown)
-    assert data["margins"]["stable"] is False
-    assert data["margins"]["sensitivity_peak"] is None  # infinite
 
 
 @pytest.mark.parametrize(("name", "error", "text"), [
@@ -158,7 +139,7 @@ def test_a_picture_never_replaces_the_configuration(
 @pytest.mark.parametrize("delay_s", [None, 8e-3])
 def test_a_picture_is_written_for_stable_and_unstable_loops(tmp_path: Path, delay_s: float | None) -> None:
     path = tmp_path / "folder" / "loop.png"
-    shown, _, _ = run_check(load_config(shipped_config("paper")), delay_s, figure=path)
+    shown, _, _ = run_check(shipped("paper"), delay_s, figure=path)
     assert path.read_bytes().startswith(b"\x89PNG")
     assert "loop.png" in shown
 
@@ -167,7 +148,7 @@ def test_a_picture_is_written_for_stable_and_unstable_loops(tmp_path: Path, dela
     ("transmission_type", "periods"), [(0, 1.0), (1, 1.0), (2, 2.0), (240, 240.0), (254, 1.0), (255, 1.0)]
 )
 def test_the_assumed_delay_follows_the_rpdo(transmission_type: int, periods: float) -> None:
-    config = changed("drive", rpdo_transmission_type=transmission_type)
+    config = shipped("paper", drive__rpdo_transmission_type=transmission_type)
     settings, assumptions = loop_settings(config)
     assert settings.delay_s == pytest.approx(periods * 1e-3)
     origin = assumptions[1].origin
@@ -175,49 +156,44 @@ def test_the_assumed_delay_follows_the_rpdo(transmission_type: int, periods: flo
     assert ("asynchronous" in origin) is (transmission_type > 240)
 
 
-def test_measured_beats_configured_beats_assumed() -> None:
-    config = changed("margin", loop_delay_s=1.7e-3, current_lag_s=0.9e-3)
-    settings, assumptions = loop_settings(config)
-    assert (settings.delay_s, settings.lag_s) == (1.7e-3, 0.9e-3)
-    assert assumptions[1].origin == "margin.loop_delay_s"
-    settings, assumptions = loop_settings(config, 2.5e-3)
-    assert settings.delay_s == 2.5e-3
-    assert assumptions[1].origin == "measured"
-
-
-def test_the_section_of_the_configuration_is_used() -> None:
-    config = changed("margin", loop_delay_s=0.0, current_lag_s=0.001)
-    settings, _ = loop_settings(config)
-    assert (settings.delay_s, settings.lag_s) == (0.0, 0.001)  # a delay of 0 is a value, not "unknown"
+@pytest.mark.parametrize("configured_s", [1.7e-3, 0.0])  # a delay of 0 is a value, not "unknown"
+def test_measured_beats_configured_beats_assumed(configured_s: float) -> None:
+    config = shipped("paper", margin__loop_delay_s=configured_s, margin__current_lag_s=0.9e-3)
+    for measured_s, origin in ((None, "margin.loop_delay_s"), (2.5e-3, "measured")):
+        settings, assumptions = loop_settings(config, measured_s)
+        assert (settings.delay_s, settings.lag_s) == (measured_s or configured_s, 0.9e-3)
+        assert assumptions[1].origin == origin
 
 
 def test_a_negative_measured_delay_is_named() -> None:
     with pytest.raises(ConfigurationError, match=r"delay_s \(=-0\.001\) must be >= 0"):
-        require_margin(load_config(shipped_config("paper")), -1e-3)
+        require_margin(shipped("paper"), -1e-3)
 
 
-def test_every_kind_of_the_configuration_can_be_checked() -> None:
+@pytest.mark.parametrize(
+    ("settings", "delay_s", "remedy"),
+    [
+        ({"kind": "computed_torque"}, None, ""),
+        ({"kind": "computed_torque_observer", "observer_radps": 60.0}, None, ""),
+        ({"kind": "computed_torque_observer", "observer_radps": 200.0}, 3e-3, "control.observer_radps = "),
+        ({"kind": "pid", "kp": 6075.0, "kv": 135.0, "ki": 91125.0}, None, ""),
+        ({"kind": "pid", "kp": 6075.0, "kv": 135.0, "ki": 91125.0}, 5e-3, ", ki = "),
+    ],
+)
+def test_the_other_kinds_can_be_checked_and_their_remedies_name_their_own_settings(
+    settings: dict[str, Any], delay_s: float | None, remedy: str
+) -> None:
     assert set(CONTROLLERS) == set(ControllerKind)
-    for kind, extra in (
-        ("computed_torque", {}),
-        ("computed_torque_observer", {"observer_radps": 60.0}),
-        ("pid", {"kp": 6075.0, "kv": 135.0, "ki": 91125.0}),
-    ):
-        shown, _, code = run_check(changed("control", kind=kind, **extra))
-        assert code == 0
-        assert "eigenvalues of P" not in shown
-
-
-def test_remedies_of_the_other_kinds_name_their_own_settings() -> None:
-    pid = changed("control", kind="pid", kp=6075.0, kv=135.0, ki=91125.0)
-    assert ", ki = " in run_check(pid, 5e-3)[1]
-    observer = changed("control", kind="computed_torque_observer", observer_radps=200.0)
-    assert "control.observer_radps = " in run_check(observer, 3e-3)[1]
+    config = shipped("paper", **{f"control__{key}": value for key, value in settings.items()})
+    shown, messages, code = run_check(config, delay_s)
+    assert code == (9 if remedy else 0)
+    assert remedy in messages
+    assert "eigenvalues of P" not in shown
 
 
 def test_widths_and_q_pairs_arrive() -> None:
     widths = tuple(0.01 * (i + 1) for i in range(15))
-    settings, _ = loop_settings(changed("control", widths=widths, lyapunov_q=(1000.0, 20.0)))
+    settings, _ = loop_settings(shipped("paper", control__widths=widths, control__lyapunov_q=(1000.0, 20.0)))
     assert settings.widths == widths
     assert settings.q == (1000.0, 20.0)
     assert len(settings.centres) == 15
@@ -225,44 +201,31 @@ def test_widths_and_q_pairs_arrive() -> None:
 
 
 def test_what_the_model_leaves_out_is_said() -> None:
-    config = changed("joint", gravity_Nm=5.0, coriolis_Nmspr=0.1)
-    config = changed("control", config, dead_zone_rad=1e-4)
-    texts = not_modelled(config)
-    assert [text.split(" ")[0] for text in texts] == [
+    config = shipped("paper", joint__gravity_Nm=5.0, joint__coriolis_Nmspr=0.1, control__dead_zone_rad=1e-4)
+    assert [text.split(" ")[0] for text in not_modelled(config)] == [
         "control.feed_forward", "joint.gravity_Nm", "joint.coriolis_Nmspr", "control.dead_zone_rad",
     ]  # fmt: skip
-    assert not_modelled(changed("control", feed_forward="desired")) == []
-
-
-def precise_with(bits: int, side: str = "joint") -> Config:
-    config = load_config(shipped_config("precise"))
-    return changed("encoder", config, counts_per_turn=2**bits, side=side)
+    assert not_modelled(shipped("paper", control__feed_forward="desired")) == []
 
 
 @pytest.mark.parametrize(
     ("bits", "side", "warned"), [(14, "joint", True), (16, "joint", True), (17, "joint", False), (14, "motor", False)]
 )
 def test_an_encoder_too_coarse_for_the_gains_is_told(bits: int, side: str, warned: bool) -> None:
-    texts = [text for text in not_modelled(precise_with(bits, side)) if "chatter" in text]
-    assert bool(texts) is warned
+    config = shipped("precise", encoder__counts_per_turn=2**bits, encoder__side=side)
+    assert any("chatter" in text for text in not_modelled(config)) is warned
 
 
-def test_a_soft_reducer_is_told_with_its_resonance() -> None:
-    config = load_config(shipped_config("precise"))
-    assert not [text for text in not_modelled(config) if "reducer" in text]
-    soft = changed(
-        "virtual",
-        config,
-        flexible=True,
-        motor_side_inertia_kgm2=1.05,
-        reducer_stiffness_Nmprad=1.05 / 2 * 6283.2**2 / 1e4,
-    )
-    assert [text for text in not_modelled(soft) if "the reducer resonates at 10.0 Hz" in text]
-
-
-def test_of_a_real_joint_nobody_knows_the_reducer() -> None:
-    config = load_config(shipped_config("precise")).model_copy(update={"virtual": None})
-    assert [text for text in not_modelled(config) if "flexibility of the reducer" in text]
+def test_a_soft_reducer_is_told_with_its_resonance_and_of_a_real_joint_nobody_knows_it() -> None:
+    soft = {"flexible": True, "motor_side_inertia_kgm2": 1.05, "reducer_stiffness_Nmprad": 1.05 / 2 * 6283.2**2 / 1e4}
+    for changes, words in (
+        ({}, []),
+        ({f"virtual__{key}": value for key, value in soft.items()}, ["the reducer resonates at 10.0 Hz"]),
+        ({"virtual": None}, ["flexibility of the reducer"]),
+    ):
+        texts = [text for text in not_modelled(shipped("precise", **changes)) if "reducer" in text]
+        assert len(texts) == len(words)
+        assert all(word in text for word, text in zip(words, texts, strict=True))
 
 
 # --- `jointctl check` on a serial line: a rate that the line cannot carry is refused, and the advice passes ---
@@ -313,9 +276,9 @@ def test_a_rate_that_leaves_the_gains_as_they_are(tmp_path: Path) -> None:
 
 
 def test_what_is_simulated_in_lockstep_is_refused_in_one_line() -> None:
-    config = load_config(shipped_config("elmo_serial"))
+    config = shipped("elmo_serial")
     with pytest.raises(ConfigurationError, match=r'drive.kind \(=elmo_serial\) must be "canopen" for fault-campaign'):
         fault_campaign(config, Output())
     with pytest.raises(ConfigurationError, match=r'drive.kind \(=elmo_serial\) must be "canopen" for study'):
         from_file("elmo_serial")
-    require_simulated(load_config(shipped_config("virtual")), "fault-campaign")  # the twin
+    require_simulated(shipped("virtual"), "fault-campaign")  # the twin

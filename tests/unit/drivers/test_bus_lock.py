@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import SimpleNamespace
-from typing import IO, Any
+from typing import Any
 
 import pytest
 
@@ -37,14 +37,6 @@ from jointctl.drivers.local_socket import send_line
 from jointctl.tools.session import stop_call
 from jointctl.tools.session.stop_call import StopCall
 
-LOCK = """
-import sys, time
-from jointctl.drivers.bus_lock import BusLock
-lock = BusLock(*sys.argv[1:])
-print("mine", flush=True)
-time.sleep(60)
-"""
-
 
 @pytest.fixture
 def channel() -> str:
@@ -52,35 +44,49 @@ def channel() -> str:
     return f"locked-{os.getpid()}"
 
 
-def test_the_second_is_told_who_has_the_bus(channel: str) -> None:
-    command = [sys.executable, "-c", LOCK, "socketcan", channel]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as first:
-        try:
-            said: IO[str] | None = first.stdout
-            assert said is not None
-            assert said.readline() == "mine\n"
-            for _ in range(3):
-                with pytest.raises(BusError, match=rf"controls socketcan:{channel} \(.*, pid {first.pid}\)"):
-                    BusLock("socketcan", channel)
-            first.send_signal(signal.SIGKILL)
-            first.wait()
-            BusLock("socketcan", channel).close()
-        finally:
-            first.kill()
+@pytest.fixture
+def name(channel: str) -> str:
+    """That of its lock."""
+    return lock_name("socketcan", channel)
 
 
-def test_a_bus_is_free_again_after_its_controller(channel: str) -> None:
+@contextmanager
+def squatter(name: str) -> Iterator[socket.socket]:
+    """Someone who holds the name of a lock and is no controller."""
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(b"\0" + name.encode())
+        listener.listen()
+        yield listener
+
+
+@contextmanager
+def first_holder(channel: str) -> Iterator[Holder]:
+    """The one that a stop would ask."""
+    (holder,) = lock_holders("socketcan", channel)
+    yield holder
+    holder.close()
+
+
+def test_the_second_is_told_who_has_the_bus_and_a_dead_one_leaves_nothing(channel: str) -> None:
+    with controller(channel) as first:
+        for _ in range(3):
+            with pytest.raises(BusError, match=rf"controls socketcan:{channel} \(.*, pid {first.pid}\)"):
+                BusLock("socketcan", channel)
+        first.kill()
+        first.wait()
+        BusLock("socketcan", channel).close()
+
+
+def test_a_bus_is_free_again_after_its_controller_and_others_are_others(channel: str) -> None:
     lock = BusLock("socketcan", channel)
     lock.close()
     lock.close()
-    with BusLock("socketcan", channel), pytest.raises(BusError):
-        BusLock("socketcan", channel)
-    BusLock("socketcan", channel).close()
-
-
-def test_other_buses_are_others(channel: str) -> None:
     with BusLock("socketcan", channel), BusLock("socketcan", f"{channel}2"), BusLock("pcan", channel):
-        pass
+        with pytest.raises(BusError):
+            BusLock("socketcan", channel)
+        with BusLock("virtual", channel), BusLock("virtual", channel):  # inside a process: no lock is needed
+            pass
+    BusLock("socketcan", channel).close()
 
 
 def test_links_lead_to_the_same_bus(tmp_path: Path) -> None:
@@ -120,11 +126,6 @@ def test_where_such_sockets_are_forbidden_there_is_no_lock(channel: str, monkeyp
     BusLock("socketcan", channel).close()
 
 
-def test_a_bus_inside_a_process_needs_no_lock(channel: str) -> None:
-    with BusLock("virtual", channel), BusLock("virtual", channel):
-        pass
-
-
 def test_no_process_that_was_started_keeps_the_lock(channel: str) -> None:
     lock = BusLock("socketcan", channel)
     command = [sys.executable, "-c", "print(flush=True); input()"]
@@ -162,21 +163,17 @@ def controller(channel: str, code: str = HOLD) -> Iterator[subprocess.Popen[str]
 
 
 @pytest.mark.parametrize("held", [1, NAMES])
-def test_a_mere_holder_of_the_name_is_a_remark(channel: str, held: int) -> None:
-    name = lock_name("socketcan", channel)
+def test_a_mere_holder_of_the_name_is_a_remark(channel: str, name: str, held: int) -> None:
     with ExitStack() as stack:
         for number in range(held):
-            squatter = stack.enter_context(socket.socket(socket.AF_UNIX))
-            squatter.bind(b"\0" + (name if number == 0 else f"{name}-{number}").encode())
-            squatter.listen()
+            stack.enter_context(squatter(name if number == 0 else f"{name}-{number}"))
         with BusLock("socketcan", channel) as lock:
             assert len(lock.remarks) == held + (held == NAMES)
             assert "is no controller: it is ignored" in lock.remarks[0]
             if held < NAMES:
                 with pytest.raises(BusError, match="another program controls"):
                     BusLock("socketcan", channel)
-        called = StopCall("socketcan", channel)
-        with called:
+        with StopCall("socketcan", channel) as called:
             assert called.end(lambda _: None) is False
 
 
@@ -218,15 +215,14 @@ def test_one_that_does_not_end_is_ended(channel: str, number: signal.Signals | N
 
 
 @pytest.mark.parametrize("data", [b"", b"garbage\n", b"[" * 300, b'{"ask": 7}\n', b"x" * 10_000])
-def test_garbage_and_silence_keep_no_one_from_stopping(channel: str, data: bytes) -> None:
+def test_garbage_and_silence_keep_no_one_from_stopping(channel: str, name: str, data: bytes) -> None:
     stopped: list[int] = []
     with BusLock("socketcan", channel, lambda: stopped.append(1)), ExitStack() as stack:
         for _ in range(100):
-            caller = stack.enter_context(socket.socket(socket.AF_UNIX))
-            caller.connect(b"\0" + lock_name("socketcan", channel).encode())
+            caller = stack.enter_context(caller_of(channel))
             with suppress(OSError):
                 caller.sendall(data)
-        holder = Holder(lock_name("socketcan", channel), 0)
+        holder = Holder(name, 0)
         holder.send("stop")
         wait_for_answers([holder])
         assert holder.within_s is not None
@@ -263,12 +259,13 @@ def caller_of(channel: str) -> socket.socket:
     return caller
 
 
-def asked(channel: str, ask: str) -> Holder:
-    """To be closed."""
-    (holder,) = lock_holders("socketcan", channel)
-    holder.send(ask)
-    wait_for_answers([holder])
-    return holder
+@contextmanager
+def asked(channel: str, ask: str) -> Iterator[Holder]:
+    """The one that holds the lock, after its answer."""
+    with first_holder(channel) as holder:
+        holder.send(ask)
+        wait_for_answers([holder])
+        yield holder
 
 
 def test_a_stop_counts_once_and_its_signals_are_blocked_where_it_is_called(channel: str) -> None:
@@ -277,34 +274,31 @@ def test_a_stop_counts_once_and_its_signals_are_blocked_where_it_is_called(chann
     def on_stop() -> None:
         masks.append(signal.pthread_sigmask(signal.SIG_BLOCK, []))  # type: ignore[arg-type]
 
-    with BusLock("socketcan", channel, on_stop, 3.5):
-        who = asked(channel, "who")
-        assert (who.is_controller, who.within_s, who.refused, masks) == (True, None, "", [])
-        stops = [asked(channel, "stop") for _ in range(2)]
-        assert [stop.within_s for stop in stops] == [3.5, 3.5]
-        assert not stops[0].left
-    assert len(masks) == 1
-    assert {signal.SIGINT, signal.SIGTERM, signal.SIGHUP} <= masks[0]
-    assert all(holder.left for holder in (who, *stops))
-    for holder in (who, *stops):
-        holder.close()
+    with ExitStack() as stack:
+        with BusLock("socketcan", channel, on_stop, 3.5):
+            who = stack.enter_context(asked(channel, "who"))
+            assert (who.is_controller, who.within_s, who.refused, masks) == (True, None, "", [])
+            stops = [stack.enter_context(asked(channel, "stop")) for _ in range(2)]
+            assert [stop.within_s for stop in stops] == [3.5, 3.5]
+            assert not stops[0].left
+        assert len(masks) == 1
+        assert {signal.SIGINT, signal.SIGTERM, signal.SIGHUP} <= masks[0]
+        assert all(holder.left for holder in (who, *stops))
 
 
-def test_a_stop_of_another_user_is_refused(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("allowed", [False, True])
+def test_a_stop_of_another_user_is_refused(channel: str, monkeypatch: pytest.MonkeyPatch, allowed: bool) -> None:
     stopped: list[int] = []
-    monkeypatch.setattr(bus_lock, "may_ask", lambda _: False)
-    with BusLock("socketcan", channel, lambda: stopped.append(1)):
-        holder = asked(channel, "stop")
-        assert (holder.refused, holder.within_s) == ("this program belongs to another user", None)
-        holder.close()
-    assert stopped == []
+    monkeypatch.setattr(bus_lock, "may_ask", lambda _: allowed)
+    with BusLock("socketcan", channel, lambda: stopped.append(1)), asked(channel, "stop") as holder:
+        refused = "" if allowed else "this program belongs to another user"
+        assert (holder.refused, holder.within_s) == (refused, STOP_WITHIN_S if allowed else None)
+    assert stopped == [1] * allowed
 
 
 def test_a_program_that_cannot_stop_acknowledges_all_the_same(channel: str) -> None:
-    with BusLock("socketcan", channel):
-        holder = asked(channel, "stop")
+    with BusLock("socketcan", channel), asked(channel, "stop") as holder:
         assert holder.within_s == STOP_WITHIN_S
-        holder.close()
 
 
 def test_a_request_may_come_in_parts_and_again(channel: str) -> None:
@@ -367,17 +361,14 @@ def test_the_65th_caller_takes_the_place_of_the_oldest(channel: str) -> None:
     ],
 )
 def test_a_controller_answers_for_this_lock_and_for_itself(
-    channel: str, answer: dict[str, Any], is_controller: bool, within_s: float | None
+    name: str, answer: dict[str, Any], is_controller: bool, within_s: float | None
 ) -> None:
-    name = lock_name("socketcan", channel)
     said = {**answer, "pid": answer.get("pid", 0) + os.getpid(), "controls": answer.get("controls", "-")}
     said["controls"] = said["controls"].replace("NAME", name)
-    with socket.socket(socket.AF_UNIX) as squatter:
-        squatter.bind(b"\0" + name.encode())
-        squatter.listen()
+    with squatter(name) as listener:
         holder = Holder(name, 0)
         assert not holder.poll()
-        with squatter.accept()[0] as end:
+        with listener.accept()[0] as end:
             send_line(end, said)
             assert holder.poll()
             assert (holder.is_controller, holder.within_s, holder.refused) == (is_controller, within_s, "")
@@ -389,42 +380,32 @@ def test_a_controller_answers_for_this_lock_and_for_itself(
         holder.close()
 
 
-def test_one_that_dies_before_it_has_read_has_left(channel: str) -> None:
-    with socket.socket(socket.AF_UNIX) as squatter:
-        squatter.bind(b"\0" + lock_name("socketcan", channel).encode())
-        squatter.listen()
-        (holder,) = lock_holders("socketcan", channel)
+def test_one_that_dies_before_it_has_read_has_left(channel: str, name: str) -> None:
+    with squatter(name) as listener, first_holder(channel) as holder:
         holder.send("who")
-        squatter.accept()[0].close()
+        listener.accept()[0].close()
         assert holder.left
-        holder.close()
 
 
 def test_an_answer_that_does_not_come_is_waited_for_as_long_as_said(
-    channel: str, monkeypatch: pytest.MonkeyPatch
+    channel: str, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = iter([10.0, 10.0, 11.0, 12.0])
     waits_s: list[float] = []
-    with socket.socket(socket.AF_UNIX) as squatter:
-        squatter.bind(b"\0" + lock_name("socketcan", channel).encode())
-        squatter.listen()
-        (holder,) = lock_holders("socketcan", channel)
+    with squatter(name), first_holder(channel) as holder:
         monkeypatch.setattr(bus_lock, "time", SimpleNamespace(monotonic=lambda: next(clock)))
         monkeypatch.setattr(selectors.DefaultSelector, "select", lambda _, wait_s: waits_s.append(wait_s) or [])
         wait_for_answers([holder], 2.0)
-        holder.close()
     assert waits_s == [2.0, 1.0]
 
 
 def test_once_all_have_answered_no_one_waits(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter([10.0, 10.0])  # a third look at it would be an error
-    with BusLock("socketcan", channel):
-        (holder,) = lock_holders("socketcan", channel)
+    with BusLock("socketcan", channel), first_holder(channel) as holder:
         holder.send("who")
         monkeypatch.setattr(bus_lock, "time", SimpleNamespace(monotonic=lambda: next(clock)))
         wait_for_answers([holder])
         assert holder.is_controller
-        holder.close()
 
 
 def marked_proc(folder: Path, marks: dict[int | str, list[str]]) -> Path:

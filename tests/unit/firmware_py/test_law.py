@@ -60,22 +60,13 @@ def test_the_gain_is_that_of_the_exact_discretisation() -> None:
     assert 1.0 - twice == pytest.approx((1.0 - once) ** 2)
 
 
-def test_the_first_sample_only_primes() -> None:
+@pytest.mark.parametrize("gap_cycles", [1, 2, 5])
+def test_the_first_sample_only_primes_and_a_gap_between_samples_is_counted(gap_cycles: int) -> None:
     constants, state = velocity_blocks(cutoff_Hz=0.0)
     step_velocity(constants, state, 0.7, 0.7, 1)
     assert (state.velocity_radps, state.error_rate_radps, state.primed) == (0.0, 0.0, 1)
-    step_velocity(constants, state, 0.701, 0.7005, 1)
-    assert state.velocity_radps == pytest.approx(1.0)
-    assert state.error_rate_radps == pytest.approx(0.5)
-
-
-@pytest.mark.parametrize("gap_cycles", [1, 2, 5])
-def test_a_gap_between_samples_is_counted(gap_cycles: int) -> None:
-    constants, state = velocity_blocks(cutoff_Hz=0.0)
-    step_velocity(constants, state, 0.0, 0.0, 1)
-    step_velocity(constants, state, 0.002 * gap_cycles, 0.001 * gap_cycles, gap_cycles)
-    assert state.velocity_radps == pytest.approx(2.0)
-    assert state.error_rate_radps == pytest.approx(1.0)
+    step_velocity(constants, state, 0.7 + 0.002 * gap_cycles, 0.7 + 0.001 * gap_cycles, gap_cycles)
+    assert (state.velocity_radps, state.error_rate_radps) == pytest.approx((2.0, 1.0))
 
 
 @pytest.mark.parametrize("gap_cycles", [1, 3])
@@ -212,22 +203,15 @@ def test_with_the_papers_width_the_network_is_one_integrator() -> None:
     assert hidden_max <= 1.0
 
 
-def test_leakage_forgets_exponentially() -> None:
+@pytest.mark.parametrize("leakage", [0.5, 0.0])
+def test_leakage_forgets_exponentially_and_without_it_nothing_is_forgotten(leakage: float) -> None:
     constants, state = network()
-    constants.leakage = 0.5
+    constants.leakage = leakage
     state.weights[:] = 2.0
     for _ in range(1000):
         network_torque_Nm(constants, state, 0.0, 0.0)
         adapt_network(constants, state, 0.0, 0.0, 1e-3)
-    np.testing.assert_allclose(state.weights, 2.0 * math.exp(-0.5), rtol=1e-3)
-
-
-def test_without_leakage_nothing_is_forgotten() -> None:
-    constants, state = network()
-    for _ in range(1000):
-        network_torque_Nm(constants, state, 0.0, 0.0)
-        adapt_network(constants, state, 0.0, 0.0, 1e-3)
-    assert list(state.weights) == [0.01] * NEURONS
+    np.testing.assert_allclose(state.weights, 2.0 * math.exp(-leakage), rtol=1e-3 if leakage else 0.0)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -400,22 +384,20 @@ def test_an_error_that_grows_in_three_repetitions_switches_learning_off(growth: 
     assert state.grown == (GROWN if stops else 0)
 
 
-def test_two_repetitions_that_grow_do_not_and_a_better_one_begins_anew() -> None:
+@pytest.mark.parametrize(
+    ("errors_mrad", "grown"),
+    [
+        ([1, 2, 4], GROWN - 1),  # two that grow are not enough
+        ([1, 2, 4, 3, 5, 9], 2),  # a better one begins anew
+        ([1], 0),  # the first one is compared with nothing
+        ([0, 1, 2, 3], 2),  # and nothing has grown from no error at all
+    ],
+)
+def test_what_does_not_grow_three_times_in_a_row_goes_on(errors_mrad: list[int], grown: int) -> None:
     constants, state = learning()
-    repeat(constants, state, [1e-3, 2e-3, 4e-3])
-    assert (state.grown, state.stopped) == (GROWN - 1, 0)
-    constants, state = learning()
-    repeat(constants, state, [1e-3, 2e-3, 4e-3, 3e-3, 5e-3, 9e-3])
-    assert (state.grown, state.stopped) == (2, 0)
-
-
-def test_the_first_repetition_is_compared_with_nothing() -> None:
-    constants, state = learning()
-    repeat(constants, state, [1e-3])
-    assert (state.error_rad, state.grown, state.samples) == (pytest.approx(1e-3), 0, 1)
-    constants, state = learning()
-    repeat(constants, state, [0.0, 1e-3, 2e-3, 3e-3])  # and nothing has grown from no error at all
-    assert (state.grown, state.stopped) == (2, 0)
+    repeat(constants, state, [1e-3 * error for error in errors_mrad])
+    assert (state.grown, state.stopped, state.samples) == (grown, 0, 1)
+    assert state.error_rad == pytest.approx(1e-3 * errors_mrad[-1])
 
 
 def test_what_was_learned_fades_out_over_the_blend_time_and_stays_off() -> None:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -15,6 +12,7 @@ import pytest
 
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram, Word, count
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault
+from tests.python_process import run_python
 from tests.unit.firmware_py.stub_loop import (
     BUSY_CYCLE,
     CYCLE,
@@ -227,15 +225,6 @@ print(loop.state[0].phase, *allocations(100_000))
 @pytest.mark.parametrize("exchange", ["stub", "driver"])
 def test_no_memory_is_allocated_per_cycle(exchange: str) -> None:
     """Neither when the loop begins nor afterwards, tracking with every part of the law."""
-    result = subprocess.run(
-        [sys.executable, "-c", _COUNT_ALLOCATIONS, exchange],
-        env={**os.environ, "NUMBA_NRT_STATS": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=240.0,
-    )
-    assert result.returncode == 0, result.stderr[-3000:]
-    phase, *counts = map(int, result.stdout.split())
+    phase, *counts = map(int, run_python(_COUNT_ALLOCATIONS, exchange, NUMBA_NRT_STATS="1").split())
     assert phase == (AxisPhase.TRACKING if exchange == "stub" else AxisPhase.WAITING)
     assert counts == [0, 0]

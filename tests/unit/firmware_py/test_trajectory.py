@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.records import Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import TrajectoryKind
@@ -28,6 +26,7 @@ from jointctl.firmware_py.trajectory import (
     table_from_csv,
     trapezoid_times_s,
 )
+from tests.python_process import run_python
 
 # Trajectories: the three quantities belong together, joins and ends are as promised, approach and brake are exact.
 NO_TABLE = np.zeros((0, 5))
@@ -49,9 +48,34 @@ def constants(kind, **values):
 
 
 def at(c, t_s, table=NO_TABLE):
-    reference = new(Reference)[0]
-    reference_at(c, table, 0, t_s, reference)
-    return float(reference.position_rad), float(reference.velocity_radps), float(reference.acceleration_radps2)
+    return tuple(sampled(c, table, [t_s])[0].tolist())
+
+
+@kernel
+def sample(c, table, hint, times, reference, rows):
+    for k in range(len(times)):
+        hint = reference_at(c, table, hint, times[k], reference)
+        rows[k, 0], rows[k, 1] = reference.position_rad, reference.velocity_radps
+        rows[k, 2] = reference.acceleration_radps2
+
+
+def sampled(c, table, times, hint=0):
+    """Position, velocity and acceleration at each time, as rows."""
+    rows = np.zeros((len(times), 3))
+    sample(c, table, hint, np.asarray(times, float), new(Reference)[0], rows)
+    return rows
+
+
+@kernel
+def brake_to_rest(reference, brake_radps2, period_s, rows):
+    """How many steps it takes; position, velocity and acceleration after each of them."""
+    steps = 0
+    while reference.velocity_radps != 0.0 and steps < len(rows):
+        brake_step(reference, brake_radps2, period_s)
+        rows[steps, 0], rows[steps, 1] = reference.position_rad, reference.velocity_radps
+        rows[steps, 2] = reference.acceleration_radps2
+        steps += 1
+    return steps
 
 
 def assert_consistent(function, t_s, step_s, tolerance):
@@ -206,17 +230,16 @@ def test_an_approach_without_duration_rests_where_the_joint_stands():
 def test_brake_lands_on_exactly_zero_within_the_deceleration(position, velocity, brake, period_s):
     reference = new(Reference)[0]
     reference.position_rad, reference.velocity_radps = position, velocity
-    steps = 0
-    while reference.velocity_radps != 0.0:
-        before = (float(reference.position_rad), float(reference.velocity_radps))
-        brake_step(reference, brake, period_s)
-        acceleration = float(reference.acceleration_radps2)
-        assert abs(acceleration) <= brake * (1.0 + 1e-12)
-        assert acceleration * velocity <= 0.0
-        assert float(reference.velocity_radps) == pytest.approx(before[1] + acceleration * period_s, abs=1e-12)
-        travel = before[1] * period_s + 0.5 * acceleration * period_s**2
-        assert float(reference.position_rad) == pytest.approx(before[0] + travel, abs=1e-12)
-        steps += 1
+    rows = np.zeros((100_000, 3))
+    steps = brake_to_rest(reference, brake, period_s, rows)
+    positions, velocities = np.vstack([(position, velocity), rows[:steps, :2]]).T
+    accelerations = rows[:steps, 2]
+    assert np.all(np.abs(accelerations) <= brake * (1.0 + 1e-12))
+    assert np.all(accelerations * velocity <= 0.0)
+    np.testing.assert_allclose(np.diff(velocities), accelerations * period_s, rtol=0.0, atol=1e-12)
+    travel = velocities[:-1] * period_s + 0.5 * accelerations * period_s**2
+    np.testing.assert_allclose(np.diff(positions), travel, rtol=0.0, atol=1e-12)
+    assert reference.velocity_radps == 0.0
     assert abs(steps - math.ceil(abs(velocity) / (brake * period_s))) <= 1
     ideal = position + velocity * abs(velocity) / (2.0 * brake)
     assert abs(float(reference.position_rad) - ideal) <= brake * period_s**2
@@ -237,15 +260,6 @@ def test_a_brake_that_is_not_positive_stops_at_once():
 POINTS = "time_s,position_rad\n10,0.0\n11,0.5\n12.5,-0.25\n13,0.0\n"
 
 
-def sampled(c, table, times, hint=0):
-    reference = new(Reference)[0]
-    rows = []
-    for t_s in times:
-        hint = reference_at(c, table, hint, float(t_s), reference)
-        rows.append(reference.tolist())
-    return np.array(rows)
-
-
 @pytest.fixture
 def table(tmp_path):
     path = tmp_path / "motion.csv"
@@ -262,19 +276,13 @@ def test_table_goes_through_the_points_at_rest_at_both_ends(table):
     assert sampled(c, table, [1e-9, 3.0 - 1e-9])[:, 1] == pytest.approx([0.0, 0.0], abs=1e-6)
 
 
-def test_table_is_continuous_up_to_the_acceleration(table):
+def test_table_is_continuous_up_to_the_acceleration_and_its_derivatives_belong_together(table):
     c = constants(TrajectoryKind.TABLE, table_rows=4)
     for join in (1.0, 2.5):
         before, after = sampled(c, table, [join - 1e-9, join + 1e-9])
         assert after == pytest.approx(before, abs=1e-6)
-
-
-def test_table_derivatives(table):
-    c = constants(TrajectoryKind.TABLE, table_rows=4)
     for t_s in np.linspace(0.01, 2.99, 50):
-        before, now, after = sampled(c, table, [t_s - 1e-5, t_s, t_s + 1e-5])
-        assert (after[0] - before[0]) / 2e-5 == pytest.approx(now[1], abs=1e-6)
-        assert (after[1] - before[1]) / 2e-5 == pytest.approx(now[2], abs=1e-3)
+        assert_consistent(lambda t: at(c, t, table), t_s, 1e-5, 1e-3)
 
 
 def test_repeat_wraps_where_the_ends_meet_and_stays_where_they_do_not(table, tmp_path):
@@ -307,7 +315,7 @@ def test_any_row_hint_gives_the_same_motion(times, hint):
 
 def test_a_table_that_is_missing_rests_at_the_start():
     c = constants(TrajectoryKind.TABLE, table_rows=7, start_rad=0.4)
-    assert sampled(c, np.zeros((0, 5)), [0.0, 3.0]).tolist() == [[0.4, 0.0, 0.0]] * 2
+    assert sampled(c, NO_TABLE, [0.0, 3.0]).tolist() == [[0.4, 0.0, 0.0]] * 2
 
 
 @pytest.mark.parametrize(
@@ -367,7 +375,7 @@ def test_peak_of_a_sine_over_the_run(amplitude, omega, shift, switch_s, duration
         amplitude_rad=amplitude, omega_radps=omega, shift_s=shift, offset_rad=0.1,
         amplitude2_rad=0.3, omega2_radps=2.0, shift2_s=0.4, offset2_rad=-0.2,
     )  # fmt: skip
-    assert_peak_covers_exactly(c, np.zeros((0, 5)), duration_s)
+    assert_peak_covers_exactly(c, NO_TABLE, duration_s)
 
 
 def test_peak_of_an_endless_sine():
@@ -379,7 +387,7 @@ def test_peak_of_an_endless_sine():
 @pytest.mark.parametrize("kind", [TrajectoryKind.MIN_JERK, TrajectoryKind.TRAPEZOID])
 def test_peak_of_moves(kind, target):
     c = constants(kind, target_rad=target, move_s=1.5, speed_radps=0.8, acceleration_radps2=2.0)
-    assert_peak_covers_exactly(c, np.zeros((0, 5)), 4.0)
+    assert_peak_covers_exactly(c, NO_TABLE, 4.0)
 
 
 def test_peak_of_a_table_finds_what_lies_between_the_points(table):
@@ -466,17 +474,9 @@ print(json.dumps(out))
 
 
 def test_compiled_and_plain_python_agree():
-    results = []
-    for disabled in ("0", "1"):
-        environment = {**os.environ, "NUMBA_DISABLE_JIT": disabled}
-        done = subprocess.run(
-            [sys.executable, "-W", "error", "-c", _BOTH_WAYS],
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-        results.append(np.array(json.loads(done.stdout)))
-    assert results[0].shape == (238, 4)
-    assert results[1] == pytest.approx(results[0], rel=1e-9, abs=1e-12)
+    compiled, plain = (
+        np.array(json.loads(run_python(_BOTH_WAYS, NUMBA_DISABLE_JIT=disabled, PYTHONWARNINGS="error")))
+        for disabled in ("0", "1")
+    )
+    assert compiled.shape == (238, 4)
+    assert plain == pytest.approx(compiled, rel=1e-9, abs=1e-12)

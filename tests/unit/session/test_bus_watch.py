@@ -32,8 +32,7 @@ from jointctl.tools.recording.run_summary import summarise
 from jointctl.tools.session import bus_watch as module
 from jointctl.tools.session.bus_watch import STALE_S, BusWatch, TemperatureWatch, bus_watch
 from jointctl.tools.session.fault_words import fault_text
-from tests.configurations import shipped
-from tests.places import CONFIGS
+from tests.configurations import shipped, written
 
 # --- What a sick SocketCAN interface adds to a run: its complaints as they come, its state as the cause of a fault ---
 TEXT = fault_text(Fault.STALE_SAMPLE, 5.0, 0)
@@ -124,25 +123,19 @@ def test_an_interface_that_does_not_exist_is_told_by_the_drive(config: Config) -
 S = 1_000_000_000  # ns
 
 
-def config_with(folder: Path, line: str) -> Path:
-    text = (CONFIGS / "virtual.toml").read_text()
-    path = folder / "joint.toml"
-    shown = [row for row in text.splitlines() if not row.startswith("temperature_")]
-    path.write_text("\n".join(shown).replace("[encoder]", f"{line}\n\n[encoder]", 1))
-    return path
-
-
 def test_the_configuration_names_object_unit_and_offset(tmp_path: Path) -> None:
-    lines = 'temperature_object = "2203:2"\ntemperature_unit_degC = 0.01\ntemperature_offset_degC = -273.15'
-    found = temperature_object(load_config(config_with(tmp_path, lines)))
-    assert found == TemperatureObject(0x2203, 2, 0.01, -273.15)
-    assert temperature_object(load_config(config_with(tmp_path, ""))) is None
+    path = tmp_path / "joint.toml"
+    named = {"object": "2203:2", "unit_degC": 0.01, "offset_degC": -273.15}
+    config = load_config(written(path, **{f"drive__temperature_{key}": value for key, value in named.items()}))
+    assert temperature_object(config) == TemperatureObject(0x2203, 2, 0.01, -273.15)
+    without = written(path, drive__temperature_object=None, drive__temperature_unit_degC=None)
+    assert temperature_object(load_config(without)) is None
 
 
-@pytest.mark.parametrize("wrong", ['"1000"', '"2203:255"', '"temperature"', "0x2203", '""'])
-def test_a_place_that_is_none_is_refused(tmp_path: Path, wrong: str) -> None:
+@pytest.mark.parametrize("wrong", ["1000", "2203:255", "temperature", 0x2203, ""])
+def test_a_place_that_is_none_is_refused(tmp_path: Path, wrong: str | int) -> None:
     with pytest.raises(ConfigurationError, match=r"drive\.temperature_object"):
-        load_config(config_with(tmp_path, f"temperature_object = {wrong}"))
+        load_config(written(tmp_path / "joint.toml", drive__temperature_object=wrong))
 
 
 # --- watch, log and what is made of it ---

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import errno
-import os
 import socket
-import subprocess
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 import pytest
@@ -26,6 +24,7 @@ from jointctl.firmware_py.libc import WAIT_SCRATCH_WORDS, wait_readable_ns
 from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.tools.configuration.canopen import cyclic_bus_load
 from tests.configurations import shipped
+from tests.python_process import run_python
 
 # --- Frame lengths and bus budget, against the figures of the hardware specification, section 4 ---
 SYNC, POSITION, TORQUE = 0, 8, 4
@@ -36,54 +35,42 @@ def test_bits_of_one_frame(length: int, worst: int) -> None:
     assert worst_frame_bits(length) == worst
 
 
-def test_bits_of_an_extended_frame() -> None:
-    assert worst_frame_bits(8, extended=True) == 160  # Davis et al. (2007)
-
-
 def test_every_length_follows_the_formula() -> None:
     for length in range(9):
         assert worst_frame_bits(length) == 47 + 8 * length + (33 + 8 * length) // 4
+    assert worst_frame_bits(8, extended=True) == 160  # Davis et al. (2007)
 
 
-def test_the_cycle_of_the_controller() -> None:
-    cycle = [SYNC, POSITION, TORQUE]
-    assert worst_cycle_bits(cycle) == 285
-    assert bus_load(cycle, 1000.0, 1_000_000) == pytest.approx(0.285, abs=1e-12)
-    assert highest_rate_Hz(cycle, 1_000_000) == pytest.approx(3508.77, abs=0.01)
-    assert bus_load(cycle, 1000.0, 500_000) == pytest.approx(0.57, abs=1e-12)
-    assert bus_load(cycle, 1000.0, 250_000) > 1.0
+@pytest.mark.parametrize(
+    ("lengths", "rate_Hz", "bitrate", "load"),
+    [
+        ([SYNC, POSITION, TORQUE], 1000.0, 1_000_000, 0.285), ([SYNC, POSITION, TORQUE], 1000.0, 500_000, 0.57),
+        ([SYNC, POSITION, TORQUE], 1000.0, 250_000, 1.14),
+        ([SYNC, POSITION, POSITION, TORQUE], 2000.0, 1_000_000, 0.84),
+        ([SYNC, POSITION, POSITION, 8], 2000.0, 1_000_000, 0.92),
+    ],
+)  # fmt: skip
+def test_the_load_of_a_cycle(lengths: list[int], rate_Hz: float, bitrate: int, load: float) -> None:
+    assert bus_load(lengths, rate_Hz, bitrate) == pytest.approx(load, abs=1e-12)
+    assert worst_cycle_bits(lengths) * rate_Hz / bitrate == pytest.approx(load, abs=1e-12)
+    highest_Hz = highest_rate_Hz(lengths, bitrate, highest_load=0.7)
+    assert bus_load(lengths, highest_Hz, bitrate) == pytest.approx(0.7)
+    assert highest_rate_Hz(lengths, bitrate) == pytest.approx(rate_Hz / load)
 
 
-def test_a_second_input_frame_at_2_kHz() -> None:
-    assert bus_load([SYNC, POSITION, POSITION, TORQUE], 2000.0, 1_000_000) == pytest.approx(0.84)
-    assert bus_load([SYNC, POSITION, POSITION, 8], 2000.0, 1_000_000) == pytest.approx(0.92)
-
-
-def test_highest_rate_is_where_the_load_is_reached() -> None:
-    cycle = [SYNC, POSITION, TORQUE]
-    rate_Hz = highest_rate_Hz(cycle, 500_000, highest_load=0.7)
-    assert bus_load(cycle, rate_Hz, 500_000) == pytest.approx(0.7)
-
-
-@pytest.mark.parametrize("length", [-1, 9])
-def test_length_outside_is_refused(length: int) -> None:
-    with pytest.raises(ValueError, match=rf"data length \(={length}\) must be in \[0..8\]"):
-        worst_frame_bits(length)
-
-
-@pytest.mark.parametrize("bitrate", [0, -1, 1_000_001])
-def test_bitrate_outside_is_refused(bitrate: int) -> None:
-    with pytest.raises(ValueError, match=rf"bitrate_bitps \(={bitrate}\)"):
-        bus_load([0], 1000.0, bitrate)
-
-
-def test_other_bad_input_is_refused() -> None:
-    with pytest.raises(ValueError, match="rate_Hz"):
-        bus_load([0], float("nan"), 1_000_000)
-    with pytest.raises(ValueError, match="at least one frame"):
-        highest_rate_Hz([], 1_000_000)
-    with pytest.raises(ValueError, match="highest_load"):
-        highest_rate_Hz([0], 1_000_000, 1.5)
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        *((partial(worst_frame_bits, n), rf"data length \(={n}\) must be in \[0..8\]") for n in (-1, 9)),
+        *((partial(bus_load, [0], 1000.0, n), rf"bitrate_bitps \(={n}\)") for n in (0, -1, 1_000_001)),
+        (partial(bus_load, [0], float("nan"), 1_000_000), "rate_Hz"),
+        (partial(highest_rate_Hz, [], 1_000_000), "at least one frame"),
+        (partial(highest_rate_Hz, [0], 1_000_000, 1.5), "highest_load"),
+    ],
+)
+def test_what_no_bus_has_is_refused(call: Callable[[], float], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        call()
 
 
 @pytest.mark.parametrize(
@@ -247,15 +234,6 @@ def test_waiting(pair: Pair) -> None:
 
 
 def test_no_allocation_in_100_000_exchanges_nor_in_the_hub(tmp_path_factory: pytest.TempPathFactory) -> None:
-    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_DISABLE_JIT"}
-    environment["NUMBA_NRT_STATS"] = "1"
     path = tmp_path_factory.mktemp("b") / "bus.sock"
-    done = subprocess.run(
-        [sys.executable, "-c", ALLOCATION_COUNT, str(path)],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["end", "True", "hub", "True", "hub", "True"]
+    said = run_python(ALLOCATION_COUNT, str(path), NUMBA_NRT_STATS="1", NUMBA_DISABLE_JIT="0")
+    assert said.split() == ["end", "True", "hub", "True", "hub", "True"]

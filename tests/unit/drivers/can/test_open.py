@@ -13,7 +13,7 @@ import threading
 import time
 import tomllib
 import tty
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -238,25 +238,22 @@ def test_an_interface_that_does_not_exist_on_this_computer() -> None:
     assert caught.value.hint
 
 
-@pytest.mark.parametrize("number", [errno.ENODEV, errno.ENETDOWN])
-def test_missing_or_down(kernel_with_can: Any, number: int) -> None:
-    kernel_with_can.bind_error = number
-    with pytest.raises(BusError, match="can0") as caught:
-        socketcan.open_socket("can0")
-    assert "sudo ip link set can0 up type can bitrate 1000000" in caught.value.hint
-    assert FakeCanSocket.last.closed
-
-
 @pytest.mark.parametrize(
     ("step", "number", "words"),
-    [("pending_error", errno.ENETDOWN, "can0 is down"), ("bind_error", errno.EPERM, "no permission")],
-)
-def test_down_is_also_told_after_the_bind_and_so_is_a_missing_right(
+    [
+        ("bind_error", errno.ENODEV, "can0"), ("bind_error", errno.ENETDOWN, "can0"),
+        ("pending_error", errno.ENETDOWN, "can0 is down"), ("bind_error", errno.EPERM, "no permission"),
+    ],
+)  # fmt: skip
+def test_missing_or_down_also_after_the_bind_or_without_the_right(
     kernel_with_can: Any, step: str, number: int, words: str
 ) -> None:
     setattr(kernel_with_can, step, number)
-    with pytest.raises(BusError, match=words):
+    with pytest.raises(BusError, match=words) as caught:
         socketcan.open_socket("can0")
+    up = "sudo ip link set can0 up type can bitrate 1000000" in caught.value.hint
+    assert up is (number != errno.EPERM)
+    assert FakeCanSocket.last.closed
 
 
 def test_the_options_of_a_good_socket(kernel_with_can: Any) -> None:
@@ -286,21 +283,17 @@ def buses(path: Path) -> Iterator[tuple[VirtualBus, VirtualBus]]:
         yield a, b
 
 
-def test_no_bus_listens(path: Path) -> None:
+@pytest.mark.parametrize("dead", [False, True])
+def test_no_bus_listens_or_one_has_left_its_socket_file(path: Path, dead: bool) -> None:
+    if dead:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as left:
+            left.bind(str(path))
     for attempt in (open_cyclic_end, open_python_can):
         with pytest.raises(BusError, match="no virtual bus at") as caught:
             attempt("jointctl", str(path))
         assert caught.value.hint == "start one with `jointctl hil CONFIG`"
     with pytest.raises(can.CanInitializationError, match="start one with `jointctl hil CONFIG`"):
         VirtualBus(str(path))
-
-
-def test_a_dead_socket_file_is_no_bus(path: Path) -> None:
-    dead = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    dead.bind(str(path))
-    dead.close()
-    with pytest.raises(BusError, match="no virtual bus at"):
-        virtual_bus.connect(str(path))
 
 
 def test_a_socket_of_another_kind(path: Path) -> None:
@@ -322,13 +315,9 @@ def test_a_folder_that_others_may_write_is_refused(monkeypatch: pytest.MonkeyPat
 
 
 def test_can_fd_and_error_frames_are_refused(buses: tuple[VirtualBus, VirtualBus], path: Path) -> None:
-    for message in (
-        can.Message(is_fd=True, arbitration_id=1),
-        can.Message(is_error_frame=True),
-        can.Message(arbitration_id=0x800, is_extended_id=False),
-    ):
+    for kind in ({"is_fd": True}, {"is_error_frame": True}, {"arbitration_id": 0x800, "is_extended_id": False}):
         with pytest.raises(ValueError, match=r"supported|cannot be sent|identifier"):
-            buses[0].send(message)
+            buses[0].send(can.Message(**{"arbitration_id": 1, **kind}))
     assert buses[1].recv(0.0) is None
     for settings in ({"fd": True}, {"receive_own_messages": True}):
         with pytest.raises(can.CanInitializationError, match="not supported"):
@@ -392,19 +381,26 @@ def test_an_interface_that_is_unknown_or_not_there(opened: Any, interface: str, 
         opened(interface, channel, 1_000_000) if interface == "slcan" else opened(interface, channel)
 
 
-@pytest.mark.parametrize(("interface", "remedy"), [("slcan", "sudo usermod -aG dialout $USER"), ("pcan", "group")])
-def test_a_missing_right_is_told_with_its_cure(interface: str, remedy: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(**settings: Any) -> None:
-        raise PermissionError(errno.EACCES, "Permission denied")
-
-    monkeypatch.setattr(can, "Bus", fail)
-    with pytest.raises(BusError, match="no permission to open") as caught:
-        open_python_can(interface, "socket://nowhere")
-    assert remedy in caught.value.hint
+Opening = Callable[[BaseException], None]
 
 
-def test_errors_of_an_interface_become_bus_errors(monkeypatch: pytest.MonkeyPatch) -> None:
-    causes: list[tuple[Exception, str]] = [
+@pytest.fixture
+def opening_raises(monkeypatch: pytest.MonkeyPatch) -> Opening:
+    """Each interface of python-can raises this when it is opened, and logs it before."""
+
+    def install(error: BaseException) -> None:
+        def fail(*_: Any, **__: Any) -> None:
+            logging.getLogger("can.somewhere").warning(str(error))
+            raise error
+
+        monkeypatch.setattr(open_module.can, "Bus", fail)
+
+    return install
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
         (PermissionError(errno.EACCES, "Permission denied"), "no permission to open pcan:x"),
         (OSError(errno.ENODEV, "No such device"), "no such device: pcan:x"),
         (OSError(errno.EBUSY, "Busy"), "cannot open pcan:x: Busy"),
@@ -412,56 +408,75 @@ def test_errors_of_an_interface_become_bus_errors(monkeypatch: pytest.MonkeyPatc
         (can.CanInterfaceNotImplementedError("no driver"), "cannot be used here"),
         (can.CanInitializationError("wrong bit rate"), "cannot open pcan:x: wrong bit rate"),
         (ValueError("bad"), "cannot open pcan:x: bad"),
-    ]
-    for cause, text in causes:
+        *((odd, "cannot open pcan:x") for odd in (
+            NameError("name 'canOpen' is not defined"), AttributeError("no attribute"), KeyError("x"),
+            ctypes.ArgumentError("argument 1"), AssertionError(), IndexError("list index"),
+            RuntimeError("odd\nsecond line"), UnicodeDecodeError("utf-8", b"\xff", 0, 1, "start byte"),
+            RecursionError(), ZeroDivisionError(), Exception(),
+        )),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, Exception) else "",
+)  # fmt: skip
+def test_whatever_an_interface_raises_is_one_bus_error(
+    opening_raises: Opening, caplog: pytest.LogCaptureFixture, error: Exception, words: str
+) -> None:
+    opening_raises(error)
+    with pytest.raises(BusError, match=words) as caught:
+        open_python_can("pcan", "x")
+    assert (caught.value.exit_code, caplog.records) == (4, [])  # what it logs is told once
+    logging.getLogger("can.somewhere").warning("afterwards")
+    assert len(caplog.records) == 1
 
-        def fail(cause: Exception = cause, **settings: Any) -> None:
-            raise cause
 
-        monkeypatch.setattr(can, "Bus", fail)
-        with pytest.raises(BusError, match=text):
-            open_python_can("pcan", "x")
+@pytest.mark.parametrize(("interface", "remedy"), [("slcan", "sudo usermod -aG dialout $USER"), ("pcan", "group")])
+def test_a_missing_right_is_told_with_its_cure(interface: str, remedy: str, opening_raises: Opening) -> None:
+    opening_raises(PermissionError(errno.EACCES, "Permission denied"))
+    with pytest.raises(BusError, match="no permission to open") as caught:
+        open_python_can(interface, "socket://nowhere")
+    assert remedy in caught.value.hint
+
+
+def test_what_ends_the_program_is_no_error_of_a_bus(opening_raises: Opening) -> None:
+    opening_raises(KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        open_python_can("kvaser", "0")
 
 
 @pytest.fixture
-def serial_line() -> Iterator[str]:
-    """The port of a serial adapter that says nothing."""
+def serial_ends() -> Iterator[tuple[int, str]]:
+    """The descriptor of a serial adapter that says nothing by itself, and the port that leads to it."""
     near, far = os.openpty()
     tty.setraw(far)
-    yield os.ttyname(far)
+    yield near, os.ttyname(far)
     os.close(near)
     os.close(far)
 
 
+@pytest.fixture
+def serial_line(serial_ends: tuple[int, str]) -> str:
+    return serial_ends[1]
+
+
 def test_a_serial_adapter_serves_one_program_at_a_time(serial_line: str) -> None:
-    first = open_python_can("slcan", serial_line, 500_000, sleep_after_open=0.0)
-    try:
+    with open_python_can("slcan", serial_line, 500_000, sleep_after_open=0.0):
         with pytest.raises(BusError, match=f"the adapter on {serial_line} is in use by another program") as caught:
             open_python_can("slcan", f"{serial_line}@115200", 500_000)
         assert "jointctl stop" in (caught.value.hint or "")
         open_python_can("slcan", serial_line, 500_000, exclusive=False, sleep_after_open=0.0).shutdown()
-    finally:
-        first.shutdown()
     open_python_can("slcan", serial_line, 500_000, sleep_after_open=0.0).shutdown()
 
 
-def test_a_damaged_line_of_an_adapter_is_a_lost_frame() -> None:
+def test_a_damaged_line_of_an_adapter_is_a_lost_frame(serial_ends: tuple[int, str]) -> None:
     """Two programs on one adapter cut into each other's lines; ValueError ended whoever made the joint safe."""
-    near, far = os.openpty()
-    tty.setraw(far)
-    bus = open_python_can("slcan", os.ttyname(far), 500_000, sleep_after_open=0.0)
-    try:
+    near, port = serial_ends
+    with open_python_can("slcan", port, 500_000, sleep_after_open=0.0) as bus:
         for line in (b"t1812AAtBB\r", b"t1\r", b"txyz2AABB\r", b"t18129\xff\r"):
             os.write(near, line)
             assert bus.recv(0.5) is None
         os.write(near, b"t1812AABB\r")
         message = bus.recv(0.5)
-        assert message is not None
-        assert (message.arbitration_id, bytes(message.data)) == (0x181, b"\xaa\xbb")
-    finally:
-        bus.shutdown()
-        os.close(near)
-        os.close(far)
+    assert message is not None
+    assert (message.arbitration_id, bytes(message.data)) == (0x181, b"\xaa\xbb")
 
 
 class Odd:
@@ -505,21 +520,6 @@ def test_an_adapter_that_is_refused_leaves_the_port_free(serial_line: str) -> No
 WORKING = {"virtual", "udp_multicast", "jointctl"}
 
 
-def test_what_an_interface_logs_is_told_once(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
-    log = logging.getLogger("can.somewhere")
-
-    def fail(*_: Any, **__: Any) -> None:
-        log.warning("Failed to connect")
-        raise can.CanInitializationError("Failed to connect")
-
-    monkeypatch.setattr(open_module.can, "Bus", fail)
-    with pytest.raises(BusError, match="Failed to connect"):
-        open_python_can("kvaser", "0")
-    assert not caplog.records
-    log.warning("afterwards")
-    assert len(caplog.records) == 1
-
-
 @pytest.mark.filterwarnings("ignore")  # of the libraries, about themselves
 @pytest.mark.parametrize("interface", sorted(set(can.VALID_INTERFACES) - WORKING))
 def test_an_interface_that_is_not_there_is_one_line(interface: str) -> None:
@@ -527,31 +527,3 @@ def test_an_interface_that_is_not_there_is_one_line(interface: str) -> None:
         open_python_can(interface, "/dev/null/0" if interface in ("slcan", "serial", "robotell") else "0", 500_000)
     gc.collect()  # what a library has left open
     assert "\n" not in raised.value.message
-
-
-@pytest.mark.parametrize(
-    "odd",
-    [
-        NameError("name 'canOpen' is not defined"), AttributeError("no attribute"), ctypes.ArgumentError("argument 1"),
-        KeyError("x"), AssertionError(), IndexError("list index"), RuntimeError("odd\nsecond line"),
-        UnicodeDecodeError("utf-8", b"\xff", 0, 1, "start byte"), RecursionError(), ZeroDivisionError(), Exception(),
-    ],
-    ids=lambda error: type(error).__name__,
-)  # fmt: skip
-def test_whatever_an_interface_raises(monkeypatch: pytest.MonkeyPatch, odd: Exception) -> None:
-    def fail(*_: Any, **__: Any) -> None:
-        raise odd
-
-    monkeypatch.setattr(open_module.can, "Bus", fail)
-    with pytest.raises(BusError, match="cannot open kvaser:0") as raised:
-        open_python_can("kvaser", "0")
-    assert raised.value.exit_code == 4
-
-
-def test_what_ends_the_program_is_no_error_of_a_bus(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*_: Any, **__: Any) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(open_module.can, "Bus", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        open_python_can("kvaser", "0")

@@ -41,14 +41,15 @@ def commissioned(joint: Any) -> Iterator[Any]:
 
 def test_the_report(commissioned: Any) -> None:
     _, _, report = commissioned
-    assert report.mode == "cyclic_sync_torque"
-    assert report.start_position_rad == pytest.approx(0.1, abs=2.0 * math.pi / 2**19)
-    assert report.torque_resolution_Nm == pytest.approx(0.0605)
-    assert report.position_resolution_rad == pytest.approx(2.0 * math.pi / 2**19)
+    count_rad = 2.0 * math.pi / 2**19
+    assert (report.mode, report.commands_velocity) == ("cyclic_sync_torque", False)
+    assert report.start_position_rad == pytest.approx(0.1, abs=count_rad)
+    assert (report.torque_resolution_Nm, report.position_resolution_rad) == pytest.approx((0.0605, count_rad))
     assert report.identity.name == "jointctl virtual joint"
     assert report.settings["max torque"] == "1000 permille = 60.5 Nm"
     assert report.settings["60C2"] == "1e-3 s"
     assert report.settings["watchdog"].startswith("200 ms")
+    assert "max velocity" not in report.settings
 
 
 def test_what_is_in_the_drive_afterwards(commissioned: Any) -> None:
@@ -76,11 +77,11 @@ def test_targets_are_zeroed_before_anything_else_is_written(commissioned: Any) -
     written = [
         struct.unpack_from("<H", data, 1)[0] for cob, data in bus.requests if cob == 0x601 and data[0] & 0xE0 == 0x20
     ]
+    assert not {0x607F, 0x6083} & set(written)  # of the velocity modes
     first = {index: written.index(index) for index in written}
     assert written[0] == 0x6040
     assert first[0x6071] < first[0x6060] < first[0x6072] < first[0x60C2] < first[0x1016] < first[0x1800]
-    words = [data[4] for cob, data in bus.requests if cob == 0x601 and data[:3] == b"\x2b\x40\x60"]
-    assert set(words) == {0}  # nothing but "disable voltage" is ever written while commissioning
+    assert set(bus.downloads(0x6040)) == {0}  # nothing but "disable voltage" is ever written while commissioning
 
 
 def test_a_pdo_is_remapped_in_the_order_of_the_standard(commissioned: Any) -> None:
@@ -117,36 +118,19 @@ def test_torque_mode_where_the_drive_has_no_cyclic_one(joint: Any) -> None:
     assert any("TQ" in remark for remark in report.remarks)
 
 
-def downloads(bus: Any, index: int, sub: int = 0) -> list[int]:
-    """What was written to an object, in order: expedited downloads."""
-    found = []
-    for cob, data in bus.requests:
-        if cob == 0x601 and data[0] & 0xE2 == 0x22 and struct.unpack_from("<HB", data, 1) == (index, sub):
-            size = 4 - (data[0] >> 2 & 3)
-            found.append(int.from_bytes(data[4 : 4 + size], "little"))
-    return found
-
-
 @pytest.mark.parametrize(("mode", "shown"), [("csv", Mode.CYCLIC_SYNC_VELOCITY), ("pv", Mode.PROFILE_VELOCITY)])
 def test_a_velocity_mode_begins_with_no_target_and_the_drives_own_limit(joint: Any, mode: str, shown: Mode) -> None:
     with joint.opened(mode=mode) as drive:
         report = drive.commission()
     assert report.commands_velocity
     assert joint.value(0x6060) == shown
-    assert downloads(joint, 0x60FF)[-1] == 0
+    assert joint.downloads(0x60FF)[-1] == 0
     unit_radps = 2.0 * math.pi / 2**19  # counts/s at the joint
     assert joint.value(0x607F) == math.ceil(1.0 / unit_radps)
     assert report.settings["max velocity"] == f"{joint.value(0x607F)} counts/s = 1.00 rad/s"
     steep = [round(STEEP_RADPS2 / unit_radps)] if shown is Mode.PROFILE_VELOCITY else []
-    assert (downloads(joint, 0x6083), downloads(joint, 0x6084)) == (steep, steep)
+    assert (joint.downloads(0x6083), joint.downloads(0x6084)) == (steep, steep)
     assert any("profile velocity mode (PV)" in remark for remark in report.remarks) == bool(steep)
-
-
-def test_a_torque_mode_has_nothing_to_do_with_the_velocity(commissioned: Any) -> None:
-    bus, _, report = commissioned
-    assert not report.commands_velocity
-    assert "max velocity" not in report.settings
-    assert downloads(bus, 0x607F) == downloads(bus, 0x6083) == []
 
 
 @pytest.mark.parametrize(("torque_max_Nm", "cut"), [(60.0, False), (3000.0, True)])
@@ -161,15 +145,7 @@ def test_a_torque_beyond_what_6072_holds_is_reported(joint: Any, torque_max_Nm: 
 def test_the_period_is_written_with_its_exponent(joint: Any, rate_Hz: float, period: tuple[int, int]) -> None:
     with joint.opened(rate_Hz=rate_Hz) as drive:
         drive.commission()
-    assert (downloads(joint, 0x60C2, 1), downloads(joint, 0x60C2, 2)) == ([period[0]], [period[1] & 0xFF])
-
-
-def test_the_drive_listens_to_our_sync(joint: Any) -> None:
-    joint.sequences[(0x1005, 0)] = [0x40000081]  # at first it is to produce SYNC itself
-    with joint.opened() as drive:
-        report = drive.commission()
-    assert downloads(joint, 0x1005) == [0x80]
-    assert "1005 was 40000081h, it is now 00000080h" in report.remarks
+    assert (joint.downloads(0x60C2, 1), joint.downloads(0x60C2, 2)) == ([period[0]], [period[1] & 0xFF])
 
 
 @pytest.mark.parametrize("left", [0, 126 << 16 | 500])
@@ -178,28 +154,15 @@ def test_a_watchdog_that_was_left_armed_is_ended_first(joint: Any, left: int) ->
     joint.requests.clear()
     with joint.opened() as drive:
         drive.commission()
-    assert downloads(joint, 0x1016, 1) == [*([0] if left else []), 126 << 16 | 200]
-
-
-def test_an_unanswered_request_is_repeated(joint: Any) -> None:
-    joint.mute += [(0x6072, 0), (0x6072, 0), (0x6064, 0)]
-    with joint.opened() as drive:
-        drive.commission()
-    assert joint.mute == []
+    assert joint.downloads(0x1016, 1) == [*([0] if left else []), 126 << 16 | 200]
 
 
 # --- refusals ---
-def test_wrong_node_names_those_that_answer(joint: Any) -> None:
+def test_a_drive_that_does_not_answer_or_falls_silent(joint: Any, empty_bus: Any) -> None:
     message = refusal(joint, NoDeviceError, node=7)
     assert "node 7 does not answer; these do: 1" in message
     assert "drive.node" in message
-
-
-def test_nobody_answers(empty_bus: Any) -> None:
     assert "node 1 does not answer, and neither does any other" in refusal(empty_bus, NoDeviceError)
-
-
-def test_a_drive_that_falls_silent(joint: Any) -> None:
     joint.mute += [(0x6076, 0)] * 3
     message = refusal(joint, NoDeviceError)
     assert "reading object 6076 (motor rated torque) got no answer in 3 attempts" in message

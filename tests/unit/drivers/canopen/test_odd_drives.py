@@ -79,27 +79,22 @@ def test_a_torque_slope_that_is_not_there_is_a_remark(lacking: Any) -> None:
     assert "60C2" not in report.settings
 
 
-@pytest.mark.parametrize("sub", [None, 1])
-def test_without_a_consumer_heartbeat_it_is_never_used(lacking: Any, sub: int | None) -> None:
-    with pytest.raises(DeviceError, match=r"no object 1016:1 .* which jointctl needs: without it the drive cannot"):
-        lacking((0x1016, sub))
-
-
-def test_neither_reaction_to_a_lost_connection_is_refused(lacking: Any) -> None:
-    with pytest.raises(DeviceError, match=r"neither object 6007 .* nor 1029:1"):
-        lacking((0x6007, None), (0x1029, None))
-
-
-def test_without_6502_a_mode_that_is_not_taken_is_refused(lacking: Any, joint: Any) -> None:
-    joint.answers[(0x6061, 0)] = 0
-    with pytest.raises(DeviceError, match="6061 shows mode 0, mode 10 was selected"):
-        lacking((0x6502, None))
-
-
-def test_without_603f_a_fault_has_no_code(lacking: Any, joint: Any) -> None:
-    joint.answers[(0x6041, 0)] = 0x0218
-    with pytest.raises(DeviceError, match=r"is in fault \(error code 0000h\)"):
-        lacking((0x603F, None))
+@pytest.mark.parametrize(
+    ("places", "answers", "message"),
+    [
+        ([(0x1016, None)], {}, r"no object 1016:1 .* which jointctl needs: without it the drive cannot"),
+        ([(0x1016, 1)], {}, r"no object 1016:1 .* which jointctl needs: without it the drive cannot"),
+        ([(0x6007, None), (0x1029, None)], {}, r"neither object 6007 .* nor 1029:1"),
+        ([(0x6502, None)], {(0x6061, 0): 0}, "6061 shows mode 0, mode 10 was selected"),
+        ([(0x603F, None)], {(0x6041, 0): 0x0218}, r"is in fault \(error code 0000h\)"),
+    ],
+)
+def test_what_a_drive_is_refused_for_that_lacks_objects(
+    lacking: Any, joint: Any, places: list[tuple[int, int | None]], answers: dict[tuple[int, int], int], message: str
+) -> None:
+    joint.answers.update(answers)
+    with pytest.raises(DeviceError, match=message):
+        lacking(*places)
 
 
 @pytest.mark.parametrize(
@@ -178,32 +173,29 @@ def test_permille_of_rated_torque_or_of_rated_current(commission: Any, reference
 
 
 # --- time ---
+
+
 def test_a_drive_that_boots_for_seconds_and_one_for_longer_than_allowed(commission: Any, joint: Any) -> None:
     # each attempt: a request and an abort of the library
     joint.deaf_frames = 10
-    commission(boot_timeout_s=1.5)
-    assert joint.deaf_frames == 0
+    joint.sequences[(0x6041, 0)] = [0x0200] * 20  # not ready to switch on
+    commission(boot_timeout_s=2.0)
+    assert (joint.deaf_frames, joint.sequences[(0x6041, 0)]) == (0, [])
+    joint.answers[(0x6041, 0)] = 0x0200
+    message = r"node 1 is not ready to switch on \(statusword 0200h\) after 0\.3 s \(motor supply, .*boot_timeout_s\)"
+    with pytest.raises(DeviceError, match=message):
+        commission(boot_timeout_s=0.3)
     joint.deaf_frames = 1000
     with pytest.raises(NoDeviceError, match="node 1 does not answer"):
         commission(boot_timeout_s=0.5)
 
 
-def test_not_ready_to_switch_on_for_a_while_and_for_too_long(commission: Any, joint: Any) -> None:
-    joint.sequences[(0x6041, 0)] = [0x0200] * 20
-    commission(boot_timeout_s=2.0)
-    joint.answers[(0x6041, 0)] = 0x0200
-    message = r"node 1 is not ready to switch on \(statusword 0200h\) after 0\.3 s \(motor supply, .*boot_timeout_s\)"
-    with pytest.raises(DeviceError, match=message):
-        commission(boot_timeout_s=0.3)
-
-
 def test_no_statusword_until_the_first_controlword_that_is_not_zero(commission: Any, joint: Any) -> None:
     joint.sequences[(0x6041, 0)] = [0, 0, 0, 0]
     commission(boot_timeout_s=1.0)
-    words = [data[4] for cob, data in joint.requests if cob == 0x601 and data[:3] == b"\x2b\x40\x60"]
+    words = joint.downloads(0x6040)
     assert words[:2] == [0x00, 0x06]
-    assert 0x07 not in words
-    assert 0x0F not in words
+    assert not {0x07, 0x0F} & set(words)
     assert joint.value(0x6041) & 0x6F == 0x40
 
 
@@ -336,21 +328,22 @@ def test_a_fixed_feedback_map_is_used_by_its_offsets(commission: Any, joint: Any
 
 
 @pytest.mark.parametrize(
-    ("kinds", "entries", "refused", "message"),
+    ("first", "cob_id", "pdos", "kind", "entries", "message"),
     [
-        (range(4), (STATUS, VELOCITY), False,
+        (0x1800, 0x181, 4, 1, (STATUS, VELOCITY),
          r"none of the drive's own TPDOs holds statusword \(6041\), position actual value \(6064\) together"),
-        (range(1), (STATUS, POSITION), True, r"PDO 1800 .*transmission type 255: it does not answer every SYNC"),
+        (0x1800, 0x181, 1, 255, (STATUS, POSITION), r"PDO 1800 .*transmission type 255: it does not answer every SYNC"),
+        (0x1400, 0x201, 4, 1, (CONTROL, TARGET, SPEED_LIMIT),
+         "also carries object 607F: jointctl does not know what to send there"),
     ],
 )  # fmt: skip
-def test_a_fixed_feedback_map_without_the_position_or_without_sync_is_refused(
-    commission: Any, joint: Any, kinds: range, entries: tuple[int, int], refused: bool, message: str
+def test_a_fixed_map_that_cannot_be_used_is_refused(
+    commission: Any, joint: Any, first: int, cob_id: int, pdos: int, kind: int, entries: tuple[int, ...], message: str
 ) -> None:
-    refuse_maps(joint, 0x1800)
-    for k in kinds:
-        fixed_map(joint, 0x1800 + k, 0x181 + k * 0x100, 255 if refused else 1, *entries)
-    if refused:
-        joint.refused[(0x1800, 2)] = READ_ONLY
+    refuse_maps(joint, first)
+    for k in range(pdos):
+        fixed_map(joint, first + k, cob_id + k * 0x100, kind, *entries)
+    joint.refused[first, 2] = READ_ONLY
     with pytest.raises(DeviceError, match=message):
         commission()
 
@@ -368,14 +361,6 @@ def test_a_fixed_command_map_is_filled_where_the_loop_writes_nothing(commission:
     end_cycle(port, frames, sample, command)
     assert bytes(frames[2].payload)[:7] == struct.pack("<HHbh", 1000, 0x0F, 10, 100)
     assert frames[2].length == 7
-
-
-def test_a_fixed_command_map_with_an_object_that_zero_could_harm_is_refused(commission: Any, joint: Any) -> None:
-    refuse_maps(joint, 0x1400)
-    for base in range(0x1400, 0x1404):
-        fixed_map(joint, base, 0x201 + (base & 3) * 0x100, 1, CONTROL, TARGET, SPEED_LIMIT)
-    with pytest.raises(DeviceError, match="also carries object 607F: jointctl does not know what to send there"):
-        commission()
 
 
 def test_dummies_and_target_velocity_in_a_fixed_command_map_are_zero(commission: Any, joint: Any) -> None:

@@ -18,8 +18,8 @@ def listening(own_loop: bool = False) -> OtherControllers:
     return others
 
 
-def heard(others: OtherControllers, identifier: int, data: bytes = b"", *, extended: bool = False) -> str:
-    others.on_message_received(can.Message(arbitration_id=identifier, data=data, is_extended_id=extended))
+def heard(others: OtherControllers, identifier: int, data: bytes = b"") -> str:
+    others.on_message_received(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
     return others.found()
 
 
@@ -56,13 +56,10 @@ def test_its_twins_are_the_drives_own_and_those_of_other_nodes(identifier: int, 
     others.refuse()
 
 
-def test_frames_with_long_identifiers_are_no_frames_of_canopen() -> None:
-    assert heard(listening(), 0x080, extended=True) == ""
-
-
-def test_frames_of_errors_are_no_ones_command() -> None:
+@pytest.mark.parametrize("kind", ["is_extended_id", "is_error_frame"])
+def test_frames_with_long_identifiers_and_those_of_errors_are_no_ones_command(kind: str) -> None:
     others = listening()
-    others.on_message_received(can.Message(arbitration_id=0x080, is_error_frame=True, is_extended_id=False))
+    others.on_message_received(can.Message(arbitration_id=0x080, **{"is_extended_id": False, kind: True}))
     assert others.found() == ""
 
 
@@ -94,21 +91,16 @@ def test_beside_our_own_loop_commands_and_writes_that_matter_count(identifier: i
     assert heard(listening(own_loop=True), identifier, data) == words
 
 
-def test_rpdos_by_the_drives_own_word_count_from_the_beginning() -> None:
+def test_rpdos_by_the_drives_own_word_count_from_the_beginning_and_once() -> None:
     others = listening()
     for _ in range(3):
         assert heard(others, 0x333, bytes(8)) == ""
-    others.add_rpdos([0x333, 0x334])
-    assert others.found() == "3 x RPDO of the drive (333h)"
+    known = heard(others, 0x200 + NODE, bytes(4))
+    assert known == "1 x RPDO to node 5 (205h)"
+    others.add_rpdos([0x333, 0x334, 0x200 + NODE])
+    assert others.found() == f"3 x RPDO of the drive (333h), {known}"
     heard(others, 0x334, bytes(8))
     assert "1 x RPDO of the drive (334h)" in others.found()
-
-
-def test_an_rpdo_that_is_known_already_is_not_counted_twice() -> None:
-    others = listening()
-    heard(others, 0x200 + NODE, bytes(4))
-    others.add_rpdos([0x200 + NODE])
-    assert others.found() == "1 x RPDO to node 5 (205h)"
 
 
 def test_four_kinds_of_frames_are_named_and_the_others_counted() -> None:

@@ -56,8 +56,8 @@ def test_no_eds_is_needed(joint: Any) -> None:
     power_up(joint)
     assert joint.stop_drive() == "switch on disabled"
     assert not powered(joint)
-    words_ = [data[4] for cob, data in joint.requests if cob == 0x601 and data[:3] == b"\x2b\x40\x60"]
-    assert (words_[4], words_[-1]) == (2, 0)  # after the four of power_up: quick stop, then disable voltage
+    controls = joint.downloads(0x6040)
+    assert (controls[4], controls[-1]) == (2, 0)  # after the four of power_up: quick stop, then disable voltage
     assert NMT_STOP not in joint.requests
 
 
@@ -403,8 +403,6 @@ def test_the_words_for_a_run_that_was_not_begun(state: str, said: str) -> None:
 
 
 # --- a drive that somebody else has enabled, without SYNC ---
-def control_words(joint: Any) -> list[int]:
-    return [data[4] for cob, data in joint.requests if cob == 0x601 and data[:3] == b"\x2b\x40\x60"]
 
 
 def test_a_drive_that_is_found_enabled_brakes_before_its_power_goes_off(joint: Any) -> None:
@@ -412,7 +410,7 @@ def test_a_drive_that_is_found_enabled_brakes_before_its_power_goes_off(joint: A
     joint.requests.clear()
     with joint.opened() as drive:
         report = drive.commission(lambda _: True)
-    assert control_words(joint)[:2] == [2, 0]  # quick stop, then disable voltage
+    assert joint.downloads(0x6040)[:2] == [2, 0]  # quick stop, then disable voltage
     first_nmt = next(at for at, (cob, _) in enumerate(joint.requests) if cob == 0)
     quick_stop = next(at for at, (cob, data) in enumerate(joint.requests) if data[:5] == b"\x2b\x40\x60\x00\x02")
     assert quick_stop < first_nmt
@@ -496,7 +494,7 @@ def test_one_that_is_enabled_again_after_its_quick_stop_is_anothers(afterwards: 
 def test_its_twin_that_is_off_is_not_braked(joint: Any) -> None:
     with joint.opened() as drive:
         report = drive.commission()
-    assert 2 not in control_words(joint)
+    assert 2 not in joint.downloads(0x6040)
     assert not any("the drive was enabled" in remark for remark in report.remarks)
 
 

@@ -211,24 +211,19 @@ class TestDeadMan:
 
 class TestNumbers:
     @pytest.mark.parametrize(
-        ("velocity_radps", "cps"),
-        [(0.0, 0), (0.5, 41722), (-0.5, -41722), (1.0, 80_000), (-1e9, -80_000), (math.nan, 0), (math.inf, 0)],
-    )
-    @pytest.mark.parametrize("direction", [1, -1])
-    def test_velocity_is_saturated_before_the_cast(self, velocity_radps: float, cps: int, direction: int) -> None:
-        port = new(ElmoPort)[0]
-        port.position_radpcount, port.max_velocity_cps = direction / PER_RAD, 80_000
-        assert velocity_cps(port, velocity_radps) == direction * cps
-
-    @pytest.mark.parametrize(
         ("torque_Nm", "milli"),
         [(0.0, 0), (12.1, 1000), (60.5, 5000), (60.6, 5000), (-1e9, -5000), (math.nan, 0), (math.inf, 0), (0.00605, 0),
          (0.0061, 1)],
     )  # fmt: skip
-    def test_torque_is_saturated_before_the_cast(self, torque_Nm: float, milli: int) -> None:
+    @pytest.mark.parametrize("direction", [1, -1])
+    def test_torque_and_velocity_are_saturated_before_the_cast(
+        self, torque_Nm: float, milli: int, direction: int
+    ) -> None:
         port = new(ElmoPort)[0]
-        port.torque_NmpA, port.max_current_mA = 12.1, 5000
-        assert current_mA(port, torque_Nm) == milli
+        port.torque_NmpA, port.max_current_mA = 12.1 * direction, 5000
+        assert current_mA(port, torque_Nm) == direction * milli
+        port.position_radpcount, port.max_velocity_cps = direction * 0.0121, 5000
+        assert velocity_cps(port, torque_Nm) == direction * milli
 
     @pytest.mark.parametrize("milli", [0, 1, -1, 9, 10, 999, 1000, -1001, 12345, -99999, 123456])
     def test_the_text_of_a_current_reads_back(self, milli: int) -> None:
@@ -273,13 +268,18 @@ class TestFaultsOfTheDrive:
         assert talk.sample.drive_state == DriveState.OFF
         assert b"MO=1" not in said
 
-    def test_a_restart_shows_by_the_unit_mode(self) -> None:
-        talk = Talk().enabled()
+    @pytest.mark.parametrize("restarted", [True, False])
+    def test_a_restart_shows_by_the_unit_mode_and_its_twin_that_only_goes_off_does_not(self, restarted: bool) -> None:
+        talk = Talk()
+        assert b"MO=1" not in talk.cycle()  # without a status nothing is switched on
+        talk.enabled()
         assert talk.sample.restarts == 0
-        talk.device.restart()
+        if restarted:
+            talk.device.restart()
+        else:
+            talk.device.execute(b"MO=0")
         talk.cycle(count=4)
-        assert talk.sample.restarts == 1
-        assert talk.sample.drive_state == DriveState.OFF
+        assert (talk.sample.restarts, talk.sample.drive_state) == (int(restarted), DriveState.OFF)
 
     def test_a_restart_before_the_first_status_is_one_and_nothing_is_switched_on(self, talk: Talk) -> None:
         talk.device.execute(b"UM=5")
@@ -287,15 +287,6 @@ class TestFaultsOfTheDrive:
         assert talk.sample.restarts == 1
         said = [line for _ in range(2 * int(talk.port.enable_retry_cycles)) for line in talk.cycle()]
         assert (b"MO=1" in said, talk.device.m.motor_on, talk.sample.restarts) == (False, 0, 1)
-
-    def test_without_a_status_nothing_is_switched_on(self, talk: Talk) -> None:
-        assert b"MO=1" not in talk.cycle()
-
-    def test_its_twin_a_drive_that_goes_off_and_stays_in_torque_mode_has_not_restarted(self) -> None:
-        talk = Talk().enabled()
-        talk.device.execute(b"MO=0")
-        talk.cycle(count=4)
-        assert talk.sample.restarts == 0
 
 
 # --- The compiled exchange on a descriptor: a cycle that was held up, and its twin in time ---

@@ -4,17 +4,39 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 
 import pytest
 
+from jointctl.drivers.elmo.drive import ElmoDrive
 from jointctl.drivers.elmo.line_budget import cycle_characters, highest_rate_Hz, measured_exchange
 from jointctl.drivers.elmo.serial_port import SerialPort
 from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
 from jointctl.hil.elmo.motor import switch_off
 from jointctl.tools.verbs.elmo_bench import SHARED_ATTEMPTS
 from tests.unit.drivers.elmo.virtual_line import COUNTS, SETTINGS, MemoryPort
+
+Answer = Callable[[bytes, bytes], bytes]
+
+
+def saying(reply: bytes, to: bytes | None = None) -> Answer:
+    """A drive that says this to one command, or to all."""
+    return lambda line, good: reply if to in (None, line) else good
+
+
+def lacks(*names: bytes, code: bytes = b"\x02") -> Answer:
+    """A drive that knows none of these commands."""
+    return lambda line, reply: line + b"\r" + code + b"?;" if line.startswith(names) else reply
+
+
+@pytest.fixture
+def commissioned(port: MemoryPort) -> ElmoDrive:
+    drive = port.drive()
+    drive.commission()
+    return drive
 
 
 # --- Commissioning of the serial drive on a port in memory: what it writes, what it refuses and in which words ---
@@ -38,12 +60,6 @@ class TestCommissioning:
         assert port.device.echo == echo
         assert drive.port()[0].echo == int(echo)
 
-    def test_a_motor_that_was_on_is_switched_off_and_told(self, port: MemoryPort) -> None:
-        port.device.execute(b"MO=1")
-        report = port.drive().commission(lambda _: True)
-        assert port.device.m.motor_on == 0
-        assert any("was on" in remark for remark in report.remarks)
-
     @pytest.mark.parametrize("step", [100, -100, 0])
     def test_a_motor_that_is_on_and_turns_is_left_alone(self, port: MemoryPort, step: int) -> None:
         port.device.execute(b"MO=1")
@@ -60,7 +76,7 @@ class TestCommissioning:
         assert (port.device.m.motor_on, asked) == (1, [])
 
     def test_a_real_drive_without_position_limits_is_a_remark(self, port: MemoryPort) -> None:
-        port.answer = lambda line, reply: line + b"\r\x03?;" if line.startswith((b"HL[3]", b"LL[3]")) else reply
+        port.answer = lacks(b"HL[3]", b"LL[3]", code=b"\x03")
         report = port.drive().commission()
         assert sum("bad index" in remark for remark in report.remarks) == 2
 
@@ -81,33 +97,27 @@ class TestCommissioning:
     def test_what_does_not_fit_is_refused(
         self, port: MemoryPort, changes: dict[str, Any], kind: type[JointctlError], words: str
     ) -> None:
-        drive = port.drive(**changes)
-        with pytest.raises(kind) as caught:
-            drive.commission()
-        assert words in str(caught.value)
+        with pytest.raises(kind, match=re.escape(words)):
+            port.drive(**changes).commission()
         assert port.device.m.motor_on == 0
 
     @pytest.mark.parametrize(
         ("answer", "kind", "words"),
         [
-            (lambda line, reply: b"", NoDeviceError, "no drive answers on memory at 115200 baud"),
-            (lambda line, reply: b"\xf8\x80\xfe", NoDeviceError, "baud rate"),
-            (lambda line, reply: b"\xf8;\x80;", NoDeviceError, "baud rate"),
-            (lambda line, reply: b"MO\r1;" if line == b"MO" else reply, DeviceError, "left as it is"),
-            (lambda line, reply: b"CL[1]\r4.9;" if line == b"CL[1]" else reply, DeviceError, "does not read back"),
-            (lambda line, reply: b"HL[2]\r1;" if line == b"HL[2]" else reply, DeviceError, "HL[2]"),
-            (lambda line, reply: b"UM=1\r\x02?;" if line == b"UM=1" else reply, DeviceError, "bad command"),
-            (
-                lambda line, reply: b"TC\r1.5;" if line == b"TC" else reply,
-                DeviceError,
-                "TC (=1.5) of the drive must be 0",
-            ),
-            (lambda line, reply: b"RM\r1;" if line == b"RM" else reply, DeviceError, "RM (=0) does not read back"),
-            (lambda line, reply: b"PX\rtwo;" if line == b"PX" else reply, DeviceError, "is not a number"),
+            (saying(b""), NoDeviceError, "no drive answers on memory at 115200 baud"),
+            (saying(b"\xf8\x80\xfe"), NoDeviceError, "baud rate"),
+            (saying(b"\xf8;\x80;"), NoDeviceError, "baud rate"),
+            (saying(b"MO\r1;", b"MO"), DeviceError, "left as it is"),
+            (saying(b"CL[1]\r4.9;", b"CL[1]"), DeviceError, "does not read back"),
+            (saying(b"HL[2]\r1;", b"HL[2]"), DeviceError, "HL[2]"),
+            (saying(b"UM=1\r\x02?;", b"UM=1"), DeviceError, "bad command"),
+            (saying(b"TC\r1.5;", b"TC"), DeviceError, "TC (=1.5) of the drive must be 0"),
+            (saying(b"RM\r1;", b"RM"), DeviceError, "RM (=0) does not read back"),
+            (saying(b"PX\rtwo;", b"PX"), DeviceError, "is not a number"),
         ],
     )
     def test_drives_that_answer_wrongly(
-        self, port: MemoryPort, answer: Callable[[bytes, bytes], bytes], kind: type[JointctlError], words: str
+        self, port: MemoryPort, answer: Answer, kind: type[JointctlError], words: str
     ) -> None:
         port.answer = answer
         with pytest.raises(kind) as caught:
@@ -125,12 +135,8 @@ class TestCommissioning:
     @pytest.mark.parametrize(("slower", "refused"), [(1.1, False), (2.5, True)])
     def test_the_measured_exchange_decides_as_well(self, port: MemoryPort, slower: float, refused: bool) -> None:
         port.character_s *= slower
-        drive = port.drive(rate_Hz=150.0)
-        if refused:
-            with pytest.raises(DeviceError, match="one exchange takes"):
-                drive.commission()
-        else:
-            drive.commission()
+        with pytest.raises(DeviceError, match="one exchange takes") if refused else nullcontext():
+            port.drive(rate_Hz=150.0).commission()
 
 
 class TestBudget:
@@ -151,11 +157,6 @@ class TestBudget:
         assert measured.cycle_s == pytest.approx(0.003 + 80 / 115_200)
         assert measured.worst_cycle_s == pytest.approx(0.004 + 80 / 115_200)
         assert measured.loop_delay_s == pytest.approx(0.002 + 110 / 115_200)
-
-
-def lacks(*names: bytes) -> Callable[[bytes, bytes], bytes]:
-    """A drive that knows none of these commands."""
-    return lambda line, reply: line + b"\r\x02?;" if line.startswith(names) else reply
 
 
 class TestSpeedMode:
@@ -199,7 +200,7 @@ class TestSpeedMode:
             port.drive(mode="speed").commission()
 
     def test_a_jog_that_is_not_zero_is_refused(self, port: MemoryPort) -> None:
-        port.answer = lambda line, reply: b"JV\r1000;" if line == b"JV" else reply
+        port.answer = saying(b"JV\r1000;", b"JV")
         with pytest.raises(DeviceError, match=r"JV \(=0\) does not read back"):
             port.drive(mode="speed").commission()
 
@@ -271,7 +272,7 @@ class TestWhileTheQuestionIsOpen:
             drive.start_cyclic()
 
     def test_its_twin_torque_mode_because_speed_mode_was_refused(self, port: MemoryPort) -> None:
-        port.answer = lambda line, reply: b"SD\r1;" if line == b"SD" else reply
+        port.answer = saying(b"SD\r1;", b"SD")
         drive = port.drive(mode="auto", rate_Hz=100.0)
         drive.commission()
         port.device.execute(b"PM=0")  # of no importance in torque mode
@@ -287,12 +288,10 @@ class TestWhileTheQuestionIsOpen:
         drive.start_cyclic()
         assert {b"UM", b"RM", b"TC", b"MO", b"CL[1]", b"PL[1]", b"HL[2]", b"LL[3]"} <= set(port.commands[-20:])
 
-    def test_a_drive_that_has_gone_is_not_started(self, port: MemoryPort) -> None:
-        drive = port.drive()
-        drive.commission()
-        port.answer = lambda line, reply: b""
+    def test_a_drive_that_has_gone_is_not_started(self, port: MemoryPort, commissioned: ElmoDrive) -> None:
+        port.answer = saying(b"")
         with pytest.raises(NoDeviceError):
-            drive.start_cyclic()
+            commissioned.start_cyclic()
 
 
 class TestClearFault:
@@ -304,14 +303,16 @@ class TestClearFault:
         assert (port.device.m.motor_fault, port.device.m.motor_on, port.device.m.torque_A) == (0, 0, 0.0)
         drive.commission()
 
-    def test_without_a_fault_nothing_is_switched_on(self, port: MemoryPort) -> None:
-        assert port.drive().clear_fault() == "no fault"
-        assert b"MO=1" not in port.commands
-
-    def test_a_cause_that_remains_is_told_and_nothing_is_switched_on(self, port: MemoryPort) -> None:
-        port.device.amplifier = 3
-        with pytest.raises(DeviceError, match="undervoltage"):
-            port.drive().clear_fault()
+    @pytest.mark.parametrize("amplifier", [0, 3])
+    def test_without_a_fault_or_with_a_cause_that_remains_nothing_is_switched_on(
+        self, port: MemoryPort, amplifier: int
+    ) -> None:
+        port.device.amplifier = amplifier
+        if amplifier:
+            with pytest.raises(DeviceError, match="undervoltage"):
+                port.drive().clear_fault()
+        else:
+            assert port.drive().clear_fault() == "no fault"
         assert b"MO=1" not in port.commands
 
     def test_the_motor_goes_on_only_after_torque_zero_was_read_back(self, port: MemoryPort) -> None:
@@ -337,7 +338,7 @@ class TestClearFault:
         self, port: MemoryPort, spoilt: bytes, reply: bytes, words: str
     ) -> None:
         port.device.m.motor_fault = 0x200000
-        port.answer = lambda line, good: reply if line == spoilt else good
+        port.answer = saying(reply, spoilt)
         with pytest.raises(DeviceError, match=words):
             port.drive().clear_fault()
         assert b"MO=1" not in port.commands
@@ -361,21 +362,14 @@ class TestClearFault:
 
 
 class TestMakeSafe:
-    def test_a_drive_that_was_never_found_is_left_alone(self, port: MemoryPort) -> None:
-        drive = port.drive()
-        assert drive.make_safe() == "untouched"
-        assert port.commands == []
-
-    def test_torque_zero_and_motor_off_are_said_first(self, port: MemoryPort) -> None:
-        drive = port.drive()
-        drive.commission()
+    def test_torque_zero_and_motor_off_are_said_first(self, port: MemoryPort, commissioned: ElmoDrive) -> None:
         for line in (b"MO=1", b"TC=1"):
             port.device.execute(line)
         port.commands.clear()
-        assert drive.make_safe() == "off"
+        assert commissioned.make_safe() == "off"
         assert port.commands[1:5] == [b"TC=0", b"JV=0", b"ST", b"MO=0"]
         assert port.device.m.motor_on == 0
-        drive.close()
+        commissioned.close()
         assert port.closed
 
     def test_after_a_restart_with_the_echo_back(self, port: MemoryPort) -> None:
@@ -384,34 +378,28 @@ class TestMakeSafe:
         port.device.restart()
         assert drive.make_safe() == "off"
 
-    def test_a_fault_is_told(self, port: MemoryPort) -> None:
-        drive = port.drive()
-        drive.commission()
+    def test_a_fault_is_told(self, port: MemoryPort, commissioned: ElmoDrive) -> None:
         port.device.execute(b"MO=1")
         switch_off(port.device.m, 0x20000)
-        assert "overspeed" in drive.make_safe()
+        assert "overspeed" in commissioned.make_safe()
 
-    @pytest.mark.parametrize("silent", [True, False])
-    def test_it_never_raises_and_says_what_it_does_not_know(self, port: MemoryPort, silent: bool) -> None:
-        drive = port.drive()
-        drive.commission()
-        if silent:
-            port.answer = lambda line, reply: b""
-        else:
-            port.failure = BusError("serial port memory failed: Input/output error")
-        state = drive.make_safe()
+    def test_on_a_port_that_fails_it_says_what_it_does_not_know(
+        self, port: MemoryPort, commissioned: ElmoDrive
+    ) -> None:
+        port.failure = BusError("serial port memory failed: Input/output error")
+        state = commissioned.make_safe()
         assert state.startswith("unknown: ")
         assert "emergency stop" in state
 
     @pytest.mark.parametrize("asked", [True, False])
-    def test_a_stop_that_takes_replies_on_the_same_line_is_outlasted(self, port: MemoryPort, asked: bool) -> None:
+    def test_a_stop_that_takes_replies_on_the_same_line_is_outlasted(
+        self, port: MemoryPort, commissioned: ElmoDrive, asked: bool
+    ) -> None:
         """As long as `jointctl stop` tries; its twin without that word gives up before."""
-        drive = port.drive()
-        drive.commission()
         port.device.execute(b"MO=1")
         lines = itertools.count()  # two of each attempt
         port.answer = lambda line, reply: b"" if next(lines) < 4 * SHARED_ATTEMPTS else reply
-        state = drive.make_safe(asked=asked)
+        state = commissioned.make_safe(asked=asked)
         assert state == "off" if asked else state.startswith("unknown: ")
         assert port.device.m.motor_on == 0
 

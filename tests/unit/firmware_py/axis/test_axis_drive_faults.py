@@ -6,7 +6,7 @@ import pytest
 
 from jointctl.firmware_py.records import LINE_GONE
 from jointctl.firmware_py.sequence import reset_axis
-from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction, StopRequest
+from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction
 from tests.axis_on_stub_joint import NewRig, assert_fault, assert_well
 
 
@@ -14,11 +14,7 @@ from tests.axis_on_stub_joint import NewRig, assert_fault, assert_well
 @pytest.mark.parametrize("drive_state", [DriveState.FAULT, DriveState.FAULT_BRAKING])
 @pytest.mark.parametrize("phase", [p for p in AxisPhase if p < AxisPhase.DISABLING and p != AxisPhase.QUICK_STOPPING])
 def test_drive_fault_in_each_phase(rig: NewRig, phase: AxisPhase, drive_state: DriveState) -> None:
-    run = rig(0.05)
-    if phase in (AxisPhase.RAMPING, AxisPhase.RELEASING):
-        run.until(AxisPhase.TRACKING).run(5)
-        run.stop = StopRequest.RAMP
-    run.until(phase)
+    run = rig(0.05).reach(phase)
     run.joint.drive_state = drive_state
     run.sample.drive_error, run.sample.status_word = 0x8311, 0x0218
     run.tick()
@@ -71,11 +67,7 @@ def test_a_restart_before_the_first_cycle_ends_the_run_without_power(rig: NewRig
 @pytest.mark.parametrize("phase", [AxisPhase.APPROACH, AxisPhase.TRACKING, AxisPhase.RAMPING, AxisPhase.RELEASING])
 def test_a_drive_that_brakes_by_itself_is_left_braking(rig: NewRig, phase: AxisPhase) -> None:
     """Power off would make it coast; at standstill, or after the time for a stop, it is switched off."""
-    run = rig(0.05)
-    if phase >= AxisPhase.RAMPING:
-        run.until(AxisPhase.TRACKING).run(5)
-        run.stop = StopRequest.RAMP
-    run.until(phase)
+    run = rig(0.05).reach(phase)
     before = len(run.requests)
     run.joint.drive_state, run.joint.delay_cycles = DriveState.STOPPING, 50
     run.run(40)
@@ -133,16 +125,13 @@ def test_bus_errors(rig: NewRig, errors: int, trips: bool) -> None:
         assert_well(run)
 
 
-def test_without_a_line_the_run_ends_at_once(rig: NewRig) -> None:
+@pytest.mark.parametrize(
+    ("errors", "phase"), [(LINE_GONE, AxisPhase.FINISHED), (LINE_GONE - 1, AxisPhase.QUICK_STOPPING)]
+)
+def test_without_a_line_the_run_ends_at_once(rig: NewRig, errors: int, phase: AxisPhase) -> None:
+    """With one that only fails it goes on stopping."""
     run = rig(0.0).until(AxisPhase.TRACKING)
-    run.sample.bus_errors = LINE_GONE
+    run.sample.bus_errors = errors
     run.tick()
+    assert run.phase == phase
     assert_fault(run, Fault.BUS_ERROR, Reaction.QUICK_STOP)
-    assert run.state.phase == AxisPhase.FINISHED
-
-
-def test_with_a_line_that_only_fails_it_goes_on_stopping(rig: NewRig) -> None:
-    run = rig(0.0).until(AxisPhase.TRACKING)
-    run.sample.bus_errors = LINE_GONE - 1
-    run.tick()
-    assert run.state.phase == AxisPhase.QUICK_STOPPING

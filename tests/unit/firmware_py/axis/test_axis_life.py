@@ -122,14 +122,7 @@ def test_every_feed_forward_runs(rig: NewRig, feed_forward: FeedForward) -> None
 @pytest.mark.parametrize("phase", [p for p in AxisPhase if p < AxisPhase.DISABLING])
 @pytest.mark.parametrize("request_", [StopRequest.RAMP, StopRequest.QUICK_STOP, StopRequest.OFF])
 def test_stop_request_in_each_phase(rig: NewRig, phase: AxisPhase, request_: StopRequest) -> None:
-    run = rig(0.05)
-    if phase is AxisPhase.RAMPING or phase is AxisPhase.RELEASING:
-        run.until(AxisPhase.TRACKING).run(5)
-        run.stop = StopRequest.RAMP
-    elif phase is AxisPhase.QUICK_STOPPING:
-        run.until(AxisPhase.TRACKING).run(5)
-        run.stop = StopRequest.QUICK_STOP
-    run.until(phase)
+    run = rig(0.05).reach(phase)
     run.stop = request_
     run.tick()
     if phase <= AxisPhase.ENABLING or request_ is StopRequest.OFF:

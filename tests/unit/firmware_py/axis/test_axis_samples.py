@@ -117,26 +117,15 @@ def test_a_position_that_is_not_a_number_stops(rig: NewRig, phase: AxisPhase) ->
     assert run.phase >= AxisPhase.QUICK_STOPPING
 
 
-def test_no_samples_at_all(rig: NewRig) -> None:
-    run = rig(0.0)
-    for _ in range(80):
-        run.tick(fresh=False)
-    assert run.phase == AxisPhase.FINISHED
-    assert run.state.fault == Fault.NO_SAMPLES
-    assert set(run.requests) == {DriveRequest.OFF}
-
-
-def test_a_moving_joint_is_not_enabled(rig: NewRig) -> None:
+@pytest.mark.parametrize(
+    ("missing_every", "step_rad", "fault"),
+    [(1, 0.0, Fault.NO_SAMPLES), (4, 0.0, Fault.SAMPLES_MISSING), (100, 0.0005, Fault.NOT_AT_STANDSTILL)],
+)
+def test_without_samples_or_with_holes_or_a_joint_that_moves_nothing_is_enabled(
+    rig: NewRig, missing_every: int, step_rad: float, fault: Fault
+) -> None:
     run = rig(0.0)
     for k in range(80):
-        run.tick(offset_rad=0.0005 * k)
-    assert run.state.fault == Fault.NOT_AT_STANDSTILL
-    assert set(run.requests) == {DriveRequest.OFF}
-
-
-def test_samples_with_holes_are_not_enough_to_enable(rig: NewRig) -> None:
-    run = rig(0.0)
-    for k in range(80):
-        run.tick(fresh=k % 4 != 0)
-    assert run.state.fault == Fault.SAMPLES_MISSING
+        run.tick(fresh=k % missing_every != 0, offset_rad=step_rad * k)
+    assert (run.phase, run.state.fault) == (AxisPhase.FINISHED, fault)
     assert set(run.requests) == {DriveRequest.OFF}

@@ -91,15 +91,6 @@ def test_enable_timeout(rig: NewRig, delay_cycles: int, trips: bool) -> None:
         assert run.phase == AxisPhase.APPROACH
 
 
-@pytest.mark.parametrize(("delay_cycles", "trips"), [(19, False), (30, True)])
-def test_off_timeout(rig: NewRig, delay_cycles: int, trips: bool) -> None:
-    run = rig(0.0).until(AxisPhase.TRACKING)
-    run.joint.delay_cycles = delay_cycles
-    run.stop = StopRequest.OFF
-    finish(run)
-    assert run.state.fault == (Fault.OFF_TIMEOUT if trips else Fault.NONE)
-
-
 @pytest.mark.parametrize("moves", [True, False])
 def test_stop_timeout(rig: NewRig, moves: bool) -> None:
     run = rig(0.0)

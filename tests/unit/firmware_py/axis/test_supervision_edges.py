@@ -42,9 +42,8 @@ def after(fault: Fault, phase: AxisPhase) -> AxisPhase:
 )
 @pytest.mark.parametrize("phase", list(AxisPhase))
 def test_each_limit_at_its_edge_in_each_phase(
-    axis_constants: Any, what: str, within: int, beyond: int, fault: Fault, phase: AxisPhase
+    axis: Any, what: str, within: int, beyond: int, fault: Fault, phase: AxisPhase
 ) -> None:
-    axis = axis_constants[0]
     axis.limits.sample_age_max_cycles, axis.limits.heartbeat_age_max_cycles = 7, 9
     axis.limits.skipped_max_cycles, axis.sequence.supervisor_max_cycles = 5, 11
     torque = AxisPhase.APPROACH <= phase <= AxisPhase.RELEASING
@@ -75,11 +74,10 @@ def test_each_limit_at_its_edge_in_each_phase(
 
 
 @pytest.mark.parametrize("limit", ["heartbeat_age_max_cycles", "supervisor_max_cycles"])
-def test_what_is_not_watched_does_not_trip(axis_constants: Any, limit: str) -> None:
-    axis, state, sample = axis_constants[0], new(AxisState)[0], new(Sample)[0]
+def test_what_is_not_watched_does_not_trip(axis: Any, state: Any, limit: str) -> None:
+    sample = new(Sample)[0]
     axis.limits.heartbeat_age_max_cycles = axis.sequence.supervisor_max_cycles = 10
     setattr(axis.limits if limit.startswith("heart") else axis.sequence, limit, 0)
-    reset_axis(axis, state)
     state.phase, sample.drive_state = AxisPhase.TRACKING, DriveState.ENABLED
     sample.heartbeat_age_cycles = 0 if limit.startswith("super") else 1_000_000
     check_supervision(axis, state, sample, 0, 1_000_000 if limit.startswith("super") else 0)
@@ -87,9 +85,7 @@ def test_what_is_not_watched_does_not_trip(axis_constants: Any, limit: str) -> N
 
 
 @pytest.mark.parametrize("phase", list(AxisPhase))
-def test_suspension_in_each_phase(axis_constants: Any, phase: AxisPhase) -> None:
-    state = new(AxisState)[0]
-    reset_axis(axis_constants[0], state)
+def test_suspension_in_each_phase(state: Any, phase: AxisPhase) -> None:
     state.phase = phase
     check_suspension(state, 5.0)
     if phase < AxisPhase.QUICK_STOPPING:
@@ -99,10 +95,8 @@ def test_suspension_in_each_phase(axis_constants: Any, phase: AxisPhase) -> None
 
 
 @pytest.fixture
-def stuck(axis_constants: Any) -> tuple[Any, Any]:
+def stuck(axis: Any, state: Any) -> tuple[Any, Any]:
     """Constants and state of a joint that tracks and whose reading has stood still for a cycle."""
-    axis, state = axis_constants[0], new(AxisState)[0]
-    reset_axis(axis, state)
     axis.limits.frozen_max_rad, axis.limits.frozen_torque_Nm = 0.5, 3.0
     state.phase, state.frozen_samples = AxisPhase.TRACKING, 1
     return axis, state
@@ -201,14 +195,12 @@ def test_pushing_counts_from_the_beginning_again(stuck: tuple[Any, Any], by: str
     ],
 )  # fmt: skip
 def test_the_error_code_of_the_drive_belongs_to_faults_that_the_drive_has_a_part_in(
-    axis_constants: Any, what: str, fault: Fault, told: bool
+    axis: Any, state: Any, what: str, fault: Fault, told: bool
 ) -> None:
     """With limits of one cycle, the smallest that are no limit of zero, which means none."""
-    axis = axis_constants[0]
     axis.limits.sample_age_max_cycles = axis.limits.heartbeat_age_max_cycles = 1
     axis.limits.skipped_max_cycles = axis.sequence.supervisor_max_cycles = 1
-    state, sample = new(AxisState)[0], new(Sample)[0]
-    reset_axis(axis, state)
+    sample = new(Sample)[0]
     state.phase, sample.drive_state, sample.drive_error = AxisPhase.TRACKING, DriveState.ENABLED, 0x2310
     if what in ("bus_errors", "heartbeat_age_cycles"):
         sample[what] = 2

@@ -10,12 +10,11 @@ from typing import Any
 import canopen
 import pytest
 
-from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
+from jointctl.hil.canopen.device import DeviceSettings
 from jointctl.hil.device_loop import SEND_ERRORS_WORD
-from jointctl.hil.plant.joint import plant
 from jointctl.hil.realtime_device import RealtimeDevice
 from tests.places import EDS
-from tests.virtual_drive import NODE, Network, Rig
+from tests.virtual_drive import NODE, Network, Rig, frame, network_node, virtual_drive
 
 
 # --- The virtual drive, frame by frame, with injected time: NMT, PDO, timers, faults ---
@@ -143,18 +142,6 @@ def test_the_motors_temperature_in_tenths_of_a_degree(rig: Rig) -> None:
     assert rig.write(0x2103, 0, 0, 2) == 0x06010002
 
 
-def test_rpdo_needs_operational_and_its_length(rig: Rig) -> None:
-    rig.send(0x205, b"\x06\x00")
-    rig.run(1)
-    assert rig.get(0x6040) == 0
-    rig.operational()
-    rig.send(0x205, b"\x06")
-    assert rig.emergencies() == [0x8210]
-    assert rig.get(0x6040) == 0
-    rig.send(0x205, b"\x06\x00")
-    assert rig.get(0x6041) & 0x6F == 0x21
-
-
 def test_synchronous_pdos(rig: Rig) -> None:
     """Type 2: every second SYNC; a synchronous RPDO waits for the SYNC, which reports the state before it."""
     rig.set(0x1801, 1, 0x285, 4)
@@ -207,11 +194,7 @@ def test_settings_out_of_range_are_named() -> None:
 # --- The virtual drive seen by the `canopen` library, and in real time on a socket ---
 @pytest.fixture
 def node() -> Any:
-    network = Network(Cia402Device(EDS, DeviceSettings(node_id=NODE, serial_number=77), *plant()))
-    remote = network.add_node(NODE, str(EDS))
-    remote.sdo.RESPONSE_TIMEOUT = 0.5
-    network.run(1)
-    return remote
+    return network_node(Network(virtual_drive(DeviceSettings(node_id=NODE, serial_number=77))), 0.5)
 
 
 def test_eds_loads_without_a_word(caplog: pytest.LogCaptureFixture) -> None:
@@ -259,38 +242,10 @@ def test_remap_sync_and_torque_through_pdos(node: Any) -> None:
     assert node.tpdo[1][2].raw == 50
 
 
-@pytest.mark.parametrize("alive", [True, False])
-def test_heartbeat_loss_is_an_emergency_and_stops_the_joint(node: Any, alive: bool) -> None:
-    network = node.network
-    node.sdo[0x1016][1].raw = 0x7F << 16 | 20
-    node.sdo[0x1029][1].raw = 2
-    node.sdo[0x6007].raw = 3
-    node.sdo[0x6060].raw = 9
-    node.nmt.state = "OPERATIONAL"
-    for word in (0x06, 0x07, 0x0F):
-        node.sdo[0x6040].raw = word
-    node.sdo[0x60FF].raw = 50_000
-    network.send_message(0x77F, b"\x05")
-    for _ in range(100):
-        network.run(10)
-        if alive:
-            network.send_message(0x77F, b"\x05")
-    assert [error.code for error in node.emcy.log] == ([] if alive else [0x8130])
-    speed_radps = network.device.plant_state[0].joint_velocity_radps
-    assert bool(abs(speed_radps) > 0.5) is alive
-    assert network.device.device[0].nmt == (5 if alive else 4)
-
-
 def test_real_time_device_boots_answers_and_stops() -> None:
-    device = Cia402Device(
-        EDS, DeviceSettings(node_id=NODE), *plant(step_s=1e-3)
-    )  # coarse: keeps up without the JIT too
+    device = virtual_drive(step_s=1e-3)  # coarse: keeps up without the JIT too
     ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.settimeout(10.0)
-
-    def frame(identifier: int, data: bytes) -> bytes:
-        return struct.pack("<IB3x8s", identifier, len(data), data)
-
     with ours, its, RealtimeDevice(device, its.fileno()) as running:
         assert ours.recv(16) == frame(0x705, b"\x00")
         for word, status in ((6, 0x21), (7, 0x23), (15, 0x27)):

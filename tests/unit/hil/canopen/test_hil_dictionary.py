@@ -14,13 +14,12 @@ from canopen.objectdictionary import ODVariable
 
 from jointctl.drivers.canopen.eds import read_eds
 from jointctl.drivers.canopen.sdo import download
-from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
-from jointctl.hil.plant.joint import plant
+from jointctl.hil.canopen.device import DeviceSettings
 from jointctl.tools.simulation.virtual_joint import new_device
 from tests.places import CONFIGS, EDS
 from tests.two_encoders import NODE as TWO_NODES
 from tests.two_encoders import short_run
-from tests.virtual_drive import NODE, Network, Rig
+from tests.virtual_drive import NODE, Network, Rig, network_node, virtual_drive
 
 # --- The EDS describes the virtual drive exactly: a walk over every object, through SDO, by what the EDS says alone ---
 FORMATS = {1: "<B", 2: "<b", 3: "<h", 4: "<i", 5: "<B", 6: "<H", 7: "<I"}
@@ -44,11 +43,7 @@ LIVE = {0x6041}  # tells the present state
 
 @pytest.fixture(scope="module")
 def node() -> Any:
-    network = Network(Cia402Device(EDS, DeviceSettings(node_id=NODE), *plant()))
-    remote = network.add_node(NODE, str(EDS))
-    remote.sdo.RESPONSE_TIMEOUT = 0.5
-    network.run(1)
-    return remote
+    return network_node(Network(virtual_drive()), 0.5)
 
 
 def all_variables() -> list[ODVariable]:
@@ -171,17 +166,9 @@ def test_supported_homing_methods_are_those_that_6098_takes(node: Any) -> None:
 
 
 # --- The virtual CiA 406 node, frame by frame and by its EDS ---
-def frame(identifier: int, data: bytes) -> bytes:
-    return struct.pack("<IB3x8s", identifier, len(data), data)
-
-
-def words(frames: list[bytes]) -> list[tuple[int, bytes]]:
-    return [(struct.unpack_from("<I", f)[0], f[8 : 8 + f[4]]) for f in frames]
-
-
 @pytest.fixture
-def device(tmp_path: Path) -> Any:
-    return new_device(short_run(tmp_path, TWO_NODES, virtual__initial_position_rad=0.25))
+def two_nodes(tmp_path: Path) -> Rig:
+    return Rig(device=new_device(short_run(tmp_path, TWO_NODES, virtual__initial_position_rad=0.25)))
 
 
 def test_the_eds_is_read_by_the_library_and_is_that_of_an_encoder() -> None:
@@ -196,41 +183,38 @@ def test_the_eds_needs_no_remark_and_is_not_measured_as_that_of_a_drive() -> Non
     assert "[6502]" in "".join(read_eds(CONFIGS / "joint_encoder.eds", 2).all_remarks())
 
 
-def test_boot_up_heartbeat_and_nmt_of_its_own(device: Any) -> None:
-    assert (0x702, b"\0") in words(device.advance(1_000_000))
-    sent = device.handle(frame(0x602, struct.pack("<BHBI", 0x2B, 0x1017, 0, 100)), 2_000_000)
-    assert (0x702, b"\x7f") in words(sent + device.advance(3_000_000))
-    device.handle(frame(0, b"\x01\x02"), 4_000_000)
-    assert (0x702, b"\x05") in words(device.advance(110_000_000))
-    assert device.device[0].nmt == 127  # the drive was not meant
-    device.handle(frame(0, b"\x81\x02"), 111_000_000)
-    assert (0x702, b"\0") in words(device.advance(112_000_000))
+def test_boot_up_heartbeat_and_nmt_of_its_own(two_nodes: Rig) -> None:
+    assert (0x702, b"\0") in two_nodes.sent
+    sent = two_nodes.send(0x602, struct.pack("<BHBI", 0x2B, 0x1017, 0, 100)) + two_nodes.run(1)
+    assert (0x702, b"\x7f") in sent
+    two_nodes.send(0, b"\x01\x02")
+    assert (0x702, b"\x05") in two_nodes.run(106)
+    assert two_nodes.device.device[0].nmt == 127  # the drive was not meant
+    two_nodes.send(0, b"\x81\x02")
+    assert (0x702, b"\0") in two_nodes.run(1)
 
 
-def test_its_position_at_every_sync(device: Any) -> None:
-    device.advance(1_000_000)
-    device.handle(frame(0x602, struct.pack("<BHBI", 0x2F, 0x1800, 2, 1)), 2_000_000)
-    assert not [f for f in words(device.handle(frame(0x80, b""), 3_000_000)) if f[0] == 0x182]
-    device.handle(frame(0, b"\x01\x02"), 4_000_000)
-    sent = dict(words(device.handle(frame(0x80, b""), 5_000_000)))
+def test_its_position_at_every_sync(two_nodes: Rig) -> None:
+    two_nodes.send(0x602, struct.pack("<BHBI", 0x2F, 0x1800, 2, 1))
+    assert 0x182 not in dict(two_nodes.send(0x80, b""))
+    two_nodes.send(0, b"\x01\x02")
+    sent = dict(two_nodes.send(0x80, b""))
     assert int.from_bytes(sent[0x182], "little") == round(0.25 / math.tau * 524288) + 100_000
 
 
-def test_an_error_is_an_emergency_and_an_alarm(device: Any) -> None:
-    device.advance(1_000_000)
-    device.device[0].encoder.error_code = 0x5000
-    assert (0x82, b"\x00\x50\x21\0\0\0\0\0") in words(device.advance(2_000_000))
-    answer = words(device.handle(frame(0x602, struct.pack("<BHB4x", 0x40, 0x6503, 0)), 3_000_000))[-1]
-    assert (answer[0], answer[1][4]) == (0x582, 1)
-    device.device[0].encoder.error_code = 0
-    assert (0x82, bytes(8)) in words(device.advance(4_000_000))
+def test_an_error_is_an_emergency_and_an_alarm(two_nodes: Rig) -> None:
+    encoder = two_nodes.device.device[0].encoder
+    encoder.error_code = 0x5000
+    assert (0x82, b"\x00\x50\x21\0\0\0\0\0") in two_nodes.run(1)
+    identifier, answer = two_nodes.send(0x602, struct.pack("<BHB4x", 0x40, 0x6503, 0))[-1]
+    assert (identifier, answer[4]) == (0x582, 1)
+    encoder.error_code = 0
+    assert (0x82, bytes(8)) in two_nodes.run(1)
 
 
-def test_every_object_of_the_node_can_be_read(device: Any) -> None:
-    device.advance(1_000_000)
-    for entry in device.encoder.objects:
-        request = struct.pack("<BHB4x", 0x40, entry.index, entry.sub)
-        answer = words(device.handle(frame(0x602, request), 2_000_000))[-1][1]
+def test_every_object_of_the_node_can_be_read(two_nodes: Rig) -> None:
+    for entry in two_nodes.device.encoder.objects:
+        answer = two_nodes.send(0x602, struct.pack("<BHB4x", 0x40, entry.index, entry.sub))[-1][1]
         assert answer[0] & 0xE0 == 0x40, f"{entry.index:04X}:{entry.sub}"
 
 

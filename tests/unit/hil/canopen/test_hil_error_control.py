@@ -210,7 +210,7 @@ def test_a_pdo_that_is_too_short_is_reported_once_each_time_it_begins(rig: Rig) 
     rig.operational()
     for _ in range(5):
         rig.send(0x200 + NODE, b"\x06")
-    assert rig.emergencies() == [0x8210]
+    assert (rig.emergencies(), rig.get(0x6040)) == ([0x8210], 0)
     assert (rig.get(0x1001), rig.get(0x1003), rig.get(0x1003, 1)) == (0x11, 1, 0x8210)
     rig.send(0x300 + NODE, b"\x06")
     assert rig.emergencies() == [0x8210, 0x8210]
