@@ -21,7 +21,7 @@ from jointctl.tools.experiments.controllers import (
 )
 from jointctl.tools.experiments.paper_experiments import ideal, law, r1
 from jointctl.tools.experiments.scenarios import Scenario, run_scenario
-from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
+from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 from tests.configurations import changed as changed_config
 
 

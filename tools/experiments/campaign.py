@@ -19,13 +19,13 @@ from typing import Any
 from rich.table import Table
 
 from jointctl.firmware_py.states import Fault
+from jointctl.tools.child_process import interrupts_left_to_the_parent
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.drawing import INK, MID_BLUE, MID_GREEN, MID_RED, canvas
 from jointctl.tools.experiments.fault_scenarios import draw_scenario
 from jointctl.tools.experiments.judge import Verdict, judge
-from jointctl.tools.simulation.child_process import interrupts_left_to_the_parent
-from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.sweeping.carry_out import with_mode
 
 # --- the runs ---

@@ -22,12 +22,12 @@ from jointctl.firmware_py.states import CommandKind, Fault, TrajectoryKind
 from jointctl.firmware_py.trajectory import approach_duration_s
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_constants
+from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Advance, Output
 from jointctl.tools.recording.log_folder import log_path
 from jointctl.tools.session.consent import Consent
 from jointctl.tools.session.display import OnlyShows, Snapshot
 from jointctl.tools.session.plan import Placed, RunPlan, joint_lines, remark_lines
-from jointctl.tools.simulation.lockstep import LockstepJoint
 from jointctl.tools.sweeping.checks import constant_remarks, require_torque
 from jointctl.tools.sweeping.grid import SweepPoint
 from jointctl.tools.sweeping.meter import SweepMeter

@@ -205,8 +205,8 @@ class ElmoBench(BenchDrive):
     def serve(self, config: Config, output: Output, options: ServeOptions) -> int:
         """See `BenchDrive`; prints the port on stdout."""
         from jointctl.tools.session.control import stop_signals
-        from jointctl.tools.simulation.virtual_elmo import serve_virtual_elmo
         from jointctl.tools.verbs.hil import make_realtime, wait_for_end
+        from jointctl.tools.virtual_elmo import serve_virtual_elmo
 
         if options.port is not None:
             raise ConfigurationError(

@@ -104,7 +104,7 @@ def test_the_hash_depends_on_the_sources_and_not_on_their_place(copy_of_sources:
 @pytest.mark.parametrize(
     "edited",
     [
-        "firmware_py/friction.py", "drivers/can/frame_io.py", "drivers/canopen/cyclic.py", "hil/plant/joint.py",
+        "firmware_py/friction.py", "drivers/can/frame_io.py", "drivers/canopen/cyclic.py", "hil/plant.py",
         "tools/identification/fit.py", "tools/wake_up.py",
     ],
 )  # fmt: skip

@@ -17,7 +17,7 @@ from jointctl.drivers.canopen.eds import read_eds
 from jointctl.drivers.canopen.sdo import ATTEMPTS, ObjectAccess, download
 from jointctl.drivers.errors import DeviceError, NoDeviceError
 from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
-from jointctl.hil.plant.joint import plant
+from jointctl.hil.plant import plant
 from tests.places import EDS
 from tests.virtual_drive import NODE, Network
 

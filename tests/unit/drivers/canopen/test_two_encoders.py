@@ -17,13 +17,13 @@ from jointctl.drivers.errors import ConfigurationError, DeviceError
 from jointctl.firmware_py.records import ENCODER_RESTARTED, Command, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
-from jointctl.hil.faults.kinds import FaultConstants, FaultKind
+from jointctl.hil.fault_kinds import FaultConstants, FaultKind
 from jointctl.tools.configuration.canopen import canopen_settings, cyclic_bus_load
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.inspection.health import bus_budget
+from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.session.session_drive import session_drive
-from jointctl.tools.simulation.lockstep import LockstepJoint
-from jointctl.tools.simulation.virtual_joint import new_device
+from jointctl.tools.virtual_joint import new_device
 from tests.configurations import changed
 from tests.places import CONFIGS
 from tests.two_encoders import NODE, cycle, port_of, short_run, tell
@@ -137,7 +137,7 @@ def test_commissioning_refuses(tmp_path: Path, change: dict[str, Any], message: 
     good = short_run(tmp_path, NODE)
     device = new_device(good)
     from jointctl.drivers.canopen.drive import CanopenDrive
-    from jointctl.tools.simulation.lockstep import DirectBus
+    from jointctl.tools.lockstep import DirectBus
 
     bus = DirectBus(device)
     settings = canopen_settings(short_run(tmp_path, {**NODE, **change}))
@@ -151,7 +151,7 @@ def test_commissioning_refuses(tmp_path: Path, change: dict[str, Any], message: 
 
 def test_an_encoder_with_an_alarm_is_refused(tmp_path: Path) -> None:
     from jointctl.drivers.canopen.drive import CanopenDrive
-    from jointctl.tools.simulation.lockstep import DirectBus
+    from jointctl.tools.lockstep import DirectBus
 
     config = short_run(tmp_path, NODE)
     device = new_device(config)
@@ -167,7 +167,7 @@ def test_an_encoder_with_an_alarm_is_refused(tmp_path: Path) -> None:
 def test_an_alarm_that_comes_while_the_question_is_open_is_refused(tmp_path: Path, alarm: bool) -> None:
     """Its EMCY comes while nobody listens."""
     from jointctl.drivers.canopen.drive import CanopenDrive
-    from jointctl.tools.simulation.lockstep import DirectBus
+    from jointctl.tools.lockstep import DirectBus
 
     config = short_run(tmp_path, NODE)
     device = new_device(config)

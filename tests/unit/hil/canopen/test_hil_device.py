@@ -11,9 +11,8 @@ import canopen
 import pytest
 
 from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
-from jointctl.hil.device_loop import SEND_ERRORS_WORD
-from jointctl.hil.plant.joint import plant
-from jointctl.hil.realtime_device import RealtimeDevice
+from jointctl.hil.plant import plant
+from jointctl.hil.realtime_device import SEND_ERRORS_WORD, RealtimeDevice
 from tests.places import EDS
 from tests.virtual_drive import NODE, Network, Rig
 

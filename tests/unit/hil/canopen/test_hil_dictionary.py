@@ -15,8 +15,8 @@ from canopen.objectdictionary import ODVariable
 from jointctl.drivers.canopen.eds import read_eds
 from jointctl.drivers.canopen.sdo import download
 from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
-from jointctl.hil.plant.joint import plant
-from jointctl.tools.simulation.virtual_joint import new_device
+from jointctl.hil.plant import plant
+from jointctl.tools.virtual_joint import new_device
 from tests.places import CONFIGS, EDS
 from tests.two_encoders import NODE as TWO_NODES
 from tests.two_encoders import short_run

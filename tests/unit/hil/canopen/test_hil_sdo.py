@@ -18,7 +18,7 @@ from jointctl.hil.canopen.dictionary import load_entries
 from jointctl.hil.canopen.pdo import read_object, write_object
 from jointctl.hil.canopen.records import FIELDS, Device
 from jointctl.hil.canopen.sdo import TIMEOUT_NS, SdoServer
-from jointctl.hil.plant.joint import plant
+from jointctl.hil.plant import plant
 from tests.places import EDS, ROOT
 
 # --- SDO server and write rules of the virtual drive: every abort code that a master may meet ---
