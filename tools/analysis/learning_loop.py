@@ -22,16 +22,7 @@ import numpy as np
 
 from jointctl.tools.analysis.linear_loop import Array, LoopSettings, linear_loop
 from jointctl.tools.analysis.margins import frequencies_radps
-
-
-@dataclass(frozen=True)
-class LearningSettings:
-    """The numbers of [control.learning] that decide the convergence."""
-
-    gain: float
-    error_gain_ps2: float
-    lead_cycles: int
-    half_width_cycles: int
+from jointctl.tools.configuration.sections import Learning
 
 
 @dataclass(frozen=True)
@@ -43,7 +34,7 @@ class Convergence:
     remaining_1_Hz: float  # share of a disturbance at 1 Hz that stays in the end
 
 
-def repetition_factor(settings: LoopSettings, learning: LearningSettings, omega_radps: Array) -> tuple[Array, Array]:
+def repetition_factor(settings: LoopSettings, learning: Learning, omega_radps: Array) -> tuple[Array, Array]:
     """(|M|, |1 - S| / |1 - M|) at these frequencies [rad/s], arrays (N,)."""
     loop = linear_loop(settings)
     z = np.exp(1j * omega_radps * settings.period_s)
@@ -60,7 +51,7 @@ def repetition_factor(settings: LoopSettings, learning: LearningSettings, omega_
     return np.abs(factor), np.abs(1.0 - smoothing) / np.abs(1.0 - factor)
 
 
-def learning_convergence(settings: LoopSettings, learning: LearningSettings) -> Convergence:
+def learning_convergence(settings: LoopSettings, learning: Learning) -> Convergence:
     """Convergence of this learning on this loop."""
     omega = frequencies_radps(settings.period_s)
     factor, _ = repetition_factor(settings, learning, omega)
