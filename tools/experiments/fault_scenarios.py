@@ -29,15 +29,9 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.plant_settings import plant_settings
 from jointctl.tools.configuration.sections import Hold, MinJerk, Sine, Trapezoid
 from jointctl.tools.lockstep import LockstepJoint
-from jointctl.tools.sweeping.carry_out import (
-    middle_rad,
-    position_margin_rad,
-    sweep_constants,
-    with_tracking_law,
-)
+from jointctl.tools.sweeping.carry_out import middle_rad, sweep_constants, with_tracking_law
 from jointctl.tools.sweeping.grid import SweepPoint
-from jointctl.tools.sweeping.options import ACCELERATION_SHARE
-from jointctl.tools.sweeping.plan import PlanSettings, plan_motion, shifted
+from jointctl.tools.sweeping.plan import ACCELERATION_SHARE, PlanSettings, plan_motion, position_margin_rad, shifted
 
 # --- kinds of fault ---
 

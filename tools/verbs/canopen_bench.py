@@ -17,11 +17,12 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_section import FOR_A_PORT, wrong_kind
 from jointctl.tools.configuration.sections import checked_options
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.bench_drive import Asked, BenchDrive, MonitorOptions, ReadableKeys, ServeOptions, is_text
+from jointctl.tools.verbs.bench_drive import Asked, BenchDrive, ReadableKeys, ServeOptions, is_text
 
 if TYPE_CHECKING:
     from jointctl.tools.inspection.health import Finding
     from jointctl.tools.inspection.subject import Subject
+    from jointctl.tools.verbs.monitor import MonitorOptions
 
 MONITOR_NICENESS = 10  # the loop of a run beside it goes first
 

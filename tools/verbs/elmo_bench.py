@@ -32,11 +32,12 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo import BAUD_RATES_TEXT, BAUD_RATES_bitps, elmo_section, serial_line_share
 from jointctl.tools.output import Output
 from jointctl.tools.session.elmo_guard import GuardCall
-from jointctl.tools.verbs.bench_drive import Asked, BenchDrive, MonitorOptions, ReadableKeys, ServeOptions, is_text
+from jointctl.tools.verbs.bench_drive import Asked, BenchDrive, ReadableKeys, ServeOptions, is_text
 
 if TYPE_CHECKING:
     from jointctl.tools.analysis.linear_loop import LoopSettings
     from jointctl.tools.inspection.health import Finding
+    from jointctl.tools.verbs.monitor import MonitorOptions
 
 SHARED_ATTEMPTS = 10  # the other user of the line takes some replies
 REPLY_TIMEOUT_S = 0.2

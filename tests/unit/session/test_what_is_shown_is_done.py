@@ -34,8 +34,8 @@ from jointctl.tools.session.run_watch import Around, RunParts, RunWatch
 from jointctl.tools.sweeping.carry_out import POSITION_GAIN_ps, middle_rad, sweep_constants
 from jointctl.tools.sweeping.checks import require_torque
 from jointctl.tools.sweeping.grid import both_directions, ordered_points
-from jointctl.tools.sweeping.options import SweepOptions, make_plan
-from jointctl.tools.sweeping.plan import PlanSettings, plan_motion, shifted
+from jointctl.tools.sweeping.options import SweepOptions
+from jointctl.tools.sweeping.plan import PlanSettings, make_plan, plan_motion, shifted
 from jointctl.tools.verbs import scope as scope_module
 from tests.configurations import VIRTUAL, edited, written
 from tests.places import CONFIGS
