@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from jointctl.firmware_py.states import Fault, Notice
-from jointctl.tools.analysis.learning_loop import learning_convergence
 from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.margins import learning_convergence
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.sections import Learning
 from jointctl.tools.experiments.controllers import (

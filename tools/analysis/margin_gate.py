@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 
 from jointctl.drivers.errors import MarginError
 from jointctl.firmware_py.states import ControllerKind
-from jointctl.tools.analysis.learning_loop import Convergence, learning_convergence
 from jointctl.tools.analysis.linear_loop import LoopSettings
 from jointctl.tools.analysis.loop_settings import loop_settings
-from jointctl.tools.analysis.margins import Margins, margins, phase_margin_deg
+from jointctl.tools.analysis.margins import Convergence, Margins, learning_convergence, margins, phase_margin_deg
 from jointctl.tools.configuration.config import Config
 
 # --- remedies ---

@@ -98,8 +98,7 @@ def doctor_motion(config: Config, output: Output, *, assume_yes: bool, torque_Nm
 
 def _pull(config: Config, output: Output, control: Control, *, assume_yes: bool, torque_Nm: float | None) -> int:
     from jointctl.firmware_py.states import Fault
-    from jointctl.tools.inspection.motion_check import check_run, make_plan
-    from jointctl.tools.inspection.motion_verdict import ended_finding, judged, motion_findings
+    from jointctl.tools.inspection.motion_check import check_run, ended_finding, judged, make_plan, motion_findings
     from jointctl.tools.session import result as drive_end
     from jointctl.tools.session.consent import TerminalConsent
     from jointctl.tools.session.result import require_off

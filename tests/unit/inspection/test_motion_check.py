@@ -23,8 +23,15 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import velocity_of_a_count_radps
 from jointctl.tools.configuration.records import APPROACH_MIN_S
 from jointctl.tools.inspection.health import NOTE, OK, PROBLEM, Finding
-from jointctl.tools.inspection.motion_check import CheckMotion, CheckPlan, config_of_check, make_plan, motion_table
-from jointctl.tools.inspection.motion_verdict import judged, motion_findings
+from jointctl.tools.inspection.motion_check import (
+    CheckMotion,
+    CheckPlan,
+    config_of_check,
+    judged,
+    make_plan,
+    motion_findings,
+    motion_table,
+)
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
 from jointctl.tools.session.fault_words import fault_text
