@@ -71,11 +71,9 @@ class CanopenSection(DriveSection):
     )
 
     def problems(self, config: Config) -> list[str]:
-        """See `DriveSection`."""
         return joint_encoder_problems(config) + canopen_problems(config)
 
     def files(self, config: Config) -> tuple[tuple[str, Path], ...]:
-        """See `DriveSection`."""
         found = (("drive.eds", eds_path(config)), ("joint_encoder.eds", encoder_eds_path(config)))
         return tuple((key, path) for key, path in found if path is not None)
 
@@ -93,7 +91,6 @@ class CanopenSection(DriveSection):
         return self.heartbeat_s
 
     def assumed_delay(self, config: Config) -> tuple[float, str]:
-        """See `DriveSection`."""
         period_s, kind = 1.0 / config.loop.rate_Hz, self.rpdo_transmission_type
         if kind > LAST_SYNCHRONOUS:
             return period_s, f"assumed: at most one period (drive.rpdo_transmission_type = {kind}, asynchronous)"
@@ -102,13 +99,11 @@ class CanopenSection(DriveSection):
         return periods * period_s, f"assumed: {count} (drive.rpdo_transmission_type = {kind}, synchronous)"
 
     def in_sweep_mode(self, mode: str) -> CanopenSection:
-        """See `DriveSection`."""
         if mode == "speed":
             raise DeviceError("--mode (=speed) must be auto, csv, pv or torque: it is a CANopen drive")
         return self if mode == "torque" else self.model_copy(update={"mode": DRIVE_MODES[mode]})
 
     def free_of_torque_limit(self) -> CanopenSection:
-        """See `DriveSection`."""
         return self.model_copy(update={"max_torque_permille": None})
 
     def constants_factor(self, config: Config) -> tuple[float, str] | None:
@@ -124,7 +119,6 @@ class CanopenSection(DriveSection):
         )
 
     def measuring_constants(self) -> dict[str, float]:
-        """See `DriveSection`."""
         return {"rated_torque": float(self.torque_reference == "rated_torque")}
 
 

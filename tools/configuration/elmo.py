@@ -95,7 +95,6 @@ class ElmoSection(DriveSection):
         return {**data, "bus": bus}
 
     def problems(self, config: Config) -> list[str]:
-        """See `DriveSection`."""
         if config.joint_encoder is not None:
             return ['[joint_encoder] needs a CANopen drive: drive.kind must be "canopen"', *elmo_problems(config)]
         return elmo_problems(config)
@@ -114,11 +113,9 @@ class ElmoSection(DriveSection):
         return config.model_copy(update={"drive": drive, "bus": config.bus.model_copy(update=bus)})
 
     def assumed_delay(self, config: Config) -> tuple[float, str]:
-        """See `DriveSection`."""
         return 1.0 / config.loop.rate_Hz, "assumed: at most one period (serial line)"
 
     def in_sweep_mode(self, mode: str) -> ElmoSection:
-        """See `DriveSection`."""
         if mode not in SWEEP_MODES:
             raise DeviceError(f"--mode (={mode}) must be auto, speed or torque: it is a serial drive")
         return self.in_unit_mode(SWEEP_MODES[mode])

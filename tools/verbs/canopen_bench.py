@@ -55,7 +55,6 @@ class CanopenBench(BenchDrive):
     """See `BenchDrive`."""
 
     def stop_target(self, keys: ReadableKeys) -> CanTarget:
-        """See `BenchDrive`."""
         drive, bus, given, environ = keys.section("drive"), keys.section("bus"), keys.given, keys.environ
         if given.port is not None:
             raise wrong_kind(keys.path, drive.get("kind"), FOR_A_PORT)
@@ -82,7 +81,6 @@ class CanopenBench(BenchDrive):
         )  # fmt: skip
 
     def info(self, asked: Asked, output: Output) -> int:
-        """See `BenchDrive`."""
         from jointctl.tools.verbs.info import node_info
 
         return node_info(canopen_subject(asked), output)
@@ -96,7 +94,6 @@ class CanopenBench(BenchDrive):
         return monitor_bus(subject, output, selection, ask=options.ask)
 
     def findings(self, config: Config) -> Iterator[Finding]:
-        """See `BenchDrive`."""
         from jointctl.tools.inspection.health import adapters, bus_budget, drive_finding, interface_state
 
         yield from adapters(config)
@@ -105,7 +102,6 @@ class CanopenBench(BenchDrive):
         yield from interface_state(config)  # last: a bus on which nobody acknowledges shows once something was sent
 
     def serve(self, config: Config, output: Output, options: ServeOptions) -> int:
-        """See `BenchDrive`."""
         from jointctl.tools.verbs.hil import serve_can
 
         if options.serial or options.link is not None:

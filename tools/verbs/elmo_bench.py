@@ -134,11 +134,9 @@ class ElmoBench(BenchDrive):
     """See `BenchDrive`."""
 
     def claims(self, keys: ReadableKeys) -> bool:
-        """See `BenchDrive`."""
         return keys.given.bus is None and (keys.given.port is not None or "port" in keys.section("drive"))
 
     def stop_target(self, keys: ReadableKeys) -> PortTarget:
-        """See `BenchDrive`."""
         drive = keys.section("drive")
         if keys.given.bus is not None:
             raise ConfigurationError(
@@ -198,7 +196,6 @@ class ElmoBench(BenchDrive):
         return 0
 
     def findings(self, config: Config) -> Iterator[Finding]:
-        """See `BenchDrive`."""
         from jointctl.tools.inspection.elmo_health import serial_findings
 
         yield from serial_findings(config)
@@ -232,7 +229,6 @@ class ElmoBench(BenchDrive):
             raise ConfigurationError(error.message, _advice(config)) from None
 
     def check_rows(self, config: Config) -> tuple[tuple[str, str, str], ...]:
-        """See `BenchDrive`."""
         drive = elmo_section(config)
         highest = highest_rate_Hz(drive.baud_rate_bitps, drive.echo)
         text = f"{serial_line_share(config):.0%} of the line; up to {highest:.0f} Hz at {drive.baud_rate_bitps} baud"
