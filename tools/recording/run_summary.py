@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from rich.table import Table
+from rich.table import Column, Table
 
 from jointctl.firmware_py.states import AxisPhase, Fault, fault_name
 
@@ -182,9 +182,7 @@ def histogram_times(histogram: np.ndarray) -> TimeSummary | None:
 
 def summary_table(summary: RunSummary) -> Table:
     """The summary for a terminal; angles in mrad."""
-    table = Table(title="Run", show_header=False, title_justify="left")
-    table.add_column(style="bold")
-    table.add_column(justify="right")
+    table = Table(Column(style="bold"), Column(justify="right"), title="Run", show_header=False, title_justify="left")
     fault = "none" if summary.fault == Fault.NONE.name else summary.fault
     table.add_row("duration", f"{summary.duration_s:.2f} s, {summary.tracked_s:.2f} s of it tracking")
     table.add_row("fault", fault, style=None if fault == "none" else "red")

@@ -69,9 +69,7 @@ def report_findings(found: list[Finding], output: Output, title: str) -> int:
     """The table, and 0, or 1 if a run would fail."""
     from jointctl.tools.inspection.health import NOTE, OK, PROBLEM
 
-    table = Table(title=title, title_justify="left")
-    for column in ("", "finding", "remedy"):
-        table.add_column(column)
+    table = Table("", "finding", "remedy", title=title, title_justify="left")
     colours = {OK: "green", NOTE: "yellow", PROBLEM: "red"}
     for finding in found:
         topic = Text.assemble((finding.status, colours[finding.status]), " ", finding.topic)

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 
-from rich.table import Table
+from rich.table import Column, Table
 
 from jointctl.drivers.elmo.codes import CURRENT_LIMITED, FAULT_LATCHED, SERVO_ON, motor_off_cause, status_text
 from jointctl.drivers.elmo.dialogue import Dialogue, switch_off
@@ -157,9 +157,8 @@ class ElmoBench(BenchDrive):
         output.note(f"reading the drive on {place}")
         with inspected_drive(config) as (drive, identity):
             facts = drive.facts()
-        table = Table(title=f"{identity.name} on {place}", title_justify="left", show_header=False, box=None)
-        for column in ("name", "label", "value", "meaning"):
-            table.add_column(column, justify="right" if column == "value" else "left")
+        columns = ("name", "label", Column("value", justify="right"), "meaning")
+        table = Table(*columns, title=f"{identity.name} on {place}", title_justify="left", show_header=False, box=None)
         for fact in facts:
             table.add_row(fact.name, fact.label, fact.value, fact.meaning)
         data = {"port": section.port, "baud_rate_bitps": section.baud_rate_bitps, "version": identity.name}

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
+from rich.table import Column, Table
 
 from jointctl.drivers.errors import INTERRUPTED
 from jointctl.tools.output import Output
@@ -115,17 +115,16 @@ def _text(values: tuple[float, float, float], digits: int = 3) -> str:
 
 
 def _table(result: StudyResult, title: str, after_s: float) -> Table:
+    headings = [heading for _, heading in _COLUMNS]
     table = Table(
+        "controller",
+        *(Column(heading, justify="right") for heading in (*headings, "faults")),
         title=f"{title}: errors after {after_s:g} s [mrad], median (5..95 %)",
         caption="peak and RMSE as the encoder shows them; true: of the joint itself; "
         "settling: until the error stays within 1 mrad",
         title_justify="left",
         caption_justify="left",
     )
-    table.add_column("controller")
-    for _, heading in _COLUMNS:
-        table.add_column(heading, justify="right")
-    table.add_column("faults", justify="right")
     for name in result.controllers:
         cells = [_text(spread(result, name, key)) for key, _ in _COLUMNS]
         table.add_row(name, *cells, str(result.faults(name)))
