@@ -12,7 +12,7 @@ import errno as errno_codes
 import socket
 import threading
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -51,6 +51,31 @@ WORDS = 3
 _LONGEST_WAIT_NS = 2_000_000  # faults of the plant are seen at least this often
 _SDO_LOOK_S = 0.1
 _FRAMES_AT_ONCE = 64  # received before timers are looked at again
+
+
+class DeviceMemory(NamedTuple):
+    """What the loop works on; arrays of one record but for `faults`."""
+
+    devices: Any  # Device[1]
+    plant_constants: Any  # PlantConstants[1]
+    plant_states: Any  # PlantState[1]
+    queues: Any  # FrameQueue[1], to the bus
+    faults: Any  # FaultConstants[N], see `hil.fault_kinds`
+    fault_memories: Any  # FaultMemory[1]
+    words: np.ndarray  # int64[WORDS]
+    frame: np.ndarray  # uint8[FRAME_SIZE], as the next two scratch
+    polls: np.ndarray  # int32[4]
+    timespec: np.ndarray  # int64[2]
+
+
+class _Joint(NamedTuple):
+    """Drive and plant, what the drive sends, and the way to the Python thread."""
+
+    device: Any  # Device
+    plant_c: Any  # PlantConstants
+    plant_s: Any  # PlantState
+    queue: Any  # FrameQueue
+    service_fd: int
 
 
 @kernel
@@ -98,46 +123,31 @@ def _is_sync(device: Device, frame: np.ndarray) -> bool:
 
 
 @kernel
-def _take_frame(
-    device: Device,
-    plant_c: PlantConstants,
-    plant_s: PlantState,
-    frame: np.ndarray,
-    service_fd: int,
-    now_ns: int,
-    queue: FrameQueue,
-) -> None:
+def _take_frame(joint: _Joint, frame: np.ndarray, now_ns: int) -> None:
     """One frame at the drive's end: SDO requests go to the Python thread, all others to the core."""
+    device: Device = joint.device
     identifier = int64(frame[0]) | int64(frame[1]) << 8 | int64(frame[3]) << 24
     to_encoder = device.encoder.node_id != 0 and identifier == 0x600 + device.encoder.node_id
     if not to_encoder and identifier != 0x600 + device.node_id:
-        accept_frame(device, plant_c, plant_s, frame, now_ns, queue)
+        accept_frame(device, joint.plant_c, joint.plant_s, frame, now_ns, joint.queue)
         return
-    advance(device, plant_c, plant_s, now_ns, queue)
+    advance(device, joint.plant_c, joint.plant_s, now_ns, joint.queue)
     if to_encoder or (device.nmt != NmtState.STOPPED and device.nmt != NmtState.BOOT_UP):
         address = np.uintp(frame.ctypes.data)
-        send(np.int32(service_fd), address, np.uintp(FRAME_SIZE), np.int32(MSG_DONTWAIT | MSG_NOSIGNAL))
+        send(np.int32(joint.service_fd), address, np.uintp(FRAME_SIZE), np.int32(MSG_DONTWAIT | MSG_NOSIGNAL))
 
 
 @kernel
-def _take_frames(
-    device: Device,
-    plant_c: PlantConstants,
-    plant_s: PlantState,
-    ready: FrameQueue,
-    service_fd: int,
-    now_ns: int,
-    queue: FrameQueue,
-) -> None:
+def _take_frames(joint: _Joint, ready: FrameQueue, now_ns: int) -> None:
     """`_take_frame` for all that the wire's faults let through."""
     for i in range(ready.count):
-        _take_frame(device, plant_c, plant_s, ready.frames[i], service_fd, now_ns, queue)
+        _take_frame(joint, ready.frames[i], now_ns)
     ready.count = 0
 
 
 @kernel
 def _wait_for_frames(fd: int, service_fd: int, wait_ns: int, polls: np.ndarray, timespec: np.ndarray) -> None:
-    """Sleep until a frame of the bus or an SDO answer waits, `wait_ns` at most; scratch as in `run_device`."""
+    """Sleep until a frame of the bus or an SDO answer waits, `wait_ns` at most; scratch as in `DeviceMemory`."""
     polls[0] = fd
     polls[1] = POLLIN
     polls[2] = service_fd
@@ -148,67 +158,40 @@ def _wait_for_frames(fd: int, service_fd: int, wait_ns: int, polls: np.ndarray, 
 
 
 @kernel
-def _take_from_bus(
-    device: Device,
-    plant_c: PlantConstants,
-    plant_s: PlantState,
-    faults: Any,
-    memory: FaultMemory,
-    frame: np.ndarray,
-    service_fd: int,
-    now_ns: int,
-    queue: FrameQueue,
-) -> bool:
+def _take_from_bus(joint: _Joint, faults: Any, memory: FaultMemory, frame: np.ndarray, now_ns: int) -> bool:
     """One frame of the controller, through the wire's faults, as of the time it was sent; whether it carried one."""
     sent_ns = sent_ns_of(frame, now_ns)
     if len(faults) == 0:
-        _take_frame(device, plant_c, plant_s, frame, service_fd, sent_ns, queue)
+        _take_frame(joint, frame, sent_ns)
     else:
-        step_faults(faults, memory, device, plant_c, plant_s, sent_ns)
-        pass_frame(faults, memory, frame, True, int64(device.node_id), sent_ns, memory.ready)
-        _take_frames(device, plant_c, plant_s, memory.ready, service_fd, sent_ns, queue)
+        step_faults(faults, memory, joint.device, joint.plant_c, joint.plant_s, sent_ns)
+        pass_frame(faults, memory, frame, True, int64(joint.device.node_id), sent_ns, memory.ready)
+        _take_frames(joint, memory.ready, sent_ns)
     if sent_ns == now_ns:
         return False
-    if _is_sync(device, frame):
-        stamp_answers(queue, frame)
+    if _is_sync(joint.device, frame):
+        stamp_answers(joint.queue, frame)
     return True
 
 
 @kernel
-def _take_sdo_answer(
-    device: Device, plant_c: PlantConstants, plant_s: PlantState, frame: np.ndarray, now_ns: int, queue: FrameQueue
-) -> None:
+def _take_sdo_answer(joint: _Joint, frame: np.ndarray, now_ns: int) -> None:
     """An answer of the Python thread: the core first acts on what was written, then the frame goes out."""
-    device.next_due_ns = 0
-    advance(device, plant_c, plant_s, now_ns, queue)
-    append_frame(queue, frame)
+    joint.device.next_due_ns = 0
+    advance(joint.device, joint.plant_c, joint.plant_s, now_ns, joint.queue)
+    append_frame(joint.queue, frame)
 
 
 @kernel
-def run_device(
-    fd: int,
-    devices: Any,
-    plant_constants: Any,
-    plant_states: Any,
-    queues: Any,
-    faults: Any,
-    memories: Any,
-    words: np.ndarray,
-    service_fd: int,
-    frame: np.ndarray,
-    polls: np.ndarray,
-    timespec: np.ndarray,
-) -> int:
-    """Serve the bus until the stop word; scratch: `frame` uint8[16], `polls` int32[4], `timespec` int64[2].
-
-    `devices`, `plant_constants`, `plant_states`, `queues` are record arrays of one element, `words` int64[WORDS].
-    `faults` FaultConstants[N] and `memories` FaultMemory[1]: see `hil.fault_kinds`.  Returns the value of ENDED_WORD.
-    """
-    device: Device = devices[0]
-    plant_c: PlantConstants = plant_constants[0]
-    plant_s: PlantState = plant_states[0]
-    queue: FrameQueue = queues[0]
-    memory: FaultMemory = memories[0]
+def run_device(fd: int, service_fd: int, of: DeviceMemory) -> int:
+    """Serve the bus until the stop word; returns the value of ENDED_WORD."""
+    faults, words, frame, timespec = of.faults, of.words, of.frame, of.timespec
+    device: Device = of.devices[0]
+    plant_c: PlantConstants = of.plant_constants[0]
+    plant_s: PlantState = of.plant_states[0]
+    queue: FrameQueue = of.queues[0]
+    memory: FaultMemory = of.fault_memories[0]
+    joint = _Joint(device, plant_c, plant_s, queue, service_fd)
     node_id = int64(device.node_id)
     stamped_ns = int64(-OLDEST_STAMP_NS)  # when the last frame with a time came
     ended = 1
@@ -219,9 +202,9 @@ def run_device(
             plant_ns = now_ns - lag_ns
             step_faults(faults, memory, device, plant_c, plant_s, plant_ns)
             take_due(memory, True, plant_ns, False, memory.ready)
-            _take_frames(device, plant_c, plant_s, memory.ready, service_fd, plant_ns, queue)
+            _take_frames(joint, memory.ready, plant_ns)
         wait_ns = max(0, min(device.next_due_ns + lag_ns - now_ns, _LONGEST_WAIT_NS))
-        _wait_for_frames(fd, service_fd, wait_ns, polls, timespec)
+        _wait_for_frames(fd, service_fd, wait_ns, of.polls, timespec)
         woken_ns = monotonic_ns(timespec)
         drained = False
         for _ in range(_FRAMES_AT_ONCE):
@@ -234,11 +217,11 @@ def run_device(
             if got != FRAME_SIZE:
                 continue
             now_ns = monotonic_ns(timespec)
-            if _take_from_bus(device, plant_c, plant_s, faults, memory, frame, service_fd, now_ns, queue):
+            if _take_from_bus(joint, faults, memory, frame, now_ns):
                 stamped_ns = now_ns
             _flush_through_faults(fd, faults, memory, node_id, now_ns, queue, words)
         while _receive(service_fd, frame) == FRAME_SIZE:
-            _take_sdo_answer(device, plant_c, plant_s, frame, monotonic_ns(timespec), queue)
+            _take_sdo_answer(joint, frame, monotonic_ns(timespec))
             _flush_through_faults(fd, faults, memory, node_id, monotonic_ns(timespec), queue, words)
         # after the frames, which may be older: the plant does not go back
         if drained or lag_ns == 0:
@@ -268,20 +251,12 @@ class RealtimeDevice:
 
     def _run(self, service_fd: int) -> None:
         device = self._device
-        run_device(
-            self._fd,
-            device.device,
-            device.plant_constants,
-            device.plant_state,
-            new(FrameQueue),
-            self._faults,
-            self.fault_memory,
-            self.words,
-            service_fd,
-            np.zeros(FRAME_SIZE, np.uint8),
-            np.zeros(4, np.int32),
-            np.zeros(2, np.int64),
-        )
+        scratch = np.zeros(FRAME_SIZE, np.uint8), np.zeros(4, np.int32), np.zeros(2, np.int64)
+        memory = DeviceMemory(
+            device.device, device.plant_constants, device.plant_state, new(FrameQueue), self._faults,
+            self.fault_memory, self.words, *scratch,
+        )  # fmt: skip
+        run_device(self._fd, service_fd, memory)
 
     def _serve(self, service: socket.socket) -> None:
         """Answer SDO requests until the other end closes; an unfinished transfer is looked at now and then."""
