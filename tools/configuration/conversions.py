@@ -46,7 +46,7 @@ def law_resolution_rad(config: Config) -> float:
 
 
 def velocity_of_a_count_radps(config: Config) -> float:
-    """What the filter of the velocity (`firmware_py.velocity`) gives when the encoder counts one on.
+    """What the filter of the velocity (`firmware_py.axis`) gives when the encoder counts one on.
 
     Without its compiled function, which takes 0.2 s to load: a configuration is read by every verb.
     """
