@@ -1,20 +1,240 @@
-"""A virtual drive in real time on a descriptor: the compiled loop in one thread, the SDO server in another."""
+"""The virtual drive in real time, on a file descriptor that carries 16-byte frames (AF_CAN, or AF_UNIX SEQPACKET).
+
+One compiled loop without the interpreter lock, in one thread.  SDO requests go through a socket pair to a second,
+Python thread, and its responses come back the same way: the core first acts on what was written, then sends the
+response, so that a master which has its answer finds the controlword carried out.  The loop is the only sender on the
+bus.
+"""
 
 from __future__ import annotations
 
+import errno as errno_codes
 import socket
 import threading
 import time
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.libc import (
+    EAGAIN,
+    EINTR,
+    MSG_DONTWAIT,
+    MSG_NOSIGNAL,
+    POLLIN,
+    errno,
+    load_acquire,
+    monotonic_ns,
+    ppoll,
+    recv,
+    send,
+    store_release,
+)
 from jointctl.firmware_py.schema import new
-from jointctl.hil.bus.virtual_bus import FRAME_SIZE, FrameQueue
 from jointctl.hil.canopen.device import Cia402Device
-from jointctl.hil.device_loop import STOP_WORD, WORDS, run_device, store_release_word
-from jointctl.hil.faults.kinds import fault_memory, no_faults
+from jointctl.hil.canopen.device_core import accept_frame, advance
+from jointctl.hil.canopen.records import Device, NmtState, int64
+from jointctl.hil.fault_kinds import FaultMemory, fault_memory, no_faults
+from jointctl.hil.frame_faults import append_frame, pass_frame, take_due
+from jointctl.hil.frame_stamps import OLDEST_STAMP_NS, STAMPED_LAG_NS, sent_ns_of, stamp_answers
+from jointctl.hil.plant_faults import step_faults
+from jointctl.hil.plant_records import PlantConstants, PlantState
+from jointctl.hil.virtual_bus import FRAME_SIZE, FrameQueue
 
+ENETDOWN = errno_codes.ENETDOWN
+STOP_WORD = 0  # not zero: leave the loop
+SEND_ERRORS_WORD = 1  # frames that could not be sent
+ENDED_WORD = 2  # 1 = stopped, 2 = the bus has gone
+WORDS = 3
+
+_LONGEST_WAIT_NS = 2_000_000  # faults of the plant are seen at least this often
 _SDO_LOOK_S = 0.1
+_FRAMES_AT_ONCE = 64  # received before timers are looked at again
+
+
+class DeviceMemory(NamedTuple):
+    """What the loop works on; arrays of one record but for `faults`."""
+
+    devices: Any  # Device[1]
+    plant_constants: Any  # PlantConstants[1]
+    plant_states: Any  # PlantState[1]
+    queues: Any  # FrameQueue[1], to the bus
+    faults: Any  # FaultConstants[N], see `hil.fault_kinds`
+    fault_memories: Any  # FaultMemory[1]
+    words: np.ndarray  # int64[WORDS]
+    frame: np.ndarray  # uint8[FRAME_SIZE], as the next two scratch
+    polls: np.ndarray  # int32[4]
+    timespec: np.ndarray  # int64[2]
+
+
+class _Joint(NamedTuple):
+    """Drive and plant, what the drive sends, and the way to the Python thread."""
+
+    device: Any  # Device
+    plant_c: Any  # PlantConstants
+    plant_s: Any  # PlantState
+    queue: Any  # FrameQueue
+    service_fd: int
+
+
+@kernel
+def _flush(fd: int, queue: FrameQueue, words: np.ndarray) -> None:
+    """Send the queue; what the bus does not take is lost and counted, as on a real bus."""
+    for i in range(queue.count):
+        address = np.uintp(queue.frames[i].ctypes.data)
+        sent = send(np.int32(fd), address, np.uintp(FRAME_SIZE), np.int32(MSG_DONTWAIT | MSG_NOSIGNAL))
+        if sent != FRAME_SIZE:
+            store_release(words, SEND_ERRORS_WORD, load_acquire(words, SEND_ERRORS_WORD) + 1)
+    queue.count = 0
+
+
+@kernel
+def _flush_through_faults(
+    fd: int, faults: Any, memory: FaultMemory, node_id: int, now_ns: int, queue: FrameQueue, words: np.ndarray
+) -> None:
+    """As `_flush`, with the wire's faults; late frames go out when they are due."""
+    if len(faults) == 0:
+        _flush(fd, queue, words)
+        return
+    take_due(memory, False, now_ns, False, memory.to_controller)
+    for i in range(queue.count):
+        pass_frame(faults, memory, queue.frames[i], False, node_id, now_ns, memory.to_controller)
+    queue.count = 0
+    _flush(fd, memory.to_controller, words)
+
+
+@kernel
+def _receive(fd: int, frame: np.ndarray) -> int:
+    """Bytes received into `frame`; 0 = nothing waits, -1 = the other end has gone."""
+    got = recv(np.int32(fd), np.uintp(frame.ctypes.data), np.uintp(FRAME_SIZE), np.int32(MSG_DONTWAIT))
+    if got == 0:
+        return -1
+    if got < 0:
+        code = errno()
+        # an interface that goes down may come up again: a drive outlives its bus
+        return 0 if code in (EAGAIN, EINTR, ENETDOWN) else -1
+    return got
+
+
+@kernel
+def _is_sync(device: Device, frame: np.ndarray) -> bool:
+    return int64(frame[0]) | int64(frame[1]) << 8 == int64(device.communication.sync_cob_id) & 0x7FF
+
+
+@kernel
+def _take_frame(joint: _Joint, frame: np.ndarray, now_ns: int) -> None:
+    """One frame at the drive's end: SDO requests go to the Python thread, all others to the core."""
+    device: Device = joint.device
+    identifier = int64(frame[0]) | int64(frame[1]) << 8 | int64(frame[3]) << 24
+    to_encoder = device.encoder.node_id != 0 and identifier == 0x600 + device.encoder.node_id
+    if not to_encoder and identifier != 0x600 + device.node_id:
+        accept_frame(device, joint.plant_c, joint.plant_s, frame, now_ns, joint.queue)
+        return
+    advance(device, joint.plant_c, joint.plant_s, now_ns, joint.queue)
+    if to_encoder or (device.nmt != NmtState.STOPPED and device.nmt != NmtState.BOOT_UP):
+        address = np.uintp(frame.ctypes.data)
+        send(np.int32(joint.service_fd), address, np.uintp(FRAME_SIZE), np.int32(MSG_DONTWAIT | MSG_NOSIGNAL))
+
+
+@kernel
+def _take_frames(joint: _Joint, ready: FrameQueue, now_ns: int) -> None:
+    """`_take_frame` for all that the wire's faults let through."""
+    for i in range(ready.count):
+        _take_frame(joint, ready.frames[i], now_ns)
+    ready.count = 0
+
+
+@kernel
+def _wait_for_frames(fd: int, service_fd: int, wait_ns: int, polls: np.ndarray, timespec: np.ndarray) -> None:
+    """Sleep until a frame of the bus or an SDO answer waits, `wait_ns` at most; scratch as in `DeviceMemory`."""
+    polls[0] = fd
+    polls[1] = POLLIN
+    polls[2] = service_fd
+    polls[3] = POLLIN
+    timespec[0] = 0
+    timespec[1] = wait_ns
+    ppoll(np.uintp(polls.ctypes.data), np.uintp(2), np.uintp(timespec.ctypes.data), np.uintp(0))
+
+
+@kernel
+def _take_from_bus(joint: _Joint, faults: Any, memory: FaultMemory, frame: np.ndarray, now_ns: int) -> bool:
+    """One frame of the controller, through the wire's faults, as of the time it was sent; whether it carried one."""
+    sent_ns = sent_ns_of(frame, now_ns)
+    if len(faults) == 0:
+        _take_frame(joint, frame, sent_ns)
+    else:
+        step_faults(faults, memory, joint.device, joint.plant_c, joint.plant_s, sent_ns)
+        pass_frame(faults, memory, frame, True, int64(joint.device.node_id), sent_ns, memory.ready)
+        _take_frames(joint, memory.ready, sent_ns)
+    if sent_ns == now_ns:
+        return False
+    if _is_sync(joint.device, frame):
+        stamp_answers(joint.queue, frame)
+    return True
+
+
+@kernel
+def _take_sdo_answer(joint: _Joint, frame: np.ndarray, now_ns: int) -> None:
+    """An answer of the Python thread: the core first acts on what was written, then the frame goes out."""
+    joint.device.next_due_ns = 0
+    advance(joint.device, joint.plant_c, joint.plant_s, now_ns, joint.queue)
+    append_frame(joint.queue, frame)
+
+
+@kernel
+def run_device(fd: int, service_fd: int, of: DeviceMemory) -> int:
+    """Serve the bus until the stop word; returns the value of ENDED_WORD."""
+    faults, words, frame, timespec = of.faults, of.words, of.frame, of.timespec
+    device: Device = of.devices[0]
+    plant_c: PlantConstants = of.plant_constants[0]
+    plant_s: PlantState = of.plant_states[0]
+    queue: FrameQueue = of.queues[0]
+    memory: FaultMemory = of.fault_memories[0]
+    joint = _Joint(device, plant_c, plant_s, queue, service_fd)
+    node_id = int64(device.node_id)
+    stamped_ns = int64(-OLDEST_STAMP_NS)  # when the last frame with a time came
+    ended = 1
+    while load_acquire(words, STOP_WORD) == 0 and ended == 1:
+        now_ns = monotonic_ns(timespec)
+        lag_ns = STAMPED_LAG_NS if now_ns - stamped_ns < OLDEST_STAMP_NS else 0
+        if len(faults) > 0:
+            plant_ns = now_ns - lag_ns
+            step_faults(faults, memory, device, plant_c, plant_s, plant_ns)
+            take_due(memory, True, plant_ns, False, memory.ready)
+            _take_frames(joint, memory.ready, plant_ns)
+        wait_ns = max(0, min(device.next_due_ns + lag_ns - now_ns, _LONGEST_WAIT_NS))
+        _wait_for_frames(fd, service_fd, wait_ns, of.polls, timespec)
+        woken_ns = monotonic_ns(timespec)
+        drained = False
+        for _ in range(_FRAMES_AT_ONCE):
+            got = _receive(fd, frame)
+            if got <= 0:
+                drained = True
+                if got < 0:
+                    ended = 2
+                break
+            if got != FRAME_SIZE:
+                continue
+            now_ns = monotonic_ns(timespec)
+            if _take_from_bus(joint, faults, memory, frame, now_ns):
+                stamped_ns = now_ns
+            _flush_through_faults(fd, faults, memory, node_id, now_ns, queue, words)
+        while _receive(service_fd, frame) == FRAME_SIZE:
+            _take_sdo_answer(joint, frame, monotonic_ns(timespec))
+            _flush_through_faults(fd, faults, memory, node_id, monotonic_ns(timespec), queue, words)
+        # after the frames, which may be older: the plant does not go back
+        if drained or lag_ns == 0:
+            advance(device, plant_c, plant_s, woken_ns - lag_ns, queue)
+            _flush_through_faults(fd, faults, memory, node_id, woken_ns, queue, words)
+    store_release(words, ENDED_WORD, ended)
+    return ended
+
+
+@kernel
+def store_release_word(words: np.ndarray, index: int, value: int) -> None:
+    """`store_release` for callers in Python."""
+    store_release(words, index, value)
 
 
 class RealtimeDevice:
@@ -31,20 +251,12 @@ class RealtimeDevice:
 
     def _run(self, service_fd: int) -> None:
         device = self._device
-        run_device(
-            self._fd,
-            device.device,
-            device.plant_constants,
-            device.plant_state,
-            new(FrameQueue),
-            self._faults,
-            self.fault_memory,
-            self.words,
-            service_fd,
-            np.zeros(FRAME_SIZE, np.uint8),
-            np.zeros(4, np.int32),
-            np.zeros(2, np.int64),
-        )
+        scratch = np.zeros(FRAME_SIZE, np.uint8), np.zeros(4, np.int32), np.zeros(2, np.int64)
+        memory = DeviceMemory(
+            device.device, device.plant_constants, device.plant_state, new(FrameQueue), self._faults,
+            self.fault_memory, self.words, *scratch,
+        )  # fmt: skip
+        run_device(self._fd, service_fd, memory)
 
     def _serve(self, service: socket.socket) -> None:
         """Answer SDO requests until the other end closes; an unfinished transfer is looked at now and then."""

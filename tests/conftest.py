@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, settings
 from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.load import load_config
-from jointctl.tools.simulation.virtual_joint import new_device
+from jointctl.tools.virtual_joint import new_device
 from tests.axis_on_stub_joint import Rig, small_axis_constants
 from tests.device_on_bus import DeviceOnBus
 from tests.places import CONFIGS, ROOT

@@ -15,8 +15,8 @@ from typing import Any
 
 from jointctl.hil.elmo.device import ElmoDevice
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.simulation.virtual_elmo import serve_virtual_elmo
-from jointctl.tools.simulation.virtual_joint import serve_virtual_joint
+from jointctl.tools.virtual_elmo import serve_virtual_elmo
+from jointctl.tools.virtual_joint import serve_virtual_joint
 
 BEFORE_A_LOOP, BELOW_A_LOOP = 60, 20  # priorities
 COMPILED = ("device", "virtual bus")  # the threads that never hold the interpreter's lock for long

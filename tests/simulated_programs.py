@@ -37,11 +37,12 @@ from jointctl.firmware_py.cycle import Word
 from jointctl.firmware_py.libc import NANOSECONDS
 from jointctl.firmware_py.states import AxisPhase
 from jointctl.hil.canopen.records import PowerState
-from jointctl.hil.faults.kinds import fault_memory, no_faults
+from jointctl.hil.fault_kinds import fault_memory, no_faults
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUTHS, Scenario, run_lockstep
 from jointctl.hil.lockstep import World as Joint
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.lockstep import codec_of
 from jointctl.tools.output import Output
 from jointctl.tools.session import loop_handle as loop_module
 from jointctl.tools.session import portable_loop
@@ -49,8 +50,7 @@ from jointctl.tools.session import session as session_module
 from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.control import STOP_COMMAND, StopSignals
 from jointctl.tools.session.loop_handle import LoopHandle
-from jointctl.tools.simulation.lockstep import codec_of
-from jointctl.tools.simulation.virtual_joint import new_device
+from jointctl.tools.virtual_joint import new_device
 
 STEP_NS = 1_000_000
 FAST_STEPS = 5

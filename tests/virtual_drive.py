@@ -9,7 +9,7 @@ from typing import Any
 import canopen
 
 from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
-from jointctl.hil.plant.joint import plant
+from jointctl.hil.plant import plant
 from tests.places import EDS
 
 NODE = 5

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from jointctl.drivers.canopen.cia402 import State
@@ -93,21 +93,6 @@ class PdoLayout:
     fill: bytes = bytes(LONGEST_BYTES)  # of the RPDO where the loop writes nothing
 
 
-def own_layout(node: int, *, velocity: bool = False, torque: bool = True) -> PdoLayout:
-    """Statusword, position, torque; controlword and target torque (or target velocity)."""
-    return PdoLayout(
-        tpdo_id=TPDO1_ID + node,
-        rpdo_id=RPDO1_ID + node,
-        tpdo_length=8 if torque else 6,
-        rpdo_length=6 if velocity else 4,
-        status_at=0,
-        position_at=2,
-        torque_at=6 if torque else -1,
-        control_at=0,
-        target_at=2,
-    )
-
-
 @dataclass(frozen=True)
 class PdoMap:
     """One PDO as the drive has it."""
@@ -136,6 +121,22 @@ class PdoMap:
 
     def holds(self, *wanted: MappedObject) -> bool:
         return self.bytes <= LONGEST_BYTES and all(self.at(item) >= 0 for item in wanted)
+
+
+def layout_of(tpdo: PdoMap, rpdo: PdoMap, target: MappedObject, fill: bytes = bytes(LONGEST_BYTES)) -> PdoLayout:
+    """Of two PDOs that hold what the loop needs."""
+    return PdoLayout(
+        tpdo_id=tpdo.identifier, rpdo_id=rpdo.identifier, tpdo_length=tpdo.bytes, rpdo_length=rpdo.bytes,
+        status_at=tpdo.at(STATUS), position_at=tpdo.at(POSITION), torque_at=tpdo.at(TORQUE),
+        control_at=rpdo.at(CONTROL), target_at=rpdo.at(target), fill=fill,
+    )  # fmt: skip
+
+
+def own_layout(node: int, *, velocity: bool = False) -> PdoLayout:
+    """Statusword, position, torque; controlword and target torque (or target velocity)."""
+    target = TARGET_VELOCITY if velocity else TARGET_TORQUE
+    tpdo = PdoMap(COMMUNICATION_TPDO, TPDO1_ID + node, EVERY_SYNC, (STATUS, POSITION, TORQUE))
+    return layout_of(tpdo, PdoMap(COMMUNICATION_RPDO, RPDO1_ID + node, EVERY_SYNC, (CONTROL, target)), target)
 
 
 def read_map(objects: ObjectAccess, base: int) -> PdoMap:
@@ -266,37 +267,24 @@ def configure_loop_pdos(
     for item in (STATUS, POSITION, CONTROL, target):
         objects.require(item.index, item.sub, what=item.name)
     mapped = (STATUS, POSITION, TORQUE) if objects.has(TORQUE.index) else (STATUS, POSITION)
-    own = own_layout(node, velocity=target is not TARGET_TORQUE, torque=TORQUE in mapped)
-    tpdo = _map_or_find(objects, COMMUNICATION_TPDO, own.tpdo_id, EVERY_SYNC, mapped)
-    rpdo = _map_or_find(objects, COMMUNICATION_RPDO, own.rpdo_id, rpdo_transmission_type, (CONTROL, target))
+    tpdo = _map_or_find(objects, COMMUNICATION_TPDO, TPDO1_ID + node, EVERY_SYNC, mapped)
+    rpdo = _map_or_find(objects, COMMUNICATION_RPDO, RPDO1_ID + node, rpdo_transmission_type, (CONTROL, target))
     for first, kept in ((COMMUNICATION_TPDO, tpdo), (COMMUNICATION_RPDO, rpdo)):
         for base in pdos_of(objects, first):
-            if base != (first if kept is None else kept.base) and base not in spare:
+            if base != kept.base and base not in spare:
                 disable_pdo(objects, base)
-    layout = own
-    if tpdo is not None:
-        layout = replace(
-            layout, tpdo_id=tpdo.identifier, tpdo_length=tpdo.bytes, status_at=tpdo.at(STATUS),
-            position_at=tpdo.at(POSITION), torque_at=tpdo.at(TORQUE),
-        )  # fmt: skip
-    if rpdo is not None:
-        fill = fill_of(rpdo, target, mode, max_permille)
-        layout = replace(
-            layout, rpdo_id=rpdo.identifier, rpdo_length=rpdo.bytes, control_at=rpdo.at(CONTROL),
-            target_at=rpdo.at(target), fill=fill,
-        )  # fmt: skip
-    return layout
+    return layout_of(tpdo, rpdo, target, fill_of(rpdo, target, mode, max_permille))
 
 
 def _map_or_find(
     objects: ObjectAccess, base: int, identifier: int, kind: int, mapped: tuple[MappedObject, ...]
-) -> PdoMap | None:
-    """None if the PDO at `base` was mapped as wanted, else the drive's own PDO that is used instead."""
+) -> PdoMap:
+    """The PDO at `base`, mapped as wanted, or the drive's own PDO that is used instead."""
     objects.require(base, 1, what="PDO communication parameter")
     before = read_map(objects, base)
     try:
         configure_pdo(objects, base, identifier, kind, mapped)
-        return None
+        return PdoMap(base, identifier, kind, mapped)
     except DeviceError as error:
         if not was_refused(error):
             raise

@@ -82,22 +82,20 @@ class SwitchOff:
             with contextlib.suppress(JointctlError, can.CanError):
                 self._brake_undisturbed()
         try:
-            return self._attempt()
-        except JointctlError:
-            pass
-        except can.CanError as error:
-            return f"unknown: the bus does not take frames any more ({error})"
-        # the watchdog may have put the node into "stopped" in this very moment, where it does not answer SDO
-        try:
-            return self._attempt()
-        except JointctlError as error:
+            # once more: the watchdog may have put the node into "stopped" in this very moment, where it answers no SDO
+            with contextlib.suppress(JointctlError):
+                return self._attempt()
             try:
-                self._send_nmt(NmtCommand.STOP, self._node)
-            except can.CanError:
-                return f"unknown: {error}; the bus does not take frames any more"
-            return f"unknown: {error}; NMT stop was sent"
+                return self._attempt()
+            except JointctlError as failure:
+                reason = str(failure)
         except can.CanError as error:
             return f"unknown: the bus does not take frames any more ({error})"
+        try:
+            self._send_nmt(NmtCommand.STOP, self._node)
+        except can.CanError:
+            return f"unknown: {reason}; the bus does not take frames any more"
+        return f"unknown: {reason}; NMT stop was sent"
 
     def _brake_undisturbed(self) -> None:
         """The quick stop, in the NMT state that the node has; not longer than it is obeyed."""

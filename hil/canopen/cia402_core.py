@@ -10,10 +10,10 @@ bit 9 follows the NMT state (0 while stopped).
 from __future__ import annotations
 
 from jointctl.firmware_py.kernel import kernel
-from jointctl.hil.bus.virtual_bus import FrameQueue
 from jointctl.hil.canopen.device_errors import LENGTH_ERRORS, report_cleared, report_error
 from jointctl.hil.canopen.motion import begin_homing, interrupt_homing
 from jointctl.hil.canopen.records import Device, DriveObjects, HomingState, Mode, NmtState, PowerState, int64
+from jointctl.hil.virtual_bus import FrameQueue
 
 _HALT = 0x0100
 

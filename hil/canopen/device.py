@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from jointctl.firmware_py.schema import dtype_of, new
-from jointctl.hil.bus.virtual_bus import FRAME_SIZE, FrameQueue
 from jointctl.hil.canopen.device_core import accept_frame, advance, power_on
 from jointctl.hil.canopen.dictionary import ObjectDictionary, ParameterStore, check_write
 from jointctl.hil.canopen.encoder_node import EncoderSettings, VirtualEncoder
 from jointctl.hil.canopen.records import Device, NmtState
 from jointctl.hil.canopen.sdo import SdoServer
-from jointctl.hil.plant.records import PlantConstants, PlantState
+from jointctl.hil.plant_records import PlantConstants, PlantState
+from jointctl.hil.virtual_bus import FRAME_SIZE, FrameQueue
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def _sdo_frames(node_id: int, responses: list[bytes]) -> list[bytes]:
 class Cia402Device:
     """One drive with its plant.  `device`, `plant_constants`, `plant_state`, `queue` are record arrays for kernels.
 
-    `faults` (FaultConstants[N], see `hil.faults.kinds`) are carried out by `RealtimeDevice`, not by `handle` and
+    `faults` (FaultConstants[N], see `hil.fault_kinds`) are carried out by `RealtimeDevice`, not by `handle` and
     `advance`.
     """
 

@@ -13,7 +13,6 @@ import math
 import numpy as np
 
 from jointctl.firmware_py.kernel import inlined, kernel
-from jointctl.hil.bus.virtual_bus import FrameQueue
 from jointctl.hil.canopen.cia402_core import (
     abort_connection,
     apply_controlword,
@@ -47,8 +46,9 @@ from jointctl.hil.canopen.encoder_node import accept_encoder_frame, step_encoder
 from jointctl.hil.canopen.motion import demand_is_held, demand_torque_Nm, following_error_tripped, follows_velocity
 from jointctl.hil.canopen.pdo import mark_events, receive_rpdo, receive_sync, send_due_tpdos, start_pdos
 from jointctl.hil.canopen.records import CONSUMERS, PDOS, Device, HomingState, Mode, NmtState, PowerState, int64
-from jointctl.hil.plant.joint import encoder_counts, step_plant
-from jointctl.hil.plant.records import PlantConstants, PlantState
+from jointctl.hil.plant import encoder_counts, step_plant
+from jointctl.hil.plant_records import PlantConstants, PlantState
+from jointctl.hil.virtual_bus import FrameQueue
 
 # --- By the clock: its heartbeat, the heartbeats and frames that it watches, NMT changes ---
 # Each returns when it wants to be called next [ns].

@@ -8,8 +8,8 @@ Messages that the inhibit time 1015 holds back wait in a list of 8; one more rep
 from __future__ import annotations
 
 from jointctl.firmware_py.kernel import kernel
-from jointctl.hil.bus.virtual_bus import QUEUE_LENGTH, FrameQueue
 from jointctl.hil.canopen.records import HISTORY, Device, NmtState, int64
+from jointctl.hil.virtual_bus import QUEUE_LENGTH, FrameQueue
 
 COB_ID_INVALID = 0x80000000
 HEARTBEAT_LOST = 0x8130

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from jointctl.firmware_py.kernel import kernel
-from jointctl.hil.bus.virtual_bus import FrameQueue
 from jointctl.hil.canopen.device_errors import COB_ID_INVALID, push_frame
 from jointctl.hil.canopen.dictionary import ObjectDictionary, check_write, field_view, load_entries
 from jointctl.hil.canopen.records import (
@@ -27,7 +26,8 @@ from jointctl.hil.canopen.records import (
     int64,
 )
 from jointctl.hil.canopen.sdo import SdoServer
-from jointctl.hil.plant.records import PlantState
+from jointctl.hil.plant_records import PlantState
+from jointctl.hil.virtual_bus import FrameQueue
 
 _MS = 1_000_000
 POSITION_ALARM = 1  # bit of 6503

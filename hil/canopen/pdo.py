@@ -13,7 +13,6 @@ from __future__ import annotations
 import numpy as np
 
 from jointctl.firmware_py.kernel import kernel
-from jointctl.hil.bus.virtual_bus import FrameQueue
 from jointctl.hil.canopen.cia402_core import apply_controlword
 from jointctl.hil.canopen.device_errors import (
     COB_ID_INVALID,
@@ -33,6 +32,7 @@ from jointctl.hil.canopen.records import (
     DriveObjects,
     int64,
 )
+from jointctl.hil.virtual_bus import FrameQueue
 
 
 @kernel

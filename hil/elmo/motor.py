@@ -13,8 +13,8 @@ import math
 
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.schema import f8, i4, i8, record
-from jointctl.hil.plant.joint import encoder_counts, step_plant
-from jointctl.hil.plant.records import PlantConstants, PlantState
+from jointctl.hil.plant import encoder_counts, step_plant
+from jointctl.hil.plant_records import PlantConstants, PlantState
 
 UM_TORQUE, UM_SPEED, UM_POSITION = 1, 2, 5
 MF_SPEED_ERROR = 0x80

@@ -16,7 +16,7 @@ import pytest
 from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.lockstep import LockstepJoint
 from tests.bench.c_programs import FAST_MATH, OPTIMISED, law_library
 from tests.bench.law_speed import (
     NUMPY_TICKS,

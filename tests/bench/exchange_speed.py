@@ -40,7 +40,7 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import axis_constants, trajectory_table
 from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.loop_handle import RECEIVE_SHARE, LoopHandle
-from jointctl.tools.simulation.virtual_joint import separate_virtual_joint
+from jointctl.tools.virtual_joint import separate_virtual_joint
 from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
 from tests.bench.c_programs import NoCompilerError, exchange_program, setting_doubles
 from tests.bench.paired import Row, compared, interleaved, skipped

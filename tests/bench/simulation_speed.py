@@ -16,7 +16,7 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.identification.fit import Problem, make_problem, vector_limits
 from jointctl.tools.identification.models import FORMS, legendre
 from jointctl.tools.identification.swarm import SwarmSettings, run_swarms
-from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.lockstep import LockstepJoint
 from tests.bench.paired import Row, compared, interleaved, measured, skipped
 
 LOCKSTEP_S = 100.0

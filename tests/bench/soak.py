@@ -27,7 +27,7 @@ sys.path.insert(0, str(ROOT))
 
 from jointctl.tools.configuration.load import shipped_config  # noqa: E402
 from jointctl.tools.recording.run_log_reader import missing_records, read_run_log  # noqa: E402
-from jointctl.tools.simulation.virtual_joint import separate_virtual_joint  # noqa: E402
+from jointctl.tools.virtual_joint import separate_virtual_joint  # noqa: E402
 
 SETTLED_S = 60.0  # memory of the first minute is start-up
 COMPARED_S = 60.0  # first and last minute are compared

@@ -31,7 +31,7 @@ from jointctl.tools.configuration.load import load_config, shipped_config  # noq
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant  # noqa: E402
 from jointctl.tools.experiments.controllers import controller_constants, named  # noqa: E402
 from jointctl.tools.experiments.scenarios import Scenario, run_scenario  # noqa: E402
-from jointctl.tools.simulation.lockstep import LockstepJoint  # noqa: E402
+from jointctl.tools.lockstep import LockstepJoint  # noqa: E402
 
 MOTIONS: tuple[Scenario, ...] = get_args(Scenario)
 CONTROLLERS = ("paper", "precise", "pid")

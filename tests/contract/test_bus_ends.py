@@ -15,8 +15,8 @@ from canopen.objectdictionary import ODVariable
 
 from jointctl.drivers.can import virtual_bus
 from jointctl.drivers.can.open import open_python_can
-from jointctl.hil.bus import virtual_bus as hil_bus
-from jointctl.hil.bus.virtual_bus import VirtualBusHub
+from jointctl.hil import virtual_bus as hil_bus
+from jointctl.hil.virtual_bus import VirtualBusHub
 from tests.contract.ends_of_a_bus import (
     EXTENDED,
     LONG_S,

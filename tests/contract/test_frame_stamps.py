@@ -18,8 +18,10 @@ from jointctl.drivers.canopen.cyclic import CanopenPort
 from jointctl.drivers.canopen.exchange import end, link_of, receive
 from jointctl.firmware_py.records import Command, Sample
 from jointctl.firmware_py.schema import new
-from jointctl.hil.bus import virtual_bus
-from jointctl.hil.bus.frame_stamps import (
+from jointctl.hil import virtual_bus
+from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
+from jointctl.hil.fault_kinds import FaultConstants, FaultKind, no_faults
+from jointctl.hil.frame_stamps import (
     OLDEST_STAMP_NS,
     SHORTEST_WINDOW_US,
     SyncWatch,
@@ -29,12 +31,10 @@ from jointctl.hil.bus.frame_stamps import (
     stamp_frame,
     stamp_of,
 )
-from jointctl.hil.bus.virtual_bus import VirtualBusHub
-from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
-from jointctl.hil.faults.kinds import FaultConstants, FaultKind, no_faults
-from jointctl.hil.plant.joint import plant
-from jointctl.hil.plant.records import FrictionKind
+from jointctl.hil.plant import plant
+from jointctl.hil.plant_records import FrictionKind
 from jointctl.hil.realtime_device import RealtimeDevice
+from jointctl.hil.virtual_bus import VirtualBusHub
 from tests.places import EDS
 
 NODE = 5

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from jointctl.hil.faults.kinds import FaultKind, no_faults
+from jointctl.hil.fault_kinds import FaultKind, no_faults
 from jointctl.tools.configuration.load import load_config
-from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.lockstep import LockstepJoint
 from tests.hil.conftest import bench as bench
 from tests.places import CONFIGS
 

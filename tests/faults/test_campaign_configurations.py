@@ -12,7 +12,7 @@ import pytest
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import AxisPhase, CommandKind
-from jointctl.hil.faults.kinds import FaultKind
+from jointctl.hil.fault_kinds import FaultKind
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.experiments import judge as judge_module
@@ -27,8 +27,8 @@ from jointctl.tools.experiments.fault_scenarios import (
     placed_sweep,
 )
 from jointctl.tools.experiments.judge import envelope, in_time, judge, reaction_s, require_fit, run_scenario
+from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
-from jointctl.tools.simulation.lockstep import LockstepJoint
 from jointctl.tools.verbs.fault_campaign import fault_campaign
 from tests.configurations import shipped
 from tests.faults.campaign_variants import VARIANTS, write_variant

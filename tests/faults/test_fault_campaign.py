@@ -17,7 +17,7 @@ from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault
 from jointctl.hil.canopen.records import PowerState
-from jointctl.hil.faults.kinds import FaultKind
+from jointctl.hil.fault_kinds import FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUTHS
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
@@ -27,7 +27,7 @@ from jointctl.tools.experiments import judge as judge_module
 from jointctl.tools.experiments.campaign import campaign_figure, rows_by_kind
 from jointctl.tools.experiments.fault_scenarios import FAULT_CLASSES, draw_scenario
 from jointctl.tools.experiments.judge import Envelope, envelope, judge, reaction_s, run_scenario
-from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
+from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 from jointctl.tools.verbs.fault_campaign import fault_campaign
 from tests.page_figures import foreign_colours, svgs
 from tests.places import CONFIGS

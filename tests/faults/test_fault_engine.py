@@ -10,17 +10,17 @@ import pytest
 
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import Fault
-from jointctl.hil.bus.virtual_bus import FRAME_SIZE, FrameQueue
-from jointctl.hil.faults.frame_faults import pass_frame, take_due
-from jointctl.hil.faults.kinds import MAX_FAULTS, FaultConstants, FaultKind, fault_memory, is_active, no_faults
+from jointctl.hil.fault_kinds import MAX_FAULTS, FaultConstants, FaultKind, fault_memory, is_active, no_faults
+from jointctl.hil.frame_faults import pass_frame, take_due
 from jointctl.hil.lockstep import TRUE_ACTUATOR_Nm, TRUE_POSITION_rad
-from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.hil.virtual_bus import FRAME_SIZE, FrameQueue
+from jointctl.tools.lockstep import LockstepJoint
 
 MakeFault = Callable[..., Any]
 NODE = 1
 MS = 1_000_000
 EPOCH_ns = 7 * MS
-STAMP = (7, 8, 9)  # when it was sent, see hil.bus.frame_stamps
+STAMP = (7, 8, 9)  # when it was sent, see hil.frame_stamps
 SYNC, RPDO, OWN_HEARTBEAT = (0x80, 0), (0x201, 4), (0x77E, 1)
 TPDO, HEARTBEAT, EMCY = (0x181, 8), (0x701, 1), (0x81, 8)
 TO_DRIVE, TO_CONTROLLER = (SYNC, RPDO, OWN_HEARTBEAT), (TPDO, HEARTBEAT, EMCY)

@@ -11,9 +11,9 @@ import pytest
 from jointctl.drivers.canopen.cyclic import IGNORED_MAX_CYCLES
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.canopen.records import PowerState
-from jointctl.hil.faults.kinds import FaultKind
+from jointctl.hil.fault_kinds import FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
-from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
+from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 
 MakeFault = Callable[..., Any]
 AT_s = 2.0  # after the power stage is on: the joint tracks

@@ -10,8 +10,8 @@ import pytest
 
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
-from jointctl.hil.faults.kinds import FaultConstants, FaultKind
-from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.hil.fault_kinds import FaultConstants, FaultKind
+from jointctl.tools.lockstep import LockstepJoint
 
 MakeFault = Callable[..., Any]
 AT_s = 2.0

@@ -10,7 +10,7 @@ import pytest
 
 from jointctl.firmware_py.states import AxisPhase, Fault, Notice, Reaction
 from jointctl.tools.experiments.controllers import controller_constants, named
-from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
+from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 from tests.bench.swing_alarms import outcomes, tasks
 from tests.configurations import shipped
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from jointctl.hil.bus.virtual_bus import VirtualBusHub, default_socket_path
+from jointctl.hil.virtual_bus import VirtualBusHub, default_socket_path
 from tests.places import EDS
 
 CONTROL_WORD_ID = 0x201  # RPDO1 of node 1: only the loop sends it

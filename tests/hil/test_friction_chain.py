@@ -19,8 +19,8 @@ from jointctl.tools.identification.friction_data import read_friction_data
 from jointctl.tools.identification.identification import Options, identify_friction
 from jointctl.tools.identification.identification_report import section_values
 from jointctl.tools.identification.swarm import SwarmSettings
+from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
-from jointctl.tools.simulation.lockstep import LockstepJoint
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.verbs.sweep import sweep
 from tests.configurations import changed

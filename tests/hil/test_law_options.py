@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from jointctl.firmware_py.states import Fault, Notice
-from jointctl.tools.analysis.learning_loop import LearningSettings, learning_convergence
 from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.margins import learning_convergence
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.sections import Learning
 from jointctl.tools.experiments.controllers import (
     Controller,
     changed,
@@ -21,7 +22,7 @@ from jointctl.tools.experiments.controllers import (
 )
 from jointctl.tools.experiments.paper_experiments import ideal, law, r1
 from jointctl.tools.experiments.scenarios import Scenario, run_scenario
-from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
+from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 from tests.configurations import changed as changed_config
 
 
@@ -158,7 +159,7 @@ def test_the_convergence_that_is_computed_is_the_one_that_is_seen(name: str) -> 
     controller = replace(precise, control=changed(precise.control, {"learning": learning}, name))
     config = joint(r1(), 100.0)
     settings, _ = loop_settings(controller_config(config, controller))
-    computed = learning_convergence(settings, LearningSettings(gain, error_gain, lead, half_width))
+    computed = learning_convergence(settings, Learning(**values))
     there = LockstepJoint(config)
     made = run_scenario(there, controller_constants(config, controller, 0.0))
     error_rad = np.abs(made.log.error_rad[made.tracking])
@@ -169,7 +170,7 @@ def test_the_convergence_that_is_computed_is_the_one_that_is_seen(name: str) -> 
         assert computed.worst_factor == pytest.approx(0.6, abs=0.01)  # 1 - gain, at low frequency
         assert computed.remaining_1_Hz < 0.01
         slow, _ = loop_settings(controller_config(config, controller), 3e-3)
-        assert learning_convergence(slow, LearningSettings(gain, error_gain, lead, half_width)).worst_factor < 1.0
+        assert learning_convergence(slow, Learning(**values)).worst_factor < 1.0
 
 
 @pytest.mark.parametrize(("side", "counts", "stable"), [("joint", 2**19, False), ("motor", 2**14, True)])

@@ -33,8 +33,8 @@ from jointctl.tools.experiments.paper_experiments import (
 from jointctl.tools.experiments.scenarios import ErrorFigures, error_figures, settling_s
 from jointctl.tools.identification.identification import Options
 from jointctl.tools.identification.swarm import SwarmSettings
+from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
-from jointctl.tools.simulation.lockstep import LockstepJoint
 from jointctl.tools.verbs.paper import paper
 from tests.configurations import changed
 from tests.page_figures import foreign_colours, svgs

@@ -34,7 +34,7 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.session.loop_handle import SharedBlock
 from jointctl.tools.session.portable_loop import run_portable_loop, warm_up
-from jointctl.tools.simulation.virtual_joint import PumpedDevice, new_device, serve_virtual_joint
+from jointctl.tools.virtual_joint import PumpedDevice, new_device, serve_virtual_joint
 from tests.configurations import SLOW_LOOP, written
 from tests.sessions import constants_of
 

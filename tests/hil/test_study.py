@@ -32,8 +32,8 @@ from jointctl.tools.experiments.controller_study import (
 )
 from jointctl.tools.experiments.controllers import TABLE, controller_config, named
 from jointctl.tools.experiments.scenarios import FAILED, ErrorFigures
+from jointctl.tools.lockstep import DirectBus
 from jointctl.tools.output import Output
-from jointctl.tools.simulation.lockstep import DirectBus
 from jointctl.tools.verbs.study import study
 from tests.configurations import shipped
 from tests.page_figures import foreign_colours, svgs

@@ -186,10 +186,9 @@ def test_a_dry_run_in_lockstep_writes_nothing(config: Config, tmp_path: Path) ->
 def test_options_type_matches_the_command(config: Config) -> None:
     from inspect import signature
 
-    from jointctl.tools.verbs.sweep import sweep_verb
     from jointctl.tools.verbs.verb_options import grouped
 
-    parameters = set(signature(grouped(sweep_verb)).parameters) - {
+    parameters = set(signature(grouped(sweep)).parameters) - {
         "config", "out", "interface", "channel", "bitrate", "port", "target", "json", "quiet",
     }  # fmt: skip
     assert len(parameters) == len(dataclasses.fields(SweepOptions))

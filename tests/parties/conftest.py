@@ -10,10 +10,10 @@ import canopen
 import pytest
 
 from jointctl.drivers.can.open import open_cyclic_end
-from jointctl.hil.bus.virtual_bus import VirtualBusHub
 from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
-from jointctl.hil.plant.joint import plant
+from jointctl.hil.plant import plant
 from jointctl.hil.realtime_device import RealtimeDevice
+from jointctl.hil.virtual_bus import VirtualBusHub
 from tests.hil.conftest import bench as bench
 from tests.places import EDS
 

@@ -4,7 +4,7 @@
 
 The plant is discretised exactly for any delay d >= 0: the command of sample k acts from kT + d on, and the part of d
 inside a period splits that period in two (Astrom and Wittenmark, Computer-Controlled Systems, section 2.6).
-The controller is what the kernels compute: the difference quotient and low-pass of `firmware_py.velocity`, law (29),
+The controller is what the kernels compute: the difference quotient and low-pass of `firmware_py.axis`, law (29),
 and the network evaluated with the old weights before its Euler step (24).  For a constant reference the filtered q' and
 the filtered e' are the same signal, so that both velocity paths have this loop.
 

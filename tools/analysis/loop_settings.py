@@ -22,6 +22,7 @@ from jointctl.tools.configuration.records import hidden_layer
 if TYPE_CHECKING:
     from jointctl.tools.configuration.config import Config
 
+_SAME_IN_CONTROL = {"kp", "kv", "ki", "observer_radps", "observer_delay_cycles", "learning_rate", "leakage_1ps"}
 STEP_SHARE = 0.2  # of the torque limit; `precise` with 17 bit is below, with 16 bit, where it chatters, above
 
 
@@ -55,15 +56,9 @@ def loop_settings(config: Config, delay_s: float | None = None) -> tuple[LoopSet
             delay_s=delay_s,
             lag_s=current_lag_s,
             inertia_kgm2=config.joint.inertia_kgm2,
-            kp=control.kp,
-            kv=control.kv,
             cutoff_Hz=control.velocity_cutoff_Hz,
-            ki=control.ki,
-            observer_radps=control.observer_radps,
-            observer_delay_cycles=control.observer_delay_cycles,
             q=(control.lyapunov_q[0], control.lyapunov_q[-1]),
-            learning_rate=control.learning_rate,
-            leakage_1ps=control.leakage_1ps,
+            **control.model_dump(include=_SAME_IN_CONTROL),
             centres=centres,
             widths=widths,
             weight_Nm=control.initial_weight_Nm,

@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 
 from jointctl.drivers.errors import MarginError
 from jointctl.firmware_py.states import ControllerKind
-from jointctl.tools.analysis.learning_loop import Convergence, LearningSettings, learning_convergence
 from jointctl.tools.analysis.linear_loop import LoopSettings
 from jointctl.tools.analysis.loop_settings import loop_settings
-from jointctl.tools.analysis.margins import Margins, margins, phase_margin_deg
+from jointctl.tools.analysis.margins import Convergence, Margins, learning_convergence, margins, phase_margin_deg
 from jointctl.tools.configuration.config import Config
 
 # --- remedies ---
@@ -177,10 +176,7 @@ def require_margin(config: Config, delay_s: float | None = None, *, allow_low_ma
 def learning_of(config: Config, settings: LoopSettings) -> Convergence | None:
     """How iterative learning converges; None where there is none."""
     learning = config.control.learning
-    if learning is None:
-        return None
-    numbers = LearningSettings(learning.gain, learning.error_gain_ps2, learning.lead_cycles, learning.half_width_cycles)
-    return learning_convergence(settings, numbers)
+    return None if learning is None else learning_convergence(settings, learning)
 
 
 def refuse_diverging_learning(found: Convergence | None) -> None:

@@ -15,7 +15,7 @@ from jointctl.drivers.canopen.identifiers import EVENT_DRIVEN, LAST_SYNCHRONOUS
 from jointctl.drivers.canopen.settings import CanopenSettings, JointEncoderSettings, TemperatureObject
 from jointctl.drivers.errors import ConfigurationError, DeviceError
 from jointctl.tools.configuration.config import Config, ConfigurationProblems, beside, problem_line
-from jointctl.tools.configuration.conversions import torque_constant_NmpA
+from jointctl.tools.configuration.conversions import shared, torque_constant_NmpA
 from jointctl.tools.configuration.drive_section import FOR_A_NODE, FOR_A_PORT, DriveSection, GivenPlace, wrong_kind
 from jointctl.tools.configuration.sections import (
     Bus,
@@ -71,11 +71,9 @@ class CanopenSection(DriveSection):
     )
 
     def problems(self, config: Config) -> list[str]:
-        """See `DriveSection`."""
         return joint_encoder_problems(config) + canopen_problems(config)
 
     def files(self, config: Config) -> tuple[tuple[str, Path], ...]:
-        """See `DriveSection`."""
         found = (("drive.eds", eds_path(config)), ("joint_encoder.eds", encoder_eds_path(config)))
         return tuple((key, path) for key, path in found if path is not None)
 
@@ -93,7 +91,6 @@ class CanopenSection(DriveSection):
         return self.heartbeat_s
 
     def assumed_delay(self, config: Config) -> tuple[float, str]:
-        """See `DriveSection`."""
         period_s, kind = 1.0 / config.loop.rate_Hz, self.rpdo_transmission_type
         if kind > LAST_SYNCHRONOUS:
             return period_s, f"assumed: at most one period (drive.rpdo_transmission_type = {kind}, asynchronous)"
@@ -102,13 +99,11 @@ class CanopenSection(DriveSection):
         return periods * period_s, f"assumed: {count} (drive.rpdo_transmission_type = {kind}, synchronous)"
 
     def in_sweep_mode(self, mode: str) -> CanopenSection:
-        """See `DriveSection`."""
         if mode == "speed":
             raise DeviceError("--mode (=speed) must be auto, csv, pv or torque: it is a CANopen drive")
         return self if mode == "torque" else self.model_copy(update={"mode": DRIVE_MODES[mode]})
 
     def free_of_torque_limit(self) -> CanopenSection:
-        """See `DriveSection`."""
         return self.model_copy(update={"max_torque_permille": None})
 
     def constants_factor(self, config: Config) -> tuple[float, str] | None:
@@ -124,7 +119,6 @@ class CanopenSection(DriveSection):
         )
 
     def measuring_constants(self) -> dict[str, float]:
-        """See `DriveSection`."""
         return {"rated_torque": float(self.torque_reference == "rated_torque")}
 
 
@@ -148,38 +142,18 @@ def encoder_eds_path(config: Config) -> Path | None:
 
 def canopen_settings(config: Config) -> CanopenSettings:
     """Sections [drive], [encoder], [joint], [limits] and [loop] for commissioning."""
-    drive = canopen_section(config)
     return CanopenSettings(
-        node=drive.node,
+        **shared(CanopenSettings, canopen_section(config), config.limits),
         eds_path=eds_path(config),
-        mode=drive.mode,
         rate_Hz=config.loop.rate_Hz,
-        heartbeat_s=drive.heartbeat_s,
-        master_node=drive.master_node,
-        quick_stop_option=drive.quick_stop_option,
-        rpdo_transmission_type=drive.rpdo_transmission_type,
-        torque_reference=drive.torque_reference,
-        torque_direction=drive.torque_direction,
-        torque_max_Nm=config.limits.torque_max_Nm,
         torque_constant_NmpA=torque_constant_NmpA(config),
         reduction_ratio=config.joint.reduction_ratio,
         counts_per_turn=config.encoder.counts_per_turn,
         encoder_on_motor=config.encoder.side == "motor",
         encoder_direction=config.encoder.direction,
         zero_counts=config.encoder.zero_counts,
-        vendor_id=drive.vendor_id,
-        product_code=drive.product_code,
-        rated_current_A=drive.rated_current_A,
-        rated_torque_Nm=drive.rated_torque_Nm,
-        rated_tolerance=drive.rated_tolerance,
-        max_torque_permille=drive.max_torque_permille,
-        velocity_unit=drive.velocity_unit,
-        torque_rate_max_Nmps=config.limits.torque_rate_max_Nmps,
-        boot_timeout_s=drive.boot_timeout_s,
         joint_encoder=joint_encoder_settings(config),
         encoder_incremental=config.encoder.kind == "incremental",
-        sdo_timeout_s=drive.sdo_timeout_s,
-        velocity_max_radps=config.limits.velocity_max_radps,
         temperature=temperature_object(config),
     )
 

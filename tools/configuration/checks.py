@@ -230,11 +230,11 @@ def _shape_problems(section: str, friction: Friction) -> list[str]:
 
 
 def _drive_problems(config: Config) -> list[str]:
-    if abs(config.joint.gravity_Nm) >= config.limits.torque_max_Nm:
-        weak = [
-            f"joint.gravity_Nm (={config.joint.gravity_Nm:g}) must be less than limits.torque_max_Nm "
-            f"(={config.limits.torque_max_Nm:g}): the joint could not be held"
-        ]
-    else:
-        weak = []
-    return weak + config.drive.problems(config)
+    found = config.drive.problems(config)
+    if abs(config.joint.gravity_Nm) < config.limits.torque_max_Nm:
+        return found
+    return [
+        f"joint.gravity_Nm (={config.joint.gravity_Nm:g}) must be less than limits.torque_max_Nm "
+        f"(={config.limits.torque_max_Nm:g}): the joint could not be held",
+        *found,
+    ]

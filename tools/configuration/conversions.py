@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 from typing import Any
 
 from jointctl.firmware_py import friction as friction_model
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.sections import Friction, FrictionDirection
+from jointctl.tools.configuration.sections import Friction, FrictionDirection, Section
 
 RADPS_PER_UNIT = {"deg/s": math.pi / 180.0, "rad/s": 1.0, "r/min": math.tau / 60.0}
+
+
+def shared(settings: type[Any], *sections: Section) -> dict[str, Any]:
+    """Keyword arguments for a dataclass: its fields that the sections have by the same name, hence in the same unit."""
+    names = {field.name for field in fields(settings)}
+    return {name: getattr(section, name) for section in sections for name in names & set(type(section).model_fields)}
 
 
 def period_s(config: Config) -> float:
@@ -39,7 +46,7 @@ def law_resolution_rad(config: Config) -> float:
 
 
 def velocity_of_a_count_radps(config: Config) -> float:
-    """What the filter of the velocity (`firmware_py.velocity`) gives when the encoder counts one on.
+    """What the filter of the velocity (`firmware_py.axis`) gives when the encoder counts one on.
 
     Without its compiled function, which takes 0.2 s to load: a configuration is read by every verb.
     """

@@ -17,7 +17,7 @@ from jointctl.drivers.elmo.line_budget import highest_rate_Hz
 from jointctl.drivers.elmo.settings import SERIAL, ElmoSettings
 from jointctl.drivers.errors import ConfigurationError, DeviceError
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.conversions import torque_constant_NmpA
+from jointctl.tools.configuration.conversions import shared, torque_constant_NmpA
 from jointctl.tools.configuration.drive_section import FOR_A_NODE, FOR_A_PORT, DriveSection, GivenPlace, wrong_kind
 from jointctl.tools.configuration.sections import Rule, between
 
@@ -95,7 +95,6 @@ class ElmoSection(DriveSection):
         return {**data, "bus": bus}
 
     def problems(self, config: Config) -> list[str]:
-        """See `DriveSection`."""
         if config.joint_encoder is not None:
             return ['[joint_encoder] needs a CANopen drive: drive.kind must be "canopen"', *elmo_problems(config)]
         return elmo_problems(config)
@@ -114,11 +113,9 @@ class ElmoSection(DriveSection):
         return config.model_copy(update={"drive": drive, "bus": config.bus.model_copy(update=bus)})
 
     def assumed_delay(self, config: Config) -> tuple[float, str]:
-        """See `DriveSection`."""
         return 1.0 / config.loop.rate_Hz, "assumed: at most one period (serial line)"
 
     def in_sweep_mode(self, mode: str) -> ElmoSection:
-        """See `DriveSection`."""
         if mode not in SWEEP_MODES:
             raise DeviceError(f"--mode (={mode}) must be auto, speed or torque: it is a serial drive")
         return self.in_unit_mode(SWEEP_MODES[mode])
@@ -133,35 +130,18 @@ def elmo_section(config: Config) -> ElmoSection:
 
 def elmo_settings(config: Config) -> ElmoSettings:
     """Sections [drive], [encoder], [joint], [limits] and [loop] for the driver."""
-    drive, limits = elmo_section(config), config.limits
+    drive = elmo_section(config)
     return ElmoSettings(
-        port=drive.port,
-        baud_rate_bitps=drive.baud_rate_bitps,
-        echo=drive.echo,
-        reply_timeout_s=drive.reply_timeout_s,
+        **shared(ElmoSettings, drive, config.limits),
         rate_Hz=config.loop.rate_Hz,
-        torque_max_Nm=limits.torque_max_Nm,
         torque_constant_NmpA=torque_constant_NmpA(config),
-        torque_direction=drive.torque_direction,
         reduction_ratio=config.joint.reduction_ratio,
         counts_per_turn=config.encoder.counts_per_turn,
         encoder_on_motor=config.encoder.side == "motor",
         encoder_direction=config.encoder.direction,
         zero_counts=config.encoder.zero_counts,
-        continuous_current_A=drive.continuous_current_A,
-        peak_current_A=drive.peak_current_A,
-        peak_time_s=drive.peak_time_s,
-        velocity_max_radps=limits.velocity_max_radps,
-        position_min_rad=limits.position_min_rad,
-        position_max_rad=limits.position_max_rad,
-        limit_margin=drive.limit_margin,
-        speed_error_radps=drive.speed_error_radps,
-        position_error_rad=drive.position_error_rad,
-        dead_man_s=drive.dead_man_s,
         ramp_radps2=RAMP_SPARE * config.sequence.brake_radps2,
         mode=drive.unit_mode,
-        product=drive.product,
-        counts_parameter=drive.counts_parameter,
     )
 
 

@@ -9,9 +9,8 @@ from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.schema import new
 from jointctl.hil.canopen.device import DeviceSettings
 from jointctl.hil.canopen.encoder_node import EncoderSettings
-from jointctl.hil.faults.kinds import FaultConstants, FaultKind, no_faults
-from jointctl.hil.plant.records import EncoderSide, FrictionKind
-from jointctl.hil.plant.settings import PlantSettings
+from jointctl.hil.fault_kinds import FaultConstants, FaultKind, no_faults
+from jointctl.hil.plant_records import EncoderSide, FrictionKind, PlantSettings
 from jointctl.tools.configuration.canopen import canopen_section, encoder_eds_path
 from jointctl.tools.configuration.config import Config, raise_if
 from jointctl.tools.configuration.conversions import friction_constants, torque_constant_NmpA
@@ -35,7 +34,7 @@ def fault_constants(config: Config) -> Any:
 
 
 def plant_keywords(config: Config, torque_constant_NmpA: float, friction: Any = None) -> dict[str, Any]:
-    """Keyword arguments of `hil.plant.joint.plant`; the torque constant is in the drive's ampere."""
+    """Keyword arguments of `hil.plant.plant`; the torque constant is in the drive's ampere."""
     assert config.virtual is not None
     settings = {k: getattr(config.virtual, k) for k in Virtual.model_fields if k not in OWN_KEYS}
     return {
@@ -64,7 +63,7 @@ def plant_problems(config: Config) -> list[str]:
 
 
 def plant_settings(config: Config) -> dict[str, Any]:
-    """Keyword arguments for `hil.plant.joint.plant`; `ConfigurationError` for what the plant refuses of [virtual]."""
+    """Keyword arguments for `hil.plant.plant`; `ConfigurationError` for what the plant refuses of [virtual]."""
     if config.virtual is None:
         raise ConfigurationError(f"{config.path}: [virtual] is missing: the virtual joint needs its true values")
     friction = None

@@ -16,14 +16,14 @@ from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.states import ControllerKind, FeedForward, LimitSource, TrajectoryKind, ZeroSpeedRule
 from jointctl.firmware_py.trajectory import approach_duration_s, approach_start, ends_meet, peak_of, table_from_csv
 from jointctl.tools.configuration.checks import extremes_problems
-from jointctl.tools.configuration.config import Config, ConfigurationProblems
+from jointctl.tools.configuration.config import Config, raise_if
 from jointctl.tools.configuration.conversions import (
     friction_constants,
     law_resolution_rad,
     period_s,
     static_friction_Nm,
 )
-from jointctl.tools.configuration.sections import Control
+from jointctl.tools.configuration.sections import Control, Section
 
 # the paper's centres, in rad and in rad/s: -c_p, 0, c_p with c_p = 1e-2 [-5 -3 -1 -0.8 -0.4 -0.1 -0.05]
 _PAPER_HALF = (0.05, 0.03, 0.01, 0.008, 0.004, 0.001, 0.0005)
@@ -81,9 +81,14 @@ def trajectory_table(config: Config) -> np.ndarray:
     constants[0].kind, constants[0].table_rows = TrajectoryKind.TABLE, len(table)
     peak = peak_of(constants[0], table)
     problems = extremes_problems(config, peak.position_min_rad, peak.position_max_rad, peak.velocity_radps)
-    if problems:
-        raise ConfigurationProblems([f"{config.path}: {line}" for line in problems])
+    raise_if([f"{config.path}: {line}" for line in problems])
     return table
+
+
+def _copy(record: Any, section: Section, *names: str) -> None:
+    """Values that record and section have by the same name, hence in the same unit."""
+    for name in names:
+        setattr(record, name, getattr(section, name))
 
 
 def _fill_law(law: Any, config: Config) -> None:
@@ -91,30 +96,19 @@ def _fill_law(law: Any, config: Config) -> None:
     law.kind = ControllerKind[control.kind.upper()]
     law.feed_forward = FeedForward[control.feed_forward.upper()]
     law.zero_rule = ZeroSpeedRule[control.zero_rule.upper()]
-    law.filtered_error_rate = int(control.filtered_error_rate)
+    _copy(law, control, "filtered_error_rate", "kp", "kv", "ki", "integral_limit_rads", "zero_band_radps")
+    _copy(law, joint, "inertia_kgm2", "coriolis_Nmspr", "gravity_Nm", "gravity_zero_rad", "reduction_ratio")
     law.period_s = period_s(config)
-    law.inertia_kgm2 = joint.inertia_kgm2
-    law.coriolis_Nmspr = joint.coriolis_Nmspr
-    law.gravity_Nm = joint.gravity_Nm
-    law.gravity_zero_rad = joint.gravity_zero_rad
-    law.kp, law.kv = control.kp, control.kv
-    law.ki, law.integral_limit_rads = control.ki, control.integral_limit_rads
     law.observer.bandwidth_radps = control.observer_radps
     law.observer.delay_cycles = control.observer_delay_cycles
     if control.learning is not None:
-        law.learning.gain = control.learning.gain
-        law.learning.error_gain_ps2 = control.learning.error_gain_ps2
-        law.learning.lead_cycles = control.learning.lead_cycles
+        _copy(law.learning, control.learning, "gain", "error_gain_ps2", "lead_cycles", "blend_s")
         law.learning.half_width = control.learning.half_width_cycles
-        law.learning.blend_s = control.learning.blend_s
         law.learning.growth = config.limits.learning_growth
-    law.reduction_ratio = joint.reduction_ratio
-    law.zero_band_radps = control.zero_band_radps
     if config.friction is not None:
         law.friction = friction_constants(config.friction, joint.reduction_ratio)[0]
         if config.friction.lugre is not None:
-            law.lugre.stiffness_Nmprad = config.friction.lugre.stiffness_Nmprad
-            law.lugre.damping_Nmspr = config.friction.lugre.damping_Nmspr
+            _copy(law.lugre, config.friction.lugre, "stiffness_Nmprad", "damping_Nmspr")
     network = law.network
     _, p12, p22 = solve_lyapunov_p(control.kp, control.kv, control.lyapunov_q[0], control.lyapunov_q[-1])
     network.p_b[0] = p12 / joint.inertia_kgm2
@@ -123,11 +117,10 @@ def _fill_law(law: Any, config: Config) -> None:
     for i in range(NEURONS):
         network.centres[i, 0], network.centres[i, 1] = centres[i]
         network.inverse_width[i] = 0.5 / widths[i] ** 2
-    network.learning_rate = control.learning_rate
+    _copy(network, control, "learning_rate", "dead_zone_rad")
     network.initial_weight = control.initial_weight_Nm
     network.leakage = control.leakage_1ps
     network.weight_limit = control.weight_limit_Nm
-    network.dead_zone_rad = control.dead_zone_rad
 
 
 def hidden_layer(control: Control) -> tuple[tuple[tuple[float, float], ...], tuple[float, ...]]:
@@ -157,8 +150,8 @@ def fill_trajectory(record: Any, config: Config, table: np.ndarray) -> None:
     record.kind = TrajectoryKind[trajectory.kind.upper()]
     record.duration_s = trajectory.duration_s
     if trajectory.kind == "sine":
-        record.amplitude_rad, record.offset_rad = trajectory.amplitude_rad, trajectory.offset_rad
-        record.omega_radps, record.shift_s = math.tau * trajectory.frequency_Hz, trajectory.shift_s
+        _copy(record, trajectory, "amplitude_rad", "offset_rad", "shift_s")
+        record.omega_radps = math.tau * trajectory.frequency_Hz
         second = trajectory.switch
         if second is not None:
             record.switch_s = second.at_s
@@ -171,13 +164,8 @@ def fill_trajectory(record: Any, config: Config, table: np.ndarray) -> None:
         record.table_rows = len(table)
     else:
         record.repeats = int(trajectory.repeat)
-        record.start_rad, record.target_rad = trajectory.start_rad, trajectory.target_rad
-        record.dwell_s = trajectory.dwell_s
-        if trajectory.kind == "min_jerk":
-            record.move_s = trajectory.move_s
-        else:
-            record.speed_radps = trajectory.speed_radps
-            record.acceleration_radps2 = trajectory.acceleration_radps2
+        ways = {"min_jerk": ("move_s",), "trapezoid": ("speed_radps", "acceleration_radps2")}
+        _copy(record, trajectory, "start_rad", "target_rad", "dwell_s", *ways[trajectory.kind])
 
 
 def _cycles(config: Config, time_s: float) -> int:
@@ -186,11 +174,10 @@ def _cycles(config: Config, time_s: float) -> int:
 
 def _fill_limits(record: Any, config: Config) -> None:
     limits = config.limits
-    for key in (
-        "position_min_rad", "position_max_rad", "velocity_max_radps", "torque_max_Nm", "torque_rate_max_Nmps",
-        "following_error_max_rad", "position_jump_max_rad", "standstill_radps",
-    ):  # fmt: skip
-        setattr(record, key, getattr(limits, key))
+    _copy(
+        record, limits, "position_min_rad", "position_max_rad", "velocity_max_radps", "torque_max_Nm",
+        "torque_rate_max_Nmps", "following_error_max_rad", "position_jump_max_rad", "standstill_radps",
+    )  # fmt: skip
     share = FROZEN_SHARE_WITHOUT_MODEL if config.control.feed_forward == "none" else FROZEN_SHARE
     static_Nm = static_friction_Nm(config)
     if static_Nm is not None:
@@ -229,8 +216,7 @@ def _fill_sequence(record: Any, config: Config, table: np.ndarray, start_positio
     if start_position_rad is not None:
         record.start_rad = start_position_rad
         record.moved_max_rad = max(config.limits.following_error_max_rad, MOVED_COUNTS * law_resolution_rad(config))
-    record.brake_radps2 = sequence.brake_radps2
-    record.release_s = sequence.release_s
+    _copy(record, sequence, "brake_radps2", "release_s")
     record.settle_cycles = _cycles(config, sequence.settle_s)
     record.wait_max_cycles = _cycles(config, sequence.wait_timeout_s)
     record.enable_max_cycles = _cycles(config, sequence.enable_timeout_s)

@@ -16,16 +16,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
+from rich.table import Column, Table
 
 from jointctl.firmware_py.states import Fault
+from jointctl.tools.child_process import interrupts_left_to_the_parent
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.drawing import INK, MID_BLUE, MID_GREEN, MID_RED, canvas
 from jointctl.tools.experiments.fault_scenarios import draw_scenario
 from jointctl.tools.experiments.judge import Verdict, judge
-from jointctl.tools.simulation.child_process import interrupts_left_to_the_parent
-from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.sweeping.carry_out import with_mode
 
 # --- the runs ---
@@ -138,13 +138,11 @@ def _told(fault: str) -> str:
 
 def table(rows: Sequence[KindRow]) -> Table:
     """For people."""
-    shown = Table(title="fault campaign")
-    for name, justify in (
-        ("fault", "left"), ("runs", "right"), ("harmless", "right"), ("violations", "right"),
-        ("speed [rad/s]", "right"), ("beyond limit [rad]", "right"), ("allowed [rad]", "right"),
-        ("off after [s]", "right"), ("reported as", "left"),
-    ):  # fmt: skip
-        shown.add_column(name, justify=justify)  # type: ignore[arg-type]
+    numbers = (
+        "runs", "harmless", "violations", "speed [rad/s]", "beyond limit [rad]", "allowed [rad]", "off after [s]",
+    )  # fmt: skip
+    right = (Column(name, justify="right") for name in numbers)
+    shown = Table("fault", *right, "reported as", title="fault campaign")
     for row in rows:
         causes = ", ".join(f"{_told(name)} {count}" for name, count in row.causes.items())
         shown.add_row(

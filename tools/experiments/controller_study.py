@@ -36,13 +36,13 @@ from pydantic_core import PydanticCustomError
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.input_file import parse_toml, read_input
+from jointctl.tools.child_process import interrupts_left_to_the_parent
 from jointctl.tools.configuration.config import Config, suggestion
 from jointctl.tools.configuration.sections import Section, between
 from jointctl.tools.drawing import BLUE, GREY, INK, canvas
 from jointctl.tools.experiments.controllers import DEFAULT, Controller, changed, controller_constants, named, one_line
 from jointctl.tools.experiments.scenarios import RPDO_AT_ONCE, ErrorFigures, Scenario, error_figures, run_scenario
-from jointctl.tools.simulation.child_process import interrupts_left_to_the_parent
-from jointctl.tools.simulation.lockstep import LockstepJoint
+from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.written_file import writing
 
 if TYPE_CHECKING:

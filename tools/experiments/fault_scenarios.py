@@ -22,22 +22,16 @@ import numpy as np
 from jointctl.firmware_py.axis import low_pass_gain
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import Fault
-from jointctl.hil.faults.kinds import FaultConstants, FaultKind
-from jointctl.hil.plant.joint import plant
-from jointctl.hil.plant.records import FrictionKind
+from jointctl.hil.fault_kinds import FaultConstants, FaultKind
+from jointctl.hil.plant import plant
+from jointctl.hil.plant_records import FrictionKind
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.plant_settings import plant_settings
 from jointctl.tools.configuration.sections import Hold, MinJerk, Sine, Trapezoid
-from jointctl.tools.simulation.lockstep import LockstepJoint
-from jointctl.tools.sweeping.carry_out import (
-    middle_rad,
-    position_margin_rad,
-    sweep_constants,
-    with_tracking_law,
-)
+from jointctl.tools.lockstep import LockstepJoint
+from jointctl.tools.sweeping.carry_out import middle_rad, sweep_constants, with_tracking_law
 from jointctl.tools.sweeping.grid import SweepPoint
-from jointctl.tools.sweeping.options import ACCELERATION_SHARE
-from jointctl.tools.sweeping.plan import PlanSettings, plan_motion, shifted
+from jointctl.tools.sweeping.plan import ACCELERATION_SHARE, PlanSettings, plan_motion, position_margin_rad, shifted
 
 # --- kinds of fault ---
 

@@ -42,7 +42,7 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault, Reaction
 from jointctl.firmware_py.trajectory import reference_at
 from jointctl.hil.canopen.records import PowerState
-from jointctl.hil.faults.kinds import FaultKind
+from jointctl.hil.fault_kinds import FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_POSITION_rad, TRUE_VELOCITY_radps
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
@@ -58,7 +58,7 @@ from jointctl.tools.experiments.fault_scenarios import (
     placed_sweep,
     plant_of,
 )
-from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
+from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 
 # --- the envelope ---
 

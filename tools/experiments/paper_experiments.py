@@ -28,7 +28,7 @@ from jointctl.tools.experiments.scenarios import RPDO_AT_ONCE, Scenario, error_f
 from jointctl.tools.identification.friction_data import FrictionData
 from jointctl.tools.identification.identification import Identification, Options, identify_friction
 from jointctl.tools.identification.identification_report import fit_figure
-from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
+from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 
 # --- the runs ---
 

@@ -9,8 +9,8 @@ import numpy as np
 from jointctl.tools.drawing import BLUE, GREEN, GREY, ORANGE, RED, canvas
 from jointctl.tools.experiments.paper_experiments import Runs, friction_estimate, hidden_outputs
 from jointctl.tools.experiments.scenarios import event_s
+from jointctl.tools.lockstep import LockstepRun
 from jointctl.tools.recording.run_figure import drawn_indices
-from jointctl.tools.simulation.lockstep import LockstepRun
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -18,7 +18,7 @@ import numpy as np
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import Fault
-from jointctl.tools.simulation.lockstep import LockstepJoint, LockstepRun
+from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 
 # --- what happens ---
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import tomlkit
 from rich.console import Group, RenderableType
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 from tomlkit.exceptions import TOMLKitError
 
@@ -77,9 +77,8 @@ def parameter_table(found: Identification) -> Table:
 
 def model_table(found: Identification) -> Table:
     """The models side by side; `held out` is the error on points that the fit did not see."""
-    table = Table(title="Models", title_justify="left")
-    for title in ("model", "RMSE, mNm", "held out, mNm", "parameters"):
-        table.add_column(title, justify="left" if title == "model" else "right")
+    numbers = (Column(title, justify="right") for title in ("RMSE, mNm", "held out, mNm", "parameters"))
+    table = Table("model", *numbers, title="Models", title_justify="left")
     for name, rmse in found.rmse_by_model_Nm.items():
         from_swarm = found.rmse_Nm if name == found.model else rmse
         mark = " (chosen)" if name == found.model else ""
@@ -92,9 +91,8 @@ def model_table(found: Identification) -> Table:
 
 def error_table(errors_Nm: np.ndarray, measured_Nm: np.ndarray, ratio: float) -> Table:
     """Error of a curve on data: motor, joint, relative."""
-    table = Table(title="Error", title_justify="left")
-    for title in ("", "motor, mNm", "joint, Nm", "relative"):
-        table.add_column(title, justify="right" if title else "left")
+    numbers = (Column(title, justify="right") for title in ("motor, mNm", "joint, Nm", "relative"))
+    table = Table("", *numbers, title="Error", title_justify="left")
     rms, greatest, mean = relative_figures(errors_Nm, measured_Nm)
     for word, value, share in (
         ("RMSE", np.sqrt(np.mean(errors_Nm**2)), rms),

@@ -10,7 +10,7 @@ from jointctl.firmware_py.input_file import parse_toml
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.recording.report_page import Table
 from jointctl.tools.recording.run_log_reader import RunLog, began_at, event_rows, missing_in
-from jointctl.tools.recording.run_summary import Range, RunSummary, TimeSummary
+from jointctl.tools.recording.run_summary import TIMES, TORQUES, Range, RunSummary, TimeSummary
 
 Figures = list[tuple[str, float | None, int]]
 _EVENTS_SHOWN = 300
@@ -87,22 +87,15 @@ def motion_of(summary: RunSummary) -> Figures:
         ("error in the second half, RMSE [mrad]", late.rmse_rad * 1e3 if late else None, 3),
         ("within 1 mrad for good after [s]", summary.settling_s, 2),
     ]
-    for name, torque in (
-        ("command torque", summary.command_torque_Nm),
-        ("measured torque", summary.measured_torque_Nm),
-        ("friction feed-forward", summary.friction_torque_Nm),
-        ("network torque", summary.network_torque_Nm),
-    ):
-        rows += _ends(name, torque, "Nm", 1.0, 2)
+    for name, key in TORQUES.items():
+        rows += _ends(name, getattr(summary, key), "Nm", 1.0, 2)
     rows += _ends("temperature of the drive", summary.temperature_degC, "°C", 1.0, 1)
     return rows
 
 
 def deadlines_of(summary: RunSummary, missing: int | None) -> Figures:
     """How well the loop kept its time, in the same form."""
-    rows = _times("wake-up late", summary.wake_late)
-    rows += _times("round trip", summary.round_trip)
-    rows += _times("work", summary.work)
+    rows = [row for name, key in TIMES.items() for row in _times(name, getattr(summary, key))]
     rows += [
         ("cycles", float(summary.cycles), 0),
         ("cycles skipped", float(summary.skipped_cycles), 0),

@@ -10,12 +10,17 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from rich.table import Table
+from rich.table import Column, Table
 
 from jointctl.firmware_py.states import AxisPhase, Fault, fault_name
 
 SETTLED_RAD = 1e-3
-_TIMES = ("wake_late", "round_trip", "work")  # rows of the loop's histograms, and LogRecord fields with _ns
+# fields of the summary by their names for people; LogRecord has the times with _ns, the loop a histogram of each
+TORQUES = {
+    "command torque": "command_torque_Nm", "measured torque": "measured_torque_Nm",
+    "friction feed-forward": "friction_torque_Nm", "network torque": "network_torque_Nm",
+}  # fmt: skip
+TIMES = {"wake-up late": "wake_late", "round trip": "round_trip", "work": "work"}
 
 
 @dataclass(frozen=True)
@@ -97,6 +102,9 @@ def summarise(
     late_from_s = late_from_s if late_from_s is not None else 0.5 * float(time_s[-1]) if len(time_s) else 0.0
     faults = records["fault"][records["fault"] != 0]
     duration_ns = int(records["time_ns"][-1]) - int(records["time_ns"][0]) if len(records) else 0
+    named: dict[str, Any] = {key: _range(tracking[key]) for key in TORQUES.values()}
+    for row, key in enumerate(TIMES.values()):
+        named[key] = _times(records, None if histograms is None else histograms[row], key)
     return RunSummary(
         cycles=len(records),
         duration_s=duration_ns * 1e-9,
@@ -105,11 +113,7 @@ def summarise(
         error=_error(tracking, time_s),
         late_error=_error(tracking[time_s >= late_from_s], time_s[time_s >= late_from_s]),
         settling_s=_settling_s(tracking),
-        command_torque_Nm=_range(tracking["command_torque_Nm"]),
-        measured_torque_Nm=_range(tracking["measured_torque_Nm"]),
-        friction_torque_Nm=_range(tracking["friction_torque_Nm"]),
-        network_torque_Nm=_range(tracking["network_torque_Nm"]),
-        **{name: _times(records, histograms, row) for row, name in enumerate(_TIMES)},
+        **named,
         skipped_cycles=int(records["skipped"].sum()),
         oldest_sample_cycles=int(records["sample_age_cycles"].max()) if len(records) else 0,
         temperature_degC=_range(np.asarray(temperatures_degC, float)),
@@ -146,14 +150,14 @@ def _settling_s(tracking: np.ndarray) -> float | None:
     return float(tracking_time_s(tracking)[outside[-1] + 1 if len(outside) else 0])
 
 
-def _times(records: np.ndarray, histograms: np.ndarray | None, row: int) -> TimeSummary | None:
-    if histograms is not None:
-        found = histogram_times(histograms[row])
+def _times(records: np.ndarray, histogram: np.ndarray | None, key: str) -> TimeSummary | None:
+    if histogram is not None:
+        found = histogram_times(histogram)
         # what lies beyond the histogram is in the records, unless they were lost
-        beyond_us = float(records[f"{_TIMES[row]}_ns"].max()) / 1000.0 if len(records) else 0.0
+        beyond_us = float(records[f"{key}_ns"].max()) / 1000.0 if len(records) else 0.0
         return replace(found, max_us=max(found.max_us, beyond_us)) if found is not None and found.over_range else found
-    values = records[f"{_TIMES[row]}_ns"] / 1000.0
-    if _TIMES[row] == "round_trip":
+    values = records[f"{key}_ns"] / 1000.0
+    if key == "round_trip":
         values = values[values > 0.0]  # 0 = no sample in this cycle
     if not len(values):
         return None
@@ -178,9 +182,7 @@ def histogram_times(histogram: np.ndarray) -> TimeSummary | None:
 
 def summary_table(summary: RunSummary) -> Table:
     """The summary for a terminal; angles in mrad."""
-    table = Table(title="Run", show_header=False, title_justify="left")
-    table.add_column(style="bold")
-    table.add_column(justify="right")
+    table = Table(Column(style="bold"), Column(justify="right"), title="Run", show_header=False, title_justify="left")
     fault = "none" if summary.fault == Fault.NONE.name else summary.fault
     table.add_row("duration", f"{summary.duration_s:.2f} s, {summary.tracked_s:.2f} s of it tracking")
     table.add_row("fault", fault, style=None if fault == "none" else "red")
@@ -190,19 +192,12 @@ def summary_table(summary: RunSummary) -> Table:
             span = f"{error.from_s:.1f}..{error.to_s:.1f} s"
             table.add_row(f"{name} ({span})", f"{low:.3f} .. {high:.3f} mrad, RMSE {error.rmse_rad * 1e3:.3f}")
     table.add_row("within 1 mrad for good", _settled_text(summary))
-    for name, torque in (
-        ("command torque", summary.command_torque_Nm),
-        ("measured torque", summary.measured_torque_Nm),
-        ("friction feed-forward", summary.friction_torque_Nm),
-        ("network torque", summary.network_torque_Nm),
-    ):
+    for name, key in TORQUES.items():
+        torque: Range | None = getattr(summary, key)
         if torque is not None and (torque.least, torque.greatest) != (0.0, 0.0):  # zero: the law has no such part
             table.add_row(name, f"{torque.least:.2f} .. {torque.greatest:.2f} Nm")
-    for name, times in (
-        ("wake-up late", summary.wake_late),
-        ("round trip", summary.round_trip),
-        ("work", summary.work),
-    ):
+    for name, key in TIMES.items():
+        times: TimeSummary | None = getattr(summary, key)
         if times is not None:
             table.add_row(f"{name}, p50/p99/p99.9/max", _times_text(times))
     table.add_row("cycles, skipped", f"{summary.cycles}, {summary.skipped_cycles}")

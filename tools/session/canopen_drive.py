@@ -31,7 +31,6 @@ class CanopenSession(SessionDrive):
     """See `SessionDrive`.  The drive watches the loop's heartbeat by itself: no guard."""
 
     def check_rate(self, config: Config) -> None:
-        """See `SessionDrive`."""
         import can
 
         cyclic_bus_load(config)
@@ -42,7 +41,6 @@ class CanopenSession(SessionDrive):
             check_portable_rate(config.bus.interface, config.loop.rate_Hz)
 
     def open(self, config: Config, gate: Callable[[], None] = lambda: None) -> Drive:
-        """See `SessionDrive`."""
         from jointctl.drivers.can.open import open_python_can
         from jointctl.drivers.canopen.drive import CanopenDrive
 
@@ -54,7 +52,6 @@ class CanopenSession(SessionDrive):
         return CanopenDrive(open_bus(), canopen_settings(config), reopen=reopen, gate=gate)
 
     def port_record(self) -> type:
-        """See `SessionDrive`."""
         from jointctl.drivers.canopen.cyclic import CanopenPort
 
         return CanopenPort
@@ -66,19 +63,16 @@ class CanopenSession(SessionDrive):
         return (compiled_loop if order.interface in CYCLIC_INTERFACES else portable_loop)(order, block)
 
     def loop_delay_s(self, config: Config, histograms: np.ndarray) -> float:
-        """See `SessionDrive`."""
         kind, rate_Hz = canopen_section(config).rpdo_transmission_type, config.loop.rate_Hz
         return measured_delay_s(histograms, kind, 1.0 / rate_Hz, 1.0 / config.bus.bitrate_bitps)
 
     def fault_text(
         self, config: Config, fault: Fault, value: float, drive_error: int, encoder_error: int = 0
     ) -> FaultText:
-        """See `SessionDrive`."""
         two_encoders = config.joint_encoder is not None
         return fault_text(fault, value, drive_error, encoder_error, two_encoders=two_encoders)
 
     def error_text(self, code: int) -> str:
-        """See `SessionDrive`."""
         return f"EMCY {emergency_text(code)}"
 
     def state_text(self, status_word: int) -> str:
@@ -86,9 +80,7 @@ class CanopenSession(SessionDrive):
         return state_text(status_word)
 
     def in_fault(self, status_word: int) -> bool:
-        """See `SessionDrive`."""
         return state_of_word(status_word) in _BAD
 
     def load_row(self, share: float) -> tuple[str, str]:
-        """See `SessionDrive`."""
         return "bus load", f"{share:.1%} at worst-case stuffing"

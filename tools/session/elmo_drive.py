@@ -39,21 +39,17 @@ class ElmoSession(SessionDrive):
     """See `SessionDrive`."""
 
     def check_rate(self, config: Config) -> None:
-        """See `SessionDrive`."""
         serial_line_share(config)
 
     def open(self, config: Config, gate: Callable[[], None] = lambda: None) -> Drive:
-        """See `SessionDrive`."""
         return ElmoDrive(elmo_settings(config), gate=gate)
 
     def port_record(self) -> type:
-        """See `SessionDrive`."""
         from jointctl.drivers.elmo.cyclic import ElmoPort
 
         return ElmoPort
 
     def loop(self, order: LoopOrder, block: SharedBlock) -> AbstractContextManager[ReadyLoop]:
-        """See `SessionDrive`."""
         from jointctl.tools.session.loops import serial_loop
 
         return serial_loop(order, block)
@@ -71,7 +67,6 @@ class ElmoSession(SessionDrive):
         return GuardHandle(elmo_section(config), loop)
 
     def refuse_beside_run(self, config: Config) -> None:
-        """See `SessionDrive`."""
         port = elmo_section(config).port
         pid = running_supervisor(port)
         if pid is not None:
@@ -83,7 +78,6 @@ class ElmoSession(SessionDrive):
     def fault_text(
         self, config: Config, fault: Fault, value: float, drive_error: int, encoder_error: int = 0
     ) -> FaultText:
-        """See `SessionDrive`."""
         text = serial_fault_text(fault, value) or fault_text(fault, value, 0)
         finite = math.isfinite(value)
         happened = text.happened.format(value=value, word=f"{round(value):X}h") if finite else text.happened
@@ -92,11 +86,9 @@ class ElmoSession(SessionDrive):
         return FaultText(happened, text.cause, text.next_step)
 
     def error_text(self, code: int) -> str:
-        """See `SessionDrive`."""
         return f"motor fault: {motor_fault_text(code)}"
 
     def load_row(self, share: float) -> tuple[str, str]:
-        """See `SessionDrive`."""
         return "line load", f"{share:.1%} of the characters from the drive"
 
 

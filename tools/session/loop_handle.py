@@ -24,8 +24,8 @@ from jointctl.firmware_py.records import AxisConstants, AxisState, Command, LogR
 from jointctl.firmware_py.schema import dtype_of
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest
+from jointctl.tools.child_process import Starting
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.simulation.child_process import Starting
 
 # --- The memory that the supervisor and the loop process share: one anonymous file, passed on as a file descriptor ---
 # It has no name, so that nothing is left behind whatever dies; it lives as long as either process has it.

@@ -29,16 +29,12 @@ PROBE_TIMEOUT_S = 600.0
 FOREVER = 1 << 62
 
 
-def _nothing() -> None:
-    """For a loop that does not listen before it goes."""
-
-
 @dataclass(frozen=True)
 class ReadyLoop:
     """A loop that is warm: `go` runs it to its end, `flush` throws away what the bus has said so far."""
 
     go: Callable[[], object]
-    flush: Callable[[], None] = _nothing
+    flush: Callable[[], None] = lambda: None  # of a loop that does not listen before it goes
 
 
 def loop_call(driver: ModuleType, block: SharedBlock, period_ns: int, receive_ns: int) -> Callable[[int], int]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, TypeVar
 
 from jointctl.drivers.can.socketcan import interface_blamed
@@ -108,10 +107,6 @@ class Session:
                 if guard is not None:
                     guard.release(self.drive_state)
                 warn_unless_off(self.drive_state, self._output)
-
-    def _loop(self, tail_path: Path) -> LoopHandle:
-        port, marker_fd = self._kind.port_record(), self._control.marker_fd
-        return LoopHandle(self._config, self.plan.motion.table, port, tail_path, marker_fd)
 
     def _ask(self, question: Callable[[], Answer]) -> Answer:
         """The answer of the user, whom a stop may interrupt."""

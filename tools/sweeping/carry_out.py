@@ -22,16 +22,16 @@ from jointctl.firmware_py.states import CommandKind, Fault, TrajectoryKind
 from jointctl.firmware_py.trajectory import approach_duration_s
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_constants
+from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Advance, Output
 from jointctl.tools.recording.log_folder import log_path
 from jointctl.tools.session.consent import Consent
 from jointctl.tools.session.display import OnlyShows, Snapshot
 from jointctl.tools.session.plan import Placed, RunPlan, joint_lines, remark_lines
-from jointctl.tools.simulation.lockstep import LockstepJoint
 from jointctl.tools.sweeping.checks import constant_remarks, require_torque
 from jointctl.tools.sweeping.grid import SweepPoint
 from jointctl.tools.sweeping.meter import SweepMeter
-from jointctl.tools.sweeping.plan import SweepMotion, shifted
+from jointctl.tools.sweeping.plan import SweepMotion, position_margin_rad, shifted
 
 MODES = ("auto", "csv", "pv", "speed", "torque")
 POSITION_GAIN_ps = 5.0  # slow: far below any drive's velocity loop, fast enough to keep the joint on the plan
@@ -73,11 +73,6 @@ def middle_rad(config: Config, motion: SweepMotion, start_rad: float) -> float:
     low = config.limits.position_min_rad + margin - motion.low_rad
     high = config.limits.position_max_rad - margin - motion.high_rad
     return min(max(start_rad, low), max(high, low))
-
-
-def position_margin_rad(config: Config) -> float:
-    """Kept free at both ends of the travel: the joint may be so far from its reference."""
-    return config.limits.following_error_max_rad
 
 
 def approach_time_s(config: Config, start_rad: float, middle: float) -> float:

@@ -1,120 +1,71 @@
-"""What the user asks of a sweep, checked against the joint, and the plan that follows from it."""
+"""What the user asks of a sweep: the options of the command line, and whether they go together.
+
+`--help` loads this: what takes its time is in `plan`.
+"""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from jointctl.drivers.errors import DataError, UsageError
-from jointctl.tools.configuration.config import Config
-from jointctl.tools.sweeping.carry_out import position_margin_rad
-from jointctl.tools.sweeping.checks import measuring_constants
-from jointctl.tools.sweeping.grid import (
-    DEFAULT_POINTS,
-    MOST_POINTS,
-    SPEED_RATIO,
-    SweepPoint,
-    both_directions,
-    check_range,
-    grid_speeds,
-    listed_velocities,
-    ordered_points,
-    plan_hash,
-)
-from jointctl.tools.sweeping.plan import PlanSettings, SweepMotion, fastest_radps, plan_motion
-from jointctl.tools.sweeping.statistics import LEAST_SAMPLES
+from jointctl.tools.sweeping.grid import MOST_POINTS, check_range
 from jointctl.tools.written_file import require_target
-
-SPEED_SHARE = 0.9  # of limits.velocity_max_radps that the fastest plateau may have
-ACCELERATION_SHARE = 0.8  # of sequence.brake_radps2: braking must always be possible
-TRANSIT_SHARE = 0.5  # of the fastest plateau, for ways without measuring
-SETTLE_S = 0.3
-QUICK_S = 450.0
-QUICK_MOST, QUICK_LEAST = 120, 24
-QUICK_DWELL_S = 0.5
-SAMPLES_SPARE = 1.7  # windows are rounded to whole ripple periods, down to two thirds; 0.5 s at 125 Hz were too few
-QUICK_RATIO = 500.0
 
 
 @dataclass(frozen=True)
 class SweepOptions:
-    """The options of the command line; None = the default that fits the joint."""
+    """None = the default that fits the joint."""
 
-    points: int | None = None
-    grid: str = "near-zero"
-    speeds: Path | None = None  # of --grid list
-    max_speed_radps: float | None = None
-    min_speed_radps: float | None = None
-    quick: bool = False
-    warm_up_turns: float = 1.0
-    shuffle_seed: int | None = None
-    passes: int = 1
-    dwell_s: float | None = None
-    mode: str = "auto"
-    resume: bool = False
-    dry_run: bool = False
-    assume_yes: bool = False
-    lockstep: bool = False
-    allow_low_margin: bool = False
-    report: Path | None = None  # HTML page to write as well
-
-
-@dataclass(frozen=True)
-class SweepPlan:
-    """Points, motion settings and identity of one sweep."""
-
-    points: list[SweepPoint]
-    settings: PlanSettings
-    hash: str
-
-    def motion(self, points: list[SweepPoint], warm_up_turns: float, dwell_factor: float = 1.0) -> SweepMotion:
-        values = {**asdict(self.settings), "dwell_s": self.settings.dwell_s * dwell_factor}
-        return plan_motion(points, PlanSettings(**values), warm_up_turns)
-
-
-def make_plan(config: Config, options: SweepOptions) -> SweepPlan:
-    """Check the options against the joint and plan; `UsageError` in one line."""
-    _check_options(options)
-    limits = config.limits
-    width = limits.position_max_rad - limits.position_min_rad - 2.0 * position_margin_rad(config)
-    wanted_s = options.dwell_s or (QUICK_DWELL_S if options.quick else 1.0)
-    dwell_s = max(wanted_s, SAMPLES_SPARE * LEAST_SAMPLES / config.loop.rate_Hz)
-    allowed = SPEED_SHARE * limits.velocity_max_radps
-
-    def settings(transit_radps: float) -> PlanSettings:
-        return PlanSettings(
-            width, ACCELERATION_SHARE * config.sequence.brake_radps2, transit_radps, dwell_s, SETTLE_S,
-            config.joint.reduction_ratio,
-        )  # fmt: skip
-
-    reachable = min(allowed, fastest_radps(settings(allowed)))
-    if options.grid == "list":
-        assert options.speeds is not None
-        velocities = listed_velocities(options.speeds)
-        fastest = max(abs(v) for v in velocities)
-        _check_fastest(f"fastest speed of {options.speeds}", fastest, reachable, allowed)
-    else:
-        fastest = options.max_speed_radps or reachable
-        _check_fastest("--max-speed", fastest, reachable, allowed)
-        slowest = options.min_speed_radps or fastest / (QUICK_RATIO if options.quick else SPEED_RATIO)
-        if not slowest < fastest:
-            raise UsageError(f"--min-speed (={slowest:g}) must be less than --max-speed, {fastest:g} rad/s")
-
-        def grid(count: int) -> list[float]:
-            return both_directions(grid_speeds(options.grid, (count + 1) // 2, slowest, fastest), count)
-
-        velocities = grid(options.points or (QUICK_MOST if options.quick else DEFAULT_POINTS))
-    chosen = settings(TRANSIT_SHARE * fastest)
-    points = ordered_points(velocities, options.passes, options.shuffle_seed)
-    if options.quick:
-        count = QUICK_MOST
-        while plan_motion(points, chosen, options.warm_up_turns).duration_s > QUICK_S and count > QUICK_LEAST:
-            count -= 4
-            points = ordered_points(grid(count), options.passes, options.shuffle_seed)
-    return SweepPlan(points, chosen, plan_hash(points, asdict(chosen) | measuring_constants(config)))
+    points: Annotated[int | None, typer.Option("--points", help="plateaus in both directions together (225)")] = None
+    grid: Annotated[str, typer.Option("--grid", help="near-zero, linear, log, or list")] = "near-zero"
+    speeds: Annotated[
+        Path | None, typer.Option("--speeds", metavar="FILE", help="of --grid list: velocities in rad/s, one a line")
+    ] = None
+    max_speed_radps: Annotated[
+        float | None,
+        typer.Option("--max-speed", metavar="RAD/S", help="fastest plateau (what limits and travel allow)"),
+    ] = None
+    min_speed_radps: Annotated[
+        float | None, typer.Option("--min-speed", metavar="RAD/S", help="slowest plateau (a thousandth of the fastest)")
+    ] = None
+    quick: Annotated[bool, typer.Option("--quick", help="as many points as fit into 8 minutes, 120 at most")] = False
+    warm_up_turns: Annotated[
+        float, typer.Option("--warm-up", metavar="TURNS", help="of the joint, before measuring")
+    ] = 1.0
+    shuffle_seed: Annotated[
+        int | None, typer.Option("--shuffle", metavar="SEED", help="speeds in random order, against drift")
+    ] = None
+    passes: Annotated[int, typer.Option("--passes", help="times that the whole grid is measured")] = 1
+    dwell_s: Annotated[
+        float | None, typer.Option("--dwell", metavar="S", help="wanted measuring time per point (1, quick 0.5)")
+    ] = None
+    mode: Annotated[str, typer.Option("--mode", help="auto, csv, pv or speed (the drive's velocity loop), torque")] = (
+        "auto"
+    )
+    resume: Annotated[bool, typer.Option("--resume", help="measure what is missing in an interrupted sweep")] = False
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="commission, show the motion envelope, move nothing")] = (
+        False
+    )
+    assume_yes: Annotated[bool, typer.Option("-y", "--yes", help="move without asking")] = False
+    lockstep: Annotated[bool, typer.Option("--lockstep", help="virtual joint in simulated time: seconds")] = False
+    allow_low_margin: Annotated[
+        bool,
+        typer.Option("--allow-low-margin", help="torque mode: run a stable loop below the wanted phase margin"),
+    ] = False
+    report: Annotated[
+        Path | None, typer.Option("--report", metavar="FILE.html", help="the result as one self-contained page as well")
+    ] = None
 
 
-def _check_options(options: SweepOptions) -> None:
+AS_IT_FITS = SweepOptions()
+
+
+def check_options(options: SweepOptions) -> None:
+    """`UsageError` for what no joint can have, and for what contradicts itself."""
     if options.points is not None:
         check_range("--points", options.points, 2, MOST_POINTS)
     check_range("--passes", options.passes, 1, 100)
@@ -130,12 +81,6 @@ def _check_options(options: SweepOptions) -> None:
         raise UsageError("--points, --max-speed and --min-speed do not go with --grid list: the list says it all")
     if options.quick and (options.points is not None or options.grid == "list"):
         raise UsageError("--quick chooses the number of points: it does not go with --points and --grid list")
-
-
-def _check_fastest(name: str, fastest: float, reachable: float, allowed: float) -> None:
-    if fastest > reachable * (1.0 + 1e-9):
-        why = f"{SPEED_SHARE:.0%} of limits.velocity_max_radps" if reachable == allowed else "what the travel allows"
-        raise UsageError(f"{name} (={fastest:g}) must be at most {reachable:.4g} rad/s, {why}")
 
 
 def check_files(out: Path, resume: bool) -> None:

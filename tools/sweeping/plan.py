@@ -17,12 +17,25 @@ acceleration and constant speed are cubics, so nothing is approximated.  The acc
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from jointctl.drivers.errors import UsageError
-from jointctl.tools.sweeping.grid import SweepPoint
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.sweeping.checks import measuring_constants
+from jointctl.tools.sweeping.grid import (
+    DEFAULT_POINTS,
+    SPEED_RATIO,
+    SweepPoint,
+    both_directions,
+    grid_speeds,
+    listed_velocities,
+    ordered_points,
+    plan_hash,
+)
+from jointctl.tools.sweeping.options import SweepOptions, check_options
+from jointctl.tools.sweeping.statistics import LEAST_SAMPLES
 
 TEETH = 4
 MOST_STROKES = 8  # of one point; more travel helps more than more strokes
@@ -268,3 +281,82 @@ def shifted(motion: SweepMotion, middle_rad: float) -> SweepMotion:
     table = motion.table.copy()
     table[:, 1] += middle_rad
     return SweepMotion(table, motion.windows, motion.low_rad + middle_rad, motion.high_rad + middle_rad)
+
+
+# --- the plan that follows from the options, for a joint ---
+
+SPEED_SHARE = 0.9  # of limits.velocity_max_radps that the fastest plateau may have
+ACCELERATION_SHARE = 0.8  # of sequence.brake_radps2: braking must always be possible
+TRANSIT_SHARE = 0.5  # of the fastest plateau, for ways without measuring
+SETTLE_S = 0.3
+QUICK_S = 450.0
+QUICK_MOST, QUICK_LEAST = 120, 24
+QUICK_DWELL_S = 0.5
+SAMPLES_SPARE = 1.7  # windows are rounded to whole ripple periods, down to two thirds; 0.5 s at 125 Hz were too few
+QUICK_RATIO = 500.0
+
+
+@dataclass(frozen=True)
+class SweepPlan:
+    """Points, motion settings and identity of one sweep."""
+
+    points: list[SweepPoint]
+    settings: PlanSettings
+    hash: str
+
+    def motion(self, points: list[SweepPoint], warm_up_turns: float, dwell_factor: float = 1.0) -> SweepMotion:
+        values = {**asdict(self.settings), "dwell_s": self.settings.dwell_s * dwell_factor}
+        return plan_motion(points, PlanSettings(**values), warm_up_turns)
+
+
+def position_margin_rad(config: Config) -> float:
+    """Kept free at both ends of the travel: the joint may be so far from its reference."""
+    return config.limits.following_error_max_rad
+
+
+def make_plan(config: Config, options: SweepOptions) -> SweepPlan:
+    """Check the options against the joint and plan; `UsageError` in one line."""
+    check_options(options)
+    limits = config.limits
+    width = limits.position_max_rad - limits.position_min_rad - 2.0 * position_margin_rad(config)
+    wanted_s = options.dwell_s or (QUICK_DWELL_S if options.quick else 1.0)
+    dwell_s = max(wanted_s, SAMPLES_SPARE * LEAST_SAMPLES / config.loop.rate_Hz)
+    allowed = SPEED_SHARE * limits.velocity_max_radps
+
+    def settings(transit_radps: float) -> PlanSettings:
+        return PlanSettings(
+            width, ACCELERATION_SHARE * config.sequence.brake_radps2, transit_radps, dwell_s, SETTLE_S,
+            config.joint.reduction_ratio,
+        )  # fmt: skip
+
+    reachable = min(allowed, fastest_radps(settings(allowed)))
+    if options.grid == "list":
+        assert options.speeds is not None
+        velocities = listed_velocities(options.speeds)
+        fastest = max(abs(v) for v in velocities)
+        _check_fastest(f"fastest speed of {options.speeds}", fastest, reachable, allowed)
+    else:
+        fastest = options.max_speed_radps or reachable
+        _check_fastest("--max-speed", fastest, reachable, allowed)
+        slowest = options.min_speed_radps or fastest / (QUICK_RATIO if options.quick else SPEED_RATIO)
+        if not slowest < fastest:
+            raise UsageError(f"--min-speed (={slowest:g}) must be less than --max-speed, {fastest:g} rad/s")
+
+        def grid(count: int) -> list[float]:
+            return both_directions(grid_speeds(options.grid, (count + 1) // 2, slowest, fastest), count)
+
+        velocities = grid(options.points or (QUICK_MOST if options.quick else DEFAULT_POINTS))
+    chosen = settings(TRANSIT_SHARE * fastest)
+    points = ordered_points(velocities, options.passes, options.shuffle_seed)
+    if options.quick:
+        count = QUICK_MOST
+        while plan_motion(points, chosen, options.warm_up_turns).duration_s > QUICK_S and count > QUICK_LEAST:
+            count -= 4
+            points = ordered_points(grid(count), options.passes, options.shuffle_seed)
+    return SweepPlan(points, chosen, plan_hash(points, asdict(chosen) | measuring_constants(config)))
+
+
+def _check_fastest(name: str, fastest: float, reachable: float, allowed: float) -> None:
+    if fastest > reachable * (1.0 + 1e-9):
+        why = f"{SPEED_SHARE:.0%} of limits.velocity_max_radps" if reachable == allowed else "what the travel allows"
+        raise UsageError(f"{name} (={fastest:g}) must be at most {reachable:.4g} rad/s, {why}")

@@ -45,5 +45,10 @@ def _subject(*, config: MaybeConfig = None, bus: CanOptions) -> Subject:
     return subject_of(config, bus)
 
 
+def _subject_with_eds(*, config: MaybeConfig = None, bus: CanOptions, eds: Eds = None) -> Subject:
+    return subject_of(config, bus, eds)
+
+
 AskedDrive = Annotated["Asked", _asked]
 NodeOnBus = Annotated["Subject", _subject]
+NodeWithEds = Annotated["Subject", _subject_with_eds]

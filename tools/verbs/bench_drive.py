@@ -25,6 +25,7 @@ from jointctl.tools.output import Output
 
 if TYPE_CHECKING:
     from jointctl.tools.inspection.health import Finding
+    from jointctl.tools.verbs.monitor import MonitorOptions
 
 _HEADING = re.compile(r"\s*\[\s*(\w+)\s*\]\s*(#.*)?")
 _HINT = "it can be given on the command line: -i, -c, -b and -t, or -p for a serial port"
@@ -37,19 +38,6 @@ class Asked:
     config: Config | None
     given: GivenPlace
     eds: Path | None = None
-
-
-@dataclass(frozen=True)
-class MonitorOptions:
-    """Which lines `monitor` shows; None or empty: all, until Ctrl-C."""
-
-    cob_ids: tuple[str, ...] = ()
-    kinds: tuple[str, ...] = ()
-    nodes: tuple[int, ...] = ()
-    count: int | None = None
-    duration_s: float | None = None
-    changes: bool = False
-    ask: bool = False
 
 
 @dataclass(frozen=True)

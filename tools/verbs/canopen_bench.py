@@ -17,11 +17,12 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_section import FOR_A_PORT, wrong_kind
 from jointctl.tools.configuration.sections import checked_options
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.bench_drive import Asked, BenchDrive, MonitorOptions, ReadableKeys, ServeOptions, is_text
+from jointctl.tools.verbs.bench_drive import Asked, BenchDrive, ReadableKeys, ServeOptions, is_text
 
 if TYPE_CHECKING:
     from jointctl.tools.inspection.health import Finding
     from jointctl.tools.inspection.subject import Subject
+    from jointctl.tools.verbs.monitor import MonitorOptions
 
 MONITOR_NICENESS = 10  # the loop of a run beside it goes first
 
@@ -54,7 +55,6 @@ class CanopenBench(BenchDrive):
     """See `BenchDrive`."""
 
     def stop_target(self, keys: ReadableKeys) -> CanTarget:
-        """See `BenchDrive`."""
         drive, bus, given, environ = keys.section("drive"), keys.section("bus"), keys.given, keys.environ
         if given.port is not None:
             raise wrong_kind(keys.path, drive.get("kind"), FOR_A_PORT)
@@ -81,7 +81,6 @@ class CanopenBench(BenchDrive):
         )  # fmt: skip
 
     def info(self, asked: Asked, output: Output) -> int:
-        """See `BenchDrive`."""
         from jointctl.tools.verbs.info import node_info
 
         return node_info(canopen_subject(asked), output)
@@ -95,7 +94,6 @@ class CanopenBench(BenchDrive):
         return monitor_bus(subject, output, selection, ask=options.ask)
 
     def findings(self, config: Config) -> Iterator[Finding]:
-        """See `BenchDrive`."""
         from jointctl.tools.inspection.health import adapters, bus_budget, drive_finding, interface_state
 
         yield from adapters(config)
@@ -104,7 +102,6 @@ class CanopenBench(BenchDrive):
         yield from interface_state(config)  # last: a bus on which nobody acknowledges shows once something was sent
 
     def serve(self, config: Config, output: Output, options: ServeOptions) -> int:
-        """See `BenchDrive`."""
         from jointctl.tools.verbs.hil import serve_can
 
         if options.serial or options.link is not None:

@@ -82,9 +82,7 @@ class _Analysis:
 
 def _table(analysis: _Analysis) -> Table:
     found, ideal = analysis.found, analysis.ideal
-    table = Table(title="Linear loop", title_justify="left")
-    for heading in ("quantity", "value", "note"):
-        table.add_column(heading)
+    table = Table("quantity", "value", "note", title="Linear loop", title_justify="left")
     for a in analysis.assumptions:
         table.add_row(a.name, f"{a.value:g} {a.unit}", a.origin)
     table.add_section()

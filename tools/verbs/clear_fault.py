@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from jointctl.drivers.errors import INTERRUPTED
 from jointctl.tools.verbs.verb_options import JointOnBus, ResultOutput
-
-if TYPE_CHECKING:
-    pass
 
 
 def clear_fault(config: JointOnBus, output: ResultOutput) -> int:

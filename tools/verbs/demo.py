@@ -27,8 +27,8 @@ def demo(
     """Track a trajectory on the virtual joint: no hardware, no set-up."""
     from jointctl.tools.configuration.drive_section import GivenPlace, require_simulated
     from jointctl.tools.configuration.load import load_config, moved
-    from jointctl.tools.simulation.virtual_joint import separate_virtual_joint
     from jointctl.tools.verbs.run import run
+    from jointctl.tools.virtual_joint import separate_virtual_joint
 
     path = config_path(config)
     joint = load_config(path)

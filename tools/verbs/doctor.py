@@ -69,9 +69,7 @@ def report_findings(found: list[Finding], output: Output, title: str) -> int:
     """The table, and 0, or 1 if a run would fail."""
     from jointctl.tools.inspection.health import NOTE, OK, PROBLEM
 
-    table = Table(title=title, title_justify="left")
-    for column in ("", "finding", "remedy"):
-        table.add_column(column)
+    table = Table("", "finding", "remedy", title=title, title_justify="left")
     colours = {OK: "green", NOTE: "yellow", PROBLEM: "red"}
     for finding in found:
         topic = Text.assemble((finding.status, colours[finding.status]), " ", finding.topic)
@@ -98,8 +96,7 @@ def doctor_motion(config: Config, output: Output, *, assume_yes: bool, torque_Nm
 
 def _pull(config: Config, output: Output, control: Control, *, assume_yes: bool, torque_Nm: float | None) -> int:
     from jointctl.firmware_py.states import Fault
-    from jointctl.tools.inspection.motion_check import check_run, make_plan
-    from jointctl.tools.inspection.motion_verdict import ended_finding, judged, motion_findings
+    from jointctl.tools.inspection.motion_check import check_run, ended_finding, judged, make_plan, motion_findings
     from jointctl.tools.session import result as drive_end
     from jointctl.tools.session.consent import TerminalConsent
     from jointctl.tools.session.result import require_off

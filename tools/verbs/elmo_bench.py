@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 
-from rich.table import Table
+from rich.table import Column, Table
 
 from jointctl.drivers.elmo.codes import CURRENT_LIMITED, FAULT_LATCHED, SERVO_ON, motor_off_cause, status_text
 from jointctl.drivers.elmo.dialogue import Dialogue, switch_off
@@ -32,11 +32,12 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo import BAUD_RATES_TEXT, BAUD_RATES_bitps, elmo_section, serial_line_share
 from jointctl.tools.output import Output
 from jointctl.tools.session.elmo_guard import GuardCall
-from jointctl.tools.verbs.bench_drive import Asked, BenchDrive, MonitorOptions, ReadableKeys, ServeOptions, is_text
+from jointctl.tools.verbs.bench_drive import Asked, BenchDrive, ReadableKeys, ServeOptions, is_text
 
 if TYPE_CHECKING:
     from jointctl.tools.analysis.linear_loop import LoopSettings
     from jointctl.tools.inspection.health import Finding
+    from jointctl.tools.verbs.monitor import MonitorOptions
 
 SHARED_ATTEMPTS = 10  # the other user of the line takes some replies
 REPLY_TIMEOUT_S = 0.2
@@ -133,11 +134,9 @@ class ElmoBench(BenchDrive):
     """See `BenchDrive`."""
 
     def claims(self, keys: ReadableKeys) -> bool:
-        """See `BenchDrive`."""
         return keys.given.bus is None and (keys.given.port is not None or "port" in keys.section("drive"))
 
     def stop_target(self, keys: ReadableKeys) -> PortTarget:
-        """See `BenchDrive`."""
         drive = keys.section("drive")
         if keys.given.bus is not None:
             raise ConfigurationError(
@@ -158,9 +157,8 @@ class ElmoBench(BenchDrive):
         output.note(f"reading the drive on {place}")
         with inspected_drive(config) as (drive, identity):
             facts = drive.facts()
-        table = Table(title=f"{identity.name} on {place}", title_justify="left", show_header=False, box=None)
-        for column in ("name", "label", "value", "meaning"):
-            table.add_column(column, justify="right" if column == "value" else "left")
+        columns = ("name", "label", Column("value", justify="right"), "meaning")
+        table = Table(*columns, title=f"{identity.name} on {place}", title_justify="left", show_header=False, box=None)
         for fact in facts:
             table.add_row(fact.name, fact.label, fact.value, fact.meaning)
         data = {"port": section.port, "baud_rate_bitps": section.baud_rate_bitps, "version": identity.name}
@@ -197,7 +195,6 @@ class ElmoBench(BenchDrive):
         return 0
 
     def findings(self, config: Config) -> Iterator[Finding]:
-        """See `BenchDrive`."""
         from jointctl.tools.inspection.elmo_health import serial_findings
 
         yield from serial_findings(config)
@@ -205,8 +202,8 @@ class ElmoBench(BenchDrive):
     def serve(self, config: Config, output: Output, options: ServeOptions) -> int:
         """See `BenchDrive`; prints the port on stdout."""
         from jointctl.tools.session.control import stop_signals
-        from jointctl.tools.simulation.virtual_elmo import serve_virtual_elmo
         from jointctl.tools.verbs.hil import make_realtime, wait_for_end
+        from jointctl.tools.virtual_elmo import serve_virtual_elmo
 
         if options.port is not None:
             raise ConfigurationError(
@@ -231,7 +228,6 @@ class ElmoBench(BenchDrive):
             raise ConfigurationError(error.message, _advice(config)) from None
 
     def check_rows(self, config: Config) -> tuple[tuple[str, str, str], ...]:
-        """See `BenchDrive`."""
         drive = elmo_section(config)
         highest = highest_rate_Hz(drive.baud_rate_bitps, drive.echo)
         text = f"{serial_line_share(config):.0%} of the line; up to {highest:.0f} Hz at {drive.baud_rate_bitps} baud"

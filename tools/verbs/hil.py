@@ -42,12 +42,12 @@ def hil(
 
 def serve_can(config: Config, output: Output, *, timing: bool = False, ready_fd: int | None = None) -> int:
     """Serve until a stop signal; `ready_fd` gets one byte once the bus can be used, and its reader's end ends us."""
-    from jointctl.hil.bus.virtual_bus import default_socket_path
-    from jointctl.hil.device_loop import ENDED_WORD
+    from jointctl.hil.realtime_device import ENDED_WORD
+    from jointctl.hil.virtual_bus import default_socket_path
     from jointctl.tools.configuration.canopen import canopen_section
     from jointctl.tools.session.control import stop_signals
     from jointctl.tools.session.loop_process import slow_start
-    from jointctl.tools.simulation.virtual_joint import serve_virtual_joint
+    from jointctl.tools.virtual_joint import serve_virtual_joint
 
     with (
         slow_start(output.note, "virtual joint") as started,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -54,42 +54,42 @@ def _given_format(table: TableOptions) -> ForeignFormat:
 GivenFormat = Annotated["ForeignFormat | None", _given_format]
 
 
-def _fit(
-    model: Model = "multi-stage",
-    continuous: Annotated[bool, typer.Option("--continuous", help="let the two stages meet at the knees")] = False,
-    search_knee: Annotated[bool, typer.Option("--search-knee", help="search the knees as well")] = False,
-    knee: Annotated[float, typer.Option("--knee", help="speed at which the stages change (deg/s of the joint)")] = 40.0,
-    ws_min: Annotated[float | None, typer.Option("--ws-min", help="least Stribeck speed (deg/s)")] = None,
-    ws_max: Annotated[float, typer.Option("--ws-max", help="greatest Stribeck speed (deg/s)")] = 20.0,
-    static_max: Annotated[
+@dataclass(frozen=True)
+class FitOptions:
+    """How to fit: fields of `Options` and of `SwarmSettings`, speeds in deg/s."""
+
+    model: Model = "multi-stage"
+    continuous: Annotated[bool, typer.Option("--continuous", help="let the two stages meet at the knees")] = False
+    search_knee: Annotated[bool, typer.Option("--search-knee", help="search the knees as well")] = False
+    knee: Annotated[float, typer.Option("--knee", help="speed at which the stages change (deg/s of the joint)")] = 40.0
+    ws_min: Annotated[float | None, typer.Option("--ws-min", help="least Stribeck speed (deg/s)")] = None
+    ws_max: Annotated[float, typer.Option("--ws-max", help="greatest Stribeck speed (deg/s)")] = 20.0
+    static_max_Nm: Annotated[
         float | None, typer.Option("--static-max", help="greatest static friction (Nm, motor)")
-    ] = None,
-    outlier_threshold: Annotated[float, typer.Option("--outlier-threshold", help="robust deviations; 0 = off")] = 5.0,
-    folds: Annotated[int, typer.Option("--folds", help="of the held-out error")] = 10,
-    particles: Annotated[int, typer.Option("--particles")] = 1000,
-    iterations: Annotated[int, typer.Option("--iterations")] = 5000,
-    inertia: Annotated[float, typer.Option("--inertia", help="of the swarm")] = 0.7298,
-    cognitive: Annotated[float, typer.Option("--cognitive")] = 1.49618,
-    social: Annotated[float, typer.Option("--social")] = 1.49618,
-    seed: Annotated[int, typer.Option("--seed")] = 1,
-    stall: Annotated[
-        int, typer.Option("--stall", help="stop after so many iterations without progress; 0 = never")
-    ] = 0,
-) -> Options:
+    ] = None
+    outlier_threshold: Annotated[float, typer.Option("--outlier-threshold", help="robust deviations; 0 = off")] = 5.0
+    folds: Annotated[int, typer.Option("--folds", help="of the held-out error")] = 10
+    particles: Annotated[int, typer.Option("--particles")] = 1000
+    iterations: Annotated[int, typer.Option("--iterations")] = 5000
+    inertia: Annotated[float, typer.Option("--inertia", help="of the swarm")] = 0.7298
+    cognitive: Annotated[float, typer.Option("--cognitive")] = 1.49618
+    social: Annotated[float, typer.Option("--social")] = 1.49618
+    seed: Annotated[int, typer.Option("--seed")] = 1
+    stall: Annotated[int, typer.Option("--stall", help="stop after so many iterations without progress; 0 = never")] = 0
+
+
+def _fit(given: FitOptions) -> Options:
     from jointctl.tools.identification.identification import Options
     from jointctl.tools.identification.swarm import SwarmSettings
 
+    swarm = SwarmSettings(**{field.name: getattr(given, field.name) for field in fields(SwarmSettings)})
+    same = ("model", "continuous", "search_knee", "static_max_Nm", "outlier_threshold", "folds")
     return Options(
-        model=model,
-        continuous=continuous,
-        search_knee=search_knee,
-        knee_radps=math.radians(knee),
-        ws_min_radps=None if ws_min is None else math.radians(ws_min),
-        ws_max_radps=math.radians(ws_max),
-        static_max_Nm=static_max,
-        outlier_threshold=outlier_threshold,
-        folds=folds,
-        swarm=SwarmSettings(particles, iterations, inertia, cognitive, social, seed, stall),
+        **{name: getattr(given, name) for name in same},
+        knee_radps=math.radians(given.knee),
+        ws_min_radps=None if given.ws_min is None else math.radians(given.ws_min),
+        ws_max_radps=math.radians(given.ws_max),
+        swarm=swarm,
     )
 
 

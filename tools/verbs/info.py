@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from jointctl.tools.output import Output
@@ -44,10 +44,7 @@ def node_info(subject: Subject, output: Output) -> int:
 
 def info_table(found: dict[str, Any]) -> Table:
     """One table for all sections; sections are dicts or lists of dicts."""
-    table = Table(show_header=False, box=None, pad_edge=False)
-    table.add_column(style="bold")
-    table.add_column()
-    table.add_column()
+    table = Table(Column(style="bold"), "", "", show_header=False, box=None, pad_edge=False)
     for section, content in found.items():
         if not content:
             continue

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Group
-from rich.table import Table
+from rich.table import Column, Table
 
 from jointctl.drivers.errors import DataError
 from jointctl.tools.verbs.verb_options import ResultOutput, grouped
@@ -58,9 +58,7 @@ def log_info(path: LogPath, output: ResultOutput) -> int:
 
 
 def _facts_table(facts: dict[str, Any], drive: dict[str, str]) -> Table:
-    table = Table(title="Log", show_header=False, title_justify="left")
-    table.add_column(style="bold")
-    table.add_column()
+    table = Table(Column(style="bold"), "", title="Log", show_header=False, title_justify="left")
     for name, value in facts.items():
         if value not in ("", None):
             text = str(value) if not isinstance(value, bool) else "yes" if value else "no, cut off"
@@ -78,10 +76,9 @@ def _event_table(log: RunLog) -> Table:
 
     rows = event_rows(log)
     left_out = len(rows) - _SHOWN_EVENTS
-    table = Table(title="Events", title_justify="left", caption=f"and {left_out} more" if left_out > 0 else None)
-    table.add_column("time [s]", justify="right")
-    for heading in ("level", "source", "text"):
-        table.add_column(heading)
+    columns = (Column("time [s]", justify="right"), "level", "source", "text")
+    caption = f"and {left_out} more" if left_out > 0 else None
+    table = Table(*columns, title="Events", title_justify="left", caption=caption)
     for at, level, source, text in rows[:_SHOWN_EVENTS]:
         style = {"error": "red", "warning": "yellow"}.get(level)
         table.add_row(at, level, source, text, style=style)

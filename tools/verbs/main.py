@@ -34,7 +34,7 @@ from jointctl.tools.verbs.scope import scope
 from jointctl.tools.verbs.start import never_refuse_a_character, occupy_standard_streams
 from jointctl.tools.verbs.stop import stop
 from jointctl.tools.verbs.study import study_verb
-from jointctl.tools.verbs.sweep import sweep_verb
+from jointctl.tools.verbs.sweep import sweep
 from jointctl.tools.verbs.validate import validate
 from jointctl.tools.verbs.verb_options import BEGIN, COMPARE, FRICTION, INSPECT, LOOK, MOVE, grouped
 
@@ -74,7 +74,7 @@ for _panel, _verbs in (
     (BEGIN, (demo, new, hil, doctor)),
     (MOVE, (run, stop, clear_fault, check)),
     (INSPECT, (scan, info, monitor)),
-    (FRICTION, (sweep_verb, identify, validate)),
+    (FRICTION, (sweep, identify, validate)),
     (LOOK, (report, scope)),
     (COMPARE, (paper, study_verb, fault_campaign)),
 ):

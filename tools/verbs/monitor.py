@@ -20,9 +20,23 @@ if TYPE_CHECKING:
 
     from jointctl.tools.inspection.frame_decoder import Decoded, FrameDecoder
     from jointctl.tools.inspection.subject import Subject
-    from jointctl.tools.verbs.bench_drive import MonitorOptions
 
 POLL_S = 0.1
+
+
+@dataclass(frozen=True)
+class MonitorOptions:
+    """Which lines are shown; None: all, until Ctrl-C."""
+
+    cob_ids: Annotated[list[str] | None, typer.Option("--cob-id", help="identifier (hex); may be repeated")] = None
+    kinds: Annotated[
+        list[str] | None, typer.Option("--kind", help="nmt, sync, time, emcy, pdo, sdo, heartbeat, lss, error, other")
+    ] = None
+    nodes: Annotated[list[int] | None, typer.Option("--node", help="node number; may be repeated")] = None
+    count: Annotated[int | None, typer.Option("--count", help="end after so many lines", min=1)] = None
+    duration_s: Annotated[float | None, typer.Option("--duration", help="end after so many seconds", min=0.0)] = None
+    changes: Annotated[bool, typer.Option("--changes", help="only frames that differ from the last of theirs")] = False
+    ask: Annotated[bool, typer.Option("--ask", help="read the PDO mapping from the drive first (sends SDO)")] = False
 
 
 @dataclass(frozen=True)
@@ -50,15 +64,15 @@ def selection_of(options: MonitorOptions) -> Selection:
     from jointctl.tools.inspection.frame_decoder import KINDS
 
     identifiers = set()
-    for text in options.cob_ids:
+    for text in options.cob_ids or ():
         try:
             identifiers.add(int(text.lower().removesuffix("h").removeprefix("0x"), 16))
         except ValueError:
             raise ConfigurationError(f"--cob-id (={text}) must be a hexadecimal identifier, such as 181") from None
-    for kind in options.kinds:
+    for kind in options.kinds or ():
         if kind not in KINDS:
             raise ConfigurationError(f"--kind (={kind}) must be one of {', '.join(KINDS)}")
-    shown = frozenset(identifiers), frozenset(options.kinds), frozenset(options.nodes)
+    shown = frozenset(identifiers), frozenset(options.kinds or ()), frozenset(options.nodes or ())
     return Selection(*shown, options.count, options.duration_s, options.changes)
 
 
@@ -87,25 +101,10 @@ def new_decoder(subject: Subject, *, ask: bool) -> FrameDecoder:
     return FrameDecoder(objects, maps)
 
 
-def monitor(
-    asked: AskedDrive,
-    output: VerbOutput,
-    *,
-    cob_id: Annotated[list[str] | None, typer.Option("--cob-id", help="identifier (hex); may be repeated")] = None,
-    kind: Annotated[
-        list[str] | None, typer.Option("--kind", help="nmt, sync, time, emcy, pdo, sdo, heartbeat, lss, error, other")
-    ] = None,
-    node: Annotated[list[int] | None, typer.Option("--node", help="node number; may be repeated")] = None,
-    count: Annotated[int | None, typer.Option("--count", help="end after so many lines", min=1)] = None,
-    duration: Annotated[float | None, typer.Option("--duration", help="end after so many seconds", min=0.0)] = None,
-    changes: Annotated[bool, typer.Option("--changes", help="only frames that differ from the last of theirs")] = False,
-    ask: Annotated[bool, typer.Option("--ask", help="read the PDO mapping from the drive first (sends SDO)")] = False,
-) -> int:
+def monitor(asked: AskedDrive, output: VerbOutput, options: MonitorOptions) -> int:
     """The traffic of a bus in words: NMT, SYNC, heartbeats, EMCY, SDO, PDO by their mapping.  Listens only."""
-    from jointctl.tools.verbs.bench_drive import MonitorOptions, bench_of
+    from jointctl.tools.verbs.bench_drive import bench_of
 
-    filters = tuple(cob_id or ()), tuple(kind or ()), tuple(node or ())
-    options = MonitorOptions(*filters, count, duration, changes, ask)
     return bench_of(asked.config).monitor(asked, output, options)
 
 

@@ -90,14 +90,13 @@ def _table(rows: list[PaperRow]) -> Table:
     from jointctl.tools.experiments.paper_experiments import AFTER_s
 
     table = Table(
+        "experiment", "paper", "reference", "ours", "precise", "note",
         title=f"Errors in mrad after {AFTER_s:g} s: (least, greatest) RMSE",
         caption=f"paper: {PAPER}. reference: an independent simulation of the same equations. "
         "R1: realistic joint, friction 10 % above the model. precise: configs/precise.toml on R1.",
         title_justify="left",
         caption_justify="left",
-    )
-    for heading in ("experiment", "paper", "reference", "ours", "precise", "note"):
-        table.add_column(heading)
+    )  # fmt: skip
     for row in rows:
         table.add_row(row.experiment, row.paper, row.reference, row.ours, row.precise, row.note)
     return table

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from jointctl.drivers.errors import DECLINED, ConfigurationError, DataError, DeviceError
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.asked_drive import Eds, MaybeConfig, subject_of
+from jointctl.tools.verbs.asked_drive import NodeWithEds, subject_of
 from jointctl.tools.verbs.verb_options import CanOptions, VerbOutput, grouped
 
 if TYPE_CHECKING:
@@ -43,8 +43,12 @@ def parameters_of_drive(subject: Subject, output: Output) -> tuple[ParameterSet,
         return read_parameters(SdoReader(network, node, objects), advance), objects
 
 
-def dump(subject: Subject, output: Output, out: Path | None = None) -> int:
-    """Write a DCF to stdout or to `out`."""
+def dump(
+    subject: NodeWithEds,
+    output: VerbOutput,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="DCF to write (.dcf); default: stdout")] = None,
+) -> int:
+    """Read every readable object of the EDS.  Reads only."""
     from jointctl.tools.inspection.parameters import dcf_text
     from jointctl.tools.written_file import writing
 
@@ -236,19 +240,7 @@ def place_index(text: str) -> int:
 params_app = typer.Typer(help="All objects of a drive to a file and back.", no_args_is_help=True)
 
 
-@params_app.command("dump")
-@grouped
-def params_dump(
-    *,
-    config: MaybeConfig = None,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="DCF to write (.dcf); default: stdout")] = None,
-    bus: CanOptions,
-    eds: Eds = None,
-    output: VerbOutput,
-) -> int:
-    """Read every readable object of the EDS.  Reads only."""
-    subject = subject_of(config, bus, eds)
-    return dump(subject, output, out)
+params_app.command("dump")(grouped(dump))
 
 
 @params_app.command("restore")
@@ -256,9 +248,7 @@ def params_dump(
 def params_restore(
     *,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="a DCF, or a TOML dump of an older version")],
-    config: MaybeConfig = None,
-    bus: CanOptions,
-    eds: Eds = None,
+    subject: NodeWithEds,
     yes: Annotated[bool, typer.Option("-y", "--yes", help="write without asking")] = False,
     other_device: Annotated[
         bool, typer.Option("--other-device", help="write although maker, product or node differ")
@@ -267,7 +257,6 @@ def params_restore(
     output: VerbOutput,
 ) -> int:
     """Write the parameters that differ, read each back, tell what was refused.  The drive must be off."""
-    subject = subject_of(config, bus, eds)
     indices = [place_index(text) for text in skip or []]
     return restore_file(subject, file, output, assume_yes=yes, other_device=other_device, skip=indices)
 

@@ -53,9 +53,8 @@ def scan(
         rows = [describe(network, node, node in answered, ear.heard.heartbeats.get(node)) for node in nodes]
         if not rows:
             raise _nobody(subject, ear.heard)
-    table = Table(box=None, pad_edge=False)
-    for title in ("node", "NMT state", "device", "name", "vendor", "product", "revision", "serial", "drive state"):
-        table.add_column(title)
+    titles = ("node", "NMT state", "device", "name", "vendor", "product", "revision", "serial", "drive state")
+    table = Table(*titles, box=None, pad_edge=False)
     for row in rows:
         device = row["device_type"] or ("" if row["answers_sdo"] else "answers no SDO")
         cells = (row["node"], row["nmt_state"], device, row["name"], row["vendor_id"], row["product_code"],

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
+from rich.table import Column, Table
 
 from jointctl.drivers.errors import INTERRUPTED
 from jointctl.tools.output import Output
@@ -114,17 +115,16 @@ def _text(values: tuple[float, float, float], digits: int = 3) -> str:
 
 
 def _table(result: StudyResult, title: str, after_s: float) -> Table:
+    headings = [heading for _, heading in _COLUMNS]
     table = Table(
+        "controller",
+        *(Column(heading, justify="right") for heading in (*headings, "faults")),
         title=f"{title}: errors after {after_s:g} s [mrad], median (5..95 %)",
         caption="peak and RMSE as the encoder shows them; true: of the joint itself; "
         "settling: until the error stays within 1 mrad",
         title_justify="left",
         caption_justify="left",
     )
-    table.add_column("controller")
-    for _, heading in _COLUMNS:
-        table.add_column(heading, justify="right")
-    table.add_column("faults", justify="right")
     for name in result.controllers:
         cells = [_text(spread(result, name, key)) for key, _ in _COLUMNS]
         table.add_row(name, *cells, str(result.faults(name)))
@@ -156,17 +156,24 @@ def study_data(result: StudyResult, settings: StudySettings) -> dict[str, Any]:
     }
 
 
+@dataclass(frozen=True)
+class StudyFlags:
+    """Settings of the study that replace those of its file; None: as there."""
+
+    plants: Annotated[int | None, typer.Option("--plants", help="how many random plants")] = None
+    seed: Annotated[int | None, typer.Option("--seed")] = None
+    after_s: Annotated[float | None, typer.Option("--after", help="errors are taken after this time (s)")] = None
+    scenario: Annotated[str | None, typer.Option("--scenario", help="sine, frequency, amplitude or load")] = None
+    controllers: Annotated[
+        list[str] | None, typer.Option("--controller", help="name or configuration file; may be repeated")
+    ] = None
+    base: Annotated[str | None, typer.Option("--base", help="configuration of the joint: name or file")] = None
+
+
 def study_verb(
     *,
     file: Annotated[Path | None, typer.Option("--file", help="TOML with plants, seed and controllers")] = None,
-    plants: Annotated[int | None, typer.Option("--plants", help="how many random plants")] = None,
-    seed: Annotated[int | None, typer.Option("--seed")] = None,
-    after: Annotated[float | None, typer.Option("--after", help="errors are taken after this time (s)")] = None,
-    scenario: Annotated[str | None, typer.Option("--scenario", help="sine, frequency, amplitude or load")] = None,
-    controller: Annotated[
-        list[str] | None, typer.Option("--controller", help="name or configuration file; may be repeated")
-    ] = None,
-    base: Annotated[str | None, typer.Option("--base", help="configuration of the joint: name or file")] = None,
+    flags: StudyFlags,
     workers: Workers = None,
     csv: Annotated[Path | None, typer.Option("--csv", help="file for all single results")] = None,
     figure: Annotated[Path | None, typer.Option("--figure", help="PNG with a box plot")] = None,
@@ -176,15 +183,7 @@ def study_verb(
     """Compare controllers on many random joints: medians and 5-95 % ranges of error, peak and settling time."""
     from jointctl.tools.experiments.controller_study import StudySettings, checked, load_study
 
-    given: dict[str, Any] = {
-        "plants": plants,
-        "seed": seed,
-        "after_s": after,
-        "scenario": scenario,
-        "controllers": controller or None,
-        "base": base,
-    }
-    flags = {key: value for key, value in given.items() if value is not None}
+    given = {key: value for key, value in vars(flags).items() if value not in (None, [])}
     settings = load_study(file) if file is not None else StudySettings()
-    settings = checked({**settings.model_dump(), **flags}, "command line")
+    settings = checked({**settings.model_dump(), **given}, "command line")
     return study(settings, output, file=file, workers=workers, csv=csv, figure=figure, report=report)

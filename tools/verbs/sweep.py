@@ -15,7 +15,8 @@ from rich.table import Table
 
 from jointctl.drivers.errors import DECLINED, INTERRUPTED, MotionFault
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.verb_options import BusOptions, ConfigPath, DryRun, Report, VerbOutput, Yes, loaded
+from jointctl.tools.sweeping.options import AS_IT_FITS, SweepOptions, check_files
+from jointctl.tools.verbs.verb_options import JointOnBus, VerbOutput
 
 if TYPE_CHECKING:
     from jointctl.drivers.drive import CommissioningReport
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from jointctl.tools.sweeping.data_file import SweepFile
     from jointctl.tools.sweeping.grid import SweepPoint
     from jointctl.tools.sweeping.meter import JointModel, MeasuredPoint
-    from jointctl.tools.sweeping.options import SweepOptions
     from jointctl.tools.sweeping.plan import PlanSettings
 
 RELATIVE_TOLERANCE = 0.01
@@ -55,7 +55,7 @@ class Sweep:
         from jointctl.tools.session.consent import TerminalConsent
         from jointctl.tools.sweeping.carry_out import config_of_sweep
         from jointctl.tools.sweeping.checks import refuse_constants
-        from jointctl.tools.sweeping.options import make_plan
+        from jointctl.tools.sweeping.plan import make_plan
 
         refuse_constants(config)
         self.config = config_of_sweep(config, options.mode)
@@ -77,7 +77,6 @@ class Sweep:
         from jointctl.tools.configuration.conversions import torque_constant_NmpA
         from jointctl.tools.recording.report_page import check_target
         from jointctl.tools.sweeping.data_file import SweepFile
-        from jointctl.tools.sweeping.options import check_files
 
         options = self.options
         check_files(self.out, options.resume)
@@ -259,14 +258,19 @@ class Sweep:
         return table
 
 
-def sweep(config: Config, output: Output, out: Path, options: SweepOptions | None = None) -> int:
-    """The whole command; returns the exit code."""
+def sweep(
+    config: JointOnBus,
+    output: VerbOutput,
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="CSV file to write; its sidecar is the same name with .json")
+    ],
+    options: SweepOptions = AS_IT_FITS,
+) -> int:
+    """Measure friction: plateaus of constant speed in both directions, into a CSV file for `identify`."""
     from jointctl.tools.session import result as drive_end
     from jointctl.tools.session.consent import require_terminal
     from jointctl.tools.session.control import in_control
-    from jointctl.tools.sweeping.options import SweepOptions
 
-    options = options or SweepOptions()
     if not (options.assume_yes or options.dry_run or options.lockstep):
         require_terminal()
     command = Sweep(config, output, out, options)
@@ -280,58 +284,3 @@ def sweep(config: Config, output: Output, out: Path, options: SweepOptions | Non
             output.note(f"interrupted{by}; nothing moved" + ("" if command.file is None else " any more"))
             drive_end.require_off(command.drive_state)
             return INTERRUPTED
-
-
-def sweep_verb(
-    *,
-    config: ConfigPath,
-    out: Annotated[
-        Path, typer.Option("-o", "--out", help="CSV file to write; its sidecar is the same name with .json")
-    ],
-    points: Annotated[int | None, typer.Option("--points", help="plateaus in both directions together (225)")] = None,
-    grid: Annotated[str, typer.Option("--grid", help="near-zero, linear, log, or list")] = "near-zero",
-    speeds: Annotated[
-        Path | None, typer.Option("--speeds", metavar="FILE", help="of --grid list: velocities in rad/s, one a line")
-    ] = None,
-    max_speed: Annotated[
-        float | None,
-        typer.Option("--max-speed", metavar="RAD/S", help="fastest plateau (what limits and travel allow)"),
-    ] = None,
-    min_speed: Annotated[
-        float | None, typer.Option("--min-speed", metavar="RAD/S", help="slowest plateau (a thousandth of the fastest)")
-    ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="as many points as fit into 8 minutes, 120 at most")] = False,
-    warm_up: Annotated[float, typer.Option("--warm-up", metavar="TURNS", help="of the joint, before measuring")] = 1.0,
-    shuffle: Annotated[
-        int | None, typer.Option("--shuffle", metavar="SEED", help="speeds in random order, against drift")
-    ] = None,
-    passes: Annotated[int, typer.Option("--passes", help="times that the whole grid is measured")] = 1,
-    dwell: Annotated[
-        float | None, typer.Option("--dwell", metavar="S", help="wanted measuring time per point (1, quick 0.5)")
-    ] = None,
-    mode: Annotated[
-        str, typer.Option("--mode", help="auto, csv, pv or speed (the drive's velocity loop), torque")
-    ] = "auto",
-    resume: Annotated[bool, typer.Option("--resume", help="measure what is missing in an interrupted sweep")] = False,
-    lockstep: Annotated[bool, typer.Option("--lockstep", help="virtual joint in simulated time: seconds")] = False,
-    bus: BusOptions,
-    yes: Yes = False,
-    dry_run: DryRun = False,
-    allow_low_margin: Annotated[
-        bool,
-        typer.Option("--allow-low-margin", help="torque mode: run a stable loop below the wanted phase margin"),
-    ] = False,
-    report: Report = None,
-    output: VerbOutput,
-) -> int:
-    """Measure friction: plateaus of constant speed in both directions, into a CSV file for `identify`."""
-    from jointctl.tools.sweeping.options import SweepOptions
-
-    configuration = loaded(config, bus)
-    options = SweepOptions(
-        points=points, grid=grid, speeds=speeds, max_speed_radps=max_speed, min_speed_radps=min_speed, quick=quick,
-        warm_up_turns=warm_up, shuffle_seed=shuffle, passes=passes, dwell_s=dwell, mode=mode, resume=resume,
-        dry_run=dry_run, assume_yes=yes, lockstep=lockstep, allow_low_margin=allow_low_margin,
-        report=report,
-    )  # fmt: skip
-    return sweep(configuration, output, out, options)

@@ -18,8 +18,8 @@ from jointctl.firmware_py.records import LawConstants, LawState, Reference, Velo
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ControllerKind
 from jointctl.firmware_py.trajectory import NO_REPETITION
-from jointctl.hil.plant.joint import plant, step_plant
-from jointctl.hil.plant.records import DELAY_SLOTS
+from jointctl.hil.plant import plant, step_plant
+from jointctl.hil.plant_records import DELAY_SLOTS
 from jointctl.tools.analysis.linear_loop import LoopSettings, linear_loop, sampled_joint
 from jointctl.tools.analysis.margin_gate import longest_delay_s, remedies
 from jointctl.tools.analysis.margins import (

@@ -14,14 +14,14 @@ from typing import Any
 import pytest
 
 from jointctl.drivers.errors import DataError
+from jointctl.tools import virtual_elmo, virtual_joint
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.output import Output
-from jointctl.tools.simulation import virtual_elmo, virtual_joint
-from jointctl.tools.simulation.virtual_elmo import _make_link, _target
 from jointctl.tools.verbs import hil
 from jointctl.tools.verbs.bench_drive import ServeOptions, bench_of
 from jointctl.tools.verbs.demo import with_patience
+from jointctl.tools.virtual_elmo import _make_link, _target
 from tests.configurations import shipped
 from tests.places import CONFIGS
 

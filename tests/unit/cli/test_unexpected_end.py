@@ -18,9 +18,9 @@ import pytest
 from jointctl.drivers import errors
 from jointctl.drivers.drive import CommissioningReport, DriveIdentity
 from jointctl.drivers.errors import DECLINED
+from jointctl.tools.child_process import interrupts_left_to_the_parent
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.output import Output
-from jointctl.tools.simulation.child_process import interrupts_left_to_the_parent
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.verbs import doctor, run, sweep
 from jointctl.tools.verbs import main as main_module

@@ -135,7 +135,7 @@ def test_what_only_the_plant_refuses_is_named_where_it_is_made(tmp_path: Path) -
 
 
 def test_plant_settings_are_accepted_by_the_plant() -> None:
-    from jointctl.hil.plant.joint import plant
+    from jointctl.hil.plant import plant
 
     settings = plant_settings(load_config(shipped_config("virtual")))
     constants, state = plant(**settings)

@@ -82,7 +82,7 @@ def test_any_value_for_any_key(tmp_path: Path, number: int, value: str) -> None:
 @slow
 @given(content=st.one_of(damaged(EDS), st.binary(max_size=200)))
 def test_any_eds_text_for_the_virtual_drive(tmp_path: Path, content: bytes) -> None:
-    from jointctl.tools.simulation.virtual_joint import new_device
+    from jointctl.tools.virtual_joint import new_device
 
     path = tmp_path / "virtual_joint.eds"
     path.write_bytes(content)

@@ -19,9 +19,9 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, StopRequest
 from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.session import portable_loop
 from jointctl.tools.session.loop_handle import SharedBlock
-from jointctl.tools.simulation.lockstep import LockstepJoint
 from tests.axis_on_stub_joint import small_axis_constants
 from tests.places import ROOT
 

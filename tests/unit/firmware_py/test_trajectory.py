@@ -442,7 +442,7 @@ import numpy as np
 from jointctl.firmware_py.records import Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.trajectory import approach_at, brake_step, plan_approach, reference_at
-from jointctl.hil.plant.joint import R1, encoder_counts, plant, step_plant
+from jointctl.hil.plant import R1, encoder_counts, plant, step_plant
 
 c, r, a, out = new(TrajectoryConstants)[0], new(Reference)[0], np.zeros(6), []
 c.repeats, c.start_rad, c.target_rad, c.move_s, c.dwell_s = 1, 0.1, 0.9, 1.3, 0.2

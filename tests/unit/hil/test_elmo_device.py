@@ -26,7 +26,7 @@ from jointctl.drivers.elmo.dialogue import REPLY_MAX, Interpreter, Reply, ReplyK
 from jointctl.hil.elmo.device import ElmoDevice
 from jointctl.hil.elmo.interpreter import ElmoDeviceSettings, ElmoInterpreter
 from jointctl.hil.elmo.motor import MF_OVERSPEED, MF_POSITION_LIMIT, MF_SPEED_ERROR
-from jointctl.hil.plant.joint import plant
+from jointctl.hil.plant import plant
 
 
 # --- The ASCII interpreter without a port: commands, replies, garbage, time-outs; and codes in words ---

@@ -15,11 +15,11 @@ from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault
-from jointctl.hil.bus.virtual_bus import FrameQueue
-from jointctl.hil.faults.kinds import fault_memory, no_faults
+from jointctl.hil.fault_kinds import fault_memory, no_faults
 from jointctl.hil.lockstep import RECEIVED_SLOT, RPDO_SLOT, Scenario, World, run_lockstep
-from jointctl.tools.simulation.lockstep import DirectBus, LockstepJoint, codec_of
-from jointctl.tools.simulation.virtual_joint import new_device
+from jointctl.hil.virtual_bus import FrameQueue
+from jointctl.tools.lockstep import DirectBus, LockstepJoint, codec_of
+from jointctl.tools.virtual_joint import new_device
 from tests.configurations import shipped
 from tests.sessions import constants_of
 

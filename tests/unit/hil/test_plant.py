@@ -9,7 +9,7 @@ import pytest
 
 from jointctl.firmware_py.friction import friction_motor_torque_Nm, paper_friction
 from jointctl.firmware_py.kernel import kernel
-from jointctl.hil.plant.joint import (
+from jointctl.hil.plant import (
     R1,
     EncoderSide,
     FrictionKind,
@@ -466,4 +466,4 @@ def test_a_bad_setting_is_named_with_its_value_and_what_is_allowed(settings, mes
 )  # fmt: skip
 def test_settings_at_the_edge_are_accepted(settings):
     plant(**settings)
-    assert PlantSettings(**settings).named()["step_s"] == 50e-6
+    assert PlantSettings(**settings).step_s == 50e-6

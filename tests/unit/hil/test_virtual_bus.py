@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from jointctl.drivers.can.frames import worst_frame_bits
 from jointctl.firmware_py.schema import new
-from jointctl.hil.bus.timing import (
+from jointctl.hil.bus_timing import (
     EXTENDED,
     NO_NODE,
     REMOTE,
@@ -31,7 +31,7 @@ from jointctl.hil.bus.timing import (
     frame_bits,
     pend_frame,
 )
-from jointctl.hil.bus.virtual_bus import (
+from jointctl.hil.virtual_bus import (
     MAX_CLIENTS,
     VirtualBusError,
     VirtualBusHub,
@@ -249,7 +249,7 @@ def test_a_live_hub_is_a_clear_error_and_stays_alive(path: Path) -> None:
 
 def test_the_socket_of_a_killed_hub_is_replaced(path: Path) -> None:
     program = (
-        "import sys; from jointctl.hil.bus.virtual_bus import VirtualBusHub as Hub; "
+        "import sys; from jointctl.hil.virtual_bus import VirtualBusHub as Hub; "
         "Hub(sys.argv[1]).start(); print('up', flush=True); input()"
     )
     with subprocess.Popen(

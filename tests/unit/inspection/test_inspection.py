@@ -21,9 +21,8 @@ from jointctl.tools.inspection.drive_info import drive_info, pdo_maps
 from jointctl.tools.inspection.node_scan import Ear
 from jointctl.tools.inspection.objects import Objects, standard_variable
 from jointctl.tools.inspection.subject import SdoReader, Subject, canopen_network, subject_of_config, subject_of_flags
-from jointctl.tools.verbs.bench_drive import MonitorOptions
 from jointctl.tools.verbs.info import node_info as info
-from jointctl.tools.verbs.monitor import Selection, selection_of
+from jointctl.tools.verbs.monitor import MonitorOptions, Selection, selection_of
 from jointctl.tools.verbs.monitor import monitor_bus as monitor
 from jointctl.tools.verbs.scan import scan
 from tests.sessions import output

@@ -17,17 +17,24 @@ from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
-from jointctl.hil.faults.kinds import FaultConstants, FaultKind
+from jointctl.hil.fault_kinds import FaultConstants, FaultKind
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import velocity_of_a_count_radps
 from jointctl.tools.configuration.records import APPROACH_MIN_S
 from jointctl.tools.inspection.health import NOTE, OK, PROBLEM, Finding
-from jointctl.tools.inspection.motion_check import CheckMotion, CheckPlan, config_of_check, make_plan, motion_table
-from jointctl.tools.inspection.motion_verdict import judged, motion_findings
+from jointctl.tools.inspection.motion_check import (
+    CheckMotion,
+    CheckPlan,
+    config_of_check,
+    judged,
+    make_plan,
+    motion_findings,
+    motion_table,
+)
+from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
 from jointctl.tools.session.fault_words import fault_text
-from jointctl.tools.simulation.lockstep import LockstepJoint
 from jointctl.tools.verbs import doctor as doctor_motion_module
 from tests.two_encoders import NODE, config_with
 

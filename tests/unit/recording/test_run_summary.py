@@ -15,7 +15,7 @@ from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_figure import drawn_indices, save_run_figure
-from jointctl.tools.recording.run_summary import _TIMES, histogram_times, summarise, summary_table
+from jointctl.tools.recording.run_summary import TIMES, histogram_times, summarise, summary_table
 from tests.run_records import run_records
 
 
@@ -117,7 +117,7 @@ def test_deadlines_from_records() -> None:
 
 
 def test_the_rows_of_the_histograms_are_those_of_the_loop() -> None:
-    assert _TIMES == ("wake_late", "round_trip", "work")
+    assert tuple(TIMES.values()) == ("wake_late", "round_trip", "work")
     assert (Histogram.WAKE, Histogram.ROUND_TRIP, Histogram.WORK) == (0, 1, 2)
 
 

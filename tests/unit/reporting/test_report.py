@@ -24,7 +24,7 @@ from jointctl.tools.experiments.controller_study import PlantResult, StudyResult
 from jointctl.tools.experiments.judge import Verdict
 from jointctl.tools.experiments.scenarios import ErrorFigures
 from jointctl.tools.output import Output
-from jointctl.tools.recording.report_figures import binned, friction_points, run_figures
+from jointctl.tools.recording.report_figures import aligned, at_times, binned, friction_points, run_figures
 from jointctl.tools.recording.report_page import (
     Details,
     Figure,
@@ -39,7 +39,6 @@ from jointctl.tools.recording.report_page import (
     write_verb_page,
 )
 from jointctl.tools.recording.report_page import Table as PageTable
-from jointctl.tools.recording.run_comparison import aligned, at_times
 from jointctl.tools.recording.run_log import INFO, RunLogWriter
 from jointctl.tools.recording.run_summary import summarise
 from jointctl.tools.verbs.report import MOST_LOGS, log_names, report, verdict

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from jointctl.drivers.errors import BusError
+from jointctl.tools.child_process import IDLE_S, TELL_S, Starting, processor_time_s
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.output import Output
@@ -24,7 +25,6 @@ from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.control import in_control
 from jointctl.tools.session.kept_awake import kept_awake
 from jointctl.tools.session.loop_process import slow_start
-from jointctl.tools.simulation.child_process import IDLE_S, TELL_S, Starting, processor_time_s
 from tests.places import CONFIGS, ROOT
 
 

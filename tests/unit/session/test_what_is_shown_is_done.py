@@ -24,18 +24,18 @@ from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.records import MOVED_COUNTS
 from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check, motion_table
 from jointctl.tools.inspection.motion_check import make_plan as check_plan
+from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
 from jointctl.tools.session.bus_watch import BusWatch
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.display import PhaseLines
 from jointctl.tools.session.plan import resolve
 from jointctl.tools.session.run_watch import Around, RunParts, RunWatch
-from jointctl.tools.simulation.lockstep import LockstepJoint
 from jointctl.tools.sweeping.carry_out import POSITION_GAIN_ps, middle_rad, sweep_constants
 from jointctl.tools.sweeping.checks import require_torque
 from jointctl.tools.sweeping.grid import both_directions, ordered_points
-from jointctl.tools.sweeping.options import SweepOptions, make_plan
-from jointctl.tools.sweeping.plan import PlanSettings, plan_motion, shifted
+from jointctl.tools.sweeping.options import SweepOptions
+from jointctl.tools.sweeping.plan import PlanSettings, make_plan, plan_motion, shifted
 from jointctl.tools.verbs import scope as scope_module
 from tests.configurations import VIRTUAL, edited, written
 from tests.places import CONFIGS

@@ -32,8 +32,17 @@ from jointctl.tools.sweeping.grid import (
     ordered_points,
     plan_hash,
 )
-from jointctl.tools.sweeping.options import QUICK_S, SweepOptions, make_plan
-from jointctl.tools.sweeping.plan import PlanSettings, SweepMotion, fastest_radps, plan_motion, shifted, stroke_of
+from jointctl.tools.sweeping.options import SweepOptions
+from jointctl.tools.sweeping.plan import (
+    QUICK_S,
+    PlanSettings,
+    SweepMotion,
+    fastest_radps,
+    make_plan,
+    plan_motion,
+    shifted,
+    stroke_of,
+)
 from jointctl.tools.sweeping.statistics import LEAST_SAMPLES
 from jointctl.tools.verbs.sweep import sweep
 from tests.configurations import changed, edited

@@ -109,7 +109,7 @@ from jointctl.drivers.can.virtual_bus import connect
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.libc import WAIT_SCRATCH_WORDS, wait_readable_ns
 from jointctl.firmware_py.schema import new
-from jointctl.hil.bus.virtual_bus import VirtualBusHub
+from jointctl.hil.virtual_bus import VirtualBusHub
 
 @numba.njit(error_model="numpy", nogil=True)
 def exchange(source, sink, frames, scratch, count):

@@ -30,7 +30,7 @@ from jointctl.drivers.can.channel import NAME, port_path, split_channel, with_op
 from jointctl.drivers.can.open import normalised, open_cyclic_end, open_python_can
 from jointctl.drivers.can.virtual_bus import VirtualBus
 from jointctl.drivers.errors import BusError, ConfigurationError
-from jointctl.hil.bus.virtual_bus import VirtualBusHub
+from jointctl.hil.virtual_bus import VirtualBusHub
 from jointctl.tools.configuration.drive_section import GivenPlace
 from jointctl.tools.configuration.load import load_config, moved
 from jointctl.tools.verbs.bench_drive import stop_target

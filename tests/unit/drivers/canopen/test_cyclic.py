@@ -44,7 +44,7 @@ from jointctl.firmware_py.records import Command, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import DriveRequest, DriveState
 from jointctl.tools.configuration.load import load_config
-from jointctl.tools.simulation.virtual_joint import new_device
+from jointctl.tools.virtual_joint import new_device
 from tests.places import CONFIGS
 from tests.unit.drivers.canopen.wire import RAD_PER_COUNT, STATUSWORDS, Wire
 

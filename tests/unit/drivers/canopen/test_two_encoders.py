@@ -21,13 +21,13 @@ from jointctl.drivers.errors import ConfigurationError, DeviceError
 from jointctl.firmware_py.records import ENCODER_RESTARTED, Command, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
-from jointctl.hil.faults.kinds import FaultConstants, FaultKind
+from jointctl.hil.fault_kinds import FaultConstants, FaultKind
 from jointctl.tools.configuration.canopen import canopen_settings, cyclic_bus_load
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.inspection.health import bus_budget
+from jointctl.tools.lockstep import DirectBus, LockstepJoint
 from jointctl.tools.session.session_drive import session_drive
-from jointctl.tools.simulation.lockstep import DirectBus, LockstepJoint
-from jointctl.tools.simulation.virtual_joint import new_device
+from jointctl.tools.virtual_joint import new_device
 from tests.configurations import changed
 from tests.places import CONFIGS
 from tests.two_encoders import NODE, cycle, hear, port_of, short_run, tell

@@ -15,7 +15,7 @@ from jointctl.firmware_py.records import Command, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import DriveRequest, DriveState
 from jointctl.hil.elmo.interpreter import ElmoDeviceSettings, ElmoInterpreter
-from jointctl.hil.plant.joint import plant
+from jointctl.hil.plant import plant
 
 # --- The virtual drive's interpreter behind a port that is memory, with a time of its own ---
 COUNTS = 2**19

@@ -11,8 +11,7 @@ import canopen
 import pytest
 
 from jointctl.hil.canopen.device import DeviceSettings
-from jointctl.hil.device_loop import SEND_ERRORS_WORD
-from jointctl.hil.realtime_device import RealtimeDevice
+from jointctl.hil.realtime_device import SEND_ERRORS_WORD, RealtimeDevice
 from tests.places import EDS
 from tests.virtual_drive import NODE, Network, Rig, frame, network_node, virtual_drive
 

@@ -15,7 +15,7 @@ from canopen.objectdictionary import ODVariable
 from jointctl.drivers.canopen.eds import read_eds
 from jointctl.drivers.canopen.sdo import download
 from jointctl.hil.canopen.device import DeviceSettings
-from jointctl.tools.simulation.virtual_joint import new_device
+from jointctl.tools.virtual_joint import new_device
 from tests.places import CONFIGS, EDS
 from tests.two_encoders import NODE as TWO_NODES
 from tests.two_encoders import short_run

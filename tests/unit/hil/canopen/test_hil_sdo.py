@@ -18,7 +18,7 @@ from jointctl.hil.canopen.dictionary import load_entries
 from jointctl.hil.canopen.pdo import read_object, write_object
 from jointctl.hil.canopen.records import FIELDS, Device
 from jointctl.hil.canopen.sdo import TIMEOUT_NS, SdoServer
-from jointctl.hil.plant.joint import plant
+from jointctl.hil.plant import plant
 from tests.places import EDS, ROOT
 from tests.virtual_drive import NODE, Network, frame, network_node, virtual_drive
 

@@ -19,8 +19,15 @@ import numpy as np
 from jointctl.firmware_py.friction import friction_motor_torque_Nm, paper_friction
 from jointctl.firmware_py.kernel import inlined, kernel
 from jointctl.firmware_py.schema import new
-from jointctl.hil.plant.records import DELAY_SLOTS, EncoderSide, FrictionKind, PlantConstants, PlantState
-from jointctl.hil.plant.settings import PlantSettings, decay
+from jointctl.hil.plant_records import (
+    DELAY_SLOTS,
+    EncoderSide,
+    FrictionKind,
+    PlantConstants,
+    PlantSettings,
+    PlantState,
+    decay,
+)
 
 # --- Random numbers whose state the caller keeps, so that a run repeats bit by bit: xorshift64 ---
 # Marsaglia's full-period triple of shifts (Xorshift RNGs, 2003); no product, which would overflow aloud in plain

@@ -20,7 +20,7 @@ from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.schema import i8, record
 
 if TYPE_CHECKING:
-    from jointctl.hil.bus.virtual_bus import FrameQueue
+    from jointctl.hil.virtual_bus import FrameQueue
 
 OLDEST_STAMP_NS = 100_000_000  # an older one is not believed
 STAMPED_LAG_NS = 3_000_000  # how far drive and plant stay behind while frames are stamped

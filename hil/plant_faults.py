@@ -11,9 +11,9 @@ import numpy as np
 from jointctl.firmware_py.kernel import kernel
 from jointctl.hil.canopen.device_core import restart
 from jointctl.hil.canopen.records import Device, PowerState, int64
-from jointctl.hil.faults.kinds import FaultConstants, FaultKind, FaultMemory, is_active
-from jointctl.hil.plant.joint import shaft_position_rad
-from jointctl.hil.plant.records import PlantConstants, PlantState
+from jointctl.hil.fault_kinds import FaultConstants, FaultKind, FaultMemory, is_active
+from jointctl.hil.plant import shaft_position_rad
+from jointctl.hil.plant_records import PlantConstants, PlantState
 
 
 @kernel

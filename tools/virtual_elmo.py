@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from jointctl.drivers.errors import DataError
 from jointctl.hil.elmo.device import ElmoDevice
 from jointctl.hil.elmo.interpreter import ElmoDeviceSettings, ElmoInterpreter
-from jointctl.hil.plant.joint import plant
+from jointctl.hil.plant import plant
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo import elmo_section
 from jointctl.tools.configuration.plant_settings import plant_settings

@@ -20,15 +20,14 @@ import numpy as np
 from jointctl.drivers.can.open import CYCLIC_INTERFACES, open_cyclic_end, open_python_can
 from jointctl.drivers.can.virtual_bus import decode, encode
 from jointctl.drivers.errors import BusError, ConfigurationError
-from jointctl.hil.bus.virtual_bus import VirtualBusError, VirtualBusHub, default_socket_path
 from jointctl.hil.canopen.device import Cia402Device
-from jointctl.hil.device_loop import ENDED_WORD, SEND_ERRORS_WORD, STOP_WORD, WORDS
-from jointctl.hil.plant.joint import plant
-from jointctl.hil.realtime_device import RealtimeDevice
+from jointctl.hil.plant import plant
+from jointctl.hil.realtime_device import ENDED_WORD, SEND_ERRORS_WORD, STOP_WORD, WORDS, RealtimeDevice
+from jointctl.hil.virtual_bus import VirtualBusError, VirtualBusHub, default_socket_path
+from jointctl.tools.child_process import Starting
 from jointctl.tools.configuration.canopen import canopen_section, eds_path
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.plant_settings import device_settings, fault_constants, plant_settings
-from jointctl.tools.simulation.child_process import Starting
 
 _POLL_S = 0.1
 _LONGEST_WAIT_NS = 2_000_000  # timers and the plant move on at least this often
@@ -44,7 +43,7 @@ class PumpedDevice:
     caller's.  `words` int64[WORDS]: SEND_ERRORS_WORD counts lost frames, ENDED_WORD is 1 = stopped, 2 = bus gone.
 
     A Python thread carries the frames.  It answers within about a millisecond on an idle computer and within tens of
-    them on a busy one; the compiled `hil.device_loop`, for buses that are file descriptors, within microseconds.
+    them on a busy one; the compiled `hil.realtime_device`, for buses that are file descriptors, within microseconds.
     """
 
     def __init__(self, device: Cia402Device, bus: can.BusABC) -> None:

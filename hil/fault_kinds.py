@@ -4,7 +4,7 @@ A fault is a record `FaultConstants`; the faults of a joint are an array of them
 Times count from `FaultMemory.epoch_ns`: the start of a run, or, while that is 0, the first time that the power stage
 is on.  Chance comes from a xorshift64 generator in the memory, so that a run repeats bit by bit.
 
-Faults of the wire are carried out by `hil.faults.frame_faults`, those of drive and plant by `hil.faults.plant_faults`.
+Faults of the wire are carried out by `hil.frame_faults`, those of drive and plant by `hil.plant_faults`.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import numpy as np
 
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.schema import array_of, dtype_of, f8, i4, i8, new, record, u1
-from jointctl.hil.bus.virtual_bus import FRAME_SIZE, FrameQueue
-from jointctl.hil.plant.joint import next_state, unit_number
-from jointctl.hil.plant.records import u8
+from jointctl.hil.plant import next_state, unit_number
+from jointctl.hil.plant_records import u8
+from jointctl.hil.virtual_bus import FRAME_SIZE, FrameQueue
 
 MAX_FAULTS = 8
 LATE_FRAMES = 256  # that wait in the delay line; more are lost

@@ -24,14 +24,14 @@ from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, Fault
-from jointctl.hil.bus.virtual_bus import FRAME_SIZE
 from jointctl.hil.canopen.device import Cia402Device
-from jointctl.hil.faults.kinds import fault_memory, no_faults
+from jointctl.hil.fault_kinds import fault_memory, no_faults
 from jointctl.hil.lockstep import TRUTHS, Codec, Scenario, TRUE_POSITION_rad, World, run_lockstep
+from jointctl.hil.virtual_bus import FRAME_SIZE
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import axis_constants, trajectory_table
-from jointctl.tools.simulation.virtual_joint import new_device
+from jointctl.tools.virtual_joint import new_device
 
 _COMMISSIONING_STEP_NS = 1000  # the device's clock goes on a little with every frame
 _LISTENER_S = 5.0  # at most: it may have gone

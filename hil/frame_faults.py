@@ -12,13 +12,13 @@ from enum import IntEnum
 import numpy as np
 
 from jointctl.firmware_py.kernel import kernel
-from jointctl.hil.bus.virtual_bus import FRAME_SIZE, QUEUE_LENGTH, FrameQueue
 from jointctl.hil.canopen.device_core import accept_frame
 from jointctl.hil.canopen.records import Device, int64
-from jointctl.hil.faults.kinds import LATE_FRAMES, FaultKind, FaultMemory, draw, is_active
-from jointctl.hil.plant.records import PlantConstants, PlantState
+from jointctl.hil.fault_kinds import LATE_FRAMES, FaultKind, FaultMemory, draw, is_active
+from jointctl.hil.plant_records import PlantConstants, PlantState
+from jointctl.hil.virtual_bus import FRAME_SIZE, QUEUE_LENGTH, FrameQueue
 
-# --- Controller and drive in lockstep, with the wire of `hil.faults.frame_faults` between them ---
+# --- Controller and drive in lockstep, with the wire of `hil.frame_faults` between them ---
 
 
 @kernel
@@ -123,7 +123,7 @@ def append_frame(queue: FrameQueue, frame: np.ndarray) -> int:
 
 @kernel
 def _unstamp(frame: np.ndarray) -> None:
-    """A frame that the wire makes late or doubles shall count when it comes: see `hil.bus.frame_stamps`."""
+    """A frame that the wire makes late or doubles shall count when it comes: see `hil.frame_stamps`."""
     for i in range(5, 8):
         frame[i] = 0
 

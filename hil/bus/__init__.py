@@ -1,1 +1,0 @@
-"""The virtual CAN bus: its process, arbitration and timing, frames."""

@@ -1,1 +1,0 @@
-"""What can be made to go wrong with frames, drive and plant."""

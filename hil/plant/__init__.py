@@ -1,1 +1,0 @@
-"""The virtual joint: motor, reducer, friction, encoder, load."""
