@@ -17,9 +17,16 @@ from jointctl.tools.session.plan import resolve
 from jointctl.tools.session.session import Session
 
 
-def output(**how: Any) -> tuple[Output, io.StringIO, io.StringIO]:
+class Terminal(io.StringIO):
+    """A stream that is one."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def output(stream: type[io.StringIO] = io.StringIO, **how: Any) -> tuple[Output, io.StringIO, io.StringIO]:
     """An output, and what is written to it and beside it."""
-    out, err = io.StringIO(), io.StringIO()
+    out, err = stream(), stream()
     return Output(stdout=out, stderr=err, **how), out, err
 
 

@@ -44,6 +44,7 @@ from jointctl.tools.virtual_joint import separate_virtual_joint
 from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
 from tests.bench.c_programs import NoCompilerError, exchange_program, setting_doubles
 from tests.bench.paired import Row, compared, interleaved, skipped
+from tests.configurations import changed
 
 # --- load: a busy thread of this very process, or a busy process ---
 
@@ -145,24 +146,8 @@ def times_from_ns(rows: np.ndarray) -> LoopTimes:
 SETTLE_S = 0.5  # from the start of the loop until the drive is enabled, and a little more
 POLL_S = 0.02
 END_S = 3.0
-PATIENCE_S = 0.25
+PATIENCE_S = 0.25  # so long a computer may stand still without ending the run
 ENABLED_SHARE = 0.9
-
-
-def at_rate(config: Config, rate_Hz: float) -> Config:
-    """The same joint with another loop rate."""
-    return config.model_copy(update={"loop": config.loop.model_copy(update={"rate_Hz": rate_Hz})})
-
-
-def on_the_core(config: Config, core: int) -> Config:
-    """The same joint with its loop on that core."""
-    return config.model_copy(update={"loop": config.loop.model_copy(update={"cpu": core})})
-
-
-def patient(config: Config) -> Config:
-    """The same joint with limits that let a computer stand still for a while without ending the run."""
-    limits = config.limits.model_copy(update={"sample_age_max_s": PATIENCE_S, "skipped_max_s": PATIENCE_S})
-    return config.model_copy(update={"limits": limits})
 
 
 @contextmanager
@@ -434,13 +419,14 @@ def exchange_rows(config: Config, folder: Path, *, rounds: Rounds, seconds: floa
     if cyclictest is None:
         yield skipped(GROUP, "against cyclictest", "not installed (package rt-tests)")
     channel = f"bench{os.getpid()}"
-    config = patient(config).model_copy(
-        update={"bus": config.bus.model_copy(update={"interface": "jointctl", "channel": channel})}
-    )
+    config = changed(
+        config, bus__interface="jointctl", bus__channel=channel, loop__cpu=cores()[-1],
+        limits__sample_age_max_s=PATIENCE_S, limits__skipped_max_s=PATIENCE_S,
+    )  # fmt: skip
     with separate_virtual_joint(config.path, channel):
         for rate_Hz in RATES_Hz[:1] if quick else RATES_Hz:
             for name in LOADS[:2] if quick else LOADS:
-                case = Case(on_the_core(at_rate(config, rate_Hz), cores()[-1]), name, seconds)
+                case = Case(changed(config, loop__rate_Hz=rate_Hz), name, seconds)
                 if program is not None:
                     yield from _against_c(case, program, rounds.in_c)
                 if cyclictest is not None:

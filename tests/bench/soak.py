@@ -20,14 +20,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomlkit
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from jointctl.tools.configuration.load import shipped_config  # noqa: E402
 from jointctl.tools.recording.run_log_reader import missing_records, read_run_log  # noqa: E402
 from jointctl.tools.virtual_joint import separate_virtual_joint  # noqa: E402
+from tests.configurations import written  # noqa: E402
 
 SETTLED_S = 60.0  # memory of the first minute is start-up
 COMPARED_S = 60.0  # first and last minute are compared
@@ -85,27 +84,14 @@ def long_config(folder: Path, duration_s: float) -> Path:
 
     On a shared machine the shipped ones (50 ms) end the run with a fault sooner or later, as they should.
     """
-    shipped = shipped_config("virtual")
-    document: Any = tomlkit.parse(shipped.read_text())
-    document["trajectory"]["duration_s"] = duration_s
-    document["control"].update(kind="computed_torque", kp=100.0, kv=20.0)
-    document["limits"].update(
-        position_min_rad=-3.0,
-        position_max_rad=3.0,
-        velocity_max_radps=50.0,
-        following_error_max_rad=2.0,
-        position_jump_max_rad=2.0,
-        sample_age_max_s=1.0,
-        skipped_max_s=1.0,
-        saturation_max_s=5.0,
-    )
-    document["sequence"].update(brake_radps2=20.0)
-    document["sequence"]["supervisor_timeout_s"] = 10.0
-    document["drive"]["heartbeat_s"] = 2.0
-    document["log"]["folder"] = str(folder)
-    path = folder / "soak.toml"
-    path.write_text(tomlkit.dumps(document))
-    return path
+    return written(
+        folder / "soak.toml", trajectory__duration_s=duration_s, log__folder=str(folder),
+        control__kind="computed_torque", control__kp=100.0, control__kv=20.0,
+        limits__position_min_rad=-3.0, limits__position_max_rad=3.0, limits__velocity_max_radps=50.0,
+        limits__following_error_max_rad=2.0, limits__position_jump_max_rad=2.0, limits__sample_age_max_s=1.0,
+        limits__skipped_max_s=1.0, limits__saturation_max_s=5.0, sequence__brake_radps2=20.0,
+        sequence__supervisor_timeout_s=10.0, drive__heartbeat_s=2.0,
+    )  # fmt: skip
 
 
 def schedule_figures(records: Any, period_ns: int) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""The arithmetic and the report of the benchmarks; nothing here measures time.  `bench_*.py` beside it do."""
+"""The arithmetic and the report of the benchmarks, and that what they compare is the same; nothing measures time."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import math
 import os
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.output import Output
 from tests.bench import c_programs, speed
 from tests.bench.c_programs import (
+    FAST_MATH,
     FIRST_WEIGHT,
     OPTIMISED,
     NoCompilerError,
@@ -29,16 +31,24 @@ from tests.bench.c_programs import (
 )
 from tests.bench.exchange_speed import (
     LOADS,
-    at_rate,
     busy_core,
     cores,
     load,
     on_core,
-    on_the_core,
     run_cyclictest,
     times_from_ns,
 )
-from tests.bench.law_speed import SAME_NUMBERS, NumpyLaw, difference, kernel_ticks, law_rows, sine_inputs
+from tests.bench.law_speed import (
+    SAME_NUMBERS,
+    NumpyLaw,
+    Ticks,
+    allocations,
+    c_function,
+    difference,
+    kernel_ticks,
+    law_rows,
+    sine_inputs,
+)
 from tests.bench.paired import Row, compared, interleaved, measured, outcome_data, outcome_table, skipped, write_outcome
 from tests.sessions import constants_of
 
@@ -89,16 +99,28 @@ def test_pairs_are_measured_in_turn_and_the_order_turns_round():
     assert second == [2.0, 3.0, 6.0]
 
 
-def test_the_numpy_law_gives_the_numbers_of_the_kernel(constants):
+OTHER_LAWS: dict[str, Callable[[Any, Path], Ticks]] = {
+    "numpy": lambda constants, _: NumpyLaw(constants[0]).ticks,
+    "C": lambda constants, folder: c_function(law_library(folder, OPTIMISED), "run_ticks", constants),
+    "C, fast": lambda constants, folder: c_function(law_library(folder, FAST_MATH), "run_ticks", constants),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_LAWS)
+def test_every_law_gives_the_numbers_of_the_kernel_and_with_another_gain_others(constants, tmp_path, name):
     inputs = sine_inputs(constants[0], 3000)
-    assert difference(kernel_ticks(constants), NumpyLaw(constants[0]).ticks, inputs) <= SAME_NUMBERS
-
-
-def test_the_comparison_of_numbers_can_fail(constants):
     other = constants.copy()
     other[0].law.network.learning_rate *= 1.0 + 1e-6
-    inputs = sine_inputs(constants[0], 3000)
-    assert difference(kernel_ticks(constants), NumpyLaw(other[0]).ticks, inputs) > SAME_NUMBERS
+    try:
+        same, different = (OTHER_LAWS[name](of, tmp_path) for of in (constants, other))
+    except NoCompilerError as error:
+        pytest.skip(error.message)
+    assert difference(kernel_ticks(constants), same, inputs) <= SAME_NUMBERS
+    assert difference(kernel_ticks(constants), different, inputs) > SAME_NUMBERS
+
+
+def test_nothing_is_allocated_per_tick(constants):
+    assert allocations(constants) == 0
 
 
 def test_the_flat_memory_holds_the_law_in_the_order_of_the_c_structure(constants):
@@ -182,15 +204,6 @@ def test_a_load_keeps_to_the_first_core_and_nothing_else_does():
     with on_core(None):
         assert os.sched_getaffinity(0) == before
     assert os.sched_getaffinity(0) == before
-
-
-def test_another_rate_or_core_changes_nothing_else():
-    config = load_config(shipped_config("virtual"))
-    faster = on_the_core(at_rate(config, 2000.0), 1)
-    assert faster.loop.cpu == 1
-    assert faster.loop.rate_Hz == 2000.0
-    assert faster.limits == config.limits
-    assert config.loop.rate_Hz == 1000.0
 
 
 def test_every_verb_of_the_command_line_is_timed(monkeypatch: pytest.MonkeyPatch):

@@ -17,47 +17,23 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomlkit
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 from jointctl.firmware_py.states import AxisPhase  # noqa: E402
-from jointctl.tools.configuration.load import shipped_config  # noqa: E402
 from jointctl.tools.recording.run_log_reader import read_run_log  # noqa: E402
-from tests.browser import PROGRAM, Browser  # noqa: E402
+from jointctl.tools.virtual_joint import separate_virtual_joint  # noqa: E402
+from tests.browser import PROGRAM, Browser, free_port  # noqa: E402
+from tests.configurations import written  # noqa: E402
 
 WAYS = ("alone", "served, no page", "one page")
 JOINTCTL = (sys.executable, "-P", "-m", "jointctl.tools.verbs")
-
-
-@contextmanager
-def joint(config: Path) -> Iterator[None]:
-    """`jointctl hil`, ready for others."""
-    with (config.parent / "hil.err").open("w") as err:
-        process = subprocess.Popen([*JOINTCTL, "hil", str(config)], cwd=config.parent, stderr=err)
-    try:
-        while "Ctrl-C ends it" not in (config.parent / "hil.err").read_text():
-            if process.poll() is not None:
-                raise SystemExit((config.parent / "hil.err").read_text())
-            time.sleep(0.05)
-        yield
-    finally:
-        process.terminate()
-        process.wait()
-
-
-def free_port() -> int:
-    """For the page."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def tracked(config: Path, way: str) -> Any:
@@ -103,12 +79,9 @@ def main() -> int:
     found: dict[str, list[Any]] = {way: [] for way in ways}
     loads = []
     with tempfile.TemporaryDirectory() as folder:
-        config = Path(folder) / "joint.toml"
-        document: Any = tomlkit.parse(shipped_config("virtual").read_text())
-        document["bus"]["channel"] = f"watching-{os.getpid()}"
-        document["trajectory"]["duration_s"] = arguments.seconds
-        config.write_text(tomlkit.dumps(document))
-        with joint(config):
+        channel = f"watching-{os.getpid()}"
+        config = written(Path(folder) / "joint.toml", bus__channel=channel, trajectory__duration_s=arguments.seconds)
+        with separate_virtual_joint(config, channel):
             for number in range(arguments.rounds):
                 for way in ways[number % len(ways) :] + ways[: number % len(ways)]:
                     found[way].append(tracked(config, way))

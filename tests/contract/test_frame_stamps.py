@@ -20,7 +20,7 @@ from jointctl.firmware_py.records import Command, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.hil import virtual_bus
 from jointctl.hil.canopen.device import Cia402Device, DeviceSettings
-from jointctl.hil.fault_kinds import FaultConstants, FaultKind, no_faults
+from jointctl.hil.fault_kinds import FaultKind, no_faults
 from jointctl.hil.frame_stamps import (
     OLDEST_STAMP_NS,
     SHORTEST_WINDOW_US,
@@ -35,6 +35,7 @@ from jointctl.hil.plant import plant
 from jointctl.hil.plant_records import FrictionKind
 from jointctl.hil.realtime_device import RealtimeDevice
 from jointctl.hil.virtual_bus import VirtualBusHub
+from tests.made_faults import one_fault
 from tests.places import EDS
 
 NODE = 5
@@ -116,10 +117,7 @@ class Line:
 @pytest.fixture(params=["no faults", "faults"])
 def faults(request: pytest.FixtureRequest) -> Any:
     """Also a wire with faults, none of which is present yet, keeps the times."""
-    found = no_faults() if request.param == "no faults" else new(FaultConstants, 1)
-    for fault in found:
-        fault.kind, fault.start_s, fault.duration_s, fault.magnitude = FaultKind.TPDO_LOST, 0.0, 1.0, 1.0
-    return found
+    return no_faults() if request.param == "no faults" else one_fault(FaultKind.TPDO_LOST, duration_s=1.0)
 
 
 def test_the_drive_samples_at_the_time_of_sync_however_late_it_hears_it(faults: Any) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,8 @@ from jointctl.hil.frame_faults import pass_frame, take_due
 from jointctl.hil.lockstep import TRUE_ACTUATOR_Nm, TRUE_POSITION_rad
 from jointctl.hil.virtual_bus import FRAME_SIZE, FrameQueue
 from jointctl.tools.lockstep import LockstepJoint
+from tests.made_faults import faults_of, one_fault
 
-MakeFault = Callable[..., Any]
 NODE = 1
 MS = 1_000_000
 EPOCH_ns = 7 * MS
@@ -62,7 +61,7 @@ LOST = {
 
 
 @pytest.mark.parametrize("kind", LOST)
-def test_what_is_lost_and_what_is_not(one_fault: MakeFault, kind: FaultKind) -> None:
+def test_what_is_lost_and_what_is_not(kind: FaultKind) -> None:
     wire = Wire(one_fault(kind))
     for to_drive, frames in ((True, TO_DRIVE), (False, TO_CONTROLLER)):
         for frame in frames:
@@ -71,27 +70,25 @@ def test_what_is_lost_and_what_is_not(one_fault: MakeFault, kind: FaultKind) -> 
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
-def test_the_share_that_is_lost(one_fault: MakeFault, share: float) -> None:
+def test_the_share_that_is_lost(share: float) -> None:
     wire = Wire(one_fault(FaultKind.TPDO_LOST, magnitude=share))
     arrived = sum(len(wire.send(TPDO, False)) for _ in range(2000))
     assert arrived == pytest.approx(2000 * (1.0 - share), abs=80 if 0.0 < share < 1.0 else 0)
 
 
 @pytest.mark.parametrize(("at_ms", "present"), [(4.99, False), (5.0, True), (7.99, True), (8.0, False)])
-def test_a_fault_is_present_from_its_start_for_its_duration(one_fault: MakeFault, at_ms: float, present: bool) -> None:
+def test_a_fault_is_present_from_its_start_for_its_duration(at_ms: float, present: bool) -> None:
     wire = Wire(one_fault(FaultKind.SYNC_LOST, at_s=0.005, duration_s=0.003))
     assert len(wire.send(SYNC, True, at_ms)) == (0 if present else 1)
 
 
-def test_before_the_epoch_there_is_no_fault(one_fault: MakeFault) -> None:
+def test_before_the_epoch_there_is_no_fault() -> None:
     faults = one_fault(FaultKind.SYNC_LOST)
     assert not is_active(faults[0], fault_memory(faults)[0], 10**15)
 
 
 @pytest.mark.parametrize(("kind", "frame", "to_drive"), [("RPDO", RPDO, True), ("TPDO", TPDO, False)])
-def test_late_frames_come_when_they_are_due_in_their_order(
-    one_fault: MakeFault, kind: str, frame: tuple[int, int], to_drive: bool
-) -> None:
+def test_late_frames_come_when_they_are_due_in_their_order(kind: str, frame: tuple[int, int], to_drive: bool) -> None:
     wire = Wire(one_fault(FaultKind[f"{kind}_DELAYED"], magnitude=0.002))
     assert wire.send(frame, to_drive, 0.0) == []
     assert wire.send(frame, to_drive, 1.0) == []
@@ -104,9 +101,7 @@ def test_late_frames_come_when_they_are_due_in_their_order(
 
 
 @pytest.mark.parametrize(("kind", "frame", "to_drive"), [("RPDO", RPDO, True), ("TPDO", TPDO, False)])
-def test_doubled_reordered_corrupted_and_of_another_length(
-    one_fault: MakeFault, kind: str, frame: tuple[int, int], to_drive: bool
-) -> None:
+def test_doubled_reordered_corrupted_and_of_another_length(kind: str, frame: tuple[int, int], to_drive: bool) -> None:
     twice = Wire(one_fault(FaultKind[f"{kind}_DUPLICATED"])).send(frame, to_drive)
     assert len(twice) == 2
     assert (twice[0][:5], twice[0][8:]) == (twice[1][:5], twice[1][8:])
@@ -121,7 +116,7 @@ def test_doubled_reordered_corrupted_and_of_another_length(
     assert shorter[4] == 3
 
 
-def test_foreign_frames_come_before_the_drives_own_and_never_look_like_it(one_fault: MakeFault) -> None:
+def test_foreign_frames_come_before_the_drives_own_and_never_look_like_it() -> None:
     wire = Wire(one_fault(FaultKind.FOREIGN_FRAMES, magnitude=9.0))
     for _ in range(200):
         frames = wire.send(TPDO, False)
@@ -143,7 +138,7 @@ def test_without_a_fault_the_run_is_bit_for_bit_that_without_the_engine(lockstep
     assert plain.log.tobytes() == wired.log.tobytes()
 
 
-def test_a_run_with_faults_repeats_bit_for_bit(lockstep: LockstepJoint, one_fault: MakeFault) -> None:
+def test_a_run_with_faults_repeats_bit_for_bit(lockstep: LockstepJoint) -> None:
     faults = one_fault(FaultKind.FRAMES_LOST, 0.5, magnitude=0.3, seed=5)
     first, again = lockstep.run_with_faults(faults, longest_s=4.0), lockstep.run_with_faults(faults, longest_s=4.0)
     assert first.log.tobytes() == again.log.tobytes()
@@ -156,7 +151,7 @@ def test_a_run_with_faults_repeats_bit_for_bit(lockstep: LockstepJoint, one_faul
     [(FaultKind.ENCODER_JUMP, 0.0004, 0.0004), (FaultKind.ENCODER_DRIFT, 0.002, 0.0008)],
 )
 def test_the_encoder_is_wrong_by_the_magnitude(
-    lockstep: LockstepJoint, one_fault: MakeFault, kind: FaultKind, magnitude: float, shift_rad: float
+    lockstep: LockstepJoint, kind: FaultKind, magnitude: float, shift_rad: float
 ) -> None:
     run = lockstep.run_with_faults(one_fault(kind, 1.0, magnitude=magnitude), longest_s=1.46)
     wrong = np.asarray(run.log.position_rad) - run.truth[: len(run.log), TRUE_POSITION_rad]
@@ -169,7 +164,7 @@ def test_the_encoder_is_wrong_by_the_magnitude(
     ("kind", "magnitude", "most_Nm"), [(FaultKind.CURRENT_LOOP_DEAD, 1.0, 0.9), (FaultKind.TORQUE_SATURATED, 6.0, 6.9)]
 )
 def test_the_motor_yields_no_more_than_it_can(
-    lockstep: LockstepJoint, one_fault: MakeFault, kind: FaultKind, magnitude: float, most_Nm: float
+    lockstep: LockstepJoint, kind: FaultKind, magnitude: float, most_Nm: float
 ) -> None:
     """Torque ripple (0.8 Nm) is there with the power off as well."""
     run = lockstep.run_with_faults(one_fault(kind, 2.0, magnitude=magnitude), longest_s=2.5)
@@ -184,10 +179,7 @@ def test_faults_end_and_leave_no_trace(lockstep: LockstepJoint) -> None:
         FaultKind.ENCODER_STUCK, FaultKind.ENCODER_REVERSED, FaultKind.TORQUE_REVERSED, FaultKind.CURRENT_LOOP_DEAD,
         FaultKind.LOAD_JUMP, FaultKind.RPDO_LOST, FaultKind.FRAMES_LOST, FaultKind.FOREIGN_FRAMES,
     )  # fmt: skip
-    faults = new(FaultConstants, len(kinds))
-    for i, kind in enumerate(kinds):
-        faults[i].kind, faults[i].start_s, faults[i].duration_s = kind, 0.5 + 0.2 * i, 0.001
-        faults[i].magnitude, faults[i].seed = 1.0, 1
-    run = lockstep.run_with_faults(faults, longest_s=4.0)
+    faults = [(kind, 0.5 + 0.2 * i, 0.001, 1.0) for i, kind in enumerate(kinds)]
+    run = lockstep.run_with_faults(faults_of(*faults), longest_s=4.0)
     assert run.fault is Fault.NONE
     assert abs(run.log.position_rad[-1] - run.truth[len(run.log) - 1, TRUE_POSITION_rad]) < 2e-5

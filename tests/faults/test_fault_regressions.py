@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -14,8 +11,8 @@ from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.fault_kinds import FaultKind
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
+from tests.made_faults import one_fault
 
-MakeFault = Callable[..., Any]
 AT_s = 2.0  # after the power stage is on: the joint tracks
 HEARTBEAT_s, SAMPLE_AGE_s = 0.2, 0.05
 
@@ -29,7 +26,7 @@ def seconds_until(run: LockstepRun, state: PowerState) -> float:
 
 @pytest.mark.parametrize(("kind", "fault"), [(FaultKind.SYNC_LOST, Fault.STALE_SAMPLE), (FaultKind.RPDO_LOST, None)])
 def test_a_drive_that_does_not_hear_the_loop_is_stopped_by_its_own_watchdog(
-    lockstep: LockstepJoint, one_fault: MakeFault, kind: FaultKind, fault: Fault | None
+    lockstep: LockstepJoint, kind: FaultKind, fault: Fault | None
 ) -> None:
     """The loop went on sending its heartbeat, so that the drive held the last torque until the loop ended, 5 s on."""
     run = lockstep.run_with_faults(one_fault(kind, AT_s), tail_s=1.0)
@@ -48,7 +45,7 @@ def test_a_drive_that_does_not_hear_the_loop_is_stopped_by_its_own_watchdog(
 @pytest.mark.parametrize(("kind", "magnitude"), [(FaultKind.RPDO_LOST, 1.0), (FaultKind.RPDO_LENGTH, 2.0)])
 @pytest.mark.parametrize(("duration_s", "stops"), [(0.098, False), (0.102, True)])
 def test_a_joint_that_holds_while_its_rpdos_stay_away_is_stopped_by_the_deadline_of_the_drive(
-    lockstep: LockstepJoint, one_fault: MakeFault, kind: FaultKind, magnitude: float, duration_s: float, stops: bool
+    lockstep: LockstepJoint, kind: FaultKind, magnitude: float, duration_s: float, stops: bool
 ) -> None:
     """It stands still, so that no limit of the loop sees the loss; the drive's own error code is the reported cause."""
     constants = lockstep.constants()
@@ -63,18 +60,14 @@ def test_a_joint_that_holds_while_its_rpdos_stay_away_is_stopped_by_the_deadline
         assert run.state.phase == AxisPhase.FINISHED
 
 
-def test_its_twin_a_drive_that_hears_again_in_time_is_not_left_alone(
-    lockstep: LockstepJoint, one_fault: MakeFault
-) -> None:
+def test_its_twin_a_drive_that_hears_again_in_time_is_not_left_alone(lockstep: LockstepJoint) -> None:
     run = lockstep.run_with_faults(one_fault(FaultKind.SYNC_LOST, AT_s, 0.045))
     assert run.fault is Fault.NONE
     assert run.state.phase == AxisPhase.FINISHED
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5])
-def test_behind_a_stuck_encoder_the_joint_does_not_run_away(
-    lockstep: LockstepJoint, one_fault: MakeFault, noise: float
-) -> None:
+def test_behind_a_stuck_encoder_the_joint_does_not_run_away(lockstep: LockstepJoint, noise: float) -> None:
     """The law pushed ever harder: 4.7 rad/s before the following error was seen."""
     plant = lockstep.plant_constants.copy()
     plant[0].encoder_noise_counts = noise
@@ -87,7 +80,7 @@ def test_behind_a_stuck_encoder_the_joint_does_not_run_away(
 @pytest.mark.parametrize("friction_kind", [2, 3])
 @pytest.mark.parametrize("scale", [0.85, 1.0, 1.15])
 def test_its_twin_a_joint_that_sticks_at_its_reversals_is_not_frozen(
-    lockstep: LockstepJoint, friction_kind: int, scale: float, one_fault: MakeFault
+    lockstep: LockstepJoint, friction_kind: int, scale: float
 ) -> None:
     plant = lockstep.plant_constants.copy()
     plant[0].friction_kind = friction_kind
@@ -98,7 +91,7 @@ def test_its_twin_a_joint_that_sticks_at_its_reversals_is_not_frozen(
     assert run.state.phase == AxisPhase.FINISHED
 
 
-def test_missing_samples_are_no_frozen_reading(lockstep: LockstepJoint, one_fault: MakeFault) -> None:
+def test_missing_samples_are_no_frozen_reading(lockstep: LockstepJoint) -> None:
     """Samples that stay away were reported as a reading that stands still."""
     run = lockstep.run_with_faults(one_fault(FaultKind.TPDO_LOST, AT_s))
     assert run.fault is Fault.STALE_SAMPLE
@@ -106,7 +99,7 @@ def test_missing_samples_are_no_frozen_reading(lockstep: LockstepJoint, one_faul
 
 
 @pytest.mark.parametrize("share", [0.3, 1.0])
-def test_samples_with_holes_prove_standstill_too(lockstep: LockstepJoint, one_fault: MakeFault, share: float) -> None:
+def test_samples_with_holes_prove_standstill_too(lockstep: LockstepJoint, share: float) -> None:
     """One hole within settle_s began the wait for standstill anew: STOP_TIMEOUT at the end of a good run."""
     run = lockstep.run_with_faults(one_fault(FaultKind.TPDO_REORDERED, 0.0, magnitude=share))
     assert run.fault is Fault.NONE
@@ -115,7 +108,7 @@ def test_samples_with_holes_prove_standstill_too(lockstep: LockstepJoint, one_fa
 
 @pytest.mark.parametrize(("share", "fault"), [(0.05, Fault.NONE), (0.26, Fault.SAMPLES_MISSING)])
 def test_nothing_is_enabled_on_a_bus_that_mixes_up_every_fourth_sample(
-    lockstep: LockstepJoint, one_fault: MakeFault, share: float, fault: Fault
+    lockstep: LockstepJoint, share: float, fault: Fault
 ) -> None:
     """An answer that comes after its cycle is none; the campaign took this for harmless at any time."""
     run = lockstep.run_with_faults(one_fault(FaultKind.TPDO_REORDERED, 0.0, magnitude=share), epoch_at_start=True)
@@ -123,7 +116,7 @@ def test_nothing_is_enabled_on_a_bus_that_mixes_up_every_fourth_sample(
     assert (PowerState.OPERATION_ENABLED in run.truth[:, TRUE_POWER_STATE]) == (fault is Fault.NONE)
 
 
-def test_a_watchdog_that_trips_is_told_by_its_error_code(lockstep: LockstepJoint, one_fault: MakeFault) -> None:
+def test_a_watchdog_that_trips_is_told_by_its_error_code(lockstep: LockstepJoint) -> None:
     """A stopped node sends no TPDO: the loop saw stale samples only, and did not tell the drive's 8130h."""
     run = lockstep.run_with_faults(one_fault(FaultKind.CONTROLLER_HEARTBEAT_LOST, AT_s))
     assert (run.fault, int(run.state.fault_drive_error)) == (Fault.STALE_SAMPLE, 0x8130)
@@ -144,7 +137,7 @@ def test_a_watchdog_that_trips_is_told_by_its_error_code(lockstep: LockstepJoint
     ],
 )
 def test_a_clock_that_leaps_before_enabling_is_told_as_that(
-    lockstep: LockstepJoint, one_fault: MakeFault, at_s: float, step_s: float, fault: Fault
+    lockstep: LockstepJoint, at_s: float, step_s: float, fault: Fault
 ) -> None:
     """The wait was over at once, and what had not come in the few cycles that there were was reported as the cause."""
     run = lockstep.run_with_faults(one_fault(FaultKind.CLOCK_STEP, at_s, 0.01, step_s), epoch_at_start=True)

@@ -2,28 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 
-from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
-from jointctl.hil.fault_kinds import FaultConstants, FaultKind
+from jointctl.hil.fault_kinds import FaultKind
 from jointctl.tools.lockstep import LockstepJoint
+from tests.made_faults import faults_of, one_fault
 
-MakeFault = Callable[..., Any]
 AT_s = 2.0
-
-
-def faults_of(*chosen: tuple[FaultKind, float, float, float]) -> Any:
-    """(kind, start [s], duration [s], magnitude) of each."""
-    faults = new(FaultConstants, len(chosen))
-    for record, (kind, at_s, duration_s, magnitude) in zip(faults, chosen, strict=True):
-        record.kind, record.start_s, record.duration_s, record.magnitude = kind, at_s, duration_s, magnitude
-        record.seed = 1
-    return faults
 
 
 @pytest.mark.parametrize("other", [FaultKind.TPDO_DUPLICATED, FaultKind.TPDO_REORDERED, FaultKind.TPDO_DELAYED])
@@ -67,7 +54,7 @@ def test_the_twins_with_a_sound_encoder_go_on(lockstep: LockstepJoint, kind: Fau
 
 @pytest.mark.parametrize(("delay_s", "stale"), [(0.045, False), (0.06, True)])
 def test_a_wire_that_becomes_late_shows_by_the_hole_before(
-    lockstep: LockstepJoint, one_fault: MakeFault, delay_s: float, stale: bool
+    lockstep: LockstepJoint, delay_s: float, stale: bool
 ) -> None:
     """The joint holds its position, so that nothing but the age can notice."""
     constants = lockstep.constants()
@@ -77,8 +64,6 @@ def test_a_wire_that_becomes_late_shows_by_the_hole_before(
 
 
 @pytest.mark.parametrize(("duration_s", "silent"), [(0.35, False), (1.0, True)])
-def test_a_drive_that_loses_only_its_heartbeat(
-    lockstep: LockstepJoint, one_fault: MakeFault, duration_s: float, silent: bool
-) -> None:
+def test_a_drive_that_loses_only_its_heartbeat(lockstep: LockstepJoint, duration_s: float, silent: bool) -> None:
     run = lockstep.run_with_faults(one_fault(FaultKind.DRIVE_HEARTBEAT_LOST, AT_s, duration_s))
     assert run.fault is (Fault.DRIVE_SILENT if silent else Fault.NONE)

@@ -12,12 +12,9 @@ import pytest
 
 from jointctl.drivers.canopen.cyclic import CanopenPort
 from jointctl.firmware_py.cycle import Word
-from jointctl.firmware_py.records import LogRecord
-from jointctl.firmware_py.schema import dtype_of
 from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.configuration.records import trajectory_table
-from jointctl.tools.recording.run_log import RunLogWriter
 from jointctl.tools.recording.run_log_reader import read_run_log
 from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.loop_handle import RING_RECORDS, LoopHandle, SharedBlock
@@ -64,14 +61,6 @@ def test_loop_killed_the_supervisor_saves_the_ring(moving: Any) -> None:
     # up to the very last cycles: the ring outlives the process that wrote it
     assert killed_ns - log.records.time_ns[-1] < 100_000_000
     assert log.records.phase[-1] == AxisPhase.TRACKING
-
-
-def test_its_twin_a_run_that_ends_by_itself_leaves_no_tail(bench: Any) -> None:
-    config = bench.config()
-    bench.joint(config)
-    assert bench.run("run", config, "-y").code == 0
-    assert list(bench.folder.glob("runs/*.tail.mcap")) == []
-    assert bench.log().records.phase[-1] == AxisPhase.FINISHED
 
 
 def test_a_reader_that_stalls_loses_records_which_are_counted_and_the_loop_goes_on(bench: Any) -> None:
@@ -133,20 +122,3 @@ def test_the_ring_at_its_boundary(written: int, lost: int) -> None:
     assert counted == lost
     assert records.cycle[0] == lost
     assert records.cycle[-1] == written - 1
-
-
-def test_a_log_folder_that_is_no_folder_is_refused_before_anything_moves(bench: Any) -> None:
-    (bench.folder / "runs").write_text("")
-    config = bench.config()
-    bench.joint(config)
-    bench.run("run", config, "-y").refused(8, "runs")
-    assert bench.disabled()
-
-
-def test_the_writer_keeps_what_it_wrote_before_it_was_killed(tmp_path: Any) -> None:
-    path = tmp_path / "run.mcap"
-    log = RunLogWriter(path, {})
-    log.write_records(np.zeros(2000, dtype_of(LogRecord)))
-    log.write_event(20, "test", "flushed")
-    assert len(read_run_log(path).records) == 2000  # without close
-    log.close()

@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from jointctl.hil.elmo.device import ElmoDevice
+from jointctl.tools.session.elmo_guard import GuardOrder
 from tests.configurations import written
 
+GUARD, LOOP = "jointctl.tools.session.elmo_guard", "jointctl.tools.session.loop_process"
 # a busy computer may stop this process, and with it the virtual drive, for tens of milliseconds
 # and 100 Hz leaves room for what it adds to the measured delay
 PATIENT: dict[str, Any] = {
@@ -51,6 +53,23 @@ def serial_config(folder: Path, name: str, values: dict[str, Any]) -> str:
     return written(folder / name, "elmo_serial", **values).name
 
 
+def stick_position(device: ElmoDevice) -> None:
+    """PX does not change any more; everything else is answered as before."""
+    execute, stuck = device.interpreter.execute, device.interpreter.execute(b"PX")
+    device.interpreter.execute = (  # type: ignore[method-assign]
+        lambda line: stuck if line == b"PX" else execute(line)
+    )
+
+
+def guard_order(port: str, control_fd: int, block_fd: int, alive_fd: int, **changes: Any) -> GuardOrder:
+    """Of a guard for a supervisor and a loop that are both this process; `block_fd` is of 8 words."""
+    return GuardOrder(
+        port=port, baud_rate_bitps=115_200, reply_timeout_s=0.2, silent_s=3.0, control_fd=control_fd,
+        block_fd=block_fd, supervisor_pidfd=alive_fd, loop_pidfd=alive_fd, supervisor_pid=os.getpid(), go_word=0,
+        stop_word=1, loop_word=2, ended_word=3, held_up_word=4, words=8, stop_value=3, **changes,
+    )  # fmt: skip
+
+
 @contextmanager
 def name_kept(port: str) -> Iterator[None]:
     """No other pseudo-terminal gets this name meanwhile, also when the port has vanished."""
@@ -66,7 +85,7 @@ def end_line_guards(port: str) -> None:
     for process in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError, ValueError):
             arguments = process.read_text().split("\0")
-            if "jointctl.tools.session.elmo_guard" in arguments:
+            if GUARD in arguments:
                 guarded = json.loads(next(text for text in arguments if text.startswith("{")))["port"]
                 if os.path.realpath(guarded) == os.path.realpath(port):  # it may be a link to it
                     os.kill(int(process.parent.name), signal.SIGKILL)

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import pty
+import struct
+import termios
 import time
 from typing import Any
 
@@ -12,15 +15,22 @@ from tests.hil.bench import Finished
 from tests.hil.serial_bench import end_line_guards
 
 
+def opened_terminal() -> tuple[int, int]:
+    """Its end, which never blocks, and that of a program; 100 columns."""
+    master, slave = pty.openpty()
+    end_line_guards(os.ttyname(slave))  # of a test that had a terminal of this name before
+    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 30, 100, 0, 0))
+    os.set_blocking(master, False)
+    return master, slave
+
+
 class Terminal:
     """`jointctl` with a terminal as its standard input and error."""
 
-    def __init__(self, bench: Any, *arguments: str) -> None:
-        self.master, slave = pty.openpty()
-        end_line_guards(os.ttyname(slave))  # of a test that had a terminal of this name before
-        self.started = bench.start(*arguments, stdin=slave, stderr=slave)
+    def __init__(self, bench: Any, *arguments: str, **options: Any) -> None:
+        self.master, slave = opened_terminal()
+        self.started = bench.start(*arguments, stdin=slave, stderr=slave, **options)
         os.close(slave)
-        os.set_blocking(self.master, False)
         self.text = ""
 
     def saw(self, text: str, timeout_s: float = 180.0) -> Terminal:

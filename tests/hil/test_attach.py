@@ -1,4 +1,4 @@
-"""Other tools on the same bus: a python-can client and a CANopen client beside a run, and a CiA 402 master after it."""
+"""Other tools on the same bus: a python-can client and a CANopen client beside a run (masters: tests/parties)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import time
 from typing import Any
 
 import can
-from canopen.profiles.p402 import BaseNode402
 
 from tests.places import EDS
 
@@ -34,31 +33,4 @@ def test_clients_see_the_run_and_read_objects_meanwhile(bench: Any) -> None:
     for identifier in (SYNC_ID, TPDO_ID, RPDO_ID):
         assert seen[identifier] > 100, seen
     assert seen[HEARTBEAT_ID] >= 2, seen
-    assert bench.disabled()
-
-
-def test_a_cia402_master_of_another_library_enables_and_moves_the_joint(bench: Any) -> None:
-    config = bench.config()
-    bench.joint_process(config)
-    network = bench.network()
-    node = BaseNode402(1, str(EDS))
-    network.add_node(node)
-    node.nmt.state = "PRE-OPERATIONAL"
-    node.setup_402_state_machine()
-    node.nmt.state = "OPERATIONAL"
-    network.sync.start(0.01)
-    try:
-        before = node.sdo[0x6064].raw
-        node.op_mode = "PROFILED VELOCITY"
-        node.sdo[0x60FF].raw = 20_000  # counts/s, 0.24 rad/s
-        node.state = "OPERATION ENABLED"
-        assert node.state == "OPERATION ENABLED"
-        time.sleep(0.5)
-        moved = node.sdo[0x6064].raw - before
-        node.sdo[0x60FF].raw = 0
-        node.state = "SWITCH ON DISABLED"
-    finally:
-        network.sync.stop()
-        network.disconnect()
-    assert 2_000 < moved < 20_000
     assert bench.disabled()

@@ -16,6 +16,7 @@ import pytest
 
 from jointctl.firmware_py.states import AxisPhase
 from jointctl.hil.elmo.device import ElmoDevice
+from tests.hil.serial_bench import stick_position
 
 
 @pytest.mark.stays("serial loop: its own end, however it comes about")
@@ -73,14 +74,6 @@ def test_a_second_controller_is_kept_out(serial_bench: Any) -> None:
     assert serial_bench.standing()
 
 
-def stick_position(device: ElmoDevice) -> None:
-    """PX does not change any more; everything else is answered as before."""
-    execute, stuck = device.interpreter.execute, device.interpreter.execute(b"PX")
-    device.interpreter.execute = (  # type: ignore[method-assign]
-        lambda line: stuck if line == b"PX" else execute(line)
-    )
-
-
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
@@ -123,25 +116,6 @@ def test_a_drive_that_comes_back_with_another_baud_rate(serial_bench: Any) -> No
     assert "did not confirm that it is off" in finished.err
     # it has not understood a word: its own limits have stopped it by now, or the guard that goes on trying does
     serial_bench.device.baud_rate_bitps = 115_200
-    serial_bench.until(serial_bench.standing)
-
-
-@pytest.mark.trips("serial supervisor: the loop process")
-def test_a_killed_loop_is_switched_off_by_its_supervisor(serial_bench: Any) -> None:
-    run = serial_bench.bench.start("run", serial_bench.config(), "-y").saw("  tracking")
-    loop = run.child("loop_process")
-    os.kill(loop, signal.SIGKILL)
-    finished = run.finished()
-    finished.refused(7, "killed by signal 9", "drive state now: off")
-    assert "heartbeat" not in finished.err.split("error: ")[1]
-    serial_bench.until(serial_bench.standing)
-
-
-@pytest.mark.trips("serial loop: its own end, however it comes about")
-def test_a_killed_supervisor_is_seen_by_the_loop(serial_bench: Any) -> None:
-    run = serial_bench.bench.start("run", serial_bench.config(), "-y").saw("  tracking")
-    run.signal(signal.SIGKILL)
-    run.process.wait()
     serial_bench.until(serial_bench.standing)
 
 

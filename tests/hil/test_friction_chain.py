@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from jointctl.drivers.errors import DataError
 from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import friction_constants
@@ -20,10 +18,10 @@ from jointctl.tools.identification.identification import Options, identify_frict
 from jointctl.tools.identification.identification_report import section_values
 from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.lockstep import LockstepJoint
-from jointctl.tools.output import Output
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.verbs.sweep import sweep
 from tests.configurations import changed
+from tests.sessions import output
 
 POINTS = 60
 SMALL = {"folds": 3, "swarm": SwarmSettings(particles=60, iterations=100)}
@@ -57,8 +55,7 @@ def with_knee(friction: Friction, knee_degps: float, break_Nm: float = 0.0) -> F
 
 def data_of(config: Config, folder: Path, **options: Any) -> Any:
     out = folder / "data.csv"
-    output = Output(stdout=StringIO(), stderr=StringIO())
-    assert sweep(config, output, out, SweepOptions(lockstep=True, **{"points": POINTS, **options})) == 0
+    assert sweep(config, output()[0], out, SweepOptions(lockstep=True, **{"points": POINTS, **options})) == 0
     return read_friction_data(out)
 
 
@@ -155,9 +152,3 @@ def test_tracking_with_the_identified_model_is_that_with_the_true_one(bench: Con
     # and the model matters at all
     assert config.friction is not None  # Table 3: a tenth to a sixth less
     assert tracking_rmse_rad(config, true, config.friction) > 1.3 * with_truth
-
-
-def test_a_wrong_knee_with_no_points_beyond_is_refused(bench: Config, tmp_path: Path) -> None:
-    data = data_of(bench, tmp_path, points=24, max_speed_radps=0.6)
-    with pytest.raises(DataError, match=r"knee \(=40 deg/s\) at positive velocity: 12 points up to it and 0 beyond"):
-        model_of(data)

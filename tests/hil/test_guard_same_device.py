@@ -15,7 +15,8 @@ import pytest
 from serial.tools import list_ports
 
 from jointctl.drivers.elmo.serial_port import usb_serial_number
-from jointctl.tools.session.elmo_guard import GuardOrder, LineGuard
+from jointctl.tools.session.elmo_guard import LineGuard
+from tests.hil.serial_bench import guard_order
 
 
 @dataclass
@@ -57,12 +58,8 @@ def test_only_another_adapter_is_left_alone(
     ours, theirs = socket.socketpair()
     with ours, tempfile.TemporaryFile() as block:
         block.truncate(8 * 8)
-        guard = LineGuard(GuardOrder(
-            port=device.path, baud_rate_bitps=115_200, reply_timeout_s=0.2, silent_s=3.0,
-            control_fd=theirs.detach(), block_fd=block.fileno(), supervisor_pidfd=alive, loop_pidfd=alive,
-            supervisor_pid=os.getpid(), go_word=0, stop_word=1, loop_word=2, ended_word=3, held_up_word=4, words=8,
-            stop_value=3, usb_serial_number=known,
-        ))  # fmt: skip
+        order = guard_order(device.path, theirs.detach(), block.fileno(), alive, usb_serial_number=known)
+        guard = LineGuard(order)
         guard._close_tty()
         guard._tty = os.open(os.devnull, os.O_RDWR)  # what it says on the old one reaches nobody
         ours.sendall(json.dumps({"state": "unknown: gone"}).encode() + b"\n")

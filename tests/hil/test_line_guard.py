@@ -14,42 +14,19 @@ import subprocess
 import sys
 import tempfile
 import time
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from jointctl.tools.session.elmo_guard import GuardOrder, guard_address, running_supervisor
-
-GUARD, LOOP = "jointctl.tools.session.elmo_guard", "jointctl.tools.session.loop_process"
-
-
-def gone(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except FileNotFoundError:
-        return True
+from jointctl.tools.session.elmo_guard import guard_address, running_supervisor
+from tests.hil.moving_run import gone
+from tests.hil.serial_bench import GUARD, LOOP, guard_order
 
 
 def tracking(serial_bench: Any, **changes: Any) -> Any:
     run = serial_bench.bench.start("run", serial_bench.config(**changes), "-y").saw("  tracking")
     assert serial_bench.device.interpreter.m.motor_on
     return run
-
-
-@pytest.mark.trips("serial guard: loop and supervisor")
-def test_loop_and_supervisor_killed_the_guard_switches_off(serial_bench: Any) -> None:
-    run = tracking(serial_bench)
-    guard = run.child(GUARD)
-    loop = run.child(LOOP)
-    os.kill(loop, signal.SIGSTOP)  # it shall not see the supervisor's end
-    run.signal(signal.SIGKILL)
-    os.kill(loop, signal.SIGKILL)
-    run.process.wait()
-    serial_bench.until(serial_bench.standing)
-    serial_bench.until(lambda: gone(guard))
-    assert serial_bench.device.interpreter.m.torque_A == 0.0
-    assert "line guard: the drive on" in run.err
 
 
 def test_its_twin_without_a_guard_keeps_its_torque(serial_bench: Any) -> None:
@@ -65,19 +42,6 @@ def test_its_twin_without_a_guard_keeps_its_torque(serial_bench: Any) -> None:
     assert serial_bench.device.interpreter.m.motor_on  # what the guard is there for
     assert serial_bench.bench.run("stop", "serial.toml").code == 0
     serial_bench.until(serial_bench.standing)
-
-
-def test_loop_and_supervisor_that_hang_are_seen(serial_bench: Any) -> None:
-    run = tracking(serial_bench)
-    loop = run.child(LOOP)
-    run.signal(signal.SIGSTOP)
-    os.kill(loop, signal.SIGSTOP)
-    serial_bench.until(serial_bench.standing)
-    run.signal(signal.SIGCONT)
-    os.kill(loop, signal.SIGCONT)
-    done = run.finished()
-    assert done.code == 7, done
-    assert serial_bench.standing()
 
 
 @pytest.mark.stays("serial guard: loop and supervisor")
@@ -201,12 +165,7 @@ def test_a_dry_run_that_is_over_before_its_guard_is_up_says_nothing_of_it(serial
     alive = os.pidfd_open(os.getpid())
     with theirs, tempfile.TemporaryFile() as block:
         block.truncate(8 * 8)
-        order = GuardOrder(
-            port=serial_bench.device.path, baud_rate_bitps=115_200, reply_timeout_s=0.2, silent_s=3.0,
-            control_fd=theirs.fileno(), block_fd=block.fileno(), supervisor_pidfd=alive, loop_pidfd=alive,
-            supervisor_pid=os.getpid(), go_word=0, stop_word=1, loop_word=2, ended_word=3, held_up_word=4, words=8,
-            stop_value=3,
-        )  # fmt: skip
+        order = guard_order(serial_bench.device.path, theirs.fileno(), block.fileno(), alive)
         guard = subprocess.run(
             [sys.executable, "-P", "-m", GUARD, order.argument()],
             pass_fds=(theirs.fileno(), block.fileno(), alive), capture_output=True, timeout=60.0,

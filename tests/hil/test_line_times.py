@@ -16,7 +16,9 @@ from typing import Any
 
 import pytest
 
-LOOP = "jointctl.tools.session.loop_process"
+from tests.hil.moving_run import gone
+from tests.hil.serial_bench import GUARD, LOOP
+
 POLL_S = 0.001
 
 
@@ -36,22 +38,25 @@ def pushing(serial_bench: Any, **changes: Any) -> Any:
     return run
 
 
-# what becomes of loop and supervisor, and the time until the motor is off: as docs/safety.md has them
-CASES = {
-    "loop killed": ((signal.SIGKILL, None), 1.0),
-    "both killed": ((signal.SIGKILL, signal.SIGKILL), 1.0),
-    "supervisor killed": ((None, signal.SIGKILL), 4.5),
-    "loop stopped": ((signal.SIGSTOP, None), 4.0),
-    "supervisor stopped": ((None, signal.SIGSTOP), 4.5),
-    "both stopped": ((signal.SIGSTOP, signal.SIGSTOP), 5.0),
-}
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_torque_ends_in_time_whoever_is_killed_or_stopped(serial_bench: Any, case: str) -> None:
-    (loop_signal, supervisor_signal), at_most_s = CASES[case]
+@pytest.mark.trips("serial loop: its own end, however it comes about", "supervisor killed")
+@pytest.mark.trips("serial supervisor: the loop process", "loop killed")
+@pytest.mark.trips("serial guard: loop and supervisor", "both killed")
+@pytest.mark.parametrize(
+    ("loop_signal", "supervisor_signal", "at_most_s", "words"),  # the time until the motor is off: docs/safety.md
+    [
+        pytest.param(signal.SIGKILL, None, 1.0, ("killed by signal 9", "drive state now: off"), id="loop killed"),
+        pytest.param(signal.SIGKILL, signal.SIGKILL, 1.0, (), id="both killed"),
+        pytest.param(None, signal.SIGKILL, 4.5, (), id="supervisor killed"),
+        pytest.param(signal.SIGSTOP, None, 4.0, (), id="loop stopped"),
+        pytest.param(None, signal.SIGSTOP, 4.5, (), id="supervisor stopped"),
+        pytest.param(signal.SIGSTOP, signal.SIGSTOP, 5.0, (), id="both stopped"),
+    ],
+)
+def test_torque_ends_in_time_whoever_is_killed_or_stopped(
+    serial_bench: Any, loop_signal: int | None, supervisor_signal: int | None, at_most_s: float, words: tuple[str, ...]
+) -> None:
     run = pushing(serial_bench)
-    loop = run.child(LOOP)
+    loop, guard = run.child(LOOP), run.child(GUARD)
     motor = serial_bench.device.interpreter.m
     if supervisor_signal is not None and loop_signal is not None:
         os.kill(loop, signal.SIGSTOP)  # it shall not see the supervisor's end
@@ -60,13 +65,22 @@ def test_torque_ends_in_time_whoever_is_killed_or_stopped(serial_bench: Any, cas
             os.kill(pid, number)
     assert motor.motor_on
     taken_s = waited_s(lambda: not motor.motor_on)
-    print(f"{case}: {taken_s:.3f} s")
+    print(f"{taken_s:.3f} s")
     assert taken_s < at_most_s
     assert motor.torque_A == 0.0
     serial_bench.until(serial_bench.standing)
     for pid in (run.process.pid, loop):
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGCONT)
+    if supervisor_signal != signal.SIGKILL:
+        done = run.finished()
+        done.refused(7, *words)
+        assert "heartbeat" not in done.err.split("error: ")[1]
+    elif loop_signal == signal.SIGKILL:
+        run.process.wait()
+        assert gone(guard)
+        assert "line guard: the drive on" in run.err
+    assert serial_bench.standing()
 
 
 def test_a_port_that_vanishes_is_told_at_once_and_a_port_that_comes_back_is_used_at_once(serial_bench: Any) -> None:

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import fcntl
 import io
 import os
-import pty
-import re
-import struct
 import termios
 import time
 from typing import Any
@@ -24,6 +20,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log_reader import missing_records
 from jointctl.tools.session.display import PhaseLines, Snapshot
 from jointctl.tools.session.live_panel import LivePanel, panel, run_display, time_left
+from tests.hil.terminal import Terminal, opened_terminal
 
 ESCAPE = "\x1b["
 TERMINAL = {**os.environ, "TERM": "xterm-256color"}
@@ -95,13 +92,6 @@ def test_time_left(trajectory_s: float, duration_s: float, phase: int, text: str
     assert time_left(trajectory_s, duration_s, phase) == text
 
 
-def opened_terminal() -> tuple[int, int]:
-    master, slave = pty.openpty()
-    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 30, 100, 0, 0))
-    os.set_blocking(master, False)
-    return master, slave
-
-
 def read_all(fd: int) -> str:
     text = b""
     try:
@@ -166,19 +156,8 @@ def test_lines_where_there_is_no_terminal() -> None:
 def test_run_on_a_terminal_shows_the_panel_and_its_log_has_every_cycle_and_frame(bench: Any) -> None:
     config = bench.config(trajectory__duration_s=5.0, log__frames=True)
     bench.joint(config)
-    master, slave = opened_terminal()
-    try:
-        started = bench.start("run", config, "-y", stderr=slave, env=TERMINAL)
-        os.close(slave)
-        text, give_up = "", time.monotonic() + 180.0
-        while started.process.poll() is None:
-            assert time.monotonic() < give_up, text
-            text += read_all(master)
-            time.sleep(0.02)
-        text += read_all(master)
-    finally:
-        os.close(master)
-    done = started.finished()
+    terminal = Terminal(bench, "run", config, "-y", env=TERMINAL)
+    done, text = terminal.finished(180.0), terminal.text
     assert done.code == 0, text
     for words in (ESCAPE, "operation enabled", "time left", "wake-up p99", " tracking", "phase margin"):
         assert words in text
@@ -200,18 +179,6 @@ def test_run_on_a_terminal_shows_the_panel_and_its_log_has_every_cycle_and_frame
     assert any("phase margin" in text for text in told)
     assert log.metadata["versions"]["numpy"] == np.__version__
     assert len(log.metadata["friction"]["sha256"]) == 64
-
-
-def test_run_into_a_file_shows_lines_only(bench: Any) -> None:
-    config = bench.config(trajectory__duration_s=0.5)
-    bench.joint(config)
-    done = bench.run("run", config, "-y", env=TERMINAL)
-    assert done.code == 0, done.err
-    assert ESCAPE not in done.err
-    assert re.search(r"^  tracking$", done.err, re.MULTILINE)
-    log = bench.log()
-    assert len(log.frames) == 0
-    assert missing_records(log.records) == 0
 
 
 def test_a_run_on_a_stopped_terminal_goes_on_to_its_end(bench: Any) -> None:

@@ -9,16 +9,14 @@ import contextlib
 import fcntl
 import json
 import os
-import select
 import signal
 import struct
-import subprocess
-import sys
 import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import can
 import pytest
@@ -39,19 +37,14 @@ from tests.configurations import SLOW_LOOP, written
 from tests.sessions import constants_of
 
 RATE_HZ = SLOW_LOOP["loop__rate_Hz"]
-JOINTCTL = (sys.executable, "-P", "-m", "jointctl.tools.verbs")
 PERIOD_NS = round(1e9 / RATE_HZ)
-
-
-def written_config(folder: Path, interface: str, channel: str) -> Path:
-    """The shipped virtual joint with a loop at 100 Hz."""
-    bus = {"bus__interface": interface, "bus__channel": channel, "log__folder": str(folder / "runs")}
-    return written(folder / "joint.toml", **{**SLOW_LOOP, **bus, "trajectory__duration_s": 1.0})
 
 
 @pytest.fixture
 def config(tmp_path: Path) -> Config:
-    return load_config(written_config(tmp_path, "virtual", f"portable-{os.getpid()}-{time.monotonic_ns()}"))
+    """The shipped virtual joint with a loop at 100 Hz."""
+    bus = {"bus__interface": "virtual", "bus__channel": f"portable-{os.getpid()}-{time.monotonic_ns()}"}
+    return load_config(written(tmp_path / "joint.toml", **{**SLOW_LOOP, **bus, "trajectory__duration_s": 1.0}))
 
 
 def open_bus(config: Config) -> can.BusABC:
@@ -162,95 +155,44 @@ def test_a_run_in_threads_on_the_bus_of_one_process(config: Config) -> None:
 
 # --- two processes on udp_multicast ---
 @pytest.fixture
-def multicast_config(tmp_path: Path) -> Iterator[Path]:
+def multicast(bench: Any) -> Iterator[str]:
     """One session of tests at a time: every multicast group of one port shares the frames."""
     with open(Path(tempfile.gettempdir()) / f"jointctl-multicast-{os.getuid()}.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        yield written_config(tmp_path, "udp_multicast", "ff11::7079:7468")
+        bus = {"bus__interface": "udp_multicast", "bus__channel": "ff11::7079:7468"}
+        yield bench.config(**{**SLOW_LOOP, **bus, "trajectory__duration_s": 1.0})
+        bench.end()
 
 
-def environment() -> dict[str, str]:
-    environ = {key: value for key, value in os.environ.items() if not key.startswith("CAN_")}
-    return environ
-
-
-@contextlib.contextmanager
-def joint_process(path: Path) -> Iterator[subprocess.Popen[bytes]]:
-    read_end, write_end = os.pipe()
-    command = [
-        sys.executable, "-P", "-m", "jointctl.tools.verbs", "hil", str(path), "--ready-fd", str(write_end), "--quiet",
-    ]  # fmt: skip
-    process = subprocess.Popen(command, pass_fds=(write_end,), env=environment())
-    os.close(write_end)
-    try:
-        assert select.select([read_end], [], [], 180.0)[0]
-        assert os.read(read_end, 1) == b"+"
-        yield process
-    finally:
-        os.close(read_end)
-        process.send_signal(signal.SIGTERM)
-        process.wait(10.0)
-
-
-def start_run(path: Path) -> subprocess.Popen[str]:
-    command = [*JOINTCTL, "run", str(path), "-y", "--json"]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment())
-
-
-def test_the_whole_run_over_udp_multicast(multicast_config: Path) -> None:
-    with joint_process(multicast_config) as joint:
-        process = start_run(multicast_config)
-        stdout, stderr = process.communicate(timeout=180.0)
-        assert process.returncode == 0, stderr
-        assert joint.poll() is None
-    assert "plain Python loop over udp_multicast" in stderr
-    result = json.loads(stdout)
+def test_the_whole_run_over_udp_multicast(bench: Any, multicast: str) -> None:
+    joint = bench.joint_process(multicast)
+    done = bench.run("run", multicast, "-y", "--json")
+    assert done.code == 0, done.err
+    assert "plain Python loop over udp_multicast" in done.err
+    result = json.loads(done.out)
     assert result["fault"] is None
     assert result["drive_state"] == "switch on disabled"
     assert 1.0 - (2 + result["skipped_cycles"]) / RATE_HZ <= result["tracked_s"] <= 1.0 + 2.0 / RATE_HZ
     assert result["error"]["range_rad"]["greatest"] < 0.3
     assert 0.0 < result["bus_load"] < 0.05  # 285 bits at 100 Hz on 1 Mbit/s; own echoes would double it
-    assert joint.returncode == 0
+    joint.signal(signal.SIGTERM)
+    assert joint.finished(10.0).code == 0
 
 
-def loop_pid(parent: int) -> int | None:
-    """The child that runs the loop."""
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):
-            text = path.read_text()
-            if int(text.rpartition(")")[2].split()[1]) == parent:
-                if b"jointctl.tools.session.loop_process" in (path.parent / "cmdline").read_bytes():
-                    return int(path.parent.name)
-    return None
+def test_a_killed_loop_ends_disabled_by_the_drives_own_watchdog(bench: Any, multicast: str) -> None:
+    bench.joint_process(multicast)
+    run = bench.start("run", multicast, "-y").saw("\n  approach\n")
+    os.kill(run.child("loop_process"), signal.SIGKILL)
+    done = run.finished(60.0)
+    done.refused(7, "killed by signal 9")
+    assert "switch on disabled" in done.err or "fault" in done.err
 
 
-def test_a_killed_loop_ends_disabled_by_the_drives_own_watchdog(multicast_config: Path) -> None:
-    with joint_process(multicast_config):
-        process = start_run(multicast_config)
-        assert process.stderr is not None
-        seen = []
-        for line in process.stderr:
-            seen.append(line)
-            if "approach" in line and "to" not in line:
-                break
-        pid = loop_pid(process.pid)
-        assert pid is not None, seen
-        os.kill(pid, signal.SIGKILL)
-        _, rest = process.communicate(timeout=60.0)
-    assert process.returncode == 7, rest
-    assert "killed by signal 9" in rest
-    assert "switch on disabled" in rest or "fault" in rest
-
-
-def test_an_interrupt_ramps_down(multicast_config: Path) -> None:
-    with joint_process(multicast_config):
-        process = start_run(multicast_config)
-        assert process.stderr is not None
-        for line in process.stderr:
-            if line.strip() == "tracking":
-                break
-        process.send_signal(signal.SIGINT)
-        stdout, stderr = process.communicate(timeout=60.0)
-    assert process.returncode == 130, stderr
-    assert json.loads(stdout)["drive_state"] == "switch on disabled"
-    assert "ramping" in stderr
+def test_an_interrupt_ramps_down(bench: Any, multicast: str) -> None:
+    bench.joint_process(multicast)
+    run = bench.start("run", multicast, "-y", "--json").saw("\n  tracking\n")
+    run.signal(signal.SIGINT)
+    done = run.finished(60.0)
+    assert done.code == 130, done.err
+    assert json.loads(done.out)["drive_state"] == "switch on disabled"
+    assert "ramping" in done.err

@@ -35,11 +35,13 @@ def test_two_runs_on_one_joint_and_it_is_disabled_after_each(bench: Any) -> None
     config = bench.config()
     bench.joint(config)
     for number in (1, 2):
-        done = bench.run("run", config, "-y", "--json")
+        done = bench.run("run", config, "-y", "--json", env={**os.environ, "TERM": "xterm-256color"})
         assert done.code == 0, done.err
+        assert "\x1b" not in done.err  # a file gets lines only
+        assert "\n  tracking\n" in done.err
         assert json.loads(done.out)["fault"] is None
         assert bench.disabled()
-        assert len(list(bench.folder.glob("runs/*.mcap"))) == number
+        assert len(list(bench.folder.glob("runs/*.mcap"))) == number  # and no *.tail.mcap of what a crash left
         assert "now at" in done.err
         assert "trajectory sine" in done.err
         assert "limits" in done.err

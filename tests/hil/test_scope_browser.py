@@ -7,7 +7,6 @@ import importlib.util
 import os
 import re
 import signal
-import socket
 import time
 import urllib.error
 import urllib.request
@@ -18,7 +17,7 @@ from typing import Any
 import pytest
 
 from jointctl.firmware_py.states import AxisPhase, Fault
-from tests.browser import PROGRAM, Browser, Tab
+from tests.browser import PROGRAM, Browser, Tab, free_port
 
 MISSING = [name for name in ("nicegui", "websockets") if importlib.util.find_spec(name) is None]
 pytestmark = [
@@ -33,12 +32,6 @@ ZOOM = "getElement(document.querySelector('[data-testid=\"chart\"]').id.slice(1)
 def browser(tmp_path: Path) -> Iterator[Browser]:
     with Browser(tmp_path) as browser:
         yield browser
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def state_is(tab: Tab, words: str, timeout_s: float = 90.0) -> None:
@@ -238,39 +231,3 @@ def test_a_stalled_or_closed_browser_costs_the_run_nothing(bench: Any, browser: 
     assert int(records.fault.max()) == Fault.NONE
     assert records.trajectory_s[records.phase == AxisPhase.TRACKING][-1] > 16.0
     assert stalled_supervisor_kB - before_supervisor_kB < 40_000, (before_supervisor_kB, stalled_supervisor_kB)
-
-
-def test_beyond_this_computer_only_with_the_token(bench: Any) -> None:
-    config = bench.config(trajectory__duration_s=0.0)
-    bench.joint(config)
-    port = free_port()
-    scope = bench.start("scope", config, "--host", "0.0.0.0", "--port", str(port), env=environment()).saw("?token=")
-    found = re.search(r"token=(\S+)", scope.err)
-    assert found is not None
-    give_up = time.monotonic() + 60.0
-    for address, code in ((f"http://127.0.0.1:{port}/", 403), (f"http://127.0.0.1:{port}/?token={found[1]}", 200)):
-        while True:
-            try:
-                with urllib.request.urlopen(address, timeout=5) as answer:
-                    status = answer.status
-            except urllib.error.HTTPError as error:
-                status = error.code
-            except OSError:
-                assert time.monotonic() < give_up, scope.err
-                time.sleep(0.2)
-                continue
-            break
-        assert status == code
-    from websockets.exceptions import InvalidStatus
-    from websockets.sync.client import connect
-
-    way = f"ws://127.0.0.1:{port}/_nicegui_ws/socket.io/?EIO=4&transport=websocket"
-    with pytest.raises(InvalidStatus, match="403"):
-        connect(way, open_timeout=20)
-    with connect(way + f"&token={found[1]}", open_timeout=20) as socket_way:
-        assert socket_way.recv(timeout=20)
-    refused = urllib.request.Request(f"http://127.0.0.1:{port}/stop", method="POST")
-    with pytest.raises(urllib.error.HTTPError, match="403"):
-        urllib.request.urlopen(refused, timeout=20)
-    scope.signal(signal.SIGINT)
-    assert scope.finished(30.0).code == 0

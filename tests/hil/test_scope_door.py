@@ -14,7 +14,8 @@ from typing import Any
 
 import pytest
 
-from tests.hil.test_scope_browser import environment, free_port, printed_address
+from tests.browser import free_port
+from tests.hil.test_scope_browser import environment, printed_address
 
 MISSING = [name for name in ("nicegui", "websockets") if importlib.util.find_spec(name) is None]
 pytestmark = pytest.mark.skipif(bool(MISSING), reason=f"not installed: {', '.join(MISSING)} (extra `scope`)")
@@ -46,8 +47,8 @@ def processes_that_show(word: str) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("live", [True, False])
-def test_without_the_token_nothing_is_shown_or_taken(bench: Any, live: bool) -> None:
+@pytest.mark.parametrize(("live", "host"), [(True, "127.0.0.1"), (True, "0.0.0.0"), (False, "127.0.0.1")])
+def test_without_the_token_nothing_is_shown_or_taken(bench: Any, live: bool, host: str) -> None:
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
 
@@ -57,10 +58,11 @@ def test_without_the_token_nothing_is_shown_or_taken(bench: Any, live: bool) -> 
         assert bench.run("run", config, "-y").code == 0
     port = free_port()
     shown = config if live else str(next(bench.folder.glob("runs/*.mcap")))
-    scope = bench.start("scope", shown, "--port", str(port), "--quiet", env=environment()).saw("token=")
-    url = printed_address(scope)
-    place, token = url.split("?token=")
-    assert place == f"http://127.0.0.1:{port}/"
+    scope = bench.start("scope", shown, "--host", host, "--port", str(port), "--quiet", env=environment()).saw("token=")
+    place, token = printed_address(scope).split("?token=")
+    assert place == f"http://{host}:{port}/"
+    place = f"http://127.0.0.1:{port}/"
+    url = f"{place}?token={token}"
 
     code, body, headers = status(place)
     assert (code, "token included" in body, headers["set-cookie"]) == (403, True, None)

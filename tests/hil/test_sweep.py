@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -12,21 +11,14 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.errors import DeviceError, MotionFault
-from jointctl.firmware_py.friction import friction_curve_Nm
 from jointctl.tools.configuration.canopen import eds_path
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.conversions import friction_constants
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.configuration.sections import Friction
-from jointctl.tools.identification.friction_data import read_friction_data
-from jointctl.tools.identification.identification import Options, identify_friction
-from jointctl.tools.identification.identification_report import section_values
-from jointctl.tools.identification.swarm import SwarmSettings
-from jointctl.tools.output import Output
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.verbs.sweep import sweep
 from tests.configurations import changed
 from tests.hil.sweep_rows import rows, truth_Nm
+from tests.sessions import output
 
 QUANTISATION_Nm = 0.0005  # one per mille of the rated motor torque
 
@@ -38,8 +30,7 @@ def config() -> Config:
 
 def swept(config: Config, out: Path, **options: Any) -> Any:
     """The rows of a sweep in lockstep."""
-    output = Output(stdout=StringIO(), stderr=StringIO())
-    assert sweep(config, output, out, SweepOptions(lockstep=True, **options)) == 0
+    assert sweep(config, output()[0], out, SweepOptions(lockstep=True, **options)) == 0
     return rows(out)
 
 
@@ -51,6 +42,9 @@ def test_the_swept_curve_is_the_sliding_curve_of_the_joint(
     assert len(found) == 24
     assert np.all(found["settled"] == 1)
     assert np.sum(found["velocity_radps"] > 0.0) == 12
+    assert np.all(found["position_min_rad"] > config.limits.position_min_rad)
+    assert np.all(found["position_max_rad"] < config.limits.position_max_rad)
+    assert np.max(np.abs(found["velocity_radps"])) < config.limits.velocity_max_radps
     error_Nm = found["motor_torque_Nm"] - truth_Nm(config, found["velocity_radps"])
     assert np.max(np.abs(error_Nm)) < tolerance_Nm + QUANTISATION_Nm
     sidecar = json.loads((tmp_path / "data.json").read_text())
@@ -61,34 +55,6 @@ def test_the_swept_curve_is_the_sliding_curve_of_the_joint(
     # the drive's own limit, written and read back: 3.88 rad/s in counts/s
     limit = sidecar["drive"].get("max velocity")
     assert limit == (None if mode == "torque" else "323759 counts/s = 3.88 rad/s")
-
-
-def test_the_joint_never_leaves_its_travel_and_its_speed(config: Config, tmp_path: Path) -> None:
-    found = swept(config, tmp_path / "data.csv", points=6)
-    assert np.all(found["position_min_rad"] > config.limits.position_min_rad)
-    assert np.all(found["position_max_rad"] < config.limits.position_max_rad)
-    assert np.max(np.abs(found["velocity_radps"])) < config.limits.velocity_max_radps
-
-
-def test_an_identified_sweep_is_within_two_percent_of_the_truth(config: Config, tmp_path: Path) -> None:
-    out = tmp_path / "data.csv"
-    found = swept(config, out)
-    assert len(found) == 225
-    small = Options(swarm=SwarmSettings(particles=100, iterations=200))
-    branches = identify_friction(read_friction_data(out), small).branches
-    identified = Friction.model_validate(section_values(branches["positive"], branches["negative"]))
-    speeds = np.linspace(found["velocity_radps"].min() * -1.0, found["velocity_radps"].max(), 500)
-    both = np.concatenate([speeds, -speeds])
-    true_Nm = truth_Nm(config, both)
-    error_Nm = friction_curve_Nm(friction_constants(identified, 121.0), both) - true_Nm
-    assert np.max(np.abs(error_Nm)) < 0.02 * np.max(np.abs(true_Nm))
-
-
-def test_a_wrong_torque_constant_of_the_truth_shows_in_the_data(config: Config, tmp_path: Path) -> None:
-    weak = changed(config, virtual__friction_positive_scale=0.5, virtual__friction_negative_scale=0.5)
-    full = swept(config, tmp_path / "full.csv", points=6)
-    half = swept(weak, tmp_path / "half.csv", points=6)
-    assert half["motor_torque_Nm"] / full["motor_torque_Nm"] == pytest.approx(np.full(6, 0.5), rel=0.02)
 
 
 def test_points_that_do_not_settle_are_visited_again_and_marked(config: Config, tmp_path: Path) -> None:
@@ -158,12 +124,12 @@ def test_a_fault_keeps_what_was_measured_and_resume_completes_it(config: Config,
     assert np.all(np.diff(found["time_s"]) > 0.0)
     error_Nm = found["motor_torque_Nm"] - truth_Nm(config, found["velocity_radps"])
     assert np.max(np.abs(error_Nm)) < 0.002
-    output = Output(stdout=StringIO(), stderr=StringIO())
+    told, _, err = output()
     page = tmp_path / "sweep.html"
-    assert sweep(config, output, out, SweepOptions(lockstep=True, points=12, resume=True, report=page)) == 0
+    assert sweep(config, told, out, SweepOptions(lockstep=True, points=12, resume=True, report=page)) == 0
     assert "<svg" in page.read_text()
     assert "12 of 12" in page.read_text()
-    assert "nothing is left" in output.stderr.getvalue()  # type: ignore[attr-defined]
+    assert "nothing is left" in err.getvalue()
 
 
 def test_the_same_sweep_twice_gives_the_same_rows(config: Config, tmp_path: Path) -> None:
@@ -173,10 +139,10 @@ def test_the_same_sweep_twice_gives_the_same_rows(config: Config, tmp_path: Path
 
 
 def test_a_dry_run_in_lockstep_writes_nothing(config: Config, tmp_path: Path) -> None:
-    output = Output(stdout=StringIO(), stderr=StringIO())
+    told, _, err = output()
     options = SweepOptions(lockstep=True, points=4, dry_run=True)
-    assert sweep(config, output, tmp_path / "data.csv", options) == 0
-    text = output.stderr.getvalue()  # type: ignore[attr-defined]
+    assert sweep(config, told, tmp_path / "data.csv", options) == 0
+    text = err.getvalue()
     for word in ("approach", "sweep      4 points", "motion", "limits", "dry run"):
         assert word in text
     assert list(tmp_path.iterdir()) == []
@@ -200,15 +166,15 @@ def test_resume_revisits_what_did_not_settle_and_only_once(config: Config, tmp_p
     sidecar = json.loads(out.with_suffix(".json").read_text())
     sidecar["unsettled"] = {"2": "stopped before its second visit"}
     out.with_suffix(".json").write_text(json.dumps(sidecar))
-    output = Output(stdout=StringIO(), stderr=StringIO())
-    assert sweep(config, output, out, SweepOptions(lockstep=True, points=4, resume=True)) == 0
-    assert "1 point did not settle: once more" in output.stderr.getvalue()  # type: ignore[attr-defined]
+    told, _, err = output()
+    assert sweep(config, told, out, SweepOptions(lockstep=True, points=4, resume=True)) == 0
+    assert "1 point did not settle: once more" in err.getvalue()
     sidecar = json.loads(out.with_suffix(".json").read_text())
     assert sidecar["measured"] == [0, 1, 2, 3, 2]
     assert sidecar["unsettled"] == {}
     sidecar["unsettled"] = {"2": "not even the second time"}
     out.with_suffix(".json").write_text(json.dumps(sidecar))
-    output = Output(stdout=StringIO(), stderr=StringIO())
-    assert sweep(config, output, out, SweepOptions(lockstep=True, points=4, resume=True)) == 0
-    assert "nothing is left" in output.stderr.getvalue()  # type: ignore[attr-defined]
+    told, _, err = output()
+    assert sweep(config, told, out, SweepOptions(lockstep=True, points=4, resume=True)) == 0
+    assert "nothing is left" in err.getvalue()
     assert len(rows(out)) == 5

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import signal
-import subprocess
-import sys
 import time
 from typing import Any
 
@@ -15,29 +13,10 @@ from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.recording.run_log_reader import read_run_log
 from tests.hil.sweep_rows import rows, truth_Nm
 
-SHORT = ("--max-speed", "1.0", "--min-speed", "0.5", "--points", "6", "--dwell", "0.3", "--warm-up", "0")
-
-
-class SweepProcess:
-    """`jointctl sweep` in the folder of the bench."""
-
-    def __init__(self, bench: Any, *arguments: str) -> None:
-        self._err = bench.folder / f"sweep-{len(list(bench.folder.glob('sweep-*')))}.stderr"
-        with self._err.open("wb") as err:
-            self.process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "jointctl.tools.verbs", "sweep", *arguments], cwd=bench.folder,
-                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=err, start_new_session=True,
-            )  # fmt: skip
-
-    @property
-    def err(self) -> str:
-        return self._err.read_text()
-
-    def finished(self) -> tuple[int, str]:
-        try:
-            return self.process.wait(120.0), self.err
-        finally:
-            self.process.kill()
+SWEEP = (
+    "sweep", "joint.toml", "-o", "data.csv", "--max-speed", "1.0", "--min-speed", "0.5", "--points", "6",
+    "--dwell", "0.3", "--warm-up", "0",
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -51,18 +30,18 @@ def joint(bench: Any) -> Any:
 
 def test_ctrl_c_keeps_the_rows_and_resume_measures_the_rest(joint: Any) -> None:
     out = joint.folder / "data.csv"
-    started = SweepProcess(joint, "joint.toml", "-o", "data.csv", "-y", *SHORT)
+    started = joint.start(*SWEEP, "-y")
     give_up_s = time.monotonic() + 120.0
     while not (out.exists() and len(out.read_text().splitlines()) >= 3):
         assert started.process.poll() is None, started.err
         assert time.monotonic() < give_up_s, started.err
         time.sleep(0.05)
-    started.process.send_signal(signal.SIGINT)
-    code, err = started.finished()
-    assert code == 130, err
-    assert "Traceback" not in err
-    assert "ramping" in err
-    assert "--resume goes on" in err
+    started.signal(signal.SIGINT)
+    done = started.finished()
+    assert done.code == 130, done.err
+    assert "Traceback" not in done.err
+    assert "ramping" in done.err
+    assert "--resume goes on" in done.err
     assert joint.disabled()
     kept = out.read_text()
     assert 3 <= len(kept.splitlines()) < 7
@@ -71,8 +50,8 @@ def test_ctrl_c_keeps_the_rows_and_resume_measures_the_rest(joint: Any) -> None:
     time_s = read_run_log(log).records.time_ns * 1e-9
     assert np.sum(time_s > time_s[-1] - 2.0) > 1000  # the last seconds are whole, the ones before are not
     assert len(time_s) < 0.5 * 1000 * (time_s[-1] - time_s[0])
-    code, err = SweepProcess(joint, "joint.toml", "-o", "data.csv", "-y", "--resume", *SHORT).finished()
-    assert code == 0, err
+    done = joint.run(*SWEEP, "-y", "--resume")
+    assert done.code == 0, done.err
     assert joint.disabled()
     found = rows(out)
     assert out.read_text().startswith(kept)
@@ -85,11 +64,9 @@ def test_ctrl_c_keeps_the_rows_and_resume_measures_the_rest(joint: Any) -> None:
 
 
 def test_a_dry_run_and_a_missing_y_move_nothing(joint: Any) -> None:
-    code, err = SweepProcess(joint, "joint.toml", "-o", "data.csv", "--dry-run", *SHORT).finished()
-    assert code == 0, err
-    assert "dry run: nothing moved; the drive is disabled" in err
-    code, err = SweepProcess(joint, "joint.toml", "-o", "data.csv", *SHORT).finished()
-    assert code == 2, err
-    assert "no terminal to ask on" in err
+    done = joint.run(*SWEEP, "--dry-run")
+    assert done.code == 0, done.err
+    assert "dry run: nothing moved; the drive is disabled" in done.err
+    joint.run(*SWEEP).refused(2, "no terminal to ask on")
     assert joint.disabled()
     assert not (joint.folder / "data.csv").exists()

@@ -20,8 +20,8 @@ from jointctl.hil.elmo.device import ElmoDevice
 from jointctl.hil.elmo.motor import MF_POSITION_LIMIT
 from jointctl.tools.configuration.conversions import friction_constants
 from jointctl.tools.configuration.load import load_config
+from tests.hil.serial_bench import GUARD, LOOP, stick_position
 
-GUARD, LOOP = "jointctl.tools.session.elmo_guard", "jointctl.tools.session.loop_process"
 SHORT = ("--points", "2", "--grid", "log", "--max-speed", "0.3", "--min-speed", "0.29", "--warm-up", "0", "-y")
 
 
@@ -88,14 +88,6 @@ def test_its_twin_without_a_guard_jogs_on_to_the_drives_own_position_limit(seria
     assert abs(device.speed_cps()) > 10_000
     serial_bench.until(serial_bench.standing)
     assert device.m.motor_fault == MF_POSITION_LIMIT
-
-
-def stick_position(device: ElmoDevice) -> None:
-    """PX does not change any more; everything else is answered as before."""
-    execute, stuck = device.interpreter.execute, device.interpreter.execute(b"PX")
-    device.interpreter.execute = (  # type: ignore[method-assign]
-        lambda line: stuck if line == b"PX" else execute(line)
-    )
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import struct
 import subprocess
 import time
 from pathlib import Path
@@ -16,34 +15,15 @@ from typing import Any
 
 import can
 import canopen
-import numpy as np
 import pytest
 
 from jointctl.tools.recording.log_export import candump_lines
-
-FRAME = np.dtype(
-    [
-        ("sec", "i8"),
-        ("nanosec", "i8"),
-        ("id", "u4"),
-        ("dlc", "u1"),
-        ("is_extended", "?"),
-        ("is_rtr", "?"),
-        ("is_error", "?"),
-        ("data", "u1", 8),
-    ]
-)
+from jointctl.tools.recording.run_log import frame_array
 
 
-def rows(messages: list[can.Message]) -> np.ndarray:
-    """The messages as a run log has them."""
-    found = np.zeros(len(messages), FRAME)
-    for row, message in zip(found, messages, strict=True):
-        row["sec"], row["nanosec"] = divmod(round(message.timestamp * 1e9), 10**9)
-        row["id"], row["dlc"] = message.arbitration_id, message.dlc
-        row["is_extended"], row["is_rtr"] = message.is_extended_id, message.is_remote_frame
-        row["data"][: len(message.data)] = list(message.data)
-    return found
+def lines(messages: list[can.Message]) -> str:
+    """The messages as `jointctl log export` writes those of a log."""
+    return "".join(candump_lines(frame_array([(round(m.timestamp * 1e9), m) for m in messages]), 0, "can0"))
 
 
 def use_every_service(joint: Any, network: canopen.Network) -> None:
@@ -106,7 +86,7 @@ def test_no_frame_is_malformed(joint: Any, tmp_path: Path) -> None:
         while (message := recorder.recv(0.2)) is not None:
             messages.append(message)
     path = tmp_path / "session.log"
-    path.write_text("".join(candump_lines(rows(messages), 0, "can0")))
+    path.write_text(lines(messages))
     packets = dissect(path)
     assert len(packets) == len(messages) > 150
     for packet, message in zip(packets, messages, strict=True):
@@ -141,25 +121,10 @@ def test_no_frame_of_a_real_run_is_malformed(bench: Any) -> None:
     assert any("PDO1 (tx)" in text for text in told), told
 
 
-def test_the_writer_and_the_frames_agree() -> None:
-    """A remote frame and a data frame in the text that tshark reads."""
-    found = rows(
-        [
-            can.Message(arbitration_id=0x705, is_remote_frame=True, is_extended_id=False, dlc=1, timestamp=1.5),
-            can.Message(arbitration_id=0x85, data=struct.pack("<HB5x", 0x2340, 3), is_extended_id=False),
-        ]
-    )
-    assert list(candump_lines(found, 0, "can0")) == [
-        "(1.500000) can0 705#R1\n",
-        "(0.000000) can0 085#4023030000000000\n",
-    ]
-
-
 @pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
 @pytest.mark.parametrize(("data", "malformed"), [(bytes.fromhex("4018100100000000"), False), (b"\x40\x18", True)])
 def test_a_malformed_frame_would_be_seen(tmp_path: Path, data: bytes, malformed: bool) -> None:
     path = tmp_path / "one.log"
-    found = rows([can.Message(arbitration_id=0x605, data=data, is_extended_id=False, timestamp=1.0)])
-    path.write_text("".join(candump_lines(found, 0, "can0")))
+    path.write_text(lines([can.Message(arbitration_id=0x605, data=data, is_extended_id=False, timestamp=1.0)]))
     (packet,) = dissect(path)
     assert ("_ws.malformed" in packet or "_ws.expert.message" in packet) is malformed, packet

@@ -24,6 +24,7 @@ from jointctl.tools.configuration.elmo import elmo_section
 from jointctl.tools.configuration.load import SHIPPED_FOLDER, load_config
 from jointctl.tools.experiments.paper_experiments import synthetic_sweep
 from jointctl.tools.output import Output
+from jointctl.tools.simulation import virtual_joint
 from jointctl.tools.verbs.bench_drive import ServeOptions
 from jointctl.tools.verbs.elmo_bench import ElmoBench
 from jointctl.tools.verbs.main import EPILOG, app
@@ -35,23 +36,25 @@ QUIET = Output(stdout=io.StringIO(), stderr=io.StringIO())
 MARKUP = re.compile(r"\[[a-z#/@]")  # what the help's formatter takes for a style, and swallows
 
 
-def commands(command: Any = None, name: str = "jointctl") -> Iterator[tuple[str, Any]]:
-    """Every verb of the command line by its full name."""
+def commands(command: Any = None, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """The words that lead to each verb, and the verb."""
     command = command or typer.main.get_command(app)
-    yield name, command
+    yield words, command
     for key, inner in getattr(command, "commands", {}).items():
-        yield from commands(inner, f"{name} {key}")
+        yield from commands(inner, (*words, key))
 
 
-@pytest.mark.parametrize(("name", "command"), list(commands()))
-def test_no_help_text_loses_its_brackets(name: str, command: Any) -> None:
-    texts = [command.help or "", command.epilog or "", *(getattr(p, "help", "") or "" for p in command.params)]
+@pytest.mark.parametrize(("words", "command"), [pytest.param(*both, id="-".join(both[0])) for both in commands()])
+def test_the_help_of_every_verb_says_what_it_does_and_loses_nothing_in_80_columns(
+    words: tuple[str, ...], command: Any
+) -> None:
+    assert command.help
+    texts = [command.help, command.epilog or "", *(getattr(p, "help", "") or "" for p in command.params)]
     assert [text for text in texts if MARKUP.search(text)] == []
-
-
-@pytest.mark.parametrize(("name", "command"), list(commands()))
-def test_every_verb_says_what_it_does(name: str, command: Any) -> None:
-    assert command.help, name
+    shown = CliRunner().invoke(app, [*words, "--help"], env={"COLUMNS": "80"})
+    assert shown.exit_code == 0
+    assert "…" not in shown.output
+    assert max(len(line) for line in shown.output.splitlines()) <= 80
 
 
 def test_the_help_names_every_shipped_configuration() -> None:
@@ -87,8 +90,7 @@ def test_new_copies_a_shipped_configuration_that_loads(tmp_path: Path, shipped: 
 
 
 def test_new_counts_what_is_to_be_filled_in(tmp_path: Path) -> None:
-    output = Output(stdout=io.StringIO(), stderr=io.StringIO())
-    new(tmp_path / "mine.toml", output, shipped="elmo_gold_can")
+    new(tmp_path / "mine.toml", QUIET, shipped="elmo_gold_can")
     tomllib.loads((tmp_path / "mine.toml").read_text())
     with pytest.raises(ConfigurationError, match="missing"):
         load_config(tmp_path / "mine.toml")
@@ -110,24 +112,7 @@ def test_new_refuses(tmp_path: Path, name: str, shipped: str, error: type[Except
     assert (tmp_path / "there.toml").read_text() == "mine"
 
 
-# --- Every help page in a terminal of 80 columns, and names of shipped configurations wherever one is asked for ---
-def pages() -> list[tuple[str, ...]]:
-    """The arguments that lead to each help page."""
-    top: Any = typer.main.get_command(app)
-    found: list[tuple[str, ...]] = [()]
-    for name, command in top.commands.items():
-        found += [(name,), *((name, inner) for inner in getattr(command, "commands", ()))]
-    return found
-
-
-@pytest.mark.parametrize("words", pages(), ids="-".join)
-def test_nothing_is_cut_off_in_a_help_page_of_80_columns(words: tuple[str, ...]) -> None:
-    shown = CliRunner().invoke(app, [*words, "--help"], env={"COLUMNS": "80"})
-    assert shown.exit_code == 0
-    assert "…" not in shown.output
-    assert max(len(line) for line in shown.output.splitlines()) <= 80
-
-
+# --- Names of shipped configurations wherever one is asked for ---
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
     sweep = synthetic_sweep()
@@ -263,24 +248,27 @@ def test_options_of_the_other_kind_are_refused(path: Path, options: dict[str, An
     assert words in caught.value.message
 
 
-def refused_by_hil(*arguments: str) -> str:
-    error = CliRunner().invoke(app, ["hil", *arguments]).exception
-    assert isinstance(error, ConfigurationError)
-    return error.message
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("elmo_serial", "-p", "/dev/ttyUSB0"), "--port (=/dev/ttyUSB0) must be absent for hil"),
-        (("elmo_serial", "--timing"), "--timing is for a CAN bus"),
-        (("elmo_serial", "-c", "vcan"), "vcan names a CAN bus"),
-        (("paper", "--serial"), 'drive.kind (=canopen) must be "elmo_serial"'),
-        (("virtual", "--link", "tty"), 'drive.kind (=canopen) must be "elmo_serial"'),
+        (("hil", "elmo_serial", "-p", "/dev/ttyUSB0"), "--port (=/dev/ttyUSB0) must be absent for hil"),
+        (("hil", "elmo_serial", "--timing"), "--timing is for a CAN bus"),
+        (("hil", "elmo_serial", "-c", "vcan"), "vcan names a CAN bus"),
+        (("hil", "paper", "--serial"), 'drive.kind (=canopen) must be "elmo_serial"'),
+        (("hil", "virtual", "--link", "tty"), 'drive.kind (=canopen) must be "elmo_serial"'),
+        (("demo", "--duration=nan"), "duration"),
+        (("demo", "--duration=1e9"), "--duration (=1e+09) must be in [0.1.."),
+        (("demo", "--duration=0.05"), "duration"),
+        (("demo", "--config", "elmo_serial"), "demo"),
     ],
 )
-def test_hil_refuses_what_it_would_not_do(arguments: tuple[str, ...], words: str) -> None:
-    assert words in refused_by_hil(*arguments)
+def test_what_would_not_be_done_is_refused(
+    monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], words: str
+) -> None:
+    monkeypatch.setattr(virtual_joint, "separate_virtual_joint", lambda *_: pytest.fail("started"))
+    found = CliRunner().invoke(app, arguments)
+    assert words in (found.exception.message if isinstance(found.exception, ConfigurationError) else found.output)
+    assert found.exit_code != 0
 
 
 def test_its_twin_serves(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,7 +23,6 @@ from jointctl.tools.verbs.bench_drive import ServeOptions, bench_of
 from jointctl.tools.verbs.demo import with_patience
 from jointctl.tools.virtual_elmo import _make_link, _target
 from tests.configurations import shipped
-from tests.places import CONFIGS
 
 
 # --- `jointctl hil`: in which order it starts ---
@@ -138,15 +137,16 @@ def test_a_link_that_another_program_has_put_there_meanwhile_stays(
 
 
 # --- `jointctl demo` on a computer that stands still now and then ---
-def test_a_busy_computer_ends_no_demo_before_the_drive_would() -> None:
-    config = load_config(CONFIGS / "virtual.toml")
+@pytest.mark.parametrize(
+    ("changes", "patience_s"),
+    [
+        ({}, 0.15),
+        ({"drive__heartbeat_s": 0.1}, 0.75 * 0.1),  # a shorter heartbeat leaves less patience
+        ({"limits__sample_age_max_s": 0.4}, 0.4),  # limits that are wider stay
+    ],
+)
+def test_a_busy_computer_ends_no_demo_before_the_drive_would(changes: dict[str, float], patience_s: float) -> None:
+    config = shipped(**changes)
     limits = with_patience(config).limits
-    assert limits.sample_age_max_s == limits.skipped_max_s == 0.15 < canopen_section(config).heartbeat_s
-
-
-def test_a_shorter_heartbeat_leaves_less_patience() -> None:
-    assert with_patience(shipped(drive__heartbeat_s=0.1)).limits.sample_age_max_s == 0.75 * 0.1
-
-
-def test_limits_that_are_wider_stay() -> None:
-    assert with_patience(shipped(limits__sample_age_max_s=0.4)).limits.sample_age_max_s == 0.4
+    assert limits.sample_age_max_s == patience_s
+    assert changes or limits.skipped_max_s == patience_s < canopen_section(config).heartbeat_s

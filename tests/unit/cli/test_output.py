@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
 import pytest
 from rich.console import Group, RenderableType
 from rich.padding import Padding
@@ -30,15 +31,12 @@ from jointctl.tools.session.live_panel import LivePanel
 from jointctl.tools.verbs import study as study_module
 from jointctl.tools.verbs.info import info_table
 from jointctl.tools.written_file import prepare_folder, prepare_target, replace_file, require_target
+from tests.sessions import Terminal
+from tests.sessions import output as output_to
 
 # --- What reaches a terminal, however narrow ---
 NUMBERS = ["0.0949 .. 0.358", "0.00788 .. 0.0162", "0.00762 .. 0.00944"]
 PATH = "runs/a_joint_with_a_long_name-20260101-120000.mcap"
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
 
 
 def shown_at(columns: int, table: RenderableType, monkeypatch: pytest.MonkeyPatch) -> list[str]:
@@ -141,15 +139,6 @@ EVIL = "a\x1b]0;owned\x07\x1b[2J\x9b31m\u202eb\rc\x7f[red]x[/]<script>alert(1)</
 OBEYED = "\x1b\x07\x9b\u202e\r\x7f"
 
 
-def said(*, json_wanted: bool = False, terminal: bool = False) -> tuple[Output, io.StringIO, io.StringIO]:
-    class Stream(io.StringIO):
-        def isatty(self) -> bool:
-            return terminal
-
-    out, err = Stream(), Stream()
-    return Output(json=json_wanted, stdout=out, stderr=err), out, err
-
-
 def assert_shown(text: str, times: int) -> None:
     assert not any(c in text for c in OBEYED), ascii(text)
     assert text.count("[red]x[/]") == times
@@ -158,7 +147,7 @@ def assert_shown(text: str, times: int) -> None:
 
 def test_every_kind_of_message(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NO_COLOR", "1")
-    output, _, err = said()
+    output, _, err = output_to()
     output.note(EVIL)
     output.fact(EVIL)
     output.warning(EVIL)
@@ -169,10 +158,17 @@ def test_every_kind_of_message(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(err.getvalue().splitlines()) == 8
 
 
-def test_a_name_makes_no_second_line() -> None:
-    output, _, err = said()
+def test_each_message_goes_to_its_own_stream_as_one_line() -> None:
+    output, out, err = output_to()
+    output.result("a result that is much longer than eighty columns, " * 3, {"a": 1})
     output.note("evil\nerror: all is well")
-    assert err.getvalue() == "evil\\nerror: all is well\n"
+    output.note("a note [bus]")
+    output.error("first\nsecond", "do this")
+    with output.progress("work", 10.0) as advance:
+        advance(5.0)
+    assert out.getvalue().count("\n") == 1
+    told = "evil\\nerror: all is well\na note [bus]\nerror: first\nerror: second\nhint: do this\n"
+    assert err.getvalue() == told
 
 
 def test_every_kind_of_result() -> None:
@@ -184,10 +180,10 @@ def test_every_kind_of_result() -> None:
     for shown, times in (
         (EVIL, 1), (Text(EVIL), 1), (table(), 5), (Group(table(), EVIL, Text(EVIL), Padding(EVIL, 1)), 8),
     ):  # fmt: skip
-        output, out, _ = said()
+        output, out, _ = output_to()
         output.result(shown)
         assert_shown(out.getvalue(), times)
-    output, out, _ = said()
+    output, out, _ = output_to()
     output.line(f"{EVIL}\n{EVIL}")
     assert_shown(out.getvalue(), 2)
 
@@ -197,18 +193,20 @@ def test_a_table_that_a_narrow_terminal_shows_as_a_list(monkeypatch: pytest.Monk
     monkeypatch.setenv("NO_COLOR", "1")
     made = Table("first", "second", "third")
     made.add_row("\x1b[2Jlong" * 6, "a\nb", "\x9bc")
-    output, out, _ = said(terminal=True)
+    output, out, _ = output_to(Terminal)
     output.result(made)
     assert "\x1b[2J" not in out.getvalue()
     assert "\x9b" not in out.getvalue()
 
 
 def test_json_stays_json_and_toml_stays_toml() -> None:
-    output, out, _ = said(json_wanted=True)
-    output.result("", {EVIL: [EVIL, 1.0]})
+    output, out, err = output_to(json=True, quiet=True)
+    output.result("for people", {EVIL: [EVIL, 1.0], "figures": [np.float64(0.5), np.arange(2), float("nan")]})
+    output.note("not shown")
     assert not any(c in out.getvalue() for c in OBEYED)
-    assert json.loads(out.getvalue()) == {EVIL: [EVIL, 1.0]}
-    output, out, _ = said()
+    assert json.loads(out.getvalue()) == {EVIL: [EVIL, 1.0], "figures": [0.5, [0, 1], None]}
+    assert err.getvalue() == ""
+    output, out, _ = output_to()
     output.line('key = "a\u202e\x7fb"')
     assert tomllib.loads(out.getvalue()) == {"key": "a\u202e\x7fb"}
 
@@ -270,27 +268,20 @@ def unread() -> Iterator[IO[str]]:
     stream.close()
 
 
-def test_a_result_that_nobody_reads_is_thrown_away(unread: IO[str]) -> None:
-    output = Output(stdout=unread, stderr=io.StringIO())
-    output.result("a table")
-    output.result("another one")
+@pytest.mark.parametrize("json_wanted", [False, True])
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_what_nobody_reads_is_thrown_away(unread: IO[str], stream: str, json_wanted: bool) -> None:
+    output = Output(json=json_wanted, **{"stdout": io.StringIO(), "stderr": io.StringIO(), stream: unread})
+    output.result("a table", {"a": 1})
+    output.result("another one", {"a": 1})
+    output.note("two")
+    output.warning("three")
+    output.error("four", "five")
 
 
 def test_one_that_comes_bit_by_bit_ends_when_nobody_reads_it(unread: IO[str]) -> None:
     assert not Output(stdout=unread, stderr=io.StringIO()).line("a frame")
-    assert Output(stdout=io.StringIO(), stderr=io.StringIO()).line("a frame")
-
-
-def test_json_that_nobody_reads_is_thrown_away(unread: IO[str]) -> None:
-    Output(json=True, stdout=unread, stderr=io.StringIO()).result("", {"a": 1})
-
-
-def test_what_stderr_does_not_take_is_no_reason_to_end(unread: IO[str]) -> None:
-    output = Output(stdout=io.StringIO(), stderr=unread)
-    output.note("one")
-    output.note("two")
-    output.warning("three")
-    output.error("four", "five")
+    assert output_to()[0].line("a frame")
 
 
 def test_a_slow_reader_of_stderr_hears_what_is_said_when_it_has_caught_up() -> None:
@@ -377,11 +368,10 @@ def test_a_study_is_not_begun(key: str, tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(
         "jointctl.tools.experiments.controller_study.run_study", lambda *_, **__: pytest.fail("hours of simulation")
     )
-    output = Output(stdout=io.StringIO(), stderr=io.StringIO())
     folder = tmp_path / "folder.png"
     folder.mkdir()
     with pytest.raises(DataError, match="is a folder"):
-        study_module.study(StudySettings(), output, **{key: folder})
+        study_module.study(StudySettings(), output_to()[0], **{key: folder})
 
 
 @pytest.mark.parametrize("kind", ["fifo", "device"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import io
+import json
 import multiprocessing
 import os
 import resource
@@ -19,13 +19,13 @@ from jointctl.drivers import errors
 from jointctl.drivers.drive import CommissioningReport, DriveIdentity
 from jointctl.drivers.errors import DECLINED
 from jointctl.tools.child_process import interrupts_left_to_the_parent
-from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.output import Output
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.verbs import doctor, run, sweep
 from jointctl.tools.verbs import main as main_module
 from jointctl.tools.verbs.main import TRACEBACK
 from jointctl.tools.verbs.start import FREE_DESCRIPTORS
+from tests.configurations import shipped
+from tests.sessions import Terminal, output
 
 # --- What no verb has foreseen, and a computer that has too little of something: one line and a documented code ---
 COMMAND = [sys.executable, "-P", "-m", "jointctl.tools.verbs"]
@@ -106,30 +106,31 @@ def test_what_the_encoding_of_the_terminal_lacks_is_escaped(tmp_path: Path) -> N
     assert len(done.stderr.splitlines()) == 2
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("check", "{}"), ("identify", "{}"), ("validate", "virtual", "{}"), ("log", "info", "{}"), ("report", "{}"),
-        ("study", "--file", "{}"), ("params", "diff", "{}", "{}"), ("clear-fault", "{}"),
-        ("sweep", "sweep_virtual", "--lockstep", "-o", "x.csv", "--grid", "list", "--speeds", "{}"),
-        ("info", "-i", "virtual", "-c", "0", "-t", "1", "--eds", "{}"), ("params", "diff", "{}.eds", "{}.eds"),
-    ],
-    ids=lambda arguments: " ".join(arguments[:2]),
-)  # fmt: skip
-@pytest.mark.parametrize("name", ["/dev/zero", "fifo"])
-def test_every_reader_refuses_what_is_no_file(tmp_path: Path, arguments: tuple[str, ...], name: str) -> None:
-    os.mkfifo(tmp_path / "fifo")
-    os.mkfifo(tmp_path / "fifo.eds")
-    (tmp_path / "zero.eds").symlink_to("/dev/zero")
-    if ".eds" in arguments[-1]:
-        name = name.removeprefix("/dev/")
-    done = ended(*(word.format(name) for word in arguments), cwd=tmp_path)
-    assert done.returncode in (2, 3, 8), done.stderr
-    assert "Traceback" not in done.stderr
-    assert len([line for line in done.stderr.splitlines() if line.startswith("error: ")]) == 1
+READERS = [
+    ("check", "{}"), ("identify", "{}"), ("validate", "virtual", "{}"), ("log", "info", "{}"), ("report", "{}"),
+    ("study", "--file", "{}"), ("params", "diff", "{}", "{}"), ("clear-fault", "{}"),
+    ("sweep", "sweep_virtual", "--lockstep", "-o", "x.csv", "--grid", "list", "--speeds", "{}"),
+    ("info", "-i", "virtual", "-c", "0", "-t", "1", "--eds", "{}.eds"), ("params", "diff", "{}.eds", "{}.eds"),
+]  # fmt: skip
+# all of them in one process, which a timeout can end
+READ = (
+    "import json, sys; from typer.testing import CliRunner; from jointctl.tools.verbs.main import app\n"
+    "for words in json.loads(sys.argv[1]):\n"
+    "    error = CliRunner().invoke(app, words).exception\n"
+    "    print(json.dumps([getattr(error, 'exit_code', None) or getattr(error, 'code', None), repr(error), words]))"
+)
 
 
-_ROOT = str(Path(__file__).parents[3])
+@pytest.mark.parametrize("name", ["zero", "fifo"])
+def test_every_reader_refuses_what_is_no_file(tmp_path: Path, name: str) -> None:
+    for path in (tmp_path / name, tmp_path / f"{name}.eds"):
+        os.mkfifo(path) if name == "fifo" else path.symlink_to("/dev/zero")
+    asked = [[word.format(name) for word in words] for words in READERS]
+    command = [sys.executable, "-P", "-c", READ, json.dumps(asked)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    told = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [words for _, _, words in told] == asked, done.stderr
+    assert [answer for answer in told if answer[0] not in (2, 3, 8)] == []
 
 
 # --- Ctrl-C before a verb has begun, and in the worker processes of one ---
@@ -229,9 +230,16 @@ class Asking:
         assert self._consent.dry_run or not self._consent.agreed(placed.lines)
 
 
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
+def ended_with(verb: str, folder: Path, *, dry_run: bool = False) -> int:
+    """Its exit code, where it may ask."""
+    shown, *_ = output()
+    if verb == "run":
+        return run.run(shipped(), shown, assume_yes=False, dry_run=dry_run)
+    if verb == "sweep":
+        return sweep.sweep(
+            shipped("sweep_virtual"), shown, folder / "data.csv", SweepOptions(points=24, dry_run=dry_run)
+        )
+    return doctor.doctor_motion(shipped(), shown, assume_yes=False)
 
 
 @pytest.mark.parametrize("answer", ["n\n", "\n", "", "no\n", "maybe\n"])
@@ -240,15 +248,7 @@ def test_no_is_a_code_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "stdin", Terminal(answer))
     monkeypatch.setattr("jointctl.tools.session.session.Session", Asking)
-    output = Output(stdout=io.StringIO(), stderr=io.StringIO())
-    if verb == "run":
-        code = run.run(load_config(shipped_config("virtual")), output, assume_yes=False)
-    elif verb == "sweep":
-        options = SweepOptions(points=24)
-        code = sweep.sweep(load_config(shipped_config("sweep_virtual")), output, tmp_path / "data.csv", options)
-    else:
-        code = doctor.doctor_motion(load_config(shipped_config("virtual")), output, assume_yes=False)
-    assert code == DECLINED == 12
+    assert ended_with(verb, tmp_path) == DECLINED == 12
     assert not list(tmp_path.glob("*.csv"))
 
 
@@ -256,10 +256,4 @@ def test_no_is_a_code_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_a_dry_run_is_a_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("jointctl.tools.session.session.Session", Asking)
-    output = Output(stdout=io.StringIO(), stderr=io.StringIO())
-    if verb == "run":
-        code = run.run(load_config(shipped_config("virtual")), output, assume_yes=False, dry_run=True)
-    else:
-        options = SweepOptions(points=24, dry_run=True)
-        code = sweep.sweep(load_config(shipped_config("sweep_virtual")), output, tmp_path / "data.csv", options)
-    assert code == 0
+    assert ended_with(verb, tmp_path, dry_run=True) == 0

@@ -38,7 +38,7 @@ def paper_data(seed=0, velocity_radps=UNIFORM_radps, noise_Nm=NOISE_Nm, torque_f
 
 
 # --- Sweeps with known friction, as files ---
-def write_sweep(path, seed=0, factor=1.0, noise_Nm=0.0046):
+def write_sweep(path, seed=0, factor=1.0, noise_Nm=0.0046, **sidecar):
     velocity = np.linspace(-200.0, 200.0, 224) * DEGREE
     noise = np.random.default_rng(seed).normal(0.0, noise_Nm, len(velocity))
     torque = factor * (friction_curve_Nm(paper_friction(), velocity) + noise)
@@ -46,7 +46,7 @@ def write_sweep(path, seed=0, factor=1.0, noise_Nm=0.0046):
     for v, t in zip(velocity, torque, strict=True):
         lines.append(f"{v:.9g},{t / 0.1:.9g},{t:.9g},0.01,0.05,500,1,-0.5,0.5,1.0,,{1 if v > 0 else -1},0")
     path.write_text("\n".join(lines) + "\n")
-    path.with_suffix(".json").write_text(json.dumps(sidecar_contents(121.0, 0.1)))
+    path.with_suffix(".json").write_text(json.dumps(sidecar_contents(121.0, 0.1, **sidecar)))
     return path
 
 

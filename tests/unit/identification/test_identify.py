@@ -266,6 +266,83 @@ def test_other_peoples_table_gives_the_same_model_as_our_own(sweep, tmp_path):
     assert other["positive"] == pytest.approx(ours["positive"], rel=1e-3, abs=1e-10)
 
 
+# --- By which limits data are checked: a configuration's, else the sidecar's; without any, that is said ---
+CONFIG = shipped_config("sweep_virtual")
+JOINT_LIMITS = {"torque_max_Nm": 60.0, "velocity_max_radps": 3.88}
+FOREIGN = {"velocity_column": "speed", "torque_column": "torque", "velocity_unit": "r/min", "side": "motor",
+           "torque_side": "motor", "ratio": 121.0}  # fmt: skip
+IN_AMPERE = {"torque_column": None, "torque_side": None, "current_column": "current"}
+
+
+def foreign_file(folder):
+    """Velocity in r/min of the motor, torque of the motor [Nm] and current [A] for 0.1 Nm/A."""
+    path = folder / "theirs.csv"
+    velocity = np.linspace(-200.0, 200.0, 120)
+    torque = friction_curve_Nm(paper_friction(), velocity * DEGREE)
+    rows = zip(velocity * 121.0 / 6.0, torque, torque / 0.1, strict=True)
+    path.write_text("speed,torque,current\n" + "".join(f"{v:.9g},{t:.9g},{i:.9g}\n" for v, t, i in rows))
+    return path
+
+
+def said(path, told=None, config=None):
+    out = output()
+    assert identify(path, out, config=config, given=told, options=QUICK) == 0
+    return out.stderr.getvalue().replace("\n", " ")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({}, None),
+        ({**IN_AMPERE, "torque_constant_NmpA": 1.0},
+         r"torque constant of the data \(=1 Nm/A\) differs from the configured one \(=0.1 in the drive's ampere"),
+        ({"ratio": 100.0}, r"reduction ratio of the data \(=100\) differs from joint.reduction_ratio \(=121\)"),
+        ({"side": "joint"}, r"highest joint speed \(=422.4 rad/s\) is 109 times limits.velocity_max_radps"),
+        ({"velocity_unit": "rad/s"}, r"highest joint speed \(=33.33 rad/s\) is 8.59 times limits"),
+        ({"velocity_unit": "deg/s"}, r"at positive velocity: .* and 0 beyond; at least"),
+        ({"torque_side": "joint"}, "times limits.torque_max_Nm: check torque constant, ratio, units and sides"),
+    ],
+)  # fmt: skip
+def test_flags_are_checked_against_the_configuration(tmp_path, change, words):
+    try:
+        text = said(foreign_file(tmp_path), ForeignFormat(**{**FOREIGN, **change}), CONFIG)
+    except DataError as error:
+        text = error.message
+    assert re.search(words, text) if words else "warning" not in text, text
+
+
+@pytest.mark.parametrize(("factor", "config"), [(1.0, None), (1.0, CONFIG), (1.7, None), (1.9, None)])
+def test_the_sidecars_limits_serve_where_no_configuration_is_given(tmp_path, factor, config):
+    # 95 % of the points are below 41 Nm at the joint; 1.2 times the 60 Nm of the sidecar are allowed
+    path = write_sweep(tmp_path / "own.csv", factor=factor, noise_Nm=0.0, limits=JOINT_LIMITS)
+    if factor == 1.9:
+        with pytest.raises(DataError, match=r"friction at the joint reaches .* times limits.torque_max_Nm"):
+            said(path)
+    else:
+        text = said(path, config=config)
+        assert ("times limits.torque_max_Nm" in text) is ("warning" in text) is (factor == 1.7)  # near the limit
+
+
+def test_without_any_limits_it_is_said_that_nothing_was_checked(tmp_path):
+    words = "no limits of the joint are known: sizes of torque and speed could not be checked"
+    wrong = ForeignFormat(**{**FOREIGN, **IN_AMPERE, "torque_constant_NmpA": 10.0})
+    assert words in said(foreign_file(tmp_path), wrong)
+    assert words in said(write_sweep(tmp_path / "own.csv"))
+
+
+def test_a_ratio_that_contradicts_the_sidecar_is_refused(tmp_path):
+    path = write_sweep(tmp_path / "own.csv", noise_Nm=0.0, limits=JOINT_LIMITS)
+    with pytest.raises(DataError, match=r"--ratio \(=100\) differs from reduction_ratio \(=121\)"):
+        said(path, ForeignFormat(ratio=100.0))
+    assert "warning" not in said(path, ForeignFormat(ratio=121.0))
+
+
+@pytest.mark.parametrize("limits", [3, {"torque_max_Nm": -1.0, "velocity_max_radps": 1.0}, {"torque_max_Nm": 60.0}])
+def test_damaged_limits_of_a_sidecar_are_named(tmp_path, limits):
+    with pytest.raises(DataError, match=r"own.json: limits\.\w+ \(=.*\) must be a number"):
+        said(write_sweep(tmp_path / "own.csv", limits=limits))
+
+
 # --- The verb validate: the error of a model on other data, and friction that has grown ---
 def test_validate_reports_the_error_on_other_data(config, tmp_path):
     other = write_sweep(tmp_path / "other.csv", seed=9)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import struct
@@ -18,7 +17,6 @@ import pytest
 from jointctl.drivers.can.socketcan import parse_link
 from jointctl.drivers.errors import BusError
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.inspection import health
 from jointctl.tools.inspection.health import (
     NOTE,
@@ -35,11 +33,12 @@ from jointctl.tools.inspection.health import (
     sdo_round_trips_us,
     wake_up,
 )
-from jointctl.tools.output import Output
 from jointctl.tools.session import loops as start_time
 from jointctl.tools.verbs import doctor as doctor_module
 from jointctl.tools.verbs.doctor import doctor, findings
 from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
+from tests.configurations import changed
+from tests.sessions import output
 
 
 # --- A folder with files as /sys and /proc have them ---
@@ -49,20 +48,10 @@ def write(root: Path, name: str, text: str) -> None:
     path.write_text(text)
 
 
-# --- `jointctl doctor`: what it finds on a bus and about the computer, and that it only ever reads ---
 # --- `jointctl doctor` on a bus: what it finds, what it says about it, and that it only ever reads ---
-@pytest.fixture(scope="module")
-def config() -> Config:
-    return load_config(shipped_config("virtual"))
-
-
-def changed(config: Config, **values: Any) -> Config:
-    """The configuration with another bus or rate."""
-    bus = {key: values[key] for key in ("interface", "channel", "bitrate_bitps") if key in values}
-    loop = {key: values[key] for key in ("rate_Hz", "priority") if key in values}
-    return config.model_copy(
-        update={"bus": config.bus.model_copy(update=bus), "loop": config.loop.model_copy(update=loop)}
-    )
+@pytest.fixture
+def config(virtual_config: Config) -> Config:
+    return virtual_config
 
 
 class SdoBus:
@@ -108,7 +97,7 @@ class TestBus:
     def test_no_interface_is_a_problem_only_where_needed(
         self, config: Config, tmp_path: Path, interface: str, status: str
     ) -> None:
-        found = {f.topic: f for f in adapters(changed(config, interface=interface), tmp_path)}["CAN interfaces"]
+        found = {f.topic: f for f in adapters(changed(config, bus__interface=interface), tmp_path)}["CAN interfaces"]
         assert (found.status, found.text) == (status, "none")
 
     @pytest.mark.parametrize(
@@ -117,13 +106,13 @@ class TestBus:
          (1000.0, 357_000, OK), (1000.0, 356_000, PROBLEM)],
     )  # fmt: skip
     def test_budget(self, config: Config, rate_Hz: float, bitrate: int, status: str) -> None:
-        found = bus_budget(changed(config, rate_Hz=rate_Hz, bitrate_bitps=bitrate))
+        found = bus_budget(changed(config, loop__rate_Hz=rate_Hz, bus__bitrate_bitps=bitrate))
         assert found.status == status
         assert found.numbers["load"] == pytest.approx(285.0 * rate_Hz / bitrate)
 
     @pytest.mark.parametrize(("rate_Hz", "status"), [(499.0, OK), (500.0, OK), (501.0, PROBLEM), (1000.0, PROBLEM)])
     def test_budget_of_the_plain_python_loop(self, config: Config, rate_Hz: float, status: str) -> None:
-        found = bus_budget(changed(config, interface="slcan", rate_Hz=rate_Hz))
+        found = bus_budget(changed(config, bus__interface="slcan", loop__rate_Hz=rate_Hz))
         assert found.status == status
         assert "plain Python loop" in found.text
 
@@ -181,13 +170,13 @@ class TestBus:
     ) -> None:
         link = {"ifname": "can0", "flags": ["UP"], "txqlen": queue, "linkinfo": {"info_kind": "can", "info_data": data}}
         monkeypatch.setattr(health, "link_state", lambda name: parse_link(link))
-        told = list(interface_state(changed(config, interface="socketcan", channel="can0")))
+        told = list(interface_state(changed(config, bus__interface="socketcan", bus__channel="can0")))
         assert [(finding.topic, finding.status) for finding in told] == found
         assert all(finding.remedy for finding in told if finding.status != OK)
         assert list(interface_state(config)) == []  # another kind of bus
 
     def test_a_missing_interface(self, config: Config) -> None:
-        (found,) = interface_state(changed(config, interface="socketcan", channel="jc_none0"))
+        (found,) = interface_state(changed(config, bus__interface="socketcan", bus__channel="jc_none0"))
         assert found.status == PROBLEM
         assert "ip link set jc_none0 up" in found.remedy
 
@@ -197,16 +186,15 @@ class TestBus:
     ) -> None:
         monkeypatch.setattr(health, "open_python_can", lambda *_: SdoBus(config.drive.node))
         monkeypatch.setattr(health, "sdo_round_trips_us", lambda *_: [1000.0] * SDO_READS)
-        found = drive_finding(changed(config, rate_Hz=rate_Hz))
+        found = drive_finding(changed(config, loop__rate_Hz=rate_Hz))
         assert (found.status, found.numbers["allowed_rate_Hz"]) == (status, 600.0)
 
 
 class TestReport:
     def report(self, config: Config, found: list[Finding], monkeypatch: pytest.MonkeyPatch, **how: bool) -> Any:
         monkeypatch.setattr(doctor_module, "findings", lambda *_, **__: iter(found))
-        stdout, stderr = io.StringIO(), io.StringIO()
-        code = doctor(config, Output(stdout=stdout, stderr=stderr, **how))
-        return code, stdout.getvalue(), stderr.getvalue()
+        shown, stdout, stderr = output(**how)
+        return doctor(config, shown), stdout.getvalue(), stderr.getvalue()
 
     @pytest.mark.parametrize(("status", "code"), [(OK, 0), (NOTE, 0), (PROBLEM, 1)])
     def test_exit_code_and_table(self, config: Config, status: str, code: int, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -228,7 +216,7 @@ class TestReport:
 
     def test_on_this_computer(self, config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(health, "start_time_s", lambda cache: 1.0)
-        elsewhere = changed(config, channel="nobody-listens-here")
+        elsewhere = changed(config, bus__channel="nobody-listens-here")
         found = list(findings(elsewhere, wake_cycles=10))
         topics = [f.topic for f in found]
         assert len(set(topics)) == len(topics) >= 15
@@ -365,21 +353,14 @@ def open_files() -> set[str]:
     }
 
 
-def test_zero_latency_is_asked_for_and_held(tmp_path: Path) -> None:
+def test_zero_latency_is_asked_for_and_held_until_the_block_ends_or_fails(tmp_path: Path) -> None:
     device = tmp_path / "latency"
     device.touch()
-    with cores_awake(device) as refused:
+    with pytest.raises(ZeroDivisionError), cores_awake(device) as refused:  # noqa: PT012
         assert refused == ""
         assert device.read_bytes() == b"\0\0\0\0"
         assert str(device) in open_files()
-    assert str(device) not in open_files()
-
-
-def test_it_is_given_back_when_the_block_fails(tmp_path: Path) -> None:
-    device = tmp_path / "latency"
-    device.touch()
-    with pytest.raises(RuntimeError), cores_awake(device):
-        raise RuntimeError
+        _ = 1 / 0
     assert str(device) not in open_files()
 
 

@@ -17,7 +17,7 @@ from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault
-from jointctl.hil.fault_kinds import FaultConstants, FaultKind
+from jointctl.hil.fault_kinds import FaultKind
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import velocity_of_a_count_radps
@@ -36,18 +36,23 @@ from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
 from jointctl.tools.session.fault_words import fault_text
 from jointctl.tools.verbs import doctor as doctor_motion_module
+from tests.made_faults import one_fault
 from tests.two_encoders import NODE, config_with
+
+REPORT = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.1, 0.06, 1e-5)
 
 
 # --- The motion check on a virtual joint in simulated time ---
-def check_in_lockstep(joint: LockstepJoint, config: Config, plan: CheckPlan, faults: Any = None) -> tuple[Any, Fault]:
-    """The same motion on a virtual joint in simulated time: its records and the fault."""
+def check_in_lockstep(
+    joint: LockstepJoint, config: Config, plan: CheckPlan, faults: Any = None, **options: Any
+) -> tuple[Any, Any, Fault]:
+    """The same motion on a virtual joint in simulated time: its records, the plant in the end and the fault."""
     table = motion_table(plan, joint.report.start_position_rad)
     constants = CheckMotion(config_of_check(config, plan), plan).constants(joint.report, table)
     constants[0].sequence.supervisor_max_cycles = 0  # nobody watches in simulated time
     joint.table = table
-    run = joint.run(constants) if faults is None else joint.run_with_faults(faults, constants)
-    return run.log, run.fault
+    run = joint.run(constants) if faults is None else joint.run_with_faults(faults, constants, **options)
+    return run.log, run.plant, run.fault
 
 
 def checked(config: Config, change: Any = None, faults: Any = None) -> tuple[dict[str, Finding], Any, Fault]:
@@ -56,7 +61,7 @@ def checked(config: Config, change: Any = None, faults: Any = None) -> tuple[dic
     joint = LockstepJoint(config)
     if change is not None:
         change(joint)
-    records, fault = check_in_lockstep(joint, config, plan, faults)
+    records, _, fault = check_in_lockstep(joint, config, plan, faults)
     text = fault_text(fault, 0.0, 0) if fault is not Fault.NONE else None
     return {f.topic: f for f in motion_findings(config, plan, records, fault, text)}, records, fault
 
@@ -75,8 +80,7 @@ def test_the_torque_is_that_of_friction_and_gravity_and_never_above_the_limit(tm
 def test_the_check_only_narrows_torque_speed_and_travel(tmp_path: Path) -> None:
     config = config_with(tmp_path)
     plan = make_plan(config, None)
-    report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.1, 0.06, 1e-5)
-    made = CheckMotion(config_of_check(config, plan), plan).constants(report, motion_table(plan, 0.1))[0].limits
+    made = CheckMotion(config_of_check(config, plan), plan).constants(REPORT, motion_table(plan, 0.1))[0].limits
     assert made.torque_max_Nm == plan.torque_Nm < config.limits.torque_max_Nm
     assert made.velocity_max_radps == 0.5 < config.limits.velocity_max_radps
     assert (made.position_min_rad, made.position_max_rad) == pytest.approx((0.0, 0.2))
@@ -90,8 +94,7 @@ def test_a_standing_joint_is_never_pushed_unwatched(tmp_path: Path, torque_Nm: f
     gravity_Nm = 0.0 if torque_Nm is None else 10.0
     config = config_with(tmp_path, joint__gravity_Nm=gravity_Nm, virtual__gravity_Nm=gravity_Nm)
     plan = make_plan(config, torque_Nm)
-    report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.1, 0.06, 1e-5)
-    made = CheckMotion(config_of_check(config, plan), plan).constants(report, motion_table(plan, 0.1))[0].limits
+    made = CheckMotion(config_of_check(config, plan), plan).constants(REPORT, motion_table(plan, 0.1))[0].limits
     assert made.frozen_torque_Nm == pytest.approx(watched_Nm)
     assert made.frozen_torque_Nm < plan.torque_Nm
 
@@ -126,8 +129,7 @@ def test_a_coarse_encoder_takes_more_travel_and_time_and_is_told_so(tmp_path: Pa
     assert plan.velocity_radps == config.limits.velocity_max_radps == 1.0  # never more than the user's
     config = config_with(tmp_path, encoder__counts_per_turn=8192)
     assert make_plan(config, None).velocity_radps > 2.0 * velocity_of_a_count_radps(config) > fine.velocity_radps
-    report = CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.1, 0.06, 1e-5)
-    assert "braked beyond 0.23 rad to either side" in " ".join(CheckMotion(config, plan).placed(report).lines)
+    assert "braked beyond 0.23 rad to either side" in " ".join(CheckMotion(config, plan).placed(REPORT).lines)
     coarsest = config_with(tmp_path, encoder__counts_per_turn=512, control__velocity_cutoff_Hz=10.0)
     assert make_plan(coarsest, None).travel_rad == 0.3
 
@@ -203,10 +205,9 @@ def test_what_stopped_a_standing_joint_is_told_unless_standing_explains_it(tmp_p
 @pytest.mark.parametrize("second", [None, NODE])
 @pytest.mark.parametrize("load_Nm", [-60.0, -1.0])
 def test_a_push_from_outside(tmp_path: Path, second: dict[str, Any] | None, load_Nm: float) -> None:
-    faults = new(FaultConstants, 1)
-    faults[0].kind, faults[0].start_s, faults[0].duration_s = FaultKind.LOAD_JUMP, 1.5, 10.0
-    faults[0].magnitude = load_Nm
-    found, _, fault = checked(config_with(tmp_path, second), None, faults)
+    found, _, fault = checked(
+        config_with(tmp_path, second), None, one_fault(FaultKind.LOAD_JUMP, 1.5, magnitude=load_Nm)
+    )
     pushed = load_Nm == -60.0
     assert fault is (Fault.VELOCITY_LIMIT if pushed else Fault.NONE)
     assert ("check" in found) is pushed
@@ -360,17 +361,10 @@ def test_a_reading_that_stands_has_no_velocity(tmp_path: Path) -> None:
 @pytest.mark.parametrize("second", [None, NODE])
 def test_a_dead_encoder_is_found_before_the_joint_has_gone_far(tmp_path: Path, second: dict[str, Any] | None) -> None:
     config = config_with(tmp_path, second)
-    faults = new(FaultConstants, 1)
-    faults[0].kind, faults[0].start_s, faults[0].duration_s = FaultKind.ENCODER_STUCK, 0.5, 100.0
-    plan, joint = make_plan(config, None), LockstepJoint(config)
-    constants = CheckMotion(config_of_check(config, plan), plan).constants(
-        joint.report, motion_table(plan, joint.report.start_position_rad)
-    )
-    constants[0].sequence.supervisor_max_cycles = 0
-    joint.table = motion_table(plan, joint.report.start_position_rad)
-    run = joint.run_with_faults(faults, constants, tail_s=0.2)
-    assert run.fault in (Fault.POSITION_FROZEN, Fault.POSITION_DISAGREEMENT)
-    assert abs(float(run.plant.joint_position_rad) - joint.report.start_position_rad) < 0.1
+    stuck = one_fault(FaultKind.ENCODER_STUCK, 0.5)
+    records, plant, fault = check_in_lockstep(LockstepJoint(config), config, make_plan(config, None), stuck, tail_s=0.2)
+    assert fault in (Fault.POSITION_FROZEN, Fault.POSITION_DISAGREEMENT)
+    assert abs(float(plant.joint_position_rad) - records.position_rad[0]) < 0.1
 
 
 def test_the_records_name_the_encoder_that_stood(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ from jointctl.tools.inspection.parameters import (
 )
 from jointctl.tools.inspection.subject import ATTEMPTS, SdoReader, Subject, canopen_network, new_dictionary
 from jointctl.tools.verbs.params import DIFFERENT, diff, dump, place_index, restore_file
-from tests.sessions import output
+from tests.sessions import Terminal, output
 
 # --- Subject and output of the verb params, and a DCF that is changed ---
 OLDER_DUMP = Path(__file__).with_name("older_dump.toml")
@@ -348,10 +348,6 @@ class TestRestore:
 
     @pytest.mark.parametrize(("answer", "written"), [("y\n", True), ("n\n", False), ("", False)])
     def test_it_asks(self, joint: Any, file: Path, answer: str, written: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-        class Terminal(io.StringIO):
-            def isatty(self) -> bool:
-                return True
-
         change(file, o6072="700")
         monkeypatch.setattr(sys, "stdin", Terminal(answer))
         assert restored(joint, file, assume_yes=False) == (0 if written else DECLINED)
@@ -363,10 +359,7 @@ class TestRestore:
     ) -> None:
         """A joint that moves by now must not lose its controller: not even pre-operational is said."""
 
-        class Terminal(io.StringIO):
-            def isatty(self) -> bool:
-                return True
-
+        class Asked(Terminal):
             def readline(self, *_: Any) -> str:
                 if what == "SYNC":
                     with can.Bus(interface="virtual", channel=joint.channel) as bus:
@@ -376,7 +369,7 @@ class TestRestore:
                 return "y\n"
 
         change(file, o6072="700")
-        monkeypatch.setattr(sys, "stdin", Terminal())
+        monkeypatch.setattr(sys, "stdin", Asked())
         if what == "nothing":
             assert restored(joint, file, assume_yes=False) == 0
         else:

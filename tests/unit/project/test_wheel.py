@@ -1,6 +1,6 @@
 """What the archives hold is what the tree holds: wheel by way of the sdist, as an index would build it.
 
-The wheel works from an empty folder, without the tree.
+The wheel works from an empty folder, without the tree; the version is written once.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import tomllib
 import zipfile
 from email.message import Message
 from email.parser import Parser
@@ -18,6 +19,9 @@ from pathlib import Path
 
 import pytest
 
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.configuration.canopen import eds_path
+from jointctl.tools.configuration.load import SHIPPED_FOLDER, load_config
 from tests.places import ROOT
 
 TOP = ("firmware_py", "drivers", "hil", "tools", "configs")
@@ -92,6 +96,21 @@ def test_what_the_metadata_say(unpacked: Path, metadata: Message) -> None:
     assert classifiers is not None
     assert not [name for name in classifiers if name.startswith("License ::")], "the SPDX expression stands alone"
     assert {f"Programming Language :: Python :: 3.{minor}" for minor in (11, 12, 13)} <= set(classifiers)
+
+
+def test_the_version_is_that_of_the_project_file() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert version("jointctl") == project["version"]
+
+
+def test_every_configuration_names_an_eds_that_is_shipped_or_marked() -> None:
+    for file in SHIPPED_FOLDER.glob("*.toml"):
+        try:
+            config = load_config(file)
+        except ConfigurationError:
+            assert "FILL IN" in file.read_text()
+            continue
+        assert config.drive.kind != "canopen" or eds_path(config).parent == SHIPPED_FOLDER
 
 
 def test_it_works_from_an_empty_folder(unpacked: Path, tmp_path: Path) -> None:

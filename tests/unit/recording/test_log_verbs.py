@@ -10,10 +10,11 @@ import shutil
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import nullcontext
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
 import can
 import numpy as np
@@ -37,15 +38,10 @@ from jointctl.tools.session.events import EventFinder
 from jointctl.tools.session.session_drive import session_drive
 from jointctl.tools.verbs.log import log_export, log_info, log_plot
 from tests.configurations import changed
+from tests.sessions import output
 
 
 # --- Name, room and age of run logs, and what is refused before the user is asked ---
-class Usage(NamedTuple):
-    total: int
-    used: int
-    free: int
-
-
 @pytest.fixture
 def in_folder(virtual_config: Config, tmp_path: Path) -> Callable[..., Config]:
     """configs/virtual.toml with its logs in the test's folder."""
@@ -58,10 +54,6 @@ def in_folder(virtual_config: Config, tmp_path: Path) -> Callable[..., Config]:
         return config
 
     return build
-
-
-def report(start_rad: float) -> Any:
-    return SimpleNamespace(start_position_rad=start_rad)
 
 
 def names(folder: Path) -> list[str]:
@@ -112,12 +104,8 @@ def test_only_the_newest_runs_are_kept_with_the_new_one(
 
 
 def test_files_that_are_not_runs_of_this_configuration_stay(in_folder: Callable[..., Config], tmp_path: Path) -> None:
-    others = [
-        "virtual-notes.mcap",
-        "other-20260101-120000.mcap",
-        "virtual-20260101-120000.csv",
-        "my-virtual-20260101-120000.png",
-    ]
+    others = ["virtual-notes.mcap", "other-20260101-120000.mcap", "virtual-20260101-120000.csv",
+              "my-virtual-20260101-120000.png"]  # fmt: skip
     for name in others:
         (tmp_path / name).write_text("mine")
     config = in_folder(keep=1)
@@ -131,11 +119,9 @@ def test_a_disk_without_room_for_the_run_is_told(
 ) -> None:
     config = in_folder()
     needed = 10.0 * 1000.0 * (dtype_of(LogRecord).itemsize + 40)
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, int(needed * factor)))
-    if refused:
-        with pytest.raises(DataError, match="MB are free, the log of this run takes about 4 MB"):
-            require_room(config, log_path(config))
-    else:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=int(needed * factor)))
+    told = "MB are free, the log of this run takes about 4 MB"
+    with pytest.raises(DataError, match=told) if refused else nullcontext():
         require_room(config, log_path(config))
     assert names(tmp_path) == []
 
@@ -147,19 +133,14 @@ def test_a_folder_that_cannot_be_made_is_told(in_folder: Callable[..., Config], 
         require_room(config, log_path(config))
 
 
-@pytest.mark.parametrize("start_rad", [-0.7001, 0.7001])
+@pytest.mark.parametrize("start_rad", [-0.7001, -0.7, 0.0, 0.7, 0.7001])
 def test_a_joint_outside_its_limits_is_told_before_anybody_is_asked(
     in_folder: Callable[..., Config], start_rad: float
 ) -> None:
-    config = in_folder()
-    with pytest.raises(MotionFault, match=r"POSITION_LIMIT \(1\): the joint stands at .0?.7001 rad, .*\[-0.7..0.7\]"):
-        require_ready(config, report(start_rad), log_path(config))
-
-
-@pytest.mark.parametrize("start_rad", [-0.7, 0.0, 0.7])
-def test_a_joint_at_its_limits_is_ready(in_folder: Callable[..., Config], start_rad: float) -> None:
-    config = in_folder()
-    require_ready(config, report(start_rad), log_path(config))
+    config, report = in_folder(), SimpleNamespace(start_position_rad=start_rad)
+    told = r"POSITION_LIMIT \(1\): the joint stands at .0?.7001 rad, .*\[-0.7..0.7\]"
+    with pytest.raises(MotionFault, match=told) if abs(start_rad) > 0.7 else nullcontext():
+        require_ready(config, report, log_path(config))  # type: ignore[arg-type]
 
 
 # --- `jointctl log`: what is told, what is exported, and that foreign readers read it back; raw frames ---
@@ -215,8 +196,8 @@ def made_log(tmp_path: Path) -> Path:
 
 def spoken(verb: Any, *arguments: Any, **options: Any) -> Any:
     """What the verb says with --json."""
-    out = io.StringIO()
-    assert verb(arguments[0], Output(json=True, stdout=out, stderr=io.StringIO()), *arguments[1:], **options) == 0
+    told, out, _ = output(json=True)
+    assert verb(arguments[0], told, *arguments[1:], **options) == 0
     return json.loads(out.getvalue())
 
 
@@ -229,8 +210,8 @@ def test_info_tells_what_the_log_holds(made_log: Path) -> None:
     assert [e["text"] for e in data["event_list"] if e["source"] == "loop"] == [
         "waiting", "enabling", "tracking", "finished",
     ]  # fmt: skip
-    out = io.StringIO()
-    assert log_info(made_log, Output(stdout=out, stderr=io.StringIO())) == 0
+    told, out, _ = output()
+    assert log_info(made_log, told) == 0
     for text in ("missing records", "operation enabled", "joint.toml", "RMSE"):
         assert text in out.getvalue()
 
@@ -241,16 +222,16 @@ def test_a_log_that_is_thinned_on_purpose_misses_nothing(tmp_path: Path) -> None
         log.write_records(run_records()[::20])
     data = spoken(log_info, path)
     assert (data["records_kept"], data["missing_records"]) == ("every 20th, the last 2 s whole", None)
-    out = io.StringIO()
-    log_info(path, Output(stdout=out, stderr=io.StringIO()))
+    told, out, _ = output()
+    log_info(path, told)
     assert "every 20th" in out.getvalue()
     assert "missing" not in out.getvalue()
 
 
 def test_info_of_a_log_that_was_cut_off_says_so(made_log: Path) -> None:
     made_log.write_bytes(made_log.read_bytes()[:-400])
-    err = io.StringIO()
-    assert log_info(made_log, Output(json=True, stdout=io.StringIO(), stderr=err)) == 0
+    told, _, err = output(json=True)
+    assert log_info(made_log, told) == 0
     assert "cut off" in err.getvalue()
 
 

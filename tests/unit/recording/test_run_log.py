@@ -30,10 +30,10 @@ from jointctl.tools.recording.run_log_reader import read_run_log
 
 
 # --- Records of a run stay whole and in order, in memory or in a file ---
-def numbered(first: int, count: int) -> np.ndarray:
-    records = np.zeros(count, dtype_of(LogRecord))
-    records["cycle"] = np.arange(first, first + count)
-    records["error_rad"] = records["cycle"] * 1e-3
+def numbered(first: int, count: int) -> Any:
+    records = new(LogRecord, count)
+    records.cycle = np.arange(first, first + count)
+    records.error_rad = records.cycle * 1e-3
     return records
 
 
@@ -76,15 +76,9 @@ def test_every_second_record_of_a_chunk_is_kept_as_it_is(tmp_path):
 
 
 # --- A thinned stream of records: every n-th one of the old, all of the last ---
-def counted(count: int) -> Any:
-    records = np.zeros(count, dtype_of(LogRecord)).view(np.recarray)
-    records.cycle = np.arange(count)
-    return records
-
-
 @pytest.mark.parametrize("portions", [(100,), (1,) * 100, (7, 0, 33, 60), (99, 1)])
 def test_however_they_come_the_old_ones_are_thinned_and_the_last_ones_whole(portions: tuple[int, ...]) -> None:
-    records, thinned = counted(100), ThinnedRecords(20, 30)
+    records, thinned = numbered(0, 100), ThinnedRecords(20, 30)
     ends = list(itertools.accumulate(portions))
     written = [thinned.take(records[end - count : end]).cycle for count, end in zip(portions, ends, strict=True)]
     assert list(np.concatenate(written)) == [0, 20, 40, 60]
@@ -94,7 +88,7 @@ def test_however_they_come_the_old_ones_are_thinned_and_the_last_ones_whole(port
 
 def test_a_short_run_is_kept_whole() -> None:
     thinned = ThinnedRecords(20, 30)
-    assert len(thinned.take(counted(30))) == 0
+    assert len(thinned.take(numbered(0, 30))) == 0
     assert len(thinned.last()) == 30
 
 

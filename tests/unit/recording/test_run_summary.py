@@ -13,7 +13,6 @@ from rich.console import Console
 from jointctl.drivers.errors import DataError
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram
 from jointctl.firmware_py.states import Fault
-from jointctl.tools.output import Output
 from jointctl.tools.recording.run_figure import drawn_indices, save_run_figure
 from jointctl.tools.recording.run_summary import TIMES, histogram_times, summarise, summary_table
 from tests.run_records import run_records
@@ -203,24 +202,3 @@ def test_no_peak_is_lost_in_the_figure(count: int) -> None:
     assert {0, count - 1} <= set(drawn)
     assert (values[drawn].min(), values[drawn].max()) == (-7.0, 5.0)
     assert np.all(np.diff(drawn) > 0)
-
-
-def test_results_and_messages_go_to_their_own_streams() -> None:
-    out, err = io.StringIO(), io.StringIO()
-    output = Output(stdout=out, stderr=err)
-    output.result("a result that is much longer than eighty columns, " * 3, {"a": 1})
-    output.note("a note [bus]")
-    output.error("first\nsecond", "do this")
-    with output.progress("work", 10.0) as advance:
-        advance(5.0)
-    assert out.getvalue().count("\n") == 1
-    assert err.getvalue() == "a note [bus]\nerror: first\nerror: second\nhint: do this\n"
-
-
-def test_json_is_the_only_thing_on_stdout() -> None:
-    out, err = io.StringIO(), io.StringIO()
-    output = Output(json=True, quiet=True, stdout=out, stderr=err)
-    output.result("text for people", {"peak_rad": np.float64(0.5), "rows": np.arange(2), "bad": float("nan")})
-    output.note("not shown")
-    assert json.loads(out.getvalue()) == {"peak_rad": 0.5, "rows": [0, 1], "bad": None}
-    assert err.getvalue() == ""

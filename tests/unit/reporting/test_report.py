@@ -43,6 +43,7 @@ from jointctl.tools.recording.run_log import INFO, RunLogWriter
 from jointctl.tools.recording.run_summary import summarise
 from jointctl.tools.verbs.report import MOST_LOGS, log_names, report, verdict
 from tests.page_figures import foreign_colours, svgs
+from tests.sessions import output
 
 
 # --- One style for files and pages: PNG on white, SVG in the colours of the page ---
@@ -234,8 +235,8 @@ def write_log(path: Path, records: Any, configuration: str = "[control]\nkind = 
 
 
 def made(paths: list[Path], out: Path | None = None) -> str:
-    said = io.StringIO()
-    assert report(paths, Output(json=True, stdout=said, stderr=io.StringIO()), out) == 0
+    told, said, _ = output(json=True)
+    assert report(paths, told, out) == 0
     return Path(json.loads(said.getvalue())["report"]).read_text()
 
 

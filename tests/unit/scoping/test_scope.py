@@ -7,7 +7,6 @@ import io
 import math
 import os
 import socket
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,7 +26,6 @@ from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import INFO, Event
 from jointctl.tools.scoping import feed as feed_module
-from jointctl.tools.scoping import server
 from jointctl.tools.scoping import server as server_module
 from jointctl.tools.scoping.feed import EVENT, PIECE, RECORDS, SETTINGS, ScopeFeed, ScopeOrder, scope_order
 from jointctl.tools.scoping.history import EVENTS, POINTS, SIGNALS, History, crossing_s, percentiles_us
@@ -218,23 +216,29 @@ def test_the_run_is_told_when_the_last_page_closes_and_when_one_opens_again(
     assert feed.stop_request() is StopRequest.NONE
 
 
+class Clock:
+    """What the feed takes for the time."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now_s = 1000.0
+        monkeypatch.setattr(feed_module, "time", SimpleNamespace(monotonic=lambda: self.now_s))
+
+
 @pytest.mark.parametrize(("limit_s", "expected"), [(None, StopRequest.NONE), (0.3, StopRequest.RAMP)])
 def test_a_run_that_nobody_watches_brakes_if_that_is_wanted(
-    ends: tuple[socket.socket, socket.socket], limit_s: float | None, expected: StopRequest
-) -> None:
-    feed = ScopeFeed(ends[0], unwatched_s=limit_s)
-    ends[1].send(asked("viewers", count=0))
-    time.sleep(0.4)
-    assert feed.stop_request() is StopRequest.NONE  # nobody has been there yet
-    for count in (1, 0, 1):
-        ends[1].send(asked("viewers", count=count))
+    ends: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch, limit_s: float | None,
+    expected: StopRequest,
+) -> None:  # fmt: skip
+    clock, feed = Clock(monkeypatch), ScopeFeed(ends[0], unwatched_s=limit_s)
+    # nobody has been there yet; somebody is there; nobody any more
+    for counts, then in (((0,), StopRequest.NONE), ((1, 0, 1), StopRequest.NONE), ((0,), expected)):
+        for count in counts:
+            ends[1].send(asked("viewers", count=count))
+            assert feed.stop_request() is StopRequest.NONE
+        clock.now_s += 0.299
         assert feed.stop_request() is StopRequest.NONE
-    time.sleep(0.4)
-    assert feed.stop_request() is StopRequest.NONE  # somebody is there
-    ends[1].send(asked("viewers", count=0))
-    assert feed.stop_request() is StopRequest.NONE
-    time.sleep(0.4)
-    assert feed.stop_request() is expected
+        clock.now_s += 0.002
+        assert feed.stop_request() is then
     assert feed.stop_reason() == ("the scope: no page open for 0.3 s" if limit_s else "")
 
 
@@ -243,14 +247,13 @@ def test_a_server_that_hangs_counts_as_nobody(
     ends: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch, limit_s: float | None,
     expected: StopRequest,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(feed_module, "SILENT_S", 0.5)
-    feed = ScopeFeed(ends[0], unwatched_s=limit_s)
+    clock, feed = Clock(monkeypatch), ScopeFeed(ends[0], unwatched_s=limit_s)
     for _ in range(6):  # longer than that, but the server repeats its word
         ends[1].send(asked("viewers", count=1))
-        time.sleep(0.15)
         assert feed.stop_request() is StopRequest.NONE
+        clock.now_s += 0.3 * feed_module.SILENT_S
     assert feed.requests() == []
-    time.sleep(0.5)
+    clock.now_s += feed_module.SILENT_S
     assert feed.stop_request() is expected
     (told,) = feed.requests()
     assert "no word from the scope's server" in told.values["text"]
@@ -552,6 +555,6 @@ def test_a_stop_does_not_wait_for_it(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert is_marked(os.getpid(), STARTING)
     monkeypatch.setattr("jointctl.tools.recording.run_log_reader.read_run_log", lambda _: None)
     monkeypatch.setattr("jointctl.tools.scoping.feed.scope_order", lambda *_, **__: SimpleNamespace(url=""))
-    monkeypatch.setattr(server, "serve", lambda _: None)
+    monkeypatch.setattr(server_module, "serve", lambda _: None)
     assert scope_module.scope(tmp_path / "run.mcap", Output(quiet=True)) == 0
     assert not is_marked(os.getpid(), STARTING)

@@ -219,14 +219,12 @@ def test_an_interrupted_window_gives_no_point() -> None:
 def test_a_window_with_too_few_samples_is_named_and_not_written() -> None:
     log = records()
     log.sample_age_cycles[1000 : 2000 - LEAST_SAMPLES + 1] = 3
-    found: list[MeasuredPoint] = []
-    meter = SweepMeter((Window(FAST, 1.0, 2.0, True),), MODEL, found.append)
-    meter.feed(log)
-    assert (found, meter.lost_points) == ([], [FAST])
-    log.sample_age_cycles[2000 - LEAST_SAMPLES] = 0
-    meter = SweepMeter((Window(FAST, 1.0, 2.0, True),), MODEL, found.append)
-    meter.feed(log)
-    assert (len(found), meter.lost_points) == (1, [])
+    for kept, lost in ((0, [FAST]), (1, [])):
+        found: list[MeasuredPoint] = []
+        meter = SweepMeter((Window(FAST, 1.0, 2.0, True),), MODEL, found.append)
+        meter.feed(log)
+        assert (len(found), meter.lost_points) == (kept, lost)
+        log.sample_age_cycles[2000 - LEAST_SAMPLES] = 0
 
 
 def test_gravity_is_subtracted() -> None:
@@ -331,26 +329,26 @@ def test_another_plan_is_refused_and_nothing_is_changed(path: Path) -> None:
     assert path.read_text() == before
 
 
-def test_damaged_files_are_one_line(path: Path) -> None:
-    with pytest.raises(DataError, match="cannot be read"):
+@pytest.mark.parametrize(
+    ("csv", "sidecar", "words"),
+    [
+        (None, None, "cannot be read"),
+        (lambda text: "".join(text.splitlines(keepends=True)[:3]), str, "holds 2 rows, its sidecar counts 3"),
+        (lambda text: text.replace("velocity", "speed", 1), str, "holds 3 rows"),
+        (str, lambda text: text[:50], "damaged"),
+        (str, lambda text: "[]", "not the sidecar"),
+    ],
+)
+def test_damaged_files_are_one_line(path: Path, csv: Any, sidecar: Any, words: str) -> None:
+    if csv is not None:
+        created(path, 3).close()
+        assert path.read_text().startswith(HEADING)
+        for file, damaged in ((path, csv), (path.with_suffix(".json"), sidecar)):
+            file.write_text(damaged(file.read_text()))
+        before = path.read_text()
+    with pytest.raises(DataError, match=words):
         SweepFile.resume(path, 0.1, "abc")
-    created(path, 3).close()
-    whole, sidecar = path.read_text(), path.with_suffix(".json").read_text()
-    path.write_text("".join(whole.splitlines(keepends=True)[:3]))
-    with pytest.raises(DataError, match="holds 2 rows, its sidecar counts 3"):
-        SweepFile.resume(path, 0.1, "abc")
-    path.write_text(whole.replace("velocity", "speed", 1))
-    with pytest.raises(DataError, match="holds 3 rows"):
-        SweepFile.resume(path, 0.1, "abc")
-    path.write_text(whole)
-    path.with_suffix(".json").write_text(sidecar[:50])
-    with pytest.raises(DataError, match="damaged"):
-        SweepFile.resume(path, 0.1, "abc")
-    path.with_suffix(".json").write_text("[]")
-    with pytest.raises(DataError, match="not the sidecar"):
-        SweepFile.resume(path, 0.1, "abc")
-    assert path.read_text() == whole
-    assert whole.startswith(HEADING)
+    assert csv is None or path.read_text() == before
 
 
 def test_a_disk_that_takes_nothing_more_is_told_with_the_next_row_or_at_the_end(
