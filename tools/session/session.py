@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, TypeVar
 
 from jointctl.drivers.can.socketcan import interface_blamed
@@ -64,6 +63,7 @@ class Session:
         self._make_display = display or (lambda _: PhaseLines(output))
         self._kind = session_drive(plan.config.drive.kind)
         self.drive_state = ""  # in words, after the run
+        self.loop: LoopHandle | None = None  # once it has been started
 
     def run(self) -> RunResult | None:
         """The whole run; None if it was declined.  Afterwards the drive is off, or `drive_state` says otherwise."""
@@ -79,6 +79,7 @@ class Session:
             bus_watch(config) as bus_news,
             kept_awake(config, self._output),
         ):
+            self.loop = loop
             drive = self._kind.open(config, signals.leave_if_asked)
             guard: Guard | None = None
             try:
@@ -108,10 +109,6 @@ class Session:
                 if guard is not None:
                     guard.release(self.drive_state)
                 warn_unless_off(self.drive_state, self._output)
-
-    def _loop(self, tail_path: Path) -> LoopHandle:
-        port, marker_fd = self._kind.port_record(), self._control.marker_fd
-        return LoopHandle(self._config, self.plan.motion.table, port, tail_path, marker_fd)
 
     def _ask(self, question: Callable[[], Answer]) -> Answer:
         """The answer of the user, whom a stop may interrupt."""
