@@ -155,14 +155,13 @@ class SetPointProblem(IntEnum):
 
     NONE = 0
     TIME = 1  # not after the one before, or too long after it
-    NOT_FINITE = 2
-    POSITION = 3
-    VELOCITY = 4  # at the set-point or on the way to it
-    JUMP = 5  # too far from the one before
-    ACCELERATION = 6
-    TORQUE = 7
-    TORQUE_RATE = 8
-    STOPPING_WAY = 9  # braked from there, the joint would leave its position limits
+    POSITION = 2  # a value that is not finite is outside every limit
+    VELOCITY = 3  # at the set-point or on the way to it
+    JUMP = 4  # too far from the one before
+    ACCELERATION = 5
+    TORQUE = 6
+    TORQUE_RATE = 7
+    STOPPING_WAY = 8  # braked from there, the joint would leave its position limits
 
 
 class LimitSource(IntEnum):

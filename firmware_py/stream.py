@@ -27,9 +27,9 @@ from jointctl.firmware_py.records import (
     StreamConstants,
     StreamState,
 )
-from jointctl.firmware_py.safety import cubic, set_point_problem
+from jointctl.firmware_py.safety import set_point_problem
 from jointctl.firmware_py.states import AxisPhase, SetPointProblem, TrajectoryKind
-from jointctl.firmware_py.trajectory import brake_step
+from jointctl.firmware_py.trajectory import brake_step, cubic
 
 CLOSE_SHARE = 3  # of the delay: set-points nearer than that are one
 

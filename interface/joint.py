@@ -519,7 +519,6 @@ class _Stream:
                 f"time_s is {later_s:g} s after the set-point before, must be in (0..{longest_s:g}]",
                 "stream.timeout_s and stream.delay_s",
             ),
-            SetPointProblem.NOT_FINITE: (f"{at} and {speed} must be finite", ""),
             SetPointProblem.POSITION: (f"{at} must be in [{low:g}..{high:g}]", "limits.position_*"),
             SetPointProblem.VELOCITY: (
                 f"{speed}, or that on the way there, must be in [{-top:g}..{top:g}]", "limits.velocity_max_radps"

@@ -209,12 +209,9 @@ class LiveMotor:
 
     def require(self) -> None:
         """See `Motor`."""
+        if self.axis is not None and self.axis[0].phase > AxisPhase.TRACKING:
+            self._join()  # it is being stopped: the cause is known at the end
         self._raise()
-        if self.constants is not None and self.axis[0].phase > AxisPhase.TRACKING:
-            name = in_words(AxisPhase(int(self.axis[0].phase)))
-            fault = int(self.axis[0].fault)
-            cause = f" because of {fault_name(fault)}" if fault else ""
-            raise MotionFault(f"the joint is being stopped{cause} ({name})", "leave the block for the whole story")
 
     def enable(self, approve: Callable[[Sequence[str]], bool] | None) -> None:
         """See `Motor`."""

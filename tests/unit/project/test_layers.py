@@ -41,9 +41,12 @@ def test_the_links_are_the_folders_under_their_installed_names() -> None:
     links = ROOT / ".typed" / "jointctl"
     if not links.exists():
         pytest.skip("this is no clone: an sdist has no links")
-    assert {link.name for link in links.iterdir()} == {"__init__.py", *TOP_LEVEL}
+    face = {path.name for path in (ROOT / "interface").glob("*.py")}
+    assert {link.name for link in links.iterdir() if link.name != "__pycache__"} == face | set(TOP_LEVEL)
     for name in TOP_LEVEL:
         assert (links / name).resolve() == ROOT / name
+    for name in face - {"__init__.py"}:
+        assert (links / name).resolve() == ROOT / "interface" / name
 
 
 def test_layers_are_kept(tmp_path: Path) -> None:
@@ -53,6 +56,8 @@ def test_layers_are_kept(tmp_path: Path) -> None:
     (tmp_path / "jointctl" / "__init__.py").touch()
     for name in TOP_LEVEL:
         (tmp_path / "jointctl" / name).symlink_to(ROOT / name)
+    for path in (ROOT / "interface").glob("[a-z]*.py"):
+        (tmp_path / "jointctl" / path.name).symlink_to(path)
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 0, done.stdout + done.stderr
