@@ -47,7 +47,8 @@ from jointctl.firmware_py.sequence import (
     step_waiting,
     write_command,
 )
-from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, Reaction
+from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, Reaction, TrajectoryKind
+from jointctl.firmware_py.stream import following_set_points, step_other_motion, step_stream
 from jointctl.firmware_py.trajectory import NO_REPETITION, approach_at, brake_step, reference_at, repetition
 
 # --- Velocity from position differences with a first-order low-pass ---
@@ -152,6 +153,8 @@ def _move_reference(constants: AxisConstants, state: AxisState, table: np.ndarra
         approach_at(state.approach, state.trajectory_s + constants.sequence.approach_s, state.reference)
     elif state.phase == AxisPhase.TRACKING and state.change.motion != MotionChange.NONE:
         step_new_motion(constants, state, table, elapsed_cycles)
+    elif state.phase == AxisPhase.TRACKING and constants.trajectory.kind == TrajectoryKind.STREAM:
+        step_stream(constants, state, elapsed_cycles)
     elif state.phase == AxisPhase.TRACKING:
         state.table_row = reference_at(
             constants.trajectory, table, state.table_row, state.trajectory_s, state.reference
@@ -198,6 +201,8 @@ def _command_torque(constants: AxisConstants, state: AxisState, table: np.ndarra
             state.command_torque_Nm,
             where,
         )
+        if state.stream.torque_Nm != 0.0:
+            state.unlimited_torque_Nm += state.stream.torque_Nm
     else:
         state.unlimited_torque_Nm = 0.0
     limits = constants.limits
@@ -275,6 +280,8 @@ def step_axis(
     elif state.phase == AxisPhase.ENABLING:
         step_enabling(constants, state, sample, table)
     step_change(constants, state, table, elapsed_cycles)
+    if not following_set_points(constants, state):
+        step_other_motion(constants, state, elapsed_cycles)
     if state.phase >= AxisPhase.APPROACH and state.phase <= AxisPhase.RAMPING:
         _move_reference(constants, state, table, elapsed_cycles)
     if gap_cycles > 0:

@@ -213,6 +213,7 @@ def step_cycle(memory: CycleMemory, exchange: Exchange, clock: Clock, slot: Slot
     slept_ns = clock.slept_ns(words, memory.timespec)
     for axis in range(len(memory.state)):
         state, sample = memory.state[axis], samples[axis]
+        state.slot_ns = slot.deadline_ns
         # a sample that answers an earlier SYNC belongs to no slot that could be named
         state.sample_late_s = (slot.wake_ns - slot.deadline_ns) * 1e-9 if sample.time_ns > slot.wake_ns else 0.0
         if slept_ns > SUSPENDED_MIN_NS:

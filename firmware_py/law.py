@@ -403,6 +403,8 @@ def step_law(
 
     `sent_torque_Nm` is the limited torque of the cycle before, `where` the place in a repeating trajectory.
     """
+    if constants.kind == ControllerKind.OUTSIDE:
+        return state.outside_torque_Nm
     error = position_rad - reference.position_rad
     if constants.filtered_error_rate != 0:
         error_rate = velocity.error_rate_radps

@@ -77,20 +77,20 @@ def gains_allowed(low: Gains, high: Gains, gains: Gains) -> bool:
 def trajectory_allowed(limits: LimitConstants, c: TrajectoryConstants, table_rows: int) -> bool:
     """Whether the whole motion stays inside the position and velocity limits.
 
-    The rows of a table were checked when the run was prepared; only that very table may be followed.
+    The rows of a table are checked by the supervisor, when it writes them; each reference by `check_reference` as ever.
     """
     low, high, top = limits.position_min_rad, limits.position_max_rad, limits.velocity_max_radps
     if not within(c.duration_s, 0.0, _LONGEST_s):
         return False
     if c.kind == TrajectoryKind.TABLE:
-        return c.table_rows >= 2 and c.table_rows == table_rows
+        return 2 <= c.table_rows <= table_rows
     if c.kind == TrajectoryKind.SINE:
         swing = abs(c.amplitude_rad)
         inside = within(c.offset_rad - swing, low, high) and within(c.offset_rad + swing, low, high)
         return (
             inside and within(swing * abs(c.omega_radps), 0.0, top) and c.switch_s == 0.0 and math.isfinite(c.shift_s)
         )
-    if c.kind == TrajectoryKind.HOLD:
+    if c.kind == TrajectoryKind.HOLD or c.kind == TrajectoryKind.STREAM:
         return within(c.start_rad, low, high)
     if not (within(c.start_rad, low, high) and within(c.target_rad, low, high) and within(c.dwell_s, 0.0, _LONGEST_s)):
         return False
@@ -109,7 +109,9 @@ def trajectory_allowed(limits: LimitConstants, c: TrajectoryConstants, table_row
 
 @kernel
 def move_duration_s(constants: ChangeConstants, distance_rad: float) -> float:
-    """Of a move from rest to rest within the speed and acceleration of moves."""
+    """Of a move from rest to rest within the speed and acceleration of moves; 0 where it is there already."""
+    if distance_rad == 0.0:
+        return 0.0
     by_speed_s = QUINTIC_PEAK_SPEED * abs(distance_rad) / constants.move_speed_radps
     by_acceleration_s = math.sqrt(QUINTIC_PEAK_ACCELERATION * abs(distance_rad) / constants.move_acceleration_radps2)
     return max(by_speed_s, by_acceleration_s, constants.move_min_s)

@@ -148,6 +148,7 @@ class LawState:
     learning: LearningState
     lugre_deflection_rad: f8
     integral_rads: f8
+    outside_torque_Nm: f8  # ControllerKind.OUTSIDE only
     # kept for the log: the parts of the torque at the joint
     inertia_torque_Nm: f8
     feedback_torque_Nm: f8
@@ -279,6 +280,52 @@ class ChangeState:
     next_trajectory: TrajectoryConstants
 
 
+# --- Set-points that come while the joint moves: see `stream` ---
+
+
+SET_POINTS = 256  # on their way from a program to the loop
+
+
+@record
+class SetPoint:
+    time_ns: i8  # CLOCK_MONOTONIC; the joint is to be there `StreamConstants.delay_ns` later
+    position_rad: f8
+    velocity_radps: f8
+    acceleration_radps2: f8  # NaN: that between the velocities of two set-points
+    torque_Nm: f8  # on top of the law's
+
+
+@record
+class StreamConstants:
+    """Limits of set-points, and the ring that they come through: `written` is counted up behind each of them.
+
+    The limits never change after the start; ring, `written` and `alive_ns` belong to the program outside.
+    """
+
+    delay_ns: i8
+    timeout_ns: i8  # between two set-points
+    client_timeout_ns: i8  # of the program's sign of life; 0 = none is expected
+    acceleration_max_radps2: f8
+    jump_max_rad: f8
+    torque_max_Nm: f8
+    torque_rate_max_Nmps: f8
+    written: Annotated[np.ndarray, array_of(i8, 1)]  # set-points since the start
+    alive_ns: Annotated[np.ndarray, array_of(i8, 1)]  # CLOCK_MONOTONIC of the newest sign of life
+    time_ns: Annotated[np.ndarray, array_of(i8, SET_POINTS)]
+    values: Annotated[np.ndarray, array_of(f8, SET_POINTS, 4)]  # position, velocity, acceleration, torque
+
+
+@record
+class StreamState:
+    taken: i8  # set-points taken out of the ring
+    refused: i8  # of them those that the loop did not follow
+    following: i4  # 1 between two set-points, 0 at rest or braking
+    before: SetPoint
+    after: SetPoint
+    coming: SetPoint  # on its way from the ring
+    torque_Nm: f8  # on top of the law's, in this cycle
+
+
 # --- One joint: limits, phases, samples, commands ---
 
 
@@ -397,6 +444,7 @@ class AxisConstants:
     command_kind: i4  # CommandKind
     velocity_command: VelocityCommandConstants
     change: ChangeConstants
+    stream: StreamConstants
 
 
 LINE_GONE = 1_000_000  # of `Sample.bus_errors`: more than any limit
@@ -452,6 +500,7 @@ class AxisState:
     table_row: i4  # search hint of the trajectory table
     fault_value: f8  # the value that tripped the limit
     trajectory_s: f8
+    slot_ns: i8  # the loop's time of this cycle
     sample_late_s: f8  # from the slot to the request of this cycle's sample; set by a real-time loop, else 0
     measured_position_rad: f8  # at the slot
     second_position_rad: f8
@@ -464,6 +513,7 @@ class AxisState:
     velocity: VelocityState
     law: LawState
     change: ChangeState
+    stream: StreamState
     swing: SwingState
 
 

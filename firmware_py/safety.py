@@ -9,16 +9,29 @@ from __future__ import annotations
 import math
 
 from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.libc import load_acquire
 from jointctl.firmware_py.records import (
     AxisConstants,
     AxisState,
     LimitConstants,
     Sample,
+    SetPoint,
+    StreamConstants,
     Swing,
     SwingConstants,
     SwingState,
 )
-from jointctl.firmware_py.states import AxisPhase, CommandKind, DriveState, Fault, LimitSource, Notice, Reaction
+from jointctl.firmware_py.states import (
+    AxisPhase,
+    CommandKind,
+    DriveState,
+    Fault,
+    LimitSource,
+    Notice,
+    Reaction,
+    SetPointProblem,
+)
+from jointctl.firmware_py.trajectory import cubic
 
 # Half swings in a row that are a limit cycle.  On 480 runs of healthy joints there were 2 at most of either kind,
 # and 6 that grew.
@@ -167,6 +180,13 @@ def _check_drive(state: AxisState, sample: Sample) -> None:
 
 
 @kernel
+def client_silent_s(constants: StreamConstants, now_ns: int) -> float:
+    """How long the program that commands the joint has been silent, if that is too long; else 0."""
+    silent_ns = now_ns - load_acquire(constants.alive_ns, 0)
+    return silent_ns * 1e-9 if 0 < constants.client_timeout_ns < silent_ns else 0.0
+
+
+@kernel
 def check_supervision(
     constants: AxisConstants, state: AxisState, sample: Sample, skipped_cycles: int, supervisor_age_cycles: int
 ) -> None:
@@ -183,6 +203,9 @@ def check_supervision(
         # not before: in WAITING the power is off, and without the supervisor's word it stays off
         if 0 < constants.sequence.supervisor_max_cycles < supervisor_age_cycles:
             trip(state, Fault.SUPERVISOR_LOST, float(supervisor_age_cycles), 0)
+        client_s = client_silent_s(constants.stream, state.slot_ns)
+        if state.phase <= AxisPhase.TRACKING and client_s > 0.0:  # a joint that is being stopped needs no client
+            trip(state, Fault.CLIENT_SILENT, client_s, 0)
         # last: samples that stay away as well tell more, and sooner
         if 0 < limits.heartbeat_age_max_cycles < sample.heartbeat_age_cycles:
             trip(state, Fault.DRIVE_SILENT, float(sample.heartbeat_age_cycles), sample.drive_error)
@@ -227,6 +250,42 @@ def check_reference(constants: AxisConstants, state: AxisState) -> None:
         REACTION_CYCLES * constants.law.period_s,
     )
     trip(state, fault, state.reference.position_rad, 0)
+
+
+@kernel
+def set_point_problem(
+    limits: LimitConstants, stream: StreamConstants, brake_radps2: float, before: SetPoint, after: SetPoint
+) -> SetPointProblem:
+    """What is wrong with going from one set-point to the next.  It is no fault: the joint never follows it."""
+    if not 0 < after.time_ns - before.time_ns <= stream.timeout_ns + stream.delay_ns:
+        return SetPointProblem.TIME
+    if not within(after.position_rad, limits.position_min_rad, limits.position_max_rad):
+        return SetPointProblem.POSITION
+    if not within(after.velocity_radps, -limits.velocity_max_radps, limits.velocity_max_radps):
+        return SetPointProblem.VELOCITY
+    if not abs(after.position_rad - before.position_rad) <= stream.jump_max_rad:
+        return SetPointProblem.JUMP
+    if not within(after.torque_Nm, -stream.torque_max_Nm, stream.torque_max_Nm):
+        return SetPointProblem.TORQUE
+    duration_s, c2, c3 = cubic(before, after)
+    if not abs(after.torque_Nm - before.torque_Nm) <= stream.torque_rate_max_Nmps * duration_s:
+        return SetPointProblem.TORQUE_RATE
+    # a program that runs slower than its own time has velocities that are a little greater than its positions say
+    off_rad = after.position_rad - before.position_rad
+    off_rad -= 0.5 * duration_s * (before.velocity_radps + after.velocity_radps)
+    room_radps = stream.acceleration_max_radps2 * duration_s
+    steep = abs(after.acceleration_radps2) > stream.acceleration_max_radps2  # not for NaN
+    steep = steep or not abs(after.velocity_radps - before.velocity_radps) <= room_radps
+    if steep or not abs(off_rad) <= 0.5 * room_radps * duration_s:
+        return SetPointProblem.ACCELERATION
+    for d in (0.25 * duration_s, 0.5 * duration_s, 0.75 * duration_s, duration_s):
+        way_rad = before.position_rad + d * (before.velocity_radps + d * (c2 + d * c3))
+        speed_radps = before.velocity_radps + d * (2.0 * c2 + 3.0 * d * c3)
+        if not within(speed_radps, -limits.velocity_max_radps, limits.velocity_max_radps):
+            return SetPointProblem.VELOCITY
+        if reference_fault(limits, way_rad, speed_radps, brake_radps2, stream.delay_ns * 1e-9) != Fault.NONE:
+            return SetPointProblem.STOPPING_WAY
+    return SetPointProblem.NONE
 
 
 @kernel
@@ -486,8 +545,8 @@ def swing_Hz(state: SwingState, period_s: float) -> float:
 def check_swing(constants: AxisConstants, state: AxisState, torque_Nm: float) -> None:
     """A torque or an error that swings while the law is active; `torque_Nm` is the command, or the measured torque.
 
-    What the desired acceleration asks for is no swing, however quick.  While the torque is released, nothing is looked
-    at: the law is no longer active.
+    What the desired acceleration or a set-point asks for is no swing, however quick.  While the torque is released,
+    nothing is looked at: the law is no longer active.
     """
     if state.phase < AxisPhase.APPROACH or state.phase > AxisPhase.RAMPING:
         return
@@ -495,7 +554,7 @@ def check_swing(constants: AxisConstants, state: AxisState, torque_Nm: float) ->
     fault = swing_fault(
         constants.limits,
         state.swing,
-        torque_Nm - constants.law.inertia_kgm2 * reference.acceleration_radps2,
+        torque_Nm - constants.law.inertia_kgm2 * reference.acceleration_radps2 - state.stream.torque_Nm,
         state.measured_position_rad - reference.position_rad,
         reference.velocity_radps,
         state.cycle,

@@ -16,6 +16,7 @@ from jointctl.firmware_py.live_change import reset_change
 from jointctl.firmware_py.records import LINE_GONE, AxisConstants, AxisState, Command, Sample
 from jointctl.firmware_py.safety import enter, limit_position_rad, motion_fault, react, reset_swing, trip
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction, StopRequest
+from jointctl.firmware_py.stream import reset_stream
 from jointctl.firmware_py.trajectory import plan_approach, reference_at
 
 # The drive answers a request one cycle later at the earliest; a state older than this is not its answer.
@@ -32,6 +33,7 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.fault_encoder_error = 0
     state.fault_value = 0.0
     state.cycle = 0
+    state.slot_ns = 0
     state.phase_cycle = 0
     state.held_up_cycles = 0
     state.good_samples = 0
@@ -50,6 +52,7 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.velocity.primed = 0
     reset_law(constants.law, state.law)
     reset_change(state.change)
+    reset_stream(state.stream)
     state.notices = 0
     reset_swing(state.swing)
 

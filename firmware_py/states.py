@@ -102,6 +102,7 @@ class Fault(IntEnum):
     MOVED_BEFORE_START = 25, Reaction.QUICK_STOP  # the joint is not where it was when the motion was shown
     SAMPLES_MISSING = 26, Reaction.QUICK_STOP  # samples came before enabling, but never enough of them in a row
     LIMIT_CYCLE = 27, Reaction.QUICK_STOP  # torque or error swing back and forth instead of settling
+    CLIENT_SILENT = 28, Reaction.RAMP  # the program whose set-points the joint follows has gone silent
 
 
 class Notice(IntEnum):
@@ -135,6 +136,7 @@ class ControllerKind(IntEnum):
     COMPUTED_TORQUE_RBF = 1  # the paper's (29)
     COMPUTED_TORQUE_OBSERVER = 2  # a disturbance observer in the network's place
     PID = 3  # no friction model unless the feed-forward is switched on
+    OUTSIDE = 4  # none: the torque is given in each cycle, at simulated time only
 
 
 class TrajectoryKind(IntEnum):
@@ -145,6 +147,21 @@ class TrajectoryKind(IntEnum):
     MIN_JERK = 2
     TRAPEZOID = 3
     TABLE = 4
+    STREAM = 5  # set-points that come while the joint moves, at rest where there are none
+
+
+class SetPointProblem(IntEnum):
+    """Why a set-point that comes while the joint moves is not followed."""
+
+    NONE = 0
+    TIME = 1  # not after the one before, or too long after it
+    POSITION = 2  # a value that is not finite is outside every limit
+    VELOCITY = 3  # at the set-point or on the way to it
+    JUMP = 4  # too far from the one before
+    ACCELERATION = 5
+    TORQUE = 6
+    TORQUE_RATE = 7
+    STOPPING_WAY = 8  # braked from there, the joint would leave its position limits
 
 
 class LimitSource(IntEnum):

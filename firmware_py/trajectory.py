@@ -12,7 +12,7 @@ import numpy as np
 
 from jointctl.firmware_py.input_file import LARGEST_TABLE_BYTES, number_from, read_input
 from jointctl.firmware_py.kernel import kernel
-from jointctl.firmware_py.records import Reference, TrajectoryConstants
+from jointctl.firmware_py.records import Reference, SetPoint, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import TrajectoryKind
 
@@ -266,6 +266,15 @@ def approach_at(coefficients: np.ndarray, t_s: float, reference: Reference) -> N
     reference.position_rad = a[0] + t * (a[1] + t * (a[2] + t * (a[3] + t * (a[4] + t * a[5]))))
     reference.velocity_radps = a[1] + t * (2.0 * a[2] + t * (3.0 * a[3] + t * (4.0 * a[4] + t * 5.0 * a[5])))
     reference.acceleration_radps2 = 2.0 * a[2] + t * (6.0 * a[3] + t * (12.0 * a[4] + t * 20.0 * a[5]))
+
+
+@kernel
+def cubic(before: SetPoint, after: SetPoint) -> tuple[float, float, float]:
+    """(duration [s], c2, c3) of p = p0 + v0 d + c2 d^2 + c3 d^3 between two set-points (Hermite)."""
+    duration_s = (after.time_ns - before.time_ns) * 1e-9
+    rate = (after.position_rad - before.position_rad) / duration_s
+    v0, v1 = before.velocity_radps, after.velocity_radps
+    return duration_s, (3.0 * rate - 2.0 * v0 - v1) / duration_s, (v0 + v1 - 2.0 * rate) / (duration_s * duration_s)
 
 
 @kernel

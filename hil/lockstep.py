@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jointctl.firmware_py.cycle import Clock, CycleMemory, Exchange, Slot, Word, step_cycle
-from jointctl.firmware_py.kernel import inlined, kernel
+from jointctl.firmware_py.kernel import entry, inlined, kernel
 from jointctl.firmware_py.libc import load_acquire, store_release
 from jointctl.firmware_py.records import AxisState, Sample
 from jointctl.firmware_py.states import StopRequest
@@ -34,6 +34,7 @@ from jointctl.hil.virtual_bus import FRAME_SIZE, FrameQueue
 # columns of the array of true values that a run may leave
 TRUE_POSITION_rad, TRUE_VELOCITY_radps, TRUE_FRICTION_Nm, TRUE_ACTUATOR_Nm, TRUE_POWER_STATE = range(5)
 TRUTHS = 5
+_NO_TRUTH = np.zeros((0, TRUTHS))
 
 # slots of the frame memory, agreed with the caller that passes the codec: sent in begin (up to two), RPDO, received
 RPDO_SLOT = 2
@@ -255,3 +256,9 @@ def run_lockstep(
     truth = np.zeros((0, TRUTHS)) if truth is None else truth
     written, rows = _run(memory, codec, world, scenario, truth)
     return int(written), int(rows)
+
+
+def part_of_a_run(memory: CycleMemory, codec: Codec, world: World) -> Callable[[Scenario], object]:
+    """For a run that is made of many short parts, after a first `run_lockstep`: carries out one; no true values."""
+    run = entry(_run)
+    return lambda scenario: run(memory, codec, world, scenario, _NO_TRUTH)

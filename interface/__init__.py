@@ -1,16 +1,71 @@
 """jointctl: the controller of a robot joint, on a PC.
 
-Everything that is installed lies under this one name; the folders of the repository are its subpackages
-(`jointctl.firmware_py`, `jointctl.drivers`, `jointctl.hil`, `jointctl.tools`, `jointctl.configs`).
+    import jointctl
+
+    with jointctl.Joint("my_joint.toml") as joint:
+        joint.enable()
+        joint.move_to(0.35, duration_s=2.0)
+
+What `__all__` names stays from version to version.  The folders of the repository are the subpackages
+(`jointctl.firmware_py`, `jointctl.drivers`, `jointctl.hil`, `jointctl.tools`, `jointctl.configs`); their names may
+change.
 """
 
 from __future__ import annotations
 
-from importlib.metadata import version as _version
+from importlib import import_module as _import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jointctl.drivers.errors import (
+        BusError,
+        ConfigurationError,
+        DataError,
+        DeviceError,
+        JointctlError,
+        MarginError,
+        MotionFault,
+        NoDeviceError,
+        UsageError,
+    )
+    from jointctl.joint import Joint, SetPointError, State
+    from jointctl.verbs import check, identify, read_log, run
+
+    __version__: str
+
+__all__ = [
+    "BusError",
+    "ConfigurationError",
+    "DataError",
+    "DeviceError",
+    "Joint",
+    "JointctlError",
+    "MarginError",
+    "MotionFault",
+    "NoDeviceError",
+    "SetPointError",
+    "State",
+    "UsageError",
+    "__version__",
+    "check",
+    "identify",
+    "read_log",
+    "run",
+]
+
+_HOMES = {
+    "joint": ("Joint", "SetPointError", "State"),
+    "verbs": ("check", "identify", "read_log", "run"),
+}
+_HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 
-def __getattr__(name: str) -> str:
-    """`__version__`, which is looked up only when someone asks: that takes a while."""
+def __getattr__(name: str) -> object:
+    """A name of `__all__`, whose module is loaded only when someone asks for it."""
     if name == "__version__":
-        return _version("jointctl")
-    raise AttributeError(f"module 'jointctl' has no attribute {name!r}")
+        from importlib.metadata import version
+
+        return version("jointctl")
+    if name not in __all__:
+        raise AttributeError(f"module 'jointctl' has no attribute {name!r}")
+    return getattr(_import_module(f"jointctl.{_HOME.get(name, 'drivers.errors')}"), name)

@@ -134,6 +134,7 @@ class Rig:
             self.sample.second_position_rad = self.sample.position_rad + self.twin_rad
             self.sample.drive_state = self.joint.drive_state
             self.sample.count += 1
+        self.state.slot_ns += round(elapsed_cycles * PERIOD_s * 1e9)
         step_axis(
             self.axis,
             self.state,

@@ -63,7 +63,7 @@ def set_keys(document: Any, **changes: Any) -> None:
         *sections, key = path.split("__")
         table = document
         for section in sections:
-            table = table[section]
+            table = table.setdefault(section, tomlkit.table())
         if value is None:
             del table[key]
         else:

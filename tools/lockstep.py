@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import queue
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,14 +20,14 @@ from jointctl.drivers.canopen.drive import CanopenDrive
 from jointctl.drivers.canopen.exchange import accept, begin, end, link_of
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Histogram
+from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Histogram, Word
 from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.canopen.device import Cia402Device
 from jointctl.hil.fault_kinds import fault_memory, no_faults
-from jointctl.hil.lockstep import TRUTHS, Codec, Scenario, TRUE_POSITION_rad, World, run_lockstep
+from jointctl.hil.lockstep import TRUTHS, Codec, Scenario, TRUE_POSITION_rad, World, part_of_a_run, run_lockstep
 from jointctl.hil.virtual_bus import FRAME_SIZE
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config
@@ -37,6 +38,7 @@ _COMMISSIONING_STEP_NS = 1000  # the device's clock goes on a little with every 
 _LISTENER_S = 5.0  # at most: it may have gone
 _START_GRID_NS = 5_000_000_000
 NO_STOP = -1
+STEP_RECORDS = 1 << 12  # that a stepped run's ring holds
 NO_FAULTS = no_faults()
 
 
@@ -115,6 +117,58 @@ class LockstepRun:
         return np.asarray(self.truth[:, TRUE_POSITION_rad] - self.log.desired_position_rad)
 
 
+def _memory(constants: Any, state: Any, table: np.ndarray, log: Any) -> CycleMemory:
+    return CycleMemory(
+        constants, state, table[np.newaxis], new(Sample), new(Command), np.zeros(WORDS, np.int64), log,
+        np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64), np.zeros(2, np.int64),
+    )  # fmt: skip
+
+
+class SteppedRun:
+    """A run that goes on when it is asked to; between two steps `memory` and `world` are the caller's."""
+
+    def __init__(self, memory: CycleMemory, codec: Codec, world: World, start_ns: int) -> None:
+        self.memory, self._codec, self.world = memory, codec, world
+        self.now_ns = start_ns
+        self._period_ns = round(float(memory.constants[0].law.period_s) * 1e9)
+        self._phase = memory.state["phase"]
+        self._head, self._ring = memory.words[Word.HEAD : Word.HEAD + 1], memory.ring.view(np.ndarray)
+        self._kept: list[np.ndarray] = []
+        self._taken = 0
+        self._part: Callable[[Scenario], object] | None = None
+
+    def step(self, cycles: int) -> None:
+        """So many cycles, fewer if the axis has FINISHED; the simulated time goes on all the same."""
+        while cycles > 0:
+            count = min(cycles, len(self._ring))
+            if int(self._head[0]) + count - self._taken > len(self._ring):
+                self._keep()
+            if self._phase[0] != AxisPhase.FINISHED:
+                scenario = Scenario(self.now_ns, self._period_ns, count)
+                if self._part is None:
+                    run_lockstep(self.memory, self._codec, self.world, scenario)
+                    self._part = part_of_a_run(self.memory, self._codec, self.world)
+                else:
+                    self._part(scenario)
+            self.now_ns += count * self._period_ns
+            cycles -= count
+
+    def newest(self) -> Any:
+        """The newest log record, a structured scalar that the next step may change."""
+        return self._ring[(int(self._head[0]) - 1) % len(self._ring)]
+
+    def _keep(self) -> None:
+        head = int(self._head[0])
+        self._kept.append(self._ring[np.arange(self._taken, head) % len(self._ring)])
+        self._taken = head
+
+    def records(self) -> Any:
+        """Every log record so far, a record array (N,)."""
+        self._keep()
+        self._kept = [np.concatenate(self._kept)]
+        return self._kept[0].view(np.recarray)
+
+
 class LockstepJoint:
     """The joint of a configuration, commissioned, disabled and operational."""
 
@@ -144,6 +198,17 @@ class LockstepJoint:
         constants = axis_constants(self.config, self.table, start_position_rad=self.report.start_position_rad)
         constants[0].sequence.supervisor_max_cycles = 0  # nobody to watch: simulated time has no wall clock
         return constants
+
+    def stepped(self, constants: Any, table: np.ndarray, records: int = STEP_RECORDS) -> SteppedRun:
+        """A run that goes on when it is asked to; `table` float64 (N, 5) as in `reference_at`."""
+        state = new(AxisState)
+        reset_axis(constants[0], state[0])
+        memory = _memory(constants, state, table, new(LogRecord, records))
+        world = World(
+            self._virtual.device.copy(), self.plant_constants, self.plant_state.copy(), self._virtual.queue.copy(),
+            NO_FAULTS, fault_memory(NO_FAULTS, 0),
+        )  # fmt: skip
+        return SteppedRun(memory, codec_of(self._port.copy()), world, self.start_ns)
 
     def run(
         self,
@@ -233,10 +298,7 @@ class LockstepJoint:
             faults,
             fault_memory(faults, epoch_ns),
         )
-        memory = CycleMemory(
-            constants, state, self.table[np.newaxis], new(Sample), new(Command), np.zeros(WORDS, np.int64), log,
-            np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64), np.zeros(2, np.int64),
-        )  # fmt: skip
+        memory = _memory(constants, state, self.table, log)
         scenario = Scenario(self.start_ns, round(float(axis.law.period_s) * 1e9), **how)
         written, rows = run_lockstep(memory, codec_of(self._port.copy()), world, scenario, truth)
         return LockstepRun(log[:written], state[0], plant[0], world.device[0], Fault(int(state[0].fault)), truth[:rows])

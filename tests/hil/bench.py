@@ -42,10 +42,11 @@ class Finished:
 class Started:
     """A `jointctl` process in a session of its own, its streams in files."""
 
-    def __init__(self, folder: Path, arguments: tuple[str, ...], **options: Any) -> None:
+    def __init__(self, folder: Path, arguments: tuple[str, ...], script: Path | None = None, **options: Any) -> None:
         number = len(list(folder.glob("*.stderr")))
         self._files = [folder / f"{number}.stdout", folder / f"{number}.stderr"]
-        command = [sys.executable, "-P", "-m", "jointctl.tools.verbs", *arguments]
+        what = ["-m", "jointctl.tools.verbs"] if script is None else [str(script)]
+        command = [sys.executable, "-P", *what, *arguments]
         with self._files[0].open("wb") as out, self._files[1].open("wb") as err:
             options = {"stdin": subprocess.DEVNULL, "stdout": out, "stderr": err, **options}
             self.process = subprocess.Popen(command, cwd=folder, start_new_session=True, **options)
@@ -113,6 +114,12 @@ class Bench:
 
     def run(self, *arguments: str, timeout_s: float = 180.0, **options: Any) -> Finished:
         return self.start(*arguments, **options).finished(timeout_s)
+
+    def program(self, text: str) -> Started:
+        """A program of the user's own, as a file in the folder."""
+        script = self.folder / "program.py"
+        script.write_text(text)
+        return self.start(script=script)
 
     def joint(self, config: str) -> None:
         """The virtual joint in this process, for tests that need one and no more."""

@@ -30,6 +30,7 @@ from jointctl.tools.configuration.sections import (
     Margin,
     Section,
     Sequence,
+    Stream,
     Trajectory,
     Virtual,
     whole_channel,
@@ -55,6 +56,7 @@ class Config(Section):
     virtual: Virtual | None = None
     margin: Margin = Margin()
     live: Live = Live()
+    stream: Stream = Stream()
     log: Log = Log()
 
     _path: Path = PrivateAttr(default=Path())

@@ -60,6 +60,7 @@ def axis_constants(config: Config, table: np.ndarray, *, start_position_rad: flo
     _fill_limits(axis.limits, config)
     _fill_sequence(axis.sequence, config, table, start_position_rad)
     fill_change(axis.change, axis.law, config)
+    _fill_stream(axis.stream, config)
     return constants
 
 
@@ -142,6 +143,20 @@ def fill_change(record: Any, law: Any, config: Config) -> None:
     record.move_speed_radps = APPROACH_SPEED * config.limits.velocity_max_radps
     record.move_acceleration_radps2 = config.sequence.brake_radps2
     record.move_min_s = MOVE_MIN_S
+
+
+def _fill_stream(record: Any, config: Config) -> None:
+    """Without a sign of life of the program that sends set-points: whoever follows one asks for it."""
+    stream, limits = config.stream, config.limits
+    record.delay_ns, record.timeout_ns = round(stream.delay_s * 1e9), round(stream.timeout_s * 1e9)
+    for key, automatic in (
+        ("acceleration_max_radps2", 0.5 * limits.torque_max_Nm / config.joint.inertia_kgm2),
+        ("jump_max_rad", limits.following_error_max_rad),
+        ("torque_max_Nm", 0.2 * limits.torque_max_Nm),
+        ("torque_rate_max_Nmps", 0.1 * limits.torque_rate_max_Nmps),
+    ):
+        chosen = getattr(stream, key)
+        setattr(record, key, automatic if isinstance(chosen, str) else chosen)
 
 
 def fill_trajectory(record: Any, config: Config, table: np.ndarray) -> None:

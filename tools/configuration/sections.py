@@ -300,6 +300,21 @@ class Live(Section):
     ramp_s: Annotated[float, between(0.05, 60.0)] = 0.5  # duration of a change of gains
 
 
+class Stream(Section):
+    """Set-points that a program sends while the joint moves (`jointctl.Joint.command`)."""
+
+    delay_s: Annotated[float, between(0.002, 1.0)] = 0.03  # by which the joint follows behind them
+    timeout_s: Annotated[float, between(0.002, 10.0)] = 0.1  # between two of them, after which the next is a new start
+    client_timeout_s: Annotated[float, between(0.05, 3600.0)] = 1.0  # silence of the program that ends the run
+    # "auto": half of what limits.torque_max_Nm gives the inertia
+    acceleration_max_radps2: Annotated[float | Literal["auto"], _auto_or_number(1e-6, 1e9)] = "auto"
+    # from one to the next; "auto": limits.following_error_max_rad
+    jump_max_rad: Annotated[float | Literal["auto"], _auto_or_number(1e-9, 100.0)] = "auto"
+    # on top of the law's; "auto": a fifth of limits.torque_max_Nm, a tenth of limits.torque_rate_max_Nmps
+    torque_max_Nm: Annotated[float | Literal["auto"], _auto_or_number(0.0, 1e6)] = "auto"
+    torque_rate_max_Nmps: Annotated[float | Literal["auto"], _auto_or_number(1e-6, 1e9)] = "auto"
+
+
 class Log(Section):
     folder: Annotated[str, Field(min_length=1)] = "runs"  # of the run logs, from where jointctl is started
     keep: Annotated[int, between(0, 100_000)] = 0  # newest runs to keep; 0 = all

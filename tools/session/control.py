@@ -33,7 +33,8 @@ class StopSignals:
     While `raising`, a signal also raises KeyboardInterrupt: it does so wherever nothing has to come to its end first.
     """
 
-    def __init__(self, *, raising: bool = False) -> None:
+    def __init__(self, *, raising: bool = False, wake: Callable[[], None] | None = None) -> None:
+        self._wake = wake or _wake_main
         self.count = 0
         self.name = ""  # of the first signal, or STOP_COMMAND
         self.raising = raising
@@ -75,7 +76,7 @@ class StopSignals:
         self.commanded_ns = time.monotonic_ns()
         self.name = STOP_COMMAND
         self.on_command(self.request)
-        _wake_main()  # from whatever the run waits for
+        self._wake()  # from whatever the run waits for
 
     def leave_if_asked(self) -> None:
         """`KeyboardInterrupt` once a stop was asked for: between two steps before the joint may move."""
@@ -165,6 +166,17 @@ def in_control(config: Config, output: Output) -> Iterator[Control]:
     """`BusError` names the program that has the bus."""
     with control_of(config.bus.interface, config.bus.channel, output, stop_within_s(config)) as control:
         yield control
+
+
+@contextmanager
+def in_program(config: Config, output: Output) -> Iterator[Control]:
+    """As `in_control`, for a run in another thread than the main one: Python's signals stay the program's own."""
+    signals = StopSignals(wake=lambda: None)
+    bus = config.bus
+    with BusLock(bus.interface, bus.channel, signals.on_stop_command, stop_within_s(config)) as lock:
+        for remark in lock.remarks:
+            output.warning(remark)
+        yield Control(signals, lock.marker_fd)
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol, Self
 
@@ -35,6 +35,15 @@ class ViewerRequest:
     def encoded(self) -> bytes:
         """As one message."""
         return json.dumps(asdict(self)).encode()
+
+
+@dataclass(frozen=True)
+class PreparedMotion(ViewerRequest):
+    """A motion that a program of this very process has checked; `answered` gets "" or why the loop refused it."""
+
+    trajectory: Any = None  # record array of one TrajectoryConstants
+    words: str = ""
+    answered: Callable[[str], None] = lambda _: None
 
 
 def viewer(address: str | None) -> str:

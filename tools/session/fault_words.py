@@ -165,6 +165,11 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         "run `jointctl check`; then lower the gains (kp, kv, observer_radps), switch learning off, "
         "or measure with more counts",
     ),
+    Fault.CLIENT_SILENT: FaultWords(
+        "the program that commands the joint was silent for {value:.2f} s",
+        "it hangs, computes for longer than stream.client_timeout_s, or sends only set-points that are refused",
+        "let it call the joint more often (wait instead of sleep), or raise stream.client_timeout_s",
+    ),
     Fault.DRIVE_FAULT: FaultWords(
         "the drive reported a fault (statusword {word})",
         "see the drive's error code",

@@ -27,7 +27,7 @@ from jointctl.tools.configuration.config import Config, problem_line
 from jointctl.tools.configuration.records import fill_trajectory
 from jointctl.tools.configuration.sections import Section, Trajectory
 from jointctl.tools.recording.run_log import INFO, WARNING, Event, RunLogWriter
-from jointctl.tools.session.display import Display, ViewerRequest
+from jointctl.tools.session.display import Display, PreparedMotion, ViewerRequest
 
 # --- Gains: the same gate as before enabling, on the whole way from the old ones to the new ---
 
@@ -141,6 +141,8 @@ def _what(record: Any, speed_radps: float) -> str:
     if kind is TrajectoryKind.HOLD:
         return f"set-point {record.start_rad:+.4f} rad"
     name = in_words(kind)
+    if kind is TrajectoryKind.STREAM:
+        return f"set-points as they come, from {record.start_rad:+.4f} rad"
     if kind is TrajectoryKind.SINE:
         ends = record.offset_rad - abs(record.amplitude_rad), record.offset_rad + abs(record.amplitude_rad)
     elif kind is TrajectoryKind.TABLE:
@@ -175,6 +177,7 @@ class _Change:
     payload: Any  # Gains as a mapping, or TrajectoryConstants
     gate: Future[float] | None = None
     number: int = 0  # 0: not yet with the loop
+    answered: Callable[[str], None] = lambda _: None
 
 
 class LiveChanges:
@@ -238,10 +241,13 @@ class LiveChanges:
             if int(self._block.state[0].phase) not in (AxisPhase.APPROACH, AxisPhase.TRACKING):
                 raise ConfigurationError(_WHY[ChangeAnswer.WRONG_PHASE])
             self._open = self._gains(request) if request.kind == "gains" else self._motion(request)
+            return
         except JointctlError as error:
             self._refuse(request.who, error)
         except Exception as error:  # whatever a page sends, the joint's run goes on
             self._refuse(request.who, JointctlError(f"not understood: {type(error).__name__}: {error}"))
+        if isinstance(request, PreparedMotion):
+            request.answered("refused")
 
     def _gains(self, request: ViewerRequest) -> _Change | None:
         delay_s = self._delay_s()
@@ -264,8 +270,13 @@ class LiveChanges:
         values: Mapping[str, Any] = request.values
         if request.kind == "set_point":
             values = {"kind": "hold", "duration_s": 0.0, "position_rad": request.values.get("position_rad")}
-        trajectory, words = new_motion(self._config, self._block.table, values)
+        if isinstance(request, PreparedMotion):
+            trajectory, words = request.trajectory, request.words
+        else:
+            trajectory, words = new_motion(self._config, self._block.table, values)
         change = _Change(f"motion {self.motion()} -> {words}", request.who, ChangeKind.MOTION, trajectory)
+        if isinstance(request, PreparedMotion):
+            change.answered = request.answered
         self._post(change)
         return change
 
@@ -306,6 +317,7 @@ class LiveChanges:
             return
         self._open = None
         answer = ChangeAnswer(int(state.answer))
+        change.answered("" if answer is ChangeAnswer.TAKEN else _WHY.get(answer, answer.name))
         if answer is ChangeAnswer.TAKEN:
             self._tell(INFO, f"parameter change: {change.text}, by {change.who}")
         else:
@@ -365,7 +377,7 @@ class ViewerOrders:
     def serve(self, display: Display) -> None:
         """Take what was asked for since the last call, go on with what is open, tell the page."""
         for request in display.requests():
-            if request.kind in ("gains", "set_point", "trajectory"):
+            if request.kind in ("gains", "set_point", "trajectory", "motion"):
                 self._changes.take(request)
             elif request.kind == "record":
                 self._record(bool(request.values.get("on")), request.who)

@@ -63,6 +63,7 @@ class Session:
         self._make_display = display or (lambda _: PhaseLines(output))
         self._kind = session_drive(plan.config.drive.kind)
         self.drive_state = ""  # in words, after the run
+        self.loop: LoopHandle | None = None  # once it has been started
 
     def run(self) -> RunResult | None:
         """The whole run; None if it was declined.  Afterwards the drive is off, or `drive_state` says otherwise."""
@@ -78,6 +79,7 @@ class Session:
             bus_watch(config) as bus_news,
             kept_awake(config, self._output),
         ):
+            self.loop = loop
             drive = self._kind.open(config, signals.leave_if_asked)
             guard: Guard | None = None
             try:

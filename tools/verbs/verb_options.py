@@ -140,18 +140,24 @@ VerbOutput = Annotated[Output, _output]
 
 def grouped(verb: Callable[..., int | None]) -> Callable[..., None]:
     """The verb for Typer, which ends the program with the verb's exit code; the options of its output come last."""
-    options: list[inspect.Parameter] = []
-    last: list[inspect.Parameter] = []
-    call = _collect(verb, options, last)
+    options, call = option_call(verb)
 
     @wraps(verb)
     def command(**given: Any) -> None:
         raise typer.Exit(call(given) or 0)
 
     del vars(command)["__wrapped__"]  # Typer would look through it
-    vars(command)["__signature__"] = inspect.Signature([*options, *last])
-    command.__annotations__ = {option.name: option.annotation for option in [*options, *last]}
+    vars(command)["__signature__"] = inspect.Signature(options)
+    command.__annotations__ = {option.name: option.annotation for option in options}
     return command
+
+
+def option_call(verb: Callable[..., int | None]) -> tuple[list[inspect.Parameter], Callable[[dict[str, Any]], Any]]:
+    """The verb's options, those of its output last, and what calls it with the values of all of them by name."""
+    options: list[inspect.Parameter] = []
+    last: list[inspect.Parameter] = []
+    call = _collect(verb, options, last)
+    return [*options, *last], call
 
 
 def _collect(

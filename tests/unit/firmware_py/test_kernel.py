@@ -154,12 +154,12 @@ def test_old_caches_are_removed_but_not_those_in_use(tmp_path: Path) -> None:
 PLAIN = (
     "firmware_py/axis/test_safety*", "firmware_py/axis/test_axis_swing*", "firmware_py/axis/test_sequence_*",
     "firmware_py/test_friction", "firmware_py/test_law", "drivers/canopen/test_cia402",
-    "firmware_py/axis/test_live_*", "firmware_py/axis/test_supervision_edges",
+    "firmware_py/axis/test_live_*", "firmware_py/axis/test_stream", "firmware_py/axis/test_supervision_edges",
     "firmware_py/axis/test_sweep_velocity_command",
 )  # fmt: skip
 FULLY_COVERED = (
     "drivers/canopen/cia402.py",
-    *(f"firmware_py/{name}.py" for name in ("safety", "sequence", "live_change")),
+    *(f"firmware_py/{name}.py" for name in ("safety", "sequence", "live_change", "stream")),
 )
 
 

@@ -38,9 +38,12 @@ def test_the_links_are_the_folders_under_their_installed_names() -> None:
     links = ROOT / ".typed" / "jointctl"
     if not links.exists():
         pytest.skip("this is no clone: an sdist has no links")
-    assert {link.name for link in links.iterdir()} == {"__init__.py", *TOP_LEVEL}
+    face = {path.name for path in (ROOT / "interface").glob("*.py")}
+    assert {link.name for link in links.iterdir() if link.name != "__pycache__"} == face | set(TOP_LEVEL)
     for name in TOP_LEVEL:
         assert (links / name).resolve() == ROOT / name
+    for name in face - {"__init__.py"}:
+        assert (links / name).resolve() == ROOT / "interface" / name
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,34 @@ def test_supervisor_lost(rig: NewRig, phase: AxisPhase, age_cycles: int, trips: 
         assert_well(run)
 
 
+@pytest.mark.trips(Fault.CLIENT_SILENT, "(101, True)")
+@pytest.mark.stays(Fault.CLIENT_SILENT, "(100, False)")
+@pytest.mark.parametrize("phase", [AxisPhase.ENABLING, AxisPhase.APPROACH, AxisPhase.TRACKING])
+@pytest.mark.parametrize(("silent_ms", "trips"), [(100, False), (101, True)])
+def test_client_silent(rig: NewRig, phase: AxisPhase, silent_ms: int, trips: bool) -> None:
+    run = rig(0.0).until(phase)
+    stream = run.axis.stream
+    stream.client_timeout_ns = 100_000_000
+    stream.alive_ns[0] = run.state.slot_ns + 1_000_000 - silent_ms * 1_000_000
+    run.tick()
+    if trips:
+        assert run.state.fault_value == pytest.approx(1e-3 * silent_ms)
+        reaction = Reaction.OFF if phase is AxisPhase.ENABLING else Reaction.RAMP
+        assert_fault(run, Fault.CLIENT_SILENT, reaction)
+    else:
+        stream.client_timeout_ns = 0
+        assert_well(run.until(AxisPhase.TRACKING))
+
+
+def test_a_joint_that_is_being_stopped_needs_no_client(rig: NewRig) -> None:
+    run = rig(0.0).until(AxisPhase.TRACKING)
+    run.stop = StopRequest.RAMP
+    run.tick()
+    run.axis.stream.client_timeout_ns = 1
+    finish(run)
+    assert run.state.fault == Fault.NONE
+
+
 def test_a_run_without_supervision_does_not_look_for_it(rig: NewRig) -> None:
     run = rig(0.0)
     run.axis.sequence.supervisor_max_cycles = 0

@@ -124,8 +124,11 @@ TRAJECTORIES: list[tuple[dict[str, float], bool]] = [
     ({"kind": TrajectoryKind.TRAPEZOID, "target_rad": 1.0, "speed_radps": 1.0, "acceleration_radps2": 0.0}, False),
     ({"kind": TrajectoryKind.TRAPEZOID, "target_rad": 1.0, "speed_radps": 1.0, "acceleration_radps2": math.nan}, False),
     ({"kind": TrajectoryKind.TABLE, "table_rows": 7}, True),
-    ({"kind": TrajectoryKind.TABLE, "table_rows": 6}, False),
+    ({"kind": TrajectoryKind.TABLE, "table_rows": 2}, True),
+    ({"kind": TrajectoryKind.TABLE, "table_rows": 1}, False),
     ({"kind": TrajectoryKind.TABLE, "table_rows": 8}, False),
+    ({"kind": TrajectoryKind.STREAM, "start_rad": 1.0}, True),
+    ({"kind": TrajectoryKind.STREAM, "start_rad": 1.001}, False),
     ({"kind": 9}, False),
 ]  # fmt: skip
 

@@ -96,7 +96,7 @@ def test_drive_state(state: DriveState, expected: bool) -> None:
 
 
 POWERED = (AxisPhase.APPROACH, AxisPhase.TRACKING, AxisPhase.RAMPING, AxisPhase.RELEASING)
-BY_RAMP = (Fault.REFERENCE_LIMIT, Fault.SUPERVISOR_LOST, Fault.OVERRUN)
+BY_RAMP = (Fault.REFERENCE_LIMIT, Fault.SUPERVISOR_LOST, Fault.OVERRUN, Fault.CLIENT_SILENT)
 BY_POWER_OFF = (Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED, Fault.DRIVE_RESTARTED)
 
 

@@ -38,6 +38,7 @@ def after(fault: Fault, phase: AxisPhase) -> AxisPhase:
         ("heartbeat_age_cycles", 9, 10, Fault.DRIVE_SILENT),
         ("skipped", 5, 6, Fault.OVERRUN),
         ("supervisor", 11, 12, Fault.SUPERVISOR_LOST),
+        ("client", 50, 51, Fault.CLIENT_SILENT),
     ],
 )
 @pytest.mark.parametrize("phase", list(AxisPhase))
@@ -46,6 +47,7 @@ def test_each_limit_at_its_edge_in_each_phase(
 ) -> None:
     axis.limits.sample_age_max_cycles, axis.limits.heartbeat_age_max_cycles = 7, 9
     axis.limits.skipped_max_cycles, axis.sequence.supervisor_max_cycles = 5, 11
+    axis.stream.client_timeout_ns = 50
     torque = AxisPhase.APPROACH <= phase <= AxisPhase.RELEASING
     if phase >= AxisPhase.DISABLING:
         counts = False
@@ -53,6 +55,8 @@ def test_each_limit_at_its_edge_in_each_phase(
         counts = True
     elif fault in (Fault.DRIVE_NOT_ENABLED, Fault.OVERRUN):
         counts = torque
+    elif fault is Fault.CLIENT_SILENT:
+        counts = AxisPhase.ENABLING <= phase <= AxisPhase.TRACKING
     else:
         counts = torque or phase == AxisPhase.ENABLING
     for value, trips in ((within, False), (beyond, counts)):
@@ -61,6 +65,8 @@ def test_each_limit_at_its_edge_in_each_phase(
         state.phase, sample.drive_state = phase, DriveState.ENABLED
         if what == "sample_age_cycles":
             state.sample_age_cycles = value
+        elif what == "client":
+            state.slot_ns = value
         elif what not in ("skipped", "supervisor"):
             setattr(sample, what, value)
         check_supervision(axis, state, sample, value if what == "skipped" else 0, value if what == "supervisor" else 0)

@@ -1,0 +1,1 @@
+../../interface/joint_source.py

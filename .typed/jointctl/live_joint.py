@@ -1,0 +1,1 @@
+../../interface/live_joint.py

@@ -1,0 +1,1 @@
+../../interface/lockstep_joint.py

@@ -1,0 +1,157 @@
+"""`jointctl.Joint` in real time: however the program ends, the joint is stopped and off."""
+
+from __future__ import annotations
+
+import signal
+import time
+from typing import Any
+
+import pytest
+
+from jointctl.firmware_py.states import AxisPhase, Fault
+
+PROGRAM = """
+import math, sys, time
+import jointctl
+
+def say(text):
+    print(text, file=sys.stderr, flush=True)
+
+with jointctl.Joint("joint.toml") as joint:
+    say(joint.state.phase)
+    joint.enable({approve})
+    say("enabled")
+    {body}
+say("left")
+"""
+STREAM = """
+    start = joint.state.desired_position_rad
+    begun = time.monotonic()
+    while True:
+        t = time.monotonic() - begun
+        share = min(t, 1.0) ** 2
+        joint.command(start + 0.1 * share * math.sin(t), time_s=t)
+        if t > 2.0: say("streaming")
+        time.sleep(0.005)
+"""
+
+
+def started(bench: Any, body: str, approve: str = "", **changes: Any) -> Any:
+    # a busy computer must not be the fault that is seen
+    config = bench.config(
+        **{"stream__delay_s": 0.3, "stream__timeout_s": 1.0, "stream__client_timeout_s": 3.0, **changes}
+    )
+    bench.joint(config)
+    return bench.program(PROGRAM.format(body=body.strip(), approve=approve))
+
+
+def phases(bench: Any) -> list[int]:
+    return [int(phase) for phase in dict.fromkeys(bench.log().records.phase.tolist())]
+
+
+RAMPED = [AxisPhase.TRACKING, AxisPhase.RAMPING, AxisPhase.RELEASING, AxisPhase.DISABLING, AxisPhase.FINISHED]
+
+
+def test_motions_and_set_points_then_off(bench: Any) -> None:
+    body = """
+    joint.move_to(0.2, duration_s=1.0)
+    joint.follow([0.0, 0.5, 1.0], [0.2, 0.25, 0.2])
+    for k in range(1, 200):
+        joint.command(0.2 + 1e-6 * k * k, time_s=0.005 * k)
+        time.sleep(0.005)
+    joint.wait(0.5)
+    say(f"at {joint.state.desired_position_rad:.6f}")
+    """
+    ended = started(bench, body).finished()
+    assert ended.code == 0, ended.err
+    brake_rad = (397e-6 / 0.005) ** 2 / (2.0 * 2.0)  # from the last set-point on, at 2 rad/s2
+    assert f"at {0.2 + 1e-6 * 199**2 + brake_rad:.5f}" in ended.err
+    log = bench.log()
+    assert phases(bench)[-5:] == RAMPED
+    tracking = log.records[log.records.phase == AxisPhase.TRACKING]
+    assert abs(tracking.error_rad).max() < 0.01
+    assert bench.disabled()
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ("joint.move_to(0.2); raise ValueError('mine')", "ValueError: mine"),
+        ("joint.stop(); joint.move_to(0.2)", "the run has ended, by the program; the joint is off"),
+        ("time.sleep(8.0)", "CLIENT_SILENT"),
+        ("joint.command(5.0)", "position_rad (=5) must be in [-0.7..0.7]"),
+    ],
+)
+def test_an_exception_ramps_down_and_disables(bench: Any, body: str, words: str) -> None:
+    ended = started(bench, body).finished()
+    assert ended.code == 1
+    assert words in ended.err
+    assert phases(bench)[-5:] == RAMPED
+    assert bench.disabled()
+
+
+def test_set_points_that_are_refused_are_no_sign_of_life(bench: Any) -> None:
+    body = """
+    while True:
+        try: joint.command(5.0)
+        except jointctl.SetPointError: time.sleep(0.05)
+    """
+    ended = started(bench, body).finished()
+    assert ended.code == 1
+    assert "CLIENT_SILENT" in ended.err
+    assert bench.log().records.fault[-1] == Fault.CLIENT_SILENT
+    assert bench.disabled()
+
+
+@pytest.mark.parametrize("body", ["joint.wait(30.0)", STREAM], ids=["at rest", "streaming"])
+def test_ctrl_c_ramps_down(bench: Any, body: str) -> None:
+    program = started(bench, body).saw("streaming" if body == STREAM else "enabled")
+    program.signal(signal.SIGINT)
+    ended = program.finished(30.0)
+    assert "KeyboardInterrupt" in ended.err
+    assert phases(bench)[-5:] == RAMPED
+    assert bench.disabled()
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_the_death_of_the_interpreter_ramps_down(bench: Any, number: int) -> None:
+    program = started(bench, STREAM).saw("streaming")
+    program.signal(number)
+    program.finished(30.0)
+    give_up_s = time.monotonic() + 20.0
+    while not list(bench.folder.glob("runs/*.tail.mcap")):
+        assert time.monotonic() < give_up_s
+        time.sleep(0.1)
+    time.sleep(1.0)
+    log = bench.log()
+    assert log.records.fault[-1] == Fault.SUPERVISOR_LOST
+    assert log.records.phase[-1] == AxisPhase.FINISHED
+    assert bench.disabled()
+
+
+@pytest.mark.parametrize("when", ["commissioned", "enabled"])
+def test_jointctl_stop_ends_it_for_good(bench: Any, when: str) -> None:
+    program = started(bench, "joint.wait(60.0)", approve="lambda lines: time.sleep(4.0) or True").saw(when)
+    stopped = bench.run("stop", "joint.toml")
+    assert (stopped.code, "switch on disabled" in stopped.out) == (0, True), stopped
+    ended = program.finished(30.0)
+    assert ended.code == 1
+    assert "by jointctl stop" in ended.err
+    assert bench.disabled()
+
+
+def test_a_second_program_is_refused_by_name(bench: Any) -> None:
+    program = started(bench, "joint.wait(60.0)").saw("enabled")
+    second = bench.run("run", "joint.toml", "-y")
+    second.refused(4, "program.py")
+    program.signal(signal.SIGINT)
+    program.finished(30.0)
+    assert bench.disabled()
+
+
+def test_approve_is_shown_the_envelope_and_may_say_no(bench: Any) -> None:
+    ended = started(bench, "", approve="lambda lines: say('|'.join(lines)) or False").finished()
+    assert ended.code == 1
+    assert "limits     -0.700 .. +0.700 rad" in ended.err
+    assert "not approved; nothing has moved" in ended.err
+    assert bench.disabled()

@@ -1,0 +1,296 @@
+"""Set-points that come while the joint moves: what is followed, what is refused, and what happens without them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jointctl.firmware_py.records import SET_POINTS, ChangeKind, Reference, SetPoint
+from jointctl.firmware_py.safety import set_point_problem
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest, TrajectoryKind
+from jointctl.firmware_py.states import SetPointProblem as Problem
+from jointctl.firmware_py.stream import between
+from tests.axis_on_stub_joint import NewRig, Rig, assert_well, finish
+
+DELAY_ms, TIMEOUT_ms = 30, 100
+MS = 1_000_000
+
+
+class StreamRig(Rig):
+    """A rig whose motion is set-points; `put` is what a program does."""
+
+    def __init__(self, position_rad: float = 0.0) -> None:
+        super().__init__(position_rad)
+        axis = self.axis
+        axis.trajectory.kind, axis.trajectory.start_rad, axis.sequence.approach_s = (
+            TrajectoryKind.STREAM,
+            position_rad,
+            0.0,
+        )
+        set_limits(axis.stream)
+        self.until(AxisPhase.TRACKING)
+
+    def put(self, position_rad: float, velocity_radps: float = 0.0, *, at_ms: float = 0.0, **more: float) -> None:
+        """A set-point for now, or that much later."""
+        stream = self.axis.stream
+        number = int(stream.written[0])
+        stream.time_ns[number % SET_POINTS] = self.state.slot_ns + round(at_ms * MS)
+        values = position_rad, velocity_radps, more.get("acceleration_radps2", math.nan), more.get("torque_Nm", 0.0)
+        stream.values[number % SET_POINTS] = values
+        stream.written[0] = number + 1
+
+    @property
+    def at(self) -> tuple[float, float]:
+        return float(self.state.reference.position_rad), float(self.state.reference.velocity_radps)
+
+
+def set_limits(stream: Any) -> None:
+    stream.delay_ns, stream.timeout_ns = DELAY_ms * MS, TIMEOUT_ms * MS
+    stream.acceleration_max_radps2, stream.jump_max_rad = 20.0, 0.2
+    stream.torque_max_Nm, stream.torque_rate_max_Nmps = 5.0, 500.0
+
+
+def ramp(run: StreamRig, cycles: int, every: int = 10, rate_radps: float = 0.2) -> None:
+    """Set-points of a ramp that begins softly."""
+    begun_ns = run.state.slot_ns
+    for k in range(cycles):
+        if k % every == 0:
+            t_s = (run.state.slot_ns - begun_ns) * 1e-9
+            soft_s = 0.1
+            speed = rate_radps * min(1.0, t_s / soft_s)
+            way = 0.5 * speed * t_s if t_s < soft_s else rate_radps * (t_s - 0.5 * soft_s)
+            run.put(way, speed)
+        run.tick()
+
+
+def test_the_reference_follows_the_delay_behind() -> None:
+    run = StreamRig()
+    ramp(run, 500)
+    position_rad, velocity_radps = run.at
+    assert velocity_radps == pytest.approx(0.2)
+    assert position_rad == pytest.approx(0.2 * (0.499 - 0.05 - 1e-3 * DELAY_ms), abs=2.1e-4)
+    assert run.state.stream.refused == 0
+    assert_well(run)
+
+
+@pytest.mark.parametrize("overrun", [1, 4])
+def test_without_set_points_it_brakes_and_rests_and_may_begin_again(overrun: int) -> None:
+    run = StreamRig()
+    ramp(run, 301)
+    last_rad = 0.2 * (0.3 - 0.05)
+    for _ in range(200 // overrun):
+        run.tick(overrun)
+    position_rad, velocity_radps = run.at
+    assert velocity_radps == 0.0
+    assert position_rad == pytest.approx(last_rad + 0.2**2 / 40.0, abs=1e-6)
+    run.put(position_rad + 0.005)
+    run.run(2 * DELAY_ms)
+    assert run.at == (pytest.approx(position_rad + 0.005), 0.0)
+    assert_well(run)
+
+
+def test_set_points_that_lie_close_are_one() -> None:
+    run = StreamRig()
+    for k in range(1, 30):
+        run.put(1e-5 * k, at_ms=k)
+    for _ in range(DELAY_ms + 28):
+        run.tick()
+        if run.state.stream.following:
+            length_ms = (run.state.stream.after.time_ns - run.state.stream.before.time_ns) / MS
+            assert length_ms >= DELAY_ms / 3 or run.state.stream.taken == 29
+    run.run(30)
+    assert run.at == (pytest.approx(29e-5), 0.0)
+    assert run.state.stream.refused == 0
+
+
+def test_one_that_breaks_a_limit_is_left_out_and_the_others_are_followed() -> None:
+    run = StreamRig()
+    run.put(0.001, at_ms=0)
+    run.put(9.0, at_ms=20)
+    run.put(0.002, at_ms=40)
+    run.run(120)
+    assert run.state.stream.refused == 1
+    assert run.at == (pytest.approx(0.002), 0.0)
+
+
+def test_after_an_overrun_it_goes_on_where_it_is_by_then() -> None:
+    run = StreamRig()
+    run.axis.limits.skipped_max_cycles = 50
+    for k in range(20):
+        run.put(1e-4 * k, at_ms=10 * k)
+    run.run(DELAY_ms + 20)
+    run.tick(50)
+    assert run.at[0] == pytest.approx(7e-4, abs=1e-4)
+
+
+def test_one_that_comes_after_its_time_is_left_out() -> None:
+    run = StreamRig()
+    run.put(0.01, at_ms=-DELAY_ms - 5)
+    run.run(50)
+    assert (run.state.stream.refused, run.at) == (1, (0.0, 0.0))
+
+
+def test_the_torque_comes_on_top_at_its_rate_and_goes_with_the_set_points() -> None:
+    run = StreamRig()
+    for k in range(20):
+        run.put(0.0, at_ms=10 * k, torque_Nm=min(4.0, 1.0 * k))
+    run.run(150)
+    assert run.state.stream.torque_Nm == pytest.approx(4.0)
+    run.run(80)
+    assert run.state.stream.torque_Nm < 4.0
+    for _ in range(20):
+        before = float(run.state.stream.torque_Nm)
+        run.tick()
+        assert abs(float(run.state.stream.torque_Nm) - before) <= 0.5 + 1e-12
+    assert run.state.stream.torque_Nm == 0.0
+
+
+def test_a_stop_takes_the_torque_away_and_drops_what_comes() -> None:
+    run = StreamRig()
+    run.put(0.0, at_ms=0, torque_Nm=3.0)
+    run.run(DELAY_ms)
+    assert run.state.stream.torque_Nm > 2.0
+    run.stop = StopRequest.RAMP
+    run.tick()
+    run.put(0.1)
+    finish(run)
+    assert (float(run.state.stream.torque_Nm), int(run.state.stream.refused)) == (0.0, 1)
+
+
+def test_an_acceleration_that_is_given_is_fed_forward() -> None:
+    run = StreamRig()
+    run.put(0.0, at_ms=0, acceleration_radps2=2.0)
+    run.put(0.0, at_ms=20, acceleration_radps2=4.0)
+    run.run(DELAY_ms + 10)
+    assert run.state.reference.acceleration_radps2 == pytest.approx(3.0)
+
+
+def test_set_points_are_for_rest_not_for_a_motion(rig: NewRig) -> None:
+    run = StreamRig()
+    run.axis.trajectory.kind, run.axis.trajectory.amplitude_rad = TrajectoryKind.SINE, 0.0
+    run.run(5)
+    run.axis.trajectory.amplitude_rad = 0.3
+    run.run(5)
+    run.put(0.0)
+    run.run(5)
+    assert run.axis.trajectory.kind == TrajectoryKind.SINE
+    assert run.state.stream.refused == 1
+    run.axis.trajectory.kind, run.axis.trajectory.start_rad = TrajectoryKind.HOLD, run.at[0]
+    run.tick()
+    run.put(run.at[0])
+    run.run(5)
+    assert run.axis.trajectory.kind == TrajectoryKind.STREAM
+
+
+def test_a_new_motion_ends_the_stream() -> None:
+    run = StreamRig()
+    ramp(run, 300)
+    change = run.axis.change
+    change.move_speed_radps, change.move_acceleration_radps2, change.move_min_s = 1.0, 10.0, 0.01
+    request = change.request
+    request.kind, request.trajectory.kind, request.trajectory.start_rad = ChangeKind.MOTION, TrajectoryKind.STREAM, 0.0
+    request.first = request.last = 1
+    change.order[0] = 1
+    run.put(0.06)
+    run.run(600)
+    assert run.at == (pytest.approx(0.0, abs=1e-12), 0.0)
+    assert_well(run)
+
+
+# --- the limits, as a pure function ---
+def problem(before: tuple[float, ...] = (0.0,) * 3, after: tuple[float, ...] = (0.0,) * 3, ms: float = 30.0) -> Problem:
+    run = Rig()
+    limits = run.axis.limits
+    limits.position_min_rad, limits.position_max_rad, limits.velocity_max_radps = -0.5, 0.5, 1.0
+    set_limits(run.axis.stream)
+    points = new(SetPoint, 2)
+    for point, (position, velocity, torque), at_ms in zip(points, (before, after), (0.0, ms), strict=True):
+        point.position_rad, point.velocity_radps, point.torque_Nm = position, velocity, torque
+        point.time_ns, point.acceleration_radps2 = round(at_ms * MS), math.nan
+    if len(after) > 3:
+        points[1].acceleration_radps2 = after[3]
+    return Problem(int(set_point_problem(limits, run.axis.stream, 20.0, points[0], points[1])))
+
+
+NONE, FAST = Problem.NONE, (0.0, 0.9, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("inside", "outside", "expected"),
+    [
+        ({"ms": 130.0}, {"ms": 130.001}, Problem.TIME),
+        ({"ms": 0.001}, {"ms": 0.0}, Problem.TIME),
+        ({}, {"after": (math.nan, 0.0, 0.0)}, Problem.POSITION),
+        ({}, {"after": (0.0, math.inf, 0.0)}, Problem.VELOCITY),
+        ({"before": (0.5, 0.0, 0.0), "after": (0.5, 0.0, 0.0)}, {"after": (0.501, 0.0, 0.0)}, Problem.POSITION),
+        ({"before": FAST, "after": (0.0285, 1.0, 0.0)}, {"before": FAST, "after": (0.0, 1.001, 0.0)}, Problem.VELOCITY),
+        ({"after": (0.2, 0.0, 0.0), "before": (0.195, 0.0, 0.0)}, {"after": (0.201, 0.0, 0.0)}, Problem.JUMP),
+        ({"after": (0.0, 0.0, 5.0)}, {"after": (0.0, 0.0, 5.001)}, Problem.TORQUE),
+        ({"after": (0.0, 0.0, 0.5), "ms": 1.0}, {"after": (0.0, 0.0, 0.501), "ms": 1.0}, Problem.TORQUE_RATE),
+        ({}, {"after": (0.0, 0.0, math.nan)}, Problem.TORQUE),
+        ({"after": (0.009, 0.6, 0.0)}, {"after": (0.009, 0.601, 0.0)}, Problem.ACCELERATION),
+        ({"after": (0.00899, 0.0, 0.0)}, {"after": (0.00901, 0.0, 0.0)}, Problem.ACCELERATION),
+    ],
+)  # fmt: skip
+def test_each_limit_at_its_edge(inside: dict[str, Any], outside: dict[str, Any], expected: Problem) -> None:
+    assert problem(**inside) is NONE
+    assert problem(**outside) is expected
+
+
+@pytest.mark.parametrize("given_radps2", [20.0, 20.1, -math.inf])
+def test_an_acceleration_that_is_given_has_the_same_limit(given_radps2: float) -> None:
+    expected = NONE if given_radps2 == 20.0 else Problem.ACCELERATION
+    run = Rig()
+    set_limits(run.axis.stream)
+    points = new(SetPoint, 2)
+    points[1].time_ns, points[1].acceleration_radps2 = 30 * MS, given_radps2
+    assert set_point_problem(run.axis.limits, run.axis.stream, 20.0, points[0], points[1]) == expected
+
+
+def test_a_way_that_could_not_be_braked_inside_the_limits_is_refused() -> None:
+    before, after = (0.44, 0.6, 0.0), (0.458, 0.6, 0.0)
+    assert problem(before, after) is NONE
+    assert problem((0.46, 0.6, 0.0), (0.478, 0.6, 0.0)) is Problem.STOPPING_WAY
+
+
+def test_a_velocity_between_two_set_points_counts_too() -> None:
+    assert problem((0.0, 0.95, 0.0), (0.0285, 0.95, 0.0)) is NONE
+    assert problem((0.0, 0.95, 0.0), (0.036, 0.95, 0.0)) is Problem.VELOCITY
+
+
+numbers = st.floats(-2.0, 2.0) | st.sampled_from([math.nan, math.inf, -math.inf, 1e300])
+
+
+@settings(max_examples=200)
+@given(st.lists(st.tuples(numbers, numbers, numbers, st.floats(-50.0, 300.0)), max_size=30), st.integers(1, 3))
+def test_whatever_comes_the_reference_stays_inside_its_limits(points: list[tuple[float, ...]], elapsed: int) -> None:
+    run = StreamRig()
+    limits = run.axis.limits
+    limits.position_min_rad, limits.position_max_rad, limits.velocity_max_radps = -0.5, 0.5, 2.0
+    for position, velocity, torque, at_ms in points:
+        run.put(position, velocity, torque_Nm=torque, at_ms=at_ms)
+        for _ in range(8):
+            run.tick(elapsed)
+            reference = run.state.reference
+            assert -0.5 <= reference.position_rad <= 0.5
+            assert abs(reference.velocity_radps) <= 2.0
+            assert abs(float(run.state.stream.torque_Nm)) <= 5.0
+            assert run.state.fault == Fault.NONE
+
+
+def test_between_two_set_points_it_is_the_cubic() -> None:
+    points, reference = new(SetPoint, 2), new(Reference)[0]
+    points[1].time_ns, points[1].position_rad, points[1].velocity_radps = 100 * MS, 0.1, 1.0
+    points[0].acceleration_radps2 = math.nan
+    grid = np.linspace(0.0, 0.1, 11)
+    for t_s in grid:
+        between(points[0], points[1], round(t_s * 1e9), reference)
+        u = t_s / 0.1
+        wanted = 0.1 * (3 * u * u - 2 * u**3) + 0.1 * (u**3 - u * u)
+        assert reference.position_rad == pytest.approx(wanted, abs=1e-12)

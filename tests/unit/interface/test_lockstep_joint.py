@@ -1,0 +1,225 @@
+"""`jointctl.Joint` at simulated time: motions, set-points, refusals, faults, one's own law."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+import jointctl
+from jointctl.joint import Joint, SetPointError
+
+RATE_Hz = 100.0
+
+
+@pytest.fixture
+def joint() -> Iterator[Joint]:
+    with Joint("virtual", lockstep=True) as joint:
+        joint.enable()
+        yield joint
+
+
+def sine(amplitude_rad: float, frequency_Hz: float, t_s: float) -> tuple[float, float]:
+    """From rest: the amplitude grows for a second."""
+    omega = math.tau * frequency_Hz
+    u = min(t_s, 1.0)
+    share, rate = u * u * (3.0 - 2.0 * u), 6.0 * u * (1.0 - u)
+    return (
+        amplitude_rad * share * math.sin(omega * t_s),
+        amplitude_rad * (share * omega * math.cos(omega * t_s) + rate * math.sin(omega * t_s)),
+    )
+
+
+def streamed(joint: Joint, seconds: float, rate_Hz: float = RATE_Hz, *, velocity: bool = True, **more: float) -> None:
+    start_rad = joint.state.desired_position_rad
+    for k in range(1, round(seconds * rate_Hz) + 1):
+        position_rad, velocity_radps = sine(0.05, 0.5, k / rate_Hz)
+        joint.command(start_rad + position_rad, velocity_radps if velocity else None, time_s=k / rate_Hz, **more)
+        joint.step(1.0 / rate_Hz)
+
+
+def test_it_is_commissioned_then_enabled_then_moves_and_is_off_afterwards() -> None:
+    with Joint("virtual", lockstep=True) as joint:
+        assert joint.state.phase == "commissioned"
+        joint.enable()
+        assert joint.state.phase == "tracking"
+        joint.move_to(0.2, duration_s=1.0)
+        assert joint.state.desired_position_rad == pytest.approx(0.2)
+        assert abs(joint.state.position_rad - 0.2) < 1e-3
+    assert joint.state.phase == "finished"
+    assert joint.state.fault == ""
+
+
+@pytest.mark.parametrize("rate_Hz", [50.0, 200.0, 1000.0])
+def test_the_reference_is_the_cubic_through_the_set_points_a_delay_later(joint: Joint, rate_Hz: float) -> None:
+    start_rad = joint.state.desired_position_rad
+    first = len(joint.records)
+    streamed(joint, 3.0, rate_Hz)
+    log = joint.records[first:]
+    delay = round(joint.config.stream.delay_s * 1000.0)
+    wanted = np.array([start_rad + sine(0.05, 0.5, k / 1000.0 + 1.0 / rate_Hz)[0] for k in range(len(log))])
+    off = log.desired_position_rad[delay + 100 :] - wanted[100 : len(log) - delay]
+    assert np.abs(off).max() < 1e-6
+    assert np.abs(log.error_rad).max() < 2e-3
+
+
+def test_where_no_set_point_comes_the_reference_brakes_and_never_goes_beyond(joint: Joint) -> None:
+    rate_radps = 0.1
+    start_rad = joint.state.desired_position_rad
+    for k in range(1, 101):  # up to a constant speed, then nothing more
+        t_s = k / RATE_Hz
+        joint.command(start_rad + 0.5 * rate_radps * t_s * t_s, rate_radps * t_s, time_s=t_s)
+        joint.step(1.0 / RATE_Hz)
+    joint.step(0.5)
+    state = joint.state
+    brake_rad = rate_radps**2 / (2.0 * joint.config.sequence.brake_radps2)
+    assert state.desired_position_rad == pytest.approx(start_rad + 0.5 * rate_radps + brake_rad, abs=1e-6)
+    assert joint.records[-1].desired_velocity_radps == 0.0
+    assert state.phase == "tracking"
+    joint.command(state.desired_position_rad + 0.001, 0.0)  # and it may begin again
+    joint.step(0.2)
+    assert joint.state.desired_position_rad == pytest.approx(state.desired_position_rad + 0.001)
+
+
+@pytest.mark.parametrize(
+    ("point", "words"),
+    [
+        ((math.nan,), r"position_rad \(=nan\)"),
+        ((0.1, math.inf), r"velocity_radps \(=inf\)"),
+        ((5.0,), r"position_rad \(=5\) must be in \[-0.7..0.7\]"),
+        ((0.1, 100.0), r"velocity_radps \(=100\)"),
+        ((0.69,), "from the set-point before, must be within"),
+        ((0.14,), "takes more than"),
+        ((0.1, 0.0, math.nan), "acceleration_radps2"),
+        ((0.1, 0.0, 0.0, 1e6), r"torque_Nm \(=1e\+06\)"),
+        (("x",), "must be made of numbers"),
+    ],
+)
+def test_a_set_point_that_breaks_a_limit_is_refused_and_changes_nothing(
+    joint: Joint, point: tuple[float, ...], words: str
+) -> None:
+    before = joint.state.desired_position_rad
+    with pytest.raises(SetPointError, match=words):
+        joint.command(*point)
+    joint.step(0.3)
+    assert joint.state.desired_position_rad == before
+    joint.command(before)  # the next good one is followed
+    joint.step(0.1)
+
+
+def test_times_must_ascend_without_a_gap(joint: Joint) -> None:
+    at_rad = joint.state.desired_position_rad
+    joint.command(at_rad, 0.0, time_s=7.0)
+    joint.step(0.01)
+    for time_s in (7.0, 6.9, 7.5):
+        with pytest.raises(SetPointError, match="after the set-point before"):
+            joint.command(at_rad, 0.0, time_s=time_s)
+    joint.command(at_rad, 0.0, time_s=7.01)
+
+
+def test_a_torque_comes_on_top_and_goes_at_its_rate(joint: Joint) -> None:
+    at_rad = joint.state.desired_position_rad
+    for k in range(1, 201):
+        joint.command(at_rad, 0.0, 0.0, min(3.0, 0.1 * k), time_s=0.01 * k)
+        joint.step(0.01)
+    assert float(joint._motor.axis[0].stream.torque_Nm) == pytest.approx(3.0)
+    first = len(joint.records)
+    joint.step(1.0)
+    assert float(joint._motor.axis[0].stream.torque_Nm) == 0.0
+    steps = np.abs(np.diff(joint.records[first:].command_torque_Nm))
+    assert steps.max() < 3.0
+
+
+def test_a_motion_waits_for_the_one_before_and_set_points_are_for_rest(joint: Joint) -> None:
+    joint.move_to(0.2, duration_s=1.0, wait=False)
+    with pytest.raises(SetPointError, match="a motion is under way"):
+        joint.command(0.2)
+    joint.move_to(0.0, duration_s=1.0)
+    assert joint.state.desired_position_rad == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_table_is_followed_twice(joint: Joint) -> None:
+    times = np.linspace(0.0, 2.0, 21)
+    for amplitude_rad in (0.1, -0.1):
+        joint.follow(times, amplitude_rad * np.sin(np.pi * times / 4.0) ** 2)
+        assert joint.state.desired_position_rad == pytest.approx(amplitude_rad)
+
+
+@pytest.mark.parametrize(
+    ("times", "positions", "words"),
+    [
+        ([0.0, 1.0], [0.0, 3.0], r"\[-0.7..0.7\]"),
+        ([0.0, 0.01, 0.02], [0.0, 0.5, 0.0], "limits"),
+        ([0.0, 1.0, 0.5], [0.0, 0.1, 0.0], r"times_s\[2\]"),
+        ([0.0, 1.0], [0.0, math.nan], r"positions_rad\[1\]"),
+        ([0.0], [0.0], "must both be"),
+        ([0.0, 1.0], ["a", "b"], "numbers"),
+    ],
+)
+def test_a_table_is_checked_before_it_begins(
+    joint: Joint, times: list[float], positions: list[float], words: str
+) -> None:
+    before = joint.state.desired_position_rad
+    with pytest.raises(jointctl.ConfigurationError, match=words):
+        joint.follow(times, positions)
+    joint.step(0.1)
+    assert joint.state.desired_position_rad == before
+
+
+def test_nothing_enables_twice_and_nothing_moves_after_a_stop(joint: Joint) -> None:
+    with pytest.raises(jointctl.UsageError, match="enabled before"):
+        joint.enable()
+    joint.stop()
+    assert joint.state.phase == "finished"
+    for call in (lambda: joint.move_to(0.1), lambda: joint.command(0.1), lambda: joint.wait(0.1)):
+        with pytest.raises(jointctl.MotionFault):
+            call()
+    with pytest.raises(jointctl.UsageError):
+        joint.enable()
+
+
+def pushed() -> None:
+    with Joint("virtual", lockstep=True) as joint:
+        joint.enable()
+        for _ in range(3000):
+            joint.step_torque(40.0)
+            joint.wait(0.001)
+
+
+def test_a_fault_is_raised_with_its_cause() -> None:
+    with pytest.raises(jointctl.MotionFault, match=r"(POSITION|VELOCITY)_LIMIT"):
+        pushed()
+
+
+def test_it_is_deterministic() -> None:
+    logs = []
+    for _ in range(2):
+        with Joint("virtual", lockstep=True) as joint:
+            joint.enable()
+            streamed(joint, 1.0)
+        logs.append(joint.records)
+    assert (logs[0] == logs[1]).all()
+
+
+def test_a_law_in_python_holds_the_joint() -> None:
+    with Joint("virtual", lockstep=True) as joint:
+        joint.enable()
+        state, target_rad = joint.state, joint.state.position_rad + 0.02
+        for _ in range(2000):
+            state = joint.step_torque(8000.0 * (target_rad - state.position_rad) - 300.0 * state.velocity_radps)
+        assert abs(state.position_rad - target_rad) < 5e-3
+
+
+def test_approve_has_the_last_word() -> None:
+    with Joint("virtual", lockstep=True) as joint, pytest.raises(jointctl.MotionFault, match="not approved"):
+        joint.enable(approve=lambda lines: False)
+    assert joint.state.phase == "commissioned"
+
+
+def test_without_enable_nothing_is_followed() -> None:
+    with Joint("virtual", lockstep=True) as joint:
+        for call in (lambda: joint.move_to(0.1), lambda: joint.command(0.1)):
+            with pytest.raises(jointctl.UsageError, match="enable"):
+                call()
