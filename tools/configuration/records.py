@@ -146,7 +146,7 @@ def fill_change(record: Any, law: Any, config: Config) -> None:
 
 
 def _fill_stream(record: Any, config: Config) -> None:
-    """Without a sign of life of the program that sends set-points: whoever follows one asks for it."""
+    """Without a sign of life of the program that sends set-points: only a run that follows one asks for it."""
     stream, limits = config.stream, config.limits
     record.delay_ns, record.timeout_ns = round(stream.delay_s * 1e9), round(stream.timeout_s * 1e9)
     for key, automatic in (

@@ -49,6 +49,24 @@ class RunLog:
     frames: Any = field(default_factory=lambda: np.zeros(0, CAN_FRAME))  # array of CAN_FRAME, shape (N,)
     temperatures: Any = field(default_factory=lambda: np.zeros(0, TEMPERATURE))  # array of TEMPERATURE, shape (N,)
 
+    def to_pandas(self) -> Any:
+        """The records as a DataFrame with one column for each field, `weights_0` and so on for the network's weights.
+
+        `DataError` where pandas is not installed; jointctl itself does not need it.
+        """
+        try:
+            import pandas
+        except ModuleNotFoundError:
+            raise DataError("pandas is not installed", "python -m pip install pandas") from None
+        columns: dict[str, np.ndarray] = {}
+        for name in self.records.dtype.names:
+            values = np.asarray(self.records[name])
+            if values.ndim == 1:
+                columns[name] = values
+            else:
+                columns |= {f"{name}_{k}": values[:, k] for k in range(values.shape[1])}
+        return pandas.DataFrame(columns)
+
 
 def read_run_log(path: str | Path) -> RunLog:
     """Everything in a run log; `DataError` if it is not one. A cut-off tail is left out (`complete` is False)."""

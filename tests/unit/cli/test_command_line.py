@@ -19,12 +19,12 @@ import typer
 from typer.testing import CliRunner
 
 from jointctl.drivers.errors import ConfigurationError, DataError
+from jointctl.tools import virtual_joint
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.elmo import elmo_section
 from jointctl.tools.configuration.load import SHIPPED_FOLDER, load_config
 from jointctl.tools.experiments.paper_experiments import synthetic_sweep
 from jointctl.tools.output import Output
-from jointctl.tools.simulation import virtual_joint
 from jointctl.tools.verbs.bench_drive import ServeOptions
 from jointctl.tools.verbs.elmo_bench import ElmoBench
 from jointctl.tools.verbs.main import EPILOG, app

@@ -105,7 +105,7 @@ def test_the_hash_depends_on_the_sources_and_not_on_their_place(copy_of_sources:
     ("edited", "counts"),
     [
         ("firmware_py/friction.py", True), ("drivers/can/frame_io.py", True), ("drivers/canopen/cyclic.py", True),
-        ("hil/plant/joint.py", True), ("tools/identification/fit.py", True), ("tools/wake_up.py", True),
+        ("hil/plant.py", True), ("tools/identification/fit.py", True), ("tools/wake_up.py", True),
         ("tools/verbs/run.py", False),
     ],
 )  # fmt: skip
