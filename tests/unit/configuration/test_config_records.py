@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.elmo.settings import ElmoSettings
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py import friction as friction_model
 from jointctl.firmware_py.axis import step_velocity
@@ -16,6 +20,7 @@ from jointctl.firmware_py.records import VelocityState
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ControllerKind, FeedForward, TrajectoryKind
 from jointctl.firmware_py.trajectory import approach_peak, approach_start, peak_of
+from jointctl.tools.configuration.canopen import CanopenSection
 from jointctl.tools.configuration.checks import trajectory_extremes
 from jointctl.tools.configuration.conversions import (
     friction_constants,
@@ -23,13 +28,36 @@ from jointctl.tools.configuration.conversions import (
     torque_constant_NmpA,
     velocity_of_a_count_radps,
 )
+from jointctl.tools.configuration.elmo import ElmoSection
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.plant_settings import plant_settings
 from jointctl.tools.configuration.records import approach_s, trajectory_table
+from jointctl.tools.configuration.sections import Limits, Section
 from tests.configurations import VIRTUAL, load, problems
 from tests.sessions import constants_of
 
 NO_TABLE = np.zeros((1, 5))
+
+
+ENCODER_AND_JOINT = {
+    "rate_Hz", "torque_constant_NmpA", "reduction_ratio", "counts_per_turn", "encoder_on_motor", "encoder_direction",
+    "zero_counts",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("settings", "section", "by_hand"),
+    [
+        (CanopenSettings, CanopenSection, {"eds_path", "encoder_incremental", "joint_encoder", "temperature"}),
+        (ElmoSettings, ElmoSection, {"mode", "ramp_radps2"}),
+    ],
+)
+def test_a_setting_of_a_drive_that_no_key_gives_is_filled_by_hand(
+    settings: type[Any], section: type[Section], by_hand: set[str]
+) -> None:
+    """The others are copied by name: a key that is renamed on one side alone would leave a default in force."""
+    keys = set(section.model_fields) | set(Limits.model_fields)
+    assert {field.name for field in fields(settings)} - keys == by_hand | ENCODER_AND_JOINT
 
 
 def test_records_of_the_paper() -> None:
