@@ -314,7 +314,7 @@ def tpdo(stamp: bytes, counts: int = 7) -> bytes:
 def test_the_driver_sends_plain_frames_and_reads_no_stamp() -> None:
     with Exchange() as exchange:
         seen: list[bytes] = []
-        assert exchange.cycle(lambda sync: seen.append(sync) or tpdo(bytes((1, 2, 3)))) == 1
+        assert exchange.cycle(lambda sync: seen.append(sync) or tpdo(bytes((1, 2, 3))), wait_ns=10_000_000_000) == 1
         assert seen[0][5:8] == bytes(3)
 
 
