@@ -74,18 +74,23 @@ def check(config: str | Path, **options: Any) -> dict[str, Any]:
     return found
 
 
-def identify(data: str | Path, *, config: str | Path | None = None, **options: Any) -> Identification:
+def identify(
+    data: str | Path, *, config: str | Path | None = None, table: dict[str, Any] | None = None, **options: Any
+) -> Identification:
     """Friction model of measured plateaus, as `jointctl identify`, but nothing is written.
 
-    `options` are fields of `Options` of that module; with `config` torque and speed are checked for plausibility.
+    `table` says how to read a table that is not ours (fields of `ForeignFormat`), `options` are fields of `Options`;
+    with `config` torque and speed are checked for plausibility.
     """
-    from jointctl.tools.identification.friction_data import read_friction_data
+    from jointctl.tools.identification.friction_data import ForeignFormat, read_friction_data
     from jointctl.tools.identification.identification import Options, identify_friction
     from jointctl.tools.verbs.identify import joint_limits
     from jointctl.tools.verbs.verb_options import config_path
 
     limits = None if config is None else joint_limits(config_path(Path(config)))
-    return identify_friction(read_friction_data(Path(data)), Options(**options), limits=limits)
+    return identify_friction(
+        read_friction_data(Path(data), ForeignFormat(**(table or {}))), Options(**options), limits=limits
+    )
 
 
 def read_log(path: str | Path) -> RunLog:
