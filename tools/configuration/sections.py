@@ -310,8 +310,9 @@ class Stream(Section):
     acceleration_max_radps2: Annotated[float | Literal["auto"], _auto_or_number(1e-6, 1e9)] = "auto"
     # from one to the next; "auto": limits.following_error_max_rad
     jump_max_rad: Annotated[float | Literal["auto"], _auto_or_number(1e-9, 100.0)] = "auto"
-    # on top of the law's; "auto": a fifth of limits.torque_max_Nm, a tenth of limits.torque_rate_max_Nmps
+    # on top of the law's; "auto": a fifth of limits.torque_max_Nm
     torque_max_Nm: Annotated[float | Literal["auto"], _auto_or_number(0.0, 1e6)] = "auto"
+    # of that torque; "auto": a tenth of limits.torque_rate_max_Nmps
     torque_rate_max_Nmps: Annotated[float | Literal["auto"], _auto_or_number(1e-6, 1e9)] = "auto"
 
 

@@ -188,6 +188,18 @@ def test_set_points_are_for_rest_not_for_a_motion(rig: NewRig) -> None:
     assert run.axis.trajectory.kind == TrajectoryKind.STREAM
 
 
+def test_a_motion_from_where_the_reference_rests_begins_at_once() -> None:
+    run = StreamRig()
+    request = run.axis.change.request
+    request.kind, request.trajectory.kind = ChangeKind.MOTION, TrajectoryKind.MIN_JERK
+    request.trajectory.target_rad, request.trajectory.move_s = 0.1, 0.5
+    run.axis.change.move_min_s = 0.2
+    request.first = request.last = 1
+    run.axis.change.order[0] = 1
+    run.run(253)
+    assert run.at[0] == pytest.approx(0.05, abs=1e-3)
+
+
 def test_a_new_motion_ends_the_stream() -> None:
     run = StreamRig()
     ramp(run, 300)
