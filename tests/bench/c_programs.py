@@ -39,18 +39,21 @@ def compiler() -> str:
     raise NoCompilerError("no C compiler on this computer")
 
 
-def _compile(source: str, target: Path, options: tuple[str, ...]) -> None:
+def _compile(source: str | Path, target: Path, options: tuple[str, ...]) -> None:
     command = [compiler(), *options, str(SOURCES / source), "-o", str(target), "-lm"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode != 0:
         first = (result.stderr.strip().splitlines() or ["no message"])[0]
-        raise NoCompilerError(f"{source} does not compile: {first}")
+        raise NoCompilerError(f"{Path(source).name} does not compile: {first}")
 
 
 def law_library(folder: Path, options: tuple[str, ...]) -> ctypes.CDLL:
     """law_tick.c as a library with the given optimisation."""
     target = folder / f"law{'-'.join(options).replace('=', '-')}.so"
-    _compile("law_tick.c", target, (*options, "-shared", "-fPIC"))
+    compiled = target.with_suffix(".o")
+    _compile("law_tick.c", compiled, (*options, "-fPIC", "-c"))
+    # linked without -ffast-math: a library that is linked with it makes the whole process flush denormals to zero
+    _compile(compiled, target, ("-shared",))
     library = ctypes.CDLL(str(target))
     for name in ("run_ticks", "run_hidden"):
         getattr(library, name).argtypes = [ctypes.c_void_p] * 4 + [ctypes.c_long]

@@ -31,7 +31,7 @@ GENTLE = {
     # the guest has one processor: an answer that waited while it stood still seems to belong to the next SYNC
     "limits.position_jump_max_rad": 0.1, "limits.velocity_max_radps": 5.0,
     "sequence.supervisor_timeout_s": 5.0, "sequence.wait_timeout_s": 30.0, "drive.heartbeat_s": 0.6,
-    "log.picture": False, "loop.priority": None,
+    "log.picture": False, "loop.priority": None, "sequence.settle_s": 0.005,
 }  # fmt: skip
 # as the driver of a controller makes it
 ERROR_PASSIVE = "20000004#0020000000008000"
