@@ -43,7 +43,7 @@ def proportional_and_derivative() -> float:
             position_rad, velocity_radps, acceleration_radps2 = wanted(k * period_s)
             error_rad = state.position_rad - start_rad - position_rad
             errors.append(error_rad)
-            feedback = 3000.0 * error_rad + 60.0 * (state.velocity_radps - velocity_radps)
+            feedback = 1000.0 * error_rad + 60.0 * (state.velocity_radps - velocity_radps)
             state = joint.step_torque(inertia_kgm2 * (acceleration_radps2 - feedback))
     return 1e3 * float(np.sqrt(np.mean(np.square(errors))))
 

@@ -130,6 +130,7 @@ class LockstepMotor:
     def stop(self) -> None:
         """See `Motor`."""
         if int(self._run.memory.words[Word.HEAD]) and self.axis[0].phase < AxisPhase.FINISHED:
+            self._outside_Nm[0] = 0.0
             self._run.memory.words[Word.STOP] = StopRequest.RAMP
             self._until(AxisPhase.FINISHED)
 

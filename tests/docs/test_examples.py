@@ -31,10 +31,10 @@ def test_at_simulated_time(tmp_path: Path) -> None:
     (first,) = (block for block in blocks if "lockstep=True" in block)
     (law,) = (block for block in blocks if "step_torque" in block)
     indented = re.sub(r"^(?=.)", "    ", law, flags=re.M)
-    out = ran(tmp_path, "-c", f"import jointctl\n{first}\n{indented}\n    print(state.position_rad)")
-    error_rad, position_rad = (float(line) for line in out.splitlines())
+    out = ran(tmp_path, "-c", f"import jointctl\n{first}\n{indented}\n    print(state.position_rad - target_rad)")
+    error_rad, off_rad = (float(line) for line in out.splitlines())
     assert error_rad < 2e-3
-    assert position_rad == pytest.approx(0.1, abs=5e-3)
+    assert off_rad == pytest.approx(0.0, abs=5e-3)
 
 
 @pytest.mark.realtime

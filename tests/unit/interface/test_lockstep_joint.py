@@ -212,6 +212,14 @@ def test_a_law_in_python_holds_the_joint() -> None:
         assert abs(state.position_rad - target_rad) < 5e-3
 
 
+def test_a_stop_takes_the_torque_of_ones_own_law_away() -> None:
+    with Joint("virtual", lockstep=True) as joint:
+        joint.enable()
+        for _ in range(60):
+            joint.step_torque(30.0)
+    assert (joint.state.phase, joint.state.fault) == ("finished", "")
+
+
 def test_approve_has_the_last_word() -> None:
     with Joint("virtual", lockstep=True) as joint, pytest.raises(jointctl.MotionFault, match="not approved"):
         joint.enable(approve=lambda lines: False)
