@@ -30,7 +30,9 @@ UNIT_TESTS = ROOT / "tests" / "unit"
 TESTS = {  # below UNIT_TESTS
     "firmware_py/safety.py": (
         "firmware_py/axis/test_safety", "firmware_py/axis/test_axis_*", "firmware_py/axis/test_supervision_edges",
+        "firmware_py/axis/test_stream",
     ),
+    "firmware_py/stream.py": ("firmware_py/axis/test_stream",),
     "firmware_py/sequence.py": ("firmware_py/axis/test_sequence_*", "firmware_py/axis/test_axis_*"),
     "drivers/canopen/cia402.py": ("drivers/canopen/test_cia402",),
     "drivers/canopen/network.py": ("drivers/canopen/test_other_controllers", "drivers/canopen/test_switch_off"),
@@ -71,6 +73,7 @@ ENUMERATIONS = (
     "Notice",
     "NmtCommand",
     "NmtState",
+    "SetPointProblem",
 )
 HOMES = {  # of enumerations that are not in firmware_py/states.py
     "State": "drivers/canopen/cia402.py", "ControlWord": "drivers/canopen/cia402.py",
