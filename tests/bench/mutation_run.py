@@ -32,7 +32,7 @@ TESTS = {  # below UNIT_TESTS
         "firmware_py/axis/test_safety", "firmware_py/axis/test_axis_*", "firmware_py/axis/test_supervision_edges",
         "firmware_py/axis/test_stream",
     ),
-    "firmware_py/stream.py": ("firmware_py/axis/test_stream",),
+    "firmware_py/stream.py": ("firmware_py/axis/test_stream", "firmware_py/axis/test_sequence_rules"),
     "firmware_py/sequence.py": ("firmware_py/axis/test_sequence_*", "firmware_py/axis/test_axis_*"),
     "drivers/canopen/cia402.py": ("drivers/canopen/test_cia402",),
     "drivers/canopen/network.py": ("drivers/canopen/test_other_controllers", "drivers/canopen/test_switch_off"),

@@ -299,10 +299,29 @@ def test_whatever_comes_the_reference_stays_inside_its_limits(points: list[tuple
 def test_between_two_set_points_it_is_the_cubic() -> None:
     points, reference = new(SetPoint, 2), new(Reference)[0]
     points[1].time_ns, points[1].position_rad, points[1].velocity_radps = 100 * MS, 0.1, 1.0
-    points[0].acceleration_radps2 = math.nan
-    grid = np.linspace(0.0, 0.1, 11)
-    for t_s in grid:
-        between(points[0], points[1], round(t_s * 1e9), reference)
-        u = t_s / 0.1
-        wanted = 0.1 * (3 * u * u - 2 * u**3) + 0.1 * (u**3 - u * u)
-        assert reference.position_rad == pytest.approx(wanted, abs=1e-12)
+    points[0].acceleration_radps2, points[0].velocity_radps = math.nan, 0.5
+    for u in np.linspace(0.0, 1.0, 11):
+        between(points[0], points[1], round(u * 100 * MS), reference)
+        position = 0.1 * (3 * u**2 - 2 * u**3 + u**3 - u**2 + 0.5 * (u - 2 * u**2 + u**3))
+        velocity = 6 * u - 6 * u**2 + 3 * u**2 - 2 * u + 0.5 * (1 - 4 * u + 3 * u**2)
+        assert reference.position_rad == pytest.approx(position, abs=1e-12)
+        assert reference.velocity_radps == pytest.approx(velocity, abs=1e-12)
+        assert reference.acceleration_radps2 == pytest.approx(5.0)  # between the velocities: 0.5 rad/s in 0.1 s
+
+
+def test_it_brakes_from_the_time_of_the_last_set_point_on() -> None:
+    run = StreamRig()
+    run.put(0.003, 0.2, at_ms=0.4)
+    run.run(DELAY_ms + 1)  # 0.6 ms behind it
+    assert run.at[1] == pytest.approx(0.2 - 20.0 * 0.6e-3)
+
+
+def test_the_rate_of_the_torque_is_one_of_time_not_of_cycles() -> None:
+    run = StreamRig()
+    run.put(0.0, at_ms=0, torque_Nm=5.0)
+    run.put(0.0, at_ms=20, torque_Nm=5.0)
+    run.run(DELAY_ms + 19)
+    before = float(run.state.stream.torque_Nm)
+    run.run(1)
+    run.tick(3)  # no set-point any more: 500 Nm/s for 3 ms
+    assert before - float(run.state.stream.torque_Nm) == pytest.approx(1.5, abs=0.51)
