@@ -95,6 +95,20 @@ def test_without_set_points_it_brakes_and_rests_and_may_begin_again(overrun: int
     assert_well(run)
 
 
+def test_it_begins_again_from_wherever_the_reference_is_without_a_jump() -> None:
+    run = StreamRig()
+    ramp(run, 301)
+    while run.state.stream.following:
+        run.tick()
+    run.run(4)  # it brakes
+    position_rad, velocity_radps = run.at
+    run.put(position_rad + 0.004, velocity_radps)
+    run.tick()
+    assert run.state.stream.following
+    assert run.at[0] - position_rad == pytest.approx(0.5e-3 * velocity_radps, abs=7e-5)  # within a cycle
+    assert run.at[1] == pytest.approx(velocity_radps, abs=0.02)
+
+
 def test_set_points_that_lie_close_are_one() -> None:
     run = StreamRig()
     for k in range(1, 30):
