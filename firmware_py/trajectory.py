@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import math
@@ -371,16 +372,20 @@ def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def spline_table(time_s: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
     """The table of `reference_at`, float64 (N, 5), from ascending times and places (N,), N >= 2; the last row ends it.
 
-    A cubic spline at rest at both ends; velocity and acceleration are continuous between.  ValueError, or numbers that
-    are not finite, where the steps of time are too short for one.
+    A cubic spline at rest at both ends; velocity and acceleration are continuous between.  ValueError where the
+    steps of time are too short for one.
     """
     from scipy.interpolate import CubicSpline  # here: every start of a run would wait a third of a second for it
 
     table = np.zeros((len(time_s), 5))
     table[:, 0] = time_s
-    table[:-1, 1:] = CubicSpline(time_s, position_rad, bc_type="clamped").c[::-1].T
     table[-1, 1] = position_rad[-1]
-    return table
+    with np.errstate(all="ignore"), contextlib.suppress(ValueError, np.linalg.LinAlgError):
+        table[:-1, 1:] = CubicSpline(time_s, position_rad, bc_type="clamped").c[::-1].T
+        if np.all(np.isfinite(table)):
+            return table
+    closest = float(np.min(np.diff(time_s)))
+    raise ValueError(f"the smallest time step (={closest:g} s) must be longer, no spline can be computed")
 
 
 def table_from_csv(path: str | Path) -> np.ndarray:
@@ -391,16 +396,10 @@ def table_from_csv(path: str | Path) -> np.ndarray:
     """
     path = Path(path)
     time_s, position_rad = _read_points(path)
-    time_s = time_s - time_s[0]
-    with np.errstate(all="ignore"):
-        try:
-            table = spline_table(time_s, position_rad)
-        except (ValueError, np.linalg.LinAlgError):
-            table = np.full((1, 5), np.nan)
-    if not np.all(np.isfinite(table)):
-        closest = float(np.min(np.diff(time_s)))
-        raise ValueError(f"{path}: the smallest time step (={closest:g} s) must be longer, no spline can be computed")
-    return table
+    try:
+        return spline_table(time_s - time_s[0], position_rad)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def ends_meet(table: np.ndarray) -> bool:

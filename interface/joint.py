@@ -208,16 +208,15 @@ class Joint:
         beginning and follows it.  Errors as those of `move_to`.
         """
         from jointctl.firmware_py.records import TrajectoryConstants
-        from jointctl.tools.configuration.checks import extremes_problems
-        from jointctl.tools.session.live_changes import motion_in_words
+        from jointctl.tools.session.live_changes import checked_motion
 
         table = _table(times_s, positions_rad)
         trajectory = new(TrajectoryConstants)
         trajectory[0].kind, trajectory[0].table_rows = TrajectoryKind.TABLE, len(table)
-        peak = _peak_within(self.config, trajectory[0], table, extremes_problems)
+        words = checked_motion(self.config, trajectory[0], table)
         self._at_rest()
         self._motor.table[: len(table)] = table
-        self._go(trajectory, motion_in_words(trajectory[0], peak), float(table[-1, 0]), wait)
+        self._go(trajectory, words, float(table[-1, 0]), wait)
 
     def command(
         self,
@@ -230,9 +229,9 @@ class Joint:
     ) -> None:
         """The next set-point: the joint is there `stream.delay_s` later, along the cubic from the one before.
 
-        Without a velocity it is that from the set-point before to this one.  Without an acceleration it is that of the
-        cubic.  `torque_Nm` comes on top of the law's.  `time_s` is any clock of the program that runs at the rate of
-        real time; without it set-points count as evenly spaced.  Returns at once.
+        Without a velocity it is that from the set-point before to this one.  Without an acceleration it is that between
+        the two velocities.  `torque_Nm` comes on top of the law's.  `time_s` is any clock of the program that runs at
+        the rate of real time; without it set-points count as evenly spaced.  Returns at once.
 
         `SetPointError` names what is wrong, with value and limit: the joint goes on to the last valid set-point and
         rests there.  A set-point that is refused is no sign of life.
@@ -352,33 +351,10 @@ def _table(times_s: npt.ArrayLike, positions_rad: npt.ArrayLike) -> np.ndarray:
     if len(late):
         row = int(late[0]) + 1
         raise ConfigurationError(f"times_s[{row}] (={times[row]:g}) must be above the one before ({times[row - 1]:g})")
-    with np.errstate(all="ignore"):
-        try:
-            table = spline_table(times - times[0], positions)
-        except (ValueError, np.linalg.LinAlgError):
-            table = np.full((1, 5), np.nan)
-    if not np.all(np.isfinite(table)):
-        raise ConfigurationError(
-            f"times_s: the smallest step (={np.min(np.diff(times)):g} s) is too short for a spline"
-        )
-    return table
-
-
-def _peak_within(config: Config, trajectory: Any, table: np.ndarray, extremes_problems: Any) -> float:
-    """Greatest speed of a table; `ConfigurationError` where it leaves the limits."""
-    from jointctl.firmware_py.trajectory import peak_of
-
-    peak = peak_of(trajectory, table)
-    problems = extremes_problems(config, peak.position_min_rad, peak.position_max_rad, peak.velocity_radps)
-    torque_Nm = config.joint.inertia_kgm2 * peak.acceleration_radps2
-    if not torque_Nm <= config.limits.torque_max_Nm:
-        problems.append(
-            f"positions_rad: acceleration (={peak.acceleration_radps2:g} rad/s2) takes {torque_Nm:g} Nm, must be in "
-            f"[0..{config.limits.torque_max_Nm:g}], up to limits.torque_max_Nm"
-        )
-    if problems:
-        raise ConfigurationError(problems[0])
-    return peak.velocity_radps
+    try:
+        return spline_table(times - times[0], positions)
+    except ValueError as error:
+        raise ConfigurationError(f"times_s: {error}") from None
 
 
 _Point = tuple[int, float, float, float]  # time [ns], position, velocity, torque

@@ -28,7 +28,7 @@ from jointctl.tools.session import result as drive_end
 from jointctl.tools.session.control import Control, in_program
 from jointctl.tools.session.display import OnlyShows, PreparedMotion, Snapshot, ViewerRequest
 from jointctl.tools.session.loop_handle import RING_RECORDS, LoopHandle
-from jointctl.tools.session.plan import Placed, RunPlan, joint_lines, remark_lines
+from jointctl.tools.session.plan import Placed, RunPlan, joint_lines, limits_line, remark_lines
 from jointctl.tools.session.result import RunResult
 from jointctl.tools.session.session import Session
 from jointctl.tools.session.session_drive import drive_state_name, session_drive
@@ -55,14 +55,11 @@ class FreeMotion:
         config, start_rad = self._config, report.start_position_rad
         constants = free_constants(config, start_rad)
         constants[0].stream.client_timeout_ns = round(config.stream.client_timeout_s * 1e9)
-        limits = config.limits
         lines = (
             *joint_lines(report),
             f"motion     as the program says, from {start_rad:+.4f} rad; it may be silent for "
             f"{config.stream.client_timeout_s:g} s",
-            f"limits     {limits.position_min_rad:+.3f} .. {limits.position_max_rad:+.3f} rad, "
-            f"{limits.velocity_max_radps:.2f} rad/s, {limits.torque_max_Nm:.1f} Nm, "
-            f"following error {limits.following_error_max_rad:.3f} rad",
+            limits_line(config.limits),
             *remark_lines(report.remarks),
         )
         return Placed(constants, self.table, lines)
@@ -144,7 +141,7 @@ class LiveMotor:
 
     def __init__(self, source: JointSource, *, allow_low_margin: bool = False) -> None:
         self._source, self._allow_low_margin = source, allow_low_margin
-        self.config = source.config
+        self.config, self._drive = source.config, session_drive(source.config.drive.kind)
         self._motion, self._display = FreeMotion(self.config), _ProgramDisplay()
         self._stack = ExitStack()
         self._thread: threading.Thread | None = None
@@ -247,7 +244,7 @@ class LiveMotor:
             at_rad, age_s = self._motion.start_rad, (now_ns - self._began_ns) * 1e-9
             return State(at_rad, 0.0, 0.0, at_rad, "commissioned", "", "switch on disabled", age_s, now_ns * 1e-9)
         record = loop.block.ring.view(np.ndarray)[(head - 1) % RING_RECORDS].copy()
-        return state_of(record, session_drive(self.config.drive.kind), now_ns)
+        return state_of(record, self._drive, now_ns)
 
     def now_ns(self) -> int:
         """See `Motor`."""

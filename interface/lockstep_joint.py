@@ -17,10 +17,10 @@ from jointctl.joint import TABLE_ROWS, State
 from jointctl.live_joint import free_constants, state_of
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.lockstep import LockstepJoint
+from jointctl.tools.session.live_changes import post_change
 from jointctl.tools.session.session_drive import session_drive
 
 STOP_S = 30.0  # of simulated time, for enabling or stopping
-_POLL_S = 0.005
 
 
 class LockstepMotor:
@@ -116,12 +116,7 @@ class LockstepMotor:
     def post(self, trajectory: Any, words: str) -> None:
         """See `Motor`."""
         self.require()
-        change = self.constants[0].change
-        number = int(change.order[0]) + 1
-        request = change.request
-        request.kind, request.trajectory = ChangeKind.MOTION, trajectory[0]
-        request.first = request.last = number
-        change.order[0] = number
+        post_change(self.constants[0].change, ChangeKind.MOTION, trajectory)
         self._run.step(1)
         answer = ChangeAnswer(int(self.axis[0].change.answer))
         if answer is not ChangeAnswer.TAKEN:

@@ -1,7 +1,7 @@
 """The commands as functions: each takes the options of its command by name and returns its result.
 
     report = jointctl.check("my_joint.toml")
-    jointctl.sweep("my_joint.toml", out="sweep.csv", yes=True)
+    figures = jointctl.run("my_joint.toml", yes=True)
 
 A result is what `--json` prints, as numbers, texts, lists and dicts; `identify` and `read_log` have types of their own.
 What a command says on the way goes to stderr, as at the terminal; an exit code that is not 0 is an exception.

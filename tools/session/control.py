@@ -171,21 +171,21 @@ def in_control(config: Config, output: Output) -> Iterator[Control]:
 @contextmanager
 def in_program(config: Config, output: Output) -> Iterator[Control]:
     """As `in_control`, for a run in another thread than the main one: Python's signals stay the program's own."""
-    signals = StopSignals(wake=lambda: None)
-    bus = config.bus
-    with BusLock(bus.interface, bus.channel, signals.on_stop_command, stop_within_s(config)) as lock:
-        for remark in lock.remarks:
-            output.warning(remark)
-        yield Control(signals, lock.marker_fd)
+    bus, signals = config.bus, StopSignals(wake=lambda: None)
+    with _locked(bus.interface, bus.channel, output, stop_within_s(config), signals) as control:
+        yield control
 
 
 @contextmanager
 def control_of(interface: str, channel: str, output: Output, within_s: float = STOP_WITHIN_S) -> Iterator[Control]:
     """Of a bus; `within_s`: how long the program may take to end after `jointctl stop`."""
-    with (
-        stop_signals(raising=True) as signals,
-        BusLock(interface, channel, signals.on_stop_command, within_s) as lock,
-    ):
+    with stop_signals(raising=True) as signals, _locked(interface, channel, output, within_s, signals) as control:
+        yield control
+
+
+@contextmanager
+def _locked(interface: str, channel: str, output: Output, within_s: float, signals: StopSignals) -> Iterator[Control]:
+    with BusLock(interface, channel, signals.on_stop_command, within_s) as lock:
         for remark in lock.remarks:
             output.warning(remark)
         yield Control(signals, lock.marker_fd)

@@ -105,6 +105,11 @@ def new_motion(config: Config, table: Any, values: Mapping[str, Any]) -> tuple[A
     fill_trajectory(record, config.model_copy(update={"trajectory": trajectory}), table)
     if record.kind == TrajectoryKind.SINE:
         record.shift_s, record.switch_s = 0.5 * math.pi / record.omega_radps, 0.0
+    return constants, checked_motion(config, record, table)
+
+
+def checked_motion(config: Config, record: Any, table: Any) -> str:
+    """A `TrajectoryConstants` in words; `ConfigurationError` where position, speed or torque leave the limits."""
     peak = peak_of(record, table)
     problems = extremes_problems(config, peak.position_min_rad, peak.position_max_rad, peak.velocity_radps)
     torque_Nm = config.joint.inertia_kgm2 * peak.acceleration_radps2
@@ -115,7 +120,7 @@ def new_motion(config: Config, table: Any, values: Mapping[str, Any]) -> tuple[A
         )
     if problems:
         raise ConfigurationError(problems[0])
-    return constants, motion_in_words(record, peak.velocity_radps)
+    return motion_in_words(record, peak.velocity_radps)
 
 
 def _trajectory(config: Config, values: Mapping[str, Any]) -> Any:
@@ -167,6 +172,23 @@ _WHY = {
     ChangeAnswer.MOTION_LIMIT: "the motion leaves the limits of position or velocity",
     ChangeAnswer.NOT_FROM_REST: "the motion does not begin at rest",
 }
+
+
+def post_change(box: Any, kind: ChangeKind, payload: Any) -> int:
+    """Into the letter box of `ChangeConstants`, the request first, its number last; the loop has answered the others.
+
+    `payload`: gains as a mapping, or a record array of one `TrajectoryConstants`.
+    """
+    number, request = int(box.order[0]) + 1, box.request
+    request.kind = kind
+    if kind is ChangeKind.GAINS:
+        for name in NAMES:
+            request.gains[name] = payload[name]
+    else:
+        request.trajectory = payload[0]
+    request.first = request.last = number
+    box.order[0] = number
+    return number
 
 
 @dataclass
@@ -281,18 +303,7 @@ class LiveChanges:
         return change
 
     def _post(self, change: _Change) -> None:
-        """The request first, its number last; the loop has answered every earlier one."""
-        box = self._axis.change
-        change.number = int(box.order[0]) + 1
-        request = box.request
-        request.kind = change.kind
-        if change.kind is ChangeKind.GAINS:
-            for name in NAMES:
-                request.gains[name] = change.payload[name]
-        else:
-            request.trajectory = change.payload[0]
-        request.first = request.last = change.number
-        box.order[0] = change.number
+        change.number = post_change(self._axis.change, change.kind, change.payload)
 
     def poll(self) -> None:
         """Go on with the open change: the gate's word, then the loop's."""

@@ -20,6 +20,7 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.trajectory import approach_start, peak_of, reference_at
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import axis_constants, fill_trajectory, trajectory_table
+from jointctl.tools.configuration.sections import Limits
 from jointctl.tools.recording.log_folder import log_path
 
 START_SHARE = 0.1  # of the following error: how far from the trajectory a run without an approach may begin
@@ -75,6 +76,15 @@ def joint_lines(report: CommissioningReport) -> list[str]:
     ]
 
 
+def limits_line(limits: Limits) -> str:
+    """Of the envelope of a motion that is followed under all of them."""
+    return (
+        f"limits     {limits.position_min_rad:+.3f} .. {limits.position_max_rad:+.3f} rad, "
+        f"{limits.velocity_max_radps:.2f} rad/s, {limits.torque_max_Nm:.1f} Nm, "
+        f"following error {limits.following_error_max_rad:.3f} rad"
+    )
+
+
 def remark_lines(remarks: Iterable[str]) -> list[str]:
     """The last lines of every envelope."""
     return [f"remark     {remark}" for remark in remarks]
@@ -120,7 +130,7 @@ class ConfiguredMotion:
         first = new(Reference)[0]
         reference_at(axis.trajectory, self.table, 0, 0.0, first)
         approach = float(axis.sequence.approach_s)
-        limits, duration = config.limits, config.trajectory.duration_s
+        duration = config.trajectory.duration_s
         time_text = f"{approach + duration:.0f} s" if duration else "until stopped"
         return [
             *joint_lines(report),
@@ -129,8 +139,6 @@ class ConfiguredMotion:
             else f"approach   none: at once to {first.position_rad:+.4f} rad",
             f"trajectory {config.trajectory.kind}: {low:+.4f} .. {high:+.4f} rad, up to {speed:.3f} rad/s "
             f"and {acceleration:.3f} rad/s2, {time_text}",
-            f"limits     {limits.position_min_rad:+.3f} .. {limits.position_max_rad:+.3f} rad, "
-            f"{limits.velocity_max_radps:.2f} rad/s, {limits.torque_max_Nm:.1f} Nm, "
-            f"following error {limits.following_error_max_rad:.3f} rad",
+            limits_line(config.limits),
             *remark_lines(report.remarks),
         ]
