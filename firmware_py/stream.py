@@ -77,15 +77,18 @@ def between(before: SetPoint, after: SetPoint, time_ns: int, reference: Referenc
 
 
 @kernel
-def _next(constants: AxisConstants, state: AxisState, time_ns: int) -> bool:
-    """Go on to the first set-point after `time_ns` that may be followed; False if there is none yet."""
+def _next(constants: AxisConstants, state: AxisState, time_ns: int, elapsed_ns: int) -> bool:
+    """Go on to the first set-point after `time_ns` that may be followed; False if there is none yet.
+
+    `elapsed_ns`: since the reference was as `state` has it.
+    """
     stream, own = constants.stream, state.stream
     written = load_acquire(stream.written, 0)
     while own.taken < written:
         _fetch(stream, own.taken, own.coming)
         own.taken += 1
         if own.following == 0:  # from wherever the reference is
-            own.after.time_ns = time_ns
+            own.after.time_ns = time_ns - elapsed_ns
             own.after.position_rad = state.reference.position_rad
             own.after.velocity_radps = state.reference.velocity_radps
             own.after.acceleration_radps2 = math.nan
@@ -109,7 +112,8 @@ def step_stream(constants: AxisConstants, state: AxisState, elapsed_cycles: int)
     """The reference of this cycle, and the torque that goes with it."""
     own, reference = state.stream, state.reference
     time_ns = state.slot_ns - constants.stream.delay_ns
-    if (own.following != 0 and time_ns < own.after.time_ns) or _next(constants, state, time_ns):
+    elapsed_ns = round(elapsed_cycles * constants.law.period_s * 1e9)
+    if (own.following != 0 and time_ns < own.after.time_ns) or _next(constants, state, time_ns, elapsed_ns):
         _turn_torque(constants, state, between(own.before, own.after, time_ns, reference), elapsed_cycles)
         return
     period_s = constants.law.period_s
