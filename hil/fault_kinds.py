@@ -59,9 +59,14 @@ class FaultKind(IntEnum):
     LOOP_HELD_UP = 29  # the controller gets no processor; lockstep only
     CLOCK_STEP = 30  # the controller's clock jumps ahead, once; lockstep only [s]
     SUPERVISOR_SILENT = 31  # lockstep only
+    PROGRAM_SILENT = 32  # that sends set-points; lockstep only
+    PROGRAM_WILD = 33  # its set-points are that far off; lockstep only [rad, or NaN]
 
 
-LOCKSTEP_ONLY = (FaultKind.LOOP_HELD_UP, FaultKind.CLOCK_STEP, FaultKind.SUPERVISOR_SILENT)
+LOCKSTEP_ONLY = (
+    FaultKind.LOOP_HELD_UP, FaultKind.CLOCK_STEP, FaultKind.SUPERVISOR_SILENT, FaultKind.PROGRAM_SILENT,
+    FaultKind.PROGRAM_WILD,
+)  # fmt: skip
 
 
 @record

@@ -21,11 +21,11 @@ import numpy as np
 from jointctl.firmware_py.cycle import Clock, CycleMemory, Exchange, Slot, Word, step_cycle
 from jointctl.firmware_py.kernel import entry, inlined, kernel
 from jointctl.firmware_py.libc import load_acquire, store_release
-from jointctl.firmware_py.records import AxisState, Sample
+from jointctl.firmware_py.records import SET_POINTS, AxisState, Sample, StreamConstants
 from jointctl.firmware_py.states import StopRequest
 from jointctl.hil.canopen.device_core import accept_frame, advance
 from jointctl.hil.canopen.records import Device
-from jointctl.hil.fault_kinds import FaultKind, kind_active
+from jointctl.hil.fault_kinds import FaultKind, is_active, kind_active
 from jointctl.hil.frame_faults import clock_step_cycles, collect, hand_over, take_due, to_drive
 from jointctl.hil.plant_faults import step_faults
 from jointctl.hil.plant_records import PlantState
@@ -35,6 +35,9 @@ from jointctl.hil.virtual_bus import FRAME_SIZE, FrameQueue
 TRUE_POSITION_rad, TRUE_VELOCITY_radps, TRUE_FRICTION_Nm, TRUE_ACTUATOR_Nm, TRUE_POWER_STATE = range(5)
 TRUTHS = 5
 _NO_TRUTH = np.zeros((0, TRUTHS))
+# columns of the set-points that a program sends in a run: when, as it goes on, and what
+POINT_TIME_s, POINT_VALUES = 0, 1  # position, velocity, acceleration, torque: four columns
+NO_POINTS = np.zeros((0, 5))
 
 # slots of the frame memory, agreed with the caller that passes the codec: sent in begin (up to two), RPDO, received
 RPDO_SLOT = 2
@@ -80,6 +83,7 @@ class Scenario(NamedTuple):
     supervisor_beats: bool = True  # else its sign of life ages from what `memory.words` holds
     lost_to_drive: bool = False
     lost_from_drive: bool = False
+    set_points: np.ndarray = NO_POINTS  # float64 (N, 5), of a program: times since the start, ascending
 
 
 class _Link(NamedTuple):
@@ -179,6 +183,26 @@ def _never_slept_ns(words: np.ndarray, timespec: np.ndarray) -> int:
 # --- The run ---
 
 
+@kernel
+def _put_set_points(stream: StreamConstants, world: World, scenario: Scenario, put: int, now_ns: int) -> int:
+    """What the program does by `now_ns`, with its faults; how many of its set-points it has come to by then."""
+    faults, memory, points = world.faults, world.fault_memory[0], scenario.set_points
+    silent = kind_active(faults, memory, FaultKind.PROGRAM_SILENT, now_ns)
+    while put < len(points) and scenario.start_ns + round(points[put, POINT_TIME_s] * 1e9) <= now_ns:
+        if not silent:
+            slot = stream.written[0] % SET_POINTS
+            stream.time_ns[slot] = now_ns
+            for column in range(4):
+                stream.values[slot, column] = points[put, POINT_VALUES + column]
+            for i in range(len(faults)):
+                if faults[i].kind == FaultKind.PROGRAM_WILD and is_active(faults[i], memory, now_ns):
+                    stream.values[slot, 0] += faults[i].magnitude
+            store_release(stream.alive_ns, 0, now_ns)
+            store_release(stream.written, 0, stream.written[0] + 1)
+        put += 1
+    return put
+
+
 @inlined
 def _step_world(world: World, now_ns: int) -> None:
     """Drive and joint up to now; what has come out of the wire by now is handed over."""
@@ -208,7 +232,7 @@ def _run(memory: CycleMemory, codec: Codec, world: World, scenario: Scenario, tr
     if scenario.supervisor_beats:
         store_release(words, Word.SUPERVISOR_NS, scenario.start_ns - period_ns)
     world.queue[0].count = 0
-    first, rows, missed, elapsed = load_acquire(words, Word.HEAD), 0, 0, 1
+    first, rows, missed, elapsed, put = load_acquire(words, Word.HEAD), 0, 0, 1, 0
     finished_at = scenario.cycles
     for cycle in range(scenario.cycles + scenario.tail_cycles):
         if cycle >= finished_at + scenario.tail_cycles:
@@ -227,6 +251,8 @@ def _run(memory: CycleMemory, codec: Codec, world: World, scenario: Scenario, tr
         if scenario.supervisor_beats and not kind_active(faults, fault, FaultKind.SUPERVISOR_SILENT, now_ns):
             store_release(words, Word.SUPERVISOR_NS, now_ns)
         clock_memory[_NOW_NS] = now_ns
+        if len(scenario.set_points) > 0:
+            put = _put_set_points(memory.constants[0].stream, world, scenario, put, now_ns)
         if faulty:
             if kind_active(faults, fault, FaultKind.LOOP_HELD_UP, now_ns):
                 missed += 1

@@ -16,11 +16,10 @@ import numpy as np
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import JointctlError, MotionFault
 from jointctl.firmware_py.cycle import Word
-from jointctl.firmware_py.states import AxisPhase, Fault, TrajectoryKind, fault_name, in_words
+from jointctl.firmware_py.states import AxisPhase, Fault, fault_name, in_words
 from jointctl.joint import POLL_S, TABLE_ROWS, State
 from jointctl.joint_source import JointSource
-from jointctl.tools.configuration.records import axis_constants
-from jointctl.tools.configuration.sections import Hold
+from jointctl.tools.configuration.records import free_constants
 from jointctl.tools.output import Output
 from jointctl.tools.recording.log_folder import log_path
 from jointctl.tools.recording.run_log import ERROR, Event
@@ -54,7 +53,6 @@ class FreeMotion:
         self.start_rad = report.start_position_rad
         config, start_rad = self._config, report.start_position_rad
         constants = free_constants(config, start_rad)
-        constants[0].stream.client_timeout_ns = round(config.stream.client_timeout_s * 1e9)
         lines = (
             *joint_lines(report),
             f"motion     as the program says, from {start_rad:+.4f} rad; it may be silent for "
@@ -66,16 +64,6 @@ class FreeMotion:
 
     def require_start(self, start_position_rad: float) -> None:
         """It begins where the joint stands."""
-
-
-def free_constants(config: Any, start_rad: float) -> Any:
-    """A record array of one `AxisConstants`: at rest at `start_rad`, ready for set-points and motions."""
-    hold = Hold(kind="hold", duration_s=0.0, position_rad=start_rad)
-    sequence = config.sequence.model_copy(update={"approach_s": 0.0})
-    held = config.model_copy(update={"trajectory": hold, "sequence": sequence})
-    constants = axis_constants(held, np.zeros((1, 5)), start_position_rad=start_rad)
-    constants[0].trajectory.kind = TrajectoryKind.STREAM
-    return constants
 
 
 class _Approval:

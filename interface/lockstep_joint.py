@@ -14,8 +14,9 @@ from jointctl.firmware_py.cycle import Word
 from jointctl.firmware_py.records import ChangeAnswer, ChangeKind
 from jointctl.firmware_py.states import AxisPhase, ControllerKind, Fault, StopRequest, in_words
 from jointctl.joint import TABLE_ROWS, State
-from jointctl.live_joint import free_constants, state_of
+from jointctl.live_joint import state_of
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.records import free_constants
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.session.live_changes import post_change
 from jointctl.tools.session.session_drive import session_drive
@@ -32,7 +33,7 @@ class LockstepMotor:
         self._joint = LockstepJoint(config)
         self._drive = session_drive(config.drive.kind)
         constants = free_constants(config, self._joint.report.start_position_rad)
-        constants[0].sequence.supervisor_max_cycles = 0
+        constants[0].sequence.supervisor_max_cycles = constants[0].stream.client_timeout_ns = 0  # nobody watches
         self._run = self._joint.stepped(constants, np.zeros((TABLE_ROWS, 5)))
         self._period_s = float(constants[0].law.period_s)
         self._left_s = 0.0  # of time asked for, less than a cycle

@@ -17,6 +17,7 @@ import struct
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from functools import partial
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,6 +30,7 @@ import numpy as np
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoCommunicationError
 
+from jointctl import live_joint as live_joint_module
 from jointctl.drivers.canopen import drive as drive_module
 from jointctl.drivers.canopen import switch_off as switch_off_module
 from jointctl.drivers.canopen.drive import CanopenDrive
@@ -48,7 +50,7 @@ from jointctl.tools.session import loop_handle as loop_module
 from jointctl.tools.session import portable_loop
 from jointctl.tools.session import session as session_module
 from jointctl.tools.session.canopen_drive import CanopenSession
-from jointctl.tools.session.control import STOP_COMMAND, StopSignals
+from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.loop_handle import LoopHandle
 from jointctl.tools.virtual_joint import new_device
 
@@ -58,6 +60,8 @@ OFF_STEPS = 100  # without power, where nothing is timed
 SHORT_NAP_s, OFF_NAP_s = 0.05, 0.25  # a supervisor that looks often does so less often without power
 LONGEST_CHUNK = 250  # cycles of the loop in one compiled call
 FRAME_NS = 1_000
+LOOK_s = 0.005
+SUPERVISOR, SESSION = "supervisor", "session"  # the second: a thread of the first, where that is a user's program
 _FRAME = struct.Struct("<IB3x8s")
 POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
 
@@ -154,13 +158,20 @@ class World:
         self.programs[name] = Program(name, function, self.now_ns, self.hub)
 
     def kill(self, *names: str) -> None:
-        """They execute nothing more; one that is executing now ends here."""
+        """They execute nothing more, nor do their threads; one that is executing now ends here."""
+        if SUPERVISOR in names:
+            names = (*names, SESSION)
         for name in names:
             if (program := self.programs.pop(name, None)) is not None:
                 self.dead.append(program)  # what is forgotten would be unwound, and so act once more
         if self.current is not None and self.current.name in names:
             self.hub.switch()
             raise AssertionError("a dead program was woken")
+
+    def hang(self, name: str) -> None:
+        """It executes nothing more, but its threads go on."""
+        if (program := self.programs.pop(name, None)) is not None:
+            self.dead.append(program)
 
     # --- frames ---
 
@@ -346,6 +357,39 @@ class SimulatedLoop(LoopHandle):
         self.world.kill("loop")
 
 
+class SimulatedThread:
+    """The session of a program that uses `jointctl.Joint`: a program of the world, which ends with its interpreter."""
+
+    def __init__(self, world: World, *, target: Callable[[], Any], name: str) -> None:
+        self._world, self._target = world, target
+
+    def start(self) -> None:
+        self._world.start(SESSION, self._target)
+
+    def is_alive(self) -> bool:
+        return SESSION in self._world.programs
+
+    def join(self, timeout: float | None = None) -> None:
+        until_ns = self._world.now_ns + round((1e6 if timeout is None else timeout) * NANOSECONDS)
+        while self.is_alive() and self._world.now_ns < until_ns:
+            self._world.sleep(LOOK_s)
+
+
+class SimulatedEvent:
+    """What one program waits for and another one sets."""
+
+    def __init__(self, world: World) -> None:
+        self._world, self._happened = world, False
+
+    def set(self) -> None:
+        self._happened = True
+
+    def wait(self, timeout: float) -> bool:
+        if not self._happened:
+            self._world.sleep(timeout)
+        return self._happened
+
+
 class SilentLog:
     """Keeps the texts of events."""
 
@@ -365,10 +409,7 @@ class SilentLog:
 def stop_of_this_computer(world: World, signals: StopSignals, node: int) -> None:
     """`jointctl stop`: the request through the lock of the bus, and the frames."""
     stop_of_another_computer(world, node)
-    signals.commanded_ns = world.now_ns
-    signals.name = STOP_COMMAND
-    signals.on_command(signals.request)
-    signals.on_signal(15, None)
+    signals.on_stop_command()
 
 
 def stop_of_another_computer(world: World, node: int) -> None:
@@ -408,6 +449,7 @@ def simulated(joint: Config) -> Iterator[World]:
         return loops[-1]
 
     made = type("Loop", (SimulatedLoop,), {"world": world})
+    threads = SimpleNamespace(Thread=partial(SimulatedThread, world), Event=partial(SimulatedEvent, world))
     private = SimpleNamespace(mmap=lambda fd, size: mmap.mmap(fd, size, flags=mmap.MAP_PRIVATE))
     with contextlib.ExitStack() as stack:
         for place, name, value in (
@@ -425,6 +467,7 @@ def simulated(joint: Config) -> Iterator[World]:
             (session_module, "recording", lambda _: contextlib.nullcontext()),
             (session_module, "kept_awake", lambda *_: contextlib.nullcontext()),
             (session_module, "RunLogWriter", SilentLog),
+            (live_joint_module, "threading", threads),
         ):
             stack.callback(setattr, place, name, getattr(place, name))
             setattr(place, name, value)

@@ -27,7 +27,16 @@ from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.canopen.device import Cia402Device
 from jointctl.hil.fault_kinds import fault_memory, no_faults
-from jointctl.hil.lockstep import TRUTHS, Codec, Scenario, TRUE_POSITION_rad, World, part_of_a_run, run_lockstep
+from jointctl.hil.lockstep import (
+    NO_POINTS,
+    TRUTHS,
+    Codec,
+    Scenario,
+    TRUE_POSITION_rad,
+    World,
+    part_of_a_run,
+    run_lockstep,
+)
 from jointctl.hil.virtual_bus import FRAME_SIZE
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config
@@ -252,11 +261,13 @@ class LockstepJoint:
         stop_cycle: int = NO_STOP,
         longest_s: float | None = None,
         tail_s: float = 0.0,
+        set_points: np.ndarray = NO_POINTS,
     ) -> LockstepRun:
         """As `run`, with these `FaultConstants`; `truth` has a row each period.
 
         The faults' times count from the first time that the power stage is on, or from the start of the run.
         The joint is watched for `tail_s` after the controller has ended and is silent.
+        `set_points`: those of a program, see `hil.lockstep.Scenario`.
         """
         constants = self.constants() if constants is None else constants
         cycles = self._longest_cycles(constants[0], longest_s)
@@ -264,7 +275,7 @@ class LockstepJoint:
         return self._carry_out(
             constants, plant_constants, plant_state, new(LogRecord, cycles), np.zeros((cycles + tail_cycles, TRUTHS)),
             log_every=1, cycles=cycles, stop_cycle=stop_cycle, tail_cycles=tail_cycles,
-            faults=faults, epoch_ns=-1 if epoch_at_start else 0,
+            faults=faults, epoch_ns=-1 if epoch_at_start else 0, set_points=set_points,
         )  # fmt: skip
 
     @staticmethod

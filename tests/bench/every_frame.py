@@ -1,12 +1,13 @@
 """A stop, a death, another controller or a loss after EVERY frame of a run: is the joint off in time, and off for good?
 
-    python tests/bench/every_frame.py [--kind run|sweep] [--deadline yes|no] [--every 1] [--rest 20] [--workers 2]
-                                      [--phase NAME] [--injection NAME]
+    python tests/bench/every_frame.py [--kind run|sweep|program] [--deadline yes|no] [--every 1] [--rest 20]
+                                      [--workers 2] [--phase NAME] [--injection NAME]
 
 The run is simulated (`tests/simulated_programs.py`): supervisor, loop, `jointctl stop` and virtual drive at simulated
-time, frame by frame.  Right after frame k the process is forked for each injection; the child carries the run on to
-its end and judges it, the parent goes on as if nothing had been.  `--rest N`: every Nth frame where nothing changes:
-while the loop waits with the drive off, and from 100 ms after enabling until the stop.  Exit code 1 on a violation.
+time, frame by frame; `program` is a user's program that sends set-points through `jointctl.Joint`.  Right after frame k
+the process is forked for each injection; the child carries the run on to its end and judges it, the parent goes on as
+if nothing had been.  `--rest N`: every Nth frame where nothing changes: while the loop waits with the drive off, and
+from 100 ms after enabling until the stop.  Exit code 1 on a violation.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import argparse
 import contextlib
 import gc
 import json
+import math
 import os
 import re
 import struct
@@ -31,9 +33,11 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
+from jointctl import live_joint  # noqa: E402
 from jointctl.drivers.errors import JointctlError  # noqa: E402
 from jointctl.firmware_py.cycle import Word  # noqa: E402
 from jointctl.firmware_py.states import Fault  # noqa: E402
+from jointctl.joint import Joint  # noqa: E402
 from jointctl.tools.configuration.canopen import canopen_section  # noqa: E402
 from jointctl.tools.configuration.config import Config  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
@@ -45,8 +49,10 @@ from jointctl.tools.session.control import (  # noqa: E402
 )
 from jointctl.tools.session.display import PhaseLines  # noqa: E402
 from jointctl.tools.session.plan import resolve  # noqa: E402
+from jointctl.tools.session.result import RunResult  # noqa: E402
 from jointctl.tools.session.session import Session  # noqa: E402
 from tests.simulated_programs import (  # noqa: E402
+    SUPERVISOR,
     World,
     quiet_output,
     simulated,
@@ -60,6 +66,7 @@ FIRST_MOTION_CYCLES = 100  # of the approach, in which every frame is tried
 ENABLING_s = 0.05  # another controller's write while the loop enables is seen at the supervisor's next look
 QUIET_s = 0.2  # for so long after the end the drive must stay off
 LONGEST_s = 30.0
+SET_POINTS, SET_POINT_s, SWING_rad = 30, 0.01, 0.01
 PROGRESS_s = 60.0
 WARM_UP = ("stop", "NMT stop", "SDO 6007 = 0", "frames to the drive lost")
 # What is waited for, shorter than on a joint: the time that is allowed follows.
@@ -74,7 +81,7 @@ class Scene:
     world: World
     config: Config
     signals: StopSignals
-    supervisor: Session
+    carried_out: Callable[[], RunResult | None]  # the whole of the supervisor's program
     outcome: str = ""  # how the supervisor ended: "" while it runs
     text: str = ""
 
@@ -97,14 +104,14 @@ class Scene:
     def carry_out(self) -> None:
         """The supervisor's program."""
         try:
-            result = self.supervisor.run()
+            result = self.carried_out()
         except KeyboardInterrupt:
             self.outcome, self.text = "interrupted", self.signals.name
         except JointctlError as error:
             self.outcome, self.text = type(error).__name__, str(error)
         else:
             self.outcome = "done" if result is not None else "declined"
-            if result is not None and result.stopped_by:
+            if result is not None and result.stopped_by not in ("", live_joint.WHO):
                 self.outcome, self.text = "interrupted", result.stopped_by
             elif result is not None and result.fault is not Fault.NONE:
                 self.outcome = "fault"
@@ -165,6 +172,10 @@ def by_heartbeat(config: Config) -> float:
     return 20.0 / config.loop.rate_Hz + canopen_section(config).heartbeat_s + config.limits.sample_age_max_s
 
 
+def by_silence(config: Config) -> float:
+    return config.stream.client_timeout_s + by_ramp(config)
+
+
 def by_ramp(config: Config) -> float:
     return config.sequence.supervisor_timeout_s + config.sequence.stop_timeout_s + config.sequence.release_s
 
@@ -174,6 +185,7 @@ OTHERS = ("another controller", "another program", "DRIVE_", "STALE", "NO_SAMPLE
 SILENCE = ("no answer", "does not answer", "STALE", "NO_SAMPLES", "SAMPLES_MISSING", "DRIVE_", "did not react",
            "ENABLE_TIMEOUT", "OFF_TIMEOUT", "did not confirm", "watchdog tripped", "cannot be read",
            "timed out")  # fmt: skip
+HANGS = "the program hangs"  # but the session's thread goes on
 INJECTIONS = {
     "stop": Injection(lambda s: stop_of_this_computer(s.world, s.signals, s.node), at_once, (STOP_COMMAND,)),
     "stop of another computer": Injection(
@@ -181,6 +193,7 @@ INJECTIONS = {
     ),
     "loop dies": Injection(die("loop"), by_heartbeat, ("loop process",), may_enable=True),
     "supervisor dies": Injection(die("supervisor"), by_ramp, may_enable=True),
+    HANGS: Injection(lambda s: s.world.hang(SUPERVISOR), by_silence, may_enable=True),
     "both die": Injection(die("loop", "supervisor"), by_heartbeat, may_enable=True),
     "NMT pre-operational": Injection(nmt(128), at_once, OTHERS),
     "NMT stop": Injection(nmt(2), at_once, OTHERS),
@@ -268,6 +281,27 @@ def prepared(kind: str, deadline: bool, folder: Path) -> tuple[Config, Config]:
     return load_config(folder / f"{kind}.toml"), load_config(folder / "drive.toml")
 
 
+def of_a_program(config: Config, control: Control, world: World) -> Callable[[], RunResult | None]:
+    """A user's program: it sends set-points, and ends."""
+    live_joint.in_program = lambda *_: contextlib.nullcontext(control)  # type: ignore[assignment]
+    live_joint.Output = lambda **_: quiet_output()  # type: ignore[assignment, misc]
+    joint = Joint(config)
+    turn = math.tau / (SET_POINTS * SET_POINT_s)
+
+    def send() -> RunResult | None:
+        with joint:
+            joint.enable()
+            start_rad = joint.state.position_rad
+            for k in range(SET_POINTS):
+                t = k * SET_POINT_s
+                joint.command(start_rad + SWING_rad * (1.0 - math.cos(turn * t)), SWING_rad * turn * math.sin(turn * t))
+                world.sleep(SET_POINT_s)
+        motor: Any = joint._motor
+        return motor.result  # type: ignore[no-any-return]
+
+    return send
+
+
 def new_session(kind: str, config: Config, control: Control, folder: Path) -> Session:
     output, log = quiet_output(), folder / "log.mcap"
     consent = TerminalConsent(output, assume_yes=True)
@@ -299,7 +333,7 @@ class Exhaustion:
         self.child = False
         self.chosen = self.in_rest = 0
         self.phases: list[str] = []  # the only ones, or all
-        self.injections = list(INJECTIONS)
+        self.injections = [name for name in INJECTIONS if kind == "program" or name != HANGS]
         self.why: tuple[str, int, str, int, bool, int] | None = None
 
     def run(self) -> int:
@@ -326,7 +360,7 @@ class Exhaustion:
         """One run with an injection: what is loaded or remembered at its first use would be so in every child."""
         with simulated(joint) as world:
             session = self._start(config, world, folder)
-            world.run(lambda: session.phase == "approach")
+            world.run(lambda: session.phase in ("approach", "tracking"))
             world.fast = world.long_naps = True
             INJECTIONS[name].act(session)
             world.run(lambda: world.now_ns > LONGEST_s * 1e9)
@@ -342,10 +376,14 @@ class Exhaustion:
             return SEEN[-1]
 
         session_module.LoopHandle = make  # type: ignore[misc, assignment]
-        signals = StopSignals()
-        supervisor = new_session(self.kind, config, Control(signals), folder)
-        session = Scene(world, supervisor.plan.config, signals, supervisor)
-        world.start("supervisor", session.carry_out)
+        if self.kind == "program":  # its session has a thread of its own
+            signals = StopSignals(wake=lambda: None)
+            session = Scene(world, config, signals, of_a_program(config, Control(signals), world))
+        else:
+            signals = StopSignals(wake=lambda: signals.on_signal(15, None))
+            supervisor = new_session(self.kind, config, Control(signals), folder)
+            session = Scene(world, supervisor.plan.config, signals, supervisor.run)
+        world.start(SUPERVISOR, session.carry_out)
         return session
 
     def _wanted(self, phase: str) -> bool:
@@ -454,7 +492,7 @@ def rows_of_parts(command: list[str], workers: int) -> Iterator[dict[str, Any]]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kind", choices=("run", "sweep"), action="append")
+    parser.add_argument("--kind", choices=("run", "sweep", "program"), action="append")
     parser.add_argument("--deadline", choices=("yes", "no"), action="append", help="whether the drive has 1400:5")
     parser.add_argument("--every", type=int, default=1, help="every Nth of the frames that would be tried")
     parser.add_argument("--rest", type=int, default=20, help="every Nth frame where nothing changes")
@@ -463,7 +501,7 @@ def main() -> int:
     parser.add_argument("--injection", choices=list(INJECTIONS), action="append", help="only this one")
     parser.add_argument("--part", help=argparse.SUPPRESS)
     given = parser.parse_args()
-    kinds, deadlines = given.kind or ["run", "sweep"], given.deadline or ["yes", "no"]
+    kinds, deadlines = given.kind or ["run", "sweep", "program"], given.deadline or ["yes", "no"]
     if given.part:
         number, count = map(int, given.part.split("/"))
         one = Exhaustion(kinds[0], deadlines[0] == "yes", given.every, given.rest, (number, count), sys.stdout)

@@ -18,12 +18,12 @@ from jointctl.tools.configuration.load import load_config
 from jointctl.tools.experiments import judge as judge_module
 from jointctl.tools.experiments.campaign import campaign_joint, run_campaign
 from jointctl.tools.experiments.fault_scenarios import (
-    FAULT_CLASSES,
     BEFORE_s,
     LONGEST_s,
     SweepStrokes,
     draw_scenario,
     fitted,
+    kinds_during,
     placed_sweep,
 )
 from jointctl.tools.experiments.judge import envelope, in_time, judge, reaction_s, require_fit, run_scenario
@@ -37,13 +37,13 @@ from tests.places import CONFIGS
 
 pytestmark = pytest.mark.slow("some sixty faults on each of seven joints")
 
-KINDS = len(FAULT_CLASSES)
+KINDS = len(kinds_during("run"))
 
 
 @pytest.mark.parametrize("name", ["precise", *VARIANTS])
 def test_no_scenario_violates_an_invariant_with_other_configurations(tmp_path: Path, name: str) -> None:
     path = write_variant(name, tmp_path) if name in VARIANTS else CONFIGS / f"{name}.toml"
-    config, joint = campaign_joint(load_config(path), sweep=False)
+    config, joint = campaign_joint(load_config(path), "run")
     require_fit(config)
     found = [judge(config, joint, draw_scenario(13, number)) for number in range(2 * KINDS)]
     assert [(v.number, v.kind, v.violations) for v in found if v.violations] == []
@@ -53,18 +53,18 @@ def test_no_scenario_violates_an_invariant_with_other_configurations(tmp_path: P
 # --- during a sweep ---
 @pytest.fixture(scope="module")
 def sweep() -> tuple[Config, LockstepJoint]:
-    return campaign_joint(load_config(CONFIGS / "sweep_virtual.toml"), sweep=True)
+    return campaign_joint(load_config(CONFIGS / "sweep_virtual.toml"), "sweep")
 
 
 def test_no_scenario_violates_an_invariant_during_a_sweep(sweep: tuple[Config, LockstepJoint]) -> None:
-    found = [judge(*sweep, draw_scenario(13, number, sweep=True)) for number in range(2 * KINDS)]
+    found = [judge(*sweep, draw_scenario(13, number, "sweep")) for number in range(2 * KINDS)]
     assert [(v.number, v.kind, v.violations) for v in found if v.violations] == []
     assert sum(v.fault != "NONE" for v in found) > len(found) // 4
 
 
 def test_a_sweep_is_carried_out_in_its_own_mode_to_its_end(sweep: tuple[Config, LockstepJoint]) -> None:
     config, joint = sweep
-    scenario = dataclasses.replace(draw_scenario(13, 0, sweep=True), at_s=1e6)
+    scenario = dataclasses.replace(draw_scenario(13, 0, "sweep"), at_s=1e6)
     assert isinstance(scenario.trajectory, SweepStrokes)
     run, constants = run_scenario(config, joint, scenario)
     assert constants[0].command_kind == CommandKind.VELOCITY
@@ -78,20 +78,20 @@ def test_a_sweep_is_carried_out_in_its_own_mode_to_its_end(sweep: tuple[Config, 
 def test_the_fault_of_a_sweep_begins_before_its_end(sweep: tuple[Config, LockstepJoint]) -> None:
     """Seed 915311, scenario 1949: a push in the last 5 ms of the watch, long after the run; not at rest in the end."""
     for number in (1949, *range(20)):
-        drawn = draw_scenario(915311, number, sweep=True)
+        drawn = draw_scenario(915311, number, "sweep")
         assert isinstance(drawn.trajectory, SweepStrokes)
         seen = in_time(*sweep, drawn)
         assert seen == dataclasses.replace(drawn, at_s=seen.at_s)
         placed = placed_sweep(*sweep, drawn.trajectory, 0.0)
         assert 0.0 <= seen.at_s / drawn.at_s == pytest.approx((BEFORE_s + placed.duration_s) / (BEFORE_s + LONGEST_s))
         assert seen.at_s <= BEFORE_s + placed.duration_s
-    assert judge(*sweep, draw_scenario(915311, 1949, sweep=True)).violations == ()
+    assert judge(*sweep, draw_scenario(915311, 1949, "sweep")).violations == ()
     run = draw_scenario(915311, 1949)
     assert in_time(*sweep, run) == run
 
 
 def test_without_a_velocity_mode_the_law_of_a_sweep_closes_the_loop() -> None:
-    config, joint = campaign_joint(load_config(CONFIGS / "virtual.toml"), sweep=False)
+    config, joint = campaign_joint(load_config(CONFIGS / "virtual.toml"), "run")
     placed = placed_sweep(config, joint, SweepStrokes((0.1, -0.1), 0.1), 0.05)
     assert placed.constants[0].command_kind == CommandKind.TORQUE
     assert placed.constants[0].law.observer.bandwidth_radps > 0.0
@@ -99,8 +99,8 @@ def test_without_a_velocity_mode_the_law_of_a_sweep_closes_the_loop() -> None:
 
 
 def test_workers_sweep_as_well(sweep: tuple[Config, LockstepJoint]) -> None:
-    found, _, _ = run_campaign(CONFIGS / "sweep_virtual.toml", 9, 20, lambda _: None, workers=2, sweep=True)
-    alone = [judge(*sweep, draw_scenario(9, number, sweep=True)) for number in range(20)]
+    found, _, _ = run_campaign(CONFIGS / "sweep_virtual.toml", 9, 20, lambda _: None, workers=2, during="sweep")
+    alone = [judge(*sweep, draw_scenario(9, number, "sweep")) for number in range(20)]
     assert [dataclasses.astuple(v)[:8] for v in found] == [dataclasses.astuple(v)[:8] for v in alone]
 
 

@@ -25,7 +25,7 @@ from jointctl.tools.drawing import png
 from jointctl.tools.experiments import campaign as runner
 from jointctl.tools.experiments import judge as judge_module
 from jointctl.tools.experiments.campaign import campaign_figure, rows_by_kind
-from jointctl.tools.experiments.fault_scenarios import FAULT_CLASSES, draw_scenario
+from jointctl.tools.experiments.fault_scenarios import FAULT_CLASSES, During, draw_scenario, kinds_during
 from jointctl.tools.experiments.judge import Envelope, envelope, judge, reaction_s, run_scenario
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 from jointctl.tools.verbs.fault_campaign import fault_campaign
@@ -34,7 +34,7 @@ from tests.places import CONFIGS
 from tests.sessions import output
 
 CONFIG = CONFIGS / "virtual.toml"
-KINDS = len(FAULT_CLASSES)
+KINDS = len(kinds_during("run"))
 WIDE = Envelope(-9.0, 9.0, 9.0, 60.0, 20.0, 1.0, 2.0)
 
 
@@ -43,11 +43,12 @@ def config() -> Config:
     return load_config(CONFIG)
 
 
-@pytest.mark.parametrize("seed", [11, 12])
-def test_no_scenario_violates_an_invariant(config: Config, lockstep: LockstepJoint, seed: int) -> None:
-    found = [judge(config, lockstep, draw_scenario(seed, number)) for number in range(6 * KINDS)]
+@pytest.mark.parametrize(("seed", "during"), [(11, "run"), (12, "run"), (13, "program")])
+def test_no_scenario_violates_an_invariant(config: Config, lockstep: LockstepJoint, seed: int, during: During) -> None:
+    kinds = kinds_during(during)
+    found = [judge(config, lockstep, draw_scenario(seed, number, during)) for number in range(6 * len(kinds))]
     assert [(v.number, v.kind, v.violations) for v in found if v.violations] == []
-    assert {v.kind for v in found} == {kind.name.lower() for kind in FAULT_CLASSES}
+    assert {v.kind for v in found} == {kind.name.lower() for kind in kinds}
     assert any(v.harmless for v in found)
     tripped = [v for v in found if v.fault != "NONE"]
     assert len(tripped) > len(found) // 4  # the faults are no trifles

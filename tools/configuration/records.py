@@ -23,7 +23,7 @@ from jointctl.tools.configuration.conversions import (
     period_s,
     static_friction_Nm,
 )
-from jointctl.tools.configuration.sections import Control, Section
+from jointctl.tools.configuration.sections import Control, Hold, Section
 
 # the paper's centres, in rad and in rad/s: -c_p, 0, c_p with c_p = 1e-2 [-5 -3 -1 -0.8 -0.4 -0.1 -0.05]
 _PAPER_HALF = (0.05, 0.03, 0.01, 0.008, 0.004, 0.001, 0.0005)
@@ -61,6 +61,17 @@ def axis_constants(config: Config, table: np.ndarray, *, start_position_rad: flo
     _fill_sequence(axis.sequence, config, table, start_position_rad)
     fill_change(axis.change, axis.law, config)
     _fill_stream(axis.stream, config)
+    return constants
+
+
+def free_constants(config: Config, start_rad: float) -> Any:
+    """A record array of one `AxisConstants`: at rest at `start_rad`, for the set-points of a watched program."""
+    hold = Hold(kind="hold", duration_s=0.0, position_rad=start_rad)
+    sequence = config.sequence.model_copy(update={"approach_s": 0.0})
+    held = config.model_copy(update={"trajectory": hold, "sequence": sequence})
+    constants = axis_constants(held, np.zeros((1, 5)), start_position_rad=start_rad)
+    constants[0].trajectory.kind = TrajectoryKind.STREAM
+    constants[0].stream.client_timeout_ns = round(config.stream.client_timeout_s * 1e9)
     return constants
 
 

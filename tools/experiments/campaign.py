@@ -13,6 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from jointctl.tools.child_process import interrupts_left_to_the_parent
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.drawing import INK, MID_BLUE, MID_GREEN, MID_RED, canvas
-from jointctl.tools.experiments.fault_scenarios import draw_scenario
+from jointctl.tools.experiments.fault_scenarios import During, draw_scenario
 from jointctl.tools.experiments.judge import Verdict, judge
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.sweeping.carry_out import with_mode
@@ -31,38 +32,34 @@ from jointctl.tools.sweeping.carry_out import with_mode
 # --- the runs ---
 
 AT_ONCE = 16  # scenarios that a worker takes at a time
-_worker: dict[str, object] = {}
+_worker: dict[str, Any] = {}
 
 
-def campaign_joint(config: Config, *, sweep: bool) -> tuple[Config, LockstepJoint]:
+def campaign_joint(config: Config, during: During) -> tuple[Config, LockstepJoint]:
     """The configuration in the mode of the drive that a run, or a sweep, uses, and its joint, commissioned."""
-    config = with_mode(config, "auto") if sweep else config
+    config = with_mode(config, "auto") if during == "sweep" else config
     return config, LockstepJoint(config)
 
 
-def _begin(path: str, seed: int, sweep: bool) -> None:
+def _begin(path: str, seed: int, during: During) -> None:
     """In each worker: commission a joint of its own."""
-    config, joint = campaign_joint(load_config(path), sweep=sweep)
-    _worker.update(config=config, joint=joint, seed=seed, sweep=sweep)
+    config, joint = campaign_joint(load_config(path), during)
+    _worker.update(config=config, joint=joint, draw=partial(draw_scenario, seed, during=during))
 
 
 def _work(number: int) -> Verdict:
-    config, joint, seed = _worker["config"], _worker["joint"], _worker["seed"]
-    assert isinstance(config, Config)
-    assert isinstance(joint, LockstepJoint)
-    assert isinstance(seed, int)
-    return judge(config, joint, draw_scenario(seed, number, sweep=bool(_worker["sweep"])))
+    return judge(_worker["config"], _worker["joint"], _worker["draw"](number))
 
 
-def _verdicts(path: Path, seed: int, count: int, workers: int, sweep: bool) -> Iterator[Verdict]:
+def _verdicts(path: Path, seed: int, count: int, workers: int, during: During) -> Iterator[Verdict]:
     if workers == 1:
-        config, joint = campaign_joint(load_config(path), sweep=sweep)
+        config, joint = campaign_joint(load_config(path), during)
         for number in range(count):
-            yield judge(config, joint, draw_scenario(seed, number, sweep=sweep))
+            yield judge(config, joint, draw_scenario(seed, number, during))
         return
     context = multiprocessing.get_context("spawn")
     with interrupts_left_to_the_parent():
-        started = context.Pool(workers, _begin, (str(path), seed, sweep))
+        started = context.Pool(workers, _begin, (str(path), seed, during))
     with started as pool:
         yield from pool.imap_unordered(_work, range(count), AT_ONCE)
 
@@ -73,15 +70,14 @@ def run_campaign(
     count: int,
     advance: Callable[[float], None],
     workers: int | None = None,
-    *,
-    sweep: bool = False,
+    during: During = "run",
 ) -> tuple[list[Verdict], float, bool]:
     """(verdicts in order of their numbers, time taken [s], whether Ctrl-C ended it early)."""
     started_s = time.monotonic()
     found: list[Verdict] = []
     interrupted = False
     try:
-        for verdict in _verdicts(path, seed, count, workers or os.cpu_count() or 1, sweep):
+        for verdict in _verdicts(path, seed, count, workers or os.cpu_count() or 1, during):
             found.append(verdict)
             advance(float(len(found)))
     except KeyboardInterrupt:
@@ -152,24 +148,24 @@ def table(rows: Sequence[KindRow]) -> Table:
     return shown
 
 
-def violations(verdicts: Sequence[Verdict], seed: int, *, sweep: bool = False) -> list[dict[str, Any]]:
+def violations(verdicts: Sequence[Verdict], seed: int, during: During = "run") -> list[dict[str, Any]]:
     """Everything that is needed to look at each violation again."""
     return [
-        {**asdict(verdict), "scenario": draw_scenario(seed, verdict.number, sweep=sweep).describe()}
+        {**asdict(verdict), "scenario": draw_scenario(seed, verdict.number, during).describe()}
         for verdict in verdicts
         if verdict.violations
     ]
 
 
-def write_json(path: Path, seed: int, verdicts: Sequence[Verdict], elapsed_s: float, *, sweep: bool = False) -> None:
+def write_json(path: Path, seed: int, verdicts: Sequence[Verdict], elapsed_s: float, during: During = "run") -> None:
     """Rows and violations."""
     content = {
         "seed": seed,
-        "sweep": sweep,
+        "during": during,
         "scenarios": len(verdicts),
         "elapsed_s": round(elapsed_s, 1),
         "kinds": [asdict(row) for row in rows_by_kind(verdicts)],
-        "violations": violations(verdicts, seed, sweep=sweep),
+        "violations": violations(verdicts, seed, during),
     }
     text = json.dumps(content, indent=1, allow_nan=False)
     path.write_text(text + "\n")

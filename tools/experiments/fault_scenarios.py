@@ -8,6 +8,7 @@ sample counted the wrong way is a leap at any speed worth a trajectory.  Causes 
 
 The motion is a trajectory of `jointctl run`, or a few plateaus of constant speed as of `jointctl sweep`, in the mode in
 which a sweep runs: the drive closes the velocity loop where it can (CSV, else PV), else the law that a sweep uses.
+Or a program sends the same trajectories as set-points, some 2 to 20 ms apart, and may fail as well.
 """
 
 from __future__ import annotations
@@ -15,23 +16,29 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from jointctl.firmware_py.axis import low_pass_gain
+from jointctl.firmware_py.records import Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import Fault
+from jointctl.firmware_py.trajectory import reference_at
 from jointctl.hil.fault_kinds import FaultConstants, FaultKind
+from jointctl.hil.lockstep import POINT_VALUES, POINT_TIME_s
 from jointctl.hil.plant import plant
 from jointctl.hil.plant_records import FrictionKind
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.plant_settings import plant_settings
+from jointctl.tools.configuration.records import fill_trajectory
 from jointctl.tools.configuration.sections import Hold, MinJerk, Sine, Trapezoid
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.sweeping.carry_out import middle_rad, sweep_constants, with_tracking_law
 from jointctl.tools.sweeping.grid import SweepPoint
 from jointctl.tools.sweeping.plan import ACCELERATION_SHARE, PlanSettings, plan_motion, position_margin_rad, shifted
+
+During = Literal["run", "sweep", "program"]
 
 # --- kinds of fault ---
 
@@ -183,9 +190,17 @@ _CLASSES = (
         frozenset({Fault.SUPERVISOR_LOST}),
     ),
 )  # fmt: skip
-FAULT_CLASSES = {item.kind: item for item in _CLASSES}
+_OF_A_PROGRAM = (
+    FaultClass(
+        # harmful: longer than stream.client_timeout_s
+        FaultKind.PROGRAM_SILENT, Sizes((1.1, LONG_s), (1.0, 1.0)), Sizes((0.001, 0.9), (1.0, 1.0)),
+        frozenset({Fault.CLIENT_SILENT}),
+    ),
+    FaultClass(FaultKind.PROGRAM_WILD, None, Sizes((0.002, 1.0), (0.05, 100.0))),  # nothing of it is followed
+)  # fmt: skip
+FAULT_CLASSES = {item.kind: item for item in (*_CLASSES, *_OF_A_PROGRAM)}
 EMERGENCY_CODES = (0x2311, 0x3120, 0x3310, 0x4310, 0x5441, 0x7121, 0x7300, 0x8480, 0x8611)
-SIGNED = frozenset({FaultKind.ENCODER_JUMP, FaultKind.ENCODER_DRIFT, FaultKind.LOAD_JUMP})
+SIGNED = frozenset({FaultKind.ENCODER_JUMP, FaultKind.ENCODER_DRIFT, FaultKind.LOAD_JUMP, FaultKind.PROGRAM_WILD})
 
 
 # --- the motion of a sweep ---
@@ -240,6 +255,39 @@ def placed_sweep(config: Config, joint: LockstepJoint, strokes: SweepStrokes, st
     return PlacedSweep(constants, placed.table, start_rad, placed.duration_s)
 
 
+# --- the set-points of a program ---
+
+SOFT_s = 0.2  # in which the clock of a program's trajectory comes up to its rate, and in which it slows down again
+
+
+@dataclass(frozen=True)
+class Program:
+    """A trajectory as set-points, `every_s` apart."""
+
+    trajectory: Any
+    every_s: float
+
+
+def set_points_of(program: Program, config: Config, table: np.ndarray) -> np.ndarray:
+    """Rows of `hil.lockstep.Scenario.set_points`: at rest for `BEFORE_s`, then the trajectory, from rest to rest."""
+    shown = config.model_copy(update={"trajectory": program.trajectory})
+    trajectory, at = new(TrajectoryConstants)[0], new(Reference)[0]
+    fill_trajectory(trajectory, shown, table)
+    lasts_s = program.trajectory.duration_s
+    times_s = np.arange(0.0, BEFORE_s + lasts_s, program.every_s)
+    points = np.zeros((len(times_s), 5))
+    points[:, POINT_TIME_s] = times_s
+    up, down = np.clip([(times_s - BEFORE_s) / SOFT_s, (BEFORE_s + lasts_s - times_s) / SOFT_s], 0.0, 1.0)
+    rates = up * up * (3.0 - 2.0 * up) * down * down * (3.0 - 2.0 * down)
+    begun, left = (SOFT_s * share**3 * (1.0 - 0.5 * share) for share in (up, down))  # integrals of the rate
+    between = np.clip(times_s - BEFORE_s - SOFT_s, 0.0, lasts_s - 2.0 * SOFT_s)
+    gone_s = begun + between + 0.5 * SOFT_s - left
+    for row, rate, t in zip(points, rates, gone_s, strict=True):
+        reference_at(trajectory, table, 0, float(t), at)
+        row[POINT_VALUES : POINT_VALUES + 3] = at.position_rad, rate * at.velocity_radps, math.nan
+    return points
+
+
 # --- the scenario ---
 
 HARMLESS_SHARE = 0.35
@@ -274,12 +322,14 @@ class Scenario:
 
     def describe(self) -> dict[str, Any]:
         """For the report."""
-        trajectory = self.trajectory
+        trajectory, every = self.trajectory, {}
+        if isinstance(trajectory, Program):
+            trajectory, every = trajectory.trajectory, {"set_point_every_s": trajectory.every_s}
         strokes = isinstance(trajectory, SweepStrokes)
         return {
             **{k: v for k, v in asdict(self).items() if k != "trajectory"},
             "kind": self.kind.name.lower(),
-            "trajectory": asdict(trajectory) if strokes else trajectory.model_dump(exclude_none=True),
+            "trajectory": asdict(trajectory) if strokes else {**trajectory.model_dump(exclude_none=True), **every},
             "plant": {k: (v.name.lower() if isinstance(v, FrictionKind) else v) for k, v in self.plant.items()},
         }
 
@@ -334,10 +384,15 @@ def _size(random: np.random.Generator, sizes: Sizes) -> tuple[float, float]:
     return float(duration), float(random.uniform(*sizes.magnitude))
 
 
-def draw_scenario(seed: int, number: int, *, sweep: bool = False) -> Scenario:
-    """Scenario `number` of the campaign with this seed; `sweep`: during a sweep instead of a run."""
+def kinds_during(during: During) -> list[FaultKind]:
+    """The kinds of fault of a campaign, in their order."""
+    return [item.kind for item in (*_CLASSES, *(_OF_A_PROGRAM if during == "program" else ()))]
+
+
+def draw_scenario(seed: int, number: int, during: During = "run") -> Scenario:
+    """Scenario `number` of the campaign with this seed."""
     random = np.random.default_rng([seed, number])
-    kinds = list(FAULT_CLASSES)
+    kinds = kinds_during(during)
     chosen = FAULT_CLASSES[kinds[number % len(kinds)]]  # in turn: every kind gets its share
     harmless = chosen.harmful is None or (chosen.harmless is not None and random.random() < HARMLESS_SHARE)
     sizes = chosen.harmless if harmless else chosen.harmful
@@ -348,12 +403,17 @@ def draw_scenario(seed: int, number: int, *, sweep: bool = False) -> Scenario:
     if chosen.kind is FaultKind.DRIVE_FAULT:
         magnitude = float(random.choice(EMERGENCY_CODES))
     tracking_s = float(random.uniform(0.5, 2.5))
+    latest_s = BEFORE_s + (LONGEST_s if during == "sweep" else tracking_s)
+    at_s = float(random.uniform(0.0, latest_s))
+    trajectory = draw_strokes(random) if during == "sweep" else _trajectory(random, tracking_s)
+    if during == "program":
+        trajectory = Program(trajectory, float(random.uniform(0.002, 0.02)))
     return Scenario(
         number, seed, chosen.kind, harmless,
-        at_s=float(random.uniform(0.0, BEFORE_s + (LONGEST_s if sweep else tracking_s))),
+        at_s=at_s,
         duration_s=duration,
         magnitude=magnitude,
-        trajectory=draw_strokes(random) if sweep else _trajectory(random, tracking_s),
+        trajectory=trajectory,
         start_offset_rad=float(random.uniform(-0.1, 0.1)),
         plant=_plant(random),
     )  # fmt: skip

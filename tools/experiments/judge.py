@@ -43,22 +43,31 @@ from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault, Reaction
 from jointctl.firmware_py.trajectory import reference_at
 from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.fault_kinds import FaultKind
-from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_POSITION_rad, TRUE_VELOCITY_radps
+from jointctl.hil.lockstep import (
+    NO_POINTS,
+    POINT_VALUES,
+    TRUE_POWER_STATE,
+    POINT_TIME_s,
+    TRUE_POSITION_rad,
+    TRUE_VELOCITY_radps,
+)
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.configuration.records import axis_constants, free_constants
 from jointctl.tools.experiments.fault_scenarios import (
     FAULT_CLASSES,
     LATE_CAUSES,
     BEFORE_s,
     LONGEST_s,
+    Program,
     Scenario,
     SweepStrokes,
     fitted,
     placed_sweep,
     plant_of,
+    set_points_of,
 )
-from jointctl.tools.lockstep import LockstepJoint, LockstepRun
+from jointctl.tools.lockstep import NO_STOP, LockstepJoint, LockstepRun
 
 # --- the envelope ---
 
@@ -230,6 +239,7 @@ def require_fit(config: Config) -> None:
 APPROACH_s = 1.0
 SPARE_s = 14.0  # for waiting, enabling and stopping
 TAIL_s = 2.5  # watched after the controller has ended
+AFTER_s = 0.1  # after its last set-point, a program stops the joint
 NOTICED_s = 0.35  # a certain fault that begins so long before the end of the trajectory must be noticed
 POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
 
@@ -255,7 +265,15 @@ def run_scenario(config: Config, joint: LockstepJoint, scenario: Scenario) -> tu
     if isinstance(scenario.trajectory, SweepStrokes):
         placed = placed_sweep(config, joint, scenario.trajectory, scenario.start_offset_rad)
         joint.table = placed.table
-        return _carry_out(config, joint, scenario, placed.constants, placed.start_rad, placed.duration_s)
+        return _carry_out(
+            joint, scenario, placed.constants, placed.duration_s, plant_of(config, scenario, placed.start_rad)
+        )
+    if isinstance(scenario.trajectory, Program):
+        points = set_points_of(scenario.trajectory, config, joint.table)
+        start = float(points[0, POINT_VALUES])
+        constants = free_constants(config, start)
+        lasts_s = float(points[-1, POINT_TIME_s]) + AFTER_s
+        return _carry_out(joint, scenario, constants, lasts_s, plant_of(config, scenario, start), points)
     sequence = config.sequence.model_copy(update={"approach_s": APPROACH_s})
     shown = config.model_copy(update={"trajectory": scenario.trajectory, "sequence": sequence})
     first = new(Reference)
@@ -264,7 +282,8 @@ def run_scenario(config: Config, joint: LockstepJoint, scenario: Scenario) -> tu
     start = float(first[0].position_rad) + scenario.start_offset_rad
     start = min(max(start, limits.position_min_rad + 0.05), limits.position_max_rad - 0.05)
     constants = axis_constants(shown, joint.table, start_position_rad=start)
-    return _carry_out(shown, joint, scenario, constants, start, scenario.trajectory.duration_s)
+    duration_s = scenario.trajectory.duration_s
+    return _carry_out(joint, scenario, constants, duration_s, plant_of(shown, scenario, start))
 
 
 def in_time(config: Config, joint: LockstepJoint, scenario: Scenario) -> Scenario:
@@ -276,17 +295,18 @@ def in_time(config: Config, joint: LockstepJoint, scenario: Scenario) -> Scenari
 
 
 def _carry_out(
-    config: Config,
     joint: LockstepJoint,
     scenario: Scenario,
     constants: np.recarray,
-    start_rad: float,
     duration_s: float,
+    plant: tuple[Any, Any],
+    set_points: np.ndarray = NO_POINTS,
 ) -> tuple[LockstepRun, Any]:
-    plant_constants, plant_state = plant_of(config, scenario, start_rad)
+    """`duration_s`: of the motion, or, with set-points, until the program stops the joint."""
     run = joint.run_with_faults(
         scenario.fault(), constants,
-        plant_constants=plant_constants, plant_state=plant_state, epoch_at_start=True,
+        plant_constants=plant[0], plant_state=plant[1], epoch_at_start=True, set_points=set_points,
+        stop_cycle=round(duration_s / float(constants[0].law.period_s)) if len(set_points) else NO_STOP,
         longest_s=float(constants[0].sequence.approach_s) + duration_s + SPARE_s, tail_s=TAIL_s,
     )  # fmt: skip
     return run, constants

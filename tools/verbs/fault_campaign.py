@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from jointctl.drivers.errors import INTERRUPTED
+from jointctl.drivers.errors import INTERRUPTED, UsageError
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import Report, VerbOutput, Workers, loaded
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.config import Config
+    from jointctl.tools.experiments.fault_scenarios import During
     from jointctl.tools.experiments.judge import Verdict
 
 EXIT_VIOLATIONS = 10
@@ -37,6 +38,9 @@ def fault_campaign(
         int | None, typer.Option("--scenario", help="replay this one alone", min=0, max=LARGEST)
     ] = None,
     sweep: Annotated[bool, typer.Option("--sweep", help="during a sweep, in its mode, instead of a run")] = False,
+    program: Annotated[
+        bool, typer.Option("--program", help="while a program sends set-points, which may fail too")
+    ] = False,
     folder: Annotated[Path, typer.Option("--folder", help="for report, JSON and picture")] = Path("fault-campaign"),
     workers: Workers = None,
     report: Report = None,
@@ -56,20 +60,23 @@ def fault_campaign(
     from jointctl.tools.recording.report_page import check_target
     from jointctl.tools.written_file import prepare_folder
 
+    if sweep and program:
+        raise UsageError("--sweep and --program exclude each other")
+    during: During = "sweep" if sweep else "program" if program else "run"
     require_simulated(config, "fault-campaign")
     require_fit(config)
     if scenario is not None:
-        return _replay(config, output, seed, scenario, sweep)
+        return _replay(config, output, seed, scenario, during)
     if report is not None:
         check_target(report)
     prepare_folder(folder)
     with output.progress("fault campaign", float(count)) as advance:
-        verdicts, elapsed_s, interrupted = run_campaign(config.path, seed, count, advance, workers, sweep=sweep)
+        verdicts, elapsed_s, interrupted = run_campaign(config.path, seed, count, advance, workers, during)
     rows = rows_by_kind(verdicts)
-    found = violations(verdicts, seed, sweep=sweep)
+    found = violations(verdicts, seed, during)
     figure = campaign_figure(verdicts, config.limits.velocity_max_radps)
     if verdicts:
-        write_json(folder / "campaign.json", seed, verdicts, elapsed_s, sweep=sweep)
+        write_json(folder / "campaign.json", seed, verdicts, elapsed_s, during)
         save_png(figure, folder / "campaign.png")
     data = {
         "scenarios": len(verdicts), "violations": len(found), "seed": seed, "elapsed_s": round(elapsed_s, 1),
@@ -84,8 +91,8 @@ def fault_campaign(
     if found:
         output.error(
             f"{len(found)} of {len(verdicts)} scenarios violate an invariant",
-            f"replay one with: jointctl fault-campaign {config.path}{' --sweep' if sweep else ''} --seed {seed} "
-            f"--scenario {found[0]['number']}",
+            f"replay one with: jointctl fault-campaign {config.path}{'' if during == 'run' else f' --{during}'} "
+            f"--seed {seed} --scenario {found[0]['number']}",
         )
         return EXIT_VIOLATIONS
     return INTERRUPTED if interrupted else 0
@@ -123,14 +130,14 @@ def _write_page(
     write_verb_page(path, "Fault campaign", sections, output, subtitle=str(config.path))
 
 
-def _replay(config: Config, output: Output, seed: int, number: int, sweep: bool) -> int:
+def _replay(config: Config, output: Output, seed: int, number: int, during: During) -> int:
     """One scenario, with all that it consists of."""
     from jointctl.tools.experiments.campaign import campaign_joint
     from jointctl.tools.experiments.fault_scenarios import draw_scenario
     from jointctl.tools.experiments.judge import judge
 
-    chosen = draw_scenario(seed, number, sweep=sweep)
-    verdict = judge(*campaign_joint(config, sweep=sweep), chosen)
+    chosen = draw_scenario(seed, number, during)
+    verdict = judge(*campaign_joint(config, during), chosen)
     described = chosen.describe()
     lines = [f"{key}: {value}" for key, value in described.items()]
     lines += [
