@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import socket
 import struct
 import threading
@@ -113,6 +114,7 @@ def bus_watch(config: Config) -> Iterator[BusWatch]:
 QUEUE_FRAMES = 1 << 16  # more than 20 s at 1 kHz
 RECEIVE_S = 0.1  # how long the thread waits before it looks whether it is to end
 FAILURE_PAUSE_S = 0.05
+LAST_S = 0.5  # for frames that have arrived before the end, at most
 SAME_CLOCK_S = 5.0
 
 
@@ -130,14 +132,21 @@ class FrameRecorder:
         self._thread.start()
 
     def _receive(self) -> None:
-        while not self._ended.is_set():
+        until_s = math.inf
+        while time.monotonic() < until_s:
+            ended = self._ended.is_set()
+            if ended and until_s == math.inf:
+                until_s = time.monotonic() + LAST_S
             try:
-                message = self._bus.recv(RECEIVE_S)
+                message = self._bus.recv(0.0 if ended else RECEIVE_S)
             except (can.CanError, OSError, ValueError):
                 # the bus is down: the loop sees it as well and stops the joint, there is nothing to add
-                self._ended.wait(FAILURE_PAUSE_S)
+                if self._ended.wait(FAILURE_PAUSE_S):
+                    return
                 continue
             if message is None:
+                if ended:
+                    return
                 continue
             if len(self._queue) >= self._queue_frames:
                 self.dropped += 1
@@ -154,10 +163,14 @@ class FrameRecorder:
         """(CLOCK_MONOTONIC in nanoseconds, message) of every frame since the last call."""
         return [self._queue.popleft() for _ in range(len(self._queue))]
 
-    def close(self) -> None:
-        """End the thread and leave the bus; what was received can still be fetched."""
+    def end(self) -> None:
+        """Nothing is received any more but what has arrived; it can still be fetched."""
         self._ended.set()
         self._thread.join(2.0)
+
+    def close(self) -> None:
+        """End, and leave the bus."""
+        self.end()
         self._bus.shutdown()
 
 

@@ -196,10 +196,12 @@ class Session:
         watch.take_records(last=True)
         self._raise_what_others_did(watch, loop)
         state = drive.make_safe(asked=bool(signals.commanded_ns))
+        recorder = watch.around.recorder
+        if recorder is not None:
+            recorder.end()
         watch.take_records(last=True)
         watch.tell_bus_news()  # it often explains the fault that has ended the run
         watch.log.write_event(INFO, "drive", f"after the run: {state}")
-        recorder = watch.around.recorder
         if recorder is not None and recorder.dropped:
             watch.log.write_event(WARNING, "log", f"{recorder.dropped} CAN frames were not recorded: too slow")
         return self._result(watch, report, state, elapsed_s)
