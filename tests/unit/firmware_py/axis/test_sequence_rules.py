@@ -37,13 +37,18 @@ def test_reset_leaves_nothing_of_the_run_before_behind(axis: Any, state: Any) ->
     plain = [name for name in used.dtype.names if used.dtype[name].kind in "if"]
     for name in plain:
         used[name] = 3
-    changed = ("answered", "answer", "ramping", "ramp_s", "motion")
-    for name in changed:
-        used.change[name] = 3
+    inside = {
+        "change": ("answered", "answer", "ramping", "ramp_s", "motion"),
+        "stream": ("taken", "refused", "following", "torque_Nm"),
+    }
+    for record, names in inside.items():
+        for name in names:
+            used[record][name] = 3
     used.velocity.primed, used.law.lugre_deflection_rad, used.law.network.weights[:] = 1, 0.1, 5.0
     reset_axis(axis, used)
     assert [name for name in plain if name not in WRITTEN_FIRST and used[name] != 0] == []
-    assert [name for name in changed if used.change[name] != 0] == []
+    left = [(record, name) for record, names in inside.items() for name in names if used[record][name] != 0]
+    assert left == []
     assert (used.velocity.primed, used.law.lugre_deflection_rad) == (0, 0.0)
     assert list(used.law.network.weights) == [0.01] * 15
 
