@@ -98,6 +98,7 @@ def write_log(record: LogRecord, state: AxisState, sample: Sample, command: Comm
     record.drive_state = sample.drive_state
     record.status_word = sample.status_word
     record.drive_error = sample.drive_error
+    record.notices = state.notices
 
 
 # --- What a cycle works on, and what its front end hands in ---

@@ -13,7 +13,6 @@ from jointctl.firmware_py.schema import array_of, f8, i4, i8, record, u4
 
 # --- The control law: friction model, network, observer, learning, and the law that holds them ---
 # Constants are set once, state changes in every cycle.  SI units; `joint_` is the low-velocity side of the reducer.
-# Import them from `firmware_py.records`, which has every record.
 
 
 NEURONS = 15
@@ -73,7 +72,7 @@ class NetworkState:
 
 @record
 class ObserverConstants:
-    """See `disturbance_observer`."""
+    """See `law.step_observer`."""
 
     bandwidth_radps: f8  # 0 = off
     delay_cycles: i8  # from the command to the torque that it becomes
@@ -89,7 +88,7 @@ class ObserverState:
 
 @record
 class LearningConstants:
-    """See `iterative_learning`."""
+    """See `law.learning_torque_Nm`."""
 
     gain: f8  # 0 = off
     error_gain_ps2: f8  # J error_gain e is learned on top of what feedback and observer added [1/s^2]
@@ -197,7 +196,6 @@ class TrajectoryConstants:
 
 
 # --- What may change while the joint moves: gains and the motion; see `live_change` ---
-# Import them from `firmware_py.records`, which has every record.
 
 
 class ChangeKind(IntEnum):
@@ -428,7 +426,7 @@ class SequenceConstants:
 
 @record
 class VelocityCommandConstants:
-    """See `velocity_command`."""
+    """See `axis.velocity_command_radps`."""
 
     position_gain_ps: f8
     acceleration_max_radps2: f8
@@ -519,7 +517,7 @@ class AxisState:
 
 @record
 class LogRecord:
-    """One cycle, as it stands in the ring and in the run log."""
+    """One cycle, as it stands in the ring and, byte for byte, in the run log: no padding, at the end neither."""
 
     time_ns: i8  # CLOCK_MONOTONIC at the deadline
     cycle: i8
@@ -554,4 +552,5 @@ class LogRecord:
     drive_state: i4
     status_word: u4
     drive_error: u4
-    skipped: i4
+    skipped: i4  # cycles left out before this one
+    notices: i4  # bits of `Notice`, so far in this run

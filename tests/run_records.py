@@ -1,4 +1,4 @@
-"""Records of a run whose summary is known in advance."""
+"""Records of a run whose summary is known in advance, and records whose every value differs."""
 
 from __future__ import annotations
 
@@ -24,4 +24,18 @@ def run_records(tracking: int = 1000) -> np.recarray:
     records.network_torque_Nm[100:] = 1.5
     records.wake_late_ns = np.arange(len(records)) * 1000
     records.round_trip_ns[::2] = 300_000
+    return records
+
+
+def sample_records(count: int, first: int = 0) -> np.recarray:
+    """Records whose every field and array element differs."""
+    records = new(LogRecord, count)
+    for i, name in enumerate(records.dtype.names):
+        base = 1000 * (i + 1) + np.arange(first, first + count)
+        if name == "weights":
+            records[name] = base[:, None] + np.arange(15) / 16.0
+        elif records.dtype[name].kind == "f":
+            records[name] = -base / 8.0
+        else:
+            records[name] = base
     return records

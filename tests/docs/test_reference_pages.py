@@ -7,7 +7,6 @@ import re
 from jointctl.drivers.errors import DECLINED, INTERRUPTED, JointctlError
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.identification.friction_data import SWEEP_COLUMNS
-from jointctl.tools.recording.run_log import CAN_TOPIC, EVENT_TOPIC, RECORD_TOPIC
 from jointctl.tools.verbs.fault_campaign import EXIT_VIOLATIONS
 from jointctl.tools.verbs.params import DIFFERENT
 from tests.places import ROOT

@@ -145,6 +145,7 @@ def test_a_coarse_encoder_is_reported_as_torque_noise(bits: int, noisy: bool) ->
     run = carry_out("precise", 20.0, bits=bits)
     assert run.fault is Fault.NONE
     assert bool(run.state.notices & Notice.TORQUE_NOISE) is noisy
+    assert (run.log.notices[0], run.log.notices[-1]) == (0, run.state.notices)  # in the log since when
     if noisy:
         assert run.state.swing.noise_told_Nm > 0.2 * LIMIT_Nm
         assert np.abs(run.log.command_torque_Nm).max() < LIMIT_Nm

@@ -18,7 +18,7 @@ import canopen
 import pytest
 
 from jointctl.tools.recording.log_export import candump_lines
-from jointctl.tools.recording.run_log import frame_array
+from jointctl.tools.recording.ros_messages import frame_array
 
 
 def lines(messages: list[can.Message]) -> str:

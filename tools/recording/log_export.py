@@ -17,8 +17,9 @@ import numpy as np
 
 from jointctl.drivers.can.frames import ERROR_FLAG
 from jointctl.drivers.errors import DataError
-from jointctl.tools.recording.run_log import SECOND_NS, frame_times_ns
-from jointctl.tools.recording.run_log_reader import RunLog, calendar_offset_ns
+from jointctl.tools.recording.ros_messages import SECOND_NS, stamps_ns
+from jointctl.tools.recording.run_log import calendar_offset_ns
+from jointctl.tools.recording.run_log_reader import RunLog
 
 _ROWS = 10_000  # turned into Python numbers at once
 
@@ -90,7 +91,7 @@ def candump_lines(frames: np.ndarray, offset_ns: int, channel: str) -> Iterator[
 
     Eight hexadecimal digits mark an extended identifier; an error frame has the error flag in its identifier.
     """
-    for time_ns, row in zip((frame_times_ns(frames) + offset_ns).tolist(), frames, strict=True):
+    for time_ns, row in zip((stamps_ns(frames) + offset_ns).tolist(), frames, strict=True):
         seconds, rest_ns = divmod(time_ns, SECOND_NS)
         identifier = int(row["id"])
         if row["is_error"]:
@@ -106,7 +107,8 @@ def candump_bytes(log: RunLog, path: Path) -> bytes:
     """The raw frames in calendar time, for canplayer, cantools, Wireshark and the like."""
     if not len(log.frames):
         raise DataError(f"{path}: holds no CAN frames", "set log.frames = true in the configuration and run again")
-    return "".join(candump_lines(log.frames, calendar_offset_ns(log), "can0")).encode()
+    offset_ns = calendar_offset_ns(log.metadata.get("clock", {}))
+    return "".join(candump_lines(log.frames, offset_ns, "can0")).encode()
 
 
 # format -> (ending of the file, its maker)

@@ -14,7 +14,7 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.recording.kept_records import IN_MEMORY
 from jointctl.tools.written_file import writing
 
-MESSAGE_BYTES = dtype_of(LogRecord).itemsize + 40  # of the log file for a record
+MESSAGE_BYTES = dtype_of(LogRecord).itemsize + 65  # of the log file for a record, its share of the joint states in it
 UNKNOWN_S = 60.0  # room for a run until it is stopped
 
 

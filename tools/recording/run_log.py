@@ -1,13 +1,13 @@
 """Run logs: MCAP files that Foxglove, PlotJuggler and rosbag2 open.
 
-Each cycle is one message on `/joint`: a 4-byte CDR header and the bytes of the `LogRecord`.  An aligned little-endian
-record IS the CDR body: CDR aligns each number to its size counted from the end of the header, as C does, and sends
-fixed arrays without a length.  (Padding at the end of a record, if any, is ignored by readers.)  So writing costs no
-encoding and reading is `np.frombuffer`.
+Each cycle is one message on `/joint`, the bytes of the `LogRecord`.  A hundred times a second there is one on
+`/joint_states` as well, which the tools of ROS draw without a package of ours.  Events are on `/events`, the drive's
+temperature, if it reports one, on `/temperature`, raw CAN frames, if they are recorded, on `/can`; what was run
+(configuration, versions, identity of the drive) is in metadata records at the beginning of the file.
 
-Events are on `/events`, the drive's temperature, if it reports one, on `/temperature`, raw CAN frames, if they are
-recorded, on `/can`; what was run (configuration, versions, identity of the drive) is in metadata records at the
-beginning of the file.  Times are nanoseconds of CLOCK_MONOTONIC; `metadata["clock"]` relates them to the calendar.
+The program's times are nanoseconds of CLOCK_MONOTONIC.  In the file, the times of messages and the stamps in them are
+calendar times: the same with an offset that is taken once, when the log is begun, and stands in `metadata["clock"]`.
+So a calendar clock that is set in the meantime does not tear the log.
 A file that was cut off, because the writer was killed or the disk is full, reads up to the last whole chunk.
 """
 
@@ -16,11 +16,11 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-import struct
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
@@ -32,50 +32,29 @@ from jointctl.drivers.errors import DataError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
 from jointctl.tools.recording.mcap_file import McapFile, message_rows
+from jointctl.tools.recording.ros_messages import (
+    CAN_TOPIC,
+    CDR_HEADER,
+    EVENT_TOPIC,
+    JOINT_STATE_TOPIC,
+    RECORD_TOPIC,
+    TEMPERATURE,
+    TEMPERATURE_TOPIC,
+    Topic,
+    event_body,
+    joint_states,
+    stamp,
+    stamps_ns,
+)
 
 if TYPE_CHECKING:
     from jointctl.drivers.drive import CommissioningReport
     from jointctl.tools.configuration.config import Config
 
-RECORD_TOPIC, RECORD_SCHEMA = "/joint", "jointctl_msgs/msg/LogRecord"
-EVENT_TOPIC, EVENT_SCHEMA = "/events", "jointctl_msgs/msg/Event"
-EVENT_DEFINITION = "int64 time_ns\nint32 level\nstring source\nstring text\n"
-TEMPERATURE_TOPIC, TEMPERATURE_SCHEMA = "/temperature", "jointctl_msgs/msg/Temperature"
-TEMPERATURE = np.dtype([("time_ns", "<i8"), ("temperature_degC", "<f8")])
-INFO, WARNING, ERROR = 20, 30, 40  # levels, those of Python's logging
-# A frame is one `can_msgs/msg/Frame` of ROS, which bag tools know.  Its `frame_id` is always empty, so that the message
-# has a fixed size and its CDR body is an aligned record, as the loop's records are.
-CAN_TOPIC, CAN_SCHEMA = "/can", "can_msgs/msg/Frame"
-CAN_DEFINITION = (
-    "std_msgs/Header header\nuint32 id\nbool is_rtr\nbool is_extended\nbool is_error\nuint8 dlc\nuint8[8] data\n"
-    "================================================================================\n"
-    "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
-    "================================================================================\n"
-    "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
-)
-SECOND_NS = 1_000_000_000
-CAN_FRAME = np.dtype(
-    [
-        ("sec", "<i4"),  # CLOCK_MONOTONIC, as everything in the log
-        ("nanosec", "<u4"),
-        ("frame_id_length", "<u4"),  # of the empty string: its end zero
-        ("frame_id_end", "u1"),
-        ("id", "<u4"),
-        ("is_rtr", "u1"),
-        ("is_extended", "u1"),
-        ("is_error", "u1"),
-        ("dlc", "u1"),
-        ("data", "u1", (8,)),
-    ],
-    align=True,
-)
+INFO, WARNING, ERROR = 20, 30, 40  # levels, those of Python's logging and of rcl_interfaces/msg/Log
+JOINT_STATE_NS = 10_000_000  # between two of them; a tenth of the records costs 3 % of the file, all 33 %
 # metadata of a log from which records are left out on purpose: "every" so many one is kept, the last "whole_s" all
 THINNING = "thinning"
-CDR_HEADER = bytes((0, 1, 0, 0))  # representation: little-endian plain CDR; no options
-_ROS_TYPES = {
-    "<f8": "float64", "<f4": "float32", "<i8": "int64", "<i4": "int32", "<i2": "int16", "|i1": "int8",
-    "<u8": "uint64", "<u4": "uint32", "<u2": "uint16", "|u1": "uint8",
-}  # fmt: skip
 _PACKAGES = ("jointctl", "numpy", "numba", "python-can", "canopen", "mcap")
 
 
@@ -87,75 +66,10 @@ class Event:
     text: str
 
 
-# --- message bodies: the little of CDR (version 1, little-endian) and of ROS 2 message definitions that is needed ---
-
-
-def message_definition(dtype: np.dtype[Any]) -> str:
-    """The ros2msg text of a flat record; field names in lower case, which ROS 2 demands (`torque_Nm` -> `torque_nm`).
-
-    Raises TypeError for a field that the definition cannot name or whose offset CDR would not give it.
-    """
-    lines, end = [], 0
-    for name in dtype.names or ():
-        field = dtype.fields[name]  # type: ignore[index]
-        base, shape = field[0].subdtype or (field[0], ())
-        if base.str not in _ROS_TYPES or len(shape) > 1:
-            raise TypeError(f"{name} (of {field[0]}) has no plain ROS 2 type")
-        start = -(-end // base.itemsize) * base.itemsize
-        if field[1] != start:
-            raise TypeError(f"{name} is at byte {field[1]} and must be at {start}: the record is not aligned as CDR")
-        end = start + field[0].itemsize
-        lines.append(f"{_ROS_TYPES[base.str]}{f'[{shape[0]}]' if shape else ''} {name.lower()}\n")
-    return "".join(lines)
-
-
-def _text(value: str) -> bytes:
-    data = value.encode("utf-8", "replace").replace(b"\0", b" ") + b"\0"
-    return struct.pack("<I", len(data)) + data
-
-
-def event_body(time_ns: int, level: int, source: str, text: str) -> bytes:
-    """int64, int32, string, string; a string is a length with its end zero, on a multiple of 4 bytes."""
-    body = struct.pack("<qi", time_ns, level) + _text(source)
-    return body + bytes(-len(body) % 4) + _text(text)
-
-
-def event_from_body(body: bytes) -> tuple[int, int, str, str]:
-    """The inverse of `event_body`."""
-    time_ns, level = struct.unpack_from("<qi", body)
-    at, texts = 12, []
-    for _ in range(2):
-        at += -at % 4
-        (size,) = struct.unpack_from("<I", body, at)
-        texts.append(body[at + 4 : at + 4 + size - 1].decode("utf-8", "replace"))
-        at += 4 + size
-    return time_ns, level, texts[0], texts[1]
-
-
+@cache
 def cdr_rows(dtype: np.dtype[Any]) -> np.dtype[Any]:
     """Messages of records of `dtype` as the rows of an array; the records are in the field `record`."""
     return message_rows(("cdr", "S4"), ("record", dtype))
-
-
-def frame_array(frames: list[tuple[int, Any]]) -> np.ndarray:
-    """Records of (time in nanoseconds of CLOCK_MONOTONIC, python-can message), shape (N,) of CAN_FRAME."""
-    array = np.zeros(len(frames), CAN_FRAME)
-    array["frame_id_length"] = 1
-    for i, (time_ns, message) in enumerate(frames):
-        data = bytes(message.data or b"")[:8]
-        row = array[i]
-        row["sec"], row["nanosec"] = divmod(time_ns, SECOND_NS)
-        row["id"], row["dlc"] = message.arbitration_id, min(message.dlc, 8)
-        row["is_rtr"], row["is_extended"] = message.is_remote_frame, message.is_extended_id
-        row["is_error"] = message.is_error_frame
-        row["data"][: len(data)] = list(data)
-    return array
-
-
-def frame_times_ns(frames: np.ndarray) -> np.ndarray:
-    """int64[N], nanoseconds of CLOCK_MONOTONIC."""
-    times: np.ndarray = frames["sec"].astype(np.int64) * SECOND_NS + frames["nanosec"]
-    return times
 
 
 # --- metadata ---
@@ -190,9 +104,27 @@ def versions() -> dict[str, str]:
     return found
 
 
+def calendar_offset_ns(clock: Mapping[str, str]) -> int:
+    """What to add to CLOCK_MONOTONIC for nanoseconds since 1970, by `metadata["clock"]`; 0 if it does not say.
+
+    Older versions wrote the calendar time as a text only.
+    """
+    try:
+        if "unix_ns" in clock:
+            calendar_ns = int(clock["unix_ns"])
+        else:
+            calendar_ns = int(np.datetime64(clock["utc"].removesuffix("+00:00"), "ns").astype(np.int64))
+        offset_ns = calendar_ns - int(clock["monotonic_ns"])
+    except (KeyError, ValueError):
+        return 0
+    return offset_ns if abs(offset_ns) < 1 << 62 else 0  # a damaged text; times have 64 bits
+
+
 def _clock_metadata() -> dict[str, str]:
     """One instant in both clocks, so that a log can be placed in the calendar."""
-    return {"utc": datetime.now(UTC).isoformat(), "monotonic_ns": str(time.monotonic_ns())}
+    monotonic_ns, unix_ns = time.monotonic_ns(), time.time_ns()
+    utc = datetime.fromtimestamp(unix_ns * 1e-9, UTC).isoformat()
+    return {"utc": utc, "unix_ns": str(unix_ns), "monotonic_ns": str(monotonic_ns)}
 
 
 class RunLogWriter:
@@ -221,22 +153,29 @@ class RunLogWriter:
         except OSError as error:
             raise DataError(f"{self.path}: cannot be created: {error.strerror or error}") from None
         self._mcap = McapFile(self._file, self.path.parent, profile="ros2", library="jointctl")
-        for name, values in {"clock": _clock_metadata(), **metadata}.items():
+        clocks = _clock_metadata()
+        self._offset_ns = calendar_offset_ns(clocks)
+        for name, values in {"clock": clocks, **metadata}.items():
             self._mcap.add_metadata(name, {key: str(value) for key, value in values.items()})
-        definition = message_definition(dtype_of(LogRecord))
-        self._record_channel = self._mcap.add_channel(RECORD_TOPIC, RECORD_SCHEMA, definition)
-        self._event_channel = self._mcap.add_channel(EVENT_TOPIC, EVENT_SCHEMA, EVENT_DEFINITION)
-        self._can_channel: int | None = None  # only in logs with frames
-        self._temperature_channel: int | None = None  # only where the drive reports one
+        self._channels: dict[str, int] = {}
+        for topic in (RECORD_TOPIC, JOINT_STATE_TOPIC, EVENT_TOPIC):  # the others only in logs that have them
+            self._channel(topic)
+        self._unflushed = bytearray()  # records whose joint states are still to be written
+        self._slot = -1  # of the last joint state
         self._file.flush()
 
-    def _add(self, channel: int, times_ns: np.ndarray, records: np.ndarray, numbers: np.ndarray | int = 0) -> None:
-        """Messages of `records`, their bytes as they are."""
-        rows = np.zeros(len(records), cdr_rows(np.dtype(f"V{records.dtype.itemsize}")))
+    def _channel(self, topic: Topic) -> int:
+        if topic.name not in self._channels:
+            self._channels[topic.name] = self._mcap.add_channel(topic.name, topic.schema, topic.definition)
+        return self._channels[topic.name]
+
+    def _add(self, topic: Topic, times_ns: np.ndarray, messages: np.ndarray, numbers: np.ndarray | int = 0) -> None:
+        """Messages at `times_ns` (CLOCK_MONOTONIC), their bytes as they are."""
+        rows = np.zeros(len(messages), cdr_rows(np.dtype(f"V{messages.dtype.itemsize}")))
         rows["sequence"] = numbers
         rows["cdr"] = CDR_HEADER
-        rows["record"] = records.view(np.ndarray).view(rows.dtype["record"])
-        self._mcap.add_messages(channel, times_ns, rows)
+        rows["record"] = messages.view(np.ndarray).view(rows.dtype["record"])
+        self._mcap.add_messages(self._channel(topic), times_ns + self._offset_ns, rows)
 
     def write_records(self, records: np.ndarray) -> None:
         """Append log records, an array of shape (N,) of LogRecord in order of time."""
@@ -244,33 +183,43 @@ class RunLogWriter:
         if records.dtype != dtype_of(LogRecord):
             raise TypeError(f"records (of {records.dtype}) must be an array of LogRecord")
         numbers = (self._written + np.arange(len(records))) & 0xFFFFFFFF
-        self._add(self._record_channel, records["time_ns"], records, numbers)
+        self._add(RECORD_TOPIC, records["time_ns"], records, numbers)
         self._written += len(records)
+        self._unflushed += records.tobytes()
         if self._clock() - self._flushed_at_s >= self._flush_s:
             self.flush()
 
     def write_frames(self, frames: np.ndarray) -> None:
         """Append raw CAN frames, an array of shape (N,) of CAN_FRAME in order of time."""
-        if self._can_channel is None:
-            self._can_channel = self._mcap.add_channel(CAN_TOPIC, CAN_SCHEMA, CAN_DEFINITION)
-        self._add(self._can_channel, frame_times_ns(frames), np.ascontiguousarray(frames))
+        times_ns, frames = stamps_ns(frames), np.array(frames)
+        stamp(frames, times_ns + self._offset_ns)
+        self._add(CAN_TOPIC, times_ns, frames)
 
     def write_event(self, level: int, source: str, text: str, time_ns: int | None = None) -> None:
         """Append an event and flush: it may be the last thing that this process does."""
         time_ns = time.monotonic_ns() if time_ns is None else time_ns
-        self._mcap.add_message(self._event_channel, time_ns, CDR_HEADER + event_body(time_ns, level, source, text))
+        calendar_ns = time_ns + self._offset_ns
+        body = event_body(calendar_ns, level, source, text)
+        self._mcap.add_message(self._channel(EVENT_TOPIC), calendar_ns, CDR_HEADER + body)
         self.flush()
 
     def write_temperature(self, time_ns: int, temperature_degC: float) -> None:
         """Append a reading of the drive's temperature."""
-        if self._temperature_channel is None:
-            definition = message_definition(TEMPERATURE)
-            self._temperature_channel = self._mcap.add_channel(TEMPERATURE_TOPIC, TEMPERATURE_SCHEMA, definition)
         reading = np.array([(time_ns, temperature_degC)], TEMPERATURE)
-        self._add(self._temperature_channel, reading["time_ns"], reading)
+        self._add(TEMPERATURE_TOPIC, reading["time_ns"], reading)
+
+    def _write_joint_states(self) -> None:
+        if self._unflushed:
+            records = np.frombuffer(self._unflushed, dtype_of(LogRecord))
+            self._unflushed = bytearray()
+            slots = records["time_ns"] // JOINT_STATE_NS
+            chosen = records[np.diff(slots, prepend=self._slot) != 0]
+            self._slot = int(slots[-1])
+            self._add(JOINT_STATE_TOPIC, chosen["time_ns"], joint_states(chosen, self._offset_ns))
 
     def flush(self) -> None:
         """Close the chunk in progress and hand everything to the operating system."""
+        self._write_joint_states()
         self._mcap.flush()
         self._flushed_at_s = self._clock()
 
@@ -278,7 +227,7 @@ class RunLogWriter:
         """Finish the file (index and summary); may be called twice."""
         if not self._file.closed:
             try:
-                self._mcap.flush()
+                self.flush()
                 self._mcap.finish()
             finally:
                 self._mcap.close()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
@@ -21,23 +21,21 @@ from jointctl.firmware_py.input_file import LARGEST_LOG_BYTES, open_input
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
 from jointctl.tools.recording.mcap_file import BEFORE_BODY, MESSAGE_HEAD
-from jointctl.tools.recording.run_log import (
+from jointctl.tools.recording.ros_messages import (
     CAN_FRAME,
     CAN_TOPIC,
     CDR_HEADER,
-    ERROR,
     EVENT_TOPIC,
-    RECORD_SCHEMA,
+    OLDER_RECORD_DEFINITION,
     RECORD_TOPIC,
     TEMPERATURE,
     TEMPERATURE_TOPIC,
-    THINNING,
-    WARNING,
-    Event,
-    cdr_rows,
     event_from_body,
-    message_definition,
+    older_event_from_body,
+    stamp,
+    stamps_ns,
 )
+from jointctl.tools.recording.run_log import ERROR, THINNING, WARNING, Event, calendar_offset_ns, cdr_rows
 
 
 @dataclass(frozen=True)
@@ -102,16 +100,25 @@ def _read(file: IO[bytes], path: Path) -> RunLog:
         complete = False
     if not log.metadata and not log.record_parts:
         raise DataError(f"{path}: holds no run log")
-    dtype = dtype_of(LogRecord)
-    records = np.concatenate(log.record_parts) if log.record_parts else np.zeros(0, dtype)
+    records = np.concatenate([np.zeros(0, dtype_of(LogRecord)), *log.record_parts])
+    if log.older:
+        records["notices"] = 0  # there was padding
     records.flags.writeable = False
-    frames = np.concatenate(log.frame_parts) if log.frame_parts else np.zeros(0, CAN_FRAME)
+    frames = np.concatenate([np.zeros(0, CAN_FRAME), *log.frame_parts])
     temperatures = np.concatenate([np.zeros(0, TEMPERATURE), *log.temperature_parts])
-    return RunLog(records.view(np.recarray), tuple(log.events), log.metadata, complete, frames, temperatures)
+    events = log.events
+    if not log.older:
+        offset_ns = calendar_offset_ns(log.metadata.get("clock", {}))
+        stamp(frames, stamps_ns(frames) - offset_ns)
+        events = [replace(event, time_ns=event.time_ns - offset_ns) for event in events]
+    return RunLog(records.view(np.recarray), tuple(events), log.metadata, complete, frames, temperatures)
 
 
 class _Collector:
-    """Takes chunks apart: runs of log records or frames by one `np.frombuffer`, else message by message."""
+    """Takes chunks apart: runs of log records or frames by one `np.frombuffer`, else message by message.
+
+    Of a log of an `older` version, the times of frames and events are CLOCK_MONOTONIC, else calendar times.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -120,12 +127,12 @@ class _Collector:
         self.temperature_parts: list[np.ndarray] = []
         self.events: list[Event] = []
         self.metadata: dict[str, dict[str, str]] = {}
+        self.older = False
         self._topics: dict[int, str] = {}
-        self._definition = message_definition(dtype_of(LogRecord)).encode()
         bodies = {
-            RECORD_TOPIC: (dtype_of(LogRecord), self.record_parts),
-            CAN_TOPIC: (CAN_FRAME, self.frame_parts),
-            TEMPERATURE_TOPIC: (TEMPERATURE, self.temperature_parts),
+            RECORD_TOPIC.name: (dtype_of(LogRecord), self.record_parts),
+            CAN_TOPIC.name: (CAN_FRAME, self.frame_parts),
+            TEMPERATURE_TOPIC.name: (TEMPERATURE, self.temperature_parts),
         }
         # topics whose messages all have the same size, so that a run of them is an array
         self._runs = {topic: (cdr_rows(body), parts) for topic, (body, parts) in bodies.items()}
@@ -143,9 +150,9 @@ class _Collector:
                 if message is not None and parts is not None and length == message.itemsize - BEFORE_BODY:
                     at += _take_run(data, at, channel, message, parts)
                     continue
-                if topic == EVENT_TOPIC:
+                if topic == EVENT_TOPIC.name:
                     body = data[at + MESSAGE_HEAD.itemsize + len(CDR_HEADER) : at + 9 + length]
-                    self.events.append(Event(*event_from_body(body)))
+                    self.events.append(Event(*(older_event_from_body if self.older else event_from_body)(body)))
             elif opcode == Opcode.CHANNEL:
                 self._take_channel(Channel.read(_stream(data, at, length)))
             elif opcode == Opcode.SCHEMA:
@@ -156,7 +163,9 @@ class _Collector:
         self._topics[channel.id] = channel.topic
 
     def _take_schema(self, schema: Schema) -> None:
-        if schema.name == RECORD_SCHEMA and schema.data != self._definition:
+        if schema.name == RECORD_TOPIC.schema and schema.data == OLDER_RECORD_DEFINITION.encode():
+            self.older = True
+        elif schema.name == RECORD_TOPIC.schema and schema.data != RECORD_TOPIC.definition.encode():
             raise DataError(f"{self.path}: was written by another version of jointctl, with other log fields")
 
 
@@ -198,19 +207,9 @@ def kept_share(log: RunLog) -> str:
     return f"every {thinning['every']}th, the last {thinning['whole_s']} s whole" if thinning else ""
 
 
-def calendar_offset_ns(log: RunLog) -> int:
-    """What to add to the log's times for nanoseconds since 1970; 0 if the log does not tell."""
-    clock = log.metadata.get("clock", {})
-    try:
-        at_s = np.datetime64(clock["utc"].removesuffix("+00:00"), "ns").astype(np.int64)
-        return int(at_s) - int(clock["monotonic_ns"])
-    except (KeyError, ValueError):
-        return 0
-
-
 def began_at(log: RunLog) -> str:
     """Local time of the first record; "" if the log does not tell."""
-    offset_ns = calendar_offset_ns(log)
+    offset_ns = calendar_offset_ns(log.metadata.get("clock", {}))
     if not offset_ns or not len(log.records):
         return ""
     at = datetime.fromtimestamp((int(log.records["time_ns"][0]) + offset_ns) * 1e-9, UTC)

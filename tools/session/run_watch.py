@@ -17,7 +17,8 @@ from jointctl.firmware_py.cycle import Histogram, Word
 from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, StopRequest, in_words
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.recording.kept_records import KeptRecords, ThinnedRecords
-from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter, frame_array
+from jointctl.tools.recording.ros_messages import frame_array
+from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter
 from jointctl.tools.session.bus_watch import BusWatch, FrameRecorder, TemperatureWatch
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.display import Display, Snapshot

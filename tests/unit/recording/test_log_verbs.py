@@ -23,13 +23,14 @@ from mcap_ros2.decoder import DecoderFactory
 
 from jointctl.drivers.errors import ConfigurationError, DataError, MotionFault
 from jointctl.firmware_py.records import LogRecord
-from jointctl.firmware_py.schema import dtype_of, new
+from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, DriveState
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
 from jointctl.tools.recording.log_export import FORMATS, columns, parquet_bytes
-from jointctl.tools.recording.log_folder import log_path, remove_oldest, require_room
-from jointctl.tools.recording.run_log import THINNING, RunLogWriter, frame_array, frame_times_ns
+from jointctl.tools.recording.log_folder import MESSAGE_BYTES, log_path, remove_oldest, require_room
+from jointctl.tools.recording.ros_messages import frame_array, stamps_ns
+from jointctl.tools.recording.run_log import THINNING, RunLogWriter
 from jointctl.tools.recording.run_log_reader import missing_records, read_run_log
 from jointctl.tools.session.bus_watch import FrameRecorder, recording
 from jointctl.tools.session.consent import prepare_log, require_ready
@@ -117,12 +118,22 @@ def test_a_disk_without_room_for_the_run_is_told(
     in_folder: Callable[..., Config], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factor: float, refused: bool
 ) -> None:
     config = in_folder()
-    needed = 10.0 * 1000.0 * (dtype_of(LogRecord).itemsize + 40)
+    needed = 10.0 * 1000.0 * MESSAGE_BYTES
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=int(needed * factor)))
     told = "MB are free, the log of this run takes about 4 MB"
     with pytest.raises(DataError, match=told) if refused else nullcontext():
         require_room(config, log_path(config))
     assert names(tmp_path) == []
+
+
+def test_the_room_for_a_run_is_what_its_log_takes(tmp_path: Path) -> None:
+    def size(count: int) -> int:
+        path = tmp_path / f"{count}.mcap"
+        with RunLogWriter(path, {}) as log:
+            log.write_records(run_records(count))
+        return path.stat().st_size
+
+    assert (size(12_000) - size(2000)) / 10_000 == pytest.approx(MESSAGE_BYTES, rel=5e-3)
 
 
 def test_a_folder_that_cannot_be_made_is_told(in_folder: Callable[..., Config], tmp_path: Path) -> None:
@@ -290,8 +301,11 @@ def test_a_ros_2_decoder_reads_the_frames(made_log: Path) -> None:
         (0x84, True, False, True, 8), (0x181, False, False, False, 8),
     ]  # fmt: skip
     assert bytes(messages[4].data) == bytes(range(0xF8, 0x100))
-    assert (messages[4].header.stamp.sec, messages[4].header.stamp.nanosec) == (5, 4_000_000)
-    np.testing.assert_array_equal(read_run_log(made_log).frames, some_frames())
+    log = read_run_log(made_log)
+    np.testing.assert_array_equal(log.frames, some_frames())
+    found_ns = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in messages]
+    offset_ns = int(log.metadata["clock"]["unix_ns"]) - int(log.metadata["clock"]["monotonic_ns"])
+    assert found_ns == [START_NS + i * 1_000_000 + offset_ns for i in range(5)]
 
 
 def test_parquet_holds_every_column_and_the_metadata(made_log: Path) -> None:
@@ -375,7 +389,7 @@ def test_a_recorder_that_nobody_fetches_from_drops_and_counts(queue: int, kept: 
             recorder.close()
     assert [message.arbitration_id for _, message in found] == list(range(kept))
     assert recorder.dropped == 10 - kept
-    times = frame_times_ns(frame_array(found))
+    times = stamps_ns(frame_array(found))
     assert np.all(np.diff(times) >= 0)
     assert recorder.new_frames() == []
 
