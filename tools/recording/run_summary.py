@@ -5,7 +5,7 @@ Errors and torques are those of the TRACKING phase (e = q - q_d, at the joint); 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -97,9 +97,12 @@ def summarise(
     statistics come from it, because the loop counts every cycle there even if the log lost some.
     `late_from_s` is a trajectory time, `temperatures_degC` what the drive has reported.
     """
-    tracking = records[records["phase"] == AxisPhase.TRACKING]
-    time_s = tracking_time_s(tracking)
+    chosen = records["phase"] == AxisPhase.TRACKING
+    # of these fields only: of a long run the records are a file of gigabytes
+    tracking = {name: records[name][chosen] for name in ("time_ns", "trajectory_s", "error_rad", *TORQUES.values())}
+    time_s, error_rad = tracking_time_s(tracking), tracking["error_rad"]
     late_from_s = late_from_s if late_from_s is not None else 0.5 * float(time_s[-1]) if len(time_s) else 0.0
+    late = time_s >= late_from_s
     faults = records["fault"][records["fault"] != 0]
     duration_ns = int(records["time_ns"][-1]) - int(records["time_ns"][0]) if len(records) else 0
     named: dict[str, Any] = {key: _range(tracking[key]) for key in TORQUES.values()}
@@ -110,9 +113,9 @@ def summarise(
         duration_s=duration_ns * 1e-9,
         tracked_s=float(time_s[-1] - time_s[0]) if len(time_s) else 0.0,
         fault=fault_name(int(faults[0])) if len(faults) else Fault.NONE.name,
-        error=_error(tracking, time_s),
-        late_error=_error(tracking[time_s >= late_from_s], time_s[time_s >= late_from_s]),
-        settling_s=_settling_s(tracking),
+        error=_error(error_rad, time_s),
+        late_error=_error(error_rad[late], time_s[late]),
+        settling_s=_settling_s(error_rad, time_s),
         **named,
         skipped_cycles=int(records["skipped"].sum()),
         oldest_sample_cycles=int(records["sample_age_cycles"].max()) if len(records) else 0,
@@ -120,9 +123,9 @@ def summarise(
     )
 
 
-def tracking_time_s(tracking: np.ndarray) -> np.ndarray:
+def tracking_time_s(tracking: Mapping[str, np.ndarray]) -> np.ndarray:
     """Trajectory time [s] of TRACKING records; goes on where a change of the motion has set the loop's own back."""
-    time_s: np.ndarray = tracking["trajectory_s"]
+    time_s = tracking["trajectory_s"]
     if len(time_s) < 2 or np.all(np.diff(time_s) >= 0.0):
         return time_s
     since: np.ndarray = (tracking["time_ns"] - tracking["time_ns"][0]) * 1e-9
@@ -134,20 +137,19 @@ def _range(values: np.ndarray) -> Range | None:
     return Range(float(values.min()), float(values.max())) if len(values) else None
 
 
-def _error(tracking: np.ndarray, time_s: np.ndarray) -> ErrorSummary | None:
-    error = tracking["error_rad"]
-    found = _range(error)
+def _error(error_rad: np.ndarray, time_s: np.ndarray) -> ErrorSummary | None:
+    found = _range(error_rad)
     if found is None:
         return None
-    rmse = float(np.sqrt(np.mean(np.square(error[np.isfinite(error)]))))
+    rmse = float(np.sqrt(np.mean(np.square(error_rad[np.isfinite(error_rad)]))))
     return ErrorSummary(float(time_s[0]), float(time_s[-1]), found, rmse)
 
 
-def _settling_s(tracking: np.ndarray) -> float | None:
-    outside = np.flatnonzero(~(np.abs(tracking["error_rad"]) <= SETTLED_RAD))
-    if len(tracking) == 0 or (len(outside) and outside[-1] == len(tracking) - 1):
+def _settling_s(error_rad: np.ndarray, time_s: np.ndarray) -> float | None:
+    outside = np.flatnonzero(~(np.abs(error_rad) <= SETTLED_RAD))
+    if len(error_rad) == 0 or (len(outside) and outside[-1] == len(error_rad) - 1):
         return None
-    return float(tracking_time_s(tracking)[outside[-1] + 1 if len(outside) else 0])
+    return float(time_s[outside[-1] + 1 if len(outside) else 0])
 
 
 def _times(records: np.ndarray, histogram: np.ndarray | None, key: str) -> TimeSummary | None:
