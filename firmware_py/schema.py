@@ -6,7 +6,8 @@
         weights: Vector15
 
 mypy checks the field names wherever a kernel parameter is annotated with the class; numba and the log see the
-aligned little-endian dtype.  An aligned record is also a valid CDR message body, which the run log relies on.
+aligned little-endian dtype.  Without padding at its end that is a valid CDR message body as well, which the run log
+relies on.
 """
 
 from __future__ import annotations
