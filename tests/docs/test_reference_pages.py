@@ -87,9 +87,8 @@ def test_every_field_of_a_log_is_named_with_type_and_unit() -> None:
 
 
 def test_every_value_of_an_enumeration_is_named() -> None:
-    values = {name: values for name, values in table("enumeration")}
-    assert values == {
-        name: ", ".join(f"{each.value} {each.name}" for each in kind) for name, kind in ENUMERATIONS.items()
-    }
+    assert table("enumeration") == [
+        [name, ", ".join(f"{each.value} {each.name}" for each in kind)] for name, kind in ENUMERATIONS.items()
+    ]
     enumerated = {name for name, _, unit, _ in table("field | type") if unit in ("enumeration", "bits")}
     assert enumerated == set(ENUMERATIONS)
