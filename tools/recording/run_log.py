@@ -33,6 +33,7 @@ from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
 from jointctl.tools.recording.mcap_file import McapFile, message_rows
 from jointctl.tools.recording.ros_messages import (
+    CAN_FRAME,
     CAN_TOPIC,
     CDR_HEADER,
     EVENT_TOPIC,
@@ -191,9 +192,12 @@ class RunLogWriter:
 
     def write_frames(self, frames: np.ndarray) -> None:
         """Append raw CAN frames, an array of shape (N,) of CAN_FRAME in order of time."""
-        times_ns, frames = stamps_ns(frames), np.array(frames)
-        stamp(frames, times_ns + self._offset_ns)
-        self._add(CAN_TOPIC, times_ns, frames)
+        messages = np.zeros(len(frames), CAN_FRAME)
+        for name in CAN_FRAME.names or ():  # one by one: a copy of whole frames may have anything between the fields
+            messages[name] = frames[name]
+        times_ns = stamps_ns(frames)
+        stamp(messages, times_ns + self._offset_ns)
+        self._add(CAN_TOPIC, times_ns, messages)
 
     def write_event(self, level: int, source: str, text: str, time_ns: int | None = None) -> None:
         """Append an event and flush: it may be the last thing that this process does."""

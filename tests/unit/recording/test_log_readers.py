@@ -62,10 +62,18 @@ def written(tmp_path: Path, request: pytest.FixtureRequest) -> Written:
             if at < 60:
                 log.write_event(*EVENTS[at // 20], start_ns + at * MS)
                 log.write_temperature(start_ns + at * MS, 20.0 + at)
-                log.write_frames(frame_array([(start_ns + at * MS, frame)]))
+                frames = frame_array([(start_ns + at * MS, frame)])
+                leave_traces(frames.nbytes)
+                log.write_frames(frames)
         kept.append(thinned.last())
         log.write_records(kept[-1])
     return Written(path, np.concatenate(kept).view(np.recarray), start_ns, calendar_ns)
+
+
+def leave_traces(size: int) -> None:
+    """Memory of `size` bytes that the next array of this size gets is not zero; numpy keeps what is freed for it."""
+    arrays = [np.full(size, 0xA5, np.uint8) for _ in range(20)]
+    del arrays
 
 
 def compare(written: Written, found: dict[str, list[tuple[int, Any]]]) -> None:
