@@ -15,7 +15,7 @@ from jointctl.firmware_py.safety import set_point_problem
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest, TrajectoryKind
 from jointctl.firmware_py.states import SetPointProblem as Problem
-from jointctl.firmware_py.stream import between
+from jointctl.firmware_py.stream import between, step_other_motion
 from tests.axis_on_stub_joint import NewRig, Rig, assert_well, finish
 
 DELAY_ms, TIMEOUT_ms = 30, 100
@@ -107,6 +107,39 @@ def test_it_begins_again_from_wherever_the_reference_is_without_a_jump() -> None
     assert run.state.stream.following
     assert run.at[0] - position_rad == pytest.approx(1e-3 * velocity_radps, abs=2e-5)  # it has gone on meanwhile
     assert run.at[1] == pytest.approx(velocity_radps, abs=0.02)
+
+
+def test_what_it_begins_again_with_is_not_that_of_the_last_set_point() -> None:
+    run = StreamRig()
+    for k in range(301):
+        if k % 10 == 0:
+            run.put(1e-4 * k, 0.1 * min(1.0, k / 100), acceleration_radps2=3.0, torque_Nm=min(4.0, 0.04 * k))
+        run.tick()
+    while run.state.stream.following:
+        run.tick()
+    run.run(4)  # it brakes, and the torque goes back at its rate
+    torque_Nm, (position_rad, velocity_radps) = float(run.state.stream.torque_Nm), run.at
+    assert 1.0 < torque_Nm < 3.0
+    run.put(position_rad + 0.001, velocity_radps, acceleration_radps2=3.0, torque_Nm=torque_Nm)
+    for _ in range(5):
+        run.tick()
+        assert run.state.stream.following
+        assert run.state.stream.torque_Nm == pytest.approx(torque_Nm)
+        assert abs(run.state.reference.acceleration_radps2) < 0.1  # between two equal velocities
+
+
+@pytest.mark.parametrize(
+    ("velocity", "acceleration", "begins"), [(0.0, 0.0, True), (0.0, 1.0, False), (1.0, 0.0, False)]
+)
+def test_another_motion_gives_way_at_rest_only(velocity: float, acceleration: float, begins: bool) -> None:
+    run = StreamRig()
+    run.axis.trajectory.kind = TrajectoryKind.SINE
+    reference = run.state.reference
+    reference.velocity_radps, reference.acceleration_radps2 = velocity, acceleration
+    run.put(0.0)
+    step_other_motion(run.axis, run.state, 1)
+    assert bool(run.axis.trajectory.kind == TrajectoryKind.STREAM) is begins
+    assert run.state.stream.refused == (0 if begins else 1)
 
 
 def test_set_points_that_lie_close_are_one() -> None:
