@@ -139,13 +139,18 @@ class DeviceOnBus:
         return stop_node(bus, 1, sdo_timeout_s=0.15, sleep=lambda s: time.sleep(s / DEVICE_TIME_FACTOR))
 
     def drive(
-        self, settings: CanopenSettings, *, listened: bool = True, gate: Callable[[], None] = lambda: None
+        self,
+        settings: CanopenSettings,
+        *,
+        listened: bool = True,
+        gate: Callable[[], None] = lambda: None,
+        echoes: bool = False,
     ) -> CanopenDrive:
         """The real driver on another end of this bus; its waiting is short, but long for the device.
 
-        `listened`: it has listened to the bus for long enough already.
+        `listened`: it has listened to the bus for long enough already.  `echoes`: it receives its own frames as well.
         """
-        bus = can.Bus(interface="virtual", channel=self.channel)
+        bus = can.Bus(interface="virtual", channel=self.channel, receive_own_messages=echoes)
         passed = threading.Event()
 
         def hear(message: can.Message) -> None:

@@ -16,6 +16,7 @@ import pytest
 from jointctl.drivers.canopen.cia402 import Mode
 from jointctl.drivers.canopen.commissioning import LARGEST_PERMILLE, STEEP_RADPS2
 from jointctl.drivers.canopen.drive import GATE_S, REOPEN_ATTEMPTS, REOPEN_PAUSE_S, CanopenDrive
+from jointctl.drivers.canopen.network import LISTEN_S
 from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
 
 pytestmark = pytest.mark.usefixtures("short_timeout")
@@ -318,12 +319,41 @@ def test_a_drive_that_watches_a_node_on_the_bus_is_anothers(joint: Any, heartbea
             assert "other nodes are on the bus: heartbeats of 9, 43" in drive.commission().remarks
 
 
+def test_nothing_is_sent_before_the_bus_was_silent_for_its_time(joint: Any) -> None:
+    def sleep(seconds: float) -> None:
+        slept_s.append(seconds)
+        if sum(slept_s) > LISTEN_S - 2.0 * GATE_S and not joint.requests:
+            joint.send(0x080, b"")
+
+    slept_s: list[float] = []
+    with joint.opened() as drive:
+        drive._others._started_s = drive._others._clock()
+        drive._sleep = sleep
+        with pytest.raises(BusError, match="another controller is active on this bus: 1 x SYNC"):
+            drive.commission()
+        assert sum(slept_s) == pytest.approx(LISTEN_S, abs=GATE_S)
+        assert joint.requests == [(0x080, b"")]
+
+
+def test_our_own_frames_that_come_back_are_no_ones_elses(joint: Any) -> None:
+    drive = joint.drive(joint.settings, echoes=True)
+    try:
+        drive.commission()
+        drive.start_cyclic()
+        assert drive.make_safe() == "switch on disabled"
+    finally:
+        drive.close()
+
+
 def test_an_rpdo_that_only_the_drive_knows_of_is_anothers_command(joint: Any) -> None:
     joint.answers[0x1401, 1] = 0x333
     with joint.opened() as drive:
         joint.send(0x333, bytes(8))
         with pytest.raises(BusError, match=r"another controller is active on this bus: 1 x RPDO of the drive \(333h\)"):
             drive.commission()
+    assert {struct.unpack_from("<H", data, 1)[0] for cob, data in joint.requests if cob == 0x601} <= {
+        0x1000, *range(0x1400, 0x1600)
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("step", ["commission", "start_cyclic"])
