@@ -319,7 +319,8 @@ def test_a_drive_that_watches_a_node_on_the_bus_is_anothers(joint: Any, heartbea
             assert "other nodes are on the bus: heartbeats of 9, 43" in drive.commission().remarks
 
 
-def test_nothing_is_sent_before_the_bus_was_silent_for_its_time(joint: Any) -> None:
+@pytest.mark.parametrize("step", ["commission", "clear_fault"])
+def test_nothing_is_sent_before_the_bus_was_silent_for_its_time(joint: Any, step: str) -> None:
     def sleep(seconds: float) -> None:
         slept_s.append(seconds)
         if sum(slept_s) > LISTEN_S - 2.0 * GATE_S and not joint.requests:
@@ -330,7 +331,7 @@ def test_nothing_is_sent_before_the_bus_was_silent_for_its_time(joint: Any) -> N
         drive._others._started_s = drive._others._clock()
         drive._sleep = sleep
         with pytest.raises(BusError, match="another controller is active on this bus: 1 x SYNC"):
-            drive.commission()
+            getattr(drive, step)()
         assert sum(slept_s) == pytest.approx(LISTEN_S, abs=GATE_S)
         assert joint.requests == [(0x080, b"")]
 
