@@ -142,6 +142,17 @@ def test_another_motion_gives_way_at_rest_only(velocity: float, acceleration: fl
     assert run.state.stream.refused == (0 if begins else 1)
 
 
+def test_set_points_a_third_of_the_delay_apart_are_not_close() -> None:
+    run = StreamRig()
+    for k in range(1, 10):
+        run.put(1e-5 * k, at_ms=k * DELAY_ms / 3)
+    lengths = []
+    for _ in range(4 * DELAY_ms):
+        run.tick()
+        lengths += [run.state.stream.after.time_ns - run.state.stream.before.time_ns] * bool(run.state.stream.following)
+    assert set(lengths[DELAY_ms // 3 + 1 :]) == {DELAY_ms * MS // 3}
+
+
 def test_set_points_that_lie_close_are_one() -> None:
     run = StreamRig()
     for k in range(1, 30):
