@@ -163,7 +163,10 @@ def test_a_drive_that_does_not_answer_or_falls_silent(joint: Any, empty_bus: Any
     message = refusal(joint, NoDeviceError, node=7)
     assert "node 7 does not answer; these do: 1" in message
     assert "drive.node" in message
-    assert "node 1 does not answer, and neither does any other" in refusal(empty_bus, NoDeviceError)
+    alone = "node 1 does not answer, and neither does any other"
+    assert alone in refusal(empty_bus, NoDeviceError)
+    with empty_bus.opened() as drive, pytest.raises(NoDeviceError, match=alone):
+        drive.clear_fault()
     joint.mute += [(0x6076, 0)] * 3
     message = refusal(joint, NoDeviceError)
     assert "reading object 6076 (motor rated torque) got no answer in 3 attempts" in message
@@ -346,12 +349,13 @@ def test_our_own_frames_that_come_back_are_no_ones_elses(joint: Any) -> None:
         drive.close()
 
 
-def test_an_rpdo_that_only_the_drive_knows_of_is_anothers_command(joint: Any) -> None:
+@pytest.mark.parametrize("step", ["commission", "clear_fault"])
+def test_an_rpdo_that_only_the_drive_knows_of_is_anothers_command(joint: Any, step: str) -> None:
     joint.answers[0x1401, 1] = 0x333
     with joint.opened() as drive:
         joint.send(0x333, bytes(8))
         with pytest.raises(BusError, match=r"another controller is active on this bus: 1 x RPDO of the drive \(333h\)"):
-            drive.commission()
+            getattr(drive, step)()
     assert {struct.unpack_from("<H", data, 1)[0] for cob, data in joint.requests if cob == 0x601} <= {
         0x1000, *range(0x1400, 0x1600)
     }  # fmt: skip
