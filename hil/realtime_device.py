@@ -60,7 +60,7 @@ class DeviceMemory(NamedTuple):
     plant_constants: Any  # PlantConstants[1]
     plant_states: Any  # PlantState[1]
     queues: Any  # FrameQueue[1], to the bus
-    faults: Any  # FaultConstants[N], see `hil.fault_kinds`
+    faults: Any  # FaultConstants[N], see `hil.fault_kinds`; None = none, and nothing of them is compiled
     fault_memories: Any  # FaultMemory[1]
     words: np.ndarray  # int64[WORDS]
     frame: np.ndarray  # uint8[FRAME_SIZE], as the next two scratch
@@ -94,7 +94,7 @@ def _flush_through_faults(
     fd: int, faults: Any, memory: FaultMemory, node_id: int, now_ns: int, queue: FrameQueue, words: np.ndarray
 ) -> None:
     """As `_flush`, with the wire's faults; late frames go out when they are due."""
-    if len(faults) == 0:
+    if faults is None:
         _flush(fd, queue, words)
         return
     take_due(memory, False, now_ns, False, memory.to_controller)
@@ -158,10 +158,20 @@ def _wait_for_frames(fd: int, service_fd: int, wait_ns: int, polls: np.ndarray, 
 
 
 @kernel
+def _let_faults_act(joint: _Joint, faults: Any, memory: FaultMemory, now_ns: int) -> None:
+    """Those of drive and plant begin and end; frames that the wire has kept come out of it."""
+    if faults is None:
+        return
+    step_faults(faults, memory, joint.device, joint.plant_c, joint.plant_s, now_ns)
+    take_due(memory, True, now_ns, False, memory.ready)
+    _take_frames(joint, memory.ready, now_ns)
+
+
+@kernel
 def _take_from_bus(joint: _Joint, faults: Any, memory: FaultMemory, frame: np.ndarray, now_ns: int) -> bool:
     """One frame of the controller, through the wire's faults, as of the time it was sent; whether it carried one."""
     sent_ns = sent_ns_of(frame, now_ns)
-    if len(faults) == 0:
+    if faults is None:
         _take_frame(joint, frame, sent_ns)
     else:
         step_faults(faults, memory, joint.device, joint.plant_c, joint.plant_s, sent_ns)
@@ -198,11 +208,7 @@ def run_device(fd: int, service_fd: int, of: DeviceMemory) -> int:
     while load_acquire(words, STOP_WORD) == 0 and ended == 1:
         now_ns = monotonic_ns(timespec)
         lag_ns = STAMPED_LAG_NS if now_ns - stamped_ns < OLDEST_STAMP_NS else 0
-        if len(faults) > 0:
-            plant_ns = now_ns - lag_ns
-            step_faults(faults, memory, device, plant_c, plant_s, plant_ns)
-            take_due(memory, True, plant_ns, False, memory.ready)
-            _take_frames(joint, memory.ready, plant_ns)
+        _let_faults_act(joint, faults, memory, now_ns - lag_ns)
         wait_ns = max(0, min(device.next_due_ns + lag_ns - now_ns, _LONGEST_WAIT_NS))
         _wait_for_frames(fd, service_fd, wait_ns, of.polls, timespec)
         woken_ns = monotonic_ns(timespec)
@@ -244,8 +250,8 @@ class RealtimeDevice:
         self._device = device
         self._fd = fd
         self.words = np.zeros(WORDS, np.int64)
-        self._faults = device.faults if len(device.faults) else no_faults()
-        self.fault_memory = fault_memory(self._faults)
+        self._faults = device.faults if len(device.faults) else None
+        self.fault_memory = fault_memory(device.faults if len(device.faults) else no_faults())
         self._threads: list[threading.Thread] = []
         self._core_end: socket.socket | None = None
 

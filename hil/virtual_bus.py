@@ -249,7 +249,7 @@ class HubMemory(NamedTuple):
 
 
 @kernel
-def _pass_on(memory: HubMemory, node: int, began_ns: int, timing: bool) -> None:
+def _pass_on(memory: HubMemory, node: int, began_ns: int, timing: bool | None) -> None:
     """The frame that has been read from `node`, stamped, to the wire or to the clients; an answer too late to none."""
     frame, watch, now_ns = memory.frame_bytes[0], memory.watch[0], monotonic_ns(memory.scratch)
     stamp_us = stamp_of(frame)
@@ -258,22 +258,37 @@ def _pass_on(memory: HubMemory, node: int, began_ns: int, timing: bool) -> None:
     elif over(watch, stamp_us, now_ns):
         memory.bus[0].late += 1
         return
-    if timing:
-        pend_frame(memory.frame, node, began_ns, memory.waiting)
-    else:
+    if timing is None:
         bits, bitrate = frame_bits(memory.frame, 0), memory.wire[0].bitrate_bitps
         _deliver(node, bits, bitrate, memory.clients, memory.bus, memory.frame)
+    else:
+        pend_frame(memory.frame, node, began_ns, memory.waiting)
 
 
 @kernel
-def run_hub(listener: int, wake: int, timing: bool, memory: HubMemory) -> None:
-    """Forward frames until the stop word is set (and `wake` is readable).  Allocation-free; see VirtualBusHub."""
+def _finish_frames(memory: HubMemory, now_ns: int, timing: bool | None) -> None:
+    """With `timing`, what has been on the wire for its time is delivered."""
+    if timing is None:
+        return
+    wire, frames = memory.wire, memory.frame
+    while True:
+        sender = finish_frame(wire, now_ns, memory.waiting, memory.on_wire, frames)
+        if sender == NO_NODE:
+            break
+        _deliver(sender, wire[0].bits, wire[0].bitrate_bitps, memory.clients, memory.bus, frames)
+
+
+@kernel
+def run_hub(listener: int, wake: int, timing: bool | None, memory: HubMemory) -> None:
+    """Forward frames until the stop word is set (and `wake` is readable).  Allocation-free; see VirtualBusHub.
+
+    `timing`: True, or None, and nothing of it is compiled.
+    """
     poll_words, scratch, clients, bus, wire = (
         memory.poll_words, memory.scratch, memory.clients, memory.bus, memory.wire
     )  # fmt: skip
     frames, waiting = memory.frame, memory.waiting
     accepting = True
-    bitrate = wire[0].bitrate_bitps
     began_ns = monotonic_ns(scratch)
     while load_acquire(memory.stop_word, 0) == 0:
         for node in range(MAX_CLIENTS):
@@ -285,7 +300,7 @@ def run_hub(listener: int, wake: int, timing: bool, memory: HubMemory) -> None:
         now_ns = monotonic_ns(scratch)
         bus[0].work_ns += now_ns - began_ns
         timeout = np.uintp(0)
-        if timing and wire[0].sender != NO_NODE:
+        if timing is not None and wire[0].sender != NO_NODE:
             rest_ns = max(wire[0].delivered_ns - now_ns, 0)
             scratch[0] = rest_ns // libc.NANOSECONDS
             scratch[1] = rest_ns % libc.NANOSECONDS
@@ -304,11 +319,7 @@ def run_hub(listener: int, wake: int, timing: bool, memory: HubMemory) -> None:
                 happened = poll_words[node] >> 48
                 if happened and _read(node, (happened & _GONE) != 0, clients, bus, frames, scratch):
                     _pass_on(memory, node, began_ns, timing)
-        while timing:
-            sender = finish_frame(wire, began_ns, waiting, memory.on_wire, frames)
-            if sender == NO_NODE:
-                break
-            _deliver(sender, wire[0].bits, bitrate, clients, bus, frames)
+        _finish_frames(memory, began_ns, timing)
         for node in range(MAX_CLIENTS):
             # A slot is used again only when the last frame of the client that left has been on the wire.
             if clients[node].state == DRAINING and waiting.counts[node] == 0 and wire[0].sender != node:
@@ -433,6 +444,7 @@ class VirtualBusHub:
             raise VirtualBusError(f"socket path (={self.path}) must have at most {_LONGEST_PATH} bytes")
         self.bitrate_bitps = bitrate_bitps
         self.timing = timing
+        self._timed = True if timing else None
         self._thread: threading.Thread | None = None
         self._stop_word = np.zeros(1, np.int64)
         self._reset()
@@ -474,7 +486,7 @@ class VirtualBusHub:
             raise VirtualBusError(f"the virtual bus at {self.path} is already started")
         self._reset()
         self._stop_word[0] = 1
-        run_hub(NO_FD, NO_FD, self.timing, self._memory())  # compile or load before anybody can connect
+        run_hub(NO_FD, NO_FD, self._timed, self._memory())  # compile or load before anybody can connect
         self._reset()
         self._listen()
         self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
@@ -509,7 +521,7 @@ class VirtualBusHub:
         if self.timing:
             # The default slack of a timer is 50 us, as long as a short frame at 1 Mbit/s.
             ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1))
-        run_hub(self._listener.fileno(), self._wake, self.timing, self._memory())
+        run_hub(self._listener.fileno(), self._wake, self._timed, self._memory())
 
     def stop(self) -> None:
         """Disconnect all clients and remove the socket; does nothing if the hub does not run."""
