@@ -29,7 +29,22 @@ if TYPE_CHECKING:
         UsageError,
     )
     from jointctl.joint import Joint, SetPointError, State
-    from jointctl.verbs import check, identify, read_log, run
+    from jointctl.verbs import (
+        check,
+        doctor,
+        fault_campaign,
+        identify,
+        info,
+        paper,
+        read_log,
+        report,
+        run,
+        scan,
+        stop,
+        study,
+        sweep,
+        validate,
+    )
 
     __version__: str
 
@@ -48,16 +63,22 @@ __all__ = [
     "UsageError",
     "__version__",
     "check",
+    "doctor",
+    "fault_campaign",
     "identify",
+    "info",
+    "paper",
     "read_log",
+    "report",
     "run",
+    "scan",
+    "stop",
+    "study",
+    "sweep",
+    "validate",
 ]
 
-_HOMES = {
-    "joint": ("Joint", "SetPointError", "State"),
-    "verbs": ("check", "identify", "read_log", "run"),
-}
-_HOME = {name: home for home, names in _HOMES.items() for name in names}
+_OF_JOINT = ("Joint", "SetPointError", "State")
 
 
 def __getattr__(name: str) -> object:
@@ -68,4 +89,5 @@ def __getattr__(name: str) -> object:
         return version("jointctl")
     if name not in __all__:
         raise AttributeError(f"module 'jointctl' has no attribute {name!r}")
-    return getattr(_import_module(f"jointctl.{_HOME.get(name, 'drivers.errors')}"), name)
+    home = "joint" if name in _OF_JOINT else "verbs" if name.islower() else "drivers.errors"
+    return getattr(_import_module(f"jointctl.{home}"), name)

@@ -1,77 +1,146 @@
 """The commands as functions: each takes the options of its command by name and returns its result.
 
-    report = jointctl.check("my_joint.toml")
-    figures = jointctl.run("my_joint.toml", yes=True)
+    margins = jointctl.check("my_joint.toml").margins
+    result = jointctl.run("my_joint.toml", yes=True)
 
-A result is what `--json` prints, as numbers, texts, lists and dicts; `identify` and `read_log` have types of their own.
-What a command says on the way goes to stderr, as at the terminal; an exit code that is not 0 is an exception.
+Options have the names and units that `help(jointctl.run)` shows; what stands without a name on the command line comes
+first.  What a command says on the way goes to stderr, as at the terminal; an exit code that is not 0 is an exception.
 """
 
 from __future__ import annotations
 
-import contextlib
 import inspect
-import io
-import json
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
-from jointctl.drivers.errors import DECLINED, INTERRUPTED, JointctlError, MotionFault
+from jointctl.drivers.errors import DECLINED, INTERRUPTED, JointctlError, MotionFault, UsageError
 
 if TYPE_CHECKING:
+    from jointctl.tools.experiments.controller_study import StudyResult
+    from jointctl.tools.experiments.judge import Verdict
     from jointctl.tools.identification.identification import Identification
+    from jointctl.tools.inspection.health import Finding
     from jointctl.tools.recording.run_log_reader import RunLog
+    from jointctl.tools.session.result import RunResult
+    from jointctl.tools.verbs.check import LoopCheck
+    from jointctl.tools.verbs.paper import PaperResult
+    from jointctl.tools.verbs.sweep import SweepResult
+    from jointctl.tools.verbs.validate import Validation
+
+# What each command returns; None where nothing was done, as by `dry_run=True`.  The functions are made of the commands.
+run: Callable[..., RunResult | None]
+check: Callable[..., LoopCheck]
+sweep: Callable[..., SweepResult | None]
+validate: Callable[..., Validation]
+report: Callable[..., Path]
+study: Callable[..., StudyResult]
+paper: Callable[..., PaperResult]
+fault_campaign: Callable[..., list[Verdict]]
+doctor: Callable[..., list[Finding]]
+scan: Callable[..., dict[str, Any]]
+info: Callable[..., dict[str, Any]]
+stop: Callable[..., str]
+
+VERBS = tuple(__annotations__)
+_ANSWERS = {"doctor": JointctlError.exit_code, "fault_campaign": 10}  # exit codes that the result explains
+_NAMES = {"assume_yes": "yes"}  # of options that have another name inside
 
 
-def _called(verb: Callable[..., int | None], given: dict[str, Any]) -> Any:
-    """The document that the verb prints with --json; `given` are its options by name."""
+def __getattr__(name: str) -> Callable[..., object]:
+    """One of `VERBS`, when it is asked for."""
+    if name not in VERBS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = function = _function(name)
+    return function
+
+
+def _function(name: str) -> Callable[..., object]:
+    from typer.models import ArgumentInfo
+
     from jointctl.tools.verbs.verb_options import option_call
 
-    options, call = option_call(verb)
-    names = {option.name: option for option in options}
-    unknown = [name for name in given if name not in names]
-    if unknown:
-        raise TypeError(f"{verb.__name__}() has no option {unknown[0]!r}; there are {', '.join(sorted(names))}")
-    values = {name: given.get(name, option.default) for name, option in names.items()}
-    missing = [name for name, value in values.items() if value is inspect.Parameter.empty]
-    if missing:
-        raise TypeError(f"{verb.__name__}() needs {missing[0]!r}")
-    for name, option in names.items():
-        base = get_args(option.annotation)[0] if get_args(option.annotation) else option.annotation
-        if isinstance(values[name], str) and (base is Path or Path in get_args(base)):
-            values[name] = Path(values[name])
-    if "json" in names:
-        values["json"] = True
-    printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
-        code = call(values) or 0
-    text = printed.getvalue().strip()
-    result = json.loads(text.splitlines()[-1]) if text else None
+    home = import_module(f"jointctl.tools.verbs.{name}")
+    verb: Callable[..., int | None] = getattr(home, f"{name}_verb", None) or getattr(home, name)
+    found: list[object] = []
+    listed, call = option_call(verb, found.append)
+    options = {_NAMES.get(option.name, option.name): option for option in listed if option.name != "json"}
+    first = [key for key, option in options.items() if isinstance(_given_as(option), ArgumentInfo)]
+
+    def function(*arguments: object, **given: object) -> object:
+        if len(arguments) > len(first):
+            raise TypeError(f"{name}() takes {len(first)} arguments without a name at most, not {len(arguments)}")
+        given |= dict(zip(first, arguments, strict=False))
+        unknown = [key for key in given if key not in options]
+        if unknown:
+            raise TypeError(f"{name}() has no option {unknown[0]!r}; there are {', '.join(sorted(options))}")
+        missing = [key for key, option in options.items() if option.default is option.empty and key not in given]
+        if missing:
+            raise TypeError(f"{name}() needs {missing[0]!r}")
+        values = {option.name: option.default for option in options.values()}
+        values |= {options[key].name: _checked(name, key, value, options[key]) for key, value in given.items()}
+        found.clear()
+        code = call({"json": False, **values}) or 0
+        result = found[-1] if found else None
+        if code and code != _ANSWERS.get(name):
+            _raise(name, code, result)
+        return result
+
+    shown = [
+        inspect.Parameter(
+            key, option.POSITIONAL_OR_KEYWORD if key in first else option.KEYWORD_ONLY,
+            default=option.default, annotation=_kind(option),
+        )
+        for key, option in options.items()
+    ]  # fmt: skip
+    shown.sort(key=lambda option: (option.kind, option.default is not option.empty))
+    result = __annotations__[name].removeprefix("Callable[..., ").removesuffix("]")
+    words = {option.name: getattr(_given_as(options[option.name]), "help", None) for option in shown}
+    function.__name__ = function.__qualname__ = name
+    function.__doc__ = "\n\n".join(
+        [inspect.getdoc(verb) or "", "\n".join(f"{key}: {text}" for key, text in words.items() if text)]
+    )
+    vars(function)["__signature__"] = inspect.Signature(shown, return_annotation=result)
+    return function
+
+
+def _kind(option: inspect.Parameter) -> Any:
+    return (get_args(option.annotation) or (option.annotation,))[0]
+
+
+def _given_as(option: inspect.Parameter) -> Any:
+    """What Typer is told of an option; None without anything."""
+    return next(iter(get_args(option.annotation)[1:]), None)
+
+
+def _checked(verb: str, name: str, value: object, option: inspect.Parameter) -> object:
+    """The value in the option's type and within its bounds; `UsageError` if that cannot be."""
+    from pydantic import Field, TypeAdapter, ValidationError
+
+    if value is None and option.default is None:
+        return None
+    base, info = _kind(option), _given_as(option)
+    if isinstance(value, (str, Path)) and getattr(base, "__origin__", None) is list:
+        value = [value]  # one of several
+    low, high = getattr(info, "min", None), getattr(info, "max", None)
+    kind = base if low is None and high is None else Annotated[base, Field(ge=low, le=high)]
+    try:
+        return TypeAdapter(kind).validate_python(value)
+    except ValidationError as error:
+        why = error.errors()[0]["msg"]
+        raise UsageError(f"{verb}(): {name} (={value!r}): {why[0].lower()}{why[1:]}") from None
+
+
+def _raise(verb: str, code: int, result: object) -> None:
     if code == INTERRUPTED:
         raise KeyboardInterrupt
-    if code:
-        what = "was declined" if code == DECLINED else f"ended with exit code {code}"
-        fault = result.get("fault") if isinstance(result, dict) else None
-        kind = MotionFault if code == MotionFault.exit_code else JointctlError
-        raise kind(f"{verb.__name__} {what}{f': {fault}' if fault else ''}")
-    return result
-
-
-def run(config: str | Path, *, yes: bool = False, **options: Any) -> dict[str, Any]:
-    """Track the configured trajectory, as `jointctl run`; figures of the run.  In the main thread only."""
-    from jointctl.tools.verbs.run import run as verb
-
-    found: dict[str, Any] = _called(verb, {"config": config, "assume_yes": yes, **options})
-    return found
-
-
-def check(config: str | Path, **options: Any) -> dict[str, Any]:
-    """Stability margins with the modelled delay, as `jointctl check`; `MarginError` where they are too small."""
-    from jointctl.tools.verbs.check import check as verb
-
-    found: dict[str, Any] = _called(verb, {"config": config, **options})
-    return found
+    if code == DECLINED:
+        raise JointctlError(f"{verb}() was declined: nothing moved")
+    fault, text = getattr(result, "fault", None), getattr(result, "fault_text", None)
+    if fault is not None and text is not None:
+        raise MotionFault(f"{fault.name} ({int(fault)}): {text.happened}", text.advice)
+    raise JointctlError(f"{verb}() ended with exit code {code}")
 
 
 def identify(

@@ -79,6 +79,7 @@ class Output:
     quiet: bool = False
     stdout: IO[str] = field(default_factory=lambda: sys.stdout)
     stderr: IO[str] = field(default_factory=lambda: sys.stderr)
+    taken: Callable[[object], None] | None = None  # by a program: results go there instead
 
     def __post_init__(self) -> None:
         # rich wraps at 80 columns where there is no terminal; a line of a log file or of a pipe is not to be broken
@@ -86,13 +87,18 @@ class Output:
         self._results = _console(self.stdout, width)
         self._messages = _console(self.stderr)
 
-    def result(self, shown: RenderableType, data: object = None) -> None:
-        """A result: `shown` for people, `data` (numbers, texts, lists, dicts) with `--json`."""
-        if self.json:
+    def result(self, shown: RenderableType, data: object = None, found: object = None) -> None:
+        """A result: `shown` for people, `data` (numbers, texts, lists, dicts) with `--json`.
+
+        A program gets `found`, or `data` where there is no type for it.
+        """
+        if self.taken is not None:
+            self.taken(data if found is None else found)
+        elif self.json:
             if data is not None:
                 self.line(json_format.dumps(_plain(data), allow_nan=False))
-            return
-        self._write(lambda: _print_whole(self._results, shown))
+        else:
+            self._write(lambda: _print_whole(self._results, shown))
 
     def line(self, text: str) -> bool:
         """One line of a result that comes bit by bit; False if nobody reads it any more."""

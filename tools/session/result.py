@@ -105,7 +105,7 @@ def report_run(result: RunResult, output: Output, config: Config) -> int:
     if drawn is not None:
         table.add_row("picture", str(drawn))
     try:
-        output.result(table, _data(result, drawn))
+        output.result(table, _data(result, drawn), result)
     except DataError as error:
         if result.fault_text is None:
             require_off(result.drive_state)

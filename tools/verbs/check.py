@@ -45,7 +45,7 @@ def check(
     changes = [] if enough else remedies(settings, minimum_deg)
     accepted = enough or (found.stable and allow_low_margin)
     verdict = "ok" if enough else "below the minimum, accepted" if accepted else "too small"
-    analysis = _Analysis(settings, assumptions, found, theory(settings), minimum_deg, verdict, changes)
+    analysis = LoopCheck(settings, assumptions, found, theory(settings), minimum_deg, verdict, changes)
     table = _table(analysis)
     for row in drive.check_rows(config):
         table.add_row(*row)
@@ -58,7 +58,7 @@ def check(
 
         save_loop_figure(settings, figure, config.path.name, minimum_deg)
         table.add_row("picture", str(figure), "")
-    output.result(table, _data(analysis, figure))
+    output.result(table, _data(analysis, figure), analysis)
     for text in not_modelled(config):
         output.note(f"not in this analysis: {text}")
     if not accepted:
@@ -68,20 +68,20 @@ def check(
 
 
 @dataclass(frozen=True)
-class _Analysis:
-    """What is printed, as a table or as JSON."""
+class LoopCheck:
+    """What the linear loop promises; margins hold for the settings and assumptions, the delay among them."""
 
     settings: LoopSettings
     assumptions: tuple[Assumption, ...]
-    found: Margins
-    ideal: Theory
-    minimum_deg: float
+    margins: Margins
+    theory: Theory
+    min_phase_margin_deg: float  # wanted
     verdict: str
-    changes: list[Remedy]
+    remedies: list[Remedy]
 
 
-def _table(analysis: _Analysis) -> Table:
-    found, ideal = analysis.found, analysis.ideal
+def _table(analysis: LoopCheck) -> Table:
+    found, ideal = analysis.margins, analysis.theory
     table = Table("quantity", "value", "note", title="Linear loop", title_justify="left")
     for a in analysis.assumptions:
         table.add_row(a.name, f"{a.value:g} {a.unit}", a.origin)
@@ -105,7 +105,7 @@ def _table(analysis: _Analysis) -> Table:
         oscillation = f"{found.oscillation_Hz:.2f} Hz, damping {found.oscillation_damping:.3f}"
         table.add_row("oscillation", oscillation, "pair of the sampled loop that decays slowest")
     table.add_section()
-    wanted = f"at least {analysis.minimum_deg:g} deg wanted (margin.min_phase_margin_deg)"
+    wanted = f"at least {analysis.min_phase_margin_deg:g} deg wanted (margin.min_phase_margin_deg)"
     table.add_row("verdict", analysis.verdict, wanted)
     return table
 
@@ -121,17 +121,17 @@ def _add_margins(table: Table, found: Margins) -> None:
     table.add_row("slowest mode", f"{found.slowest_time_constant_s:.3g} s", "time constant")
 
 
-def _data(analysis: _Analysis, figure: Path | None) -> dict[str, Any]:
+def _data(analysis: LoopCheck, figure: Path | None) -> dict[str, Any]:
     """For --json; a complex pole is a pair [real, imaginary]."""
-    measured = asdict(analysis.found)
-    measured["poles"] = [[pole.real, pole.imag] for pole in analysis.found.poles]
+    measured = asdict(analysis.margins)
+    measured["poles"] = [[pole.real, pole.imag] for pole in analysis.margins.poles]
     return {
         "verdict": analysis.verdict,
-        "min_phase_margin_deg": analysis.minimum_deg,
+        "min_phase_margin_deg": analysis.min_phase_margin_deg,
         "kind": analysis.settings.kind.name.lower(),
         "assumptions": [asdict(a) for a in analysis.assumptions],
-        "theory": asdict(analysis.ideal),
+        "theory": asdict(analysis.theory),
         "margins": measured,
-        "remedies": [{"change": r.text, "phase_margin_deg": r.phase_margin_deg} for r in analysis.changes],
+        "remedies": [{"change": r.text, "phase_margin_deg": r.phase_margin_deg} for r in analysis.remedies],
         "picture": None if figure is None else str(figure),
     }

@@ -75,7 +75,7 @@ def report_findings(found: list[Finding], output: Output, title: str) -> int:
         topic = Text.assemble((finding.status, colours[finding.status]), " ", finding.topic)
         table.add_row(topic, finding.text, finding.remedy)
     bad = any(finding.status == PROBLEM for finding in found)
-    output.result(table, {"healthy": not bad, "findings": [asdict(finding) for finding in found]})
+    output.result(table, {"healthy": not bad, "findings": [asdict(finding) for finding in found]}, found)
     return 1 if bad else 0
 
 

@@ -82,7 +82,7 @@ def fault_campaign(
         "scenarios": len(verdicts), "violations": len(found), "seed": seed, "elapsed_s": round(elapsed_s, 1),
         "interrupted": interrupted, "report": str(folder / "campaign.json"),
     }  # fmt: skip
-    output.result(table(rows), data)
+    output.result(table(rows), data, verdicts)
     if report is not None and verdicts:
         _write_page(report, config, verdicts, found, figure, seed, output)
     output.note(f"{len(verdicts)} scenarios in {elapsed_s:.0f} s, seed {seed}; report in {folder}")
@@ -144,5 +144,5 @@ def _replay(config: Config, output: Output, seed: int, number: int, during: Duri
         f"reported as {verdict.fault}, reaction {verdict.reaction}, greatest speed {verdict.peak_radps:.3f} rad/s"
     ]
     lines += [f"VIOLATION: {line}" for line in verdict.violations] or ["no invariant violated"]
-    output.result("\n".join(lines), {"scenario": described, "verdict": vars(verdict)})
+    output.result("\n".join(lines), {"scenario": described, "verdict": vars(verdict)}, [verdict])
     return EXIT_VIOLATIONS if verdict.violations else 0

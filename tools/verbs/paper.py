@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +18,15 @@ PAPER = (
     "Shen, Zhou, Yu, Wang: Design of Adaptive RBFNN and Computed-torque Control for Manipulator Joint "
     "Considering Friction Modeling"
 )
+
+
+@dataclass(frozen=True)
+class PaperResult:
+    """The paper's experiments: the rows of the table, and the runs behind them by name."""
+
+    rows: list[PaperRow]
+    runs: dict[str, PaperRun]
+    identified: PaperIdentification | None
 
 
 def paper(
@@ -67,7 +76,7 @@ def paper(
         "runs": {key: asdict(error_figures(made.run, AFTER_s)) for key, made in runs.items()},
         "pictures": [str(path) for path in pictures],
     }
-    output.result(_table(rows), data)
+    output.result(_table(rows), data, PaperResult(rows, runs, identified))
     for path in pictures:
         output.note(f"written: {path}")
     if report is not None:

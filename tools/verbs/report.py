@@ -39,7 +39,7 @@ def report(
     names = log_names(paths)
     html = page(" and ".join(names), report_sections(names, logs), subtitle=", ".join(str(path) for path in paths))
     write_page(target, html, paths)
-    output.result(str(target), {"report": str(target), "logs": [str(path) for path in paths]})
+    output.result(str(target), {"report": str(target), "logs": [str(path) for path in paths]}, target)
     return 0
 
 

@@ -30,7 +30,7 @@ def stop(config: ConfigPath, output: ResultOutput, bus: BusOptions = AS_CONFIGUR
         elif failure is not None:
             raise failure
     try:
-        output.result(f"the drive is {state}", {"drive_state": state})
+        output.result(f"the drive is {state}", {"drive_state": state}, state)
     finally:  # a result that cannot be written must not hide that the drive is not off
         _warn_of(path, output)
         require_off(state)

@@ -76,7 +76,7 @@ def study(
         output.warning(f"interrupted: only {done} of {settings.plants} plants are in the result")
     if done:
         # first of all: a file that cannot be written does not cost the result
-        output.result(_table(result, title, settings.after_s), study_data(result, settings))
+        output.result(_table(result, title, settings.after_s), study_data(result, settings), result)
         if csv is not None:
             write_csv(result, csv)
             output.note(f"written: {csv}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -46,6 +46,18 @@ def joint_model(config: Config, settings: PlanSettings) -> JointModel:
          settings.ripple_per_motor_turn * config.joint.reduction_ratio / math.tau,
          2.0 * settings.ripple_per_motor_turn * config.joint.reduction_ratio / math.tau),
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """What a sweep measured: plateaus, in a file that `identify` reads."""
+
+    points: int
+    planned: int
+    unsettled: int
+    stopped_by: str | None  # name of the signal
+    data: str  # the file
+    plan: str  # hash
 
 
 class Sweep:
@@ -226,9 +238,10 @@ class Sweep:
         drive_end.require_off(self.drive_state)
         assert self.file is not None
         done = len(self.file.done)
-        data = {"points": done, "planned": len(self.plan.points), "unsettled": len(self._unsettled),
-                "stopped_by": stopped or None, "data": str(self.out), "plan": self.plan.hash}  # fmt: skip
-        self.output.result(self._table(), data)
+        found = SweepResult(
+            done, len(self.plan.points), len(self._unsettled), stopped or None, str(self.out), self.plan.hash
+        )
+        self.output.result(self._table(), vars(found), found)
         self._write_page()
         if self._unsettled:
             shown = ", ".join(f"{p.velocity_radps:+.4g}" for p in list(self._unsettled.values())[:8])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +17,24 @@ if TYPE_CHECKING:
 
     from jointctl.tools.identification.friction_data import FrictionData
     from jointctl.tools.identification.models import Branch
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Errors of a friction model, measured torque minus the model's; at the motor."""
+
+    config: str
+    data: str
+    data_sha256: str
+    points: int
+    rmse_Nm: float
+    max_error_Nm: float
+    mean_error_Nm: float
+    relative_rmse: float
+    relative_max_error: float
+    warnings: list[str]
+    notes: list[str]
+    picture: str
 
 
 def _branch(record: Any) -> Branch:
@@ -92,15 +111,12 @@ def validate(
     for warning in warnings:
         output.warning(warning)
     relative_rmse, relative_worst, _ = relative_figures(errors, measured)
-    output.result(
-        error_table(errors, measured, data.reduction_ratio),
-        {
-            "config": str(path), "data": str(data_path), "data_sha256": data.sha256, "points": len(errors),
-            "rmse_Nm": float(np.sqrt(np.mean(errors**2))), "max_error_Nm": float(np.max(np.abs(errors))),
-            "mean_error_Nm": float(np.mean(errors)), "relative_rmse": relative_rmse,
-            "relative_max_error": relative_worst, "warnings": warnings, "notes": list(data.notes),
-            "picture": str(figure),
-        },
+    found = Validation(
+        config=str(path), data=str(data_path), data_sha256=data.sha256, points=len(errors),
+        rmse_Nm=float(np.sqrt(np.mean(errors**2))), max_error_Nm=float(np.max(np.abs(errors))),
+        mean_error_Nm=float(np.mean(errors)), relative_rmse=relative_rmse, relative_max_error=relative_worst,
+        warnings=warnings, notes=list(data.notes), picture=str(figure),
     )  # fmt: skip
+    output.result(error_table(errors, measured, data.reduction_ratio), vars(found), found)
     output.note(f"written: {figure}")
     return 0

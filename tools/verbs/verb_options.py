@@ -13,7 +13,7 @@ import inspect
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, is_dataclass, replace
 from functools import wraps
 from operator import itemgetter
 from pathlib import Path
@@ -152,16 +152,31 @@ def grouped(verb: Callable[..., int | None]) -> Callable[..., None]:
     return command
 
 
-def option_call(verb: Callable[..., int | None]) -> tuple[list[inspect.Parameter], Callable[[dict[str, Any]], Any]]:
-    """The verb's options, those of its output last, and what calls it with the values of all of them by name."""
+Taker = Callable[[object], None]
+
+
+def option_call(
+    verb: Callable[..., int | None], taken: Taker | None = None
+) -> tuple[list[inspect.Parameter], Callable[[dict[str, Any]], Any]]:
+    """The verb's options, those of its output last, and what calls it with the values of all of them by name.
+
+    With `taken` its results go there, for a program, instead of to stdout.
+    """
     options: list[inspect.Parameter] = []
     last: list[inspect.Parameter] = []
-    call = _collect(verb, options, last)
+    call = _collect(verb, options, last, taken)
     return [*options, *last], call
 
 
+def _taking(made: Callable[[dict[str, Any]], Output], taken: Taker | None) -> Callable[[dict[str, Any]], Output]:
+    return made if taken is None else lambda given: replace(made(given), taken=taken)
+
+
 def _collect(
-    function: Callable[..., Any], options: list[inspect.Parameter], last: list[inspect.Parameter]
+    function: Callable[..., Any],
+    options: list[inspect.Parameter],
+    last: list[inspect.Parameter],
+    taken: Taker | None,
 ) -> Callable[[dict[str, Any]], Any]:
     """Appends the options for which the function's parameters stand; what calls it with the values of all options."""
     values: dict[str, Callable[[dict[str, Any]], Any]] = {}
@@ -171,7 +186,8 @@ def _collect(
         parts = get_args(annotation) or (annotation,)
         several = inspect.isfunction(parts[-1]) or is_dataclass(parts[-1])
         if several:
-            values[parameter.name] = _collect(parts[-1], last if parts[0] is Output else options, last)
+            made = _collect(parts[-1], last if parts[0] is Output else options, last, taken)
+            values[parameter.name] = _taking(made, taken) if parts[0] is Output else made
         else:
             options.append(parameter.replace(annotation=annotation, kind=inspect.Parameter.KEYWORD_ONLY))
             values[parameter.name] = itemgetter(parameter.name)
