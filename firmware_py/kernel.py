@@ -175,16 +175,6 @@ def kernel(function: Function) -> Function:
     return cast(Function, _compiled(function))
 
 
-def entry(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The machine code of a kernel that has been called with one set of argument types, for those types only.
-
-    A call finds out the types of all its arguments first: a millisecond where they are many records.  Nothing is
-    checked here.  In plain Python, before the first call or with several sets of types, it is the kernel itself.
-    """
-    found = list(getattr(function, "overloads", {}).values())
-    return found[0].entry_point if len(found) == 1 else function
-
-
 def plain(function: Function) -> Function:
     """The Python function of a kernel: for a few calls outside the loop: loading the compiled one takes longer."""
     return cast(Function, getattr(function, "py_func", function))

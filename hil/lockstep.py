@@ -13,13 +13,13 @@ heartbeat then.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jointctl.firmware_py.cycle import Clock, CycleMemory, Exchange, Slot, Word, step_cycle
-from jointctl.firmware_py.kernel import entry, inlined, kernel
+from jointctl.firmware_py.kernel import inlined, kernel
 from jointctl.firmware_py.libc import load_acquire, store_release
 from jointctl.firmware_py.records import SET_POINTS, AxisState, Sample, StreamConstants
 from jointctl.firmware_py.states import StopRequest
@@ -34,7 +34,6 @@ from jointctl.hil.virtual_bus import FRAME_SIZE, FrameQueue
 # columns of the array of true values that a run may leave
 TRUE_POSITION_rad, TRUE_VELOCITY_radps, TRUE_FRICTION_Nm, TRUE_ACTUATOR_Nm, TRUE_POWER_STATE = range(5)
 TRUTHS = 5
-_NO_TRUTH = np.zeros((0, TRUTHS))
 # columns of the set-points that a program sends in a run: when, as it goes on, and what
 POINT_TIME_s, POINT_VALUES = 0, 1  # position, velocity, acceleration, torque: four columns
 NO_POINTS = np.zeros((0, 5))
@@ -284,7 +283,20 @@ def run_lockstep(
     return int(written), int(rows)
 
 
-def part_of_a_run(memory: CycleMemory, codec: Codec, world: World) -> Callable[[Scenario], object]:
-    """For a run that is made of many short parts, after a first `run_lockstep`: carries out one; no true values."""
-    run = entry(_run)
-    return lambda scenario: run(memory, codec, world, scenario, _NO_TRUTH)
+@kernel
+def parts_of_a_run(
+    memory: CycleMemory, codec: Codec, world: World, scenario: Scenario, part: np.ndarray, no_truth: np.ndarray
+) -> Iterator[tuple[int, int]]:
+    """For a run that is made of many short parts: each `next` carries out one, without true values.
+
+    `part` int64[2]: when it begins and its cycles, to be set before; `no_truth` float64[0, TRUTHS].  Arguments are
+    taken over from Python once: for a part of one cycle that would last ten times as long as the cycle.  The caller
+    keeps the arrays.
+    """
+    s = scenario
+    while True:
+        now = Scenario(
+            part[0], s.period_ns, part[1], s.stop_cycle, s.stop_request, s.tail_cycles, s.log_every, s.ideal_velocity,
+            s.supervisor_beats, s.lost_to_drive, s.lost_from_drive, s.set_points,
+        )  # fmt: skip
+        yield _run(memory, codec, world, now, no_truth)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +21,7 @@ from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Histogram, Word
 from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
-from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.hil.canopen.device import Cia402Device
@@ -34,7 +33,7 @@ from jointctl.hil.lockstep import (
     Scenario,
     TRUE_POSITION_rad,
     World,
-    part_of_a_run,
+    parts_of_a_run,
     run_lockstep,
 )
 from jointctl.hil.virtual_bus import FRAME_SIZE
@@ -49,6 +48,7 @@ _START_GRID_NS = 5_000_000_000
 NO_STOP = -1
 STEP_RECORDS = 1 << 12  # that a stepped run's ring holds
 NO_FAULTS = no_faults()
+_HEAD, _FINISHED = int(Word.HEAD), int(AxisPhase.FINISHED)
 
 
 class DirectBus(can.BusABC):
@@ -141,34 +141,34 @@ class SteppedRun:
         self.now_ns = start_ns
         self._period_ns = round(float(memory.constants[0].law.period_s) * 1e9)
         self._phase = memory.state["phase"]
-        self._head, self._ring = memory.words[Word.HEAD : Word.HEAD + 1], memory.ring.view(np.ndarray)
+        self._words, self._ring = memory.words.data, memory.ring.view(dtype_of(LogRecord), np.ndarray)
         self._kept: list[np.ndarray] = []
         self._taken = 0
-        self._part: Callable[[Scenario], object] | None = None
+        self._part = np.zeros(2, np.int64)
+        self._truth = np.zeros((0, TRUTHS))  # none
+        self._scenario = Scenario(start_ns, self._period_ns, 0)
+        self._parts = parts_of_a_run(memory, codec, world, self._scenario, self._part, self._truth)
 
     def step(self, cycles: int) -> None:
         """So many cycles, fewer if the axis has FINISHED; the simulated time goes on all the same."""
         while cycles > 0:
             count = min(cycles, len(self._ring))
-            if int(self._head[0]) + count - self._taken > len(self._ring):
+            if self._words[_HEAD] + count - self._taken > len(self._ring):
                 self._keep()
-            if self._phase[0] != AxisPhase.FINISHED:
-                scenario = Scenario(self.now_ns, self._period_ns, count)
-                if self._part is None:
-                    run_lockstep(self.memory, self._codec, self.world, scenario)
-                    self._part = part_of_a_run(self.memory, self._codec, self.world)
-                else:
-                    self._part(scenario)
+            if self._phase[0] != _FINISHED:
+                self._part[:] = self.now_ns, count
+                next(self._parts)
             self.now_ns += count * self._period_ns
             cycles -= count
 
     def newest(self) -> Any:
         """The newest log record, a structured scalar that the next step may change."""
-        return self._ring[(int(self._head[0]) - 1) % len(self._ring)]
+        return self._ring[(self._words[_HEAD] - 1) % len(self._ring)]
 
     def _keep(self) -> None:
-        head = int(self._head[0])
-        self._kept.append(self._ring[np.arange(self._taken, head) % len(self._ring)])
+        head, size = self._words[_HEAD], len(self._ring)
+        begin, end = self._taken % size, self._taken % size + head - self._taken
+        self._kept += [self._ring[begin:end].copy(), self._ring[: max(end - size, 0)].copy()]
         self._taken = head
 
     def records(self) -> Any:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+import jointctl
 from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.identification.fit import Problem, make_problem, vector_limits
@@ -24,6 +25,8 @@ LOCKSTEP_GOAL_S = 0.15
 ITERATIONS = 5000
 NOISE_Nm = 0.0046
 SPEEDS = 225
+STEP_S, STEP_GOAL_ms = 0.1, 0.5  # of `Joint.step`: 200 times as fast as real time
+CYCLES, CYCLE_GOAL_us = 2000, 50.0  # of `Joint.step_torque`: 20,000 a second
 
 
 def lockstep_rows(config: Config, *, runs: int) -> Iterator[Row]:
@@ -48,6 +51,29 @@ def lockstep_rows(config: Config, *, runs: int) -> Iterator[Row]:
     yield measured("simulation", f"{LOCKSTEP_S:g} s of lockstep, logged", logged, "s", note=note)
     cycles = LOCKSTEP_S * config.loop.rate_Hz
     yield measured("simulation", "one cycle of it", [value / cycles * 1e9 for value in bare], "ns")
+
+
+def program_rows(config: Config, *, runs: int) -> Iterator[Row]:
+    """A program at simulated time: `Joint.step` in short steps, and a law in Python, one cycle a call."""
+    steps_ms, cycles_us = [], []
+    for _ in range(runs):
+        with jointctl.Joint(config, lockstep=True) as joint:
+            joint.enable()
+            joint.step(STEP_S)  # compiles
+            begin_s = time.perf_counter()
+            for _ in range(100):
+                joint.step(STEP_S)
+            steps_ms.append((time.perf_counter() - begin_s) * 10.0)
+            state = joint.state
+            hold_rad, begin_s = state.position_rad, time.perf_counter()
+            for _ in range(CYCLES):
+                state = joint.step_torque(8000.0 * (hold_rad - state.position_rad) - 300.0 * state.velocity_radps)
+            cycles_us.append((time.perf_counter() - begin_s) * 1e6 / CYCLES)
+    note = f"{STEP_S * 1e3 / float(np.median(steps_ms)):.0f} times as fast as real time"
+    what = f"program: {STEP_S:g} s by Joint.step"
+    yield measured("simulation", what, steps_ms, "ms", goal=STEP_GOAL_ms, note=note)
+    note = f"{1e6 / float(np.median(cycles_us)):.0f} a second"
+    yield measured("simulation", "program: a cycle by step_torque", cycles_us, "us", goal=CYCLE_GOAL_us, note=note)
 
 
 def paper_problems() -> list[Problem]:

@@ -27,10 +27,10 @@ from jointctl.tools.written_file import prepare_folder
 from tests.bench.exchange_speed import Rounds, exchange_rows
 from tests.bench.law_speed import law_rows
 from tests.bench.paired import Row, conditions, outcome_data, outcome_table, skipped, write_outcome
-from tests.bench.simulation_speed import lockstep_rows, swarm_rows
+from tests.bench.simulation_speed import lockstep_rows, program_rows, swarm_rows
 from tests.bench.start_speed import start_rows
 
-PARTS = ("law", "loop", "lockstep", "swarm", "start")
+PARTS = ("law", "loop", "lockstep", "program", "swarm", "start")
 
 
 def _part(name: str, config: Config, folder: Path, quick: bool, verbs: Sequence[str]) -> Iterator[Row]:
@@ -44,6 +44,7 @@ def _part(name: str, config: Config, folder: Path, quick: bool, verbs: Sequence[
             quick=quick,
         ),
         "lockstep": lambda: lockstep_rows(config, runs=3 if quick else 15),
+        "program": lambda: program_rows(config, runs=3 if quick else 15),
         "swarm": lambda: swarm_rows(pairs=1 if quick else 3, pyswarms_iterations=20 if quick else 100),
         "start": lambda: start_rows(config, runs=2 if quick else 7, cold=not quick, verbs=() if quick else verbs),
     }
