@@ -13,7 +13,7 @@ import inspect
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin
 
 from jointctl.drivers.errors import DECLINED, INTERRUPTED, JointctlError, MotionFault, UsageError
 
@@ -71,6 +71,8 @@ def _function(name: str) -> Callable[..., object]:
     def function(*arguments: object, **given: object) -> object:
         if len(arguments) > len(first):
             raise TypeError(f"{name}() takes {len(first)} arguments without a name at most, not {len(arguments)}")
+        if twice := given.keys() & set(first[: len(arguments)]):
+            raise TypeError(f"{name}() got {twice.pop()!r} twice")
         given |= dict(zip(first, arguments, strict=False))
         unknown = [key for key in given if key not in options]
         if unknown:
@@ -110,7 +112,7 @@ def _kind(option: inspect.Parameter) -> Any:
 
 
 def _given_as(option: inspect.Parameter) -> Any:
-    """What Typer is told of an option; None without anything."""
+    """What Typer gets with an option; None without anything."""
     return next(iter(get_args(option.annotation)[1:]), None)
 
 
@@ -121,10 +123,10 @@ def _checked(verb: str, name: str, value: object, option: inspect.Parameter) -> 
     if value is None and option.default is None:
         return None
     base, info = _kind(option), _given_as(option)
-    if isinstance(value, (str, Path)) and getattr(base, "__origin__", None) is list:
+    if isinstance(value, (str, Path)) and any(get_origin(part) is list for part in (base, *get_args(base))):
         value = [value]  # one of several
     low, high = getattr(info, "min", None), getattr(info, "max", None)
-    kind = base if low is None and high is None else Annotated[base, Field(ge=low, le=high)]
+    kind: Any = base if low is None and high is None else Annotated[base, Field(ge=low, le=high)]
     try:
         return TypeAdapter(kind).validate_python(value)
     except ValidationError as error:

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import inspect
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import jointctl
+from jointctl import verbs
+from jointctl.drivers.errors import DECLINED, INTERRUPTED
+from jointctl.firmware_py.states import Fault
+from jointctl.tools.inspection.health import PROBLEM, Finding
+from jointctl.tools.session.fault_words import fault_text
+from jointctl.tools.verbs.verb_options import ResultOutput
 from tests.places import CONFIGS
 
 
@@ -30,14 +38,79 @@ def test_importing_loads_nothing_heavy() -> None:
 
 def test_check_gives_the_margins() -> None:
     report = jointctl.check("virtual")
-    assert report["verdict"] == "ok"
-    assert report["margins"]["phase_margin_deg"] > 20.0
+    assert report.verdict == "ok"
+    assert report.margins.phase_margin_deg > 20.0
     with pytest.raises(jointctl.MarginError, match="phase margin"):
         jointctl.check(CONFIGS / "virtual.toml", delay_s=0.02)
     with pytest.raises(TypeError, match="check\\(\\) has no option 'dellay'"):
         jointctl.check("virtual", dellay=1.0)
     with pytest.raises(jointctl.ConfigurationError):
         jointctl.check("no_such_file.toml")
+
+
+def test_a_value_of_the_wrong_type_or_beyond_its_bounds_is_named() -> None:
+    with pytest.raises(jointctl.UsageError, match=r"check\(\): delay_s \(=-1\): input should be greater than"):
+        jointctl.check("virtual", delay_s=-1)
+    with pytest.raises(jointctl.UsageError, match=r"study\(\): plants \(='x'\): input should be a valid integer"):
+        jointctl.study(plants="x")
+    with pytest.raises(TypeError, match="needs 'config'"):
+        jointctl.check()
+    with pytest.raises(TypeError, match="takes 1 arguments without a name at most, not 2"):
+        jointctl.check("virtual", 0.01)
+
+
+@pytest.mark.parametrize("name", verbs.VERBS)
+def test_a_verb_shows_its_options_and_what_it_returns(name: str) -> None:
+    function = getattr(jointctl, name)
+    shown = inspect.signature(function)
+    assert not {"json", "output", "assume_yes"} & set(shown.parameters)
+    assert "Callable" not in str(shown.return_annotation)
+    text = inspect.getdoc(function) or ""
+    assert all(f"\n{key}: " in text for key in shown.parameters if key in ("yes", "dry_run", "report", "quiet"))
+
+
+def test_results_come_as_objects_and_nothing_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = tmp_path / "sweep.csv"
+    swept = jointctl.sweep("sweep_virtual", out=data, lockstep=True, points=8, dwell_s=0.1, quiet=True)
+    assert (swept.points, swept.data) == (8, str(data))
+    studied = jointctl.study(plants=1, controllers=["pid"], after_s=1.0, workers=1, quiet=True)
+    assert studied.values("pid", "rmse_mrad")[0] > 0.0
+    assert capsys.readouterr().out == ""
+    with pytest.raises(jointctl.DataError, match="exists already"):
+        jointctl.sweep("sweep_virtual", out=data, lockstep=True)
+
+
+def test_what_the_doctor_finds_is_a_result_and_no_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    bad = Finding("bus", PROBLEM, "there is none", "make one")
+    monkeypatch.setattr(import_module("jointctl.tools.verbs.doctor"), "findings", lambda config, cold: iter([bad]))
+    assert jointctl.doctor(quiet=True) == [bad]
+
+
+class Ended:
+    """As a `RunResult` that a fault has ended."""
+
+    fault, fault_text = Fault.FOLLOWING_ERROR, fault_text(Fault.FOLLOWING_ERROR, 0.1, 0)
+
+
+@pytest.mark.parametrize(
+    ("code", "result", "kind", "words"),
+    [
+        (DECLINED, None, jointctl.JointctlError, "declined"),
+        (INTERRUPTED, None, KeyboardInterrupt, None),
+        (jointctl.MotionFault.exit_code, Ended(), jointctl.MotionFault, "FOLLOWING_ERROR"),
+        (1, None, jointctl.JointctlError, "exit code 1"),
+    ],
+)
+def test_an_exit_code_that_no_result_explains_is_an_exception(
+    monkeypatch: pytest.MonkeyPatch, code: int, result: object, kind: type[BaseException], words: str | None
+) -> None:
+    def stop(output: ResultOutput) -> int:
+        output.result("", None, result)
+        return code
+
+    monkeypatch.setattr(import_module("jointctl.tools.verbs.stop"), "stop", stop)
+    with pytest.raises(kind, match=words):
+        verbs._function("stop")()
 
 
 def test_identify_gives_the_model_and_writes_nothing(tmp_path: Path) -> None:
