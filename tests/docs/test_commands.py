@@ -2,6 +2,7 @@
 
 The `sh` blocks of a page are one script, run in an empty folder with the installed package.  A block whose fence reads
 `sh no-run: reason` is not run; of every command anywhere, verb and options are checked to exist.
+Those in Python are for test_examples.py.
 """
 
 from __future__ import annotations
@@ -86,7 +87,9 @@ def test_every_verb_and_option_that_is_named_exists(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_a_block_that_is_not_run_says_why(page: Path) -> None:
     for block in blocks(page):
-        assert block.info in ("sh", "text", "toml", "") or re.fullmatch(r"sh no-run: .{5,}", block.info), block.info
+        assert block.info in ("sh", "python", "text", "toml", "") or re.fullmatch(r"sh no-run: .{5,}", block.info), (
+            block.info
+        )
 
 
 def test_few_blocks_are_not_run() -> None:
