@@ -12,7 +12,7 @@ LOCKSTEP = tuple(
         "hil": "friction_chain law_options paper_figures study sweep",
         "faults": "campaign_configurations every_frame fault_campaign fault_engine fault_regressions late_samples"
         " limit_cycle unwatched_loop",
-        "docs": "configuration_reference reference_pages troubleshooting",
+        "docs": "configuration_reference notebook reference_pages troubleshooting",
     }.items()
     for name in names.split()
 )

@@ -2,7 +2,7 @@
 
 The `sh` blocks of a page are one script, run in an empty folder with the installed package.  A block whose fence reads
 `sh no-run: reason` is not run; of every command anywhere, verb and options are checked to exist.
-Those in Python are for test_examples.py.
+Those in Python are for test_notebook.py.
 """
 
 from __future__ import annotations
