@@ -23,7 +23,7 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
@@ -146,10 +146,11 @@ class _InnerCache(caching.FunctionCache):
     """Beside the kernel's own entries in the same files."""
 
     def _index_key(self, sig: object, codegen: object) -> tuple[object, ...]:
-        return (*super()._index_key(sig, codegen), "inner")
+        base: Any = super()
+        return (*base._index_key(sig, codegen), "inner")
 
 
-class _Kernel(CPUDispatcher):  # type: ignore[misc]
+class _Kernel(CPUDispatcher):
     """As numba makes it; `inner` is its twin."""
 
     inner: Any
@@ -160,19 +161,36 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
 
 
 def _compiled(function: Callable[..., Any], **more: bool) -> Any:
-    made: Any = numba.njit(**_OPTIONS, **more)(function)
+    compiler: Any = numba.njit
+    made = compiler(**_OPTIONS, **more)(function)
     if JIT_DISABLED:
         return made
     made.__class__ = _Kernel
-    made.inner = numba.njit(**_OPTIONS, **more, **_ONLY_CALLED_BY_KERNELS)(function)
+    made.inner = compiler(**_OPTIONS, **more, **_ONLY_CALLED_BY_KERNELS)(function)
     if cache_folder is not None:
-        made.inner._cache = _InnerCache(function)
+        cache: Any = _InnerCache
+        made.inner._cache = cache(function)
     return made
 
 
 def kernel(function: Function) -> Function:
     """Compile `function` for the control loop (nogil, cached, no allocation, no exceptions from arithmetic)."""
     return cast(Function, _compiled(function))
+
+
+@contextlib.contextmanager
+def on_compiling(tell: Callable[[], object]) -> Iterator[None]:
+    """`tell` is called when a kernel is compiled inside, for each; not for those that come from the cache."""
+
+    class Listener(event.Listener):
+        def on_start(self, event: object) -> None:
+            tell()
+
+        def on_end(self, event: object) -> None:
+            """Of no interest."""
+
+    with event.install_listener("numba:compile", Listener()):
+        yield
 
 
 def plain(function: Function) -> Function:

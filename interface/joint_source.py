@@ -26,12 +26,17 @@ class JointSource:
     @contextmanager
     def served(self) -> Iterator[None]:
         """With the virtual joint running, in a process of its own, where it is one's own."""
+        from jointctl.tools.session.loops import compiling_beside
         from jointctl.tools.virtual_joint import separate_virtual_joint
 
         if not self.own_virtual:
             yield
             return
-        with separate_virtual_joint(self.config.path, self.config.bus.channel):
+        with (
+            compiling_beside() as loop_compiled,
+            separate_virtual_joint(self.config.path, self.config.bus.channel),
+        ):
+            loop_compiled()
             yield
 
 

@@ -59,7 +59,7 @@ class Starting:
         self._used_s = 0.0
 
     def check(self) -> None:
-        """Tell now and then what it does; raises if it has ended, or hangs."""
+        """Tell now and then that it is at work; raises if it has ended, or hangs."""
         now_s = self._clock()
         so_far = f"{now_s - self._started_s:.0f} s"
         code = self._process.poll()
@@ -76,7 +76,7 @@ class Starting:
             )
         if now_s - self._told_s >= TELL_S:
             self._told_s = now_s
-            self._tell(f"{self._name} is compiling: {so_far} so far, {used_s:.0f} s of processor time")
+            self._tell(f"{self._name} is starting: {so_far} so far, {used_s:.0f} s of processor time")
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import select
 import signal
@@ -134,7 +135,9 @@ def serve_virtual_joint(config: Config, timing: bool = False) -> Iterator[Realti
     """Drive in threads of this process; the bus as well if it is the virtual one, all others exist already."""
     device = new_device(config)
     if config.bus.interface in CYCLIC_INTERFACES:
+        gc.disable()  # what a compiler leaves behind is little beside what it holds
         RealtimeDevice(device, -1).compile()  # a bus that can be found has a drive that answers
+        gc.enable()
     with ExitStack() as stack:
         if config.bus.interface == "jointctl":
             path = default_socket_path(config.bus.channel)

@@ -24,25 +24,29 @@ from pathlib import Path
 
 from jointctl.drivers.errors import JointctlError
 from jointctl.firmware_py.cycle import Word
+from jointctl.firmware_py.kernel import on_compiling
 from jointctl.tools.session.loop_handle import LoopOrder, SharedBlock
 from jointctl.tools.session.session_drive import session_drive
 from jointctl.tools.wake_up import cores_awake
 
-SLOW_START_S = 4.0
+SLOW_START_S = 2.0
 _MLOCK_CURRENT_AND_FUTURE = 3
 _POLL_S = 0.001
 
 
 @contextmanager
 def slow_start(tell: Callable[[str], object], who: str, after_s: float = SLOW_START_S) -> Iterator[Callable[[], None]]:
-    """Tells after `after_s` that `who` compiles, unless what this gives has been called, or the block has ended."""
-    timer = threading.Timer(
-        after_s, tell, [f"{who}: compiling, which only the first start does; it takes a minute or two"]
-    )
+    """Tells that `who` compiles, `after_s` after it has begun to, unless what this gives has been called by then."""
+    timer = threading.Timer(after_s, tell, [f"{who}: compiling, which only the first start does"])
     timer.daemon = True
-    timer.start()
+
+    def compiling() -> None:
+        if timer.ident is None:
+            timer.start()
+
     try:
-        yield timer.cancel
+        with on_compiling(compiling):
+            yield timer.cancel
     finally:
         timer.cancel()
 
@@ -83,10 +87,10 @@ def run(order: LoopOrder) -> int:
     def tell(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
+    gc.disable()
     with slow_start(tell, "loop") as started, drive.loop(order, block) as ready:
         started()
         gc.freeze()
-        gc.disable()
         for line in become_realtime(order.cpu, order.priority):
             print(f"loop: {line}", file=sys.stderr, flush=True)
         with cores_awake():  # where that is refused, `doctor` says so

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import socket
 import subprocess
@@ -18,14 +19,18 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+from jointctl.drivers.errors import JointctlError
 from jointctl.firmware_py.cycle import Exchange
+from jointctl.firmware_py.kernel import cache_folder
 from jointctl.firmware_py.libc import NANOSECONDS
+from jointctl.tools.child_process import Starting
 from jointctl.tools.session.loop_handle import LoopOrder, SharedBlock
 
 if TYPE_CHECKING:
     import can
 
 PROBE_TIMEOUT_S = 600.0
+POLL_S = 0.02
 FOREVER = 1 << 62
 
 
@@ -163,6 +168,34 @@ def warm_up_compiled_loop() -> None:
     os.close(block.fd)
 
 
+@contextmanager
+def compiling_beside(tell: Callable[[str], None] = lambda _: None) -> Iterator[Callable[[], None]]:
+    """Where the loop is not compiled yet, a process does that beside what the block does; what this gives waits for it.
+
+    Whatever becomes of it: the loop compiles by itself what it does not find.
+    """
+    if cache_folder is None or any(cache_folder.rglob("realtime.run_loop-*.nbi")):
+        yield lambda: None
+        return
+    tell("compiling, which only the first start does")
+    command = [sys.executable, "-P", "-m", "jointctl.tools.session.loops"]
+    silent = subprocess.DEVNULL
+    process = subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent, start_new_session=True)
+
+    def wait() -> None:
+        starting = Starting("the loop", process, tell)
+        with contextlib.suppress(JointctlError):
+            while process.poll() is None:
+                starting.check()
+                time.sleep(POLL_S)
+
+    try:
+        yield wait
+    finally:
+        process.kill()
+        process.wait()
+
+
 def start_time_s(cache: Path | None = None) -> float:
     """Seconds from starting a process until the loop is ready in it; `cache` another cache folder than the present.
 
@@ -176,4 +209,5 @@ def start_time_s(cache: Path | None = None) -> float:
 
 
 if __name__ == "__main__":
+    gc.disable()  # what a compiler leaves behind is little beside what it holds
     warm_up_compiled_loop()

@@ -27,6 +27,7 @@ def demo(
     """Track a trajectory on the virtual joint: no hardware, no set-up."""
     from jointctl.tools.configuration.drive_section import GivenPlace, require_simulated
     from jointctl.tools.configuration.load import load_config, moved
+    from jointctl.tools.session.loops import compiling_beside
     from jointctl.tools.verbs.run import run
     from jointctl.tools.virtual_joint import separate_virtual_joint
 
@@ -41,7 +42,8 @@ def demo(
         joint = _with_duration(joint, duration_s)
     joint = with_patience(joint)
     output.note("starting the virtual joint")
-    with separate_virtual_joint(path, channel, output.note):
+    with compiling_beside(output.note) as loop_compiled, separate_virtual_joint(path, channel, output.note):
+        loop_compiled()
         return run(joint, output, assume_yes=True)
 
 

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from numba.core import event
 
 from jointctl.drivers.errors import BusError
 from jointctl.tools.child_process import IDLE_S, TELL_S, Starting, processor_time_s
@@ -28,10 +29,17 @@ from jointctl.tools.session.loop_process import slow_start
 from tests.places import CONFIGS, ROOT
 
 
-# --- The word about a slow start comes when it is slow, and never after its end ---
+# --- The word about a slow start comes when it is slow because it compiles, and never after its end ---
+def compile_something() -> None:
+    with event.trigger_event("numba:compile"):
+        """As the compiler tells it."""
+
+
 def test_a_slow_start_is_told_once() -> None:
     told = threading.Event()
     with slow_start(lambda _: told.set(), "loop", 0.01):
+        assert not told.wait(0.1)  # nothing compiles
+        compile_something()
         assert told.wait(10.0)
 
 
@@ -39,6 +47,7 @@ def test_a_slow_start_is_told_once() -> None:
 def test_a_quick_one_is_not_nor_one_that_fails(fails: bool) -> None:
     told = threading.Event()
     with contextlib.suppress(ValueError), slow_start(lambda _: told.set(), "loop", 0.2) as started:
+        compile_something()
         if fails:
             raise ValueError
         started()
@@ -81,7 +90,7 @@ def waiting(process: subprocess.Popen[bytes]) -> Iterator[Waiting]:
 def test_it_is_waited_for_as_long_as_it_works_and_told_meanwhile(waiting: Waiting) -> None:
     waiting.go(1000.0, 0.01)  # a hundredth of a processor: a computer that is very busy
     assert len(waiting.told) == int(1000.0 / TELL_S)
-    assert waiting.told[1] == "the virtual joint is compiling: 30 s so far, 0 s of processor time"
+    assert waiting.told[1] == "the virtual joint is starting: 30 s so far, 0 s of processor time"
 
 
 def test_one_that_does_not_work_any_more_hangs_and_its_twin_does_not(waiting: Waiting) -> None:
