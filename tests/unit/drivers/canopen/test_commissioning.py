@@ -16,7 +16,9 @@ import pytest
 from jointctl.drivers.canopen.cia402 import Mode
 from jointctl.drivers.canopen.commissioning import LARGEST_PERMILLE, STEEP_RADPS2
 from jointctl.drivers.canopen.drive import GATE_S, REOPEN_ATTEMPTS, REOPEN_PAUSE_S, CanopenDrive
+from jointctl.drivers.canopen.identifiers import NmtCommand
 from jointctl.drivers.canopen.network import LISTEN_S
+from jointctl.drivers.canopen.sdo import ATTEMPTS as SDO_ATTEMPTS
 from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
 
 pytestmark = pytest.mark.usefixtures("short_timeout")
@@ -170,6 +172,17 @@ def test_a_drive_that_does_not_answer_or_falls_silent(joint: Any, empty_bus: Any
     joint.mute += [(0x6076, 0)] * 3
     message = refusal(joint, NoDeviceError)
     assert "reading object 6076 (motor rated torque) got no answer in 3 attempts" in message
+
+
+@pytest.mark.parametrize("attempts", [0, SDO_ATTEMPTS])
+def test_only_a_node_that_does_not_answer_is_sent_pre_operational_at_first(joint: Any, attempts: int) -> None:
+    joint.mute += [(0x1000, 0)] * attempts
+    with joint.opened(boot_timeout_s=1.0) as drive:
+        drive.commission()
+    first = next(place for place, (cob, _) in enumerate(joint.requests) if cob == 0)
+    assert joint.requests[first] == (0, bytes([NmtCommand.ENTER_PRE_OPERATIONAL, 1]))
+    read = [struct.unpack_from("<H", data, 1)[0] for cob, data in joint.requests[:first] if cob == 0x601]
+    assert (0x6041 in read) is (attempts == 0)
 
 
 UNRATED = {"rated_torque_Nm": None, "rated_current_A": None}
