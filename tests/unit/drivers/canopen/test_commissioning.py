@@ -352,6 +352,17 @@ def test_nothing_is_sent_before_the_bus_was_silent_for_its_time(joint: Any, step
         assert joint.requests == [(0x080, b"")]
 
 
+def test_a_controller_that_comes_at_the_last_moment_keeps_its_drive(
+    joint: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step = "jointctl.drivers.canopen.drive.brake_if_enabled"
+    monkeypatch.setattr(step, lambda *_: joint.send(0x080, b""))
+    seen = "another controller is active on this bus: 1 x SYNC"
+    with joint.opened() as drive, pytest.raises(BusError, match=seen):
+        drive.commission()
+    assert (0, bytes([NmtCommand.ENTER_PRE_OPERATIONAL, 1])) not in joint.requests
+
+
 def test_our_own_frames_that_come_back_are_no_ones_elses(joint: Any) -> None:
     drive = joint.drive(joint.settings, echoes=True)
     try:
