@@ -30,7 +30,7 @@ UNIT_TESTS = ROOT / "tests" / "unit"
 TESTS = {  # below UNIT_TESTS
     "firmware_py/safety.py": (
         "firmware_py/axis/test_safety", "firmware_py/axis/test_axis_*", "firmware_py/axis/test_supervision_edges",
-        "firmware_py/axis/test_stream",
+        "firmware_py/axis/test_stream", "firmware_py/axis/test_sequence_rules",
     ),
     "firmware_py/stream.py": ("firmware_py/axis/test_stream", "firmware_py/axis/test_sequence_rules"),
     "firmware_py/sequence.py": ("firmware_py/axis/test_sequence_*", "firmware_py/axis/test_axis_*"),

@@ -363,6 +363,15 @@ def test_a_controller_that_comes_at_the_last_moment_keeps_its_drive(
     assert (0, bytes([NmtCommand.ENTER_PRE_OPERATIONAL, 1])) not in joint.requests
 
 
+def test_what_was_verified_before_a_new_commissioning_is_forgotten(joint: Any) -> None:
+    with joint.opened() as drive:
+        drive._objects.write_verified(0x6087, 0, 1000, what="torque slope")
+        assert (0x6087, 0) in drive._objects.verified()
+        drive.commission()
+        assert (0x6087, 0) not in drive._objects.verified()
+        assert (0x6072, 0) in drive._objects.verified()
+
+
 def test_our_own_frames_that_come_back_are_no_ones_elses(joint: Any) -> None:
     drive = joint.drive(joint.settings, echoes=True)
     try:
