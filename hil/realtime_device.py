@@ -247,7 +247,7 @@ class RealtimeDevice:
     """Runs a device on a connected socket: `start`, `stop`, or a `with` block.  The descriptor stays the caller's."""
 
     def __init__(self, device: Cia402Device, fd: int) -> None:
-        self._device = device
+        self._device, self.plant_state = device, device.plant_state
         self._fd = fd
         self.words = np.zeros(WORDS, np.int64)
         self._faults = device.faults if len(device.faults) else None

@@ -9,8 +9,6 @@ Units: rad, rad/s, rad/s^2, Nm, s, at the joint.  Every error is a `JointctlErro
 
 from __future__ import annotations
 
-import math
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,23 +19,18 @@ import numpy as np
 import numpy.typing as npt
 
 from jointctl.drivers.errors import ConfigurationError, JointctlError, UsageError
-from jointctl.firmware_py.records import MotionChange, SetPoint
-from jointctl.firmware_py.safety import set_point_problem
+from jointctl.firmware_py.records import MotionChange
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.states import SetPointProblem, TrajectoryKind
-from jointctl.firmware_py.stream import CLOSE_SHARE
+from jointctl.firmware_py.states import TrajectoryKind
+from jointctl.tools.session.set_points import SetPointError, SetPointStream, finite
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.config import Config
 
+__all__ = ["Joint", "SetPointError", "State"]
+
 POLL_S = 0.005
 TABLE_ROWS = 1 << 16  # of `Joint.follow`, at most
-
-
-class SetPointError(JointctlError):
-    """A set-point was refused: the joint does not follow it."""
-
-    exit_code = 7
 
 
 @dataclass(frozen=True)
@@ -105,6 +98,9 @@ class Joint:
     set-point that is accepted, `state`, or one of the calls that wait.  A program that is silent for longer, an
     exception, Ctrl-C and the death of the interpreter brake the joint and disable it.
 
+    `foxglove` (True, or "HOST:PORT") and `ros2` (True, or the domain) let others look on and stop; `allow_remote` lets
+    them change gains as well.  Set-points are this program's alone.
+
     Not for several threads.
     """
 
@@ -120,20 +116,26 @@ class Joint:
         port: str | None = None,
         target: int | None = None,
         allow_low_margin: bool = False,
+        foxglove: bool | str = False,
+        ros2: bool | int = False,
+        allow_remote: bool = False,
     ) -> None:
-        from jointctl.joint_source import joint_source
+        from jointctl.joint_source import joint_source, observers
 
         place = interface, channel, bitrate, port, target
         source = joint_source(config, place, virtual=virtual)
+        options = observers(foxglove, ros2, allow_remote=allow_remote)
         if lockstep:
+            if options.foxglove is not None or options.ros2 is not None:
+                raise UsageError("lockstep=True is simulated time: nothing of it can be watched with foxglove or ros2")
             from jointctl.lockstep_joint import LockstepMotor
 
             self._motor: Motor = LockstepMotor(source.config)
         else:
             from jointctl.live_joint import LiveMotor
 
-            self._motor = LiveMotor(source, allow_low_margin=allow_low_margin)
-        self._stream: _Stream | None = None
+            self._motor = LiveMotor(source, options, allow_low_margin=allow_low_margin)
+        self._stream: SetPointStream | None = None
         self._enabled = False
         self._lasts_s = 0.0  # of the newest motion
 
@@ -177,7 +179,7 @@ class Joint:
             raise UsageError("the joint was enabled before; after a stop or a fault a new Joint is needed")
         self._enabled = True
         self._motor.enable(approve)
-        self._stream = _Stream(self._motor)
+        self._stream = SetPointStream(self._motor)
 
     def move_to(self, position_rad: float, duration_s: float | None = None, *, wait: bool = True) -> None:
         """From rest to rest along the quintic of least jerk; returns there, or at once without `wait`.
@@ -190,14 +192,14 @@ class Joint:
         from jointctl.tools.session.live_changes import new_motion
 
         start_rad = self._at_rest()
-        position_rad = _number("position_rad", position_rad)
+        position_rad = finite("position_rad", position_rad)
         if duration_s is None:
             duration_s = float(plain(move_duration_s)(self._axis.change, position_rad - start_rad))
             if duration_s == 0.0:
                 return
         values = {
             "kind": "min_jerk", "duration_s": 0.0, "start_rad": start_rad, "target_rad": position_rad,
-            "move_s": _number("duration_s", duration_s), "dwell_s": 0.0, "repeat": False,
+            "move_s": finite("duration_s", duration_s), "dwell_s": 0.0, "repeat": False,
         }  # fmt: skip
         self._go(*new_motion(self.config, self._motor.table, values), float(duration_s), wait)
 
@@ -243,14 +245,14 @@ class Joint:
 
     def wait(self, seconds: float) -> None:
         """Wait, and say that the program is alive.  At simulated time the joint moves on for so long."""
-        end_ns = self._motor.now_ns() + round(_number("seconds", seconds) * 1e9)
+        end_ns = self._motor.now_ns() + round(finite("seconds", seconds) * 1e9)
         while (left_ns := end_ns - self._motor.now_ns()) > 0:
             self._alive()
             self._motor.wait(min(left_ns * 1e-9, 0.05))
 
     def step(self, seconds: float) -> None:
         """At simulated time only: the joint moves on for so long."""
-        self._simulated("step").step(_number("seconds", seconds))
+        self._simulated("step").step(finite("seconds", seconds))
 
     def step_torque(self, torque_Nm: float) -> State:
         """At simulated time only: one cycle with this torque [Nm] instead of the law's; the state after it.
@@ -259,7 +261,7 @@ class Joint:
         nothing else is watched.
         """
         motor = self._simulated("step_torque")
-        motor.step_torque(_number("torque_Nm", torque_Nm))
+        motor.step_torque(finite("torque_Nm", torque_Nm))
         return motor.state()
 
     @property
@@ -282,7 +284,7 @@ class Joint:
     def _axis(self) -> Any:
         return self._motor.constants[0]
 
-    def _following(self) -> _Stream:
+    def _following(self) -> SetPointStream:
         if self._stream is None:
             raise UsageError("the joint is not enabled: call enable() first")
         return self._stream
@@ -322,16 +324,6 @@ class Joint:
             self._motor.wait(POLL_S)
 
 
-def _number(name: str, value: float) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        raise ConfigurationError(f"{name} (={str(value)[:40]}) must be a number") from None
-    if not math.isfinite(number):
-        raise ConfigurationError(f"{name} (={number:g}) must be finite")
-    return number
-
-
 def _table(times_s: npt.ArrayLike, positions_rad: npt.ArrayLike) -> np.ndarray:
     from jointctl.firmware_py.trajectory import spline_table
 
@@ -355,165 +347,3 @@ def _table(times_s: npt.ArrayLike, positions_rad: npt.ArrayLike) -> np.ndarray:
         return spline_table(times - times[0], positions)
     except ValueError as error:
         raise ConfigurationError(f"times_s: {error}") from None
-
-
-_Point = tuple[int, float, float, float]  # time [ns], position, velocity, torque
-
-
-class _Stream:
-    """Writes set-points into the loop's ring, after the checks that the loop makes as well."""
-
-    _TIME_GAIN, _CALLS = 0.05, 65  # of the clock recovered from calls without a time
-
-    def __init__(self, motor: Motor) -> None:
-        axis, state = motor.constants[0], motor.axis[0]
-        self._motor, self._limits, self._constants = motor, axis.limits, axis.stream
-        self._brake_radps2 = float(axis.sequence.brake_radps2)
-        self._by_velocity = int(axis.command_kind) != 0
-        stream = motor.constants["stream"]
-        self._times, self._values = stream["time_ns"][0], stream["values"][0]
-        self._written, self._alive_ns = stream["written"][0], stream["alive_ns"][0]
-        self._delay_ns, self._timeout_ns = int(axis.stream.delay_ns), int(axis.stream.timeout_ns)
-        self._close_ns = self._delay_ns // CLOSE_SHARE
-        self._state, self._reference = state.stream, state.reference
-        self._before, self._point = new(SetPoint), new(SetPoint)
-        self._accepted: deque[_Point] = deque()
-        self._calls_ns: deque[int] = deque(maxlen=self._CALLS)
-        self._offset_ns: int | None = None  # of the program's own clock
-        self._refused = int(self._state.refused)
-        self.alive()
-
-    def alive(self) -> None:
-        """The program's sign of life."""
-        self._alive_ns[0] = self._motor.now_ns()
-
-    def take(
-        self, position_rad: float, velocity_radps: float | None, acceleration_radps2: float | None, torque_Nm: float,
-        time_s: float | None,
-    ) -> None:  # fmt: skip
-        """One set-point; `SetPointError` if it is refused."""
-        self._motor.require()
-        self._check_loop()
-        try:
-            position_rad, torque_Nm = float(position_rad), float(torque_Nm)
-            velocity = None if velocity_radps is None else float(velocity_radps)
-            acceleration = math.nan if acceleration_radps2 is None else float(acceleration_radps2)
-        except (TypeError, ValueError):
-            raise SetPointError("a set-point must be made of numbers") from None
-        if acceleration_radps2 is not None and not math.isfinite(acceleration):
-            raise SetPointError(f"acceleration_radps2 (={acceleration:g}) must be finite")
-        if torque_Nm and self._by_velocity:
-            raise SetPointError(f"torque_Nm (={torque_Nm:g}) must be 0: the drive closes the velocity loop by itself")
-        now_ns, accepted = self._motor.now_ns(), self._accepted
-        if accepted and accepted[-1][0] <= now_ns - self._delay_ns:  # the loop has come to the end of them
-            accepted.clear()
-        time_ns = self._time_of(time_s, now_ns, accepted[-1][0] if accepted else None)
-        if accepted and time_ns <= accepted[-1][0]:
-            self._refuse(SetPointProblem.TIME, (time_ns, position_rad, velocity or 0.0, torque_Nm), accepted[-1])
-        if velocity is None:
-            velocity = (position_rad - accepted[-1][1]) / ((time_ns - accepted[-1][0]) * 1e-9) if accepted else 0.0
-        if not accepted:
-            reference = self._reference
-            rest_ns = now_ns - self._delay_ns
-            start = float(reference.position_rad), float(reference.velocity_radps), float(self._state.torque_Nm)
-            accepted.append((rest_ns, *start))
-        before = accepted[0]
-        for point in accepted:
-            if time_ns - point[0] < self._close_ns:
-                break
-            before = point
-        found = (time_ns, position_rad, velocity, torque_Nm)
-        self._before[0], self._point[0] = (*before[:3], math.nan, before[3]), (*found[:3], acceleration, torque_Nm)
-        problem = int(
-            set_point_problem(self._limits, self._constants, self._brake_radps2, self._before[0], self._point[0])
-        )
-        if problem:
-            self._refuse(problem, found, before)
-        self._put(time_ns, (position_rad, velocity, acceleration, torque_Nm))
-        while len(accepted) > 1 and time_ns - accepted[1][0] >= self._close_ns:
-            accepted.popleft()
-        accepted.append(found)
-        self._alive_ns[0] = now_ns
-
-    def _refuse(self, problem: int, point: _Point, before: _Point) -> None:
-        if len(self._accepted) == 1:
-            self._accepted.clear()  # that was only where the reference rests
-        raise SetPointError(*self._words(SetPointProblem(problem), point, before))
-
-    def _put(self, time_ns: int, values: tuple[float, ...]) -> None:
-        number, slots = int(self._written[0]), len(self._times)
-        if number - int(self._state.taken) >= slots:
-            raise SetPointError(f"{slots} set-points wait for the loop already", "send them as the joint moves on")
-        slot = number % slots
-        self._times[slot], self._values[slot] = time_ns, values
-        self._written[0] = number + 1  # last
-
-    def _check_loop(self) -> None:
-        refused = int(self._state.refused)
-        if refused != self._refused:
-            count, self._refused = refused - self._refused, refused
-            self._accepted.clear()
-            raise SetPointError(
-                f"{count} set-points were not followed: they came after their time, or during another motion",
-                "begin again from where the joint is to rest",
-            )
-
-    def _time_of(self, time_s: float | None, now_ns: int, last_ns: int | None) -> int:
-        """Time of the set-point [ns]; calls without a time are taken as even, at the rate of the last ones."""
-        if time_s is not None:
-            given_ns = round(_number("time_s", time_s) * 1e9)
-            if self._offset_ns is None or last_ns is None:
-                self._offset_ns = now_ns - given_ns
-            return given_ns + self._offset_ns
-        self._offset_ns = None
-        calls = self._calls_ns
-        if last_ns is None or now_ns - calls[-1] > self._delay_ns:  # a beginning, or after a pause
-            calls.clear()
-        calls.append(now_ns)
-        if last_ns is None or len(calls) == 1:
-            return max(now_ns, (last_ns or 0) + 1)
-        interval_ns = (now_ns - calls[0]) / (len(calls) - 1)
-        off_ns = now_ns - (last_ns + interval_ns)
-        return last_ns + max(round(interval_ns + self._TIME_GAIN * off_ns), round(0.5 * interval_ns), 1)
-
-    def _words(self, problem: SetPointProblem, point: _Point, before: _Point) -> tuple[str, str]:
-        """Message and hint: the value and what is allowed, and the key that it comes from."""
-        limits, stream = self._limits, self._constants
-        low, high, top = (float(limits[key]) for key in ("position_min_rad", "position_max_rad", "velocity_max_radps"))
-        at, speed, torque = (
-            f"position_rad (={point[1]:g})",
-            f"velocity_radps (={point[2]:g})",
-            f"torque_Nm (={point[3]:g})",
-        )
-        way, more = f"{point[1] - before[1]:+g} rad", f"{point[3] - before[3]:+g} Nm"
-        later_s, longest_s = (point[0] - before[0]) * 1e-9, (self._timeout_ns + self._delay_ns) * 1e-9
-        jump, steepest = float(stream.jump_max_rad), float(stream.acceleration_max_radps2)
-        most, rate = float(stream.torque_max_Nm), float(stream.torque_rate_max_Nmps)
-        start = f"{before[1]:g} rad at {before[2]:g} rad/s"
-        texts = {
-            SetPointProblem.TIME: (
-                f"time_s is {later_s:g} s after the set-point before, must be in (0..{longest_s:g}]",
-                "stream.timeout_s and stream.delay_s",
-            ),
-            SetPointProblem.POSITION: (f"{at} must be in [{low:g}..{high:g}]", "limits.position_*"),
-            SetPointProblem.VELOCITY: (
-                f"{speed}, or that on the way there, must be in [{-top:g}..{top:g}]", "limits.velocity_max_radps"
-            ),
-            SetPointProblem.JUMP: (
-                f"{at} is {way} from the set-point before, must be within {jump:g} rad", "stream.jump_max_rad"
-            ),
-            SetPointProblem.ACCELERATION: (
-                f"the way from {start} to {at} with {speed} in {later_s:g} s takes more than {steepest:g} rad/s2",
-                "stream.acceleration_max_radps2",
-            ),
-            SetPointProblem.TORQUE: (f"{torque} must be in [{-most:g}..{most:g}]", "stream.torque_max_Nm"),
-            SetPointProblem.TORQUE_RATE: (
-                f"{torque} is {more} from the one before, must change by {rate:g} Nm/s at most",
-                "stream.torque_rate_max_Nmps",
-            ),
-            SetPointProblem.STOPPING_WAY: (
-                f"braked from {at} with {speed}, the joint would leave [{low:g}..{high:g}]",
-                "limits.position_*, sequence.brake_radps2",
-            ),
-        }  # fmt: skip
-        return texts[problem]

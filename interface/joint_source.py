@@ -11,6 +11,7 @@ from pathlib import Path
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.scoping.remote_options import FOXGLOVE_AT, RemoteOptions, usual_domain
 
 _NUMBERS = count(1)
 Place = tuple[str | None, str | None, int | None, str | None, int | None]  # interface, channel, bitrate, port, node
@@ -38,6 +39,13 @@ class JointSource:
         ):
             loop_compiled()
             yield
+
+
+def observers(foxglove: bool | str, ros2: bool | int, *, allow_remote: bool) -> RemoteOptions:
+    """Who may look on, as the options of `jointctl run` say it."""
+    at = FOXGLOVE_AT if foxglove is True else foxglove or None
+    domain = usual_domain() if ros2 is True else None if ros2 is False else ros2
+    return RemoteOptions(at, domain, allow_remote=allow_remote)
 
 
 def joint_source(given: str | Path | Config, place: Place, *, virtual: bool) -> JointSource:

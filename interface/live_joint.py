@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -13,21 +12,21 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import JointctlError, MotionFault
 from jointctl.firmware_py.cycle import Word
 from jointctl.firmware_py.states import AxisPhase, Fault, fault_name, in_words
 from jointctl.joint import POLL_S, TABLE_ROWS, State
 from jointctl.joint_source import JointSource
-from jointctl.tools.configuration.records import free_constants
 from jointctl.tools.output import Output
 from jointctl.tools.recording.log_folder import log_path
 from jointctl.tools.recording.run_log import ERROR, Event
+from jointctl.tools.scoping.remote import remote
+from jointctl.tools.scoping.remote_options import NOBODY_REMOTE, RemoteOptions
 from jointctl.tools.session import result as drive_end
 from jointctl.tools.session.control import Control, in_program
 from jointctl.tools.session.display import OnlyShows, PreparedMotion, Snapshot, ViewerRequest
 from jointctl.tools.session.loop_handle import RING_RECORDS, LoopHandle
-from jointctl.tools.session.plan import Placed, RunPlan, joint_lines, limits_line, remark_lines
+from jointctl.tools.session.plan import FreeMotion, RunPlan
 from jointctl.tools.session.result import RunResult
 from jointctl.tools.session.session import Session
 from jointctl.tools.session.session_drive import drive_state_name, session_drive
@@ -38,32 +37,6 @@ ENDED = "the run has ended"
 _NEEDED = ("scipy.interpolate", "jointctl.tools.session.live_changes", "jointctl.tools.configuration.checks")
 _PHASES = tuple(in_words(phase) for phase in AxisPhase)
 ANSWER_S = 2.0  # of the loop to a new motion
-
-
-class FreeMotion:
-    """Hold where the joint stands, then what the program asks for; see `Motion`."""
-
-    def __init__(self, config: Any) -> None:
-        self._config = config
-        self.table = np.zeros((TABLE_ROWS, 5))
-        self.start_rad = math.nan  # where commissioning found the joint
-
-    def placed(self, report: CommissioningReport) -> Placed:
-        """See `Motion`."""
-        self.start_rad = report.start_position_rad
-        config, start_rad = self._config, report.start_position_rad
-        constants = free_constants(config, start_rad)
-        lines = (
-            *joint_lines(report),
-            f"motion     as the program says, from {start_rad:+.4f} rad; it may be silent for "
-            f"{config.stream.client_timeout_s:g} s",
-            limits_line(config.limits),
-            *remark_lines(report.remarks),
-        )
-        return Placed(constants, self.table, lines)
-
-    def require_start(self, start_position_rad: float) -> None:
-        """It begins where the joint stands."""
 
 
 class _Approval:
@@ -127,10 +100,13 @@ class _ProgramDisplay(OnlyShows):
 class LiveMotor:
     """See `Motor`.  The session supervises in a thread; the loop has its own process, as in `jointctl run`."""
 
-    def __init__(self, source: JointSource, *, allow_low_margin: bool = False) -> None:
-        self._source, self._allow_low_margin = source, allow_low_margin
+    def __init__(
+        self, source: JointSource, options: RemoteOptions = NOBODY_REMOTE, *, allow_low_margin: bool = False
+    ) -> None:
+        self._source, self._options, self._allow_low_margin = source, options, allow_low_margin
         self.config, self._drive = source.config, session_drive(source.config.drive.kind)
-        self._motion, self._display = FreeMotion(self.config), _ProgramDisplay()
+        self._motion = FreeMotion(self.config, np.zeros((TABLE_ROWS, 5)), by_program=True)
+        self._display = _ProgramDisplay()
         self._stack = ExitStack()
         self._thread: threading.Thread | None = None
         self._session: Session | None = None
@@ -151,11 +127,13 @@ class LiveMotor:
         try:
             self._stack.enter_context(self._source.served())
             output = Output(quiet=True)
+            others = self._stack.enter_context(remote(self._options, self.config, output, owner=WHO))
             control = self._control = self._stack.enter_context(in_program(self.config, output))
             self._approval = _Approval(control.signals.leave_if_asked)
             plan = RunPlan(self.config, self._motion, log_path(self.config), self._allow_low_margin)
             self.log_path = plan.log_path
-            self._session = Session(plan, self._approval, output, control, lambda _: self._display)
+            display = others.beside(lambda _: self._display)
+            self._session = Session(plan, self._approval, output, control, display, others.set_points)
             self._thread = threading.Thread(target=self._run, name="jointctl session")
             self._thread.start()
             for name in _NEEDED:  # commissioning waits for the drive most of the time

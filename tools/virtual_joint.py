@@ -48,7 +48,7 @@ class PumpedDevice:
     """
 
     def __init__(self, device: Cia402Device, bus: can.BusABC) -> None:
-        self._device = device
+        self._device, self.plant_state = device, device.plant_state
         self._bus = bus
         self.words = np.zeros(WORDS, np.int64)
         self._thread: threading.Thread | None = None

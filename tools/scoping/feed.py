@@ -12,7 +12,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from typing import Any, Self
 
@@ -25,13 +25,15 @@ from jointctl.tools.session.display import LONGEST_BYTES, Snapshot, ViewerReques
 
 RECORDS, EVENT, SETTINGS = b"R", b"E", b"S"  # first byte of a message
 REQUESTS = 16  # of viewers, at most between two looks
+AT_ONCE = 64  # messages of a server that are read in one look: it must not hold the supervisor up
 PIECE = 64  # records a message; less than the buffer of the socket
 COUNT_AGAIN_S = 2.0  # how often the server tells the number of open pages, changed or not
 SILENT_S = 3.0 * COUNT_AGAIN_S  # without that word nobody is there: the server hangs, and STOP with it
 SERVER_SILENT = (
     f"no word from the scope's server for {SILENT_S:g} s: it counts as no page open; Ctrl-C or `jointctl stop` brakes"
 )
-SERVER_ENDED = "the scope's server has ended: no page shows or stops the joint"
+SCOPE = "the scope"
+SERVER_ENDED = "{}'s server has ended: no page shows or stops the joint"
 
 
 @dataclass(frozen=True)
@@ -62,15 +64,18 @@ def scope_order(title: str, host: str, port: int, **more: Any) -> ScopeOrder:
         raise DataError("the scope needs the package nicegui, which is not installed", "install the extra `scope`")
     if not 1 <= port <= 65535:
         raise UsageError(f"--port (={port}) must be in [1..65535]")
+    require_free("the scope", host, port, "choose another --port")
+    return ScopeOrder(printable(title), host, port, secrets.token_urlsafe(16), **more)
+
+
+def require_free(what: str, host: str, port: int, hint: str) -> None:
+    """`DataError` if it cannot be served there."""
     try:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
     except OSError as error:
-        raise DataError(
-            f"the scope cannot be served at {host}:{port}: {error.strerror or error}", "choose another --port"
-        ) from None
-    return ScopeOrder(printable(title), host, port, secrets.token_urlsafe(16), **more)
+        raise DataError(f"{what} cannot be served at {host}:{port}: {error.strerror or error}", hint) from None
 
 
 class ScopeFeed:
@@ -78,10 +83,19 @@ class ScopeFeed:
 
     `in_charge`: the run is led from the page, so it brakes when the server has ended.  `unwatched_s`: it brakes when no
     page has been open for so long; None = it goes on.  In any case it is reported in the terminal and the log.
+    `takes`: the kinds of requests that are passed on besides STOP; None = all.
     """
 
-    def __init__(self, end: socket.socket, *, in_charge: bool = False, unwatched_s: float | None = None) -> None:
-        self._end = end
+    def __init__(
+        self,
+        end: socket.socket,
+        *,
+        in_charge: bool = False,
+        unwatched_s: float | None = None,
+        server: str = SCOPE,
+        takes: frozenset[str] | None = None,
+    ) -> None:
+        self._end, self._server, self._takes = end, server, takes
         end.setblocking(False)
         self._in_charge, self._unwatched_limit_s = in_charge, unwatched_s
         self.dropped = 0  # messages
@@ -94,7 +108,8 @@ class ScopeFeed:
         self._temperature_degC: float | None = None  # as it was passed on
         self._unwatched_since_s: float | None = None  # None: somebody watches, or nobody ever has
 
-    def _send(self, kind: bytes, body: bytes) -> None:
+    def send(self, kind: bytes, body: bytes) -> None:
+        """Pass one message on, or drop it."""
         try:
             self._end.send(kind + body)
         except OSError:  # full, or the server has gone
@@ -112,19 +127,19 @@ class ScopeFeed:
             self._temperature_degC = snapshot.temperature_degC
             self.settings({"temperature_degC": self._temperature_degC})
         for at in range(0, len(snapshot.records), PIECE):
-            self._send(RECORDS, snapshot.records[at : at + PIECE].tobytes())
+            self.send(RECORDS, snapshot.records[at : at + PIECE].tobytes())
 
     def event(self, event: Event) -> None:
         """Pass on an event."""
-        self._send(EVENT, json.dumps(asdict(event)).encode())
+        self.send(EVENT, json.dumps(asdict(event)).encode())
 
     def settings(self, values: Mapping[str, Any]) -> None:
         """Tell the pages what can be changed, or in which stage things are."""
-        self._send(SETTINGS, json.dumps(dict(values)).encode())
+        self.send(SETTINGS, json.dumps(dict(values)).encode())
 
     def _receive(self) -> None:
         with contextlib.suppress(OSError):
-            while True:
+            for _ in range(AT_ONCE):
                 word = self._end.recv(LONGEST_BYTES)
                 if not word:
                     self._server_ended()
@@ -132,10 +147,10 @@ class ScopeFeed:
                 if (request := decoded(word)) is None:
                     continue
                 if request.kind == "stop":
-                    self._ask_stop(request.values.get("strength"), f"the scope's STOP, {request.who}")
+                    self._ask_stop(request.values.get("strength"), f"{self._server}'s STOP, {request.who}")
                 elif request.kind == "viewers":
                     self._count_viewers(request.values.get("count"))
-                else:
+                elif self._takes is None or request.kind in self._takes:
                     self._requests.append(request)
 
     def _ask_stop(self, strength: object, reason: str) -> None:
@@ -170,11 +185,10 @@ class ScopeFeed:
             return
         self.gone = True
         self._viewers = max(self._viewers, 1)  # reported whether or not a page was open
-        self._count_viewers(
-            0, SERVER_ENDED + (", braking" if self._in_charge else "; Ctrl-C or `jointctl stop` brakes")
-        )
+        ended = SERVER_ENDED.format(self._server)
+        self._count_viewers(0, ended + (", braking" if self._in_charge else "; Ctrl-C or `jointctl stop` brakes"))
         if self._in_charge:
-            self._ask_stop(1, "the end of the scope's server")
+            self._ask_stop(1, f"the end of {self._server}'s server")
 
     def stop_request(self) -> StopRequest:
         """The strongest stop that a viewer, or the absence of viewers, has asked for."""
@@ -220,22 +234,37 @@ def scope_server(
 ) -> Iterator[ScopeFeed]:
     """The server process; it ends by itself a moment after this does.  For the rest see `ScopeFeed`."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    fed = ScopeOrder(**{**asdict(order), "feed_fd": theirs.fileno()})
+    with server_process("jointctl.tools.scoping.server", replace(order, feed_fd=theirs.fileno()), [theirs], [ours]):
+        yield ScopeFeed(ours, in_charge=in_charge, unwatched_s=unwatched_s)
+
+
+@contextmanager
+def server_process(
+    module: str, order: Any, theirs: Sequence[socket.socket], ours: Sequence[socket.socket]
+) -> Iterator[None]:
+    """A process that serves a run: it gets `order`, a dataclass, on its standard input, and one end of each pair.
+
+    It ends by itself when our ends are closed, which is done here.
+    """
     process = subprocess.Popen(
-        [sys.executable, "-P", "-m", "jointctl.tools.scoping.server"],
-        pass_fds=(theirs.fileno(),),
+        [sys.executable, "-P", "-m", module],
+        pass_fds=[end.fileno() for end in theirs],
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         start_new_session=True,  # keys that a terminal turns into signals are for the supervisor
     )
-    theirs.close()
+    for end in theirs:
+        end.close()
     assert process.stdin is not None
     with contextlib.suppress(OSError), process.stdin:  # a server that ends at once is noticed as any that has ended
-        process.stdin.write(json.dumps(asdict(fed)).encode())  # far less than a pipe holds
+        process.stdin.write(json.dumps(asdict(order)).encode())  # far less than a pipe holds
     try:
-        yield ScopeFeed(ours, in_charge=in_charge, unwatched_s=unwatched_s)
+        yield
     finally:
-        ours.close()
+        for end in ours:
+            with contextlib.suppress(OSError):  # wakes a thread that reads it
+                end.shutdown(socket.SHUT_RDWR)
+            end.close()
         try:
             process.wait(5.0)
         except subprocess.TimeoutExpired:

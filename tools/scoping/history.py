@@ -42,13 +42,13 @@ SIGNALS: dict[str, tuple[str, float]] = {
 _OF_THE_LAW = ("error_rad", "desired_position_rad", "desired_velocity_radps")
 
 
-def _printable(value: object) -> Any:
+def printable_values(value: object) -> Any:
     """Every text in a message of the supervisor as it may be shown."""
     if isinstance(value, str):
         return printable(value)
     if isinstance(value, Mapping):
-        return {printable(key): _printable(item) for key, item in value.items()}
-    return [_printable(item) for item in value] if isinstance(value, list) else value
+        return {printable(key): printable_values(item) for key, item in value.items()}
+    return [printable_values(item) for item in value] if isinstance(value, list) else value
 
 
 class History:
@@ -71,7 +71,7 @@ class History:
 
     def take_settings(self, found: Mapping[str, Any]) -> None:
         """What the supervisor tells besides, likewise."""
-        self.settings.update(_printable(found))
+        self.settings.update(printable_values(found))
 
     def take(self, records: np.ndarray) -> None:
         """Append records, shape (N,), in order of time."""

@@ -14,28 +14,24 @@ import os
 import secrets
 import socket
 import sys
-import threading
 import time
 from collections.abc import Awaitable, Callable, Iterator, MutableMapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
-from jointctl.tools.recording.run_log import Event
 from jointctl.tools.recording.run_log_reader import read_run_log
-from jointctl.tools.scoping.feed import COUNT_AGAIN_S, EVENT, RECORDS, SETTINGS, ScopeOrder
+from jointctl.tools.scoping.feed import COUNT_AGAIN_S, ScopeOrder
 from jointctl.tools.scoping.history import EVENTS, RING_RECORDS, History
+from jointctl.tools.scoping.supervisor_link import NICE, Feed
 from jointctl.tools.session.display import ViewerRequest, viewer
 
 if TYPE_CHECKING:
     from starlette.requests import Request
 
-_LONGEST = 1 << 20  # bytes of a message
 MESSAGES = 20  # that a page which was cut off for a moment gets again
 RECONNECT_S = 10.0  # a page that was cut off for less goes on where it was
-_AFTER_END_S = 1.5  # for the pages to show the end of the run
 COUNT_S = 0.5  # how often the open pages are counted
-NICE = 5  # a viewer comes after the supervisor, but STOP has to arrive on a busy computer
 RELOAD_S = 3.0  # nobody for so long: the last page is closed, not reloaded
 COOKIE = "jointctl_scope"  # how their names begin
 Scope = MutableMapping[str, Any]
@@ -116,57 +112,6 @@ async def _refuse(scope: Scope, send: Send) -> None:
 
 
 # --- the server ---
-
-
-class Feed(threading.Thread):
-    """Receives what the supervisor sends, until it closes the socket; then ends the server."""
-
-    def __init__(self, end: socket.socket, history: History) -> None:
-        super().__init__(name="scope feed", daemon=True)
-        self._end = end
-        self._history = history
-        self._stops = 0  # since the stage has changed
-
-    def run(self) -> None:
-        """See `Thread`."""
-        while True:
-            try:
-                message = self._end.recv(_LONGEST)
-            except OSError:
-                message = b""
-            if not message:
-                break
-            if message[:1] == RECORDS:
-                self._history.take_bytes(message[1:])
-            elif message[:1] == EVENT:
-                self._history.take_event(Event(**json.loads(message[1:])))
-            elif message[:1] == SETTINGS:
-                found = json.loads(message[1:])
-                if found.get("stage") == "running" != self._history.settings.get("stage"):
-                    self._history.begin()
-                if found.get("stage", self._history.settings.get("stage")) != self._history.settings.get("stage"):
-                    self._stops = 0
-                self._history.take_settings(found)
-            self._history.heard_s = time.monotonic()
-        self._history.ended = True
-        time.sleep(_AFTER_END_S)
-        os._exit(0)  # the server itself would wait for every open page
-
-    def stop(self, who: str) -> int:
-        """A press of STOP: 1 brake, 2 quick stop if it was pressed before, 0 if the supervisor does not take it."""
-        strength = 2 if self._stops else 1
-        if not self.ask(ViewerRequest("stop", who, {"strength": strength})):
-            return 0
-        self._stops += 1
-        return strength
-
-    def ask(self, request: ViewerRequest) -> bool:
-        """Pass on what a viewer asks for, without waiting; False if it is not taken."""
-        try:
-            self._end.send(request.encoded(), socket.MSG_DONTWAIT)
-        except OSError:
-            return False
-        return True
 
 
 def history_of_log(path: str) -> History:

@@ -6,6 +6,7 @@ it (`Motion.placed`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ from jointctl.firmware_py.records import Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.trajectory import approach_start, peak_of, reference_at
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.records import axis_constants, fill_trajectory, trajectory_table
+from jointctl.tools.configuration.records import axis_constants, fill_trajectory, free_constants, trajectory_table
 from jointctl.tools.configuration.sections import Limits
 from jointctl.tools.recording.log_folder import log_path
 
@@ -90,10 +91,50 @@ def remark_lines(remarks: Iterable[str]) -> list[str]:
     return [f"remark     {remark}" for remark in remarks]
 
 
-def resolve(config: Config, *, allow_low_margin: bool = False) -> RunPlan:
-    """The plan of `run`; `ConfigurationError` for a table that leaves the limits or cannot be read."""
-    motion = ConfiguredMotion(config, trajectory_table(config))
+def resolve(config: Config, *, allow_low_margin: bool = False, hold: bool = False) -> RunPlan:
+    """The plan of `run`; `ConfigurationError` for a table that leaves the limits or cannot be read.
+
+    `hold`: the joint stays where it stands, ready for set-points, instead of the configured trajectory.
+    """
+    table = trajectory_table(config)
+    motion: Motion = FreeMotion(config, table) if hold else ConfiguredMotion(config, table)
     return RunPlan(config, motion, log_path(config), allow_low_margin)
+
+
+class FreeMotion:
+    """Hold where the joint stands, then go where set-points and motions say; see `Motion`.
+
+    `by_program`: they come from the program that has started the run, which must not be silent from the beginning.
+    """
+
+    def __init__(self, config: Config, table: np.ndarray, *, by_program: bool = False) -> None:
+        self._config, self.table, self._by_program = config, table, by_program
+        self.start_rad = math.nan  # where commissioning found the joint
+
+    def placed(self, report: CommissioningReport) -> Placed:
+        """See `Motion`."""
+        config, start_rad = self._config, report.start_position_rad
+        self.start_rad = start_rad
+        constants = free_constants(config, start_rad)
+        if not self._by_program:
+            what, constants[0].stream.client_timeout_ns = "none: the joint holds its place", 0
+        else:
+            what = f"as the program says; it may be silent for {config.stream.client_timeout_s:g} s"
+        lines = (
+            *joint_lines(report),
+            f"motion     from {start_rad:+.4f} rad, {what}",
+            limits_line(config.limits),
+            *remark_lines(report.remarks),
+        )
+        return Placed(constants, self.table, lines)
+
+    def require_start(self, start_position_rad: float) -> None:
+        """It begins where the joint stands."""
+
+
+def expect_client(constants: Any, config: Config) -> None:
+    """The loop ends the run when whoever commands the joint has been silent for `stream.client_timeout_s`."""
+    constants[0].stream.client_timeout_ns = round(config.stream.client_timeout_s * 1e9)
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from jointctl.tools.session.live_changes import ViewerOrders
 from jointctl.tools.session.loop_handle import LoopHandle
 from jointctl.tools.session.plan import RunPlan
 from jointctl.tools.session.session_drive import Guard, session_drive
+from jointctl.tools.session.set_points import SetPointSources
 
 GUARD_ENDED = "the guard of the line has ended: nobody switches the drive off if this program and the loop both die"
 DELAY_CYCLES = 300  # how many cycles with the drive off the loop delay is measured over
@@ -53,6 +54,7 @@ class RunParts:
     kept: KeptRecords
     display: Display
     metadata: Mapping[str, Mapping[str, str]]
+    set_points: SetPointSources | None = None
 
 
 class RunWatch:
@@ -63,6 +65,7 @@ class RunWatch:
         config = plan.config
         self.config, self.loop, self.around = config, parts.loop, parts.around
         self.log, self.kept, self.display = parts.log, parts.kept, parts.display
+        self._set_points = parts.set_points or SetPointSources("the program")  # none from elsewhere
         self.temperature = TemperatureWatch()  # until the drive's own thermometer is known
         self.settings_guard: SettingsGuard | None = None
         self._allowed = False  # whether the loop may enable
@@ -82,10 +85,12 @@ class RunWatch:
         )  # fmt: skip
 
     def __enter__(self) -> Self:
+        self._set_points.begin(self.loop.block)
         return self
 
     def __exit__(self, *exception: object) -> None:
         """Viewers can change nothing any more; a recording of theirs ends.  The log gets what is held back of it."""
+        self._set_points.end()
         self._orders.__exit__(*exception)
         with contextlib.suppress(OSError):  # a full disk may be why this ends
             self._keep(self._decimated.last())
@@ -117,6 +122,8 @@ class RunWatch:
             self.log.write_event(WARNING, "supervisor", GUARD_ENDED)
             self.display.note(GUARD_ENDED)
         self._orders.serve(self.display)
+        for level, text in self._set_points.poll():
+            self._tell_scope(level, text)
         if (phase := self.loop.phase) is not self._phase:
             self._phase = phase
             self.display.phase(phase_name(phase))

@@ -31,6 +31,7 @@ from jointctl.tools.session.plan import Placed, RunPlan
 from jointctl.tools.session.result import RunResult, warn_unless_off
 from jointctl.tools.session.run_watch import Around, RunParts, RunWatch
 from jointctl.tools.session.session_drive import Guard, session_drive
+from jointctl.tools.session.set_points import SetPointSources
 
 POLL_S = 0.02
 Answer = TypeVar("Answer")
@@ -46,7 +47,7 @@ class Session:
     """Carries out one plan: run, sweep, motion check and live page differ in plan, consent and display only.
 
     `consent` has the last word before anything moves.  `display` makes what shows the run, once the joint is known;
-    by default a line for each phase.
+    by default a line for each phase.  `set_points`: sources in processes of their own.
     """
 
     def __init__(
@@ -56,8 +57,9 @@ class Session:
         output: Output,
         control: Control,
         display: Callable[[CommissioningReport], Display] | None = None,
+        set_points: SetPointSources | None = None,
     ) -> None:
-        self.plan, self._config = plan, plan.config
+        self.plan, self._config, self._set_points = plan, plan.config, set_points
         self._consent, self._output, self._control = consent, output, control
         self.signals = control.signals
         self._make_display = display or (lambda _: PhaseLines(output))
@@ -132,6 +134,8 @@ class Session:
         """The motion from where the joint stands, shown, possible and agreed to; None if it is not to be."""
         plan, start_rad = self.plan, report.start_position_rad
         placed = plan.motion.placed(report)
+        if self._set_points is not None:
+            placed = self._set_points.announced(placed, self._config)
         self._consent.show(placed.lines)
         if self._consent.dry_run:
             return None
@@ -155,7 +159,9 @@ class Session:
             RunLogWriter(plan.log_path, metadata) as log,
             KeptRecords(plan.log_path.parent) as kept,
             self._make_display(report) as display,
-            RunWatch(plan, placed.constants[0], RunParts(loop, around, log, kept, display, metadata)) as watch,
+            RunWatch(
+                plan, placed.constants[0], RunParts(loop, around, log, kept, display, metadata, self._set_points)
+            ) as watch,
         ):
             return self._carry_out(drive, loop, placed.constants, report, watch)
 

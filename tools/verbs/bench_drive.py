@@ -22,6 +22,7 @@ from jointctl.firmware_py.input_file import parse_toml, read_input
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_section import DEFAULT_KIND, KINDS, GivenPlace
 from jointctl.tools.output import Output
+from jointctl.tools.scoping.remote_options import NOBODY, ObserveOptions
 
 if TYPE_CHECKING:
     from jointctl.tools.inspection.health import Finding
@@ -49,6 +50,7 @@ class ServeOptions:
     port: str | None = None
     link: str | None = None
     ready_fd: int | None = None
+    live: ObserveOptions = NOBODY
 
 
 class StopTarget(Protocol):

@@ -106,7 +106,7 @@ class CanopenBench(BenchDrive):
 
         if options.serial or options.link is not None:
             raise wrong_kind(config.path, config.drive.kind, FOR_A_PORT)
-        return serve_can(config, output, timing=options.timing, ready_fd=options.ready_fd)
+        return serve_can(config, output, timing=options.timing, ready_fd=options.ready_fd, live=options.live)
 
 
 def canopen_subject(asked: Asked) -> Subject:

@@ -202,7 +202,7 @@ class ElmoBench(BenchDrive):
     def serve(self, config: Config, output: Output, options: ServeOptions) -> int:
         """See `BenchDrive`; prints the port on stdout."""
         from jointctl.tools.session.control import stop_signals
-        from jointctl.tools.verbs.hil import make_realtime, wait_for_end
+        from jointctl.tools.verbs.hil import make_realtime, wait_for_end, watched
         from jointctl.tools.virtual_elmo import serve_virtual_elmo
 
         if options.port is not None:
@@ -217,7 +217,8 @@ class ElmoBench(BenchDrive):
             path = options.link or device.path
             output.result(path, {"port": path, "baud_rate_bitps": device.baud_rate_bitps})
             output.note(f"virtual drive: {path} at {device.baud_rate_bitps} baud; Ctrl-C ends it")
-            wait_for_end(signals, options.ready_fd)
+            with watched(config, options.live, output, device.interpreter.state):
+                wait_for_end(signals, options.ready_fd)
         return 0
 
     def require_rate(self, config: Config) -> None:

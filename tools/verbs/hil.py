@@ -7,13 +7,14 @@ import os
 import select
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from jointctl.tools.output import Output
+from jointctl.tools.scoping.remote_options import NOBODY, ObserveOptions
 from jointctl.tools.verbs.verb_options import BusOptions, ConfigPath, ProgressOutput, loaded
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from jointctl.tools.session.control import StopSignals
 
 _POLL_S = 0.05
+_STATES_S = 0.01  # between two joint states
 
 
 def hil(
@@ -31,16 +33,24 @@ def hil(
     link: Annotated[str | None, typer.Option("--link", help="serial drive: path of a link to its port")] = None,
     timing: Annotated[bool, typer.Option("--timing", help="model bit times and arbitration")] = False,
     ready_fd: Annotated[int | None, typer.Option("--ready-fd", hidden=True)] = None,
+    live: ObserveOptions = NOBODY,
     output: ProgressOutput,
 ) -> int:
     """Keep the virtual joint up, on a virtual bus or a pseudo-terminal, for other programs to attach to."""
     from jointctl.tools.verbs.bench_drive import ServeOptions, bench_of
 
     joint = loaded(Path("elmo_serial") if serial and config == Path("virtual") else config, bus)
-    return bench_of(joint).serve(joint, output, ServeOptions(timing, serial, bus.port, link, ready_fd))
+    return bench_of(joint).serve(joint, output, ServeOptions(timing, serial, bus.port, link, ready_fd, live))
 
 
-def serve_can(config: Config, output: Output, *, timing: bool = False, ready_fd: int | None = None) -> int:
+def serve_can(
+    config: Config,
+    output: Output,
+    *,
+    timing: bool = False,
+    ready_fd: int | None = None,
+    live: ObserveOptions = NOBODY,
+) -> int:
     """Serve until a stop signal; `ready_fd` gets one byte once the bus can be used, and its reader's end ends us."""
     from jointctl.hil.realtime_device import ENDED_WORD
     from jointctl.hil.virtual_bus import default_socket_path
@@ -63,8 +73,39 @@ def serve_can(config: Config, output: Output, *, timing: bool = False, ready_fd:
         output.note(f"virtual joint: node {canopen_section(config).node} on {place}; Ctrl-C ends it")
         if bus.interface == "jointctl":
             output.note(f'attach with python-can: can.Bus(interface="jointctl", channel="{bus.channel}")')
-        wait_for_end(signals, ready_fd, lambda: bool(joint.words[ENDED_WORD]))
+        with watched(config, live, output, joint.plant_state):
+            wait_for_end(signals, ready_fd, lambda: bool(joint.words[ENDED_WORD]))
     return 0
+
+
+@contextlib.contextmanager
+def watched(config: Config, live: ObserveOptions, output: Output, plant_state: Any) -> Iterator[None]:
+    """With Foxglove and ROS 2 looking on: the joint states of the plant, a record array of one `PlantState`."""
+    from jointctl.firmware_py.records import LogRecord
+    from jointctl.firmware_py.schema import new
+    from jointctl.tools.scoping.feed import RECORDS
+    from jointctl.tools.scoping.remote import remote
+
+    with remote(live, config, output, only_states=True) as others:
+        ended, plant, record = threading.Event(), plant_state[0], new(LogRecord)
+
+        def watch() -> None:
+            while not ended.wait(_STATES_S):
+                record[0].time_ns = time.monotonic_ns()
+                record[0].position_rad, record[0].velocity_radps = plant.joint_position_rad, plant.joint_velocity_radps
+                record[0].measured_torque_Nm = plant.actuator_torque_Nm
+                for feed in others.feeds:
+                    feed.send(RECORDS, record.tobytes())
+
+        thread = threading.Thread(target=watch, name="joint states", daemon=True)
+        if others.feeds:
+            thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            if others.feeds:
+                thread.join()
 
 
 def make_realtime(config: Config, output: Output) -> None:

@@ -14,6 +14,7 @@ import typer
 from jointctl.drivers.errors import INTERRUPTED, DataError, JointctlError, UsageError
 from jointctl.drivers.printable import one_line
 from jointctl.tools.output import Output, abandon, let_go
+from jointctl.tools.scoping.remote_options import with_values
 from jointctl.tools.verbs.check import check
 from jointctl.tools.verbs.clear_fault import clear_fault
 from jointctl.tools.verbs.demo import demo
@@ -134,7 +135,7 @@ def main() -> None:
     atexit.register(let_go, sys.stderr)
     _start_quickly()
     try:
-        sys.exit(app(standalone_mode=False))
+        sys.exit(app(with_values(sys.argv[1:]), standalone_mode=False))
     except JointctlError as error:
         Output().error(error.message, error.hint)
         sys.exit(error.exit_code)

@@ -10,6 +10,7 @@ import typer
 
 from jointctl.drivers.errors import DECLINED, INTERRUPTED
 from jointctl.tools.output import Output
+from jointctl.tools.scoping.remote_options import NOBODY_REMOTE, RemoteOptions
 from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOnBus, VerbOutput, Yes
 
 if TYPE_CHECKING:
@@ -34,8 +35,10 @@ def run(
     dry_run: DryRun = False,
     allow_low_margin: AllowLowMargin = False,
     scope: Annotated[tuple[str, int] | None, _page] = None,
+    live: RemoteOptions = NOBODY_REMOTE,
 ) -> int:
     """Track the configured trajectory on a real or virtual joint."""
+    from jointctl.tools.scoping.remote import remote
     from jointctl.tools.session import result as drive_end
     from jointctl.tools.session.consent import TerminalConsent, require_terminal
     from jointctl.tools.session.control import in_control
@@ -45,10 +48,16 @@ def run(
 
     if not (assume_yes or dry_run):
         require_terminal()
-    plan = resolve(config, allow_low_margin=allow_low_margin)
+    plan = resolve(config, allow_low_margin=allow_low_margin, hold=live.hold)
     consent = TerminalConsent(output, assume_yes=assume_yes, dry_run=dry_run)
-    with _displays(config, output, run_title(config), scope) as display, in_control(config, output) as control:
-        session = Session(plan, consent, output, control, display)
+    with (
+        _displays(config, output, run_title(config), scope) as display,
+        remote(live, config, output) as others,
+        in_control(config, output) as control,
+    ):
+        session = Session(
+            plan, others.consent(consent, output), output, control, others.beside(display), others.set_points
+        )
         try:
             result = session.run()
         except KeyboardInterrupt:

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from jointctl.drivers.errors import DECLINED, INTERRUPTED, MotionFault
+from jointctl.drivers.errors import DECLINED, INTERRUPTED, MotionFault, UsageError
 from jointctl.tools.output import Output
+from jointctl.tools.scoping.remote_options import NOBODY, ObserveOptions
 from jointctl.tools.sweeping.options import AS_IT_FITS, SweepOptions, check_files
 from jointctl.tools.verbs.verb_options import JointOnBus, VerbOutput
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from jointctl.drivers.drive import CommissioningReport
     from jointctl.firmware_py.states import Fault
     from jointctl.tools.configuration.config import Config
+    from jointctl.tools.scoping.remote import Remote
     from jointctl.tools.session.control import Control
     from jointctl.tools.session.display import Display
     from jointctl.tools.session.fault_words import FaultText
@@ -63,7 +65,9 @@ class SweepResult:
 class Sweep:
     """One `sweep` command: plan, ask, measure, report."""
 
-    def __init__(self, config: Config, output: Output, out: Path, options: SweepOptions) -> None:
+    def __init__(
+        self, config: Config, output: Output, out: Path, options: SweepOptions, others: Remote | None = None
+    ) -> None:
         from jointctl.tools.session.consent import TerminalConsent
         from jointctl.tools.sweeping.carry_out import config_of_sweep
         from jointctl.tools.sweeping.checks import refuse_constants
@@ -74,6 +78,7 @@ class Sweep:
         self.output = output
         self.out = out
         self.options = options
+        self._others = others
         self.control: Control | None = None  # of the joint; in lockstep there is none
         self.plan = make_plan(config, options)
         self.file: SweepFile | None = None
@@ -167,7 +172,8 @@ class Sweep:
 
         assert self.control is not None
         plan = sweep_run(swept, allow_low_margin=options.allow_low_margin)
-        session = Session(plan, self._consent, self.output, self.control, display)
+        beside = display if self._others is None else self._others.beside(display)
+        session = Session(plan, self._consent, self.output, self.control, beside)
         try:
             result = session.run()
         finally:
@@ -278,16 +284,20 @@ def sweep(
         Path, typer.Option("-o", "--out", help="CSV file to write; its sidecar is the same name with .json")
     ],
     options: SweepOptions = AS_IT_FITS,
+    live: ObserveOptions = NOBODY,
 ) -> int:
     """Measure friction: plateaus of constant speed in both directions, into a CSV file for `identify`."""
+    from jointctl.tools.scoping.remote import remote
     from jointctl.tools.session import result as drive_end
     from jointctl.tools.session.consent import require_terminal
     from jointctl.tools.session.control import in_control
 
+    if options.lockstep and live != NOBODY:
+        raise UsageError("--lockstep is simulated time: nothing of it can be watched with --foxglove or --ros2")
     if not (options.assume_yes or options.dry_run or options.lockstep):
         require_terminal()
-    command = Sweep(config, output, out, options)
     with contextlib.ExitStack() as stack:
+        command = Sweep(config, output, out, options, stack.enter_context(remote(live, config, output)))
         try:
             if not options.lockstep:
                 command.control = stack.enter_context(in_control(command.config, output))

@@ -1,0 +1,254 @@
+"""The ROS 2 node: `python -m jointctl.tools.scoping.ros2_server`, started by --ros2; see `rmw_zenoh`.
+
+Publishes joint_states and /diagnostics, serves ~/stop, and with --allow-remote ~/enable and the set-points of
+~/command.  Anyone whom zenoh lets in can send these: the supervisor judges what comes; what is no message is refused
+here.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from jointctl.drivers.printable import printable
+from jointctl.firmware_py.states import fault_name
+from jointctl.tools.recording.ros_messages import JOINT_STATE_TOPIC, SECOND_NS
+from jointctl.tools.recording.run_log import ERROR, WARNING, Event
+from jointctl.tools.scoping.live_view import LiveView, WayBack, serve_order
+from jointctl.tools.scoping.remote import RemoteOrder
+from jointctl.tools.scoping.rmw_zenoh import (
+    ADMIN_SPACE,
+    DIAGNOSTICS,
+    JOINT_STATE,
+    PUBLISHER,
+    SERVICE,
+    SET_POINT,
+    SUBSCRIPTION,
+    TRIGGER,
+    Endpoint,
+    Node,
+    attachment,
+    gid_of,
+    node_of,
+    read_attachment,
+    type_store,
+)
+from jointctl.tools.session.events import fault_words, phase_name
+from jointctl.tools.session.session_drive import drive_state_name, session_drive
+from jointctl.tools.session.set_points import RemoteSetPoint
+
+ROUTER_AT = "tcp/localhost:7447"  # where every ROS 2 node looks for its router
+DIAGNOSTICS_S = 1.0
+MOST_NODES = 4096  # that are remembered by name
+_OK, _WARN, _ERROR = 0, 1, 2  # levels of diagnostic_msgs/msg/DiagnosticStatus
+NOT_WAITING = "nothing waits for it: it enables once, after the approval at the terminal"
+
+
+def session_config(listen: str) -> zenoh.Config:
+    """A peer as rmw_zenoh's nodes are: it looks for the router of this computer, and for no one by multicast."""
+    config = zenoh.Config()
+    for key, value in {
+        "mode": "peer",
+        "listen/endpoints": [listen],
+        "connect/endpoints": [ROUTER_AT],
+        "connect/exit_on_failure": False,
+        "connect/timeout_ms": -1,  # in the background, again and again
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": True,
+        "transport/shared_memory/enabled": False,
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+class Ros2View:
+    """See `Publisher`; and what other nodes may do."""
+
+    def __init__(self, order: RemoteOrder) -> None:
+        self._order = order
+        self._types = type_store()
+        self.view = LiveView(self)
+        self.way = WayBack(order, self.view, self._refused)
+        self._session = zenoh.open(session_config(order.place))
+        self._node = Node(order.domain, str(self._session.info.zid()), order.joint)
+        self._kept: list[object] = []  # what zenoh takes back when it is dropped
+        self._count, self._told_s = 0, 0.0
+        self._drive = session_drive(order.drive)
+        self._problem: tuple[int, str] = (_OK, "")  # the newest warning or error of the run
+        self._refusal = ""
+        self._names: dict[bytes, str] = {}
+        self._lock = threading.Lock()
+        self._keep(self._session.liveliness().declare_token(self._node.token))
+        self._put_states = self._publisher(JOINT_STATE_TOPIC.name, JOINT_STATE)
+        self._put_diagnostics = self._publisher("/diagnostics", DIAGNOSTICS)
+        if not order.only_states:
+            self._serve("stop", self._stop)
+        if order.allow_remote:
+            self._serve("enable", self._enable)
+            self._follow()
+
+    # --- endpoints ---
+
+    def _keep(self, declared: object) -> None:
+        self._kept.append(declared)
+
+    def _endpoint(self, kind: str, name: str, ros_type: str) -> Endpoint:
+        self._count += 1
+        found = self._node.endpoint(self._count, kind, name, (ros_type, self._types.hash_rihs01(ros_type)))
+        self._keep(self._session.liveliness().declare_token(found.token))
+        return found
+
+    def _publisher(self, name: str, ros_type: str) -> Callable[[bytes], None]:
+        endpoint = self._endpoint(PUBLISHER, name, ros_type)
+        publisher = self._session.declare_publisher(endpoint.key, congestion_control=zenoh.CongestionControl.DROP)
+        self._keep(publisher)
+        sent = 0
+
+        def put(body: bytes) -> None:
+            nonlocal sent
+            sent += 1
+            publisher.put(body, attachment=attachment(sent, endpoint.gid))
+
+        return put
+
+    def _serve(self, name: str, answer: Callable[[str], tuple[bool, str]]) -> None:
+        endpoint = self._endpoint(SERVICE, f"/{self._order.joint}/{name}", TRIGGER)
+        response = self._types.types[f"{TRIGGER}_Response"]
+
+        def call(query: zenoh.Query) -> None:
+            found = read_attachment(query.attachment.to_bytes()) if query.attachment is not None else None
+            success, message = answer(self._name_of(found))
+            body = self._types.serialize_cdr(response(success=success, message=message), f"{TRIGGER}_Response")
+            given = attachment(*found) if found is not None else None
+            query.reply(endpoint.key, bytes(body), attachment=given)
+            query.drop()  # type: ignore[no-untyped-call]  # the caller waits until then
+
+        self._keep(self._session.declare_queryable(endpoint.key, call, complete=True))
+
+    def _follow(self) -> None:
+        """Set-points, and who there is to send them."""
+        endpoint = self._endpoint(SUBSCRIPTION, f"/{self._order.joint}/command", SET_POINT)
+        self._keep(self._session.declare_subscriber(endpoint.key, self._on_command))
+        tokens = f"{ADMIN_SPACE}/{self._order.domain}/**"
+        self._keep(self._session.liveliness().declare_subscriber(tokens, self._on_token, history=True))
+
+    # --- what other nodes ask for ---
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        token = str(sample.key_expr)
+        if sample.kind == zenoh.SampleKind.PUT and (name := printable(node_of(token))):
+            with self._lock:
+                if len(self._names) < MOST_NODES:
+                    self._names.setdefault(gid_of(token), f"ROS 2 node {name[:80]}")
+
+    def _name_of(self, found: tuple[int, bytes] | None) -> str:
+        """The same from the first message on, whatever is announced later."""
+        if found is None:
+            return "a program without a ROS 2 name"
+        gid = found[1]
+        with self._lock:
+            name = self._names.get(gid, f"ROS 2 endpoint {gid.hex()[:8]}")
+            if len(self._names) < MOST_NODES:
+                self._names[gid] = name
+        return name
+
+    def _on_command(self, sample: zenoh.Sample) -> None:
+        found = read_attachment(sample.attachment.to_bytes()) if sample.attachment is not None else None
+        who = self._name_of(found)
+        try:
+            point: Any = self._types.deserialize_cdr(sample.payload.to_bytes(), SET_POINT)
+            self.way.set_point(set_point_of(who, point))
+        except Exception as error:  # whatever comes, the node goes on
+            self._refused(who, f"not understood: {printable(str(error))[:200] or type(error).__name__}")
+
+    def _refused(self, who: str, words: str) -> None:
+        self._refusal = f"set-point of {who} refused: {words}"
+
+    def _stop(self, who: str) -> tuple[bool, str]:
+        return self.way.stop(who)
+
+    def _enable(self, who: str) -> tuple[bool, str]:
+        if self.view.settings.get("stage") != "approved":
+            return False, NOT_WAITING
+        self.view.settings["stage"] = "enable asked for"  # once
+        taken = self.way.ask("enable", who, {"number": self.view.settings.get("number")})
+        return taken, "enabling" if taken else "not taken: jointctl does not listen"
+
+    # --- Publisher ---
+
+    def states(self, record: Any, body: bytes, wall_ns: int) -> None:
+        """See `Publisher`."""
+        self._put_states(body)
+        now_s = time.monotonic()
+        if now_s - self._told_s >= DIAGNOSTICS_S:
+            self._told_s = now_s
+            self._put_diagnostics(self._diagnostics(record, wall_ns))
+
+    def event(self, event: Event, body: bytes, wall_ns: int) -> None:
+        """See `Publisher`: the newest warning or error is in the diagnostics."""
+        if event.level >= WARNING:
+            self._problem = (_ERROR if event.level >= ERROR else _WARN, f"{event.source}: {event.text}")
+
+    def settings(self, settings: Mapping[str, Any]) -> None:
+        """See `Publisher`: they are in the diagnostics."""
+
+    def _diagnostics(self, record: Any, wall_ns: int) -> bytes:
+        types, order, settings = self._types.types, self._order, self.view.settings
+        pair, status = types["diagnostic_msgs/msg/KeyValue"], types["diagnostic_msgs/msg/DiagnosticStatus"]
+        fault, (level, problem) = int(record["fault"]), self._problem
+        values: dict[str, object] = {
+            "position_rad": f"{record['position_rad']:.6g}",
+            "torque_Nm": f"{record['measured_torque_Nm']:.6g}",
+        }
+        message = problem or "ok"
+        if not order.only_states:
+            drive = drive_state_name(self._drive, int(record["status_word"]), int(record["drive_state"]))
+            phase = phase_name(int(record["phase"]))
+            values |= {"phase": phase, "drive": drive, "fault": fault_name(fault) if fault else "none"}
+            values |= {"motion": settings.get("motion"), "temperature_degC": settings.get("temperature_degC")}
+            values |= {"newest event": problem, "newest refusal": self._refusal, "skipped": int(record["skipped"])}
+            level = _ERROR if fault else level
+            message = f"{phase}: {fault_words(fault)}" if fault else phase
+        shown = [pair(key=key, value=str(value)) for key, value in values.items() if value not in (None, "")]
+        sec, nanosec = divmod(wall_ns, SECOND_NS)
+        found = types[DIAGNOSTICS](
+            header=types["std_msgs/msg/Header"](
+                stamp=types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec), frame_id=""
+            ),
+            status=[status(level=level, name=f"{order.joint}: joint", message=message, hardware_id="", values=shown)],
+        )
+        return bytes(self._types.serialize_cdr(found, DIAGNOSTICS))
+
+
+def set_point_of(who: str, point: Any) -> RemoteSetPoint:
+    """Of a JointTrajectoryPoint of one joint; a time of zero is none.  `ValueError` tells what is wrong."""
+    given: dict[str, float | None] = {}
+    for name, least in (("positions", 1), ("velocities", 0), ("accelerations", 0), ("effort", 0)):
+        values = np.asarray(getattr(point, name), float)
+        if not least <= len(values) <= 1:
+            raise ValueError(f"{name} has {len(values)} values, must have {'1' if least else '0 or 1'}: one joint")
+        given[name] = float(values[0]) if len(values) else None
+    time_s = point.time_from_start.sec + point.time_from_start.nanosec * 1e-9
+    assert given["positions"] is not None
+    return RemoteSetPoint(
+        who, given["positions"], given["velocities"], given["accelerations"], given["effort"] or 0.0, time_s or None
+    )
+
+
+def serve(order: RemoteOrder) -> None:
+    """Until the run ends."""
+    zenoh.init_log_from_env_or("off")
+    way = Ros2View(order).way
+    way.ready()
+    way.run()
+
+
+if __name__ == "__main__":
+    sys.exit(serve_order(serve))

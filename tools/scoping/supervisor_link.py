@@ -1,0 +1,137 @@
+"""The server's end of the way to the supervisor: what it sends, and what viewers ask for.
+
+Each server has a process of its own (the page, Foxglove, ROS 2); what it is to serve comes as JSON on its standard
+input.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from typing import Any, Protocol
+
+from jointctl.tools.recording.run_log import Event
+from jointctl.tools.scoping.feed import EVENT, RECORDS, SETTINGS
+from jointctl.tools.session.display import ViewerRequest
+from jointctl.tools.session.set_points import RemoteSetPoint
+
+LONGEST_BYTES = 1 << 20  # of a message
+NICE = 5  # a viewer comes after the supervisor, but STOP has to arrive on a busy computer
+_AFTER_END_S = 1.5  # for the pages to show the end of the run
+SET_POINTS_HZ = 1000.0  # of one server, at most
+BURST = 100  # that may come at once
+
+
+class Watcher(Protocol):
+    """What becomes of the messages; called in the thread of the feed."""
+
+    settings: dict[str, Any]
+    ended: bool
+    heard_s: float  # when the last message came, time.monotonic
+
+    def take_bytes(self, body: bytes) -> None:
+        """Log records, as they stand in the log."""
+
+    def take_event(self, event: Event) -> None:
+        """One more event."""
+
+    def take_settings(self, found: Mapping[str, Any]) -> None:
+        """What else there is to know: stage, gains, motion."""
+
+    def begin(self) -> None:
+        """A new run."""
+
+
+class Feed(threading.Thread):
+    """Receives what the supervisor sends, until it closes the socket; then ends the server."""
+
+    def __init__(self, end: socket.socket, watcher: Watcher) -> None:
+        super().__init__(name="feed", daemon=True)
+        self._end = end
+        self._watcher = watcher
+        self._stops = 0  # since the stage has changed
+
+    def run(self) -> None:
+        """See `Thread`."""
+        while True:
+            try:
+                message = self._end.recv(LONGEST_BYTES)
+            except OSError:
+                message = b""
+            if not message:
+                break
+            if message[:1] == RECORDS:
+                self._watcher.take_bytes(message[1:])
+            elif message[:1] == EVENT:
+                self._watcher.take_event(Event(**json.loads(message[1:])))
+            elif message[:1] == SETTINGS:
+                found = json.loads(message[1:])
+                if found.get("stage") == "running" != self._watcher.settings.get("stage"):
+                    self._watcher.begin()
+                if found.get("stage", self._watcher.settings.get("stage")) != self._watcher.settings.get("stage"):
+                    self._stops = 0
+                self._watcher.take_settings(found)
+            self._watcher.heard_s = time.monotonic()
+        self._watcher.ended = True
+        time.sleep(_AFTER_END_S)
+        os._exit(0)  # the server itself would wait for every open page
+
+    def stop(self, who: str) -> int:
+        """A press of STOP: 1 brake, 2 quick stop if it was pressed before, 0 if the supervisor does not take it."""
+        strength = 2 if self._stops else 1
+        if not self.ask(ViewerRequest("stop", who, {"strength": strength})):
+            return 0
+        self._stops += 1
+        return strength
+
+    def ask(self, request: ViewerRequest) -> bool:
+        """Pass on what a viewer asks for, without waiting; False if it is not taken."""
+        try:
+            self._end.send(request.encoded(), socket.MSG_DONTWAIT)
+        except OSError:
+            return False
+        return True
+
+
+class SetPointLink:
+    """Set-points to the supervisor; what it refuses comes back to `refused(who, words)`, in a thread.
+
+    No more than SET_POINTS_HZ a second are passed on: a client that floods reaches neither supervisor nor loop.
+    """
+
+    def __init__(
+        self, end: socket.socket, refused: Callable[[str, str], None], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._end, self._refused, self._clock = end, refused, clock
+        self._left, self._counted_s = float(BURST), clock()
+        self._lock = threading.Lock()
+        threading.Thread(target=self._listen, name="refusals", daemon=True).start()
+
+    def _listen(self) -> None:
+        with contextlib.suppress(OSError):
+            while message := self._end.recv(LONGEST_BYTES):
+                who, words = json.loads(message)
+                self._refused(who, words)
+
+    def send(self, point: RemoteSetPoint) -> None:
+        """Pass it on, or refuse it here."""
+        with self._lock:
+            now_s = self._clock()
+            self._left = min(BURST, self._left + (now_s - self._counted_s) * SET_POINTS_HZ)
+            self._counted_s = now_s
+            if full := self._left < 1.0:
+                words = f"more than {SET_POINTS_HZ:g} set-points a second"
+            else:
+                self._left -= 1.0
+                try:
+                    self._end.send(json.dumps(asdict(point)).encode(), socket.MSG_DONTWAIT)
+                except OSError:
+                    full, words = True, "not taken: jointctl does not listen, or cannot keep up"
+        if full:
+            self._refused(point.who, words)

@@ -1,0 +1,360 @@
+"""Set-points of a program on their way into the ring of the loop: checked as the loop does, refused in words.
+
+`SetPointStream` is one source.  `SetPointSources` holds the sources of a run apart that have processes of their own:
+the first whose set-point is accepted has the joint until the run ends, every other one is refused by its name.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+from jointctl.drivers.errors import ConfigurationError, JointctlError
+from jointctl.firmware_py.cycle import Word
+from jointctl.firmware_py.records import MotionChange, SetPoint
+from jointctl.firmware_py.safety import set_point_problem
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, SetPointProblem, TrajectoryKind, in_words
+from jointctl.firmware_py.stream import CLOSE_SHARE
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.recording.run_log import INFO, WARNING
+from jointctl.tools.session.plan import Placed, expect_client
+
+TELL_S = 1.0  # how often refusals are reported, at most
+MOST_SOURCES = 16  # whose refusals are told apart in one report
+
+
+class SetPointError(JointctlError):
+    """A set-point was refused: the joint does not follow it."""
+
+    exit_code = 7
+
+
+class StreamedLoop(Protocol):
+    """What a source needs of the loop, in real time or at simulated time."""
+
+    @property
+    def constants(self) -> Any:
+        """Record array of one AxisConstants, that of the loop."""
+        ...
+
+    @property
+    def axis(self) -> Any:
+        """Record array of one AxisState, that of the loop."""
+        ...
+
+    def now_ns(self) -> int:
+        """The loop's clock."""
+        ...
+
+    def require(self) -> None:
+        """`JointctlError` if the joint follows nothing, with the cause."""
+
+
+def finite(name: str, value: float) -> float:
+    """`ConfigurationError` for what is no finite number."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise ConfigurationError(f"{name} (={str(value)[:40]}) must be a number") from None
+    if not math.isfinite(number):
+        raise ConfigurationError(f"{name} (={number:g}) must be finite")
+    return number
+
+
+_Point = tuple[int, float, float, float]  # time [ns], position, velocity, torque
+
+
+class SetPointStream:
+    """Writes set-points into the loop's ring, after the checks that the loop makes as well."""
+
+    _TIME_GAIN, _CALLS = 0.05, 65  # of the clock recovered from calls without a time
+
+    def __init__(self, loop: StreamedLoop) -> None:
+        axis, state = loop.constants[0], loop.axis[0]
+        self._loop, self._limits, self._constants = loop, axis.limits, axis.stream
+        self._brake_radps2 = float(axis.sequence.brake_radps2)
+        self._by_velocity = int(axis.command_kind) != 0
+        stream = loop.constants["stream"]
+        self._times, self._values = stream["time_ns"][0], stream["values"][0]
+        self._written, self._alive_ns = stream["written"][0], stream["alive_ns"][0]
+        self._delay_ns, self._timeout_ns = int(axis.stream.delay_ns), int(axis.stream.timeout_ns)
+        self._close_ns = self._delay_ns // CLOSE_SHARE
+        self._state, self._reference = state.stream, state.reference
+        self._before, self._point = new(SetPoint), new(SetPoint)
+        self._accepted: deque[_Point] = deque()
+        self._calls_ns: deque[int] = deque(maxlen=self._CALLS)
+        self._offset_ns: int | None = None  # of the program's own clock
+        self._refused = int(self._state.refused)
+        self.alive()
+
+    def alive(self) -> None:
+        """The program's sign of life."""
+        self._alive_ns[0] = self._loop.now_ns()
+
+    def take(
+        self, position_rad: float, velocity_radps: float | None, acceleration_radps2: float | None, torque_Nm: float,
+        time_s: float | None,
+    ) -> None:  # fmt: skip
+        """One set-point; `SetPointError` if it is refused."""
+        self._loop.require()
+        self._check_loop()
+        try:
+            position_rad, torque_Nm = float(position_rad), float(torque_Nm)
+            velocity = None if velocity_radps is None else float(velocity_radps)
+            acceleration = math.nan if acceleration_radps2 is None else float(acceleration_radps2)
+        except (TypeError, ValueError):
+            raise SetPointError("a set-point must be made of numbers") from None
+        if acceleration_radps2 is not None and not math.isfinite(acceleration):
+            raise SetPointError(f"acceleration_radps2 (={acceleration:g}) must be finite")
+        if torque_Nm and self._by_velocity:
+            raise SetPointError(f"torque_Nm (={torque_Nm:g}) must be 0: the drive closes the velocity loop by itself")
+        now_ns, accepted = self._loop.now_ns(), self._accepted
+        if accepted and accepted[-1][0] <= now_ns - self._delay_ns:  # the loop has come to the end of them
+            accepted.clear()
+        time_ns = self._time_of(time_s, now_ns, accepted[-1][0] if accepted else None)
+        if accepted and time_ns <= accepted[-1][0]:
+            self._refuse(SetPointProblem.TIME, (time_ns, position_rad, velocity or 0.0, torque_Nm), accepted[-1])
+        if velocity is None:
+            velocity = (position_rad - accepted[-1][1]) / ((time_ns - accepted[-1][0]) * 1e-9) if accepted else 0.0
+        if not accepted:
+            reference = self._reference
+            rest_ns = now_ns - self._delay_ns
+            start = float(reference.position_rad), float(reference.velocity_radps), float(self._state.torque_Nm)
+            accepted.append((rest_ns, *start))
+        before = accepted[0]
+        for point in accepted:
+            if time_ns - point[0] < self._close_ns:
+                break
+            before = point
+        found = (time_ns, position_rad, velocity, torque_Nm)
+        self._before[0], self._point[0] = (*before[:3], math.nan, before[3]), (*found[:3], acceleration, torque_Nm)
+        problem = int(
+            set_point_problem(self._limits, self._constants, self._brake_radps2, self._before[0], self._point[0])
+        )
+        if problem:
+            self._refuse(problem, found, before)
+        self._put(time_ns, (position_rad, velocity, acceleration, torque_Nm))
+        while len(accepted) > 1 and time_ns - accepted[1][0] >= self._close_ns:
+            accepted.popleft()
+        accepted.append(found)
+        self._alive_ns[0] = now_ns
+
+    def _refuse(self, problem: int, point: _Point, before: _Point) -> None:
+        if len(self._accepted) == 1:
+            self._accepted.clear()  # that was only where the reference rests
+        raise SetPointError(*self._words(SetPointProblem(problem), point, before))
+
+    def _put(self, time_ns: int, values: tuple[float, ...]) -> None:
+        number, slots = int(self._written[0]), len(self._times)
+        if number - int(self._state.taken) >= slots:
+            raise SetPointError(f"{slots} set-points wait for the loop already", "send them as the joint moves on")
+        slot = number % slots
+        self._times[slot], self._values[slot] = time_ns, values
+        self._written[0] = number + 1  # last
+
+    def _check_loop(self) -> None:
+        refused = int(self._state.refused)
+        if refused != self._refused:
+            count, self._refused = refused - self._refused, refused
+            self._accepted.clear()
+            raise SetPointError(
+                f"{count} set-points were not followed: they came after their time, or during another motion",
+                "begin again from where the joint is to rest",
+            )
+
+    def _time_of(self, time_s: float | None, now_ns: int, last_ns: int | None) -> int:
+        """Time of the set-point [ns]; calls without a time are taken as even, at the rate of the last ones."""
+        if time_s is not None:
+            given_ns = round(finite("time_s", time_s) * 1e9)
+            if self._offset_ns is None or last_ns is None:
+                self._offset_ns = now_ns - given_ns
+            return given_ns + self._offset_ns
+        self._offset_ns = None
+        calls = self._calls_ns
+        if last_ns is None or now_ns - calls[-1] > self._delay_ns:  # a beginning, or after a pause
+            calls.clear()
+        calls.append(now_ns)
+        if last_ns is None or len(calls) == 1:
+            return max(now_ns, (last_ns or 0) + 1)
+        interval_ns = (now_ns - calls[0]) / (len(calls) - 1)
+        off_ns = now_ns - (last_ns + interval_ns)
+        return last_ns + max(round(interval_ns + self._TIME_GAIN * off_ns), round(0.5 * interval_ns), 1)
+
+    def _words(self, problem: SetPointProblem, point: _Point, before: _Point) -> tuple[str, str]:
+        """Message and hint: the value and what is allowed, and the key that it comes from."""
+        limits, stream = self._limits, self._constants
+        low, high, top = (float(limits[key]) for key in ("position_min_rad", "position_max_rad", "velocity_max_radps"))
+        at, speed, torque = (
+            f"position_rad (={point[1]:g})",
+            f"velocity_radps (={point[2]:g})",
+            f"torque_Nm (={point[3]:g})",
+        )
+        way, more = f"{point[1] - before[1]:+g} rad", f"{point[3] - before[3]:+g} Nm"
+        later_s, longest_s = (point[0] - before[0]) * 1e-9, (self._timeout_ns + self._delay_ns) * 1e-9
+        jump, steepest = float(stream.jump_max_rad), float(stream.acceleration_max_radps2)
+        most, rate = float(stream.torque_max_Nm), float(stream.torque_rate_max_Nmps)
+        start = f"{before[1]:g} rad at {before[2]:g} rad/s"
+        texts = {
+            SetPointProblem.TIME: (
+                f"time_s is {later_s:g} s after the set-point before, must be in (0..{longest_s:g}]",
+                "stream.timeout_s and stream.delay_s",
+            ),
+            SetPointProblem.POSITION: (f"{at} must be in [{low:g}..{high:g}]", "limits.position_*"),
+            SetPointProblem.VELOCITY: (
+                f"{speed}, or that on the way there, must be in [{-top:g}..{top:g}]", "limits.velocity_max_radps"
+            ),
+            SetPointProblem.JUMP: (
+                f"{at} is {way} from the set-point before, must be within {jump:g} rad", "stream.jump_max_rad"
+            ),
+            SetPointProblem.ACCELERATION: (
+                f"the way from {start} to {at} with {speed} in {later_s:g} s takes more than {steepest:g} rad/s2",
+                "stream.acceleration_max_radps2",
+            ),
+            SetPointProblem.TORQUE: (f"{torque} must be in [{-most:g}..{most:g}]", "stream.torque_max_Nm"),
+            SetPointProblem.TORQUE_RATE: (
+                f"{torque} is {more} from the one before, must change by {rate:g} Nm/s at most",
+                "stream.torque_rate_max_Nmps",
+            ),
+            SetPointProblem.STOPPING_WAY: (
+                f"braked from {at} with {speed}, the joint would leave [{low:g}..{high:g}]",
+                "limits.position_*, sequence.brake_radps2",
+            ),
+        }  # fmt: skip
+        return texts[problem]
+
+
+# --- Sources in processes of their own ---
+
+
+@dataclass(frozen=True)
+class RemoteSetPoint:
+    """As the arguments of `Joint.command`, and who sends it."""
+
+    who: str
+    position_rad: float
+    velocity_radps: float | None = None
+    acceleration_radps2: float | None = None
+    torque_Nm: float = 0.0
+    time_s: float | None = None
+
+
+class SetPointSources:
+    """Which source has the joint; called from the thread of each source and from the supervisor.
+
+    `owner`: the program that has it from the beginning.  Without one, the supervisor gives the sign of life that the
+    loop expects, until a source has it: from then on that source's accepted set-points are the only one.
+    """
+
+    def __init__(self, owner: str = "") -> None:
+        self.owner = owner
+        self._program = owner
+        self._block: Any = None
+        self._stream: SetPointStream | None = None
+        self._lock = threading.Lock()
+        self._news: list[tuple[int, str]] = []
+        self._refused: dict[str, tuple[int, str]] = {}  # how often since the last report, and why the last time
+        self._told_s = -TELL_S
+
+    def announced(self, placed: Placed, config: Config) -> Placed:
+        """The motion that is about to begin, with what these sources may do; the loop watches them."""
+        if self._program:
+            return placed
+        expect_client(placed.constants, config)
+        # compiled or loaded now: nothing is to be while the supervisor watches
+        axis, point = placed.constants[0], new(SetPoint)
+        set_point_problem(axis.limits, axis.stream, float(axis.sequence.brake_radps2), point[0], point[0])
+        line = (
+            "remote     set-points from Foxglove or ROS 2 where the joint holds its place, by anyone who reaches them; "
+            f"a source may be silent for {config.stream.client_timeout_s:g} s"
+        )
+        return replace(placed, lines=(*placed.lines, line))
+
+    # what SetPointStream asks for
+
+    @property
+    def constants(self) -> Any:
+        """See `StreamedLoop`."""
+        return self._block.constants
+
+    @property
+    def axis(self) -> Any:
+        """See `StreamedLoop`."""
+        return self._block.state
+
+    def now_ns(self) -> int:
+        """See `StreamedLoop`."""
+        return time.monotonic_ns()
+
+    def require(self) -> None:
+        """See `StreamedLoop`: it tracks, and nothing but set-points or standing still."""
+        phase, change = AxisPhase(int(self.axis[0].phase)), int(self.axis[0].change.motion)
+        if phase is not AxisPhase.TRACKING:
+            raise SetPointError(f"the joint follows no set-points now ({in_words(phase)})")
+        kind = TrajectoryKind(int(self.constants[0].trajectory.kind))
+        if kind not in (TrajectoryKind.STREAM, TrajectoryKind.HOLD) or change != MotionChange.NONE:
+            raise SetPointError(
+                f"a motion is under way ({in_words(kind)}): set-points are followed where the joint holds its place"
+            )
+
+    # the supervisor's side
+
+    def begin(self, block: Any) -> None:
+        """The loop is let go, with this memory."""
+        with self._lock:
+            self._block, self._stream = block, None
+            self.owner = self._program
+
+    def end(self) -> None:
+        """The run is over."""
+        with self._lock:
+            self._block = self._stream = None
+
+    def poll(self) -> list[tuple[int, str]]:
+        """The sign of life while no source has the joint; events (level, text) since the last call."""
+        with self._lock:
+            if self._block is not None and not self.owner:
+                self._block.constants["stream"]["alive_ns"][0][0] = time.monotonic_ns()
+            now_s = time.monotonic()
+            if self._refused and now_s - self._told_s >= TELL_S:
+                for who, (count, words) in self._refused.items():
+                    times = f" ({count} times)" if count > 1 else ""
+                    self._news.append((WARNING, f"set-point of {who} refused{times}: {words}"))
+                self._refused, self._told_s = {}, now_s
+            news, self._news = self._news, []
+        return news
+
+    # a source's side
+
+    def take(self, point: RemoteSetPoint) -> str:
+        """Hand it to the loop; "" or why it is refused."""
+        with self._lock:
+            try:
+                self._hand_over(point)
+                return ""
+            except JointctlError as error:
+                return self._refusal(point.who, f"{error.message} ({error.hint})" if error.hint else error.message)
+
+    def _hand_over(self, point: RemoteSetPoint) -> None:
+        if self.owner and self.owner != point.who:
+            raise SetPointError(f"the set-points of this run come from {self.owner}, not from {point.who}")
+        if self._block is None or not int(self._block.words[Word.GO]):
+            raise SetPointError("the joint is not enabled")
+        self._stream = self._stream or SetPointStream(self)
+        self._stream.take(
+            point.position_rad, point.velocity_radps, point.acceleration_radps2, point.torque_Nm, point.time_s
+        )
+        if not self.owner:
+            self.owner = point.who
+            self._news.append((INFO, f"set-points come from {point.who}"))
+
+    def _refusal(self, who: str, words: str) -> str:
+        """Reported as an event too, at most every TELL_S of each source."""
+        count = self._refused.pop(who, (0, ""))[0]
+        if len(self._refused) < MOST_SOURCES:
+            self._refused[who] = count + 1, words
+        return words
