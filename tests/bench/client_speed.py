@@ -1,17 +1,28 @@
-"""What a program that streams set-points costs the loop: wake-up and work with it and without, in turn.
+"""What others cost the loop that have to do with a run: wake-up and work with them and without, in turn.
 
-    python -m tests.bench.client_speed [--pairs 20] [--seconds 5] [--rate 500] [--json]
+    python -m tests.bench.client_speed [--with set-points] [--pairs 20] [--seconds 5] [--rate 500] [--json]
 
-One run of the virtual joint; windows with set-points from Python and windows in which the program only waits alternate,
-and which of the two comes first.  From the run's log: p99 of the wake-up and of the work in each window, the ratio of
-each pair, and the median of the ratios with its quartiles.
+One run of the virtual joint; windows with them and windows in which the program only waits alternate, and which of the
+two comes first.  `set-points`: the program sends them.  `foxglove`, `ros2`: the server serves a client that gets every
+topic, on the same cores; in the other windows both processes are held.
+
+From the run's log: p99 of the wake-up and of the work in each window, the ratio of each pair, and the median of the
+ratios with its quartiles.
 """
 
 from __future__ import annotations
 
 import math
+import os
+import signal
+import subprocess
+import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Annotated, Any
+from unittest.mock import patch
 
 import numpy as np
 import typer
@@ -19,26 +30,66 @@ import typer
 import jointctl
 from jointctl.tools.output import Output
 from tests.bench.paired import Row, conditions, outcome_data, outcome_table
+from tests.foxglove_client import free_port
 
 GROUP = "client"
+SET_POINTS, FOXGLOVE, ROS2 = "set-points", "foxglove", "ros2"
 GOAL = 1.1
 AMPLITUDE_rad, FREQUENCY_Hz = 0.05, 0.5
 STREAM_DELAY_S, STREAM_TIMEOUT_S = 0.2, 0.5  # a shared computer may stand still for so long
 
 
-def _windows(joint: jointctl.Joint, pairs: int, seconds: float, rate_Hz: float) -> list[tuple[bool, int, int]]:
-    """(with set-points, from, to [CLOCK_MONOTONIC ns]) of each window, two for each pair."""
+Load = Callable[[jointctl.Joint, float], None]  # for so many seconds
+
+
+def _windows(joint: jointctl.Joint, pairs: int, seconds: float, load: Load) -> list[tuple[bool, int, int]]:
+    """(with the load, from, to [CLOCK_MONOTONIC ns]) of each window, two for each pair."""
     found = []
     for pair in range(pairs):
-        for streaming in (True, False) if pair % 2 else (False, True):
+        for loaded in (True, False) if pair % 2 else (False, True):
             joint.wait(0.5)  # the reference comes to rest
             begun_ns = time.monotonic_ns()
-            if streaming:
-                _stream(joint, seconds, rate_Hz)
+            if loaded:
+                load(joint, seconds)
             else:
                 joint.wait(seconds)
-            found.append((streaming, begun_ns, time.monotonic_ns()))
+            found.append((loaded, begun_ns, time.monotonic_ns()))
     return found
+
+
+@contextmanager
+def _onlooker(kind: str, port: int) -> Iterator[Load]:
+    """A client of its own process, which runs, as the server does, only for the windows with it."""
+    command = [sys.executable, "-P", "-m", "tests.bench.onlooker", kind, str(port)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        pids = [process.pid, _child(f"{kind}_server")]
+
+        def look_on(joint: jointctl.Joint, seconds: float) -> None:
+            _signal(pids, signal.SIGCONT)
+            joint.wait(seconds)
+            _signal(pids, signal.SIGSTOP)
+
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline()  # it has seen a message
+            _signal(pids, signal.SIGSTOP)
+            yield look_on
+        finally:
+            _signal(pids, signal.SIGCONT)
+            process.kill()
+
+
+def _signal(pids: list[int], number: int) -> None:
+    for pid in pids:
+        os.kill(pid, number)
+
+
+def _child(module: str) -> int:
+    """The process of ours that runs this module."""
+    for pid in Path(f"/proc/self/task/{os.getpid()}/children").read_text().split():
+        if module in Path(f"/proc/{pid}/cmdline").read_text():
+            return int(pid)
+    raise RuntimeError(f"no process of ours runs {module}")
 
 
 def _stream(joint: jointctl.Joint, seconds: float, rate_Hz: float) -> None:
@@ -52,18 +103,34 @@ def _stream(joint: jointctl.Joint, seconds: float, rate_Hz: float) -> None:
         time.sleep(max(0.0, begun_s + sent / rate_Hz - time.monotonic()))
 
 
-def client_rows(pairs: int, seconds: float, rate_Hz: float) -> list[Row]:
+def client_rows(pairs: int, seconds: float, rate_Hz: float, beside: str = SET_POINTS) -> list[Row]:
     """A row each for wake-up and work."""
     from jointctl.tools.configuration.load import load_config, shipped_config
 
     config = load_config(shipped_config("virtual"))
-    stream = config.stream.model_copy(update={"delay_s": STREAM_DELAY_S, "timeout_s": STREAM_TIMEOUT_S})
-    with jointctl.Joint(config.model_copy(update={"stream": stream}), virtual=True) as joint:
+    # the program waits for a client that starts
+    patient = {"delay_s": STREAM_DELAY_S, "timeout_s": STREAM_TIMEOUT_S, "client_timeout_s": 60.0}
+    config = config.model_copy(update={"stream": config.stream.model_copy(update=patient)})
+    port = free_port()
+    at = f"127.0.0.1:{port}"
+    with ExitStack() as stack:
+        stack.enter_context(patch("jointctl.tools.scoping.remote.LISTEN_AT", f"tcp/{at}"))
+        joint = stack.enter_context(
+            jointctl.Joint(
+                config, virtual=True, foxglove=at if beside == FOXGLOVE else False,
+                ros2=port % 200 if beside == ROS2 else False,
+            )
+        )  # fmt: skip
         joint.enable()
-        windows = _windows(joint, pairs, seconds, rate_Hz)
+        if beside == SET_POINTS:
+            windows = _windows(joint, pairs, seconds, lambda joint, seconds: _stream(joint, seconds, rate_Hz))
+        else:
+            load = stack.enter_context(_onlooker(beside, port))
+            windows = _windows(joint, pairs, seconds, load)
     assert joint.log_path is not None
     records = jointctl.read_log(joint.log_path).records
-    return [_row(records, windows, "wake_late_ns", "wake-up"), _row(records, windows, "work_ns", "work")]
+    names = ("wake_late_ns", "wake-up"), ("work_ns", "work")
+    return [_row(records, windows, field, f"{name} with {beside}") for field, name in names]
 
 
 def _row(records: Any, windows: list[tuple[bool, int, int]], field: str, name: str) -> Row:
@@ -74,7 +141,7 @@ def _row(records: Any, windows: list[tuple[bool, int, int]], field: str, name: s
     ratios = np.array(p99[True]) / np.array(p99[False])
     low, middle, high = (float(value) for value in np.percentile(ratios, [25.0, 50.0, 75.0]))
     return Row(
-        GROUP, f"p99 of the {name} with set-points", float(np.median(p99[True])), "us", float(np.median(p99[False])),
+        GROUP, f"p99 of the {name}", float(np.median(p99[True])), "us", float(np.median(p99[False])),
         "without", middle, low, high, len(ratios), GOAL,
     )  # fmt: skip
 
@@ -83,10 +150,11 @@ def main(
     pairs: Annotated[int, typer.Option(min=1)] = 20,
     seconds: Annotated[float, typer.Option(min=2.5)] = 5.0,
     rate: Annotated[float, typer.Option(help="set-points a second", min=1.0)] = 500.0,
+    beside: Annotated[str, typer.Option("--with", help=f"{SET_POINTS}, {FOXGLOVE} or {ROS2}")] = SET_POINTS,
     json: bool = False,
 ) -> None:
     """Measure and print."""
-    rows = client_rows(pairs, seconds, rate)
+    rows = client_rows(pairs, seconds, rate, beside)
     Output(json=json).result(outcome_table(rows), outcome_data(rows, conditions()))
 
 
