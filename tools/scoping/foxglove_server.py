@@ -10,9 +10,9 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping
-from typing import Any
 
 import foxglove
+import numpy as np
 from foxglove import Channel, Schema
 from foxglove.websocket import (
     Capability,
@@ -73,7 +73,7 @@ def _channel(topic: Topic) -> Channel:
     return Channel(topic.name, schema=schema, message_encoding="cdr")
 
 
-def _json_schema(name: str, schema: Mapping[str, Any]) -> MessageSchema:
+def _json_schema(name: str, schema: Mapping[str, object]) -> MessageSchema:
     return MessageSchema(
         encoding="json", schema=Schema(name=name, encoding="jsonschema", data=json.dumps(schema).encode())
     )
@@ -114,7 +114,7 @@ class FoxgloveView(ServerListener):
 
     # --- Publisher ---
 
-    def states(self, record: Any, body: bytes, wall_ns: int) -> None:
+    def states(self, record: np.void, body: bytes, wall_ns: int) -> None:
         """See `Publisher`."""
         self._states.log(body, log_time=wall_ns)
         if self._records is not None:
@@ -124,7 +124,7 @@ class FoxgloveView(ServerListener):
         """See `Publisher`."""
         self._events.log(body, log_time=wall_ns)
 
-    def settings(self, settings: Mapping[str, Any]) -> None:
+    def settings(self) -> None:
         """See `Publisher`: gains that have changed go to the clients."""
         gains = self._gains()
         if gains != self._shown and self._server is not None:

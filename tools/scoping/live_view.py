@@ -36,14 +36,14 @@ NO_STOP = "not taken: jointctl does not listen"
 class Publisher(Protocol):
     """One kind of server; called in the thread of the feed.  Bodies are CDR, as they stand in the log."""
 
-    def states(self, record: Any, body: bytes, wall_ns: int) -> None:
+    def states(self, record: np.void, body: bytes, wall_ns: int) -> None:
         """A log record and the sensor_msgs/msg/JointState of it, a hundred times a second; its time since 1970."""
 
     def event(self, event: Event, body: bytes, wall_ns: int) -> None:
         """What has happened, and the rcl_interfaces/msg/Log of it."""
 
-    def settings(self, settings: Mapping[str, Any]) -> None:
-        """What else is known by now: stage, gains, motion."""
+    def settings(self) -> None:
+        """`LiveView.settings` have changed: stage, gains, motion."""
 
 
 class LiveView:
@@ -76,7 +76,7 @@ class LiveView:
     def take_settings(self, found: Mapping[str, Any]) -> None:
         """See `Watcher`."""
         self.settings.update(printable_values(found))
-        self._publisher.settings(self.settings)
+        self._publisher.settings()
 
     def begin(self) -> None:
         """See `Watcher`: a new run goes on where the last one was."""
@@ -103,7 +103,7 @@ class WayBack:
         strength = self._feed.stop(who)
         return strength > 0, ("", "STOP taken; again: quick stop", "STOP taken: quick stop")[strength] or NO_STOP
 
-    def ask(self, kind: str, who: str, values: Mapping[str, Any] | None = None) -> bool:
+    def ask(self, kind: str, who: str, values: Mapping[str, object] | None = None) -> bool:
         """A request; whether it was taken."""
         return self._feed.ask(ViewerRequest(kind, who, values or {}))
 

@@ -82,7 +82,7 @@ def joint_name(path: Path) -> str:
 
 
 class Remote:
-    """What is served beside a run, for whoever makes its session: displays, set-point sources, and the consent."""
+    """What is served beside a run, for the one who makes its session: displays, set-point sources, and the consent."""
 
     def __init__(
         self, feeds: Sequence[ScopeFeed], enabling: ScopeFeed | None, set_points: SetPointSources | None

@@ -11,7 +11,7 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -183,7 +183,7 @@ class Ros2View:
 
     # --- Publisher ---
 
-    def states(self, record: Any, body: bytes, wall_ns: int) -> None:
+    def states(self, record: np.void, body: bytes, wall_ns: int) -> None:
         """See `Publisher`."""
         self._put_states(body)
         now_s = time.monotonic()
@@ -196,10 +196,10 @@ class Ros2View:
         if event.level >= WARNING:
             self._problem = (_ERROR if event.level >= ERROR else _WARN, f"{event.source}: {event.text}")
 
-    def settings(self, settings: Mapping[str, Any]) -> None:
+    def settings(self) -> None:
         """See `Publisher`: they are in the diagnostics."""
 
-    def _diagnostics(self, record: Any, wall_ns: int) -> bytes:
+    def _diagnostics(self, record: np.void, wall_ns: int) -> bytes:
         types, order, settings = self._types.types, self._order, self.view.settings
         pair, status = types["diagnostic_msgs/msg/KeyValue"], types["diagnostic_msgs/msg/DiagnosticStatus"]
         fault, (level, problem) = int(record["fault"]), self._problem

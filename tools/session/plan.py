@@ -133,7 +133,7 @@ class FreeMotion:
 
 
 def expect_client(constants: Any, config: Config) -> None:
-    """The loop ends the run when whoever commands the joint has been silent for `stream.client_timeout_s`."""
+    """The loop ends the run when the program that commands the joint has been silent for `stream.client_timeout_s`."""
     constants[0].stream.client_timeout_ns = round(config.stream.client_timeout_s * 1e9)
 
 

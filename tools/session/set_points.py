@@ -22,10 +22,11 @@ from jointctl.firmware_py.states import AxisPhase, SetPointProblem, TrajectoryKi
 from jointctl.firmware_py.stream import CLOSE_SHARE
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.recording.run_log import INFO, WARNING
+from jointctl.tools.session.loop_handle import SharedBlock
 from jointctl.tools.session.plan import Placed, expect_client
 
 TELL_S = 1.0  # how often refusals are reported, at most
-MOST_SOURCES = 16  # whose refusals are told apart in one report
+MOST_SOURCES = 16  # whose refusals are counted one by one in a report
 
 
 class SetPointError(JointctlError):
@@ -253,7 +254,7 @@ class SetPointSources:
     def __init__(self, owner: str = "") -> None:
         self.owner = owner
         self._program = owner
-        self._block: Any = None
+        self._block: SharedBlock | None = None
         self._stream: SetPointStream | None = None
         self._lock = threading.Lock()
         self._news: list[tuple[int, str]] = []
@@ -279,12 +280,17 @@ class SetPointSources:
     @property
     def constants(self) -> Any:
         """See `StreamedLoop`."""
-        return self._block.constants
+        return self._running().constants
 
     @property
     def axis(self) -> Any:
         """See `StreamedLoop`."""
-        return self._block.state
+        return self._running().state
+
+    def _running(self) -> SharedBlock:
+        if self._block is None or not int(self._block.words[Word.GO]):
+            raise SetPointError("the joint is not enabled")
+        return self._block
 
     def now_ns(self) -> int:
         """See `StreamedLoop`."""
@@ -303,7 +309,7 @@ class SetPointSources:
 
     # the supervisor's side
 
-    def begin(self, block: Any) -> None:
+    def begin(self, block: SharedBlock) -> None:
         """The loop is let go, with this memory."""
         with self._lock:
             self._block, self._stream = block, None
@@ -312,7 +318,7 @@ class SetPointSources:
     def end(self) -> None:
         """The run is over."""
         with self._lock:
-            self._block = self._stream = None
+            self._block, self._stream = None, None
 
     def poll(self) -> list[tuple[int, str]]:
         """The sign of life while no source has the joint; events (level, text) since the last call."""
@@ -342,8 +348,7 @@ class SetPointSources:
     def _hand_over(self, point: RemoteSetPoint) -> None:
         if self.owner and self.owner != point.who:
             raise SetPointError(f"the set-points of this run come from {self.owner}, not from {point.who}")
-        if self._block is None or not int(self._block.words[Word.GO]):
-            raise SetPointError("the joint is not enabled")
+        self._running()
         self._stream = self._stream or SetPointStream(self)
         self._stream.take(
             point.position_rad, point.velocity_radps, point.acceleration_radps2, point.torque_Nm, point.time_s
