@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
+import time
 from collections.abc import Mapping
 
 import foxglove
@@ -38,6 +40,8 @@ from jointctl.tools.session.set_points import RemoteSetPoint
 BACKLOG = 256  # messages for a client that does not read: 1 s of all topics
 GAIN = "control."  # before the name of a gain
 REFUSED = "set-point"  # id of the status that reports one
+REFUSED_S = 0.2  # between two reports
+MOST_CLIENTS = 32  # in one report
 CLOSED = "{} can be changed only where --allow-remote was given at the bench"
 _KEYS = ("position_rad", "velocity_radps", "acceleration_radps2", "torque_Nm", "time_s")
 _TRIGGER = "std_srvs/srv/Trigger"
@@ -89,6 +93,8 @@ class FoxgloveView(ServerListener):
         self._server: WebSocketServer | None = None
         self._topics: dict[tuple[int, int], ClientChannel] = {}
         self._shown: dict[str, float] = {}  # gains, as clients have them
+        self._refusals: dict[str, str] = {}  # the newest of each client, not yet reported
+        self._told_s, self._lock = 0.0, threading.Lock()
         self._states, self._events = _channel(JOINT_STATE_TOPIC), _channel(EVENT_TOPIC)
         self._records = None if order.only_states else _channel(RECORD_TOPIC)
 
@@ -116,6 +122,7 @@ class FoxgloveView(ServerListener):
 
     def states(self, record: np.void, body: bytes, wall_ns: int) -> None:
         """See `Publisher`."""
+        self._tell_refusals()
         self._states.log(body, log_time=wall_ns)
         if self._records is not None:
             self._records.log(CDR_HEADER + record.tobytes(), log_time=wall_ns)
@@ -146,7 +153,20 @@ class FoxgloveView(ServerListener):
             self._server.publish_status(text, level, name)
 
     def _refused(self, who: str, words: str) -> None:
-        self._tell(f"set-point of {who} refused: {words}", name=REFUSED)
+        """Every client gets to know, but no client can flood the others by what it is refused."""
+        with self._lock:
+            if who in self._refusals or len(self._refusals) < MOST_CLIENTS:
+                self._refusals[who] = words
+        self._tell_refusals()
+
+    def _tell_refusals(self) -> None:
+        with self._lock:
+            now_s = time.monotonic()
+            if not self._refusals or now_s - self._told_s < REFUSED_S:
+                return
+            refusals, self._refusals, self._told_s = self._refusals, {}, now_s
+        for who, words in refusals.items():
+            self._tell(f"set-point of {who} refused: {words}", name=REFUSED)
 
     def _stop(self, request: ServiceRequest) -> bytes:
         taken, words = self.way.stop(client_name(request.client_id))
