@@ -19,6 +19,7 @@ from jointctl.drivers.canopen.drive import GATE_S, REOPEN_ATTEMPTS, REOPEN_PAUSE
 from jointctl.drivers.canopen.identifiers import NmtCommand
 from jointctl.drivers.canopen.network import LISTEN_S
 from jointctl.drivers.canopen.sdo import ATTEMPTS as SDO_ATTEMPTS
+from jointctl.drivers.drive import UNTOUCHED
 from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
 
 pytestmark = pytest.mark.usefixtures("short_timeout")
@@ -370,6 +371,39 @@ def test_what_was_verified_before_a_new_commissioning_is_forgotten(joint: Any) -
         drive.commission()
         assert (0x6087, 0) not in drive._objects.verified()
         assert (0x6072, 0) in drive._objects.verified()
+
+
+def test_a_stop_at_the_last_moment_keeps_the_drive_from_being_started(joint: Any) -> None:
+    def gate() -> None:
+        if asked:
+            raise Stop
+
+    asked: list[bool] = []
+    drive = joint.drive(joint.settings, gate=gate)
+    try:
+        drive.commission()
+        drive._others.refuse = lambda: asked.append(True)  # the last look before NMT start
+        with pytest.raises(Stop):
+            drive.start_cyclic()
+        assert (0, bytes([NmtCommand.START, 1])) not in joint.requests
+    finally:
+        drive.close()
+
+
+@pytest.mark.parametrize("started", [True, False])
+def test_who_comes_after_the_start_does_not_keep_us_from_switching_off(joint: Any, started: bool) -> None:
+    with joint.opened() as drive:
+        drive.commission()
+        if started:
+            drive.start_cyclic()
+        joint.send(0x601, b"\x2b\x40\x60\x00\x06\0\0\0")
+        assert drive.make_safe() == ("switch on disabled" if started else UNTOUCHED)
+
+
+def test_a_drive_whose_fault_was_cleared_is_made_safe(joint: Any) -> None:
+    with joint.opened() as drive:
+        drive.clear_fault()
+        assert drive.make_safe() == "switch on disabled"
 
 
 def test_our_own_frames_that_come_back_are_no_ones_elses(joint: Any) -> None:
