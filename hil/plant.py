@@ -4,15 +4,18 @@
 
 A substep is drift - kick - drift (leapfrog): torques that depend on position are taken half a substep ahead, so that a
 constant torque is integrated exactly and a spring neither gains nor loses energy.  The joint is rigid; optionally it
-is two masses joined by the reducer's stiffness and damping, the friction on the motor's side and load, gravity and
-end stops on the other.
+is two masses with the reducer between them, load, gravity and end stops on the link's side:
 
-Not modelled: backlash, hysteresis of the reducer, Coriolis torque (C0 = 0 for one joint), faults of the drive."""
+    Jm theta'' = actuator - motor friction - torsion (1 + eps'(theta))     theta = motor angle / n
+    Jl q''     = torsion - link friction - load - gravity                  q = link angle
+    torsion    = spring(twist) + hysteresis(twist) + D twist'              twist = theta + eps(theta) - q
+
+Not modelled: backlash, Coriolis torque (C0 = 0 for one joint), faults of the drive."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,11 +24,14 @@ from jointctl.firmware_py.kernel import inlined, kernel
 from jointctl.firmware_py.schema import new
 from jointctl.hil.plant_records import (
     DELAY_SLOTS,
+    KNEES,
+    EccentricityConstants,
     EncoderSide,
     FrictionKind,
     PlantConstants,
     PlantSettings,
     PlantState,
+    WaveConstants,
     decay,
 )
 
@@ -56,9 +62,10 @@ def unit_number(state: np.uint64) -> float:
 
 # --- The virtual encoder: joint angle to the counts that the drive reports ---
 # Nearest count (a half count either way, no bias), multi-turn, signed, at the joint or at the motor.  Noise is white,
-# normal, in counts, from a xorshift64 generator in the plant's state, so that a run repeats bit by bit.
+# normal, in counts, from a xorshift64 generator in the plant's state, so that a run repeats bit by bit.  An eccentric
+# disc reads a sine too much, once a turn of its shaft.
 #
-# Not modelled: eccentricity, interpolation error, sampling delay (the drive model has it), loss of counts.
+# Not modelled: interpolation error, sampling delay (the drive model has it), loss of counts.
 
 
 @kernel
@@ -76,10 +83,48 @@ def _normal(s: PlantState) -> float:
     return radius * math.cos(2.0 * math.pi * _uniform(s))
 
 
+@inlined
+def sine_of_turns(turns: float) -> float:
+    """sin(2 pi turns), absolute error below 2e-11; range reduction in turns is exact, without branch or library call.
+
+    Half a turn either way is r (1/4 - r^2) P(r^2), P of degree 6 fitted for the least maximum error.  Several times as
+    fast as libm, which matters for three ripples in each of two million substeps; the plant needs no more than 1e-6.
+    """
+    r = turns - np.rint(turns)
+    y = r * r
+    y2 = y * y
+    low = (25.1327412271771 - y * 64.8358437584691) + y2 * (67.0776056610595 - y * 38.5126054685551)
+    high = (14.1788906187473 - y * 3.62170359416296) + y2 * 0.614277835548814
+    return r * (0.25 - y) * (low + y2 * y2 * high)
+
+
+@inlined
+def _read_too_much_rad(disc: EccentricityConstants, position_rad: float) -> float:
+    """By an eccentric disc [rad at the joint]."""
+    if disc.joint_rad == 0.0:
+        return 0.0
+    return disc.joint_rad * sine_of_turns(disc.turns_prad * position_rad + disc.phase_turns)
+
+
+@kernel
+def link_reading_rad(c: PlantConstants, s: PlantState) -> float:
+    """Link angle as an encoder on the joint sees it."""
+    return s.joint_position_rad + _read_too_much_rad(c.joint_eccentricity, s.joint_position_rad)
+
+
+@kernel
+def shaft_velocity_radps(c: PlantConstants, s: PlantState) -> float:
+    """Velocity, at the joint, of the shaft that the drive's encoder sits on."""
+    return s.motor_velocity_radps if c.encoder_motor_side != 0 else s.joint_velocity_radps
+
+
 @kernel
 def shaft_position_rad(c: PlantConstants, s: PlantState) -> float:
     """Joint angle as the encoder sees it, its present faults included."""
-    position_rad = s.motor_position_rad if c.encoder_motor_side != 0 else s.joint_position_rad
+    if c.encoder_motor_side != 0:
+        position_rad = s.motor_position_rad + _read_too_much_rad(c.motor_eccentricity, s.motor_position_rad)
+    else:
+        position_rad = link_reading_rad(c, s)
     if s.encoder_stuck != 0:
         return s.encoder_stuck_rad
     if s.encoder_reversed != 0:
@@ -103,7 +148,8 @@ def encoder_counts(c: PlantConstants, s: PlantState) -> int:
 # * SIGN: the curve at the velocity at the start of the substep; 0 at exactly zero velocity.  It chatters around zero.
 # * STICK_SLIP: set-valued at zero velocity.  At rest it holds while the net torque is within the static friction of
 # either direction.  Where the velocity reaches zero inside a substep, that instant is worked out and the rest of the
-# substep is at rest, or in the other direction. * LUGRE: dz/dt = v - sigma0 |v| z / g(v), friction = sigma0 z +
+# substep is at rest, or in the other direction.
+# * LUGRE: dz/dt = v - sigma0 |v| z / g(v), friction = sigma0 z +
 # sigma1 dz/dt (Canudas de Wit et al. 1995), g the magnitude of the sliding curve, viscous part included, so that
 # steady sliding gives (11).  z takes an implicit step, which is stable at any stiffness and has the exact steady
 # state.
@@ -137,53 +183,63 @@ def sliding_torque_Nm(c: PlantConstants, velocity_radps: float) -> float:
 
 
 @inlined
-def lugre_torque_Nm(c: PlantConstants, s: PlantState, velocity_radps: float, factor: float) -> float:
-    """LuGre friction at the joint; advances the bristle deflection by one substep."""
-    z = s.bristle_deflection_rad
+def lugre_torque_Nm(c: PlantConstants, z: float, velocity_radps: float, factor: float) -> tuple[float, float]:
+    """LuGre friction at the joint, and the bristle deflection after the substep that was z [rad] before it."""
     z_next = z
     if velocity_radps != 0.0:
         g = max(abs(sliding_torque_Nm(c, velocity_radps)) * factor, _LEAST_FRICTION_Nm)
         travel = c.step_s * velocity_radps
         z_next = (z + travel) * g / (g + c.bristle_stiffness_Nmprad * abs(travel))
-        s.bristle_deflection_rad = z_next
-    return c.bristle_stiffness_Nmprad * z_next + c.bristle_damping_Nmspr * c.inverse_step_Hz * (z_next - z)
+    torque = c.bristle_stiffness_Nmprad * z_next + c.bristle_damping_Nmspr * c.inverse_step_Hz * (z_next - z)
+    return torque, z_next
 
 
 @kernel
-def _from_rest(c: PlantConstants, net_torque_Nm: float, time_s: float, factor: float) -> tuple[float, float, float]:
+def _from_rest(
+    c: PlantConstants, mass: Mass, net_torque_Nm: float, time_s: float, factor: float
+) -> tuple[float, float, float]:
     """Velocity, travel and friction `time_s` after standstill under a constant torque, for the set-valued kind."""
-    forward = c.positive_factor * factor * c.friction.positive.static_Nm
-    backward = -c.negative_factor * factor * c.friction.negative.static_Nm
+    forward = c.positive_factor * factor * mass.friction_share * c.friction.positive.static_Nm
+    backward = -c.negative_factor * factor * mass.friction_share * c.friction.negative.static_Nm
     if net_torque_Nm > forward:
         friction = forward
     elif net_torque_Nm < backward:
         friction = backward
     else:
         return 0.0, 0.0, net_torque_Nm
-    velocity = (net_torque_Nm - friction) * c.inverse_driven_inertia * time_s
+    velocity = (net_torque_Nm - friction) * mass.inverse_inertia * time_s
     return velocity, 0.5 * velocity * time_s, friction
+
+
+class Mass(NamedTuple):
+    """A mass that friction acts on."""
+
+    inverse_inertia: float  # [1/(kg m^2)]
+    friction_share: float  # of the joint's friction
 
 
 @inlined
 def advance(
-    c: PlantConstants, s: PlantState, velocity_radps: float, position_rad: float, net_torque_Nm: float
-) -> tuple[float, float, float]:
-    """One substep of the mass that friction acts on: new velocity [rad/s], travel [rad], friction [Nm at the joint].
+    c: PlantConstants, mass: Mass, velocity_radps: float, bristle_rad: float, net_torque_Nm: float, factor: float
+) -> tuple[float, float, float, float]:
+    """One substep of a mass: new velocity [rad/s], travel [rad], friction [Nm at the joint], bristle deflection [rad].
 
-    `net_torque_Nm` is everything but friction, constant over the substep, so that the travel is exact.
+    `net_torque_Nm` is everything but friction, constant over the substep, so that the travel is exact; `factor` is that
+    of `modulation`.
     """
     step_s = c.step_s
     friction = 0.0
     kind = c.friction_kind
-    if kind != FrictionKind.NONE:
-        factor = modulation(c, s, position_rad)
-        if kind == FrictionKind.LUGRE:
-            friction = lugre_torque_Nm(c, s, velocity_radps, factor)
-        elif velocity_radps != 0.0:
-            friction = factor * sliding_torque_Nm(c, velocity_radps)
+    if kind == FrictionKind.LUGRE:
+        friction, bristle_rad = lugre_torque_Nm(c, bristle_rad, velocity_radps, factor)
+        friction *= mass.friction_share
+    elif kind != FrictionKind.NONE:
+        if velocity_radps != 0.0:
+            friction = mass.friction_share * (factor * sliding_torque_Nm(c, velocity_radps))
         elif kind == FrictionKind.STICK_SLIP:
-            return _from_rest(c, net_torque_Nm, step_s, factor)
-    acceleration = (net_torque_Nm - friction) * c.inverse_driven_inertia
+            velocity, travel, friction = _from_rest(c, mass, net_torque_Nm, step_s, factor)
+            return velocity, travel, friction, bristle_rad
+    acceleration = (net_torque_Nm - friction) * mass.inverse_inertia
     new_velocity = velocity_radps + step_s * acceleration
     if kind == FrictionKind.STICK_SLIP and (
         velocity_radps > 0.0 >= new_velocity or velocity_radps < 0.0 <= new_velocity
@@ -191,9 +247,9 @@ def advance(
         # the velocity changed, so that the acceleration is not zero, and standstill comes within the substep
         until_rest_s = min(-velocity_radps / acceleration, step_s)
         travel_to_rest = 0.5 * velocity_radps * until_rest_s
-        rest_velocity, rest_travel, rest_friction = _from_rest(c, net_torque_Nm, step_s - until_rest_s, factor)
-        return rest_velocity, travel_to_rest + rest_travel, rest_friction
-    return new_velocity, 0.5 * step_s * (velocity_radps + new_velocity), friction
+        rest_velocity, rest_travel, rest_friction = _from_rest(c, mass, net_torque_Nm, step_s - until_rest_s, factor)
+        return rest_velocity, travel_to_rest + rest_travel, rest_friction, bristle_rad
+    return new_velocity, 0.5 * step_s * (velocity_radps + new_velocity), friction, bristle_rad
 
 
 # --- The virtual drive's current loop and motor: target torque in, delivered joint torque out ---
@@ -202,21 +258,6 @@ def advance(
 # error of the reducer, and it is there with the power off.
 #
 # Not modelled: voltage limit, back-EMF, the current loop's own dynamics beyond one pole, i^2 t limits.
-
-
-@inlined
-def sine_of_turns(turns: float) -> float:
-    """sin(2 pi turns), absolute error below 2e-11; range reduction in turns is exact, without branch or library call.
-
-    Half a turn either way is r (1/4 - r^2) P(r^2), P of degree 6 fitted for the least maximum error.  Several times as
-    fast as libm, which matters for three ripples in each of two million substeps; the plant needs no more than 1e-6.
-    """
-    r = turns - np.rint(turns)
-    y = r * r
-    y2 = y * y
-    low = (25.1327412271771 - y * 64.8358437584691) + y2 * (67.0776056610595 - y * 38.5126054685551)
-    high = (14.1788906187473 - y * 3.62170359416296) + y2 * 0.614277835548814
-    return r * (0.25 - y) * (low + y2 * y2 * high)
 
 
 @inlined
@@ -249,16 +290,64 @@ def step_current(c: PlantConstants, s: PlantState, target_joint_torque_Nm: float
 def torque_ripple_Nm(c: PlantConstants, motor_position_rad: float) -> float:
     """Ripple torque at the joint; `motor_position_rad` is the motor angle / n, the orders are per joint turn."""
     ripple = 0.0
-    for i in range(c.torque_ripples):
-        turns = motor_position_rad * c.torque_ripple_turns_prad[i] + c.torque_ripple_phase_turns[i]
-        ripple += c.torque_ripple_Nm[i] * sine_of_turns(turns)
+    for i in range(c.torque_ripple.count):
+        turns = motor_position_rad * c.torque_ripple.turns_prad[i] + c.torque_ripple.phase_turns[i]
+        ripple += c.torque_ripple.amplitude[i] * sine_of_turns(turns)
     return ripple
+
+
+# --- The reducer of a flexible joint ---
+# The spring is stiffer the more torque it transmits: three slopes, with knees.  The hysteresis is a bristle that slides
+# at half the loop's width: dz = dtwist - |dtwist| z / (width / 2), torque K1 z; it depends on the way alone, not on the
+# speed, and near a reversal adds its own stiffness K1 to the spring's.  z takes a step that is exact to second order.
+#
+# Not modelled: a stiffness that depends on the angle, play.
+
+
+@inlined
+def kinematic_error_rad(c: PlantConstants, motor_position_rad: float) -> tuple[float, float]:
+    """(eps, eps'): by how much the reducer's output is ahead of theta [rad], and its slope against theta."""
+    error = 0.0
+    slope = 0.0
+    for i in range(c.kinematic_error.count):
+        turns = motor_position_rad * c.kinematic_error.turns_prad[i] + c.kinematic_error.phase_turns[i]
+        amplitude = c.kinematic_error.amplitude[i]
+        error += amplitude * sine_of_turns(turns)
+        slope += amplitude * (2.0 * math.pi * c.kinematic_error.turns_prad[i]) * sine_of_turns(turns + 0.25)
+    return error, slope
+
+
+@inlined
+def spring_torque_Nm(c: PlantConstants, twist_rad: float) -> float:
+    """Of the three slopes, without hysteresis and damping."""
+    size = abs(twist_rad)
+    torque = c.reducer_stiffness_Nmprad * size
+    for i in range(KNEES):
+        torque += c.reducer_stiffening_Nmprad[i] * max(size - c.reducer_knee_rad[i], 0.0)
+    return math.copysign(torque, twist_rad)
+
+
+@inlined
+def hysteresis_torque_Nm(c: PlantConstants, s: PlantState, twist_rad: float) -> float:
+    """Of the bristle, which goes along to `twist_rad`."""
+    if c.hysteresis_slide_rad == 0.0:
+        return 0.0
+    way = twist_rad - s.twist_rad
+    half = 0.5 * abs(way)
+    z = (s.hysteresis_rad * (c.hysteresis_slide_rad - half) + c.hysteresis_slide_rad * way) / (
+        c.hysteresis_slide_rad + half
+    )
+    s.twist_rad = twist_rad
+    s.hysteresis_rad = z
+    return c.reducer_stiffness_Nmprad * z
 
 
 # --- The virtual joint: one substep of motor, reducer, friction and load ---
 
 
 __all__ = ["R1", "EncoderSide", "FrictionKind", "PlantSettings", "encoder_counts", "plant", "step_plant"]
+
+_LOOSENING_STEPS = 40  # each divides the twist that is left by a hundred or so
 
 # The realistic plant of the reference figures; its friction is 10 % above Table 3, which the controller believes.
 R1: dict[str, Any] = {
@@ -311,7 +400,11 @@ def step_plant(c: PlantConstants, s: PlantState, target_joint_torque_Nm: float) 
 
     if c.flexible == 0:
         actuator = c.torque_per_current_NmpA * current + torque_ripple_Nm(c, joint_middle)
-        velocity, travel, friction = advance(c, s, joint_velocity, joint_middle, actuator - resisting)
+        factor = modulation(c, s, joint_middle)
+        whole = Mass(c.inverse_driven_inertia, 1.0)
+        velocity, travel, friction, s.bristle_deflection_rad = advance(
+            c, whole, joint_velocity, s.bristle_deflection_rad, actuator - resisting, factor
+        )
         position = s.joint_position_rad + travel
         s.joint_position_rad = position
         s.joint_velocity_radps = velocity
@@ -321,15 +414,25 @@ def step_plant(c: PlantConstants, s: PlantState, target_joint_torque_Nm: float) 
         motor_velocity = s.motor_velocity_radps
         motor_middle = s.motor_position_rad + half_step_s * motor_velocity
         actuator = c.torque_per_current_NmpA * current + torque_ripple_Nm(c, motor_middle)
-        twist = motor_middle - joint_middle
-        through = c.reducer_stiffness_Nmprad * twist + c.reducer_damping_Nmspr * (motor_velocity - joint_velocity)
-        velocity, travel, friction = advance(c, s, motor_velocity, motor_middle, actuator - through)
+        error, slope = kinematic_error_rad(c, motor_middle)
+        twist = motor_middle + error - joint_middle
+        twist_rate = motor_velocity * (1.0 + slope) - joint_velocity
+        through = spring_torque_Nm(c, twist) + c.reducer_damping_Nmspr * twist_rate + hysteresis_torque_Nm(c, s, twist)
+        factor = modulation(c, s, motor_middle)
+        motor = Mass(c.inverse_driven_inertia, c.motor_friction_share)
+        velocity, travel, friction, s.bristle_deflection_rad = advance(
+            c, motor, motor_velocity, s.bristle_deflection_rad, actuator - through * (1.0 + slope), factor
+        )
         s.motor_position_rad += travel
         s.motor_velocity_radps = velocity
-        joint_velocity += c.step_s * (through - resisting) * c.inverse_link_inertia
-        s.joint_position_rad = joint_middle + half_step_s * joint_velocity
-        s.joint_velocity_radps = joint_velocity
+        link = Mass(c.inverse_link_inertia, 1.0 - c.motor_friction_share)
+        link_velocity, link_travel, link_friction, s.link_bristle_deflection_rad = advance(
+            c, link, joint_velocity, s.link_bristle_deflection_rad, through - resisting, factor
+        )
+        s.joint_position_rad += link_travel
+        s.joint_velocity_radps = link_velocity
         s.reducer_torque_Nm = through
+        friction += link_friction
 
     s.actuator_torque_Nm = actuator
     s.friction_torque_Nm = friction
@@ -367,13 +470,42 @@ def _fill_actuator(c: PlantConstants, settings: PlantSettings) -> None:
     c.current_limit_A = settings.current_limit_A
     c.current_decay = decay(settings.step_s, settings.current_lag_s)
     c.delay_substeps = round(settings.command_delay_s / settings.step_s)
-    c.torque_ripples = len(settings.torque_ripple_Nm)
-    phases = settings.torque_ripple_phase_rad or (0.0,) * len(settings.torque_ripple_Nm)
-    ripples = zip(settings.torque_ripple_Nm, settings.torque_ripple_per_motor_turn, phases, strict=True)
-    for i, (amplitude, order, phase) in enumerate(ripples):
-        c.torque_ripple_Nm[i] = amplitude
-        c.torque_ripple_turns_prad[i] = order * settings.reduction_ratio / (2.0 * math.pi)
-        c.torque_ripple_phase_turns[i] = phase / (2.0 * math.pi)
+    _fill_waves(
+        c.torque_ripple, settings, settings.torque_ripple_Nm, settings.torque_ripple_per_motor_turn,
+        settings.torque_ripple_phase_rad,
+    )  # fmt: skip
+
+
+def _fill_waves(
+    waves: WaveConstants,
+    settings: PlantSettings,
+    amplitudes: tuple[float, ...],
+    orders: tuple[float, ...],
+    phases: tuple[float, ...],
+) -> None:
+    waves.count = len(amplitudes)
+    for i, (amplitude, order, phase) in enumerate(
+        zip(amplitudes, orders, phases or (0.0,) * len(amplitudes), strict=True)
+    ):
+        waves.amplitude[i] = amplitude
+        waves.turns_prad[i] = order * settings.reduction_ratio / (2.0 * math.pi)
+        waves.phase_turns[i] = phase / (2.0 * math.pi)
+
+
+def _fill_reducer(c: PlantConstants, settings: PlantSettings) -> None:
+    c.motor_friction_share = 1.0 - settings.link_friction_share
+    c.hysteresis_slide_rad = 0.5 * settings.hysteresis_width_rad
+    _fill_waves(
+        c.kinematic_error, settings, settings.kinematic_error_rad, settings.kinematic_error_per_motor_turn,
+        settings.kinematic_error_phase_rad,
+    )  # fmt: skip
+    slope, twist, torque = settings.reducer_stiffness_Nmprad, 0.0, 0.0
+    steeper = zip(settings.reducer_knees_Nm, settings.reducer_stiffness_beyond_Nmprad, strict=True)
+    for i, (knee_Nm, beyond) in enumerate(steeper):
+        twist += (knee_Nm - torque) / slope
+        c.reducer_knee_rad[i] = twist
+        c.reducer_stiffening_Nmprad[i] = beyond - slope
+        slope, torque = beyond, knee_Nm
 
 
 def _fill_mechanics(c: PlantConstants, settings: PlantSettings) -> None:
@@ -407,6 +539,19 @@ def _fill_encoder(c: PlantConstants, settings: PlantSettings) -> None:
     c.counts_prad = settings.encoder_direction * settings.encoder_counts_per_turn * shaft_turns / (2.0 * math.pi)
     c.encoder_offset_counts = settings.encoder_offset_counts
     c.encoder_noise_counts = settings.encoder_noise_counts
+    for disc, turns, amplitude_rad, phase_rad in (
+        (
+            c.motor_eccentricity, settings.reduction_ratio,
+            settings.motor_encoder_eccentricity_rad, settings.motor_encoder_eccentricity_phase_rad,
+        ),
+        (
+            c.joint_eccentricity, 1.0,
+            settings.joint_encoder_eccentricity_rad, settings.joint_encoder_eccentricity_phase_rad,
+        ),
+    ):  # fmt: skip
+        disc.joint_rad = amplitude_rad / turns
+        disc.turns_prad = turns / (2.0 * math.pi)
+        disc.phase_turns = phase_rad / (2.0 * math.pi)
 
 
 def plant(**settings: Any) -> tuple[Any, Any]:
@@ -426,7 +571,10 @@ def plant(**settings: Any) -> tuple[Any, Any]:
     _fill_actuator(c, checked)
     _fill_friction(c, checked)
     _fill_encoder(c, checked)
+    _fill_reducer(c, checked)
     s.joint_position_rad = s.motor_position_rad = checked.initial_position_rad
+    for _ in range(_LOOSENING_STEPS):  # the reducer's spring is slack at the start
+        s.motor_position_rad = checked.initial_position_rad - kinematic_error_rad(c, s.motor_position_rad)[0]
     s.motor_temperature_degC = checked.ambient_degC
     s.noise_state = checked.encoder_seed
     return constants, state

@@ -17,7 +17,8 @@ import numpy as np
 from jointctl.firmware_py.records import FrictionConstants
 from jointctl.firmware_py.schema import array_of, dtype_of, f8, i4, i8, record
 
-RIPPLES = 4
+RIPPLES = 4  # sines of a torque ripple or of a kinematic error
+KNEES = 2  # of the reducer's stiffness
 DELAY_SLOTS = 1024  # the command delay is below this many substeps
 
 u8 = Annotated[int, np.dtype("<u8")]
@@ -61,8 +62,11 @@ class PlantSettings:
     """A virtual joint in physical values; the default is an ideal one: no friction, lag, ripple, load or noise.
 
     Torque ripple i is ``torque_ripple_Nm[i] sin(torque_ripple_per_motor_turn[i] theta_m + torque_ripple_phase_rad[i])``
-    (phases may be left out).  `friction` is a FrictionConstants record, None meaning the paper's Table 3.
-    `inertia_kgm2` is the whole joint's; a flexible joint has `motor_side_inertia_kgm2` of it before the reducer.
+    (phases may be left out), and so is the kinematic error of a flexible joint's reducer.  `friction` is a
+    FrictionConstants record, None meaning the paper's Table 3.  `inertia_kgm2` is the whole joint's; a flexible joint
+    has `motor_side_inertia_kgm2` of it before the reducer, and the share `link_friction_share` of the friction behind.
+    The reducer's stiffness is `reducer_stiffness_Nmprad` up to the first of `reducer_knees_Nm`, then each of
+    `reducer_stiffness_beyond_Nmprad`; `hysteresis_width_rad` is that of its loop at no torque.
     """
 
     step_s: float = number(50e-6, 1e-6, 1e-3)
@@ -88,6 +92,13 @@ class PlantSettings:
     motor_side_inertia_kgm2: float = number(1.2, 1e-3, 1e4)
     reducer_stiffness_Nmprad: float = number(1.3e4, 1.0, 1e8)
     reducer_damping_Nmspr: float = number(5.0, 0.0, 1e5)
+    reducer_knees_Nm: tuple[float, ...] = ()
+    reducer_stiffness_beyond_Nmprad: tuple[float, ...] = ()
+    hysteresis_width_rad: float = number(0.0, 0.0, 0.1)
+    kinematic_error_rad: tuple[float, ...] = ()
+    kinematic_error_per_motor_turn: tuple[float, ...] = ()
+    kinematic_error_phase_rad: tuple[float, ...] = ()
+    link_friction_share: float = number(0.0, 0.0, 1.0)
     load_torque_Nm: float = number(0.0, -1e5, 1e5)
     load_step_Nm: float = number(0.0, -1e5, 1e5)
     load_step_at_s: float = number(80.0, 0.0, 1e9)
@@ -108,6 +119,11 @@ class PlantSettings:
     encoder_offset_counts: int = whole(0, -(2**40), 2**40)  # reported at joint position 0
     encoder_noise_counts: float = number(0.0, 0.0, 1e6)  # standard deviation
     encoder_seed: int = whole(1, 1, 2**63)
+    # of an encoder on that shaft, and in radians of it
+    motor_encoder_eccentricity_rad: float = number(0.0, 0.0, 0.1)
+    motor_encoder_eccentricity_phase_rad: float = number(0.0, -100.0, 100.0)
+    joint_encoder_eccentricity_rad: float = number(0.0, 0.0, 0.1)
+    joint_encoder_eccentricity_phase_rad: float = number(0.0, -100.0, 100.0)
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -118,7 +134,9 @@ class PlantSettings:
             if isinstance(value, bool) or not isinstance(value, accepted) or not low <= float(value) <= high:
                 raise _allowed(item.name, value, f"{kind} in [{low:.13g}..{high:.13g}]")
         self._check_choices()
-        self._check_ripples()
+        self._check_waves("torque_ripple", "Nm", 1e4)
+        self._check_waves("kinematic_error", "rad", 0.01)
+        self._check_reducer()
         self._check_stability()
 
     def _check_choices(self) -> None:
@@ -142,28 +160,48 @@ class PlantSettings:
         if self.command_delay_s > longest_s * (1.0 + 1e-9):
             raise _allowed("command_delay_s", self.command_delay_s, f"in [0..{longest_s:g}] at step_s={self.step_s:g}")
 
-    def _check_ripples(self) -> None:
-        amplitudes, orders, phases = (
-            self.torque_ripple_Nm,
-            self.torque_ripple_per_motor_turn,
-            self.torque_ripple_phase_rad,
-        )
-        for name, low, high in (
-            ("torque_ripple_Nm", 0.0, 1e4),
-            ("torque_ripple_per_motor_turn", 0.0, 1e4),
-            ("torque_ripple_phase_rad", -100.0, 100.0),
-        ):
-            if not isinstance(getattr(self, name), tuple | list):
-                raise _allowed(name, getattr(self, name), "a list of numbers")
-            for value in getattr(self, name):
-                if isinstance(value, bool) or not isinstance(value, Real) or not low <= float(value) <= high:
-                    raise _allowed(name, getattr(self, name), f"numbers in [{low:g}..{high:g}]")
+    def _check_list(self, name: str, low: float, high: float) -> None:
+        values = getattr(self, name)
+        if not isinstance(values, tuple | list):
+            raise _allowed(name, values, "a list of numbers")
+        for value in values:
+            if isinstance(value, bool) or not isinstance(value, Real) or not low <= float(value) <= high:
+                raise _allowed(name, values, f"numbers in [{low:g}..{high:g}]")
+
+    def _check_waves(self, name: str, unit: str, largest: float) -> None:
+        """Amplitudes, orders and phases of a sum of sines of the motor angle."""
+        names = f"{name}_{unit}", f"{name}_per_motor_turn", f"{name}_phase_rad"
+        for item, low, high in zip(names, (0.0, 0.0, -100.0), (largest, 1e4, 100.0), strict=True):
+            self._check_list(item, low, high)
+        amplitudes, orders, phases = (getattr(self, item) for item in names)
         if len(amplitudes) > RIPPLES:
-            raise _allowed("torque_ripple_Nm", amplitudes, f"at most {RIPPLES} amplitudes")
+            raise _allowed(names[0], amplitudes, f"at most {RIPPLES} amplitudes")
         if len(orders) != len(amplitudes):
-            raise _allowed("torque_ripple_per_motor_turn", orders, f"{len(amplitudes)} orders, one per amplitude")
+            raise _allowed(names[1], orders, f"{len(amplitudes)} orders, one per amplitude")
         if len(phases) not in (0, len(amplitudes)):
-            raise _allowed("torque_ripple_phase_rad", phases, f"left out, or {len(amplitudes)} phases")
+            raise _allowed(names[2], phases, f"left out, or {len(amplitudes)} phases")
+
+    def _check_reducer(self) -> None:
+        knees, beyond = self.reducer_knees_Nm, self.reducer_stiffness_beyond_Nmprad
+        self._check_list("reducer_knees_Nm", 0.0, 1e5)
+        self._check_list("reducer_stiffness_beyond_Nmprad", 1.0, 1e8)
+        if len(knees) > KNEES or list(knees) != sorted(set(knees)):
+            raise _allowed("reducer_knees_Nm", knees, f"at most {KNEES} torques in ascending order")
+        if len(beyond) != len(knees):
+            raise _allowed("reducer_stiffness_beyond_Nmprad", beyond, f"{len(knees)} stiffnesses, one beyond each knee")
+        if not self.flexible:
+            for name in ("kinematic_error_rad", "hysteresis_width_rad", "link_friction_share", "reducer_knees_Nm"):
+                value = getattr(self, name)
+                if value:
+                    raise _allowed(name, value, "left out unless flexible is true")
+        slope = sum(
+            2.0 * amplitude * order * self.reduction_ratio
+            for amplitude, order in zip(self.kinematic_error_rad, self.kinematic_error_per_motor_turn, strict=True)
+        )
+        if slope > 1.0:
+            raise _allowed(
+                "kinematic_error_rad", self.kinematic_error_rad, "so small that the joint never turns against the motor"
+            )
 
     def _check_stability(self) -> None:
         """Explicit steps need stiffness h^2 / inertia and damping h / inertia well below 1."""
@@ -171,17 +209,21 @@ class PlantSettings:
         link = self.inertia_kgm2 - self.motor_side_inertia_kgm2 if self.flexible else self.inertia_kgm2
         springs = []
         if self.friction_kind == FrictionKind.LUGRE:
-            springs.append(("bristle", driven))
+            springs += [("bristle_stiffness_Nmprad", driven, 2), ("bristle_damping_Nmspr", driven, 1)]
+            if self.link_friction_share > 0.0:
+                of_link = link / self.link_friction_share
+                springs += [("bristle_stiffness_Nmprad", of_link, 2), ("bristle_damping_Nmspr", of_link, 1)]
         if self.flexible:
-            springs.append(("reducer", driven * link / (driven + link)))
+            reduced = driven * link / (driven + link)
+            springs += [("reducer_stiffness_Nmprad", reduced, 2), ("reducer_damping_Nmspr", reduced, 1)]
+            springs += [("reducer_stiffness_beyond_Nmprad", reduced, 2)] if self.reducer_knees_Nm else []
         if self.end_stops:
-            springs.append(("end_stop", link))
-        for name, inertia in springs:
-            for unit, power in (("stiffness_Nmprad", 2), ("damping_Nmspr", 1)):
-                value, largest = getattr(self, f"{name}_{unit}"), 0.25 * inertia / self.step_s**power
-                if value > largest:
-                    allowed = f"at most {largest:.6g}, or the step of step_s={self.step_s:g} is too long for it"
-                    raise _allowed(f"{name}_{unit}", value, allowed)
+            springs += [("end_stop_stiffness_Nmprad", link, 2), ("end_stop_damping_Nmspr", link, 1)]
+        for name, inertia, power in springs:
+            value, largest = getattr(self, name), 0.25 * inertia / self.step_s**power
+            if np.max(value) > largest:
+                allowed = f"at most {largest:.6g}, or the step of step_s={self.step_s:g} is too long for it"
+                raise _allowed(name, value, allowed)
 
 
 def decay(step_s: float, time_constant_s: float) -> float:
@@ -190,6 +232,25 @@ def decay(step_s: float, time_constant_s: float) -> float:
 
 
 # --- What the kernels read ---
+
+
+@record
+class WaveConstants:
+    """A sum of sines of the motor angle."""
+
+    count: i4  # how many of the following are in use
+    amplitude: Annotated[np.ndarray, array_of(f8, RIPPLES)]
+    turns_prad: Annotated[np.ndarray, array_of(f8, RIPPLES)]  # order per joint turn / 2 pi
+    phase_turns: Annotated[np.ndarray, array_of(f8, RIPPLES)]
+
+
+@record
+class EccentricityConstants:
+    """Of the disc of an encoder."""
+
+    joint_rad: f8  # amplitude at the joint; 0 = it is centred
+    turns_prad: f8  # of the disc, per joint radian
+    phase_turns: f8
 
 
 @record
@@ -205,16 +266,17 @@ class PlantConstants:
     flexible: i4
     reducer_stiffness_Nmprad: f8
     reducer_damping_Nmspr: f8
+    reducer_stiffening_Nmprad: Annotated[np.ndarray, array_of(f8, KNEES)]  # by how much the slope rises at each knee
+    reducer_knee_rad: Annotated[np.ndarray, array_of(f8, KNEES)]  # twist of the knee
+    hysteresis_slide_rad: f8  # deflection at which the bristle slides; 0 = no hysteresis
+    kinematic_error: WaveConstants  # [rad]
     # actuator
     current_per_torque_ApNm: f8  # 1 / (n K_m)
     torque_per_current_NmpA: f8  # n K_m
     current_limit_A: f8
     current_decay: f8  # exp(-step / lag), 0 without lag
     delay_substeps: i4
-    torque_ripples: i4  # how many of the following are in use
-    torque_ripple_Nm: Annotated[np.ndarray, array_of(f8, RIPPLES)]
-    torque_ripple_turns_prad: Annotated[np.ndarray, array_of(f8, RIPPLES)]  # order per joint turn / 2 pi
-    torque_ripple_phase_turns: Annotated[np.ndarray, array_of(f8, RIPPLES)]
+    torque_ripple: WaveConstants  # [Nm]
     # friction
     friction_kind: i4  # FrictionKind
     friction_modulated: i4  # friction ripple or temperature in use
@@ -225,6 +287,7 @@ class PlantConstants:
     friction_ripple_turns_prad: f8
     bristle_stiffness_Nmprad: f8
     bristle_damping_Nmspr: f8
+    motor_friction_share: f8  # of a flexible joint, the rest is on the link's side
     # heating
     thermal: i4
     ambient_degC: f8
@@ -246,6 +309,8 @@ class PlantConstants:
     counts_prad: f8  # per joint radian, with the sign of the direction
     encoder_offset_counts: f8
     encoder_noise_counts: f8
+    motor_eccentricity: EccentricityConstants
+    joint_eccentricity: EccentricityConstants
 
 
 @record
@@ -264,7 +329,10 @@ class PlantState:
     load_torque_Nm: f8  # constant, step and added load; positive against positive motion
     gravity_torque_Nm: f8
     reducer_torque_Nm: f8  # through the flexible element; 0 for a rigid joint
-    bristle_deflection_rad: f8
+    twist_rad: f8  # up to which the hysteresis has come
+    hysteresis_rad: f8  # deflection of its bristle
+    bristle_deflection_rad: f8  # on the motor's side of a flexible joint
+    link_bristle_deflection_rad: f8
     motor_temperature_degC: f8
     added_load_torque_Nm: f8
     # faults, written by `hil.plant_faults`; all zero = none

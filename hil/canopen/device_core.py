@@ -46,7 +46,7 @@ from jointctl.hil.canopen.encoder_node import accept_encoder_frame, step_encoder
 from jointctl.hil.canopen.motion import demand_is_held, demand_torque_Nm, following_error_tripped, follows_velocity
 from jointctl.hil.canopen.pdo import mark_events, receive_rpdo, receive_sync, send_due_tpdos, start_pdos
 from jointctl.hil.canopen.records import CONSUMERS, PDOS, Device, HomingState, Mode, NmtState, PowerState, int64
-from jointctl.hil.plant import encoder_counts, step_plant
+from jointctl.hil.plant import encoder_counts, link_reading_rad, shaft_velocity_radps, step_plant
 from jointctl.hil.plant_records import PlantConstants, PlantState
 from jointctl.hil.virtual_bus import FrameQueue
 
@@ -260,9 +260,9 @@ def sample_objects(device: Device, plant_c: PlantConstants, plant_s: PlantState)
     drive = device.drive
     drive.position = _position_counts(device, plant_c, plant_s)
     drive.second_position = _int32(
-        math.floor(plant_s.joint_position_rad * device.second_counts_prad + device.second_offset_counts + 0.5)
+        math.floor(link_reading_rad(plant_c, plant_s) * device.second_counts_prad + device.second_offset_counts + 0.5)
     )
-    drive.velocity = _int32(plant_s.joint_velocity_radps * device.counts_per_rad)
+    drive.velocity = _int32(shaft_velocity_radps(plant_c, plant_s) * device.counts_per_rad)
     current_A = device.torque_sign * plant_s.current_A
     motor_torque_mNm = 1e3 * plant_c.torque_per_current_NmpA * current_A / device.reduction_ratio
     drive.torque = _int16(1e3 * motor_torque_mNm / int64(drive.rated_torque_mNm))
@@ -307,7 +307,7 @@ def _torque_Nm(
         elif following_error_tripped(device, counts, dt_s):
             raise_fault(device, FOLLOWING_ERROR, queue)
     held = not sampled and demand_is_held(device)
-    return demand_torque_Nm(device, counts, plant_s.joint_velocity_radps, dt_s), held
+    return demand_torque_Nm(device, counts, shaft_velocity_radps(plant_c, plant_s), dt_s), held
 
 
 @kernel
@@ -345,7 +345,7 @@ def advance(device: Device, plant_c: PlantConstants, plant_s: PlantState, until_
     _notice_status(device)
     if until_ns >= device.next_due_ns:
         run_timers(device, until_ns, queue)
-    step_encoder(device.encoder, plant_s, until_ns, queue)
+    step_encoder(device.encoder, link_reading_rad(plant_c, plant_s), until_ns, queue)
 
 
 @kernel
@@ -389,7 +389,7 @@ def accept_frame(
     identifier = int64(frame[0]) | int64(frame[1]) << 8
     size = int64(frame[4])
     if not (frame[3] & 0xE0 or frame[2] or identifier > 0x7FF):
-        accept_encoder_frame(device.encoder, plant_s, identifier, frame, queue)
+        accept_encoder_frame(device.encoder, link_reading_rad(plant_c, plant_s), identifier, frame, queue)
     if frame[3] & 0xA0 or frame[2] or identifier > 0x7FF or device.nmt == NmtState.BOOT_UP or size > 8:
         return  # extended and error frames are not for this device
     if frame[3] & 0x40:

@@ -26,7 +26,6 @@ from jointctl.hil.canopen.records import (
     int64,
 )
 from jointctl.hil.canopen.sdo import SdoServer
-from jointctl.hil.plant_records import PlantState
 from jointctl.hil.virtual_bus import FrameQueue
 
 _MS = 1_000_000
@@ -46,10 +45,10 @@ def restart_encoder(node: EncoderNode) -> None:
 
 
 @kernel
-def sample_position(node: EncoderNode, plant: PlantState) -> None:
-    """6004: the nearest count of the true joint angle, modulo the total measuring range."""
+def sample_position(node: EncoderNode, reading_rad: float) -> None:
+    """6004: the nearest count of the joint angle that the disc shows, modulo the total measuring range."""
     if node.stuck == 0:
-        counts = (plant.joint_position_rad + node.error_rad) * node.counts_prad + node.offset_counts
+        counts = (reading_rad + node.error_rad) * node.counts_prad + node.offset_counts
         node.stuck_counts = math.floor(counts + 0.5)
     range_counts = int64(node.objects.range_counts)
     node.objects.position = int64(node.stuck_counts) % range_counts
@@ -68,9 +67,9 @@ def _mapped_value(node: EncoderNode, entry: int) -> int:
 
 
 @kernel
-def _send_tpdo(node: EncoderNode, plant: PlantState, queue: FrameQueue) -> None:
+def _send_tpdo(node: EncoderNode, reading_rad: float, queue: FrameQueue) -> None:
     group = node.objects
-    sample_position(node, plant)
+    sample_position(node, reading_rad)
     slot = push_frame(queue, int64(group.tpdo_cob_id) & 0x7FF, 0)
     if slot < 0:
         return
@@ -105,11 +104,11 @@ def _tell_errors(node: EncoderNode, queue: FrameQueue) -> None:
 
 
 @kernel
-def step_encoder(node: EncoderNode, plant: PlantState, now_ns: int, queue: FrameQueue) -> None:
+def step_encoder(node: EncoderNode, reading_rad: float, now_ns: int, queue: FrameQueue) -> None:
     """Timers: boot-up, heartbeat, errors, the event-driven TPDO.  Does nothing where there is no node."""
     if node.node_id == 0:
         return
-    sample_position(node, plant)
+    sample_position(node, reading_rad)
     if node.boot_pending != 0:
         node.boot_pending = 0
         node.nmt = NmtState.PRE_OPERATIONAL
@@ -126,12 +125,12 @@ def step_encoder(node: EncoderNode, plant: PlantState, now_ns: int, queue: Frame
     sends = node.nmt == NmtState.OPERATIONAL and not int64(group.tpdo_cob_id) & COB_ID_INVALID
     if sends and group.tpdo_type >= EVENT_DRIVEN and timer_ns != 0 and now_ns >= node.tpdo_due_ns:
         node.tpdo_due_ns = now_ns + timer_ns
-        _send_tpdo(node, plant, queue)
+        _send_tpdo(node, reading_rad, queue)
 
 
 @kernel
 def accept_encoder_frame(
-    node: EncoderNode, plant: PlantState, identifier: int, frame: np.ndarray, queue: FrameQueue
+    node: EncoderNode, reading_rad: float, identifier: int, frame: np.ndarray, queue: FrameQueue
 ) -> None:
     """NMT and SYNC; SDO is answered elsewhere, everything else is foreign.  `frame` is a data frame of 11 bits."""
     if node.node_id == 0 or node.nmt == NmtState.BOOT_UP:
@@ -154,7 +153,7 @@ def accept_encoder_frame(
         node.syncs += 1
         if node.syncs >= group.tpdo_type:
             node.syncs = 0
-            _send_tpdo(node, plant, queue)
+            _send_tpdo(node, reading_rad, queue)
 
 
 # --- Its object dictionary and SDO server ---

@@ -27,6 +27,7 @@ from jointctl.hil.elmo.motor import (
     status_register,
     switch_off,
 )
+from jointctl.hil.plant import shaft_velocity_radps
 
 # --- Its language: error codes, the shape of a command, where a setting is kept ---
 
@@ -299,7 +300,7 @@ class ElmoInterpreter:
 
     def speed_cps(self) -> float:
         """VX."""
-        return float(self._s.joint_velocity_radps) * float(self._c.counts_prad)
+        return float(shaft_velocity_radps(self._c, self._s)) * float(self._c.counts_prad)
 
 
 _HANDLERS: dict[str, Callable[[ElmoInterpreter, float | None], str]] = {

@@ -13,7 +13,7 @@ import math
 
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.schema import f8, i4, i8, record
-from jointctl.hil.plant import encoder_counts, step_plant
+from jointctl.hil.plant import encoder_counts, shaft_velocity_radps, step_plant
 from jointctl.hil.plant_records import PlantConstants, PlantState
 
 UM_TORQUE, UM_SPEED, UM_POSITION = 1, 2, 5
@@ -121,8 +121,9 @@ def _limited_A(m: ElmoMotor, demand_A: float, step_s: float) -> float:
 def advance_motor(m: ElmoMotor, c: PlantConstants, s: PlantState, substeps: int) -> None:
     """Drive and joint together, `substeps` of `c.step_s`."""
     for _ in range(substeps):
-        speed_cps = s.joint_velocity_radps * c.counts_prad
-        counts = s.joint_position_rad * c.counts_prad + c.encoder_offset_counts
+        speed_cps = shaft_velocity_radps(c, s) * c.counts_prad
+        position_rad = s.motor_position_rad if c.encoder_motor_side != 0 else s.joint_position_rad
+        counts = position_rad * c.counts_prad + c.encoder_offset_counts
         demand_A = 0.0
         if m.motor_on != 0:
             if speed_cps > m.speed_high_cps or speed_cps < m.speed_low_cps:

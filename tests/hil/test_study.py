@@ -34,7 +34,7 @@ from jointctl.tools.experiments.controllers import TABLE, controller_config, nam
 from jointctl.tools.experiments.scenarios import FAILED, ErrorFigures
 from jointctl.tools.lockstep import DirectBus
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.study import study
+from jointctl.tools.verbs.study import study, with_plants
 from tests.configurations import shipped
 from tests.page_figures import foreign_colours, svgs
 
@@ -187,6 +187,42 @@ def test_the_verb_prints_json_and_says_when_it_was_interrupted(
 
 
 # --- settings and controllers ---
+def test_a_flexible_plant_is_the_rigid_one_with_a_reducer_and_a_second_encoder(base: Config) -> None:
+    rigid, flexible = EnsembleSettings(), EnsembleSettings(flexible=True)
+    for index in range(20):
+        before, after = random_plant(base, rigid, 1, index), random_plant(base, flexible, 1, index)
+        assert before.virtual is not None
+        assert after.virtual is not None
+        assert after.virtual.friction_kind == before.virtual.friction_kind
+        assert after.virtual.current_lag_s == before.virtual.current_lag_s
+        assert after.joint_encoder is not None
+        assert after.joint_encoder.counts_per_turn == before.encoder.counts_per_turn
+        assert after.encoder.side == "motor"
+        assert before.joint_encoder is None
+
+
+def test_flexible_plants_fill_their_ranges_and_stay_inside(base: Config) -> None:
+    settings = EnsembleSettings(flexible=True)
+    plants = [random_plant(base, settings, 1, index) for index in range(400)]
+    values = [plant.virtual for plant in plants if plant.virtual is not None]
+    inertia = np.array([value.inertia_scale * base.joint.inertia_kgm2 for value in values])
+    motor = np.array([value.motor_side_inertia_kgm2 for value in values])
+    stiffness = np.array([value.reducer_stiffness_Nmprad for value in values])
+    damping = np.array([value.reducer_damping_Nmspr for value in values])
+    for drawn, (low, high) in (
+        (inertia / base.joint.inertia_kgm2, settings.flexible_inertia_scale),
+        ((inertia - motor) / motor, settings.inertia_ratio),
+        (damping / (2.0 * np.sqrt(stiffness * motor * (inertia - motor) / inertia)), settings.reducer_damping),
+        (np.array([value.hysteresis_width_rad for value in values]), settings.hysteresis_width_rad),
+        (np.array([value.kinematic_error_rad[0] for value in values]), settings.kinematic_error_rad),
+        (np.array([value.link_friction_share for value in values]), settings.link_friction_share),
+    ):
+        assert low * (1.0 - 1e-9) <= drawn.min() < low + 0.05 * (high - low)
+        assert high - 0.05 * (high - low) < drawn.max() <= high * (1.0 + 1e-9)
+    assert set(stiffness) == {1.0e4, 1.6e4, 3.1e4}
+    assert {round(math.log2(plant.encoder.counts_per_turn)) for plant in plants} == {14, 15, 16, 17}
+
+
 def test_every_named_controller_is_a_valid_configuration(base: Config) -> None:
     for controller in named():
         assert controller_config(base, controller).control == controller.control
@@ -210,6 +246,7 @@ def test_a_study_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("data", "words"),
     [
+        ({"plant": {"reducer_sizes": [18]}}, "reducer_sizes .*must be some of 17, 20, 25"),
         ({"plants": 0}, r"plants \(=0\): must be in \[1\.\.100000\]"),
         ({"plant": {"encoder_bit": [1, 2]}}, "plant.encoder_bit is not a known key: did you mean encoder_bits"),
         ({"plant": {"friction_scale": [1.1, 0.9]}}, "friction_scale .* two numbers in ascending order"),
@@ -234,3 +271,18 @@ def test_bad_controllers_are_named() -> None:
         study_controllers(StudySettings(variants={"x": {"kv": 1.0}}))
     with pytest.raises(ConfigurationError, match=r"variants\.paper must not have the name of another"):
         study_controllers(StudySettings(variants={"paper": {"of": "paper"}}))
+
+
+@pytest.mark.parametrize(
+    ("words", "plants", "flexible"),
+    [([], 40, False), (["7"], 7, False), (["realistic"], 40, True), (["realistic", "7"], 7, True)],
+)
+def test_plants_are_a_number_or_an_ensemble_or_both(words: list[str], plants: int, flexible: bool) -> None:
+    settings = with_plants(StudySettings(), words)
+    assert (settings.plants, settings.plant.flexible) == (plants, flexible)
+
+
+@pytest.mark.parametrize("word", ["0", "-1", "many", "1.5", ""])
+def test_plants_that_are_neither_are_refused(word: str) -> None:
+    with pytest.raises(ConfigurationError, match=r"plants \(="):
+        with_plants(StudySettings(), [word])

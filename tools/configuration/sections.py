@@ -509,6 +509,13 @@ class Virtual(Section):
     motor_side_inertia_kgm2: Annotated[float, between(1e-3, 1e4)] = 1.2  # at the joint; of joint.inertia_kgm2
     reducer_stiffness_Nmprad: Annotated[float, between(1.0, 1e8)] = 1.3e4  # with flexible = true
     reducer_damping_Nmspr: Annotated[float, between(0.0, 1e5)] = 5.0  # with flexible = true
+    reducer_knees_Nm: Numbers = ()  # transmitted torques beyond which the reducer is stiffer, two at most
+    reducer_stiffness_beyond_Nmprad: Numbers = ()  # beyond each knee
+    hysteresis_width_rad: Annotated[float, between(0.0, 0.1)] = 0.0  # of the reducer's loop, twist at no torque
+    kinematic_error_rad: Numbers = ()  # amplitudes, at the joint, by which the reducer's output is ahead
+    kinematic_error_per_motor_turn: Numbers = ()  # periods of each
+    kinematic_error_phase_rad: Numbers = ()  # of each
+    link_friction_share: Annotated[float, between(0.0, 1.0)] = 0.0  # of the friction that acts behind the reducer
     load_torque_Nm: Annotated[float, between(-1e5, 1e5)] = 0.0  # constant, at the joint
     load_step_Nm: Annotated[float, between(-1e5, 1e5)] = 0.0  # a load from load_step_at_s on
     load_step_at_s: Annotated[float, between(0.0, 1e9)] = 80.0  # of the plant's own time
@@ -525,5 +532,10 @@ class Virtual(Section):
     friction_per_kelvin: Annotated[float, between(-0.05, 0.05)] = -0.005  # relative change
     encoder_noise_counts: Annotated[float, between(0.0, 1e6)] = 0.0  # standard deviation
     encoder_seed: Annotated[int, between(1, 2**31 - 1)] = 1  # of the noise
+    # an encoder on the motor reads a sine too much, once a turn: radians of the motor
+    motor_encoder_eccentricity_rad: Annotated[float, between(0.0, 0.1)] = 0.0
+    motor_encoder_eccentricity_phase_rad: Annotated[float, between(-100.0, 100.0)] = 0.0  # of that sine
+    joint_encoder_eccentricity_rad: Annotated[float, between(0.0, 0.1)] = 0.0  # the same of one on the joint
+    joint_encoder_eccentricity_phase_rad: Annotated[float, between(-100.0, 100.0)] = 0.0  # of that sine
     friction: Friction | None = None  # The true curve, if it is not that of [friction].
     faults: Annotated[tuple[VirtualFault, ...], BeforeValidator(Rule(FAULTS_TEXT, _faults))] = ()

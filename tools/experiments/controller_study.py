@@ -11,6 +11,7 @@ does not depend on the number of processes.  A study comes from flags and from a
 
     [plant]                           # any of the ranges of `EnsembleSettings`
     encoder_bits = [14, 16]
+    flexible = true                   # the realistic ensemble: a soft reducer, and an encoder on either side of it
 
     [variants.more_damping]           # keys of [control] changed, on top of a named controller
     of = "precise"
@@ -28,7 +29,7 @@ from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationError
@@ -38,7 +39,7 @@ from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.input_file import parse_toml, read_input
 from jointctl.tools.child_process import interrupts_left_to_the_parent
 from jointctl.tools.configuration.config import Config, suggestion
-from jointctl.tools.configuration.sections import Section, between
+from jointctl.tools.configuration.sections import JointEncoder, Section, between
 from jointctl.tools.drawing import BLUE, GREY, INK, canvas
 from jointctl.tools.experiments.controllers import DEFAULT, Controller, changed, controller_constants, named, one_line
 from jointctl.tools.experiments.scenarios import RPDO_AT_ONCE, ErrorFigures, Scenario, error_figures, run_scenario
@@ -73,6 +74,21 @@ def _as_tuple(value: object) -> Any:
 _FromList = BeforeValidator(_as_tuple)
 Interval = tuple[float, float]
 
+# size of a harmonic reducer, ratio 80 and more -> stiffness up to the first knee, beyond each knee [Nm/rad], and the
+# knees [Nm]: such values as their catalogues give
+REDUCERS: dict[int, tuple[float, tuple[float, float], tuple[float, float]]] = {
+    17: (1.0e4, (1.4e4, 1.6e4), (3.9, 12.0)),
+    20: (1.6e4, (2.5e4, 2.9e4), (7.0, 25.0)),
+    25: (3.1e4, (5.0e4, 5.7e4), (14.0, 48.0)),
+}
+ENCODERS_APART_rad = 0.02  # by which two encoders of a flexible joint may differ
+
+
+def _sizes(value: tuple[int, ...]) -> tuple[int, ...]:
+    if not value or not set(value) <= set(REDUCERS):
+        raise PydanticCustomError("sizes", "must be some of {known}", {"known": ", ".join(map(str, REDUCERS))})
+    return value
+
 
 class EnsembleSettings(Section):
     """Ranges of the plants; (low, high) are uniform unless the comment says otherwise."""
@@ -88,6 +104,44 @@ class EnsembleSettings(Section):
     torque_ripple_Nm: Annotated[Interval, _FromList, _interval(0.0, 1e4)] = (0.0, 1.5)
     friction_ripple: Annotated[Interval, _FromList, _interval(0.0, 0.9)] = (0.0, 0.05)  # 18 per joint turn
     inertia_scale: Annotated[Interval, _FromList, _interval(0.1, 10.0)] = (0.95, 1.05)
+    # the rest, where the reducer is flexible: the encoder on the joint is then a second one, beside that on the motor
+    flexible: bool = False
+    law: Literal["encoder", "joint_encoder"] = "joint_encoder"  # which of them feeds the law
+    reducer_sizes: Annotated[tuple[int, ...], _FromList, AfterValidator(_sizes)] = tuple(REDUCERS)
+    flexible_inertia_scale: Annotated[Interval, _FromList, _interval(0.1, 10.0)] = (0.85, 1.15)  # in its place
+    inertia_ratio: Annotated[Interval, _FromList, _interval(0.01, 100.0)] = (0.3, 5.0)  # link to motor, log-uniform
+    reducer_damping: Annotated[Interval, _FromList, _interval(0.0, 1.0)] = (0.02, 0.06)  # share of the critical one
+    hysteresis_width_rad: Annotated[Interval, _FromList, _interval(0.0, 0.1)] = (1e-4, 3e-4)
+    kinematic_error_rad: Annotated[Interval, _FromList, _interval(0.0, 0.01)] = (1e-4, 3e-4)  # 2 per motor turn
+    kinematic_error_share: Annotated[Interval, _FromList, _interval(0.0, 1.0)] = (0.1, 0.4)  # of it 4 per motor turn
+    link_friction_share: Annotated[Interval, _FromList, _interval(0.0, 1.0)] = (0.05, 0.2)
+    motor_encoder_bits: Annotated[tuple[int, int], _FromList, _interval(8, 26)] = (14, 17)
+
+
+def _flexible(base: Config, settings: EnsembleSettings, random: np.random.Generator) -> dict[str, Any]:
+    """Keys of [virtual] for a reducer of a random size."""
+    low, high = np.log(settings.inertia_ratio)
+    scale = float(random.uniform(*settings.flexible_inertia_scale))
+    ratio = float(np.exp(random.uniform(low, high)))
+    inertia = base.joint.inertia_kgm2 * scale
+    motor = inertia / (1.0 + ratio)
+    stiffness, beyond, knees = REDUCERS[int(random.choice(settings.reducer_sizes))]
+    critical = 2.0 * math.sqrt(stiffness * motor * (inertia - motor) / inertia)
+    error = float(random.uniform(*settings.kinematic_error_rad))
+    return {
+        "flexible": True,
+        "inertia_scale": scale,
+        "motor_side_inertia_kgm2": motor,
+        "reducer_stiffness_Nmprad": stiffness,
+        "reducer_stiffness_beyond_Nmprad": beyond,
+        "reducer_knees_Nm": knees,
+        "reducer_damping_Nmspr": critical * float(random.uniform(*settings.reducer_damping)),
+        "hysteresis_width_rad": float(random.uniform(*settings.hysteresis_width_rad)),
+        "kinematic_error_rad": (error, error * float(random.uniform(*settings.kinematic_error_share))),
+        "kinematic_error_per_motor_turn": (2.0, 4.0),
+        "kinematic_error_phase_rad": tuple(float(x) for x in random.uniform(0.0, math.tau, 2)),
+        "link_friction_share": float(random.uniform(*settings.link_friction_share)),
+    }
 
 
 def random_plant(base: Config, settings: EnsembleSettings, seed: int, index: int) -> Config:
@@ -116,14 +170,22 @@ def random_plant(base: Config, settings: EnsembleSettings, seed: int, index: int
         "initial_position_rad": 0.0,
     }
     bits = int(random.integers(settings.encoder_bits[0], settings.encoder_bits[1] + 1))
+    update: dict[str, Any] = {
+        "drive": base.drive.model_copy(update={"rpdo_transmission_type": RPDO_AT_ONCE}),
+        "encoder": base.encoder.model_copy(update={"counts_per_turn": 2**bits, "side": "joint"}),
+    }
+    if settings.flexible:
+        virtual |= _flexible(base, settings, random)
+        low_bits, high_bits = settings.motor_encoder_bits
+        motor = {"counts_per_turn": 2 ** int(random.integers(low_bits, high_bits + 1)), "side": "motor"}
+        update["encoder"] = base.encoder.model_copy(update=motor)
+        update["joint_encoder"] = JointEncoder(
+            source="drive", counts_per_turn=2**bits, direction=1, zero_counts=0, law=settings.law,
+            disagreement_max_rad=ENCODERS_APART_rad,
+        )  # fmt: skip
     assert base.virtual is not None
-    return base.model_copy(
-        update={
-            "virtual": base.virtual.model_copy(update=virtual),
-            "encoder": base.encoder.model_copy(update={"counts_per_turn": 2**bits, "side": "joint"}),
-            "drive": base.drive.model_copy(update={"rpdo_transmission_type": RPDO_AT_ONCE}),
-        }
-    )
+    update["virtual"] = base.virtual.model_copy(update=virtual)
+    return base.model_copy(update=update)
 
 
 # --- what is compared ---
@@ -242,7 +304,8 @@ def run_plant(task: PlantTask) -> PlantResult:
         constants = controller_constants(config, controller, joint.report.start_position_rad)
         figures.append(error_figures(run_scenario(joint, constants, task.scenario), task.after_s))
     assert config.virtual is not None
-    bits = round(math.log2(config.encoder.counts_per_turn))
+    on_joint = config.encoder if config.joint_encoder is None else config.joint_encoder
+    bits = round(math.log2(on_joint.counts_per_turn))
     return PlantResult(task.index, config.virtual.friction_kind, bits, tuple(figures))
 
 

@@ -101,6 +101,7 @@ class ErrorFigures:
     true_rmse_mrad: float
     settling_s: float  # until the measured error stays within 1 mrad; inf = it never does
     torque_peak_Nm: float  # of the command, after `after_s`
+    chatter_Nm: float = math.inf  # mean change of the command from cycle to cycle
 
 
 FAILED = (math.inf, math.inf, -math.inf, math.inf, math.inf, math.inf, math.inf, math.inf)
@@ -135,4 +136,5 @@ def error_figures(run: LockstepRun, after_s: float) -> ErrorFigures:
         true_rmse_mrad=float(np.sqrt(np.mean(true**2))),
         settling_s=settling_s(time_s, error),
         torque_peak_Nm=float(np.max(np.abs(run.log.command_torque_Nm[tracking][late]))),
+        chatter_Nm=float(np.mean(np.abs(np.diff(run.log.command_torque_Nm[tracking][late])))),
     )

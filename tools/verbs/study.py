@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Column, Table
 
-from jointctl.drivers.errors import INTERRUPTED
+from jointctl.drivers.errors import INTERRUPTED, ConfigurationError
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import Report, VerbOutput, Workers
 
@@ -23,6 +23,7 @@ _COLUMNS = (
     ("true_peak_mrad", "true peak [mrad]"),
     ("true_rmse_mrad", "true RMSE [mrad]"),
     ("settling_s", "settling [s]"),
+    ("chatter_Nm", "chatter [Nm]"),
 )
 _BOXES = (
     "Box: quartiles, line: median; whiskers: 5 and 95 %; dots: plants beyond them. A run ended by a fault is left out."
@@ -121,7 +122,7 @@ def _table(result: StudyResult, title: str, after_s: float) -> Table:
         *(Column(heading, justify="right") for heading in (*headings, "faults")),
         title=f"{title}: errors after {after_s:g} s [mrad], median (5..95 %)",
         caption="peak and RMSE as the encoder shows them; true: of the joint itself; "
-        "settling: until the error stays within 1 mrad",
+        "settling: until the error stays within 1 mrad; chatter: mean change of the torque command in a cycle",
         title_justify="left",
         caption_justify="left",
     )
@@ -160,7 +161,12 @@ def study_data(result: StudyResult, settings: StudySettings) -> dict[str, Any]:
 class StudyFlags:
     """Settings of the study that replace those of its file; None: as there."""
 
-    plants: Annotated[int | None, typer.Option("--plants", help="how many random plants")] = None
+    plants: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--plants", help="how many random plants; rigid or realistic (a soft reducer): which; both in turn"
+        ),
+    ] = None
     seed: Annotated[int | None, typer.Option("--seed")] = None
     after_s: Annotated[float | None, typer.Option("--after", help="errors are taken after this time (s)")] = None
     scenario: Annotated[str | None, typer.Option("--scenario", help="sine, frequency, amplitude or load")] = None
@@ -168,6 +174,21 @@ class StudyFlags:
         list[str] | None, typer.Option("--controller", help="name or configuration file; may be repeated")
     ] = None
     base: Annotated[str | None, typer.Option("--base", help="configuration of the joint: name or file")] = None
+
+
+def with_plants(settings: StudySettings, given: list[str]) -> StudySettings:
+    """How many plants, and of which ensemble."""
+    from jointctl.tools.experiments.controller_study import checked
+
+    changed = settings.model_dump()
+    for text in given:
+        if text in ("rigid", "realistic"):
+            changed["plant"]["flexible"] = text == "realistic"
+        elif text.isascii() and text.isdigit():
+            changed["plants"] = int(text)
+        else:
+            raise ConfigurationError(f"--plants (={text}) must be a number, rigid or realistic")
+    return checked(changed, "command line")
 
 
 def study_verb(
@@ -183,7 +204,8 @@ def study_verb(
     """Compare controllers on many random joints: medians and 5-95 % ranges of error, peak and settling time."""
     from jointctl.tools.experiments.controller_study import StudySettings, checked, load_study
 
-    given = {key: value for key, value in vars(flags).items() if value not in (None, [])}
+    given = {key: value for key, value in vars(flags).items() if key != "plants" and value not in (None, [])}
     settings = load_study(file) if file is not None else StudySettings()
     settings = checked({**settings.model_dump(), **given}, "command line")
+    settings = with_plants(settings, flags.plants or [])
     return study(settings, output, file=file, workers=workers, csv=csv, figure=figure, report=report)

@@ -239,7 +239,7 @@ def added(line: str) -> str:
     return f"standstill_radps = 0.02\n{line}"
 
 
-@pytest.mark.parametrize("name", ["virtual", "paper", "precise", "sweep_virtual"])
+@pytest.mark.parametrize("name", ["virtual", "paper", "precise", "realistic", "sweep_virtual"])
 def test_the_monitor_is_on_in_every_file_that_does_not_name_it(name: str) -> None:
     config = load_config(shipped_config(name))
     axis = constants_of(config)[0]

@@ -15,6 +15,8 @@ from jointctl.hil.plant import (
     FrictionKind,
     PlantSettings,
     encoder_counts,
+    hysteresis_torque_Nm,
+    link_reading_rad,
     plant,
     sine_of_turns,
     step_plant,
@@ -342,6 +344,211 @@ def test_heating_follows_current_squared_and_lowers_friction():
     assert s[0].motor_temperature_degC == 25.0
 
 
+# --- The reducer: three slopes, hysteresis, kinematic error, friction on both sides ---
+SIZE_20 = {
+    "flexible": True, "motor_side_inertia_kgm2": 1.2, "reducer_stiffness_Nmprad": 1.6e4,
+    "reducer_knees_Nm": (7.0, 25.0),
+    "reducer_stiffness_beyond_Nmprad": (2.5e4, 2.9e4), "reducer_damping_Nmspr": 0.0,
+}  # fmt: skip
+# transmitted torque [Nm] -> (twist [rad], slope there [Nm/rad])
+WIND_UP = [
+    (3.0, 3.0 / 1.6e4, 1.6e4), (16.0, 7.0 / 1.6e4 + 9.0 / 2.5e4, 2.5e4),
+    (40.0, 7.0 / 1.6e4 + 18.0 / 2.5e4 + 15.0 / 2.9e4, 2.9e4),
+]  # fmt: skip
+WAVY = {"kinematic_error_rad": (1e-3, 3e-4), "kinematic_error_per_motor_turn": (2.0, 4.0)}
+
+
+def kinematic_error(position_rad):
+    return 1e-3 * math.sin(2.0 * RATIO * position_rad) + 3e-4 * math.sin(4.0 * RATIO * position_rad)
+
+
+def spring_energy_J(twist_rad):
+    """Of the three slopes, integrated by hand."""
+    size, energy, slope, knee_Nm, knee_rad = abs(twist_rad), 0.0, 1.6e4, 0.0, 0.0
+    for next_Nm, beyond in ((7.0, 2.5e4), (25.0, 2.9e4), (math.inf, math.nan)):
+        next_rad = knee_rad + (next_Nm - knee_Nm) / slope
+        way = min(size, next_rad) - knee_rad
+        energy += knee_Nm * way + 0.5 * slope * way * way
+        if size <= next_rad:
+            return energy
+        slope, knee_Nm, knee_rad = beyond, next_Nm, next_rad
+    raise AssertionError
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("torque_Nm", "twist_rad", "slope_Nmprad"), WIND_UP)
+def test_static_wind_up_follows_the_three_slopes(torque_Nm, twist_rad, slope_Nmprad, sign):
+    c, s = plant(**{**SIZE_20, "reducer_damping_Nmspr": 40.0})
+    s[0].added_load_torque_Nm = sign * torque_Nm
+    run(c[0], s[0], sign * torque_Nm, 40000)
+    assert s[0].motor_position_rad - s[0].joint_position_rad == pytest.approx(sign * twist_rad, rel=1e-6)
+    assert s[0].reducer_torque_Nm == pytest.approx(sign * torque_Nm, rel=1e-6)
+
+
+@pytest.mark.parametrize(("torque_Nm", "twist_rad", "slope_Nmprad"), WIND_UP)
+def test_the_joint_rings_at_the_resonance_of_the_slope_it_is_on(torque_Nm, twist_rad, slope_Nmprad):
+    c, s = plant(**SIZE_20)
+    s[0].added_load_torque_Nm = torque_Nm
+    s[0].motor_position_rad = twist_rad + 5e-5
+    twist = np.empty(20000)
+    for i in range(len(twist)):
+        step_plant(c[0], s[0], torque_Nm)
+        twist[i] = s[0].motor_position_rad - s[0].joint_position_rad - twist_rad
+    crossings = np.flatnonzero((twist[:-1] < 0.0) & (twist[1:] >= 0.0))
+    measured_Hz = (len(crossings) - 1) / ((crossings[-1] - crossings[0]) * STEP_s)
+    reduced = 1.2 * 0.9 / 2.1
+    assert measured_Hz == pytest.approx(math.sqrt(slope_Nmprad / reduced) / (2.0 * math.pi), rel=2e-3)
+    assert np.max(np.abs(twist[-1000:])) == pytest.approx(5e-5, rel=1e-2)
+
+
+def test_slopes_kinematic_error_and_gravity_neither_gain_nor_lose_energy():
+    c, s = plant(**SIZE_20, **WAVY, gravity_Nm=20.0)
+
+    def energy_J():
+        state = s[0]
+        twist = state.motor_position_rad + kinematic_error(state.motor_position_rad) - state.joint_position_rad
+        kinetic = 0.5 * (1.2 * state.motor_velocity_radps**2 + 0.9 * state.joint_velocity_radps**2)
+        return kinetic + spring_energy_J(twist) + 20.0 * (1.0 - math.cos(state.joint_position_rad))
+
+    s[0].motor_velocity_radps = s[0].joint_velocity_radps = 0.3
+    s[0].motor_position_rad += 2e-3
+    at_start = energy_J()
+    found = []
+    for _ in range(400):
+        run(c[0], s[0], 0.0, 100)
+        found.append(energy_J())
+    assert np.mean(found) == pytest.approx(at_start, rel=2e-3)
+    assert np.max(np.abs(np.array(found) - at_start)) < 0.01 * at_start
+    # no drift: the last tenth is like the first
+    assert np.mean(found[-40:]) == pytest.approx(np.mean(found[:40]), rel=2e-3)
+
+
+@pytest.mark.parametrize(("amplitude_rad", "width_rad"), [(1e-3, 2e-4), (1e-4, 2e-4), (5e-4, 3e-4), (2e-3, 1e-4)])
+def test_the_area_of_the_hysteresis_loop(amplitude_rad, width_rad):
+    c, s = plant(**SIZE_20, hysteresis_width_rad=width_rad)
+    samples = 2000
+    cycle = amplitude_rad * np.sin(2.0 * np.pi * np.arange(samples + 1) / samples)
+    for _ in range(20):  # into the steady loop
+        torques = np.array([hysteresis_torque_Nm(c[0], s[0], twist) for twist in cycle])
+    area_J = np.sum(0.5 * (torques[1:] + torques[:-1]) * np.diff(cycle))
+    slide = 0.5 * width_rad
+    left = math.exp(-2.0 * amplitude_rad / slide)
+    end = slide * math.tanh(amplitude_rad / slide)
+    expected_J = 2.0 * 1.6e4 * slide * (2.0 * amplitude_rad - (end + slide) * (1.0 - left))
+    assert area_J == pytest.approx(expected_J, rel=2e-3)
+    assert abs(s[0].hysteresis_rad) <= slide
+
+
+def test_hysteresis_leaves_half_its_width_behind_and_doubles_the_stiffness_of_a_small_motion():
+    c, s = plant(**SIZE_20, hysteresis_width_rad=2e-4)
+    for twist in np.linspace(0.0, 2e-3, 4000):
+        hysteresis_torque_Nm(c[0], s[0], twist)
+    assert s[0].hysteresis_rad == pytest.approx(1e-4, rel=1e-6)
+    before = hysteresis_torque_Nm(c[0], s[0], 2e-3)
+    slope = (before - hysteresis_torque_Nm(c[0], s[0], 2e-3 - 1e-7)) / 1e-7
+    assert slope == pytest.approx(2.0 * 1.6e4, rel=2e-3)  # a reversal at full deflection: (1 + z / slide) K1
+    c, s = plant(**SIZE_20, hysteresis_width_rad=2e-4)
+    assert hysteresis_torque_Nm(c[0], s[0], 1e-7) / 1e-7 == pytest.approx(1.6e4, rel=2e-3)
+
+
+def test_a_slow_link_follows_the_kinematic_error_of_the_reducer():
+    c, s = plant(**{**SIZE_20, "reducer_damping_Nmspr": 60.0}, **WAVY)
+    s[0].motor_velocity_radps = 0.02  # four per motor turn are 1.5 Hz, the resonance is at 28 Hz
+    s[0].joint_velocity_radps = 0.02
+    worst = 0.0
+    for _ in range(4000):
+        motor_rad = s[0].motor_position_rad
+        s[0].motor_velocity_radps = 0.02  # an infinitely strong motor
+        run(c[0], s[0], 0.0, 10)
+        if s[0].time_s > 0.5:
+            motor_rad = s[0].motor_position_rad
+            worst = max(worst, abs(s[0].joint_position_rad - motor_rad - kinematic_error(motor_rad)))
+    assert worst < 3e-5  # of 1.2e-3
+
+
+@pytest.mark.parametrize("position_rad", [0.0, 0.4, -1.3])
+def test_at_the_start_the_spring_is_slack(position_rad):
+    phases = {"kinematic_error_phase_rad": (0.7, -2.0)}
+    c, s = plant(**SIZE_20, **WAVY, **phases, initial_position_rad=position_rad)
+    step_plant(c[0], s[0], 0.0)
+    assert s[0].joint_position_rad == pytest.approx(position_rad, abs=1e-15)
+    assert s[0].reducer_torque_Nm == pytest.approx(0.0, abs=1e-8)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3])
+def test_friction_on_the_link_holds_its_share_before_the_reducer_feels_a_load(share):
+    settings = {**SIZE_20, "reducer_damping_Nmspr": 40.0, "friction_kind": FrictionKind.STICK_SLIP}
+    static_Nm = share * -STATIC_BACKWARD_Nm  # a positive load pushes the link backwards
+    c, s = plant(**settings, link_friction_share=share)
+    s[0].added_load_torque_Nm = 0.999 * static_Nm
+    run(c[0], s[0], 0.0, 20000)
+    assert s[0].joint_position_rad == 0.0
+    assert s[0].friction_torque_Nm == pytest.approx(-0.999 * static_Nm)
+    # the twin: a little more, and the spring carries what friction does not
+    s[0].added_load_torque_Nm = static_Nm + 1.0
+    run(c[0], s[0], 0.0, 40000)
+    assert s[0].joint_position_rad < 0.0
+    assert s[0].motor_position_rad == 0.0
+    assert 0.0 < s[0].reducer_torque_Nm < 2.0 * 1.0 + 1e-6  # it may come to rest anywhere inside the friction's band
+
+
+@pytest.mark.parametrize("kind", [FrictionKind.STICK_SLIP, FrictionKind.LUGRE])
+def test_both_sides_together_have_the_friction_of_the_whole_joint(kind):
+    c, s = plant(**{**SIZE_20, "reducer_damping_Nmspr": 40.0}, link_friction_share=0.2, friction_kind=kind)
+    s[0].motor_velocity_radps = s[0].joint_velocity_radps = 100.0 * DEGREE
+    run(c[0], s[0], RATIO * 0.28871, 60000)
+    assert s[0].joint_velocity_radps == pytest.approx(100.0 * DEGREE, rel=5e-3)
+    assert s[0].friction_torque_Nm == pytest.approx(RATIO * 0.28871, rel=2e-3)
+    assert s[0].reducer_torque_Nm == pytest.approx(0.2 * RATIO * 0.28871, rel=5e-3)
+
+
+REALISTIC = {
+    **R1, **SIZE_20, "reducer_damping_Nmspr": 7.0, "hysteresis_width_rad": 2e-4, "link_friction_share": 0.12,
+    "kinematic_error_rad": (2e-4, 5e-5), "kinematic_error_per_motor_turn": (2.0, 4.0), "command_delay_s": 0.0,
+}  # fmt: skip
+
+
+@kernel
+def track_motor(c, s, seconds):
+    """A damped law at 1 kHz on the motor, the same for any step of the plant."""
+    torque = 0.0
+    every = round(1e-3 / c.step_s)
+    for k in range(round(seconds / c.step_s)):
+        if k % every == 0:
+            angle = 0.2 * math.pi * k * c.step_s
+            torque = -640.0 * (s.motor_position_rad - 0.35 * math.sin(angle))
+            torque -= 42.0 * (s.motor_velocity_radps - 0.07 * math.pi * math.cos(angle))
+        step_plant(c, s, torque)
+
+
+def test_the_step_is_short_enough_for_a_realistic_reducer():
+    link_rad = []
+    for step_s in (50e-6, 5e-6):
+        c, s = plant(**REALISTIC, step_s=step_s)
+        track_motor(c[0], s[0], 3.0)
+        link_rad.append(float(s[0].joint_position_rad))
+    assert link_rad[0] == pytest.approx(link_rad[1], abs=2e-6)
+
+
+def test_an_eccentric_disc_reads_a_sine_too_much_once_a_turn_of_its_shaft():
+    turn = {"encoder_counts_per_turn": 2**26}
+    c, s = plant(**turn, joint_encoder_eccentricity_rad=1e-3, joint_encoder_eccentricity_phase_rad=0.4)
+    for position in np.linspace(-7.0, 7.0, 50):
+        s[0].joint_position_rad = position
+        expected = position + 1e-3 * math.sin(position + 0.4)
+        assert link_reading_rad(c[0], s[0]) == pytest.approx(expected, abs=1e-12)
+        assert encoder_counts(c[0], s[0]) * 2.0 * math.pi / 2**26 == pytest.approx(expected, abs=1e-7)
+    c, s = plant(**turn, encoder_side=EncoderSide.MOTOR, motor_encoder_eccentricity_rad=2e-3)
+    for position in np.linspace(-0.1, 0.1, 50):
+        s[0].motor_position_rad = position
+        expected = position + 2e-3 * math.sin(RATIO * position) / RATIO
+        assert encoder_counts(c[0], s[0]) * 2.0 * math.pi / 2**26 / RATIO == pytest.approx(expected, abs=1e-9)
+    # the twin: a centred disc reads what there is
+    c, s = plant(**turn)
+    s[0].joint_position_rad = 1.0
+    assert link_reading_rad(c[0], s[0]) == 1.0
+
+
 # --- The virtual joint's actuator and encoder, and what its settings accept ---
 def test_current_lag_is_the_exact_exponential():
     c, s = plant(current_lag_s=0.5e-3)
@@ -446,6 +653,18 @@ def test_encoder_noise_is_normal_seeded_and_off_by_default():
         ({"torque_ripple_Nm": (0.5,)}, r"torque_ripple_per_motor_turn (=()) must be 1 orders, one per amplitude"),
         ({"torque_ripple_Nm": 0.5}, r"torque_ripple_Nm (=0.5) must be a list of numbers"),
         ({"torque_ripple_Nm": (-0.5,)}, r"torque_ripple_Nm (=(-0.5,)) must be numbers in [0..10000]"),
+        ({"kinematic_error_rad": (1e-4,)}, r"kinematic_error_per_motor_turn (=()) must be 1 orders, one per amplitude"),
+        ({"hysteresis_width_rad": 1e-4}, r"hysteresis_width_rad (=0.0001) must be left out unless flexible is true"),
+        ({**SIZE_20, "reducer_knees_Nm": (25.0, 7.0)}, r"reducer_knees_Nm (=(25.0, 7.0)) must be at most 2 torques in"),
+        ({**SIZE_20, "reducer_knees_Nm": (7.0,)}, r"reducer_stiffness_beyond_Nmprad (=(25000.0, 29000.0)) must be 1"),
+        (
+            {**SIZE_20, "kinematic_error_rad": (3e-3,), "kinematic_error_per_motor_turn": (2.0,)},
+            r"kinematic_error_rad (=(0.003,)) must be so small that",
+        ),
+        (
+            {**SIZE_20, "reducer_stiffness_beyond_Nmprad": (2.5e4, 1e8)},
+            r"reducer_stiffness_beyond_Nmprad (=(25000.0, 100000000.0)) must be at most",
+        ),
         ({"inertia": 2.1}, r"inertia (=2.1) is not a setting of the virtual joint"),
     ],
 )

@@ -45,9 +45,9 @@ def test_cyclic_torque_scales_by_rated_torque_and_moves_the_plant(rig: Rig) -> N
 def test_the_reported_torque_is_that_of_the_current_without_the_ripple(rig: Rig) -> None:
     rig.enable(10)
     plant = rig.device.plant_constants[0]
-    plant.torque_ripples = 1
-    plant.torque_ripple_Nm[0] = 6.0
-    plant.torque_ripple_phase_turns[0] = 0.25  # its crest, at any angle
+    plant.torque_ripple.count = 1
+    plant.torque_ripple.amplitude[0] = 6.0
+    plant.torque_ripple.phase_turns[0] = 0.25  # its crest, at any angle
     rig.set(0x6071, 0, 100, 2)
     rig.run(50)
     assert rig.get(0x6077) == 100
