@@ -1,13 +1,12 @@
-"""One tick of one joint: sample in, command out; with the velocity filter and the velocity command that it uses."""
+"""One tick of one joint: sample in, command out; with the velocity command that it uses."""
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
+from jointctl.firmware_py.flexible_joint import Reading
 from jointctl.firmware_py.kernel import kernel
-from jointctl.firmware_py.law import step_law
+from jointctl.firmware_py.law import step_flexible_law, step_law
 from jointctl.firmware_py.live_change import step_change, step_new_motion
 from jointctl.firmware_py.records import (
     AxisConstants,
@@ -17,8 +16,6 @@ from jointctl.firmware_py.records import (
     Reference,
     Sample,
     VelocityCommandConstants,
-    VelocityConstants,
-    VelocityState,
 )
 from jointctl.firmware_py.safety import (
     check_encoders,
@@ -47,44 +44,17 @@ from jointctl.firmware_py.sequence import (
     step_waiting,
     write_command,
 )
-from jointctl.firmware_py.states import AxisPhase, CommandKind, Fault, Reaction, TrajectoryKind
+from jointctl.firmware_py.states import AxisPhase, CommandKind, ControllerKind, Fault, Reaction, TrajectoryKind
 from jointctl.firmware_py.stream import following_set_points, step_other_motion, step_stream
-from jointctl.firmware_py.trajectory import NO_REPETITION, approach_at, brake_step, reference_at, repetition
-
-# --- Velocity from position differences with a first-order low-pass ---
-# The filter lags, and a velocity error e' = filter(q') - q_d' then carries the lag of q' but not of q_d', which an
-# integrating law absorbs as a bias.  `error_rate_radps` is the matched version: the difference quotient of e = q -
-# q_d sent as a whole through the same filter.
-
-
-@kernel
-def low_pass_gain(cutoff_Hz: float, interval_s: float) -> float:
-    """Weight of the new value in one step of the exactly discretised first-order low-pass; 1 = no filter."""
-    if cutoff_Hz <= 0.0:
-        return 1.0
-    return 1.0 - math.exp(-2.0 * math.pi * cutoff_Hz * interval_s)
-
-
-@kernel
-def step_velocity(
-    constants: VelocityConstants, state: VelocityState, position_rad: float, error_rad: float, elapsed_cycles: int
-) -> None:
-    """Take a sample that came `elapsed_cycles` (>= 1) periods after the last one; the first one only primes."""
-    if state.primed == 0:
-        state.primed = 1
-        state.velocity_radps = 0.0
-        state.error_rate_radps = 0.0
-    else:
-        interval_s = elapsed_cycles * constants.period_s
-        if elapsed_cycles == 1:
-            gain = constants.period_gain
-        else:
-            gain = low_pass_gain(constants.cutoff_Hz, interval_s)
-        state.velocity_radps += gain * ((position_rad - state.last_position_rad) / interval_s - state.velocity_radps)
-        state.error_rate_radps += gain * ((error_rad - state.last_error_rad) / interval_s - state.error_rate_radps)
-    state.last_position_rad = position_rad
-    state.last_error_rad = error_rad
-
+from jointctl.firmware_py.trajectory import (
+    NO_REPETITION,
+    Repetition,
+    approach_at,
+    brake_step,
+    reference_at,
+    repetition,
+)
+from jointctl.firmware_py.velocity import step_velocity
 
 # --- The velocity command: the reference's velocity plus a small position correction ---
 # For a drive that closes the velocity loop itself:
@@ -118,7 +88,9 @@ def _take_position(constants: AxisConstants, state: AxisState, sample: Sample, e
     if sample.count == state.sample_count:
         state.sample_age_cycles += elapsed_cycles
         state.good_samples = 0
-        state.measured_position_rad += state.velocity.velocity_radps * elapsed_cycles * constants.velocity.period_s
+        moved_rad = state.velocity.velocity_radps * elapsed_cycles * constants.velocity.period_s
+        state.measured_position_rad += moved_rad
+        state.second_position_rad += moved_rad
         return 0
     gap_cycles = state.sample_age_cycles + elapsed_cycles
     check_jump(constants, state, sample, gap_cycles)
@@ -184,7 +156,26 @@ def _brake(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> N
 
 
 @kernel
-def _command_torque(constants: AxisConstants, state: AxisState, table: np.ndarray, elapsed_cycles: int) -> None:
+def law_torque_Nm(constants: AxisConstants, state: AxisState, where: Repetition, gap_cycles: int) -> float:
+    """What the law asks for, unlimited."""
+    if constants.law.kind == ControllerKind.FLEXIBLE_JOINT:
+        reading = Reading(state.measured_position_rad, state.second_position_rad, gap_cycles)
+        return step_flexible_law(constants.law, state.law, reading, state.reference, state.command_torque_Nm, where)
+    return step_law(
+        constants.law,
+        state.law,
+        state.measured_position_rad,
+        state.velocity,
+        state.reference,
+        state.command_torque_Nm,
+        where,
+    )
+
+
+@kernel
+def _command_torque(
+    constants: AxisConstants, state: AxisState, table: np.ndarray, elapsed_cycles: int, gap_cycles: int
+) -> None:
     """The torque of this cycle; a torque that is not finite is never sent."""
     if state.phase == AxisPhase.RELEASING:
         state.unlimited_torque_Nm = released_torque_Nm(constants, state, elapsed_cycles)
@@ -192,15 +183,7 @@ def _command_torque(constants: AxisConstants, state: AxisState, table: np.ndarra
         where = NO_REPETITION
         if state.phase == AxisPhase.TRACKING:
             where = repetition(constants.trajectory, table, state.trajectory_s)
-        state.unlimited_torque_Nm = step_law(
-            constants.law,
-            state.law,
-            state.measured_position_rad,
-            state.velocity,
-            state.reference,
-            state.command_torque_Nm,
-            where,
-        )
+        state.unlimited_torque_Nm = law_torque_Nm(constants, state, where, gap_cycles)
         if state.stream.torque_Nm != 0.0:
             state.unlimited_torque_Nm += state.stream.torque_Nm
     else:
@@ -288,7 +271,9 @@ def step_axis(
         watch_rest(constants, state, sample)
         # The drive samples when SYNC comes, and SYNC goes out when the loop wakes up.  Until then the joint moved on
         # with about the desired velocity: without this, 0.1 ms at 0.2 rad/s would look like 20 urad of error.
-        state.measured_position_rad -= state.reference.velocity_radps * state.sample_late_s
+        moved_rad = state.reference.velocity_radps * state.sample_late_s
+        state.measured_position_rad -= moved_rad
+        state.second_position_rad -= moved_rad
         error_rad = state.measured_position_rad - state.reference.position_rad
         step_velocity(constants.velocity, state.velocity, state.measured_position_rad, error_rad, gap_cycles)
     if powered(state.phase):
@@ -297,6 +282,6 @@ def step_axis(
     if constants.command_kind == CommandKind.VELOCITY:
         _command_velocity(constants, state, elapsed_cycles)
     else:
-        _command_torque(constants, state, table, elapsed_cycles)
+        _command_torque(constants, state, table, elapsed_cycles, gap_cycles)
     step_stopping(constants, state, sample)
     write_command(state, command)

@@ -1,9 +1,12 @@
-"""The control law: PID, adaptive network, disturbance observer, iterative learning, and their sum, computed torque."""
+"""The control law: PID, adaptive network, disturbance observer, iterative learning, and their sums.
+
+Those are computed torque, and the law for a joint whose reducer is not rigid (`flexible_joint`)."""
 
 from __future__ import annotations
 
 import math
 
+from jointctl.firmware_py.flexible_joint import Reading, desired_motor, motor_and_link_errors, reset_flexible
 from jointctl.firmware_py.friction import compensation_motor_torque_Nm, step_lugre
 from jointctl.firmware_py.kernel import kernel, plain
 from jointctl.firmware_py.records import (
@@ -310,6 +313,7 @@ def reset_law(constants: LawConstants, state: LawState) -> None:
     reset_observer(state.observer, 0.0)
     reset_learning(state.learning)
     state.learning.stopped = 0
+    reset_flexible(state.flexible)
     state.lugre_deflection_rad = 0.0
     state.integral_rads = 0.0
     state.inertia_torque_Nm = 0.0
@@ -432,3 +436,43 @@ def step_law(
         + state.learned_torque_Nm
         + rest_Nm
     )
+
+
+# --- The law for a joint whose reducer is not rigid; see `flexible_joint` for the equations ---
+
+
+@kernel
+def step_flexible_law(
+    constants: LawConstants,
+    state: LawState,
+    reading: Reading,
+    reference: Reference,
+    sent_torque_Nm: float,
+    where: Repetition,
+) -> float:
+    """One cycle, as `step_law`: the unlimited torque at the joint [Nm]."""
+    flexible, own = constants.flexible, state.flexible
+    state.friction_torque_Nm = friction_feed_forward_Nm(constants, state, 0.0, reference.velocity_radps)
+    gravity_slope_Nmprad = 0.0
+    state.gravity_torque_Nm = 0.0
+    if constants.gravity_Nm != 0.0:
+        lever = reference.position_rad - constants.gravity_zero_rad
+        state.gravity_torque_Nm = constants.gravity_Nm * math.sin(lever)
+        gravity_slope_Nmprad = constants.gravity_Nm * math.cos(lever)
+    known_Nm = desired_motor(constants, state, reference, gravity_slope_Nmprad)
+    state.inertia_torque_Nm = known_Nm - state.friction_torque_Nm - state.gravity_torque_Nm
+    motor_rad, link_rad = motor_and_link_errors(flexible, own, reading, reference.position_rad)
+    rate_radps = own.motor_velocity.error_rate_radps
+    momentum = flexible.motor_inertia_kgm2 * rate_radps
+    momentum += flexible.link_inertia_kgm2 * own.link_velocity.error_rate_radps
+    state.observer_torque_Nm = step_observer(
+        constants.observer, state.observer, sent_torque_Nm - own.known_torque_Nm, 0.0, momentum, constants.period_s
+    )
+    state.feedback_torque_Nm = -constants.inertia_kgm2 * (
+        constants.kp * (motor_rad + own.twist_error_rad) + constants.kv * rate_radps
+    )
+    correction_Nm = state.feedback_torque_Nm + state.observer_torque_Nm
+    correction_Nm -= constants.inertia_kgm2 * constants.learning.error_gain_ps2 * link_rad
+    state.learned_torque_Nm = _learn(constants, state, where, correction_Nm, link_rad)
+    own.known_torque_Nm = known_Nm + state.learned_torque_Nm
+    return own.known_torque_Nm + state.feedback_torque_Nm + state.observer_torque_Nm

@@ -12,12 +12,13 @@ import numpy as np
 from jointctl.firmware_py.schema import array_of, f8, i4, i8, record, u4
 
 # --- The control law: friction model, network, observer, learning, and the law that holds them ---
-# Constants are set once, state changes in every cycle.  SI units; `joint_` is the low-velocity side of the reducer.
 
 
 NEURONS = 15
 TORQUE_HISTORY = 16  # cycles that an observer can look back
 LEARNING_BINS = 1 << 14
+HARMONICS = 4  # of a map of the reducer
+KNEES = 2  # of the reducer's stiffness
 
 
 @record
@@ -117,6 +118,62 @@ class LearningState:
 
 
 @record
+class HarmonicSeries:
+    """A sum of sines of the motor angle."""
+
+    count: i4  # how many of the following are in use
+    amplitude: Annotated[np.ndarray, array_of(f8, HARMONICS)]
+    turns_prad: Annotated[np.ndarray, array_of(f8, HARMONICS)]  # order per joint turn / 2 pi
+    phase_turns: Annotated[np.ndarray, array_of(f8, HARMONICS)]
+
+
+@record
+class VelocityConstants:
+    period_s: f8
+    cutoff_Hz: f8  # first-order low-pass on the difference quotient; 0 = none
+    period_gain: f8  # velocity.low_pass_gain(cutoff_Hz, period_s), computed once
+
+
+@record
+class VelocityState:
+    primed: i4  # 0 until the first sample
+    last_position_rad: f8
+    velocity_radps: f8
+    last_error_rad: f8
+    error_rate_radps: f8  # the filtered error rate's e'
+
+
+@record
+class FlexibleConstants:
+    """See `flexible_joint`: a joint with a reducer that is not rigid; every value at the joint."""
+
+    encoders: i4  # Encoders
+    motor_inertia_kgm2: f8
+    link_inertia_kgm2: f8
+    link_friction_share: f8
+    compliance_radpNm: f8  # up to the first knee
+    stiffening_radpNm: Annotated[np.ndarray, array_of(f8, KNEES)]  # by which the compliance falls at each knee
+    knee_Nm: Annotated[np.ndarray, array_of(f8, KNEES)]
+    kinematic_error: HarmonicSeries  # [rad]
+    torque_ripple: HarmonicSeries  # [Nm]
+    twist_gain: f8  # of the slow correction of the twist, of one period
+    motor_velocity: VelocityConstants
+    link_velocity: VelocityConstants
+
+
+@record
+class FlexibleState:
+    primed: i4
+    target_rad: f8  # theta_d
+    ahead_rad: f8  # theta_d and the kinematic error there
+    motor_per_link: f8  # slope of theta_d against that
+    twist_error_rad: f8  # b
+    known_torque_Nm: f8  # of the last cycle: feed-forward and what was learned
+    motor_velocity: VelocityState
+    link_velocity: VelocityState
+
+
+@record
 class LawConstants:
     kind: i4  # ControllerKind
     feed_forward: i4  # FeedForward
@@ -138,6 +195,7 @@ class LawConstants:
     network: NetworkConstants
     observer: ObserverConstants
     learning: LearningConstants
+    flexible: FlexibleConstants
 
 
 @record
@@ -145,6 +203,7 @@ class LawState:
     network: NetworkState
     observer: ObserverState
     learning: LearningState
+    flexible: FlexibleState
     lugre_deflection_rad: f8
     integral_rads: f8
     outside_torque_Nm: f8  # ControllerKind.OUTSIDE only
@@ -166,6 +225,7 @@ class Reference:
     position_rad: f8
     velocity_radps: f8
     acceleration_radps2: f8
+    snap_radps4: f8  # fourth derivative; 0 where the motion has jumps in it, or where it is not known
 
 
 @record
@@ -325,22 +385,6 @@ class StreamState:
 
 
 # --- One joint: limits, phases, samples, commands ---
-
-
-@record
-class VelocityConstants:
-    period_s: f8
-    cutoff_Hz: f8  # first-order low-pass on the difference quotient; 0 = none
-    period_gain: f8  # velocity.low_pass_gain(cutoff_Hz, period_s), computed once
-
-
-@record
-class VelocityState:
-    primed: i4  # 0 until the first sample
-    last_position_rad: f8
-    velocity_radps: f8
-    last_error_rad: f8
-    error_rate_radps: f8  # the filtered error rate's e'
 
 
 @record

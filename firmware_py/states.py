@@ -137,6 +137,15 @@ class ControllerKind(IntEnum):
     COMPUTED_TORQUE_OBSERVER = 2  # a disturbance observer in the network's place
     PID = 3  # no friction model unless the feed-forward is switched on
     OUTSIDE = 4  # none: the torque is given in each cycle, at simulated time only
+    FLEXIBLE_JOINT = 5  # damping from the motor's encoder, position from the joint's
+
+
+class Encoders(IntEnum):
+    """What the law of a flexible joint reads."""
+
+    BOTH = 0  # the link's feeds the law, the motor's is the other one
+    MOTOR = 1
+    LINK = 2
 
 
 class TrajectoryKind(IntEnum):

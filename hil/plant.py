@@ -19,19 +19,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jointctl.firmware_py.flexible_joint import series_at, sine_of_turns, value_at
 from jointctl.firmware_py.friction import friction_motor_torque_Nm, paper_friction
 from jointctl.firmware_py.kernel import inlined, kernel
+from jointctl.firmware_py.records import KNEES, HarmonicSeries
 from jointctl.firmware_py.schema import new
 from jointctl.hil.plant_records import (
     DELAY_SLOTS,
-    KNEES,
     EccentricityConstants,
     EncoderSide,
     FrictionKind,
     PlantConstants,
     PlantSettings,
     PlantState,
-    WaveConstants,
     decay,
 )
 
@@ -81,21 +81,6 @@ def _normal(s: PlantState) -> float:
     """A standard normal number (Box-Muller, one of the pair)."""
     radius = math.sqrt(-2.0 * math.log(1.0 - _uniform(s)))
     return radius * math.cos(2.0 * math.pi * _uniform(s))
-
-
-@inlined
-def sine_of_turns(turns: float) -> float:
-    """sin(2 pi turns), absolute error below 2e-11; range reduction in turns is exact, without branch or library call.
-
-    Half a turn either way is r (1/4 - r^2) P(r^2), P of degree 6 fitted for the least maximum error.  Several times as
-    fast as libm, which matters for three ripples in each of two million substeps; the plant needs no more than 1e-6.
-    """
-    r = turns - np.rint(turns)
-    y = r * r
-    y2 = y * y
-    low = (25.1327412271771 - y * 64.8358437584691) + y2 * (67.0776056610595 - y * 38.5126054685551)
-    high = (14.1788906187473 - y * 3.62170359416296) + y2 * 0.614277835548814
-    return r * (0.25 - y) * (low + y2 * y2 * high)
 
 
 @inlined
@@ -286,35 +271,12 @@ def step_current(c: PlantConstants, s: PlantState, target_joint_torque_Nm: float
     return current
 
 
-@inlined
-def torque_ripple_Nm(c: PlantConstants, motor_position_rad: float) -> float:
-    """Ripple torque at the joint; `motor_position_rad` is the motor angle / n, the orders are per joint turn."""
-    ripple = 0.0
-    for i in range(c.torque_ripple.count):
-        turns = motor_position_rad * c.torque_ripple.turns_prad[i] + c.torque_ripple.phase_turns[i]
-        ripple += c.torque_ripple.amplitude[i] * sine_of_turns(turns)
-    return ripple
-
-
 # --- The reducer of a flexible joint ---
 # The spring is stiffer the more torque it transmits: three slopes, with knees.  The hysteresis is a bristle that slides
 # at half the loop's width: dz = dtwist - |dtwist| z / (width / 2), torque K1 z; it depends on the way alone, not on the
 # speed, and near a reversal adds its own stiffness K1 to the spring's.  z takes a step that is exact to second order.
 #
 # Not modelled: a stiffness that depends on the angle, play.
-
-
-@inlined
-def kinematic_error_rad(c: PlantConstants, motor_position_rad: float) -> tuple[float, float]:
-    """(eps, eps'): by how much the reducer's output is ahead of theta [rad], and its slope against theta."""
-    error = 0.0
-    slope = 0.0
-    for i in range(c.kinematic_error.count):
-        turns = motor_position_rad * c.kinematic_error.turns_prad[i] + c.kinematic_error.phase_turns[i]
-        amplitude = c.kinematic_error.amplitude[i]
-        error += amplitude * sine_of_turns(turns)
-        slope += amplitude * (2.0 * math.pi * c.kinematic_error.turns_prad[i]) * sine_of_turns(turns + 0.25)
-    return error, slope
 
 
 @inlined
@@ -399,7 +361,7 @@ def step_plant(c: PlantConstants, s: PlantState, target_joint_torque_Nm: float) 
         resisting += _end_stop_torque_Nm(c, joint_middle, joint_velocity)
 
     if c.flexible == 0:
-        actuator = c.torque_per_current_NmpA * current + torque_ripple_Nm(c, joint_middle)
+        actuator = c.torque_per_current_NmpA * current + value_at(c.torque_ripple, joint_middle)
         factor = modulation(c, s, joint_middle)
         whole = Mass(c.inverse_driven_inertia, 1.0)
         velocity, travel, friction, s.bristle_deflection_rad = advance(
@@ -413,8 +375,8 @@ def step_plant(c: PlantConstants, s: PlantState, target_joint_torque_Nm: float) 
     else:
         motor_velocity = s.motor_velocity_radps
         motor_middle = s.motor_position_rad + half_step_s * motor_velocity
-        actuator = c.torque_per_current_NmpA * current + torque_ripple_Nm(c, motor_middle)
-        error, slope = kinematic_error_rad(c, motor_middle)
+        actuator = c.torque_per_current_NmpA * current + value_at(c.torque_ripple, motor_middle)
+        error, slope, _ = series_at(c.kinematic_error, motor_middle)
         twist = motor_middle + error - joint_middle
         twist_rate = motor_velocity * (1.0 + slope) - joint_velocity
         through = spring_torque_Nm(c, twist) + c.reducer_damping_Nmspr * twist_rate + hysteresis_torque_Nm(c, s, twist)
@@ -477,7 +439,7 @@ def _fill_actuator(c: PlantConstants, settings: PlantSettings) -> None:
 
 
 def _fill_waves(
-    waves: WaveConstants,
+    waves: HarmonicSeries,
     settings: PlantSettings,
     amplitudes: tuple[float, ...],
     orders: tuple[float, ...],
@@ -574,7 +536,7 @@ def plant(**settings: Any) -> tuple[Any, Any]:
     _fill_reducer(c, checked)
     s.joint_position_rad = s.motor_position_rad = checked.initial_position_rad
     for _ in range(_LOOSENING_STEPS):  # the reducer's spring is slack at the start
-        s.motor_position_rad = checked.initial_position_rad - kinematic_error_rad(c, s.motor_position_rad)[0]
+        s.motor_position_rad = checked.initial_position_rad - value_at(c.kinematic_error, s.motor_position_rad)
     s.motor_temperature_degC = checked.ambient_degC
     s.noise_state = checked.encoder_seed
     return constants, state

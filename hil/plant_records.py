@@ -14,11 +14,9 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from jointctl.firmware_py.records import FrictionConstants
+from jointctl.firmware_py.records import HARMONICS, KNEES, FrictionConstants, HarmonicSeries
 from jointctl.firmware_py.schema import array_of, dtype_of, f8, i4, i8, record
 
-RIPPLES = 4  # sines of a torque ripple or of a kinematic error
-KNEES = 2  # of the reducer's stiffness
 DELAY_SLOTS = 1024  # the command delay is below this many substeps
 
 u8 = Annotated[int, np.dtype("<u8")]
@@ -174,8 +172,8 @@ class PlantSettings:
         for item, low, high in zip(names, (0.0, 0.0, -100.0), (largest, 1e4, 100.0), strict=True):
             self._check_list(item, low, high)
         amplitudes, orders, phases = (getattr(self, item) for item in names)
-        if len(amplitudes) > RIPPLES:
-            raise _allowed(names[0], amplitudes, f"at most {RIPPLES} amplitudes")
+        if len(amplitudes) > HARMONICS:
+            raise _allowed(names[0], amplitudes, f"at most {HARMONICS} amplitudes")
         if len(orders) != len(amplitudes):
             raise _allowed(names[1], orders, f"{len(amplitudes)} orders, one per amplitude")
         if len(phases) not in (0, len(amplitudes)):
@@ -235,16 +233,6 @@ def decay(step_s: float, time_constant_s: float) -> float:
 
 
 @record
-class WaveConstants:
-    """A sum of sines of the motor angle."""
-
-    count: i4  # how many of the following are in use
-    amplitude: Annotated[np.ndarray, array_of(f8, RIPPLES)]
-    turns_prad: Annotated[np.ndarray, array_of(f8, RIPPLES)]  # order per joint turn / 2 pi
-    phase_turns: Annotated[np.ndarray, array_of(f8, RIPPLES)]
-
-
-@record
 class EccentricityConstants:
     """Of the disc of an encoder."""
 
@@ -269,14 +257,14 @@ class PlantConstants:
     reducer_stiffening_Nmprad: Annotated[np.ndarray, array_of(f8, KNEES)]  # by how much the slope rises at each knee
     reducer_knee_rad: Annotated[np.ndarray, array_of(f8, KNEES)]  # twist of the knee
     hysteresis_slide_rad: f8  # deflection at which the bristle slides; 0 = no hysteresis
-    kinematic_error: WaveConstants  # [rad]
+    kinematic_error: HarmonicSeries  # [rad]
     # actuator
     current_per_torque_ApNm: f8  # 1 / (n K_m)
     torque_per_current_NmpA: f8  # n K_m
     current_limit_A: f8
     current_decay: f8  # exp(-step / lag), 0 without lag
     delay_substeps: i4
-    torque_ripple: WaveConstants  # [Nm]
+    torque_ripple: HarmonicSeries  # [Nm]
     # friction
     friction_kind: i4  # FrictionKind
     friction_modulated: i4  # friction ripple or temperature in use

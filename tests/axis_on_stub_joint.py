@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.firmware_py.axis import low_pass_gain, step_axis
+from jointctl.firmware_py.axis import step_axis
 from jointctl.firmware_py.friction import paper_friction
 from jointctl.firmware_py.law import solve_lyapunov_p
 from jointctl.firmware_py.records import NEURONS, AxisConstants, AxisState, Command, Sample
@@ -23,6 +23,7 @@ from jointctl.firmware_py.states import (
     StopRequest,
     TrajectoryKind,
 )
+from jointctl.firmware_py.velocity import low_pass_gain
 
 PERIOD_s = 1e-3
 INERTIA_kgm2 = 2.1

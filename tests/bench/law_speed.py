@@ -10,19 +10,21 @@ import ctypes
 import math
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numba.core import runtime
 
-from jointctl.firmware_py.axis import step_velocity
+from jointctl.firmware_py.axis import law_torque_Nm
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import network_torque_Nm, reset_law, step_law
 from jointctl.firmware_py.records import AxisConstants, AxisState
 from jointctl.firmware_py.safety import limited_torque_Nm
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.trajectory import NO_REPETITION
+from jointctl.firmware_py.trajectory import NO_REPETITION, repetition
+from jointctl.firmware_py.velocity import step_velocity
 from tests.bench.c_programs import (
     FAST_MATH,
     OPTIMISED,
@@ -135,6 +137,7 @@ class NumpyLaw:
 GROUP = "control law"
 SAME_NUMBERS = 1e-12  # of the largest torque
 GOAL_TO_C = 1.3
+GOAL_TO_RIGID = 2.0
 CHUNK_TICKS = 20_000
 NUMPY_TICKS = 500
 
@@ -155,6 +158,26 @@ def run_ticks(constants: np.ndarray, state: np.ndarray, inputs: np.ndarray, torq
         unlimited = step_law(
             axis.law, now.law, position_rad, now.velocity, now.reference, now.command_torque_Nm, NO_REPETITION
         )
+        limited, _ = limited_torque_Nm(axis.limits, unlimited, now.command_torque_Nm, axis.law.period_s)
+        now.command_torque_Nm = limited
+        torque_Nm[i] = limited
+
+
+@kernel
+def run_any_law(
+    constants: np.ndarray, state: np.ndarray, table: np.ndarray, inputs: np.ndarray, torque_Nm: np.ndarray
+) -> None:
+    """As `run_ticks`, for any kind of law, learning included; both encoders show the same position."""
+    axis: AxisConstants = constants[0]
+    now: AxisState = state[0]
+    for i in range(len(torque_Nm)):
+        now.reference.position_rad = inputs[i, 1]
+        now.reference.velocity_radps = inputs[i, 2]
+        now.reference.acceleration_radps2 = inputs[i, 3]
+        now.measured_position_rad = now.second_position_rad = inputs[i, 0]
+        step_velocity(axis.velocity, now.velocity, inputs[i, 0], inputs[i, 0] - inputs[i, 1], 1)
+        where = repetition(axis.trajectory, table, i * axis.law.period_s)
+        unlimited = law_torque_Nm(axis, now, where, 1)
         limited, _ = limited_torque_Nm(axis.limits, unlimited, now.command_torque_Nm, axis.law.period_s)
         now.command_torque_Nm = limited
         torque_Nm[i] = limited
@@ -259,6 +282,20 @@ def _versus_c(constants: Any, folder: Path, pairs: int) -> Iterator[Row]:
         hidden = _timer(lambda i, t, state=state: run_hidden(constants, state, i, t), inputs)  # type: ignore[misc]
         values = interleaved(pairs, hidden, _timer(c_function(library, "run_hidden", constants), inputs))
         yield compared(GROUP, "of it: the network's 15 exponentials", values[0], values[1], "ns", name)
+
+
+def flexible_rows(flexible: Any, rigid: Any, *, pairs: int) -> Iterator[Row]:
+    """The law of a flexible joint against the one of a rigid joint; `AxisConstants` arrays of one."""
+    timers = []
+    for constants in (flexible, rigid):
+        state = new(AxisState)
+        reset_law(constants[0].law, state[0].law)
+        inputs = sine_inputs(constants[0], CHUNK_TICKS)
+        run = partial(run_any_law, constants, state, np.zeros((0, 5)))
+        timers.append(_timer(run, inputs))
+    values = interleaved(pairs, *timers)
+    name = "that of precise.toml"
+    yield compared(GROUP, "tick for a flexible joint", values[0], values[1], "ns", name, goal=GOAL_TO_RIGID)
 
 
 def law_rows(constants: Any, folder: Path, *, pairs: int) -> Iterator[Row]:

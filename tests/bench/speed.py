@@ -25,7 +25,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.verbs.main import app
 from jointctl.tools.written_file import prepare_folder
 from tests.bench.exchange_speed import Rounds, exchange_rows
-from tests.bench.law_speed import law_rows
+from tests.bench.law_speed import flexible_rows, law_rows
 from tests.bench.paired import Row, conditions, outcome_data, outcome_table, skipped, write_outcome
 from tests.bench.simulation_speed import lockstep_rows, program_rows, swarm_rows
 from tests.bench.start_speed import start_rows
@@ -33,9 +33,18 @@ from tests.bench.start_speed import start_rows
 PARTS = ("law", "loop", "lockstep", "program", "swarm", "start")
 
 
+def _law(config: Config, folder: Path, pairs: int) -> Iterator[Row]:
+    def constants(of: Config) -> Any:
+        return axis_constants(of, trajectory_table(of))
+
+    yield from law_rows(constants(config), folder, pairs=pairs)
+    flexible, rigid = (constants(load_config(shipped_config(name))) for name in ("realistic", "precise"))
+    yield from flexible_rows(flexible, rigid, pairs=pairs)
+
+
 def _part(name: str, config: Config, folder: Path, quick: bool, verbs: Sequence[str]) -> Iterator[Row]:
     parts: dict[str, Callable[[], Iterator[Row]]] = {
-        "law": lambda: law_rows(axis_constants(config, trajectory_table(config)), folder, pairs=15 if quick else 61),
+        "law": lambda: _law(config, folder, 15 if quick else 61),
         "loop": lambda: exchange_rows(
             config,
             folder,

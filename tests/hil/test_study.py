@@ -205,7 +205,7 @@ def test_flexible_plants_fill_their_ranges_and_stay_inside(base: Config) -> None
     settings = EnsembleSettings(flexible=True)
     plants = [random_plant(base, settings, 1, index) for index in range(400)]
     values = [plant.virtual for plant in plants if plant.virtual is not None]
-    inertia = np.array([value.inertia_scale * base.joint.inertia_kgm2 for value in values])
+    inertia = np.array([plant.virtual.inertia_scale * plant.joint.inertia_kgm2 for plant in plants if plant.virtual])
     motor = np.array([value.motor_side_inertia_kgm2 for value in values])
     stiffness = np.array([value.reducer_stiffness_Nmprad for value in values])
     damping = np.array([value.reducer_damping_Nmspr for value in values])
@@ -221,6 +221,27 @@ def test_flexible_plants_fill_their_ranges_and_stay_inside(base: Config) -> None
         assert high - 0.05 * (high - low) < drawn.max() <= high * (1.0 + 1e-9)
     assert set(stiffness) == {1.0e4, 1.6e4, 3.1e4}
     assert {round(math.log2(plant.encoder.counts_per_turn)) for plant in plants} == {14, 15, 16, 17}
+
+
+def test_what_the_controller_believes_of_a_reducer_is_wrong_by_as_much_as_is_said(base: Config) -> None:
+    for index in range(40):
+        plant = random_plant(base, EnsembleSettings(flexible=True), 3, index)
+        true, believed = plant.virtual, plant.reducer
+        assert true is not None
+        assert believed is not None
+        assert believed.map is not None
+        link = true.inertia_scale * plant.joint.inertia_kgm2 - true.motor_side_inertia_kgm2
+        for belief, truth, error in (
+            (believed.motor_inertia_kgm2, true.motor_side_inertia_kgm2, 0.15),
+            (plant.joint.inertia_kgm2 - believed.motor_inertia_kgm2, link, 0.15),
+            (believed.stiffness_Nmprad, true.reducer_stiffness_Nmprad, 0.15),
+            (believed.map.kinematic_error_rad[0], true.kinematic_error_rad[0], 0.05),
+        ):
+            assert belief == pytest.approx(truth, rel=error)
+            assert belief != truth
+    blind = random_plant(base, EnsembleSettings(flexible=True, maps=False), 3, 0)
+    assert blind.reducer is not None
+    assert blind.reducer.map is None
 
 
 def test_every_named_controller_is_a_valid_configuration(base: Config) -> None:

@@ -16,9 +16,12 @@ h_i0, so that one state is exact: s = sum h_i0 dw_i, s <- (1 - leakage T) s + be
 
 Neglected, because it is of second order in x or not linear: the change of h during adaptation, dead zone, projection,
 limits of torque, rate and integral, encoder quantisation, lost samples.  Iterative learning acts from one repetition to
-the next, outside this loop.  Not modelled: flexibility, and friction, gravity and Coriolis
-torque together with their compensation (friction damps the joint; feed-forward on the measured velocity takes damping
-back).
+the next, outside this loop.  Not modelled: sliding friction, gravity and Coriolis torque together with their
+compensation (friction damps the joint; feed-forward on the measured velocity takes damping back).
+
+A joint whose reducer is not rigid is two masses with a spring and a damper between them; friction that holds is a
+bristle from either mass to the ground.  The law of a flexible joint reads two positions: P is then a column, C a row,
+and L = P C still one number, because there is one torque.
 """
 
 from __future__ import annotations
@@ -26,13 +29,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jointctl.firmware_py.axis import low_pass_gain
 from jointctl.firmware_py.law import solve_lyapunov_p
-from jointctl.firmware_py.states import ControllerKind
+from jointctl.firmware_py.states import ControllerKind, Encoders
+from jointctl.firmware_py.velocity import low_pass_gain
 
 # --- the plant between two samples ---
 
@@ -42,25 +46,22 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class StateSpace:
-    """x <- a x + b input, output = c x + d input; a (n, n), b (n,), c (n,), one input, one output."""
+    """x <- a x + b input, output = c x + d input; a (n, n), b (n, inputs), c (outputs, n), d (outputs, inputs)."""
 
     a: Array
     b: Array
     c: Array
-    d: float
+    d: Array
 
     def response(self, z: ComplexArray) -> ComplexArray:
-        """Transfer function at the points z, shape (N,).
+        """Transfer matrices at the points z (N,), shape (N, outputs, inputs).
 
         `scipy.signal.dfreqresp` gives the same margins to eight digits; but its import takes several times as long as
         all margins together, which every start of a motion would wait for, and below 1 mHz it is badly conditioned.
         """
-        count = len(self.b)
-        if count == 0:
-            return np.full(z.shape, self.d, dtype=np.complex128)
-        matrices = z[:, None, None] * np.eye(count) - self.a
-        solved = np.linalg.solve(matrices, np.broadcast_to(self.b[:, None], (len(z), count, 1)))
-        response: ComplexArray = solved[:, :, 0] @ self.c + self.d
+        matrices = z[:, None, None] * np.eye(len(self.a)) - self.a
+        solved = np.linalg.solve(matrices, np.broadcast_to(self.b, (len(z), *self.b.shape)))
+        response: ComplexArray = np.asarray(self.c @ solved + self.d, dtype=np.complex128)
         return response
 
 
@@ -81,49 +82,110 @@ def _hold_step(step_s: float, lag_s: float, inertia_kgm2: float) -> tuple[Array,
 
 
 @dataclass(frozen=True)
+class TwoMasses:
+    """Motor and link with the reducer between them, as they truly are; every value at the joint."""
+
+    motor_kgm2: float
+    link_kgm2: float
+    stiffness_Nmprad: float  # of a small motion
+    damping_Nmspr: float
+    bristle_Nmprad: tuple[float, float] = (0.0, 0.0)  # of friction that holds motor and link
+    bristle_damping_Nmspr: tuple[float, float] = (0.0, 0.0)
+    name: str = ""  # in what it differs from the configured joint
+
+    @property
+    def resonance_Hz(self) -> float:
+        return math.sqrt(self.stiffness_Nmprad * (1.0 / self.motor_kgm2 + 1.0 / self.link_kgm2)) / math.tau
+
+
+@lru_cache(maxsize=256)  # gains are changed far more often than joints
+def _hold_step_of_two(joint: TwoMasses, step_s: float, lag_s: float) -> tuple[Array, Array]:
+    """(phi, gamma) of x = (motor, its rate, link, its rate, torque), as `_hold_step`."""
+    from scipy.linalg import expm  # here: a start with a rigid joint would wait for it
+
+    k, d = joint.stiffness_Nmprad, joint.damping_Nmspr
+    matrix = np.zeros((6, 6))
+    matrix[0, 1] = matrix[2, 3] = 1.0
+    for row, inertia, own, other, held, held_d in (
+        (1, joint.motor_kgm2, 0, 2, joint.bristle_Nmprad[0], joint.bristle_damping_Nmspr[0]),
+        (3, joint.link_kgm2, 2, 0, joint.bristle_Nmprad[1], joint.bristle_damping_Nmspr[1]),
+    ):
+        matrix[row, own], matrix[row, own + 1] = -(k + held) / inertia, -(d + held_d) / inertia
+        matrix[row, other], matrix[row, other + 1] = k / inertia, d / inertia
+    matrix[1, 4] = 1.0 / joint.motor_kgm2
+    lag_s = max(lag_s, 1e-4 * step_s, 1e-12)  # as good as none
+    matrix[4, 4], matrix[4, 5] = -1.0 / lag_s, 1.0 / lag_s
+    moved = np.asarray(expm(matrix * step_s), dtype=np.float64)
+    return moved[:5, :5], moved[:5, 5]
+
+
+@dataclass(frozen=True)
 class SampledJoint:
-    """x(k+1) = phi x(k) + late u(k - whole) + early u(k - whole - 1); q is the first state."""
+    """x(k+1) = phi x(k) + late u(k - whole) + early u(k - whole - 1), positions = seen x."""
 
     phi: Array
     late: Array
     early: Array
     whole: int  # whole periods of delay
+    seen: Array  # (positions that the law reads, states)
 
     def response(self, z: ComplexArray) -> ComplexArray:
-        """q over u [rad/Nm] at the points z; the delay line is a power of z, so that it costs nothing."""
-        first = np.array([1.0, 0.0, 0.0])
-        late = StateSpace(self.phi, self.late, first, 0.0).response(z)
-        early = StateSpace(self.phi, self.early, first, 0.0).response(z)
-        response: ComplexArray = (late + early / z) / z**self.whole
-        return response
+        """Positions over u [rad/Nm] at the points z, (N, positions, 1).
+
+        The delay line is a power of z, so that it costs nothing.
+        """
+        taps = np.column_stack((self.late, self.early))
+        both = StateSpace(self.phi, taps, self.seen, np.zeros((len(self.seen), 2))).response(z)
+        delayed = z[:, None]
+        response: ComplexArray = (both[:, :, 0] + both[:, :, 1] / delayed) / delayed**self.whole
+        return response[:, :, None]
 
     def state_space(self) -> StateSpace:
         """The same with the delay line as states: x, u(k-1), u(k-2), ..."""
         line = self.whole + (1 if np.any(self.early) else 0)
-        size = 3 + line
-        a, b = np.zeros((size, size)), np.zeros(size)
-        a[:3, :3] = self.phi
+        n = len(self.phi)
+        size = n + line
+        a, b = np.zeros((size, size)), np.zeros((size, 1))
+        a[:n, :n] = self.phi
         for taps, back in ((self.late, self.whole), (self.early, self.whole + 1)):
             if back == 0:
-                b[:3] += taps
+                b[:n, 0] += taps
             elif back <= line:
-                a[:3, 2 + back] += taps
+                a[:n, n - 1 + back] += taps
         if line:
-            b[3] = 1.0
+            b[n, 0] = 1.0
             for i in range(1, line):
-                a[3 + i, 2 + i] = 1.0
-        return StateSpace(a, b, np.eye(size)[0], 0.0)
+                a[n + i, n - 1 + i] = 1.0
+        seen = np.hstack((self.seen, np.zeros((len(self.seen), line))))
+        return StateSpace(a, b, seen, np.zeros((len(self.seen), 1)))
 
 
-def sampled_joint(period_s: float, delay_s: float, lag_s: float, inertia_kgm2: float) -> SampledJoint:
-    """Delay, hold, lag and joint over one period, exactly."""
+_MOTOR, _LINK = np.eye(5)[0], np.eye(5)[2]
+_SEEN = {
+    Encoders.BOTH: np.array([_LINK, _MOTOR]),
+    Encoders.MOTOR: _MOTOR[None, :],
+    Encoders.LINK: _LINK[None, :],
+}
+
+
+def sampled_joint(
+    period_s: float, delay_s: float, lag_s: float, joint: float | TwoMasses, encoders: Encoders = Encoders.LINK
+) -> SampledJoint:
+    """Delay, hold, lag and joint over one period, exactly; a rigid `joint` is its inertia."""
     whole = math.floor(delay_s / period_s + 1e-9)  # 0.003 / 0.001 is a little below 3
     fraction_s = max(delay_s - whole * period_s, 0.0)
     if fraction_s < 1e-9 * period_s:
         fraction_s = 0.0
-    phi_old, gamma_old = _hold_step(fraction_s, lag_s, inertia_kgm2)
-    phi_new, gamma_new = _hold_step(period_s - fraction_s, lag_s, inertia_kgm2)
-    return SampledJoint(phi_new @ phi_old, gamma_new, phi_new @ gamma_old, whole)
+
+    def hold_step(step_s: float) -> tuple[Array, Array]:
+        if isinstance(joint, TwoMasses):
+            return _hold_step_of_two(joint, step_s, lag_s)
+        return _hold_step(step_s, lag_s, joint)
+
+    phi_old, gamma_old = hold_step(fraction_s)
+    phi_new, gamma_new = hold_step(period_s - fraction_s)
+    seen = _SEEN[encoders] if isinstance(joint, TwoMasses) else np.eye(1, 3)
+    return SampledJoint(phi_new @ phi_old, gamma_new, phi_new @ gamma_old, whole, seen)
 
 
 # --- what decides the loop ---
@@ -131,6 +193,7 @@ def sampled_joint(period_s: float, delay_s: float, lag_s: float, inertia_kgm2: f
 _POSITIVE = ("period_s", "inertia_kgm2", "kp", "kv")
 _NOT_NEGATIVE = (
     "delay_s", "lag_s", "cutoff_Hz", "learning_rate", "leakage_1ps", "ki", "observer_radps", "observer_delay_cycles",
+    "motor_inertia_kgm2", "twist_radps", "link_cutoff_Hz",
 )  # fmt: skip
 MAX_DELAY_PERIODS = 500  # one state each
 
@@ -157,6 +220,12 @@ class LoopSettings:
     centres: tuple[tuple[float, float], ...] = ()  # [rad, rad/s]
     widths: tuple[float, ...] = ()  # b, one for each centre
     weight_Nm: float = 0.0  # of every neuron at the point of linearisation
+    # a joint that is not rigid: those that the loop must bear, of which the worst counts; none = it is rigid
+    joints: tuple[TwoMasses, ...] = ()
+    encoders: Encoders = Encoders.LINK
+    motor_inertia_kgm2: float = 0.0  # of `inertia_kgm2`, as the law of a flexible joint believes
+    twist_radps: float = 0.0
+    link_cutoff_Hz: float = 0.0
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -195,22 +264,30 @@ def network_gains(settings: LoopSettings) -> tuple[float, float, float, float]:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Linear forms of (states, input), each an array of that size; the first two states are last error and rate."""
+    """Linear forms of (states, inputs), each an array of that size; the first two states are last error and rate."""
 
     size: int
+    inputs: int = 1
 
     def state(self, index: int) -> Array:
-        return np.eye(self.size + 1)[index]
+        return np.eye(self.size + self.inputs)[index]
+
+    def input(self, index: int) -> Array:
+        return self.state(self.size + index)
 
     @property
     def error(self) -> Array:
         """e = q - q_d, the input [rad]."""
-        return np.eye(self.size + 1)[self.size]
+        return self.input(0)
+
+    def filtered(self, error: Array, first: int, cutoff_Hz: float, period_s: float) -> Array:
+        """Rate of an error in this period [rad/s]; the states from `first` on are the last error and rate."""
+        gain = low_pass_gain(cutoff_Hz, period_s)
+        return (1.0 - gain) * self.state(first + 1) + gain / period_s * (error - self.state(first))
 
     def rate(self, settings: LoopSettings) -> Array:
         """e' of this period: low-pass of the difference quotient [rad/s]."""
-        gain = low_pass_gain(settings.cutoff_Hz, settings.period_s)
-        return (1.0 - gain) * self.state(1) + gain / settings.period_s * (self.error - self.state(0))
+        return self.filtered(self.error, 0, settings.cutoff_Hz, settings.period_s)
 
     def feedback(self, settings: LoopSettings) -> Array:
         """-J (kv e' + kp e) [Nm]."""
@@ -218,9 +295,12 @@ class _Rows:
 
     def state_space(self, settings: LoopSettings, following: list[Array], output: Array) -> StateSpace:
         """`following`: next values of the states from the third on."""
-        rows = np.array([self.error, self.rate(settings), *following])
-        n = self.size
-        return StateSpace(rows[:, :n], rows[:, n], output[:n], float(output[n]))
+        return self.of_rows([self.error, self.rate(settings), *following], output)
+
+    def of_rows(self, following: list[Array], output: Array) -> StateSpace:
+        """`following`: next values of all states."""
+        rows, n = np.array(following), self.size
+        return StateSpace(rows[:, :n], rows[:, n:], output[None, :n], output[None, n:])
 
 
 def computed_torque(settings: LoopSettings) -> StateSpace:
@@ -266,11 +346,34 @@ def pid(settings: LoopSettings) -> StateSpace:
     return rows.state_space(settings, [integral], output - settings.inertia_kgm2 * settings.ki * integral)
 
 
+def flexible_joint(settings: LoopSettings) -> StateSpace:
+    """The law for two masses: (last e_m, v_m, last e_l, v_l, b, z [Nms], d [Nm], commands that are not yet applied).
+
+    Its inputs are link and motor; with one encoder e_l is e_m.
+    """
+    waiting, period_s = settings.observer_delay_cycles + 1, settings.period_s
+    both = settings.encoders == Encoders.BOTH
+    rows = _Rows(7 + waiting, 2 if both else 1)
+    link, motor = rows.input(0), rows.input(1 if both else 0)
+    motor_rate = rows.filtered(motor, 0, settings.cutoff_Hz, period_s)
+    link_rate = rows.filtered(link, 2, settings.link_cutoff_Hz if both else settings.cutoff_Hz, period_s)
+    keep = math.exp(-settings.twist_radps * period_s)
+    twist = keep * rows.state(4) + (1.0 - keep) * (link - motor)
+    momentum = settings.motor_inertia_kgm2 * motor_rate
+    momentum = momentum + (settings.inertia_kgm2 - settings.motor_inertia_kgm2) * link_rate
+    integral = rows.state(5) + period_s * (rows.state(6 + waiting) - rows.state(6))
+    disturbance = settings.observer_radps * (integral - momentum)
+    output = disturbance - settings.inertia_kgm2 * (settings.kp * (motor + twist) + settings.kv * motor_rate)
+    sent = [output, *(rows.state(7 + i) for i in range(waiting - 1))]
+    return rows.of_rows([motor, motor_rate, link, link_rate, twist, integral, disturbance, *sent], output)
+
+
 CONTROLLERS: dict[ControllerKind, Callable[[LoopSettings], StateSpace]] = {
     ControllerKind.COMPUTED_TORQUE: computed_torque,
     ControllerKind.COMPUTED_TORQUE_RBF: computed_torque_rbf,
     ControllerKind.COMPUTED_TORQUE_OBSERVER: computed_torque_observer,
     ControllerKind.PID: pid,
+    ControllerKind.FLEXIBLE_JOINT: flexible_joint,
 }
 
 
@@ -288,16 +391,14 @@ class LinearLoop:
     def open_loop(self, omega_radps: Array) -> ComplexArray:
         """L at these frequencies, shape (N,), each in (0..pi/T]."""
         z = np.exp(1j * np.asarray(omega_radps, dtype=np.float64) * self.settings.period_s)
-        response: ComplexArray = -self.joint.response(z) * self.controller.response(z)
+        response: ComplexArray = -(self.controller.response(z) @ self.joint.response(z))[:, 0, 0]
         return response
 
     def closed_loop_poles(self, gain: float = 1.0) -> ComplexArray:
         """Eigenvalues z of the closed loop with L times `gain`; stable where all |z| < 1."""
         plant, law = self.joint.state_space(), self.controller
         b = gain * plant.b
-        matrix = np.block(
-            [[plant.a + np.outer(b, law.d * plant.c), np.outer(b, law.c)], [np.outer(law.b, plant.c), law.a]]
-        )
+        matrix = np.block([[plant.a + b @ law.d @ plant.c, b @ law.c], [law.b @ plant.c, law.a]])
         return np.asarray(np.linalg.eigvals(matrix), dtype=np.complex128)
 
     def is_stable(self, gain: float = 1.0) -> bool:
@@ -305,6 +406,7 @@ class LinearLoop:
 
 
 def linear_loop(settings: LoopSettings) -> LinearLoop:
-    """The loop of these settings."""
-    joint = sampled_joint(settings.period_s, settings.delay_s, settings.lag_s, settings.inertia_kgm2)
+    """The loop of these settings; of several joints with the first."""
+    true: float | TwoMasses = settings.joints[0] if settings.joints else settings.inertia_kgm2
+    joint = sampled_joint(settings.period_s, settings.delay_s, settings.lag_s, true, settings.encoders)
     return LinearLoop(settings, joint, CONTROLLERS[settings.kind](settings))

@@ -9,18 +9,20 @@ the drive adds inside is not visible on the bus: `margin.loop_delay_s` or a meas
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.firmware_py.axis import low_pass_gain
-from jointctl.firmware_py.states import ControllerKind
-from jointctl.tools.analysis.linear_loop import LoopSettings
+from jointctl.firmware_py.states import ControllerKind, Encoders
+from jointctl.firmware_py.velocity import low_pass_gain
+from jointctl.tools.analysis.linear_loop import LoopSettings, TwoMasses
+from jointctl.tools.analysis.margins import phase_margin_deg
 from jointctl.tools.configuration.conversions import joint_rad_per_count
-from jointctl.tools.configuration.records import hidden_layer
+from jointctl.tools.configuration.records import encoders_of_law, hidden_layer
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.config import Config
+    from jointctl.tools.configuration.sections import Reducer
 
 _SAME_IN_CONTROL = {"kp", "kv", "ki", "observer_radps", "observer_delay_cycles", "learning_rate", "leakage_1ps"}
 STEP_SHARE = 0.2  # of the torque limit; `precise` with 17 bit is below, with 16 bit, where it chatters, above
@@ -62,17 +64,87 @@ def loop_settings(config: Config, delay_s: float | None = None) -> tuple[LoopSet
             centres=centres,
             widths=widths,
             weight_Nm=control.initial_weight_Nm,
+            **_two_masses(config),
         )
     except ValueError as error:
         raise ConfigurationError(f"{config.path}: {error}") from None
-    assumptions = (
+    assumptions: tuple[Assumption, ...] = (
         Assumption("loop rate", config.loop.rate_Hz, "Hz", "loop.rate_Hz"),
         Assumption("loop delay", delay_s, "s", delay_origin),
         Assumption("current lag", current_lag_s, "s", "margin.current_lag_s"),
         Assumption("velocity filter", control.velocity_cutoff_Hz, "Hz", "control.velocity_cutoff_Hz (0 = none)"),
         Assumption("joint inertia", config.joint.inertia_kgm2, "kg m^2", "joint.inertia_kgm2"),
     )
+    if config.reducer is not None:
+        resonance_Hz = two_masses(config, config.reducer, 1.0, 1.0, False).resonance_Hz
+        assumptions += (
+            Assumption("motor inertia", config.reducer.motor_inertia_kgm2, "kg m^2", "reducer.motor_inertia_kgm2"),
+            Assumption("resonance", round(resonance_Hz, 1), "Hz", "of both masses on reducer.loop_stiffness_Nmprad"),
+        )
     return settings, assumptions
+
+
+def _two_masses(config: Config) -> dict[str, Any]:
+    """Fields of `LoopSettings` for a joint whose reducer is not rigid."""
+    reducer, margin, control = config.reducer, config.margin, config.control
+    if reducer is None:
+        return {}
+    encoders = encoders_of_law(config)
+    if control.kind != "flexible_joint" and encoders == Encoders.BOTH:
+        encoders = Encoders.LINK  # the others read that alone
+    error = margin.stiffness_error
+    joints = [
+        two_masses(config, reducer, payload, stiffness, held)
+        for payload in sorted({1.0, *margin.payload_range})
+        for stiffness in sorted({1.0 - error, 1.0, 1.0 + error})
+        for held in (False, True)
+        if not held or (config.friction is not None and config.friction.lugre is not None)
+    ]
+    return {
+        "joints": tuple(joints),
+        "encoders": encoders,
+        "motor_inertia_kgm2": reducer.motor_inertia_kgm2,
+        "twist_radps": control.twist_radps,
+        "link_cutoff_Hz": control.link_cutoff_Hz,
+    }
+
+
+def two_masses(config: Config, reducer: Reducer, payload: float, stiffness: float, held: bool) -> TwoMasses:
+    """The joint with these factors on link inertia and stiffness, at rest (`held` by friction) or free of friction."""
+    share, lugre = reducer.link_friction_share, config.friction.lugre if config.friction is not None else None
+    bristles = damping = (0.0, 0.0)
+    if held and lugre is not None:
+        bristles = (1.0 - share) * lugre.stiffness_Nmprad, share * lugre.stiffness_Nmprad
+        damping = (1.0 - share) * lugre.damping_Nmspr, share * lugre.damping_Nmspr
+    words = [f"link inertia x {payload:g}"] if payload != 1.0 else []
+    words += [f"stiffness x {stiffness:g}"] if stiffness != 1.0 else []
+    words += ["held by friction" if held else "without friction"]
+    return TwoMasses(
+        reducer.motor_inertia_kgm2,
+        payload * (config.joint.inertia_kgm2 - reducer.motor_inertia_kgm2),
+        stiffness * (reducer.loop_stiffness_Nmprad or reducer.stiffness_Nmprad),
+        reducer.damping_Nmspr,
+        bristles,
+        damping,
+        ", ".join(words),
+    )
+
+
+OUTSIDE = (0.5, 2.0)  # factors on the link's inertia that are looked at beyond what must hold
+
+
+def outside_payload_range(config: Config, settings: LoopSettings) -> list[str]:
+    """What happens with lighter and heavier links than `margin.payload_range` says, in words."""
+    found = []
+    for payload in OUTSIDE if config.reducer is not None else ():
+        if config.margin.payload_range[0] <= payload <= config.margin.payload_range[1]:
+            continue
+        assert config.reducer is not None
+        joint = two_masses(config, config.reducer, payload, 1.0, False)
+        phase_deg = phase_margin_deg(replace(settings, joints=(joint,)))
+        text = f"phase margin {phase_deg:.1f} deg" if phase_deg > 0.0 else "the control loop is UNSTABLE"
+        found.append(f"outside margin.payload_range, link inertia x {payload:g}: {text}")
+    return found
 
 
 def not_modelled(config: Config) -> list[str]:
@@ -87,7 +159,9 @@ def not_modelled(config: Config) -> list[str]:
     if control.kind == "computed_torque_rbf" and control.dead_zone_rad:
         found.append(f"control.dead_zone_rad (={control.dead_zone_rad:g}): taken as if the error were outside")
     virtual = config.virtual
-    if virtual is None:
+    if config.reducer is not None:
+        found.append("hysteresis of the reducer beyond what margin.stiffness_error covers, and sliding friction")
+    elif virtual is None:
         found.append("flexibility of the reducer: a soft one resonates and takes margin that is not counted here")
     elif virtual.flexible:
         motor_kgm2 = virtual.motor_side_inertia_kgm2

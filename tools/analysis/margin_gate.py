@@ -15,7 +15,15 @@ from jointctl.drivers.errors import MarginError
 from jointctl.firmware_py.states import ControllerKind
 from jointctl.tools.analysis.linear_loop import LoopSettings
 from jointctl.tools.analysis.loop_settings import loop_settings
-from jointctl.tools.analysis.margins import Convergence, Margins, learning_convergence, margins, phase_margin_deg
+from jointctl.tools.analysis.margins import (
+    OBSERVING,
+    Convergence,
+    Margins,
+    learning_convergence,
+    margins,
+    phase_margin_deg,
+    worst_case,
+)
 from jointctl.tools.configuration.config import Config
 
 # --- remedies ---
@@ -75,12 +83,19 @@ def _search(
 
 
 def remedies(settings: LoopSettings, minimum_deg: float) -> list[Remedy]:
-    """Changes that each reach `minimum_deg`, the mildest for the tracking error first; empty if none does alone."""
-    s = settings
+    """Changes that each reach `minimum_deg`, the mildest for the tracking error first; empty if none does alone.
+
+    Of several joints each is searched with the worst one, and then must do for all.
+    """
+    s = worst_case(settings)
     network = s.kind == ControllerKind.COMPUTED_TORQUE_RBF and s.learning_rate > 0.0
     found = []
 
     def add(text: str, result: tuple[float, LoopSettings, float] | None) -> None:
+        if result is not None and s.joints:
+            everywhere = replace(result[1], joints=settings.joints)
+            reached = phase_margin_deg(everywhere)
+            result = (result[0], everywhere, reached) if reached >= minimum_deg else None
         if result is not None:
             found.append(Remedy(text.format(value=result[0], changed=result[1]), result[1], result[2]))
 
@@ -98,7 +113,7 @@ def remedies(settings: LoopSettings, minimum_deg: float) -> list[Remedy]:
     if s.kind == ControllerKind.PID and s.ki > 0.0:
         result = _search(s, minimum_deg, s.ki, s.ki * 1e-3, lambda v: replace(s, ki=v))
         add(f"control.ki = {{value:g}} (now {s.ki:g})", result)
-    if s.kind == ControllerKind.COMPUTED_TORQUE_OBSERVER and s.observer_radps > 0.0:
+    if s.kind in OBSERVING and s.observer_radps > 0.0:
         result = _search(
             s, minimum_deg, s.observer_radps, s.observer_radps * 1e-3, lambda v: replace(s, observer_radps=v)
         )
@@ -134,7 +149,7 @@ def slower(settings: LoopSettings, factor: float) -> LoopSettings:
 def _rest_text(settings: LoopSettings, network: bool) -> str:
     if settings.kind == ControllerKind.PID:
         return ", ki = {changed.ki:.4g}"
-    if settings.kind == ControllerKind.COMPUTED_TORQUE_OBSERVER:
+    if settings.kind in OBSERVING:
         return ", observer_radps = {changed.observer_radps:.4g}"
     if not network:
         return ""
@@ -203,7 +218,7 @@ def refusal(settings: LoopSettings, found: Margins, minimum_deg: float, changes:
     else:
         what = f"the control loop is unstable; a phase margin of at least {minimum_deg:g} deg is required"
     texts = [f"{r.text} gives {r.phase_margin_deg:.1f} deg" for r in changes]
-    longest_s = longest_delay_s(settings, minimum_deg)
+    longest_s = longest_delay_s(worst_case(settings), minimum_deg)
     if longest_s is not None and longest_s > 0.0:
         texts.append(f"a loop delay of {longest_s * 1e3:g} ms or less")
     hint = "any one of: " + "; ".join(texts) if texts else "no single setting reaches it: lower kp, kv and q together"

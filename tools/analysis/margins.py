@@ -29,6 +29,8 @@ from jointctl.tools.configuration.sections import Learning
 
 _ROUND_POINTS = 33  # of a round; an odd number keeps a symmetric extremum on the grid
 
+OBSERVING = (ControllerKind.COMPUTED_TORQUE_OBSERVER, ControllerKind.FLEXIBLE_JOINT)
+
 Function = Callable[[np.ndarray], np.ndarray]
 
 
@@ -65,6 +67,7 @@ def least_between(function: Function, low: float, high: float, tolerance: float 
 # --- margins ---
 
 _POINTS = 3000
+_COARSE_POINTS = 600  # for searches
 _DECADES = 6.5  # below pi / T
 _SCAN = 12  # delays tried below the expected limit, in case that stability ends earlier
 
@@ -85,6 +88,7 @@ class Margins:
     oscillation_Hz: float  # of the complex pair that decays slowest; nan without one
     oscillation_damping: float  # its damping ratio, negative if it grows
     poles: tuple[complex, ...]  # eigenvalues z, largest first
+    joint: str = ""  # the one that these are of, where the loop must bear several
 
 
 @dataclass(frozen=True)
@@ -202,8 +206,39 @@ def _in_s_plane(poles: list[complex], period_s: float) -> list[complex]:
     return [complex(math.log(abs(z)), math.atan2(z.imag, z.real)) / period_s for z in kept]
 
 
+def cases(settings: LoopSettings) -> list[LoopSettings]:
+    """One for each joint that the loop must bear."""
+    return [replace(settings, joints=(joint,)) for joint in settings.joints] or [settings]
+
+
+def worst_case(settings: LoopSettings) -> LoopSettings:
+    """The joint with the least phase margin; where the loop is unstable with several, the fastest to grow."""
+    found = cases(settings)
+    if len(found) == 1:
+        return found[0]
+    omega = frequencies_radps(settings.period_s, _COARSE_POINTS)
+    z = np.exp(1j * omega * settings.period_s)
+    law = linear_loop(settings).controller.response(z)  # the same for all of them
+
+    def rank(case: LoopSettings) -> tuple[float, float]:
+        loop = linear_loop(case)
+        radius = float(np.max(np.abs(loop.closed_loop_poles())))
+        if radius >= 1.0:
+            return 0.0, -radius
+        response = -(law @ loop.joint.response(z))[:, 0, 0]
+        logarithm = np.log(np.abs(response))
+        i = np.flatnonzero((logarithm[:-1] > 0.0) != (logarithm[1:] > 0.0))
+        share = logarithm[i] / (logarithm[i] - logarithm[i + 1])
+        crossing = (1.0 - share) * response[i] + share * response[i + 1]
+        return float(np.min(np.abs(np.angle(-crossing)), initial=math.pi)), 0.0
+
+    return min(found, key=rank)
+
+
 def margins(settings: LoopSettings) -> Margins:
-    """All margins of the loop with these settings."""
+    """All margins of the loop with these settings; of several joints those of the worst one."""
+    settings = worst_case(settings)
+    joint = settings.joints[0].name if settings.joints else ""
     loop = linear_loop(settings)
     poles = sorted((complex(z) for z in loop.closed_loop_poles()), key=abs, reverse=True)
     radius = abs(poles[0])
@@ -211,8 +246,9 @@ def margins(settings: LoopSettings) -> Margins:
     oscillation_Hz = frequency / math.tau
     if radius >= 1.0:
         return Margins(
-            False, 0.0, math.nan, 1.0, 1.0, 0.0, math.inf, math.nan, math.inf, oscillation_Hz, damping, tuple(poles)
-        )
+            False, 0.0, math.nan, 1.0, 1.0, 0.0, math.inf, math.nan, math.inf, oscillation_Hz, damping, tuple(poles),
+            joint,
+        )  # fmt: skip
     omega = frequencies_radps(settings.period_s)
     response = loop.open_loop(omega)
     crossings = _gain_crossings(loop, omega, np.abs(response))
@@ -233,15 +269,17 @@ def margins(settings: LoopSettings) -> Margins:
         oscillation_Hz=oscillation_Hz,
         oscillation_damping=damping,
         poles=tuple(poles),
+        joint=joint,
     )
 
 
 def phase_margin_deg(settings: LoopSettings) -> float:
-    """Only the phase margin, for searches; 0 if unstable."""
+    """Only the phase margin, for searches; 0 if unstable; of several joints that of the worst one."""
+    settings = worst_case(settings)
     loop = linear_loop(settings)
     if not loop.is_stable():
         return 0.0
-    omega = frequencies_radps(settings.period_s, 600)
+    omega = frequencies_radps(settings.period_s, _COARSE_POINTS)
     crossings = _gain_crossings(loop, omega, np.abs(loop.open_loop(omega)))
     return math.degrees(min((abs(math.atan2(-v.imag, -v.real)) for _, v in crossings), default=math.pi))
 
@@ -252,7 +290,7 @@ def theory(settings: LoopSettings) -> Theory:
     polynomial: tuple[float, ...] = (1.0, kv, kp)
     if settings.kind == ControllerKind.PID and settings.ki != 0.0:
         polynomial = (1.0, kv, kp, settings.ki)
-    if settings.kind == ControllerKind.COMPUTED_TORQUE_OBSERVER and settings.observer_radps != 0.0:
+    if settings.kind in OBSERVING and settings.observer_radps != 0.0:
         # with the exact inertia the observer's pole is not moved by the loop
         bandwidth = settings.observer_radps
         polynomial = (1.0, kv + bandwidth, kp + bandwidth * kv, bandwidth * kp)
@@ -302,7 +340,7 @@ def repetition_factor(settings: LoopSettings, learning: Learning, omega_radps: A
     loop = linear_loop(settings)
     z = np.exp(1j * omega_radps * settings.period_s)
     open_loop = loop.open_loop(omega_radps)
-    moved = loop.joint.response(z) / (1.0 + open_loop)
+    moved = loop.joint.response(z)[:, 0, 0] / (1.0 + open_loop)
     taken = open_loop / (1.0 + open_loop)
     width = learning.half_width_cycles
     smoothing = np.ones_like(omega_radps)
@@ -315,7 +353,12 @@ def repetition_factor(settings: LoopSettings, learning: Learning, omega_radps: A
 
 
 def learning_convergence(settings: LoopSettings, learning: Learning) -> Convergence:
-    """Convergence of this learning on this loop."""
+    """Convergence of this learning on this loop; of several joints with the worst one."""
+    found = [_learning_convergence(case, learning) for case in cases(settings)]
+    return max(found, key=lambda one: one.worst_factor)
+
+
+def _learning_convergence(settings: LoopSettings, learning: Learning) -> Convergence:
     omega = frequencies_radps(settings.period_s)
     factor, _ = repetition_factor(settings, learning, omega)
     worst = int(np.argmax(factor))

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from jointctl.firmware_py.records import KNEES
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import RADPS_PER_UNIT, velocity_of_a_count_radps
-from jointctl.tools.configuration.sections import Friction, FrictionDirection
+from jointctl.tools.configuration.sections import Friction, FrictionDirection, Reducer, ReducerMap
 
+OBSERVING = ("computed_torque_observer", "flexible_joint")  # laws with a disturbance observer
 SWING_PERIODS = 4.0  # that half a swing takes at least: a faster one no sampled loop can follow
 CURVE_POINTS = 200  # at which a friction curve is looked at
 SWITCH_rad, SWITCH_radps = 1e-3, 1e-2  # what rounding of the numbers in a file may leave at a switch
@@ -82,6 +84,7 @@ def problems_between_sections(config: Config) -> list[str]:
         *_limit_problems(config),
         *_control_problems(config),
         *_friction_problems(config),
+        *_reducer_problems(config),
         *_drive_problems(config),
     ]
 
@@ -147,16 +150,16 @@ def _control_problems(config: Config) -> list[str]:
     # explicit integration of the error dynamics: beyond this even the ideal sampled loop is unstable
     if control.kv + control.kp / rate >= 2.0 * rate:
         found.append(f"control.kv (={control.kv:g}) and control.kp (={control.kp:g}) are too high for {rate:g} Hz")
-    if (control.kind == "computed_torque_observer") != (control.observer_radps > 0.0):
+    if (control.kind in OBSERVING) != (control.observer_radps > 0.0):
         found.append(
-            f"control.observer_radps (={control.observer_radps:g}) must be more than 0 with "
-            f'control.kind "computed_torque_observer" and 0 with any other (={control.kind})'
+            f"control.observer_radps (={control.observer_radps:g}) must be more than 0 with control.kind "
+            f'"computed_torque_observer" or "flexible_joint" and 0 with any other (={control.kind})'
         )
     if control.kind != "pid" and control.ki:
         found.append(f'control.ki (={control.ki:g}) must be 0 unless control.kind is "pid" (={control.kind})')
-    if control.learning is not None and control.kind != "computed_torque_observer":
+    if control.learning is not None and control.kind not in OBSERVING:
         found.append(
-            f'[control.learning] needs control.kind "computed_torque_observer" (={control.kind}): '
+            f'[control.learning] needs control.kind "computed_torque_observer" or "flexible_joint" (={control.kind}): '
             "the observer takes over when learning starts anew"
         )
     if control.zero_rule == "linear" and control.zero_band_radps == 0.0:
@@ -166,6 +169,106 @@ def _control_problems(config: Config) -> list[str]:
             f"control.initial_weight_Nm (={control.initial_weight_Nm:g}) must be in "
             f"[{-control.weight_limit_Nm:g}..{control.weight_limit_Nm:g}], the control.weight_limit_Nm"
         )
+    return found
+
+
+def _reducer_problems(config: Config) -> list[str]:
+    """[reducer] and the law that needs it."""
+    reducer, control = config.reducer, config.control
+    if reducer is None:
+        return ["[reducer] is missing: control.kind (=flexible_joint) needs it"] if _is_flexible(config) else []
+    found = []
+    low, high = config.margin.payload_range
+    if not low <= 1.0 <= high:
+        found.append(f"margin.payload_range (=[{low:g}, {high:g}]) must be two factors with 1 between them")
+    if reducer.motor_inertia_kgm2 >= config.joint.inertia_kgm2:
+        found.append(
+            f"reducer.motor_inertia_kgm2 (={reducer.motor_inertia_kgm2:g}) must be less than joint.inertia_kgm2 "
+            f"(={config.joint.inertia_kgm2:g}), which is that of motor and link together"
+        )
+    knees, beyond = reducer.knees_Nm, reducer.stiffness_beyond_Nmprad
+    slopes = (reducer.stiffness_Nmprad, *beyond)
+    if len(knees) > KNEES or list(knees) != sorted(set(knees)) or (knees and knees[0] <= 0.0):
+        found.append(f"reducer.knees_Nm (={list(knees)}) must be at most {KNEES} torques in ascending order, above 0")
+    elif len(beyond) != len(knees):
+        found.append(f"reducer.stiffness_beyond_Nmprad (={list(beyond)}) must be {len(knees)}, one for each knee")
+    elif list(slopes) != sorted(slopes):
+        found.append(
+            f"reducer.stiffness_beyond_Nmprad (={list(beyond)}) must rise from reducer.stiffness_Nmprad "
+            f"(={reducer.stiffness_Nmprad:g})"
+        )
+    elif _is_flexible(config):
+        found += _room_problems(config, reducer)
+    if reducer.map is not None:
+        found += _map_problems(config, reducer.map)
+    if not _is_flexible(config):
+        return found
+    if control.feed_forward == "measured":
+        found.append(
+            'control.feed_forward (=measured) must be none, desired or lugre_desired for control.kind "flexible_joint"'
+        )
+    if not control.filtered_error_rate:
+        found.append('control.filtered_error_rate (=false) must be true for control.kind "flexible_joint"')
+    if config.joint_encoder is not None and config.encoder.side != "motor":
+        found.append(
+            'encoder.side (=joint) must be "motor" for control.kind "flexible_joint" beside [joint_encoder]: '
+            "are the two encoders swapped?"
+        )
+    return found
+
+
+def _is_flexible(config: Config) -> bool:
+    return config.control.kind == "flexible_joint"
+
+
+def _room_problems(config: Config, reducer: Reducer) -> list[str]:
+    """Whether the motor, which is ahead of the link by the twist, stays inside the limits as well (theta_d)."""
+    slopes = (reducer.stiffness_Nmprad, *reducer.stiffness_beyond_Nmprad)
+    ends = (0.0, *reducer.knees_Nm, math.inf)
+    limits, torque_Nm = config.limits, config.limits.torque_max_Nm
+    twist = sum(max(min(torque_Nm, ends[i + 1]) - ends[i], 0.0) / slope for i, slope in enumerate(slopes))
+    if reducer.map is not None:
+        twist += sum(reducer.map.kinematic_error_rad)
+    found = []
+    if twist >= limits.following_error_max_rad:
+        found.append(
+            f"limits.following_error_max_rad (={limits.following_error_max_rad:g}) must be more than {twist:.4g}, by "
+            "which the reducer twists at limits.torque_max_Nm"
+        )
+    extremes = trajectory_extremes(config.trajectory)
+    if extremes is None or (config.encoder.side == "joint" and config.joint_encoder is None):
+        return found
+    for key, needed, enough in (
+        ("position_min_rad", extremes[0] - twist, limits.position_min_rad <= extremes[0] - twist),
+        ("position_max_rad", extremes[1] + twist, limits.position_max_rad >= extremes[1] + twist),
+    ):
+        if not enough:
+            value = getattr(limits, key)
+            found.append(
+                f"limits.{key} (={value:g}) must leave room for the motor, which is ahead of the link by up to "
+                f"{twist:.4g}: {needed:.5g} is reached"
+            )
+    return found
+
+
+def _map_problems(config: Config, made: ReducerMap) -> list[str]:
+    """A map belongs to one mounting of the motor's encoder, and its lists to each other."""
+    encoder = config.encoder
+    if encoder.side != "motor":
+        return ['[reducer.map] needs encoder.side = "motor": it is a map of the motor angle']
+    found = [
+        f"reducer.map.{key} (={getattr(made, key)}) differs from encoder.{key} (={getattr(encoder, key)}): "
+        "the map was made for another mounting; make a new one"
+        for key in ("direction", "zero_counts")
+        if getattr(made, key) != getattr(encoder, key)
+    ]
+    for name, unit in (("kinematic_error", "rad"), ("torque_ripple", "Nm")):
+        counts = [len(getattr(made, f"{name}_{rest}")) for rest in (unit, "per_motor_turn", "phase_rad")]
+        if len(set(counts)) > 1:
+            found.append(
+                f"reducer.map.{name}_{unit} must be as long a list as its per_motor_turn and phase_rad, "
+                f"{' and '.join(map(str, counts))} are given"
+            )
     return found
 
 

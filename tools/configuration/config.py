@@ -28,6 +28,7 @@ from jointctl.tools.configuration.sections import (
     Log,
     Loop,
     Margin,
+    Reducer,
     Section,
     Sequence,
     Stream,
@@ -47,6 +48,7 @@ class Config(Section):
     encoder: Encoder
     joint: Joint
     joint_encoder: JointEncoder | None = None
+    reducer: Reducer | None = None
     limits: Limits
     sequence: Sequence
     loop: Loop

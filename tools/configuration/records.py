@@ -8,13 +8,20 @@ from typing import Any
 import numpy as np
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.firmware_py.axis import low_pass_gain
 from jointctl.firmware_py.law import solve_lyapunov_p
 from jointctl.firmware_py.live_change import gains_of
 from jointctl.firmware_py.records import NEURONS, AxisConstants, Gains, TrajectoryConstants
 from jointctl.firmware_py.schema import dtype_of, new
-from jointctl.firmware_py.states import ControllerKind, FeedForward, LimitSource, TrajectoryKind, ZeroSpeedRule
+from jointctl.firmware_py.states import (
+    ControllerKind,
+    Encoders,
+    FeedForward,
+    LimitSource,
+    TrajectoryKind,
+    ZeroSpeedRule,
+)
 from jointctl.firmware_py.trajectory import approach_duration_s, approach_start, ends_meet, peak_of, table_from_csv
+from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.tools.configuration.checks import extremes_problems
 from jointctl.tools.configuration.config import Config, raise_if
 from jointctl.tools.configuration.conversions import (
@@ -23,7 +30,7 @@ from jointctl.tools.configuration.conversions import (
     period_s,
     static_friction_Nm,
 )
-from jointctl.tools.configuration.sections import Control, Hold, Section
+from jointctl.tools.configuration.sections import Control, Hold, Reducer, Section
 
 # the paper's centres, in rad and in rad/s: -c_p, 0, c_p with c_p = 1e-2 [-5 -3 -1 -0.8 -0.4 -0.1 -0.05]
 _PAPER_HALF = (0.05, 0.03, 0.01, 0.008, 0.004, 0.001, 0.0005)
@@ -53,9 +60,7 @@ def axis_constants(config: Config, table: np.ndarray, *, start_position_rad: flo
     constants = new(AxisConstants)
     axis = constants[0]
     _fill_law(axis.law, config)
-    axis.velocity.period_s = period_s(config)
-    axis.velocity.cutoff_Hz = config.control.velocity_cutoff_Hz
-    axis.velocity.period_gain = low_pass_gain(config.control.velocity_cutoff_Hz, period_s(config))
+    _fill_velocity(axis.velocity, config, config.control.velocity_cutoff_Hz)
     fill_trajectory(axis.trajectory, config, table)
     _fill_limits(axis.limits, config)
     _fill_sequence(axis.sequence, config, table, start_position_rad)
@@ -121,6 +126,8 @@ def _fill_law(law: Any, config: Config) -> None:
         law.friction = friction_constants(config.friction, joint.reduction_ratio)[0]
         if config.friction.lugre is not None:
             _copy(law.lugre, config.friction.lugre, "stiffness_Nmprad", "damping_Nmspr")
+    if config.reducer is not None:
+        _fill_flexible(law.flexible, config, config.reducer)
     network = law.network
     _, p12, p22 = solve_lyapunov_p(control.kp, control.kv, control.lyapunov_q[0], control.lyapunov_q[-1])
     network.p_b[0] = p12 / joint.inertia_kgm2
@@ -133,6 +140,46 @@ def _fill_law(law: Any, config: Config) -> None:
     network.initial_weight = control.initial_weight_Nm
     network.leakage = control.leakage_1ps
     network.weight_limit = control.weight_limit_Nm
+
+
+def _fill_flexible(record: Any, config: Config, reducer: Reducer) -> None:
+    """What the law of a flexible joint reads and believes; the others have no use for it."""
+    control, ratio = config.control, config.joint.reduction_ratio
+    record.encoders = encoders_of_law(config)
+    record.motor_inertia_kgm2 = reducer.motor_inertia_kgm2
+    record.link_inertia_kgm2 = config.joint.inertia_kgm2 - reducer.motor_inertia_kgm2
+    record.link_friction_share = reducer.link_friction_share
+    record.compliance_radpNm = compliance = 1.0 / reducer.stiffness_Nmprad
+    for i, (knee_Nm, stiffness) in enumerate(zip(reducer.knees_Nm, reducer.stiffness_beyond_Nmprad, strict=True)):
+        record.knee_Nm[i] = knee_Nm
+        record.stiffening_radpNm[i] = compliance - 1.0 / stiffness
+        compliance = 1.0 / stiffness
+    record.twist_gain = -math.expm1(-control.twist_radps * period_s(config))
+    _fill_velocity(record.motor_velocity, config, control.velocity_cutoff_Hz)
+    both = record.encoders == Encoders.BOTH
+    _fill_velocity(record.link_velocity, config, control.link_cutoff_Hz if both else control.velocity_cutoff_Hz)
+    if reducer.map is not None:
+        for name, unit in (("kinematic_error", "rad"), ("torque_ripple", "Nm")):
+            amplitudes = getattr(reducer.map, f"{name}_{unit}")
+            series = getattr(record, name)
+            series.count = len(amplitudes)
+            for i, amplitude in enumerate(amplitudes):
+                series.amplitude[i] = amplitude
+                series.turns_prad[i] = ratio * getattr(reducer.map, f"{name}_per_motor_turn")[i] / math.tau
+                series.phase_turns[i] = getattr(reducer.map, f"{name}_phase_rad")[i] / math.tau
+
+
+def _fill_velocity(record: Any, config: Config, cutoff_Hz: float) -> None:
+    record.period_s = period_s(config)
+    record.cutoff_Hz = cutoff_Hz
+    record.period_gain = low_pass_gain(cutoff_Hz, period_s(config))
+
+
+def encoders_of_law(config: Config) -> Encoders:
+    """What there is for the law of a flexible joint to read."""
+    if config.joint_encoder is not None and config.joint_encoder.law == "joint_encoder":
+        return Encoders.BOTH
+    return Encoders.MOTOR if config.encoder.side == "motor" else Encoders.LINK
 
 
 def hidden_layer(control: Control) -> tuple[tuple[tuple[float, float], ...], tuple[float, ...]]:

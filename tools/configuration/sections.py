@@ -214,7 +214,7 @@ class Loop(Section):
 
 
 class Learning(Section):
-    """Iterative learning on a repeating trajectory, on top of computed_torque_observer."""
+    """Iterative learning on a repeating trajectory, on top of computed_torque_observer or flexible_joint."""
 
     # share of the remaining error torque taken over in each repetition
     gain: Annotated[float, between(0.0, 1.0, open_low=True)]
@@ -225,12 +225,14 @@ class Learning(Section):
 
 
 class Control(Section):
-    kind: Literal["computed_torque", "computed_torque_rbf", "computed_torque_observer", "pid"]  # docs/law.md
+    # docs/law.md
+    kind: Literal["computed_torque", "computed_torque_rbf", "computed_torque_observer", "pid", "flexible_joint"]
     kp: Annotated[float, between(0.0, 1e6, open_low=True)]  # [1/s²] of the position error
     kv: Annotated[float, between(0.0, 1e4, open_low=True)]  # [1/s] of the velocity error
     ki: Annotated[float, between(0.0, 1e8)] = 0.0  # [1/s³] of the error's integral, pid only
     integral_limit_rads: Annotated[float, between(0.0, 1e3)] = 0.0  # pid only, 0 = none
-    observer_radps: Annotated[float, between(0.0, 2000.0)] = 0.0  # bandwidth, computed_torque_observer only
+    # bandwidth, computed_torque_observer and flexible_joint only
+    observer_radps: Annotated[float, between(0.0, 2000.0)] = 0.0
     observer_delay_cycles: Annotated[int, between(0, 15)] = 1  # from a command to its torque
     # of the Lyapunov equation: Q = q I, or diag(q1, q2)
     lyapunov_q: Annotated[tuple[float, ...], _numbers("numbers", 1, 2, low=0.0, high=1e12)]
@@ -249,6 +251,9 @@ class Control(Section):
     zero_band_radps: Annotated[float, between(0.0, 10.0)] = 0.0  # half width of the linear zero rule
     velocity_cutoff_Hz: Annotated[float, between(0.0, 2000.0)]  # 0 = no filter
     filtered_error_rate: bool  # filter the velocity error as a whole: no bias from the filter's lag
+    # with which the link's encoder corrects the expected twist, flexible_joint with both encoders only
+    twist_radps: Annotated[float, between(0.0, 1000.0, open_low=True)] = 60.0
+    link_cutoff_Hz: Annotated[float, between(0.0, 2000.0)] = 60.0  # of the link's velocity there; 0 = no filter
     learning: Learning | None = None
 
 
@@ -291,6 +296,10 @@ class Margin(Section):
         None  # from the position sample to the torque; none = from the RPDO type
     )
     current_lag_s: Annotated[float, between(0.0, 0.1)] = 0.0005  # of the drive's current loop, first order
+    # with [reducer]: the loop must bear these factors on the link's inertia, lightest and heaviest
+    payload_range: Annotated[tuple[float, ...], _numbers("factors", 2, low=0.0, high=100.0)] = (0.7, 1.4)
+    # with [reducer]: by this share the stiffness may be less or more
+    stiffness_error: Annotated[float, between(0.0, 0.9)] = 0.3
 
 
 class Live(Section):
@@ -360,6 +369,50 @@ class JointEncoder(Section):
     stiffness_Nmprad: Annotated[float, between(0.0, 1e9, open_low=True)] | None = (
         None  # of the reducer between them: torque / stiffness is allowed in addition
     )
+
+
+NUMBERS_TEXT = "a list of up to 4 numbers"
+
+
+def _list(value: Any) -> Any:
+    """Lists of TOML as tuples, which a frozen model needs."""
+    good = isinstance(value, (list, tuple)) and len(value) <= 4
+    if not good or any(isinstance(x, bool) or not isinstance(x, (int, float)) for x in value):
+        raise PydanticCustomError("numbers", f"must be {NUMBERS_TEXT}")
+    return tuple(float(x) for x in value)
+
+
+Numbers = Annotated[tuple[float, ...], BeforeValidator(Rule(NUMBERS_TEXT, _list))]
+
+
+# --- [reducer]: of a joint that is not rigid ---
+
+
+class ReducerMap(Section):
+    """Errors of the reducer and of the motor as sines of the motor angle, good for one mounting of its encoder."""
+
+    direction: Direction  # encoder.direction when it was made
+    zero_counts: Annotated[int, between(-(2**31), 2**31 - 1)]  # encoder.zero_counts when it was made
+    kinematic_error_rad: Numbers = ()  # amplitudes, at the joint, by which the reducer's output is ahead
+    kinematic_error_per_motor_turn: Numbers = ()  # periods of each
+    kinematic_error_phase_rad: Numbers = ()  # of each
+    torque_ripple_Nm: Numbers = ()  # amplitudes, at the joint, positive towards positive angle
+    torque_ripple_per_motor_turn: Numbers = ()  # periods of each
+    torque_ripple_phase_rad: Numbers = ()  # of each
+
+
+class Reducer(Section):
+    """What twists between motor and link; every value at the joint."""
+
+    motor_inertia_kgm2: Annotated[float, between(0.0, 10_000.0, open_low=True)]  # of joint.inertia_kgm2
+    stiffness_Nmprad: Annotated[float, between(0.0, 1e9, open_low=True)]  # under a steady torque, up to the first knee
+    knees_Nm: Numbers = ()  # transmitted torques beyond which it is stiffer, two at most
+    stiffness_beyond_Nmprad: Numbers = ()  # beyond each knee
+    # of a small motion, which hysteresis makes stiffer; none = stiffness_Nmprad
+    loop_stiffness_Nmprad: Annotated[float, between(0.0, 1e9, open_low=True)] | None = None
+    damping_Nmspr: Annotated[float, between(0.0, 1e6)] = 0.0  # of a small motion
+    link_friction_share: Annotated[float, between(0.0, 1.0)] = 0.0  # of [friction], that acts behind the reducer
+    map: ReducerMap | None = None
 
 
 # --- The [trajectory] section: one model per kind of motion; which keys exist depends on `kind` ---
@@ -446,20 +499,6 @@ FAULT_KINDS = (
     "torque_reversed", "torque_saturated", "current_loop_dead", "load_jump",
 )  # fmt: skip
 FAULT_KINDS_TEXT = "one of " + ", ".join(FAULT_KINDS)
-
-
-NUMBERS_TEXT = "a list of up to 4 numbers"
-
-
-def _list(value: Any) -> Any:
-    """Lists of TOML as tuples, which a frozen model needs."""
-    good = isinstance(value, (list, tuple)) and len(value) <= 4
-    if not good or any(isinstance(x, bool) or not isinstance(x, (int, float)) for x in value):
-        raise PydanticCustomError("numbers", f"must be {NUMBERS_TEXT}")
-    return tuple(float(x) for x in value)
-
-
-Numbers = Annotated[tuple[float, ...], BeforeValidator(Rule(NUMBERS_TEXT, _list))]
 
 
 def _kind(value: Any) -> Any:

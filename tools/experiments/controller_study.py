@@ -39,7 +39,7 @@ from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.input_file import parse_toml, read_input
 from jointctl.tools.child_process import interrupts_left_to_the_parent
 from jointctl.tools.configuration.config import Config, suggestion
-from jointctl.tools.configuration.sections import JointEncoder, Section, between
+from jointctl.tools.configuration.sections import JointEncoder, Reducer, ReducerMap, Section, Virtual, between
 from jointctl.tools.drawing import BLUE, GREY, INK, canvas
 from jointctl.tools.experiments.controllers import DEFAULT, Controller, changed, controller_constants, named, one_line
 from jointctl.tools.experiments.scenarios import RPDO_AT_ONCE, ErrorFigures, Scenario, error_figures, run_scenario
@@ -82,6 +82,7 @@ REDUCERS: dict[int, tuple[float, tuple[float, float], tuple[float, float]]] = {
     25: (3.1e4, (5.0e4, 5.7e4), (14.0, 48.0)),
 }
 ENCODERS_APART_rad = 0.02  # by which two encoders of a flexible joint may differ
+SMALL_MOTION = 1.6  # times the stiffness of the catalogue: what an identification with small motions finds
 
 
 def _sizes(value: tuple[int, ...]) -> tuple[int, ...]:
@@ -116,6 +117,10 @@ class EnsembleSettings(Section):
     kinematic_error_share: Annotated[Interval, _FromList, _interval(0.0, 1.0)] = (0.1, 0.4)  # of it 4 per motor turn
     link_friction_share: Annotated[Interval, _FromList, _interval(0.0, 1.0)] = (0.05, 0.2)
     motor_encoder_bits: Annotated[tuple[int, int], _FromList, _interval(8, 26)] = (14, 17)
+    # what the controller believes of the reducer: each inertia and the stiffness are wrong by up to this share
+    model_error: Annotated[float, between(0.0, 0.5)] = 0.15
+    maps: bool = True  # whether it has maps of kinematic error and torque ripple
+    map_error: Annotated[float, between(0.0, 1.0)] = 0.05  # share by which their amplitudes are wrong at most
 
 
 def _flexible(base: Config, settings: EnsembleSettings, random: np.random.Generator) -> dict[str, Any]:
@@ -144,6 +149,38 @@ def _flexible(base: Config, settings: EnsembleSettings, random: np.random.Genera
     }
 
 
+def _belief(
+    base: Config, true: Virtual, settings: EnsembleSettings, random: np.random.Generator
+) -> tuple[Reducer, float]:
+    """(What the controller believes of a reducer, link inertia [kg m^2]): as an identification would find them."""
+
+    def about(value: float, error: float = settings.model_error) -> float:
+        return value * (1.0 + float(random.uniform(-error, error)))
+
+    def maps(amplitudes: tuple[float, ...]) -> tuple[float, ...]:
+        return tuple(about(amplitude, settings.map_error) for amplitude in amplitudes)
+
+    inertia = base.joint.inertia_kgm2 * true.inertia_scale
+    motor, link, scale = about(true.motor_side_inertia_kgm2), about(inertia - true.motor_side_inertia_kgm2), about(1.0)
+    error, ripple = maps(true.kinematic_error_rad), maps(true.torque_ripple_Nm)
+    made = ReducerMap(
+        direction=base.encoder.direction, zero_counts=base.encoder.zero_counts,
+        kinematic_error_rad=error, kinematic_error_per_motor_turn=true.kinematic_error_per_motor_turn,
+        kinematic_error_phase_rad=true.kinematic_error_phase_rad,
+        torque_ripple_Nm=ripple, torque_ripple_per_motor_turn=true.torque_ripple_per_motor_turn,
+        torque_ripple_phase_rad=true.torque_ripple_phase_rad,
+    )  # fmt: skip
+    stiffness, critical = true.reducer_stiffness_Nmprad * scale, 2.0 * math.sqrt(motor * link / (motor + link))
+    believed = Reducer(
+        motor_inertia_kgm2=motor, stiffness_Nmprad=stiffness, knees_Nm=true.reducer_knees_Nm,
+        stiffness_beyond_Nmprad=tuple(scale * x for x in true.reducer_stiffness_beyond_Nmprad),
+        loop_stiffness_Nmprad=SMALL_MOTION * stiffness,
+        damping_Nmspr=float(np.mean(settings.reducer_damping)) * critical * math.sqrt(stiffness),
+        link_friction_share=float(np.mean(settings.link_friction_share)), map=made if settings.maps else None,
+    )  # fmt: skip
+    return believed, link
+
+
 def random_plant(base: Config, settings: EnsembleSettings, seed: int, index: int) -> Config:
     """The configuration with the virtual joint number `index` of the study with this seed."""
     random = np.random.default_rng([seed, index])
@@ -170,6 +207,7 @@ def random_plant(base: Config, settings: EnsembleSettings, seed: int, index: int
         "initial_position_rad": 0.0,
     }
     bits = int(random.integers(settings.encoder_bits[0], settings.encoder_bits[1] + 1))
+    assert base.virtual is not None
     update: dict[str, Any] = {
         "drive": base.drive.model_copy(update={"rpdo_transmission_type": RPDO_AT_ONCE}),
         "encoder": base.encoder.model_copy(update={"counts_per_turn": 2**bits, "side": "joint"}),
@@ -183,7 +221,11 @@ def random_plant(base: Config, settings: EnsembleSettings, seed: int, index: int
             source="drive", counts_per_turn=2**bits, direction=1, zero_counts=0, law=settings.law,
             disagreement_max_rad=ENCODERS_APART_rad,
         )  # fmt: skip
-    assert base.virtual is not None
+        true = base.virtual.model_copy(update=virtual)
+        update["reducer"], link_kgm2 = _belief(base, true, settings, random)
+        believed_kgm2 = update["reducer"].motor_inertia_kgm2 + link_kgm2
+        virtual["inertia_scale"] *= base.joint.inertia_kgm2 / believed_kgm2
+        update["joint"] = base.joint.model_copy(update={"inertia_kgm2": believed_kgm2})
     update["virtual"] = base.virtual.model_copy(update=virtual)
     return base.model_copy(update=update)
 

@@ -60,7 +60,7 @@ def config_of_sweep(config: Config, mode: str) -> Config:
 def with_tracking_law(config: Config) -> Config:
     """For torque mode: a law that holds a speed against unknown friction; one with integral action is kept."""
     control = config.control
-    if control.kind in ("pid", "computed_torque_observer"):
+    if control.kind in ("pid", "computed_torque_observer", "flexible_joint"):
         update: dict[str, Any] = {"learning": None}
     else:
         update = {"kind": "computed_torque_observer", "observer_radps": OBSERVER_radps, "learning": None}

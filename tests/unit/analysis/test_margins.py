@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from jointctl.firmware_py.axis import low_pass_gain, step_velocity
 from jointctl.firmware_py.kernel import JIT_DISABLED, kernel
 from jointctl.firmware_py.law import reset_law, solve_lyapunov_p, step_law
 from jointctl.firmware_py.records import LawConstants, LawState, Reference, VelocityConstants, VelocityState
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ControllerKind
 from jointctl.firmware_py.trajectory import NO_REPETITION
+from jointctl.firmware_py.velocity import low_pass_gain, step_velocity
 from jointctl.hil.plant import plant, step_plant
 from jointctl.hil.plant_records import DELAY_SLOTS
 from jointctl.tools.analysis.linear_loop import LoopSettings, linear_loop, sampled_joint
@@ -109,7 +109,7 @@ def test_frequency_response_and_state_space_agree(loop, delay_s):
     whole = linear_loop(replace(loop, delay_s=delay_s))
     omega = np.array([1.0, 80.0, 900.0, 3000.0])
     z = np.exp(1j * omega * 1e-3)
-    by_states = -whole.joint.state_space().response(z) * whole.controller.response(z)
+    by_states = -(whole.controller.response(z) @ whole.joint.state_space().response(z))[:, 0, 0]
     assert whole.open_loop(omega) == pytest.approx(by_states, rel=1e-7)
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointctl.firmware_py.axis import low_pass_gain, step_velocity
 from jointctl.firmware_py.friction import friction_motor_torque_Nm, step_lugre
 from jointctl.firmware_py.law import (
     GROWN,
@@ -41,6 +40,7 @@ from jointctl.firmware_py.records import (
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ControllerKind, FeedForward, ZeroSpeedRule
 from jointctl.firmware_py.trajectory import NO_REPETITION
+from jointctl.firmware_py.velocity import low_pass_gain, step_velocity
 
 # --- Velocity from position differences ---
 PERIOD_s = 1e-3

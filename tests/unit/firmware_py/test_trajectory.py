@@ -199,6 +199,39 @@ def test_no_distance_is_rest_and_not_a_division_by_zero(kind):
         assert at(c, t_s) == (1.0, 0.0, 0.0)
 
 
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        (TrajectoryKind.SINE, {"amplitude_rad": 0.4, "omega_radps": 5.0, "shift_s": 0.3, "offset_rad": 0.1}),
+        (TrajectoryKind.MIN_JERK, {"start_rad": -0.2, "target_rad": 0.5, "move_s": 1.3}),
+    ],
+)
+def test_the_fourth_derivative_is_that_of_the_acceleration_twice(kind, values):
+    c, reference, step_s = constants(kind, **values), new(Reference)[0], 1e-4
+    for t_s in (0.2, 0.65, 1.1):
+        around = [at(c, t_s + k * step_s)[2] for k in (-1, 0, 1)]
+        reference_at(c, NO_TABLE, 0, t_s, reference)
+        expected = (around[0] - 2.0 * around[1] + around[2]) / step_s**2
+        assert reference.snap_radps4 == pytest.approx(expected, rel=1e-3, abs=1e-3)
+
+
+def test_the_fourth_derivative_of_an_approach_and_of_rest():
+    reference, coefficients, step_s = new(Reference)[0], np.zeros(6), 1e-4
+    reference.position_rad, reference.velocity_radps, reference.acceleration_radps2 = 0.6, 0.2, -1.0
+    plan_approach(0.1, reference, 2.0, coefficients)
+    around = []
+    for k in (-1, 0, 1):
+        approach_at(coefficients, 0.7 + k * step_s, reference)
+        around.append(float(reference.acceleration_radps2))
+    approach_at(coefficients, 0.7, reference)
+    assert reference.snap_radps4 == pytest.approx((around[0] - 2.0 * around[1] + around[2]) / step_s**2, rel=1e-3)
+    brake_step(reference, 1.0, 1e-3)
+    assert reference.snap_radps4 == 0.0
+    approach_at(coefficients, 0.7, reference)
+    reference_at(constants(TrajectoryKind.HOLD, start_rad=0.3), NO_TABLE, 0, 1.0, reference)
+    assert reference.snap_radps4 == 0.0
+
+
 @quick
 @given(angle, st.tuples(angle, st.floats(-1.0, 1.0), st.floats(-2.0, 2.0)), st.floats(0.5, 20.0), fraction)
 def test_approach_starts_at_rest_and_ends_in_the_trajectory(position, target, duration_s, part):
@@ -245,7 +278,7 @@ def test_brake_lands_on_exactly_zero_within_the_deceleration(position, velocity,
     assert abs(float(reference.position_rad) - ideal) <= brake * period_s**2
     resting = float(reference.position_rad)
     brake_step(reference, brake, period_s)
-    assert reference.tolist() == (resting, 0.0, 0.0)
+    assert reference.tolist() == (resting, 0.0, 0.0, 0.0)
 
 
 def test_a_brake_that_is_not_positive_stops_at_once():
@@ -253,7 +286,7 @@ def test_a_brake_that_is_not_positive_stops_at_once():
         reference = new(Reference)[0]
         reference.position_rad, reference.velocity_radps, reference.acceleration_radps2 = 1.0, 2.0, 3.0
         brake_step(reference, brake, 1e-3)
-        assert reference.tolist() == (1.0, 0.0, 0.0)
+        assert reference.tolist() == (1.0, 0.0, 0.0, 0.0)
 
 
 # --- Tables from CSV, the demands of a trajectory, the duration of an approach; compiled and plain runs agree ---
@@ -461,14 +494,17 @@ for _ in range(30):
     out.append([0, *map(float, r.tolist())])
     brake_step(r, 2.0, 0.01)
 for kind in range(4):
-    loaded = {"flexible": True, "thermal": True, "gravity_Nm": 5.0, "end_stops": True, "encoder_noise_counts": 2.0}
+    loaded = {"flexible": True, "thermal": True, "gravity_Nm": 5.0, "end_stops": True, "encoder_noise_counts": 2.0,
+              "hysteresis_width_rad": 2e-4, "link_friction_share": 0.2, "kinematic_error_rad": (2e-4,),
+              "kinematic_error_per_motor_turn": (2.0,), "reducer_knees_Nm": (7.0, 25.0),
+              "reducer_stiffness_beyond_Nmprad": (2.5e4, 2.9e4)}
     for extra in ({}, loaded):
         pc, ps = plant(**{**R1, "friction_kind": kind, **extra})
         for k in range(300):
             step_plant(pc[0], ps[0], 40.0 if k < 200 else -55.0)
         s = ps[0]
         out.append([encoder_counts(pc[0], s), float(s.joint_position_rad), float(s.joint_velocity_radps),
-                    float(s.friction_torque_Nm)])
+                    float(s.friction_torque_Nm), float(s.motor_position_rad)])
 print(json.dumps(out))
 """
 
@@ -478,5 +514,5 @@ def test_compiled_and_plain_python_agree():
         np.array(json.loads(run_python(_BOTH_WAYS, NUMBA_DISABLE_JIT=disabled, PYTHONWARNINGS="error")))
         for disabled in ("0", "1")
     )
-    assert compiled.shape == (238, 4)
+    assert compiled.shape == (238, 5)
     assert plain == pytest.approx(compiled, rel=1e-9, abs=1e-12)

@@ -1,0 +1,164 @@
+"""The law for a joint whose reducer is not rigid: damping from the motor's encoder, position from the link's.
+
+    theta motor angle / n,  q link angle,  y_m, y_l their readings,  e_m = y_m - theta_d,  e_l = y_l - q_d
+    b'  = wb ((e_l - e_m) - b)                                what the twist is away from the expected one, slowly
+    v_m = low-pass(e_m'),  v_l = slower low-pass(e_l')
+    d   = L (p - (Jm v_m + Jl v_l)),  p' = u_applied - d      disturbance observer on the momentum of both masses
+    u   = -(Jm + Jl) (kp (e_m + b) + kv v_m) + d
+    tau = tau_ff + u + learned torque
+
+The feed-forward takes the desired motion of the link through the reducer (the joint is flat in q):
+
+    tau_l   = Jl q_d'' + F_l + G(q_d) + C0 q_d'               torque through the reducer
+    theta_d = q_d + twist(tau_l) - eps(theta_d)
+    tau_ff  = Jm theta_d'' + (1 + eps') tau_l + F_m - r(theta_d)
+
+eps is the kinematic error of the reducer and r the torque ripple, both sums of sines of the motor angle; theta_d''
+needs the fourth derivative of q_d.  With one encoder alone e_l = e_m: with the motor's, the link is where the
+feed-forward expects it; with the link's, the loop must be slow against the reducer's resonance.
+
+Not modelled: hysteresis and damping of the reducer, the rates of the friction in theta_d''."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from jointctl.firmware_py.kernel import inlined, kernel
+from jointctl.firmware_py.records import (
+    KNEES,
+    FlexibleConstants,
+    FlexibleState,
+    HarmonicSeries,
+    LawConstants,
+    LawState,
+    Reference,
+)
+from jointctl.firmware_py.states import Encoders
+from jointctl.firmware_py.velocity import step_velocity
+
+
+class Reading(NamedTuple):
+    """What the encoders say in a cycle."""
+
+    position_rad: float  # of the one that feeds the law
+    second_position_rad: float
+    gap_cycles: int  # periods since the last sample, 0 where there is no new one
+
+
+@kernel
+def reset_flexible(state: FlexibleState) -> None:
+    """Nothing known of the twist; the next cycle begins with the errors that it finds."""
+    state.primed = 0
+    state.twist_error_rad = 0.0
+    state.known_torque_Nm = 0.0
+    state.motor_velocity.primed = 0
+    state.link_velocity.primed = 0
+
+
+@inlined
+def sine_of_turns(turns: float) -> float:
+    """sin(2 pi turns), absolute error below 2e-11; range reduction in turns is exact, without branch or library call.
+
+    Half a turn either way is r (1/4 - r^2) P(r^2), P of degree 6 fitted for the least maximum error.  Several times as
+    fast as libm, which matters for the ripples of a simulated joint, two million substeps long.
+    """
+    r = turns - np.rint(turns)
+    y = r * r
+    y2 = y * y
+    low = (25.1327412271771 - y * 64.8358437584691) + y2 * (67.0776056610595 - y * 38.5126054685551)
+    high = (14.1788906187473 - y * 3.62170359416296) + y2 * 0.614277835548814
+    return r * (0.25 - y) * (low + y2 * y2 * high)
+
+
+@inlined
+def series_at(series: HarmonicSeries, angle_rad: float) -> tuple[float, float, float]:
+    """(value, first, second derivative) at a motor angle / n."""
+    value = 0.0
+    slope = 0.0
+    bend = 0.0
+    for i in range(series.count):
+        order = 2.0 * math.pi * series.turns_prad[i]
+        turns = series.turns_prad[i] * angle_rad + series.phase_turns[i]
+        wave = series.amplitude[i] * sine_of_turns(turns)
+        value += wave
+        slope += order * series.amplitude[i] * sine_of_turns(turns + 0.25)
+        bend -= order * order * wave
+    return value, slope, bend
+
+
+@inlined
+def value_at(series: HarmonicSeries, angle_rad: float) -> float:
+    """The value alone."""
+    value = 0.0
+    for i in range(series.count):
+        value += series.amplitude[i] * sine_of_turns(series.turns_prad[i] * angle_rad + series.phase_turns[i])
+    return value
+
+
+@inlined
+def twist_of(constants: FlexibleConstants, torque_Nm: float) -> tuple[float, float]:
+    """(twist [rad], compliance there [rad/Nm]) of the reducer under a steady torque."""
+    size = abs(torque_Nm)
+    compliance = constants.compliance_radpNm
+    twist = compliance * size
+    for i in range(KNEES):
+        beyond = size - constants.knee_Nm[i]
+        if beyond > 0.0:
+            twist -= constants.stiffening_radpNm[i] * beyond
+            compliance -= constants.stiffening_radpNm[i]
+    return math.copysign(twist, torque_Nm), compliance
+
+
+@kernel
+def desired_motor(constants: LawConstants, state: LawState, reference: Reference, gravity_slope_Nmprad: float) -> float:
+    """Feed-forward torque [Nm]; leaves theta_d in the state.  Friction and gravity of this cycle are there already."""
+    flexible = constants.flexible
+    speed, acceleration = reference.velocity_radps, reference.acceleration_radps2
+    link_friction = flexible.link_friction_share * state.friction_torque_Nm
+    through = flexible.link_inertia_kgm2 * acceleration + link_friction + state.gravity_torque_Nm
+    through += constants.coriolis_Nmspr * speed
+    twist, compliance = twist_of(flexible, through)
+    bend = flexible.link_inertia_kgm2 * reference.snap_radps4  # the second derivative of that torque
+    bend += gravity_slope_Nmprad * acceleration - state.gravity_torque_Nm * speed * speed
+    # theta + eps(theta) = q_d + twist: a step of Newton's method from where theta was, moved along
+    own, ahead = state.flexible, reference.position_rad + twist
+    target = own.target_rad + own.motor_per_link * (ahead - own.ahead_rad) if own.primed != 0 else ahead
+    error, slope, curvature = series_at(flexible.kinematic_error, target)
+    inverse = 1.0 / (1.0 + slope)
+    target -= (target + error - ahead) * inverse
+    own.target_rad, own.ahead_rad, own.motor_per_link = target, ahead, inverse
+    motor_speed = speed * inverse
+    motor_acceleration = (acceleration + compliance * bend - curvature * motor_speed * motor_speed) * inverse
+    motor_friction = state.friction_torque_Nm - link_friction - value_at(flexible.torque_ripple, target)
+    return flexible.motor_inertia_kgm2 * motor_acceleration + (1.0 + slope) * through + motor_friction
+
+
+@kernel
+def motor_and_link_errors(
+    constants: FlexibleConstants, state: FlexibleState, reading: Reading, desired_rad: float
+) -> tuple[float, float]:
+    """(e_m, e_l) [rad]; moves the filters of both and the correction of the twist on."""
+    position = reading.position_rad
+    if constants.encoders == Encoders.LINK:
+        motor, target = position, desired_rad
+    elif constants.encoders == Encoders.MOTOR:
+        motor, target = position, state.target_rad
+    else:
+        motor, target = reading.second_position_rad, state.target_rad
+    motor_error = motor - target
+    link_error = motor_error
+    if constants.encoders == Encoders.BOTH:
+        link_error = position - desired_rad
+    if reading.gap_cycles > 0 or state.primed == 0:
+        gap = max(reading.gap_cycles, 1)
+        step_velocity(constants.motor_velocity, state.motor_velocity, motor, motor_error, gap)
+        step_velocity(constants.link_velocity, state.link_velocity, position, link_error, gap)
+    apart = link_error - motor_error
+    if state.primed == 0:
+        state.primed = 1
+        state.twist_error_rad = apart
+    state.twist_error_rad += constants.twist_gain * (apart - state.twist_error_rad)
+    return motor_error, link_error

@@ -1,0 +1,294 @@
+"""The law for a joint whose reducer is not rigid: feed-forward against the plant, feedback, and runs in lockstep."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.flexible_joint import Reading, motor_and_link_errors, reset_flexible, series_at, twist_of
+from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.law import reset_law, step_flexible_law
+from jointctl.firmware_py.records import FlexibleConstants, FlexibleState, LawConstants, LawState, Reference
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import ControllerKind, Encoders, Fault, FeedForward
+from jointctl.firmware_py.trajectory import NO_REPETITION
+from jointctl.firmware_py.velocity import low_pass_gain
+from jointctl.hil.plant import plant, spring_torque_Nm, step_plant
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.configuration.sections import Learning
+from jointctl.tools.lockstep import LockstepJoint
+from tests.configurations import shipped, written
+
+RATIO = 121.0
+JM, JL = 1.2, 0.9
+SLOPES, KNEES_Nm = (1.6e4, 2.5e4, 2.9e4), (7.0, 25.0)
+ERROR = ((1e-4, 4e-5), (2.0, 4.0), (0.3, -1.0))  # amplitudes, per motor turn, phases
+RIPPLE = ((1.5, 0.5), (2.0, 10.0), (1.2, 0.1))
+
+
+def fill_series(series: Any, amplitudes: Any, orders: Any, phases: Any) -> None:
+    series.count = len(amplitudes)
+    for i, (amplitude, order, phase) in enumerate(zip(amplitudes, orders, phases, strict=True)):
+        series.amplitude[i] = amplitude
+        series.turns_prad[i], series.phase_turns[i] = order * RATIO / math.tau, phase / math.tau
+
+
+def flexible_law(**gains: float) -> tuple[Any, Any]:
+    """Constants that are true of `flexible_plant`, and a state; the gains are zero unless given."""
+    constants, state = new(LawConstants), new(LawState)
+    law, flexible = constants[0], constants[0].flexible
+    law.kind, law.feed_forward, law.period_s = ControllerKind.FLEXIBLE_JOINT, FeedForward.NONE, 50e-6
+    law.inertia_kgm2, law.reduction_ratio, law.gravity_Nm = JM + JL, RATIO, 12.0
+    law.kp, law.kv = gains.get("kp", 0.0), gains.get("kv", 0.0)
+    law.observer.bandwidth_radps = gains.get("observer", 0.0)
+    flexible.motor_inertia_kgm2, flexible.link_inertia_kgm2 = JM, JL
+    compliance = flexible.compliance_radpNm = 1.0 / SLOPES[0]
+    for i, (knee, slope) in enumerate(zip(KNEES_Nm, SLOPES[1:], strict=True)):
+        flexible.knee_Nm[i], flexible.stiffening_radpNm[i] = knee, compliance - 1.0 / slope
+        compliance = 1.0 / slope
+    fill_series(flexible.kinematic_error, *ERROR)
+    fill_series(flexible.torque_ripple, *RIPPLE)
+    for velocity in (flexible.motor_velocity, flexible.link_velocity):
+        velocity.period_s, velocity.cutoff_Hz = law.period_s, 300.0
+        velocity.period_gain = low_pass_gain(300.0, law.period_s)
+    reset_law(law, state[0])
+    return constants, state
+
+
+def flexible_plant(**settings: Any) -> tuple[Any, Any]:
+    return plant(
+        **{
+            "flexible": True, "inertia_kgm2": JM + JL, "motor_side_inertia_kgm2": JM, "gravity_Nm": 12.0,
+            "reducer_stiffness_Nmprad": SLOPES[0], "reducer_knees_Nm": KNEES_Nm,
+            "reducer_stiffness_beyond_Nmprad": SLOPES[1:], "reducer_damping_Nmspr": 0.0,
+            "kinematic_error_rad": ERROR[0], "kinematic_error_per_motor_turn": ERROR[1],
+            "kinematic_error_phase_rad": ERROR[2], "torque_ripple_Nm": RIPPLE[0],
+            "torque_ripple_per_motor_turn": RIPPLE[1], "torque_ripple_phase_rad": RIPPLE[2], **settings,
+        }
+    )  # fmt: skip
+
+
+# --- the feed-forward ---
+@pytest.mark.parametrize("torque_Nm", [-60.0, -25.001, -6.999, -1.0, 0.0, 3.0, 7.001, 16.0, 24.999, 60.0])
+def test_the_twist_of_a_torque_is_the_inverse_of_the_spring(torque_Nm: float) -> None:
+    (law, _), (c, _) = flexible_law(), flexible_plant()
+    twist, compliance = twist_of(law[0].flexible, torque_Nm)
+    assert spring_torque_Nm(c[0], twist) == pytest.approx(torque_Nm, abs=1e-9)
+    a_little_more, _ = twist_of(law[0].flexible, torque_Nm + 1e-6)
+    assert (a_little_more - twist) * 1e6 == pytest.approx(compliance, rel=1e-3)
+
+
+def test_the_derivatives_of_a_series() -> None:
+    law, _ = flexible_law()
+    series = law[0].flexible.kinematic_error
+    for angle in np.linspace(-0.5, 0.5, 41):
+        value, slope, bend = series_at(series, angle)
+        before, after = series_at(series, angle - 1e-6), series_at(series, angle + 1e-6)
+        expected = sum(a * math.sin(order * RATIO * angle + phase) for a, order, phase in zip(*ERROR, strict=True))
+        assert value == pytest.approx(expected, abs=1e-14)
+        assert slope == pytest.approx((after[0] - before[0]) / 2e-6, abs=1e-6)
+        assert bend == pytest.approx((after[1] - before[1]) / 2e-6, abs=1e-3)
+
+
+@kernel
+def follow(law_c, law_s, plant_c, plant_s, reference, amplitude_rad, omega_radps, snap_share, errors):
+    """The feed-forward alone, at every substep of the plant, on a sine that begins at its crest."""
+    for k in range(len(errors)):
+        phase = omega_radps * k * plant_c.step_s
+        reference.position_rad = amplitude_rad * math.cos(phase)
+        reference.velocity_radps = -amplitude_rad * omega_radps * math.sin(phase)
+        reference.acceleration_radps2 = -amplitude_rad * omega_radps**2 * math.cos(phase)
+        reference.snap_radps4 = snap_share * amplitude_rad * omega_radps**4 * math.cos(phase)
+        reading = Reading(plant_s.joint_position_rad, plant_s.motor_position_rad, 1)
+        torque = step_flexible_law(law_c, law_s, reading, reference, 0.0, NO_REPETITION)
+        if k == 0:
+            plant_s.joint_position_rad = reference.position_rad
+            plant_s.motor_position_rad = law_s.flexible.target_rad
+        errors[k, 0] = plant_s.joint_position_rad - reference.position_rad
+        errors[k, 1] = plant_s.motor_position_rad - law_s.flexible.target_rad
+        step_plant(plant_c, plant_s, torque)
+
+
+@pytest.mark.parametrize("frequency_Hz", [0.2, 0.7])
+def test_the_feed_forward_alone_moves_the_link_as_desired(frequency_Hz: float) -> None:
+    """Nothing damps here: an error of sign or of size in any of the terms would ring on."""
+    (law, state), (c, s) = flexible_law(), flexible_plant()
+    errors = np.zeros((round(0.5 / 50e-6), 2))
+    follow(law[0], state[0], c[0], s[0], new(Reference)[0], 0.3, math.tau * frequency_Hz, 1.0, errors)
+    # the twist is up to 1 mrad here, the kinematic error 0.14 mrad
+    assert np.max(np.abs(errors)) < 3e-5
+
+
+@pytest.mark.parametrize(
+    "left_out", ["link_inertia_kgm2", "compliance_radpNm", "kinematic_error", "torque_ripple", "gravity_Nm"]
+)
+def test_each_term_of_the_feed_forward_is_needed(left_out: str) -> None:
+    (law, state), (c, s) = flexible_law(), flexible_plant()
+    errors, flexible = np.zeros((round(0.5 / 50e-6), 2)), law[0].flexible
+    if left_out in ("kinematic_error", "torque_ripple"):
+        flexible[left_out].count = 0
+    elif left_out == "gravity_Nm":
+        law[0].gravity_Nm = 0.0
+    else:
+        flexible[left_out] = 0.0
+    follow(law[0], state[0], c[0], s[0], new(Reference)[0], 0.3, math.tau * 0.7, 1.0, errors)
+    assert np.max(np.abs(errors)) > 6e-5
+
+
+def test_a_quick_motion_needs_its_fourth_derivative() -> None:
+    found = []
+    for snap_share in (1.0, 0.0):
+        (law, state), (c, s) = flexible_law(), flexible_plant()
+        errors = np.zeros((round(0.5 / 50e-6), 2))
+        follow(law[0], state[0], c[0], s[0], new(Reference)[0], 0.05, math.tau * 3.0, snap_share, errors)
+        found.append(float(np.max(np.abs(errors))))
+    assert found[0] < 0.3 * found[1]
+
+
+# --- the errors ---
+def errors_of(encoders: Encoders) -> tuple[Any, Any]:
+    constants, state = new(FlexibleConstants)[0], new(FlexibleState)[0]
+    constants.encoders, constants.twist_gain = encoders, 0.1
+    for velocity in (constants.motor_velocity, constants.link_velocity):
+        velocity.period_s, velocity.period_gain = 1e-3, 1.0
+    reset_flexible(state)
+    state.target_rad = 0.5005
+    return constants, state
+
+
+@pytest.mark.parametrize(
+    ("encoders", "reading", "expected"),
+    [
+        (Encoders.BOTH, Reading(0.501, 0.503, 1), (0.0025, 0.001)),
+        (Encoders.MOTOR, Reading(0.503, 99.0, 1), (0.0025, 0.0025)),
+        (Encoders.LINK, Reading(0.501, 99.0, 1), (0.001, 0.001)),
+    ],
+)
+def test_which_encoder_is_compared_with_what(encoders: Encoders, reading: Reading, expected: tuple[float, ...]) -> None:
+    constants, state = errors_of(encoders)
+    assert motor_and_link_errors(constants, state, reading, 0.5) == pytest.approx(expected, abs=1e-12)
+    assert state.twist_error_rad == pytest.approx(expected[1] - expected[0], abs=1e-12)  # no jump at the start
+
+
+def test_the_expected_twist_is_corrected_slowly_towards_what_is_seen() -> None:
+    constants, state = errors_of(Encoders.BOTH)
+    motor_and_link_errors(constants, state, Reading(0.5, 0.5005, 1), 0.5)
+    for cycle in range(1, 60):
+        motor_and_link_errors(constants, state, Reading(0.5, 0.5015, 1), 0.5)  # the motor is 1 mrad further ahead
+        assert state.twist_error_rad == pytest.approx(-1e-3 * (1.0 - 0.9**cycle), rel=1e-9)
+
+
+def test_a_lost_sample_is_no_motion_and_a_gap_is_counted() -> None:
+    constants, state = errors_of(Encoders.BOTH)
+    motor_and_link_errors(constants, state, Reading(0.5, 0.5005, 1), 0.5)
+    motor_and_link_errors(constants, state, Reading(0.501, 0.5015, 1), 0.5)
+    assert state.motor_velocity.error_rate_radps == pytest.approx(1.0)
+    motor_and_link_errors(constants, state, Reading(0.502, 0.5025, 0), 0.5)
+    assert state.motor_velocity.error_rate_radps == pytest.approx(1.0)
+    motor_and_link_errors(constants, state, Reading(0.505, 0.5055, 2), 0.5)
+    assert state.motor_velocity.error_rate_radps == pytest.approx(2.0)
+
+
+# --- runs in lockstep ---
+def link_error_mrad(config: Config, after_s: float) -> np.ndarray:
+    """Of the link itself, in the trajectory."""
+    run = LockstepJoint(config).run()
+    assert run.fault is Fault.NONE
+    late = run.tracking & (run.log.trajectory_s >= after_s)
+    error: np.ndarray = run.true_error_rad[late] * 1e3
+    return error
+
+
+def rmse(error: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(error**2)))
+
+
+def realistic(**changes: Any) -> Config:
+    return shipped("realistic", **{"trajectory__duration_s": 20.0, **changes})
+
+
+def test_the_realistic_joint_is_tracked_where_its_link_is() -> None:
+    error = link_error_mrad(realistic(), 5.0)
+    assert rmse(error) < 0.05
+    assert np.max(np.abs(error)) < 0.3
+
+
+def test_what_maps_and_the_second_encoder_buy() -> None:
+    """The last is the law for a rigid joint on the motor's encoder."""
+    whole = realistic()
+    assert whole.reducer is not None
+    assert whole.joint_encoder is not None
+    without_maps = realistic(reducer__map=None)
+    motor = {"joint_encoder": whole.joint_encoder.model_copy(update={"law": "encoder"})}
+    rigid = shipped("precise").control.model_copy(update={"learning": None})
+    found = [
+        rmse(link_error_mrad(config, 5.0))
+        for config in (whole, realistic(**motor), without_maps, realistic(**motor, control=rigid))
+    ]
+    assert found == sorted(found)
+    assert found[1] > 1.2 * found[0]
+    assert found[2] > 4.0 * found[0]
+    assert found[3] > 5.0 * found[0]
+
+
+def test_learning_takes_out_what_repeats() -> None:
+    learning = Learning(gain=0.6, error_gain_ps2=300.0, lead_cycles=10, half_width_cycles=10)
+    config = realistic(trajectory__duration_s=60.0, control__learning=learning)
+    error = link_error_mrad(config, 40.0)
+    assert rmse(error) < 0.02
+
+
+def test_a_load_on_the_link_is_held_where_the_link_is_and_the_rigid_law_on_the_motor_does_not_see_it() -> None:
+    whole = realistic(virtual__load_step_Nm=3.0, virtual__load_step_at_s=6.0)
+    error = link_error_mrad(whole, 8.0)
+    assert rmse(error) < 0.06
+    motor = whole.joint_encoder
+    assert motor is not None
+    rigid = shipped("precise").control.model_copy(update={"learning": None})
+    other = whole.model_copy(update={"joint_encoder": motor.model_copy(update={"law": "encoder"}), "control": rigid})
+    assert abs(np.mean(link_error_mrad(other, 8.0))) > 0.12  # 3 Nm on 1.6e4 Nm/rad and more
+
+
+def test_a_run_repeats_bit_by_bit() -> None:
+    config = realistic(trajectory__duration_s=2.0, virtual__initial_position_rad=0.3)
+    first, second = (LockstepJoint(config).run().log for _ in range(2))
+    assert first.tobytes() == second.tobytes()
+
+
+# --- bad input ---
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"reducer": None}, "[reducer] is missing: control.kind (=flexible_joint) needs it"),
+        ({"reducer__motor_inertia_kgm2": None}, "reducer.motor_inertia_kgm2 is missing"),
+        ({"reducer__motor_inertia_kgm2": 2.1}, "reducer.motor_inertia_kgm2 (=2.1) must be less than joint.inertia"),
+        ({"reducer__knees_Nm": [25.0, 7.0]}, "reducer.knees_Nm (=[25.0, 7.0]) must be at most 2 torques in ascending"),
+        ({"reducer__stiffness_beyond_Nmprad": [1e4]}, "reducer.stiffness_beyond_Nmprad (=[10000.0]) must be 2"),
+        ({"reducer__stiffness_Nmprad": 3e4}, "reducer.stiffness_beyond_Nmprad (=[26000.0, 31000.0]) must rise from"),
+        ({"reducer__map__direction": -1}, "reducer.map.direction (=-1) differs from encoder.direction (=1): the map"),
+        ({"reducer__map__zero_counts": 7}, "reducer.map.zero_counts (=7) differs from encoder.zero_counts (=0): the"),
+        ({"reducer__map__torque_ripple_Nm": [1.0]}, "reducer.map.torque_ripple_Nm must be as long a list as its"),
+        ({"encoder__side": "joint"}, "are the two encoders swapped?"),
+        ({"control__feed_forward": "measured"}, "control.feed_forward (=measured) must be none, desired or lugre"),
+        ({"control__filtered_error_rate": False}, "control.filtered_error_rate (=false) must be true for control.kind"),
+        ({"control__observer_radps": 0.0}, "control.observer_radps (=0) must be more than 0 with control.kind"),
+        ({"limits__following_error_max_rad": 0.002}, "by which the reducer twists at limits.torque_max_Nm"),
+        ({"limits__position_max_rad": 0.351}, "limits.position_max_rad (=0.351) must leave room for the motor"),
+        ({"margin__payload_range": [1.1, 1.4]}, "margin.payload_range (=[1.1, 1.4]) must be two factors with 1"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_clear_line(tmp_path: Any, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        load_config(written(tmp_path / "joint.toml", "realistic", **changes))
+    lines = caught.value.message.splitlines()
+    assert [line for line in lines if message in line], lines
+
+
+def test_what_is_just_inside_is_accepted(tmp_path: Any) -> None:
+    changes = {"limits__following_error_max_rad": 0.003, "limits__position_max_rad": 0.3535}
+    load_config(written(tmp_path / "joint.toml", "realistic", **changes))
