@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointctl.tools.analysis.linear_loop import LoopSettings, linear_loop
-from jointctl.tools.analysis.margins import Margins, frequencies_radps, margins
+from jointctl.tools.analysis.margins import Margins, frequencies_radps, margins, worst_case
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, SOFT, canvas, save_png
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ _DAMPING_LINES = (0.1, 0.3, 0.5, 0.7)
 
 def save_loop_figure(settings: LoopSettings, path: Path, title: str, minimum_deg: float) -> Path:
     """Draw the loop into a PNG at `path`; an unstable one is drawn too, without margins."""
+    settings = worst_case(settings)
     found = margins(settings)
     with canvas(6.8, f"{title}: {'stable' if found.stable else 'UNSTABLE'}") as figure:
         _draw(figure, settings, found, minimum_deg)
@@ -35,6 +36,10 @@ def _draw(figure: Figure, settings: LoopSettings, found: Margins, minimum_deg: f
     response = linear_loop(settings).open_loop(omega)
     frequency_Hz = omega / math.tau
     _magnitude(axes[0, 0], frequency_Hz, np.abs(response), found)
+    for joint in settings.joints:
+        axes[0, 0].axvline(joint.resonance_Hz, color=ORANGE, linewidth=0.8, linestyle="--")
+        text = f"resonance {joint.resonance_Hz:.3g} Hz\n{joint.name}"
+        axes[0, 0].text(0.03, 0.05, text, transform=axes[0, 0].transAxes, va="bottom", color=ORANGE, fontsize=9)
     _phase(axes[1, 0], frequency_Hz, np.degrees(np.unwrap(np.angle(response))), found, minimum_deg)
     _sensitivity(axes[0, 1], frequency_Hz, 1.0 / np.abs(1.0 + response), found)
     _poles(axes[1, 1], found, settings.period_s)

@@ -213,6 +213,8 @@ def refusal(settings: LoopSettings, found: Margins, minimum_deg: float, changes:
         f"at {1.0 / settings.period_s:g} Hz with {settings.delay_s * 1e3:g} ms loop delay, "
         f"{settings.lag_s * 1e3:g} ms current lag, {filtered}"
     )
+    if found.joint:
+        where += f"; worst case: {found.joint}"
     if found.stable:
         what = f"phase margin (={found.phase_margin_deg:.1f} deg) must be at least {minimum_deg:g} deg"
     else:

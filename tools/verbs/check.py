@@ -28,7 +28,7 @@ def check(
     allow_low_margin: Annotated[bool, typer.Option("--allow-low-margin", help="accept a stable loop below it")] = False,
 ) -> int:
     """Is the control loop stable enough?  Margins, bounds and what would help."""
-    from jointctl.tools.analysis.loop_settings import loop_settings, not_modelled
+    from jointctl.tools.analysis.loop_settings import loop_settings, not_modelled, outside_payload_range
     from jointctl.tools.analysis.margin_gate import learning_of, meets, refusal, refuse_diverging_learning, remedies
     from jointctl.tools.analysis.margins import margins, theory
     from jointctl.tools.drawing import require_png
@@ -61,6 +61,8 @@ def check(
     output.result(table, _data(analysis, figure), analysis)
     for text in not_modelled(config):
         output.note(f"not in this analysis: {text}")
+    for text in outside_payload_range(config, settings):
+        output.warning(text)
     if not accepted:
         raise refusal(settings, found, minimum_deg, changes)
     refuse_diverging_learning(learning)
@@ -98,6 +100,11 @@ def _table(analysis: LoopCheck) -> Table:
         "continuous time: the theory's loop, slowest mode " + f"{ideal.slowest_time_constant_s:.3g} s",
     )
     table.add_section()
+    if analysis.settings.joints:
+        note = (
+            f"of {len(analysis.settings.joints)} joints: payload, stiffness, friction; the rest of the table is of it"
+        )
+        table.add_row("worst case", found.joint, note)
     table.add_row("stable", "yes" if found.stable else "NO", "with the delay, lag, filter and rate above")
     if found.stable:
         _add_margins(table, found)

@@ -282,3 +282,72 @@ def test_what_is_simulated_in_lockstep_is_refused_in_one_line() -> None:
     with pytest.raises(ConfigurationError, match=r'drive.kind \(=elmo_serial\) must be "canopen" for study'):
         from_file("elmo_serial")
     require_simulated(shipped("virtual"), "fault-campaign")  # the twin
+
+
+# --- a joint whose reducer is not rigid ---
+def rigid_law_behind_a_reducer(encoder: str) -> Config:
+    """The law of precise.toml on the joint of realistic.toml."""
+    config = shipped("realistic", control=shipped("precise").control)
+    assert config.joint_encoder is not None
+    return config.model_copy(update={"joint_encoder": config.joint_encoder.model_copy(update={"law": encoder})})
+
+
+def test_the_worst_of_all_joints_is_judged_and_named(tmp_path: Path) -> None:
+    shown, messages, code = run_check(shipped("realistic"), figure=tmp_path / "loop.png")
+    assert code == 0
+    assert re.search(r"worst case +│ link inertia x [01]\.[74], stiffness x [01]\.[73], without friction", shown)
+    assert "of 18 joints" in shown
+    assert "35.6 Hz" in shown  # the resonance
+    for payload in ("0.5", "2"):
+        assert f"outside margin.payload_range, link inertia x {payload}: phase margin" in messages
+    assert (tmp_path / "loop.png").stat().st_size > 1000
+
+
+def test_a_law_for_a_rigid_joint_is_refused_on_the_link_of_a_soft_reducer() -> None:
+    _, messages, code = run_check(rigid_law_behind_a_reducer("joint_encoder"))
+    assert code == 9
+    assert "the control loop is unstable" in messages
+    assert "worst case: " in messages
+    # its twin: a softer law of that kind on the motor's encoder
+    motor = rigid_law_behind_a_reducer("encoder")
+    soft = {"kp": 300.0, "kv": 20.0, "observer_radps": 40.0, "velocity_cutoff_Hz": 300.0, "learning": None}
+    assert run_check(motor.model_copy(update={"control": motor.control.model_copy(update=soft)}))[2] == 0
+
+
+def test_a_wider_payload_range_is_judged_and_no_longer_a_warning() -> None:
+    narrow, _ = loop_settings(shipped("realistic"))
+    wide, _ = loop_settings(shipped("realistic", margin__payload_range=(0.4, 2.5)))
+    assert phase_margin_deg(wide) < phase_margin_deg(narrow)
+    assert "outside margin" not in run_check(shipped("realistic", margin__payload_range=(0.4, 2.5)))[1]
+
+
+def test_friction_that_holds_is_looked_at_where_its_bristles_are_known() -> None:
+    config = shipped("realistic")
+    assert config.friction is not None
+    names = [joint.name for joint in loop_settings(config)[0].joints]
+    assert sum("held by friction" in name for name in names) == 9
+    without = config.model_copy(update={"friction": config.friction.model_copy(update={"lugre": None})})
+    assert not any("held" in joint.name for joint in loop_settings(without)[0].joints)
+
+
+def test_a_remedy_does_for_every_joint() -> None:
+    config = shipped("realistic", control__kv=90.0, control__kp=2500.0, margin__min_phase_margin_deg=30.0)
+    _, messages, code = run_check(config)
+    assert code == 9
+    found = re.search(r"control\.kv = ([\d.]+)", messages) or re.search(r"kp = [\d.e+]+, kv = ([\d.]+)", messages)
+    assert found is not None
+    settings, _ = loop_settings(shipped("realistic", control__kp=2500.0, control__kv=float(found[1])))
+    if "a slower loop" not in messages:
+        assert phase_margin_deg(settings) >= 30.0
+
+
+def test_learning_is_judged_with_the_worst_joint() -> None:
+    from jointctl.tools.analysis.margin_gate import learning_of
+    from jointctl.tools.configuration.sections import Learning
+
+    good = Learning(gain=0.6, error_gain_ps2=300.0, lead_cycles=10, half_width_cycles=10)
+    for learning, converges in ((good, True), (good.model_copy(update={"error_gain_ps2": 60000.0}), False)):
+        config = shipped("realistic", control__learning=learning)
+        found = learning_of(config, loop_settings(config)[0])
+        assert found is not None
+        assert (found.worst_factor < 1.0) is converges
