@@ -307,3 +307,19 @@ def test_plants_are_a_number_or_an_ensemble_or_both(words: list[str], plants: in
 def test_plants_that_are_neither_are_refused(word: str) -> None:
     with pytest.raises(ConfigurationError, match=r"plants \(="):
         with_plants(StudySettings(), [word])
+
+
+def test_a_law_for_flexible_joints_gets_gains_for_each_of_them(base: Config) -> None:
+    controllers = named(("realistic", "paper"))
+    found = {}
+    for choose in (True, False):
+        plant = {"flexible": True, "choose_gains": choose}
+        settings = checked({"plants": 2, "seed": 5, "after_s": 1.0, "plant": plant}, "test")
+        found[choose] = run_study(base, controllers, settings, workers=1)
+        assert found[choose].faults("realistic") == 0
+        assert np.max(found[choose].values("realistic", "true_rmse_mrad")) < 0.25
+        assert np.max(found[choose].values("realistic", "chatter_Nm")) < 1.0
+    differ = [found[choose].values("realistic", "true_rmse_mrad").tolist() for choose in (True, False)]
+    assert differ[0] != differ[1]
+    same = [found[choose].values("paper", "true_rmse_mrad").tolist() for choose in (True, False)]
+    assert same[0] == same[1]

@@ -41,7 +41,15 @@ from jointctl.tools.child_process import interrupts_left_to_the_parent
 from jointctl.tools.configuration.config import Config, suggestion
 from jointctl.tools.configuration.sections import JointEncoder, Reducer, ReducerMap, Section, Virtual, between
 from jointctl.tools.drawing import BLUE, GREY, INK, canvas
-from jointctl.tools.experiments.controllers import DEFAULT, Controller, changed, controller_constants, named, one_line
+from jointctl.tools.experiments.controllers import (
+    DEFAULT,
+    Controller,
+    changed,
+    controller_constants,
+    named,
+    one_line,
+    with_chosen_gains,
+)
 from jointctl.tools.experiments.scenarios import RPDO_AT_ONCE, ErrorFigures, Scenario, error_figures, run_scenario
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.written_file import writing
@@ -82,6 +90,7 @@ REDUCERS: dict[int, tuple[float, tuple[float, float], tuple[float, float]]] = {
     25: (3.1e4, (5.0e4, 5.7e4), (14.0, 48.0)),
 }
 ENCODERS_APART_rad = 0.02  # by which two encoders of a flexible joint may differ
+DELAY_ERROR_s = 0.2e-3  # by which the loop delay is measured wrong
 SMALL_MOTION = 1.6  # times the stiffness of the catalogue: what an identification with small motions finds
 
 
@@ -120,6 +129,7 @@ class EnsembleSettings(Section):
     # what the controller believes of the reducer: each inertia and the stiffness are wrong by up to this share
     model_error: Annotated[float, between(0.0, 0.5)] = 0.15
     maps: bool = True  # whether it has maps of kinematic error and torque ripple
+    choose_gains: bool = True  # of the law with both encoders, for what it believes of each; else they are as given
     map_error: Annotated[float, between(0.0, 1.0)] = 0.05  # share by which their amplitudes are wrong at most
 
 
@@ -226,6 +236,9 @@ def random_plant(base: Config, settings: EnsembleSettings, seed: int, index: int
         believed_kgm2 = update["reducer"].motor_inertia_kgm2 + link_kgm2
         virtual["inertia_scale"] *= base.joint.inertia_kgm2 / believed_kgm2
         update["joint"] = base.joint.model_copy(update={"inertia_kgm2": believed_kgm2})
+        delay_s = virtual["command_delay_s"] + float(random.uniform(-DELAY_ERROR_s, DELAY_ERROR_s))
+        measured = {"loop_delay_s": delay_s, "current_lag_s": virtual["current_lag_s"]}
+        update["margin"] = base.margin.model_copy(update=measured)
     update["virtual"] = base.virtual.model_copy(update=virtual)
     return base.model_copy(update=update)
 
@@ -343,6 +356,9 @@ def run_plant(task: PlantTask) -> PlantResult:
     joint = LockstepJoint(config)
     figures = []
     for controller in task.controllers:
+        both = task.plant.flexible and task.plant.law == "joint_encoder"
+        if controller.control.kind == "flexible_joint" and both and task.plant.choose_gains:
+            controller = with_chosen_gains(config, controller)
         constants = controller_constants(config, controller, joint.report.start_position_rad)
         figures.append(error_figures(run_scenario(joint, constants, task.scenario), task.after_s))
     assert config.virtual is not None

@@ -14,6 +14,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.analysis.flexible_gains import chosen_gains
+from jointctl.tools.analysis.loop_settings import loop_settings
 from jointctl.tools.configuration.checks import problems_between_sections
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_section import require_simulated
@@ -111,6 +113,15 @@ def controller_config(base: Config, controller: Controller) -> Config:
     if problems:
         raise ConfigurationError(f"controller {controller.name}: {problems[0]}")
     return config
+
+
+def with_chosen_gains(base: Config, controller: Controller) -> Controller:
+    """The law of a flexible joint with gains for what is believed of the base joint."""
+    config = controller_config(base, controller)
+    gains = chosen_gains(config, loop_settings(config)[0])
+    return Controller(
+        controller.name, changed(controller.control, gains.changes(), controller.name), controller.friction
+    )
 
 
 def controller_constants(base: Config, controller: Controller, start_position_rad: float) -> Any:

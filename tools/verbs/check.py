@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from jointctl.tools.analysis.loop_settings import Assumption
     from jointctl.tools.analysis.margin_gate import Remedy
     from jointctl.tools.analysis.margins import Margins, Theory
+    from jointctl.tools.configuration.config import Config
 
 
 def check(
@@ -26,6 +27,7 @@ def check(
     *,
     figure: Annotated[Path | None, typer.Option("--figure", help="PNG to write: Bode, sensitivity, poles")] = None,
     allow_low_margin: Annotated[bool, typer.Option("--allow-low-margin", help="accept a stable loop below it")] = False,
+    choose_gains: Annotated[bool, typer.Option("--choose-gains", help="search gains for a flexible joint")] = False,
 ) -> int:
     """Is the control loop stable enough?  Margins, bounds and what would help."""
     from jointctl.tools.analysis.loop_settings import loop_settings, not_modelled, outside_payload_range
@@ -53,6 +55,8 @@ def check(
     if learning is not None:
         value = f"factor {learning.worst_factor:.2f} at {learning.worst_Hz:.1f} Hz"
         table.add_row("learning", value, "what is left to learn after one repetition, below 1 it converges")
+    if choose_gains:
+        _add_gains(table, config, settings)
     if figure is not None:
         from jointctl.tools.analysis.loop_figure import save_loop_figure
 
@@ -67,6 +71,16 @@ def check(
         raise refusal(settings, found, minimum_deg, changes)
     refuse_diverging_learning(learning)
     return 0
+
+
+def _add_gains(table: Table, config: Config, settings: LoopSettings) -> None:
+    """What would suit the joint that [reducer] describes."""
+    from jointctl.tools.analysis.flexible_gains import chosen_gains
+
+    gains = chosen_gains(config, settings)
+    value = ", ".join(f"{name} = {number:g}" for name, number in gains.changes().items())
+    note = f"largest |S| {gains.largest_s:.2f} over all joints, torque noise {gains.noise_Nm:.2f} Nm"
+    table.add_row("chosen gains", value, note)
 
 
 @dataclass(frozen=True)

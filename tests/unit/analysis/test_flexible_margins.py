@@ -19,8 +19,12 @@ from jointctl.firmware_py.states import ControllerKind, Encoders, FeedForward
 from jointctl.firmware_py.trajectory import NO_REPETITION
 from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.hil.plant import plant, step_plant
+from jointctl.tools.analysis.flexible_gains import LARGEST_S_ANYWHERE, LARGEST_NOISE_Nm, chosen_gains
 from jointctl.tools.analysis.linear_loop import LoopSettings, TwoMasses, linear_loop
-from jointctl.tools.analysis.margins import delay_margin_s, margins, phase_margin_deg, worst_case
+from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.margins import cases, delay_margin_s, margins, phase_margin_deg, worst_case
+from jointctl.tools.configuration.config import Config
+from tests.configurations import shipped
 
 JIT_DISABLED = bool(numba.config.DISABLE_JIT)
 PERIOD_s = 1e-3
@@ -200,3 +204,41 @@ def test_the_link_alone_is_not_to_be_had_with_the_gains_for_both():
         assert not margins(flexible_loop(joint, encoders=Encoders.LINK)).stable
         slow = flexible_loop(joint, encoders=Encoders.LINK, kp=36.0, kv=8.0, observer_radps=6.0, cutoff_Hz=60.0)
         assert margins(slow).stable
+
+
+# --- gains for what is believed of a joint ---
+def believed(**changes: Any) -> Config:
+    return shipped("realistic", **changes)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"reducer__motor_inertia_kgm2": 0.4},
+        {"reducer__motor_inertia_kgm2": 1.6, "reducer__loop_stiffness_Nmprad": 1.6e4},
+        {"margin__loop_delay_s": 2.5e-3},
+    ],
+)
+def test_chosen_gains_keep_their_promise_on_every_joint(changes: dict[str, Any]) -> None:
+    config = believed(**changes)
+    settings, _ = loop_settings(config)
+    gains = chosen_gains(config, settings)
+    assert gains.largest_s <= LARGEST_S_ANYWHERE * 1.01
+    assert gains.noise_Nm <= LARGEST_NOISE_Nm * 1.01
+    chosen = replace(settings, **gains.changes())
+    for case in cases(chosen):
+        if case.joints[0].bristle_Nmprad == (0.0, 0.0):
+            found = margins(case)
+            assert found.stable
+            assert found.sensitivity_peak <= gains.largest_s * 1.01  # of the same joints and more
+    assert phase_margin_deg(chosen) > 20.0
+
+
+def test_more_delay_leaves_smaller_gains() -> None:
+    found = []
+    for delay_s in (0.5e-3, 1.5e-3, 3e-3):
+        config = believed(margin__loop_delay_s=delay_s)
+        found.append(chosen_gains(config, loop_settings(config)[0]).kv)
+    assert found == sorted(found, reverse=True)
+    assert found[-1] < 0.7 * found[0]

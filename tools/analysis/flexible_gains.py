@@ -1,0 +1,135 @@
+"""Gains for the law of a flexible joint, chosen for what is believed of it.
+
+The least error of the link after a step of friction at the motor, subject to
+
+    |S| <= LARGEST_S with the joint as it is believed, <= LARGEST_S_ANYWHERE with every one of `LoopSettings.joints`
+    torque noise of the encoders' counts <= LARGEST_NOISE_Nm
+
+Searched by Nelder and Mead over kv and the observer's bandwidth.  kp is KP_OF_KV kv^2: with less damping the search
+finds loops that a joint a little different from what is believed makes unstable, and so does an observer above
+LARGEST_OBSERVER_radps.  A constraint that is not met costs in proportion.  The motor's inertia may be wrong by
+MOTOR_ERROR besides.  The joints held by friction are left to the margin gate: what holds takes the resonance away.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.states import ControllerKind, Encoders
+from jointctl.tools.analysis.linear_loop import Array, ComplexArray, LinearLoop, LoopSettings, linear_loop
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad
+
+LARGEST_S = 1.8
+LARGEST_S_ANYWHERE = 2.5
+LARGEST_NOISE_Nm = 0.6
+LARGEST_OBSERVER_radps = 110.0
+KP_OF_KV = 1.5
+MOTOR_ERROR = 0.15
+PENALTY = 20.0  # on the logarithm of the error, for each unit by which a constraint is missed
+UNSTABLE = 1e3
+_START = np.log([20.0, 80.0])  # kv [1/s], observer [rad/s]
+_LOWEST_Hz = 0.3
+_POINTS = 250
+_EVALUATIONS = 80
+
+
+@dataclass(frozen=True)
+class FlexibleGains:
+    """What the search found; `largest_s` is that of all joints."""
+
+    kp: float
+    kv: float
+    observer_radps: float
+    largest_s: float
+    noise_Nm: float
+
+    def changes(self) -> dict[str, float]:
+        """Keys of [control]."""
+        return {"kp": self.kp, "kv": self.kv, "observer_radps": self.observer_radps}
+
+
+@dataclass(frozen=True)
+class _Judged:
+    error: float  # of the link, in any unit
+    s: float  # max |S| of the believed joint
+    s_anywhere: float
+    noise_Nm: float
+    beyond: float  # logarithm of the observer's bandwidth over the largest one
+
+    @property
+    def cost(self) -> float:
+        missed = max(self.s - LARGEST_S, 0.0) + max(self.s_anywhere - LARGEST_S_ANYWHERE, 0.0) + self.beyond
+        return math.log(self.error) + PENALTY * (missed + max(self.noise_Nm / LARGEST_NOISE_Nm - 1.0, 0.0))
+
+
+def _with_gains(settings: LoopSettings, logarithms: Array) -> LoopSettings:
+    """The loop with these logarithms of kv and of the observer's bandwidth, to three digits."""
+    kv, observer = (float(f"{math.exp(x):.3g}") for x in logarithms)
+    return replace(settings, kp=float(f"{KP_OF_KV * kv * kv:.3g}"), kv=kv, observer_radps=observer)
+
+
+class _Search:
+    """Responses of the joints, which no gain changes."""
+
+    def __init__(self, settings: LoopSettings, count_rad: Array) -> None:
+        self._settings, self._count_rad = settings, count_rad
+        self._omega = np.geomspace(math.tau * _LOWEST_Hz, math.pi / settings.period_s, _POINTS)
+        self._z = np.exp(1j * self._omega * settings.period_s)
+        free = [joint for joint in settings.joints if joint.bristle_Nmprad == (0.0, 0.0)]
+        wrong = (1.0 - MOTOR_ERROR, 1.0 + MOTOR_ERROR)
+        free += [replace(joint, motor_kgm2=factor * joint.motor_kgm2) for joint in free for factor in wrong]
+        self._joints = [linear_loop(replace(settings, joints=(joint,))).joint for joint in free]
+        self._responses = [joint.response(self._z) for joint in self._joints]
+        size = [joint.stiffness_Nmprad * joint.link_kgm2 * joint.motor_kgm2 for joint in free]
+        self._believed = int(np.argsort(size)[len(size) // 2])
+
+    def judged(self, settings: LoopSettings) -> _Judged:
+        controller = linear_loop(settings).controller
+        law = controller.response(self._z)
+        largest = []
+        for joint, response in zip(self._joints, self._responses, strict=True):
+            radius = float(np.max(np.abs(LinearLoop(settings, joint, controller).closed_loop_poles())))
+            if radius >= 1.0:
+                return _Judged(UNSTABLE, UNSTABLE * radius, UNSTABLE * radius, 0.0, 0.0)
+            largest.append(float(np.max(np.abs(self._sensitivity(law, response)))))
+        response = self._responses[self._believed]
+        sensitivity = self._sensitivity(law, response)
+        error = response[:, 0, 0] * sensitivity / self._omega  # of a step of torque
+        noise = np.abs(law[:, 0, :] * sensitivity[:, None]) ** 2 @ (self._count_rad**2 / 12.0)
+        return _Judged(
+            error=math.sqrt(np.trapezoid(np.abs(error) ** 2, self._omega)),
+            s=largest[self._believed],
+            s_anywhere=max(largest),
+            noise_Nm=math.sqrt(np.trapezoid(noise, self._omega) * settings.period_s / math.pi),
+            beyond=max(math.log(settings.observer_radps / LARGEST_OBSERVER_radps), 0.0),
+        )
+
+    @staticmethod
+    def _sensitivity(law: ComplexArray, response: ComplexArray) -> ComplexArray:
+        sensitivity: ComplexArray = 1.0 / (1.0 - (law @ response)[:, 0, 0])
+        return sensitivity
+
+
+def chosen_gains(config: Config, settings: LoopSettings) -> FlexibleGains:
+    """For the loop of `loop_settings(config)` with both encoders; about half a second."""
+    from scipy.optimize import minimize  # here: only this search waits for it
+
+    if settings.kind != ControllerKind.FLEXIBLE_JOINT or settings.encoders != Encoders.BOTH:
+        raise ConfigurationError(
+            f'{config.path}: gains are chosen for control.kind = "flexible_joint" (={config.control.kind}) with both '
+            "encoders only"
+        )
+    counts_rad = [law_resolution_rad(config), abs(joint_rad_per_count(config))]  # link, motor
+    search = _Search(settings, np.array(counts_rad))
+    found = minimize(
+        lambda x: search.judged(_with_gains(settings, x)).cost, _START, method="Nelder-Mead",
+        options={"maxfev": _EVALUATIONS, "initial_simplex": _START + 0.4 * np.vstack((np.zeros(2), -np.eye(2)))},
+    )  # fmt: skip
+    chosen = _with_gains(settings, found.x)
+    judged = search.judged(chosen)
+    return FlexibleGains(chosen.kp, chosen.kv, chosen.observer_radps, judged.s_anywhere, judged.noise_Nm)
