@@ -14,15 +14,17 @@ from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import reset_law, step_flexible_law
 from jointctl.firmware_py.records import FlexibleConstants, FlexibleState, LawConstants, LawState, Reference
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.states import ControllerKind, Encoders, Fault, FeedForward
+from jointctl.firmware_py.states import ControllerKind, DriveState, Encoders, Fault, FeedForward
 from jointctl.firmware_py.trajectory import NO_REPETITION
 from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.hil.plant import plant, spring_torque_Nm, step_plant
+from jointctl.tools import lockstep
+from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.configuration.sections import Learning
 from jointctl.tools.lockstep import LockstepJoint
-from tests.configurations import shipped, written
+from tests.configurations import changed, shipped, written
 
 RATIO = 121.0
 JM, JL = 1.2, 0.9
@@ -261,6 +263,28 @@ def test_a_run_repeats_bit_by_bit() -> None:
 
 
 # --- bad input ---
+@pytest.mark.parametrize(
+    ("believed", "moves"),
+    [
+        ({}, True),
+        ({"joint_encoder__direction": -1}, False),  # the sign of one
+        ({"encoder__counts_per_turn": 131072}, False),  # the ratio of one
+        ({"encoder__counts_per_turn": 524288, "joint_encoder__counts_per_turn": 65536}, False),  # plugs swapped
+    ],
+)
+def test_encoders_that_are_not_those_of_the_file_are_found_before_motion(
+    monkeypatch: pytest.MonkeyPatch, believed: dict[str, Any], moves: bool
+) -> None:
+    true = realistic(trajectory__duration_s=0.5, virtual__initial_position_rad=0.1)
+    monkeypatch.setattr(lockstep, "canopen_settings", lambda _: canopen_settings(changed(true, **believed)))
+    run = LockstepJoint(true).run()
+    assert (run.fault is Fault.NONE) is moves
+    enabled = bool(np.any(run.log.drive_state == DriveState.ENABLED))
+    assert enabled is moves
+    if not moves:
+        assert run.fault is Fault.POSITION_DISAGREEMENT
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
