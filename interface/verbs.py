@@ -123,8 +123,9 @@ def _checked(verb: str, name: str, value: object, option: inspect.Parameter) -> 
     if value is None and option.default is None:
         return None
     base, info = _kind(option), _given_as(option)
-    if isinstance(value, (str, Path)) and any(get_origin(part) is list for part in (base, *get_args(base))):
-        value = [value]  # one of several
+    several = next((part for part in (base, *get_args(base)) if get_origin(part) is list), None)
+    if several is not None and isinstance(value, (str, Path, int)):
+        value = [str(value) if get_args(several) == (str,) else value]  # one of several
     low, high = getattr(info, "min", None), getattr(info, "max", None)
     kind: Any = base if low is None and high is None else Annotated[base, Field(ge=low, le=high)]
     try:

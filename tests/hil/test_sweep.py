@@ -156,6 +156,7 @@ def test_options_type_matches_the_command(config: Config) -> None:
 
     parameters = set(signature(grouped(sweep)).parameters) - {
         "config", "out", "interface", "channel", "bitrate", "port", "target", "json", "quiet",
+        "foxglove", "ros2", "ros2_listen",
     }  # fmt: skip
     assert len(parameters) == len(dataclasses.fields(SweepOptions))
 

@@ -87,6 +87,9 @@ def watched(config: Config, live: ObserveOptions, output: Output, plant_state: A
     from jointctl.tools.scoping.remote import remote
 
     with remote(live, config, output, only_states=True) as others:
+        if not others.feeds:
+            yield
+            return
         ended, plant, record = threading.Event(), plant_state[0], new(LogRecord)
 
         def watch() -> None:
@@ -98,14 +101,12 @@ def watched(config: Config, live: ObserveOptions, output: Output, plant_state: A
                     feed.send(RECORDS, record.tobytes())
 
         thread = threading.Thread(target=watch, name="joint states", daemon=True)
-        if others.feeds:
-            thread.start()
+        thread.start()
         try:
             yield
         finally:
             ended.set()
-            if others.feeds:
-                thread.join()
+            thread.join()
 
 
 def make_realtime(config: Config, output: Output) -> None:

@@ -51,8 +51,8 @@ def test_check_gives_the_margins() -> None:
 def test_a_value_of_the_wrong_type_or_beyond_its_bounds_is_named() -> None:
     with pytest.raises(jointctl.UsageError, match=r"check\(\): delay_s \(=-1\): input should be greater than"):
         jointctl.check("virtual", delay_s=-1)
-    with pytest.raises(jointctl.UsageError, match=r"study\(\): plants \(='x'\): input should be a valid integer"):
-        jointctl.study(plants="x")
+    with pytest.raises(jointctl.UsageError, match=r"study\(\): seed \(='x'\): input should be a valid integer"):
+        jointctl.study(seed="x")
     with pytest.raises(TypeError, match="needs 'config'"):
         jointctl.check()
     with pytest.raises(TypeError, match="takes 1 arguments without a name at most, not 2"):
