@@ -202,7 +202,7 @@ def synthetic_sweep(seed: int = 1) -> FrictionData:
 def identify_paper_friction(options: Options | None = None, seed: int = 1) -> PaperIdentification:
     """Identify the synthetic sweep with the swarm of the paper, or with other options."""
     data = synthetic_sweep(seed)
-    found = identify_friction(data, options or Options())
+    found = identify_friction(data, options or Options(model="multi-stage"))
     truth = friction_curve_Nm(paper_friction(), data.velocity_radps)
     curve = np.empty_like(truth)
     for word, sign in (("positive", 1.0), ("negative", -1.0)):

@@ -12,6 +12,7 @@ a robust test, a model is chosen by its error on points held out of the fit (k-f
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +30,7 @@ class Problem:
     form: Form
     x: np.ndarray
     y_Nm: np.ndarray
+    weight: np.ndarray  # of the squared errors, 1 on average: by the noise's dependence on torque
     top_radps: float
     knee: float
     ws_low: float
@@ -37,12 +39,12 @@ class Problem:
 
     def part(self, keep: np.ndarray) -> Problem:
         """The same problem with some of its points."""
-        return replace(self, x=self.x[keep], y_Nm=self.y_Nm[keep])
+        return replace(self, x=self.x[keep], y_Nm=self.y_Nm[keep], weight=self.weight[keep])
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Parameters of one direction (normalised) and the squared error on the points that they were fitted to."""
+    """Parameters of one direction (normalised) and the weighted squared error on the fitted points."""
 
     problem: Problem
     beta: np.ndarray
@@ -51,7 +53,18 @@ class Fit:
     rss: float
 
     @property
+    def residual_Nm(self) -> np.ndarray:
+        """Measured minus model (N,)."""
+        return self.problem.y_Nm - self.torque_Nm(self.problem.x)
+
+    @property
     def rmse_Nm(self) -> float:
+        """Without weights."""
+        return float(np.sqrt(np.mean(self.residual_Nm**2)))
+
+    @property
+    def weighted_rmse_Nm(self) -> float:
+        """Root of what was minimised, over the number of points."""
         return float(np.sqrt(self.rss / len(self.problem.x)))
 
     def torque_Nm(self, x: np.ndarray) -> np.ndarray:
@@ -82,7 +95,7 @@ def make_problem(
     ws_high = ws_limits_radps[1] / top
     ws_low = float(x[0]) / 3.0 if ws_limits_radps[0] is None else ws_limits_radps[0] / top
     limit = static_limit_Nm(form, x, y, knee) if static_max_Nm is None else static_max_Nm
-    return Problem(form, x, y, top, knee, min(ws_low, 0.5 * ws_high), ws_high, limit)
+    return Problem(form, x, y, np.ones(len(x)), top, knee, min(ws_low, 0.5 * ws_high), ws_high, limit)
 
 
 def static_limit_Nm(form: Form, x: np.ndarray, y_Nm: np.ndarray, knee: float) -> float:
@@ -99,7 +112,8 @@ def _least_squares(columns: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, floa
 
 def solve_linear(problem: Problem, ws: float, knee: float) -> tuple[np.ndarray, float]:
     """Best linear parameters with 0 <= tc <= ts <= static_max; returns (beta, squared error)."""
-    columns, y, limit = basis(problem.form, problem.x, ws, knee), problem.y_Nm, problem.static_max_Nm
+    root, limit = np.sqrt(problem.weight), problem.static_max_Nm
+    columns, y = root[:, None] * basis(problem.form, problem.x, ws, knee), root * problem.y_Nm
     beta, rss = _least_squares(columns, y)
     if not problem.form.stribeck:
         if beta[0] >= 0.0:
@@ -238,8 +252,9 @@ def polish(fit: Fit) -> Fit:
                    float(np.exp(vector[2])), knee, 0.0)  # fmt: skip
 
     def residual(vector: np.ndarray) -> np.ndarray:
-        return unpack(vector).torque_Nm(problem.x) - problem.y_Nm
+        return root * (unpack(vector).torque_Nm(problem.x) - problem.y_Nm)
 
+    root = np.sqrt(problem.weight)
     found = least_squares(
         residual, np.clip(start, lower + margin, upper - margin), bounds=(lower, upper), x_scale=upper - lower,
         xtol=1e-14, ftol=1e-14, gtol=1e-14, max_nfev=400,
@@ -251,8 +266,49 @@ def polish(fit: Fit) -> Fit:
 
 # --- which points and which model to believe ---
 
+NOISE_EXPONENT_MAX = 2.0
+_SIGNIFICANT = 3.84  # twice the gain of log-likelihood that one parameter without effect seldom reaches
+_LEAST_FRICTION = 0.05  # of the greatest: below, the noise is not taken to vanish with the friction
+
 MAX_OUTLIERS = 0.2  # of a direction's points: beyond, it is the model that does not fit
 _TIE = 1.01  # held-out errors within 1 % count as equal, then fewer parameters win
+
+
+def _noise_scale(fit: Fit, exponent: float) -> np.ndarray:
+    size = np.abs(fit.torque_Nm(fit.problem.x))
+    return np.asarray(np.maximum(size / np.max(size), _LEAST_FRICTION) ** exponent)
+
+
+def noise_exponent(fits: Sequence[Fit]) -> float:
+    """g of the noise's standard deviation ~ |friction|^g, of all directions together: 0 = the same everywhere.
+
+    Maximum likelihood over the residuals, each divided by what its leverage leaves of it and counted for as many as
+    there are degrees of freedom; 0 unless that is significantly better.
+    """
+    residual, size = [], []
+    for fit in fits:
+        root = np.sqrt(fit.problem.weight)
+        columns = root[:, None] * basis(fit.problem.form, fit.problem.x, fit.ws, fit.knee)
+        leverage = np.sum(np.linalg.qr(columns)[0] ** 2, axis=1)
+        residual.append(fit.residual_Nm / np.sqrt(1.0 - np.minimum(leverage, 0.9)))
+        size.append(_noise_scale(fit, 1.0) * np.max(np.abs(fit.torque_Nm(fit.problem.x))))
+    free = 1.0 - sum(fit.problem.form.parameters for fit in fits) / sum(len(each) for each in residual)
+    r, log_size = np.concatenate(residual), np.log(np.concatenate(size))
+    if not np.any(r):
+        return 0.0
+
+    def surprise(exponent: float) -> float:  # minus twice the log-likelihood, but for a constant
+        each = np.log(np.mean((r * np.exp(-exponent * log_size)) ** 2)) + 2.0 * exponent * np.mean(log_size)
+        return float(max(free, 0.0) * len(r) * each)
+
+    found = minimize_scalar(surprise, bounds=(0.0, NOISE_EXPONENT_MAX), method="bounded")
+    return float(found.x) if surprise(0.0) - found.fun > _SIGNIFICANT else 0.0
+
+
+def with_noise(fit: Fit, exponent: float) -> Problem:
+    """The problem of a fit with weights for noise that goes with a power of the friction."""
+    weight = _noise_scale(fit, exponent) ** -2.0
+    return replace(fit.problem, weight=weight / np.mean(weight))
 
 
 def find_outliers(problem: Problem, threshold: float) -> tuple[np.ndarray, np.ndarray]:
@@ -269,8 +325,9 @@ def find_outliers(problem: Problem, threshold: float) -> tuple[np.ndarray, np.nd
     for _ in range(20):
         fit = project(problem.part(~out))
         columns = basis(problem.form, problem.x, fit.ws, fit.knee)
-        residual = problem.y_Nm - columns @ fit.beta
-        orthonormal = np.linalg.qr(columns[~out])[0]
+        root = np.sqrt(problem.weight)
+        residual = root * (problem.y_Nm - columns @ fit.beta)
+        orthonormal = np.linalg.qr((root[:, None] * columns)[~out])[0]
         # capped: the lowest speed alone decides on ts, and would otherwise always look innocent or guilty
         leverage = np.minimum(np.sum(orthonormal**2, axis=1), 0.5)
         kept = residual[~out]

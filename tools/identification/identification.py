@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -21,15 +21,17 @@ from jointctl.tools.identification.fit import (
     find_outliers,
     held_out_rss,
     make_problem,
+    noise_exponent,
     polish,
     project,
     with_form,
+    with_noise,
 )
 from jointctl.tools.identification.friction_data import FrictionData, relative_figures
 from jointctl.tools.identification.models import FORMS, MIN_PER_STAGE, Branch, Form
 from jointctl.tools.identification.plausibility import JointLimits, check_branches, check_data
 from jointctl.tools.identification.swarm import SwarmResult, SwarmSettings, run_swarms
-from jointctl.tools.identification.uncertainty import Uncertainty, uncertainty
+from jointctl.tools.identification.uncertainty import Uncertainty, noise_of, uncertainty
 
 # --- the flags of `jointctl identify`, and what of them is allowed ---
 
@@ -42,7 +44,7 @@ MODELS = ("multi-stage", "stribeck", "coulomb-viscous", "auto")
 class Options:
     """What to fit and how; speeds in joint rad/s."""
 
-    model: str = "multi-stage"
+    model: str = "auto"
     continuous: bool = False
     search_knee: bool = False
     knee_radps: float = 40.0 * DEGREE
@@ -95,6 +97,21 @@ class Direction:
     index: np.ndarray  # of the used points in the data
     outliers: np.ndarray  # indices in the data
 
+    def errors_Nm(self, data: FrictionData, points: np.ndarray) -> np.ndarray:
+        """Measured minus model at the motor, mirrored, of points of this direction."""
+        model = self.fit.torque_Nm(np.abs(data.velocity_radps[points]) / self.fit.problem.top_radps)
+        return np.asarray(np.sign(data.velocity_radps[points]) * data.motor_torque_Nm[points] - model)
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What the fit did not see, and what it would make of the error."""
+
+    outliers: int
+    unsettled: int
+    error_share: float  # of the squared error over all points, in [0..1]
+    rmse_with_Nm: float  # over all points, those that were left out included
+
 
 @dataclass(frozen=True)
 class Identification:
@@ -106,6 +123,7 @@ class Identification:
     directions: dict[str, Direction]
     rmse_by_model_Nm: dict[str, float]
     held_out_by_model_Nm: dict[str, float]
+    noise_exponent: float  # of the friction in the noise's standard deviation, which weights the points; 0 = the same
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
 
@@ -130,8 +148,25 @@ class Identification:
         return float(np.sqrt(np.mean(self.errors_Nm**2)))
 
     @property
+    def left_out(self) -> LeftOut:
+        """The measured points that the fit did not see."""
+        outliers, unsettled = [], []
+        for word, sign in DIRECTIONS:
+            found = self.directions[word]
+            moving = np.flatnonzero(~self.data.settled & (sign * self.data.velocity_radps > 0.0))
+            outliers.append(found.errors_Nm(self.data, found.outliers))
+            unsettled.append(found.errors_Nm(self.data, moving))
+        of_outliers, of_unsettled = np.concatenate(outliers), np.concatenate(unsettled)
+        out, used = np.concatenate([of_outliers, of_unsettled]), self.errors_Nm
+        whole = float(used @ used + out @ out)
+        return LeftOut(
+            len(of_outliers), len(of_unsettled), float(out @ out) / whole if whole else 0.0,
+            float(np.sqrt(whole / (len(used) + len(out)))),
+        )  # fmt: skip
+
+    @property
     def projected_rmse_Nm(self) -> float:
-        """What variable projection reaches: the least possible."""
+        """What variable projection reaches, weighted as the fit: the least possible."""
         return _pooled({w: d.projected_rmse_Nm for w, d in self.directions.items()}, self.directions)
 
     def to_dict(self) -> dict[str, Any]:
@@ -145,6 +180,7 @@ class Identification:
             "relative_rmse": relative[0],
             "relative_max_error": relative[1],
             "held_out_rmse_Nm": self.held_out_by_model_Nm[self.model],
+            "left_out": asdict(self.left_out), "noise_exponent": self.noise_exponent,
             "projected_rmse_Nm": self.projected_rmse_Nm,
             "models": {
                 name: {"rmse_Nm": self.rmse_by_model_Nm[name], "held_out_rmse_Nm": self.held_out_by_model_Nm[name]}
@@ -167,7 +203,7 @@ def _direction_dict(found: Direction, data: FrictionData) -> dict[str, Any]:
             for name, i in found.uncertainty.intervals.items()
         },
         "knee_radps": model.knee_radps, "max_radps": model.max_radps, "rmse_Nm": found.fit.rmse_Nm,
-        "swarm_rmse_Nm": found.swarm.fit.rmse_Nm if found.swarm else None,
+        "swarm_rmse_Nm": found.swarm.fit.weighted_rmse_Nm if found.swarm else None,
         "projected_rmse_Nm": found.projected_rmse_Nm, "source": found.source,
         "iterations": found.swarm.iterations if found.swarm else 0,
         "outlier_lines": [int(n) for n in data.line[found.outliers]],
@@ -241,7 +277,12 @@ def identify_friction(
     _refuse(data, before.problems)
     notes, warnings = list(data.notes), list(before.warnings)
     first = _first_form(data, options, notes)
-    points = {word: _points(data, options, first, word, sign, notes, warnings) for word, sign in DIRECTIONS}
+    points, exponent = _weighted_points(data, options, first, warnings)
+    for word, found in points.items():
+        for line, score in zip(data.line[found.outliers], found.score, strict=True):
+            notes.append(f"line {line}: outlier at {word} velocity, {abs(score):.1f} standard deviations: not used")
+    if exponent:
+        notes.append(f"the noise goes with the friction to the power of {exponent:.2g}: points are weighted by it")
     rmse, held_out = _compared([found.problem for found in points.values()], first, options)
     greatest_Nm = max(float(np.max(np.abs(found.problem.y_Nm))) for found in points.values())
     model = _model(held_out, options, first, _EXACT * greatest_Nm, warnings)
@@ -249,7 +290,7 @@ def identify_friction(
     after = check_branches({word: found.fit.branch() for word, found in directions.items()})
     _refuse(data, after.problems)
     return Identification(
-        data, options, model, directions, rmse, held_out, tuple(notes), tuple(warnings + after.warnings)
+        data, options, model, directions, rmse, held_out, exponent, tuple(notes), tuple(warnings + after.warnings)
     )  # fmt: skip
 
 
@@ -260,18 +301,47 @@ class _Points:
     problem: Problem
     index: np.ndarray
     outliers: np.ndarray
+    score: np.ndarray  # of the outliers, in standard deviations
+
+
+def _weighted_points(
+    data: FrictionData, options: Options, first: Form, warnings: list[str]
+) -> tuple[dict[str, _Points], float]:
+    """The points of both directions, and the power of the friction that the noise goes with (see `noise_exponent`).
+
+    Which points are outliers hangs on the noise, and the noise on which points are used.
+    """
+    exponent, told = 0.0, list[str]()
+    shapes: dict[str, Fit] = {}
+    for _ in range(2):
+        told.clear()
+        points = {
+            word: _points(data, options, first, sign, (shapes.get(word), exponent), told) for word, sign in DIRECTIONS
+        }
+        shapes = {word: project(found.problem) for word, found in points.items()}
+        before, exponent = exponent, noise_exponent(list(shapes.values()))
+        if exponent == before:
+            break
+    warnings += told
+    return {
+        word: replace(found, problem=with_noise(shapes[word], exponent)) for word, found in points.items()
+    }, exponent
 
 
 def _points(
-    data: FrictionData, options: Options, first: Form, word: str, sign: int, notes: list[str], warnings: list[str]
+    data: FrictionData, options: Options, first: Form, sign: int, noise: tuple[Fit | None, float], warnings: list[str]
 ) -> _Points:
     """Those of one direction without outliers, with the knee where the data have it if it is searched."""
+    word = "positive" if sign > 0 else "negative"
     chosen = data.direction(sign)
     chosen = chosen[np.argsort(sign * data.velocity_radps[chosen], kind="stable")]
     problem = make_problem(
         first, sign * data.velocity_radps[chosen], sign * data.motor_torque_Nm[chosen], options.knee_radps,
         (options.ws_min_radps, options.ws_max_radps), options.static_max_Nm,
     )  # fmt: skip
+    shape, exponent = noise
+    if shape is not None and exponent:
+        problem = with_noise(replace(shape, problem=problem), exponent)
     if not options.search_knee:
         _stage_check(data, problem, word)
     elif first.cubic:
@@ -283,22 +353,22 @@ def _points(
             "does not describe these data; none was left out"
         )
         out = np.zeros_like(out)
-    for line, value in zip(data.line[chosen[out]], score[out], strict=True):
-        notes.append(f"line {line}: outlier at {word} velocity, {abs(value):.1f} standard deviations: not used")
     problem = problem.part(~out)
     if options.search_knee and first.cubic and out.any():
         problem = replace(problem, knee=project(problem, search_knee=True).knee)
     _stage_check(data, problem, word)
-    return _Points(problem, chosen[~out], chosen[out])
+    return _Points(problem, chosen[~out], chosen[out], score[out])
 
 
 def _compared(problems: Sequence[Problem], first: Form, options: Options) -> tuple[dict[str, float], dict[str, float]]:
     """RMSE [Nm] of each model that the data allow: of all points, and of points held out of the fit."""
     total = sum(len(problem.x) for problem in problems)
     rmse, held_out = {}, {}
-    for name in [n for n in FORMS if FORMS[n].cubic <= first.cubic]:
-        parts = [with_form(problem, FORMS[name]) for problem in problems]
-        rmse[name] = float(np.sqrt(sum(project(part).rss for part in parts) / total))
+    for name, form in FORMS.items():
+        if form.cubic > first.cubic:
+            continue
+        parts = [with_form(problem, form) for problem in problems]
+        rmse[name] = float(np.sqrt(sum(project(part).rmse_Nm ** 2 * len(part.x) for part in parts) / total))
         squared = sum(held_out_rss(part, options.folds, options.swarm.seed) for part in parts)
         held_out[name] = float(np.sqrt(squared / total))
     return rmse, held_out
@@ -306,7 +376,7 @@ def _compared(problems: Sequence[Problem], first: Form, options: Options) -> tup
 
 def _model(held_out: dict[str, float], options: Options, first: Form, rounding_Nm: float, warnings: list[str]) -> str:
     """The model asked for, or the one that predicts best; a warning where the former predicts worse."""
-    best = choose(held_out)
+    best = choose({name: error for name, error in held_out.items() if not options.continuous or name != "multi-stage"})
     model = best if options.model == "auto" else first.name
     if model != best and held_out[best] < held_out[model] / 1.02 and held_out[model] > rounding_Nm:
         warnings.append(
@@ -327,10 +397,14 @@ def _fitted(
     swarms: list[SwarmResult | None] = [None] * len(problems)
     if form.stribeck:
         swarms = list(run_swarms(problems, options.swarm, search_knee=options.search_knee, progress=progress))
+    best = [
+        _best_fit(problem, swarm, warnings, word) for word, problem, swarm in zip(points, problems, swarms, strict=True)
+    ]
+    noises = noise_of([fit for fit, _, _ in best])
     directions = {}
-    for (word, used), problem, swarm in zip(points.items(), problems, swarms, strict=True):
-        fit, projected, source = _best_fit(problem, swarm, warnings, word)
-        directions[word] = Direction(fit, swarm, projected, source, uncertainty(fit), used.index, used.outliers)
+    for (word, used), swarm, (fit, projected, source), noise in zip(points.items(), swarms, best, noises, strict=True):
+        sure = uncertainty(fit, noise)
+        directions[word] = Direction(fit, swarm, projected, source, sure, used.index, used.outliers)
         share = fit.rmse_Nm / float(np.mean(np.abs(fit.problem.y_Nm)))
         if share > _BAD_FIT:
             warnings.append(
@@ -342,14 +416,16 @@ def _fitted(
 def _best_fit(problem: Problem, swarm: SwarmResult | None, warnings: list[str], word: str) -> tuple[Fit, float, str]:
     """(fit, RMSE of variable projection, source); the exact minimum is taken where swarm and polish stay above it."""
     projected = project(problem)  # a searched knee is already the problem's
+    least_Nm = projected.weighted_rmse_Nm
     if swarm is None:
-        return projected, projected.rmse_Nm, "least squares"
+        return projected, least_Nm, "least squares"
     polished = polish(swarm.fit)
     if polished.rss <= projected.rss * (1.0 + 1e-6):
-        return polished, projected.rmse_Nm, "swarm and polish"
-    if polished.rmse_Nm > max(1.01 * projected.rmse_Nm, _EXACT * float(np.max(np.abs(problem.y_Nm)))):
+        return polished, least_Nm, "swarm and polish"
+    reached_Nm = polished.weighted_rmse_Nm
+    if reached_Nm > max(1.01 * least_Nm, _EXACT * float(np.max(np.abs(problem.y_Nm)))):
         warnings.append(
-            f"the swarm at {word} velocity ended {polished.rmse_Nm / projected.rmse_Nm - 1.0:.1%} above the least "
+            f"the swarm at {word} velocity ended {reached_Nm / least_Nm - 1.0:.1%} above the least "
             "RMSE: more particles or iterations, or another seed; the variable projection is used"
         )
-    return projected, projected.rmse_Nm, "variable projection"
+    return projected, least_Nm, "variable projection"

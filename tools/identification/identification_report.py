@@ -105,9 +105,21 @@ def error_table(errors_Nm: np.ndarray, measured_Nm: np.ndarray, ratio: float) ->
     return table
 
 
+def left_out_text(found: Identification) -> str:
+    """What the fit did not see and its share of the error, one line."""
+    out = found.left_out
+    if not out.outliers + out.unsettled:
+        return "no measured point was left out"
+    return (
+        f"left out: {out.outliers} outliers, {out.unsettled} never settled, {out.error_share:.0%} of the squared "
+        f"error; RMSE {1e3 * found.rmse_Nm:.4g} mNm without them, {1e3 * out.rmse_with_Nm:.4g} with them"
+    )
+
+
 def identification_report(found: Identification) -> RenderableType:
     table = error_table(found.errors_Nm, found.measured_Nm, found.data.reduction_ratio)
-    return Group(parameter_table(found), table, model_table(found), Text("\n".join(_origin(found))))
+    lines = [left_out_text(found), *_origin(found)]
+    return Group(parameter_table(found), table, model_table(found), Text("\n".join(lines)))
 
 
 def _origin(found: Identification) -> list[str]:
@@ -115,11 +127,12 @@ def _origin(found: Identification) -> list[str]:
     lines = [f"data SHA-256 {found.data.sha256}"]
     if any(d.swarm is not None for d in found.directions.values()):
         lines.append(f"particle swarm: {swarm.particles} particles x {swarm.iterations} iterations, seed {swarm.seed}")
+    weighted = ", weighted" if found.noise_exponent else ""
     for word, d in found.directions.items():
-        swarm_text = f"swarm alone {1e3 * d.swarm.fit.rmse_Nm:.4g}, " if d.swarm is not None else ""
+        swarm_text = f"swarm alone {1e3 * d.swarm.fit.weighted_rmse_Nm:.4g}, " if d.swarm is not None else ""
         lines.append(
             f"{word}: {len(d.index)} points, RMSE {1e3 * d.fit.rmse_Nm:.4g} mNm from {d.source} "
-            f"({swarm_text}least possible {1e3 * d.projected_rmse_Nm:.4g})"
+            f"({swarm_text}least possible {1e3 * d.projected_rmse_Nm:.4g}{weighted})"
         )
     return lines
 
@@ -179,9 +192,10 @@ def _paint_fit(
         if identified is not None:
             direction = identified.directions[word]
             inside = speeds[speeds >= direction.fit.problem.x[0] * found.max_radps]
-            half = direction.uncertainty.band_Nm(direction.fit, inside / direction.fit.problem.top_radps)
+            ends = direction.uncertainty.band_Nm(direction.fit, inside / direction.fit.problem.top_radps)
+            low, high = (1e3 * sign * (end - found.torque_Nm(inside)) for end in ends)
             axes[1].fill_between(
-                sign * inside / DEGREE, -1e3 * half, 1e3 * half, color=ORANGE, alpha=0.3, linewidth=0.0,
+                sign * inside / DEGREE, low, high, color=ORANGE, alpha=0.3, linewidth=0.0,
                 label="95 % band of the curve" if sign > 0 else None, zorder=1,
             )  # fmt: skip
         velocity = data.velocity_radps[chosen]

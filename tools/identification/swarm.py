@@ -1,4 +1,4 @@
-"""Particle swarm optimisation of one direction of (11), compiled: minimise E = sum of squared errors (12).
+"""Particle swarm optimisation of one direction of (11), compiled: minimise E = sum of (weighted) squared errors (12).
 
 A particle is a parameter vector in the box [lower, upper]:
 
@@ -25,7 +25,7 @@ import math
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -82,6 +82,7 @@ class Samples(NamedTuple):
 
     x: np.ndarray  # (N,), sorted
     y: np.ndarray  # (N,) [Nm]
+    weight: np.ndarray  # (N,) of the squared errors
     sums: np.ndarray  # (N + 1, 15) from `suffix_sums`
     table: np.ndarray  # from `stage_table`
     knee: float
@@ -114,7 +115,7 @@ class Weights(NamedTuple):
 @inlined
 def squared_error(p: np.ndarray, samples: Samples) -> float:
     """E of one particle."""
-    x, y, sums, table, knee = samples.x, samples.y, samples.sums, samples.table, samples.knee
+    x, y, weight, sums, table, knee = samples.x, samples.y, samples.weight, samples.sums, samples.table, samples.knee
     tc = p[0] * p[1]
     d = p[0] - tc
     tv = p[3]
@@ -127,7 +128,7 @@ def squared_error(p: np.ndarray, samples: Samples) -> float:
         inverse_ws = math.exp(-p[2])
         for i in range(split):
             r = tc + d * math.exp(-x[i] * inverse_ws) + tv * x[i] - y[i]
-            error += r * r
+            error += weight[i] * r * r
     else:
         # row 0 holds n, x, x^2, y, x y, y^2 summed over the stage; first log ws and 1 / step
         place = (p[2] - table[0, 6]) * table[0, 7]
@@ -185,15 +186,18 @@ def squared_error(p: np.ndarray, samples: Samples) -> float:
     return max(error, 0.0)
 
 
-def suffix_sums(x: np.ndarray, y: np.ndarray, knee: float) -> np.ndarray:
-    """Row k: y'y, P'y (4) and the upper triangle of P'P (10) over the points k.. of the sorted data; (N + 1, 15)."""
+def suffix_sums(x: np.ndarray, y: np.ndarray, weight: np.ndarray, knee: float) -> np.ndarray:
+    """Row k: y'y, P'y (4) and the upper triangle of P'P (10) over the points k.. of the sorted data; (N + 1, 15).
+
+    Weighted sums, as those of `stage_table`.
+    """
     polynomials = legendre(x, knee) if knee < 1.0 else np.zeros((len(x), 4))
     upper = [polynomials[:, i] * polynomials[:, j] for i in range(4) for j in range(i, 4)]
-    terms = np.column_stack([y * y, *(polynomials[:, i] * y for i in range(4)), *upper])
+    terms = weight[:, None] * np.column_stack([y * y, *(polynomials[:, i] * y for i in range(4)), *upper])
     return np.vstack([np.cumsum(terms[::-1], axis=0)[::-1], np.zeros(15)])
 
 
-def stage_table(x: np.ndarray, y: np.ndarray, log_ws_low: float, log_ws_high: float) -> np.ndarray:
+def stage_table(x: np.ndarray, y: np.ndarray, weight: np.ndarray, log_ws_low: float, log_ws_high: float) -> np.ndarray:
     """Sums over the Stribeck stage for every ws; (TABLE_NODES + 1, 8).
 
     Row 0: sums of 1, x, x^2, y, x y, y^2, then the first log ws and the nodes per unit of log ws.  Row k + 1: at node k
@@ -204,8 +208,9 @@ def stage_table(x: np.ndarray, y: np.ndarray, log_ws_low: float, log_ws_high: fl
     scaled = x / np.exp(nodes)[:, None]
     e = np.exp(-scaled)
     rate = scaled * e * step  # d e / d node
-    head = [float(len(x)), np.sum(x), np.sum(x * x), np.sum(y), np.sum(x * y), np.sum(y * y), log_ws_low, 1.0 / step]
-    columns = [e.sum(1), (e * e).sum(1), e @ x, e @ y, rate.sum(1), 2.0 * (e * rate).sum(1), rate @ x, rate @ y]
+    w, wx, wy = weight, weight * x, weight * y
+    head = [np.sum(w), np.sum(wx), wx @ x, np.sum(wy), wx @ y, wy @ y, log_ws_low, 1.0 / step]
+    columns = [e @ w, (e * e) @ w, e @ wx, e @ wy, rate @ w, 2.0 * (e * rate) @ w, rate @ wx, rate @ wy]
     return np.vstack([head, np.column_stack(columns)])
 
 
@@ -309,7 +314,8 @@ def run_swarm(
         limits = np.column_stack([limits, [candidates[0], candidates[-1]]])
     lower, upper = np.ascontiguousarray(limits[0]), np.ascontiguousarray(limits[1])
     split = int(np.searchsorted(problem.x, problem.knee, side="right")) if form.cubic else len(problem.x)
-    sums = suffix_sums(problem.x, problem.y_Nm, problem.knee)
+    weight = problem.weight
+    sums = suffix_sums(problem.x, problem.y_Nm, weight, problem.knee)
     shape = (len(lower), settings.particles)
     base = stream_seed(settings.seed, stream)
     # in an array, because a compiled function returns an unsigned scalar as a Python int, which is then taken as signed
@@ -324,9 +330,10 @@ def run_swarm(
     leader = position[:, 0].copy()
     curve = np.empty(settings.iterations)
     done, still = 0, 0
-    table = stage_table(problem.x[:split], problem.y_Nm[:split], float(lower[2]), float(upper[2]))
+    stage = slice(0, split)
+    table = stage_table(problem.x[stage], problem.y_Nm[stage], weight[stage], float(lower[2]), float(upper[2]))
     samples = Samples(
-        problem.x, problem.y_Nm, sums, table, problem.knee, split, form.cubic, form.continuous, search_knee
+        problem.x, problem.y_Nm, weight, sums, table, problem.knee, split, form.cubic, form.continuous, search_knee
     )
     swarm = Swarm(position, velocity, best, best_error, leader, np.empty(shape[0]), random, lower, upper)
     weights = Weights(settings.inertia, settings.cognitive, settings.social)
@@ -350,8 +357,7 @@ def _as_fit(problem: Problem, vector: np.ndarray, knee: float) -> Fit:
     """The particle as a fit; its polynomials are on [problem.knee..1], those of a fit on [knee..1]."""
     beta, ws = beta_from_vector(problem, vector, knee)
     fit = Fit(problem, beta, ws, knee, 0.0)
-    residual = problem.y_Nm - fit.torque_Nm(problem.x)
-    return Fit(problem, beta, ws, knee, float(residual @ residual))
+    return replace(fit, rss=float(problem.weight @ fit.residual_Nm**2))
 
 
 def run_swarms(

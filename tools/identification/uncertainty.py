@@ -1,23 +1,31 @@
 """What the data determine and what not: 95 % intervals of the parameters and a band around the curve.
 
-Linearised (Wald): from the Jacobian at the minimum, with the residual variance and Student's t.  Parameters that lie
-on a limit are held there.  For the Stribeck speed also the profile likelihood: all ws for which the best fit with
-that ws is not significantly worse (F test), which is right also where the problem is far from linear (Bates and Watts
-1988).  Independent errors of equal variance are assumed; errors of the model itself are not covered.
+Profile likelihood (Bates and Watts 1988): an interval holds every value for which the best fit with that value is not
+significantly worse (F test).  Given the Stribeck speed ws the model is linear, so that the set is an ellipsoid there;
+the interval of a linear parameter or of the curve at a speed is what these ellipsoids reach over all ws.  Limits of
+parameters cut the intervals.  Independent errors are assumed, whose standard deviation is the same everywhere or goes
+with a power of the friction (the weights of the problem).  Not covered: errors of the model itself, and the choice
+of the knee.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
+from scipy.optimize import brentq
 
 from jointctl.tools.identification.fit import Fit, solve_linear
 from jointctl.tools.identification.models import Branch, basis, branch
 
 LEVEL = 0.95
-PROFILE_POINTS = 120
+PROFILE_POINTS = 120  # of the search for the ends of ws
+ELLIPSOIDS = 41  # values of ws between them, over which the other intervals are taken
+# the F test of a searched ws errs by a share that falls with the points (Bartlett); counted, tests/bench
+_SEARCHED = 4.0
+_ALIKE = 0.99  # of the F distribution: variances of the two directions up to it count as equal
 _WEAK = 0.5  # half-width of the interval relative to the value, from which on a parameter counts as not determined
 NAMES = ("tc", "ts", "ws", "tv", "a0", "a1", "a2", "a3")
 
@@ -34,124 +42,166 @@ class Interval:
 
 
 @dataclass(frozen=True)
+class _Ellipsoid:
+    """The linear parameters that fit well enough for one ws: |root^-1 (beta - middle)| <= 1."""
+
+    ws: float
+    middle: np.ndarray
+    root: np.ndarray
+
+    def reach(self, functional: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Least and greatest value of `functional` (M, p) times the parameters."""
+        value = functional @ self.middle
+        half = np.linalg.norm(functional @ self.root, axis=1)
+        return value - half, value + half
+
+
+@dataclass(frozen=True)
 class Uncertainty:
     intervals: dict[str, Interval]
-    covariance: np.ndarray  # of (linear parameters, log ws); zero where held
-    t_value: float
+    ellipsoids: tuple[_Ellipsoid, ...]
 
-    def band_Nm(self, fit: Fit, x: np.ndarray) -> np.ndarray:
-        """Half-width of the pointwise 95 % band of the curve [Nm] at normalised speeds."""
-        gradient = _gradient(fit, x)
-        variance = np.einsum("ij,jk,ik->i", gradient, self.covariance, gradient)
-        return self.t_value * np.sqrt(np.maximum(variance, 0.0))
-
-
-def _gradient(fit: Fit, x: np.ndarray) -> np.ndarray:
-    """d curve / d (linear parameters, log ws), shape (N, p + 1)."""
-    form = fit.problem.form
-    columns = basis(form, x, fit.ws, fit.knee)
-    if not form.stribeck:
-        return np.column_stack([columns, np.zeros(len(x))])
-    step = 1e-5
-    upper, lower = fit.ws * np.exp(step), fit.ws * np.exp(-step)
-    by_ws = (basis(form, x, upper, fit.knee) - basis(form, x, lower, fit.knee)) @ fit.beta / (2.0 * step)
-    return np.column_stack([columns, by_ws])
+    def band_Nm(self, fit: Fit, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper end of the pointwise 95 % band of the curve [Nm] at normalised speeds."""
+        form = fit.problem.form
+        parts = [each.reach(basis(form, x, each.ws, fit.knee)) for each in self.ellipsoids]
+        curve = fit.torque_Nm(x)
+        return np.min([curve, *(low for low, _ in parts)], axis=0), np.max([curve, *(up for _, up in parts)], axis=0)
 
 
 def _values(found: Branch) -> np.ndarray:
     return np.array([found.coulomb_Nm, found.static_Nm, found.stribeck_radps, found.viscous_Nmspr, *found.cubic])
 
 
-def _physical_jacobian(fit: Fit) -> np.ndarray:
-    """d (tc, ts, ws, tv, a0..a3) / d (linear parameters, log ws); differences, exact for the linear ones."""
-
-    def at(beta: np.ndarray, log_ws: float) -> np.ndarray:
-        found = branch(fit.problem.form, beta, float(np.exp(log_ws)), fit.knee, fit.problem.top_radps)
-        return _values(found)
-
-    base, columns = np.log(fit.ws), []
-    for k in range(len(fit.beta)):
-        step = np.zeros_like(fit.beta)
-        step[k] = 1e-3
-        columns.append((at(fit.beta + step, base) - at(fit.beta - step, base)) / 2e-3)
-    columns.append((at(fit.beta, base + 1e-5) - at(fit.beta, base - 1e-5)) / 2e-5)
+def _functionals(fit: Fit, ws: float) -> np.ndarray:
+    """What the physical parameters are of the linear ones at a ws, shape (8, p); that of ws itself is zero."""
+    form, top, none = fit.problem.form, fit.problem.top_radps, np.zeros_like(fit.beta)
+    offset = _values(branch(form, none, ws, fit.knee, top))
+    columns = [_values(branch(form, unit, ws, fit.knee, top)) - offset for unit in np.eye(len(none))]
     return np.column_stack(columns)
 
 
-def _limits(fit: Fit) -> tuple[np.ndarray, dict[str, str]]:
-    """Directions in which the parameters are free, shape (p + 1, f), and why the others are not."""
-    problem, form = fit.problem, fit.problem.form
-    size = len(fit.beta) + 1
-    directions, why = np.eye(size), {}
+def _at_limits(fit: Fit) -> dict[str, str]:
+    """Parameters that lie on a limit, with a word on it."""
+    problem, form, why = fit.problem, fit.problem.form, {}
     tolerance = 1e-6 * problem.static_max_Nm
-    held = []
-    if not form.stribeck:
-        held.append(size - 1)
-        if fit.beta[0] <= tolerance:
-            held, why = [*held, 0], {"tc": "at its limit 0"}
-        return np.delete(directions, held, axis=1), why
-    tc, ts = fit.beta[0], fit.beta[1]
-    if ts - tc <= tolerance:
-        why["ts"], why["ws"] = "no Stribeck effect found (ts = tc)", "without effect (ts = tc)"
-        directions[1, 0] = 1.0
-        held += [1, size - 1]
+    tc = fit.beta[0]
+    if form.stribeck:
+        ts = fit.beta[1]
+        if ts - tc <= tolerance:
+            why["ts"], why["ws"] = "no Stribeck effect found (ts = tc)", "without effect (ts = tc)"
+        if problem.static_max_Nm - ts <= tolerance:
+            why["ts"] = f"at its limit {problem.static_max_Nm:.3g} Nm"
+        for limit in (problem.ws_low, problem.ws_high):
+            if abs(np.log(fit.ws / limit)) < 1e-3:
+                why["ws"] = f"at its limit {limit * problem.top_radps:.3g} rad/s"
     if tc <= tolerance:
         why["tc"] = "at its limit 0"
-        held.append(0)
-    if problem.static_max_Nm - ts <= tolerance:
-        why["ts"] = f"at its limit {problem.static_max_Nm:.3g} Nm"
-        held.append(1)
-    for limit in (problem.ws_low, problem.ws_high):
-        if abs(np.log(fit.ws / limit)) < 1e-3:
-            why["ws"] = f"at its limit {limit * problem.top_radps:.3g} rad/s"
-            held.append(size - 1)
-    return np.delete(directions, sorted(set(held)), axis=1), why
+    return why
 
 
-def uncertainty(fit: Fit) -> Uncertainty:
+def _ws_ends(fit: Fit, worst: float) -> tuple[float, float, tuple[bool, bool]]:
+    """Least and greatest ws whose best fit has at most the error `worst`, and whether the data bound them."""
+    problem = fit.problem
+
+    def excess(log_ws: float) -> float:
+        return solve_linear(problem, float(np.exp(log_ws)), fit.knee)[1] - worst
+
+    scan = np.append(np.linspace(np.log(problem.ws_low), np.log(problem.ws_high), PROFILE_POINTS), np.log(fit.ws))
+    scan.sort()
+    inside = np.array([excess(at) <= 0.0 for at in scan])
+    inside[np.searchsorted(scan, np.log(fit.ws))] = True
+    first, last = np.flatnonzero(inside)[[0, -1]]
+
+    def between(outside: int, within: int) -> float:
+        if not 0 <= outside < len(scan) or excess(scan[within]) > 0.0:  # the latter: no error left to compare
+            return float(scan[within])
+        return float(brentq(excess, scan[outside], scan[within], xtol=1e-6))
+
+    low, high = between(first - 1, first), between(last + 1, last)
+    return float(np.exp(low)), float(np.exp(high)), (first > 0, bool(last < len(scan) - 1))
+
+
+def _ellipsoid(fit: Fit, ws: float, worst: float) -> _Ellipsoid | None:
+    """None where no linear parameters are good enough; those of the fit itself always are."""
+    root = np.sqrt(fit.problem.weight)
+    columns = root[:, None] * basis(fit.problem.form, fit.problem.x, ws, fit.knee)
+    u, s, v = np.linalg.svd(columns, full_matrices=False)
+    seen = s > 1e-10 * s[0]
+    share = u[:, seen].T @ (root * fit.problem.y_Nm)
+    middle = v[seen].T @ (share / s[seen])
+    rest = worst - float(np.sum((root * fit.problem.y_Nm - columns @ middle) ** 2))
+    if rest < 0.0 and ws != fit.ws:
+        return None
+    return _Ellipsoid(ws, middle, v[seen].T / s[seen] * np.sqrt(max(rest, 0.0)))
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Variance of one point [Nm2], but for the weights, and from how many degrees of freedom it is known."""
+
+    variance_Nm2: float
+    freedom: int
+
+
+def noise_of(fits: Sequence[Fit]) -> list[Noise]:
+    """The noise of each direction: of both together, unless they differ significantly."""
+    own = [Noise(fit.rss / free, free) for fit in fits for free in (_freedom(fit),)]
+    most, least = (pick(own, key=lambda noise: noise.variance_Nm2) for pick in (max, min))
+    if most.variance_Nm2 > least.variance_Nm2 * stats.f.ppf(_ALIKE, most.freedom, least.freedom):
+        return own
+    freedom = sum(noise.freedom for noise in own)
+    return [Noise(sum(fit.rss for fit in fits) / freedom, freedom)] * len(own)
+
+
+def _freedom(fit: Fit) -> int:
+    return max(len(fit.problem.x) - fit.problem.form.parameters, 1)
+
+
+def uncertainty(fit: Fit, noise: Noise) -> Uncertainty:
     """Intervals of every parameter of one direction."""
     problem, form = fit.problem, fit.problem.form
-    free, why = _limits(fit)
-    freedom = max(len(problem.x) - free.shape[1], 1)
-    variance = fit.rss / freedom
-    t_value = float(stats.t.ppf(0.5 + 0.5 * LEVEL, freedom))
-    jacobian = _gradient(fit, problem.x) @ free
-    # pinv: directions that the data do not see at all get no variance here, but the profile shows them
-    covariance = free @ np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-13, hermitian=True) @ free.T * variance
-    transform = _physical_jacobian(fit)
-    half = t_value * np.sqrt(np.maximum(np.diag(transform @ covariance @ transform.T), 0.0))
+    correction = 1.0 + (_SEARCHED / len(problem.x) if form.stribeck else 0.0)
+    worst = fit.rss + correction * noise.variance_Nm2 * float(stats.f.ppf(LEVEL, 1, noise.freedom))
+    ends, bounded = (fit.ws, fit.ws), (True, True)
+    if form.stribeck:
+        least, most, bounded = _ws_ends(fit, worst)
+        ends = (least, most)
+    scan = np.unique(np.append(np.geomspace(*ends, ELLIPSOIDS), fit.ws)) if ends[1] > ends[0] else [fit.ws]
+    found = [_ellipsoid(fit, float(ws), worst) for ws in scan]
+    ellipsoids = tuple(each for each in found if each is not None)
     values = _values(fit.branch())
-    profile_ws, profile_rss = _profile(fit)
+    reached = np.array([each.reach(_functionals(fit, each.ws)) for each in ellipsoids])
+    low = np.min([values, *reached[:, 0]], axis=0)
+    high = np.max([values, *reached[:, 1]], axis=0)
+    at_ws = NAMES.index("ws")
+    low[at_ws], high[at_ws] = (end * problem.top_radps for end in ends)
+    low[:2] = np.maximum(low[:2], 0.0)  # friction is not negative
+    if form.stribeck:
+        high[:2] = np.minimum(high[:2], np.maximum(problem.static_max_Nm, values[:2]))
+    why = _at_limits(fit)
     used = {"tc", *(("ts", "ws") if form.stribeck else ()), *(("tv",) if form.viscous else ())}
     used |= {"a0", "a1", "a2", "a3"} if form.cubic else set()
     intervals = {}
-    for name, value, width in zip(NAMES, values, half, strict=True):
-        if name not in used:
-            continue
-        low, high, weak = value - width, value + width, why.get(name, "")
-        if name == "ws":
-            inside = profile_rss <= fit.rss * (1.0 + float(stats.f.ppf(LEVEL, 1, freedom)) / freedom)
-            chosen = np.concatenate([profile_ws[inside], [value]])
-            low, high = float(chosen.min()), float(chosen.max())
-            open_ends = [e for e, at in (("below", 0), ("above", -1)) if inside[at]]
-            if not weak and open_ends:
-                weak = f"not bounded {' and '.join(open_ends)} by the data"
-            if not weak and high / low > 3.0:
-                weak = f"uncertain by a factor of {high / low:.1f}"
-        elif not weak and width > _WEAK * abs(value):
-            zero = width > abs(value) and name not in ("tc", "ts")
-            weak = "not distinguishable from 0" if zero else f"uncertain by {width / abs(value):.0%}"
-        if name in ("tc", "ts"):  # friction is not negative
-            low = max(low, 0.0)
-        intervals[name] = Interval(name, float(value), float(low), float(high), weak)
-    return Uncertainty(intervals, covariance, t_value)
+    for k, name in enumerate(NAMES):
+        if name in used:
+            ends_of = (float(values[k]), float(low[k]), float(high[k]))
+            weak = why.get(name) or (_weak_ws(ends, bounded) if name == "ws" else _weak(name, *ends_of))
+            intervals[name] = Interval(name, *ends_of, weak)
+    return Uncertainty(intervals, ellipsoids)
 
 
-def _profile(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Squared error of the best fit for each given ws, from limit to limit; joint rad/s."""
-    problem = fit.problem
-    if not problem.form.stribeck:
-        return np.empty(0), np.empty(0)
-    scan = np.geomspace(problem.ws_low, problem.ws_high, PROFILE_POINTS)
-    errors = np.array([solve_linear(problem, float(ws), fit.knee)[1] for ws in scan])
-    return scan * problem.top_radps, errors
+def _weak_ws(ends: tuple[float, float], bounded: tuple[bool, bool]) -> str:
+    open_ends = [word for word, known in zip(("below", "above"), bounded, strict=True) if not known]
+    if open_ends:
+        return f"not bounded {' and '.join(open_ends)} by the data"
+    return f"uncertain by a factor of {ends[1] / ends[0]:.1f}" if ends[1] / ends[0] > 3.0 else ""
+
+
+def _weak(name: str, value: float, low: float, high: float) -> str:
+    width = max(high - value, value - low)
+    if width <= _WEAK * abs(value):
+        return ""
+    if low <= 0.0 <= high and name not in ("tc", "ts"):
+        return "not distinguishable from 0"
+    return f"uncertain by {width / abs(value):.0%}" if value else "uncertain"

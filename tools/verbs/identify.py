@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 
 
 Data = Annotated[Path, typer.Argument(metavar="DATA", help="CSV of velocity plateaus, from sweep or elsewhere")]
-Model = Annotated[str, typer.Option("--model", help="multi-stage, stribeck, coulomb-viscous, or auto (held-out error)")]
+Model = Annotated[
+    str, typer.Option("--model", help="auto (least held-out error), multi-stage, stribeck or coulomb-viscous")
+]
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ GivenFormat = Annotated["ForeignFormat | None", _given_format]
 class FitOptions:
     """How to fit: fields of `Options` and of `SwarmSettings`, speeds in deg/s."""
 
-    model: Model = "multi-stage"
+    model: Model = "auto"
     continuous: Annotated[bool, typer.Option("--continuous", help="let the two stages meet at the knees")] = False
     search_knee: Annotated[bool, typer.Option("--search-knee", help="search the knees as well")] = False
     knee: Annotated[float, typer.Option("--knee", help="speed at which the stages change (deg/s of the joint)")] = 40.0
@@ -136,11 +138,14 @@ def _not_compensated(path: Path) -> bool:
 
 def remarks(found: Identification) -> list[str]:
     """Comment lines above the section: where the numbers come from."""
+    from jointctl.tools.identification.identification_report import left_out_text
+
     swarm = found.options.swarm
     return [
         f"{found.data.path.name}, SHA-256 {found.data.sha256}",
         f"model {found.model}, seed {swarm.seed}, {swarm.particles} particles x {swarm.iterations} iterations",
-        f"RMSE {found.rmse_Nm:.4g} Nm, held out {found.held_out_by_model_Nm[found.model]:.4g} Nm at the motor",
+        f"RMSE {found.rmse_Nm:.4g} Nm, held out {found.held_out_by_model_Nm[found.model]:.4g} Nm at the motor; "
+        + left_out_text(found),
     ]
 
 
@@ -238,7 +243,12 @@ def identify(
 def _write_page(
     path: Path, found: Identification, fit: Any, convergence: Any | None, section: str, output: Output
 ) -> None:
-    from jointctl.tools.identification.identification_report import error_table, model_table, parameter_table
+    from jointctl.tools.identification.identification_report import (
+        error_table,
+        left_out_text,
+        model_table,
+        parameter_table,
+    )
     from jointctl.tools.recording.report_page import Details, Section, from_terminal, svg_figure, write_verb_page
     from jointctl.tools.recording.report_page import remarks as notes_of
 
@@ -247,7 +257,15 @@ def _write_page(
     if convergence is not None:
         pictures.append(svg_figure(convergence, "How the particle swarm converged"))
     sections = [
-        Section("Fit", [*notes_of(found.warnings), from_terminal(model_table(found)), from_terminal(errors)]),
+        Section(
+            "Fit",
+            [
+                *notes_of(found.warnings),
+                *notes_of([left_out_text(found)], ""),
+                from_terminal(model_table(found)),
+                from_terminal(errors),
+            ],
+        ),
         Section("Parameters", [from_terminal(parameter_table(found))]),
         Section("Figures", pictures),
         Section("Origin", [*notes_of(remarks(found), ""), Details("The section for a configuration", section)]),

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
 from jointctl.tools.identification.fit import (
@@ -16,10 +18,12 @@ from jointctl.tools.identification.fit import (
     held_out_rss,
     knee_candidates,
     make_problem,
+    noise_exponent,
     polish,
     project,
     solve_linear,
     vector_limits,
+    with_noise,
 )
 from jointctl.tools.identification.models import FORMS, basis, legendre, legendre_to_powers
 from jointctl.tools.identification.swarm import (
@@ -34,7 +38,7 @@ from jointctl.tools.identification.swarm import (
     stream_seed,
     suffix_sums,
 )
-from jointctl.tools.identification.uncertainty import uncertainty
+from jointctl.tools.identification.uncertainty import noise_of, uncertainty
 from tests.unit.identification.synthetic_friction import DENSE_radps, NOISE_Nm, UNIFORM_radps, paper_data
 
 # --- Models, variable projection, particle swarm, polish: on data of Table 3 they reach what can be reached ---
@@ -147,10 +151,10 @@ def test_limits_of_static_and_coulomb_friction_hold_and_the_face_found_is_the_be
 def test_the_error_of_a_particle_is_the_sum_of_squares(form, search_knee):
     problem = paper_problems(2, form)[1]
     search_knee = search_knee and problem.form.cubic
-    sums = suffix_sums(problem.x, problem.y_Nm, problem.knee)
+    sums = suffix_sums(problem.x, problem.y_Nm, problem.weight, problem.knee)
     limits = vector_limits(problem)
     stage = problem.x <= problem.knee
-    table = stage_table(problem.x[stage], problem.y_Nm[stage], limits[0, 2], limits[1, 2])
+    table = stage_table(problem.x[stage], problem.y_Nm[stage], problem.weight[stage], limits[0, 2], limits[1, 2])
     rng = np.random.default_rng(0)
     for ws_share in (0.0, *rng.uniform(0.0, 1.0, 30), 1.0):
         vector = rng.uniform(limits[0], limits[1])
@@ -160,7 +164,7 @@ def test_the_error_of_a_particle_is_the_sum_of_squares(form, search_knee):
         expected = np.sum((problem.y_Nm - basis(problem.form, problem.x, ws, knee) @ beta) ** 2)
         particle = np.append(vector, knee) if search_knee else vector
         split = int(np.searchsorted(problem.x, knee, side="right")) if problem.form.cubic else len(problem.x)
-        samples = Samples(problem.x, problem.y_Nm, sums, table, problem.knee, split, problem.form.cubic,
+        samples = Samples(problem.x, problem.y_Nm, problem.weight, sums, table, problem.knee, split, problem.form.cubic,
                           problem.form.continuous, search_knee)  # fmt: skip
         found = squared_error(particle, samples)
         assert found == pytest.approx(expected, rel=1e-9)
@@ -339,11 +343,15 @@ def test_among_equals_the_model_with_fewer_parameters_is_chosen():
     assert choose({"multi-stage": 1.0, "multi-stage-continuous": 1.011, "stribeck": 4.0}) == "multi-stage"
 
 
+def sure(fit):
+    return uncertainty(fit, noise_of([fit])[0])
+
+
 def test_intervals_cover_the_truth_about_as_often_as_they_say():
     inside = {"tc": 0, "tv": 0, "a1": 0, "a3": 0}
     truth = {"tc": 0.11985, "tv": 0.0026518 / DEGREE, "a1": 0.0012298 / DEGREE, "a3": -7.6969e-9 / DEGREE**3}
     for seed in range(60):
-        found = uncertainty(project(one_direction(seed, velocity_radps=DENSE_radps))).intervals
+        found = sure(project(one_direction(seed, velocity_radps=DENSE_radps))).intervals
         for name in inside:
             inside[name] += found[name].low <= truth[name] <= found[name].high
     # 57 expected, standard deviation 1.7
@@ -355,25 +363,75 @@ def test_the_band_covers_the_true_curve_about_as_often_as_it_says():
     for seed in range(40):
         problem = one_direction(seed)
         fit = project(problem)
-        half = uncertainty(fit).band_Nm(fit, problem.x)
+        low, high = sure(fit).band_Nm(fit, problem.x)
         truth = friction_curve_Nm(paper_friction(), problem.x * problem.top_radps)
-        covered.append(np.mean(np.abs(fit.torque_Nm(problem.x) - truth) <= half))
+        covered.append(np.mean((low <= truth) & (truth <= high)))
     assert 0.88 < np.mean(covered) < 0.985
 
 
 def test_the_profile_says_that_a_uniform_grid_does_not_determine_ws_and_a_dense_one_does():
-    weak = [uncertainty(project(one_direction(seed))).intervals["ws"].weak for seed in range(8)]
+    weak = [sure(project(one_direction(seed))).intervals["ws"].weak for seed in range(8)]
     assert sum(bool(w) for w in weak) >= 7
-    dense = [uncertainty(project(one_direction(seed, velocity_radps=DENSE_radps, noise_Nm=0.001))) for seed in range(8)]
+    dense = [sure(project(one_direction(seed, velocity_radps=DENSE_radps, noise_Nm=0.001))) for seed in range(8)]
     intervals = [u.intervals["ws"] for u in dense]
     assert not any(i.weak for i in intervals)
     assert sum(i.low <= 1.2301 * DEGREE <= i.high for i in intervals) >= 6
 
 
+def test_the_interval_of_ws_ends_where_the_f_test_crosses_and_moves_with_the_noise():
+    """Not at points of a grid: noise that is 1 % larger widens it by less than a step of 4 %, but widens it."""
+    fit = project(one_direction(3, velocity_radps=DENSE_radps, noise_Nm=0.001))
+    noise = noise_of([fit])[0]
+    for part in (1.0, 1.01):
+        interval = uncertainty(fit, replace(noise, variance_Nm2=part * noise.variance_Nm2)).intervals["ws"]
+        ends = [
+            solve_linear(fit.problem, end / fit.problem.top_radps, fit.knee)[1] for end in (interval.low, interval.high)
+        ]
+        reached = 1.0 + 4.0 / len(fit.problem.x)
+        allowed = fit.rss + part * reached * noise.variance_Nm2 * stats.f.ppf(0.95, 1, noise.freedom)
+        assert ends == pytest.approx([allowed, allowed], rel=1e-4)
+
+
+@pytest.mark.parametrize("true", [0.0, 1.0])
+def test_noise_that_grows_with_the_friction_is_found_and_weighted(true):
+    found = []
+    for seed in range(6):
+        fits = []
+        for word in (seed, 100 + seed):
+            problem = one_direction(word, velocity_radps=DENSE_radps, noise_Nm=0.0)
+            scale = np.abs(problem.y_Nm / np.mean(problem.y_Nm)) ** true
+            noise = NOISE_Nm * scale * np.random.default_rng(word).standard_normal(len(problem.x))
+            fits.append(project(replace(problem, y_Nm=problem.y_Nm + noise)))
+        found.append(noise_exponent(fits))
+    assert np.median(found) == pytest.approx(true, abs=0.25)
+    weight = with_noise(fits[0], 1.0).weight
+    assert np.mean(weight) == pytest.approx(1.0)
+    assert weight[0] / weight[-1] == pytest.approx(
+        (fits[0].torque_Nm(np.ones(1))[0] / fits[0].torque_Nm(fits[0].problem.x[:1])[0]) ** 2
+    )
+
+
+def test_the_swarm_and_the_exact_minimum_agree_with_weights_as_well():
+    fit = project(one_direction(5))
+    weighted = with_noise(fit, 1.5)
+    exact = project(weighted)
+    assert exact.rss < weighted.weight @ fit.residual_Nm**2
+    found = polish(run_swarm(weighted, SwarmSettings(particles=200, iterations=500)).fit)
+    assert found.rss == pytest.approx(exact.rss, rel=0.005)
+
+
+def test_directions_of_unlike_noise_are_not_pooled():
+    alike = [project(one_direction(seed)) for seed in (1, 2)]
+    assert noise_of(alike)[0] == noise_of(alike)[1]
+    unlike = [project(one_direction(1)), project(one_direction(2, noise_Nm=3.0 * NOISE_Nm))]
+    quiet, loud = noise_of(unlike)
+    assert loud.variance_Nm2 > 4.0 * quiet.variance_Nm2
+
+
 def test_no_stribeck_effect_is_told_and_not_made_up():
     u = np.linspace(0.05, 3.0, 80)
     y = 0.1 + 0.02 * u - 0.02 * np.exp(-u / 0.3)
-    found = uncertainty(project(make_problem(FORMS["stribeck"], u, y, 1.0, (None, 0.5)))).intervals
+    found = sure(project(make_problem(FORMS["stribeck"], u, y, 1.0, (None, 0.5)))).intervals
     assert found["ts"].value == pytest.approx(found["tc"].value, rel=1e-6)
     assert found["ts"].weak == "no Stribeck effect found (ts = tc)"
     assert found["ws"].weak

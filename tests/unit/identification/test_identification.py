@@ -11,6 +11,7 @@ from jointctl.drivers.errors import DataError, UsageError
 from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
 from jointctl.tools.identification.fit import make_problem, project
 from jointctl.tools.identification.identification import Options, identify_friction
+from jointctl.tools.identification.identification_report import left_out_text
 from jointctl.tools.identification.models import FORMS, MIN_PER_STAGE
 from jointctl.tools.identification.plausibility import JointLimits, check_branches, check_data
 from jointctl.tools.identification.swarm import SwarmSettings
@@ -50,6 +51,29 @@ def test_outliers_are_named_with_their_line_and_do_not_move_the_result():
     assert found.rmse_Nm == pytest.approx(clean.rmse_Nm, rel=0.02)
     kept = identify_friction(data, Options(swarm=QUICK.swarm, outlier_threshold=0.0))
     assert kept.rmse_Nm > 1.5 * found.rmse_Nm
+
+
+def test_what_was_left_out_is_reported_with_its_share_of_the_error():
+    data = paper_data(3)
+    data.motor_torque_Nm[[20, 180]] += 0.08
+    data.settled[100] = False
+    found = identify_friction(data, QUICK)
+    out = found.to_dict()["left_out"]
+    assert (out["outliers"], out["unsettled"]) == (2, 1)
+    squared = found.rmse_Nm**2 * found.to_dict()["points"]
+    assert out["rmse_with_Nm"] ** 2 * (found.to_dict()["points"] + 3) * (1.0 - out["error_share"]) == pytest.approx(
+        squared
+    )
+    assert out["error_share"] == pytest.approx(2 * 0.08**2 / (squared + 2 * 0.08**2), rel=0.1)
+    assert "2 outliers, 1 never settled" in left_out_text(found)
+    assert left_out_text(identify_friction(paper_data(3), QUICK)) == "no measured point was left out"
+
+
+def test_a_joint_slower_than_the_knee_gets_a_model_without_being_asked():
+    speeds = np.geomspace(0.2, 25.0, 60) * DEGREE
+    found = identify_friction(paper_data(1, np.concatenate([-speeds[::-1], speeds]), noise_Nm=0.001), QUICK)
+    assert found.model == "stribeck"
+    assert any("too few for the multi-stage model" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(("share", "warned"), [(0.12, False), (0.26, True)])
@@ -118,7 +142,7 @@ def test_a_searched_knee_is_told_and_not_worse():
 
 @pytest.mark.parametrize(("knee_degps", "fits"), [(8.0, False), (10.0, True), (190.0, True), (193.0, False)])
 def test_a_knee_with_too_few_points_on_one_side_is_refused(knee_degps, fits):
-    options = Options(knee_radps=knee_degps * DEGREE, swarm=QUICK.swarm)
+    options = Options(model="multi-stage", knee_radps=knee_degps * DEGREE, swarm=QUICK.swarm)
     if fits:
         assert identify_friction(paper_data(0), options).rmse_Nm < 0.03
         return

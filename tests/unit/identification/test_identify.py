@@ -57,7 +57,7 @@ def test_the_report_of_an_identification_holds_tables_pictures_and_section(sweep
     assert identify(sweep, out, options=QUICK, report=page) == 0
     html = page.read_text()
     assert [foreign_colours(svg) for svg in svgs(html)] == [set(), set()]
-    for word in ("95 % interval", "held out", "multi-stage (chosen)", "tc+", "[friction.positive]", "SHA-256"):
+    for word in ("95 % interval", "held out", "(chosen)", "tc+", "[friction.positive]", "SHA-256"):
         assert word in html
     assert f"written: {page}" in out.stderr.getvalue()
     for wrong, told in ((sweep.parent / "found.txt", "must end in .html"), (sweep.parent / "no" / "a.html", "folder")):
@@ -248,7 +248,7 @@ def test_json_output_is_one_document(sweep):
     out = output(json=True)
     identify(sweep, out, options=QUICK)
     result = json.loads(out.stdout.getvalue())
-    assert result["model"] == "multi-stage"
+    assert result["model"] == "multi-stage-continuous"  # the step at the knee is below the noise
     assert all(Path(p).exists() for p in result["files"])
 
 
@@ -299,7 +299,7 @@ def said(path, told=None, config=None):
         ({"ratio": 100.0}, r"reduction ratio of the data \(=100\) differs from joint.reduction_ratio \(=121\)"),
         ({"side": "joint"}, r"highest joint speed \(=422.4 rad/s\) is 109 times limits.velocity_max_radps"),
         ({"velocity_unit": "rad/s"}, r"highest joint speed \(=33.33 rad/s\) is 8.59 times limits"),
-        ({"velocity_unit": "deg/s"}, r"at positive velocity: .* and 0 beyond; at least"),
+        ({"velocity_unit": "deg/s"}, r"too few for the multi-stage model.*is 0.15 times limits.velocity_max_radps"),
         ({"torque_side": "joint"}, "times limits.torque_max_Nm: check torque constant, ratio, units and sides"),
     ],
 )  # fmt: skip
