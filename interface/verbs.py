@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from jointctl.tools.experiments.controller_study import StudyResult
     from jointctl.tools.experiments.judge import Verdict
     from jointctl.tools.identification.identification import Identification
+    from jointctl.tools.identification.motion_fit import MotionFit
     from jointctl.tools.inspection.health import Finding
     from jointctl.tools.recording.run_log_reader import RunLog
     from jointctl.tools.session.result import RunResult
@@ -163,6 +164,20 @@ def identify(
     return identify_friction(
         read_friction_data(Path(data), ForeignFormat(**(table or {}))), Options(**options), limits=limits
     )
+
+
+def identify_motion(data: str | Path, *, table: dict[str, Any] | None = None, **settings: Any) -> MotionFit:
+    """Inertia, gravity and friction from a run log or a table in time, as `jointctl identify`; nothing is written.
+
+    `table` says how to read a table (fields of `ForeignFormat`), `settings` are fields of `MotionSettings`.
+    """
+    from jointctl.tools.identification import motion_fit
+    from jointctl.tools.identification.friction_data import ForeignFormat
+    from jointctl.tools.identification.motion_data import MotionSettings
+    from jointctl.tools.verbs.identify import motion_from
+
+    chosen = MotionSettings(**settings)
+    return motion_fit.identify_motion(motion_from(Path(data), ForeignFormat(**(table or {})), chosen), chosen)
 
 
 def read_log(path: str | Path) -> RunLog:

@@ -279,6 +279,21 @@ class LuGre(Section):
     damping_Nmspr: Annotated[float, between(0.0, 1e6)]  # of the bristles, at the joint
 
 
+class FrictionLoad(Section):
+    """Friction that goes with the torque that the reducer transmits, at the joint; identified, no law uses it yet."""
+
+    coulomb: Annotated[float, between(0.0, 2.0)] = 0.0  # Coulomb friction per transmitted torque, its sign ignored
+    viscous_spr: Annotated[float, between(0.0, 2.0)] = 0.0  # viscous friction per transmitted torque, joint rad/s
+
+
+class FrictionTemperature(Section):
+    """Friction times exp(-k (T - reference_degC)), at the drive's temperature; identified, no law uses it yet."""
+
+    reference_degC: Annotated[float, between(-50.0, 200.0)]  # at which the curve holds as it stands
+    coulomb_pK: Annotated[float, between(-0.2, 0.2)] = 0.0  # k of Coulomb, static and load friction
+    viscous_pK: Annotated[float, between(-0.2, 0.2)] = 0.0  # k of the rest of the curve
+
+
 class Friction(Section):
     velocity_unit: Literal["deg/s", "rad/s", "r/min"]  # of ws, tv, a0..a3, knee and max
     velocity_side: Literal["joint", "motor"]  # of the velocity
@@ -286,6 +301,8 @@ class Friction(Section):
     positive: FrictionDirection
     negative: FrictionDirection
     lugre: LuGre | None = None
+    load: FrictionLoad | None = None
+    temperature: FrictionTemperature | None = None
 
 
 class Margin(Section):

@@ -274,6 +274,7 @@ def check_directions(data: FrictionData, both: bool) -> None:
 # --- a table with columns of other names ---
 
 SIDES = ("joint", "motor")
+RAD_PER_UNIT = {"rad": 1.0, "deg": math.pi / 180.0, "turn": math.tau}
 
 
 @dataclass(frozen=True)
@@ -289,6 +290,12 @@ class ForeignFormat:
     ratio: float | None = None
     torque_constant_NmpA: float | None = None
     delimiter: str = "auto"
+    # of a time series
+    time_column: str | None = None  # [s]
+    position_column: str | None = None
+    position_unit: str | None = None
+    load_column: str | None = None  # torque at the joint that the load is known to need [Nm]
+    temperature_column: str | None = None  # [degC]
 
     @property
     def mapped(self) -> bool:
@@ -301,6 +308,7 @@ def check_given(given: ForeignFormat) -> None:
         ("--velocity-unit", given.velocity_unit, tuple(RADPS_PER_UNIT)),
         ("--side", given.side, SIDES),
         ("--torque-side", given.torque_side, SIDES),
+        ("--position-unit", given.position_unit, tuple(RAD_PER_UNIT)),
     ):
         if value is not None and value not in allowed:
             raise UsageError(f"{flag} (={value}) must be one of {', '.join(allowed)}")
@@ -443,6 +451,8 @@ def read_friction_data(path: str | Path, given: ForeignFormat | None = None, *, 
     """Read and check; `both` asks for enough points in both directions, else one is enough to go on with."""
     path, given = Path(path), given or ForeignFormat()
     check_given(given)
+    if given.time_column is not None:
+        raise UsageError(f"--time-column (={given.time_column}) is for time series, which only `identify` reads")
     table = read_table(path, given.delimiter)
     ours = not given.mapped and "velocity_radps" in table.columns and "motor_torque_Nm" in table.columns
     if ours:

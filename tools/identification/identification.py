@@ -29,6 +29,7 @@ from jointctl.tools.identification.fit import (
 )
 from jointctl.tools.identification.friction_data import FrictionData, relative_figures
 from jointctl.tools.identification.models import FORMS, MIN_PER_STAGE, Branch, Form
+from jointctl.tools.identification.motion_data import MotionSettings
 from jointctl.tools.identification.plausibility import JointLimits, check_branches, check_data
 from jointctl.tools.identification.swarm import SwarmResult, SwarmSettings, run_swarms
 from jointctl.tools.identification.uncertainty import Uncertainty, noise_of, uncertainty
@@ -54,6 +55,7 @@ class Options:
     outlier_threshold: float = 5.0
     folds: int = 10
     swarm: SwarmSettings = field(default_factory=SwarmSettings)
+    motion: MotionSettings = field(default_factory=MotionSettings)  # of a time series, whose model is always chosen
 
     def check(self) -> None:
         """Raise `UsageError` for a value out of range."""
@@ -311,18 +313,18 @@ def _weighted_points(
 
     Which points are outliers hangs on the noise, and the noise on which points are used.
     """
-    exponent, told = 0.0, list[str]()
+    exponent, said = 0.0, list[str]()
     shapes: dict[str, Fit] = {}
     for _ in range(2):
-        told.clear()
+        said.clear()
         points = {
-            word: _points(data, options, first, sign, (shapes.get(word), exponent), told) for word, sign in DIRECTIONS
+            word: _points(data, options, first, sign, (shapes.get(word), exponent), said) for word, sign in DIRECTIONS
         }
         shapes = {word: project(found.problem) for word, found in points.items()}
         before, exponent = exponent, noise_exponent(list(shapes.values()))
         if exponent == before:
             break
-    warnings += told
+    warnings += said
     return {
         word: replace(found, problem=with_noise(shapes[word], exponent)) for word, found in points.items()
     }, exponent

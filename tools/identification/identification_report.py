@@ -294,6 +294,7 @@ def convergence_figure(identified: Identification) -> Any | None:
 # --- the [friction] section ---
 
 MARK = "# identified by jointctl: "
+OPTIONAL = ("load", "temperature")  # sections of [friction] that only a motion identifies
 
 
 def direction_values(found: Branch, *, negative: bool) -> dict[str, float]:
@@ -327,7 +328,7 @@ def snippet(values: dict[str, Any], remarks: list[str]) -> str:
     """The section as a text of its own."""
     lines = [MARK + line for line in remarks] + ["[friction]"]
     lines += [f'{key} = "{values[key]}"' for key in ("velocity_unit", "velocity_side", "torque_side")]
-    for name in ("positive", "negative"):
+    for name in [key for key in ("positive", "negative", *OPTIONAL) if key in values]:
         lines += ["", f"[friction.{name}]", *(f"{key} = {value!r}" for key, value in values[name].items())]
     return "\n".join(lines) + "\n"
 
@@ -346,7 +347,9 @@ def with_section(text: str, values: dict[str, Any], remarks: list[str]) -> str:
         return kept + gap + newline + snippet(values, remarks).replace("\n", newline)
     for key in ("velocity_unit", "velocity_side", "torque_side"):
         friction[key] = values[key]
-    for name in ("positive", "negative"):
+    for name in OPTIONAL:  # they belong to the curve that they were found with
+        friction.pop(name, None)
+    for name in [key for key in ("positive", "negative", *OPTIONAL) if key in values]:
         if name not in friction:
             friction[name] = tomlkit.table()
         for key, value in values[name].items():

@@ -12,6 +12,7 @@ import numpy as np
 
 from jointctl.tools.identification.friction_data import FrictionData
 from jointctl.tools.identification.models import Branch
+from jointctl.tools.identification.motion_data import Motion
 
 _OPPOSING = 0.9  # least share of points whose torque has the sign of the velocity
 _SPEED_WARN_RADPS, _SPEED_MAX_RADPS = 30.0, 1000.0  # of a joint behind a reducer
@@ -89,12 +90,36 @@ def check_data(data: FrictionData, limits: JointLimits | None) -> Verdict:
     return verdict
 
 
+def check_motion(motion: Motion, limits: JointLimits) -> Verdict:
+    """Ratio and sizes of a motion against a configuration."""
+    verdict = Verdict()
+    if abs(motion.reduction_ratio / limits.reduction_ratio - 1.0) > 1e-6:
+        verdict.problems.append(_other_ratio(motion.reduction_ratio, limits))
+    top_radps = float(np.max(np.abs(motion.velocity_radps)))
+    joint_Nm = float(np.percentile(np.abs(motion.torque_Nm), 95))
+    for share, text in (
+        (top_radps / limits.velocity_max_radps / _SPEED_OVER,
+         f"{motion.speed_name}: reaches {top_radps:.4g} rad/s, {top_radps / limits.velocity_max_radps:.3g} times "
+         "limits.velocity_max_radps"),
+        (joint_Nm / limits.torque_max_Nm / _TORQUE_MAX,
+         f"{motion.torque_name}: reaches {joint_Nm:.4g} Nm at the joint, {joint_Nm / limits.torque_max_Nm:.3g} times "
+         "limits.torque_max_Nm"),
+    ):  # fmt: skip
+        if share > 1.0:
+            verdict.problems.append(f"{text}: {_CAUSES}")
+    if joint_Nm < _TORQUE_SMALL * limits.torque_max_Nm:
+        text = f"{motion.torque_name}: reaches no more than {joint_Nm:.4g} Nm at the joint"
+        verdict.warnings.append(f"{text}, {joint_Nm / limits.torque_max_Nm:.3g} times limits.torque_max_Nm: {_CAUSES}")
+    return verdict
+
+
+def _other_ratio(ratio: float, limits: JointLimits) -> str:
+    return f"reduction ratio of the data (={ratio:g}) differs from joint.reduction_ratio (={limits.reduction_ratio:g})"
+
+
 def _check_limits(data: FrictionData, limits: JointLimits, top_radps: float, verdict: Verdict) -> None:
     if abs(data.reduction_ratio / limits.reduction_ratio - 1.0) > 1e-6:
-        verdict.problems.append(
-            f"reduction ratio of the data (={data.reduction_ratio:g}) differs from joint.reduction_ratio "
-            f"(={limits.reduction_ratio:g})"
-        )
+        verdict.problems.append(_other_ratio(data.reduction_ratio, limits))
     constant = data.torque_constant_NmpA
     if constant is not None and abs(constant / limits.torque_constant_NmpA - 1.0) > 1e-3:
         verdict.problems.append(

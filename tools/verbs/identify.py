@@ -1,4 +1,4 @@
-"""`jointctl identify DATA`: a friction model from measured plateaus, into a configuration.
+"""`jointctl identify DATA`: a friction model from measured plateaus or from any motion, into a configuration.
 
 Nothing is written unless the whole computation succeeds; every file is replaced in one step.
 """
@@ -18,13 +18,18 @@ from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import Report, VerbOutput, config_path
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
     from jointctl.tools.identification.friction_data import ForeignFormat
     from jointctl.tools.identification.identification import Identification, Options
+    from jointctl.tools.identification.motion_data import Motion, MotionSettings
     from jointctl.tools.identification.plausibility import JointLimits
-    from jointctl.tools.recording.report_page import Block
+    from jointctl.tools.recording.report_page import Block, Section
 
 
-Data = Annotated[Path, typer.Argument(metavar="DATA", help="CSV of velocity plateaus, from sweep or elsewhere")]
+Data = Annotated[
+    Path, typer.Argument(metavar="DATA", help="CSV of velocity plateaus, run log (MCAP), or table of a motion in time")
+]
 Model = Annotated[
     str, typer.Option("--model", help="auto (least held-out error), multi-stage, stribeck or coulomb-viscous")
 ]
@@ -45,6 +50,17 @@ class TableOptions:
     ratio: Annotated[float | None, typer.Option("--ratio", help="reduction ratio")] = None
     torque_constant_NmpA: Annotated[float | None, typer.Option("--torque-constant", help="of the motor (Nm/A)")] = None
     delimiter: Annotated[str, typer.Option("--delimiter", help="between columns: auto, or the character")] = "auto"
+    time_column: Annotated[
+        str | None, typer.Option("--time-column", help="name of the time column (s): the table is a motion in time")
+    ] = None
+    position_column: Annotated[str | None, typer.Option("--position-column", help="name of the position column")] = None
+    position_unit: Annotated[str | None, typer.Option("--position-unit", help="rad, deg or turn")] = None
+    load_column: Annotated[
+        str | None, typer.Option("--load-column", help="name of the column of the known load's torque (joint, Nm)")
+    ] = None
+    temperature_column: Annotated[
+        str | None, typer.Option("--temperature-column", help="name of the temperature column (degC)")
+    ] = None
 
 
 def _given_format(table: TableOptions) -> ForeignFormat:
@@ -78,12 +94,24 @@ class FitOptions:
     social: Annotated[float, typer.Option("--social")] = 1.49618
     seed: Annotated[int, typer.Option("--seed")] = 1
     stall: Annotated[int, typer.Option("--stall", help="stop after so many iterations without progress; 0 = never")] = 0
+    band: Annotated[
+        float | None, typer.Option("--band", help="of the differentiation of a motion (Hz); 20 if not given")
+    ] = None
+    speed_min: Annotated[float, typer.Option("--speed-min", help="of the samples of a motion (rad/s)")] = 0.05
+    acceleration_max: Annotated[
+        float, typer.Option("--acceleration-max", help="of the samples of a motion (rad/s2)")
+    ] = math.inf
+    mean_samples: Annotated[
+        int | None, typer.Option("--mean-samples", help="running mean of a motion, in place of the band's low-pass")
+    ] = None
 
 
 def _fit(given: FitOptions) -> Options:
     from jointctl.tools.identification.identification import Options
+    from jointctl.tools.identification.motion_data import MotionSettings
     from jointctl.tools.identification.swarm import SwarmSettings
 
+    motion = MotionSettings(given.band, given.speed_min, given.acceleration_max, given.mean_samples)
     swarm = SwarmSettings(**{field.name: getattr(given, field.name) for field in fields(SwarmSettings)})
     same = ("model", "continuous", "search_knee", "static_max_Nm", "outlier_threshold", "folds")
     return Options(
@@ -92,6 +120,7 @@ def _fit(given: FitOptions) -> Options:
         ws_min_radps=None if given.ws_min is None else math.radians(given.ws_min),
         ws_max_radps=math.radians(given.ws_max),
         swarm=swarm,
+        motion=motion,
     )
 
 
@@ -149,6 +178,21 @@ def remarks(found: Identification) -> list[str]:
     ]
 
 
+@dataclass(frozen=True)
+class _Found:
+    """What an identification writes and shows, whatever it was made from."""
+
+    shown: RenderableType
+    result: dict[str, Any]
+    section: dict[str, Any]
+    remarks: list[str]
+    pictures: dict[str, tuple[Any, str]]  # (figure, caption) by the end of its file's name
+    tables: list[Section]  # of the page, before the pictures
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
+    title: str
+
+
 def identify(
     data_path: Data,
     output: VerbOutput,
@@ -160,23 +204,14 @@ def identify(
     options: Fit = None,
     report: Report = None,
 ) -> int:
-    """Fit the friction model (11) to measured plateaus; writes TOML, figures and a report beside the data."""
+    """Fit the friction model (11) to plateaus, or to any motion; writes TOML, figures and a report beside the data."""
     # into: the section goes into it, figures and the JSON report beside the data.  Otherwise into `out`, default
     # DATA.friction.toml, and they beside it.
-    import numpy as np
-
     from jointctl.tools.configuration.load import shipped_config
     from jointctl.tools.drawing import png
-    from jointctl.tools.identification.friction_data import read_friction_data
-    from jointctl.tools.identification.identification import Options, identify_friction
-    from jointctl.tools.identification.identification_report import (
-        convergence_figure,
-        fit_figure,
-        identification_report,
-        section_values,
-        snippet,
-        write_into,
-    )
+    from jointctl.tools.identification.identification import Options
+    from jointctl.tools.identification.identification_report import snippet, write_into
+    from jointctl.tools.identification.motion_data import is_series
     from jointctl.tools.recording.report_page import check_target
     from jointctl.tools.written_file import replace_file, require_target
 
@@ -190,15 +225,8 @@ def identify(
         raise DataError(f"--into {into}: a shipped configuration is not written into", hint)
     config = None if config is None else config_path(config)
     limits = _limits(into, config, output)
-    data = read_friction_data(data_path, given)
-    if limits is None and data.recorded_limits is None:
-        output.warning(
-            f"{data_path}: no limits of the joint are known: sizes of torque and speed could not be checked, a wrong "
-            "torque constant, ratio, unit or side may go unnoticed; --config CONFIG checks them"
-        )
-    total = 2.0 * options.swarm.iterations
-    with output.progress("particle swarm", total) as advance:
-        found = identify_friction(data, options, limits=limits, progress=advance)
+    from_data = _from_motion if is_series(data_path, given) else _from_plateaus
+    found = from_data(data_path, given, options, limits, output)
     for note in found.notes:
         output.note(f"{data_path}: {note}")
     for warning in found.warnings:
@@ -207,68 +235,118 @@ def identify(
     if out is None and into is None:
         out = data_path.with_suffix(".friction.toml")
     stem = out.with_suffix("") if out is not None else data_path.with_suffix(".friction")
-    used = {word: direction.index for word, direction in found.directions.items()}
-    outliers = np.concatenate([direction.outliers for direction in found.directions.values()])
-    fit = fit_figure(
-        data, found.branches, used, f"{data_path.name}: {found.model}", outliers=outliers, identified=found
-    )
-    convergence = convergence_figure(found)
-    values = section_values(found.branches["positive"], found.branches["negative"])
-    result = {**found.to_dict(), "friction": values}
-    files = {
-        stem.with_name(stem.name + ".png"): png(fit),
-        stem.with_name(stem.name + ".report.json"): json.dumps(result, indent=1, allow_nan=False).encode("utf-8"),
-    }
-    if convergence is not None:
-        files[stem.with_name(stem.name + ".convergence.png")] = png(convergence)
+    result = {**found.result, "friction": found.section}
+    text = snippet(found.section, found.remarks)
+    files = {stem.with_name(f"{stem.name}{end}.png"): png(figure) for end, (figure, _) in found.pictures.items()}
+    report_json = json.dumps(result, indent=1, allow_nan=False)
+    files[stem.with_name(stem.name + ".report.json")] = report_json.encode("utf-8")
     if out is not None:
-        files[out] = snippet(values, remarks(found)).encode("utf-8")
+        files[out] = text.encode("utf-8")
     protected = [p for p in (data_path, data_path.with_suffix(".json"), into, config) if p is not None]
     for path in files:
         require_target(path, protected)
     if into is not None:  # first, because it is the one that may be refused
-        write_into(into, values, remarks(found))
+        write_into(into, found.section, found.remarks)
     for path, content in files.items():
         replace_file(path, content)
-    output.result(identification_report(found), {**result, "files": [str(p) for p in files]})
+    output.result(found.shown, {**result, "files": [str(p) for p in files]})
     for path in ([into] if into is not None else []) + list(files):
         output.note(f"written: {path}")
     if into is not None and _not_compensated(into):
         output.warning(f'{into}: control.feed_forward (="none") leaves the friction to the feedback; "desired" uses it')
     if report is not None:
-        _write_page(report, found, fit, convergence, snippet(values, remarks(found)), output)
+        _write_page(report, found, text, data_path, output)
     return 0
 
 
-def _write_page(
-    path: Path, found: Identification, fit: Any, convergence: Any | None, section: str, output: Output
-) -> None:
-    from jointctl.tools.identification.identification_report import (
-        error_table,
-        left_out_text,
-        model_table,
-        parameter_table,
-    )
-    from jointctl.tools.recording.report_page import Details, Section, from_terminal, svg_figure, write_verb_page
+def _from_plateaus(
+    path: Path, given: ForeignFormat | None, options: Options, limits: JointLimits | None, output: Output
+) -> _Found:
+    import numpy as np
+
+    from jointctl.tools.identification import identification_report as reports
+    from jointctl.tools.identification.friction_data import read_friction_data
+    from jointctl.tools.identification.identification import identify_friction
+    from jointctl.tools.recording.report_page import Section, from_terminal
     from jointctl.tools.recording.report_page import remarks as notes_of
 
-    errors = error_table(found.errors_Nm, found.measured_Nm, found.data.reduction_ratio)
-    pictures: list[Block] = [svg_figure(fit, "Measured friction torque and the model, and the error between them")]
+    data = read_friction_data(path, given)
+    if limits is None and data.recorded_limits is None:
+        output.warning(
+            f"{path}: no limits of the joint are known: sizes of torque and speed could not be checked, a wrong "
+            "torque constant, ratio, unit or side may go unnoticed; --config CONFIG checks them"
+        )
+    with output.progress("particle swarm", 2.0 * options.swarm.iterations) as advance:
+        found = identify_friction(data, options, limits=limits, progress=advance)
+    used = {word: direction.index for word, direction in found.directions.items()}
+    outliers = np.concatenate([direction.outliers for direction in found.directions.values()])
+    fit = reports.fit_figure(
+        data, found.branches, used, f"{path.name}: {found.model}", outliers=outliers, identified=found
+    )
+    pictures = {"": (fit, "Measured friction torque and the model, and the error between them")}
+    convergence = reports.convergence_figure(found)
     if convergence is not None:
-        pictures.append(svg_figure(convergence, "How the particle swarm converged"))
-    sections = [
-        Section(
-            "Fit",
-            [
-                *notes_of(found.warnings),
-                *notes_of([left_out_text(found)], ""),
-                from_terminal(model_table(found)),
-                from_terminal(errors),
-            ],
-        ),
-        Section("Parameters", [from_terminal(parameter_table(found))]),
-        Section("Figures", pictures),
-        Section("Origin", [*notes_of(remarks(found), ""), Details("The section for a configuration", section)]),
+        pictures[".convergence"] = (convergence, "How the particle swarm converged")
+    errors = reports.error_table(found.errors_Nm, found.measured_Nm, data.reduction_ratio)
+    left_out = notes_of([reports.left_out_text(found)], "")
+    models = from_terminal(reports.model_table(found))
+    tables = [
+        Section("Fit", [*notes_of(found.warnings), *left_out, models, from_terminal(errors)]),
+        Section("Parameters", [from_terminal(reports.parameter_table(found))]),
     ]
-    title = f"Friction of {found.data.path.stem}: {found.model}"
-    write_verb_page(path, title, sections, output, subtitle=str(found.data.path), inputs=(found.data.path,))
+    section = reports.section_values(found.branches["positive"], found.branches["negative"])
+    return _Found(
+        reports.identification_report(found), found.to_dict(), section, remarks(found), pictures, tables, found.notes,
+        found.warnings, f"Friction of {path.stem}: {found.model}",
+    )  # fmt: skip
+
+
+def motion_from(path: Path, given: ForeignFormat, settings: MotionSettings) -> Motion:
+    """The motion of a run log or of a table."""
+    from jointctl.tools.identification.motion_data import motion_of_log, read_motion
+    from jointctl.tools.recording.run_log_reader import read_run_log
+
+    if path.suffix.lower() == ".mcap":
+        return motion_of_log(path, read_run_log(path), given, settings)
+    return read_motion(path, given, settings)
+
+
+def _from_motion(
+    path: Path, given: ForeignFormat | None, options: Options, limits: JointLimits | None, output: Output
+) -> _Found:
+    from jointctl.tools.identification import motion_report as reports
+    from jointctl.tools.identification.friction_data import ForeignFormat
+    from jointctl.tools.identification.motion_fit import identify_motion
+    from jointctl.tools.identification.plausibility import Verdict, check_motion
+    from jointctl.tools.recording.report_page import Section, from_terminal
+    from jointctl.tools.recording.report_page import remarks as notes_of
+
+    motion = motion_from(path, given or ForeignFormat(), options.motion)
+    verdict = check_motion(motion, limits) if limits is not None else Verdict()
+    if verdict.problems:
+        raise DataError(f"{path}: {'; '.join(verdict.problems)}")
+    found = identify_motion(motion, options.motion, knee_radps=options.knee_radps, seed=options.swarm.seed)
+    section = reports.motion_section(found)
+    warnings = list(verdict.warnings)
+    if {"load", "temperature"} & section.keys():
+        warnings.append("friction that goes with load or temperature is written, but no law uses it yet")
+    if len(found.model.directions) == 1:
+        warnings.append(f"{motion.speed_name}: no reversal: friction of the other direction is taken to be the same")
+    tables = [
+        Section("Fit", [*notes_of(reports.motion_lines(found), ""), *map(from_terminal, reports.motion_tables(found))]),
+        Section("Left open by these data", notes_of(found.untold)),
+    ]
+    return _Found(
+        reports.motion_report(found), found.to_dict(), section, reports.motion_remarks(found),
+        reports.motion_figures(found), tables, found.notes, tuple(warnings), f"Motion of {path.stem}",
+    )  # fmt: skip
+
+
+def _write_page(path: Path, found: _Found, text: str, data_path: Path, output: Output) -> None:
+    from jointctl.tools.recording.report_page import Details, Section, svg_figure, write_verb_page
+    from jointctl.tools.recording.report_page import remarks as notes_of
+
+    pictures: list[Block] = [svg_figure(figure, caption) for figure, caption in found.pictures.values()]
+    origin = [*notes_of(found.remarks, ""), Details("The section for a configuration", text)]
+    sections = [*found.tables, Section("Figures", pictures), Section("Origin", origin)]
+    write_verb_page(path, found.title, sections, output, subtitle=str(data_path), inputs=(data_path,))

@@ -1,0 +1,409 @@
+"""Identification from any motion: what is found again, what is untold, which data are refused, and real joints."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tomlkit
+
+import jointctl
+from jointctl.drivers.errors import DataError, UsageError
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.identification.friction_data import ForeignFormat
+from jointctl.tools.identification.identification import Options
+from jointctl.tools.identification.models import FORMS
+from jointctl.tools.identification.motion_data import Motion, MotionSettings, read_motion
+from jointctl.tools.identification.motion_fit import MotionFit, identify_motion
+from jointctl.tools.identification.plausibility import JointLimits, check_motion
+from jointctl.tools.recording.run_log import RunLogWriter
+from jointctl.tools.verbs.identify import identify, motion_from
+from tests.page_figures import foreign_colours, svgs
+from tests.places import PUBLIC_DATA
+from tests.unit.identification.synthetic_friction import output
+from tests.unit.identification.synthetic_motion import FORMAT, TrueJoint, motion_columns, read, write_table
+
+SETTINGS = MotionSettings()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("motion")
+
+
+@pytest.fixture(scope="module")
+def loaded(folder) -> tuple[TrueJoint, MotionFit]:
+    """A joint with gravity, whose friction grows with the torque that it transmits and falls as it warms up."""
+    joint = TrueJoint(load_coulomb=0.2, load_viscous_spr=0.1, coulomb_perK=0.01, viscous_perK=0.03)
+    columns = motion_columns(joint, warming_K=30.0, seconds=90.0, seed=5)
+    motion = read(folder / "loaded.csv", columns, temperature_column="warmth")
+    return joint, identify_motion(motion, SETTINGS)
+
+
+# --- what is found again ---
+
+
+def test_every_parameter_of_a_known_joint_is_found_within_its_interval(loaded):
+    joint, found = loaded
+    warm = found.reference_degC - 40.0  # the middle of the warming, where the true joint counts from
+    coulomb, viscous = math.exp(-joint.coulomb_perK * warm), math.exp(-joint.viscous_perK * warm)
+    truth = {
+        "inertia": joint.inertia_kgm2,
+        "gravity_sin": joint.gravity_Nm * math.cos(joint.gravity_zero_rad),
+        "gravity_cos": -joint.gravity_Nm * math.sin(joint.gravity_zero_rad),
+        "load_coulomb": joint.load_coulomb * coulomb,
+        "load_viscous": joint.load_viscous_spr * viscous,
+        "temperature_coulomb": joint.coulomb_perK,
+        "temperature_viscous": joint.viscous_perK,
+        "tc positive": joint.coulomb_Nm[0] * coulomb,
+        "tc negative": joint.coulomb_Nm[1] * coulomb,
+        "tv positive": joint.viscous_Nmspr * viscous,
+        "tv negative": joint.viscous_Nmspr * viscous,
+    }
+    assert found.model.form is FORMS["stribeck"]
+    outside = {
+        name: (true, found.parameters[name])
+        for name, true in truth.items()
+        if not found.parameters[name].low <= true <= found.parameters[name].high
+    }
+    assert len(outside) <= 1, outside
+    for name, true in truth.items():
+        assert found.parameters[name].value == pytest.approx(true, rel=0.15), name
+    assert found.to_dict()["gravity"]["zero_rad"] == pytest.approx(joint.gravity_zero_rad, abs=0.03)
+
+
+def test_the_held_out_error_is_the_noise_and_halves_where_the_extension_is_allowed(loaded):
+    _, found = loaded
+    assert found.rmse_Nm(odd=True) < 1.15 * 0.3
+    before = next(step for step in found.steps if step.name == "stribeck")
+    assert found.rmse_Nm(odd=True) < 0.5 * before.held_out_rmse_Nm
+
+
+def test_no_term_comes_in_that_the_joint_does_not_have(folder):
+    columns = motion_columns(TrueJoint(), seed=2)
+    found = identify_motion(read(folder / "plain.csv", columns), SETTINGS)
+    assert not found.model.terms & {"load-viscous", "temperature-coulomb", "temperature-viscous"}
+    assert found.value.get("load_coulomb", 0.0) < 0.03
+
+
+def test_a_known_load_gives_the_scale_of_the_torque_too(folder):
+    columns = motion_columns(TrueJoint(load_coulomb=0.2), load_Nm=20.0, seed=3)
+    columns["load"] = columns["load"] / 0.9  # the masses are thought to be larger than they are
+    found = identify_motion(read(folder / "known.csv", columns, load_column="load"), SETTINGS)
+    assert found.parameters["load_scale"].value == pytest.approx(-0.1, abs=0.02)
+    assert found.parameters["load_coulomb"].value == pytest.approx(0.2, abs=0.04)
+    assert not any("torque constant" in line for line in found.untold)
+
+
+def test_single_wild_samples_do_not_move_the_result(folder):
+    columns = motion_columns(TrueJoint(), seed=2)
+    wild = np.random.default_rng(0).random(len(columns["t"])) < 0.005
+    spoiled = {**columns, "tau": np.where(wild, 80.0, columns["tau"])}
+    found = identify_motion(read(folder / "wild.csv", spoiled), SETTINGS)
+    assert found.parameters["inertia"].value == pytest.approx(2.0, rel=0.1)
+    assert found.parameters["tc positive"].value == pytest.approx(6.0, rel=0.1)
+
+
+def test_both_halves_of_the_blocks_see_both_directions(folder):
+    """One slow stroke there and one back: halves of eighths would do, eighths of quarters would not."""
+    t = np.arange(0.0, 80.0, 0.01)
+    w = 2.0 * np.pi / 80.0
+    q, v, a = 8.0 * np.sin(w * t), 8.0 * w * np.cos(w * t), -8.0 * w * w * np.sin(w * t)
+    tau = TrueJoint().torque_Nm(q, v, a) + 0.1 * np.random.default_rng(0).standard_normal(len(t))
+    found = identify_motion(read(folder / "stroke.csv", {"t": t, "q": q, "tau": tau}), SETTINGS)
+    used = found.motion.used(SETTINGS)
+    for sign in (1.0, -1.0):
+        mine = used & (sign * found.motion.velocity_radps > 0.0)
+        assert 0.2 <= np.mean(found.block[mine] % 2) <= 0.8
+
+
+# --- what the data cannot tell ---
+
+
+def untold_of(folder, columns, **change):
+    return " | ".join(identify_motion(read(folder / "untold.csv", columns, **change), SETTINGS).untold)
+
+
+def test_each_thing_that_cannot_be_told_is_named_with_the_experiment_that_would(folder):
+    forward = motion_columns(TrueJoint(), seconds=30.0)
+    t, slow = forward["t"], 0.3 * forward["t"]
+    noise = 0.1 * np.random.default_rng(0).standard_normal(len(t))
+    still = np.zeros_like(t)
+    constant = TrueJoint().torque_Nm(slow, np.full_like(t, 0.3), still) + noise
+    text = untold_of(folder, {"t": t, "q": slow, "tau": constant})
+    assert "q: no reversal" in text
+    assert "move both ways" in text
+    assert "q: constant speed only (0.3 to 0.3 rad/s)" in text
+    assert "temperature: no column of it" in text
+    assert "tau: its scale (the torque constant) stays unknown without a known load" in text
+    text = untold_of(folder, forward, temperature_column="warmth")
+    assert "temperature: constant within 0 K: measure cold, and again 15 K warmer" in text
+    assert "no reversal" not in text
+    one_way = {"t": t, "q": slow, "tau": TrueJoint().torque_Nm(slow, np.full_like(t, 0.3), still, 9.0 * np.sin(slow))}
+    text = untold_of(folder, {**one_way, "load": 10.0 * np.sin(slow)}, load_column="load")
+    assert "one direction only cannot tell load friction from an error of the torque constant" in text
+
+
+def test_one_sine_and_a_ripple_that_repeats_with_the_angle_are_named(folder):
+    t = np.arange(0.0, 60.0, 0.005)
+    w = 2.0 * np.pi * 0.2
+    q, v, a = 0.6 * np.sin(w * t), 0.6 * w * np.cos(w * t), -0.6 * w * w * np.sin(w * t)
+    noise = 0.1 * np.random.default_rng(1).standard_normal(len(t))
+    plain = {"t": t, "q": q, "tau": TrueJoint().torque_Nm(q, v, a) + noise}
+    text = untold_of(folder, plain)
+    assert "q: the acceleration goes with the angle, as in a single sine" in text
+    assert "repeats with the angle" not in text
+    text = untold_of(folder, {**plain, "tau": plain["tau"] + 0.8 * np.sin(40.0 * q)})
+    assert "tau: the residual repeats with the angle" in text
+    assert "the acceleration goes with" not in untold_of(folder, motion_columns(TrueJoint(), seconds=20.0))
+
+
+def test_without_a_way_gravity_is_not_made_up(folder):
+    t = np.arange(0.0, 30.0, 0.005)
+    w = 2.0 * np.pi * 1.3
+    q, v, a = 0.05 * np.sin(w * t), 0.05 * w * np.cos(w * t), -0.05 * w * w * np.sin(w * t)
+    tau = TrueJoint(gravity_Nm=0.0).torque_Nm(q, v, a) + 0.1 * np.random.default_rng(1).standard_normal(len(t))
+    found = identify_motion(read(folder / "small.csv", {"t": t, "q": q, "tau": tau}), SETTINGS)
+    assert "gravity" not in found.model.terms
+    assert any("gravity cannot be separated from friction: move over 1 rad or more" in line for line in found.untold)
+
+
+# --- data that are wrong, one line that names the column and what was seen ---
+
+WITH_VELOCITY = {"velocity_column": "v", "velocity_unit": "rad/s"}
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda c: {**c, "v": np.degrees(c["v"])}, r"v: is 57.\d* times the slope of q: one of them is in degrees"),
+        (lambda c: {**c, "v": np.radians(c["v"])}, r"v: is 0.0174\d* times the slope of q: one of them is in degrees"),
+        (lambda c: {**c, "v": 100.0 * c["v"]}, r"v: is 100 times the slope of q: one of them is of the motor"),
+        (lambda c: {**c, "q": 100.0 * c["q"]}, r"v: is 0.01 times the slope of q: one of them is of the motor"),
+        (lambda c: {**c, "v": -c["v"]}, r"v: is -1 times the slope of q: must be near 1"),
+        (lambda c: {**c, "v": 1.5 * c["v"]}, r"v: is 1.5 times the slope of q: must be near 1"),
+        (lambda c: {**c, "t": np.where(c["t"] > 5.0, c["t"] - 2.0, c["t"])}, r"t: does not go on at sample 1002: 5 s"),
+        (
+            lambda c: {**c, "tau": np.clip(c["tau"], -3.0, 3.0)},
+            r"tau: is at its greatest or least value in \d+% of the samples",
+        ),
+        (lambda c: {**c, "tau": 0.0 * c["tau"]}, r"tau: is zero throughout"),
+        (lambda c: {**c, "tau": -c["tau"]}, r"tau: friction at \w+ velocity would drive the motion"),
+        (lambda c: {**c, "q": 0.01 * c["q"], "v": 0.01 * c["v"]}, r"v: 0 of \d+ samples are faster than 0.05 rad/s"),
+        (lambda c: {**c, "q": 300.0 * c["q"], "v": 300.0 * c["v"]}, r"v: reaches \d+\.?\d* rad/s of the joint"),
+        (lambda c: {name: values[:150] for name, values in c.items()}, r"t: 150 samples: at least 200 are needed"),
+    ],
+)
+def test_wrong_data_are_refused_with_the_column_and_what_was_seen(tmp_path, spoil, message):
+    columns = spoil(motion_columns(seconds=20.0))
+    with pytest.raises(DataError, match=message) as caught:
+        identify_motion(read(tmp_path / "wrong.csv", columns, **WITH_VELOCITY), SETTINGS)
+    assert "\n" not in caught.value.message
+
+
+def test_a_torque_on_the_wrong_side_shows_against_a_known_load(tmp_path):
+    columns = motion_columns(seconds=20.0, load_Nm=60.0)
+    columns["tau"] = columns["tau"] / 100.0
+    with pytest.raises(DataError, match=r"tau: goes with 0\.0\d+ times load, near the ratio"):
+        read(tmp_path / "side.csv", columns, load_column="load")
+
+
+def test_gaps_and_some_saturation_are_told_and_not_used(tmp_path):
+    columns = motion_columns(seconds=30.0)
+    columns["tau"] = np.clip(columns["tau"], None, 14.0)
+    columns["t"] = np.where(columns["t"] > 10.0, columns["t"] + 0.7, columns["t"])
+    motion = read(tmp_path / "gap.csv", columns)
+    assert [note.split(":")[0] for note in motion.notes] == ["t", "tau"]
+    assert "1 gaps of up to 0.705 s" in motion.notes[0]
+    assert "saturated; they are not used" in motion.notes[1]
+    inside = (motion.time_s > 10.0) & (motion.time_s < 10.7)
+    assert not motion.whole[inside].any()
+    assert motion.torque_Nm[motion.whole].max() < 14.0
+
+
+def test_some_samples_at_the_time_of_another_are_left_out_and_a_coarse_clock_is_refused(tmp_path):
+    columns = motion_columns(seconds=20.0)
+    twice = np.arange(len(columns["t"])) % 10 == 5
+    motion = read(tmp_path / "twice.csv", {**columns, "t": np.where(twice, columns["t"] - 0.005, columns["t"])})
+    assert motion.notes[0] == "t: 400 samples at the time of the one before: left out"
+    with pytest.raises(DataError, match="t: does not go on at sample 2"):
+        read(tmp_path / "coarse.csv", {**columns, "t": np.floor(columns["t"] * 50.0) / 50.0})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"position_unit": None}, "--position-unit is missing"),
+        ({"position_column": None}, "--position-column or --velocity-column is missing"),
+        ({"torque_column": None}, "--torque-column or --current-column is missing"),
+        ({"torque_side": None}, "--torque-side is missing"),
+        ({"ratio": None}, "--ratio is missing"),
+        ({"position_unit": "grad"}, r"--position-unit \(=grad\) must be one of rad, deg, turn"),
+        ({"torque_column": None, "current_column": "tau"}, "--torque-constant is missing"),
+    ],
+)
+def test_nothing_of_a_table_is_guessed(tmp_path, change, message):
+    with pytest.raises(UsageError, match=message):
+        read(tmp_path / "a.csv", motion_columns(seconds=5.0), **change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"band_Hz": 95.0}, r"--band \(=95 Hz\) must be below 90 Hz"),
+        ({"speed_min_radps": -1.0}, r"--speed-min \(=-1\) must be in"),
+        ({"acceleration_max_radps2": 0.0}, r"--acceleration-max \(=0\) must be in"),
+        ({"mean_samples": 0}, r"--mean-samples \(=0\)"),
+    ],
+)
+def test_settings_out_of_range_are_refused(tmp_path, change, message):
+    with pytest.raises(UsageError, match=message):
+        read(tmp_path / "a.csv", motion_columns(seconds=5.0), replace(SETTINGS, **change))
+
+
+def test_sizes_are_checked_against_a_configuration(tmp_path):
+    motion = read(tmp_path / "a.csv", motion_columns(seconds=5.0))
+    assert check_motion(motion, JointLimits(60.0, 3.0, 100.0, 0.1)).problems == []
+    (problem,) = check_motion(motion, JointLimits(60.0, 3.0, 121.0, 0.1)).problems
+    assert "reduction ratio of the data (=100) differs from joint.reduction_ratio (=121)" in problem
+    (problem,) = check_motion(motion, JointLimits(60.0, 0.1, 100.0, 0.1)).problems
+    assert "q: reaches" in problem
+    (problem,) = check_motion(motion, JointLimits(5.0, 3.0, 100.0, 0.1)).problems
+    assert "tau: reaches" in problem
+
+
+# --- sources: units, sides, run logs ---
+
+
+def test_units_sides_and_current_make_no_difference(tmp_path):
+    columns = motion_columns(seconds=10.0)
+    ours = read(tmp_path / "a.csv", columns)
+    theirs = {**columns, "q": np.degrees(columns["q"]) * 100.0, "tau": columns["tau"] / 100.0 / 0.1}
+    same = read(tmp_path / "b.csv", theirs, position_unit="deg", side="motor", torque_column=None,
+                current_column="tau", torque_constant_NmpA=0.1, torque_side=None)  # fmt: skip
+    for name in ("position_rad", "velocity_radps", "acceleration_radps2", "torque_Nm"):
+        assert getattr(same, name) == pytest.approx(getattr(ours, name), abs=1e-4)
+
+
+def test_differentiation_has_no_phase_and_the_band_that_it_states(tmp_path):
+    t = np.arange(0.0, 20.0, 0.002)
+    for frequency_Hz, kept in ((1.0, 1.0), (10.0, 0.5)):
+        w = 2.0 * np.pi * frequency_Hz
+        columns = {"t": t, "q": 2.0 * t + np.sin(w * t) / w, "tau": np.cos(w * t)}
+        motion = read(tmp_path / "a.csv", columns, replace(SETTINGS, band_Hz=10.0))
+        inside = slice(1000, -1000)
+        wave = motion.velocity_radps[inside] - 2.0
+        share = wave @ np.cos(w * t[inside]) / np.sum(np.cos(w * t[inside]) ** 2)
+        quadrature = wave @ np.sin(w * t[inside]) / np.sum(np.sin(w * t[inside]) ** 2)
+        assert share == pytest.approx(kept, abs=0.02)
+        assert quadrature == pytest.approx(0.0, abs=1e-3)
+
+
+def run_log(path, columns, ratio_text="reduction_ratio = 100.0"):
+    records = new(LogRecord, len(columns["t"]))
+    records.time_ns = 10**12 + np.round(columns["t"] * 1e9).astype(np.int64)
+    records.position_rad, records.measured_torque_Nm = columns["q"], columns["tau"]
+    records.phase = AxisPhase.TRACKING
+    records.phase[:20] = AxisPhase.ENABLING
+    with RunLogWriter(path, {"run": {"configuration": f"[joint]\n{ratio_text}\n", "path": "joint.toml"}}) as log:
+        log.write_records(records)
+    return path
+
+
+def test_a_run_log_is_read_as_a_table_is_and_knows_its_ratio(tmp_path):
+    columns = motion_columns(seconds=20.0)
+    motion = motion_from(run_log(tmp_path / "run.mcap", columns), ForeignFormat(), SETTINGS)
+    table = read(tmp_path / "a.csv", columns)
+    assert motion.reduction_ratio == 100.0
+    assert len(motion.time_s) == len(table.time_s) - 20  # nothing of before the law moves the joint
+    assert motion.torque_Nm[500:-500] == pytest.approx(table.torque_Nm[520:-500], abs=1e-3)
+    with pytest.raises(DataError, match="names no reduction ratio"):
+        motion_from(run_log(tmp_path / "none.mcap", columns, "x = 1"), ForeignFormat(), SETTINGS)
+
+
+# --- the verb ---
+
+
+@pytest.fixture
+def config(tmp_path):
+    path = tmp_path / "joint.toml"
+    shutil.copy(shipped_config("virtual"), path)
+    return path
+
+
+def test_the_python_interface_gives_the_fit_and_writes_nothing(tmp_path):
+    data = write_table(tmp_path / "move.csv", motion_columns(TrueJoint(), seconds=20.0))
+    table = {name: value for name, value in vars(FORMAT).items() if value is not None}
+    found = jointctl.identify_motion(data, table=table, speed_min_radps=0.1)
+    assert found.parameters["inertia"].value == pytest.approx(2.0, rel=0.1)
+    assert [path.name for path in tmp_path.iterdir()] == ["move.csv"]
+
+
+def test_the_verb_writes_section_pictures_page_and_report(tmp_path, config):
+    joint = TrueJoint(load_coulomb=0.2, coulomb_perK=0.01)
+    data = write_table(tmp_path / "move.csv", motion_columns(joint, seconds=40.0, warming_K=25.0))
+    given = replace(FORMAT, ratio=121.0, temperature_column="warmth")
+    out, page = output(json=True), tmp_path / "found.html"
+    assert identify(data, out, into=config, given=given, options=Options(), report=page) == 0
+    result = json.loads(out.stdout.getvalue())
+    assert result["kind"] == "motion"
+    assert "no law uses it yet" in out.stderr.getvalue()
+    friction = load_config(config).friction
+    assert friction.load.coulomb == pytest.approx(0.2, rel=0.2)
+    assert friction.temperature.coulomb_pK == pytest.approx(0.01, rel=0.2)
+    assert friction.model_dump(exclude_none=True)["load"] == result["friction"]["load"]
+    tc_Nm = result["friction"]["positive"]["tc_Nm"] * 121.0
+    assert tc_Nm == pytest.approx(6.0, rel=0.15)
+    assert "# identified by jointctl: for [joint]: inertia_kgm2 = " in config.read_text()
+    html = page.read_text()
+    assert [foreign_colours(svg) for svg in svgs(html)] == [set(), set(), set()]
+    for word in ("load_coulomb", "held out", "Left open by these data", "[friction.temperature]"):
+        assert word in html
+    for end in ("", ".residuals", ".families"):
+        assert (tmp_path / f"move.friction{end}.png").read_bytes().startswith(b"\x89PNG")
+    # a later curve without them takes them away: they belong to the curve that they were found with
+    plain = write_table(tmp_path / "plain.csv", motion_columns(TrueJoint(), seconds=40.0, seed=2))
+    identify(plain, output(), into=config, given=replace(FORMAT, ratio=121.0), options=Options())
+    assert "temperature" not in tomlkit.parse(config.read_text()).unwrap()["friction"]
+    assert load_config(config).friction.lugre is not None
+
+
+# --- real joints ---
+
+KINOVA = PUBLIC_DATA / "kinova"
+COLUMNS = ForeignFormat(
+    time_column="time_s", position_column="position_rad", position_unit="rad", velocity_column="velocity_radps",
+    velocity_unit="rad/s", side="joint", torque_column="current_torque_Nm", torque_side="joint", ratio=100.0,
+    load_column="model_torque_Nm", temperature_column="temperature_degC",
+)  # fmt: skip
+# speed above 0.05 rad/s, acceleration below 1 rad/s2, mean of 25 samples
+CONDITIONS = MotionSettings(speed_min_radps=0.05, acceleration_max_radps2=1.0, mean_samples=25)
+
+
+def real_motion(number: int) -> Motion:
+    path = KINOVA / f"joint_{number}.csv"
+    if not path.exists():
+        pytest.skip(f"{path}: the public data of five strain-wave joints are not here")
+    return read_motion(path, COLUMNS, CONDITIONS)
+
+
+@pytest.mark.parametrize(("number", "most_Nm"), [(1, 0.20), (4, 0.35), (5, 0.09), (6, 0.08), (7, 0.12)])
+def test_five_real_strain_wave_joints_on_held_out_blocks(number, most_Nm):
+    found = identify_motion(real_motion(number), CONDITIONS)
+    assert found.blocks == 8
+    assert found.rmse_Nm(odd=True) <= most_Nm
+    assert found.rmse_Nm(odd=True, every=True) < 3.0 * most_Nm
+    text = " | ".join(found.untold)
+    assert "velocity_radps: no reversal" in text
+    assert "velocity_radps: constant speed only" in text
+    assert "temperature: constant within" in text
+    if number in (4, 6):  # under gravity load
+        assert found.model.terms & {"load-scale", "load-coulomb"}
+        assert "one direction only cannot tell load friction from an error of the torque constant" in text

@@ -1,0 +1,409 @@
+"""Time series of a joint that moves in any way: from a run log or a table of time, position, velocity and torque.
+
+What comes out is on a uniform grid of time, at the joint: rad, rad/s, rad/s2, Nm.  What is differentiated passes
+through a zero-phase low-pass before (Butterworth of second order, forwards and backwards: -6 dB at `band_Hz`).  Torques
+and velocities pass through the same one, or through a running mean of `mean_samples`, which has no phase either.
+Samples near a gap of the clock, at the ends, near a reversal, and where the current is saturated are not used.  Every
+problem is one `DataError` that names the column and what was seen.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
+from scipy.signal import butter, sosfiltfilt
+
+from jointctl.drivers.errors import DataError, UsageError
+from jointctl.firmware_py.input_file import LARGEST_LOG_BYTES, open_input
+from jointctl.firmware_py.states import AxisPhase
+from jointctl.tools.configuration.conversions import RADPS_PER_UNIT
+from jointctl.tools.identification.friction_data import (
+    RAD_PER_UNIT,
+    ForeignFormat,
+    TableFile,
+    check_given,
+    numbers,
+    read_table,
+)
+
+BAND_Hz, BAND_SHARE = 20.0, 0.2  # default: at most this share of the rate; with a running mean its first zero
+LEAST_SAMPLES = 200
+_GAP = 3.0  # times the usual step of time
+_FACTOR_TOLERANCE = 0.05  # of velocity over slope of position: gears and filters give some per cent
+_SATURATED_SHARE = 0.005  # of the samples at the greatest torque: more is a limit, not a peak
+_TWICE_SHARE = 0.2  # of the samples: more at the time of the one before are a clock that is too coarse
+_SAME = 1e-9
+_TOP_SPEED_radps = 100.0  # of a joint behind a reducer
+_SIDE_TOLERANCE = 0.5  # of the logarithm of a factor that is near the ratio
+
+
+@dataclass(frozen=True)
+class MotionSettings:
+    """Which band is looked at, and which samples are used."""
+
+    band_Hz: float | None = None  # None: see BAND_Hz
+    speed_min_radps: float = 0.05  # slower, friction is set-valued
+    acceleration_max_radps2: float = math.inf
+    mean_samples: int | None = None  # of a running mean that takes the low-pass's place where nothing is differentiated
+
+    def check(self) -> None:
+        for flag, value, low, high in (
+            ("--band", 1.0 if self.band_Hz is None else self.band_Hz, 0.01, 1e4),
+            ("--speed-min", self.speed_min_radps, 0.0, 100.0),
+            ("--acceleration-max", min(self.acceleration_max_radps2, 1e6), 1e-6, 1e6),
+            ("--mean-samples", 1 if self.mean_samples is None else self.mean_samples, 1, 10_000),
+        ):  # fmt: skip
+            if not low <= value <= high:
+                raise UsageError(f"{flag} (={value:g}) must be in [{low:g}..{high:g}]")
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Samples (N,) at the joint on a uniform grid of time, filtered."""
+
+    path: Path
+    sha256: str
+    rate_Hz: float
+    band_Hz: float
+    time_s: np.ndarray
+    position_rad: np.ndarray
+    velocity_radps: np.ndarray
+    acceleration_radps2: np.ndarray
+    torque_Nm: np.ndarray  # of the motor, times the ratio
+    load_Nm: np.ndarray | None  # known torque of the load, positive where it needs a positive motor torque
+    temperature_degC: np.ndarray | None
+    whole: np.ndarray  # bool: no gap, no end and no saturation near
+    reversing: np.ndarray  # bool: so near to a reversal that the low-pass smears the jump of the friction
+    reduction_ratio: float
+    torque_name: str  # of the column
+    speed_name: str  # of the velocity's column, or of the position's where there is none
+    notes: tuple[str, ...] = ()
+
+    def used(self, settings: MotionSettings) -> np.ndarray:
+        """Samples (N,) that the model is to describe."""
+        moving = np.abs(self.velocity_radps) > settings.speed_min_radps
+        return (
+            self.whole
+            & ~self.reversing
+            & moving
+            & (np.abs(self.acceleration_radps2) < settings.acceleration_max_radps2)
+        )
+
+
+@dataclass
+class _Raw:
+    """Columns as they were read, in SI at the joint, with the names under which problems are reported."""
+
+    path: Path
+    sha256: str
+    time_s: np.ndarray
+    torque_Nm: np.ndarray
+    ratio: float
+    names: dict[str, str]
+    position_rad: np.ndarray | None = None
+    velocity_radps: np.ndarray | None = None
+    load_Nm: np.ndarray | None = None
+    temperature_degC: np.ndarray | None = None
+    notes: list[str] = field(default_factory=list)
+
+    def keep(self, chosen: np.ndarray) -> None:
+        """Leave the other samples out."""
+        for name in ("time_s", "torque_Nm", "position_rad", "velocity_radps", "load_Nm", "temperature_degC"):
+            values = getattr(self, name)
+            setattr(self, name, None if values is None else values[chosen])
+
+    def problem(self, which: str, seen: str, hint: str = "") -> DataError:
+        return DataError(f"{self.path}: {self.names[which]}: {seen}", hint)
+
+
+# --- reading ---
+
+
+def is_series(path: Path, given: ForeignFormat | None) -> bool:
+    """Whether a file holds a time series: a run log, or a table with a column of time named by the user."""
+    return path.suffix.lower() == ".mcap" or (given is not None and given.time_column is not None)
+
+
+def read_motion(path: Path, given: ForeignFormat, settings: MotionSettings) -> Motion:
+    """A table: read, check, filter."""
+    settings.check()
+    check_given(given)
+    return _prepared(_table(path, given), settings)
+
+
+class LoggedRun(Protocol):
+    """What is used of a run log."""
+
+    @property
+    def records(self) -> Any: ...  # record array of LogRecord
+    @property
+    def temperatures(self) -> Any: ...  # array of time_ns, temperature_degC
+    @property
+    def metadata(self) -> dict[str, dict[str, str]]: ...
+    @property
+    def complete(self) -> bool: ...
+
+
+def motion_of_log(path: Path, log: LoggedRun, given: ForeignFormat, settings: MotionSettings) -> Motion:
+    """A run log: check, filter."""
+    settings.check()
+    check_given(given)
+    return _prepared(_run_log(path, log, given), settings)
+
+
+def _run_log(path: Path, log: LoggedRun, given: ForeignFormat) -> _Raw:
+    """Measured position and torque of the phases in which the law moves the joint."""
+    records = log.records
+    records = records[(records.phase >= AxisPhase.APPROACH) & (records.phase <= AxisPhase.RAMPING)]
+    ratio = given.ratio
+    if ratio is None:
+        try:
+            joint = tomllib.loads(log.metadata["run"]["configuration"])["joint"]
+            ratio = float(joint["reduction_ratio"])
+        except (KeyError, ValueError, TypeError):
+            raise DataError(f"{path}: the log names no reduction ratio", "give --ratio") from None
+    if len(records) < LEAST_SAMPLES:
+        raise DataError(f"{path}: {len(records)} cycles in motion: at least {LEAST_SAMPLES} are needed")
+    time_ns = np.asarray(records.time_ns, np.int64)
+    names = {
+        "time": "time_ns",
+        "position": "position_rad",
+        "torque": "measured_torque_Nm",
+        "temperature": "/temperature",
+    }
+    with open_input(path, LARGEST_LOG_BYTES) as file:
+        sha256 = hashlib.sha256(file.read()).hexdigest()
+    raw = _Raw(
+        path, sha256, (time_ns - time_ns[0]) * 1e-9,
+        np.asarray(records.measured_torque_Nm, float), ratio, names, np.asarray(records.position_rad, float),
+    )  # fmt: skip
+    if len(log.temperatures):
+        at_s = (log.temperatures["time_ns"] - time_ns[0]) * 1e-9
+        raw.temperature_degC = np.interp(raw.time_s, at_s, log.temperatures["temperature_degC"])
+    if not log.complete:
+        raw.notes.append("the log was cut off: its tail is missing")
+    return raw
+
+
+def _table(path: Path, given: ForeignFormat) -> _Raw:
+    assert given.time_column is not None
+    table = read_table(path, given.delimiter)
+    _check_mapped(table, given)
+    assert given.ratio is not None
+    ratio = given.ratio
+    to_joint = 1.0 / ratio if given.side == "motor" else 1.0
+    names = {"time": given.time_column, "torque": given.torque_column or given.current_column or ""}
+    if given.current_column:
+        assert given.torque_constant_NmpA is not None
+        torque = numbers(table, given.current_column) * given.torque_constant_NmpA * ratio
+    else:
+        assert given.torque_column is not None
+        torque = numbers(table, given.torque_column) * (ratio if given.torque_side == "motor" else 1.0)
+    raw = _Raw(path, table.sha256, numbers(table, given.time_column), torque, ratio, names)
+    if given.position_column:
+        assert given.position_unit is not None
+        names["position"] = given.position_column
+        raw.position_rad = numbers(table, given.position_column) * RAD_PER_UNIT[given.position_unit] * to_joint
+    if given.velocity_column:
+        assert given.velocity_unit is not None
+        names["velocity"] = given.velocity_column
+        raw.velocity_radps = numbers(table, given.velocity_column) * RADPS_PER_UNIT[given.velocity_unit] * to_joint
+    if given.load_column:
+        names["load"] = given.load_column
+        raw.load_Nm = numbers(table, given.load_column)
+    if given.temperature_column:
+        names["temperature"] = given.temperature_column
+        raw.temperature_degC = numbers(table, given.temperature_column)
+    return raw
+
+
+def _check_mapped(table: TableFile, given: ForeignFormat) -> None:
+    """`UsageError` where something that a table does not tell was not given."""
+    has = f"the file has: {', '.join(table.columns)}"
+    if not (given.position_column or given.velocity_column):
+        raise UsageError("--position-column or --velocity-column is missing", has)
+    if not (given.torque_column or given.current_column):
+        raise UsageError("--torque-column or --current-column is missing", has)
+    needed: list[tuple[str, object]] = [("--side", given.side), ("--ratio", given.ratio)]
+    needed += [("--position-unit", given.position_unit)] if given.position_column else []
+    needed += [("--velocity-unit", given.velocity_unit)] if given.velocity_column else []
+    needed += [("--torque-side", given.torque_side)] if given.torque_column else []
+    needed += [("--torque-constant", given.torque_constant_NmpA)] if given.current_column else []
+    for flag, value in needed:
+        if value is None:
+            raise UsageError(f"{flag} is missing: a table of numbers does not tell it", "nothing is guessed")
+
+
+# --- what is wrong with the data, before anything is fitted ---
+
+
+def _clock(raw: _Raw) -> float:
+    """The usual step of time [s]; `DataError` where the clock does not go on."""
+    twice = np.append(False, np.diff(raw.time_s) == 0.0)
+    if 0 < np.count_nonzero(twice) <= _TWICE_SHARE * len(twice):
+        raw.notes.append(
+            f"{raw.names['time']}: {np.count_nonzero(twice)} samples at the time of the one before: left out"
+        )
+        raw.keep(~twice)
+    steps = np.diff(raw.time_s)
+    if len(steps) < LEAST_SAMPLES:
+        raise raw.problem("time", f"{len(raw.time_s)} samples: at least {LEAST_SAMPLES} are needed")
+    back = np.flatnonzero(steps <= 0.0)
+    step = float(np.median(steps))
+    if len(back):
+        at = int(back[0])
+        raise raw.problem(
+            "time", f"does not go on at sample {at + 2}: {raw.time_s[at]:.6g} s, then {raw.time_s[at + 1]:.6g} s"
+            + (f", and {len(back) - 1} times more" if len(back) > 1 else ""), "the clock was set, or files are joined",
+        )  # fmt: skip
+    gaps = np.flatnonzero(steps > _GAP * step)
+    if len(gaps):
+        raw.notes.append(
+            f"{raw.names['time']}: {len(gaps)} gaps of up to {steps.max():.3g} s (usual step {step:.3g} s): samples "
+            "near them are not used"
+        )
+    if float(np.sum(steps[gaps])) > 0.5 * (raw.time_s[-1] - raw.time_s[0]):
+        raise raw.problem("time", f"more than half of it is gaps longer than {_GAP * step:.3g} s")
+    return step
+
+
+def _check_units(raw: _Raw, position: np.ndarray, velocity: np.ndarray, slope: np.ndarray) -> None:
+    """Velocity against the slope of position: a wrong unit or side shows as a known factor."""
+    moving = np.abs(slope) > 0.1 * np.max(np.abs(slope))
+    if not moving.any() or float(np.ptp(position)) == 0.0:
+        raise raw.problem("position", "does not move")
+    factor = float(np.median(velocity[moving] / slope[moving]))
+    if abs(factor - 1.0) <= _FACTOR_TOLERANCE:
+        return
+    causes = {
+        math.degrees(1.0): "one of them is in degrees, the other in radians",
+        raw.ratio: "one of them is of the motor, the other of the joint",
+        math.tau: "one of them is in turns, the other in radians",
+        60.0 / math.tau: "the velocity is in r/min",
+        360.0 / 60.0: "r/min and deg/s are mixed up",
+    }
+    for size, cause in causes.items():
+        for known in (size, 1.0 / size):
+            if abs(abs(factor) / known - 1.0) <= _FACTOR_TOLERANCE:
+                sign = "" if factor > 0.0 else ", and the signs differ"
+                raise raw.problem(
+                    "velocity", f"is {factor:.4g} times the slope of {raw.names['position']}: {cause}{sign}"
+                )
+    if factor < 0.0 or not 0.8 < factor < 1.25:
+        raise raw.problem("velocity", f"is {factor:.4g} times the slope of {raw.names['position']}: must be near 1")
+    raw.notes.append(f"{raw.names['velocity']} is {factor:.3f} times the slope of {raw.names['position']}")
+
+
+def _saturated(raw: _Raw) -> np.ndarray:
+    """Samples (N,) at the greatest or least torque, where that is a limit: reached often, in runs, and to the digit."""
+    found = np.zeros(len(raw.torque_Nm), bool)
+    if not raw.torque_Nm.any():
+        raise raw.problem("torque", "is zero throughout")
+    for word, end_Nm in (("greatest", float(raw.torque_Nm.max())), ("least", float(raw.torque_Nm.min()))):
+        there = np.abs(raw.torque_Nm - end_Nm) <= _SAME * abs(end_Nm)
+        share, held = float(np.mean(there)), np.count_nonzero(there[1:] & there[:-1])
+        if share < _SATURATED_SHARE or held < 0.5 * np.count_nonzero(there):
+            continue
+        found |= there
+        raw.notes.append(
+            f"{raw.names['torque']}: at its {word} value ({end_Nm:.4g} Nm at the joint) in {share:.1%} of the samples: "
+            "saturated; they are not used"
+        )
+    if np.mean(found) > 0.5:
+        raise raw.problem(
+            "torque", f"is at its greatest or least value in {np.mean(found):.0%} of the samples: saturated"
+        )
+    return found
+
+
+def _prepared(raw: _Raw, settings: MotionSettings) -> Motion:
+    """On a uniform grid, filtered, with the samples marked that nothing spoils."""
+    step = _clock(raw)
+    saturated = _saturated(raw)
+    rate_Hz = 1.0 / step
+    window = settings.mean_samples
+    usual_Hz = BAND_Hz if window is None else rate_Hz / window
+    band_Hz = settings.band_Hz or min(usual_Hz, BAND_SHARE * rate_Hz)
+    if not band_Hz < 0.45 * rate_Hz:
+        raise UsageError(
+            f"--band (={band_Hz:g} Hz) must be below {0.45 * rate_Hz:.4g} Hz at {rate_Hz:.4g} samples a second"
+        )
+    low_pass = butter(2, band_Hz, fs=rate_Hz, output="sos")
+    time_s = np.arange(raw.time_s[0], raw.time_s[-1] + 0.5 * step, step)
+
+    def at_grid(values: np.ndarray) -> np.ndarray:
+        return np.interp(time_s, raw.time_s, values)
+
+    def smooth(values: np.ndarray) -> np.ndarray:
+        return np.asarray(sosfiltfilt(low_pass, values))
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return smooth(values) if window is None else uniform_filter1d(values, window)
+
+    torque = at_grid(raw.torque_Nm)
+    if raw.position_rad is not None:
+        position = at_grid(raw.position_rad)
+        slope = np.gradient(smooth(position), step)
+        given = None if raw.velocity_radps is None else at_grid(raw.velocity_radps)
+        banded = slope if given is None else smooth(given)
+        velocity = slope if given is None else mean(given)
+        _check_units(raw, position, banded, slope)
+        position = smooth(position)
+    else:
+        assert raw.velocity_radps is not None
+        given = at_grid(raw.velocity_radps)
+        banded, velocity = smooth(given), mean(given)
+        position = np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1])) * step])
+        raw.notes.append("no column of position: gravity cannot be found from the angle")
+    margin = max(math.ceil(0.5 * rate_Hz / band_Hz), (window or 1) // 2) + 1
+    spoiled = np.zeros(len(time_s), bool)
+    for at in np.flatnonzero(np.diff(raw.time_s) > _GAP * step):
+        spoiled |= (time_s > raw.time_s[at]) & (time_s < raw.time_s[at + 1])
+    spoiled |= at_grid(saturated.astype(float)) > 0.0
+    spoiled[[0, -1]] = True
+    near = maximum_filter1d(spoiled, 2 * margin + 1)
+    turns = np.zeros(len(time_s), bool)
+    turns[1:] = np.signbit(velocity[1:]) != np.signbit(velocity[:-1])
+    motion = Motion(
+        raw.path, raw.sha256, rate_Hz, band_Hz, time_s, position, velocity,
+        mean(np.gradient(banded, step)) if window else np.gradient(banded, step), mean(torque),
+        None if raw.load_Nm is None else mean(at_grid(raw.load_Nm)),
+        None if raw.temperature_degC is None else at_grid(raw.temperature_degC), ~near,
+        maximum_filter1d(turns, 4 * margin + 1), raw.ratio,
+        raw.names["torque"], raw.names.get("velocity") or raw.names["position"], tuple(raw.notes),
+    )  # fmt: skip
+    _check_motion(raw, motion, settings)
+    return motion
+
+
+def _check_motion(raw: _Raw, motion: Motion, settings: MotionSettings) -> None:
+    """`DataError` where too little moves, or a size shows that a unit or a side is wrong."""
+    used = motion.used(settings)
+    if np.count_nonzero(used) < LEAST_SAMPLES:
+        raise DataError(
+            f"{raw.path}: {motion.speed_name}: {np.count_nonzero(used)} of {len(used)} samples are faster than "
+            f"{settings.speed_min_radps:g} rad/s and otherwise usable: at least {LEAST_SAMPLES} are needed",
+            "--speed-min, --acceleration-max",
+        )
+    top = float(np.max(np.abs(motion.velocity_radps[used])))
+    if top > _TOP_SPEED_radps:
+        raise DataError(f"{raw.path}: {motion.speed_name}: reaches {top:.4g} rad/s of the joint: unit or side is wrong")
+    if motion.load_Nm is None or float(np.ptp(motion.load_Nm[used])) == 0.0:
+        return
+    load = motion.load_Nm[used] - np.mean(motion.load_Nm[used])
+    factor = float(load @ motion.torque_Nm[used] / (load @ load))
+    # friction spoils the factor; where the load decides on the torque it is small against the ratio
+    share = float(np.corrcoef(load, motion.torque_Nm[used])[0, 1] ** 2)
+    for wrong in (raw.ratio, 1.0 / raw.ratio):
+        if share > 0.5 and abs(np.log(abs(factor) / wrong)) < _SIDE_TOLERANCE:
+            raise raw.problem(
+                "torque", f"goes with {factor:.4g} times {raw.names['load']}, near the ratio (={raw.ratio:g}) or its "
+                "inverse: one of them is at the motor, the other at the joint",
+            )  # fmt: skip
