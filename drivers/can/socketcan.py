@@ -27,11 +27,11 @@ _SOL_CAN_RAW = 101
 _LONGEST_NAME = 15
 
 
-def up_command(channel: str) -> str:
-    """The command that sets up an interface at 1 Mbit/s; a virtual one has no bit rate."""
+def up_command(channel: str, bitrate_bitps: int | None = None) -> str:
+    """The command that sets up an interface, at 1 Mbit/s unless another rate is given; a virtual one has none."""
     if channel.startswith("vcan"):
         return f"sudo ip link add {channel} type vcan; sudo ip link set {channel} up"
-    return f"sudo ip link set {channel} up type can bitrate 1000000"
+    return f"sudo ip link set {channel} up type can bitrate {bitrate_bitps or 1_000_000}"
 
 
 def open_socket(channel: str) -> socket.socket:
@@ -137,7 +137,7 @@ def link_problem(link: LinkState, bitrate_bitps: int | None = None) -> tuple[str
     if link.transmit_errors is not None:
         counters = f" (transmit errors {link.transmit_errors}, receive errors {link.receive_errors})"
     if not link.up:
-        return f"CAN interface {name} is down", up_command(name)
+        return f"CAN interface {name} is down", up_command(name, bitrate_bitps)
     if link.state == "BUS-OFF":
         return (
             f"CAN interface {name} is bus-off{counters}: too many of its frames failed",

@@ -237,7 +237,7 @@ def interface_state(config: Config) -> Iterator[Finding]:
                 "interface", NOTE, f"{name} exists, its state is unknown", "install iproute2 (the program ip)"
             )
         else:
-            remedy = f"plug it in, then: {up_command(name)}"
+            remedy = f"plug it in, then: {up_command(name, config.bus.bitrate_bitps)}"
             yield Finding("interface", PROBLEM, f"there is no CAN interface {name}", remedy)
         return
     problem = link_problem(link, config.bus.bitrate_bitps)
