@@ -26,9 +26,14 @@ from jointctl.hil.plant import plant
 from jointctl.hil.realtime_device import ENDED_WORD, SEND_ERRORS_WORD, STOP_WORD, WORDS, RealtimeDevice
 from jointctl.hil.virtual_bus import VirtualBusError, VirtualBusHub, default_socket_path
 from jointctl.tools.child_process import Starting
-from jointctl.tools.configuration.canopen import canopen_section, eds_path
+from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.plant_settings import device_settings, fault_constants, plant_settings
+from jointctl.tools.configuration.plant_settings import (
+    VIRTUAL_EDS,
+    device_settings,
+    fault_constants,
+    plant_settings,
+)
 
 _POLL_S = 0.1
 _LONGEST_WAIT_NS = 2_000_000  # timers and the plant move on at least this often
@@ -120,11 +125,11 @@ class PumpedDevice:
 
 
 def new_device(config: Config) -> Cia402Device:
-    """The drive with its plant, as the configuration says that the joint truly is."""
+    """The drive with its plant, as the configuration says that the joint truly is, and with the objects of its EDS."""
     constants, state = plant(**plant_settings(config))
     try:
-        return Cia402Device(eds_path(config), device_settings(config), constants, state, fault_constants(config))
-    except ValueError as error:  # what the EDS file must hold for a virtual drive
+        return Cia402Device(VIRTUAL_EDS, device_settings(config), constants, state, fault_constants(config))
+    except (ValueError, OverflowError) as error:  # what the EDS file must hold for a virtual drive
         raise ConfigurationError(
             f"drive.eds (={canopen_section(config).eds}) does not make a virtual drive: {error}"
         ) from None

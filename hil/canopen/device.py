@@ -7,6 +7,7 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 
+import canopen
 import numpy as np
 
 from jointctl.firmware_py.schema import dtype_of, new
@@ -44,6 +45,7 @@ class DeviceSettings:
     second_counts_prad: float = 0.0  # of 60E4:1, on the joint, with the sign of its direction
     second_offset_counts: float = 0.0
     encoder: EncoderSettings | None = None  # an encoder node on the joint
+    shown: canopen.ObjectDictionary | None = None  # the objects of another drive, see `ObjectDictionary`
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -107,7 +109,7 @@ class Cia402Device:
         self.device = new(Device)
         self.queue = new(FrameQueue)
         self._frame = np.zeros(FRAME_SIZE, np.uint8)
-        self.objects = ObjectDictionary(eds_path, settings.node_id, self.device)
+        self.objects = ObjectDictionary(eds_path, settings.node_id, self.device, settings.shown)
         self._configure()
         self.parameters = ParameterStore(self.objects, settings.parameter_file)
         self.objects.restore_strings()

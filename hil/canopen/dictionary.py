@@ -6,7 +6,7 @@ import json
 import os
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 from canopen.objectdictionary import ODVariable
 
 from jointctl.firmware_py.schema import dtype_of
-from jointctl.hil.canopen.records import EVENT_DRIVEN, FIELDS, LAST_SYNCHRONOUS, Device, PowerState
+from jointctl.hil.canopen.records import EVENT_DRIVEN, FIELDS, LAST_SYNCHRONOUS, MAPPED, PDOS, Device, PowerState
 
 # --- The object dictionary of the virtual drive: what the EDS states, laid over the memory of the compiled core ---
 # The EDS alone says what exists, its type, access, limits, default and PDO-mappability.  An object that the core uses
@@ -24,6 +24,8 @@ from jointctl.hil.canopen.records import EVENT_DRIVEN, FIELDS, LAST_SYNCHRONOUS,
 
 
 _TYPES = {1: "u1", 2: "i1", 3: "<i2", 4: "<i4", 5: "u1", 6: "<u2", 7: "<u4"}
+_OTHER_TYPES = {0x15: "<i8", 0x1B: "<u8"}  # of another drive's EDS; the core has none of them
+_BYTES = {8: 4, 0x10: 3, 0x11: 8, 0x12: 5, 0x13: 6, 0x14: 7, 0x16: 3, 0x18: 5, 0x19: 6, 0x1A: 7}  # kept as they come
 _VISIBLE_STRING = 9
 
 TOGGLE_ERROR = 0x05030000
@@ -65,7 +67,7 @@ class SdoAbort(Exception):
 
 @dataclass(frozen=True)
 class Entry:
-    """One (index, sub) as the EDS describes it; `dtype` is None for a string."""
+    """One (index, sub) as the EDS describes it; `dtype` is None for a string or bytes."""
 
     index: int
     sub: int
@@ -99,19 +101,42 @@ def load_entries(eds_path: Path, node_id: int) -> dict[tuple[int, int], Entry]:
                     f"{eds_path.name}: DataType of {key[0]:04X}:{key[1]} (={variable.data_type}) must be in "
                     f"{sorted(_TYPES)} or {_VISIBLE_STRING}"
                 )
-            name = _TYPES.get(variable.data_type)
-            entries[key] = Entry(
-                *key,
-                name=variable.name,
-                dtype=np.dtype(name) if name else None,
-                readable=variable.readable,
-                writable=variable.writable,
-                mappable=bool(variable.pdo_mappable),
-                default=variable.default if variable.default is not None else (0 if name else ""),
-                low=variable.min,
-                high=variable.max,
-            )
+            entries[key] = _entry(variable)
     return entries
+
+
+def _entry(variable: ODVariable) -> Entry:
+    name = {**_TYPES, **_OTHER_TYPES}.get(variable.data_type or 0)
+    return Entry(
+        variable.index,
+        variable.subindex,
+        name=variable.name,
+        dtype=np.dtype(name) if name else None,
+        readable=variable.readable,
+        writable=variable.writable,
+        mappable=bool(variable.pdo_mappable),
+        default=variable.default if variable.default is not None else (0 if name else ""),
+        low=variable.min,
+        high=variable.max,
+    )
+
+
+def _foreign_entry(variable: ODVariable, own: Entry | None) -> Entry:
+    """An object of another drive's EDS.  Where that leaves the default open, `own` has it.
+
+    Many files give 0 as the default of everything: for a drive object (6000h and above) it counts as left open.
+    Limits below 2000h are the standard's: files have them wrong (1016:1 up to 65535, without the node).
+    """
+    entry = _entry(variable)
+    if own is not None and entry.index < 0x2000:
+        entry = replace(entry, low=own.low, high=own.high)
+    if entry.dtype is None:
+        size = _BYTES.get(variable.data_type or 0)
+        return replace(entry, default=str(entry.default) if size is None else "\0" * size)
+    left_open = variable.default is None or (entry.default == 0 and entry.index >= 0x6000)
+    if left_open and own is not None and own.dtype is not None:
+        return replace(entry, default=own.default)
+    return entry
 
 
 def split_field(field: str) -> tuple[str, int]:
@@ -134,9 +159,16 @@ def field_view(memory: np.recarray, path: tuple[str, ...], field: str) -> np.nda
 
 
 class ObjectDictionary:
-    """Values of all objects of one device; `memory` is its `Device` record array of one element."""
+    """Values of all objects of one device; `memory` is its `Device` record array of one element.
 
-    def __init__(self, eds_path: Path, node_id: int, memory: np.recarray) -> None:
+    `shown` are the objects of another drive: SDO and mappings know those and no others.  What the core has of them
+    lives in `memory`, the rest is stored and read back and does nothing; what `shown` lacks works on unseen, with the
+    defaults of the EDS.
+    """
+
+    def __init__(
+        self, eds_path: Path, node_id: int, memory: np.recarray, shown: canopen.ObjectDictionary | None = None
+    ) -> None:
         self._take_entries(load_entries(eds_path, node_id))
         for key, field in FIELDS.items():
             if key not in self.entries:
@@ -155,6 +187,8 @@ class ObjectDictionary:
             except (ValueError, OverflowError):
                 place, kind = f"{key[0]:04X}:{key[1]}", self._live[key].dtype
                 raise ValueError(f"{eds_path.name}: DefaultValue of {place} (={default}) must be a {kind}") from None
+        if shown is not None:
+            self._show(shown)
         self.restore_strings()
 
     def _take_entries(self, entries: dict[tuple[int, int], Entry]) -> None:
@@ -164,6 +198,36 @@ class ObjectDictionary:
         self._initial: dict[tuple[int, int], np.ndarray] = {}
         self._strings: dict[tuple[int, int], bytes] = {}
         self._default_strings = {k: str(e.default).encode() for k, e in entries.items() if e.dtype is None}
+
+    def _show(self, shown: canopen.ObjectDictionary) -> None:
+        """Replace the entries by those of another drive; the core's objects keep their memory."""
+        own, live, initial = self.entries, self._live, self._initial
+        variables = [v for item in shown.values() for v in ([item] if isinstance(item, ODVariable) else item.values())]
+        entries = {(v.index, v.subindex): _foreign_entry(v, own.get((v.index, v.subindex))) for v in variables}
+        self._take_entries(entries)
+        self._live, self._initial = live, initial
+        for key, entry in entries.items():
+            if entry.dtype is None:
+                live.pop(key, None)
+                initial.pop(key, None)
+            elif key in live and live[key].dtype.itemsize == entry.size:
+                live[key], initial[key] = live[key].view(entry.dtype), initial[key].view(entry.dtype)
+                initial[key][0] = entry.default
+            else:
+                live.pop(key, None)
+                initial.pop(key, None)
+                self._default_strings[key] = np.array(entry.default, entry.dtype).tobytes()
+        self._drop_odd_mappings()
+
+    def _drop_odd_mappings(self) -> None:
+        """A PDO of the file that the core cannot pack (too long, bits, too many objects) begins with nothing mapped."""
+        for index in (base + pdo for base in (0x1600, 0x1A00) for pdo in range(PDOS)):
+            count = self._initial.get((index, 0))
+            if count is None:
+                continue
+            bits = [int(self._initial[index, sub][0]) & 0xFF for sub in range(1, min(int(count[0]), MAPPED) + 1)]
+            if count[0] > MAPPED or sum(bits) > 64 or any(size % 8 for size in bits):
+                count[0] = 0
 
     def __iter__(self) -> Iterator[Entry]:
         return iter(self.entries.values())
@@ -179,8 +243,10 @@ class ObjectDictionary:
         """Change what a reset restores (settings of the device); the present value changes at the next reset."""
         if isinstance(value, bytes):
             self._default_strings[index, sub] = value
-        else:
+        elif (index, sub) in self._initial:
             self._initial[index, sub][0] = value
+        else:
+            self._default_strings[index, sub] = np.array(value, self.entries[index, sub].dtype).tobytes()
 
     def default(self, index: int, sub: int) -> int | bytes:
         """What a reset restores."""
@@ -194,7 +260,13 @@ class ObjectDictionary:
     def value(self, index: int, sub: int) -> int:
         """Present value of a number, whatever its access."""
         live = self._live.get((index, sub))
-        return int(live[0]) if live is not None else int(self.entry(index, sub).default)
+        if live is not None:
+            return int(live[0])
+        entry = self.entry(index, sub)
+        stored = self._strings.get((index, sub))
+        if stored is not None and entry.dtype is not None:
+            return int(np.frombuffer(stored, entry.dtype)[0])
+        return int(entry.default)
 
     def read(self, index: int, sub: int) -> bytes:
         """What an SDO upload gives."""
@@ -228,7 +300,7 @@ class ObjectDictionary:
         if (index, sub) in self._live:
             live = self._live[index, sub]
             live[0] = np.frombuffer(data, live.dtype)[0]
-        elif self.entries[index, sub].dtype is None:
+        elif (index, sub) in self._strings:
             self._strings[index, sub] = data
 
 
@@ -295,7 +367,7 @@ def _check_mapping(objects: ObjectDictionary, index: int, sub: int, value: int) 
     if not objects.value(index - 0x200, 1) & _INVALID:
         raise SdoAbort(UNSUPPORTED_ACCESS)
     if sub == 0:
-        if (index, value) not in objects.entries:
+        if value > MAPPED or (index, value) not in objects.entries:
             raise SdoAbort(PDO_LENGTH)
         bits = sum(_check_entry(objects, objects.value(index, i + 1), received) for i in range(value))
         if bits > 64:
@@ -340,7 +412,8 @@ def check_write(objects: ObjectDictionary, index: int, sub: int, value: int, pow
         if objects.value(0x1006, 0):
             raise SdoAbort(DEVICE_STATE)
     elif index in _VALUES:
-        if value not in _VALUES[index]:
+        # a mode of another drive's EDS must also be in its 6502
+        if value not in _VALUES[index] or (index == 0x6060 and value and not objects.value(0x6502, 0) >> value - 1 & 1):
             raise SdoAbort(INVALID_VALUE)
     elif index in (0x6075, 0x6076) and power_state >= PowerState.OPERATION_ENABLED:
         # rescaling a running torque would step it
@@ -377,7 +450,7 @@ class ParameterStore:
             self._saved = {}
             for text, value in stored.items():
                 index, sub = (int(part, 16) for part in text.split(":"))
-                data = value.encode() if isinstance(value, str) else int(value)
+                data = value.encode("latin-1") if isinstance(value, str) else int(value)
                 if (index, sub) not in self._factory or type(data) is not type(self._factory[index, sub]):
                     raise ValueError(f"{text} (={value}) is not a parameter of this drive")
                 self._objects.set_default(index, sub, data)
@@ -415,7 +488,7 @@ class ParameterStore:
         if self._path is None:
             return
         texts = {
-            f"{index:04X}:{sub:X}": value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+            f"{index:04X}:{sub:X}": value.decode("latin-1") if isinstance(value, bytes) else value
             for (index, sub), value in saved.items()
         }
         new = self._path.with_name(self._path.name + ".new")

@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from jointctl.drivers.canopen.eds import read_eds
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.schema import new
 from jointctl.hil.canopen.device import DeviceSettings
 from jointctl.hil.canopen.encoder_node import EncoderSettings
 from jointctl.hil.fault_kinds import FaultConstants, FaultKind, no_faults
 from jointctl.hil.plant_records import EncoderSide, FrictionKind, PlantSettings
-from jointctl.tools.configuration.canopen import canopen_section, encoder_eds_path
-from jointctl.tools.configuration.config import Config, raise_if
+from jointctl.tools.configuration.canopen import canopen_section, eds_path, encoder_eds_path
+from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config, raise_if
 from jointctl.tools.configuration.conversions import friction_constants, torque_constant_NmpA
 from jointctl.tools.configuration.sections import OWN_KEYS, Virtual
 
+VIRTUAL_EDS = SHIPPED_FOLDER / "virtual_joint.eds"  # what the virtual drive is, whatever objects it shows
 DEFAULT_RATED_CURRENT_A = 5.0
 DEFAULT_RATED_TORQUE_NM = 0.5
 
@@ -75,8 +77,11 @@ def plant_settings(config: Config) -> dict[str, Any]:
 
 
 def device_settings(config: Config) -> DeviceSettings:
-    """The virtual drive that the configuration describes."""
+    """The virtual drive that the configuration describes, with the objects and the identity of its EDS."""
     drive = canopen_section(config)
+    path = eds_path(config)
+    eds = None if path.resolve() == VIRTUAL_EDS else read_eds(path, drive.node)
+    vendor_id, product_code = (eds.vendor_id, eds.product_code) if eds is not None else (None, None)
     return DeviceSettings(
         node_id=drive.node,
         rated_current_mA=round((drive.rated_current_A or DEFAULT_RATED_CURRENT_A) * 1000.0),
@@ -84,8 +89,9 @@ def device_settings(config: Config) -> DeviceSettings:
         reduction_ratio=config.joint.reduction_ratio,
         motor_torque_constant_NmpA=torque_constant_NmpA(config),
         torque_direction=drive.torque_direction,
-        vendor_id=drive.vendor_id or 0,
-        product_code=drive.product_code or 1,
+        vendor_id=drive.vendor_id or vendor_id or 0,
+        product_code=drive.product_code or product_code or 1,
+        shown=eds.dictionary if eds is not None else None,
         **_second_encoder(config),
     )
 

@@ -8,11 +8,13 @@ import select
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.output import Output
 from jointctl.tools.scoping.remote_options import NOBODY, ObserveOptions
 from jointctl.tools.verbs.verb_options import BusOptions, ConfigPath, ProgressOutput, loaded
@@ -22,6 +24,19 @@ if TYPE_CHECKING:
     from jointctl.tools.session.control import StopSignals
 
 _POLL_S = 0.05
+
+
+@dataclass(frozen=True)
+class ModelOptions:
+    """What the virtual drive and its bus are like."""
+
+    timing: Annotated[bool, typer.Option("--timing", help="model bit times and arbitration")] = False
+    eds: Annotated[
+        Path | None, typer.Option("--eds", help="EDS of another drive: the virtual one gets its objects and identity")
+    ] = None
+
+
+AS_IT_IS = ModelOptions()
 _STATES_S = 0.01  # between two joint states
 
 
@@ -31,7 +46,7 @@ def hil(
     bus: BusOptions,
     serial: Annotated[bool, typer.Option("--serial", help="the virtual serial drive instead of the CAN bus")] = False,
     link: Annotated[str | None, typer.Option("--link", help="serial drive: path of a link to its port")] = None,
-    timing: Annotated[bool, typer.Option("--timing", help="model bit times and arbitration")] = False,
+    model: ModelOptions = AS_IT_IS,
     ready_fd: Annotated[int | None, typer.Option("--ready-fd", hidden=True)] = None,
     live: ObserveOptions = NOBODY,
     output: ProgressOutput,
@@ -40,7 +55,19 @@ def hil(
     from jointctl.tools.verbs.bench_drive import ServeOptions, bench_of
 
     joint = loaded(Path("elmo_serial") if serial and config == Path("virtual") else config, bus)
-    return bench_of(joint).serve(joint, output, ServeOptions(timing, serial, bus.port, link, ready_fd, live))
+    if model.eds is not None:
+        joint = with_eds(joint, model.eds)
+    return bench_of(joint).serve(joint, output, ServeOptions(model.timing, serial, bus.port, link, ready_fd, live))
+
+
+def with_eds(config: Config, eds: Path) -> Config:
+    """The joint whose drive has the objects of that file; an object of the maker's own cannot be looked up in it."""
+    from jointctl.tools.configuration.canopen import canopen_section
+
+    if not eds.is_file():
+        raise ConfigurationError(f"--eds (={eds}) must name a file")
+    drive = canopen_section(config).model_copy(update={"eds": str(eds.resolve()), "temperature_object": None})
+    return config.model_copy(update={"drive": drive})
 
 
 def serve_can(
