@@ -21,6 +21,7 @@ from jointctl.firmware_py.input_file import (
 from jointctl.tools.configuration.checks import problems_between_sections
 from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config, ConfigurationProblems, problem_lines, raise_if
 from jointctl.tools.configuration.drive_section import GivenPlace, completed
+from jointctl.tools.configuration.units import with_units
 
 
 def shipped_config(name: str) -> Path:
@@ -76,8 +77,9 @@ def load_config(path: str | Path) -> Config:
     except tomllib.TOMLDecodeError as error:
         raise ConfigurationError(f"{path}: not valid TOML: {error}") from None
     data, remarks = renamed(data)
+    data, converted = with_units(data)
     config = _validated(data, str(path))
-    config._path, config._text, config._remarks = path, text, remarks
+    config._path, config._text, config._remarks = path, text, (*remarks, *converted)
     raise_if([f"{path}: {line}" for line in problems_between_sections(config)])
     table = (("trajectory.file", config.table_path),) if config.table_path is not None else ()
     for key, file in (*config.drive.files(config), *table):
