@@ -106,6 +106,9 @@ class CanopenSection(DriveSection):
     def free_of_torque_limit(self) -> CanopenSection:
         return self.model_copy(update={"max_torque_permille": None})
 
+    def motor_current(self) -> tuple[str, float] | None:
+        return None if self.rated_current_A is None else ("drive.rated_current_A", self.rated_current_A)
+
     def constants_factor(self, config: Config) -> tuple[float, str] | None:
         """Torque constant times rated current over rated torque."""
         if self.rated_torque_Nm is None or self.rated_current_A is None:

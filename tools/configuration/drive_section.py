@@ -72,6 +72,10 @@ class DriveSection(Section, ABC):
         """Period of the heartbeat that the drive itself sends; None: it sends none."""
         return None
 
+    def motor_current(self) -> tuple[str, float] | None:
+        """The current that the drive is set up for [A], with its key; None where the configuration does not have it."""
+        return None
+
     @abstractmethod
     def assumed_delay(self, config: Config) -> tuple[float, str]:
         """The loop delay [s] where none is measured or configured, and why."""

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError, DeviceError
+from jointctl.tools.configuration.checks import rated_contradiction
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
 
-DOUBTFUL_FACTOR = 1.25  # motors are rated at a speed, where losses take part of the torque
 WRONG_FACTOR = 3.0
 
 
@@ -36,10 +36,7 @@ def require_torque(report: CommissioningReport) -> None:
 
 def constant_remarks(config: Config) -> list[str]:
     """What the user should look at before the joint moves."""
-    found = config.drive.constants_factor(config)
-    if found is None or 1.0 / DOUBTFUL_FACTOR <= found[0] <= DOUBTFUL_FACTOR:
-        return []
-    return [found[1] + "; friction would be wrong by that factor"]
+    return [line + "; friction would be wrong by that factor" for line in rated_contradiction(config)]
 
 
 def recorded_limits(config: Config) -> dict[str, float]:

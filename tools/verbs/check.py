@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from jointctl.tools.analysis.linear_loop import LoopSettings
     from jointctl.tools.analysis.loop_settings import Assumption
     from jointctl.tools.analysis.margin_gate import Remedy
-    from jointctl.tools.analysis.margins import Margins, Theory
+    from jointctl.tools.analysis.margins import Convergence, Margins, Theory
     from jointctl.tools.configuration.config import Config
 
 
@@ -33,6 +33,7 @@ def check(
     from jointctl.tools.analysis.loop_settings import loop_settings, not_modelled, outside_payload_range
     from jointctl.tools.analysis.margin_gate import learning_of, meets, refusal, refuse_diverging_learning, remedies
     from jointctl.tools.analysis.margins import margins, theory
+    from jointctl.tools.configuration.checks import contradictions
     from jointctl.tools.drawing import require_png
     from jointctl.tools.verbs.bench_drive import bench_of
 
@@ -51,7 +52,7 @@ def check(
     table = _table(analysis)
     for row in drive.check_rows(config):
         table.add_row(*row)
-    learning = learning_of(config, settings)
+    learning, warnings = learning_of(config, settings), contradictions(config)
     if learning is not None:
         value = f"factor {learning.worst_factor:.2f} at {learning.worst_Hz:.1f} Hz"
         table.add_row("learning", value, "what is left to learn after one repetition, below 1 it converges")
@@ -62,7 +63,10 @@ def check(
 
         save_loop_figure(settings, figure, config.path.name, minimum_deg)
         table.add_row("picture", str(figure), "")
-    output.result(table, _data(analysis, figure), analysis)
+    data = {**_data(analysis, figure), "learning": learning_data(learning), "warnings": warnings}
+    output.result(table, data, analysis)
+    for text in warnings:
+        output.warning(text)
     for text in not_modelled(config):
         output.note(f"not in this analysis: {text}")
     for text in outside_payload_range(config, settings):
@@ -81,6 +85,11 @@ def _add_gains(table: Table, config: Config, settings: LoopSettings) -> None:
     value = ", ".join(f"{name} = {number:g}" for name, number in gains.changes().items())
     note = f"largest |S| {gains.largest_s:.2f} over all joints, torque noise {gains.noise_Nm:.2f} Nm"
     table.add_row("chosen gains", value, note)
+
+
+def learning_data(learning: Convergence | None) -> dict[str, float] | None:
+    """For --json: what is left to learn after one repetition, below 1 it converges; None without learning."""
+    return None if learning is None else {"worst_factor": learning.worst_factor, "worst_Hz": learning.worst_Hz}
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,7 @@ from jointctl.tools.verbs.study import study_verb
 from jointctl.tools.verbs.sweep import sweep
 from jointctl.tools.verbs.validate import validate
 from jointctl.tools.verbs.verb_options import BEGIN, COMPARE, FRICTION, INSPECT, LOOK, MOVE, grouped
+from jointctl.tools.verbs.zero import zero
 
 TRACEBACK = "JOINTCTL_TRACEBACK"  # in the environment: show where an unexpected error comes from
 EPILOG = (
@@ -72,7 +73,7 @@ def callback(
 
 
 for _panel, _verbs in (
-    (BEGIN, (demo, new, hil, doctor)),
+    (BEGIN, (demo, new, zero, hil, doctor)),
     (MOVE, (run, stop, clear_fault, check)),
     (INSPECT, (scan, info, monitor)),
     (FRICTION, (sweep, identify, validate)),

@@ -57,6 +57,21 @@ def test_the_paper_on_its_platform_passes_and_everything_is_printed() -> None:
     assert 'control.feed_forward = "measured"' in messages
 
 
+def test_learning_and_contradictions_are_in_the_json_too() -> None:
+    shown, messages, _ = run_check(shipped("precise"), json=True)
+    found = json.loads(shown)
+    assert 0.0 < found["learning"]["worst_factor"] < 1.0
+    assert found["learning"]["worst_Hz"] > 0.0
+    assert found["warnings"] == []
+    assert "warning" not in messages
+    shown, messages, code = run_check(shipped("virtual", joint__torque_constant_NmpA=20.0), json=True)
+    found = json.loads(shown)
+    assert found["learning"] is None
+    assert any("joint.torque_constant_NmpA (=20" in line for line in found["warnings"])
+    assert "warning: joint.torque_constant_NmpA" in messages
+    assert code == 0
+
+
 @pytest.mark.parametrize("name", ["virtual", "paper"])
 def test_every_shipped_virtual_configuration_has_its_margin(name: str) -> None:
     found = require_margin(shipped(name))

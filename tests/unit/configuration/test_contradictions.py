@@ -1,0 +1,82 @@
+"""Constants that are each in range and contradict each other: one warning, dense at its boundary."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from jointctl.tools.configuration.checks import contradictions, trajectory_acceleration
+from tests.configurations import changed, shipped
+
+VIRTUAL = shipped()
+NO_RATED = {"drive__rated_current_A": None, "drive__rated_torque_Nm": None}
+
+
+def lines(**changes: Any) -> str:
+    return "\n".join(contradictions(changed(VIRTUAL, **changes)))
+
+
+@pytest.mark.parametrize("name", ["virtual", "precise", "paper", "sweep_virtual", "elmo_serial"])
+def test_what_is_shipped_contradicts_nothing(name: str) -> None:
+    assert contradictions(shipped(name)) == []
+
+
+def test_a_torque_constant_of_another_world() -> None:
+    assert "is 0.00496 A of the motor" in lines(joint__torque_constant_NmpA=100.0, **NO_RATED)
+
+
+@pytest.mark.parametrize(
+    ("current_A", "rated_A", "warned"),
+    [(0.0201, None, False), (0.0199, None, True), (299.0, None, False), (301.0, None, True),
+     (0.101, 5.0, False), (0.099, 5.0, True), (49.9, 5.0, False), (50.1, 5.0, True)],
+)  # fmt: skip
+def test_the_current_that_the_torque_limit_asks_for(current_A: float, rated_A: float | None, warned: bool) -> None:
+    joint = VIRTUAL.joint
+    limit = current_A * joint.torque_constant_NmpA * joint.reduction_ratio
+    text = lines(
+        limits__torque_max_Nm=limit, drive__rated_current_A=rated_A, drive__rated_torque_Nm=None,
+        joint__inertia_kgm2=1e-3 * limit, joint__gravity_Nm=0.0, sequence__brake_radps2=1e-3,
+    )  # fmt: skip
+    assert ("limits.torque_max_Nm" in text) is warned
+    assert not warned or rated_A is None or "times drive.rated_current_A (=5)" in text
+
+
+@pytest.mark.parametrize(("factor", "warned"), [(1.24, False), (1.26, True), (0.81, False), (0.79, True)])
+def test_rated_values_and_torque_constant(factor: float, warned: bool) -> None:
+    assert ("drive.rated_torque_Nm" in lines(drive__rated_torque_Nm=0.5 / factor)) is warned
+
+
+@pytest.mark.parametrize(("share", "warned"), [(0.99, False), (1.01, True)])
+def test_braking_and_motion_need_less_than_the_torque_limit(share: float, warned: bool) -> None:
+    limits, sequence = VIRTUAL.limits, VIRTUAL.sequence
+    heavy = share * limits.torque_max_Nm / sequence.brake_radps2
+    assert ("times sequence.brake_radps2" in lines(joint__inertia_kgm2=heavy)) is warned
+    acceleration = trajectory_acceleration(VIRTUAL.trajectory)
+    assert acceleration is not None
+    text = lines(joint__inertia_kgm2=share * limits.torque_max_Nm / acceleration)
+    assert ("the trajectory's largest acceleration" in text) is warned
+    text = lines(joint__inertia_kgm2=heavy, joint__gravity_Nm=-limits.torque_max_Nm * 0.02)
+    assert "times sequence.brake_radps2" in text
+
+
+@pytest.mark.parametrize(("share", "warned"), [(1.01, False), (0.99, True)])
+def test_an_inertia_that_is_the_motors(share: float, warned: bool) -> None:
+    limits = VIRTUAL.limits
+    light = share * limits.torque_max_Nm / VIRTUAL.loop.rate_Hz / limits.velocity_max_radps
+    assert ("without the ratio squared?" in lines(joint__inertia_kgm2=light)) is warned
+
+
+def test_largest_accelerations() -> None:
+    class Motion:
+        kind = "min_jerk"
+        start_rad, target_rad, move_s = 0.0, 0.1, 3.0
+
+    times = [3.0 * k / 10000 for k in range(10001)]
+    quintic = [0.1 / 9.0 * (60 * s - 180 * s**2 + 120 * s**3) for s in (t / 3.0 for t in times)]
+    assert trajectory_acceleration(Motion()) == pytest.approx(max(quintic), rel=1e-4)
+    sine = VIRTUAL.trajectory
+    assert sine.kind == "sine"
+    expected = sine.amplitude_rad * (math.tau * sine.frequency_Hz) ** 2
+    assert trajectory_acceleration(sine) == pytest.approx(expected)

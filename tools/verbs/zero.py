@@ -1,0 +1,138 @@
+"""`jointctl zero CONFIG`: where the joint stands now becomes its angle 0, or another one; the drive is only read.
+
+The zero lives in the configuration (`zero_counts`), not in the drive: no object is written, so no other program's
+homing is disturbed, and the old value is in the file's history.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from jointctl.drivers.errors import DECLINED, ConfigurationError, DeviceError
+from jointctl.tools.verbs.verb_options import JointOnBus, VerbOutput
+
+if TYPE_CHECKING:
+    from jointctl.tools.configuration.config import Config
+    from jointctl.tools.inspection.subject import SdoReader
+
+POSITION, ENCODER_POSITION = (0x6064, 0), (0x6004, 0)
+_APART_S = 0.2  # two readings, to see that the joint stands
+_NOISE_COUNTS = 8  # of a joint at rest
+
+
+@dataclass(frozen=True)
+class Zero:
+    """One encoder: its present reading, and its zero before and after."""
+
+    section: str
+    counts: int
+    before: int
+    after: int
+    rad_per_count: float
+
+    @property
+    def angle_rad(self) -> float:
+        """The angle here, with the zero as it was."""
+        return (self.counts - self.before) * self.rad_per_count
+
+
+def zero(
+    config: JointOnBus,
+    output: VerbOutput,
+    *,
+    angle_rad: Annotated[float, typer.Option("--angle", help="rad that the joint shall have where it stands")] = 0.0,
+    assume_yes: Annotated[bool, typer.Option("-y", "--yes", help="write without asking")] = False,
+) -> int:
+    """Set the joint's zero: the angle here becomes 0, or --angle.  Moves nothing, writes the configuration only."""
+    from jointctl.tools.configuration.config import SHIPPED_FOLDER
+    from jointctl.tools.configuration.load import load_config, read_text
+    from jointctl.tools.configuration.template import filled
+    from jointctl.tools.session.consent import agreed, require_terminal
+    from jointctl.tools.written_file import replace_file
+
+    if config.path.resolve().is_relative_to(SHIPPED_FOLDER):
+        raise ConfigurationError(
+            f"{config.path.name} is a shipped configuration and is not changed",
+            f"`jointctl new mine.toml --from {config.path.stem}` makes it yours",
+        )
+    if not -math.tau * 100.0 <= angle_rad <= math.tau * 100.0:
+        raise ConfigurationError(f"--angle (={angle_rad:g}) must be in [-628..628] rad")
+    if not assume_yes:
+        require_terminal("this changes where the limits are and there is no terminal to ask on", "give -y")
+    found = _readings(config, angle_rad)
+    for each in found:
+        output.note(f"[{each.section}] zero_counts {each.before} -> {each.after} (it reads {each.counts})")
+        output.note(f"  the angle here {each.angle_rad:+.4f} rad -> {angle_rad:+.4f} rad")
+    moved_rad = found[0].angle_rad - angle_rad
+    limits = config.limits
+    output.note(
+        f"limits.position_*_rad stay {limits.position_min_rad:+.4f} .. {limits.position_max_rad:+.4f} rad: at the "
+        f"joint that is {moved_rad:+.4f} rad from where they were, {limits.position_min_rad - angle_rad:+.4f} .. "
+        f"{limits.position_max_rad - angle_rad:+.4f} rad from here"
+    )
+    data = {
+        "angle_before_rad": found[0].angle_rad, "angle_after_rad": angle_rad,
+        "zero_counts": {each.section: {"before": each.before, "after": each.after} for each in found},
+    }  # fmt: skip
+    if not (assume_yes or agreed(output, f"Write {config.path}?")):
+        output.note("nothing was changed")
+        return DECLINED
+    text = filled(read_text(config.path), {(each.section, "zero_counts"): each.after for each in found})
+
+    def loads(path: object) -> None:
+        written = load_config(str(path))
+        if written.encoder.zero_counts != found[0].after:
+            raise ConfigurationError(f"{config.path}: encoder.zero_counts is written in a way that is not understood")
+
+    replace_file(config.path, text.encode(), loads)
+    output.result(f"{config.path}: the joint is at {angle_rad:+.4f} rad here", data)
+    return 0
+
+
+def _readings(config: Config, angle_rad: float) -> list[Zero]:
+    """Of [encoder] and, where it is there, [joint_encoder]; `DeviceError` if the joint moves."""
+    from jointctl.tools.configuration.canopen import canopen_section, encoder_eds_path
+    from jointctl.tools.configuration.conversions import joint_rad_per_count
+    from jointctl.tools.configuration.sections import index_and_sub
+    from jointctl.tools.inspection.objects import Objects, read_dictionary
+    from jointctl.tools.inspection.subject import SdoReader, canopen_network, subject_of_config
+
+    node, second = canopen_section(config).node, config.joint_encoder
+    places = [("encoder", node, POSITION, config.encoder.zero_counts, joint_rad_per_count(config))]
+    if second is not None:
+        of_drive = second.source == "drive" or second.node is None
+        place = index_and_sub(second.object) if of_drive else ENCODER_POSITION
+        scale = second.direction * math.tau / second.counts_per_turn
+        second_node = node if second.node is None or of_drive else second.node
+        places.append(("joint_encoder", second_node, place, second.zero_counts, scale))
+    with canopen_network(subject_of_config(config)) as network:
+        readers = {node: SdoReader(network, node)}
+        eds = encoder_eds_path(config)
+        if second is not None and second.node is not None and eds is not None:
+            readers[second.node] = SdoReader(network, second.node, Objects(read_dictionary(eds, second.node)))
+        first = [_counts(readers[number], *place) for _, number, place, _, _ in places]
+        time.sleep(_APART_S)
+        counts = [_counts(readers[number], *place) for _, number, place, _, _ in places]
+    for (section, *_, scale), before, after in zip(places, first, counts, strict=True):
+        travel = max(abs(after - before) - _NOISE_COUNTS, 0) * abs(scale)
+        if travel > config.limits.standstill_radps * _APART_S:
+            raise DeviceError(
+                f"the joint moves: [{section}] went from {before} to {after} in {_APART_S:g} s", "hold it"
+            )
+    return [
+        Zero(section, now, was, round(now - angle_rad / scale), scale)
+        for (section, _, _, was, scale), now in zip(places, counts, strict=True)
+    ]
+
+
+def _counts(reader: SdoReader, index: int, sub: int) -> int:
+    reader.require_answer()
+    value = reader.value(index, sub)
+    if not isinstance(value, int):
+        raise DeviceError(f"node {reader.node} does not tell its position ({index:04X}:{sub})")
+    return value
