@@ -185,6 +185,94 @@ def test_the_terminal_is_told_when_the_last_page_closes(bench: Any, browser: Bro
     assert bench.disabled()
 
 
+KEYS = {"Escape": (27, "Escape"), "Space": (32, " ")}
+# what every text has against what is behind it; WCAG 2.2, 1.4.3: 4.5, 3 for large or bold text
+CONTRASTS = """(() => {
+  const linear = v => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4
+  const light = c => { const [r, g, b] = c.map(v => linear(v / 255)); return 0.2126 * r + 0.7152 * g + 0.0722 * b }
+  const parts = text => (text.match(/[0-9.]+/g) || []).map(Number)
+  const filled = element => parts(getComputedStyle(element).backgroundColor)
+  const opaque = element => filled(element).length && filled(element)[3] !== 0
+  const poor = []
+  for (const element of document.querySelectorAll('.nicegui-content *')) {
+    const text = [...element.childNodes].filter(n => n.nodeType === 3).map(n => n.textContent.trim()).join('')
+    const style = getComputedStyle(element)
+    const hidden = !element.getClientRects().length || style.visibility === 'hidden'
+    if (!text || hidden || element.closest('[disabled], .disabled')) continue
+    let behind = element
+    while (behind && !opaque(behind)) behind = behind.parentElement
+    const back = behind ? filled(behind).slice(0, 3) : [255, 255, 255]
+    const pair = [light(parts(style.color).slice(0, 3)), light(back)].sort((a, b) => b - a)
+    const ratio = (pair[0] + 0.05) / (pair[1] + 0.05), large = parseFloat(style.fontSize) >= 24
+    if (ratio < (large ? 3 : 4.5)) poor.push(text.slice(0, 30) + ' ' + ratio.toFixed(2))
+  }
+  return poor.join('; ')
+})()"""
+
+
+def press(tab: Tab, key: str, *, held: int = 0) -> None:
+    code, text = KEYS[key]
+    event = {"code": key, "key": text, "windowsVirtualKeyCode": code}
+    tab.call("Input.dispatchKeyEvent", type="keyDown", **event)
+    for _ in range(held):
+        tab.call("Input.dispatchKeyEvent", type="keyDown", autoRepeat=True, **event)
+    tab.call("Input.dispatchKeyEvent", type="keyUp", **event)
+
+
+@pytest.mark.parametrize(("key", "focus"), [("Escape", "set-point"), ("Space", "record"), ("Space", "set-point")])
+def test_a_key_stops_from_anywhere(bench: Any, browser: Browser, key: str, focus: str) -> None:
+    _, tab, _ = opened(bench, browser)
+    start(tab)
+    tab.until("document.querySelector('[data-testid=\"beat\"]').textContent.endsWith('MOVES')")
+    tab.js(f"document.querySelector('[data-testid=\"{focus}\"]').focus(); null")
+    press(tab, key, held=3)
+    tab.until("document.querySelector('[data-testid=\"stop-word\"]').innerText.includes('STOP taken; again')")
+    state_is(tab, "the run has ended")
+    assert bench.disabled()
+    log = bench.log()
+    assert AxisPhase.QUICK_STOPPING not in set(log.records.phase.tolist())  # held down is pressed once
+    assert not any("recording" in event.text for event in log.events)  # the button under the key was not pressed
+
+
+def test_the_page_can_be_read_and_used_without_eyes_or_mouse(bench: Any, browser: Browser) -> None:
+    _, tab, _ = opened(bench, browser)
+    press(tab, "Space")  # nothing is under control yet: space is for the page's own
+    time.sleep(0.5)
+    state_is(tab, "ready; nothing moves")
+    assert tab.js("document.documentElement.lang") == "en-US"
+    heads = tab.js("[...document.querySelectorAll('[role=heading]')].map(h => h.getAttribute('aria-level')).join('')")
+    assert heads[0] == "1"
+    assert set(heads[1:]) == {"2"}
+    for name, role in (("state", "status"), ("stop-word", "alert"), ("stale", "alert"), ("events", "log")):
+        assert tab.js(f"document.querySelector('[data-testid=\"{name}\"]').getAttribute('role')") == role
+    assert tab.js("document.querySelectorAll('[role=main]').length") == 1
+    order = (
+        "[...document.querySelectorAll('button, input, [tabindex=\"0\"]')].filter(e => e.getClientRects().length)[0]"
+    )
+    assert tab.js(f"{order}.getAttribute('data-testid')") == "stop"
+    unnamed = """[...document.querySelectorAll('input, button')].filter(e => e.getClientRects().length && !(
+        e.innerText || e.getAttribute('aria-label') || e.title || e.labels && e.labels.length)).length"""
+    assert tab.js(unnamed) == 0
+    assert tab.js(CONTRASTS) == ""
+    tab.click("dark")
+    tab.until("document.body.classList.contains('body--dark')")
+    assert tab.js(CONTRASTS) == ""
+    start(tab)  # with the fields of a joint that is under way
+    tab.until("document.querySelector('[data-testid=\"apply\"]') !== null")
+    assert tab.js(CONTRASTS) == ""
+
+
+def test_a_refused_set_point_is_told_at_its_field(bench: Any, browser: Browser) -> None:
+    _, tab, _ = opened(bench, browser)
+    start(tab)
+    tab.enter("set-point", "9")
+    tab.click("go")
+    field = "document.querySelector('[data-testid=\"set-point\"]').closest('.q-field')"
+    tab.until(f"{field}.innerText.includes('must be in')")
+    tab.enter("set-point", "0.1")
+    tab.until(f"!{field}.innerText.includes('must be in')")
+
+
 def test_stop_before_start_ends_the_preparation(bench: Any, browser: Browser) -> None:
     _, tab, _ = opened(bench, browser)
     tab.click("stop")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import re
 import time
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
@@ -17,15 +19,19 @@ from jointctl.tools.session.display import ViewerRequest, viewer
 from jointctl.tools.session.events import fault_words, phase_name
 from jointctl.tools.session.session_drive import drive_state_name, session_drive
 
+HEADING = "role=heading aria-level=2"
+_PREFERS_DARK = "window.matchMedia('(prefers-color-scheme: dark)').matches"
+
 # --- STOP ---
 
 STOP_PATH = "/stop"
 ANSWER_s = 2.0
 STALE_s = 3.0
 NOT_TAKEN = "STOP DID NOT ARRIVE: Ctrl-C in the terminal, jointctl stop, or the emergency stop"
+STOP_KEYS = "Escape or space, from anywhere"
 STALE = "no news: what this page shows is old, and the joint may move"
 
-_PRESSED = """() => {
+_PRESSED = """window.jointctlStop = () => {
   const word = document.querySelector('[data-testid="stop-word"]')
   const tell = (text, bad) => { word.textContent = text; word.style.color = bad ? '#c62828' : 'inherit' }
   tell('…', false)
@@ -35,7 +41,24 @@ _PRESSED = """() => {
     .catch(() => tell('NOT_TAKEN', true))
 }"""
 
+# Escape always; space too while the joint is under control, also from a field or a focused button: nothing there needs
+# it then.  A key that is held down is one press.
 _WATCH = """<script>
+PRESSED
+document.addEventListener('keydown', event => {
+  const beat = document.querySelector('[data-testid="beat"]')
+  const moves = beat && beat.textContent.endsWith('MOVES')
+  if (event.key !== 'Escape' && !(moves && event.code === 'Space')) return
+  event.preventDefault()
+  event.stopImmediatePropagation()
+  if (!event.repeat) window.jointctlStop()
+}, true)
+document.addEventListener('keyup', event => {
+  const beat = document.querySelector('[data-testid="beat"]')
+  if (event.code !== 'Space' || !beat || !beat.textContent.endsWith('MOVES')) return
+  event.preventDefault()
+  event.stopImmediatePropagation()
+}, true);
 (() => {
   let seen = '', at = Date.now()
   setInterval(() => {
@@ -52,28 +75,30 @@ class StopButton:
     """The button, what became of the last press, and the mark of a page without news for `STALE_s`.
 
     A press is a plain HTTP request of its own, so that it works when nothing else on the page does: it needs neither
-    the page's web socket nor its state on the server.  That it did not arrive is shown as well.
+    the page's web socket nor its state on the server.  That it did not arrive is shown as well.  Escape and, while
+    the joint is under control, space press it from anywhere.
     """
 
     def __init__(self) -> None:
-        ui.add_body_html(_WATCH.replace("STALE_MS", f"{STALE_s * 1e3:.0f}"))
         pressed = _PRESSED.replace("STOP_PATH", STOP_PATH).replace("NOT_TAKEN", NOT_TAKEN)
         pressed = pressed.replace("ANSWER_MS", f"{ANSWER_s * 1e3:.0f}")
+        ui.add_body_html(_WATCH.replace("PRESSED", pressed).replace("STALE_MS", f"{STALE_s * 1e3:.0f}"))
         with ui.column().classes("items-end gap-1 shrink-0"):
-            button = ui.button("STOP", color="red-8").on("click", js_handler=pressed)
-            button.classes("text-3xl font-bold px-14 py-3").props('data-testid="stop"')
-            word = ui.label("").classes("text-sm font-bold").props('data-testid="stop-word"')
+            button = ui.button("STOP", color="red-8").on("click", js_handler="() => window.jointctlStop()")
+            button.classes("text-3xl font-bold px-14 py-3")
+            button.props(f'data-testid="stop" aria-keyshortcuts="Escape Space" title="{STOP_KEYS}"')
+            word = ui.label("").classes("text-sm font-bold").props('data-testid="stop-word" role=alert')
             word.style("max-width: 420px; text-align: right")
         self._beat: Any = ui.label("").style("display: none").props('data-testid="beat"')
 
-    def beat(self, number: int) -> None:
-        """A sign of life, at least once a second."""
-        self._beat.text = str(number)
+    def beat(self, number: int, *, moves: bool) -> None:
+        """A sign of life, at least once a second, and whether the joint is under control."""
+        self._beat.text = f"{number} MOVES" if moves else str(number)
 
 
 def stale_mark() -> None:
     """Where the page says that what it shows is old."""
-    label = ui.label(STALE).props('data-testid="stale"')
+    label = ui.label(STALE).props('data-testid="stale" role=alert')
     label.style("display: none; color: white; background: #c62828; padding: 2px 8px; font-weight: 600")
 
 
@@ -92,14 +117,14 @@ class StartPanel:
         self._ask = ask
         self._number: int | None = None
         with ui.card().classes("w-full p-3 gap-1").props('flat bordered data-testid="start-panel"') as self._card:
-            self._title = ui.label("").classes("font-bold")
+            self._title = ui.label("").classes("font-bold").props(HEADING)
             self._lines = ui.label("").style("white-space: pre-wrap; font: 13px/1.5 monospace")
             with ui.row().classes("items-center gap-6"):
                 self._clear = ui.checkbox("this range is clear, and I can reach the emergency stop")
                 self._clear.props('data-testid="clear"').on_value_change(self._on_tick)
-                self._start = ui.button("Start", on_click=self._on_start, color="green-8")
+                self._start = ui.button("Start", on_click=self._on_start, color="green-9")
                 self._start.classes("text-lg px-8").props('no-caps data-testid="start"')
-                self._prepare = ui.button("Prepare the next run", on_click=lambda: ask("prepare", {}))
+                self._prepare = ui.button("Prepare the next run", on_click=lambda: ask("prepare", {}), color=None)
                 self._prepare.props('no-caps outline data-testid="prepare"')
         self._card.visible = False
 
@@ -178,10 +203,15 @@ class Followed:
 
 
 class ChangePanels:
-    """The right-hand side of the page; nothing here is more than a wish: the supervisor checks each."""
+    """The right-hand side of the page; nothing here is more than a wish: the supervisor checks each.
 
-    def __init__(self, ask: Ask) -> None:
-        self._ask = ask
+    What it refuses is shown at the field that it is about, until something else is typed there.
+    """
+
+    def __init__(self, ask: Ask, who: str) -> None:
+        self._pass_on, self._who = ask, who
+        self._asked = ""  # the kind of the last request from here
+        self._refusals: int | None = None  # seen so far; None: what was before this page was opened is not known
         self._gains: dict[str, Followed] = {}
         self._given: dict[str, Any] = {}
         self._recording = False
@@ -197,12 +227,16 @@ class ChangePanels:
                 self._kind.props('dense options-dense data-testid="kind"')
                 self._fields = ui.grid(columns=2).classes("w-full gap-x-2 gap-y-0")
                 _button("Follow it", self._follow, "follow")
-            ui.label(ENDLESS).classes("text-xs text-grey-7")
+            ui.label(ENDLESS).classes("text-xs scope-aside")
             with _card("Gains"):
                 self._gain_rows = ui.grid(columns=2).classes("w-full gap-x-2 gap-y-0")
                 _button("Apply", self._apply, "apply")
             self._record = _button("Record", self._on_record, "record").classes("w-full")
-            self._recorded = ui.label("the run log has everything in any case").classes("text-xs text-grey-7")
+            self._recorded = ui.label("the run log has everything in any case").classes("text-xs scope-aside")
+
+    def _ask(self, kind: str, values: dict[str, Any]) -> None:
+        self._asked = kind
+        self._pass_on(kind, values)
 
     def _go(self) -> None:
         self._ask("set_point", {"position_rad": _number(self._set_point)})
@@ -248,9 +282,32 @@ class ChangePanels:
             self._gains[name].field.props(f'hint="now {now:.5g}, {low:.4g} to {high:.4g}"')
         if "reference_rad" in settings:
             self._angle.follow(float(settings["reference_rad"]))
+        self._show_refusal(settings.get("refused"))
         self._recording = bool(settings.get("recording"))
         self._record.text = "Stop recording" if self._recording else "Record"
         self._recorded.text = str(settings.get("recording") or "the run log has everything in any case")
+
+    def _show_refusal(self, refused: Mapping[str, Any] | None) -> None:
+        """At the fields that it names, or at all of that request."""
+        count = 0 if refused is None else int(refused["count"])
+        new, self._refusals = self._refusals is not None and count > self._refusals, count
+        if refused is None or not new or refused["who"] != self._who or refused["kind"] != self._asked:
+            return
+        for field in refused_fields(str(refused["text"]), self._fields_of(self._asked)):
+            field.error = str(refused["text"])
+
+    def _fields_of(self, kind: str) -> dict[str, Any]:
+        if kind == "set_point":
+            return {"position_rad": self._set_point}
+        if kind == "trajectory":
+            return self._given or {"kind": self._kind}
+        typed = {name: gain.field for name, gain in self._gains.items() if gain.typed}
+        return typed or {name: gain.field for name, gain in self._gains.items()}
+
+
+def refused_fields(text: str, fields: Mapping[str, Any]) -> list[Any]:
+    """Those whose key the refusal names; where it names none, all."""
+    return [field for name, field in fields.items() if re.search(rf"\b{name}\b", text)] or list(fields.values())
 
 
 def _number(field: ui.number) -> float | None:
@@ -260,12 +317,16 @@ def _number(field: ui.number) -> float | None:
 def _card(title: str) -> Any:
     card = ui.card().classes("w-full p-3 gap-1").props("flat bordered")
     with card:
-        ui.label(title).classes("font-bold leading-tight")
+        ui.label(title).classes("font-bold leading-tight").props(HEADING)
     return card
 
 
 def _button(text: str, action: Callable[[], None], name: str) -> Any:
-    return ui.button(text, on_click=action).props(f'no-caps dense outline data-testid="{name}"').classes("px-4")
+    return (
+        ui.button(text, on_click=action, color=None)
+        .props(f'no-caps dense outline data-testid="{name}"')
+        .classes("px-4")
+    )
 
 
 # --- the page ---
@@ -279,6 +340,9 @@ SILENT_s = 2.0  # a run tells something 50 times a second
 CSS = (
     ".q-field__label{font-size:13px} body{font-size:14px} .nicegui-content{padding:0 14px 10px; gap:8px}"
     " .scope-head{position:sticky; top:0; z-index:10; background:#fff; padding:10px 0 4px}"
+    " .body--dark .scope-head{background:#121212} .scope-aside{color:#5f5f5f} .body--dark .scope-aside{color:#b0b0b0}"
+    " .scope-bad{color:#c62828; font-weight:600} .body--dark .scope-bad{color:#ff8a80}"
+    " :focus-visible{outline:3px solid #1f5fa8; outline-offset:2px} .body--dark :focus-visible{outline-color:#6fa8e8}"
     " @media (max-width: 900px) {.scope-body{flex-wrap:wrap} .scope-body>*{width:100%}}"
 )
 STAGES = {
@@ -306,6 +370,9 @@ class ScopePage:
         self._draw_again_s = 0.0
         client: Any = ui.context.client
         self._who = viewer(getattr(client, "ip", None))
+        self._dark = ui.dark_mode(False)
+        client.on_connect(self._follow_system)
+        ui.colors(primary="#1f5fa8")
         ui.add_css(CSS)
         self._build()
         self._tell()
@@ -315,22 +382,35 @@ class ScopePage:
         self._stop: StopButton | None = None
         with ui.row().classes("w-full items-start no-wrap gap-4 scope-head"):
             with ui.column().classes("gap-0 grow min-w-0"):
-                ui.label(self._order.title).classes("text-xl font-bold leading-tight")
-                self._state = ui.label("waiting for the run").classes("text-base").props('data-testid="state"')
+                ui.label(self._order.title).classes("text-xl font-bold leading-tight").props(
+                    "role=heading aria-level=1"
+                )
+                self._state = ui.label("waiting for the run").classes("text-base")
+                self._state.props('data-testid="state" role=status')
                 stale_mark()
             if self._link is not None:
                 self._stop = StopButton()
         self._start = StartPanel(self._ask) if self._link is not None else None
-        with ui.row().classes("w-full no-wrap items-start gap-4 scope-body"):
+        with ui.row().classes("w-full no-wrap items-start gap-4 scope-body").props("role=main"):
             with ui.column().classes("grow min-w-0 gap-2"):
                 self._chart = Chart(self._history, live=self._link is not None)
                 with ui.row().classes("w-full no-wrap gap-10 items-start scope-body"):
                     self._deadlines = _text_block(f"Deadlines, last {STATISTICS_s:g} s", "deadlines")
                     self._events = _text_block("Events", "events")
             if self._link is not None:
-                self._changes: ChangePanels | None = ChangePanels(self._ask)
+                self._changes: ChangePanels | None = ChangePanels(self._ask, self._who)
             else:
                 self._changes = None
+        self._dark_switch = ui.switch("dark", on_change=self._on_dark).props('dense data-testid="dark"')
+
+    async def _follow_system(self) -> None:
+        """Dark where the viewer's system is, until the switch is used."""
+        with contextlib.suppress(TimeoutError):
+            self._dark_switch.value = bool(await ui.run_javascript(_PREFERS_DARK))
+
+    def _on_dark(self) -> None:
+        self._dark.value = bool(self._dark_switch.value)
+        self._chart.dark(self._dark.value)
 
     def _ask(self, kind: str, values: dict[str, Any]) -> None:
         if self._link is not None and not self._link.ask(ViewerRequest(kind, self._who, values)):
@@ -350,7 +430,8 @@ class ScopePage:
         """Everything but the picture."""
         self._texts()
         if self._stop is not None:
-            self._stop.beat(self._ticks)
+            stage = self._history.settings.get("stage")
+            self._stop.beat(self._ticks, moves=stage == "running" and not self._history.ended)
         settings = self._history.settings
         if self._start is not None:
             self._start.show(settings)
@@ -369,7 +450,7 @@ class ScopePage:
         if stage == "running" and not self._history.ended and silent_s > SILENT_s:
             words.append(f"NO NEWS FROM THE RUN for {silent_s:.0f} s")
         bad = (fault and stage not in STAGES) or (silent_s > SILENT_s and stage == "running")
-        self._state.style(replace="color: #c62828; font-weight: 600" if bad else "color: inherit")
+        self._state.classes(add="scope-bad" if bad else "", remove="" if bad else "scope-bad")
         if len(rows):
             lines = [f"{name:13}{text}" for name, text in percentiles_us(rows).items()]
             lines.append(f"{'skipped':13}{self._history.skipped} cycles since the start")
@@ -397,10 +478,10 @@ class ScopePage:
 
 def _text_block(title: str, name: str) -> Any:
     with ui.column().classes("gap-0 min-w-0" if name == "events" else "gap-0 shrink-0"):
-        ui.label(title).classes("font-bold")
+        ui.label(title).classes("font-bold").props(HEADING)
         label = ui.label("-").style("white-space: pre-wrap; font: 12px/1.45 monospace")
         label.style("" if name == "events" else "white-space: pre")
-        return label.props(f'data-testid="{name}"')
+        return label.props(f'data-testid="{name}"' + (" role=log" if name == "events" else ""))
 
 
 def build_page(order: ScopeOrder, history: History, link: Link | None) -> None:

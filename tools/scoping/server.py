@@ -181,7 +181,7 @@ def serve(order: ScopeOrder) -> None:
     app.add_middleware(AccessControl, token=order.token)
     ui.run(
         host=order.host, port=order.port, show=False, reload=False, show_welcome_message=False, dark=False,
-        message_history_length=MESSAGES, reconnect_timeout=RECONNECT_S,
+        language="en-US", message_history_length=MESSAGES, reconnect_timeout=RECONNECT_S,
         uvicorn_logging_level="error",
     )  # fmt: skip
 

@@ -198,6 +198,7 @@ class _Change:
     kind: ChangeKind
     payload: Any  # Gains as a mapping, or TrajectoryConstants
     gate: Future[float] | None = None
+    request: str = ""  # kind of the request
     number: int = 0  # 0: not yet with the loop
     answered: Callable[[str], None] = lambda _: None
 
@@ -217,6 +218,7 @@ class LiveChanges:
         self._config, self._block, self._tell, self._delay_s = config, block, tell, delay_s
         self._allow_low_margin = allow_low_margin
         self._open: _Change | None = None
+        self.refused: dict[str, Any] | None = None  # the last one: what a page shows at its field
         self._pool = ThreadPoolExecutor(1, "stability gate")
 
     @property
@@ -265,9 +267,10 @@ class LiveChanges:
             self._open = self._gains(request) if request.kind == "gains" else self._motion(request)
             return
         except JointctlError as error:
-            self._refuse(request.who, error)
+            self._refuse(request.who, request.kind, error)
         except Exception as error:  # whatever a page sends, the joint's run goes on
-            self._refuse(request.who, JointctlError(f"not understood: {type(error).__name__}: {error}"))
+            words = JointctlError(f"not understood: {type(error).__name__}: {error}")
+            self._refuse(request.who, request.kind, words)
         if isinstance(request, PreparedMotion):
             request.answered("refused")
 
@@ -286,7 +289,7 @@ class LiveChanges:
         gate = self._pool.submit(
             require_change, self._config, now, after, delay_s, allow_low_margin=self._allow_low_margin
         )
-        return _Change(text, request.who, ChangeKind.GAINS, {**before, **after}, gate)
+        return _Change(text, request.who, ChangeKind.GAINS, {**before, **after}, gate, request.kind)
 
     def _motion(self, request: ViewerRequest) -> _Change:
         values: Mapping[str, Any] = request.values
@@ -296,7 +299,8 @@ class LiveChanges:
             trajectory, words = request.trajectory, request.words
         else:
             trajectory, words = new_motion(self._config, self._block.table, values)
-        change = _Change(f"motion {self.motion()} -> {words}", request.who, ChangeKind.MOTION, trajectory)
+        text = f"motion {self.motion()} -> {words}"
+        change = _Change(text, request.who, ChangeKind.MOTION, trajectory, request=request.kind)
         if isinstance(request, PreparedMotion):
             change.answered = request.answered
         self._post(change)
@@ -316,7 +320,7 @@ class LiveChanges:
             error = change.gate.exception()
             if error is not None:
                 words = error if isinstance(error, JointctlError) else JointctlError(f"the gate failed: {error}")
-                self._refuse(change.who, words)
+                self._refuse(change.who, change.request, words)
                 self._open = None
                 return
             margin_deg = change.gate.result()
@@ -332,11 +336,13 @@ class LiveChanges:
         if answer is ChangeAnswer.TAKEN:
             self._tell(INFO, f"parameter change: {change.text}, by {change.who}")
         else:
-            self._tell(WARNING, f"parameter change refused: {_WHY.get(answer, answer.name)}; asked for by {change.who}")
+            self._refuse(change.who, change.request, JointctlError(_WHY.get(answer, answer.name)))
 
-    def _refuse(self, who: str, error: JointctlError) -> None:
-        hint = f" ({error.hint})" if error.hint else ""
-        self._tell(WARNING, f"parameter change refused: {error.message}{hint}; asked for by {who}")
+    def _refuse(self, who: str, kind: str, error: JointctlError) -> None:
+        text = error.message + (f" ({error.hint})" if error.hint else "")
+        count = 1 if self.refused is None else self.refused["count"] + 1
+        self.refused = {"count": count, "who": who, "kind": kind, "text": text}
+        self._tell(WARNING, f"parameter change refused: {text}; asked for by {who}")
 
     def close(self) -> None:
         """Nothing more is checked."""
@@ -352,6 +358,7 @@ def settings_of(changes: LiveChanges, config: Config) -> dict[str, Any]:
         "range": (config.limits.position_min_rad, config.limits.position_max_rad),
         "reference_rad": changes.reference_rad,
         "under_way": changes.under_way,
+        "refused": changes.refused,
     }
 
 

@@ -443,6 +443,73 @@ def test_what_was_typed_stays_until_it_is_in_force() -> None:
     assert page.apply() == [("gains", {"kp": None})]  # refused by the supervisor, in words
 
 
+class Asking:
+    """The change panels of one viewer, with a set-point, one gain and one field of a trajectory."""
+
+    def __init__(self) -> None:
+        page = pytest.importorskip("jointctl.tools.scoping.scope_page")
+        self.panels = page.ChangePanels.__new__(page.ChangePanels)
+        self.panels._pass_on, self.panels._who = lambda kind, values: None, "a viewer at 10.0.0.5"
+        self.panels._asked, self.panels._refusals = "", None
+        self.set_point, self.gain, self.other, self.move = (SimpleNamespace(value=1.0, error=None) for _ in range(4))
+        self.panels._set_point = self.set_point
+        self.panels._gains = {name: page.Followed(f, ".5g") for name, f in (("kp", self.gain), ("kv", self.other))}
+        self.panels._given, self.panels._kind = {"amplitude_rad": self.move}, SimpleNamespace(error=None)
+
+    def refused(self, kind: str, count: int, text: str = "no", who: str = "a viewer at 10.0.0.5") -> None:
+        self.panels._show_refusal({"count": count, "who": who, "kind": kind, "text": text})
+
+    def errors(self) -> tuple[Any, ...]:
+        return self.set_point.error, self.gain.error, self.other.error, self.move.error
+
+
+def test_a_refusal_is_shown_at_its_field() -> None:
+    page = Asking()
+    page.panels._show_refusal(None)
+    page.panels._ask("set_point", {"position_rad": 9.0})
+    page.refused("set_point", 1, "position_rad (=9) must be in [-0.7..0.7]")
+    assert page.errors() == ("position_rad (=9) must be in [-0.7..0.7]", None, None, None)
+    page.panels._ask("trajectory", {})
+    page.refused("trajectory", 2, "trajectory: highest position is too high")
+    assert page.move.error == "trajectory: highest position is too high"
+    page.panels._ask("gains", {})
+    page.refused("gains", 3, "control.kv (=1e9) is too high")
+    assert (page.gain.error, page.other.error) == (None, "control.kv (=1e9) is too high")
+
+
+def test_refusals_of_others_and_of_before_are_not_shown() -> None:
+    page = Asking()
+    page.panels._asked = "set_point"
+    page.refused("set_point", 4)  # there when the page was opened
+    page.refused("set_point", 5, who="a viewer at 10.0.0.6")
+    page.refused("gains", 6)
+    page.refused("set_point", 6)  # seen already
+    assert page.errors() == (None, None, None, None)
+    page.refused("set_point", 7)
+    assert page.errors() == ("no", None, None, None)
+
+
+# --- The axis of a joint at rest ---
+@pytest.mark.parametrize(
+    ("low", "high", "unit", "fits_itself"),
+    [(0.1, 0.10001, "[rad]", False), (0.1, 0.1019, "[rad]", False), (0.1, 0.1021, "[rad]", True),
+     (-0.01, 0.01, "[mrad]", False), (-0.2, 0.2, "[mrad]", True), (1.0, 1.0, "[unknown]", True)],
+)  # fmt: skip
+def test_noise_is_not_magnified(low: float, high: float, unit: str, fits_itself: bool) -> None:
+    chart = pytest.importorskip("jointctl.tools.scoping.chart")
+    found = chart.axis_range(low, high, unit)
+    assert (found is None) is fits_itself
+    if found is not None:
+        assert found[0] < low <= high < found[1]
+        assert found[1] - found[0] == pytest.approx(1.5 * chart.LEAST_SPAN[unit])
+        assert chart.axis_range(low + 1e-9, high + 1e-9, unit) == found
+
+
+def test_every_signal_has_a_least_span() -> None:
+    chart = pytest.importorskip("jointctl.tools.scoping.chart")
+    assert {name[name.index("[") :] for name in SIGNALS} <= set(chart.LEAST_SPAN)
+
+
 def test_what_a_browser_rounds_was_not_typed() -> None:
     page = Panels(kp=784.12345)
     page.fields["kp"].value = 784.12
