@@ -35,7 +35,14 @@ class Advance(Protocol):
 
 FACT_COLUMN = 11  # where the text of a `fact` begins
 _UNIT, _HELD = re.compile(r"(?<=\d) (?=(rad|deg|s|min|ms|us|Nm|A|Hz|mrad|kbit|bit)\b)"), "\N{NO-BREAK SPACE}"
+LEAST_COLUMNS = 20  # of the environment's COLUMNS that is believed
 PIPE_COLUMNS = 140  # of a table that goes to a file or a pipe, or more if it needs them
+
+
+def wanted_columns() -> int | None:
+    """COLUMNS of the environment, which goes before anything else; None where it is no number of columns."""
+    text = os.environ.get("COLUMNS", "")
+    return int(text) if text.isdecimal() and int(text) >= LEAST_COLUMNS else None
 
 
 class _Console(Console):
@@ -83,7 +90,7 @@ class Output:
 
     def __post_init__(self) -> None:
         # rich wraps at 80 columns where there is no terminal; a line of a log file or of a pipe is not to be broken
-        width = None if self.stdout.isatty() else PIPE_COLUMNS
+        width = None if self.stdout.isatty() else wanted_columns() or PIPE_COLUMNS
         self._results = _console(self.stdout, width)
         self._messages = _console(self.stderr)
 
@@ -180,7 +187,7 @@ def _print_whole(console: Console, shown: RenderableType) -> None:
     """As wide as the terminal; on a pipe as wide as the widest table needs."""
     shown = _printable(shown)
     if not console.file.isatty():
-        console.width = max(PIPE_COLUMNS, widest(shown))
+        console.width = wanted_columns() or max(PIPE_COLUMNS, widest(shown))
     console.print(fitted(shown, console.width))
 
 

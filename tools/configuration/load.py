@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import tomllib
 from collections.abc import Mapping
@@ -23,10 +24,20 @@ from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config, Configur
 from jointctl.tools.configuration.drive_section import GivenPlace, completed
 from jointctl.tools.configuration.units import with_units
 
+SPELT_ALIKE = 0.7  # of difflib's ratio
+
 
 def shipped_config(name: str) -> Path:
     """Path of a configuration shipped with the package, with or without `.toml`."""
     return SHIPPED_FOLDER / (name if name.endswith(".toml") else f"{name}.toml")
+
+
+def _meant(path: Path) -> str:
+    """The shipped configuration, or the file beside, whose name is spelt alike; "" if there is none."""
+    shipped = {each.stem: each.stem for each in SHIPPED_FOLDER.glob("*.toml")} if path.parent == Path() else {}
+    beside = {each.name: str(each) for each in path.parent.glob("*.toml")}
+    near = difflib.get_close_matches(path.name, [*shipped, *beside], n=1, cutoff=SPELT_ALIKE)
+    return f"did you mean {({**shipped, **beside})[near[0]]}?" if near else ""
 
 
 def read_text(path: Path) -> str:
@@ -38,7 +49,7 @@ def read_text(path: Path) -> str:
     try:
         return read_input(path).decode("utf-8-sig")
     except FileNotFoundError:
-        raise ConfigurationError(f"{path}: no such file", f"shipped configurations: {known}") from None
+        raise ConfigurationError(f"{path}: no such file", _meant(path) or f"shipped configurations: {known}") from None
     except IsADirectoryError:
         raise ConfigurationError(f"{path}: is a folder, not a configuration file") from None
     except UnicodeDecodeError as error:

@@ -32,8 +32,8 @@ HEAD = """# Configuration reference
 
 Made from the models by `python -m jointctl.tools.configuration.reference docs/configuration.md`; do not edit.
 
-A configuration is one TOML file. The unit of a quantity is part of its key; a text with another one (`"30 deg"`, `"20 rpm"`,
-`"1 kHz"`) is understood where it has one meaning, and echoed. A key without a default must be there; one
+A configuration is one TOML file. The unit of a quantity is part of its key; a text with another one (`"30 deg"`,
+`"20 rpm"`, `"1 kHz"`) is understood where it has one meaning, and echoed. A key without a default must be there; one
 with the default *none* may be left out. Ranges are wide: they catch a wrong unit or a slip of the finger, not a bold
 choice. What must fit together between sections (trajectory inside the limits, gains against the rate, and so on) is
 checked as well, with a line that says what. Begin with one of the files in [configs](../configs/).

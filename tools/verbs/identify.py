@@ -227,8 +227,8 @@ def identify(
     limits = _limits(into, config, output)
     from_data = _from_motion if is_series(data_path, given) else _from_plateaus
     found = from_data(data_path, given, options, limits, output)
-    for note in found.notes:
-        output.note(f"{data_path}: {note}")
+    for note in found.notes:  # also with -q: a fit of other points than were measured is another result
+        output.address(f"{data_path}: {note}")
     for warning in found.warnings:
         output.warning(warning)
 

@@ -92,6 +92,15 @@ def test_a_pipe_is_as_wide_as_the_table_needs() -> None:
     assert out.getvalue().count("0.123456789012345678901") == 8
 
 
+@pytest.mark.parametrize(("columns", "kept"), [("40", True), ("0", False), ("wide", False), ("", False)])
+def test_a_pipe_is_as_wide_as_columns_says(columns: str, kept: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
+    out = io.StringIO()
+    Output(stdout=out, stderr=io.StringIO()).result(wide())
+    longest = max(len(line) for line in out.getvalue().splitlines())
+    assert (longest <= len(PATH)) is kept  # the longest word is not broken: a list of rows instead of a table
+
+
 def test_what_a_terminal_wraps_of_a_fact_goes_below_its_text(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "40")
     text = "motion     -0.477 .. +0.650 rad, back and forth, about 7 min"

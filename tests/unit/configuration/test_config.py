@@ -426,3 +426,26 @@ def test_an_old_key_beside_its_new_one_is_refused(tmp_path: Path) -> None:
     both = edited_file(tmp_path, ("lyapunov_q = 1800.0", "lyapunov_q = 1800.0\nq = 1800.0"))
     with pytest.raises(ConfigurationError, match=r"control\.q is not a known key"):
         load_config(both)
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [("virutal", "did you mean virtual?"), ("precice", "did you mean precise?"),
+     ("mien.toml", "did you mean mine.toml?"), ("elmo_serail", "did you mean elmo_serial?"),
+     ("qqq", "shipped configurations: ")],
+)  # fmt: skip
+def test_a_name_that_is_spelt_alike_is_suggested(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, hint: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.toml").write_text("")
+    with pytest.raises(ConfigurationError, match="no such file") as refused:
+        load_config(name)
+    assert refused.value.hint.startswith(hint)
+
+
+def test_a_file_of_another_folder_is_suggested_with_it(tmp_path: Path) -> None:
+    (tmp_path / "elbow.toml").write_text("")
+    with pytest.raises(ConfigurationError) as refused:
+        load_config(tmp_path / "elbwo.toml")
+    assert refused.value.hint == f"did you mean {tmp_path / 'elbow.toml'}?"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import shutil
@@ -20,6 +21,7 @@ from jointctl.tools.identification.friction_data import ForeignFormat
 from jointctl.tools.identification.identification import Options
 from jointctl.tools.identification.identification_report import MARK, snippet, with_section
 from jointctl.tools.identification.swarm import SwarmSettings
+from jointctl.tools.output import Output
 from jointctl.tools.verbs.identify import identify
 from jointctl.tools.verbs.validate import validate
 from tests.page_figures import foreign_colours, svgs
@@ -65,6 +67,15 @@ def test_the_report_of_an_identification_holds_tables_pictures_and_section(sweep
         with pytest.raises(DataError, match=told):
             identify(sweep, output(), options=QUICK, report=wrong)
         assert contents(sweep.parent) == before
+
+
+def test_points_that_are_left_out_are_told_even_to_who_wants_no_progress(sweep):
+    lines = sweep.read_text().splitlines()
+    sweep.write_text("\n".join([*lines, lines[-1]]) + "\n")
+    out = Output(quiet=True, stdout=io.StringIO(), stderr=io.StringIO())
+    assert identify(sweep, out, options=QUICK) == 0
+    assert "exact copy of another line, counted once" in out.stderr.getvalue()
+    assert "written:" not in out.stderr.getvalue()
 
 
 def test_identify_writes_a_section_a_report_and_pictures_beside_the_data(sweep):
