@@ -29,6 +29,7 @@ from jointctl.tools.experiments.paper_experiments import (
     law,
     network_difference_mrad,
     paper_rows,
+    window_s,
 )
 from jointctl.tools.experiments.scenarios import ErrorFigures, error_figures, settling_s
 from jointctl.tools.identification.identification import Options
@@ -51,7 +52,7 @@ def made(key: str) -> PaperRun:
 
 
 def figures(key: str) -> ErrorFigures:
-    return error_figures(made(key).run, AFTER_s)
+    return error_figures(made(key).run, window_s(_ALL[key]))
 
 
 # --- section 4.2 ---

@@ -41,11 +41,11 @@ def paper(
     """Reproduce every experiment of the paper on the virtual joint, in lockstep: its figure beside ours."""
     from jointctl.tools.drawing import save_png
     from jointctl.tools.experiments.paper_experiments import (
-        AFTER_s,
         PaperRun,
         experiments,
         identify_paper_friction,
         paper_rows,
+        window_s,
     )
     from jointctl.tools.experiments.scenarios import error_figures
     from jointctl.tools.recording.report_page import Section, check_target, from_terminal, svg_figure, write_verb_page
@@ -73,7 +73,7 @@ def paper(
     data = {
         "paper": PAPER,
         "rows": [asdict(row) for row in rows],
-        "runs": {key: asdict(error_figures(made.run, AFTER_s)) for key, made in runs.items()},
+        "runs": {key: asdict(error_figures(made.run, window_s(made.experiment))) for key, made in runs.items()},
         "pictures": [str(path) for path in pictures],
     }
     output.result(_table(rows), data, PaperResult(rows, runs, identified))
@@ -100,7 +100,7 @@ def _table(rows: list[PaperRow]) -> Table:
 
     table = Table(
         "experiment", "paper", "reference", "ours", "precise", "note",
-        title=f"Errors in mrad after {AFTER_s:g} s: (least, greatest) RMSE",
+        title=f"Errors in mrad from {AFTER_s:g} s on, after a change from it on: (least, greatest) RMSE",
         caption=f"paper: {PAPER}. reference: an independent simulation of the same equations. "
         "R1: realistic joint, friction 10 % above the model. precise: configs/precise.toml on R1.",
         title_justify="left",
