@@ -275,8 +275,8 @@ def canopen_problems(config: Config) -> list[str]:
                     f"limits.torque_max_Nm (={limits.torque_max_Nm:g}) must be in (0..{reach:g}], "
                     "what drive.max_torque_permille allows"
                 )
-    if config.virtual is not None and drive.rated_current_A is None:
-        found.append("drive.rated_current_A is missing: the virtual drive needs it")
-    if config.virtual is not None and drive.rated_torque_Nm is None:
-        found.append("drive.rated_torque_Nm is missing: the virtual drive needs it")
+    # the other one follows from the torque constant: a drive that lacks 6075 or 6076 cannot be compared with it
+    reference = f"{drive.torque_reference}_{'A' if drive.torque_reference == 'rated_current' else 'Nm'}"
+    if config.virtual is not None and getattr(drive, reference) is None:
+        found.append(f"drive.{reference} is missing: the virtual drive needs it, torque is in thousandths of it")
     return found

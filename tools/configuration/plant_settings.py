@@ -18,8 +18,6 @@ from jointctl.tools.configuration.conversions import friction_constants, torque_
 from jointctl.tools.configuration.sections import OWN_KEYS, Virtual
 
 VIRTUAL_EDS = SHIPPED_FOLDER / "virtual_joint.eds"  # what the virtual drive is, whatever objects it shows
-DEFAULT_RATED_CURRENT_A = 5.0
-DEFAULT_RATED_TORQUE_NM = 0.5
 
 
 def fault_constants(config: Config) -> Any:
@@ -82,10 +80,15 @@ def device_settings(config: Config) -> DeviceSettings:
     path = eds_path(config)
     eds = None if path.resolve() == VIRTUAL_EDS else read_eds(path, drive.node)
     vendor_id, product_code = (eds.vendor_id, eds.product_code) if eds is not None else (None, None)
+    current_A, torque_Nm, constant_NmpA = drive.rated_current_A, drive.rated_torque_Nm, torque_constant_NmpA(config)
+    if current_A is None and torque_Nm is None:  # `problems` refuses a file with [virtual] for that
+        raise ConfigurationError(
+            "drive.rated_current_A or drive.rated_torque_Nm is missing: the virtual drive needs it"
+        )
     return DeviceSettings(
         node_id=drive.node,
-        rated_current_mA=round((drive.rated_current_A or DEFAULT_RATED_CURRENT_A) * 1000.0),
-        rated_torque_mNm=round((drive.rated_torque_Nm or DEFAULT_RATED_TORQUE_NM) * 1000.0),
+        rated_current_mA=round((current_A or (torque_Nm or 0.0) / constant_NmpA) * 1000.0),
+        rated_torque_mNm=round((torque_Nm or (current_A or 0.0) * constant_NmpA) * 1000.0),
         reduction_ratio=config.joint.reduction_ratio,
         motor_torque_constant_NmpA=torque_constant_NmpA(config),
         torque_direction=drive.torque_direction,

@@ -13,9 +13,10 @@ from jointctl.drivers.errors import ConfigurationError, DeviceError
 from jointctl.hil.canopen.device import Cia402Device
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.load import load_config
 from jointctl.tools.verbs.hil import with_eds
 from jointctl.tools.virtual_joint import new_device
-from tests.configurations import changed, shipped
+from tests.configurations import changed, shipped, written
 from tests.device_on_bus import DeviceOnBus
 from tests.eds_styles import EPOS4, GOLD, NANOTEC, STYLES, Listed, Style, eds_text
 from tests.virtual_drive import NODE, Rig
@@ -79,6 +80,29 @@ def test_what_commissioning_says(tmp_path: Path, style: Style) -> None:
             with pytest.raises(DeviceError) as refused:
                 opened.commission()
     assert style.refusal in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("reference", "current_A", "torque_Nm", "rated"),
+    [("rated_current", 4.0, None, (4000, 400)), ("rated_torque", None, 0.6, (6000, 600)),
+     ("rated_current", 4.0, 0.7, (4000, 700))],
+)  # fmt: skip
+def test_the_rated_value_that_is_not_given_follows_from_the_torque_constant(
+    tmp_path: Path, reference: str, current_A: float | None, torque_Nm: float | None, rated: tuple[int, int]
+) -> None:
+    drive = {"rated_current_A": current_A, "rated_torque_Nm": torque_Nm, "torque_reference": reference}
+    path = written(tmp_path / "joint.toml", **{f"drive__{key}": value for key, value in drive.items()})
+    objects = new_device(load_config(path)).objects
+    assert (objects.default(0x6075, 0), objects.default(0x6076, 0)) == rated
+
+
+@pytest.mark.parametrize(
+    ("reference", "key"), [("rated_current", "rated_current_A"), ("rated_torque", "rated_torque_Nm")]
+)
+def test_the_rated_value_that_torque_refers_to_must_be_there(tmp_path: Path, reference: str, key: str) -> None:
+    path = written(tmp_path / "joint.toml", **{"drive__torque_reference": reference, f"drive__{key}": None})
+    with pytest.raises(ConfigurationError, match=rf"drive\.{key} is missing"):
+        load_config(path)
 
 
 def test_an_object_of_the_maker_keeps_what_is_written_until_a_reset(tmp_path: Path) -> None:
