@@ -29,6 +29,8 @@ def pytest_configure() -> None:
     """Ctrl-C reaches what the tests start, although `nohup` or `&` makes a shell start pytest with SIGINT ignored."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    for name in ("COLUMNS", "LINES"):  # readline gives them to processes that a test process starts
+        os.environ.pop(name, None)
     os.environ["JOINTCTL_TRACEBACK"] = "1"  # what no one has foreseen is to be seen in what the tests start
 
 
