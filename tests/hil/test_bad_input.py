@@ -111,8 +111,8 @@ def test_a_drive_that_lacks_the_mode(bench: Any) -> None:
 
 
 def test_an_eds_that_makes_no_virtual_drive(bench: Any) -> None:
-    (bench.folder / "poor.eds").write_text(eds_without(EDS.read_text(), "6077"))
-    bench.run("hil", bench.config(drive__eds="poor.eds")).refused(3, "poor.eds", "6077")
+    (bench.folder / "poor.eds").write_text("[6077\nParameterName=torque\n")
+    bench.run("hil", bench.config(drive__eds="poor.eds")).refused(3, "poor.eds", "describes no object")
 
 
 def test_the_witness_sees_a_joint_that_is_enabled(bench: Any) -> None:

@@ -141,7 +141,8 @@ def test_cyclic_position_by_pdo_and_sync(joint: Any, node: Any) -> None:
 
 def test_the_program_in_the_documentation(joint: Any) -> None:
     page = (joint.eds.parents[1] / "docs" / "virtual-joint.md").read_text()
-    program = page.split("```text\n")[1].split("```")[0]
+    blocks = [part.split("```")[0] for part in page.split("```text\n")[1:]]
+    program = next(block for block in blocks if "import canopen" in block)
     for shown, here in (('"virtual0"', repr(joint.channel)), ("(1,", f"({joint.node_id},"), ('"configs/', '"')):
         assert shown in program
         program = program.replace(shown, here, 1)
