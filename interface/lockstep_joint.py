@@ -33,7 +33,7 @@ class LockstepMotor:
         self._joint = LockstepJoint(config)
         self._drive = session_drive(config.drive.kind)
         constants = free_constants(config, self._joint.report.start_position_rad)
-        constants[0].sequence.supervisor_max_cycles = constants[0].stream.client_timeout_ns = 0  # nobody watches
+        constants[0].sequence.supervisor_max_cycles = 0  # nobody watches
         self._run = self._joint.stepped(constants, np.zeros((TABLE_ROWS, 5)))
         self._period_s = float(constants[0].law.period_s)
         self._left_s = 0.0  # of time asked for, less than a cycle

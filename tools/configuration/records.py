@@ -70,14 +70,18 @@ def axis_constants(config: Config, table: np.ndarray, *, start_position_rad: flo
 
 
 def free_constants(config: Config, start_rad: float) -> Any:
-    """A record array of one `AxisConstants`: at rest at `start_rad`, for the set-points of a watched program."""
+    """A record array of one `AxisConstants`: at rest at `start_rad`, for set-points; no one need be alive."""
     hold = Hold(kind="hold", duration_s=0.0, position_rad=start_rad)
     sequence = config.sequence.model_copy(update={"approach_s": 0.0})
     held = config.model_copy(update={"trajectory": hold, "sequence": sequence})
     constants = axis_constants(held, np.zeros((1, 5)), start_position_rad=start_rad)
     constants[0].trajectory.kind = TrajectoryKind.STREAM
-    constants[0].stream.client_timeout_ns = round(config.stream.client_timeout_s * 1e9)
     return constants
+
+
+def expect_client(constants: Any, config: Config) -> None:
+    """The loop ends the run when the program that commands the joint has been silent for `stream.client_timeout_s`."""
+    constants[0].stream.client_timeout_ns = round(config.stream.client_timeout_s * 1e9)
 
 
 def trajectory_table(config: Config) -> np.ndarray:

@@ -53,7 +53,7 @@ from jointctl.hil.lockstep import (
 )
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.records import axis_constants, free_constants
+from jointctl.tools.configuration.records import axis_constants, expect_client, free_constants
 from jointctl.tools.experiments.fault_scenarios import (
     FAULT_CLASSES,
     LATE_CAUSES,
@@ -272,6 +272,7 @@ def run_scenario(config: Config, joint: LockstepJoint, scenario: Scenario) -> tu
         points = set_points_of(scenario.trajectory, config, joint.table)
         start = float(points[0, POINT_VALUES])
         constants = free_constants(config, start)
+        expect_client(constants, config)
         lasts_s = float(points[-1, POINT_TIME_s]) + AFTER_s
         return _carry_out(joint, scenario, constants, lasts_s, plant_of(config, scenario, start), points)
     sequence = config.sequence.model_copy(update={"approach_s": APPROACH_s})

@@ -24,6 +24,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -322,15 +323,21 @@ def check_given(given: ForeignFormat) -> None:
         raise UsageError("--torque-column and --current-column: give one of them, the friction comes from one")
 
 
+def require_told(table: TableFile, given: ForeignFormat, needed: Sequence[tuple[str, object]]) -> None:
+    """`UsageError` where what a table does not tell was not given: the torque's column, and each (flag, value)."""
+    if not (given.torque_column or given.current_column):
+        raise UsageError("--torque-column or --current-column is missing", f"the file has: {', '.join(table.columns)}")
+    for flag, value in needed:
+        if value is None:
+            raise UsageError(f"{flag} is missing: a table of numbers does not tell it", "nothing is guessed")
+
+
 def read_foreign(table: TableFile, given: ForeignFormat) -> FrictionData:
     """Points in our units; `UsageError` where something that a table does not tell was not given."""
     if not given.velocity_column:
         raise UsageError("--velocity-column is missing", f"the file has: {', '.join(table.columns)}")
-    if not (given.torque_column or given.current_column):
-        raise UsageError("--torque-column or --current-column is missing", f"the file has: {', '.join(table.columns)}")
-    for flag, value in (("--velocity-unit", given.velocity_unit), ("--side", given.side), ("--ratio", given.ratio)):
-        if value is None:
-            raise UsageError(f"{flag} is missing: a table of numbers does not tell it", "nothing is guessed")
+    told = [("--velocity-unit", given.velocity_unit), ("--side", given.side), ("--ratio", given.ratio)]
+    require_told(table, given, told)
     assert given.velocity_unit is not None
     assert given.ratio is not None
     scale = RADPS_PER_UNIT[given.velocity_unit] / (given.ratio if given.side == "motor" else 1.0)

@@ -31,6 +31,7 @@ from jointctl.tools.identification.friction_data import (
     check_given,
     numbers,
     read_table,
+    require_told,
 )
 
 BAND_Hz, BAND_SHARE = 20.0, 0.2  # default: at most this share of the rate; with a running mean its first zero
@@ -226,19 +227,15 @@ def _table(path: Path, given: ForeignFormat) -> _Raw:
 
 def _check_mapped(table: TableFile, given: ForeignFormat) -> None:
     """`UsageError` where something that a table does not tell was not given."""
-    has = f"the file has: {', '.join(table.columns)}"
     if not (given.position_column or given.velocity_column):
-        raise UsageError("--position-column or --velocity-column is missing", has)
-    if not (given.torque_column or given.current_column):
-        raise UsageError("--torque-column or --current-column is missing", has)
+        missing = "--position-column or --velocity-column is missing"
+        raise UsageError(missing, f"the file has: {', '.join(table.columns)}")
     needed: list[tuple[str, object]] = [("--side", given.side), ("--ratio", given.ratio)]
     needed += [("--position-unit", given.position_unit)] if given.position_column else []
     needed += [("--velocity-unit", given.velocity_unit)] if given.velocity_column else []
     needed += [("--torque-side", given.torque_side)] if given.torque_column else []
     needed += [("--torque-constant", given.torque_constant_NmpA)] if given.current_column else []
-    for flag, value in needed:
-        if value is None:
-            raise UsageError(f"{flag} is missing: a table of numbers does not tell it", "nothing is guessed")
+    require_told(table, given, needed)
 
 
 # --- what is wrong with the data, before anything is fitted ---

@@ -33,7 +33,7 @@ from foxglove.websocket import (
 
 from jointctl.tools.recording.ros_messages import CDR_HEADER, EVENT_TOPIC, JOINT_STATE_TOPIC, RECORD_TOPIC, Topic
 from jointctl.tools.recording.run_log import Event
-from jointctl.tools.scoping.live_view import LiveView, WayBack, serve_order
+from jointctl.tools.scoping.live_view import NOT_TAKEN, LiveView, WayBack, serve_order
 from jointctl.tools.scoping.remote import RemoteOrder
 from jointctl.tools.session.set_points import RemoteSetPoint
 
@@ -186,7 +186,7 @@ class FoxgloveView(ServerListener):
         if not self._order.allow_remote:
             self._tell(CLOSED.format("gains"))
         elif not self.way.ask("gains", client_name(client.id), given):
-            self._tell("gains not taken: jointctl does not listen")
+            self._tell(f"gains {NOT_TAKEN}")
         return [found for found in self._parameters() if found.name.removeprefix(GAIN) in given]
 
     def on_client_advertise(self, client: Client, channel: ClientChannel) -> None:

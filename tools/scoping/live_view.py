@@ -30,7 +30,7 @@ from jointctl.tools.session.display import ViewerRequest
 
 RATE_HZ = 100
 _PERIOD_NS = 1_000_000_000 // RATE_HZ
-NO_STOP = "not taken: jointctl does not listen"
+NOT_TAKEN = "not taken: jointctl does not listen"
 
 
 class Publisher(Protocol):
@@ -101,7 +101,7 @@ class WayBack:
     def stop(self, who: str) -> tuple[bool, str]:
         """A press of STOP: whether it was taken, and what it does."""
         strength = self._feed.stop(who)
-        return strength > 0, ("", "STOP taken; again: quick stop", "STOP taken: quick stop")[strength] or NO_STOP
+        return strength > 0, ("", "STOP taken; again: quick stop", "STOP taken: quick stop")[strength] or NOT_TAKEN
 
     def ask(self, kind: str, who: str, values: Mapping[str, object] | None = None) -> bool:
         """A request; whether it was taken."""

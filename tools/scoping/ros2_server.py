@@ -21,7 +21,7 @@ from jointctl.drivers.printable import printable
 from jointctl.firmware_py.states import fault_name
 from jointctl.tools.recording.ros_messages import JOINT_STATE_TOPIC, SECOND_NS
 from jointctl.tools.recording.run_log import ERROR, WARNING, Event
-from jointctl.tools.scoping.live_view import LiveView, WayBack, serve_order
+from jointctl.tools.scoping.live_view import NOT_TAKEN, LiveView, WayBack, serve_order
 from jointctl.tools.scoping.remote import RemoteOrder
 from jointctl.tools.scoping.rmw_zenoh import (
     ADMIN_SPACE,
@@ -179,7 +179,7 @@ class Ros2View:
             return False, NOT_WAITING
         self.view.settings["stage"] = "enable asked for"  # once
         taken = self.way.ask("enable", who, {"number": self.view.settings.get("number")})
-        return taken, "enabling" if taken else "not taken: jointctl does not listen"
+        return taken, "enabling" if taken else NOT_TAKEN
 
     # --- Publisher ---
 

@@ -20,7 +20,13 @@ from jointctl.firmware_py.records import Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.trajectory import approach_start, peak_of, reference_at
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.records import axis_constants, fill_trajectory, free_constants, trajectory_table
+from jointctl.tools.configuration.records import (
+    axis_constants,
+    expect_client,
+    fill_trajectory,
+    free_constants,
+    trajectory_table,
+)
 from jointctl.tools.configuration.sections import Limits
 from jointctl.tools.recording.log_folder import log_path
 
@@ -116,9 +122,9 @@ class FreeMotion:
         config, start_rad = self._config, report.start_position_rad
         self.start_rad = start_rad
         constants = free_constants(config, start_rad)
-        if not self._by_program:
-            what, constants[0].stream.client_timeout_ns = "none: the joint holds its place", 0
-        else:
+        what = "none: the joint holds its place"
+        if self._by_program:
+            expect_client(constants, config)
             what = f"as the program says; it may be silent for {config.stream.client_timeout_s:g} s"
         lines = (
             *joint_lines(report),
@@ -130,11 +136,6 @@ class FreeMotion:
 
     def require_start(self, start_position_rad: float) -> None:
         """It begins where the joint stands."""
-
-
-def expect_client(constants: Any, config: Config) -> None:
-    """The loop ends the run when the program that commands the joint has been silent for `stream.client_timeout_s`."""
-    constants[0].stream.client_timeout_ns = round(config.stream.client_timeout_s * 1e9)
 
 
 @dataclass(frozen=True)

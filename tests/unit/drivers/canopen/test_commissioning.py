@@ -288,7 +288,10 @@ def test_a_wait_looks_for_a_stop_before_each_of_its_parts_and_at_its_end(
     assert log == pytest.approx([number for part in slices_s for number in (-1.0, part)] + [-1.0])
 
 
-def test_once_a_stop_was_asked_for_the_drive_is_only_made_safe(joint: Any) -> None:
+@pytest.fixture
+def stoppable(joint: Any) -> Iterator[Any]:
+    """The commissioned driver, and the list that asks for a stop as soon as there is something in it."""
+
     def gate() -> None:
         if asked:
             raise Stop
@@ -297,15 +300,20 @@ def test_once_a_stop_was_asked_for_the_drive_is_only_made_safe(joint: Any) -> No
     drive = joint.drive(joint.settings, gate=gate)
     try:
         drive.commission()
-        asked.append(True)
-        joint.requests.clear()
-        for step in (drive.commission, drive.start_cyclic, lambda: drive._objects.read(0x1000, what="device type")):
-            with pytest.raises(Stop):
-                step()
-        assert joint.requests == []
-        assert drive.make_safe() == "switch on disabled"
+        yield drive, asked
     finally:
         drive.close()
+
+
+def test_once_a_stop_was_asked_for_the_drive_is_only_made_safe(joint: Any, stoppable: Any) -> None:
+    drive, asked = stoppable
+    asked.append(True)
+    joint.requests.clear()
+    for step in (drive.commission, drive.start_cyclic, lambda: drive._objects.read(0x1000, what="device type")):
+        with pytest.raises(Stop):
+            step()
+    assert joint.requests == []
+    assert drive.make_safe() == "switch on disabled"
 
 
 @pytest.mark.parametrize(("configured_s", "used_s"), [(None, 0.15), (0.7, 0.7)])
@@ -373,21 +381,13 @@ def test_what_was_verified_before_a_new_commissioning_is_forgotten(joint: Any) -
         assert (0x6072, 0) in drive._objects.verified()
 
 
-def test_a_stop_at_the_last_moment_keeps_the_drive_from_being_started(joint: Any) -> None:
-    def gate() -> None:
-        if asked:
-            raise Stop
-
-    asked: list[bool] = []
-    drive = joint.drive(joint.settings, gate=gate)
-    try:
-        drive.commission()
-        drive._others.refuse = lambda: asked.append(True)  # the last look before NMT start
-        with pytest.raises(Stop):
-            drive.start_cyclic()
-        assert (0, bytes([NmtCommand.START, 1])) not in joint.requests
-    finally:
-        drive.close()
+def test_a_stop_at_the_last_moment_keeps_the_drive_from_being_started(joint: Any, stoppable: Any) -> None:
+    drive, asked = stoppable
+    drive._others.refuse = lambda: asked.append(True)  # the last look before NMT start
+    joint.requests.clear()  # the watchdog's proof is over
+    with pytest.raises(Stop):
+        drive.start_cyclic()
+    assert (0, bytes([NmtCommand.START, 1])) not in joint.requests
 
 
 @pytest.mark.parametrize("started", [True, False])
