@@ -32,6 +32,7 @@ from jointctl.tools.output import Output
 from tests.bench.paired import Row, conditions, outcome_data, outcome_table
 from tests.foxglove_client import free_port
 
+ROOT = Path(__file__).resolve().parents[2]
 GROUP = "client"
 SET_POINTS, FOXGLOVE, ROS2 = "set-points", "foxglove", "ros2"
 GOAL = 1.1
@@ -60,8 +61,8 @@ def _windows(joint: jointctl.Joint, pairs: int, seconds: float, load: Load) -> l
 @contextmanager
 def _onlooker(kind: str, port: int) -> Iterator[Load]:
     """A client of its own process, which runs, as the server does, only for the windows with it."""
-    command = [sys.executable, "-P", "-m", "tests.bench.onlooker", kind, str(port)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+    command = [sys.executable, "-m", "tests.bench.onlooker", kind, str(port)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE) as process:
         pids = [process.pid, _child(f"{kind}_server")]
 
         def look_on(joint: jointctl.Joint, seconds: float) -> None:
