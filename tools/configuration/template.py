@@ -16,7 +16,7 @@ from pydantic.fields import FieldInfo
 
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_section import section_class
-from jointctl.tools.configuration.units import echo, understood, unit_of, unit_text
+from jointctl.tools.configuration.load import echo, understood, unit_of, unit_text
 
 _SECTION = re.compile(r"\[(\w+)\]")
 _KEY = re.compile(

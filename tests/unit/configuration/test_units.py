@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.tools.configuration.load import load_config
-from jointctl.tools.configuration.units import understood, unit_of, with_units
+from jointctl.tools.configuration.load import load_config, understood, unit_of, with_units
 from tests.configurations import VIRTUAL, load, problems
 
 
