@@ -41,7 +41,7 @@ from jointctl.drivers.elmo.codes import (
     ZERO,
     UnitMode,
 )
-from jointctl.drivers.elmo.line_budget import BITS_PER_CHARACTER
+from jointctl.drivers.elmo.settings import BITS_PER_CHARACTER
 from jointctl.drivers.position_counts import WRAP, take_counts
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.records import LINE_GONE, Command, Sample

@@ -21,9 +21,14 @@ from jointctl.drivers.elmo.codes import (
 from jointctl.drivers.elmo.commissioning import SPEED_MODE, TORQUE_MODE, set_speed_mode, set_torque_mode, write_limits
 from jointctl.drivers.elmo.cyclic import ElmoPort
 from jointctl.drivers.elmo.dialogue import SAFE_ATTEMPTS, Dialogue, RefusedError, ReplyKind, changed, encode, switch_off
-from jointctl.drivers.elmo.line_budget import LARGEST_SHARE, MeasuredExchange, highest_rate_Hz, measured_exchange
 from jointctl.drivers.elmo.serial_port import BytePort, SerialPort
-from jointctl.drivers.elmo.settings import ElmoSettings
+from jointctl.drivers.elmo.settings import (
+    LARGEST_SHARE,
+    ElmoSettings,
+    MeasuredExchange,
+    highest_rate_Hz,
+    measured_exchange,
+)
 from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
 from jointctl.firmware_py.schema import new
 

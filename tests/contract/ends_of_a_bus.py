@@ -11,9 +11,9 @@ from typing import Protocol
 import can
 import numpy as np
 
-from jointctl.drivers.can.frame_io import receive_frame, send_frame
 from jointctl.drivers.can.frames import Frame
 from jointctl.drivers.can.open import open_cyclic_end
+from jointctl.drivers.canopen.exchange import receive_frame, send_frame
 from jointctl.firmware_py.libc import WAIT_SCRATCH_WORDS, wait_readable_ns
 from jointctl.firmware_py.schema import new
 

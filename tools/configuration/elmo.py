@@ -13,8 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, Field, PrivateAttr
 from pydantic_core import PydanticCustomError
 
-from jointctl.drivers.elmo.line_budget import highest_rate_Hz
-from jointctl.drivers.elmo.settings import SERIAL, ElmoSettings
+from jointctl.drivers.elmo.settings import SERIAL, ElmoSettings, highest_rate_Hz
 from jointctl.drivers.errors import ConfigurationError, DeviceError
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import shared, torque_constant_NmpA

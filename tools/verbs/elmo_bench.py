@@ -24,9 +24,8 @@ from rich.table import Column, Table
 from jointctl.drivers.elmo.codes import CURRENT_LIMITED, FAULT_LATCHED, SERVO_ON, motor_off_cause, status_text
 from jointctl.drivers.elmo.dialogue import Dialogue, switch_off
 from jointctl.drivers.elmo.drive import ElmoDrive
-from jointctl.drivers.elmo.line_budget import LARGEST_SHARE, highest_rate_Hz
 from jointctl.drivers.elmo.serial_port import SerialPort
-from jointctl.drivers.elmo.settings import SERIAL
+from jointctl.drivers.elmo.settings import LARGEST_SHARE, SERIAL, highest_rate_Hz
 from jointctl.drivers.errors import BusError, ConfigurationError, JointctlError
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.elmo import BAUD_RATES_TEXT, BAUD_RATES_bitps, elmo_section, serial_line_share

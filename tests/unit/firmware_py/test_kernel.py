@@ -104,7 +104,7 @@ def test_the_hash_depends_on_the_sources_and_not_on_their_place(copy_of_sources:
 @pytest.mark.parametrize(
     ("edited", "counts"),
     [
-        ("firmware_py/friction.py", True), ("drivers/can/frame_io.py", True), ("drivers/canopen/cyclic.py", True),
+        ("firmware_py/friction.py", True), ("drivers/canopen/exchange.py", True), ("drivers/canopen/cyclic.py", True),
         ("hil/plant.py", True), ("tools/identification/fit.py", True), ("tools/wake_up.py", True),
         ("tools/verbs/run.py", False),
     ],

@@ -10,7 +10,6 @@ from functools import partial
 import numpy as np
 import pytest
 
-from jointctl.drivers.can.frame_io import receive_frame, send_frame
 from jointctl.drivers.can.frames import (
     FRAME_BYTES,
     Frame,
@@ -19,6 +18,7 @@ from jointctl.drivers.can.frames import (
     worst_cycle_bits,
     worst_frame_bits,
 )
+from jointctl.drivers.canopen.exchange import receive_frame, send_frame
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.libc import WAIT_SCRATCH_WORDS, wait_readable_ns
 from jointctl.firmware_py.schema import dtype_of, new
@@ -103,7 +103,7 @@ import socket, sys, threading
 import numba
 import numpy as np
 from numba.core.runtime import rtsys
-from jointctl.drivers.can.frame_io import receive_frame, send_frame
+from jointctl.drivers.canopen.exchange import receive_frame, send_frame
 from jointctl.drivers.can.frames import Frame
 from jointctl.drivers.can.virtual_bus import connect
 from jointctl.firmware_py.kernel import kernel

@@ -10,8 +10,8 @@ import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
 
+from jointctl.drivers.canopen.drive import Thermometer
 from jointctl.drivers.canopen.settings import TemperatureObject
-from jointctl.drivers.canopen.thermometer import Thermometer
 from jointctl.drivers.drive import Reading
 from jointctl.drivers.errors import DeviceError
 
