@@ -20,7 +20,6 @@ from jointctl.drivers.errors import DataError
 from jointctl.firmware_py.input_file import LARGEST_LOG_BYTES, open_input
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
-from jointctl.tools.recording.mcap_file import BEFORE_BODY, MESSAGE_HEAD
 from jointctl.tools.recording.ros_messages import (
     CAN_FRAME,
     CAN_TOPIC,
@@ -35,7 +34,16 @@ from jointctl.tools.recording.ros_messages import (
     stamp,
     stamps_ns,
 )
-from jointctl.tools.recording.run_log import ERROR, THINNING, WARNING, Event, calendar_offset_ns, cdr_rows
+from jointctl.tools.recording.run_log import (
+    BEFORE_BODY,
+    ERROR,
+    MESSAGE_HEAD,
+    THINNING,
+    WARNING,
+    Event,
+    calendar_offset_ns,
+    cdr_rows,
+)
 
 
 @dataclass(frozen=True)

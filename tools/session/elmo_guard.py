@@ -26,10 +26,10 @@ import time
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from jointctl.drivers.bus_lock import ANSWER_S, listener, may_ask, received_line, send_line
 from jointctl.drivers.elmo.dialogue import SWITCH_OFF, Dialogue, switch_off
 from jointctl.drivers.elmo.serial_port import SerialPort, open_descriptor, usb_serial_number
 from jointctl.drivers.errors import BusError, JointctlError
-from jointctl.drivers.local_socket import ANSWER_S, listener, may_ask, received_line, send_line
 
 # --- Speaking with the guard of a serial line from another terminal ---
 # The guard listens on an abstract Unix socket named after the device: nothing is left behind, and the kernel tells

@@ -52,9 +52,15 @@ def log_names(paths: Sequence[Path]) -> list[str]:
 def report_sections(names: Sequence[str], logs: Sequence[RunLog]) -> list[Section]:
     """The body of the page."""
     from jointctl.firmware_py.states import Fault
-    from jointctl.tools.recording.report_figures import comparison, run_figures, temperature_figure
+    from jointctl.tools.recording.report_figures import (
+        comparison,
+        events_table,
+        figure_tables,
+        run_figures,
+        temperature_figure,
+        what_ran,
+    )
     from jointctl.tools.recording.report_page import Details, Paragraph, Section
-    from jointctl.tools.recording.report_tables import events_table, figure_tables, what_ran
     from jointctl.tools.recording.run_summary import summarise
 
     summaries = [summarise(log.records, temperatures_degC=log.temperatures["temperature_degC"]) for log in logs]

@@ -29,11 +29,11 @@ from jointctl.drivers.bus_lock import (
     lock_holders,
     lock_name,
     marked_processes,
+    send_line,
     wait_for_answers,
 )  # fmt: skip
 from jointctl.drivers.can.virtual_bus import socket_path
 from jointctl.drivers.errors import BusError
-from jointctl.drivers.local_socket import send_line
 from jointctl.tools.session import stop_call
 from jointctl.tools.session.stop_call import StopCall
 

@@ -9,7 +9,7 @@ from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 from zenoh.ext import Int64, UInt8, z_serialize
 
 from jointctl.tools.recording.ros_messages import JOINT_STATE_TOPIC
-from jointctl.tools.scoping import rmw_zenoh as ros
+from jointctl.tools.scoping import ros2_server as ros
 from jointctl.tools.scoping.ros2_server import session_config, set_point_of
 from jointctl.tools.session.set_points import RemoteSetPoint
 from tests.ros2_client import DEFINITIONS, HASHES, JOINT_STATE, SET_POINT, TRIGGER, key
