@@ -18,8 +18,7 @@ from jointctl.firmware_py.states import AxisPhase, Fault, fault_name, in_words
 from jointctl.joint import POLL_S, TABLE_ROWS, State
 from jointctl.joint_source import JointSource
 from jointctl.tools.output import Output
-from jointctl.tools.recording.log_folder import log_path
-from jointctl.tools.recording.run_log import ERROR, Event
+from jointctl.tools.recording.run_log import ERROR, Event, log_path
 from jointctl.tools.scoping.remote import remote
 from jointctl.tools.scoping.remote_options import NOBODY_REMOTE, RemoteOptions
 from jointctl.tools.session import result as drive_end

@@ -309,10 +309,9 @@ def new_session(kind: str, config: Config, control: Control, folder: Path) -> Se
         plan = replace(resolve(config), log_path=log)
         return Session(plan, consent, output, control, lambda _: PhaseLines(output))
     from jointctl.tools.sweeping.carry_out import MeterDisplay, SweepPass, config_of_sweep, sweep_run
-    from jointctl.tools.sweeping.meter import SweepMeter
+    from jointctl.tools.sweeping.meter import SweepMeter, Tolerance
     from jointctl.tools.sweeping.options import SweepOptions
     from jointctl.tools.sweeping.plan import make_plan
-    from jointctl.tools.sweeping.statistics import Tolerance
     from jointctl.tools.verbs.sweep import joint_model
 
     config = config_of_sweep(config, "auto")

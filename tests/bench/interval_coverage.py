@@ -25,7 +25,7 @@ from jointctl.tools.identification.identification import DIRECTIONS, Options, id
 from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.identification.uncertainty import NAMES
 from jointctl.tools.output import Output
-from jointctl.tools.sweeping.grid import grid_speeds
+from jointctl.tools.sweeping.options import grid_speeds
 
 GOAL = (0.92, 0.98)
 NOISE_Nm = 0.0046

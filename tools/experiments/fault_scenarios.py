@@ -35,7 +35,7 @@ from jointctl.tools.configuration.records import fill_trajectory
 from jointctl.tools.configuration.sections import Hold, MinJerk, Sine, Trapezoid
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.sweeping.carry_out import middle_rad, sweep_constants, with_tracking_law
-from jointctl.tools.sweeping.grid import SweepPoint
+from jointctl.tools.sweeping.options import SweepPoint
 from jointctl.tools.sweeping.plan import ACCELERATION_SHARE, PlanSettings, plan_motion, position_margin_rad, shifted
 
 During = Literal["run", "sweep", "program"]

@@ -30,7 +30,7 @@ from jointctl.tools.configuration.conversions import (
 )
 from jointctl.tools.configuration.records import APPROACH_MIN_S, axis_constants
 from jointctl.tools.inspection.health import NOTE, OK, PROBLEM, Finding
-from jointctl.tools.recording.log_folder import log_path
+from jointctl.tools.recording.run_log import log_path
 from jointctl.tools.session.fault_words import FaultText
 from jointctl.tools.session.plan import Placed, RunPlan, joint_lines, remark_lines
 

@@ -33,8 +33,8 @@ from foxglove.websocket import (
 
 from jointctl.tools.recording.ros_messages import CDR_HEADER, EVENT_TOPIC, JOINT_STATE_TOPIC, RECORD_TOPIC, Topic
 from jointctl.tools.recording.run_log import Event
-from jointctl.tools.scoping.live_view import NOT_TAKEN, LiveView, WayBack, serve_order
 from jointctl.tools.scoping.remote import RemoteOrder
+from jointctl.tools.scoping.supervisor_link import NOT_TAKEN, LiveView, WayBack, serve_order
 from jointctl.tools.session.set_points import RemoteSetPoint
 
 BACKLOG = 256  # messages for a client that does not read: 1 s of all topics

@@ -12,7 +12,7 @@ from jointctl.drivers.errors import MotionFault, UsageError
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
-from jointctl.tools.recording.log_folder import remove_oldest, require_room
+from jointctl.tools.recording.run_log import remove_oldest, require_room
 from jointctl.tools.session.fault_words import fault_text
 
 # --- The one conversation before something is done to a joint or its drive: what is shown, and who says yes ---

@@ -28,7 +28,7 @@ from jointctl.tools.configuration.records import (
     trajectory_table,
 )
 from jointctl.tools.configuration.sections import Limits
-from jointctl.tools.recording.log_folder import log_path
+from jointctl.tools.recording.run_log import log_path
 
 START_SHARE = 0.1  # of the following error: how far from the trajectory a run without an approach may begin
 

@@ -24,14 +24,13 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_constants
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Advance, Output
-from jointctl.tools.recording.log_folder import log_path
+from jointctl.tools.recording.run_log import log_path
 from jointctl.tools.session.consent import Consent
 from jointctl.tools.session.display import OnlyShows, Snapshot
 from jointctl.tools.session.plan import Placed, RunPlan, joint_lines, remark_lines
-from jointctl.tools.sweeping.checks import constant_remarks, require_torque
-from jointctl.tools.sweeping.grid import SweepPoint
 from jointctl.tools.sweeping.meter import SweepMeter
-from jointctl.tools.sweeping.plan import SweepMotion, position_margin_rad, shifted
+from jointctl.tools.sweeping.options import SweepPoint
+from jointctl.tools.sweeping.plan import SweepMotion, constant_remarks, position_margin_rad, require_torque, shifted
 
 MODES = ("auto", "csv", "pv", "speed", "torque")
 POSITION_GAIN_ps = 5.0  # slow: far below any drive's velocity loop, fast enough to keep the joint on the plan

@@ -5,6 +5,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import math
+import random
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -12,8 +16,115 @@ from typing import Annotated
 import typer
 
 from jointctl.drivers.errors import DataError, UsageError
-from jointctl.tools.sweeping.grid import MOST_POINTS, check_range
+from jointctl.firmware_py.input_file import number_from, read_input
 from jointctl.tools.written_file import require_target
+
+# --- Which speeds a sweep visits: the grid, both directions, the order ---
+# Speeds are joint speeds [rad/s] > 0; a point is one plateau, its velocity signed.  An odd number of points is kept to
+# the letter (the paper has 225): the slowest speed is then visited in the positive direction only.
+
+
+GRIDS = ("near-zero", "linear", "log", "list")
+DEFAULT_POINTS = 225
+SPEED_RATIO = 1000.0  # default: the slowest speed is this many times slower than the fastest
+MOST_POINTS = 5000
+_GRID_POWER = 2.0  # near-zero: speeds go with this power of their number
+
+
+@dataclass(frozen=True)
+class SweepPoint:
+    """One plateau of the grid; `index` is its place in the plan and never changes."""
+
+    index: int
+    velocity_radps: float
+    pass_number: int
+
+    @property
+    def direction(self) -> int:
+        return 1 if self.velocity_radps > 0.0 else -1
+
+
+def check_range(name: str, value: float, low: float, high: float) -> None:
+    """`UsageError` unless low <= value <= high."""
+    if not low <= value <= high:
+        raise UsageError(f"{name} (={value:g}) must be in [{low:g}..{high:g}]")
+
+
+def grid_speeds(grid: str, count: int, slowest_radps: float, fastest_radps: float) -> list[float]:
+    """`count` ascending speeds from the slowest to the fastest; linear is the paper's k/count of the fastest."""
+    if grid not in GRIDS[:3]:
+        raise UsageError(f"--grid (={grid}) must be one of {', '.join(GRIDS)}")
+    if count == 1:
+        return [fastest_radps]
+    if grid == "linear":
+        step = fastest_radps / count
+        return [max(slowest_radps, step * (k + 1)) for k in range(count)]
+    shares = [k / (count - 1) for k in range(count)]
+    if grid == "log":
+        return [slowest_radps * (fastest_radps / slowest_radps) ** u for u in shares]
+    return [slowest_radps + (fastest_radps - slowest_radps) * u**_GRID_POWER for u in shares]
+
+
+def listed_velocities(path: Path) -> list[float]:
+    """Velocities [rad/s] of a file, one a line; `#` comments and the heading velocity_radps are allowed."""
+    try:
+        text = read_input(path).decode("utf-8-sig")
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: byte {error.start} is not UTF-8 text") from None
+    found: list[float] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        word = line.split("#")[0].strip()
+        if not word or word == "velocity_radps":
+            continue
+        try:
+            value = number_from(word)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value) or value == 0.0:
+            raise DataError(f"{path}: line {number} (={word[:40]}) must be a velocity in rad/s, finite and not zero")
+        if value in found:
+            raise DataError(f"{path}: line {number} (={word[:40]}) is a velocity that the list already has")
+        found.append(value)
+    if not found:
+        raise DataError(f"{path}: holds no velocities; one a line, in rad/s")
+    return found
+
+
+def both_directions(speeds: list[float], points: int) -> list[float]:
+    """Each speed forwards and backwards, slowest first; the slowest only forwards where `points` is odd."""
+    velocities = [signed for speed in speeds for signed in (speed, -speed)]
+    if points % 2:
+        del velocities[1]
+    return velocities
+
+
+def ordered_points(velocities: list[float], passes: int, shuffle_seed: int | None) -> list[SweepPoint]:
+    """All points in the order of measuring: pass by pass, both directions of a speed one after the other.
+
+    A shuffled order is another one in each pass, so that drift does not look like a property of the speed.
+    """
+    random_order = None if shuffle_seed is None else random.Random(shuffle_seed)
+    points: list[SweepPoint] = []
+    for number in range(passes):
+        speeds = list(dict.fromkeys(abs(v) for v in velocities))
+        if random_order is not None:
+            random_order.shuffle(speeds)
+        for speed in speeds:
+            pair = sorted((v for v in velocities if abs(v) == speed), reverse=True)
+            points += [SweepPoint(len(points) + k, velocity, number) for k, velocity in enumerate(pair)]
+    return points
+
+
+def plan_hash(points: list[SweepPoint], more: dict[str, float]) -> str:
+    """Identifies a plan: its points in their order, and what else decides about the measurement."""
+    content = [[f"{p.velocity_radps:.9g}", p.pass_number] for p in points]
+    text = json.dumps([content, {key: f"{value:.9g}" for key, value in sorted(more.items())}])
+    return hashlib.sha256(text.encode("ascii")).hexdigest()[:16]
+
+
+# --- Options ---
 
 
 @dataclass(frozen=True)

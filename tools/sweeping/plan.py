@@ -21,22 +21,26 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from jointctl.drivers.errors import UsageError
+from jointctl.drivers.drive import CommissioningReport
+from jointctl.drivers.errors import ConfigurationError, DeviceError, UsageError
+from jointctl.tools.configuration.checks import rated_contradiction
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.sweeping.checks import measuring_constants
-from jointctl.tools.sweeping.grid import (
+from jointctl.tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
+from jointctl.tools.sweeping.options import (
     DEFAULT_POINTS,
     SPEED_RATIO,
+    SweepOptions,
     SweepPoint,
     both_directions,
+    check_options,
     grid_speeds,
     listed_velocities,
     ordered_points,
     plan_hash,
 )
-from jointctl.tools.sweeping.options import SweepOptions, check_options
-from jointctl.tools.sweeping.statistics import LEAST_SAMPLES
 
+BATCHES = 16  # of the samples of a window; their spread tells how far its mean can be trusted
+LEAST_SAMPLES = 4 * BATCHES
 TEETH = 4
 MOST_STROKES = 8  # of one point; more travel helps more than more strokes
 PATIENCE = 3.0  # a whole period at the joint may take this many dwell times before teeth take its place
@@ -360,3 +364,55 @@ def _check_fastest(name: str, fastest: float, reachable: float, allowed: float) 
     if fastest > reachable * (1.0 + 1e-9):
         why = f"{SPEED_SHARE:.0%} of limits.velocity_max_radps" if reachable == allowed else "what the travel allows"
         raise UsageError(f"{name} (={fastest:g}) must be at most {reachable:.4g} rad/s, {why}")
+
+
+# --- Do the constants that turn the drive's reading into torque agree?  And what the sidecar keeps of them ---
+# A CiA 402 drive tells its torque in thousandths of a rated value, so that a wrong torque constant or rated value
+# scales all friction by the same factor, and nothing in the curve's shape shows it.  But three of the numbers are tied:
+# rated torque is about torque constant times rated current.  A factor of 1.41 between them is rms against sine
+# amplitude.  A serial drive tells amperes and has no rated torque: its torque constant cannot be checked this way.
+
+
+WRONG_FACTOR = 3.0
+
+
+def refuse_constants(config: Config) -> None:
+    """Raise `ConfigurationError` if no motor can have these constants."""
+    found = config.drive.constants_factor(config)
+    if found is not None and not 1.0 / WRONG_FACTOR <= found[0] <= WRONG_FACTOR:
+        raise ConfigurationError(f"{config.path}: {found[1]}", "nothing was moved; see the data sheets")
+
+
+def require_torque(report: CommissioningReport) -> None:
+    """`DeviceError` where the torque of every sample would be zero."""
+    if not report.measures_torque:
+        raise DeviceError(
+            "the drive does not tell its torque in the cyclic exchange (object 6077): friction would read as zero, "
+            "and a blocked joint would not be noticed",
+            "use an EDS with 6077, and let it be mapped to a PDO",
+        )
+
+
+def constant_remarks(config: Config) -> list[str]:
+    """What the user should look at before the joint moves."""
+    return [line + "; friction would be wrong by that factor" for line in rated_contradiction(config)]
+
+
+def recorded_limits(config: Config) -> dict[str, float]:
+    """For the sidecar: what `identify` compares the data with when no configuration is at hand; at the joint."""
+    return {
+        "torque_max_Nm": config.limits.torque_max_Nm,
+        "velocity_max_radps": config.limits.velocity_max_radps,
+    }
+
+
+def measuring_constants(config: Config) -> dict[str, float]:
+    """What turns readings into velocity and friction: points measured with other numbers are not one sweep."""
+    return {
+        "torque_constant_NmpA": torque_constant_NmpA(config),
+        "torque_direction": float(config.drive.torque_direction),
+        "rad_per_count": joint_rad_per_count(config),
+        "gravity_Nm": config.joint.gravity_Nm,
+        "gravity_zero_rad": config.joint.gravity_zero_rad,
+        **config.drive.measuring_constants(),
+    }

@@ -15,7 +15,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import Bitrate, Channel, Interface, ProgressOutput
 
 if TYPE_CHECKING:
-    from jointctl.tools.configuration.template import Mark, Place
+    from jointctl.tools.inspection.first_values import Mark, Place
     from jointctl.tools.inspection.subject import Subject
 
 Node = Annotated[int | None, typer.Option("--node", "-t", help="CANopen node of the drive", min=1, max=127)]
@@ -48,7 +48,7 @@ def new(
     The drive says what it knows (identity, rated values, counts), the rest is asked for, one question each.
     """
     from jointctl.tools.configuration.load import read_text, shipped_config
-    from jointctl.tools.configuration.template import filled
+    from jointctl.tools.inspection.first_values import filled
 
     source = shipped_config(shipped)
     text = read_text(source)
@@ -77,8 +77,7 @@ def new(
 def _from_drive(drive: DriveOptions, text: str, folder: Path, output: Output, *, ask: bool) -> dict[Place, object]:
     """The values that the drive and the user give."""
     from jointctl.tools.configuration.drive_section import GivenPlace
-    from jointctl.tools.configuration.template import marks, toml_text
-    from jointctl.tools.inspection.first_values import first_values
+    from jointctl.tools.inspection.first_values import first_values, marks, toml_text
     from jointctl.tools.inspection.subject import SdoReader, canopen_network, subject_of_flags
 
     given = GivenPlace(drive.interface, drive.channel, drive.bitrate, None, drive.node)
@@ -116,7 +115,7 @@ def _bus(subject: Subject) -> dict[Place, tuple[object, str]]:
 
 def _asked(mark: Mark, suggested: tuple[object, str] | None, output: Output) -> Iterator[tuple[Place, object]]:
     """One question, until its answer may be; nothing if it is left open."""
-    from jointctl.tools.configuration.template import checked, default_of, toml_text
+    from jointctl.tools.inspection.first_values import checked, default_of, toml_text
 
     usual = toml_text(default_of(mark.place)) if mark.optional else ""
     default = usual if suggested is None else toml_text(suggested[0])

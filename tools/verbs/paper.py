@@ -88,8 +88,7 @@ def paper(
 
 def _figures(runs: dict[str, PaperRun], identified: PaperIdentification | None) -> dict[str, Any]:
     """By the name of the file, in the paper's order."""
-    from jointctl.tools.experiments.paper_experiments import identification_figure
-    from jointctl.tools.experiments.paper_figures import draw_all
+    from jointctl.tools.experiments.paper_experiments import draw_all, identification_figure
 
     found = {"fig07_identification": identification_figure(identified)} if identified is not None else {}
     return {**found, **draw_all(runs)}

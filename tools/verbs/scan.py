@@ -13,8 +13,7 @@ from jointctl.tools.verbs.asked_drive import NodeOnBus
 from jointctl.tools.verbs.verb_options import VerbOutput
 
 if TYPE_CHECKING:
-    from jointctl.tools.inspection.node_scan import Heard
-    from jointctl.tools.inspection.subject import Subject
+    from jointctl.tools.inspection.subject import Heard, Subject
 
 _NOT_CANOPEN = "power the drives; check the bit rate of each (a drive that keeps silent may only send when asked)"
 
@@ -29,8 +28,7 @@ def scan(
 ) -> int:
     """Which CANopen nodes are on the bus: identity, device type, NMT state, drive state.  Reads only."""
     from jointctl.drivers.canopen.identifiers import HIGHEST_NODE
-    from jointctl.tools.inspection.node_scan import Ear, ask_everybody, describe
-    from jointctl.tools.inspection.subject import canopen_network
+    from jointctl.tools.inspection.subject import Ear, ask_everybody, canopen_network, describe
 
     ear = Ear()
     with canopen_network(subject, ear) as network:

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from jointctl.tools.session.display import Display
     from jointctl.tools.session.fault_words import FaultText
     from jointctl.tools.sweeping.data_file import SweepFile
-    from jointctl.tools.sweeping.grid import SweepPoint
     from jointctl.tools.sweeping.meter import JointModel, MeasuredPoint
+    from jointctl.tools.sweeping.options import SweepPoint
     from jointctl.tools.sweeping.plan import PlanSettings
 
 RELATIVE_TOLERANCE = 0.01
@@ -70,8 +70,7 @@ class Sweep:
     ) -> None:
         from jointctl.tools.session.consent import TerminalConsent
         from jointctl.tools.sweeping.carry_out import config_of_sweep
-        from jointctl.tools.sweeping.checks import refuse_constants
-        from jointctl.tools.sweeping.plan import make_plan
+        from jointctl.tools.sweeping.plan import make_plan, refuse_constants
 
         refuse_constants(config)
         self.config = config_of_sweep(config, options.mode)
@@ -141,8 +140,7 @@ class Sweep:
         from jointctl.tools.session.session import Session
         from jointctl.tools.sweeping.carry_out import MeterDisplay, SweepPass, sweep_in_lockstep, sweep_run
         from jointctl.tools.sweeping.data_file import SweepFile
-        from jointctl.tools.sweeping.meter import SweepMeter
-        from jointctl.tools.sweeping.statistics import Tolerance
+        from jointctl.tools.sweeping.meter import SweepMeter, Tolerance
 
         config, options = self.config, self.options
         motion = self.plan.motion(points, warm_up_turns, dwell_factor)
@@ -192,7 +190,7 @@ class Sweep:
         """What the sidecar tells besides the constants."""
         from importlib.metadata import version
 
-        from jointctl.tools.sweeping.checks import recorded_limits
+        from jointctl.tools.sweeping.plan import recorded_limits
 
         options = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(self.options).items()}
         return {
@@ -258,7 +256,7 @@ class Sweep:
         return 0
 
     def _write_page(self) -> None:
-        from jointctl.tools.sweeping.sweep_page import write_sweep_page
+        from jointctl.tools.sweeping.data_file import write_sweep_page
 
         if self.options.report is not None and self.file is not None and self.file.done:
             write_sweep_page(self.options.report, self.out, self._table(), self.output)

@@ -51,7 +51,7 @@ def zero(
     """Set the joint's zero: the angle here becomes 0, or --angle.  Moves nothing, writes the configuration only."""
     from jointctl.tools.configuration.config import SHIPPED_FOLDER
     from jointctl.tools.configuration.load import load_config, read_text
-    from jointctl.tools.configuration.template import filled
+    from jointctl.tools.inspection.first_values import filled
     from jointctl.tools.session.consent import agreed, require_terminal
     from jointctl.tools.written_file import replace_file
 

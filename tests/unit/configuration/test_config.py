@@ -24,8 +24,8 @@ from jointctl.tools.configuration.reference import models_in, rows_of, sections_
 from jointctl.tools.output import Output
 from jointctl.tools.session.fault_words import FAULT_TEXTS
 from jointctl.tools.session.session_drive import session_drive
-from jointctl.tools.sweeping.checks import constant_remarks, recorded_limits, refuse_constants
 from jointctl.tools.sweeping.options import SweepOptions
+from jointctl.tools.sweeping.plan import constant_remarks, recorded_limits, refuse_constants
 from jointctl.tools.verbs.sweep import sweep
 from tests.configurations import VIRTUAL, edited_file, load, problems, replaced, shipped
 from tests.sessions import constants_of

@@ -16,11 +16,17 @@ from jointctl.drivers.errors import ConfigurationError, NoDeviceError
 from jointctl.tools.configuration.canopen import eds_path
 from jointctl.tools.configuration.drive_section import GivenPlace
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.inspection import node_scan
+from jointctl.tools.inspection import subject as node_scan
 from jointctl.tools.inspection.drive_info import drive_info, pdo_maps
-from jointctl.tools.inspection.node_scan import Ear
 from jointctl.tools.inspection.objects import Objects, standard_variable
-from jointctl.tools.inspection.subject import SdoReader, Subject, canopen_network, subject_of_config, subject_of_flags
+from jointctl.tools.inspection.subject import (
+    Ear,
+    SdoReader,
+    Subject,
+    canopen_network,
+    subject_of_config,
+    subject_of_flags,
+)
 from jointctl.tools.verbs.info import node_info as info
 from jointctl.tools.verbs.monitor import MonitorOptions, Selection, selection_of
 from jointctl.tools.verbs.monitor import monitor_bus as monitor

@@ -32,10 +32,8 @@ from jointctl.tools.session.display import PhaseLines
 from jointctl.tools.session.plan import resolve
 from jointctl.tools.session.run_watch import Around, RunParts, RunWatch
 from jointctl.tools.sweeping.carry_out import POSITION_GAIN_ps, middle_rad, sweep_constants
-from jointctl.tools.sweeping.checks import require_torque
-from jointctl.tools.sweeping.grid import both_directions, ordered_points
-from jointctl.tools.sweeping.options import SweepOptions
-from jointctl.tools.sweeping.plan import PlanSettings, make_plan, plan_motion, shifted
+from jointctl.tools.sweeping.options import SweepOptions, both_directions, ordered_points
+from jointctl.tools.sweeping.plan import PlanSettings, make_plan, plan_motion, require_torque, shifted
 from jointctl.tools.verbs import scope as scope_module
 from tests.configurations import VIRTUAL, edited, written
 from tests.places import CONFIGS

@@ -26,21 +26,22 @@ from jointctl.tools.identification.friction_data import SWEEP_COLUMNS, read_fric
 from jointctl.tools.output import Advance, Output
 from jointctl.tools.session.display import Snapshot
 from jointctl.tools.sweeping.data_file import HEADING, SweepFile
-from jointctl.tools.sweeping.grid import SweepPoint
-from jointctl.tools.sweeping.meter import JointModel, MeasuredPoint, SweepMeter
-from jointctl.tools.sweeping.options import SweepOptions
-from jointctl.tools.sweeping.plan import Window
-from jointctl.tools.sweeping.statistics import (
+from jointctl.tools.sweeping.meter import (
     BATCHES,
     LEAST_SAMPLES,
+    JointModel,
+    MeasuredPoint,
     PlateauResult,
     Samples,
+    SweepMeter,
     Tolerance,
     half_interval,
     plateau,
     sticking_share,
     without_ripple,
 )
+from jointctl.tools.sweeping.options import SweepOptions, SweepPoint
+from jointctl.tools.sweeping.plan import Window
 from jointctl.tools.verbs import sweep as verb
 
 # --- Means, spreads and confidence of plateaus of a known signal ---

@@ -23,7 +23,9 @@ from jointctl.tools.configuration.elmo import elmo_section, elmo_settings
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.plant_settings import plant_settings
 from jointctl.tools.sweeping.carry_out import ACCELERATION_SPARE, middle_rad, with_mode, with_tracking_law
-from jointctl.tools.sweeping.grid import (
+from jointctl.tools.sweeping.meter import LEAST_SAMPLES
+from jointctl.tools.sweeping.options import (
+    SweepOptions,
     SweepPoint,
     both_directions,
     grid_speeds,
@@ -31,7 +33,6 @@ from jointctl.tools.sweeping.grid import (
     ordered_points,
     plan_hash,
 )
-from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.sweeping.plan import (
     QUICK_S,
     PlanSettings,
@@ -42,7 +43,6 @@ from jointctl.tools.sweeping.plan import (
     shifted,
     stroke_of,
 )
-from jointctl.tools.sweeping.statistics import LEAST_SAMPLES
 from jointctl.tools.verbs.sweep import sweep
 from tests.configurations import changed, edited
 from tests.sessions import output
