@@ -465,7 +465,6 @@ def simulated(joint: Config) -> Iterator[World]:
             (session_module, "LoopHandle", new_loop),
             (CanopenSession, "open", lambda _, *arguments: open_simulated(*arguments)),
             (session_module, "recording", lambda _: contextlib.nullcontext()),
-            (session_module, "kept_awake", lambda *_: contextlib.nullcontext()),
             (session_module, "RunLogWriter", SilentLog),
             (live_joint_module, "threading", threads),
         ):

@@ -47,7 +47,6 @@ class DriveSection(Section, ABC):
 
     simulated: ClassVar[bool] = False  # its joint can be simulated faster than real time
     sends_frames: ClassVar[bool] = False  # on a CAN bus that others can listen to
-    holds_last_command: ClassVar[bool] = False  # where nobody speaks to it any more
     when_the_loop_ends: ClassVar[str]  # by accident: what becomes of the joint
     torque_source: ClassVar[str]  # for a sweep's data: which reading the torque comes from
 

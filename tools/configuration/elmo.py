@@ -65,7 +65,6 @@ class ElmoSection(DriveSection):
     )
     _unit_mode: UnitModeChoice = PrivateAttr("torque")
 
-    holds_last_command: ClassVar[bool] = True
     when_the_loop_ends: ClassVar[str] = "a serial drive does not notice that: it has been commanded to switch off"
     torque_source: ClassVar[str] = (
         "current IQ as the drive measures it; motor_torque_Nm = current_A * torque_constant_NmpA"

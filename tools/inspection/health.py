@@ -32,11 +32,11 @@ from jointctl.drivers.errors import BusError
 from jointctl.tools.configuration.canopen import HIGHEST_LOAD, canopen_section, cycle_bytes
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.session.loop_handle import RECEIVE_SHARE
-from jointctl.tools.session.loops import start_time_s
 from jointctl.tools.session.portable_loop import HIGHEST_RATE_HZ
 from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
 
 OK, NOTE, PROBLEM = "ok", "note", "problem"
+PROBE_TIMEOUT_S = 600.0  # of starting a loop, which may compile
 
 
 @dataclass(frozen=True)
@@ -332,3 +332,15 @@ def drive_finding(config: Config) -> Finding:
         )
         return Finding("drive", NOTE, text, remedy, numbers)
     return Finding("drive", OK if good else NOTE, text, "" if good else "SDO is being lost: wiring, bus load", numbers)
+
+
+def start_time_s(cache: Path | None = None) -> float:
+    """Seconds from starting a process until the loop is ready in it; `cache` another cache folder than the present.
+
+    Raises subprocess.SubprocessError if the process fails.
+    """
+    environment = dict(os.environ, **({"JOINTCTL_CACHE_DIR": str(cache)} if cache else {}))
+    command = [sys.executable, "-P", "-m", "jointctl.tools.session.loops"]
+    started_s = time.monotonic()
+    subprocess.run(command, env=environment, check=True, timeout=PROBE_TIMEOUT_S, capture_output=True)
+    return time.monotonic() - started_s

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointctl.drivers.can.frames import worst_frame_bits
 from jointctl.drivers.can.open import CYCLIC_INTERFACES, SHARED_INTERFACES
 from jointctl.drivers.canopen.cia402 import State, state_of_word, state_text
+from jointctl.drivers.canopen.identifiers import EVENT_DRIVEN
 from jointctl.drivers.drive import Drive
+from jointctl.firmware_py.cycle import Histogram
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.canopen import canopen_section, canopen_settings, cyclic_bus_load
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.session.fault_words import FaultText, emergency_text, fault_text
-from jointctl.tools.session.loop_delay import measured_delay_s
+from jointctl.tools.session.loop_handle import QUANTILE, quantile_s
 from jointctl.tools.session.session_drive import SessionDrive
 
 if TYPE_CHECKING:
@@ -84,3 +88,26 @@ class CanopenSession(SessionDrive):
 
     def load_row(self, share: float) -> tuple[str, str]:
         return "bus load", f"{share:.1%} at worst-case stuffing"
+
+
+RPDO_BYTES = 4
+
+
+def measured_delay_s(histograms: np.ndarray, rpdo_transmission_type: int, period_s: float, bit_s: float) -> float:
+    """Loop delay [s] from the histograms of the first cycles; `bit_s` is the duration of one bit on the bus.
+
+    From the position sample (SYNC) to the moment at which the torque computed from it takes effect in the drive.
+
+    Round trip and work at their 99th percentile, and the RPDO on the wire.  A synchronous RPDO waits for the next
+    SYNC (transmission type n > 1: for the n-th), so that its delay is a whole number of periods.
+    """
+    rpdo_s = worst_frame_bits(RPDO_BYTES) * bit_s
+    path_s = (
+        quantile_s(histograms[Histogram.ROUND_TRIP], QUANTILE)
+        + quantile_s(histograms[Histogram.WORK], QUANTILE)
+        + rpdo_s
+    )
+    if rpdo_transmission_type >= EVENT_DRIVEN:
+        return path_s
+    periods = math.ceil(path_s / period_s)
+    return period_s * max(periods, rpdo_transmission_type, 1)

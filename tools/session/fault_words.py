@@ -102,7 +102,6 @@ class FaultWords(FaultText):
     """A row of the table: the words on a CAN bus, and those that differ."""
 
     two_encoders: FaultText | None = None  # with [joint_encoder] a sample counts only once both encoders have answered
-    serial: FaultText | None = None  # {word} is the status register (SR) there
     follows_pause: bool = False  # a loop that stands still commands its last torque, and receives nothing
 
 
@@ -139,13 +138,6 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
             "frames lost, cable, bus load, or the drive or the joint's encoder went silent",
             "check wiring and termination; watch the bus with candump: which of the two is missing?",
         ),
-        serial=FaultText(
-            "no usable position reply came for {value:.0f} cycles",
-            # Linux hands over what a serial port received by a worker of ordinary priority, however urgent the loop is
-            "cable or drive went silent, noise garbles the replies, or a busy computer hands them over late",
-            "check the cable and its ground, and what else the computer does; the drive's own limits watched the joint "
-            "in the meantime",
-        ),
         follows_pause=True,
     ),
     Fault.NOT_FINITE: FaultWords(
@@ -174,43 +166,23 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         "the drive reported a fault (statusword {word})",
         "see the drive's error code",
         "remove the cause, then reset the drive's fault; jointctl never does it by itself",
-        serial=FaultText(
-            "the drive switched its motor off because of a fault (SR {word})",
-            "see the drive's motor fault",
-            "remove the cause; jointctl resets nothing by itself",
-        ),
         follows_pause=True,
     ),
     Fault.DRIVE_NOT_ENABLED: FaultWords(
         "the drive left Operation Enabled by itself (statusword {word})",
         "its enable input or STO was opened, a limit switch, or another master on the bus",
         "check the enable and STO wiring",
-        serial=FaultText(
-            "the motor was switched off without being asked (SR {word})",
-            "inhibit input or STO was opened, another program on the line, or a restart of the drive",
-            "check the inhibit and STO wiring and the supply",
-        ),
         follows_pause=True,
     ),
     Fault.DRIVE_RESTARTED: FaultWords(
         "the drive restarted while the loop was running",
         "its supply dropped, or somebody reset it",
         "check the supply; the drive has lost its configuration, start again",
-        serial=FaultText(
-            "the drive restarted while the loop was running: its unit mode is another one (SR {word})",
-            "its supply dropped, or somebody reset it",
-            "check the supply; the drive has lost its limits, start again",
-        ),
     ),
     Fault.ENABLE_TIMEOUT: FaultWords(
         "the drive did not reach Operation Enabled in time (statusword {word})",
         "no motor supply, STO open, or an interlock of the drive",
         "check voltage and STO; the statusword's bit 4 is the motor supply",
-        serial=FaultText(
-            "the drive did not switch its motor on in time (SR {word})",
-            "no motor supply, STO open, or inhibit input active",
-            "check voltage, STO and inhibit; MO=1 is refused until they are right",
-        ),
     ),
     Fault.SUPERVISOR_LOST: FaultWords(
         "the supervising process was silent for {value:.0f} cycles",
@@ -221,11 +193,6 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         "{value:.0f} frames in a row could not be sent",
         "interface down, bus off, or nobody acknowledges: cable or bit rate",
         "ip -details link show, then bring the interface up again",
-        serial=FaultText(
-            "the serial port is gone or takes no characters any more",
-            "adapter or cable unplugged",
-            "make sure that the joint stands: nothing could be said to the drive; then plug it in again",
-        ),
     ),
     Fault.STOP_TIMEOUT: FaultWords(
         "the joint did not come to rest ({value:.3f} rad/s)",
@@ -236,11 +203,6 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         "the drive did not confirm that its power stage is off (statusword {word})",
         "the drive is unreachable",
         "use the emergency stop; then check the bus",
-        serial=FaultText(
-            "the drive did not confirm that its motor is off (SR {word})",
-            "the line is cut or the drive is silent",
-            "use the emergency stop; then check the line",
-        ),
     ),
     Fault.NO_SAMPLES: FaultWords(
         "not one sample came from the drive",
@@ -251,21 +213,11 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
             "the drive or the joint's encoder does not answer SYNC: PDOs disabled, or not operational",
             "look for SYNC (080) and the TPDOs of both (180 + node, 280 + node of the drive) with candump",
         ),
-        serial=FaultText(
-            "not one position reply came from the drive",
-            "the drive went silent after commissioning",
-            "check the cable; run again",
-        ),
     ),
     Fault.SAMPLES_MISSING: FaultWords(
         "positions came, but never {value:.0f} of them in a row, as sequence.settle_s wants it before enabling",
         "a computer too busy for loop.rate_Hz, or a bus that loses a frame now and then",
         "run `jointctl doctor`, then `jointctl monitor`; set loop.priority, or lower loop.rate_Hz",
-        serial=FaultText(
-            "positions came, but never {value:.0f} of them in a row, as sequence.settle_s wants it before enabling",
-            "noise garbles replies, or a busy computer hands them over late",
-            "check the cable and its ground, and what else the computer does; or lower loop.rate_Hz",
-        ),
         follows_pause=True,
     ),
     Fault.NOT_AT_STANDSTILL: FaultWords(
@@ -282,11 +234,6 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         "the drive is enabled although nobody asked for it, and does not switch off (statusword {word})",
         "another master on the bus, or a drive that ignores the controlword",
         "use the emergency stop; check who else writes object 6040",
-        serial=FaultText(
-            "the motor is on although nobody asked for it, and does not switch off (SR {word})",
-            "another program on the line, or a drive that ignores MO=0",
-            "use the emergency stop; check who else uses the port",
-        ),
     ),
     Fault.POSITION_FROZEN: FaultWords(
         "the position reading stood still although the joint was driven (reference moved by {value:.4f} rad)",
@@ -297,12 +244,6 @@ FAULT_TEXTS: dict[Fault, FaultWords] = {
         "the computer slept for {value:.1f} s while the loop was running",
         "standby or hibernation: lid, power button, energy saving",
         "switch standby off (systemd-inhibit jointctl run ...); the drive's watchdog stopped the joint in the meantime",
-        serial=FaultText(
-            "the computer slept for {value:.1f} s while the loop was running; the drive held its last command "
-            "in the meantime",
-            "standby or hibernation: lid, power button, energy saving",
-            "make sure that the joint stands; switch standby off, or try systemd-inhibit --what=sleep jointctl ...",
-        ),
     ),
     Fault.DRIVE_SILENT: FaultWords(
         "the drive's own heartbeat stayed away for {value:.0f} cycles although its samples came",

@@ -24,14 +24,13 @@ from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import ERROR, Event
 from jointctl.tools.session.display import Display, OnlyShows, PhaseLines, Snapshot
 from jointctl.tools.session.events import fault_words, phase_name
-from jointctl.tools.session.loop_delay import quantile_s
+from jointctl.tools.session.loop_handle import QUANTILE, quantile_s
 from jointctl.tools.session.session_drive import drive_state_name, session_drive
 
 # --- The panel of `run`: the picture of one moment, from the newest `Snapshot`; nothing here is drawn or waits ---
 
 
 NOTES = 3  # how many of the newest remarks stay in the panel
-_QUANTILE = 0.99
 _NAME_WIDTH, _LEAST_WIDTH, _RIGHT_WIDTH = 11, 15, 19  # columns of the panel
 
 
@@ -82,7 +81,7 @@ def _cells(phase: str, snapshot: Snapshot | None) -> list[tuple[str, str | Text]
     record = snapshot.record
     active = AxisPhase.APPROACH <= int(record.phase) <= AxisPhase.RAMPING
     fault = int(record.fault)
-    p99_s = quantile_s(snapshot.histograms[Histogram.WAKE], _QUANTILE)
+    p99_s = quantile_s(snapshot.histograms[Histogram.WAKE], QUANTILE)
     values: tuple[str | Text, ...] = (
         Text(phase_name(int(record.phase)), style="bold"),
         drive_state_name(session_drive(snapshot.drive), int(record.status_word), int(record.drive_state)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import mmap
 import os
 import subprocess
@@ -99,6 +100,18 @@ class SharedBlock:
         now = int(self.words[Word.HEAD])
         late = min(len(records), max(0, now + 1 - RING_RECORDS - tail - lost)) if now > head else 0
         return records[late:], lost + late
+
+
+QUANTILE = 0.99  # of the times that a loop delay is made of
+
+
+def quantile_s(histogram: np.ndarray, quantile: float) -> float:
+    """Upper edge [s] of the bin that holds the quantile of one histogram row; nan when it is empty."""
+    total = int(histogram.sum())
+    if total == 0:
+        return math.nan
+    bin_us = int(np.searchsorted(np.cumsum(histogram), quantile * total))
+    return (bin_us + 1) * 1e-6
 
 
 # --- The loop process as seen by its supervisor: start it, let it go, listen to it, ask it to stop ---

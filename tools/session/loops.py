@@ -9,28 +9,20 @@ import contextlib
 import gc
 import os
 import socket
-import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from jointctl.drivers.errors import JointctlError
 from jointctl.firmware_py.cycle import Exchange
-from jointctl.firmware_py.kernel import cache_folder
 from jointctl.firmware_py.libc import NANOSECONDS
-from jointctl.tools.child_process import Starting
 from jointctl.tools.session.loop_handle import LoopOrder, SharedBlock
 
 if TYPE_CHECKING:
     import can
 
-PROBE_TIMEOUT_S = 600.0
-POLL_S = 0.02
 FOREVER = 1 << 62
 
 
@@ -128,37 +120,6 @@ def portable_loop(order: LoopOrder, block: SharedBlock) -> Iterator[ReadyLoop]:
             yield ReadyLoop(lambda: run_portable_loop(opened(), block, order.period_ns, order.receive_ns))
 
 
-# The loop on a serial line is compiled, and not plain Python as for CAN adapters without a descriptor: a serial port
-# is a descriptor that the C library reads and writes.  Wake-up late p50 / p99 / max at 150 Hz on a noisy 2-core
-# virtual machine, SCHED_FIFO: this loop 27 / 56 / 178 us, a bare Python sleep 43 / 84 / 221 us, and 123 / 155 / 3168
-# us without SCHED_FIFO.
-@contextmanager
-def serial_loop(order: LoopOrder, block: SharedBlock) -> Iterator[ReadyLoop]:
-    """The compiled loop on a serial line, warm.
-
-    The port is opened when the loop is let go: by then the supervisor has locked and configured it.  However the
-    loop ends, the drive is commanded to switch off: it would keep its last torque command for ever.
-    """
-    from jointctl.drivers.elmo import exchange
-    from jointctl.drivers.elmo.dialogue import SWITCH_OFF
-    from jointctl.drivers.elmo.serial_port import open_descriptor
-
-    call = loop_call(exchange, block, order.period_ns, order.receive_ns)
-    call(0)  # compiles, or loads from the cache
-
-    def go() -> None:
-        fd = open_descriptor(order.channel)
-        try:
-            block.port[0].fd = fd
-            call(FOREVER)
-        finally:
-            with contextlib.suppress(OSError):
-                os.write(fd, SWITCH_OFF)
-            os.close(fd)
-
-    yield ReadyLoop(go)
-
-
 def warm_up_compiled_loop() -> None:
     """Do what the loop process does before it is ready; no bus is opened, nothing is sent."""
     from jointctl.drivers.canopen.cyclic import CanopenPort
@@ -166,46 +127,6 @@ def warm_up_compiled_loop() -> None:
     block = SharedBlock.create(1, CanopenPort)
     compiled_call(block, 1_000_000, 0)(0)
     os.close(block.fd)
-
-
-@contextmanager
-def compiling_beside(tell: Callable[[str], None] = lambda _: None) -> Iterator[Callable[[], None]]:
-    """Where the loop is not compiled yet, a process does that beside what the block does; what this gives waits for it.
-
-    Whatever becomes of it: the loop compiles by itself what it does not find.
-    """
-    if cache_folder is None or any(cache_folder.rglob("realtime.run_loop-*.nbi")):
-        yield lambda: None
-        return
-    tell("compiling, which only the first start does")
-    command = [sys.executable, "-P", "-m", "jointctl.tools.session.loops"]
-    silent = subprocess.DEVNULL
-    process = subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent, start_new_session=True)
-
-    def wait() -> None:
-        starting = Starting("the loop", process, tell)
-        with contextlib.suppress(JointctlError):
-            while process.poll() is None:
-                starting.check()
-                time.sleep(POLL_S)
-
-    try:
-        yield wait
-    finally:
-        process.kill()
-        process.wait()
-
-
-def start_time_s(cache: Path | None = None) -> float:
-    """Seconds from starting a process until the loop is ready in it; `cache` another cache folder than the present.
-
-    Raises subprocess.SubprocessError if the process fails.
-    """
-    environment = dict(os.environ, **({"JOINTCTL_CACHE_DIR": str(cache)} if cache else {}))
-    command = [sys.executable, "-P", "-m", "jointctl.tools.session.loops"]
-    started_s = time.monotonic()
-    subprocess.run(command, env=environment, check=True, timeout=PROBE_TIMEOUT_S, capture_output=True)
-    return time.monotonic() - started_s
 
 
 if __name__ == "__main__":

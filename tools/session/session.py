@@ -25,7 +25,6 @@ from jointctl.tools.session.consent import Consent, prepare_log, require_ready
 from jointctl.tools.session.control import Control, StopSignals
 from jointctl.tools.session.display import Display, PhaseLines
 from jointctl.tools.session.fault_words import held_up_text
-from jointctl.tools.session.kept_awake import kept_awake
 from jointctl.tools.session.loop_handle import LoopHandle
 from jointctl.tools.session.plan import Placed, RunPlan
 from jointctl.tools.session.result import RunResult, warn_unless_off
@@ -79,7 +78,7 @@ class Session:
             ) as loop,
             recording(config) as recorder,
             bus_watch(config) as bus_news,
-            kept_awake(config, self._output),
+            self._kind.kept_awake(self._output),
         ):
             self.loop = loop
             drive = self._kind.open(config, signals.leave_if_asked)

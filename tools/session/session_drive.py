@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from jointctl.drivers.drive import Drive
 from jointctl.firmware_py.states import DriveState, Fault, in_words
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.output import Output
 from jointctl.tools.session.fault_words import FaultText
 
 if TYPE_CHECKING:
@@ -70,6 +71,10 @@ class SessionDrive(ABC):
     def guard(self, config: Config, loop: LoopHandle) -> Guard | None:
         """Started; None where the drive itself watches over the loop."""
         return None
+
+    def kept_awake(self, output: Output) -> AbstractContextManager[bool]:
+        """Keeps the computer from falling asleep where the drive would hold its last command; gives whether it does."""
+        return nullcontext(False)
 
     def refuse_beside_run(self, config: Config) -> None:  # noqa: B027  (most need nothing)
         """`BusError` while a run has the line, where the lock of the bus does not tell."""

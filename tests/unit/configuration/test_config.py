@@ -22,7 +22,7 @@ from jointctl.tools.configuration.elmo import elmo_section, serial_line_share
 from jointctl.tools.configuration.load import load_config, moved, shipped_config
 from jointctl.tools.configuration.reference import models_in, rows_of, sections_of_drives
 from jointctl.tools.output import Output
-from jointctl.tools.session.fault_words import FAULT_TEXTS
+from jointctl.tools.session.elmo_drive import SERIAL_TEXTS
 from jointctl.tools.session.session_drive import session_drive
 from jointctl.tools.sweeping.options import SweepOptions
 from jointctl.tools.sweeping.plan import constant_remarks, recorded_limits, refuse_constants
@@ -382,7 +382,7 @@ def test_gains_of_a_fast_bus_are_refused_naming_some_that_are_carried(config: Co
     assert require_margin(config.model_copy(update={"control": named, "margin": margin}), 0.003).stable
 
 
-@pytest.mark.parametrize("fault", [fault for fault in FAULT_TEXTS if FAULT_TEXTS[fault].serial])
+@pytest.mark.parametrize("fault", SERIAL_TEXTS)
 def test_every_fault_text_takes_its_value(config: Config, fault: Fault) -> None:
     text = session_drive("elmo_serial").fault_text(config, fault, 144.0, 0x20000)
     assert "{" not in text.happened

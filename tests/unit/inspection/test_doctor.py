@@ -33,7 +33,6 @@ from jointctl.tools.inspection.health import (
     sdo_round_trips_us,
     wake_up,
 )
-from jointctl.tools.session import loops as start_time
 from jointctl.tools.verbs import doctor as doctor_module
 from jointctl.tools.verbs.doctor import doctor, findings
 from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
@@ -336,10 +335,10 @@ class TestCache:
 
     def test_the_probe_gets_the_other_cache(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         calls: list[dict[str, Any]] = []
-        monkeypatch.setattr(start_time.subprocess, "run", lambda command, **rest: calls.append(rest))
+        monkeypatch.setattr(health.subprocess, "run", lambda command, **rest: calls.append(rest))
         monkeypatch.setenv("JOINTCTL_CACHE_DIR", "unchanged")
-        assert start_time.start_time_s() >= 0.0
-        assert start_time.start_time_s(tmp_path) >= 0.0
+        assert health.start_time_s() >= 0.0
+        assert health.start_time_s(tmp_path) >= 0.0
         assert [call["env"]["JOINTCTL_CACHE_DIR"] for call in calls] == ["unchanged", str(tmp_path)]
         assert calls[0]["check"]
 

@@ -21,11 +21,11 @@ from jointctl.tools.child_process import IDLE_S, TELL_S, Starting, processor_tim
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.output import Output
-from jointctl.tools.session import kept_awake as module
+from jointctl.tools.session import elmo_drive as module
 from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.control import in_control
-from jointctl.tools.session.kept_awake import kept_awake
 from jointctl.tools.session.loop_process import slow_start
+from jointctl.tools.session.session_drive import session_drive
 from tests.places import CONFIGS, ROOT
 
 
@@ -156,6 +156,10 @@ def install(path: Path, text: str) -> None:
 def log_of(stand_in: Path) -> list[str]:
     path = Path(f"{stand_in}.log")
     return path.read_text().splitlines() if path.exists() else []
+
+
+def kept_awake(config: Config, output: Output) -> contextlib.AbstractContextManager[bool]:
+    return session_drive(config.drive.kind).kept_awake(output)
 
 
 def serial() -> Config:
