@@ -71,7 +71,6 @@ def may_ask(peer: socket.socket) -> bool:
 
 
 def send_line(peer: socket.socket, message: dict[str, Any]) -> None:
-    """One message."""
     peer.sendall(json.dumps(message).encode() + b"\n")
 
 

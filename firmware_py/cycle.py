@@ -60,7 +60,6 @@ class Histogram(IntEnum):
 
 @kernel
 def count(histogram: np.ndarray, row: int, duration_ns: int) -> None:
-    """Add one duration to a row."""
     bin_us = duration_ns // 1000
     histogram[row, min(max(bin_us, 0), HISTOGRAM_BINS - 1)] += 1
 
@@ -138,8 +137,6 @@ class Clock(NamedTuple):
 
 
 class Slot(NamedTuple):
-    """When a cycle runs."""
-
     period_ns: int
     deadline_ns: int  # a whole number of periods after the last one
     wake_ns: int

@@ -219,7 +219,6 @@ def _step_world(world: World, now_ns: int) -> None:
 
 @kernel
 def _run(memory: CycleMemory, codec: Codec, world: World, scenario: Scenario, truth: np.ndarray) -> tuple[int, int]:
-    """See `run_lockstep`."""
     words, clock_memory, period_ns = memory.words, memory.timespec, scenario.period_ns
     faults, fault = world.faults, world.fault_memory[0]
     faulty = len(faults) > 0

@@ -547,7 +547,6 @@ class VirtualBusHub:
 
     @property
     def counters(self) -> Any:
-        """A copy of the BusCounters record."""
         return self._bus.copy()[0]
 
     @property

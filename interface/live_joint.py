@@ -54,7 +54,6 @@ class _Approval:
         """See `Consent`."""
 
     def agreed(self, lines: Sequence[str]) -> bool:
-        """See `Consent`."""
         self.lines = tuple(lines)
         self.asked.set()
         while not self.answered.wait(POLL_S):
@@ -70,7 +69,6 @@ class _ProgramDisplay(OnlyShows):
         self.motions: list[PreparedMotion] = []
 
     def note(self, text: str) -> None:
-        """See `Display`."""
         self.notes.append(text)
 
     def phase(self, text: str) -> None:
@@ -80,12 +78,10 @@ class _ProgramDisplay(OnlyShows):
         """See `Display`."""
 
     def event(self, event: Event) -> None:
-        """See `Display`."""
         if event.level >= ERROR:
             self.notes.append(event.text)
 
     def requests(self) -> Sequence[ViewerRequest]:
-        """See `Display`."""
         taken, self.motions = self.motions, []
         return taken
 
@@ -170,13 +166,11 @@ class LiveMotor:
         raise MotionFault(f"{ENDED}{f', by {by}' if by else ''}; the joint is off", "begin a new Joint")
 
     def require(self) -> None:
-        """See `Motor`."""
         if self.axis is not None and self.axis[0].phase > AxisPhase.TRACKING:
             self._join()  # it is being stopped: the cause is known at the end
         self._raise()
 
     def enable(self, approve: Callable[[Sequence[str]], bool] | None) -> None:
-        """See `Motor`."""
         approval, session = self._approval, self._session
         if approval is None or session is None:
             raise MotionFault("the joint is not commissioned", "use it in a `with` block")
@@ -200,7 +194,6 @@ class LiveMotor:
             time.sleep(POLL_S)
 
     def state(self) -> State:
-        """See `Motor`."""
         now_ns = time.monotonic_ns()
         loop = self._loop
         head = 0 if loop is None else int(loop.block.words[Word.HEAD])
@@ -212,16 +205,13 @@ class LiveMotor:
         return state_of(record, self._drive, now_ns)
 
     def now_ns(self) -> int:
-        """See `Motor`."""
         return time.monotonic_ns()
 
     def wait(self, seconds: float) -> None:
-        """See `Motor`."""
         time.sleep(min(seconds, 0.05))
         self.require()
 
     def post(self, trajectory: Any, words: str) -> None:
-        """See `Motor`."""
         self.require()
         answers: list[str] = []
         self._display.motions.append(PreparedMotion("motion", WHO, {}, trajectory, words, answers.append))
@@ -235,7 +225,6 @@ class LiveMotor:
             raise MotionFault(f"the loop did not take the motion: {answers[0]}")
 
     def stop(self) -> None:
-        """See `Motor`."""
         self._end()
 
     def _end(self) -> None:
@@ -260,7 +249,6 @@ class LiveMotor:
             self._thread.join(seconds)
 
     def close(self) -> None:
-        """See `Motor`."""
         try:
             self._end()
         finally:

@@ -45,7 +45,6 @@ class LockstepMotor:
         """See `Motor`: done already."""
 
     def state(self) -> State:
-        """See `Motor`."""
         now_ns = self.now_ns()
         if not int(self._run.memory.words[Word.HEAD]):
             at_rad = self._joint.report.start_position_rad
@@ -53,7 +52,6 @@ class LockstepMotor:
         return state_of(self._run.newest(), self._drive, now_ns)
 
     def enable(self, approve: Callable[[Sequence[str]], bool] | None) -> None:
-        """See `Motor`."""
         if approve is not None and not approve((f"simulated: {self.config.path.name}",)):
             raise MotionFault("the motion was not approved; nothing has moved")
         self._until(AxisPhase.TRACKING)
@@ -67,7 +65,6 @@ class LockstepMotor:
             self.require()
 
     def require(self) -> None:
-        """See `Motor`."""
         axis = self.axis[0]
         phase, fault = AxisPhase(int(axis.phase)), Fault(int(axis.fault))
         if fault is not Fault.NONE:
@@ -92,12 +89,10 @@ class LockstepMotor:
         self._run.step(cycles)
 
     def wait(self, seconds: float) -> None:
-        """See `Motor`."""
         self._run.step(max(1, round(seconds / self._period_s)))
         self.require()
 
     def step_torque(self, torque_Nm: float) -> None:
-        """See `Joint.step_torque`."""
         if not self._outside:
             self.require()
             self._outside, axis = True, self.constants[0]
@@ -115,7 +110,6 @@ class LockstepMotor:
         return self._run.records()
 
     def post(self, trajectory: Any, words: str) -> None:
-        """See `Motor`."""
         self.require()
         post_change(self.constants[0].change, ChangeKind.MOTION, trajectory)
         self._run.step(1)
@@ -124,14 +118,12 @@ class LockstepMotor:
             raise MotionFault(f"the loop did not take the motion {words}: {in_words(answer)}")
 
     def stop(self) -> None:
-        """See `Motor`."""
         if int(self._run.memory.words[Word.HEAD]) and self.axis[0].phase < AxisPhase.FINISHED:
             self._outside_Nm[0] = 0.0
             self._run.memory.words[Word.STOP] = StopRequest.RAMP
             self._until(AxisPhase.FINISHED)
 
     def close(self) -> None:
-        """See `Motor`."""
         self.stop()
         if self.axis[0].fault:
             self.require()

@@ -183,7 +183,6 @@ class VirtualBus(can.BusABC):
         return self._socket.fileno()
 
     def shutdown(self) -> None:
-        """Leave the bus."""
         if not self._is_shutdown:
             super().shutdown()
             self._socket.close()

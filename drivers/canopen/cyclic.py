@@ -145,14 +145,12 @@ def get_u16(data: np.ndarray, at: int) -> int:
 
 @kernel
 def get_i16(data: np.ndarray, at: int) -> int:
-    """Little-endian signed 16 bit."""
     value = get_u16(data, at)
     return value - 0x10000 if value >= 0x8000 else value
 
 
 @kernel
 def get_i32(data: np.ndarray, at: int) -> int:
-    """Little-endian signed 32 bit."""
     value = get_u16(data, at) | get_u16(data, at + 2) << 16
     return value - WRAP if value >= HALF_WRAP else value
 

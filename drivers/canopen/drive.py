@@ -289,7 +289,6 @@ class CanopenDrive:
         self._handed_over = False
 
     def port(self) -> Any:
-        """See `Drive.port`."""
         if self._findings is None:
             raise DeviceError("the drive has not been commissioned")
         found = self._findings

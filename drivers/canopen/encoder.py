@@ -111,7 +111,6 @@ class EncoderEnd:
             self._objects = ObjectAccess(node, eds.name, eds.unusable)
 
     def send_command(self, command: NmtCommand) -> None:
-        """An NMT command."""
         if self._node is not None:
             send_nmt(self._network, command, self._node)
 

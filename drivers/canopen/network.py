@@ -65,7 +65,6 @@ class OtherControllers(can.Listener):
         self.heartbeats: set[int] = set()  # nodes that send one, ours and the drive's not among them
 
     def on_message_received(self, msg: can.Message) -> None:
-        """In the receiving thread."""
         if msg.is_error_frame or msg.is_extended_id:
             return
         identifier = msg.arbitration_id
@@ -166,7 +165,6 @@ def new_network(bus: can.BusABC, sleep: Callable[[float], None], *listeners: can
 
 
 def send_nmt(network: canopen.Network, command: NmtCommand, node: int) -> None:
-    """An NMT command to one node."""
     network.send_message(NMT_ID, bytes([command, node]))
 
 

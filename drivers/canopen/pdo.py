@@ -47,15 +47,12 @@ DUMMIES = 0x20  # data types mapped as place holders have indices below
 
 @dataclass(frozen=True)
 class MappedObject:
-    """One entry of a PDO."""
-
     index: int
     sub: int
     bits: int
     name: str
 
     def entry(self) -> int:
-        """The 32 bit mapping entry."""
         return self.index << 16 | self.sub << 8 | self.bits
 
     def __str__(self) -> str:
@@ -421,7 +418,6 @@ def new_port(
 def _fill_second(
     second: SecondPosition, settings: CanopenSettings, encoder: JointEncoderSettings, range_counts: int
 ) -> None:
-    """The second encoder of the joint."""
     if encoder.node is None:
         second.tpdo_id = TPDO2_ID + settings.node
     else:

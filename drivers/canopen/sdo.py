@@ -346,7 +346,6 @@ class SdoReads:
         network.subscribe(self._tx, self._on_frame)
 
     def add(self, index: int, sub: int, period_s: float, on_answer: Callable[..., None]) -> None:
-        """Read it from now on."""
         self._reads.append(SdoRead(index, sub, period_s, on_answer, self._clock_ns()))
 
     def _on_frame(self, _: int, data: bytearray, __: float) -> None:

@@ -531,7 +531,6 @@ def end_cycle(port: ElmoPort, sample: Sample, command: Command) -> None:
 
 @kernel
 def note_written(port: ElmoPort, sample: Sample, error: int) -> None:
-    """Count failed writes in a row."""
     if error == 0:
         port.consecutive_failures = 0
     else:

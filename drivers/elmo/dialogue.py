@@ -39,8 +39,6 @@ _NAME = re.compile(r"[A-Z]{2}", re.ASCII)
 
 
 class ReplyKind(Enum):
-    """How one command ended."""
-
     VALUE = "value"  # `text` is the value; empty for an assignment
     ERROR = "error"  # refused; `error_code` is the byte before `?`, or 0 where none came
     GARBLED = "garbled"  # bytes came that are no reply to this command
@@ -49,8 +47,6 @@ class ReplyKind(Enum):
 
 @dataclass(frozen=True)
 class Reply:
-    """The end of one command."""
-
     kind: ReplyKind
     text: str = ""
     error_code: int = 0
@@ -104,7 +100,6 @@ class Interpreter:
 
     @property
     def busy(self) -> bool:
-        """Whether a command is open."""
         return self._command is not None
 
     def begin(self, command: bytes, now_s: float, timeout_s: float) -> bytes:
@@ -159,8 +154,6 @@ class Interpreter:
 
 
 class RefusedError(DeviceError):
-    """The drive answered with an error code."""
-
     def __init__(self, command: str, code: int) -> None:
         super().__init__(f"the drive refused {command}: {error_text(code)}")
         self.code = code
@@ -228,11 +221,9 @@ class Dialogue:
         return int(reply.text) if reply.kind is ReplyKind.VALUE and reply.text.isdigit() else 0
 
     def query(self, name: str, index: int | None = None) -> str:
-        """The value as text."""
         return self.ask(encode(name, index))
 
     def number(self, name: str, index: int | None = None) -> float:
-        """The value as a number."""
         text = self.query(name, index)
         try:
             return float(text)

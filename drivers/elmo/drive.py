@@ -370,7 +370,6 @@ class ElmoDrive:
         line.resynchronise()
 
     def port(self) -> Any:
-        """See `Drive.port`: an `ElmoPort`."""
         if not self._commissioned:
             raise DeviceError("the drive has not been commissioned")
         settings = self._settings
@@ -449,7 +448,6 @@ class ElmoDrive:
         return f"cleared: {cause}"
 
     def close(self) -> None:
-        """Leave the port."""
         self._byte_port.close()
 
 

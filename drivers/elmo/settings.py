@@ -64,7 +64,6 @@ class ElmoSettings:
 
     @property
     def velocity_digits(self) -> int:
-        """Digits of the greatest JV."""
         return len(str(self.max_velocity_cps))
 
     def counts_at(self, position_rad: float) -> int:

@@ -139,7 +139,6 @@ class Cia402Device:
             objects.set_default(0x1018, sub, value)
 
     def _write(self, index: int, sub: int, data: bytes) -> None:
-        """A complete SDO download."""
         value = self.objects.check(index, sub, data)
         state = int(self.device[0].state)
         check_write(self.objects, index, sub, value, state)

@@ -249,7 +249,6 @@ class ObjectDictionary:
             self._default_strings[index, sub] = np.array(value, self.entries[index, sub].dtype).tobytes()
 
     def default(self, index: int, sub: int) -> int | bytes:
-        """What a reset restores."""
         initial = self._initial.get((index, sub))
         return int(initial[0]) if initial is not None else self._default_strings[index, sub]
 

@@ -50,8 +50,6 @@ INDEXED = frozenset(("CL", "PL", "HL", "LL", "ER", "VL", "VH", "CA"))
 
 
 class RefusedCommandError(Exception):
-    """Carries the error code."""
-
     def __init__(self, code: int) -> None:
         super().__init__(code)
         self.code = code

@@ -138,7 +138,6 @@ def eds_path(config: Config) -> Path:
 
 
 def encoder_eds_path(config: Config) -> Path | None:
-    """The EDS file of the joint's encoder node."""
     encoder = config.joint_encoder
     return beside(config.path, encoder.eds) if encoder is not None and encoder.source == "node" else None
 

@@ -67,7 +67,6 @@ class Config(Section):
 
     @property
     def path(self) -> Path:
-        """The file that this was read from."""
         return self._path
 
     @property
@@ -82,7 +81,6 @@ class Config(Section):
 
     @property
     def table_path(self) -> Path | None:
-        """The file of a table trajectory."""
         return beside(self._path, self.trajectory.file) if self.trajectory.kind == "table" else None
 
 

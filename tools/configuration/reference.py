@@ -153,12 +153,10 @@ def section_lines(
 
 
 def sections_of_drives() -> list[type[BaseModel]]:
-    """Of all kinds."""
     return [section for kind in KINDS if (section := section_class(kind)) is not None]
 
 
 def reference() -> str:
-    """The whole page."""
     lines = [HEAD.rstrip()]
     seen: dict[type[BaseModel], str] = {}
     for key, field in Config.model_fields.items():

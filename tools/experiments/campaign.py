@@ -128,12 +128,10 @@ def rows_by_kind(verdicts: Sequence[Verdict]) -> list[KindRow]:
 
 
 def _told(fault: str) -> str:
-    """In words, which a table may wrap."""
     return "no fault" if fault == Fault.NONE.name else fault.lower().replace("_", " ")
 
 
 def table(rows: Sequence[KindRow]) -> Table:
-    """For people."""
     numbers = (
         "runs", "harmless", "violations", "speed [rad/s]", "beyond limit [rad]", "allowed [rad]", "off after [s]",
     )  # fmt: skip
@@ -158,7 +156,6 @@ def violations(verdicts: Sequence[Verdict], seed: int, during: During = "run") -
 
 
 def write_json(path: Path, seed: int, verdicts: Sequence[Verdict], elapsed_s: float, during: During = "run") -> None:
-    """Rows and violations."""
     content = {
         "seed": seed,
         "during": during,

@@ -321,7 +321,6 @@ class Scenario:
         return faults
 
     def describe(self) -> dict[str, Any]:
-        """For the report."""
         trajectory, every = self.trajectory, {}
         if isinstance(trajectory, Program):
             trajectory, every = trajectory.trajectory, {"set_point_every_s": trajectory.every_s}

@@ -103,7 +103,6 @@ def law(name: str, **changes: Any) -> Controller:
 
 
 def experiments() -> list[Experiment]:
-    """All of them, in the order of the paper."""
     with_model = law("with friction model")
     without_model = law("without friction model", feed_forward="none")
     simulated = law("simulation", lyapunov_q=Q_SIMULATION)
@@ -329,7 +328,6 @@ def identification_rows(found: PaperIdentification | None) -> list[PaperRow]:
 
 
 def paper_rows(runs: Runs, identification: PaperIdentification | None) -> list[PaperRow]:
-    """Every row, in the order of the paper."""
     rows = identification_rows(identification)
     rows.append(_simulation_row(runs["4.2 more friction"], "4.2, Fig. 8: friction 10 % above the model"))
     rows.append(_simulation_row(runs["4.2 less friction"], "4.2: friction 10 % below the model"))

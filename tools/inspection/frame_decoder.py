@@ -65,7 +65,6 @@ class PdoMap:
 
     @property
     def entries(self) -> list[tuple[int, int, int]]:
-        """What is mapped."""
         highest = max(self.slots, default=0) if self.count is None else self.count
         raw = [self.slots[sub] for sub in range(1, highest + 1) if sub in self.slots]
         return [(entry >> 16, entry >> 8 & 0xFF, entry & 0xFF) for entry in raw]

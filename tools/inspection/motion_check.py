@@ -146,7 +146,6 @@ class CheckMotion:
 
     @property
     def table(self) -> np.ndarray:
-        """See `Motion`."""
         return motion_table(self.plan, 0.0)
 
     def placed(self, report: CommissioningReport) -> Placed:
@@ -166,7 +165,6 @@ class CheckMotion:
             )
 
     def _envelope(self, report: CommissioningReport) -> list[str]:
-        """What is about to happen, in lines."""
         plan, start = self.plan, report.start_position_rad
         return [
             *joint_lines(report),

@@ -118,7 +118,6 @@ def differences(first: ParameterSet, second: ParameterSet, *, readings: bool = F
 
 
 def shown(objects: Objects, place: Place, value: Value | None) -> str:
-    """A value for people."""
     if value is None:
         return "-"
     variable = objects.variable(place.index, place.sub)

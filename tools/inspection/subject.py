@@ -155,7 +155,6 @@ class SdoReader:
         self.remote.sdo.RESPONSE_TIMEOUT = timeout_s
 
     def upload(self, index: int, sub: int = 0) -> bytes | Refusal:
-        """The bytes of an object."""
         for _ in range(ATTEMPTS):
             try:
                 return bytes(self.remote.sdo.upload(index, sub))
@@ -266,7 +265,6 @@ def ask_everybody(
 
 
 def describe(network: canopen.Network, node: int, answers: bool, nmt: int | None) -> dict[str, Any]:
-    """One row of the result."""
     row: dict[str, Any] = {
         "node": node, "answers_sdo": answers, "nmt_state": nmt_state(nmt), "device_type": None,
         "vendor_id": None, "product_code": None, "revision": None, "serial_number": None, "name": None,

@@ -80,7 +80,6 @@ def _mark(axes: Axes, records: np.ndarray) -> None:
 
 
 def trajectory_figure(records: np.ndarray) -> Figure:
-    """Measured and desired angle."""
     time_s, on = seconds(records), powered(records)
 
     def paint(figure: Picture) -> None:

@@ -168,7 +168,6 @@ class McapFile:
                 self._end_chunk()
 
     def add_message(self, channel: int, time_ns: int, body: bytes) -> None:
-        """One message of any size."""
         row = np.zeros(1, message_rows(("body", f"V{len(body)}")))
         row["body"] = np.void(body)
         self.add_messages(channel, np.array([time_ns]), row)
@@ -428,7 +427,6 @@ class RunLogWriter:
         self.flush()
 
     def write_temperature(self, time_ns: int, temperature_degC: float) -> None:
-        """Append a reading of the drive's temperature."""
         reading = np.array([(time_ns, temperature_degC)], TEMPERATURE)
         self._add(TEMPERATURE_TOPIC, reading["time_ns"], reading)
 
@@ -442,7 +440,6 @@ class RunLogWriter:
             self._add(JOINT_STATE_TOPIC, chosen["time_ns"], joint_states(chosen, self._offset_ns))
 
     def flush(self) -> None:
-        """Close the chunk in progress and hand everything to the operating system."""
         self._write_joint_states()
         self._mcap.flush()
         self._flushed_at_s = self._clock()

@@ -25,8 +25,6 @@ TIMES = {"wake-up late": "wake_late", "round trip": "round_trip", "work": "work"
 
 @dataclass(frozen=True)
 class Range:
-    """Least and greatest value."""
-
     least: float
     greatest: float
 

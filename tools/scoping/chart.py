@@ -59,7 +59,6 @@ class Chart:
         self.dark(False)
 
     def dark(self, on: bool) -> None:
-        """Colours for a dark page, or for a light one."""
         self._colours, text = (DARK_COLOURS, _DARK_TEXT) if on else (COLOURS, _TEXT)
         options, plain = self._chart.options, {"color": text}
         options["textStyle"], options["legend"]["textStyle"] = plain, plain
@@ -83,7 +82,6 @@ class Chart:
         self._chart.run_chart_method("dispatchAction", {"type": "dataZoom", "start": 0, "end": 100})
 
     def refresh(self) -> None:
-        """Draw what is new."""
         span_s = float(self._span.value)
         rows = self._history.newest(span_s, self._held_s)
         if not len(rows):

@@ -50,7 +50,6 @@ class ScopeOrder:
 
     @property
     def url(self) -> str:
-        """What to open."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"http://{host}:{self.port}/?token={self.token}"
 
@@ -122,7 +121,6 @@ class ScopeFeed:
         """So are phases."""
 
     def show(self, snapshot: Snapshot) -> None:
-        """Pass on the records of the snapshot."""
         if snapshot.temperature_degC != self._temperature_degC:
             self._temperature_degC = snapshot.temperature_degC
             self.settings({"temperature_degC": self._temperature_degC})
@@ -130,7 +128,6 @@ class ScopeFeed:
             self.send(RECORDS, snapshot.records[at : at + PIECE].tobytes())
 
     def event(self, event: Event) -> None:
-        """Pass on an event."""
         self.send(EVENT, json.dumps(asdict(event)).encode())
 
     def settings(self, values: Mapping[str, Any]) -> None:
@@ -204,7 +201,6 @@ class ScopeFeed:
         return self._reason
 
     def requests(self) -> Sequence[ViewerRequest]:
-        """What viewers have asked for since the last call."""
         self._receive()
         found = list(self._requests)
         self._requests.clear()

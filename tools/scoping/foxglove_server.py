@@ -99,7 +99,6 @@ class FoxgloveView(ServerListener):
         self._records = None if order.only_states else _channel(RECORD_TOPIC)
 
     def start(self) -> None:
-        """Serve."""
         order = self._order
         host, _, port = order.place.rpartition(":")
         capabilities, services = [Capability.Time], []
@@ -121,14 +120,12 @@ class FoxgloveView(ServerListener):
     # --- Publisher ---
 
     def states(self, record: np.void, body: bytes, wall_ns: int) -> None:
-        """See `Publisher`."""
         self._tell_refusals()
         self._states.log(body, log_time=wall_ns)
         if self._records is not None:
             self._records.log(CDR_HEADER + record.tobytes(), log_time=wall_ns)
 
     def event(self, event: Event, body: bytes, wall_ns: int) -> None:
-        """See `Publisher`."""
         self._events.log(body, log_time=wall_ns)
 
     def settings(self) -> None:
@@ -190,14 +187,12 @@ class FoxgloveView(ServerListener):
         return [found for found in self._parameters() if found.name.removeprefix(GAIN) in given]
 
     def on_client_advertise(self, client: Client, channel: ClientChannel) -> None:
-        """A client is about to publish."""
         self._topics[client.id, channel.id] = channel
         if channel.topic != self._command_topic or channel.encoding != "json":
             self._tell(f"{client_name(client.id)}: {channel.topic} ({channel.encoding}) means nothing here; "
                        f"set-points are JSON on {self._command_topic}")  # fmt: skip
 
     def on_client_unadvertise(self, client: Client, client_channel_id: int) -> None:
-        """It does so no longer."""
         self._topics.pop((client.id, client_channel_id), None)
 
     @property
@@ -205,7 +200,6 @@ class FoxgloveView(ServerListener):
         return f"/{self._order.joint}/command"
 
     def on_message_data(self, client: Client, client_channel_id: int, data: bytes) -> None:
-        """A set-point."""
         channel, who = self._topics.get((client.id, client_channel_id)), client_name(client.id)
         if channel is None or channel.topic != self._command_topic or channel.encoding != "json":
             return

@@ -90,7 +90,6 @@ class Remote:
         self.feeds, self._enabling, self.set_points = feeds, enabling, set_points
 
     def beside(self, display: Callable[[CommissioningReport], Display]) -> Callable[[CommissioningReport], Display]:
-        """What shows the run, and these."""
         return (lambda report: Displays([display(report), *self.feeds])) if self.feeds else display
 
     def consent(self, consent: Consent, output: Output) -> Consent:
@@ -106,7 +105,6 @@ class EnabledFromElsewhere:
 
     @property
     def dry_run(self) -> bool:
-        """See `Consent`."""
         return self._consent.dry_run
 
     @property
@@ -115,7 +113,6 @@ class EnabledFromElsewhere:
         return self._consent.brake
 
     def show(self, lines: Sequence[str]) -> None:
-        """See `Consent`."""
         self._consent.show(lines)
 
     def agreed(self, lines: Sequence[str]) -> bool:

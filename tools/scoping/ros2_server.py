@@ -295,7 +295,6 @@ class Ros2View:
     # --- Publisher ---
 
     def states(self, record: np.void, body: bytes, wall_ns: int) -> None:
-        """See `Publisher`."""
         self._put_states(body)
         now_s = time.monotonic()
         if now_s - self._told_s >= DIAGNOSTICS_S:

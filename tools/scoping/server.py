@@ -187,7 +187,6 @@ def serve(order: ScopeOrder) -> None:
 
 
 def main() -> int:
-    """Entry point of the process."""
     os.nice(NICE)
     serve(ScopeOrder(**json.loads(sys.stdin.buffer.read())))
     return 0

@@ -69,7 +69,6 @@ class Feed(threading.Thread):
         self._stops = 0  # since the stage has changed
 
     def run(self) -> None:
-        """See `Thread`."""
         while True:
             try:
                 message = self._end.recv(LONGEST_BYTES)
@@ -191,14 +190,12 @@ class LiveView:
             self._publisher.states(record, body, int(record["time_ns"]) + self._wall_ns)
 
     def take_event(self, event: Event) -> None:
-        """See `Watcher`."""
         shown = replace(event, source=printable(event.source), text=printable(event.text))
         wall_ns = event.time_ns + self._wall_ns
         body = CDR_HEADER + event_body(wall_ns, shown.level, shown.source, shown.text)
         self._publisher.event(shown, body, wall_ns)
 
     def take_settings(self, found: Mapping[str, Any]) -> None:
-        """See `Watcher`."""
         self.settings.update(printable_values(found))
         self._publisher.settings()
 

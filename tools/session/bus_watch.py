@@ -169,7 +169,6 @@ class FrameRecorder:
         self._thread.join(2.0)
 
     def close(self) -> None:
-        """End, and leave the bus."""
         self.end()
         self._bus.shutdown()
 
@@ -225,7 +224,6 @@ class TemperatureWatch:
 
     @property
     def values_degC(self) -> list[float]:
-        """All readings of the run."""
         return [value for _, value in self.readings]
 
     @property

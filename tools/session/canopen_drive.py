@@ -80,7 +80,6 @@ class CanopenSession(SessionDrive):
         return f"EMCY {emergency_text(code)}"
 
     def state_text(self, status_word: int) -> str:
-        """Of CiA 402."""
         return state_text(status_word)
 
     def in_fault(self, status_word: int) -> bool:

@@ -51,12 +51,10 @@ class TerminalConsent:
         self._given = False
 
     def show(self, lines: Sequence[str]) -> None:
-        """See `Consent`."""
         for line in () if self._given else lines:
             self._output.fact(line)
 
     def agreed(self, lines: Sequence[str]) -> bool:
-        """See `Consent`."""
         self._given = self._given or self._assume_yes or agreed(self._output)
         return self._given
 

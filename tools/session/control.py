@@ -54,7 +54,6 @@ class StopSignals:
         return f" by {STOP_COMMAND}" if self.commanded_ns else ""
 
     def on_signal(self, number: int, _: FrameType | None) -> None:
-        """Signal handler."""
         if self._again:
             self._again = False
         else:

@@ -33,7 +33,6 @@ class ViewerRequest:
     values: Mapping[str, Any] = field(default_factory=dict)
 
     def encoded(self) -> bytes:
-        """As one message."""
         return json.dumps(asdict(self)).encode()
 
 
@@ -125,11 +124,9 @@ class OnlyShows:
         return StopRequest.NONE
 
     def stop_reason(self) -> str:
-        """As above."""
         return ""
 
     def requests(self) -> Sequence[ViewerRequest]:
-        """As above."""
         return ()
 
     def settings(self, values: Mapping[str, Any]) -> None:
@@ -144,39 +141,31 @@ class Displays:
         self._stack = contextlib.ExitStack()
 
     def note(self, text: str) -> None:
-        """See `Display`."""
         for display in self._displays:
             display.note(text)
 
     def phase(self, text: str) -> None:
-        """See `Display`."""
         for display in self._displays:
             display.phase(text)
 
     def show(self, snapshot: Snapshot) -> None:
-        """See `Display`."""
         for display in self._displays:
             display.show(snapshot)
 
     def event(self, event: Event) -> None:
-        """See `Display`."""
         for display in self._displays:
             display.event(event)
 
     def stop_request(self) -> StopRequest:
-        """See `Display`."""
         return max(display.stop_request() for display in self._displays)
 
     def stop_reason(self) -> str:
-        """See `Display`."""
         return next((reason for display in self._displays if (reason := display.stop_reason())), "")
 
     def requests(self) -> Sequence[ViewerRequest]:
-        """See `Display`."""
         return [request for display in self._displays for request in display.requests()]
 
     def settings(self, values: Mapping[str, Any]) -> None:
-        """See `Display`."""
         for display in self._displays:
             display.settings(values)
 
@@ -186,7 +175,6 @@ class Displays:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leave all of them."""
         self._stack.close()
 
 
@@ -200,7 +188,6 @@ class PhaseLines(OnlyShows):
         self._output = output
 
     def note(self, text: str) -> None:
-        """See `Display`."""
         with contextlib.suppress(OSError):  # the terminal may have been closed: no reason to stop watching
             self._output.note(f"  {text}")
 

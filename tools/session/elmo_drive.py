@@ -127,11 +127,9 @@ class GuardHandle:
 
     @property
     def pid(self) -> int:
-        """Process id of the guard."""
         return self._process.pid
 
     def wait_ready(self) -> None:
-        """Until it watches; without it nothing may be enabled."""
         self._control.settimeout(READY_TIMEOUT_S)
         try:
             ready = self._control.recv(1) == b"+"
@@ -141,7 +139,6 @@ class GuardHandle:
             raise JointctlError("the guard of the serial line did not start", "run again")
 
     def just_ended(self) -> bool:
-        """True once, if it has gone before it was released."""
         ended = not self._ended and self._process.poll() is not None
         self._ended = self._ended or ended
         return ended

@@ -121,7 +121,6 @@ class GuardOrder:
     usb_serial_number: str | None = None  # of the port's adapter, where it has one
 
     def argument(self) -> str:
-        """As one command line argument."""
         return json.dumps(asdict(self))
 
 

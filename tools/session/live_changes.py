@@ -462,6 +462,5 @@ class ViewerOrders:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """The run is over."""
         self._end_recording("with the run")
         self._changes.close()

@@ -157,7 +157,6 @@ class LivePanel(OnlyShows):
         self._thread = threading.Thread(target=self._draw_until_ended, name="live panel", daemon=True)
 
     def note(self, text: str) -> None:
-        """See `Display`."""
         self._notes = [*self._notes, message_line(text)][-NOTES:]
 
     def event(self, event: Event) -> None:
@@ -166,11 +165,9 @@ class LivePanel(OnlyShows):
             self.note(event.text)
 
     def phase(self, text: str) -> None:
-        """See `Display`."""
         self._phase = text
 
     def show(self, snapshot: Snapshot) -> None:
-        """See `Display`."""
         self._snapshot = snapshot
 
     def __enter__(self) -> Self:

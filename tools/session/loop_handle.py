@@ -83,7 +83,6 @@ class SharedBlock:
         return self._take(dtype_of(cls), count).view(np.recarray)
 
     def memory(self) -> CycleMemory:
-        """What the loop works on."""
         return CycleMemory(
             self.constants, self.state, self.table[np.newaxis], self.sample, self.command, self.words, self.ring,
             self.histograms, np.zeros(2, np.int64),
@@ -125,8 +124,6 @@ RECEIVE_SHARE = 0.6  # of a period: how long a cycle waits for its sample
 
 @dataclass(frozen=True)
 class LoopOrder:
-    """The orders of the loop process."""
-
     supervisor_pid: int
     block_fd: int
     table_rows: int
@@ -141,7 +138,6 @@ class LoopOrder:
     tail_path: str | None = None  # where the ring is saved if the supervisor has gone
 
     def argument(self) -> str:
-        """As one command line argument."""
         return json.dumps(asdict(self))
 
 
@@ -197,7 +193,6 @@ class LoopHandle:
 
     @property
     def pid(self) -> int:
-        """Process id of the loop."""
         return self._process.pid
 
     @property
@@ -239,7 +234,6 @@ class LoopHandle:
 
     @property
     def cycles(self) -> int:
-        """Cycles that the loop has executed."""
         return int(self.block.words[Word.HEAD])
 
     def allow_enable(self) -> None:
@@ -271,7 +265,6 @@ class LoopHandle:
         return Fault(int(state.fault)), float(state.fault_value)
 
     def new_records(self) -> Any:
-        """Log records since the last call."""
         head = int(self.block.words[Word.HEAD])
         records, lost = self.block.new_records(self._tail, head)
         self._tail = head

@@ -118,7 +118,6 @@ class FreeMotion:
         self.start_rad = math.nan  # where commissioning found the joint
 
     def placed(self, report: CommissioningReport) -> Placed:
-        """See `Motion`."""
         config, start_rad = self._config, report.start_position_rad
         self.start_rad = start_rad
         constants = free_constants(config, start_rad)
@@ -146,7 +145,6 @@ class ConfiguredMotion:
     table: np.ndarray
 
     def placed(self, report: CommissioningReport) -> Placed:
-        """See `Motion`."""
         constants = axis_constants(self.config, self.table, start_position_rad=report.start_position_rad)
         return Placed(constants, self.table, tuple(self._envelope(constants[0], report)))
 

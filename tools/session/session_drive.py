@@ -24,9 +24,7 @@ class Guard(Protocol):
     """A process that switches the drive off when this program and the loop have both died."""
 
     @property
-    def pid(self) -> int:
-        """Process id."""
-        ...
+    def pid(self) -> int: ...
 
     def wait_ready(self) -> None:
         """Until it watches; without it nothing may be enabled."""

@@ -280,12 +280,10 @@ class SetPointSources:
 
     @property
     def constants(self) -> Any:
-        """See `StreamedLoop`."""
         return self._running().constants
 
     @property
     def axis(self) -> Any:
-        """See `StreamedLoop`."""
         return self._running().state
 
     def _running(self) -> SharedBlock:
@@ -294,7 +292,6 @@ class SetPointSources:
         return self._block
 
     def now_ns(self) -> int:
-        """See `StreamedLoop`."""
         return time.monotonic_ns()
 
     def require(self) -> None:
@@ -317,7 +314,6 @@ class SetPointSources:
             self.owner = self._program
 
     def end(self) -> None:
-        """The run is over."""
         with self._lock:
             self._block, self._stream = None, None
 

@@ -111,7 +111,6 @@ class SweepPass:
 
     @property
     def table(self) -> np.ndarray:
-        """See `Motion`."""
         return self.motion.table
 
     def placed(self, report: CommissioningReport) -> Placed:
@@ -124,7 +123,6 @@ class SweepPass:
         """From everywhere within the limits."""
 
     def _envelope(self, report: CommissioningReport) -> list[str]:
-        """What is about to happen, in lines."""
         config, motion = self.config, self.motion
         limits = config.limits
         start = report.start_position_rad
@@ -182,7 +180,6 @@ class MeterDisplay(OnlyShows):
         return self
 
     def __exit__(self, *exception: Any) -> None:
-        """Take the progress away."""
         self._stack.__exit__(*exception)
 
 

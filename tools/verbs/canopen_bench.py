@@ -40,11 +40,9 @@ class CanTarget:
 
     @property
     def place(self) -> tuple[str, str]:
-        """See `StopTarget`."""
         return self.interface, self.channel
 
     def switch_off(self, output: Output) -> str:
-        """See `StopTarget`."""
         from jointctl.drivers.canopen.switch_off import stop_node
 
         bus = open_python_can(self.interface, self.channel, self.bitrate_bitps, exclusive=False)

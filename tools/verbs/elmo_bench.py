@@ -97,7 +97,6 @@ class PortTarget:
 
     @property
     def place(self) -> tuple[str, str]:
-        """See `StopTarget`."""
         return SERIAL, self.port
 
     def switch_off(self, output: Output) -> str:

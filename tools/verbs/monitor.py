@@ -165,7 +165,6 @@ def text_line(message: can.Message, decoded: Decoded) -> str:
 
 
 def json_line(message: can.Message, decoded: Decoded) -> str:
-    """One JSON object."""
     return json.dumps(
         {
             "time_s": message.timestamp,

@@ -166,7 +166,6 @@ class PageConsent:
             self._output.note(line)
 
     def agreed(self, lines: Sequence[str]) -> bool:
-        """See `Consent`."""
         return confirmed(self._feed, list(lines))
 
 
