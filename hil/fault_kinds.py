@@ -4,7 +4,7 @@ A fault is a record `FaultConstants`; the faults of a joint are an array of them
 Times count from `FaultMemory.epoch_ns`: the start of a run, or, while that is 0, the first time that the power stage
 is on.  Chance comes from a xorshift64 generator in the memory, so that a run repeats bit by bit.
 
-Faults of the wire are carried out by `hil.frame_faults`, those of drive and plant by `hil.plant_faults`.
+They are carried out by `hil.faults`.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class FaultMemory:
     """State of all faults of one joint; `ready` is the queue for what comes out of the wire."""
 
     epoch_ns: i8  # 0 = not yet: the first cycle with the power stage on sets it
-    last_ns: i8  # of the last `plant_faults.step_faults`
+    last_ns: i8  # of the last `step_faults`
     random: u8  # xorshift64, never 0
     was_active: Annotated[np.ndarray, array_of(i4, MAX_FAULTS)]
     late_count: i4

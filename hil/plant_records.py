@@ -323,7 +323,7 @@ class PlantState:
     link_bristle_deflection_rad: f8
     motor_temperature_degC: f8
     added_load_torque_Nm: f8
-    # faults, written by `hil.plant_faults`; all zero = none
+    # faults, written by `hil.faults`; all zero = none
     encoder_stuck: i4
     encoder_reversed: i4
     current_capped: i4

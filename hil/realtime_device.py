@@ -36,9 +36,8 @@ from jointctl.hil.canopen.device import Cia402Device
 from jointctl.hil.canopen.device_core import accept_frame, advance
 from jointctl.hil.canopen.records import Device, NmtState, int64
 from jointctl.hil.fault_kinds import FaultMemory, fault_memory, no_faults
-from jointctl.hil.frame_faults import append_frame, pass_frame, take_due
+from jointctl.hil.faults import append_frame, pass_frame, step_faults, take_due
 from jointctl.hil.frame_stamps import OLDEST_STAMP_NS, STAMPED_LAG_NS, sent_ns_of, stamp_answers
-from jointctl.hil.plant_faults import step_faults
 from jointctl.hil.plant_records import PlantConstants, PlantState
 from jointctl.hil.virtual_bus import FRAME_SIZE, FrameQueue
 

@@ -13,8 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TextIO
 
-from jointctl.drivers.errors import UsageError
-from jointctl.drivers.printable import printable
+from jointctl.drivers.errors import UsageError, printable
 from jointctl.tools.written_file import refuse_overwriting, refuse_special, writing
 
 if TYPE_CHECKING:

@@ -1,7 +1,7 @@
 """Where output goes: results on stdout, everything else on stderr; colour and progress only on a terminal.
 
 With `json` the result is one JSON document on stdout and nothing else is printed there; NO_COLOR is honoured by rich.
-Whatever a text holds, a terminal shows it and obeys none of it (`drivers.printable`); a result is not cut.
+Whatever a text holds, a terminal shows it and obeys none of it (`drivers.errors`); a result is not cut.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Column, Table
 from rich.text import Text
 
-from jointctl.drivers.errors import DataError
-from jointctl.drivers.printable import message_line, printable
+from jointctl.drivers.errors import DataError, message_line, printable
 
 
 class Advance(Protocol):

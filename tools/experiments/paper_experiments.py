@@ -30,7 +30,7 @@ from jointctl.tools.identification.friction_data import FrictionData
 from jointctl.tools.identification.identification import Identification, Options, identify_friction
 from jointctl.tools.identification.identification_report import fit_figure
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
-from jointctl.tools.recording.run_figure import drawn_indices
+from jointctl.tools.recording.run_summary import drawn_indices
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

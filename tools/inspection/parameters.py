@@ -19,8 +19,7 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 from jointctl.drivers.canopen.eds import Sections, number_of, parse_sections, read_text
 from jointctl.drivers.canopen.pdo import DISABLED
 from jointctl.drivers.canopen.sdo import download
-from jointctl.drivers.errors import DataError
-from jointctl.drivers.printable import printable
+from jointctl.drivers.errors import DataError, printable
 from jointctl.firmware_py.input_file import parse_toml, read_input
 from jointctl.tools.inspection.objects import INTEGERS, TEXTS, Objects, Place, read_dictionary
 from jointctl.tools.inspection.subject import ATTEMPTS, Refusal, SdoReader, abort_text

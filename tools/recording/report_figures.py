@@ -17,9 +17,17 @@ from jointctl.firmware_py.input_file import parse_toml
 from jointctl.firmware_py.states import AxisPhase, Fault, fault_name
 from jointctl.tools.drawing import BLUE, COLOURS, GREEN, GREY, INK, MID_BLUE, ORANGE, RED, SERIES, SOFT, TEAL, VIOLET
 from jointctl.tools.recording.report_page import Block, Figure, Paragraph, Table, draw
-from jointctl.tools.recording.run_figure import drawn_indices, powered, seconds
 from jointctl.tools.recording.run_log_reader import RunLog, began_at, event_rows, missing_in
-from jointctl.tools.recording.run_summary import TIMES, TORQUES, Range, RunSummary, TimeSummary
+from jointctl.tools.recording.run_summary import (
+    TIMES,
+    TORQUES,
+    Range,
+    RunSummary,
+    TimeSummary,
+    drawn_indices,
+    powered,
+    seconds,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

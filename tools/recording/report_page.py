@@ -28,8 +28,7 @@ from typing import TYPE_CHECKING, Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from rich.table import Table as TerminalTable
 
-from jointctl.drivers.errors import DataError
-from jointctl.drivers.printable import printable
+from jointctl.drivers.errors import DataError, printable
 from jointctl.tools.drawing import COLOURS, canvas, save_figure
 from jointctl.tools.output import Output, cell_text
 from jointctl.tools.written_file import replace_file, require_target

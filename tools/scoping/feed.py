@@ -16,8 +16,7 @@ from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from typing import Any, Self
 
-from jointctl.drivers.errors import DataError, UsageError
-from jointctl.drivers.printable import printable
+from jointctl.drivers.errors import DataError, UsageError, printable
 from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.configuration.drive_section import DEFAULT_KIND
 from jointctl.tools.recording.run_log import Event

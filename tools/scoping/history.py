@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.printable import printable
+from jointctl.drivers.errors import printable
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of, new
-from jointctl.tools.recording.run_figure import drawn_indices, powered
 from jointctl.tools.recording.run_log import Event
+from jointctl.tools.recording.run_summary import drawn_indices, powered
 
 RING_RECORDS = 1 << 16  # 65 s at 1 kHz
 EVENTS = 50

@@ -23,13 +23,13 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 from xxhash import xxh3_128_intdigest
 
-from jointctl.drivers.printable import printable
+from jointctl.drivers.errors import printable
 from jointctl.firmware_py.states import fault_name
 from jointctl.tools.recording.ros_messages import JOINT_STATE_TOPIC, SECOND_NS
 from jointctl.tools.recording.run_log import ERROR, WARNING, Event
 from jointctl.tools.scoping.remote import RemoteOrder
 from jointctl.tools.scoping.supervisor_link import NOT_TAKEN, LiveView, WayBack, serve_order
-from jointctl.tools.session.events import fault_words, phase_name
+from jointctl.tools.session.display import fault_words, phase_name
 from jointctl.tools.session.session_drive import drive_state_name, session_drive
 from jointctl.tools.session.set_points import RemoteSetPoint
 

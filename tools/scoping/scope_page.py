@@ -15,8 +15,7 @@ from jointctl.tools.recording.run_log import Event
 from jointctl.tools.scoping.chart import Chart
 from jointctl.tools.scoping.feed import ScopeOrder
 from jointctl.tools.scoping.history import History, percentiles_us
-from jointctl.tools.session.display import ViewerRequest, viewer
-from jointctl.tools.session.events import fault_words, phase_name
+from jointctl.tools.session.display import ViewerRequest, fault_words, phase_name, viewer
 from jointctl.tools.session.session_drive import drive_state_name, session_drive
 
 HEADING = "role=heading aria-level=2"

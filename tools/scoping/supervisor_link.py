@@ -19,8 +19,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from jointctl.drivers.errors import DataError
-from jointctl.drivers.printable import one_line, printable
+from jointctl.drivers.errors import DataError, one_line, printable
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
 from jointctl.tools.output import Output

@@ -17,13 +17,12 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from jointctl.drivers.printable import message_line, printable
+from jointctl.drivers.errors import message_line, printable
 from jointctl.firmware_py.cycle import Histogram
 from jointctl.firmware_py.states import AxisPhase
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import ERROR, Event
-from jointctl.tools.session.display import Display, OnlyShows, PhaseLines, Snapshot
-from jointctl.tools.session.events import fault_words, phase_name
+from jointctl.tools.session.display import Display, OnlyShows, PhaseLines, Snapshot, fault_words, phase_name
 from jointctl.tools.session.loop_handle import QUANTILE, quantile_s
 from jointctl.tools.session.session_drive import drive_state_name, session_drive
 

@@ -14,8 +14,7 @@ from jointctl.drivers.errors import INTERRUPTED, DataError, DeviceError, MotionF
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
-from jointctl.tools.recording.run_figure import save_run_figure
-from jointctl.tools.recording.run_summary import RunSummary, summary_table
+from jointctl.tools.recording.run_summary import RunSummary, save_run_figure, summary_table
 from jointctl.tools.session.fault_words import FaultText
 
 # --- How a run leaves the drive: code that reports to the user that it is disabled asks here first ---

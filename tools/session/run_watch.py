@@ -21,8 +21,7 @@ from jointctl.tools.recording.ros_messages import frame_array
 from jointctl.tools.recording.run_log import ERROR, INFO, WARNING, Event, RunLogWriter
 from jointctl.tools.session.bus_watch import BusWatch, FrameRecorder, TemperatureWatch
 from jointctl.tools.session.control import StopSignals
-from jointctl.tools.session.display import Display, Snapshot
-from jointctl.tools.session.events import EventFinder, phase_name
+from jointctl.tools.session.display import Display, EventFinder, Snapshot, phase_name
 from jointctl.tools.session.fault_words import NoticeFinder
 from jointctl.tools.session.live_changes import ViewerOrders
 from jointctl.tools.session.loop_handle import LoopHandle

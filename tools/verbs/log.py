@@ -91,8 +91,8 @@ def log_plot(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="PNG to write; default: beside the log")] = None,
 ) -> int:
     """The picture of the run."""
-    from jointctl.tools.recording.run_figure import save_run_figure
     from jointctl.tools.recording.run_log_reader import read_run_log
+    from jointctl.tools.recording.run_summary import save_run_figure
 
     log = read_run_log(path)
     if not len(log.records):

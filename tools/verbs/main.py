@@ -11,8 +11,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from jointctl.drivers.errors import INTERRUPTED, DataError, JointctlError, UsageError
-from jointctl.drivers.printable import one_line
+from jointctl.drivers.errors import INTERRUPTED, DataError, JointctlError, UsageError, one_line
 from jointctl.tools.output import Output, abandon, let_go
 from jointctl.tools.scoping.remote_options import with_values
 from jointctl.tools.verbs.check import check

@@ -8,8 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointctl.drivers.errors import BusError
-from jointctl.drivers.printable import LONGEST_MESSAGE, LONGEST_VALUE, message_line, one_line, printable, shortened
+from jointctl.drivers.errors import (
+    LONGEST_MESSAGE,
+    LONGEST_VALUE,
+    BusError,
+    message_line,
+    one_line,
+    printable,
+    shortened,
+)
 from jointctl.tools.configuration.config import ConfigurationProblems
 
 HARMFUL = [chr(code) for code in (*range(0x20), *range(0x7F, 0xA0), 0x202E, 0x2066, 0x200F, 0x2028, 0xFEFF, 0xDCFF)]

@@ -13,8 +13,14 @@ from rich.console import Console
 from jointctl.drivers.errors import DataError
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, Histogram
 from jointctl.firmware_py.states import Fault
-from jointctl.tools.recording.run_figure import drawn_indices, save_run_figure
-from jointctl.tools.recording.run_summary import TIMES, histogram_times, summarise, summary_table
+from jointctl.tools.recording.run_summary import (
+    TIMES,
+    drawn_indices,
+    histogram_times,
+    save_run_figure,
+    summarise,
+    summary_table,
+)
 from tests.run_records import run_records
 
 

@@ -25,9 +25,8 @@ from jointctl.tools.recording.run_log import ERROR, WARNING, Event
 from jointctl.tools.recording.run_summary import summarise
 from jointctl.tools.session import result as run_report
 from jointctl.tools.session.control import StopSignals
-from jointctl.tools.session.display import PhaseLines
+from jointctl.tools.session.display import OVERRUN_CYCLES, EventFinder, PhaseLines
 from jointctl.tools.session.elmo_drive import serial_fault_text
-from jointctl.tools.session.events import OVERRUN_CYCLES, EventFinder
 from jointctl.tools.session.fault_words import (
     FAULT_TEXTS,
     FaultText,
