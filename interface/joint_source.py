@@ -27,17 +27,12 @@ class JointSource:
     @contextmanager
     def served(self) -> Iterator[None]:
         """With the virtual joint running, in a process of its own, where it is one's own."""
-        from jointctl.tools.session.loops import compiling_beside
-        from jointctl.tools.virtual_joint import separate_virtual_joint
+        from jointctl.tools.virtual_joint import own_virtual_joint
 
         if not self.own_virtual:
             yield
             return
-        with (
-            compiling_beside() as loop_compiled,
-            separate_virtual_joint(self.config.path, self.config.bus.channel),
-        ):
-            loop_compiled()
+        with own_virtual_joint(self.config.path, self.config.bus.channel):
             yield
 
 

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import can
@@ -20,7 +20,8 @@ import numpy as np
 
 from jointctl.drivers.can.open import CYCLIC_INTERFACES, open_cyclic_end, open_python_can
 from jointctl.drivers.can.virtual_bus import decode, encode
-from jointctl.drivers.errors import BusError, ConfigurationError
+from jointctl.drivers.errors import BusError, ConfigurationError, JointctlError
+from jointctl.firmware_py.kernel import cache_folder
 from jointctl.hil.canopen.device import Cia402Device
 from jointctl.hil.plant import plant
 from jointctl.hil.realtime_device import ENDED_WORD, SEND_ERRORS_WORD, STOP_WORD, WORDS, RealtimeDevice
@@ -36,6 +37,7 @@ from jointctl.tools.configuration.plant_settings import (
 )
 
 _POLL_S = 0.1
+_START_POLL_S = 0.02
 _LONGEST_WAIT_NS = 2_000_000  # timers and the plant move on at least this often
 _FRAMES_AT_ONCE = 64  # received before timers are looked at again
 _SEND_TIMEOUT_S = 0.01
@@ -193,3 +195,39 @@ def separate_virtual_joint(
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+
+
+@contextmanager
+def own_virtual_joint(config_path: Path, channel: str, tell: Callable[[str], None] = lambda _: None) -> Iterator[None]:
+    """`separate_virtual_joint`, with a loop that is compiled when the block begins."""
+    with _compiling_beside(tell) as loop_compiled, separate_virtual_joint(config_path, channel, tell):
+        loop_compiled()
+        yield
+
+
+@contextmanager
+def _compiling_beside(tell: Callable[[str], None]) -> Iterator[Callable[[], None]]:
+    """Where the loop is not compiled yet, a process does that beside what the block does; what this gives waits for it.
+
+    Whatever becomes of it: the loop compiles by itself what it does not find.
+    """
+    if cache_folder is None or any(cache_folder.rglob("realtime.run_loop-*.nbi")):
+        yield lambda: None
+        return
+    tell("compiling, which only the first start does")
+    command = [sys.executable, "-P", "-m", "jointctl.tools.session.loops"]
+    silent = subprocess.DEVNULL
+    process = subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent, start_new_session=True)
+
+    def wait() -> None:
+        starting = Starting("the loop", process, tell)
+        with suppress(JointctlError):
+            while process.poll() is None:
+                starting.check()
+                time.sleep(_START_POLL_S)
+
+    try:
+        yield wait
+    finally:
+        process.kill()
+        process.wait()

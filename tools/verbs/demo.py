@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jointctl.drivers.errors import ConfigurationError, JointctlError
+from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.verbs.verb_options import VerbOutput, config_path
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.config import Config
 
 LONGEST_S = 86_400.0
-POLL_S = 0.02
 PATIENCE_S = 0.15  # a shared computer may stand still for so long; here only simulated metal waits for it
 
 
@@ -35,7 +28,7 @@ def demo(
     from jointctl.tools.configuration.drive_section import GivenPlace, require_simulated
     from jointctl.tools.configuration.load import load_config, moved
     from jointctl.tools.verbs.run import run
-    from jointctl.tools.virtual_joint import separate_virtual_joint
+    from jointctl.tools.virtual_joint import own_virtual_joint
 
     path = config_path(config)
     joint = load_config(path)
@@ -48,8 +41,7 @@ def demo(
         joint = _with_duration(joint, duration_s)
     joint = with_patience(joint)
     output.note("starting the virtual joint")
-    with _compiling_beside(output.note) as loop_compiled, separate_virtual_joint(path, channel, output.note):
-        loop_compiled()
+    with own_virtual_joint(path, channel, output.note):
         return run(joint, output, assume_yes=True)
 
 
@@ -68,34 +60,3 @@ def _with_duration(config: Config, duration_s: float) -> Config:
         raise ConfigurationError(f"--duration (={duration_s:g}) must be in [0.1..{LONGEST_S:g}] s")
     trajectory = config.trajectory.model_copy(update={"duration_s": duration_s})
     return config.model_copy(update={"trajectory": trajectory})
-
-
-@contextmanager
-def _compiling_beside(tell: Callable[[str], None]) -> Iterator[Callable[[], None]]:
-    """Where the loop is not compiled yet, a process does that beside what the block does; what this gives waits for it.
-
-    Whatever becomes of it: the loop compiles by itself what it does not find.
-    """
-    from jointctl.firmware_py.kernel import cache_folder
-    from jointctl.tools.child_process import Starting
-
-    if cache_folder is None or any(cache_folder.rglob("realtime.run_loop-*.nbi")):
-        yield lambda: None
-        return
-    tell("compiling, which only the first start does")
-    command = [sys.executable, "-P", "-m", "jointctl.tools.session.loops"]
-    silent = subprocess.DEVNULL
-    process = subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent, start_new_session=True)
-
-    def wait() -> None:
-        starting = Starting("the loop", process, tell)
-        with contextlib.suppress(JointctlError):
-            while process.poll() is None:
-                starting.check()
-                time.sleep(POLL_S)
-
-    try:
-        yield wait
-    finally:
-        process.kill()
-        process.wait()
