@@ -43,7 +43,6 @@ from jointctl.drivers.port_users import program_name
 
 
 ANSWER_S = 1.0  # a program that lives answers at once
-LONGEST_LINE_BYTES = 4096
 
 
 def listener(address: bytes, waiting: int = 128) -> socket.socket:
@@ -81,21 +80,6 @@ def parsed_line(data: bytes) -> dict[str, Any] | None:
     except (ValueError, RecursionError):
         return None
     return message if isinstance(message, dict) else None
-
-
-def received_line(peer: socket.socket, timeout_s: float = ANSWER_S) -> dict[str, Any] | None:
-    """One message; None where none comes in time or it is none."""
-    peer.settimeout(timeout_s)
-    data = b""
-    try:
-        while not data.endswith(b"\n") and len(data) < LONGEST_LINE_BYTES:
-            part = peer.recv(1)
-            if not part:
-                break
-            data += part
-    except OSError:
-        return None
-    return parsed_line(data)
 
 
 # --- The lock ---

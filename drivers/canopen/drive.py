@@ -369,9 +369,7 @@ class CanopenDrive:
             self._network.disconnect()
 
 
-# --- The drive's temperature while the loop runs ---
-# The drive's temperature while the loop runs: one SDO upload a second, asked and answered without waiting.
-#
+# --- The drive's temperature while the loop runs: one SDO upload a second, asked and answered without waiting ---
 # CiA 402 has no object for it; the configuration names the drive's own.  Whatever goes wrong with it (abort, no answer,
 # nonsense) makes the temperature unknown and nothing else.
 

@@ -1,4 +1,4 @@
-"""The cyclic protocol on a file descriptor: what the compiled loop calls each cycle.
+"""The cyclic protocol on a file descriptor, for all drives of a bus: what the compiled loop calls each cycle.
 
 `receive` and `send` are exported with a fixed C signature, so that the loop in firmware_py can take them as arguments.
 """
@@ -89,9 +89,12 @@ def receive_frame(fd: int, frames: np.ndarray, index: int) -> int:
 
 
 class CanopenLink(NamedTuple):
-    """The memory of the exchange: a drive's record, the frames that it sends and receives, scratch."""
+    """The memory of the exchange: a record of each drive, the frames that are sent and received, scratch.
 
-    port: Any  # CanopenPort[1]
+    The drives are on one bus, that of the first record, and answer one SYNC.
+    """
+
+    port: Any  # CanopenPort[axes]
     frames: Any  # Frame[FRAME_SLOTS]
     scratch: np.ndarray  # int64[SCRATCH_WORDS]
 
@@ -102,7 +105,7 @@ _LINK = memory_type(CanopenLink, dtype_of(CanopenPort), dtype_of(Frame), np.dtyp
 
 
 def link_of(port: Any) -> CanopenLink:
-    """`port` CanopenPort[1] with the other memory of the exchange."""
+    """`port` CanopenPort[axes] with the other memory of the exchange."""
     return CanopenLink(port, new(Frame, FRAME_SLOTS), np.zeros(SCRATCH_WORDS, np.int64))
 
 
@@ -124,17 +127,26 @@ def _note_sent(port: CanopenPort, sample: Sample, error: int, last: bool) -> Non
 
 
 @kernel
-def _drain(port: CanopenPort, frames: np.ndarray, sample: Sample, now_ns: int) -> bool:
+def _drain(ports: np.ndarray, frames: np.ndarray, samples: np.ndarray, now_ns: int) -> bool:
     """Take every frame that is waiting; True if a sample was among them (of several, the last one counts)."""
     found = False
-    while receive_frame(port.fd, frames, SLOT_RECEIVED) == 1:
-        found |= accept_frame(port, frames[SLOT_RECEIVED], sample, now_ns)
+    while receive_frame(ports[0].fd, frames, SLOT_RECEIVED) == 1:
+        for axis in range(len(ports)):
+            found |= accept_frame(ports[axis], frames[SLOT_RECEIVED], samples[axis], now_ns)
     return found
+
+
+@kernel
+def _any_owed(ports: np.ndarray) -> bool:
+    for axis in range(len(ports)):
+        if answer_owed(ports[axis]):
+            return True
+    return False
 
 
 @exported(types.int64(_LINK, _SAMPLES, types.int64, types.int64))
 def receive(link: CanopenLink, samples: np.ndarray, now_ns: int, until_ns: int) -> int:
-    """Send SYNC and wait for the answering TPDO until `until_ns`; returns the time waited [ns].
+    """Send SYNC and wait for the answering TPDO of each drive until `until_ns`; returns the time waited [ns].
 
     Frames that came since the last cycle are taken first, so that a late TPDO is not mistaken for the answer.  One
     that is later still comes after this SYNC: where the last one has no answer yet, the whole time is waited and the
@@ -144,32 +156,41 @@ def receive(link: CanopenLink, samples: np.ndarray, now_ns: int, until_ns: int) 
     time since, when SYNC was late as well; as a sample of this slot it would be a leap.  The next cycle takes it,
     unless that is more than a period and a half later (`note_wake`).
     """
-    port, frames, sample = link.port[0], link.frames, samples[0]
-    note_wake(port, now_ns)
-    _drain(port, frames, sample, now_ns)
-    owed = answer_owed(port)
-    for slot in range(begin_cycle(port, frames)):
-        _note_sent(port, sample, send_frame(port.fd, frames, slot), False)
+    ports, frames = link.port, link.frames
+    for axis in range(len(ports)):
+        note_wake(ports[axis], now_ns)
+    _drain(ports, frames, samples, now_ns)
+    owed = _any_owed(ports)
+    to_send = FRAME_SLOTS
+    for axis in range(len(ports)):  # a drive that ignores a stop keeps the heartbeat from all
+        to_send = min(to_send, begin_cycle(ports[axis], frames))
+    for slot in range(to_send):
+        error = send_frame(ports[0].fd, frames, slot)
+        for axis in range(len(ports)):
+            _note_sent(ports[axis], samples[axis], error, False)
     started_ns = monotonic_ns(link.scratch)
     arrived_ns = started_ns
     while arrived_ns <= until_ns + LOOK_LATE_NS:
-        if _drain(port, frames, sample, arrived_ns) and not owed:
+        if _drain(ports, frames, samples, arrived_ns) and not owed and not _any_owed(ports):
             return monotonic_ns(link.scratch) - started_ns
         if arrived_ns >= until_ns:
             return arrived_ns - started_ns
-        wait_readable_ns(port.fd, until_ns - arrived_ns, link.scratch)
+        wait_readable_ns(ports[0].fd, until_ns - arrived_ns, link.scratch)
         arrived_ns = monotonic_ns(link.scratch)
     return arrived_ns - started_ns
 
 
 @exported(types.int32(_LINK, _SAMPLES, _COMMANDS))
 def send(link: CanopenLink, samples: np.ndarray, commands: np.ndarray) -> int:
-    """Send the RPDO; returns 0 or the errno."""
-    port = link.port[0]
-    end_cycle(port, link.frames, samples[0], commands[0])
-    error = send_frame(port.fd, link.frames, SLOT_RPDO)
-    _note_sent(port, samples[0], error, True)
-    return np.int32(error)  # type: ignore[return-value]
+    """Send the RPDO of each drive; returns 0 or the last errno."""
+    ports, failed = link.port, 0
+    for axis in range(len(ports)):
+        end_cycle(ports[axis], link.frames, samples[axis], commands[axis])
+        error = send_frame(ports[0].fd, link.frames, SLOT_RPDO)
+        _note_sent(ports[axis], samples[axis], error, True)
+        if error != 0:
+            failed = error
+    return np.int32(failed)  # type: ignore[return-value]
 
 
 # --- The same cycle for a caller that moves the frames itself (lockstep simulation) ---

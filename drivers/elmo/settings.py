@@ -72,8 +72,6 @@ class ElmoSettings:
 
 
 # --- How many characters a cycle has on the line, and what rate the line carries ---
-# How many characters a cycle has on a serial line, and what rate a line carries.
-#
 # 8N1: ten bits a character.  The characters of both directions are added up although a line is full duplex: a drive
 # answers after it has heard, and the second command of a cycle waits for the answer to the first.  That is cautious by
 # about a third; what the drive itself needs to answer is unknown before it is measured.

@@ -8,16 +8,12 @@ the drive adds inside is not visible on the bus: `margin.loop_delay_s` or a meas
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import ControllerKind, Encoders
-from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.tools.analysis.linear_loop import LoopSettings, TwoMasses
-from jointctl.tools.analysis.margins import phase_margin_deg
-from jointctl.tools.configuration.conversions import joint_rad_per_count
 from jointctl.tools.configuration.records import encoders_of_law, hidden_layer
 
 if TYPE_CHECKING:
@@ -25,7 +21,6 @@ if TYPE_CHECKING:
     from jointctl.tools.configuration.sections import Reducer
 
 _SAME_IN_CONTROL = {"kp", "kv", "ki", "observer_radps", "observer_delay_cycles", "learning_rate", "leakage_1ps"}
-STEP_SHARE = 0.2  # of the torque limit; `precise` with 17 bit is below, with 16 bit, where it chatters, above
 
 
 @dataclass(frozen=True)
@@ -128,62 +123,3 @@ def two_masses(config: Config, reducer: Reducer, payload: float, stiffness: floa
         damping,
         ", ".join(words),
     )
-
-
-OUTSIDE = (0.5, 2.0)  # factors on the link's inertia that are looked at beyond what must hold
-
-
-def outside_payload_range(config: Config, settings: LoopSettings) -> list[str]:
-    """What happens with lighter and heavier links than `margin.payload_range` says, in words."""
-    found = []
-    for payload in OUTSIDE if config.reducer is not None else ():
-        if config.margin.payload_range[0] <= payload <= config.margin.payload_range[1]:
-            continue
-        assert config.reducer is not None
-        joint = two_masses(config, config.reducer, payload, 1.0, False)
-        phase_deg = phase_margin_deg(replace(settings, joints=(joint,)))
-        text = f"phase margin {phase_deg:.1f} deg" if phase_deg > 0.0 else "the control loop is UNSTABLE"
-        found.append(f"outside margin.payload_range, link inertia x {payload:g}: {text}")
-    return found
-
-
-def not_modelled(config: Config) -> list[str]:
-    """Configured things that the linear loop does not know, in words."""
-    control, joint, found = config.control, config.joint, []
-    if control.feed_forward == "measured":
-        found.append('control.feed_forward = "measured": takes back the damping that friction gives')
-    if joint.gravity_Nm:
-        found.append(f"joint.gravity_Nm (={joint.gravity_Nm:g}): taken as compensated exactly")
-    if joint.coriolis_Nmspr:
-        found.append(f"joint.coriolis_Nmspr (={joint.coriolis_Nmspr:g}): taken as compensated exactly")
-    if control.kind == "computed_torque_rbf" and control.dead_zone_rad:
-        found.append(f"control.dead_zone_rad (={control.dead_zone_rad:g}): taken as if the error were outside")
-    virtual = config.virtual
-    if config.reducer is not None:
-        found.append("hysteresis of the reducer beyond what margin.stiffness_error covers, and sliding friction")
-    elif virtual is None:
-        found.append("flexibility of the reducer: a soft one resonates and takes margin that is not counted here")
-    elif virtual.flexible:
-        motor_kgm2 = virtual.motor_side_inertia_kgm2
-        other_kgm2 = max(joint.inertia_kgm2 * virtual.inertia_scale - motor_kgm2, 1e-9)
-        stiffness = virtual.reducer_stiffness_Nmprad
-        resonance_Hz = math.sqrt(stiffness * (1.0 / motor_kgm2 + 1.0 / other_kgm2)) / math.tau
-        found.append(
-            f"virtual.flexible (=true): the reducer resonates at {resonance_Hz:.1f} Hz, "
-            "which takes margin that is not counted here"
-        )
-    step_Nm = encoder_step_Nm(config)
-    if step_Nm > STEP_SHARE * config.limits.torque_max_Nm:
-        found.append(
-            f"encoder.counts_per_turn (={config.encoder.counts_per_turn}): one count moves the torque by "
-            f"{step_Nm:.1f} Nm, more than {STEP_SHARE:.0%} of limits.torque_max_Nm: "
-            "it will chatter; lower kv or velocity_cutoff_Hz"
-        )
-    return found
-
-
-def encoder_step_Nm(config: Config) -> float:
-    """By how much kp and kv move the torque when the reading changes by one count."""
-    control, rate_Hz = config.control, config.loop.rate_Hz
-    slope_1ps = low_pass_gain(control.velocity_cutoff_Hz, 1.0 / rate_Hz) * rate_Hz
-    return config.joint.inertia_kgm2 * (control.kp + control.kv * slope_1ps) * abs(joint_rad_per_count(config))

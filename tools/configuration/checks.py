@@ -7,15 +7,12 @@ from typing import Any
 
 from jointctl.firmware_py.records import KNEES
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.conversions import RADPS_PER_UNIT, torque_constant_NmpA, velocity_of_a_count_radps
+from jointctl.tools.configuration.conversions import RADPS_PER_UNIT, velocity_of_a_count_radps
 from jointctl.tools.configuration.sections import Friction, FrictionDirection, Reducer, ReducerMap
 
 OBSERVING = ("computed_torque_observer", "flexible_joint")  # laws with a disturbance observer
 SWING_PERIODS = 4.0  # that half a swing takes at least: a faster one no sampled loop can follow
 CURVE_POINTS = 200  # at which a friction curve is looked at
-DOUBTFUL_FACTOR = 1.25  # motors are rated at a speed, where losses take part of the torque
-MOST_RATED, LEAST_RATED = 10.0, 0.02  # of the motor's rated current, that the torque limit asks for
-MOST_A, LEAST_A = 300.0, 0.02  # where no rated current is configured
 SWITCH_rad, SWITCH_radps = 1e-3, 1e-2  # what rounding of the numbers in a file may leave at a switch
 
 
@@ -344,76 +341,3 @@ def _drive_problems(config: Config) -> list[str]:
         f"(={config.limits.torque_max_Nm:g}): the joint could not be held",
         *found,
     ]
-
-
-# --- Constants that are each in range and do not fit together: the user is warned, nothing is refused ---
-
-
-def contradictions(config: Config) -> list[str]:
-    """One line for each; every one names the keys, and what follows from them."""
-    return [*rated_contradiction(config), *_current_contradiction(config), *_inertia_contradictions(config)]
-
-
-def rated_contradiction(config: Config) -> list[str]:
-    """Torque constant, rated current and rated torque."""
-    found = config.drive.constants_factor(config)
-    if found is None or 1.0 / DOUBTFUL_FACTOR <= found[0] <= DOUBTFUL_FACTOR:
-        return []
-    return [found[1]]
-
-
-def _current_contradiction(config: Config) -> list[str]:
-    """The current that the torque limit asks of the motor."""
-    joint, limit_Nm = config.joint, config.limits.torque_max_Nm
-    current_A = limit_Nm / (torque_constant_NmpA(config) * joint.reduction_ratio)
-    rated = config.drive.motor_current()
-    low_A, high_A = (LEAST_A, MOST_A) if rated is None else (LEAST_RATED * rated[1], MOST_RATED * rated[1])
-    if low_A <= current_A <= high_A:
-        return []
-    compared = "" if rated is None else f", {current_A / rated[1]:.3g} times {rated[0]} (={rated[1]:g})"
-    return [
-        f"limits.torque_max_Nm (={limit_Nm:g}) is {current_A:.3g} A of the motor{compared}: check "
-        f"joint.torque_constant_NmpA (={joint.torque_constant_NmpA:g}) and joint.reduction_ratio "
-        f"(={joint.reduction_ratio:g})"
-    ]
-
-
-def trajectory_acceleration(trajectory: Any) -> float | None:
-    """The largest acceleration [rad/s2] of a trajectory; None where a file must be read first."""
-    if trajectory.kind == "sine":
-        parts = [trajectory] + ([trajectory.switch] if trajectory.switch else [])
-        return max(abs(p.amplitude_rad) * (math.tau * p.frequency_Hz) ** 2 for p in parts)
-    if trajectory.kind == "hold":
-        return 0.0
-    if trajectory.kind == "table":
-        return None
-    if trajectory.kind == "min_jerk":
-        # the quintic's peak: 10 / sqrt(3) of distance / time^2
-        return abs(trajectory.target_rad - trajectory.start_rad) / trajectory.move_s**2 * 10.0 / math.sqrt(3.0)
-    return float(trajectory.acceleration_radps2)
-
-
-def _inertia_contradictions(config: Config) -> list[str]:
-    """Inertia against torque: too much of it for the motion and for braking, or too little to be true."""
-    inertia, limits = config.joint.inertia_kgm2, config.limits
-    free_Nm = limits.torque_max_Nm - abs(config.joint.gravity_Nm)
-    found = []
-    wanted = (
-        ("the trajectory's largest acceleration", trajectory_acceleration(config.trajectory)),
-        ("sequence.brake_radps2", config.sequence.brake_radps2),
-    )
-    for name, acceleration in wanted:
-        if acceleration is not None and inertia * acceleration > free_Nm:
-            found.append(
-                f"joint.inertia_kgm2 (={inertia:g}) times {name} (={acceleration:.3g} rad/s2) is "
-                f"{inertia * acceleration:.3g} Nm: limits.torque_max_Nm (={limits.torque_max_Nm:g}) leaves "
-                f"{free_Nm:.3g} Nm beside gravity"
-            )
-    step = limits.torque_max_Nm / inertia / config.loop.rate_Hz
-    if step > limits.velocity_max_radps:
-        found.append(
-            f"joint.inertia_kgm2 (={inertia:g}): limits.torque_max_Nm (={limits.torque_max_Nm:g}) speeds it up by "
-            f"{step:.3g} rad/s in one period, more than limits.velocity_max_radps (={limits.velocity_max_radps:g}): "
-            "is it that of the motor, without the ratio squared?"
-        )
-    return found

@@ -26,7 +26,7 @@ import time
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from jointctl.drivers.bus_lock import ANSWER_S, listener, may_ask, received_line, send_line
+from jointctl.drivers.bus_lock import ANSWER_S, listener, may_ask, parsed_line, send_line
 from jointctl.drivers.elmo.dialogue import SWITCH_OFF, Dialogue, switch_off
 from jointctl.drivers.elmo.serial_port import SerialPort, open_descriptor, usb_serial_number
 from jointctl.drivers.errors import BusError, JointctlError
@@ -40,7 +40,23 @@ from jointctl.drivers.errors import BusError, JointctlError
 #     {"ask": "who"}   ->  {"supervisor_pid": 123}
 
 
+_LONGEST_LINE_BYTES = 4096
 ENDED_S = 25.0  # for a run to end, and a drive that is silent to be tried again
+
+
+def received_line(peer: socket.socket, timeout_s: float = ANSWER_S) -> dict[str, Any] | None:
+    """One message; None where none comes in time or it is none."""
+    peer.settimeout(timeout_s)
+    data = b""
+    try:
+        while not data.endswith(b"\n") and len(data) < _LONGEST_LINE_BYTES:
+            part = peer.recv(1)
+            if not part:
+                break
+            data += part
+    except OSError:
+        return None
+    return parsed_line(data)
 
 
 def guard_address(port: str) -> bytes:

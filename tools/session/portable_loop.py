@@ -107,22 +107,21 @@ class PortableExchange:
 
     def __init__(self, bus: FrameBus, block: SharedBlock, period_ns: int, receive_ns: int) -> None:
         self._bus = bus
-        self._port = block.port[0]
-        self._samples, self._commands = block.sample, block.command
-        self._sample = self._samples[0]
+        self._ports, self._samples, self._commands = block.port, block.sample, block.command
+        self._axes = list(zip(block.port, block.sample, block.command, strict=True))
         self._frames = new(Frame, FRAME_SLOTS)
         self._received = self._frames[SLOT_RECEIVED]
         self._bytes = self._frames.view(np.uint8).reshape(FRAME_SLOTS, -1)
         self._send_timeout_s = 0.25 * period_ns / NANOSECONDS
         self._least_wait_ns = receive_ns // 2
         self._failed = False
-        port = self._port
         # some interfaces echo a program's own frames; counted again, they would double the bus load
-        self._own = frozenset((int(port.sync_id), int(port.rpdo_id), int(port.own_heartbeat_id)))
+        names = ("sync_id", "rpdo_id", "own_heartbeat_id")
+        self._own = frozenset(int(identifier) for name in names for identifier in self._ports[name])
 
     def _fail(self, error: Exception) -> None:
         code = getattr(error, "error_code", None) or getattr(error, "errno", None)
-        self._port.last_errno = code if isinstance(code, int) and abs(code) <= INT32_MAX else _UNKNOWN_ERROR
+        self._ports.last_errno = code if isinstance(code, int) and abs(code) <= INT32_MAX else _UNKNOWN_ERROR
         self._failed = True
 
     def _send(self, slot: int) -> None:
@@ -131,7 +130,7 @@ class PortableExchange:
         try:
             self._bus.send(message, self._send_timeout_s)
         except Exception as error:  # a third-party interface may raise anything; with torque applied the loop goes on
-            self._port.send_failures += 1
+            self._ports.send_failures += 1
             self._fail(error)
 
     def _receive(self, timeout_s: float) -> can.Message | None:
@@ -143,7 +142,7 @@ class PortableExchange:
         return message
 
     def _accept(self, message: can.Message, now_ns: int) -> bool:
-        """True if it was the TPDO."""
+        """True if it was a TPDO with a new sample."""
         if message.is_error_frame:
             self._received.can_id = ERROR_FLAG
             self._received.length = 0
@@ -154,53 +153,65 @@ class PortableExchange:
             try:
                 self._bytes[SLOT_RECEIVED] = np.frombuffer(encode(message), np.uint8)
             except ValueError:  # no classic CAN frame
-                self._port.malformed += 1
+                self._ports.malformed += 1
                 return False
-        return bool(accept_frame(self._port, self._received, self._sample, now_ns))
+        found = False
+        for port, sample, _ in self._axes:
+            found |= bool(accept_frame(port, self._received, sample, now_ns))
+        return found
 
     def receive(self, link: None, samples: np.ndarray, now_ns: int, until_ns: int) -> int:
-        """Send SYNC and wait for the TPDO until `until_ns`, half the window at least; returns the time waited [ns].
+        """Send SYNC and wait for the TPDOs until `until_ns`, half the window at least; returns the time waited [ns].
 
         Frames that came since the last cycle are taken first, so that a late TPDO is not mistaken for the answer.
         The least wait keeps a late wake-up from costing the sample as well.
         """
-        note_wake(self._port, now_ns)
+        for port, _, _ in self._axes:
+            note_wake(port, now_ns)
         for _ in range(_FRAMES_AT_ONCE):
             message = self._receive(0.0)
             if message is None:
                 break
             self._accept(message, now_ns)
-        owed = answer_owed(self._port)  # as in `drivers.canopen.exchange`
-        for slot in range(SLOT_SYNC, begin_cycle(self._port, self._frames)):
+        owed = self._owed()  # as in `drivers.canopen.exchange`
+        for slot in range(SLOT_SYNC, self._begin()):
             self._send(slot)
         started_ns = arrived_ns = time.monotonic_ns()
         until_ns = max(until_ns, started_ns + self._least_wait_ns)
         while arrived_ns < until_ns:
             answer = self._receive((until_ns - arrived_ns) * 1e-9)
             arrived_ns = time.monotonic_ns()
-            if answer is None or (self._accept(answer, arrived_ns) and not owed):
+            if answer is None or (self._accept(answer, arrived_ns) and not owed and not self._owed()):
                 break  # time-out, failure, or the sample
         self._note_cycle()
         return arrived_ns - started_ns
 
+    def _owed(self) -> bool:
+        return any(answer_owed(port) for port, _, _ in self._axes)
+
+    def _begin(self) -> int:
+        return int(min([begin_cycle(port, self._frames) for port, _, _ in self._axes]))
+
     def _note_cycle(self) -> None:
-        self._port.consecutive_failures = self._port.consecutive_failures + 1 if self._failed else 0
-        self._sample.bus_errors = self._port.consecutive_failures
+        for port, sample, _ in self._axes:
+            port.consecutive_failures = port.consecutive_failures + 1 if self._failed else 0
+            sample.bus_errors = port.consecutive_failures
         self._failed = False
 
     def send(self, link: None, samples: np.ndarray, commands: np.ndarray) -> int:
-        """Send the RPDO; a failure counts in the next cycle."""
-        end_cycle(self._port, self._frames, samples[0], commands[0])
-        self._send(SLOT_RPDO)
+        """Send the RPDO of each drive; a failure counts in the next cycle."""
+        for port, sample, command in self._axes:
+            end_cycle(port, self._frames, sample, command)
+            self._send(SLOT_RPDO)
         return 0
 
     def switch_off(self) -> None:
-        """One RPDO with controlword 0 (disable voltage), and the SYNC at which a synchronous RPDO takes effect."""
-        self._commands[0].request = DriveRequest.OFF
-        self._commands[0].torque_Nm = 0.0
+        """RPDOs with controlword 0 (disable voltage), and the SYNC at which a synchronous RPDO takes effect."""
+        self._commands.request = DriveRequest.OFF
+        self._commands.torque_Nm = 0.0
         with contextlib.suppress(Exception):
             self.send(None, self._samples, self._commands)
-            begin_cycle(self._port, self._frames)
+            self._begin()
             self._send(SLOT_SYNC)
 
 

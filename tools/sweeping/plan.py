@@ -23,7 +23,7 @@ import numpy as np
 
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError, DeviceError, UsageError
-from jointctl.tools.configuration.checks import rated_contradiction
+from jointctl.tools.analysis.loop_report import rated_contradiction
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
 from jointctl.tools.sweeping.options import (

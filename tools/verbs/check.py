@@ -30,10 +30,10 @@ def check(
     choose_gains: Annotated[bool, typer.Option("--choose-gains", help="search gains for a flexible joint")] = False,
 ) -> int:
     """Is the control loop stable enough?  Margins, bounds and what would help."""
-    from jointctl.tools.analysis.loop_settings import loop_settings, not_modelled, outside_payload_range
+    from jointctl.tools.analysis.loop_report import contradictions, not_modelled, outside_payload_range
+    from jointctl.tools.analysis.loop_settings import loop_settings
     from jointctl.tools.analysis.margin_gate import learning_of, meets, refusal, refuse_diverging_learning, remedies
     from jointctl.tools.analysis.margins import margins, theory
-    from jointctl.tools.configuration.checks import contradictions
     from jointctl.tools.drawing import require_png
     from jointctl.tools.verbs.bench_drive import bench_of
 
@@ -59,7 +59,7 @@ def check(
     if choose_gains:
         _add_gains(table, config, settings)
     if figure is not None:
-        from jointctl.tools.analysis.loop_figure import save_loop_figure
+        from jointctl.tools.analysis.loop_report import save_loop_figure
 
         save_loop_figure(settings, figure, config.path.name, minimum_deg)
         table.add_row("picture", str(figure), "")

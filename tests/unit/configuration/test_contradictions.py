@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from jointctl.tools.configuration.checks import contradictions, trajectory_acceleration
+from jointctl.tools.analysis.loop_report import contradictions, trajectory_acceleration
 from tests.configurations import changed, shipped
 
 VIRTUAL = shipped()

@@ -27,6 +27,7 @@ from jointctl.drivers.canopen.cyclic import (
     SCRATCH_WORDS,
     SLOT_RECEIVED,
     SLOT_RPDO,
+    CanopenPort,
     accept_frame,
     answer_owed,
     begin_cycle,
@@ -434,6 +435,73 @@ def test_an_answer_that_comes_between_the_cycles_is_not_owed(line: Line) -> None
     line.cycle(window_s=0.01)
     line.wire.tpdo(counts=20)
     assert line.cycle((0.0, 30), window_s=30.0) == pytest.approx(30)
+
+
+class TwoDrives:
+    """`exchange` with two drives on one bus, of which those in `answering` answer SYNC; what they received."""
+
+    def __init__(self, wire: Wire, ours: socket.socket, bus: socket.socket) -> None:
+        self.ports, self.samples, self.commands = new(CanopenPort, 2), new(Sample, 2), new(Command, 2)
+        for axis, port in enumerate(self.ports):
+            self.ports[axis] = wire.port
+            port.fd = ours.fileno()
+            port.tpdo_id, port.rpdo_id, port.emergency_id, port.heartbeat_id = (
+                base + axis for base in (0x185, 0x205, 0x85, 0x705)
+            )
+        self.link, self.bus = exchange.link_of(self.ports), bus
+
+    def cycle(self, window_s: float, *answering: int) -> tuple[bool, list[int]]:
+        """(whether it has waited for the end of the window, the identifiers that it sent)."""
+        sent: list[int] = []
+
+        def drives() -> None:
+            while not sent or sent[-1] != 0x80:
+                sent.append(self._identifier())
+            for axis in answering:
+                self.bus.send(struct.pack("<IB3xHih", 0x185 + axis, 8, 0x0250, 100 * (axis + 1), 0))
+
+        thread = threading.Thread(target=drives)
+        thread.start()
+        now_ns = time.monotonic_ns()
+        until_ns = now_ns + round(window_s * 1e9)
+        exchange.receive(self.link, self.samples, np.int64(now_ns), np.int64(until_ns))
+        over = time.monotonic_ns() >= until_ns
+        thread.join()
+        assert exchange.send(self.link, self.samples, self.commands) == 0
+        while sent[-1] != 0x206:
+            sent.append(self._identifier())
+        return over, sent
+
+    def _identifier(self) -> int:
+        return int(struct.unpack_from("<I", self.bus.recv(16))[0])
+
+
+@pytest.fixture
+def two_drives(wire: Wire) -> Iterator[TwoDrives]:
+    bus, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with bus, ours:
+        yield TwoDrives(wire, ours, bus)
+
+
+def test_one_exchange_serves_the_drives_of_a_bus(two_drives: TwoDrives) -> None:
+    """One SYNC and one heartbeat for both, an RPDO and a sample of each; both are waited for."""
+    assert two_drives.cycle(30.0, 0, 1) == (False, [0x80, 0x77F, 0x205, 0x206])
+    assert list(two_drives.samples["count"]) == [1, 1]
+    assert list(two_drives.samples["position_rad"] / RAD_PER_COUNT) == pytest.approx([100.0, 200.0])
+
+
+@pytest.mark.parametrize("answering", [0, 1])
+def test_its_twin_a_drive_that_does_not_answer_costs_the_window_and_not_the_others_sample(
+    two_drives: TwoDrives, answering: int
+) -> None:
+    assert two_drives.cycle(0.02, answering)[0]
+    assert list(two_drives.samples["count"]) == [1 - answering, answering]
+
+
+@pytest.mark.parametrize("deaf", [0, 1])
+def test_a_drive_that_ignores_a_stop_costs_both_the_heartbeat(two_drives: TwoDrives, deaf: int) -> None:
+    two_drives.ports[deaf].ignored_cycles = IGNORED_MAX_CYCLES + 1
+    assert two_drives.cycle(30.0, 0, 1)[1] == [0x80, 0x205, 0x206]
 
 
 @pytest.mark.parametrize(

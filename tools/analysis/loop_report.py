@@ -1,0 +1,271 @@
+"""What `check` reports besides margins: what is not modelled, constants that do not fit together, one picture."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jointctl.firmware_py.velocity import low_pass_gain
+from jointctl.tools.analysis.linear_loop import LoopSettings, linear_loop
+from jointctl.tools.analysis.loop_settings import two_masses
+from jointctl.tools.analysis.margins import Margins, frequencies_radps, margins, phase_margin_deg, worst_case
+from jointctl.tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
+from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, SOFT, canvas, save_png
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from jointctl.tools.configuration.config import Config
+
+# --- What the linear loop does not know ---
+
+
+STEP_SHARE = 0.2  # of the torque limit; `precise` with 17 bit is below, with 16 bit, where it chatters, above
+OUTSIDE = (0.5, 2.0)  # factors on the link's inertia that are looked at beyond what must hold
+
+
+def outside_payload_range(config: Config, settings: LoopSettings) -> list[str]:
+    """What happens with lighter and heavier links than `margin.payload_range` says, in words."""
+    found = []
+    for payload in OUTSIDE if config.reducer is not None else ():
+        if config.margin.payload_range[0] <= payload <= config.margin.payload_range[1]:
+            continue
+        assert config.reducer is not None
+        joint = two_masses(config, config.reducer, payload, 1.0, False)
+        phase_deg = phase_margin_deg(replace(settings, joints=(joint,)))
+        text = f"phase margin {phase_deg:.1f} deg" if phase_deg > 0.0 else "the control loop is UNSTABLE"
+        found.append(f"outside margin.payload_range, link inertia x {payload:g}: {text}")
+    return found
+
+
+def not_modelled(config: Config) -> list[str]:
+    """Configured things that the linear loop does not know, in words."""
+    control, joint, found = config.control, config.joint, []
+    if control.feed_forward == "measured":
+        found.append('control.feed_forward = "measured": takes back the damping that friction gives')
+    if joint.gravity_Nm:
+        found.append(f"joint.gravity_Nm (={joint.gravity_Nm:g}): taken as compensated exactly")
+    if joint.coriolis_Nmspr:
+        found.append(f"joint.coriolis_Nmspr (={joint.coriolis_Nmspr:g}): taken as compensated exactly")
+    if control.kind == "computed_torque_rbf" and control.dead_zone_rad:
+        found.append(f"control.dead_zone_rad (={control.dead_zone_rad:g}): taken as if the error were outside")
+    virtual = config.virtual
+    if config.reducer is not None:
+        found.append("hysteresis of the reducer beyond what margin.stiffness_error covers, and sliding friction")
+    elif virtual is None:
+        found.append("flexibility of the reducer: a soft one resonates and takes margin that is not counted here")
+    elif virtual.flexible:
+        motor_kgm2 = virtual.motor_side_inertia_kgm2
+        other_kgm2 = max(joint.inertia_kgm2 * virtual.inertia_scale - motor_kgm2, 1e-9)
+        stiffness = virtual.reducer_stiffness_Nmprad
+        resonance_Hz = math.sqrt(stiffness * (1.0 / motor_kgm2 + 1.0 / other_kgm2)) / math.tau
+        found.append(
+            f"virtual.flexible (=true): the reducer resonates at {resonance_Hz:.1f} Hz, "
+            "which takes margin that is not counted here"
+        )
+    step_Nm = encoder_step_Nm(config)
+    if step_Nm > STEP_SHARE * config.limits.torque_max_Nm:
+        found.append(
+            f"encoder.counts_per_turn (={config.encoder.counts_per_turn}): one count moves the torque by "
+            f"{step_Nm:.1f} Nm, more than {STEP_SHARE:.0%} of limits.torque_max_Nm: "
+            "it will chatter; lower kv or velocity_cutoff_Hz"
+        )
+    return found
+
+
+def encoder_step_Nm(config: Config) -> float:
+    """By how much kp and kv move the torque when the reading changes by one count."""
+    control, rate_Hz = config.control, config.loop.rate_Hz
+    slope_1ps = low_pass_gain(control.velocity_cutoff_Hz, 1.0 / rate_Hz) * rate_Hz
+    return config.joint.inertia_kgm2 * (control.kp + control.kv * slope_1ps) * abs(joint_rad_per_count(config))
+
+
+# --- Constants that are each in range and do not fit together: the user is warned, nothing is refused ---
+
+
+DOUBTFUL_FACTOR = 1.25  # motors are rated at a speed, where losses take part of the torque
+MOST_RATED, LEAST_RATED = 10.0, 0.02  # of the motor's rated current, that the torque limit asks for
+MOST_A, LEAST_A = 300.0, 0.02  # where no rated current is configured
+
+
+def contradictions(config: Config) -> list[str]:
+    """One line for each; every one names the keys, and what follows from them."""
+    return [*rated_contradiction(config), *_current_contradiction(config), *_inertia_contradictions(config)]
+
+
+def rated_contradiction(config: Config) -> list[str]:
+    """Torque constant, rated current and rated torque."""
+    found = config.drive.constants_factor(config)
+    if found is None or 1.0 / DOUBTFUL_FACTOR <= found[0] <= DOUBTFUL_FACTOR:
+        return []
+    return [found[1]]
+
+
+def _current_contradiction(config: Config) -> list[str]:
+    """The current that the torque limit asks of the motor."""
+    joint, limit_Nm = config.joint, config.limits.torque_max_Nm
+    current_A = limit_Nm / (torque_constant_NmpA(config) * joint.reduction_ratio)
+    rated = config.drive.motor_current()
+    low_A, high_A = (LEAST_A, MOST_A) if rated is None else (LEAST_RATED * rated[1], MOST_RATED * rated[1])
+    if low_A <= current_A <= high_A:
+        return []
+    compared = "" if rated is None else f", {current_A / rated[1]:.3g} times {rated[0]} (={rated[1]:g})"
+    return [
+        f"limits.torque_max_Nm (={limit_Nm:g}) is {current_A:.3g} A of the motor{compared}: check "
+        f"joint.torque_constant_NmpA (={joint.torque_constant_NmpA:g}) and joint.reduction_ratio "
+        f"(={joint.reduction_ratio:g})"
+    ]
+
+
+def trajectory_acceleration(trajectory: Any) -> float | None:
+    """The largest acceleration [rad/s2] of a trajectory; None where a file must be read first."""
+    if trajectory.kind == "sine":
+        parts = [trajectory] + ([trajectory.switch] if trajectory.switch else [])
+        return max(abs(p.amplitude_rad) * (math.tau * p.frequency_Hz) ** 2 for p in parts)
+    if trajectory.kind == "hold":
+        return 0.0
+    if trajectory.kind == "table":
+        return None
+    if trajectory.kind == "min_jerk":
+        # the quintic's peak: 10 / sqrt(3) of distance / time^2
+        return abs(trajectory.target_rad - trajectory.start_rad) / trajectory.move_s**2 * 10.0 / math.sqrt(3.0)
+    return float(trajectory.acceleration_radps2)
+
+
+def _inertia_contradictions(config: Config) -> list[str]:
+    """Inertia against torque: too much of it for the motion and for braking, or too little to be true."""
+    inertia, limits = config.joint.inertia_kgm2, config.limits
+    free_Nm = limits.torque_max_Nm - abs(config.joint.gravity_Nm)
+    found = []
+    wanted = (
+        ("the trajectory's largest acceleration", trajectory_acceleration(config.trajectory)),
+        ("sequence.brake_radps2", config.sequence.brake_radps2),
+    )
+    for name, acceleration in wanted:
+        if acceleration is not None and inertia * acceleration > free_Nm:
+            found.append(
+                f"joint.inertia_kgm2 (={inertia:g}) times {name} (={acceleration:.3g} rad/s2) is "
+                f"{inertia * acceleration:.3g} Nm: limits.torque_max_Nm (={limits.torque_max_Nm:g}) leaves "
+                f"{free_Nm:.3g} Nm beside gravity"
+            )
+    step = limits.torque_max_Nm / inertia / config.loop.rate_Hz
+    if step > limits.velocity_max_radps:
+        found.append(
+            f"joint.inertia_kgm2 (={inertia:g}): limits.torque_max_Nm (={limits.torque_max_Nm:g}) speeds it up by "
+            f"{step:.3g} rad/s in one period, more than limits.velocity_max_radps (={limits.velocity_max_radps:g}): "
+            "is it that of the motor, without the ratio squared?"
+        )
+    return found
+
+
+# --- Bode plot with its margins, sensitivity, closed-loop poles ---
+
+
+_LOWEST_HZ = 0.1
+_DAMPING_LINES = (0.1, 0.3, 0.5, 0.7)
+
+
+def save_loop_figure(settings: LoopSettings, path: Path, title: str, minimum_deg: float) -> Path:
+    """Draw the loop into a PNG at `path`; an unstable one is drawn too, without margins."""
+    settings = worst_case(settings)
+    found = margins(settings)
+    with canvas(6.8, f"{title}: {'stable' if found.stable else 'UNSTABLE'}") as figure:
+        _draw(figure, settings, found, minimum_deg)
+    return save_png(figure, path)
+
+
+def _draw(figure: Figure, settings: LoopSettings, found: Margins, minimum_deg: float) -> None:
+    axes = figure.subplots(2, 2, width_ratios=(1.15, 1.0))
+    omega = frequencies_radps(settings.period_s)
+    omega = omega[omega >= math.tau * _LOWEST_HZ]
+    response = linear_loop(settings).open_loop(omega)
+    frequency_Hz = omega / math.tau
+    _magnitude(axes[0, 0], frequency_Hz, np.abs(response), found)
+    for joint in settings.joints:
+        axes[0, 0].axvline(joint.resonance_Hz, color=ORANGE, linewidth=0.8, linestyle="--")
+        text = f"resonance {joint.resonance_Hz:.3g} Hz\n{joint.name}"
+        axes[0, 0].text(0.03, 0.05, text, transform=axes[0, 0].transAxes, va="bottom", color=ORANGE, fontsize=9)
+    _phase(axes[1, 0], frequency_Hz, np.degrees(np.unwrap(np.angle(response))), found, minimum_deg)
+    _sensitivity(axes[0, 1], frequency_Hz, 1.0 / np.abs(1.0 + response), found)
+    _poles(axes[1, 1], found, settings.period_s)
+
+
+def _frequency_axis(axis: Axes, frequency_Hz: np.ndarray) -> None:
+    axis.set_xscale("log")
+    axis.set_xlim(frequency_Hz[0], frequency_Hz[-1])
+    axis.set_xlabel("frequency [Hz]")
+
+
+def _magnitude(axis: Axes, frequency_Hz: np.ndarray, magnitude: np.ndarray, found: Margins) -> None:
+    axis.loglog(frequency_Hz, magnitude, color=BLUE)
+    axis.axhline(1.0, color=GREY, linewidth=0.8)
+    if found.stable and math.isfinite(found.crossover_Hz):
+        axis.plot([found.crossover_Hz], [1.0], "o", color=RED)
+        up = "any factor up" if math.isinf(found.gain_margin_up) else f"x {found.gain_margin_up:.3g} up"
+        down = "any down" if found.gain_margin_down == 0.0 else f"x {found.gain_margin_down:.2g} down"
+        text = f"gain margins {up}, {down}\ncrossover {found.crossover_Hz:.3g} Hz"
+        axis.text(0.97, 0.95, text, transform=axis.transAxes, ha="right", va="top", color=RED, fontsize=9)
+    axis.set_ylabel("open loop |L|")
+    _frequency_axis(axis, frequency_Hz)
+
+
+def _phase(axis: Axes, frequency_Hz: np.ndarray, phase_deg: np.ndarray, found: Margins, minimum_deg: float) -> None:
+    # counted so that the crossover lies in the turn around -180 deg
+    near = np.argmin(np.abs(frequency_Hz - (found.crossover_Hz if found.stable else 10.0)))
+    phase_deg = phase_deg - 360.0 * round((phase_deg[near] + 180.0) / 360.0)
+    axis.plot(frequency_Hz, phase_deg, color=BLUE)
+    axis.axhline(-180.0, color=GREY, linewidth=0.8)
+    if found.stable and math.isfinite(found.crossover_Hz):
+        at_crossover = float(np.interp(found.crossover_Hz, frequency_Hz, phase_deg))
+        axis.plot([found.crossover_Hz] * 2, [-180.0, at_crossover], color=RED, linewidth=2.0)
+        text = f"phase margin {found.phase_margin_deg:.1f} deg, at least {minimum_deg:g} wanted\n"
+        text += f"delay margin {found.delay_margin_s * 1e3:.2f} ms more"
+        axis.text(0.03, 0.05, text, transform=axis.transAxes, va="bottom", color=RED, fontsize=9)
+    axis.set_ylim(-370.0, max(-80.0, min(float(phase_deg.max()), 100.0) + 10.0))
+    axis.set_yticks(range(-360, -60, 45))
+    axis.set_ylabel("phase of L [deg]")
+    _frequency_axis(axis, frequency_Hz)
+
+
+def _sensitivity(axis: Axes, frequency_Hz: np.ndarray, sensitivity: np.ndarray, found: Margins) -> None:
+    axis.semilogy(frequency_Hz, sensitivity, color=BLUE)
+    axis.axhline(1.0, color=GREY, linewidth=0.8)
+    if found.stable:
+        axis.plot([found.sensitivity_peak_Hz], [found.sensitivity_peak], "o", color=RED)
+        text = f"Ms {found.sensitivity_peak:.3g} at {found.sensitivity_peak_Hz:.3g} Hz"
+        axis.text(0.03, 0.95, text, transform=axis.transAxes, va="top", color=RED, fontsize=9)
+    axis.set_ylim(bottom=max(float(sensitivity.min()), 1e-4))
+    axis.set_ylabel("sensitivity |1 / (1 + L)|")
+    _frequency_axis(axis, frequency_Hz)
+
+
+def _poles(axis: Axes, found: Margins, period_s: float) -> None:
+    """The slower poles as s = ln z / T; those beyond a third of the Nyquist frequency are left out."""
+    reach = math.pi / period_s / 3.0
+    poles = [z for z in found.poles if abs(z) > 1e-6]
+    s = [complex(math.log(abs(z)), math.atan2(z.imag, z.real)) / period_s for z in poles]
+    shown = [x for x in s if abs(x) <= reach]
+    widest = max((abs(x) for x in shown), default=1.0) * 1.15
+    for damping in _DAMPING_LINES:
+        x, y = -widest * damping, widest * math.sqrt(1.0 - damping**2)
+        axis.plot([x, 0.0, x], [y, 0.0, -y], color=SOFT, linewidth=0.8, linestyle=":")
+        axis.annotate(f"{damping:g}", (x, y), fontsize=8, color=GREY, ha="center", va="bottom")
+    axis.axvline(0.0, color=GREY, linewidth=0.8)
+    for pole in shown:
+        color = RED if pole.real >= 0.0 else ORANGE
+        axis.plot([pole.real], [pole.imag], "x", color=color, markersize=8, markeredgewidth=2)
+    if found.stable:
+        text = f"slowest {found.slowest_time_constant_s:.3g} s"
+        if math.isfinite(found.oscillation_Hz):
+            text += f"\noscillation {found.oscillation_Hz:.3g} Hz, damping {found.oscillation_damping:.2f}"
+        axis.text(0.03, 0.04, text, transform=axis.transAxes, fontsize=9, color=RED)
+    hidden = len(found.poles) - len(shown)
+    axis.set_title(f"closed-loop poles, {hidden} fast ones not shown; dotted: damping", fontsize=9, color=GREY)
+    axis.set_xlim(-widest, max(0.15 * widest, *(1.2 * pole.real for pole in shown)))
+    axis.set_xlabel("real part [1/s]")
+    axis.set_ylabel("imaginary part [rad/s]")
