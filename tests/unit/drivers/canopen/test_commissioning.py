@@ -129,6 +129,8 @@ def test_a_velocity_mode_begins_with_no_target_and_the_drives_own_limit(joint: A
     assert report.commands_velocity
     assert joint.value(0x6060) == shown
     assert joint.downloads(0x60FF)[-1] == 0
+    written = [data[1:3] for cob, data in joint.requests if cob == 0x601 and data[0] & 0xE0 == 0x20]
+    assert b"\xff\x60" in written[written.index(b"\x60\x60") :]  # the choice of the mode may have brought one
     unit_radps = 2.0 * math.pi / 2**19  # counts/s at the joint
     assert joint.value(0x607F) == math.ceil(1.0 / unit_radps)
     assert report.settings["max velocity"] == f"{joint.value(0x607F)} counts/s = 1.00 rad/s"

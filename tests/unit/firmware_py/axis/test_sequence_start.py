@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jointctl.firmware_py.records import Sample
-from jointctl.firmware_py.safety import check_encoders
+from jointctl.firmware_py.safety import check_encoders, enter
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.sequence import step_enabling, step_waiting
 from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, Reaction
@@ -165,6 +165,16 @@ def test_a_wait_that_is_over_only_because_the_loop_was_held_up_says_so(
         assert state.phase == AxisPhase.DISABLING
         assert bool(state.fault == Fault.OVERRUN) is (fault is Fault.OVERRUN)
         assert fault is None or state.fault_value == held_up_cycles
+
+
+def test_what_held_up_the_phase_before_is_not_the_cause_of_this_ones_end(axis: Any, state: Any) -> None:
+    axis.sequence.enable_max_cycles = 30
+    settled(state)
+    state.held_up_cycles = 5
+    enter(state, AxisPhase.ENABLING)
+    state.phase_cycle = 31
+    step_enabling(axis, state, sample_of(DriveState.OFF), axis_table())
+    assert (state.phase, state.fault) == (AxisPhase.DISABLING, Fault.ENABLE_TIMEOUT)
 
 
 @pytest.mark.parametrize("drive_state", DriveState)
