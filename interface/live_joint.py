@@ -29,6 +29,7 @@ from jointctl.tools.session.plan import FreeMotion, RunPlan
 from jointctl.tools.session.result import RunResult
 from jointctl.tools.session.session import Session
 from jointctl.tools.session.session_drive import drive_state_name, session_drive
+from jointctl.tools.session.set_points import load_check
 
 WHO = "the program"
 ENDED = "the run has ended"
@@ -121,6 +122,7 @@ class LiveMotor:
         """Commission: returns with the drive ready and disabled, or raises why not."""
         try:
             self._stack.enter_context(self._source.served())
+            load_check()  # not beside commissioning: compiling would hold up the heartbeat
             output = Output(quiet=True)
             others = self._stack.enter_context(remote(self._options, self.config, output, owner=WHO))
             control = self._control = self._stack.enter_context(in_program(self.config, output))

@@ -52,8 +52,19 @@ def phases(bench: Any) -> list[int]:
 RAMPED = [AxisPhase.TRACKING, AxisPhase.RAMPING, AxisPhase.RELEASING, AxisPhase.DISABLING, AxisPhase.FINISHED]
 
 
+KERNELS = """
+    import gc
+    from numba.core.dispatcher import Dispatcher
+    def kernels():
+        return {k.py_func.__qualname__ for k in gc.get_objects() if issubclass(type(k), Dispatcher) and k.overloads}
+    at_first = kernels()
+"""
+
+
 def test_motions_and_set_points_then_off(bench: Any) -> None:
-    body = """
+    body = (
+        KERNELS
+        + """
     joint.move_to(0.2, duration_s=1.0)
     joint.follow([0.0, 0.5, 1.0], [0.2, 0.25, 0.2])
     for k in range(1, 200):
@@ -61,9 +72,12 @@ def test_motions_and_set_points_then_off(bench: Any) -> None:
         time.sleep(0.005)
     joint.wait(0.5)
     say(f"at {joint.state.desired_position_rad:.6f}")
+    say(f"kernels compiled or loaded meanwhile: {sorted(kernels() - at_first)}")
     """
+    )
     ended = started(bench, body).finished()
     assert ended.code == 0, ended.err
+    assert "meanwhile: []" in ended.err  # the loop watches its client, and compiling takes seconds
     brake_rad = (397e-6 / 0.005) ** 2 / (2.0 * 2.0)  # from the last set-point on, at 2 rad/s2
     (at_rad,) = (float(line.split()[1]) for line in ended.err.splitlines() if line.startswith("at "))
     assert at_rad == pytest.approx(0.2 + 1e-6 * 199**2 + brake_rad, abs=2e-6)

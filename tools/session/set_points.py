@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 from jointctl.drivers.errors import ConfigurationError, JointctlError
 from jointctl.firmware_py.cycle import Word
-from jointctl.firmware_py.records import MotionChange, SetPoint
+from jointctl.firmware_py.records import AxisConstants, MotionChange, SetPoint
 from jointctl.firmware_py.safety import set_point_problem
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, SetPointProblem, TrajectoryKind, in_words
@@ -66,6 +66,12 @@ def finite(name: str, value: float) -> float:
     if not math.isfinite(number):
         raise ConfigurationError(f"{name} (={number:g}) must be finite")
     return number
+
+
+def load_check() -> None:
+    """Compile or load the loop's check before the loop watches its client: that may take seconds."""
+    axis, point = new(AxisConstants)[0], new(SetPoint)[0]
+    set_point_problem(axis.limits, axis.stream, 0.0, point, point)
 
 
 _Point = tuple[int, float, float, float]  # time [ns], position, velocity, torque
@@ -267,9 +273,7 @@ class SetPointSources:
         if self._program:
             return placed
         expect_client(placed.constants, config)
-        # compiled or loaded now: nothing is to be while the supervisor watches
-        axis, point = placed.constants[0], new(SetPoint)
-        set_point_problem(axis.limits, axis.stream, float(axis.sequence.brake_radps2), point[0], point[0])
+        load_check()
         line = (
             "remote     set-points from Foxglove or ROS 2 where the joint holds its place, by anyone who reaches them; "
             f"a source may be silent for {config.stream.client_timeout_s:g} s"
