@@ -64,7 +64,6 @@ class Thermometer(Protocol):
 
     def poll(self) -> Reading | None:
         """What is new, or None.  Never waits and never raises for what the drive or its line does."""
-        ...
 
 
 class SettingsGuard(Protocol):
@@ -73,13 +72,11 @@ class SettingsGuard(Protocol):
     @property
     def confirmed(self) -> bool:
         """Whether all of it was read back since `start_cyclic`: nothing may be enabled before."""
-        ...
 
     def poll(self, *, may_ask: bool = True) -> list[str]:
         """What is to be warned of; never waits.  `DeviceError` or `BusError` where something was changed, or another
         controller has sent what matters: the run is over.  Without `may_ask` nothing is sent.
         """
-        ...
 
 
 class Drive(Protocol):
@@ -92,26 +89,21 @@ class Drive(Protocol):
         Raises `NoDeviceError` if no one answers, `DeviceError` if it refuses, differs from the configuration or must be
         left alone, `BusError` where another controller is active, `Declined`.
         """
-        ...
 
     def start_cyclic(self) -> None:
         """Let the drive take part in the cyclic exchange; still disabled."""
-        ...
 
     def port(self) -> Any:
         """The record array for the cyclic exchange, without a file descriptor; valid after `commission`."""
-        ...
 
     def thermometer(self) -> Thermometer | None:
         """What reads the drive's temperature beside the cyclic exchange; None where nothing can.
 
         Valid from `start_cyclic` until `make_safe`.
         """
-        ...
 
     def settings_guard(self) -> SettingsGuard | None:
         """None where nothing can be read beside the loop: it was read back before.  Valid as `thermometer` is."""
-        ...
 
     def make_safe(self, *, asked: bool = False) -> str:
         """Disable the drive whatever its state and confirm it; returns the state in words.  Never raises.
@@ -119,15 +111,12 @@ class Drive(Protocol):
         A drive that another controller has taken before the loop began is left alone, unless `asked`: by the user,
         with `jointctl stop`.
         """
-        ...
 
     def clear_fault(self) -> str:
         """Reset the drive's own fault; it stays disabled.  Returns what was done, in words.
 
         Raises `DeviceError` if the fault comes back, `BusError` while another controller is active.
         """
-        ...
 
     def close(self) -> None:
         """Release the bus."""
-        ...

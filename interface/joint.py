@@ -62,7 +62,6 @@ class Motor(Protocol):
 
     def state(self) -> State:
         """As of now."""
-        ...
 
     def enable(self, approve: Callable[[Sequence[str]], bool] | None) -> None:
         """Returns when the joint follows set-points."""
@@ -72,7 +71,6 @@ class Motor(Protocol):
 
     def now_ns(self) -> int:
         """The loop's clock."""
-        ...
 
     def wait(self, seconds: float) -> None:
         """Time passes; `JointctlError` if the run has ended in the meantime."""

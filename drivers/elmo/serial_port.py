@@ -24,11 +24,9 @@ class BytePort(Protocol):
 
     def read(self, timeout_s: float) -> bytes:
         """Whatever has come; waits up to `timeout_s` for the first byte; empty after a time-out."""
-        ...
 
     def discard(self) -> None:
         """Throw away what has come and not been read."""
-        ...
 
     def close(self) -> None: ...
 

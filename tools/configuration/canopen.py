@@ -15,7 +15,7 @@ from jointctl.drivers.canopen.identifiers import EVENT_DRIVEN, LAST_SYNCHRONOUS
 from jointctl.drivers.canopen.settings import CanopenSettings, JointEncoderSettings, TemperatureObject
 from jointctl.drivers.errors import ConfigurationError, DeviceError
 from jointctl.tools.configuration.config import Config, ConfigurationProblems, beside, problem_line
-from jointctl.tools.configuration.conversions import shared, torque_constant_NmpA
+from jointctl.tools.configuration.conversions import joint_settings, torque_constant_NmpA
 from jointctl.tools.configuration.drive_section import FOR_A_NODE, FOR_A_PORT, DriveSection, GivenPlace, wrong_kind
 from jointctl.tools.configuration.sections import (
     Bus,
@@ -145,15 +145,8 @@ def encoder_eds_path(config: Config) -> Path | None:
 def canopen_settings(config: Config) -> CanopenSettings:
     """Sections [drive], [encoder], [joint], [limits] and [loop] for commissioning."""
     return CanopenSettings(
-        **shared(CanopenSettings, canopen_section(config), config.limits),
+        **joint_settings(CanopenSettings, config, canopen_section(config)),
         eds_path=eds_path(config),
-        rate_Hz=config.loop.rate_Hz,
-        torque_constant_NmpA=torque_constant_NmpA(config),
-        reduction_ratio=config.joint.reduction_ratio,
-        counts_per_turn=config.encoder.counts_per_turn,
-        encoder_on_motor=config.encoder.side == "motor",
-        encoder_direction=config.encoder.direction,
-        zero_counts=config.encoder.zero_counts,
         joint_encoder=joint_encoder_settings(config),
         encoder_incremental=config.encoder.kind == "incremental",
         temperature=temperature_object(config),

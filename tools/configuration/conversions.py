@@ -19,6 +19,17 @@ def shared(settings: type[Any], *sections: Section) -> dict[str, Any]:
     return {name: getattr(section, name) for section in sections for name in names & set(type(section).model_fields)}
 
 
+def joint_settings(settings: type[Any], config: Config, drive: Section) -> dict[str, Any]:
+    """What the settings of every driver take from [drive], [limits], [loop], [joint] and [encoder]."""
+    encoder = config.encoder
+    return {
+        **shared(settings, drive, config.limits, config.loop, config.joint, encoder),
+        "torque_constant_NmpA": torque_constant_NmpA(config),
+        "encoder_on_motor": encoder.side == "motor",
+        "encoder_direction": encoder.direction,
+    }
+
+
 def period_s(config: Config) -> float:
     return 1.0 / config.loop.rate_Hz
 

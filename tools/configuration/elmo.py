@@ -16,7 +16,7 @@ from pydantic_core import PydanticCustomError
 from jointctl.drivers.elmo.settings import SERIAL, ElmoSettings, highest_rate_Hz
 from jointctl.drivers.errors import ConfigurationError, DeviceError
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.conversions import shared, torque_constant_NmpA
+from jointctl.tools.configuration.conversions import joint_settings, torque_constant_NmpA
 from jointctl.tools.configuration.drive_section import FOR_A_NODE, FOR_A_PORT, DriveSection, GivenPlace, wrong_kind
 from jointctl.tools.configuration.sections import Rule, between
 
@@ -130,14 +130,7 @@ def elmo_settings(config: Config) -> ElmoSettings:
     """Sections [drive], [encoder], [joint], [limits] and [loop] for the driver."""
     drive = elmo_section(config)
     return ElmoSettings(
-        **shared(ElmoSettings, drive, config.limits),
-        rate_Hz=config.loop.rate_Hz,
-        torque_constant_NmpA=torque_constant_NmpA(config),
-        reduction_ratio=config.joint.reduction_ratio,
-        counts_per_turn=config.encoder.counts_per_turn,
-        encoder_on_motor=config.encoder.side == "motor",
-        encoder_direction=config.encoder.direction,
-        zero_counts=config.encoder.zero_counts,
+        **joint_settings(ElmoSettings, config, drive),
         ramp_radps2=RAMP_SPARE * config.sequence.brake_radps2,
         mode=drive.unit_mode,
     )

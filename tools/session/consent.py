@@ -27,19 +27,16 @@ class Consent(Protocol):
     @property
     def dry_run(self) -> bool:
         """The envelope is shown, and that is all."""
-        ...
 
     @property
     def brake(self) -> Approval | None:
         """Asked before a drive that is found enabled is braked; None: it is left as it is."""
-        ...
 
     def show(self, lines: Sequence[str]) -> None:
         """The motion envelope."""
 
     def agreed(self, lines: Sequence[str]) -> bool:
         """Whether the joint may move as these lines say."""
-        ...
 
 
 class TerminalConsent:

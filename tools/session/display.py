@@ -97,15 +97,12 @@ class Display(Protocol):
 
     def stop_request(self) -> StopRequest:
         """What a viewer asks for."""
-        ...
 
     def stop_reason(self) -> str:
         """Who or what asked for that stop; "" if nobody did."""
-        ...
 
     def requests(self) -> Sequence[ViewerRequest]:
         """What else they have asked for since the last call."""
-        ...
 
     def settings(self, values: Mapping[str, Any]) -> None:
         """What can be changed in this run, and how it stands."""

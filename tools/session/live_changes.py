@@ -215,7 +215,7 @@ class LiveChanges:
         *,
         allow_low_margin: bool = False,
     ) -> None:
-        self._config, self._block, self._tell, self._delay_s = config, block, tell, delay_s
+        self._config, self._block, self.tell, self._delay_s = config, block, tell, delay_s
         self._allow_low_margin = allow_low_margin
         self._open: _Change | None = None
         self.refused: dict[str, Any] | None = None  # the last one: what a page shows at its field
@@ -334,7 +334,7 @@ class LiveChanges:
         answer = ChangeAnswer(int(state.answer))
         change.answered("" if answer is ChangeAnswer.TAKEN else _WHY.get(answer, answer.name))
         if answer is ChangeAnswer.TAKEN:
-            self._tell(INFO, f"parameter change: {change.text}, by {change.who}")
+            self.tell(INFO, f"parameter change: {change.text}, by {change.who}")
         else:
             self._refuse(change.who, change.request, JointctlError(_WHY.get(answer, answer.name)))
 
@@ -342,24 +342,23 @@ class LiveChanges:
         text = error.message + (f" ({error.hint})" if error.hint else "")
         count = 1 if self.refused is None else self.refused["count"] + 1
         self.refused = {"count": count, "who": who, "kind": kind, "text": text}
-        self._tell(WARNING, f"parameter change refused: {text}; asked for by {who}")
+        self.tell(WARNING, f"parameter change refused: {text}; asked for by {who}")
+
+    def settings(self) -> dict[str, Any]:
+        """What a page needs to offer changes."""
+        now, limits = self.gains(), self._config.limits
+        return {
+            "gains": {name: (low, now[name], high) for name, (low, high) in self.limits().items()},
+            "motion": self.motion(),
+            "range": (limits.position_min_rad, limits.position_max_rad),
+            "reference_rad": self.reference_rad,
+            "under_way": self.under_way,
+            "refused": self.refused,
+        }
 
     def close(self) -> None:
         """Nothing more is checked."""
         self._pool.shutdown(wait=False, cancel_futures=True)
-
-
-def settings_of(changes: LiveChanges, config: Config) -> dict[str, Any]:
-    """What a page needs to offer changes."""
-    now = changes.gains()
-    return {
-        "gains": {name: (low, now[name], high) for name, (low, high) in changes.limits().items()},
-        "motion": changes.motion(),
-        "range": (config.limits.position_min_rad, config.limits.position_max_rad),
-        "reference_rad": changes.reference_rad,
-        "under_way": changes.under_way,
-        "refused": changes.refused,
-    }
 
 
 # --- What viewers may do with a run besides stopping it: change it, and have a stretch of it recorded on its own ---
@@ -370,24 +369,13 @@ UNWATCHED = "no page is open any more; the joint goes on, Ctrl-C or `jointctl st
 
 
 class ViewerOrders:
-    """One run; `tell(level, text)` writes an event.  The run log has everything in any case.
+    """One run.  The run log has everything in any case.
 
     A recording is a log of its own beside the run log: NAME.recording-1.mcap.
     """
 
-    def __init__(
-        self,
-        config: Config,
-        block: Any,
-        log_path: Path,
-        metadata: Mapping[str, Mapping[str, str]],
-        tell: Callable[[int, str], None],
-        delay_s: Callable[[], float | None],
-        *,
-        allow_low_margin: bool = False,
-    ) -> None:
-        self._config, self._log_path, self._metadata, self._tell = config, log_path, metadata, tell
-        self._changes = LiveChanges(config, block, tell, delay_s, allow_low_margin=allow_low_margin)
+    def __init__(self, changes: LiveChanges, log_path: Path, metadata: Mapping[str, Mapping[str, str]]) -> None:
+        self._changes, self._log_path, self._metadata, self._tell = changes, log_path, metadata, changes.tell
         self._recording: RunLogWriter | None = None
         self._count = 0
         self._told_s = 0.0
@@ -406,7 +394,7 @@ class ViewerOrders:
         if now_s - self._told_s >= SETTINGS_s:
             self._told_s = now_s
             recording = self._recording.path.name if self._recording is not None else ""
-            display.settings({"stage": "running", **settings_of(self._changes, self._config), "recording": recording})
+            display.settings({"stage": "running", **self._changes.settings(), "recording": recording})
 
     def _count_viewers(self, request: ViewerRequest, display: Display) -> None:
         """Whether anybody can see the joint move: reported in the terminal and in the log."""

@@ -1,4 +1,4 @@
-"""The loops, ready to go: compiled on a CAN bus or a serial line, in plain Python over python-can.
+"""The loops, ready to go: compiled on a bus that is a descriptor, in plain Python over python-can.
 
 `python -m jointctl.tools.session.loops` loads the compiled one, or compiles it: so the time of a start is measured.
 """

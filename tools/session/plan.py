@@ -48,15 +48,12 @@ class Motion(Protocol):
     @property
     def table(self) -> np.ndarray:
         """Rows of the reference, float64 (N, 5), before the joint is known; their number is final."""
-        ...
 
     def placed(self, report: CommissioningReport) -> Placed:
         """From where commissioning found the joint; `JointctlError` where that cannot be."""
-        ...
 
     def require_start(self, start_position_rad: float) -> None:
         """`JointctlError` where the motion must not begin from there; asked when the envelope was shown."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from jointctl.tools.session.bus_watch import BusWatch, FrameRecorder, Temperatur
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.display import Display, EventFinder, Snapshot, phase_name
 from jointctl.tools.session.fault_words import NoticeFinder
-from jointctl.tools.session.live_changes import ViewerOrders
+from jointctl.tools.session.live_changes import LiveChanges, ViewerOrders
 from jointctl.tools.session.loop_handle import LoopHandle
 from jointctl.tools.session.plan import RunPlan
 from jointctl.tools.session.session_drive import Guard, session_drive
@@ -78,10 +78,10 @@ class RunWatch:
         self._phase, self._asked = AxisPhase.WAITING, StopRequest.NONE
         self._events = EventFinder(self._drive, self._fault_words)
         self._notices = NoticeFinder()
-        self._orders = ViewerOrders(
-            config, self.loop.block, self.log.path, parts.metadata, self._tell_scope, lambda: self.delay_s,
-            allow_low_margin=plan.allow_low_margin,
-        )  # fmt: skip
+        changes = LiveChanges(
+            config, self.loop.block, self._tell_scope, lambda: self.delay_s, allow_low_margin=plan.allow_low_margin
+        )
+        self._orders = ViewerOrders(changes, self.log.path, parts.metadata)
 
     def __enter__(self) -> Self:
         self._set_points.begin(self.loop.block)

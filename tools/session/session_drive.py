@@ -28,15 +28,12 @@ class Guard(Protocol):
 
     def wait_ready(self) -> None:
         """Until it watches; without it nothing may be enabled."""
-        ...
 
     def just_ended(self) -> bool:
         """True once, if it has gone before it was released."""
-        ...
 
     def release(self, state: str) -> None:
         """The drive's state as the supervisor knows it; the guard ends, or tries on by itself where it is unknown."""
-        ...
 
 
 class SessionDrive(ABC):

@@ -42,16 +42,13 @@ class StreamedLoop(Protocol):
     @property
     def constants(self) -> Any:
         """Record array of one AxisConstants, that of the loop."""
-        ...
 
     @property
     def axis(self) -> Any:
         """Record array of one AxisState, that of the loop."""
-        ...
 
     def now_ns(self) -> int:
         """The loop's clock."""
-        ...
 
     def require(self) -> None:
         """`JointctlError` if the joint follows nothing, with the cause."""

@@ -59,11 +59,9 @@ class StopTarget(Protocol):
     @property
     def place(self) -> tuple[str, str]:
         """Interface and channel, as the lock of the bus has them."""
-        ...
 
     def switch_off(self, output: Output) -> str:
         """The drive's state in words, after it was commanded to stop and to switch off."""
-        ...
 
 
 class BenchDrive(ABC):

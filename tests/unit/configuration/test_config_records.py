@@ -32,17 +32,15 @@ from jointctl.tools.configuration.elmo import ElmoSection
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.plant_settings import plant_settings
 from jointctl.tools.configuration.records import approach_s, trajectory_table
-from jointctl.tools.configuration.sections import Limits, Section
+from jointctl.tools.configuration.sections import Encoder, Joint, Limits, Loop, Section
 from tests.configurations import VIRTUAL, load, problems
 from tests.sessions import constants_of
 
 NO_TABLE = np.zeros((1, 5))
 
 
-ENCODER_AND_JOINT = {
-    "rate_Hz", "torque_constant_NmpA", "reduction_ratio", "counts_per_turn", "encoder_on_motor", "encoder_direction",
-    "zero_counts",
-}  # fmt: skip
+COPIED = (Limits, Loop, Joint, Encoder)
+OF_THE_ENCODER = {"encoder_on_motor", "encoder_direction"}
 
 
 @pytest.mark.parametrize(
@@ -56,8 +54,8 @@ def test_a_setting_of_a_drive_that_no_key_gives_is_filled_by_hand(
     settings: type[Any], section: type[Section], by_hand: set[str]
 ) -> None:
     """The others are copied by name: a key that is renamed on one side alone would leave a default in force."""
-    keys = set(section.model_fields) | set(Limits.model_fields)
-    assert {field.name for field in fields(settings)} - keys == by_hand | ENCODER_AND_JOINT
+    keys = {key for copied in (section, *COPIED) for key in copied.model_fields}
+    assert {field.name for field in fields(settings)} - keys == by_hand | OF_THE_ENCODER
 
 
 def test_records_of_the_paper() -> None:

@@ -34,7 +34,7 @@ from jointctl.tools.session import session as session_module
 from jointctl.tools.session.bus_watch import BusWatch
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.display import Displays, PhaseLines, Snapshot, ViewerRequest
-from jointctl.tools.session.live_changes import UNWATCHED, ViewerOrders, new_motion
+from jointctl.tools.session.live_changes import UNWATCHED, LiveChanges, ViewerOrders, new_motion
 from jointctl.tools.session.live_panel import time_left
 from jointctl.tools.session.plan import resolve
 from jointctl.tools.session.run_watch import Around, RunParts, RunWatch
@@ -305,7 +305,8 @@ def test_the_end_of_the_server_brakes_what_is_led_from_the_page(
 def test_nobody_watching_is_an_event_and_a_line_in_the_terminal(tmp_path: Path) -> None:
     events: list[str] = []
     config = load_config(shipped_config("virtual"))
-    orders = ViewerOrders(config, None, tmp_path / "a.mcap", {}, lambda level, text: events.append(text), lambda: None)
+    changes = LiveChanges(config, None, lambda level, text: events.append(text), lambda: None)
+    orders = ViewerOrders(changes, tmp_path / "a.mcap", {})
     orders._told_s = math.inf  # how things stand is not told
     err = io.StringIO()
 
