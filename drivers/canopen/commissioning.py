@@ -337,7 +337,6 @@ def commission(
     `pause` sleeps; `prove` shows that the armed watchdog works and returns what the drive said (None: not proven).
     """
     findings = Findings(remarks=eds.all_remarks())
-    objects.remarks.clear()
     identify(objects, settings, eds, findings)
     disable(objects, settings, pause)
     choose_mode(objects, settings, findings, pause)

@@ -14,7 +14,7 @@ import can
 import pytest
 
 from jointctl.drivers.canopen.cia402 import Mode
-from jointctl.drivers.canopen.commissioning import LARGEST_PERMILLE, STEEP_RADPS2
+from jointctl.drivers.canopen.commissioning import LARGEST_PERMILLE, READY_POLL_S, STEEP_RADPS2, wait_until_ready
 from jointctl.drivers.canopen.drive import GATE_S, REOPEN_ATTEMPTS, REOPEN_PAUSE_S, CanopenDrive
 from jointctl.drivers.canopen.identifiers import NmtCommand
 from jointctl.drivers.canopen.network import LISTEN_S
@@ -84,7 +84,7 @@ def test_targets_are_zeroed_before_anything_else_is_written(commissioned: Any) -
     assert not {0x607F, 0x6083} & set(written)  # of the velocity modes
     first = {index: written.index(index) for index in written}
     assert written[0] == 0x6040
-    assert first[0x6071] < first[0x6060] < first[0x6072] < first[0x60C2] < first[0x1016] < first[0x1800]
+    assert first[0x6071] < first[0x60FF] < first[0x6060] < first[0x6072] < first[0x60C2] < first[0x1016] < first[0x1800]
     assert set(bus.downloads(0x6040)) == {0}  # nothing but "disable voltage" is ever written while commissioning
 
 
@@ -372,6 +372,27 @@ def test_a_controller_that_comes_at_the_last_moment_keeps_its_drive(
     with joint.opened() as drive, pytest.raises(BusError, match=seen):
         drive.commission()
     assert (0, bytes([NmtCommand.ENTER_PRE_OPERATIONAL, 1])) not in joint.requests
+
+
+@pytest.mark.parametrize(("increments", "turns", "counts"), [(65536, 2, 32768.0), (65536, 0, 0.0)])
+def test_the_drives_own_encoder_resolution(joint: Any, increments: int, turns: int, counts: float) -> None:
+    joint.answers |= {(0x608F, 1): increments, (0x608F, 2): turns}
+    with joint.opened() as drive:
+        assert drive.commission().counts_per_motor_turn == counts
+
+
+def test_remarks_of_an_earlier_commissioning_are_not_repeated(joint: Any) -> None:
+    with joint.opened() as drive:
+        drive._objects.remarks.append("of an earlier one")
+        assert "of an earlier one" not in drive.commission().remarks
+
+
+def test_a_drive_that_is_not_ready_is_given_time_between_two_looks(joint: Any) -> None:
+    joint.answers[(0x6041, 0)] = 0x0200
+    pauses_s: list[float] = []
+    with joint.opened() as drive, pytest.raises(DeviceError, match="after 1 s"):
+        wait_until_ready(drive._objects, 1, 1.0, pauses_s.append)
+    assert pauses_s == [READY_POLL_S] * (round(1.0 / READY_POLL_S) - 1)
 
 
 def test_what_was_verified_before_a_new_commissioning_is_forgotten(joint: Any) -> None:
