@@ -13,7 +13,8 @@ from typing import Any
 import can
 import pytest
 
-from jointctl.drivers.canopen.cia402 import Mode
+from jointctl.drivers.canopen import commissioning
+from jointctl.drivers.canopen.cia402 import Mode, State
 from jointctl.drivers.canopen.commissioning import LARGEST_PERMILLE, READY_POLL_S, STEEP_RADPS2, wait_until_ready
 from jointctl.drivers.canopen.drive import GATE_S, REOPEN_ATTEMPTS, REOPEN_PAUSE_S, CanopenDrive
 from jointctl.drivers.canopen.identifiers import NmtCommand
@@ -393,6 +394,21 @@ def test_a_drive_that_is_not_ready_is_given_time_between_two_looks(joint: Any) -
     with joint.opened() as drive, pytest.raises(DeviceError, match="after 1 s"):
         wait_until_ready(drive._objects, 1, 1.0, pauses_s.append)
     assert pauses_s == [READY_POLL_S] * (round(1.0 / READY_POLL_S) - 1)
+
+
+def test_a_drive_is_given_time_to_switch_off_and_to_change_its_mode(
+    joint: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    states = iter([State.SWITCH_ON_DISABLED, *[State.QUICK_STOP_ACTIVE] * 3, State.SWITCH_ON_DISABLED])
+    monkeypatch.setattr(commissioning, "state_of", lambda _: next(states))
+    joint.answers[(0x6061, 0)] = 3
+    pauses_s: list[float] = []
+    with joint.opened() as drive:
+        commissioning.disable(drive._objects, joint.settings, pauses_s.append)
+        assert pauses_s == [commissioning.PAUSE_S] * 3
+        with pytest.raises(DeviceError, match="6061 shows mode 3"):
+            commissioning.choose_mode(drive._objects, joint.settings, commissioning.Findings(), pauses_s.append)
+    assert pauses_s == [commissioning.PAUSE_S] * (3 + commissioning.ATTEMPTS)
 
 
 def test_what_was_verified_before_a_new_commissioning_is_forgotten(joint: Any) -> None:
