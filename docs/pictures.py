@@ -1,24 +1,38 @@
-"""The pictures of docs/python.md: cells of examples/joint.ipynb that name one are run, and what they draw is kept.
+"""What the pages show of runs, made anew: pictures of notebook, demo and page, and the table of `paper`.
 
-python docs/pictures.py [FOLDER]
+python docs/pictures.py [notebook] [demo] [page] [paper]     all of them, without a word
+
+The page needs the extra `scope`, websockets and a Chromium.
 """
 
 from __future__ import annotations
 
 import base64
+import json
+import os
+import re
+import subprocess
 import sys
-from collections.abc import Iterator
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-import nbclient
-import nbformat
-
 DOCS = Path(__file__).resolve().parent
-NOTEBOOK = DOCS.parent / "examples" / "joint.ipynb"
+ROOT = DOCS.parent
+NOTEBOOK = ROOT / "examples" / "joint.ipynb"
+LAW = DOCS / "law.md"
+JOINTCTL = (sys.executable, "-P", "-m", "jointctl.tools.verbs")
+HEADING = "| experiment | paper | ours | `precise` |"
+PATIENCE = {"heartbeat_s": 0.4, "sample_age_max_s": 0.2, "skipped_max_s": 0.2, "duration_s": 60.0}  # a browser draws
+TRACKING_s = 12.0  # before the page is taken
 
 
 def pictures(folder: Path) -> Iterator[tuple[str, bytes]]:
     """Name and PNG of each, from a notebook that is executed in `folder`."""
+    import nbclient
+    import nbformat
+
     book = nbformat.read(NOTEBOOK, as_version=4)
     nbclient.NotebookClient(book, timeout=300, resources={"metadata": {"path": str(folder)}}).execute()
     for cell in book.cells:
@@ -29,7 +43,83 @@ def pictures(folder: Path) -> Iterator[tuple[str, bytes]]:
             yield f"{cell.metadata['picture']}.png", base64.b64decode(drawn[0])
 
 
+def notebook(folder: Path) -> None:
+    for name, png in pictures(folder):
+        (DOCS / name).write_bytes(png)
+
+
+def demo(folder: Path) -> None:
+    """The picture that `jointctl demo` leaves."""
+    subprocess.run([*JOINTCTL, "demo"], cwd=folder, check=True)
+    (picture,) = folder.glob("runs/*.png")
+    (DOCS / "demo.png").write_bytes(picture.read_bytes())
+    smaller(DOCS / "demo.png")
+
+
+def smaller(picture: Path) -> None:
+    """In 64 colours, which are enough for lines and letters."""
+    from PIL import Image
+
+    Image.open(picture).convert("RGB").quantize(64).save(picture, optimize=True)
+
+
+def page(folder: Path) -> None:
+    """The page of a run on the virtual joint, while it tracks."""
+    sys.path.insert(0, str(ROOT))
+    from tests.browser import Browser, free_port
+
+    channel, port = f"docs-{os.getpid()}", str(free_port())
+    text = (ROOT / "configs" / "virtual.toml").read_text(encoding="utf-8")
+    for key, value in PATIENCE.items():
+        text = re.sub(rf"(?m)^{key} = \S+", f"{key} = {value}", text)
+    (folder / "joint.toml").write_text(text, encoding="utf-8")
+    joint = subprocess.Popen([*JOINTCTL, "hil", "joint.toml", "-c", channel], cwd=folder)
+    told = folder / "told"
+    try:
+        time.sleep(5.0)
+        with told.open("w") as stream:
+            words = [*JOINTCTL, "run", "joint.toml", "-c", channel, "-y", "--scope", "--scope-port", port]
+            run = subprocess.Popen(words, cwd=folder, stdout=stream, stderr=stream)
+        try:
+            while (found := re.search(r"scope: (http://\S+)", told.read_text())) is None:
+                time.sleep(0.1)
+                if run.poll() is not None:
+                    raise SystemExit(told.read_text())
+            with Browser(folder, 1280, 820) as browser:
+                tab = browser.open(found[1])
+                tab.until("document.querySelector('[data-testid=\"state\"]').innerText.includes('tracking')", 60.0)
+                time.sleep(TRACKING_s)
+                if run.poll() is not None:
+                    raise SystemExit(told.read_text())
+                tab.picture(DOCS / "page.png")
+                smaller(DOCS / "page.png")
+        finally:
+            run.terminate()
+            run.wait()
+    finally:
+        joint.terminate()
+        joint.wait()
+
+
+def paper_table(rows: Sequence[Mapping[str, str]]) -> str:
+    """Rows of `jointctl paper --json`, without reference and note."""
+    shown = [[row[key].replace("|e|", "error") for key in ("experiment", "paper", "ours", "precise")] for row in rows]
+    lines = (f"| {' | '.join(row)} |".replace("|  |", "| |") for row in shown)
+    return "\n".join([HEADING, "|---|---|---|---|", *lines])
+
+
+def paper(folder: Path) -> None:
+    """The table of docs/law.md."""
+    done = subprocess.run([*JOINTCTL, "paper", "--json"], cwd=folder, check=True, capture_output=True, text=True)
+    text = LAW.read_text(encoding="utf-8")
+    before, _, after = text.partition(HEADING)
+    table, rest = paper_table(json.loads(done.stdout)["rows"]), after.partition("\n\n")[2]
+    LAW.write_text(f"{before}{table}\n\n{rest}", encoding="utf-8")
+
+
+PARTS: dict[str, Callable[[Path], None]] = {"notebook": notebook, "demo": demo, "page": page, "paper": paper}
+
 if __name__ == "__main__":
-    target = Path(sys.argv[1]) if sys.argv[1:] else DOCS
-    for name, png in pictures(target):
-        (target / name).write_bytes(png)
+    for part in sys.argv[1:] or PARTS:
+        with tempfile.TemporaryDirectory() as work:
+            PARTS[part](Path(work))

@@ -20,7 +20,6 @@ from jointctl.drivers.errors import JointctlError
 TELL_S = 15.0  # how often it is reported that it still compiles
 IDLE_S = 60.0  # alive, but at work for less than WORK_S in so long: it hangs
 WORK_S = 0.05
-_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 def processor_time_s(pid: int) -> float:
@@ -29,7 +28,7 @@ def processor_time_s(pid: int) -> float:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
         return 0.0
-    return (int(fields[11]) + int(fields[12])) / _TICKS_PER_S
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def end_text(code: int) -> str:
@@ -79,12 +78,21 @@ class Starting:
             self._tell(f"{self._name} is starting: {so_far} so far, {used_s:.0f} s of processor time")
 
 
+def processors() -> int:
+    """How many this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 @contextmanager
 def interrupts_left_to_the_parent() -> Iterator[None]:
     """Processes that are started within hold Ctrl-C back from their first instruction on; here it comes afterwards.
 
     An initialiser of a worker would be too late: its imports take a second, and each would end with a traceback.
+    A system without masks of signals starts them without.
     """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
     resource_tracker.ensure_running()  # with the first spawned process it would let the signal through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

@@ -2,6 +2,7 @@
 
     python tests/bench/every_frame.py [--kind run|sweep|program] [--deadline yes|no] [--every 1] [--rest 20]
                                       [--workers 2] [--phase NAME] [--injection NAME]
+                                      [--cluster tcp://127.0.0.1:8786] [--parts 8]
 
 The run is simulated (`tests/simulated_programs.py`): supervisor, loop, `jointctl stop` and virtual drive at simulated
 time, frame by frame; `program` is a user's program that sends set-points through `jointctl.Joint`.  Right after frame k
@@ -38,9 +39,11 @@ from jointctl.drivers.errors import JointctlError  # noqa: E402
 from jointctl.firmware_py.cycle import Word  # noqa: E402
 from jointctl.firmware_py.states import Fault  # noqa: E402
 from jointctl.joint import Joint  # noqa: E402
+from jointctl.tools.child_process import processors  # noqa: E402
 from jointctl.tools.configuration.canopen import canopen_section  # noqa: E402
 from jointctl.tools.configuration.config import Config  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
+from jointctl.tools.experiments.many_runs import Workers  # noqa: E402
 from jointctl.tools.session.consent import TerminalConsent  # noqa: E402
 from jointctl.tools.session.control import (  # noqa: E402
     STOP_COMMAND,
@@ -67,7 +70,6 @@ ENABLING_s = 0.05  # another controller's write while the loop enables is seen a
 QUIET_s = 0.2  # for so long after the end the drive must stay off
 LONGEST_s = 30.0
 SET_POINTS, SET_POINT_s, SWING_rad = 30, 0.01, 0.01
-PROGRESS_s = 60.0
 WARM_UP = ("stop", "NMT stop", "SDO 6007 = 0", "frames to the drive lost")
 # What is waited for, shorter than on a joint: the time that is allowed follows.
 SHORT = {"duration_s": 0.3, "release_s": 0.02, "heartbeat_s": 0.1, "wait_timeout_s": 1.0, "enable_timeout_s": 1.0,
@@ -330,6 +332,7 @@ class Exhaustion:
     def __init__(self, kind: str, deadline: bool, every: int, rest: int, part: tuple[int, int], out: Any) -> None:
         self.kind, self.deadline, self.every, self.rest, self.part, self.out = kind, deadline, every, rest, part, out
         self.child = False
+        self.parent = os.getppid()  # ends with it: no one would read what this finds
         self.chosen = self.in_rest = 0
         self.phases: list[str] = []  # the only ones, or all
         self.injections = [name for name in INJECTIONS if kind == "program" or name != HANGS]
@@ -408,6 +411,8 @@ class Exhaustion:
         phase = self.session.phase
         if not self._wanted(phase):
             return
+        if os.getppid() != self.parent:
+            os._exit(1)
         for name in self.injections:
             if os.fork():
                 _, status = os.wait()
@@ -466,27 +471,21 @@ def report(rows: list[dict[str, Any]], frames: dict[str, int], elapsed_s: float)
     return len(bad)
 
 
-def rows_of_parts(command: list[str], workers: int) -> Iterator[dict[str, Any]]:
-    """What that many processes find, each with its share of the frames; their progress on stderr."""
-    with contextlib.ExitStack() as stack:
-        outputs = [stack.enter_context(tempfile.TemporaryFile("w+")) for _ in range(workers)]
-        parts = [
-            subprocess.Popen([*command, "--part", f"{k}/{workers}"], stdout=output) for k, output in enumerate(outputs)
-        ]
-        for part in parts:
-            stack.callback(part.kill)
-        next_s = CLOCK() + PROGRESS_s
-        while any(part.poll() is None for part in parts):
-            time.sleep(0.2)
-            if CLOCK() > next_s:
-                next_s += PROGRESS_s
-                done = sum(os.pread(output.fileno(), 1 << 30, 0).count(b"\n") for output in outputs)
-                print(f"{' '.join(command[2:6])}: {done} injections", file=sys.stderr, flush=True)
-        for part, output in zip(parts, outputs, strict=True):
-            if part.returncode:
-                raise SystemExit(f"a part ended with code {part.returncode}")
-            output.seek(0)
-            yield from map(json.loads, output)
+def rows_of_part(words: list[str]) -> list[dict[str, Any]]:
+    """What one process finds in its share of the frames; it forks, which a worker with threads must not."""
+    done = subprocess.run([sys.executable, *words], stdout=subprocess.PIPE, text=True, check=False)
+    if done.returncode:
+        raise JointctlError(f"a part ended with code {done.returncode}")
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def rows_of_parts(words: list[str], parts: int, workers: Workers) -> Iterator[dict[str, Any]]:
+    """What all shares have shown, of the frames divided by `parts`; progress on stderr."""
+    tasks = [[*words, "--part", f"{k}/{parts}"] for k in range(parts)]
+    with contextlib.closing(workers.results(rows_of_part, tasks)) as results:
+        for number, rows in enumerate(results, 1):
+            print(f"{' '.join(words[1:5])}: {number} of {parts} parts", file=sys.stderr, flush=True)
+            yield from rows
 
 
 def main() -> int:
@@ -495,7 +494,9 @@ def main() -> int:
     parser.add_argument("--deadline", choices=("yes", "no"), action="append", help="whether the drive has 1400:5")
     parser.add_argument("--every", type=int, default=1, help="every Nth of the frames that would be tried")
     parser.add_argument("--rest", type=int, default=20, help="every Nth frame where nothing changes")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--workers", type=int, help="processes; default: one a core")
+    parser.add_argument("--cluster", help="address of a dask scheduler whose workers have this clone at this path")
+    parser.add_argument("--parts", type=int, help="shares of the frames; default: four times the processors here")
     parser.add_argument("--phase", action="append", help="only frames of this phase, as it is named in a violation")
     parser.add_argument("--injection", choices=list(INJECTIONS), action="append", help="only this one")
     parser.add_argument("--part", help=argparse.SUPPRESS)
@@ -507,15 +508,17 @@ def main() -> int:
         one.phases, one.injections = given.phase or [], given.injection or one.injections
         sys.stdout.write(json.dumps({"frames": one.run()}) + "\n")
         return 0
+    workers = Workers(given.workers, given.cluster)
+    parts = given.parts or (1 if given.workers == 1 else 4 * (given.workers or processors()))
     rows: list[dict[str, Any]] = []
     frames: dict[str, int] = {}
     started_s = CLOCK()
     for kind in kinds:
         for deadline in deadlines:
-            command = [sys.executable, __file__, "--kind", kind, "--deadline", deadline, "--every", str(given.every)]
-            command += ["--rest", str(given.rest), *(f"--phase={name}" for name in given.phase or [])]
-            command += [f"--injection={name}" for name in given.injection or []]
-            for row in rows_of_parts(command, given.workers):
+            words = [str(Path(__file__).resolve()), "--kind", kind, "--deadline", deadline, "--every", str(given.every)]
+            words += ["--rest", str(given.rest), *(f"--phase={name}" for name in given.phase or [])]
+            words += [f"--injection={name}" for name in given.injection or []]
+            for row in rows_of_parts(words, parts, workers):
                 if "frames" in row:
                     frames[f"{kind}, {'with' if deadline == 'yes' else 'without'} 1400:5"] = row["frames"]
                 else:

@@ -27,6 +27,7 @@ from jointctl.tools.experiments.fault_scenarios import (
     placed_sweep,
 )
 from jointctl.tools.experiments.judge import envelope, in_time, judge, reaction_s, require_fit, run_scenario
+from jointctl.tools.experiments.many_runs import Workers
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.fault_campaign import fault_campaign
@@ -99,7 +100,9 @@ def test_without_a_velocity_mode_the_law_of_a_sweep_closes_the_loop() -> None:
 
 
 def test_workers_sweep_as_well(sweep: tuple[Config, LockstepJoint]) -> None:
-    found, _, _ = run_campaign(CONFIGS / "sweep_virtual.toml", 9, 20, lambda _: None, workers=2, during="sweep")
+    found, _, _ = run_campaign(
+        load_config(CONFIGS / "sweep_virtual.toml"), 9, 20, lambda _: None, workers=Workers(2), during="sweep"
+    )
     alone = [judge(*sweep, draw_scenario(9, number, "sweep")) for number in range(20)]
     assert [dataclasses.astuple(v)[:8] for v in found] == [dataclasses.astuple(v)[:8] for v in alone]
 
@@ -109,7 +112,7 @@ def test_the_command_that_replays_a_violation_names_the_sweep(tmp_path: Path, mo
     err = StringIO()
     shown = Output(json=True, stdout=StringIO(), stderr=err)
     config = load_config(CONFIGS / "sweep_virtual.toml")
-    assert fault_campaign(config, shown, count=1, seed=5, folder=tmp_path, workers=1, sweep=True) == 10
+    assert fault_campaign(config, shown, count=1, seed=5, folder=tmp_path, workers=Workers(1), sweep=True) == 10
     assert "sweep_virtual.toml --sweep --seed 5 --scenario 0" in err.getvalue()
     assert fault_campaign(config, shown, seed=5, scenario=0, sweep=True) == 10
 

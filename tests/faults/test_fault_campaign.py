@@ -27,6 +27,7 @@ from jointctl.tools.experiments import judge as judge_module
 from jointctl.tools.experiments.campaign import campaign_figure, rows_by_kind
 from jointctl.tools.experiments.fault_scenarios import FAULT_CLASSES, During, draw_scenario, kinds_during
 from jointctl.tools.experiments.judge import Envelope, envelope, judge, reaction_s, run_scenario
+from jointctl.tools.experiments.many_runs import Workers
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 from jointctl.tools.verbs.fault_campaign import fault_campaign
 from tests.page_figures import foreign_colours, svgs
@@ -200,7 +201,10 @@ def test_the_envelope_follows_its_derivation(config: Config, lockstep: LockstepJ
 def test_the_verb_writes_table_json_and_picture(config: Config, tmp_path: Path) -> None:
     shown, out, _ = output(json=True)
     page = tmp_path / "campaign.html"
-    assert fault_campaign(config, shown, count=KINDS, seed=5, folder=tmp_path / "new", workers=1, report=page) == 0
+    assert (
+        fault_campaign(config, shown, count=KINDS, seed=5, folder=tmp_path / "new", workers=Workers(1), report=page)
+        == 0
+    )
     assert [foreign_colours(svg) for svg in svgs(page.read_text())] == [set()]
     assert f"0 of {KINDS} scenarios violate an invariant, seed 5." in page.read_text()
     data = json.loads(out.getvalue())
@@ -217,7 +221,7 @@ def test_a_violation_is_told_with_the_command_that_replays_it(
     monkeypatch.setattr(judge_module, "_motion", lambda run, allowed: ["made up"])
     shown, _, err = output(json=True)
     page = tmp_path / "campaign.html"
-    assert fault_campaign(config, shown, count=2, seed=5, folder=tmp_path, workers=1, report=page) == 10
+    assert fault_campaign(config, shown, count=2, seed=5, folder=tmp_path, workers=Workers(1), report=page) == 10
     assert page.read_text().count("made up") == 2
     assert "--seed 5 --scenario 0" in err.getvalue()
     report = json.loads((tmp_path / "campaign.json").read_text())
@@ -237,11 +241,11 @@ def test_ctrl_c_keeps_what_is_done(config: Config, tmp_path: Path, monkeypatch: 
     def three(*_: Any) -> Any:
         lockstep = LockstepJoint(config)
         for number in range(3):
-            yield judge(config, lockstep, draw_scenario(1, number))
+            yield [judge(config, lockstep, draw_scenario(1, number))]
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(5.0)
 
-    monkeypatch.setattr(runner, "_verdicts", three)
+    monkeypatch.setattr(Workers, "results", three)
     shown, out, _ = output(json=True)
     assert fault_campaign(config, shown, count=100, folder=tmp_path) == 130
     data = json.loads(out.getvalue())
@@ -251,7 +255,7 @@ def test_ctrl_c_keeps_what_is_done(config: Config, tmp_path: Path, monkeypatch: 
 
 def test_workers_give_the_same_verdicts_as_one_process(config: Config, lockstep: LockstepJoint, tmp_path: Path) -> None:
     done: list[float] = []
-    found, _, interrupted = runner.run_campaign(CONFIG, 9, 40, done.append, workers=2)
+    found, _, interrupted = runner.run_campaign(load_config(CONFIG), 9, 40, done.append, workers=Workers(2))
     assert not interrupted
     assert done[-1] == 40.0
     alone = [judge(config, lockstep, draw_scenario(9, number)) for number in range(40)]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+import re
+import runpy
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ from jointctl.tools.analysis.margins import phase_margin_deg
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.experiments.controller_study import StudyResult, StudySettings, quantile, run_study
 from jointctl.tools.experiments.controllers import named
+from jointctl.tools.experiments.many_runs import Workers
 from jointctl.tools.experiments.paper_experiments import (
     AFTER_s,
     Experiment,
@@ -39,6 +42,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.verbs.paper import paper
 from tests.configurations import changed
 from tests.page_figures import foreign_colours, svgs
+from tests.places import ROOT
 
 pytestmark = pytest.mark.slow("all experiments of the paper, and an ensemble of joints")
 
@@ -146,9 +150,26 @@ def test_the_verb_prints_one_table_and_draws_a_page_for_each_figure(
     assert len(data["rows"]) == 13
     assert data["runs"]["precise, R1"]["rmse_mrad"] < 0.02
     assert data["runs"]["no model, R1"]["settling_s"] is None  # never
+    compare_with_the_page(data["rows"])
     pictures = sorted(path.name for path in tmp_path.glob("*.png"))
     assert [name[:5] for name in pictures] == ["fig07", "fig08", "fig09", "fig12", "fig13", "fig14"]
     assert all(path.stat().st_size > 20_000 for path in tmp_path.glob("*.png"))
+
+
+NUMBER = re.compile(r"-?\d+\.?\d*")
+
+
+def compare_with_the_page(rows: list[dict[str, str]]) -> None:
+    """The table of docs/law.md has every row of the verb; another processor or a smaller swarm rounds otherwise."""
+    ours = runpy.run_path(str(ROOT / "docs" / "pictures.py"))["paper_table"](rows).splitlines()
+    page = (ROOT / "docs" / "law.md").read_text().splitlines()
+    begin = page.index(ours[0])
+    theirs = page[begin : begin + len(ours)]
+    assert page[begin + len(ours)] == ""
+    for mine, shown in zip(ours, theirs, strict=True):
+        assert NUMBER.sub("#", mine) == NUMBER.sub("#", shown)
+        found, told = ([float(text) for text in NUMBER.findall(row)] for row in (mine, shown))
+        assert told == pytest.approx(found, rel=0.05, abs=0.02)
 
 
 def test_the_synthetic_sweep_is_identified_to_its_noise() -> None:
@@ -184,7 +205,9 @@ def test_phase_margin_of_the_precise_law() -> None:
 def ensemble() -> StudyResult:
     names = ("computed_torque", "pid", "paper_without_friction_model", "paper", "paper_lugre", "network_stiff",
              "observer_stiff", "precise")  # fmt: skip
-    return run_study(load_config(shipped_config("precise")), named(names), StudySettings(plants=5, seed=2), workers=1)
+    return run_study(
+        load_config(shipped_config("precise")), named(names), StudySettings(plants=5, seed=2), workers=Workers(1)
+    )
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,7 @@ from jointctl.tools.experiments.controller_study import (
     write_csv,
 )
 from jointctl.tools.experiments.controllers import TABLE, controller_config, named
+from jointctl.tools.experiments.many_runs import Workers
 from jointctl.tools.experiments.scenarios import FAILED, ErrorFigures
 from jointctl.tools.lockstep import DirectBus
 from jointctl.tools.output import Output
@@ -47,7 +48,7 @@ def base() -> Config:
 
 def short_study(base: Config, seed: int, workers: int) -> StudyResult:
     controllers = named(("paper", "precise"))
-    return run_study(base, controllers, StudySettings(plants=3, seed=seed, after_s=1.0), workers=workers)
+    return run_study(base, controllers, StudySettings(plants=3, seed=seed, after_s=1.0), workers=Workers(workers))
 
 
 # --- the plants ---
@@ -109,14 +110,14 @@ def test_an_interruption_keeps_what_is_done_and_ends_the_other_processes_too(
             raise KeyboardInterrupt
 
     settings = StudySettings(plants=plants, seed=1, after_s=1.0)
-    result = run_study(base, named(("paper",)), settings, workers=workers, progress=interrupt)
+    result = run_study(base, named(("paper",)), settings, workers=Workers(workers), progress=interrupt)
     assert result.interrupted
     assert least <= len(result.plants) <= most
 
 
 def test_a_time_after_the_end_is_refused(base: Config) -> None:
     with pytest.raises(ConfigurationError, match=r"after_s \(=3\) must be in \[0\.\.3\)"):
-        run_study(base, named(("paper",)), StudySettings(plants=1, seed=1, after_s=3.0), workers=1)
+        run_study(base, named(("paper",)), StudySettings(plants=1, seed=1, after_s=3.0), workers=Workers(1))
 
 
 # --- quantiles, files ---
@@ -167,7 +168,7 @@ def test_the_verb_prints_json_and_says_when_it_was_interrupted(
     out, err = io.StringIO(), io.StringIO()
     page = tmp_path / "a.html"
     shown = Output(json=True, stdout=out, stderr=err)
-    assert study(settings, shown, workers=1, csv=tmp_path / "a.csv", report=page) == 0
+    assert study(settings, shown, workers=Workers(1), csv=tmp_path / "a.csv", report=page) == 0
     assert [foreign_colours(svg) for svg in svgs(page.read_text())] == [set()]
     data = json.loads(out.getvalue())
     assert data["plants_done"] == 2
@@ -315,7 +316,7 @@ def test_a_law_for_flexible_joints_gets_gains_for_each_of_them(base: Config) -> 
     for choose in (True, False):
         plant = {"flexible": True, "choose_gains": choose}
         settings = checked({"plants": 2, "seed": 5, "after_s": 1.0, "plant": plant}, "test")
-        found[choose] = run_study(base, controllers, settings, workers=1)
+        found[choose] = run_study(base, controllers, settings, workers=Workers(1))
         assert found[choose].faults("realistic") == 0
         assert np.max(found[choose].values("realistic", "true_rmse_mrad")) < 0.25
         assert np.max(found[choose].values("realistic", "chatter_Nm")) < 1.0

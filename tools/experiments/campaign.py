@@ -7,32 +7,40 @@ from __future__ import annotations
 
 import json
 import math
-import multiprocessing
-import os
+import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.table import Column, Table
 
 from jointctl.firmware_py.states import Fault
-from jointctl.tools.child_process import interrupts_left_to_the_parent
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.load import load_config
 from jointctl.tools.drawing import INK, MID_BLUE, MID_GREEN, MID_RED, canvas
 from jointctl.tools.experiments.fault_scenarios import During, draw_scenario
 from jointctl.tools.experiments.judge import Verdict, judge
+from jointctl.tools.experiments.many_runs import HERE, Workers
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.sweeping.carry_out import with_mode
 
 # --- the runs ---
 
 AT_ONCE = 16  # scenarios that a worker takes at a time
-_worker: dict[str, Any] = {}
+_kept = threading.local()  # of a worker: the joint of the campaign that it works for
+
+
+@dataclass(frozen=True)
+class Scenarios:
+    """Some of a campaign: `numbers` of its seed; it is sent to a worker."""
+
+    config: Config
+    seed: int
+    during: During
+    numbers: tuple[int, ...]
 
 
 def campaign_joint(config: Config, during: During) -> tuple[Config, LockstepJoint]:
@@ -41,45 +49,35 @@ def campaign_joint(config: Config, during: During) -> tuple[Config, LockstepJoin
     return config, LockstepJoint(config)
 
 
-def _begin(path: str, seed: int, during: During) -> None:
-    """In each worker: commission a joint of its own."""
-    config, joint = campaign_joint(load_config(path), during)
-    _worker.update(config=config, joint=joint, draw=partial(draw_scenario, seed, during=during))
-
-
-def _work(number: int) -> Verdict:
-    return judge(_worker["config"], _worker["joint"], _worker["draw"](number))
-
-
-def _verdicts(path: Path, seed: int, count: int, workers: int, during: During) -> Iterator[Verdict]:
-    if workers == 1:
-        config, joint = campaign_joint(load_config(path), during)
-        for number in range(count):
-            yield judge(config, joint, draw_scenario(seed, number, during))
-        return
-    context = multiprocessing.get_context("spawn")
-    with interrupts_left_to_the_parent():
-        started = context.Pool(workers, _begin, (str(path), seed, during))
-    with started as pool:
-        yield from pool.imap_unordered(_work, range(count), AT_ONCE)
+def judge_all(some: Scenarios) -> list[Verdict]:
+    """In their order; a worker commissions its joint once."""
+    key = some.config, some.during
+    if getattr(_kept, "key", None) != key:
+        _kept.joint = campaign_joint(*key)
+        _kept.key = key
+    config, joint = _kept.joint
+    return [judge(config, joint, draw_scenario(some.seed, number, some.during)) for number in some.numbers]
 
 
 def run_campaign(
-    path: Path,
+    config: Config,
     seed: int,
     count: int,
     advance: Callable[[float], None],
-    workers: int | None = None,
+    workers: Workers = HERE,
     during: During = "run",
 ) -> tuple[list[Verdict], float, bool]:
     """(verdicts in order of their numbers, time taken [s], whether Ctrl-C ended it early)."""
     started_s = time.monotonic()
     found: list[Verdict] = []
     interrupted = False
+    parts = (range(first, min(first + AT_ONCE, count)) for first in range(0, count, AT_ONCE))
+    tasks = (Scenarios(config, seed, during, tuple(numbers)) for numbers in parts)
     try:
-        for verdict in _verdicts(path, seed, count, workers or os.cpu_count() or 1, during):
-            found.append(verdict)
-            advance(float(len(found)))
+        with closing(workers.results(judge_all, tasks)) as results:
+            for verdicts in results:
+                found += verdicts
+                advance(float(len(found)))
     except KeyboardInterrupt:
         interrupted = True
     return sorted(found, key=lambda verdict: verdict.number), time.monotonic() - started_s, interrupted

@@ -22,12 +22,10 @@ from __future__ import annotations
 
 import csv
 import math
-import multiprocessing
-import os
 import tomllib
 from collections.abc import Callable
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from dataclasses import asdict, dataclass, fields
+from contextlib import closing
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -37,7 +35,7 @@ from pydantic_core import PydanticCustomError
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.input_file import parse_toml, read_input
-from jointctl.tools.child_process import interrupts_left_to_the_parent
+from jointctl.tools.child_process import processors
 from jointctl.tools.configuration.config import Config, suggestion
 from jointctl.tools.configuration.sections import JointEncoder, Reducer, ReducerMap, Section, Virtual, between
 from jointctl.tools.drawing import BLUE, GREY, INK, canvas
@@ -50,6 +48,7 @@ from jointctl.tools.experiments.controllers import (
     one_line,
     with_chosen_gains,
 )
+from jointctl.tools.experiments.many_runs import HERE, Workers
 from jointctl.tools.experiments.scenarios import RPDO_AT_ONCE, ErrorFigures, Scenario, error_figures, run_scenario
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.written_file import writing
@@ -372,13 +371,10 @@ def run_study(
     controllers: list[Controller],
     settings: StudySettings,
     *,
-    workers: int | None = None,
+    workers: Workers = HERE,
     progress: Progress | None = None,
 ) -> StudyResult:
-    """All runs; `progress` hears how many plants are done.  Ctrl-C ends it early and keeps what is there.
-
-    `workers` None takes every processor that this process may use; 1 stays in this process.
-    """
+    """All runs; `progress` hears how many plants are done.  Ctrl-C ends it early and keeps what is there."""
     after_s, plants = settings.after_s, settings.plants
     if not 0.0 <= after_s < base.trajectory.duration_s:
         raise ConfigurationError(f"after_s (={after_s:g}) must be in [0..{base.trajectory.duration_s:g}), the run")
@@ -387,46 +383,20 @@ def run_study(
         PlantTask(base, settings.plant, settings.seed, index, order, settings.scenario, after_s)
         for index in range(plants)
     ]
-    workers = min(plants, workers or len(os.sched_getaffinity(0)))
+    if workers.cluster is None:
+        workers = replace(workers, count=min(plants, workers.count or processors()))
     done: list[PlantResult] = []
     interrupted = False
-
-    def take(result: PlantResult) -> None:
-        done.append(result)
-        if progress is not None:
-            progress(float(len(done)))
-
     try:
-        if workers == 1:
-            for task in tasks:
-                take(run_plant(task))
-        else:
-            _run_in_processes(tasks, workers, take)
+        with closing(workers.results(run_plant, tasks)) as results:
+            for result in results:
+                done.append(result)
+                if progress is not None:
+                    progress(float(len(done)))
     except KeyboardInterrupt:
         interrupted = True
     done.sort(key=lambda result: result.index)
     return StudyResult(tuple(c.name for c in order), tuple(done), interrupted)
-
-
-def _run_in_processes(tasks: list[PlantTask], workers: int, take: Callable[[PlantResult], None]) -> None:
-    """Spawned, not forked: nothing of this process (threads, open buses) is to be inherited."""
-    before = set(multiprocessing.active_children())
-    executor = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
-    ended = False
-    try:
-        with interrupts_left_to_the_parent():
-            pending: set[Future[PlantResult]] = {executor.submit(run_plant, task) for task in tasks}
-        while pending:
-            finished, pending = wait(pending, return_when=FIRST_COMPLETED)
-            for future in finished:
-                take(future.result())
-        ended = True
-    finally:
-        # after an interruption or an error nobody wants the plants that are still being simulated
-        executor.shutdown(wait=ended, cancel_futures=True)
-        if not ended:
-            for process in set(multiprocessing.active_children()) - before:
-                process.terminate()
 
 
 def write_csv(result: StudyResult, path: Path) -> None:

@@ -292,7 +292,7 @@ def _draw(axes: np.ndarray, records: np.ndarray, with_network: bool) -> None:
     draw(axes[0], records["desired_position_rad"], "desired", ORANGE, linestyle="--")
     axes[0].set_ylabel("joint angle [rad]")
     draw(axes[1], records["error_rad"] * 1e3, "error", BLUE)
-    axes[1].set_ylabel("error q - q$_d$ [mrad]")
+    axes[1].set_ylabel("error q - q_d [mrad]")
     draw(axes[2], records["command_torque_Nm"], "command", INK, powered=False, linewidth=1.4)
     for name, color in _PARTS.items():
         values = records[f"{name}_torque_Nm"]

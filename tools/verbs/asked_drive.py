@@ -8,14 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.tools.verbs.verb_options import BusOptions, CanOptions, loaded, place
+from jointctl.tools.verbs.verb_options import BusOptions, CanOptions, configurations, loaded, place
 
 if TYPE_CHECKING:
     from jointctl.tools.inspection.subject import Subject
     from jointctl.tools.verbs.bench_drive import Asked
 
 MaybeConfig = Annotated[
-    Path | None, typer.Argument(metavar="[CONFIG]", help="configuration; without it give the bus by -i and -c")
+    Path | None,
+    typer.Argument(
+        metavar="[CONFIG]",
+        help="configuration; without it give the bus by -i and -c",
+        autocompletion=configurations,
+    ),
 ]
 Eds = Annotated[Path | None, typer.Option("--eds", help="EDS or DCF file of the node; default: the configuration's")]
 

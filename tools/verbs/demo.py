@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.tools.verbs.verb_options import VerbOutput, config_path
+from jointctl.tools.verbs.verb_options import VerbOutput, config_path, configurations
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.config import Config
@@ -19,7 +19,9 @@ PATIENCE_S = 0.15  # a shared computer may stand still for so long; here only si
 
 
 def demo(
-    config: Annotated[Path, typer.Option("--config", help="configuration with a virtual joint")] = Path("virtual"),
+    config: Annotated[
+        Path, typer.Option("--config", help="configuration with a virtual joint", autocompletion=configurations)
+    ] = Path("virtual"),
     *,
     duration_s: Annotated[float | None, typer.Option("--duration", help="seconds of the trajectory", min=0.1)] = None,
     output: VerbOutput,

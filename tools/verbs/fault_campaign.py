@@ -9,7 +9,7 @@ import typer
 
 from jointctl.drivers.errors import INTERRUPTED, UsageError
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.verb_options import Report, VerbOutput, Workers, loaded
+from jointctl.tools.verbs.verb_options import ConfigPath, ManyRuns, Report, VerbOutput, loaded
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.config import Config
@@ -21,7 +21,7 @@ LARGEST = 2**31 - 1  # of a seed or of a scenario's number
 SHOWN = 20
 
 
-def _joint(config: Annotated[Path, typer.Argument(metavar="CONFIG")] = Path("virtual")) -> Config:
+def _joint(config: ConfigPath = Path("virtual")) -> Config:
     return loaded(config)
 
 
@@ -42,7 +42,7 @@ def fault_campaign(
         bool, typer.Option("--program", help="while a program sends set-points, which may fail too")
     ] = False,
     folder: Annotated[Path, typer.Option("--folder", help="for report, JSON and picture")] = Path("fault-campaign"),
-    workers: Workers = None,
+    workers: ManyRuns = None,
     report: Report = None,
 ) -> int:
     """Random faults on random joints in lockstep; every safety invariant is checked in every scenario."""
@@ -57,6 +57,7 @@ def fault_campaign(
         write_json,
     )
     from jointctl.tools.experiments.judge import require_fit
+    from jointctl.tools.experiments.many_runs import HERE
     from jointctl.tools.recording.report_page import check_target
     from jointctl.tools.written_file import prepare_folder
 
@@ -71,7 +72,7 @@ def fault_campaign(
         check_target(report)
     prepare_folder(folder)
     with output.progress("fault campaign", float(count)) as advance:
-        verdicts, elapsed_s, interrupted = run_campaign(config.path, seed, count, advance, workers, during)
+        verdicts, elapsed_s, interrupted = run_campaign(config, seed, count, advance, workers or HERE, during)
     rows = rows_by_kind(verdicts)
     found = violations(verdicts, seed, during)
     figure = campaign_figure(verdicts, config.limits.velocity_max_radps)

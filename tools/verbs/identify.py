@@ -15,7 +15,7 @@ import typer
 
 from jointctl.drivers.errors import ConfigurationError, DataError
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.verb_options import Report, VerbOutput, config_path
+from jointctl.tools.verbs.verb_options import Report, VerbOutput, config_path, configuration_files, configurations
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -197,9 +197,17 @@ def identify(
     data_path: Data,
     output: VerbOutput,
     *,
-    into: Annotated[Path | None, typer.Option("--into", help="configuration whose friction section to replace")] = None,
+    into: Annotated[
+        Path | None,
+        typer.Option(
+            "--into", help="configuration whose friction section to replace", autocompletion=configuration_files
+        ),
+    ] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="TOML file to write instead")] = None,
-    config: Annotated[Path | None, typer.Option("--config", help="configuration to check plausibility against")] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", help="configuration to check plausibility against", autocompletion=configurations),
+    ] = None,
     given: GivenFormat = None,
     options: Fit = None,
     report: Report = None,

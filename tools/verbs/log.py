@@ -10,7 +10,7 @@ from rich.console import Group
 from rich.table import Column, Table
 
 from jointctl.drivers.errors import DataError
-from jointctl.tools.verbs.verb_options import ResultOutput, grouped
+from jointctl.tools.verbs.verb_options import ResultOutput, Verb, Verbs, grouped
 
 if TYPE_CHECKING:
     from jointctl.tools.recording.run_log_reader import RunLog
@@ -135,6 +135,8 @@ def _target(path: Path, out: Path | None, ending: str) -> Path:
     return target
 
 
-log_app = typer.Typer(help="Look at a run log: what it holds, a picture, other formats.", no_args_is_help=True)
+log_app = typer.Typer(
+    cls=Verbs, help="Look at a run log: what it holds, a picture, other formats.", no_args_is_help=True
+)
 for _verb in (log_info, log_plot, log_export):
-    log_app.command(_verb.__name__.removeprefix("log_"))(grouped(_verb))
+    log_app.command(_verb.__name__.removeprefix("log_"), cls=Verb)(grouped(_verb))

@@ -36,7 +36,7 @@ from jointctl.tools.verbs.stop import stop
 from jointctl.tools.verbs.study import study_verb
 from jointctl.tools.verbs.sweep import sweep
 from jointctl.tools.verbs.validate import validate
-from jointctl.tools.verbs.verb_options import BEGIN, COMPARE, FRICTION, INSPECT, LOOK, MOVE, grouped
+from jointctl.tools.verbs.verb_options import BEGIN, COMPARE, FRICTION, INSPECT, LOOK, MOVE, Verb, Verbs, grouped
 from jointctl.tools.verbs.zero import zero
 
 TRACEBACK = "JOINTCTL_TRACEBACK"  # in the environment: show where an unexpected error comes from
@@ -48,6 +48,7 @@ EPILOG = (
 
 app = typer.Typer(
     name="jointctl",
+    cls=Verbs,
     no_args_is_help=True,
     add_completion=True,
     pretty_exceptions_enable=False,
@@ -81,7 +82,7 @@ for _panel, _verbs in (
 ):
     for _verb in _verbs:
         _name = _verb.__name__.removesuffix("_verb").replace("_", "-")
-        app.command(_name, rich_help_panel=_panel)(grouped(_verb))
+        app.command(_name, cls=Verb, rich_help_panel=_panel)(grouped(_verb))
 app.add_typer(params_app, name="params", rich_help_panel=INSPECT)
 app.add_typer(log_app, name="log", rich_help_panel=LOOK)
 

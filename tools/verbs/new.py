@@ -12,7 +12,7 @@ import typer
 
 from jointctl.drivers.errors import ConfigurationError, DataError, UsageError
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.verb_options import Bitrate, Channel, Interface, ProgressOutput
+from jointctl.tools.verbs.verb_options import Bitrate, Channel, Interface, ProgressOutput, shipped_configurations
 
 if TYPE_CHECKING:
     from jointctl.tools.inspection.first_values import Mark, Place
@@ -39,7 +39,10 @@ def new(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="configuration to write (TOML)")],
     output: ProgressOutput,
     *,
-    shipped: Annotated[str, typer.Option("--from", help="name of the shipped configuration")] = "elmo_gold_can",
+    shipped: Annotated[
+        str,
+        typer.Option("--from", help="name of the shipped configuration", autocompletion=shipped_configurations),
+    ] = "elmo_gold_can",
     drive: DriveOptions = NOBODY,
     no_input: Annotated[bool, typer.Option("--no-input", help="ask nothing; what is open stays marked")] = False,
 ) -> int:

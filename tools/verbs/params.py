@@ -13,7 +13,7 @@ from rich.table import Table
 from jointctl.drivers.errors import DECLINED, ConfigurationError, DataError, DeviceError
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.asked_drive import NodeWithEds, subject_of
-from jointctl.tools.verbs.verb_options import CanOptions, VerbOutput, grouped
+from jointctl.tools.verbs.verb_options import CanOptions, Verb, VerbOutput, Verbs, grouped
 
 if TYPE_CHECKING:
     from jointctl.tools.inspection.objects import Objects
@@ -237,13 +237,13 @@ def place_index(text: str) -> int:
     return Place(index).index
 
 
-params_app = typer.Typer(help="All objects of a drive to a file and back.", no_args_is_help=True)
+params_app = typer.Typer(cls=Verbs, help="All objects of a drive to a file and back.", no_args_is_help=True)
 
 
-params_app.command("dump")(grouped(dump))
+params_app.command("dump", cls=Verb)(grouped(dump))
 
 
-@params_app.command("restore")
+@params_app.command("restore", cls=Verb)
 @grouped
 def params_restore(
     *,
@@ -261,7 +261,7 @@ def params_restore(
     return restore_file(subject, file, output, assume_yes=yes, other_device=other_device, skip=indices)
 
 
-@params_app.command("diff")
+@params_app.command("diff", cls=Verb)
 @grouped
 def params_diff(
     *,

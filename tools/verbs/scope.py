@@ -11,7 +11,14 @@ import typer
 
 from jointctl.drivers.errors import DECLINED, INTERRUPTED, JointctlError
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.verb_options import AS_CONFIGURED, AllowLowMargin, CanOptions, ProgressOutput, loaded
+from jointctl.tools.verbs.verb_options import (
+    AS_CONFIGURED,
+    AllowLowMargin,
+    CanOptions,
+    ProgressOutput,
+    loaded,
+    logs_and_configurations,
+)
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.config import Config
@@ -24,7 +31,14 @@ PREPARED_S = 300.0  # what was found and shown holds for so long; then the run i
 
 
 def scope(
-    path: Annotated[Path, typer.Argument(metavar="LOG|CONFIG", help="run log (MCAP), or configuration of a joint")],
+    path: Annotated[
+        Path,
+        typer.Argument(
+            metavar="LOG|CONFIG",
+            help="run log (MCAP), or configuration of a joint",
+            autocompletion=logs_and_configurations,
+        ),
+    ],
     output: ProgressOutput,
     *,
     host: Annotated[str, typer.Option("--host", help="address to serve at")] = HOST,

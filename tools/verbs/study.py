@@ -12,10 +12,11 @@ from rich.table import Column, Table
 
 from jointctl.drivers.errors import INTERRUPTED, ConfigurationError
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.verb_options import Report, VerbOutput, Workers
+from jointctl.tools.verbs.verb_options import ManyRuns, Report, VerbOutput, configurations
 
 if TYPE_CHECKING:
     from jointctl.tools.experiments.controller_study import StudyResult, StudySettings
+    from jointctl.tools.experiments.many_runs import Workers
 
 _COLUMNS = (
     ("peak_mrad", "peak [mrad]"),
@@ -35,7 +36,7 @@ def study(
     output: Output,
     *,
     file: Path | None = None,
-    workers: int | None = None,
+    workers: Workers | None = None,
     csv: Path | None = None,
     figure: Path | None = None,
     report: Path | None = None,
@@ -50,6 +51,7 @@ def study(
     from jointctl.tools.drawing import require_png, save_png
     from jointctl.tools.experiments.controller_study import run_study, study_controllers, write_csv
     from jointctl.tools.experiments.controllers import controller_config
+    from jointctl.tools.experiments.many_runs import HERE
     from jointctl.tools.recording.report_page import check_target
     from jointctl.tools.written_file import prepare_target, refuse_overwriting
 
@@ -70,7 +72,7 @@ def study(
         controller_config(base, controller)  # a contradiction is to be reported before an hour of simulation
     title = f"{settings.plants} plants, seed {settings.seed}, {settings.scenario}"
     with output.progress(title, settings.plants) as advance:
-        result = run_study(base, controllers, settings, workers=workers, progress=advance)
+        result = run_study(base, controllers, settings, workers=workers or HERE, progress=advance)
     done = len(result.plants)
     if result.interrupted:
         title = f"INTERRUPTED: {done} of {title}"
@@ -171,9 +173,13 @@ class StudyFlags:
     after_s: Annotated[float | None, typer.Option("--after", help="errors are taken after this time (s)")] = None
     scenario: Annotated[str | None, typer.Option("--scenario", help="sine, frequency, amplitude or load")] = None
     controllers: Annotated[
-        list[str] | None, typer.Option("--controller", help="name or configuration file; may be repeated")
+        list[str] | None,
+        typer.Option("--controller", help="name or configuration file; may be repeated", autocompletion=configurations),
     ] = None
-    base: Annotated[str | None, typer.Option("--base", help="configuration of the joint: name or file")] = None
+    base: Annotated[
+        str | None,
+        typer.Option("--base", help="configuration of the joint: name or file", autocompletion=configurations),
+    ] = None
 
 
 def with_plants(settings: StudySettings, given: list[str]) -> StudySettings:
@@ -195,7 +201,7 @@ def study_verb(
     *,
     file: Annotated[Path | None, typer.Option("--file", help="TOML with plants, seed and controllers")] = None,
     flags: StudyFlags,
-    workers: Workers = None,
+    workers: ManyRuns = None,
     csv: Annotated[Path | None, typer.Option("--csv", help="file for all single results")] = None,
     figure: Annotated[Path | None, typer.Option("--figure", help="PNG with a box plot")] = None,
     report: Report = None,

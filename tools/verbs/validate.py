@@ -10,7 +10,7 @@ import typer
 
 from jointctl.drivers.errors import ConfigurationError, DataError
 from jointctl.tools.verbs.identify import Data, GivenFormat, joint_limits
-from jointctl.tools.verbs.verb_options import VerbOutput, config_path
+from jointctl.tools.verbs.verb_options import VerbOutput, config_path, configurations
 
 if TYPE_CHECKING:
     import numpy as np
@@ -63,7 +63,12 @@ def model_errors_Nm(data: FrictionData, branches: dict[str, Branch]) -> tuple[np
 
 
 def validate(
-    path: Annotated[Path, typer.Argument(metavar="CONFIG", help="configuration with the identified friction section")],
+    path: Annotated[
+        Path,
+        typer.Argument(
+            metavar="CONFIG", help="configuration with the identified friction section", autocompletion=configurations
+        ),
+    ],
     data_path: Data,
     output: VerbOutput,
     *,

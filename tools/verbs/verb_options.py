@@ -11,25 +11,58 @@ from __future__ import annotations
 
 import inspect
 import os
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, is_dataclass, replace
-from functools import wraps
+from functools import partial, wraps
+from importlib import resources
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
+from jointctl.drivers.errors import UsageError
 from jointctl.tools.output import Output
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.config import Config
     from jointctl.tools.configuration.drive_section import GivenPlace
+    from jointctl.tools.experiments.many_runs import Workers
 
 # headings of `jointctl --help`
 BEGIN, MOVE, INSPECT, FRICTION = "Begin", "Move a joint", "Look at a bus and a drive", "Friction"
 LOOK, COMPARE = "Look at a run", "Compare and measure"
+
+
+def shipped_configurations(begun: str) -> list[str]:
+    """For the shell's completion: names of shipped configurations."""
+    names = (Path(file.name) for file in resources.files("jointctl.configs").iterdir())
+    return sorted(name.stem for name in names if name.suffix == ".toml" and name.stem.startswith(begun))
+
+
+def _files(begun: str, pattern: str) -> list[str]:
+    folder, name = os.path.split(begun)
+    files = (path.name for path in Path(folder).glob(pattern))
+    return sorted(os.path.join(folder, file) for file in files if file.startswith(name))
+
+
+def configuration_files(begun: str) -> list[str]:
+    """For the shell's completion: TOML files; with none the shell goes on with folders."""
+    return _files(begun, "*.toml")
+
+
+def configurations(begun: str) -> list[str]:
+    """For the shell's completion: shipped configurations, and files of joints."""
+    return [*shipped_configurations(begun), *configuration_files(begun)]
+
+
+def logs_and_configurations(begun: str) -> list[str]:
+    """For the shell's completion: run logs as well."""
+    return [*_files(begun, "*.mcap"), *configurations(begun)]
+
 
 Interface = Annotated[str | None, typer.Option("-i", "--interface", help="python-can interface (env CAN_INTERFACE)")]
 Channel = Annotated[
@@ -47,14 +80,16 @@ Report = Annotated[
     Path | None, typer.Option("--report", metavar="FILE.html", help="the result as one self-contained page as well")
 ]
 ConfigPath = Annotated[
-    Path, typer.Argument(metavar="CONFIG", help="configuration file (TOML), or the name of a shipped one")
+    Path,
+    typer.Argument(
+        metavar="CONFIG", help="configuration file (TOML), or the name of a shipped one", autocompletion=configurations
+    ),
 ]
 Yes = Annotated[bool, typer.Option("-y", "--yes", help="move without asking")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="commission, show the motion envelope, move nothing")]
 AllowLowMargin = Annotated[
     bool, typer.Option("--allow-low-margin", help="run a stable loop below the wanted phase margin")
 ]
-Workers = Annotated[int | None, typer.Option("--workers", help="processes; default: one a core")]
 
 
 @dataclass(frozen=True)
@@ -103,6 +138,55 @@ def loaded(config: Path, bus: CanOptions = AS_CONFIGURED) -> Config:
     return moved(found, place(bus))
 
 
+# --- What the command line makes of an option besides ---
+
+_WITH_UNIT = re.compile(r"\s*[-+]?[\d.].*[^\W\d_].*|\s*[-+]?[\d.].*[%‰°]\s*")
+
+
+def _with_units(parse: Callable[..., Any], args: list[str]) -> Any:
+    """What was given by name of option: a quantity in a unit of its kind, "30 deg" for `angle_rad`, as a number."""
+    given, *rest = parse(args)
+    for name, text in given.items():
+        if not (isinstance(text, str) and _WITH_UNIT.fullmatch(text)):
+            continue
+        from jointctl.tools.configuration.load import echo, understood  # takes its time
+
+        if (number := understood(name, text)) is not None:
+            Output().note(echo(name, text, number))
+            given[name] = repr(number)
+    return given, *rest
+
+
+class Verb(TyperCommand):
+    """A flag shows no type in the help; a number whose name has a unit may be given in another one."""
+
+    def make_parser(self, ctx: Any) -> Any:
+        """The parser, and then the units."""
+        parser = super().make_parser(ctx)
+        vars(parser)["parse_args"] = partial(_with_units, parser.parse_args)
+        return parser
+
+    def get_params(self, ctx: Any) -> Any:
+        """Those that a page of help shows."""
+        return without_types_of_flags(super().get_params(ctx))
+
+
+class Verbs(TyperGroup):
+    """A flag shows no type in the help."""
+
+    def get_params(self, ctx: Any) -> Any:
+        """Those that a page of help shows."""
+        return without_types_of_flags(super().get_params(ctx))
+
+
+def without_types_of_flags(options: Any) -> Any:
+    """The same: where nothing can be given there is no word for it."""
+    for option in options:
+        if getattr(option, "is_flag", False) and option.metavar is None:
+            option.metavar = ""
+    return options
+
+
 # --- Parameters that several options build ---
 
 
@@ -130,6 +214,24 @@ def _output(json: Json = False, quiet: Quiet = False) -> Output:
     return Output(json=json, quiet=quiet)
 
 
+def _workers(
+    workers: Annotated[int | None, typer.Option("--workers", help="processes; default: one a core", min=1)] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option("--cluster", metavar="TCP://HOST:PORT", help="on the workers of a dask scheduler (extra cluster)"),
+    ] = None,
+    cluster_unprotected: Annotated[
+        bool, typer.Option("--cluster-unprotected", help="also without TLS on another computer: docs/cluster.md")
+    ] = False,
+) -> Workers:
+    from jointctl.tools.experiments.many_runs import Workers
+
+    if cluster is not None and workers is not None:
+        raise UsageError("--workers and --cluster exclude each other: the cluster has its own workers")
+    return Workers(workers, cluster, cluster_unprotected, Output().warning)
+
+
+ManyRuns = Annotated["Workers | None", _workers]  # where many runs are carried out
 JointOnBus = Annotated["Config", _loaded]
 JointOfFile = Annotated["Config", _loaded_file]
 JointOrVirtual = Annotated["Config", _loaded_or_virtual]

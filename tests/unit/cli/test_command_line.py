@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import re
 import subprocess
@@ -176,6 +177,60 @@ def test_without_a_verb_the_help_is_shown(words: list[str]) -> None:
 
 def test_help_is_no_error() -> None:
     assert run("run", "--help").returncode == 0
+
+
+# --- What the shell completes, how a flag is shown, quantities with a unit ---
+def completed(words: str, folder: Path) -> list[str]:
+    """What bash is given for the last word, by the protocol of the script that `--show-completion` prints."""
+    code = "import sys; sys.argv[0] = 'jointctl'; from jointctl.tools.verbs.start import main; main()"
+    asked = {"COMP_WORDS": words, "COMP_CWORD": str(words.count(" ")), "_JOINTCTL_COMPLETE": "complete_bash"}
+    command = [sys.executable, "-P", "-c", code]
+    shown = subprocess.run(
+        command, capture_output=True, text=True, timeout=60.0, cwd=folder, env={**os.environ, **asked}
+    )
+    assert shown.stderr == ""
+    return shown.stdout.split()
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("jointctl run pa", ["paper", "pallet.toml"]),
+        ("jointctl check cell/pal", ["cell/pallet_2.toml"]),
+        ("jointctl check cell", []),  # a folder is the shell's own matter
+        ("jointctl info -i virtual vir", ["virtual"]),
+        ("jointctl new mine.toml --from elmo_s", ["elmo_serial"]),
+        ("jointctl identify data.csv --into pa", ["pallet.toml"]),
+        ("jointctl study --controller pre", ["precise"]),
+        ("jointctl scope pa", ["palletising.mcap", "paper", "pallet.toml"]),
+    ],
+)
+def test_the_shell_completes_configurations_and_files_of_joints(
+    tmp_path: Path, words: str, expected: list[str]
+) -> None:
+    (tmp_path / "cell").mkdir()
+    for name in ("pallet.toml", "cell/pallet_2.toml", "palletising.mcap", "pallet.csv"):
+        (tmp_path / name).touch()
+    assert completed(words, tmp_path) == expected
+
+
+@pytest.mark.parametrize(("words", "command"), [pytest.param(*both, id="-".join(both[0])) for both in commands()])
+def test_a_flag_shows_no_type(words: tuple[str, ...], command: Any) -> None:
+    assert "<bool>" not in CliRunner().invoke(app, [*words, "--help"], env={"COLUMNS": "80"}).output
+
+
+@pytest.mark.parametrize(("text", "delay_s"), [("1.5 ms", 0.0015), ("1500us", 0.0015), ("0.0015", 0.0015)])
+def test_an_option_takes_a_quantity_with_its_unit(text: str, delay_s: float) -> None:
+    done = run("check", "virtual", "--json", "--delay", text)
+    assert json.loads(done.stdout)["assumptions"][1]["value"] == pytest.approx(delay_s)
+    assert done.stderr == ("" if text == "0.0015" else f"{text} is read as 0.0015 s\n")
+
+
+@pytest.mark.parametrize("text", ["1.5 rpm", "1.5 m", "-1 ms"])
+def test_what_is_no_such_quantity_is_refused(text: str) -> None:
+    done = run("check", "virtual", "--delay", text)
+    assert done.returncode == 2
+    assert "'--delay'" in done.stderr
 
 
 # --- Options that stand in a dataclass reach the verb as one object; the command line shows them one by one ---
