@@ -29,6 +29,8 @@ _KINDS = (
     (stat.S_ISBLK, "a device"),
     (stat.S_ISSOCK, "a socket"),
 )
+# not blocking: it may have become a FIFO in the meantime; where there are texts and bytes, bytes
+_FLAGS = sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_BINARY"))
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
@@ -36,8 +38,7 @@ def open_input(path: str | Path, largest_bytes: int) -> IO[bytes]:
     """A regular file, open for reading; nothing else is opened, since that alone can do something to a device."""
     try:
         _check(os.stat(path), path, largest_bytes)
-        # not blocking: it may have become a FIFO in the meantime
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+        descriptor = os.open(path, os.O_RDONLY | _FLAGS)
     except ValueError:  # a zero or half a character in it
         raise OSError(errno.EINVAL, "is no name of a file", str(path)) from None
     try:

@@ -20,6 +20,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import platform
 import shutil
 import sys
 import time
@@ -43,7 +44,7 @@ _KEPT_CACHES = 4
 def source_hash(root: Path | None = None) -> str:
     """Hash (16 hex digits) of every source that can hold a kernel or a constant of one, and of interpreter and CPU."""
     root = root or Path(__file__).resolve().parent.parent
-    digest = hashlib.sha256(f"{sys.version}{os.uname().machine}".encode())
+    digest = hashlib.sha256(f"{sys.version}{platform.machine()}".encode())
     for pattern in _KERNEL_SOURCES:
         for path in sorted(root.glob(pattern)):
             digest.update(str(path.relative_to(root)).encode())

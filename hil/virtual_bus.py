@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import ctypes
 import errno as errno_codes
-import fcntl
 import os
 import re
 import signal
@@ -383,6 +382,13 @@ def _lock_path(path: Path) -> Path:
     return Path(f"{path}.lock")
 
 
+def _take(lock: int) -> None:
+    """The lock of an open file; BlockingIOError where another hub holds it."""
+    from fcntl import LOCK_EX, LOCK_NB, flock  # not every system has it, and the simulation loads this module
+
+    flock(lock, LOCK_EX | LOCK_NB)
+
+
 def _lock(path: Path) -> int:
     """Descriptor of the locked file beside the socket; BlockingIOError when a hub holds it.
 
@@ -394,7 +400,7 @@ def _lock(path: Path) -> int:
     while True:
         lock = os.open(name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _take(lock)
             if os.path.samestat(os.fstat(lock), os.stat(name)):
                 return lock
         except FileNotFoundError:  # between our open and our lock, its hub has stopped
@@ -417,7 +423,7 @@ def remove_dead_sockets(folder: Path) -> int:
         except OSError:
             continue
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _take(lock)
             if os.path.samestat(os.fstat(lock), os.stat(name)):
                 name.with_suffix("").unlink(missing_ok=True)
                 name.unlink()

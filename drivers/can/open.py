@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import logging
 import os
 import socket
@@ -84,8 +83,10 @@ def reserved_port(channel: str, *, exclusive: bool) -> Iterator[None]:
 
 def lock_port(descriptor: int, path: str) -> None:
     """Keep others off as long as the descriptor is open; `BusError` names the program that has the port."""
+    from fcntl import LOCK_EX, LOCK_NB, flock  # not every system has it, and each verb loads this module
+
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        flock(descriptor, LOCK_EX | LOCK_NB)
     except OSError:
         users = users_text(path)
         raise BusError(

@@ -50,7 +50,7 @@ def _require_descriptors() -> None:
     opened: list[int] = []
     try:
         while len(opened) < FREE_DESCRIPTORS:
-            opened.append(os.open("/dev/null", os.O_RDONLY | os.O_CLOEXEC))
+            opened.append(os.open(os.devnull, os.O_RDONLY))
     except OSError as error:
         if error.errno in (errno.EMFILE, errno.ENFILE):
             sys.stderr.write(
