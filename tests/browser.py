@@ -91,11 +91,17 @@ class Tab:
             self.call("Input.dispatchMouseEvent", type=kind, x=box[0], y=box[1], button="left", clickCount=1)
 
     def enter(self, name: str, text: str) -> None:
-        """Type into a field, whatever stood there."""
+        """Type into a field, whatever stood there; again if a value that was on its way came between, as one sees."""
         found = f"document.querySelector('input[data-testid=\"{name}\"]')"
+        give_up = time.monotonic() + 10.0
         self.until(found + " !== null")
-        self.js(f"{found}.focus(); {found}.select(); null")
-        self.call("Input.insertText", text=text)
+        while True:
+            self.js(f"{found}.focus(); {found}.select(); null")
+            self.call("Input.insertText", text=text)
+            time.sleep(0.3)  # until the page has what was typed, and would have undone it
+            if self.js(f"{found}.value") == text:
+                break
+            assert time.monotonic() < give_up, f"{name} never shows {text}"
         self.js(f"{found}.blur(); null")
 
     def picture(self, path: Path) -> None:

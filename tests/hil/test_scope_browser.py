@@ -301,6 +301,58 @@ def test_pause_zoom_and_trigger(bench: Any, browser: Browser) -> None:
     assert tab.js(LAST_s) == held
 
 
+def test_cursors_views_and_export(bench: Any, browser: Browser, tmp_path: Path) -> None:
+    _, tab, _ = opened(bench, browser)
+    start(tab)
+    moves(tab)
+    time.sleep(5.0)
+    tab.click("cursors")  # holds the picture
+    tab.until("document.querySelector('[data-testid=\"pause\"]').getAttribute('aria-checked') === 'true'")
+    tab.until(f"{ZOOM}.getOption().series[0].markLine.data.length === 2")
+    tab.enter("cursor-a", "2")
+    tab.enter("cursor-b", "2.5")
+    tab.until("document.querySelector('[data-testid=\"readings\"]').innerText.includes('1/(B - A) = 2 Hz')")
+    held = tab.text("readings")
+    assert [line.split()[0] for line in held.splitlines()[2:]] == ["desired", "angle", "command"]
+    x, y = tab.js(
+        f"(c => [...c.convertToPixel({{xAxisIndex: 0, yAxisIndex: 0}}, [3, 0])].map((v, i) => v + [c.getDom()."
+        f"getBoundingClientRect().x, c.getDom().getBoundingClientRect().y][i]))({ZOOM})"
+    )
+    for kind in ("mousePressed", "mouseReleased"):
+        tab.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+    tab.until("Math.abs(document.querySelector('input[data-testid=\"cursor-a\"]').value - 3) < 0.05")
+
+    folder = tmp_path / "downloads"
+    tab.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
+    tab.js(f"{ZOOM}.dispatchAction({{type: 'dataZoom', startValue: 1, endValue: 2}}); null")
+    time.sleep(0.5)
+    tab.click("csv")
+    tab.click("png")
+    rows = [line.split(",") for line in downloaded(folder / "jointctl-time.csv").decode().splitlines()]
+    assert rows[0] == ["time [s]", "desired angle [rad]", "angle [rad]", "command torque [Nm]"]
+    assert 0.999 <= float(rows[1][0]) < float(rows[-1][0]) <= 2.001
+    assert len(rows) > 900  # every sample, not the drawn ones
+    assert downloaded(folder / "jointctl-time.png").startswith(b"\x89PNG")
+
+    for view, axis in (("x-y", "desired angle [rad]"), ("spectrum", "frequency [Hz]"), ("time", "s")):
+        buttons = "[...document.querySelectorAll('[data-testid=\"view\"] button')]"
+        tab.js(f"{buttons}.find(b => b.innerText === '{view}').click(); null")
+        tab.until(f"{ZOOM}.getOption().xAxis[0].name === '{axis}'")
+        assert tab.js(CONTRASTS) == ""
+    tab.click("stop")
+    state_is(tab, "the run has ended")
+    assert bench.disabled()
+
+
+def downloaded(path: Path) -> bytes:
+    give_up = time.monotonic() + 20.0
+    while not path.exists() or not path.stat().st_size:
+        assert time.monotonic() < give_up, list(path.parent.glob("*"))
+        time.sleep(0.1)
+    time.sleep(0.3)  # a browser renames it when it is whole
+    return path.read_bytes()
+
+
 def test_a_stalled_or_closed_browser_costs_the_run_nothing(bench: Any, browser: Browser) -> None:
     scope, tab, _ = opened(bench, browser)
     start(tab)

@@ -1,4 +1,4 @@
-"""The scope's picture: chosen signals over time, with pause, zoom and trigger."""
+"""The scope's picture: chosen signals in one of their views, with pause, zoom, trigger, cursors and export."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from nicegui import ui
 
 from jointctl.tools.scoping.history import SIGNALS, History, crossing_s
+from jointctl.tools.scoping.views import AGAINST, SPECTRUM, TIME, TIME_NAME, VIEWS, Seen, readings, seen
 
 SPANS_s = (2, 5, 10, 30, 60)
 FIRST_SIGNALS = ("desired angle [rad]", "angle [rad]", "command torque [Nm]")
@@ -18,7 +19,30 @@ DARK_COLOURS = ("#6fa8e8", "#f0a35e", "#6fce9b", "#ef8791", "#b7a3ea", "#b4bec8"
 _TEXT, _DARK_TEXT = "#333333", "#dddddd"
 # an axis shows at least so much: the noise of a joint at rest is no motion
 LEAST_SPAN = {"[mrad]": 0.2, "[rad]": 2e-3, "[rad/s]": 0.02, "[Nm]": 0.2, "[us]": 20.0}
-_AXIS = {"type": "value", "scale": True, "nameTextStyle": {"fontSize": 12}, "splitLine": {"lineStyle": {"width": 0.6}}}
+# a click where no cursor was set longer ago than the other's sets it; the chart is there some time after the page
+_ON_CLICK = """(function listen() {
+  const chart = getElement(ID)?.chart
+  if (!chart) return setTimeout(listen, 200)
+  chart.getZr().on('click', event => {
+    const at = [event.offsetX, event.offsetY]
+    if (chart.containPixel('grid', at)) emitEvent('cursor-ID', chart.convertFromPixel({xAxisIndex: 0}, at[0]))
+  })
+})()"""
+_ZOOMED = "(zoom => [zoom.startValue, zoom.endValue])(getElement(ID).chart.getOption().dataZoom[0])"
+_SAVE_PNG = """(() => {
+  const link = document.createElement('a')
+  link.href = getElement(ID).chart.getDataURL({type: 'png', pixelRatio: 2, backgroundColor: 'BEHIND'})
+  link.download = 'NAME'
+  link.click()
+})()"""
+_BEHIND, _DARK_BEHIND = "#ffffff", "#121212"
+_AXIS = {
+    "type": "value",
+    "scale": True,
+    "axisLine": {"onZero": False},
+    "nameTextStyle": {"fontSize": 12},
+    "splitLine": {"lineStyle": {"width": 0.6}},
+}
 
 
 def axis_range(low: float, high: float, unit: str) -> tuple[float, float] | None:
@@ -38,8 +62,10 @@ class Chart:
         self._history = history
         self._held_s: float | None = None  # right end of the picture while it stands
         self._drawn: Any = None
-        self._names: list[str] = []
-        self._colours = COLOURS
+        self._names: tuple[str, list[str]] | None = None  # view and signals of the picture
+        self._colours, self._behind = COLOURS, _BEHIND
+        self._seen = Seen("", np.zeros(0), {})
+        self._next_cursor = 0
         with ui.row().classes("w-full items-center gap-3"):
             self._signals = ui.select(list(SIGNALS), value=list(FIRST_SIGNALS), multiple=True, label="signals")
             self._signals.classes("grow min-w-40").props('dense options-dense data-testid="signals"')
@@ -54,12 +80,82 @@ class Chart:
             self._edge = ui.toggle({True: "rising", False: "falling"}, value=True).props("dense no-caps")
             self._level = ui.number("level", value=0.0, format="%.4g").classes("w-24").props("dense")
             ui.label("holds the picture with the crossing in its middle").classes("text-xs scope-aside")
+        self._build_views()
         self._chart = ui.echart(_options()).classes("w-full").style("height: 390px")
         self._chart.props('data-testid="chart" role=img aria-label="the chosen signals over time"')
+        self._readings = ui.label("").style("white-space: pre; overflow-x: auto; font: 12px/1.45 monospace")
+        self._readings.classes("w-full").props('data-testid="readings" role=status')
+        ui.on(f"cursor-{self._chart.id}", lambda event: self._on_click(float(event.args)))
+        ui.run_javascript(_ON_CLICK.replace("ID", str(self._chart.id)))
+        self._show_cursors()
         self.dark(False)
+
+    def _build_views(self) -> None:
+        """The line with view, cursors and export."""
+        with ui.row().classes("w-full items-center gap-3"):
+            self._view = ui.toggle({view: view for view in VIEWS}, value=TIME, on_change=self._on_view)
+            self._view.props('dense no-caps data-testid="view" aria-label="view"')
+            self._cursors = ui.switch("cursors", on_change=self._on_cursors).props('dense data-testid="cursors"')
+            self._places = [ui.number(name, value=0.0, step=0.01, format="%.6g").classes("w-24") for name in "AB"]
+            for name, place in zip("ab", self._places, strict=True):
+                place.props(f'dense data-testid="cursor-{name}"')
+            self._hint = ui.label("a click sets A, the next one B").classes("text-xs scope-aside")
+            ui.space()
+            for name, save in (("CSV", self._save_csv), ("PNG", self._save_png)):
+                button = ui.button(name, on_click=save, color=None).props("flat dense no-caps")
+                button.props(f'data-testid="{name.lower()}" title="what is seen, as {name}"')
+
+    def _on_view(self) -> None:
+        self._names = None  # the zoom and the axes begin anew
+        self._drawn = None
+        self._cursors.set_enabled(self._view.value != AGAINST)
+        if self._view.value == AGAINST:
+            self._cursors.value = False
+        elif self._cursors.value:
+            self.refresh()
+            self._place_cursors()
+
+    def _on_cursors(self) -> None:
+        if self._cursors.value:
+            self._pause.value = True
+            self._place_cursors()
+        self._show_cursors()
+
+    def _place_cursors(self) -> None:
+        """At a third and two thirds of the picture."""
+        if len(self._seen.x):
+            low, high = float(self._seen.x[0]), float(self._seen.x[-1])
+            for place, share in zip(self._places, (1 / 3, 2 / 3), strict=True):
+                place.value = round(low + share * (high - low), 4)
+
+    def _show_cursors(self) -> None:
+        for part in (*self._places, self._hint, self._readings):
+            part.visible = bool(self._cursors.value)
+        self._drawn = None
+
+    def _on_click(self, x: float) -> None:
+        if self._cursors.value:
+            self._places[self._next_cursor].value = round(x, 6)
+            self._next_cursor = 1 - self._next_cursor
+
+    def _cursor_places(self) -> list[float]:
+        return [float(place.value) for place in self._places if place.value is not None] if self._cursors.value else []
+
+    async def _save_csv(self) -> None:
+        """Every sample that stands in the picture, zoom included."""
+        low, high = await ui.run_javascript(_ZOOMED.replace("ID", str(self._chart.id)))
+        ui.download.content(self._seen.csv(float(low), float(high)), self._file_name("csv"))
+
+    def _save_png(self) -> None:
+        script = _SAVE_PNG.replace("ID", str(self._chart.id)).replace("BEHIND", self._behind)
+        ui.run_javascript(script.replace("NAME", self._file_name("png")))
+
+    def _file_name(self, ending: str) -> str:
+        return f"jointctl-{self._view.value}.{ending}"
 
     def dark(self, on: bool) -> None:
         self._colours, text = (DARK_COLOURS, _DARK_TEXT) if on else (COLOURS, _TEXT)
+        self._behind = _DARK_BEHIND if on else _BEHIND
         options, plain = self._chart.options, {"color": text}
         options["textStyle"], options["legend"]["textStyle"] = plain, plain
         options["xAxis"] |= {"nameTextStyle": plain, "axisLabel": {**options["xAxis"]["axisLabel"], **plain}}
@@ -90,7 +186,8 @@ class Chart:
             self._look_for_trigger(rows, span_s)
             rows = self._history.newest(span_s, self._held_s)
         names = list(self._signals.value or [])
-        now = (int(rows["time_ns"][0]), int(rows["time_ns"][-1]), names, span_s)
+        ends = int(rows["time_ns"][0]), int(rows["time_ns"][-1])
+        now = (*ends, names, span_s, self._view.value, self._cursor_places())
         if now != self._drawn:
             self._drawn = now
             self._draw(rows, names)
@@ -109,11 +206,18 @@ class Chart:
             self._pause.value = True
 
     def _draw(self, rows: np.ndarray, names: list[str]) -> None:
+        view, found = self._view.value, seen(self._view.value, self._history, rows, names)
+        over_time = found.x_name == TIME_NAME
+        series: Mapping[str, Sequence[Sequence[float | None]]] = {
+            name: self._history.series(rows, name) if over_time else found.drawn(name) for name in found.columns
+        }
+        self._seen, chosen, names = found, (view, names), list(series)
         units = list(dict.fromkeys(name[name.index("[") :] for name in names))
-        options, series = self._chart.options, {name: self._history.series(rows, name) for name in names}
-        plain = {"color": self._text}
+        options, plain = self._chart.options, {"color": self._text}
+        options["xAxis"]["name"] = "s" if over_time else found.x_name
+        log = {"type": "log"} if view == SPECTRUM else None
         options["yAxis"] = [
-            {**_AXIS, **_ends(unit, series), "name": unit, "position": "left" if i == 0 else "right",
+            {**_AXIS, **(log or _ends(unit, series)), "name": unit, "position": "left" if i == 0 else "right",
              "offset": max(0, i - 1) * 56, "axisLabel": plain, "nameTextStyle": {"fontSize": 12, **plain}}
             for i, unit in enumerate(units or [""])
         ]  # fmt: skip
@@ -124,10 +228,15 @@ class Chart:
              "yAxisIndex": units.index(name[name.index("[") :]), "data": series[name]}
             for i, name in enumerate(names)
         ]  # fmt: skip
-        if names != self._names:  # axes that are left over would stay otherwise; the zoom begins anew
-            self._names = names
-            self._chart.run_chart_method("clear")
+        if names and (places := self._cursor_places()):
+            lines = [{"xAxis": x, "label": {"formatter": "AB"[i], **plain}} for i, x in enumerate(places)]
+            options["series"][0]["markLine"] = {"symbol": "none", "animation": False, "silent": True, "data": lines,
+                                                "lineStyle": {"color": self._text, "width": 1}}  # fmt: skip
+            self._readings.text = readings(found, *places) if len(places) == 2 else ""
         self._chart.update()
+        if chosen != self._names:  # axes that are left over would stay otherwise; the zoom begins anew
+            self._names = chosen
+            self._chart.run_chart_method("setOption", options, True)
 
 
 def _ends(unit: str, series: Mapping[str, Sequence[Sequence[float | None]]]) -> dict[str, float]:

@@ -117,15 +117,18 @@ class History:
         since: np.ndarray = (records["time_ns"] - self._start_ns) * 1e-9
         return since
 
+    def values(self, records: np.ndarray, signal: str) -> np.ndarray:
+        """float64[N] of a signal in its unit; nan where it has no meaning."""
+        field, factor = SIGNALS[signal]
+        values: np.ndarray = np.asarray(records[field], float) * factor
+        return np.where(powered(records), values, np.nan) if field in _OF_THE_LAW else values
+
     def series(self, records: np.ndarray, signal: str) -> list[list[float | None]]:
         """[seconds, value] of a signal, at most about POINTS of them, least and greatest of each stretch.
 
         Where records are missing for GAP_s the value is None: a line across them would show a motion that was not.
         """
-        field, factor = SIGNALS[signal]
-        values = np.asarray(records[field], float) * factor
-        if field in _OF_THE_LAW:
-            values = np.where(powered(records), values, np.nan)
+        values = self.values(records, signal)
         keep = drawn_indices(values, POINTS)
         keep = keep[np.isfinite(values[keep])]
         time_s = self.seconds(records)

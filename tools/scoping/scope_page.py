@@ -175,11 +175,21 @@ UNITS = {"kp": "kp [1/s2]", "kv": "kv [1/s]", "ki": "ki [1/s3]", "observer_radps
 
 
 class Followed:
-    """A field that shows what is in force until a viewer types into it, and again once that is in force."""
+    """A field that shows what is in force until a viewer types into it, and again once that is in force.
+
+    It follows nothing while it has the focus: a new value between two keys would undo what is being typed.
+    """
 
     def __init__(self, field: ui.number, digits: str) -> None:
         self.field, self._digits = field, digits
         self._shown: float | None = _number(field)
+        self.has_focus = False
+
+    def watch_focus(self) -> Followed:
+        """The same; from now on the browser reports when the field gets and loses the focus."""
+        self.field.on("focus", lambda: setattr(self, "has_focus", True), [])
+        self.field.on("blur", lambda: setattr(self, "has_focus", False), [])
+        return self
 
     def _same(self, value: float | None, other: float | None) -> bool:
         """As far as the field shows them: a browser gives back what it shows."""
@@ -194,6 +204,8 @@ class Followed:
 
     def follow(self, now: float) -> None:
         """`now` is in force."""
+        if self.has_focus:
+            return
         if self.typed and not self._same(_number(self.field), now):
             return
         if not self._same(_number(self.field), now):
@@ -218,7 +230,7 @@ class ChangePanels:
             with _card("Set-point"), ui.row().classes("w-full no-wrap items-end gap-2"):
                 self._set_point = ui.number("angle [rad]", value=0.0, step=0.01, format="%.4f")
                 self._set_point.classes("grow").props('dense data-testid="set-point"')
-                self._angle = Followed(self._set_point, ".4f")
+                self._angle = Followed(self._set_point, ".4f").watch_focus()
                 _button("Go", self._go, "go")
             with _card("Trajectory"):
                 kinds = {kind: kind.replace("_", " ") for kind in FIELDS}
@@ -275,7 +287,8 @@ class ChangePanels:
             with self._gain_rows:
                 for name, (low, now, high) in gains.items():
                     field = ui.number(UNITS.get(name, name), value=now, min=low, max=high, format="%.5g")
-                    self._gains[name] = Followed(field.props(f'dense data-testid="gain-{name}"'), ".5g")
+                    field.props(f'dense data-testid="gain-{name}"')
+                    self._gains[name] = Followed(field, ".5g").watch_focus()
         for name, (low, now, high) in gains.items():
             self._gains[name].follow(now)
             self._gains[name].field.props(f'hint="now {now:.5g}, {low:.4g} to {high:.4g}"')

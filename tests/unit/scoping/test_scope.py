@@ -444,6 +444,21 @@ def test_what_was_typed_stays_until_it_is_in_force() -> None:
     assert page.apply() == [("gains", {"kp": None})]  # refused by the supervisor, in words
 
 
+def test_a_field_with_the_focus_follows_nothing() -> None:
+    page = Panels(kp=784.0)
+    followed = page.panels._gains["kp"]
+    followed.has_focus = True
+    page.in_force(kp=700.0)
+    assert page.fields["kp"].value == 784.0
+    page.fields["kp"].value = 78.0  # typed, key by key
+    page.in_force(kp=701.0)
+    assert page.apply() == [("gains", {"kp": 78.0})]
+    page.fields["kp"].value = 784.0  # taken back, and left
+    followed.has_focus = False
+    page.in_force(kp=702.0)
+    assert page.fields["kp"].value == 702.0
+
+
 class Asking:
     """The change panels of one viewer, with a set-point, one gain and one field of a trajectory."""
 
