@@ -28,7 +28,7 @@ TOP = ("firmware_py", "drivers", "hil", "tools", "configs")
 FACE = "interface"
 READ = (
     "docs", "tests", "pyproject.toml", "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "MANIFEST.in",
-    "check", "examples", "mkdocs.yml",
+    "check", "examples", "mkdocs.yml", "release",
 )  # fmt: skip
 BUILD = "import sys, setuptools.build_meta as b; getattr(b, 'build_' + sys.argv[1])(sys.argv[2])"
 
