@@ -93,6 +93,11 @@ class Output:
         self._results = _console(self.stdout, width)
         self._messages = _console(self.stderr)
 
+    @property
+    def for_people(self) -> bool:
+        """Whether results are read as they come; a program gets one, when all is done."""
+        return not self.json and self.taken is None
+
     def result(self, shown: RenderableType, data: object = None, found: object = None) -> None:
         """A result: `shown` for people, `data` (numbers, texts, lists, dicts) with `--json`.
 

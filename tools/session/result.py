@@ -83,28 +83,22 @@ def run_title(config: Config) -> str:
 def report_run(result: RunResult, output: Output, config: Config) -> int:
     """Print and save everything, and a picture unless log.picture forbids it; returns the exit code.
 
-    That is 0, the one of `MotionFault`, or 130 after an interruption.  The cause of a fault comes before all
-    else: on a busy computer the picture takes seconds.  `DeviceError` where the drive did not confirm that it is off;
-    both outweigh the `DataError` of a result that cannot be written.
+    That is 0, the one of `MotionFault`, or 130 after an interruption.  The cause of a fault comes before all else, and
+    what people read before the picture, which takes a second or more.  `DeviceError` where the drive did not confirm
+    that it is off; both outweigh the `DataError` of a result that cannot be written.
     """
     if result.fault_text is not None:
         text = result.fault_text
         output.error(f"{result.fault.name} ({int(result.fault)}): {text.happened}", text.advice)
-    drawn = result.log_path.with_suffix(".png") if config.log.picture else None
-    if drawn is not None:
-        try:
-            save_run_figure(result.records, drawn, run_title(config))
-        except DataError as error:
-            output.warning(error.message)
-            drawn = None
+    drawn = None if output.for_people else _drawn(result, output, config)
     table = summary_table(result.summary)
     table.add_row(*result.load_row)
     table.add_row("drive afterwards", result.drive_state)
     table.add_row("log", str(result.log_path))
-    if drawn is not None:
-        table.add_row("picture", str(drawn))
     try:
         output.result(table, _data(result, drawn), result)
+        if output.for_people and (picture := _drawn(result, output, config)):
+            output.result(f"picture    {picture}")
     except DataError as error:
         if result.fault_text is None:
             require_off(result.drive_state)
@@ -119,6 +113,17 @@ def report_run(result: RunResult, output: Output, config: Config) -> int:
         output.note(f"stopped by {result.stopped_by}; the joint is {result.drive_state}")
         return INTERRUPTED
     return 0
+
+
+def _drawn(result: RunResult, output: Output, config: Config) -> Path | None:
+    """The picture beside the log, if one is wanted; why there is none then is a warning."""
+    if not config.log.picture:
+        return None
+    try:
+        return save_run_figure(result.records, result.log_path.with_suffix(".png"), run_title(config))
+    except DataError as error:
+        output.warning(error.message)
+        return None
 
 
 def _data(result: RunResult, picture: Path | None) -> dict[str, Any]:

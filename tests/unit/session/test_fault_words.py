@@ -338,12 +338,27 @@ def test_the_cause_is_told_before_the_picture_is_drawn(
 ) -> None:
     out, err = io.StringIO(), io.StringIO()
     told: list[str] = []
-    monkeypatch.setattr(run_report, "save_run_figure", lambda *_: told.append(err.getvalue()))
+    shown: list[str] = []
+
+    def draw(records: Any, path: Path, title: str) -> Path:
+        told.append(err.getvalue())
+        shown.append(out.getvalue())
+        return path
+
+    monkeypatch.setattr(run_report, "save_run_figure", draw)
     assert run_report.report_run(result(tmp_path, fault), Output(stdout=out, stderr=err), CONFIG) == code
     assert err.getvalue() == told[0]  # nothing more comes after it
     assert told[0].startswith("error: BUS_ERROR") == (fault is Fault.BUS_ERROR)
     assert ("hint: likely cause" in told[0]) == (fault is Fault.BUS_ERROR)
-    assert "picture" in out.getvalue()
+    assert "run.mcap" in shown[0]  # the result is there before the picture is drawn
+    assert out.getvalue() == f"{shown[0]}picture    {tmp_path / 'run.png'}\n"
+
+
+def test_a_program_gets_one_document_when_the_picture_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = io.StringIO()
+    monkeypatch.setattr(run_report, "save_run_figure", lambda records, path, title: path if not out.getvalue() else 0)
+    run_report.report_run(result(tmp_path, Fault.NONE), Output(json=True, stdout=out), CONFIG)
+    assert json.loads(out.getvalue())["picture"] == str(tmp_path / "run.png")
 
 
 @pytest.mark.parametrize("fault", [Fault.NONE, Fault.BUS_ERROR])
@@ -354,7 +369,7 @@ def test_a_picture_that_cannot_be_written_does_not_hide_the_result(tmp_path: Pat
     assert code == (0 if fault is Fault.NONE else 7)
     assert "run.png: cannot be written: Is a directory" in err.getvalue().replace("\n", " ")
     assert "run.mcap" in out.getvalue()
-    assert "│ picture" not in out.getvalue()
+    assert "picture " not in out.getvalue()
 
 
 def reported_to_a_full_disk(found: RunResult) -> int:
