@@ -309,29 +309,29 @@ def test_cursors_views_and_export(bench: Any, browser: Browser, tmp_path: Path) 
     tab.click("cursors")  # holds the picture
     tab.until("document.querySelector('[data-testid=\"pause\"]').getAttribute('aria-checked') === 'true'")
     tab.until(f"{ZOOM}.getOption().series[0].markLine.data.length === 2")
-    tab.enter("cursor-a", "2")
-    tab.enter("cursor-b", "2.5")
+    end_s = float(tab.js(LAST_s))
+    tab.enter("cursor-a", f"{end_s - 4.0:.2f}")
+    tab.enter("cursor-b", f"{end_s - 3.5:.2f}")
     tab.until("document.querySelector('[data-testid=\"readings\"]').innerText.includes('1/(B - A) = 2 Hz')")
     held = tab.text("readings")
     assert [line.split()[0] for line in held.splitlines()[2:]] == ["desired", "angle", "command"]
-    x, y = tab.js(
-        f"(c => [...c.convertToPixel({{xAxisIndex: 0, yAxisIndex: 0}}, [3, 0])].map((v, i) => v + [c.getDom()."
-        f"getBoundingClientRect().x, c.getDom().getBoundingClientRect().y][i]))({ZOOM})"
-    )
+    pixel = f"c.convertToPixel({{xAxisIndex: 0, yAxisIndex: 0}}, [{end_s - 3.0}, 0])"
+    box = "b = c.getDom().getBoundingClientRect()"
+    x, y = tab.js(f"(c => {{ const p = {pixel}, {box}; return [p[0] + b.x, p[1] + b.y] }})({ZOOM})")
     for kind in ("mousePressed", "mouseReleased"):
         tab.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
-    tab.until("Math.abs(document.querySelector('input[data-testid=\"cursor-a\"]').value - 3) < 0.05")
+    tab.until(f"Math.abs(document.querySelector('input[data-testid=\"cursor-a\"]').value - {end_s - 3.0}) < 0.05")
 
     folder = tmp_path / "downloads"
     tab.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
-    tab.js(f"{ZOOM}.dispatchAction({{type: 'dataZoom', startValue: 1, endValue: 2}}); null")
+    tab.js(f"{ZOOM}.dispatchAction({{type: 'dataZoom', startValue: {end_s - 2.0}, endValue: {end_s - 1.0}}}); null")
     time.sleep(0.5)
     tab.click("csv")
     tab.click("png")
     rows = [line.split(",") for line in downloaded(folder / "jointctl-time.csv").decode().splitlines()]
     assert rows[0] == ["time [s]", "desired angle [rad]", "angle [rad]", "command torque [Nm]"]
-    assert 0.999 <= float(rows[1][0]) < float(rows[-1][0]) <= 2.001
-    assert len(rows) > 900  # every sample, not the drawn ones
+    assert end_s - 2.001 <= float(rows[1][0]) < float(rows[-1][0]) <= end_s - 0.999
+    assert len(rows) > 800  # every sample, not the drawn ones
     assert downloaded(folder / "jointctl-time.png").startswith(b"\x89PNG")
 
     for view, axis in (("x-y", "desired angle [rad]"), ("spectrum", "frequency [Hz]"), ("time", "s")):
