@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -14,10 +15,12 @@ from hypothesis import HealthCheck, settings
 from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.load import load_config
+from jointctl.tools.verbs import main as main_module
 from jointctl.tools.virtual_joint import new_device
 from tests.axis_on_stub_joint import Rig, small_axis_constants
 from tests.device_on_bus import DeviceOnBus
 from tests.places import CONFIGS, ROOT
+from tests.python_process import Finished
 from tests.tiers import tier_of
 
 # no example is judged by the clock, so that none fails on a busy computer
@@ -93,3 +96,21 @@ def empty_bus(settings_of_virtual_joint: CanopenSettings) -> Iterator[DeviceOnBu
 def virtual_config() -> Any:
     """configs/virtual.toml."""
     return load_config(CONFIGS / "virtual.toml")
+
+
+@pytest.fixture
+def jointctl(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Finished]:
+    """`jointctl WORDS` in the process of the test: for what ends before it starts another one."""
+    for name in ("occupy_standard_streams", "never_refuse_a_character", "_start_quickly"):
+        monkeypatch.setattr(main_module, name, lambda: None)
+    monkeypatch.setattr(main_module.atexit, "register", lambda *_: None)
+
+    def run(*words: str) -> Finished:
+        monkeypatch.setattr(sys, "argv", ["jointctl", *words])
+        with pytest.raises(SystemExit) as ended:
+            main_module.main()
+        code = ended.value.code
+        assert isinstance(code, int)
+        return Finished(code, *capsys.readouterr())
+
+    return run

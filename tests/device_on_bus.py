@@ -13,6 +13,7 @@ from typing import Any
 
 import can
 
+from jointctl.drivers.canopen import network
 from jointctl.drivers.canopen.drive import CanopenDrive
 from jointctl.drivers.canopen.network import LISTEN_S
 from jointctl.drivers.canopen.settings import CanopenSettings
@@ -21,8 +22,13 @@ from jointctl.hil.canopen.device import Cia402Device
 
 _FRAME = struct.Struct("<IB3x8s")
 _channels = itertools.count()
-DEVICE_TIME_FACTOR = 4.0
+DEVICE_TIME_FACTOR = 50.0
 PASS_TIME, TIME_PASSED = 0x1FFFFFF0, 0x1FFFFFF1  # extended identifiers: no frames of CANopen
+network.NOTIFIER_S = 0.005  # a receiving thread is waited for whenever a driver is closed
+
+
+def pass_time(seconds: float) -> can.Message:
+    return can.Message(arbitration_id=PASS_TIME, data=struct.pack("<d", seconds))
 
 
 class DeviceOnBus:
@@ -47,6 +53,7 @@ class DeviceOnBus:
         self.sequences: dict[tuple[int, int], list[int]] = {}
         self.deaf_frames = 0
         self.requests: list[tuple[int, bytes]] = []
+        self._drives: list[tuple[CanopenDrive, threading.Event]] = []
         self._bus = can.Bus(interface="virtual", channel=self.channel)
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -61,6 +68,8 @@ class DeviceOnBus:
     def stop(self) -> None:
         """From here on the device only moves when the test moves it."""
         self._ended.set()
+        with can.Bus(interface="virtual", channel=self.channel) as bus:
+            bus.send(pass_time(0.0))  # it is waiting for a frame
         self._thread.join()
 
     def __exit__(self, *_: object) -> None:
@@ -129,9 +138,19 @@ class DeviceOnBus:
             bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
         self.settle()
 
-    def settle(self, seconds: float = 0.02) -> None:
-        """Until what was sent has been taken and answered."""
-        threading.Event().wait(seconds)
+    def settle(self) -> None:
+        """Until what was sent has been taken and answered, and has come to every driver on this bus."""
+        if self._ended.is_set():
+            return
+        open_ones = [passed for drive, passed in self._drives if drive._network.notifier is not None]
+        for passed in open_ones:
+            passed.clear()
+        with can.Bus(interface="virtual", channel=self.channel) as bus:
+            bus.send(pass_time(0.0))
+            while (message := bus.recv(5.0)) is not None and message.arbitration_id != TIME_PASSED:
+                pass
+        for passed in open_ones:
+            passed.wait(5.0)
 
     def stop_drive(self) -> str:
         """What `jointctl stop` does, from another end of this bus; the state in words."""
@@ -162,7 +181,7 @@ class DeviceOnBus:
             if self._ended.is_set() or drive._network.notifier is None:
                 return
             passed.clear()
-            bus.send(can.Message(arbitration_id=PASS_TIME, data=struct.pack("<d", seconds)))
+            bus.send(pass_time(seconds))
             passed.wait(5.0)
 
         drive = CanopenDrive(bus, settings, sleep=sleep, gate=gate)
@@ -170,6 +189,7 @@ class DeviceOnBus:
             drive._others._started_s -= LISTEN_S
         assert drive._network.notifier is not None
         drive._network.notifier.add_listener(hear)
+        self._drives.append((drive, passed))
         return drive
 
     @contextmanager

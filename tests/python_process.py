@@ -1,10 +1,29 @@
-"""Python code in a process of its own, which must end well."""
+"""What a command leaves; Python code in a process of its own, which must end well."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What a command left: exit code and its two streams."""
+
+    code: int
+    out: str
+    err: str
+
+    def refused(self, code: int, *words: str) -> None:
+        """It ended with this exit code and one line of error that holds the words, and no traceback."""
+        errors = [line for line in self.err.splitlines() if line.startswith("error: ")]
+        assert (self.code, len(errors)) == (code, 1), self.err
+        assert "Traceback" not in self.err
+        assert "Traceback" not in self.out
+        for word in words:
+            assert word in self.err, self.err
 
 
 def run_python(code: str, *arguments: str, **environment: str) -> str:

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 import uuid
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,25 +17,8 @@ import canopen
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.recording.run_log_reader import read_run_log
 from tests.configurations import written
+from tests.python_process import Finished
 from tests.real_time_joint import real_time_joint
-
-
-@dataclass(frozen=True)
-class Finished:
-    """What a command left: exit code and its two streams."""
-
-    code: int
-    out: str
-    err: str
-
-    def refused(self, code: int, *words: str) -> None:
-        """It ended with this exit code and one line of error that holds the words, and no traceback."""
-        errors = [line for line in self.err.splitlines() if line.startswith("error: ")]
-        assert (self.code, len(errors)) == (code, 1), self.err
-        assert "Traceback" not in self.err
-        assert "Traceback" not in self.out
-        for word in words:
-            assert word in self.err, self.err
 
 
 class Started:

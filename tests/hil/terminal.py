@@ -11,8 +11,8 @@ import termios
 import time
 from typing import Any
 
-from tests.hil.bench import Finished
 from tests.hil.serial_bench import end_line_guards
+from tests.python_process import Finished
 
 
 def opened_terminal() -> tuple[int, int]:

@@ -38,31 +38,6 @@ class Witness:
         self.enabled += bytes(data[1:4]) == b"\x40\x60\x00" and data[0] & 0xE0 == 0x20 and data[4] & 0x0F == 0x0F
 
 
-def test_configuration_is_refused_before_anything_is_opened(bench: Any) -> None:
-    """Which is wrong how: tests/unit/configuration/test_config.py."""
-    name = bench.config(control__kpp=3.0, drive__node=128)
-    done = bench.run("run", name, "-y")
-    assert done.code == 3, done.err
-    assert done.err.splitlines() == [
-        f"error: {name}: drive.node (=128) must be in [1..127]",
-        f"error: {name}: control.kpp is not a known key: did you mean kp?",
-    ]
-
-
-def test_files_and_arguments(bench: Any) -> None:
-    bench.run("run", "nowhere.toml", "-y").refused(3, "nowhere.toml", "no such file", "virtual")
-    name = bench.config(drive__eds="nowhere.eds")
-    bench.run("run", name, "-y").refused(3, "drive.eds", "nowhere.eds")
-    done = bench.run("run", name, "--frobnicate")
-    assert done.code == 2
-    assert "--frobnicate" in done.err
-
-
-def test_rate_too_high_for_the_bit_rate_shows_the_arithmetic(bench: Any) -> None:
-    done = bench.run("run", bench.config(), "-y", "-b", "250000")
-    done.refused(3, "loop.rate_Hz (=1000)", "bus.bitrate_bitps (=250000)", "285 bits", "114%", "80%")
-
-
 def test_no_bus_names_it_and_tells_what_to_do(bench: Any) -> None:
     done = bench.run("run", bench.config(), "-y")
     done.refused(4, bench.channel, "hint: ", "jointctl hil")
@@ -108,11 +83,6 @@ def test_a_drive_that_lacks_the_mode(bench: Any) -> None:
     assert bench.disabled()
     assert witness.enabled == 0
     witness.network.disconnect()
-
-
-def test_an_eds_that_makes_no_virtual_drive(bench: Any) -> None:
-    (bench.folder / "poor.eds").write_text("[6077\nParameterName=torque\n")
-    bench.run("hil", bench.config(drive__eds="poor.eds")).refused(3, "poor.eds", "describes no object")
 
 
 def test_the_witness_sees_a_joint_that_is_enabled(bench: Any) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import signal
 import struct
 import time
@@ -14,7 +13,6 @@ import pytest
 
 from jointctl.firmware_py.states import AxisPhase, DriveState
 from tests.hil.moving_run import gone
-from tests.places import CONFIGS
 
 ROWS = (
     "tracking error", "RMSE", "wake-up late, p50/p99/p99.9/max", "work, p50/p99/p99.9/max", "skipped", "bus load",
@@ -60,13 +58,6 @@ def test_json_is_one_document_and_nothing_else(bench: Any) -> None:
     assert 0.2 < data["bus_load"] < 0.4  # 28.5 % at 1 kHz and 1 Mbit/s without skipped slots
     assert (bench.folder / data["log"]).is_file()
     assert (bench.folder / data["picture"]).is_file()
-
-
-def test_configuration_without_a_virtual_joint_is_refused(bench: Any) -> None:
-    document = (CONFIGS / "virtual.toml").read_text()
-    text = re.sub(r"(?ms)^\[virtual\].*?(?=^\[log\])", "", document)
-    (bench.folder / "real.toml").write_text(text)
-    bench.run("demo", "--config", "real.toml").refused(3, "[virtual]")
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])

@@ -242,21 +242,6 @@ def test_a_sweep_shows_its_states_and_stops(bench: Any) -> None:
     assert bench.disabled()
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["--foxglove", "0.0.0.0:8765"], "--foxglove (=0.0.0.0:8765) must be on the loopback address"),
-        (["--foxglove=nonsense"], "--foxglove (=nonsense) must be HOST:PORT"),
-        (["--ros2", "500"], "--ros2"),
-        (["--allow-remote"], "--allow-remote goes with --foxglove or --ros2"),
-        (["--ros2-listen", "tcp/0.0.0.0:7448"], "--ros2-listen goes with --ros2"),
-        (["--ros2", "--ros2-listen", "7448"], "--ros2-listen (=7448) must be an endpoint such as"),
-    ],
-)
-def test_options_that_cannot_be(bench: Any, options: list[str], words: str) -> None:
-    bench.run("run", bench.config(), "-y", *options).refused(2, words)
-
-
 def test_a_port_that_is_taken_is_named(bench: Any, tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

@@ -62,12 +62,6 @@ def test_ctrl_c_ends_cleanly(bench: Any, verb: str) -> None:
     assert "Traceback" not in ended.err
 
 
-@pytest.mark.parametrize("verb", ["scan", "info", "monitor"])
-def test_what_is_missing_is_told_in_one_line(bench: Any, verb: str) -> None:
-    bench.run(verb).refused(3, "which bus", "-i socketcan -c can0")
-    bench.run(verb, "-i", "jointctl", "-c", "nobody-here", "-t", "1").refused(4, "no virtual bus")
-
-
 def test_a_monitor_whose_bus_ends_says_so(bench: Any) -> None:
     joint = bench.joint_process(bench.config())
     monitor = bench.start("monitor", "-i", "jointctl", "-c", bench.channel).saw("listening on")

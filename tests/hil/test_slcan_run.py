@@ -22,8 +22,6 @@ import pytest
 from tests.configurations import SLOW_LOOP
 from tests.hil.serial_bench import end_line_guards
 
-RATE_HZ = SLOW_LOOP["loop__rate_Hz"]
-
 
 class SlcanAdapter:
     """The firmware of a serial CAN adapter (Lawicel's ASCII protocol): C, O, L, S0..S8, V, N, t, T, r, R.
@@ -204,9 +202,3 @@ def test_scan_and_info_over_slcan(bench: Any, adapter: SlcanAdapter) -> None:
     assert (scan.code, "jointctl virtual joint" in scan.out) == (0, True), scan
     info = bench.run("info", *over(adapter), "-b", "500000", "-t", "1")
     assert (info.code, "Max torque" in info.out) == (0, True), info
-
-
-def test_raw_frames_are_refused_where_one_program_has_the_adapter(bench: Any, config: str) -> None:
-    logged = bench.config("frames.toml", loop__rate_Hz=RATE_HZ, log__frames=True, control__kp=36.0, control__kv=12.0,
-                          control__velocity_cutoff_Hz=25.0)  # fmt: skip
-    bench.run("run", logged, "-y", "-i", "slcan", "-c", "/dev/ttyJC_none").refused(3, "log.frames", "slcan")

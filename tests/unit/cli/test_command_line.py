@@ -9,7 +9,7 @@ import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -31,6 +31,10 @@ from jointctl.tools.verbs.elmo_bench import ElmoBench
 from jointctl.tools.verbs.main import EPILOG, app
 from jointctl.tools.verbs.new import new
 from jointctl.tools.verbs.verb_options import BusOptions, CanOptions, grouped, loaded
+from tests.configurations import SLOW_LOOP, written
+from tests.python_process import Finished
+
+Jointctl = Callable[..., Finished]
 
 # --- What the command line says about itself, and `jointctl new` ---
 QUIET = Output(stdout=io.StringIO(), stderr=io.StringIO())
@@ -137,11 +141,6 @@ def test_validate_and_identify_take_the_name_of_a_shipped_configuration(data: Pa
 
 
 # --- What the parser of the command line does not understand: one line and a hint, exit code 2 ---
-def run(*words: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "jointctl.tools.verbs", *words]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60.0, env={**os.environ, "COLUMNS": "40"})
-
-
 @pytest.mark.parametrize(
     ("words", "parts", "verb"),
     [
@@ -157,26 +156,74 @@ def run(*words: str) -> subprocess.CompletedProcess[str]:
         (["fault-campaign", "--seed", "-1"], ["--seed", "0"], "fault-campaign "),
     ],
 )
-def test_it_is_one_line_and_a_hint(words: list[str], parts: list[str], verb: str) -> None:
-    done = run(*words)
-    assert done.returncode == 2
-    error, hint = done.stderr.splitlines()
+def test_it_is_one_line_and_a_hint(
+    jointctl: Jointctl, monkeypatch: pytest.MonkeyPatch, words: list[str], parts: list[str], verb: str
+) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    done = jointctl(*words)
+    done.refused(2, *parts)
+    error, hint = done.err.splitlines()
     assert error.startswith("error: ")
-    assert all(part in error for part in parts), error
     assert hint.startswith("hint: `")
     assert f"{verb}--help` shows what there is" in hint
 
 
 @pytest.mark.parametrize("words", [[], ["log"], ["params"]])
-def test_without_a_verb_the_help_is_shown(words: list[str]) -> None:
-    done = run(*words)
-    assert done.returncode == 2
-    assert "Usage:" in done.stdout
-    assert done.stderr == ""
+def test_without_a_verb_the_help_is_shown_and_asking_for_it_is_no_error(jointctl: Jointctl, words: list[str]) -> None:
+    done = jointctl(*words)
+    assert (done.code, "Usage:" in done.out, done.err) == (2, True, "")
+    done = jointctl(*words, "--help")
+    assert (done.code, "Usage:" in done.out, done.err) == (0, True, "")
 
 
-def test_help_is_no_error() -> None:
-    assert run("run", "--help").returncode == 0
+# --- What is refused before another process is started, by each verb with its own exit code ---
+READING = ("scan", "info", "monitor")
+
+
+@pytest.mark.parametrize(
+    ("words", "changes", "code", "parts"),
+    [
+        ("run nowhere.toml -y", {}, 3, ["nowhere.toml", "no such file", "virtual"]),
+        ("run joint.toml -y", {"drive__eds": "nowhere.eds"}, 3, ["drive.eds", "nowhere.eds"]),
+        ("run joint.toml -y -b 250000", {}, 3,
+         ["loop.rate_Hz (=1000)", "bus.bitrate_bitps (=250000)", "285 bits", "114%", "80%"]),
+        ("run joint.toml -y -i slcan -c /dev/ttyJC_none", {**SLOW_LOOP, "log__frames": True}, 3,
+         ["log.frames", "slcan"]),
+        ("run joint.toml -y --foxglove 0.0.0.0:8765", {}, 2,
+         ["--foxglove (=0.0.0.0:8765) must be on the loopback address"]),
+        ("run joint.toml -y --foxglove=nonsense", {}, 2, ["--foxglove (=nonsense) must be HOST:PORT"]),
+        ("run joint.toml -y --ros2 500", {}, 2, ["--ros2"]),
+        ("run joint.toml -y --allow-remote", {}, 2, ["--allow-remote goes with --foxglove or --ros2"]),
+        ("run joint.toml -y --ros2-listen tcp/0.0.0.0:7448", {}, 2, ["--ros2-listen goes with --ros2"]),
+        ("run joint.toml -y --ros2 --ros2-listen 7448", {}, 2, ["--ros2-listen (=7448) must be an endpoint such as"]),
+        ("demo --config joint.toml", {"virtual": None}, 3, ["[virtual]"]),
+        ("hil joint.toml", {"drive__eds": "poor.eds"}, 3, ["poor.eds", "describes no object"]),
+        *((verb, {}, 3, ["which bus", "-i socketcan -c can0"]) for verb in READING),
+        *((f"{verb} -i jointctl -c nobody-here -t 1", {}, 4, ["no virtual bus"]) for verb in READING),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused_in_one_line(
+    jointctl: Jointctl, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, changes: dict[str, Any], code: int,
+    parts: list[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "poor.eds").write_text("[6077\nParameterName=torque\n")
+    written(tmp_path / "joint.toml", **changes)
+    jointctl(*words.split()).refused(code, *parts)
+
+
+def test_every_problem_of_a_configuration_has_a_line(
+    jointctl: Jointctl, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which is wrong how: tests/unit/configuration/test_config.py."""
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path / "joint.toml", control__kpp=3.0, drive__node=128)
+    done = jointctl("run", "joint.toml", "-y")
+    assert done.code == 3
+    assert done.err.splitlines() == [
+        "error: joint.toml: drive.node (=128) must be in [1..127]",
+        "error: joint.toml: control.kpp is not a known key: did you mean kp?",
+    ]
 
 
 # --- What the shell completes, how a flag is shown, quantities with a unit ---
@@ -220,17 +267,17 @@ def test_a_flag_shows_no_type(words: tuple[str, ...], command: Any) -> None:
 
 
 @pytest.mark.parametrize(("text", "delay_s"), [("1.5 ms", 0.0015), ("1500us", 0.0015), ("0.0015", 0.0015)])
-def test_an_option_takes_a_quantity_with_its_unit(text: str, delay_s: float) -> None:
-    done = run("check", "virtual", "--json", "--delay", text)
-    assert json.loads(done.stdout)["assumptions"][1]["value"] == pytest.approx(delay_s)
-    assert done.stderr == ("" if text == "0.0015" else f"{text} is read as 0.0015 s\n")
+def test_an_option_takes_a_quantity_with_its_unit(jointctl: Jointctl, text: str, delay_s: float) -> None:
+    done = jointctl("check", "virtual", "--json", "--delay", text)
+    assert json.loads(done.out)["assumptions"][1]["value"] == pytest.approx(delay_s)
+    assert done.err == ("" if text == "0.0015" else f"{text} is read as 0.0015 s\n")
 
 
 @pytest.mark.parametrize("text", ["1.5 rpm", "1.5 m", "-1 ms"])
-def test_what_is_no_such_quantity_is_refused(text: str) -> None:
-    done = run("check", "virtual", "--delay", text)
-    assert done.returncode == 2
-    assert "'--delay'" in done.stderr
+def test_what_is_no_such_quantity_is_refused(jointctl: Jointctl, text: str) -> None:
+    done = jointctl("check", "virtual", "--delay", text)
+    assert done.code == 2
+    assert "'--delay'" in done.err
 
 
 # --- Options that stand in a dataclass reach the verb as one object; the command line shows them one by one ---

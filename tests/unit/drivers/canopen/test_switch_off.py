@@ -40,11 +40,8 @@ def bus_of(joint: Any) -> can.BusABC:
 
 
 def power_up(joint: Any) -> None:
-    with bus_of(joint) as bus:
-        for control in (0x06, 0x07, 0x0F, 0x0F):
-            data = bytes((0x2B, 0x40, 0x60, 0x00, control, 0, 0, 0))
-            bus.send(can.Message(arbitration_id=0x601, data=data, is_extended_id=False))
-            time.sleep(0.05)
+    for control in (0x06, 0x07, 0x0F, 0x0F):
+        joint.send(0x601, bytes((0x2B, 0x40, 0x60, 0x00, control, 0, 0, 0)))
     assert powered(joint)
 
 
@@ -288,6 +285,9 @@ def another_controller(joint: Any) -> Iterator[None]:
 
     thread = threading.Thread(target=send)
     thread.start()
+    while (0x080, b"") not in joint.requests:
+        time.sleep(0.001)
+    joint.settle()
     try:
         yield
     finally:

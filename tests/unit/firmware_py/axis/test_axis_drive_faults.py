@@ -1,27 +1,12 @@
-"""A drive that faults, brakes, restarts or leaves Operation Enabled by itself, and a bus that fails."""
+"""A drive that brakes, restarts or leaves Operation Enabled by itself, and the error codes that are kept."""
 
 from __future__ import annotations
 
 import pytest
 
-from jointctl.firmware_py.records import LINE_GONE
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, Reaction
 from tests.axis_on_stub_joint import NewRig, assert_fault, assert_well
-
-
-@pytest.mark.trips(Fault.DRIVE_FAULT, "Fault.DRIVE_FAULT")
-@pytest.mark.parametrize("drive_state", [DriveState.FAULT, DriveState.FAULT_BRAKING])
-@pytest.mark.parametrize("phase", [p for p in AxisPhase if p < AxisPhase.DISABLING and p != AxisPhase.QUICK_STOPPING])
-def test_drive_fault_in_each_phase(rig: NewRig, phase: AxisPhase, drive_state: DriveState) -> None:
-    run = rig(0.05).reach(phase)
-    run.joint.drive_state = drive_state
-    run.sample.drive_error, run.sample.status_word = 0x8311, 0x0218
-    run.tick()
-    assert run.phase == AxisPhase.DISABLING
-    assert run.state.fault_drive_error == 0x8311
-    run.joint.drive_state = DriveState.FAULT
-    assert_fault(run, Fault.DRIVE_FAULT, Reaction.OFF)
 
 
 @pytest.mark.stays(Fault.DRIVE_FAULT)
@@ -99,39 +84,3 @@ def test_a_drive_that_leaves_enabled_unasked_is_switched_off_and_not_enabled_aga
     assert (run.requests[-1], run.torques_Nm[-1]) == (DriveRequest.OFF, 0.0)
     run.joint.drive_state = DriveState.OFF
     assert_fault(run, Fault.DRIVE_NOT_ENABLED, Reaction.OFF)
-
-
-@pytest.mark.parametrize("phase", [AxisPhase.WAITING, AxisPhase.ENABLING, AxisPhase.APPROACH, AxisPhase.TRACKING])
-def test_drive_restart(rig: NewRig, phase: AxisPhase) -> None:
-    run = rig(0.0)
-    run.tick()
-    run.until(phase)
-    assert run.state.fault == Fault.NONE
-    run.sample.restarts = 1
-    run.tick()
-    assert_fault(run, Fault.DRIVE_RESTARTED, Reaction.OFF)
-
-
-@pytest.mark.trips(Fault.BUS_ERROR, "(6, True)")
-@pytest.mark.stays(Fault.BUS_ERROR, "(5, False)")
-@pytest.mark.parametrize(("errors", "trips"), [(5, False), (6, True)])
-def test_bus_errors(rig: NewRig, errors: int, trips: bool) -> None:
-    run = rig(0.0).until(AxisPhase.TRACKING)
-    run.sample.bus_errors = errors
-    run.tick()
-    if trips:
-        assert_fault(run, Fault.BUS_ERROR, Reaction.QUICK_STOP)
-    else:
-        assert_well(run)
-
-
-@pytest.mark.parametrize(
-    ("errors", "phase"), [(LINE_GONE, AxisPhase.FINISHED), (LINE_GONE - 1, AxisPhase.QUICK_STOPPING)]
-)
-def test_without_a_line_the_run_ends_at_once(rig: NewRig, errors: int, phase: AxisPhase) -> None:
-    """With one that only fails it goes on stopping."""
-    run = rig(0.0).until(AxisPhase.TRACKING)
-    run.sample.bus_errors = errors
-    run.tick()
-    assert run.phase == phase
-    assert_fault(run, Fault.BUS_ERROR, Reaction.QUICK_STOP)

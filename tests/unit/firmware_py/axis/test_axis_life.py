@@ -119,24 +119,6 @@ def test_every_feed_forward_runs(rig: NewRig, feed_forward: FeedForward) -> None
 
 
 # --- stop requests ---
-@pytest.mark.parametrize("phase", [p for p in AxisPhase if p < AxisPhase.DISABLING])
-@pytest.mark.parametrize("request_", [StopRequest.RAMP, StopRequest.QUICK_STOP, StopRequest.OFF])
-def test_stop_request_in_each_phase(rig: NewRig, phase: AxisPhase, request_: StopRequest) -> None:
-    run = rig(0.05).reach(phase)
-    run.stop = request_
-    run.tick()
-    if phase <= AxisPhase.ENABLING or request_ is StopRequest.OFF:
-        assert run.phase == AxisPhase.DISABLING
-        assert run.requests[-1] == DriveRequest.OFF
-    elif request_ is StopRequest.QUICK_STOP:
-        assert run.phase == max(phase, AxisPhase.QUICK_STOPPING)
-        assert run.requests[-1] == DriveRequest.QUICK_STOP
-    else:
-        assert run.phase == max(phase, AxisPhase.RAMPING)
-    finish(run)
-    assert run.state.fault == Fault.NONE
-
-
 def test_a_stop_request_that_is_withdrawn_is_still_carried_out(rig: NewRig) -> None:
     run = rig(0.0).until(AxisPhase.TRACKING)
     run.stop = StopRequest.RAMP

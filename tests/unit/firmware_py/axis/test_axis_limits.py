@@ -41,21 +41,6 @@ def test_a_reference_that_will_leave_the_limits_is_braked_inside_them(rig: NewRi
     assert_fault(run, Fault.REFERENCE_LIMIT, Reaction.RAMP)
 
 
-@pytest.mark.parametrize(("limit_rad", "trips"), [(0.0040, True), (0.0100, False)])
-def test_following_error(rig: NewRig, limit_rad: float, trips: bool) -> None:
-    run = rig(0.0)
-    run.axis.law.kind = 0  # without the network a constant load leaves load / (J kp) = 6.07 mrad
-    run.axis.limits.following_error_max_rad = limit_rad
-    run.until(AxisPhase.TRACKING).run(20)
-    run.joint.load_Nm = 10.0
-    run.run(150)
-    if trips:
-        assert run.state.fault_value > limit_rad
-        assert_fault(run, Fault.FOLLOWING_ERROR, Reaction.QUICK_STOP)
-    else:
-        assert_well(run)
-
-
 def disturbed(rig: NewRig) -> Any:
     """A run that tracks, and then reads one position 5 mrad off: a short peak of velocity and of following error."""
     return rig(0.0).until(AxisPhase.TRACKING).run(20)

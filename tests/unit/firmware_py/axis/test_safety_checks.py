@@ -18,14 +18,17 @@ def tracking(state: Any) -> Any:
     return state
 
 
+@pytest.mark.trips(Fault.POSITION_JUMP, "(1.001, Fault.POSITION_JUMP)")
+@pytest.mark.stays(Fault.POSITION_JUMP, "(0.999, Fault.NONE)")
+@pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("gap_cycles", [1, 3])
 @pytest.mark.parametrize(("share", "fault"), [(0.999, Fault.NONE), (1.001, Fault.POSITION_JUMP)])
 def test_a_sample_may_be_as_far_as_the_joint_can_move(
-    axis: Any, tracking: Any, gap_cycles: int, share: float, fault: Fault
+    axis: Any, tracking: Any, sign: float, gap_cycles: int, share: float, fault: Fault
 ) -> None:
     sample = new(Sample)[0]
     moved_rad = share * gap_cycles * axis.limits.position_jump_max_rad
-    sample.position_rad, tracking.velocity.last_position_rad = 0.1 - moved_rad, 0.1
+    sample.position_rad, tracking.velocity.last_position_rad = 0.1 - sign * moved_rad, 0.1
     check_jump(axis, tracking, sample, gap_cycles)
     assert tracking.fault == Fault.NONE, "the first sample has nothing before it"
     tracking.velocity.primed = 1

@@ -45,10 +45,12 @@ def after(fault: Fault, phase: AxisPhase) -> AxisPhase:
 def test_each_limit_at_its_edge_in_each_phase(
     axis: Any, what: str, within: int, beyond: int, fault: Fault, phase: AxisPhase
 ) -> None:
+    """With the value that is latched; the drive's error code is kept for faults that the drive has a part in."""
     axis.limits.sample_age_max_cycles, axis.limits.heartbeat_age_max_cycles = 7, 9
     axis.limits.skipped_max_cycles, axis.sequence.supervisor_max_cycles = 5, 11
     axis.stream.client_timeout_ns = 50
     torque = AxisPhase.APPROACH <= phase <= AxisPhase.RELEASING
+    of_the_drive = fault in (Fault.DRIVE_RESTARTED, Fault.DRIVE_FAULT, Fault.DRIVE_NOT_ENABLED)
     if phase >= AxisPhase.DISABLING:
         counts = False
     elif fault in (Fault.DRIVE_RESTARTED, Fault.DRIVE_FAULT):
@@ -63,6 +65,7 @@ def test_each_limit_at_its_edge_in_each_phase(
         state, sample = new(AxisState)[0], new(Sample)[0]
         reset_axis(axis, state)
         state.phase, sample.drive_state = phase, DriveState.ENABLED
+        sample.status_word, sample.drive_error = 0x1237, 0x2310
         if what == "sample_age_cycles":
             state.sample_age_cycles = value
         elif what == "client":
@@ -73,10 +76,29 @@ def test_each_limit_at_its_edge_in_each_phase(
         assert state.fault == (fault if trips else Fault.NONE)
         if not trips:
             assert (state.phase, state.reaction) == (phase, Reaction.NONE)
-        elif what == "drive_state" and beyond == DriveState.STOPPING:
+            continue
+        expected = 0x1237 if of_the_drive else value * 1e-9 if what == "client" else value
+        assert state.fault_value == pytest.approx(expected)
+        told = of_the_drive or fault in (Fault.STALE_SAMPLE, Fault.DRIVE_SILENT)
+        assert state.fault_drive_error == (0x2310 if told else 0)
+        if what == "drive_state" and beyond == DriveState.STOPPING:
             assert (state.phase, state.reaction) == (AxisPhase.QUICK_STOPPING, Reaction.QUICK_STOP)
         else:
             assert state.phase == after(fault, phase)
+
+
+def test_a_limit_of_one_cycle_is_no_limit_of_zero_which_means_none(axis: Any, state: Any) -> None:
+    axis.limits.heartbeat_age_max_cycles = axis.sequence.supervisor_max_cycles = 1
+    for age_cycles, supervisor_cycles, fault in ((2, 0, Fault.DRIVE_SILENT), (0, 2, Fault.SUPERVISOR_LOST)):
+        reset_axis(axis, state)
+        sample = new(Sample)[0]
+        state.phase, sample.drive_state, sample.heartbeat_age_cycles = (
+            AxisPhase.TRACKING,
+            DriveState.ENABLED,
+            age_cycles,
+        )
+        check_supervision(axis, state, sample, 0, supervisor_cycles)
+        assert state.fault == fault
 
 
 @pytest.mark.parametrize("limit", ["heartbeat_age_max_cycles", "supervisor_max_cycles"])
@@ -96,6 +118,7 @@ def test_suspension_in_each_phase(state: Any, phase: AxisPhase) -> None:
     check_suspension(state, 5.0)
     if phase < AxisPhase.QUICK_STOPPING:
         assert (state.phase, state.fault, state.fault_value) == (after(Fault.SUSPENDED, phase), Fault.SUSPENDED, 5.0)
+        assert state.fault_drive_error == 0
     else:
         assert (state.phase, state.fault) == (phase, Fault.NONE)
 
@@ -190,30 +213,3 @@ def test_pushing_counts_from_the_beginning_again(stuck: tuple[Any, Any], by: str
         state.frozen_samples = 0
     check_reading(axis, state, 1)
     assert (state.pushed_cycles, state.fault) == (0, Fault.NONE)
-
-
-@pytest.mark.parametrize(
-    ("what", "fault", "told"),
-    [
-        ("bus_errors", Fault.BUS_ERROR, False), ("supervisor", Fault.SUPERVISOR_LOST, False),
-        ("skipped", Fault.OVERRUN, False), ("suspended", Fault.SUSPENDED, False),
-        ("sample_age_cycles", Fault.STALE_SAMPLE, True), ("heartbeat_age_cycles", Fault.DRIVE_SILENT, True),
-    ],
-)  # fmt: skip
-def test_the_error_code_of_the_drive_belongs_to_faults_that_the_drive_has_a_part_in(
-    axis: Any, state: Any, what: str, fault: Fault, told: bool
-) -> None:
-    """With limits of one cycle, the smallest that are no limit of zero, which means none."""
-    axis.limits.sample_age_max_cycles = axis.limits.heartbeat_age_max_cycles = 1
-    axis.limits.skipped_max_cycles = axis.sequence.supervisor_max_cycles = 1
-    sample = new(Sample)[0]
-    state.phase, sample.drive_state, sample.drive_error = AxisPhase.TRACKING, DriveState.ENABLED, 0x2310
-    if what in ("bus_errors", "heartbeat_age_cycles"):
-        sample[what] = 2
-    elif what == "sample_age_cycles":
-        state.sample_age_cycles = 2
-    if what == "suspended":
-        check_suspension(state, 2.0)
-    else:
-        check_supervision(axis, state, sample, 2 * (what == "skipped"), 2 * (what == "supervisor"))
-    assert (state.fault, state.fault_drive_error) == (fault, 0x2310 if told else 0)
