@@ -41,7 +41,7 @@ def told(root: Path, **bus: object) -> list[tuple[str, str]]:
     [
         (("046d", "c52b"), {"eth0": (DOWN, "1")}, {}, []),
         (("1d50", "606f", "net/can0"), {"can0": (DOWN,)}, {"bitrate_bitps": 500_000},
-         [("can0 (candleLight .* is plugged in but down", "sudo ip link set can0 up type can bitrate 500000")]),
+         [(r"can0 \(candleLight.* is plugged in but down", "sudo ip link set can0 up type can bitrate 500000")]),
         (("0c72", "000c", "net/can0"), {"can0": (UP,)}, {}, []),
         # the configured one is judged elsewhere
         (None, {"can0": (DOWN,), "can1": (DOWN,)}, {"interface": "socketcan", "channel": "can0"},
@@ -50,7 +50,8 @@ def told(root: Path, **bus: object) -> list[tuple[str, str]]:
         (None, {"vcan0": (DOWN,)}, {}, [("vcan0 is plugged in but down", "sudo ip link set vcan0 up")]),
         # a driver that is not loaded
         *(
-            (("0C72", product), {}, {}, [(f"{name} is plugged in but is no CAN interface", "sudo modprobe peak_usb;.*")])
+            (("0C72", product), {}, {},
+             [(f"{name} is plugged in but is no CAN interface", "sudo modprobe peak_usb;.*")])
             for product, name in (("000c", "PCAN-USB"), ("0012", "PCAN-USB FD"))
         ),
         # slcan is attached with the code of the bit rate, if there is one and a port

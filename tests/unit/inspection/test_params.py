@@ -264,10 +264,17 @@ def test_what_moves_or_acts_is_no_parameter() -> None:
 
 
 # --- params restore on the virtual drive of this process: read back, refused, or nothing written at all ---
+@pytest.fixture
+def listens_shortly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For another controller, whose SYNC comes each 10 ms here."""
+    monkeypatch.setattr("jointctl.drivers.canopen.network.LISTEN_S", 0.1)
+
+
 def restored(device: Any, file: Path, **how: Any) -> int:
     return restore_file(subject(device), file, output()[0], **{"assume_yes": True, "skip": [], **how})
 
 
+@pytest.mark.usefixtures("listens_shortly")
 class TestRestore:
     def test_only_what_differs_is_written_and_read_back(self, joint: Any, file: Path) -> None:
         change(file, o6072="700", o6065="12345")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import queue
 import struct
 from collections.abc import Callable
 from typing import Any
@@ -42,7 +43,7 @@ class Recording(Network):
 @pytest.mark.parametrize("length", [0, 5, 6, 7, 8, 13, 14, 15, 30])
 def test_a_text_arrives_in_segments_of_seven_bytes(length: int) -> None:
     network = Recording()
-    node, text = network_node(network, 0.05), bytes(range(65, 65 + length))
+    node, text = network_node(network, 1e-3), bytes(range(65, 65 + length))
     download(node.sdo, NAME, 0, text)
     segments = max(-(-length // 7), 1)
     assert network.requests[0] == struct.pack("<BHBI", 0x21, NAME, 0, length)
@@ -53,7 +54,7 @@ def test_a_text_arrives_in_segments_of_seven_bytes(length: int) -> None:
 @pytest.mark.parametrize(("index", "data"), [(0x6060, b"\x0a"), (0x6007, b"\3\0"), (0x6087, b"\x14\0\0\0")])
 def test_up_to_four_bytes_are_one_frame(index: int, data: bytes) -> None:
     network = Recording()
-    node = network_node(network, 0.05)
+    node = network_node(network, 1e-3)
     download(node.sdo, index, 0, data)
     assert len(network.requests) == 1
     assert node.sdo.upload(index, 0) == data
@@ -68,7 +69,7 @@ def test_nothing_is_sent_after_a_refusal_and_only_an_abort_without_an_answer(
     fail_at: int, data: bytes, silent: bool
 ) -> None:
     network = Recording(fail_at, silent=silent)
-    node = network_node(network, 0.05)
+    node = network_node(network, 1e-3)
     with pytest.raises(SdoCommunicationError if silent else SdoAbortedError) as failure:
         download(node.sdo, NAME, 0, data)
     if silent:
@@ -119,14 +120,17 @@ class Wire:
 
 
 @pytest.fixture
-def access(settings_of_virtual_joint: Any) -> Callable[[list[list[bytes]]], ObjectAccess]:
+def access(
+    settings_of_virtual_joint: Any, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[list[list[bytes]]], ObjectAccess]:
+    monkeypatch.setattr("jointctl.drivers.canopen.sdo.COLLISION_PAUSE_S", 0.0)
     eds = read_eds(settings_of_virtual_joint.eds_path, 1)
+    node = canopen.RemoteNode(1, eds.dictionary)
 
     def build(answers: list[list[bytes]]) -> ObjectAccess:
-        node = canopen.RemoteNode(1, eds.dictionary)
         wire: Any = Wire(answers)
         wire.sdo = node.sdo
-        node.sdo.network, node.sdo.RESPONSE_TIMEOUT = wire, 1e-4
+        node.sdo.network, node.sdo.RESPONSE_TIMEOUT, node.sdo.responses = wire, 1e-4, queue.Queue()
         return ObjectAccess(node, eds.name)
 
     return build

@@ -243,7 +243,7 @@ def end(data: bytes, crc: int | None = None, unused: int | None = None) -> bytes
 
 
 def client(device: Cia402Device, lose: Callable[[int, bytes], bool] = lambda identifier, data: False) -> Any:
-    return network_node(Network(device, lose), 0.05).sdo
+    return network_node(Network(device, lose), 5e-3).sdo
 
 
 @pytest.mark.parametrize("size", [1, 6, 7, 8, 190, 256])
