@@ -271,6 +271,7 @@ def _dictionary() -> canopen.ObjectDictionary:
 def test_two_canopen_networks_talk(tmp_path_factory: pytest.TempPathFactory, timing: bool) -> None:
     with VirtualBusHub(tmp_path_factory.mktemp("b") / "bus.sock", timing=timing) as hub:
         master, slave = (canopen.Network(open_python_can("jointctl", str(hub.path))) for _ in range(2))
+        master.NOTIFIER_CYCLE = slave.NOTIFIER_CYCLE = 0.02  # it is waited for at the end
         master.connect()
         slave.connect()
         try:

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
-from pathlib import Path
 
-from tests.places import ROOT
+import pytest
+
+from tests.conftest import pytest_configure
 
 ASK = "import signal; raise SystemExit(signal.getsignal(signal.SIGINT) is not signal.default_int_handler)"
-IGNORED = ("sh", "-c", 'trap "" INT; exec "$@"', "sh")
 
 
-def test_a_process_of_the_tests_can_be_interrupted() -> None:
-    assert subprocess.run([sys.executable, "-c", ASK], check=False).returncode == 0
-
-
-def test_sigint_ignored_is_passed_on_otherwise() -> None:
-    assert subprocess.run([*IGNORED, sys.executable, "-c", ASK], check=False).returncode == 1
-
-
-def test_the_first_holds_in_a_session_that_was_started_with_sigint_ignored() -> None:
-    chosen = f"{Path(__file__).resolve()}::{test_a_process_of_the_tests_can_be_interrupted.__name__}"
-    command = [*IGNORED, sys.executable, "-m", "pytest", "-n0", "-p", "no:cacheprovider", chosen]
-    found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert found.returncode == 0, found.stdout
+@pytest.mark.parametrize("configured", [False, True])
+def test_sigint_ignored_is_passed_on_unless_the_session_was_configured(configured: bool) -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        if configured:
+            pytest_configure()
+        assert subprocess.run([sys.executable, "-c", ASK], check=False).returncode == (0 if configured else 1)
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ WITH_KERNELS = sorted(path for pattern in TOOLS_WITH_KERNELS for path in (ROOT /
 MODULES = sorted(path for folder in TOP_LEVEL for path in (ROOT / folder).rglob("*.py"))
 
 
+@cache
 def imported(path: Path) -> set[str]:
     """Every name that a module imports, as `package.module` and `package.module.name`; wherever it does so."""
     found = set()

@@ -61,7 +61,9 @@ def test_a_second_set_point_while_the_first_move_is_under_way(rig: NewRig) -> No
     run.run(120)
     assert run.state.change.motion == MotionChange.MOVING
     assert answered(run, hold(run, 0.4)) is ChangeAnswer.TAKEN
-    run.run(1500)
+    while run.state.change.motion != MotionChange.NONE:
+        run.tick()
+    run.run(10)
     assert run.state.reference.position_rad == 0.4
     assert run.state.fault == Fault.NONE
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from typing import Any
 
 import numpy as np
@@ -337,7 +338,8 @@ def test_a_velocity_between_two_set_points_counts_too() -> None:
 numbers = st.floats(-2.0, 2.0) | st.sampled_from([math.nan, math.inf, -math.inf, 1e300])
 
 
-@settings(max_examples=200)
+# plain Python, which tests/unit/firmware_py/test_kernel.py repeats this in, is a hundred times slower
+@settings(max_examples=20 if os.environ.get("NUMBA_DISABLE_JIT") == "1" else 200)
 @given(st.lists(st.tuples(numbers, numbers, numbers, st.floats(-50.0, 300.0)), max_size=30), st.integers(1, 3))
 def test_whatever_comes_the_reference_stays_inside_its_limits(points: list[tuple[float, ...]], elapsed: int) -> None:
     run = StreamRig()
