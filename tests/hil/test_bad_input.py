@@ -72,19 +72,6 @@ def test_refusals_of_one_joint(bench: Any) -> None:
     witness.network.disconnect()
 
 
-def test_a_drive_that_lacks_the_mode(bench: Any) -> None:
-    """The drive itself differs from the EDS that the user has."""
-    text = EDS.read_text().replace("DefaultValue=0x000003AD", "DefaultValue=0x00000008")
-    assert text != EDS.read_text()
-    (bench.folder / "poor.eds").write_text(text)
-    bench.joint(bench.config("poor.toml", drive__eds="poor.eds"))
-    witness = Witness(bench)
-    bench.run("run", bench.config(), "-y").refused(6, "node 1", "cyclic_sync_torque", "6502", "cst")
-    assert bench.disabled()
-    assert witness.enabled == 0
-    witness.network.disconnect()
-
-
 def test_the_witness_sees_a_joint_that_is_enabled(bench: Any) -> None:
     """The twin of the refusals: a good configuration does enable."""
     name = bench.config()

@@ -7,20 +7,15 @@ import signal
 import time
 from typing import Any
 
-import pytest
 
-
-@pytest.mark.parametrize("encoder", [{}, {"encoder__counts_per_turn": 4096}], ids=["fine", "coarse"])
-def test_a_joint_that_is_right_and_one_whose_file_is_wrong_about_its_torque(
-    bench: Any, encoder: dict[str, int]
-) -> None:
-    right = bench.config(**encoder)
+def test_a_joint_that_is_right_and_one_whose_file_is_wrong_about_its_torque(bench: Any) -> None:
+    right = bench.config()
     bench.joint(right)
     done = bench.start("doctor", right, "--motion", "-y").finished()
     assert done.code == 0, done.err + done.out
     assert "the joint moved with the torque" in " ".join(done.out.replace("│", " ").split())
     assert bench.disabled()
-    wrong = bench.config("wrong.toml", drive__torque_direction=-1, **encoder)
+    wrong = bench.config("wrong.toml", drive__torque_direction=-1)
     done = bench.start("doctor", wrong, "--motion", "-y", "--json").finished()
     assert done.code == 1, done.err
     assert "moved against the torque" in done.out

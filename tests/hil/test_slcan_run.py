@@ -149,14 +149,6 @@ def longer(bench: Any, config: str) -> str:
     return config
 
 
-def test_an_interrupt_over_slcan_ramps_down(bench: Any, config: str, adapter: SlcanAdapter) -> None:
-    run = bench.start("run", longer(bench, config), "-y", *over(adapter)).saw("tracking")
-    run.signal(signal.SIGINT)
-    ended = run.finished(60.0)
-    assert ended.code == 130, ended.err
-    assert bench.disabled()
-
-
 def test_a_killed_loop_over_slcan_is_made_safe(bench: Any, config: str, adapter: SlcanAdapter) -> None:
     run = bench.start("run", longer(bench, config), "-y", *over(adapter)).saw("tracking")
     os.kill(run.child("loop_process"), signal.SIGKILL)

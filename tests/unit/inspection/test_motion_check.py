@@ -276,11 +276,13 @@ def reverse_torque(joint: Any) -> None:
     joint._port[0].torque_Nmppermille *= -1.0
 
 
-@pytest.mark.parametrize("change", [reverse_encoder, reverse_torque])
-def test_a_wrong_sign(tmp_path: Path, change: Any) -> None:
-    config = config_with(tmp_path)
+@pytest.mark.parametrize(
+    ("change", "counts"), [(reverse_encoder, 524288), (reverse_torque, 524288), (reverse_torque, 4096)]
+)
+def test_a_wrong_sign(tmp_path: Path, change: Any, counts: int) -> None:
+    config = config_with(tmp_path, encoder__counts_per_turn=counts)
     found, records, fault = checked(config, change)
-    assert fault in (Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR)
+    assert fault in (Fault.VELOCITY_LIMIT, Fault.FOLLOWING_ERROR, Fault.POSITION_LIMIT)
     assert found["direction"].status == PROBLEM
     assert "encoder.direction; else drive.torque_direction" in found["direction"].remedy
     assert_gentle(config, records)

@@ -210,37 +210,6 @@ def test_strings_and_settings_are_there(node: Any) -> None:
     assert node.sdo[0x2100].raw == "elbow of the left arm"
 
 
-def test_remap_sync_and_torque_through_pdos(node: Any) -> None:
-    network = node.network
-    node.tpdo.read()
-    node.rpdo.read()
-    node.tpdo[1].clear()
-    for index in (0x6041, 0x6064, 0x6077):
-        node.tpdo[1].add_variable(index)
-    node.tpdo[1].trans_type = 1
-    node.tpdo[1].enabled = True
-    node.rpdo[1].clear()
-    for index in (0x6040, 0x6071):
-        node.rpdo[1].add_variable(index)
-    node.rpdo[1].trans_type = 1
-    node.rpdo[1].enabled = True
-    node.tpdo.save()
-    node.rpdo.save()
-    node.sdo[0x6060].raw = 10
-    node.nmt.state = "OPERATIONAL"
-    for word in (0x06, 0x07, 0x0F, 0x0F):
-        node.rpdo[1][0].raw = word
-        node.rpdo[1][1].raw = 50 if word == 0x0F else 0
-        node.rpdo[1].transmit()
-        network.sync.transmit()
-        network.run(1)
-    network.run(100)
-    network.sync.transmit()
-    assert node.tpdo[1][0].raw & 0x6F == 0x27
-    assert node.tpdo[1][1].raw > 100
-    assert node.tpdo[1][2].raw == 50
-
-
 def test_real_time_device_boots_answers_and_stops() -> None:
     device = virtual_drive(step_s=1e-3)  # coarse: keeps up without the JIT too
     ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
