@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 import signal
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
 
 from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.hil.canopen import dictionary, encoder_node
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.verbs import main as main_module
@@ -28,6 +32,19 @@ settings.register_profile("no clock", deadline=None, suppress_health_check=[*Hea
 settings.load_profile("no clock")
 
 
+_load_entries = dictionary.load_entries
+_entries_of_shipped_file = functools.cache(_load_entries)
+
+
+def entries_read_once(eds_path: Path, node_id: int) -> dict[tuple[int, int], dictionary.Entry]:
+    """As `load_entries`: a shipped EDS file is read once, which takes most of the time that a virtual drive takes."""
+    shipped = eds_path.parent.resolve() == CONFIGS
+    return dict(_entries_of_shipped_file(eds_path, node_id)) if shipped else _load_entries(eds_path, node_id)
+
+
+dictionary.load_entries = encoder_node.load_entries = entries_read_once
+
+
 def pytest_configure() -> None:
     """Ctrl-C reaches what the tests start, although `nohup` or `&` makes a shell start pytest with SIGINT ignored."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -38,19 +55,22 @@ def pytest_configure() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Each test gets the marker of its folder, before -m chooses; `slow` tells why, and its file comes first.
+    """Each test gets the marker of its folder, before -m chooses; `slow` tells why.
 
-    Files are handed out to processes in this order: a long one at the end would be waited for by one core.
+    Files are handed out to processes in this order: a long one at the end would be waited for by one core.  So those
+    with a slow test come first, and in real time, where a test takes some seconds whichever it is, those with many.
     """
+    in_real_time: Counter[Path] = Counter()
     for item in items:
         tier = tier_of(item.path.relative_to(ROOT / "tests"))
         if tier is not None:
             item.add_marker(tier)
+            in_real_time[item.path] += 1
         for mark in item.iter_markers("slow"):
             if not (len(mark.args) == 1 and isinstance(mark.args[0], str)):
                 raise pytest.UsageError(f"{item.nodeid}: pytest.mark.slow needs its reason")
     slow = {item.path for item in items if item.get_closest_marker("slow") is not None}
-    items.sort(key=lambda item: item.path not in slow)
+    items.sort(key=lambda item: (item.path not in slow, -in_real_time[item.path]))
 
 
 @pytest.fixture
