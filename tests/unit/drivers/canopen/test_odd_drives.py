@@ -66,6 +66,16 @@ def test_what_may_be_absent_is(lacking: Any, joint: Any, index: int, sub: int | 
     assert joint.value(0x1016, 1) != 0
 
 
+@pytest.mark.parametrize(("without", "velocity_max_radps"), [(("607F",), 1.0), ((), None)])
+def test_a_velocity_limit_of_the_drive_is_set_where_both_have_one(
+    commission: Any, joint: Any, without: tuple[str, ...], velocity_max_radps: float | None
+) -> None:
+    report = commission(without=without, mode="csv", velocity_max_radps=velocity_max_radps)
+    assert report.commands_velocity
+    assert "max velocity" not in report.settings
+    assert not joint.downloads(0x607F)
+
+
 def test_a_torque_that_is_not_measured_is_not_mapped(lacking: Any, commission: Any, joint: Any) -> None:
     assert not lacking((0x6077, None)).measures_torque
     port = commission.port[0]
