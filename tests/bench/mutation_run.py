@@ -47,6 +47,7 @@ TESTS = {  # below UNIT_TESTS
     "drivers/bus_lock.py": ("drivers/test_bus_lock",),
     "tools/session/stop_call.py": ("session/test_control", "drivers/test_bus_lock"),
     "tools/session/control.py": ("session/test_control",),
+    "tools/session/set_points.py": ("interface/test_lockstep_joint", "scoping/test_remote"),
 }  # fmt: skip
 KERNELS = (*(module for module in TESTS if module.startswith("firmware_py")), "drivers/canopen/cia402.py")
 # of processor time, the second times that of all tests: a mutant that no test notices must not count as one that hangs
@@ -201,7 +202,9 @@ class Session:
             return True
         found = mutants(source, self._module)[self._part - 1 :: self._parts]
         started, lines = time.monotonic(), source.splitlines()
-        for line, what, tree in found:
+        for count, (line, what, tree) in enumerate(found):
+            if count % 20 == 0:
+                print(f"  {count} of {len(found)}, {time.monotonic() - started:.0f} s", file=sys.stderr, flush=True)
             order = sorted(range(len(items)), key=lambda i: (-noticed[i], durations_s[i]))
             by = self._first_failure(session, items, order, changed_code(self._module, tree), durations_s)
             if by is None:
