@@ -90,6 +90,7 @@ def test_the_axis_is_told_how_late_its_sample_was_asked_for(loop: Callable[..., 
         assert built.state[0].sample_late_s == (late_s if answer_ns > 0 else 0.0)
 
 
+@pytest.mark.realtime  # cycles must not be skipped
 @pytest.mark.parametrize(("stop", "phase"), [(1, AxisPhase.RAMPING), (2, AxisPhase.QUICK_STOPPING), (3, None)])
 def test_the_stop_word_is_seen_in_the_same_cycle(loop: Callable[..., Loop], stop: int, phase: AxisPhase | None) -> None:
     built = loop()
