@@ -396,6 +396,16 @@ def test_a_drive_that_is_not_ready_is_given_time_between_two_looks(joint: Any) -
     assert pauses_s == [READY_POLL_S] * (round(1.0 / READY_POLL_S) - 1)
 
 
+def test_what_is_exactly_at_its_bound_is_taken(joint: Any) -> None:
+    assert commissioning._compare_rated("rated_current_A", 9.0, 8.0, 0.125, "A") == []
+    joint.answers[(0x6087, 0)] = 2000
+    with joint.opened() as drive:
+        (remark,) = commissioning.set_torque_slope(drive._objects, 0.5, 1000.0)
+        with pytest.raises(DeviceError, match="at most 1000 Nm/s"):
+            commissioning.set_torque_slope(drive._objects, 0.5, 1000.5)
+    assert remark.endswith("; 6087 = 2000 permille/s")
+
+
 def test_a_drive_is_given_time_to_switch_off_and_to_change_its_mode(
     joint: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
