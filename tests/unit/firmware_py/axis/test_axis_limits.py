@@ -38,6 +38,7 @@ def test_a_reference_that_will_leave_the_limits_is_braked_inside_them(rig: NewRi
     assert run.state.reaction == Reaction.RAMP
     run.until(AxisPhase.RELEASING, at_most=400)
     assert 0.99 < run.state.reference.position_rad <= 1.0
+    assert run.state.fault_drive_error == 0
     assert_fault(run, Fault.REFERENCE_LIMIT, Reaction.RAMP)
 
 
