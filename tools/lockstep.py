@@ -229,10 +229,12 @@ class LockstepJoint:
         stop_cycle: int = NO_STOP,
         longest_s: float | None = None,
         ideal_velocity: bool = False,
+        table: np.ndarray | None = None,
     ) -> LockstepRun:
         """One run from power off to FINISHED; the given record arrays are not changed.
 
         Without `longest_s` a run may take ten seconds more than approach and trajectory together.
+        `table` float64 (N, 5) takes the place of the configuration's, see `reference_at`.
         `ideal_velocity` gives the controller the true position and velocity, for textbook experiments.
         """
         constants = self.constants() if constants is None else constants
@@ -247,7 +249,7 @@ class LockstepJoint:
         records = cycles // log_every + 1 if log_every else 1
         return self._carry_out(
             constants, plant_constants, plant_state, new(LogRecord, records), np.zeros((records, TRUTHS)),
-            log_every=log_every, cycles=cycles, stop_cycle=stop_cycle, ideal_velocity=ideal_velocity,
+            table=table, log_every=log_every, cycles=cycles, stop_cycle=stop_cycle, ideal_velocity=ideal_velocity,
         )  # fmt: skip
 
     def run_with_faults(
@@ -294,6 +296,7 @@ class LockstepJoint:
         truth: np.ndarray,
         faults: Any = NO_FAULTS,
         epoch_ns: int = 0,
+        table: np.ndarray | None = None,
         **how: Any,
     ) -> LockstepRun:
         """A run from copies of device and plant; `how`: fields of `Scenario`."""
@@ -309,7 +312,7 @@ class LockstepJoint:
             faults,
             fault_memory(faults, epoch_ns),
         )
-        memory = _memory(constants, state, self.table, log)
+        memory = _memory(constants, state, self.table if table is None else table, log)
         scenario = Scenario(self.start_ns, round(float(axis.law.period_s) * 1e9), **how)
         written, rows = run_lockstep(memory, codec_of(self._port.copy()), world, scenario, truth)
         return LockstepRun(log[:written], state[0], plant[0], world.device[0], Fault(int(state[0].fault)), truth[:rows])

@@ -30,10 +30,10 @@ from jointctl.firmware_py.states import Fault, Notice  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant  # noqa: E402
 from jointctl.tools.experiments.controllers import controller_constants, named  # noqa: E402
-from jointctl.tools.experiments.scenarios import Scenario, run_scenario  # noqa: E402
+from jointctl.tools.experiments.scenarios import Change, Scenario, run_scenario  # noqa: E402
 from jointctl.tools.lockstep import LockstepJoint  # noqa: E402
 
-MOTIONS: tuple[Scenario, ...] = get_args(Scenario)
+MOTIONS: tuple[Scenario, ...] = get_args(Change)
 CONTROLLERS = ("paper", "precise", "pid")
 
 

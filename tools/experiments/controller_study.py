@@ -6,7 +6,7 @@ does not depend on the number of processes.  A study comes from flags and from a
 
     plants = 40
     seed = 1
-    scenario = "sine"                 # sine, frequency, amplitude, load
+    scenario = "sine"                 # sine, frequency, amplitude, load, or a motion of `random_motions`
     controllers = ["paper", "precise", "my_joint.toml"]
 
     [plant]                           # any of the ranges of `EnsembleSettings`
@@ -35,20 +35,25 @@ from pydantic_core import PydanticCustomError
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.input_file import parse_toml, read_input
+from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.margins import phase_margin_deg
 from jointctl.tools.child_process import processors
 from jointctl.tools.configuration.config import Config, suggestion
+from jointctl.tools.configuration.conversions import law_resolution_rad
 from jointctl.tools.configuration.sections import JointEncoder, Reducer, ReducerMap, Section, Virtual, between
 from jointctl.tools.drawing import BLUE, GREY, INK, canvas
 from jointctl.tools.experiments.controllers import (
     DEFAULT,
     Controller,
     changed,
+    controller_config,
     controller_constants,
     named,
     one_line,
     with_chosen_gains,
 )
 from jointctl.tools.experiments.many_runs import HERE, Workers
+from jointctl.tools.experiments.random_motions import RANDOM_MOTIONS, random_motion
 from jointctl.tools.experiments.scenarios import RPDO_AT_ONCE, ErrorFigures, Scenario, error_figures, run_scenario
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.written_file import writing
@@ -235,9 +240,9 @@ def random_plant(base: Config, settings: EnsembleSettings, seed: int, index: int
         believed_kgm2 = update["reducer"].motor_inertia_kgm2 + link_kgm2
         virtual["inertia_scale"] *= base.joint.inertia_kgm2 / believed_kgm2
         update["joint"] = base.joint.model_copy(update={"inertia_kgm2": believed_kgm2})
-        delay_s = virtual["command_delay_s"] + float(random.uniform(-DELAY_ERROR_s, DELAY_ERROR_s))
-        measured = {"loop_delay_s": delay_s, "current_lag_s": virtual["current_lag_s"]}
-        update["margin"] = base.margin.model_copy(update=measured)
+    delay_s = virtual["command_delay_s"] + float(random.uniform(-DELAY_ERROR_s, DELAY_ERROR_s))
+    measured = {"loop_delay_s": max(delay_s, 0.0), "current_lag_s": virtual["current_lag_s"]}
+    update["margin"] = base.margin.model_copy(update=measured)
     update["virtual"] = base.virtual.model_copy(update=virtual)
     return base.model_copy(update=update)
 
@@ -334,9 +339,9 @@ class StudyResult:
     interrupted: bool
 
     def values(self, controller: str, figure: str) -> np.ndarray:
-        """One figure of one controller over the plants, shape (plants,); inf where a fault ended the run."""
+        """One figure of one controller over the plants, shape (plants,); inf where a fault ended the run, nan: none."""
         column = self.controllers.index(controller)
-        return np.array([float(getattr(plant.figures[column], figure)) for plant in self.plants])
+        return np.array([getattr(plant.figures[column], figure) for plant in self.plants], dtype=np.float64)
 
     def faults(self, controller: str) -> int:
         column = self.controllers.index(controller)
@@ -353,13 +358,19 @@ def run_plant(task: PlantTask) -> PlantResult:
     """Commission the plant and run every controller on it."""
     config = random_plant(task.base, task.plant, task.seed, task.index)
     joint = LockstepJoint(config)
+    motion = None
+    if task.scenario in RANDOM_MOTIONS:
+        motion = random_motion(task.scenario, task.seed, task.index, task.base.trajectory.duration_s)
+    count_rad = law_resolution_rad(config)
     figures = []
     for controller in task.controllers:
         both = task.plant.flexible and task.plant.law == "joint_encoder"
         if controller.control.kind == "flexible_joint" and both and task.plant.choose_gains:
             controller = with_chosen_gains(config, controller)
         constants = controller_constants(config, controller, joint.report.start_position_rad)
-        figures.append(error_figures(run_scenario(joint, constants, task.scenario), task.after_s))
+        run = run_scenario(joint, constants, task.scenario, motion=motion)
+        margin_deg = phase_margin_deg(loop_settings(controller_config(config, controller))[0])
+        figures.append(replace(error_figures(run, task.after_s, motion, count_rad), phase_margin_deg=margin_deg))
     assert config.virtual is not None
     on_joint = config.encoder if config.joint_encoder is None else config.joint_encoder
     bits = round(math.log2(on_joint.counts_per_turn))

@@ -4,6 +4,7 @@
     frequency  0.35 sin(0.125 pi (t + 1.5)) from 82.5 s on
     amplitude  0.175 sin(0.2 pi t) + 0.175 from 82.5 s on
     load       a load torque of 3 Nm at the joint from 80 s on
+    multi_sine, point_to_point, reversals, creep: motions that never repeat, see `random_motions`
 
 Both changes of the trajectory come at a crest: position and velocity go on, the acceleration jumps.
 """
@@ -17,12 +18,15 @@ from typing import Literal
 import numpy as np
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.firmware_py.states import Fault
+from jointctl.firmware_py.states import Fault, TrajectoryKind
+from jointctl.hil.lockstep import TRUE_POSITION_rad
+from jointctl.tools.experiments.random_motions import CREEP_radps, Motion, RandomMotion
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 
 # --- what happens ---
 
-Scenario = Literal["sine", "frequency", "amplitude", "load"]
+Change = Literal["sine", "frequency", "amplitude", "load"]
+Scenario = Literal[Change, RandomMotion]
 RPDO_AT_ONCE = 255  # the plant's own delay is then the whole delay from command to torque
 CHANGE_s = 82.5
 LOAD_AT_s = 80.0
@@ -38,14 +42,21 @@ def event_s(scenario: Scenario) -> float | None:
 
 
 def run_scenario(
-    joint: LockstepJoint, constants: np.recarray, scenario: Scenario = "sine", *, ideal_velocity: bool = False
+    joint: LockstepJoint,
+    constants: np.recarray,
+    scenario: Scenario = "sine",
+    *,
+    ideal_velocity: bool = False,
+    motion: Motion | None = None,
 ) -> LockstepRun:
     """One run of these constants on this joint, up to the end of the trajectory; neither is changed.
 
-    The controlled stop that follows is no part of an experiment.
+    The controlled stop that follows is no part of an experiment.  `motion` takes the place of the trajectory.
     """
     constants = constants.copy()
     trajectory = constants[0].trajectory
+    if motion is not None:
+        trajectory.kind, trajectory.repeats, trajectory.table_rows = TrajectoryKind.TABLE, 0, len(motion.table)
     at_s = event_s(scenario)
     if at_s is not None and 0.0 < trajectory.duration_s <= at_s:
         raise ConfigurationError(
@@ -63,7 +74,10 @@ def run_scenario(
         plant.load_step_Nm = LOAD_Nm
         plant.load_step_substep = round((starts_s + LOAD_AT_s) / float(plant.step_s))
     longest_s = _before_s(constants) + float(trajectory.duration_s)
-    return joint.run(constants, plant_constants=plant_constants, ideal_velocity=ideal_velocity, longest_s=longest_s)
+    return joint.run(
+        constants, plant_constants=plant_constants, ideal_velocity=ideal_velocity, longest_s=longest_s,
+        table=None if motion is None else motion.table,
+    )  # fmt: skip
 
 
 def _before_s(constants: np.recarray) -> float:
@@ -102,6 +116,10 @@ class ErrorFigures:
     settling_s: float  # until the measured error stays within 1 mrad; inf = it never does
     torque_peak_Nm: float  # of the command, after `after_s`
     chatter_Nm: float = math.inf  # mean change of the command from cycle to cycle
+    # of a motion with rests: share of them in which the measured error is within one count or 20 urad from 50 ms on
+    settled_share: float | None = None
+    stuck_share: float | None = None  # of creep: share of the time in which the joint stands still
+    phase_margin_deg: float | None = None  # of the loop that is believed, with the joint's true delay where that is known
 
 
 FAILED = (math.inf, math.inf, -math.inf, math.inf, math.inf, math.inf, math.inf, math.inf)
@@ -116,8 +134,40 @@ def settling_s(time_s: np.ndarray, error_rad: np.ndarray, within_rad: float = SE
     return math.inf if last_s > _STILL_OUTSIDE * float(time_s[-1]) else last_s
 
 
-def error_figures(run: LockstepRun, after_s: float) -> ErrorFigures:
-    """The figures of a run whose log has every cycle."""
+REST_BAND_rad = 20e-6
+REST_AFTER_S = 0.05
+_STUCK_WINDOW_S = 0.05
+_STUCK = 0.1  # of the distance that it should go
+
+
+def settled_share(time_s: np.ndarray, error_rad: np.ndarray, rests_s: np.ndarray, within_rad: float) -> float | None:
+    """Share of the rests in which |error| stays within the band from `REST_AFTER_S` on; None without any.
+
+    Arrays (N,), `rests_s` (M, 2).
+    """
+    settled = []
+    for begin_s, end_s in rests_s:
+        first, last = np.searchsorted(time_s, (begin_s + REST_AFTER_S, end_s))
+        settled.append(bool(np.all(np.abs(error_rad[first:last]) <= within_rad)))
+    return float(np.mean(settled)) if settled else None
+
+
+def stuck_share(run: LockstepRun, after_s: float) -> float:
+    """Share of a creeping motion, but for its turns, in which the joint goes less than a tenth of the way."""
+    tracking = run.tracking
+    log = run.log[tracking]
+    position = run.truth[tracking, TRUE_POSITION_rad]
+    window = round(_STUCK_WINDOW_S / float(log.trajectory_s[1] - log.trajectory_s[0]))
+    asked = np.abs(log.desired_position_rad[window:] - log.desired_position_rad[:-window])
+    moved = np.abs(position[window:] - position[:-window])
+    counts = (log.trajectory_s[window:] >= after_s) & (asked > 0.99 * CREEP_radps * _STUCK_WINDOW_S)
+    return float(np.mean(moved[counts] < _STUCK * asked[counts]))
+
+
+def error_figures(
+    run: LockstepRun, after_s: float, motion: Motion | None = None, count_rad: float = 0.0
+) -> ErrorFigures:
+    """The figures of a run whose log has every cycle; those of rests and of creep where the motion has them."""
     if run.fault is not Fault.NONE:
         return ErrorFigures(run.fault.name.lower(), *FAILED)
     tracking = run.tracking
@@ -126,6 +176,11 @@ def error_figures(run: LockstepRun, after_s: float) -> ErrorFigures:
     late = time_s >= after_s
     measured = error[late] * 1e3
     true = run.true_error_rad[tracking][late] * 1e3
+    settled = stuck = None
+    if motion is not None:
+        rests = motion.rests_s[(motion.rests_s[:, 0] >= after_s) & (motion.rests_s[:, 1] <= time_s[-1])]
+        settled = settled_share(time_s, error, rests, max(count_rad, REST_BAND_rad))
+        stuck = stuck_share(run, after_s) if motion.kind == "creep" else None
     return ErrorFigures(
         fault="",
         peak_mrad=float(np.max(np.abs(measured))),
@@ -137,4 +192,6 @@ def error_figures(run: LockstepRun, after_s: float) -> ErrorFigures:
         settling_s=settling_s(time_s, error),
         torque_peak_Nm=float(np.max(np.abs(run.log.command_torque_Nm[tracking][late]))),
         chatter_Nm=float(np.mean(np.abs(np.diff(run.log.command_torque_Nm[tracking][late])))),
+        settled_share=settled,
+        stuck_share=stuck,
     )

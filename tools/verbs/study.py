@@ -25,6 +25,9 @@ _COLUMNS = (
     ("true_rmse_mrad", "true RMSE [mrad]"),
     ("settling_s", "settling [s]"),
     ("chatter_Nm", "chatter [Nm]"),
+    ("phase_margin_deg", "margin [deg]"),
+    ("settled_share", "settled [share]"),
+    ("stuck_share", "stuck [share]"),
 )
 _BOXES = (
     "Box: quartiles, line: median; whiskers: 5 and 95 %; dots: plants beyond them. A run ended by a fault is left out."
@@ -117,19 +120,31 @@ def _text(values: tuple[float, float, float], digits: int = 3) -> str:
     return f"{texts[0]} ({texts[1]}..{texts[2]})"
 
 
+def _columns(result: StudyResult) -> list[tuple[str, str]]:
+    """Those that the motion of this study has."""
+    return [
+        (key, heading)
+        for key, heading in _COLUMNS
+        if not all(math.isnan(value) for name in result.controllers for value in result.values(name, key))
+    ]
+
+
 def _table(result: StudyResult, title: str, after_s: float) -> Table:
-    headings = [heading for _, heading in _COLUMNS]
+    columns = _columns(result)
+    headings = [heading for _, heading in columns]
     table = Table(
         "controller",
         *(Column(heading, justify="right") for heading in (*headings, "faults")),
         title=f"{title}: errors after {after_s:g} s [mrad], median (5..95 %)",
         caption="peak and RMSE as the encoder shows them; true: of the joint itself; "
-        "settling: until the error stays within 1 mrad; chatter: mean change of the torque command in a cycle",
+        "settling: until the error stays within 1 mrad; chatter: mean change of the torque command in a cycle; "
+        "settled: share of the moves after which the error is within 1 count or 20 urad from 50 ms on; "
+        "stuck: share of a creeping motion in which the joint stands",
         title_justify="left",
         caption_justify="left",
     )
     for name in result.controllers:
-        cells = [_text(spread(result, name, key)) for key, _ in _COLUMNS]
+        cells = [_text(spread(result, name, key)) for key, _ in columns]
         table.add_row(name, *cells, str(result.faults(name)))
     return table
 
@@ -147,7 +162,7 @@ def study_data(result: StudyResult, settings: StudySettings) -> dict[str, Any]:
     rows = {}
     for name in result.controllers:
         row: dict[str, Any] = {"faults": result.faults(name)}
-        for key, _ in _COLUMNS:
+        for key, _ in _columns(result):
             median, low, high = spread(result, name, key)
             row[key] = {"median": median, "p5": low, "p95": high}
         rows[name] = row
@@ -171,7 +186,7 @@ class StudyFlags:
     ] = None
     seed: Annotated[int | None, typer.Option("--seed")] = None
     after_s: Annotated[float | None, typer.Option("--after", help="errors are taken after this time (s)")] = None
-    scenario: Annotated[str | None, typer.Option("--scenario", help="sine, frequency, amplitude or load")] = None
+    scenario: Annotated[str | None, typer.Option("--scenario", help="sine, frequency, amplitude, load, or one that never repeats: multi_sine, point_to_point, reversals, creep")] = None
     controllers: Annotated[
         list[str] | None,
         typer.Option("--controller", help="name or configuration file; may be repeated", autocompletion=configurations),
