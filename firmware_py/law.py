@@ -8,6 +8,7 @@ import math
 
 from jointctl.firmware_py.flexible_joint import Reading, desired_motor, motor_and_link_errors, reset_flexible
 from jointctl.firmware_py.friction import compensation_motor_torque_Nm, step_lugre
+from jointctl.firmware_py.friction_adaptation import adapt, adapted_feed_forward_Nm, reset_adaptation, take_at_rest
 from jointctl.firmware_py.kernel import kernel, plain
 from jointctl.firmware_py.records import (
     LEARNING_BINS,
@@ -314,6 +315,7 @@ def reset_law(constants: LawConstants, state: LawState) -> None:
     reset_learning(state.learning)
     state.learning.stopped = 0
     reset_flexible(state.flexible)
+    reset_adaptation(constants.adaptation, state.adaptation)
     state.lugre_deflection_rad = 0.0
     state.integral_rads = 0.0
     state.inertia_torque_Nm = 0.0
@@ -347,6 +349,35 @@ def friction_feed_forward_Nm(
     return constants.reduction_ratio * compensation_motor_torque_Nm(
         constants.friction, constants.zero_rule, constants.zero_band_radps, speed
     )
+
+
+@kernel
+def _friction_Nm(
+    constants: LawConstants, state: LawState, velocity_radps: float, reference: Reference, motor_rad: float
+) -> float:
+    """The same for the motion desired `feed_forward_lead_s` later; adapted, of the desired motor angle / n as well."""
+    lead_s = constants.feed_forward_lead_s
+    desired_radps = reference.velocity_radps + lead_s * reference.acceleration_radps2
+    if constants.adaptation.enabled != 0:
+        ahead_rad = motor_rad + lead_s * reference.velocity_radps
+        return adapted_feed_forward_Nm(constants, state.adaptation, ahead_rad, desired_radps)
+    return friction_feed_forward_Nm(constants, state, velocity_radps, desired_radps)
+
+
+@kernel
+def _adapt(
+    constants: LawConstants, state: LawState, desired_radps: float, position_rad: float, error_rate_radps: float
+) -> None:
+    """Adapt the friction to what the observer has found; at rest, give it what the observer has added."""
+    taken_Nm = take_at_rest(constants, state.adaptation, state.observer_torque_Nm, desired_radps)
+    state.friction_torque_Nm += taken_Nm
+    add_to_disturbance(constants.observer, state.observer, -taken_Nm)
+    state.observer_torque_Nm = state.observer.disturbance_Nm
+    fed_Nm = state.friction_torque_Nm + state.learned_torque_Nm
+    adapt(
+        constants, state.adaptation, state.observer_torque_Nm, fed_Nm, desired_radps, position_rad,
+        desired_radps + error_rate_radps,
+    )  # fmt: skip
 
 
 @kernel
@@ -420,10 +451,13 @@ def step_law(
     state.gravity_torque_Nm = constants.coriolis_Nmspr * velocity.velocity_radps + constants.gravity_Nm * math.sin(
         position_rad - constants.gravity_zero_rad
     )
-    state.friction_torque_Nm = friction_feed_forward_Nm(
-        constants, state, velocity.velocity_radps, reference.velocity_radps
+    state.friction_torque_Nm = _friction_Nm(
+        constants, state, velocity.velocity_radps, reference, reference.position_rad
     )
     rest_Nm = _rest_torque_Nm(constants, state, error, error_rate, velocity.velocity_radps, sent_torque_Nm)
+    if constants.adaptation.enabled != 0:
+        _adapt(constants, state, reference.velocity_radps, position_rad, error_rate)
+        rest_Nm = state.observer_torque_Nm
     correction_Nm = proportional_Nm + rest_Nm - constants.inertia_kgm2 * constants.learning.error_gain_ps2 * error
     state.learned_torque_Nm = _learn(constants, state, where, correction_Nm, error)
     if constants.kind == ControllerKind.COMPUTED_TORQUE_OBSERVER:
@@ -452,7 +486,8 @@ def step_flexible_law(
 ) -> float:
     """One cycle, as `step_law`: the unlimited torque at the joint [Nm]."""
     flexible, own = constants.flexible, state.flexible
-    state.friction_torque_Nm = friction_feed_forward_Nm(constants, state, 0.0, reference.velocity_radps)
+    desired_rad = own.target_rad if own.primed != 0 else reference.position_rad
+    state.friction_torque_Nm = _friction_Nm(constants, state, 0.0, reference, desired_rad)
     gravity_slope_Nmprad = 0.0
     state.gravity_torque_Nm = 0.0
     if constants.gravity_Nm != 0.0:
@@ -468,6 +503,10 @@ def step_flexible_law(
     state.observer_torque_Nm = step_observer(
         constants.observer, state.observer, sent_torque_Nm - own.known_torque_Nm, 0.0, momentum, constants.period_s
     )
+    if constants.adaptation.enabled != 0:
+        known_Nm -= state.friction_torque_Nm
+        _adapt(constants, state, reference.velocity_radps, own.target_rad + motor_rad, rate_radps)
+        known_Nm += state.friction_torque_Nm
     state.feedback_torque_Nm = -constants.inertia_kgm2 * (
         constants.kp * (motor_rad + own.twist_error_rad) + constants.kv * rate_radps
     )

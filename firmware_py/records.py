@@ -19,6 +19,9 @@ TORQUE_HISTORY = 16  # cycles that an observer can look back
 LEARNING_BINS = 1 << 14
 HARMONICS = 4  # of a map of the reducer
 KNEES = 2  # of the reducer's stiffness
+BRISTLES = 4  # of different stiffness, that the adaptation of the friction weighs
+RIPPLES = 2  # sines of the motor angle that it finds
+ADAPTED_PARTS = 2 * BRISTLES + 2 * RIPPLES
 
 
 @record
@@ -174,6 +177,34 @@ class FlexibleState:
 
 
 @record
+class AdaptationConstants:
+    """See `friction_adaptation`."""
+
+    enabled: i4
+    ripples: i4  # sines in use
+    friction_error: f8  # of the weight of each kind of bristles at first, 1 = the configured friction
+    reach: f8  # by which all of them together may leave the configured friction
+    ripple_Nm: f8  # of the sines at first
+    ripple_max_Nm: f8
+    ripple_turns_prad: Annotated[np.ndarray, array_of(f8, RIPPLES)]  # order per joint turn / 2 pi
+
+
+@record
+class AdaptationState:
+    weights: Annotated[np.ndarray, array_of(f8, ADAPTED_PARTS)]
+    covariance: Annotated[np.ndarray, array_of(f8, ADAPTED_PARTS, ADAPTED_PARTS)]
+    gain: Annotated[np.ndarray, array_of(f8, ADAPTED_PARTS)]
+    filtered_Nm: Annotated[np.ndarray, array_of(f8, ADAPTED_PARTS)]
+    desired_deflection_rad: Annotated[np.ndarray, array_of(f8, BRISTLES)]
+    deflection_rad: Annotated[np.ndarray, array_of(f8, BRISTLES)]  # as measured
+    bristle: LuGreConstants  # of one kind of bristles, while they are computed
+    fed_filtered_Nm: f8
+    rest_disturbance_Nm: f8  # the observer's, when the desired motion came to rest
+    resting: i4
+    cycle: i4
+
+
+@record
 class LawConstants:
     kind: i4  # ControllerKind
     feed_forward: i4  # FeedForward
@@ -196,6 +227,8 @@ class LawConstants:
     observer: ObserverConstants
     learning: LearningConstants
     flexible: FlexibleConstants
+    adaptation: AdaptationConstants
+    feed_forward_lead_s: f8  # friction is fed forward for the motion that is desired so much later
 
 
 @record
@@ -204,6 +237,7 @@ class LawState:
     observer: ObserverState
     learning: LearningState
     flexible: FlexibleState
+    adaptation: AdaptationState
     lugre_deflection_rad: f8
     integral_rads: f8
     outside_torque_Nm: f8  # ControllerKind.OUTSIDE only

@@ -162,6 +162,11 @@ def _control_problems(config: Config) -> list[str]:
             f'[control.learning] needs control.kind "computed_torque_observer" or "flexible_joint" (={control.kind}): '
             "the observer takes over when learning starts anew"
         )
+    if control.adaptation is not None and (control.kind not in OBSERVING or control.feed_forward != "lugre_desired"):
+        found.append(
+            '[control.adaptation] needs control.kind "computed_torque_observer" or "flexible_joint" '
+            f'(={control.kind}) and control.feed_forward "lugre_desired" (={control.feed_forward})'
+        )
     if control.zero_rule == "linear" and control.zero_band_radps == 0.0:
         found.append('control.zero_band_radps (=0) must be more than 0 for control.zero_rule = "linear"')
     if control.weight_limit_Nm and abs(control.initial_weight_Nm) > control.weight_limit_Nm:

@@ -30,7 +30,7 @@ from jointctl.tools.configuration.conversions import (
     period_s,
     static_friction_Nm,
 )
-from jointctl.tools.configuration.sections import Control, Hold, Reducer, Section
+from jointctl.tools.configuration.sections import Adaptation, Control, Hold, Reducer, Section
 
 # the paper's centres, in rad and in rad/s: -c_p, 0, c_p with c_p = 1e-2 [-5 -3 -1 -0.8 -0.4 -0.1 -0.05]
 _PAPER_HALF = (0.05, 0.03, 0.01, 0.008, 0.004, 0.001, 0.0005)
@@ -126,6 +126,9 @@ def _fill_law(law: Any, config: Config) -> None:
         _copy(law.learning, control.learning, "gain", "error_gain_ps2", "lead_cycles", "blend_s")
         law.learning.half_width = control.learning.half_width_cycles
         law.learning.growth = config.limits.learning_growth
+    law.feed_forward_lead_s = control.feed_forward_lead_s
+    if control.adaptation is not None:
+        _fill_adaptation(law.adaptation, control.adaptation, joint.reduction_ratio)
     if config.friction is not None:
         law.friction = friction_constants(config.friction, joint.reduction_ratio)[0]
         if config.friction.lugre is not None:
@@ -144,6 +147,18 @@ def _fill_law(law: Any, config: Config) -> None:
     network.initial_weight = control.initial_weight_Nm
     network.leakage = control.leakage_1ps
     network.weight_limit = control.weight_limit_Nm
+
+
+RIPPLE_MOST = 4.0  # times what is expected
+
+
+def _fill_adaptation(record: Any, adaptation: Adaptation, ratio: float) -> None:
+    record.enabled = 1
+    _copy(record, adaptation, "friction_error", "reach", "ripple_Nm")
+    record.ripple_max_Nm = RIPPLE_MOST * adaptation.ripple_Nm
+    record.ripples = len(adaptation.ripple_per_motor_turn)
+    for i, order in enumerate(adaptation.ripple_per_motor_turn):
+        record.ripple_turns_prad[i] = ratio * order / math.tau
 
 
 def _fill_flexible(record: Any, config: Config, reducer: Reducer) -> None:

@@ -18,7 +18,7 @@ from pydantic_core import PydanticCustomError
 
 from jointctl.drivers.can.channel import NAME, RESERVED, split_channel, with_options
 from jointctl.drivers.can.open import CYCLIC_INTERFACES
-from jointctl.firmware_py.records import NEURONS
+from jointctl.firmware_py.records import NEURONS, RIPPLES
 
 
 def interval_text(low: float, high: float, open_low: bool = False) -> str:
@@ -224,6 +224,18 @@ class Learning(Section):
     blend_s: Annotated[float, between(0.001, 100.0)] = 0.5  # over which what has been learned comes in
 
 
+class Adaptation(Section):
+    """Friction feed-forward that adapts to the joint whatever the motion; needs an observer and lugre_desired."""
+
+    # of the share of each kind of bristles, at first: how far the configured friction may be off
+    friction_error: Annotated[float, between(0.0, 1.0, open_low=True)] = 0.15
+    # by which the whole friction of a direction may leave the configured one
+    reach: Annotated[float, between(0.0, 1.0)] = 0.3
+    # torque ripple to find: periods a motor turn, two at most
+    ripple_per_motor_turn: Annotated[tuple[float, ...], _numbers("numbers", 0, 1, RIPPLES, low=0.0, high=1000.0)] = ()
+    ripple_Nm: Annotated[float, between(0.0, 1e4, open_low=True)] = 0.7  # expected of it, at the joint; four times at most
+
+
 class Control(Section):
     # docs/law.md
     kind: Literal["computed_torque", "computed_torque_rbf", "computed_torque_observer", "pid", "flexible_joint"]
@@ -254,6 +266,9 @@ class Control(Section):
     # with which the link's encoder corrects the expected twist, flexible_joint with both encoders only
     twist_radps: Annotated[float, between(0.0, 1000.0, open_low=True)] = 60.0
     link_cutoff_Hz: Annotated[float, between(0.0, 2000.0)] = 60.0  # of the link's velocity there; 0 = no filter
+    # of the friction: the motion desired so much later, as torque is late by delay and lag
+    feed_forward_lead_s: Annotated[float, between(0.0, 0.02)] = 0.0
+    adaptation: Adaptation | None = None
     learning: Learning | None = None
 
 
