@@ -13,9 +13,9 @@ part, now driven by the motion that is measured, d + LP_L(fed forward) = w^T LP_
 filter solves it every `EVERY` cycles, for weights that drift slowly.  Driven by the desired motion the parts would be
 off where bristles give way, by as much as the joint is: soft and stiff ones would be mistaken for each other.
 
-While the desired motion rests nothing adapts, and what friction holds is anything.  The observer, which goes on until the
-joint is where it should be, would find that torque, and take it along into the next move as a disturbance.  What it adds
-after a move has ended is therefore handed over to the bristles, which hold it until they slide (`take_at_rest`).
+While the desired motion rests nothing adapts, and what friction holds is anything.  The observer, which goes on until
+the joint is where it should be, would find that torque, and take it along into the next move as a disturbance.  What it
+adds after a move has ended is therefore handed over to the bristles, which hold it until they slide (`take_at_rest`).
 
 Bounded by construction: bristles in parallel, none of them negative, that together have at most `reach` more or less
 than the configured friction in either direction, and sines of at most `ripple_max_Nm`.  Not modelled: friction that

@@ -12,12 +12,12 @@ from jointctl.firmware_py.trajectory import reference_at, repetition
 from jointctl.tools.experiments.controller_study import EnsembleSettings, checked, random_plant, run_study
 from jointctl.tools.experiments.controllers import controller_constants, named
 from jointctl.tools.experiments.random_motions import (
+    RANDOM_MOTIONS,
     ACCELERATION_radps2,
     CREEP_radps,
-    RANDOM_MOTIONS,
+    RandomMotion,
     REACH_rad,
     SPEED_radps,
-    RandomMotion,
     random_motion,
 )
 from jointctl.tools.experiments.scenarios import error_figures, run_scenario, settled_share
@@ -29,9 +29,7 @@ DURATION_S = 30.0
 
 @pytest.mark.parametrize("kind", RANDOM_MOTIONS)
 @pytest.mark.parametrize("index", range(6))
-def test_a_motion_is_smooth_begins_and_ends_at_rest_and_stays_within_its_limits(
-    kind: RandomMotion, index: int
-) -> None:
+def test_a_motion_is_smooth_begins_and_ends_at_rest_and_stays_within_its_limits(kind: RandomMotion, index: int) -> None:
     table = random_motion(kind, 3, index, DURATION_S).table
     start, c0, c1, c2, c3 = table[:-1].T
     steps = np.diff(table[:, 0])

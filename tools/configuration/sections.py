@@ -233,7 +233,9 @@ class Adaptation(Section):
     reach: Annotated[float, between(0.0, 1.0)] = 0.3
     # torque ripple to find: periods a motor turn, two at most
     ripple_per_motor_turn: Annotated[tuple[float, ...], _numbers("numbers", 0, 1, RIPPLES, low=0.0, high=1000.0)] = ()
-    ripple_Nm: Annotated[float, between(0.0, 1e4, open_low=True)] = 0.7  # expected of it, at the joint; four times at most
+    ripple_Nm: Annotated[float, between(0.0, 1e4, open_low=True)] = (
+        0.7  # expected of it, at the joint; four times at most
+    )
 
 
 class Control(Section):

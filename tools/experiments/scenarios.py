@@ -119,7 +119,9 @@ class ErrorFigures:
     # of a motion with rests: share of them in which the measured error is within one count or 20 urad from 50 ms on
     settled_share: float | None = None
     stuck_share: float | None = None  # of creep: share of the time in which the joint stands still
-    phase_margin_deg: float | None = None  # of the loop that is believed, with the joint's true delay where that is known
+    phase_margin_deg: float | None = (
+        None  # of the loop that is believed, with the joint's true delay where that is known
+    )
 
 
 FAILED = (math.inf, math.inf, -math.inf, math.inf, math.inf, math.inf, math.inf, math.inf)

@@ -7,6 +7,7 @@ replaces the file in one step; on any error the file stays as it is.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -359,8 +360,36 @@ def with_section(text: str, values: dict[str, Any], remarks: list[str]) -> str:
     return "".join(lines[:at] + [MARK + line + newline for line in remarks] + lines[at:])
 
 
+def with_map(text: str, values: dict[str, Any], remarks: list[str]) -> str:
+    """`text` with its [reducer.map] replaced or added; everything else and all comments but the map's stay."""
+    try:
+        document = tomlkit.parse(text)
+    except TOMLKitError as error:
+        raise ConfigurationError(f"not valid TOML: {error}") from None
+    reducer = document.get("reducer")
+    if reducer is None:
+        raise ConfigurationError("[reducer] is missing, which [reducer.map] belongs to")
+    if "map" not in reducer:
+        reducer["map"] = tomlkit.table()
+    found = reducer["map"]
+    for line in remarks:
+        found.comment(MARK.removeprefix("# ") + line)
+    for key, value in values.items():
+        found[key] = value
+    return tomlkit.dumps(document)
+
+
+def write_map(config_path: Path, values: dict[str, Any], remarks: list[str]) -> None:
+    """As `write_into`, with [reducer.map]."""
+    _write_changed(config_path, lambda text: with_map(text, values, remarks))
+
+
 def write_into(config_path: Path, values: dict[str, Any], remarks: list[str]) -> None:
     """Put the section into a configuration; if the result is not valid, `ConfigurationError`, and the file stays."""
+    _write_changed(config_path, lambda text: with_section(text, values, remarks))
+
+
+def _write_changed(config_path: Path, change: Callable[[str], str]) -> None:
     try:
         text = read_input(config_path).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -368,7 +397,7 @@ def write_into(config_path: Path, values: dict[str, Any], remarks: list[str]) ->
             f"{config_path}: cannot be read: {getattr(error, 'strerror', None) or error}"
         ) from None
     try:
-        changed = with_section(text, values, remarks)
+        changed = change(text)
     except ConfigurationError as error:
         raise ConfigurationError(f"{config_path}: {error.message}") from None
 

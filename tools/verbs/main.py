@@ -23,6 +23,7 @@ from jointctl.tools.verbs.hil import hil
 from jointctl.tools.verbs.identify import identify
 from jointctl.tools.verbs.info import info
 from jointctl.tools.verbs.log import log_app
+from jointctl.tools.verbs.map import map_verb
 from jointctl.tools.verbs.monitor import monitor
 from jointctl.tools.verbs.new import new
 from jointctl.tools.verbs.paper import paper
@@ -76,7 +77,7 @@ for _panel, _verbs in (
     (BEGIN, (demo, new, zero, hil, doctor)),
     (MOVE, (run, stop, clear_fault, check)),
     (INSPECT, (scan, info, monitor)),
-    (FRICTION, (sweep, identify, validate)),
+    (FRICTION, (sweep, identify, validate, map_verb)),
     (LOOK, (report, scope)),
     (COMPARE, (paper, study_verb, fault_campaign)),
 ):

@@ -186,7 +186,13 @@ class StudyFlags:
     ] = None
     seed: Annotated[int | None, typer.Option("--seed")] = None
     after_s: Annotated[float | None, typer.Option("--after", help="errors are taken after this time (s)")] = None
-    scenario: Annotated[str | None, typer.Option("--scenario", help="sine, frequency, amplitude, load, or one that never repeats: multi_sine, point_to_point, reversals, creep")] = None
+    scenario: Annotated[
+        str | None,
+        typer.Option(
+            "--scenario",
+            help="sine, frequency, amplitude, load; never repeating: multi_sine, point_to_point, reversals, creep",
+        ),
+    ] = None
     controllers: Annotated[
         list[str] | None,
         typer.Option("--controller", help="name or configuration file; may be repeated", autocompletion=configurations),

@@ -1,0 +1,183 @@
+"""Friction that adapts: it finds what is there, stays within its bounds, and takes over what holds the joint."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.friction import paper_friction, step_lugre
+from jointctl.firmware_py.friction_adaptation import (
+    AS_CONFIGURED,
+    MOST,
+    SINES,
+    STIFFNESS,
+    adapt,
+    adapted_feed_forward_Nm,
+    reset_adaptation,
+    take_at_rest,
+)
+from jointctl.firmware_py.records import BRISTLES, AdaptationState, LawConstants, LuGreConstants
+from jointctl.firmware_py.schema import new
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant
+from jointctl.tools.experiments.controllers import Controller, changed, controller_constants, named
+from jointctl.tools.experiments.random_motions import random_motion
+from jointctl.tools.experiments.scenarios import error_figures, run_scenario
+from jointctl.tools.lockstep import LockstepJoint
+from tests.configurations import shipped, written
+
+RATIO, ORDER = 121.0, 2.0
+
+
+@pytest.fixture
+def law() -> Any:
+    """Constants with the paper's friction, an observer, and one ripple to find."""
+    constants = new(LawConstants)[0]
+    constants.period_s, constants.reduction_ratio = 1e-3, RATIO
+    constants.friction = paper_friction()[0]
+    constants.lugre.stiffness_Nmprad, constants.lugre.damping_Nmspr = 8e4, 0.0
+    constants.observer.bandwidth_radps = 60.0
+    own = constants.adaptation
+    own.enabled, own.ripples, own.friction_error, own.reach = 1, 1, 0.15, 0.3
+    own.ripple_Nm, own.ripple_max_Nm = 0.7, 2.8
+    own.ripple_turns_prad[0] = ORDER * RATIO / math.tau
+    return constants
+
+
+def fresh(law: Any) -> Any:
+    state = new(AdaptationState)[0]
+    reset_adaptation(law.adaptation, state)
+    return state
+
+
+class Truth:
+    """A joint whose friction differs in both directions and whose bristles are not those of the configuration."""
+
+    def __init__(self, law: Any, stiffness: float, scales: tuple[float, float], ripple_Nm: float) -> None:
+        self.law, self.scales, self.ripple_Nm, self.deflection_rad = law, scales, ripple_Nm, 0.0
+        self.lugre = new(LuGreConstants)[0]
+        self.lugre.stiffness_Nmprad = stiffness
+
+    def torque_Nm(self, position_rad: float, velocity_radps: float) -> float:
+        self.deflection_rad, torque = step_lugre(
+            self.lugre, self.law.friction, RATIO, self.deflection_rad, velocity_radps, 1e-3
+        )
+        ripple = self.ripple_Nm * math.sin(ORDER * RATIO * position_rad + 0.5)
+        return torque * self.scales[0 if torque >= 0.0 else 1] + ripple
+
+
+def follow(law: Any, state: Any, truth: Truth, duration_s: float) -> np.ndarray:
+    """What is left of the friction after feed-forward [Nm], while a perfect loop follows a sine; (N,)."""
+    left, seen_Nm = [], 0.0
+    for k in range(round(duration_s * 1e3)):
+        time_s = 1e-3 * k
+        position, velocity = 0.1 * math.sin(2.0 * time_s), 0.2 * math.cos(2.0 * time_s)
+        true_Nm = truth.torque_Nm(position, velocity)
+        fed_Nm = adapted_feed_forward_Nm(law, state, position, velocity)
+        left.append(true_Nm - fed_Nm)
+        adapt(law, state, seen_Nm, fed_Nm, velocity, position, velocity)
+        seen_Nm += 60.0 * 1e-3 * (left[-1] - seen_Nm)
+    return np.array(left)
+
+
+@pytest.mark.parametrize("stiffness", [3e4, 8e4, 2.4e5, 2e6])
+def test_it_finds_bristles_directions_and_ripple(law: Any, stiffness: float) -> None:
+    state = fresh(law)
+    left = follow(law, state, Truth(law, stiffness, (1.1, 0.92), 1.2), 25.0)
+    rms = [math.sqrt(np.mean(part**2)) for part in (left[:3000], left[-6000:])]
+    assert rms[1] < 0.25 * rms[0]
+    sums = [sum(state.weights[side : 2 * BRISTLES : 2]) for side in (0, 1)]
+    assert sums == pytest.approx([1.1, 0.92], abs=0.03)
+    assert math.hypot(*state.weights[SINES : SINES + 2]) == pytest.approx(1.2, rel=0.15)
+
+
+def test_without_an_error_it_stays_what_it_was(law: Any) -> None:
+    state = fresh(law)
+    left = follow(law, state, Truth(law, 8e4, (1.0, 1.0), 0.0), 10.0)
+    assert np.max(np.abs(left)) < 0.2
+    assert state.weights[2 * AS_CONFIGURED] == pytest.approx(1.0, abs=0.05)
+
+
+def test_no_torque_takes_the_weights_beyond_their_bounds(law: Any) -> None:
+    state = fresh(law)
+    random = np.random.default_rng(1)
+    for k in range(4000):
+        velocity = 0.2 * math.cos(0.01 * k)
+        torque = float(random.choice([-500.0, 0.0, 500.0]))
+        adapt(law, state, torque, adapted_feed_forward_Nm(law, state, 0.1, velocity), velocity, 0.1, velocity)
+        friction = state.weights[: 2 * BRISTLES]
+        assert np.all((friction >= 0.0) & (friction <= MOST + law.adaptation.reach))
+        for side in (0, 1):
+            assert 0.7 - 1e-9 <= sum(friction[side::2]) <= 1.3 + 1e-9
+        assert np.all(np.abs(state.weights[SINES:]) <= 2.8)
+
+
+def test_nothing_adapts_while_the_desired_motion_rests(law: Any) -> None:
+    state = fresh(law)
+    follow(law, state, Truth(law, 8e4, (1.0, 1.0), 0.0), 1.0)
+    before = state.weights.copy()
+    for _ in range(1000):
+        adapt(law, state, 20.0, 0.0, 0.0, 0.1, 0.01)
+    assert np.array_equal(state.weights, before)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_at_rest_the_bristles_take_over_what_the_observer_adds_and_no_more_than_they_hold(
+    law: Any, side: float
+) -> None:
+    state = fresh(law)
+    fed = adapted_feed_forward_Nm(law, state, 0.0, 0.0)
+    disturbance = 2.0  # a load, which stays
+    assert take_at_rest(law, state, disturbance, 0.0) == 0.0
+    for _ in range(1000):
+        disturbance += side * 0.005
+        taken = take_at_rest(law, state, disturbance, 0.0)
+        disturbance -= taken
+        fed += taken
+        assert adapted_feed_forward_Nm(law, state, 0.0, 0.0) == pytest.approx(fed)
+    assert disturbance - 2.0 == pytest.approx(side * 0.25, rel=0.02)  # 5 Nm/s at 20 rad/s
+    for _ in range(5000):
+        disturbance += side * 0.05
+        disturbance -= take_at_rest(law, state, disturbance, 0.0)
+    held = STIFFNESS[AS_CONFIGURED] * 8e4 * state.desired_deflection_rad[AS_CONFIGURED]
+    branch = law.friction.positive if side > 0.0 else law.friction.negative
+    assert held == pytest.approx(side * RATIO * branch.static_Nm)
+    assert take_at_rest(law, state, disturbance, 0.2) == 0.0
+    assert state.resting == 0
+
+
+def adaptive(controller: Controller, **more: Any) -> Controller:
+    changes = {"feed_forward_lead_s": 0.002, "adaptation": {"ripple_per_motor_turn": [2.0, 10.0]}, **more}
+    return Controller("adaptive", changed(controller.control, changes, "test"), controller.friction)
+
+
+@pytest.mark.parametrize("kind", ["multi_sine", "point_to_point", "reversals"])
+def test_motions_that_never_repeat_are_followed_better(kind: Any) -> None:
+    base = shipped("precise", trajectory__duration_s=30.0)
+    precise = named(("precise",))[0]
+    before, after = [], []
+    for index in (0, 1, 3):
+        config = random_plant(base, EnsembleSettings(), 5, index)
+        joint, motion = LockstepJoint(config), random_motion(kind, 5, index, 30.0)
+        for controller, found in ((precise, before), (adaptive(precise), after)):
+            constants = controller_constants(config, controller, joint.report.start_position_rad)
+            figures = error_figures(run_scenario(joint, constants, kind, motion=motion), 15.0, motion)
+            assert figures.fault == ""
+            found.append(figures.true_rmse_mrad)
+    assert sum(after) < 0.75 * sum(before)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"control__kind": "computed_torque", "control__observer_radps": 0.0}, {"control__feed_forward": "desired"}],
+)
+def test_it_needs_an_observer_and_bristles(tmp_path: Path, wrong: dict[str, Any]) -> None:
+    keys = {"control__adaptation": {}, "control__learning": None}
+    assert load_config(written(tmp_path / "good.toml", "precise", **keys)).control.adaptation is not None
+    with pytest.raises(ConfigurationError, match=r"\[control.adaptation\] needs control.kind"):
+        load_config(written(tmp_path / "bad.toml", "precise", **keys, **wrong))

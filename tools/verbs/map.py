@@ -1,0 +1,235 @@
+"""`jointctl map CONFIG`: kinematic error and torque ripple of a reducer, from one slow motion both ways."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Column, Table
+
+from jointctl.drivers.errors import DECLINED, INTERRUPTED, ConfigurationError, MotionFault, UsageError
+from jointctl.tools.output import Output
+from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOnBus, VerbOutput, Yes
+
+if TYPE_CHECKING:
+    from jointctl.drivers.drive import CommissioningReport
+    from jointctl.tools.analysis.reducer_map import FoundMap, MapRun
+    from jointctl.tools.configuration.config import Config
+
+SPEED_radps = 0.03
+LONGEST_rad = 0.7  # of the travel, unless more is asked for
+SPEED_SHARE = 0.5  # of limits.velocity_max_radps
+ACCELERATION_SHARE = 0.5  # of sequence.brake_radps2
+_DWELL_S = 0.5
+_NEAR = 0.05  # share of the speed over which the slope of the friction is taken
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """The motion; None = what fits the joint."""
+
+    travel_rad: Annotated[
+        float | None,
+        typer.Option("--travel", metavar="RAD", help="about the middle of the limits (what they allow, 0.7)"),
+    ] = None
+    speed_radps: Annotated[
+        float, typer.Option("--speed", metavar="RAD/S", help="slow, but faster than the joint sticks")
+    ] = SPEED_radps
+    lockstep: Annotated[bool, typer.Option("--lockstep", help="virtual joint in simulated time: seconds")] = False
+
+
+def config_of_map(config: Config, options: MapOptions) -> Config:
+    """The configuration with one slow motion both ways, and nothing that learns; `UsageError` where it does not fit."""
+    from jointctl.tools.configuration.sections import Trapezoid
+    from jointctl.tools.sweeping.carry_out import with_mode, with_tracking_law
+    from jointctl.tools.sweeping.plan import position_margin_rad
+
+    limits = config.limits
+    margin_rad = position_margin_rad(config)
+    width_rad = limits.position_max_rad - limits.position_min_rad - 2.0 * margin_rad
+    travel_rad = min(width_rad, LONGEST_rad) if options.travel_rad is None else options.travel_rad
+    turn_rad = math.tau / config.joint.reduction_ratio
+    if not 4.0 * turn_rad <= travel_rad <= width_rad:
+        raise UsageError(
+            f"--travel (={travel_rad:.4g}) must be in [{4.0 * turn_rad:.4g}..{width_rad:.4g}] rad: four motor turns, "
+            "and what the limits allow"
+        )
+    fastest = SPEED_SHARE * limits.velocity_max_radps
+    if not 0.0 < options.speed_radps <= fastest:
+        raise UsageError(f"--speed (={options.speed_radps:g}) must be above 0 and at most {fastest:g} rad/s")
+    middle = 0.5 * (limits.position_min_rad + limits.position_max_rad)
+    acceleration = ACCELERATION_SHARE * config.sequence.brake_radps2
+    leg_s = travel_rad / options.speed_radps + options.speed_radps / acceleration + _DWELL_S
+    motion = Trapezoid(
+        kind="trapezoid", duration_s=round(2.0 * leg_s, 3), start_rad=middle - 0.5 * travel_rad,
+        target_rad=middle + 0.5 * travel_rad, speed_radps=options.speed_radps, acceleration_radps2=acceleration,
+        dwell_s=_DWELL_S, repeat=True,
+    )  # fmt: skip
+    torque = with_tracking_law(with_mode(config, "torque"))
+    return torque.model_copy(update={"trajectory": motion})
+
+
+def map_run(config: Config, records: Any, late_s: float) -> MapRun:
+    """What the log of such a motion says; `late_s`: from a command to its torque."""
+    from jointctl.tools.analysis.reducer_map import MapRun, late_torque_Nm, tracked
+
+    rows = tracked(records)
+    position, other = rows.position_rad.copy(), rows.second_position_rad.copy()
+    second = config.joint_encoder
+    if second is not None and second.law == "joint_encoder":
+        position, other = other, position
+    elif second is None and config.encoder.side == "joint":
+        other = None
+    # without a reducer the joint is one mass
+    motor_kgm2 = config.joint.inertia_kgm2 if config.reducer is None else config.reducer.motor_inertia_kgm2
+    return MapRun(
+        position, other if second is not None else None,
+        late_torque_Nm(rows.command_torque_Nm, 1.0 / config.loop.rate_Hz, late_s), rows.desired_velocity_radps.copy(),
+        config.joint.reduction_ratio, motor_kgm2, config.joint.inertia_kgm2 - motor_kgm2,
+        (_friction_slope(config, 1.0), _friction_slope(config, -1.0)),
+    )  # fmt: skip
+
+
+def _friction_slope(config: Config, side: float) -> float:
+    """Of [friction] against the speed at that of the motion [Nm s/rad], in the direction of `side`."""
+    import numpy as np
+
+    from jointctl.firmware_py.friction import friction_curve_Nm
+    from jointctl.tools.configuration.conversions import friction_constants
+
+    if config.friction is None or config.trajectory.kind != "trapezoid":
+        return 0.0
+    ratio = config.joint.reduction_ratio
+    around_radps = side * config.trajectory.speed_radps * np.array([1.0 - _NEAR, 1.0 + _NEAR])
+    low, high = ratio * friction_curve_Nm(friction_constants(config.friction, ratio), around_radps)
+    return float((high - low) / (around_radps[1] - around_radps[0]))
+
+
+def map_verb(
+    config: JointOnBus,
+    output: VerbOutput,
+    *,
+    options: MapOptions = MapOptions(),
+    write: Annotated[bool, typer.Option("--write", help="[reducer.map] into CONFIG; its comments stay")] = False,
+    figure: Annotated[Path | None, typer.Option("--figure", help="PNG with both series (CONFIG.map.png)")] = None,
+    assume_yes: Yes = False,
+    dry_run: DryRun = False,
+    allow_low_margin: AllowLowMargin = False,
+) -> int:
+    """Measure kinematic error and torque ripple of the reducer: one slow motion both ways, Fourier series, picture."""
+    from jointctl.tools.analysis.reducer_map import found_map, map_figure
+    from jointctl.tools.configuration.config import SHIPPED_FOLDER
+    from jointctl.tools.drawing import require_png, save_png
+    from jointctl.tools.identification.identification_report import write_map
+    from jointctl.tools.session.consent import require_terminal
+
+    if write and config.path.resolve().is_relative_to(SHIPPED_FOLDER):
+        raise ConfigurationError(
+            f"{config.path.name} is a shipped configuration and is not changed",
+            f"`jointctl new mine.toml --from {config.path.stem}` makes it yours",
+        )
+    if write and config.reducer is None:
+        raise ConfigurationError(f"{config.path}: [reducer] is missing, which [reducer.map] belongs to")
+    picture = figure or Path(f"{config.path.stem}.map.png")
+    require_png(picture, [config.path])
+    if not (assume_yes or dry_run or options.lockstep):
+        require_terminal()
+    moving = config_of_map(config, options)
+    measured = _lockstep(moving) if options.lockstep else _measured(
+        moving, output, assume_yes=assume_yes, dry_run=dry_run, allow_low_margin=allow_low_margin
+    )  # fmt: skip
+    if isinstance(measured, int):
+        return measured
+    found = found_map(map_run(moving, *measured))
+    values = found.values(config.encoder.direction, config.encoder.zero_counts)
+    output.result(_table(found), {**asdict(found), "map": values}, found)
+    save_png(map_figure(found, f"{config.path.stem}: map of the reducer"), picture)
+    output.note(f"written: {picture}")
+    if not found.kinematic_rad:
+        output.warning("only one encoder: the kinematic error cannot be seen, only the torque ripple")
+        if config.reducer is not None and config.reducer.map is not None:
+            for key in ("kinematic_error_rad", "kinematic_error_per_motor_turn", "kinematic_error_phase_rad"):
+                values[key] = list(getattr(config.reducer.map, key))
+    if write:
+        turns = f"{found.turns[0]} motor turns forwards, {found.turns[1]} backwards"
+        write_map(config.path, values, [f"map of {turns} at {found.speed_radps:g} rad/s"])
+        output.note(f"written: {config.path}")
+    return 0
+
+
+def _measured(config: Config, output: Output, **how: bool) -> tuple[Any, float] | int:
+    """(records, time from a command to its torque) of a run, or the exit code without one."""
+    from jointctl.tools.recording.run_log_reader import read_run_log
+    from jointctl.tools.session import result as drive_end
+    from jointctl.tools.session.consent import TerminalConsent
+    from jointctl.tools.session.control import in_control
+    from jointctl.tools.session.live_panel import run_display
+    from jointctl.tools.session.plan import resolve
+    from jointctl.tools.session.session import Session
+
+    plan = resolve(config, allow_low_margin=how["allow_low_margin"])
+    consent = TerminalConsent(output, assume_yes=how["assume_yes"], dry_run=how["dry_run"])
+
+    def display(_: CommissioningReport) -> Any:
+        return run_display(output, f"{config.path.stem}: map")()
+
+    with in_control(config, output) as control:
+        session = Session(plan, consent, output, control, display)
+        try:
+            result = session.run()
+        except KeyboardInterrupt:
+            output.note(f"interrupted{control.signals.by_command}; nothing moved")
+            drive_end.require_off(session.drive_state)
+            return INTERRUPTED
+    if result is None:
+        output.note(f"nothing moved; {drive_end.words(session.drive_state)}")
+        return 0 if how["dry_run"] else DECLINED
+    drive_end.require_off(session.drive_state)
+    if result.fault_text is not None:
+        text = result.fault_text
+        raise MotionFault(f"{result.fault.name} ({int(result.fault)}): {text.happened}; no map", text.advice)
+    if result.stopped_by:
+        output.note(f"stopped by {result.stopped_by}; no map")
+        return INTERRUPTED
+    return read_run_log(result.log_path).records, _late_s(config)
+
+
+def _lockstep(config: Config) -> tuple[Any, float]:
+    from jointctl.tools.lockstep import LockstepJoint
+
+    run = LockstepJoint(config).run()
+    if run.fault:
+        raise MotionFault(f"{run.fault.name} ({int(run.fault)}); no map")
+    return run.log, _late_s(config)
+
+
+def _late_s(config: Config) -> float:
+    from jointctl.tools.analysis.loop_settings import loop_settings
+
+    settings = loop_settings(config)[0]
+    return settings.delay_s + settings.lag_s
+
+
+def _table(found: FoundMap) -> Table:
+    table = Table(
+        "series",
+        *(Column(name, justify="right") for name in ("a motor turn", "amplitude", "+-", "phase [rad]", "+-")),
+        title=f"Map of {sum(found.turns)} motor turns at {found.speed_radps:g} rad/s",
+        caption="+-: intervals of 95 %; once a motor turn: eccentricity of the motor's encoder is part of it",
+        title_justify="left",
+        caption_justify="left",
+    )
+    from jointctl.tools.analysis.reducer_map import kept_waves
+
+    for name, waves, scale, digits in (
+        ("kinematic error [mrad]", found.kinematic_rad, 1e3, 4), ("torque ripple [Nm]", found.ripple_Nm, 1.0, 3),
+    ):  # fmt: skip
+        for wave in kept_waves(waves):
+            table.add_row(
+                name, str(wave.per_motor_turn), f"{scale * wave.amplitude:.{digits}f}",
+                f"{scale * wave.amplitude_half:.{digits}f}", f"{wave.phase_rad:+.3f}", f"{wave.phase_half_rad:.3f}",
+            )  # fmt: skip
+    return table
