@@ -90,7 +90,8 @@ def _sampled(moves: list[tuple[float, float, float]], duration_s: float) -> np.n
 
 
 def _point_to_point(random: np.random.Generator, duration_s: float) -> tuple[np.ndarray, np.ndarray]:
-    moves, rests = [], []
+    moves: list[tuple[float, float, float]] = []
+    rests: list[tuple[float, float]] = []
     now_s, place = 0.5, 0.0
     while True:
         target = random.uniform(-REACH_rad, REACH_rad)

@@ -1,0 +1,74 @@
+"""`map` on the virtual joint in simulated time: what the joint truly has is found and written."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from jointctl.drivers.errors import ConfigurationError, UsageError
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.output import Output
+from jointctl.tools.verbs.map import MapOptions, config_of_map, map_verb
+from tests.configurations import shipped, written
+
+IN_LOCKSTEP = MapOptions(travel_rad=0.5, lockstep=True)
+
+
+def test_the_map_of_the_realistic_joint_is_found_and_written(tmp_path: Path) -> None:
+    path = written(tmp_path / "joint.toml", "realistic", reducer__map=None)
+    text = path.read_text()
+    out = io.StringIO()
+    output = Output(json=True, stdout=out, stderr=io.StringIO())
+    assert map_verb(load_config(path), output, options=IN_LOCKSTEP, write=True, figure=tmp_path / "map.png") == 0
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+    found = load_config(path)
+    assert found.reducer is not None
+    assert found.reducer.map is not None
+    assert found.virtual is not None
+    made, true = found.reducer.map, found.virtual
+    kinematic = dict(zip(made.kinematic_error_per_motor_turn, made.kinematic_error_rad, strict=True))
+    assert [kinematic[order] for order in (2.0, 4.0)] == pytest.approx(true.kinematic_error_rad, rel=0.03)
+    assert kinematic[1.0] == pytest.approx(true.motor_encoder_eccentricity_rad / 121.0, rel=0.05)
+    ripple = dict(zip(made.torque_ripple_per_motor_turn, made.torque_ripple_Nm, strict=True))
+    assert [ripple[order] for order in (2.0, 10.0)] == pytest.approx(true.torque_ripple_Nm, rel=0.06)
+    phases = dict(zip(made.torque_ripple_per_motor_turn, made.torque_ripple_phase_rad, strict=True))
+    assert [phases[order] for order in (2.0, 10.0)] == pytest.approx(true.torque_ripple_phase_rad, abs=0.06)
+    comments = [line.split("#", 1)[1] for line in text.splitlines() if "#" in line]
+    assert all(comment in path.read_text() for comment in comments)
+    assert json.loads(out.getvalue())["map"]["direction"] == found.encoder.direction
+
+
+def test_what_cannot_be_measured_or_written_is_refused_before_anything_moves(tmp_path: Path) -> None:
+    output = Output(stdout=io.StringIO(), stderr=io.StringIO())
+    with pytest.raises(ConfigurationError, match="is a shipped configuration and is not changed"):
+        map_verb(load_config(shipped_config("realistic")), output, options=IN_LOCKSTEP, write=True)
+    rigid = load_config(written(tmp_path / "rigid.toml", "precise"))
+    with pytest.raises(ConfigurationError, match=r"\[reducer\] is missing"):
+        map_verb(rigid, output, options=IN_LOCKSTEP, write=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (MapOptions(travel_rad=0.1), r"--travel \(=0.1\) must be in \[0.2077..1.2\] rad"),
+        (MapOptions(travel_rad=2.0), r"--travel \(=2\) must be in"),
+        (MapOptions(travel_rad=math.nan), r"--travel \(=nan\) must be in"),
+        (MapOptions(speed_radps=0.0), r"--speed \(=0\) must be above 0 and at most 0.5 rad/s"),
+        (MapOptions(speed_radps=0.6), r"--speed \(=0.6\) must be above 0"),
+    ],
+)
+def test_a_motion_that_does_not_fit_is_one_clear_line(options: MapOptions, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        config_of_map(shipped("realistic"), options)
+
+
+def test_the_motion_stays_within_the_limits_and_learns_nothing() -> None:
+    config = config_of_map(shipped("realistic"), MapOptions())
+    assert config.trajectory.kind == "trapezoid"
+    assert config.control.learning is None
+    assert config.trajectory.target_rad - config.trajectory.start_rad == pytest.approx(0.7)
+    assert config.limits.position_min_rad < config.trajectory.start_rad
