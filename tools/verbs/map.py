@@ -113,7 +113,7 @@ def map_verb(
     output: VerbOutput,
     *,
     options: MapOptions = MapOptions(),
-    write: Annotated[bool, typer.Option("--write", help="[reducer.map] into CONFIG; its comments stay")] = False,
+    write: Annotated[bool, typer.Option("--write", help="section reducer.map into CONFIG; comments stay")] = False,
     figure: Annotated[Path | None, typer.Option("--figure", help="PNG with both series (CONFIG.map.png)")] = None,
     assume_yes: Yes = False,
     dry_run: DryRun = False,
