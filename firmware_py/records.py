@@ -9,6 +9,9 @@ from typing import Annotated
 
 import numpy as np
 
+from jointctl.firmware_py.adaptation_records import AdaptationConstants as AdaptationConstants
+from jointctl.firmware_py.adaptation_records import AdaptationState as AdaptationState
+from jointctl.firmware_py.adaptation_records import LuGreConstants as LuGreConstants
 from jointctl.firmware_py.schema import array_of, f8, i4, i8, record, u4
 
 # --- The control law: friction model, network, observer, learning, and the law that holds them ---
@@ -19,9 +22,6 @@ TORQUE_HISTORY = 16  # cycles that an observer can look back
 LEARNING_BINS = 1 << 14
 HARMONICS = 4  # of a map of the reducer
 KNEES = 2  # of the reducer's stiffness
-BRISTLES = 4  # of different stiffness, that the adaptation of the friction weighs
-RIPPLES = 2  # sines of the motor angle that it finds
-ADAPTED_PARTS = 2 * BRISTLES + 2 * RIPPLES
 
 
 @record
@@ -44,14 +44,6 @@ class FrictionBranch:
 class FrictionConstants:
     positive: FrictionBranch
     negative: FrictionBranch
-
-
-@record
-class LuGreConstants:
-    """Bristle stiffness and damping at the joint; the sliding curve comes from (11)."""
-
-    stiffness_Nmprad: f8
-    damping_Nmspr: f8
 
 
 @record
@@ -174,34 +166,6 @@ class FlexibleState:
     known_torque_Nm: f8  # of the last cycle: feed-forward and what was learned
     motor_velocity: VelocityState
     link_velocity: VelocityState
-
-
-@record
-class AdaptationConstants:
-    """See `friction_adaptation`."""
-
-    enabled: i4
-    ripples: i4  # sines in use
-    friction_error: f8  # of the weight of each kind of bristles at first, 1 = the configured friction
-    reach: f8  # by which all of them together may leave the configured friction
-    ripple_Nm: f8  # of the sines at first
-    ripple_max_Nm: f8
-    ripple_turns_prad: Annotated[np.ndarray, array_of(f8, RIPPLES)]  # order per joint turn / 2 pi
-
-
-@record
-class AdaptationState:
-    weights: Annotated[np.ndarray, array_of(f8, ADAPTED_PARTS)]
-    covariance: Annotated[np.ndarray, array_of(f8, ADAPTED_PARTS, ADAPTED_PARTS)]
-    gain: Annotated[np.ndarray, array_of(f8, ADAPTED_PARTS)]
-    filtered_Nm: Annotated[np.ndarray, array_of(f8, ADAPTED_PARTS)]
-    desired_deflection_rad: Annotated[np.ndarray, array_of(f8, BRISTLES)]
-    deflection_rad: Annotated[np.ndarray, array_of(f8, BRISTLES)]  # as measured
-    bristle: LuGreConstants  # of one kind of bristles, while they are computed
-    fed_filtered_Nm: f8
-    rest_disturbance_Nm: f8  # the observer's, when the desired motion came to rest
-    resting: i4
-    cycle: i4
 
 
 @record

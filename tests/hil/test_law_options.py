@@ -12,7 +12,7 @@ from jointctl.firmware_py.states import Fault, Notice
 from jointctl.tools.analysis.loop_settings import loop_settings
 from jointctl.tools.analysis.margins import learning_convergence
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.sections import Learning
+from jointctl.tools.configuration.control_section import Learning
 from jointctl.tools.experiments.controllers import (
     Controller,
     changed,

@@ -14,10 +14,10 @@ from typing import Annotated, Any, get_args
 from pydantic import AfterValidator, BaseModel, BeforeValidator, PrivateAttr, SerializeAsAny
 
 from jointctl.drivers.errors import ConfigurationError, one_line
+from jointctl.tools.configuration.control_section import Control
 from jointctl.tools.configuration.drive_section import DriveSection, checked_drive, section_class
 from jointctl.tools.configuration.sections import (
     Bus,
-    Control,
     Encoder,
     Friction,
     Joint,

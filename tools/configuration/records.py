@@ -24,13 +24,14 @@ from jointctl.firmware_py.trajectory import approach_duration_s, approach_start,
 from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.tools.configuration.checks import extremes_problems
 from jointctl.tools.configuration.config import Config, raise_if
+from jointctl.tools.configuration.control_section import Adaptation, Control
 from jointctl.tools.configuration.conversions import (
     friction_constants,
     law_resolution_rad,
     period_s,
     static_friction_Nm,
 )
-from jointctl.tools.configuration.sections import Adaptation, Control, Hold, Reducer, Section
+from jointctl.tools.configuration.sections import Hold, Reducer, Section
 
 # the paper's centres, in rad and in rad/s: -c_p, 0, c_p with c_p = 1e-2 [-5 -3 -1 -0.8 -0.4 -0.1 -0.05]
 _PAPER_HALF = (0.05, 0.03, 0.01, 0.008, 0.004, 0.001, 0.0005)

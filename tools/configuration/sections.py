@@ -18,7 +18,6 @@ from pydantic_core import PydanticCustomError
 
 from jointctl.drivers.can.channel import NAME, RESERVED, split_channel, with_options
 from jointctl.drivers.can.open import CYCLIC_INTERFACES
-from jointctl.firmware_py.records import NEURONS, RIPPLES
 
 
 def interval_text(low: float, high: float, open_low: bool = False) -> str:
@@ -60,7 +59,7 @@ def _auto_or_number(low: float, high: float) -> Any:
     return BeforeValidator(Rule(allowed, check))
 
 
-def _numbers(name: str, *counts: int, low: float, high: float) -> Any:
+def numbers(name: str, *counts: int, low: float, high: float) -> Any:
     """One number or a list of as many as `counts` allows, each in (low..high]; a tuple afterwards."""
     allowed = f"{' or '.join(map(str, counts))} {name}, each in {interval_text(low, high, True)}"
 
@@ -72,23 +71,6 @@ def _numbers(name: str, *counts: int, low: float, high: float) -> Any:
         return tuple(float(x) for x in items)
 
     return BeforeValidator(Rule(allowed, check))
-
-
-CENTRES = "15 numbers or 15 pairs [rad, rad/s], each in [-100..100]"
-
-
-def _centres(value: Any) -> Any:
-    """15 numbers, taken for both inputs as the paper does, or 15 pairs [rad, rad/s]."""
-
-    def number(x: Any) -> bool:
-        return isinstance(x, (int, float)) and not isinstance(x, bool) and abs(x) <= 100.0
-
-    if isinstance(value, (list, tuple)) and len(value) == NEURONS:
-        if all(number(x) for x in value):
-            return tuple((float(x), float(x)) for x in value)
-        if all(isinstance(x, (list, tuple)) and len(x) == 2 and all(number(y) for y in x) for x in value):
-            return tuple((float(x[0]), float(x[1])) for x in value)
-    raise PydanticCustomError("centres", "must be {allowed}", {"allowed": CENTRES})
 
 
 def _direction(value: int) -> int:
@@ -213,67 +195,6 @@ class Loop(Section):
     priority: Annotated[int, between(1, 98)] | None = None  # SCHED_FIFO; none = ordinary scheduling
 
 
-class Learning(Section):
-    """Iterative learning on a repeating trajectory, on top of computed_torque_observer or flexible_joint."""
-
-    # share of the remaining error torque taken over in each repetition
-    gain: Annotated[float, between(0.0, 1.0, open_low=True)]
-    error_gain_ps2: Annotated[float, between(0.0, 1e6)] = 0.0  # weight of the error itself
-    lead_cycles: Annotated[int, between(0, 100)]  # delay from command to measured effect
-    half_width_cycles: Annotated[int, between(0, 100)]  # of the smoothing
-    blend_s: Annotated[float, between(0.001, 100.0)] = 0.5  # over which what has been learned comes in
-
-
-class Adaptation(Section):
-    """Friction feed-forward that adapts to the joint whatever the motion; needs an observer and lugre_desired."""
-
-    # of the share of each kind of bristles, at first: how far the configured friction may be off
-    friction_error: Annotated[float, between(0.0, 1.0, open_low=True)] = 0.15
-    # by which the whole friction of a direction may leave the configured one
-    reach: Annotated[float, between(0.0, 1.0)] = 0.3
-    # torque ripple to find: periods a motor turn, two at most
-    ripple_per_motor_turn: Annotated[tuple[float, ...], _numbers("numbers", 0, 1, RIPPLES, low=0.0, high=1000.0)] = ()
-    ripple_Nm: Annotated[float, between(0.0, 1e4, open_low=True)] = (
-        0.7  # expected of it, at the joint; four times at most
-    )
-
-
-class Control(Section):
-    # docs/law.md
-    kind: Literal["computed_torque", "computed_torque_rbf", "computed_torque_observer", "pid", "flexible_joint"]
-    kp: Annotated[float, between(0.0, 1e6, open_low=True)]  # [1/s²] of the position error
-    kv: Annotated[float, between(0.0, 1e4, open_low=True)]  # [1/s] of the velocity error
-    ki: Annotated[float, between(0.0, 1e8)] = 0.0  # [1/s³] of the error's integral, pid only
-    integral_limit_rads: Annotated[float, between(0.0, 1e3)] = 0.0  # pid only, 0 = none
-    # bandwidth, computed_torque_observer and flexible_joint only
-    observer_radps: Annotated[float, between(0.0, 2000.0)] = 0.0
-    observer_delay_cycles: Annotated[int, between(0, 15)] = 1  # from a command to its torque
-    # of the Lyapunov equation: Q = q I, or diag(q1, q2)
-    lyapunov_q: Annotated[tuple[float, ...], _numbers("numbers", 1, 2, low=0.0, high=1e12)]
-    learning_rate: Annotated[float, between(0.0, 1e9)]  # of the network's weights
-    initial_weight_Nm: Annotated[float, between(-1000.0, 1000.0)]  # of each of the 15 neurons
-    widths: Annotated[tuple[float, ...], _numbers("widths", 1, NEURONS, low=0.0, high=1e4)]  # of the Gaussians
-    centres: Annotated[tuple[tuple[float, float], ...], BeforeValidator(Rule(CENTRES, _centres))] | None = (
-        None  # none = the paper's
-    )
-    leakage_1ps: Annotated[float, between(0.0, 100.0)] = 0.0  # pulls the weights to zero: bounded under noise
-    weight_limit_Nm: Annotated[float, between(0.0, 1e6)] = 0.0  # of each weight; 0 = none
-    dead_zone_rad: Annotated[float, between(0.0, 1.0)] = 0.0  # no learning at smaller errors
-    # friction compensation by measured or desired velocity
-    feed_forward: Literal["none", "measured", "desired", "lugre_desired"]
-    zero_rule: Literal["zero", "paper", "linear"]  # friction compensation at exactly zero velocity
-    zero_band_radps: Annotated[float, between(0.0, 10.0)] = 0.0  # half width of the linear zero rule
-    velocity_cutoff_Hz: Annotated[float, between(0.0, 2000.0)]  # 0 = no filter
-    filtered_error_rate: bool  # filter the velocity error as a whole: no bias from the filter's lag
-    # with which the link's encoder corrects the expected twist, flexible_joint with both encoders only
-    twist_radps: Annotated[float, between(0.0, 1000.0, open_low=True)] = 60.0
-    link_cutoff_Hz: Annotated[float, between(0.0, 2000.0)] = 60.0  # of the link's velocity there; 0 = no filter
-    # of the friction: the motion desired so much later, as torque is late by delay and lag
-    feed_forward_lead_s: Annotated[float, between(0.0, 0.02)] = 0.0
-    adaptation: Adaptation | None = None
-    learning: Learning | None = None
-
-
 class FrictionDirection(Section):
     """One column of Table 3, with the signs printed there."""
 
@@ -331,7 +252,7 @@ class Margin(Section):
     )
     current_lag_s: Annotated[float, between(0.0, 0.1)] = 0.0005  # of the drive's current loop, first order
     # with [reducer]: the loop must bear these factors on the link's inertia, lightest and heaviest
-    payload_range: Annotated[tuple[float, ...], _numbers("factors", 2, low=0.0, high=100.0)] = (0.7, 1.4)
+    payload_range: Annotated[tuple[float, ...], numbers("factors", 2, low=0.0, high=100.0)] = (0.7, 1.4)
     # with [reducer]: by this share the stiffness may be less or more
     stiffness_error: Annotated[float, between(0.0, 0.9)] = 0.3
 

@@ -18,10 +18,11 @@ from jointctl.tools.analysis.flexible_gains import chosen_gains
 from jointctl.tools.analysis.loop_settings import loop_settings
 from jointctl.tools.configuration.checks import problems_between_sections
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.control_section import Control
 from jointctl.tools.configuration.drive_section import require_simulated
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.configuration.records import axis_constants, trajectory_table
-from jointctl.tools.configuration.sections import Control, Friction
+from jointctl.tools.configuration.sections import Friction
 
 _MODEL_BASED: dict[str, Any] = {"zero_rule": "zero", "filtered_error_rate": True}
 _STIFF: dict[str, Any] = {**_MODEL_BASED, "kp": 2500.0, "kv": 130.0, "feed_forward": "lugre_desired"}

@@ -21,8 +21,8 @@ from jointctl.hil.plant import plant, spring_torque_Nm, step_plant
 from jointctl.tools import lockstep
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.control_section import Learning
 from jointctl.tools.configuration.load import load_config
-from jointctl.tools.configuration.sections import Learning
 from jointctl.tools.lockstep import LockstepJoint
 from tests.configurations import changed, shipped, written
 
