@@ -6,7 +6,7 @@ import numpy as np
 
 from jointctl.firmware_py.flexible_joint import Reading
 from jointctl.firmware_py.kernel import kernel
-from jointctl.firmware_py.law import step_flexible_law, step_law
+from jointctl.firmware_py.law import follow_temperature, step_flexible_law, step_law
 from jointctl.firmware_py.live_change import step_change, step_new_motion
 from jointctl.firmware_py.records import (
     AxisConstants,
@@ -183,10 +183,12 @@ def _command_torque(
         where = NO_REPETITION
         if state.phase == AxisPhase.TRACKING:
             where = repetition(constants.trajectory, table, state.trajectory_s)
+        follow_temperature(constants.law, state.law, False)
         state.unlimited_torque_Nm = law_torque_Nm(constants, state, where, gap_cycles)
         if state.stream.torque_Nm != 0.0:
             state.unlimited_torque_Nm += state.stream.torque_Nm
     else:
+        follow_temperature(constants.law, state.law, True)
         state.unlimited_torque_Nm = 0.0
     limits = constants.limits
     torque_Nm, finite = limited_torque_Nm(

@@ -9,7 +9,15 @@ Each direction is stored mirrored (positive speed, positive friction), so that o
 
 (11) prints the exponent of the negative direction as -v/ws, which diverges; mirrored it is -|v|/ws.
 The two stages need not meet at the knee (Table 3 has steps of 0.0017 and 0.0013 Nm).
-Not modelled: position, temperature and load dependence."""
+
+With a load and a temperature, C = tc + (ts - tc) exp(-u / ws) and V = the rest of (11) at that speed:
+
+    (C + kc |tau|) exp(-bc (T - T0)) + (V + kv |tau| u) exp(-bv (T - T0))
+
+tau is the torque that the reducer transmits, T the drive's temperature.  Friction that goes with |tau| always opposes
+the motion, as in the load-dependent models of Rhoban's BAM; the exponential is that of a lubricant's viscosity.
+
+Not modelled: dependence on position; friction that differs between driving and being driven."""
 
 from __future__ import annotations
 
@@ -44,19 +52,61 @@ def branch_torque_Nm(branch: FrictionBranch, speed_radps: float) -> float:
     return torque
 
 
+class Condition(NamedTuple):
+    """What friction depends on besides the speed."""
+
+    load_Nm: float  # size of the torque that the reducer transmits, at the motor: that at the joint over the ratio
+    coulomb: float  # factors of the temperature
+    viscous: float
+
+
+UNLOADED = Condition(0.0, 1.0, 1.0)  # and at the temperature for which the curve holds
+
+
+@kernel
+def condition_of(friction: FrictionConstants, load_Nm: float, temperature_degC: float) -> Condition:
+    """`load_Nm`: the torque that the reducer transmits, at the motor; its sign does not matter."""
+    if friction.conditioned == 0:
+        return Condition(0.0, 1.0, 1.0)
+    warming_K = min(max(temperature_degC, friction.lowest_degC), friction.highest_degC) - friction.reference_degC
+    coulomb = math.exp(-friction.temperature_coulomb_pK * warming_K)
+    viscous = math.exp(-friction.temperature_viscous_pK * warming_K)
+    return Condition(abs(load_Nm), coulomb, viscous)
+
+
 @inlined
-def friction_motor_torque_Nm(friction: FrictionConstants, velocity_radps: float) -> float:
+def conditioned_torque_Nm(
+    friction: FrictionConstants, branch: FrictionBranch, speed_radps: float, condition: Condition
+) -> float:
+    """`branch_torque_Nm` of one direction under load and at a temperature."""
+    torque = branch_torque_Nm(branch, speed_radps)
+    if friction.conditioned == 0:
+        return torque
+    decay = math.exp(-speed_radps / branch.stribeck_speed_radps)
+    coulomb = branch.coulomb_Nm + (branch.static_Nm - branch.coulomb_Nm) * decay
+    viscous = torque - coulomb + friction.load_viscous_spr * condition.load_Nm * speed_radps
+    return (coulomb + friction.load_coulomb * condition.load_Nm) * condition.coulomb + viscous * condition.viscous
+
+
+@inlined
+def friction_motor_torque_Nm(
+    friction: FrictionConstants, velocity_radps: float, condition: Condition = UNLOADED
+) -> float:
     """Friction at the motor [Nm], opposing the motion and counted positive for positive velocity; 0 at v = 0."""
     if velocity_radps > 0.0:
-        return branch_torque_Nm(friction.positive, velocity_radps)
+        return conditioned_torque_Nm(friction, friction.positive, velocity_radps, condition)
     if velocity_radps < 0.0:
-        return -branch_torque_Nm(friction.negative, -velocity_radps)
+        return -conditioned_torque_Nm(friction, friction.negative, -velocity_radps, condition)
     return 0.0
 
 
 @kernel
 def compensation_motor_torque_Nm(
-    friction: FrictionConstants, zero_rule: int, zero_band_radps: float, velocity_radps: float
+    friction: FrictionConstants,
+    zero_rule: int,
+    zero_band_radps: float,
+    velocity_radps: float,
+    condition: Condition = UNLOADED,
 ) -> float:
     """Feed-forward friction torque at the motor [Nm] with an explicit rule at v = 0, where friction is set-valued.
 
@@ -64,10 +114,10 @@ def compensation_motor_torque_Nm(
     """
     if zero_rule == ZeroSpeedRule.LINEAR and abs(velocity_radps) < zero_band_radps:
         edge = math.copysign(zero_band_radps, velocity_radps)
-        return friction_motor_torque_Nm(friction, edge) * abs(velocity_radps) / zero_band_radps
+        return friction_motor_torque_Nm(friction, edge, condition) * abs(velocity_radps) / zero_band_radps
     if zero_rule == ZeroSpeedRule.PAPER and velocity_radps == 0.0:
-        return branch_torque_Nm(friction.positive, 0.0)
-    return friction_motor_torque_Nm(friction, velocity_radps)
+        return conditioned_torque_Nm(friction, friction.positive, 0.0, condition)
+    return friction_motor_torque_Nm(friction, velocity_radps, condition)
 
 
 class PrintedBranch(NamedTuple):
@@ -146,13 +196,14 @@ def step_lugre(
     deflection_rad: float,
     velocity_radps: float,
     period_s: float,
+    condition: Condition = UNLOADED,
 ) -> tuple[float, float]:
     """(new deflection [rad], friction torque at the joint [Nm]) after `period_s` at `velocity_radps`."""
     speed = abs(velocity_radps)
     if speed == 0.0:
         return deflection_rad, lugre.stiffness_Nmprad * deflection_rad
     branch = friction.positive if velocity_radps > 0.0 else friction.negative
-    sliding_Nm = reduction_ratio * branch_torque_Nm(branch, speed)
+    sliding_Nm = reduction_ratio * conditioned_torque_Nm(friction, branch, speed, condition)
     settled_rad = math.copysign(sliding_Nm / lugre.stiffness_Nmprad, velocity_radps)
     decay = math.exp(-speed * period_s * lugre.stiffness_Nmprad / sliding_Nm)
     moved_rad = settled_rad + (deflection_rad - settled_rad) * decay

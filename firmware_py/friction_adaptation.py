@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from jointctl.firmware_py.adaptation_records import ADAPTED_PARTS, BRISTLES, AdaptationConstants, AdaptationState
 from jointctl.firmware_py.flexible_joint import sine_of_turns
-from jointctl.firmware_py.friction import step_lugre
+from jointctl.firmware_py.friction import UNLOADED, Condition, step_lugre
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.records import LawConstants
 
@@ -70,8 +70,9 @@ def reset_adaptation(constants: AdaptationConstants, state: AdaptationState) -> 
 
 @kernel
 def adapted_feed_forward_Nm(
-    law: LawConstants, state: AdaptationState, position_rad: float, velocity_radps: float
-) -> float:
+    law: LawConstants, state: AdaptationState, position_rad: float, velocity_radps: float,
+    condition: Condition = UNLOADED,
+) -> float:  # fmt: skip
     """Friction and ripple at the joint [Nm] of the desired motion, `position_rad` that of the motor / n."""
     constants = law.adaptation
     fed = 0.0
@@ -80,7 +81,7 @@ def adapted_feed_forward_Nm(
         state.bristle.damping_Nmspr = law.lugre.damping_Nmspr
         state.desired_deflection_rad[k], torque = step_lugre(
             state.bristle, law.friction, law.reduction_ratio, state.desired_deflection_rad[k], velocity_radps,
-            law.period_s,
+            law.period_s, condition,
         )  # fmt: skip
         fed += torque * state.weights[2 * k if torque >= 0.0 else 2 * k + 1]
     for j in range(constants.ripples):
@@ -128,6 +129,7 @@ def adapt(
     desired_radps: float,
     position_rad: float,
     velocity_radps: float,
+    condition: Condition = UNLOADED,
 ) -> None:
     """Learn from one cycle.
 
@@ -140,8 +142,9 @@ def adapt(
         state.bristle.stiffness_Nmprad = STIFFNESS[k] * law.lugre.stiffness_Nmprad
         state.bristle.damping_Nmspr = 0.0  # of a measured speed: noise
         state.deflection_rad[k], torque = step_lugre(
-            state.bristle, law.friction, law.reduction_ratio, state.deflection_rad[k], velocity_radps, law.period_s
-        )
+            state.bristle, law.friction, law.reduction_ratio, state.deflection_rad[k], velocity_radps, law.period_s,
+            condition,
+        )  # fmt: skip
         state.filtered_Nm[2 * k] += share * (max(torque, 0.0) - state.filtered_Nm[2 * k])
         state.filtered_Nm[2 * k + 1] += share * (min(torque, 0.0) - state.filtered_Nm[2 * k + 1])
     for j in range(constants.ripples):

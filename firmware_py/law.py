@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 
 from jointctl.firmware_py.flexible_joint import Reading, desired_motor, motor_and_link_errors, reset_flexible
-from jointctl.firmware_py.friction import compensation_motor_torque_Nm, step_lugre
+from jointctl.firmware_py.friction import Condition, compensation_motor_torque_Nm, condition_of, step_lugre
 from jointctl.firmware_py.friction_adaptation import adapt, adapted_feed_forward_Nm, reset_adaptation, take_at_rest
 from jointctl.firmware_py.kernel import kernel, plain
 from jointctl.firmware_py.records import (
@@ -314,6 +314,7 @@ def reset_law(constants: LawConstants, state: LawState) -> None:
     reset_observer(state.observer, 0.0)
     reset_learning(state.learning)
     state.learning.stopped = 0
+    state.temperature_degC = constants.friction.reference_degC
     reset_flexible(state.flexible)
     reset_adaptation(constants.adaptation, state.adaptation)
     state.lugre_deflection_rad = 0.0
@@ -328,12 +329,34 @@ def reset_law(constants: LawConstants, state: LawState) -> None:
 
 
 @kernel
+def follow_temperature(constants: LawConstants, state: LawState, at_once: bool) -> None:
+    """The temperature for the feed-forward: that of the newest reading, however old it is; none: that of the curve."""
+    if constants.friction.conditioned == 0:
+        return
+    newest_degC = constants.friction.reference_degC
+    if constants.temperature.time_ns[0] != 0:
+        newest_degC = constants.temperature.degC[0]
+    gain = 1.0 if at_once else constants.temperature.gain
+    state.temperature_degC += gain * (newest_degC - state.temperature_degC)
+
+
+@kernel
+def _condition(constants: LawConstants, state: LawState, transmitted_Nm: float) -> Condition:
+    return condition_of(constants.friction, transmitted_Nm / constants.reduction_ratio, state.temperature_degC)
+
+
+@kernel
 def friction_feed_forward_Nm(
-    constants: LawConstants, state: LawState, velocity_radps: float, desired_velocity_radps: float
+    constants: LawConstants,
+    state: LawState,
+    velocity_radps: float,
+    desired_velocity_radps: float,
+    transmitted_Nm: float = 0.0,
 ) -> float:
-    """n tau_f0 at the joint [Nm] by the configured rule."""
+    """n tau_f0 at the joint [Nm] by the configured rule; `transmitted_Nm` through the reducer by the model."""
     if constants.feed_forward == FeedForward.NONE:
         return 0.0
+    condition = _condition(constants, state, transmitted_Nm)
     if constants.feed_forward == FeedForward.LUGRE_DESIRED:
         deflection, torque = step_lugre(
             constants.lugre,
@@ -342,32 +365,36 @@ def friction_feed_forward_Nm(
             state.lugre_deflection_rad,
             desired_velocity_radps,
             constants.period_s,
+            condition,
         )
         state.lugre_deflection_rad = deflection
         return torque
     speed = velocity_radps if constants.feed_forward == FeedForward.MEASURED else desired_velocity_radps
     return constants.reduction_ratio * compensation_motor_torque_Nm(
-        constants.friction, constants.zero_rule, constants.zero_band_radps, speed
+        constants.friction, constants.zero_rule, constants.zero_band_radps, speed, condition
     )
 
 
 @kernel
 def _friction_Nm(
-    constants: LawConstants, state: LawState, velocity_radps: float, reference: Reference, motor_rad: float
-) -> float:
+    constants: LawConstants, state: LawState, velocity_radps: float, reference: Reference, motor_rad: float,
+    transmitted_Nm: float,
+) -> float:  # fmt: skip
     """The same for the motion desired `feed_forward_lead_s` later; adapted, of the desired motor angle / n as well."""
     lead_s = constants.feed_forward_lead_s
     desired_radps = reference.velocity_radps + lead_s * reference.acceleration_radps2
     if constants.adaptation.enabled != 0:
         ahead_rad = motor_rad + lead_s * reference.velocity_radps
-        return adapted_feed_forward_Nm(constants, state.adaptation, ahead_rad, desired_radps)
-    return friction_feed_forward_Nm(constants, state, velocity_radps, desired_radps)
+        condition = _condition(constants, state, transmitted_Nm)
+        return adapted_feed_forward_Nm(constants, state.adaptation, ahead_rad, desired_radps, condition)
+    return friction_feed_forward_Nm(constants, state, velocity_radps, desired_radps, transmitted_Nm)
 
 
 @kernel
 def _adapt(
-    constants: LawConstants, state: LawState, desired_radps: float, position_rad: float, error_rate_radps: float
-) -> None:
+    constants: LawConstants, state: LawState, desired_radps: float, position_rad: float, error_rate_radps: float,
+    transmitted_Nm: float,
+) -> None:  # fmt: skip
     """Adapt the friction to what the observer has found; at rest, give it what the observer has added."""
     taken_Nm = take_at_rest(constants, state.adaptation, state.observer_torque_Nm, desired_radps)
     state.friction_torque_Nm += taken_Nm
@@ -376,7 +403,7 @@ def _adapt(
     fed_Nm = state.friction_torque_Nm + state.learned_torque_Nm
     adapt(
         constants, state.adaptation, state.observer_torque_Nm, fed_Nm, desired_radps, position_rad,
-        desired_radps + error_rate_radps,
+        desired_radps + error_rate_radps, _condition(constants, state, transmitted_Nm),
     )  # fmt: skip
 
 
@@ -451,12 +478,13 @@ def step_law(
     state.gravity_torque_Nm = constants.coriolis_Nmspr * velocity.velocity_radps + constants.gravity_Nm * math.sin(
         position_rad - constants.gravity_zero_rad
     )
+    transmitted_Nm = state.inertia_torque_Nm + state.gravity_torque_Nm
     state.friction_torque_Nm = _friction_Nm(
-        constants, state, velocity.velocity_radps, reference, reference.position_rad
+        constants, state, velocity.velocity_radps, reference, reference.position_rad, transmitted_Nm
     )
     rest_Nm = _rest_torque_Nm(constants, state, error, error_rate, velocity.velocity_radps, sent_torque_Nm)
     if constants.adaptation.enabled != 0:
-        _adapt(constants, state, reference.velocity_radps, position_rad, error_rate)
+        _adapt(constants, state, reference.velocity_radps, position_rad, error_rate, transmitted_Nm)
         rest_Nm = state.observer_torque_Nm
     correction_Nm = proportional_Nm + rest_Nm - constants.inertia_kgm2 * constants.learning.error_gain_ps2 * error
     state.learned_torque_Nm = _learn(constants, state, where, correction_Nm, error)
@@ -486,14 +514,15 @@ def step_flexible_law(
 ) -> float:
     """One cycle, as `step_law`: the unlimited torque at the joint [Nm]."""
     flexible, own = constants.flexible, state.flexible
-    desired_rad = own.target_rad if own.primed != 0 else reference.position_rad
-    state.friction_torque_Nm = _friction_Nm(constants, state, 0.0, reference, desired_rad)
     gravity_slope_Nmprad = 0.0
     state.gravity_torque_Nm = 0.0
     if constants.gravity_Nm != 0.0:
         lever = reference.position_rad - constants.gravity_zero_rad
         state.gravity_torque_Nm = constants.gravity_Nm * math.sin(lever)
         gravity_slope_Nmprad = constants.gravity_Nm * math.cos(lever)
+    transmitted_Nm = flexible.link_inertia_kgm2 * reference.acceleration_radps2 + state.gravity_torque_Nm
+    desired_rad = own.target_rad if own.primed != 0 else reference.position_rad
+    state.friction_torque_Nm = _friction_Nm(constants, state, 0.0, reference, desired_rad, transmitted_Nm)
     known_Nm = desired_motor(constants, state, reference, gravity_slope_Nmprad)
     state.inertia_torque_Nm = known_Nm - state.friction_torque_Nm - state.gravity_torque_Nm
     motor_rad, link_rad = motor_and_link_errors(flexible, own, reading, reference.position_rad)
@@ -505,7 +534,7 @@ def step_flexible_law(
     )
     if constants.adaptation.enabled != 0:
         known_Nm -= state.friction_torque_Nm
-        _adapt(constants, state, reference.velocity_radps, own.target_rad + motor_rad, rate_radps)
+        _adapt(constants, state, reference.velocity_radps, own.target_rad + motor_rad, rate_radps, transmitted_Nm)
         known_Nm += state.friction_torque_Nm
     state.feedback_torque_Nm = -constants.inertia_kgm2 * (
         constants.kp * (motor_rad + own.twist_error_rad) + constants.kv * rate_radps

@@ -42,8 +42,27 @@ class FrictionBranch:
 
 @record
 class FrictionConstants:
+    """Both directions, and what they share: see `friction.conditioned_torque_Nm`."""
+
     positive: FrictionBranch
     negative: FrictionBranch
+    conditioned: i4  # whether friction depends on load or temperature: any of the following is not zero
+    load_coulomb: f8  # Coulomb friction for each Nm that the reducer transmits
+    load_viscous_spr: f8  # viscous friction for the same, joint rad/s
+    temperature_coulomb_pK: f8
+    temperature_viscous_pK: f8
+    reference_degC: f8  # where the curve holds as it stands
+    lowest_degC: f8  # the factors are those of these temperatures beyond them
+    highest_degC: f8
+
+
+@record
+class TemperatureConstants:
+    """The newest reading of the drive's temperature: written by the supervisor while the loop runs."""
+
+    gain: f8  # of one period: a new reading does not jump into the torque
+    degC: Annotated[np.ndarray, array_of(f8, 1)]
+    time_ns: Annotated[np.ndarray, array_of(i8, 1)]  # CLOCK_MONOTONIC of the reading; 0 = there was none
 
 
 @record
@@ -186,6 +205,7 @@ class LawConstants:
     reduction_ratio: f8
     zero_band_radps: f8
     friction: FrictionConstants
+    temperature: TemperatureConstants
     lugre: LuGreConstants
     network: NetworkConstants
     observer: ObserverConstants
@@ -202,6 +222,7 @@ class LawState:
     learning: LearningState
     flexible: FlexibleState
     adaptation: AdaptationState
+    temperature_degC: f8  # as the friction feed-forward takes it; it follows the newest reading
     lugre_deflection_rad: f8
     integral_rads: f8
     outside_torque_Nm: f8  # ControllerKind.OUTSIDE only

@@ -42,6 +42,7 @@ RPDO_SLOT = 2
 RECEIVED_SLOT = 3
 # No delay is modelled, but with the time of the request an answer would be that of an earlier one.
 _ANSWER_NS = 1
+_READ_EVERY_NS = 1_000_000_000  # the temperature
 # elements of `CycleMemory.timespec`, the scratch of the loop's clock: here it is the clock
 _NOW_NS, _OFF_BUS = 0, 1
 
@@ -82,6 +83,7 @@ class Scenario(NamedTuple):
     lost_to_drive: bool = False
     lost_from_drive: bool = False
     set_points: np.ndarray = NO_POINTS  # float64 (N, 5), of a program: times since the start, ascending
+    thermometer: bool = False  # the drive reports its motor's temperature, once a second
 
 
 class _Link(NamedTuple):
@@ -250,6 +252,10 @@ def _run(memory: CycleMemory, codec: Codec, world: World, scenario: Scenario, tr
         clock_memory[_NOW_NS] = now_ns
         if len(scenario.set_points) > 0:
             put = _put_set_points(memory.constants[0].stream, world, scenario, put, now_ns)
+        if scenario.thermometer and now_ns % _READ_EVERY_NS < period_ns:
+            reading = memory.constants[0].law.temperature
+            reading.degC[0] = world.plant[0].motor_temperature_degC
+            reading.time_ns[0] = now_ns
         if faulty:
             if kind_active(faults, fault, FaultKind.LOOP_HELD_UP, now_ns):
                 missed += 1
@@ -296,5 +302,6 @@ def parts_of_a_run(
         now = Scenario(
             part[0], s.period_ns, part[1], s.stop_cycle, s.stop_request, s.tail_cycles, s.log_every, s.ideal_velocity,
             s.supervisor_beats, s.lost_to_drive, s.lost_from_drive, s.set_points,
+            s.thermometer,
         )  # fmt: skip
         yield _run(memory, codec, world, now, no_truth)

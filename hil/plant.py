@@ -20,7 +20,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jointctl.firmware_py.flexible_joint import series_at, sine_of_turns, value_at
-from jointctl.firmware_py.friction import friction_motor_torque_Nm, paper_friction
+from jointctl.firmware_py.friction import (
+    Condition,
+    condition_of,
+    conditioned_torque_Nm,
+    friction_motor_torque_Nm,
+    paper_friction,
+)
 from jointctl.firmware_py.kernel import inlined, kernel
 from jointctl.firmware_py.records import KNEES, HarmonicSeries
 from jointctl.firmware_py.schema import new
@@ -142,7 +148,10 @@ def encoder_counts(c: PlantConstants, s: PlantState) -> int:
 # Its break-away depends on the rate (a few per cent below the static friction for a quick rise), and it creeps under
 # vibration, as LuGre does.
 #
-# Not modelled: dwell-time dependence of the static friction, dependence on load torque, position-dependent stiction.
+# Where the curve depends on load and temperature (`friction.conditioned_torque_Nm`), the load is the torque through the
+# reducer, that of a rigid joint what the actuator has left over for inertia, gravity and load.
+#
+# Not modelled: dwell-time dependence of the static friction, position-dependent stiction.
 
 
 _LEAST_FRICTION_Nm = 1e-9  # a curve that touches zero must not divide by it
@@ -161,18 +170,20 @@ def modulation(c: PlantConstants, s: PlantState, position_rad: float) -> float:
 
 
 @inlined
-def sliding_torque_Nm(c: PlantConstants, velocity_radps: float) -> float:
-    """(11) at the joint for velocity != 0, with its sign; ripple and temperature are not in it."""
+def sliding_torque_Nm(c: PlantConstants, velocity_radps: float, condition: Condition) -> float:
+    """(11) at the joint for velocity != 0, with its sign; the factor of `modulation` is not in it."""
     factor = c.positive_factor if velocity_radps > 0.0 else c.negative_factor
-    return factor * friction_motor_torque_Nm(c.friction, velocity_radps)
+    return factor * friction_motor_torque_Nm(c.friction, velocity_radps, condition)
 
 
 @inlined
-def lugre_torque_Nm(c: PlantConstants, z: float, velocity_radps: float, factor: float) -> tuple[float, float]:
+def lugre_torque_Nm(
+    c: PlantConstants, z: float, velocity_radps: float, factor: float, condition: Condition
+) -> tuple[float, float]:
     """LuGre friction at the joint, and the bristle deflection after the substep that was z [rad] before it."""
     z_next = z
     if velocity_radps != 0.0:
-        g = max(abs(sliding_torque_Nm(c, velocity_radps)) * factor, _LEAST_FRICTION_Nm)
+        g = max(abs(sliding_torque_Nm(c, velocity_radps, condition)) * factor, _LEAST_FRICTION_Nm)
         travel = c.step_s * velocity_radps
         z_next = (z + travel) * g / (g + c.bristle_stiffness_Nmprad * abs(travel))
     torque = c.bristle_stiffness_Nmprad * z_next + c.bristle_damping_Nmspr * c.inverse_step_Hz * (z_next - z)
@@ -181,11 +192,13 @@ def lugre_torque_Nm(c: PlantConstants, z: float, velocity_radps: float, factor: 
 
 @kernel
 def _from_rest(
-    c: PlantConstants, mass: Mass, net_torque_Nm: float, time_s: float, factor: float
+    c: PlantConstants, mass: Mass, net_torque_Nm: float, time_s: float, factor: float, condition: Condition
 ) -> tuple[float, float, float]:
     """Velocity, travel and friction `time_s` after standstill under a constant torque, for the set-valued kind."""
-    forward = c.positive_factor * factor * mass.friction_share * c.friction.positive.static_Nm
-    backward = -c.negative_factor * factor * mass.friction_share * c.friction.negative.static_Nm
+    static_Nm = conditioned_torque_Nm(c.friction, c.friction.positive, 0.0, condition)
+    forward = c.positive_factor * factor * mass.friction_share * static_Nm
+    static_Nm = conditioned_torque_Nm(c.friction, c.friction.negative, 0.0, condition)
+    backward = -c.negative_factor * factor * mass.friction_share * static_Nm
     if net_torque_Nm > forward:
         friction = forward
     elif net_torque_Nm < backward:
@@ -205,7 +218,13 @@ class Mass(NamedTuple):
 
 @inlined
 def advance(
-    c: PlantConstants, mass: Mass, velocity_radps: float, bristle_rad: float, net_torque_Nm: float, factor: float
+    c: PlantConstants,
+    mass: Mass,
+    velocity_radps: float,
+    bristle_rad: float,
+    net_torque_Nm: float,
+    factor: float,
+    condition: Condition,
 ) -> tuple[float, float, float, float]:
     """One substep of a mass: new velocity [rad/s], travel [rad], friction [Nm at the joint], bristle deflection [rad].
 
@@ -216,13 +235,13 @@ def advance(
     friction = 0.0
     kind = c.friction_kind
     if kind == FrictionKind.LUGRE:
-        friction, bristle_rad = lugre_torque_Nm(c, bristle_rad, velocity_radps, factor)
+        friction, bristle_rad = lugre_torque_Nm(c, bristle_rad, velocity_radps, factor, condition)
         friction *= mass.friction_share
     elif kind != FrictionKind.NONE:
         if velocity_radps != 0.0:
-            friction = mass.friction_share * (factor * sliding_torque_Nm(c, velocity_radps))
+            friction = mass.friction_share * (factor * sliding_torque_Nm(c, velocity_radps, condition))
         elif kind == FrictionKind.STICK_SLIP:
-            velocity, travel, friction = _from_rest(c, mass, net_torque_Nm, step_s, factor)
+            velocity, travel, friction = _from_rest(c, mass, net_torque_Nm, step_s, factor, condition)
             return velocity, travel, friction, bristle_rad
     acceleration = (net_torque_Nm - friction) * mass.inverse_inertia
     new_velocity = velocity_radps + step_s * acceleration
@@ -232,7 +251,9 @@ def advance(
         # the velocity changed, so that the acceleration is not zero, and standstill comes within the substep
         until_rest_s = min(-velocity_radps / acceleration, step_s)
         travel_to_rest = 0.5 * velocity_radps * until_rest_s
-        rest_velocity, rest_travel, rest_friction = _from_rest(c, mass, net_torque_Nm, step_s - until_rest_s, factor)
+        rest_velocity, rest_travel, rest_friction = _from_rest(
+            c, mass, net_torque_Nm, step_s - until_rest_s, factor, condition
+        )
         return rest_velocity, travel_to_rest + rest_travel, rest_friction, bristle_rad
     return new_velocity, 0.5 * step_s * (velocity_radps + new_velocity), friction, bristle_rad
 
@@ -360,13 +381,17 @@ def step_plant(c: PlantConstants, s: PlantState, target_joint_torque_Nm: float) 
     if c.end_stops != 0:
         resisting += _end_stop_torque_Nm(c, joint_middle, joint_velocity)
 
+    # the torque through the reducer in the substep before: that of this one depends on the friction
+    condition = condition_of(c.friction, s.reducer_torque_Nm * c.inverse_ratio, s.motor_temperature_degC)
     if c.flexible == 0:
         actuator = c.torque_per_current_NmpA * current + value_at(c.torque_ripple, joint_middle)
         factor = modulation(c, s, joint_middle)
         whole = Mass(c.inverse_driven_inertia, 1.0)
         velocity, travel, friction, s.bristle_deflection_rad = advance(
-            c, whole, joint_velocity, s.bristle_deflection_rad, actuator - resisting, factor
+            c, whole, joint_velocity, s.bristle_deflection_rad, actuator - resisting, factor, condition
         )
+        if c.friction.conditioned != 0:  # half the way, or two substeps in turn would differ
+            s.reducer_torque_Nm += 0.5 * (actuator - friction - s.reducer_torque_Nm)
         position = s.joint_position_rad + travel
         s.joint_position_rad = position
         s.joint_velocity_radps = velocity
@@ -383,13 +408,13 @@ def step_plant(c: PlantConstants, s: PlantState, target_joint_torque_Nm: float) 
         factor = modulation(c, s, motor_middle)
         motor = Mass(c.inverse_driven_inertia, c.motor_friction_share)
         velocity, travel, friction, s.bristle_deflection_rad = advance(
-            c, motor, motor_velocity, s.bristle_deflection_rad, actuator - through * (1.0 + slope), factor
+            c, motor, motor_velocity, s.bristle_deflection_rad, actuator - through * (1.0 + slope), factor, condition
         )
         s.motor_position_rad += travel
         s.motor_velocity_radps = velocity
         link = Mass(c.inverse_link_inertia, 1.0 - c.motor_friction_share)
         link_velocity, link_travel, link_friction, s.link_bristle_deflection_rad = advance(
-            c, link, joint_velocity, s.link_bristle_deflection_rad, through - resisting, factor
+            c, link, joint_velocity, s.link_bristle_deflection_rad, through - resisting, factor, condition
         )
         s.joint_position_rad += link_travel
         s.joint_velocity_radps = link_velocity
@@ -422,7 +447,9 @@ def _fill_friction(c: PlantConstants, settings: PlantSettings) -> None:
     c.ambient_degC = settings.ambient_degC
     c.heating_KpA2 = settings.heating_KpA2
     c.thermal_gain = -math.expm1(-settings.step_s / settings.thermal_time_s)
-    c.friction_per_kelvin = settings.friction_per_kelvin
+    of_curve = float(c.friction.temperature_coulomb_pK) != 0.0 or float(c.friction.temperature_viscous_pK) != 0.0
+    c.friction_per_kelvin = 0.0 if of_curve else settings.friction_per_kelvin
+    c.inverse_ratio = 1.0 / ratio
 
 
 def _fill_actuator(c: PlantConstants, settings: PlantSettings) -> None:

@@ -41,6 +41,9 @@ class EncoderSide(IntEnum):
 # --- What a person writes: physical values, each with its range, checked once ---
 
 
+SELF_LOCKING = 0.9  # Coulomb friction for each Nm that the reducer transmits
+
+
 def _allowed(name: str, value: object, allowed: str) -> ValueError:
     return ValueError(f"{name} (={value}) must be {allowed}")
 
@@ -147,6 +150,9 @@ class PlantSettings:
                 raise _allowed(name, getattr(self, name), f"one of {members}")
         if self.friction is not None and getattr(self.friction, "dtype", None) != dtype_of(FrictionConstants):
             raise _allowed("friction", self.friction, "a FrictionConstants record, or None for Table 3 of the paper")
+        if self.friction is not None and self.friction.load_coulomb > SELF_LOCKING:
+            allowed = f"at most {SELF_LOCKING}: a joint that locks itself is not modelled"
+            raise _allowed("friction.load.coulomb", float(self.friction.load_coulomb), allowed)
         if self.encoder_direction == 0:
             raise _allowed("encoder_direction", 0, "1 or -1")
         if self.end_stop_max_rad <= self.end_stop_min_rad:
@@ -269,6 +275,7 @@ class PlantConstants:
     friction_kind: i4  # FrictionKind
     friction_modulated: i4  # friction ripple or temperature in use
     friction: FrictionConstants
+    inverse_ratio: f8
     positive_factor: f8  # n times the scale of the direction: motor-side curve to joint torque
     negative_factor: f8
     friction_ripple: f8
@@ -316,7 +323,7 @@ class PlantState:
     friction_torque_Nm: f8  # positive against positive motion
     load_torque_Nm: f8  # constant, step and added load; positive against positive motion
     gravity_torque_Nm: f8
-    reducer_torque_Nm: f8  # through the flexible element; 0 for a rigid joint
+    reducer_torque_Nm: f8  # through the flexible element; of a rigid joint only where friction goes with it
     twist_rad: f8  # up to which the hysteresis has come
     hysteresis_rad: f8  # deflection of its bristle
     bristle_deflection_rad: f8  # on the motor's side of a flexible joint

@@ -136,7 +136,7 @@ def _memory(constants: Any, state: Any, table: np.ndarray, log: Any) -> CycleMem
 class SteppedRun:
     """A run that goes on when it is asked to; between two steps `memory` and `world` are the caller's."""
 
-    def __init__(self, memory: CycleMemory, codec: Codec, world: World, start_ns: int) -> None:
+    def __init__(self, memory: CycleMemory, codec: Codec, world: World, start_ns: int, *, thermometer: bool) -> None:
         self.memory, self._codec, self.world = memory, codec, world
         self.now_ns = start_ns
         self._period_ns = round(float(memory.constants[0].law.period_s) * 1e9)
@@ -146,7 +146,7 @@ class SteppedRun:
         self._taken = 0
         self._part = np.zeros(2, np.int64)
         self._truth = np.zeros((0, TRUTHS))  # none
-        self._scenario = Scenario(start_ns, self._period_ns, 0)
+        self._scenario = Scenario(start_ns, self._period_ns, 0, thermometer=thermometer)
         self._parts = parts_of_a_run(memory, codec, world, self._scenario, self._part, self._truth)
 
     def step(self, cycles: int) -> None:
@@ -185,7 +185,8 @@ class LockstepJoint:
         self.config = config
         virtual = new_device(config)
         bus = DirectBus(virtual)
-        drive = CanopenDrive(bus, canopen_settings(config), sleep=bus.sleep, clock=lambda: bus.now_ns * 1e-9)
+        self._settings = canopen_settings(config)
+        drive = CanopenDrive(bus, self._settings, sleep=bus.sleep, clock=lambda: bus.now_ns * 1e-9)
         try:
             self.report: CommissioningReport = drive.commission()
             drive.start_cyclic()
@@ -217,7 +218,13 @@ class LockstepJoint:
             self._virtual.device.copy(), self.plant_constants, self.plant_state.copy(), self._virtual.queue.copy(),
             NO_FAULTS, fault_memory(NO_FAULTS, 0),
         )  # fmt: skip
-        return SteppedRun(memory, codec_of(self._port.copy()), world, self.start_ns)
+        return SteppedRun(
+            memory,
+            codec_of(self._port.copy()),
+            world,
+            self.start_ns,
+            thermometer=self._settings.temperature is not None,
+        )
 
     def run(
         self,
@@ -300,6 +307,7 @@ class LockstepJoint:
         **how: Any,
     ) -> LockstepRun:
         """A run from copies of device and plant; `how`: fields of `Scenario`."""
+        constants = constants.copy()  # temperature and set-points are written into it
         axis = constants[0]
         state = new(AxisState)
         reset_axis(axis, state[0])
@@ -314,5 +322,6 @@ class LockstepJoint:
         )
         memory = _memory(constants, state, self.table if table is None else table, log)
         scenario = Scenario(self.start_ns, round(float(axis.law.period_s) * 1e9), **how)
+        scenario = scenario._replace(thermometer=self._settings.temperature is not None)
         written, rows = run_lockstep(memory, codec_of(self._port.copy()), world, scenario, truth)
         return LockstepRun(log[:written], state[0], plant[0], world.device[0], Fault(int(state[0].fault)), truth[:rows])

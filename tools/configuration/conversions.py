@@ -8,9 +8,10 @@ from typing import Any
 
 from jointctl.firmware_py import friction as friction_model
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.sections import Friction, FrictionDirection, Section
+from jointctl.tools.configuration.sections import Friction, FrictionDirection, FrictionTemperature, Section
 
 RADPS_PER_UNIT = {"deg/s": math.pi / 180.0, "rad/s": 1.0, "r/min": math.tau / 60.0}
+HELD_BEYOND_K = 40.0  # of the reference: the factors of friction are held there where no range is given
 
 
 def shared(settings: type[Any], *sections: Section) -> dict[str, Any]:
@@ -76,13 +77,47 @@ def friction_constants(friction: Friction, reduction_ratio: float) -> Any:
         printed = friction_model.PrintedBranch(d.tc_Nm, d.ts_Nm, d.ws, d.tv, cubic, d.knee, d.max)
         return friction_model.branch_constants(printed, negative=negative, radps_per_unit=speed, torque_scale=scale)
 
-    return friction_model.friction_constants(branch(friction.positive, False), branch(friction.negative, True))
+    constants = friction_model.friction_constants(branch(friction.positive, False), branch(friction.negative, True))
+    _fill_condition(constants[0], friction)
+    return constants
+
+
+def _fill_condition(record: Any, friction: Friction) -> None:
+    load, warm = friction.load, friction.temperature
+    if load is not None:
+        record.load_coulomb, record.load_viscous_spr = load.coulomb, load.viscous_spr
+    if warm is not None:
+        record.temperature_coulomb_pK, record.temperature_viscous_pK = warm.coulomb_pK, warm.viscous_pK
+        record.reference_degC = warm.reference_degC
+        record.lowest_degC, record.highest_degC = held_beyond_degC(warm)
+    record.conditioned = int(
+        any(
+            (record.load_coulomb, record.load_viscous_spr, record.temperature_coulomb_pK, record.temperature_viscous_pK)
+        )
+    )
+
+
+def held_beyond_degC(warm: FrictionTemperature) -> tuple[float, float]:
+    """The temperatures beyond which the factors of friction are held."""
+    low, high = warm.lowest_degC, warm.highest_degC
+    reference = warm.reference_degC
+    return reference - HELD_BEYOND_K if low is None else low, reference + HELD_BEYOND_K if high is None else high
 
 
 def static_friction_Nm(config: Config) -> float | None:
-    """The larger one of both directions, at the joint; None where no friction is configured."""
+    """The larger one of both directions, at the joint, under gravity and at the temperature at which it is greatest.
+
+    None where no friction is configured.
+    """
     friction = config.friction
     if friction is None:
         return None
     ratio = config.joint.reduction_ratio if friction.torque_side == "motor" else 1.0
-    return max(abs(friction.positive.ts_Nm), abs(friction.negative.ts_Nm)) * ratio
+    static_Nm = max(abs(friction.positive.ts_Nm), abs(friction.negative.ts_Nm)) * ratio
+    if friction.load is not None:
+        static_Nm += friction.load.coulomb * abs(config.joint.gravity_Nm)
+    if friction.temperature is not None:
+        warm = friction.temperature
+        ends = held_beyond_degC(warm)
+        static_Nm *= max(math.exp(-warm.coulomb_pK * (end - warm.reference_degC)) for end in ends)
+    return static_Nm

@@ -51,12 +51,19 @@ def plant_keywords(config: Config, torque_constant_NmpA: float, friction: Any = 
     }
 
 
+def _true_friction(config: Config) -> Any:
+    """The `FrictionConstants` of the virtual joint; None where the configuration has none."""
+    assert config.virtual is not None
+    table = config.virtual.friction or config.friction
+    return None if table is None else friction_constants(table, config.joint.reduction_ratio)[0]
+
+
 def plant_problems(config: Config) -> list[str]:
     """What the plant itself refuses about [virtual], such as a step too long for the stiffness."""
     if config.virtual is None:
         return []
     try:
-        PlantSettings(**plant_keywords(config, config.joint.torque_constant_NmpA))
+        PlantSettings(**plant_keywords(config, config.joint.torque_constant_NmpA, _true_friction(config)))
     except ValueError as error:
         return [f"virtual.{error}"]
     return []
@@ -66,12 +73,8 @@ def plant_settings(config: Config) -> dict[str, Any]:
     """Keyword arguments for `hil.plant.plant`; `ConfigurationError` for what the plant refuses of [virtual]."""
     if config.virtual is None:
         raise ConfigurationError(f"{config.path}: [virtual] is missing: the virtual joint needs its true values")
-    friction = None
-    table = config.virtual.friction or config.friction
-    if table is not None:
-        friction = friction_constants(table, config.joint.reduction_ratio)[0]
     raise_if([f"{config.path}: {line}" for line in plant_problems(config)])
-    return plant_keywords(config, torque_constant_NmpA(config), friction)
+    return plant_keywords(config, torque_constant_NmpA(config), _true_friction(config))
 
 
 def device_settings(config: Config) -> DeviceSettings:

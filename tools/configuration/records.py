@@ -49,6 +49,7 @@ NOISE_S = 0.25  # that the mean change of the torque command is taken over
 NOISE_OF_RATE = (
     0.6  # share of the rate limit that is noise too, where the limit is lower than the noise that is allowed
 )
+WARMING_S = 2.0  # in which the friction feed-forward follows a new reading of the temperature
 APPROACH_SPEED = 0.25  # share of limits.velocity_max_radps that an automatic approach may use
 
 
@@ -132,6 +133,7 @@ def _fill_law(law: Any, config: Config) -> None:
         _fill_adaptation(law.adaptation, control.adaptation, joint.reduction_ratio)
     if config.friction is not None:
         law.friction = friction_constants(config.friction, joint.reduction_ratio)[0]
+        law.temperature.gain = -math.expm1(-period_s(config) / WARMING_S)
         if config.friction.lugre is not None:
             _copy(law.lugre, config.friction.lugre, "stiffness_Nmprad", "damping_Nmspr")
     if config.reducer is not None:

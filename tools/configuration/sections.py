@@ -218,18 +218,20 @@ class LuGre(Section):
 
 
 class FrictionLoad(Section):
-    """Friction that goes with the torque that the reducer transmits, at the joint; identified, no law uses it yet."""
+    """Friction that goes with the torque that the reducer transmits, at the joint."""
 
     coulomb: Annotated[float, between(0.0, 2.0)] = 0.0  # Coulomb friction per transmitted torque, its sign ignored
     viscous_spr: Annotated[float, between(0.0, 2.0)] = 0.0  # viscous friction per transmitted torque, joint rad/s
 
 
 class FrictionTemperature(Section):
-    """Friction times exp(-k (T - reference_degC)), at the drive's temperature; identified, no law uses it yet."""
+    """Friction times exp(-k (T - reference_degC)), T the drive's temperature."""
 
     reference_degC: Annotated[float, between(-50.0, 200.0)]  # at which the curve holds as it stands
     coulomb_pK: Annotated[float, between(-0.2, 0.2)] = 0.0  # k of Coulomb, static and load friction
     viscous_pK: Annotated[float, between(-0.2, 0.2)] = 0.0  # k of the rest of the curve
+    lowest_degC: Annotated[float, between(-50.0, 200.0)] | None = None  # held below; none: reference - 40
+    highest_degC: Annotated[float, between(-50.0, 200.0)] | None = None  # held above; none: reference + 40
 
 
 class Friction(Section):

@@ -74,7 +74,9 @@ def motion_section(found: MotionFit) -> dict[str, Any]:
         values["load"] = {key: float(f"{number:.9g}") for key, number in load.items()}
     if any(warm.values()):
         numbers = {key: float(f"{number:.9g}") for key, number in warm.items()}
-        values["temperature"] = {"reference_degC": found.reference_degC, **numbers}
+        seen = np.asarray(found.motion.temperature_degC)
+        ends = {"lowest_degC": round(float(seen.min()), 2), "highest_degC": round(float(seen.max()), 2)}
+        values["temperature"] = {"reference_degC": found.reference_degC, **numbers, **ends}
     return values
 
 

@@ -204,23 +204,44 @@ STALE_S = 3.0  # three requests without a reading: what was read before is not t
 class TemperatureWatch:
     """`poll` it with the supervisor's other watches; a temperature that cannot be read is no reason to stop."""
 
-    def __init__(self, thermometer: Thermometer | None = None, log: RunLogWriter | None = None) -> None:
+    def __init__(
+        self, thermometer: Thermometer | None = None, log: RunLogWriter | None = None, law: Any = None
+    ) -> None:
+        """`law`: the `LawConstants` of the loop, whose friction feed-forward goes with the temperature."""
         self._thermometer, self._log = thermometer, log
+        self._law, self._held = law, False
         self._told: set[str] = set()
         self.readings: list[tuple[int, float]] = []  # (CLOCK_MONOTONIC in ns, degC) of the whole run
 
     def poll(self) -> None:
         """Take what is new; why there is none goes into the log, each reason once."""
         reading = self._thermometer.poll() if self._thermometer is not None else None
+        self._tell_held()
         if reading is None:
             return
         if reading.temperature_degC is not None:
             self.readings.append((reading.time_ns, reading.temperature_degC))
+            if self._law is not None:
+                self._law.temperature.degC[0] = reading.temperature_degC
+                self._law.temperature.time_ns[0] = reading.time_ns
             if self._log is not None:
                 self._log.write_temperature(reading.time_ns, reading.temperature_degC)
         elif reading.problem not in self._told and self._log is not None:
             self._told.add(reading.problem)
             self._log.write_event(WARNING, "drive", reading.problem, reading.time_ns)
+
+    def _tell_held(self) -> None:
+        """Once, when the law goes on with a temperature that is not that of now, and how old it is."""
+        if self._law is None or not self.readings:
+            return
+        time_ns, degC = self.readings[-1]
+        age_s = (time.monotonic_ns() - time_ns) * 1e-9
+        if age_s <= STALE_S:
+            self._held = False
+        elif not self._held and self._log is not None:
+            self._held = True
+            text = f"no temperature for {age_s:.0f} s: the friction feed-forward holds that of {degC:.1f} °C"
+            self._log.write_event(WARNING, "drive", text)
 
     @property
     def values_degC(self) -> list[float]:

@@ -173,7 +173,7 @@ class Session:
         if signals.commanded_ns:  # just before: the loop gets it all the same, and never enables
             loop.request_stop(signals.request)
         drive.start_cyclic()
-        watch.temperature = TemperatureWatch(drive.thermometer(), watch.log)
+        watch.temperature = TemperatureWatch(drive.thermometer(), watch.log, loop.block.constants[0].law)
         watch.settings_guard = drive.settings_guard()
         started_ns = time.monotonic_ns()
         loop.go(constants, drive.port())

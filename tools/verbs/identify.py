@@ -336,8 +336,6 @@ def _from_motion(
     found = identify_motion(motion, options.motion, knee_radps=options.knee_radps, seed=options.swarm.seed)
     section = reports.motion_section(found)
     warnings = list(verdict.warnings)
-    if {"load", "temperature"} & section.keys():
-        warnings.append("friction that goes with load or temperature is written, but no law uses it yet")
     if len(found.model.directions) == 1:
         warnings.append(f"{motion.speed_name}: no reversal: friction of the other direction is taken to be the same")
     tables = [

@@ -11,10 +11,12 @@ import pytest
 
 from jointctl.firmware_py.friction import (
     DEGREE,
+    Condition,
     PrintedBranch,
     branch_constants,
     branch_torque_Nm,
     compensation_motor_torque_Nm,
+    condition_of,
     friction_constants,
     friction_curve_Nm,
     friction_motor_torque_Nm,
@@ -193,3 +195,61 @@ def test_a_reversal_uses_the_other_branch(lugre: Any, friction: Any) -> None:
     assert torque < 0.0
     deflection, torque = step_lugre(lugre, friction, RATIO, deflection, -0.2, 1.0)
     assert torque == pytest.approx(RATIO * friction_motor_torque_Nm(friction, -0.2), rel=1e-6)
+
+
+# --- load and temperature ---
+SPEEDS_radps = (1e-4, 0.02, 0.3, 0.69, 0.71, 3.0)
+
+
+def conditioned(**values: float) -> Any:
+    friction = paper_friction()[0]
+    friction.reference_degC, friction.lowest_degC, friction.highest_degC, friction.conditioned = 25.0, 0.0, 60.0, 1
+    for name, value in values.items():
+        setattr(friction, name, value)
+    return friction
+
+
+def test_a_curve_without_load_and_temperature_takes_no_notice_of_them():
+    friction = paper_friction()[0]
+    for v in SPEEDS_radps:
+        assert friction_motor_torque_Nm(friction, v, Condition(3.0, 0.5, 2.0)) == friction_motor_torque_Nm(friction, v)
+    assert condition_of(friction, -7.0, 80.0) == (0.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("load_Nm", [0.1, -0.1])
+def test_load_friction_opposes_the_motion_whichever_way_the_load_pushes(sign, load_Nm):
+    friction = conditioned(load_coulomb=0.2, load_viscous_spr=0.1)
+    condition = condition_of(friction, load_Nm, 25.0)
+    for v in SPEEDS_radps:
+        more = friction_motor_torque_Nm(friction, sign * v, condition) - friction_motor_torque_Nm(friction, sign * v)
+        assert more == pytest.approx(sign * 0.1 * (0.2 + 0.1 * v), rel=1e-9)
+
+
+@pytest.mark.parametrize("degC", [5.0, 25.0, 55.0])
+def test_each_part_has_its_own_factor_of_temperature(degC):
+    friction = conditioned(temperature_coulomb_pK=0.01, temperature_viscous_pK=0.03)
+    coulomb, viscous = math.exp(-0.01 * (degC - 25.0)), math.exp(-0.03 * (degC - 25.0))
+    branch, condition = friction.positive, condition_of(friction, 0.0, degC)
+    for v in SPEEDS_radps:
+        first = branch.coulomb_Nm + (branch.static_Nm - branch.coulomb_Nm) * math.exp(-v / branch.stribeck_speed_radps)
+        rest = branch_torque_Nm(branch, v) - first
+        expected = first * coulomb + rest * viscous
+        assert friction_motor_torque_Nm(friction, v, condition) == pytest.approx(expected, rel=1e-9)
+
+
+def test_beyond_the_range_of_temperatures_the_factors_are_held():
+    friction = conditioned(temperature_coulomb_pK=0.01)
+    assert condition_of(friction, 0.0, 4000.0) == condition_of(friction, 0.0, 60.0)
+    assert condition_of(friction, 0.0, -273.0) == condition_of(friction, 0.0, 0.0)
+    assert condition_of(friction, 0.0, 59.0) != condition_of(friction, 0.0, 60.0)
+
+
+def test_the_steady_lugre_torque_has_load_and_temperature():
+    friction = conditioned(load_coulomb=0.2, temperature_coulomb_pK=0.01, temperature_viscous_pK=0.03)
+    lugre, condition = new(LuGreConstants)[0], condition_of(friction, 0.08, 45.0)
+    lugre.stiffness_Nmprad, lugre.damping_Nmspr = 8e4, 200.0
+    deflection, torque = 0.0, 0.0
+    for _ in range(2000):
+        deflection, torque = step_lugre(lugre, friction, RATIO, deflection, 0.2, 1e-3, condition)
+    assert torque == pytest.approx(RATIO * friction_motor_torque_Nm(friction, 0.2, condition), rel=1e-9)

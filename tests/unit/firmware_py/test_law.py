@@ -14,6 +14,7 @@ from jointctl.firmware_py.law import (
     GROWN,
     adapt_network,
     eigenvalues,
+    follow_temperature,
     friction_feed_forward_Nm,
     learning_torque_Nm,
     network_torque_Nm,
@@ -315,6 +316,46 @@ def test_feed_forward_by_lugre_keeps_its_deflection(law: Any) -> None:
         assert state.lugre_deflection_rad == deflection
     reset_law(law, state)
     assert state.lugre_deflection_rad == 0.0
+
+
+def conditioned(law: Any) -> Any:
+    friction = law.friction
+    friction.conditioned, friction.load_coulomb, friction.temperature_coulomb_pK = 1, 0.2, 0.01
+    friction.temperature_viscous_pK = 0.01
+    friction.reference_degC, friction.lowest_degC, friction.highest_degC = 25.0, 0.0, 60.0
+    law.temperature.gain = 0.5
+    return law
+
+
+def test_feed_forward_takes_the_torque_that_the_model_transmits(law: Any) -> None:
+    """Inertia and gravity, each with its sign; friction goes with the size of their sum."""
+    conditioned(law)
+    law.kind, law.feed_forward = ControllerKind.COMPUTED_TORQUE, FeedForward.DESIRED
+    law.gravity_Nm = 30.0
+    state, velocity, reference = blocks(law)
+    reference.velocity_radps, reference.acceleration_radps2 = 0.2, -4.0
+    step(law, state, 0.5, velocity, reference)
+    transmitted = -4.0 * 2.1 + 30.0 * math.sin(0.5 - law.gravity_zero_rad)
+    plain = 121.0 * friction_motor_torque_Nm(law.friction, 0.2)
+    assert state.friction_torque_Nm == pytest.approx(plain + 0.2 * abs(transmitted))
+
+
+def test_the_temperature_of_the_feed_forward_is_the_last_that_was_read(law: Any) -> None:
+    conditioned(law)
+    law.feed_forward = FeedForward.DESIRED
+    state, _, _ = blocks(law)
+    plain = 121.0 * friction_motor_torque_Nm(law.friction, 0.2)
+    follow_temperature(law, state, True)
+    assert state.temperature_degC == 25.0  # none was read: the curve as it stands
+    law.temperature.degC[0], law.temperature.time_ns[0] = 45.0, 1
+    follow_temperature(law, state, False)
+    assert state.temperature_degC == 35.0  # it does not jump while the joint moves
+    for _ in range(200):
+        follow_temperature(law, state, False)  # no new reading: held
+    assert friction_feed_forward_Nm(law, state, 0.0, 0.2) == pytest.approx(plain * math.exp(-0.2))
+    law.temperature.degC[0] = 5.0
+    follow_temperature(law, state, True)
+    assert friction_feed_forward_Nm(law, state, 0.0, 0.2) == pytest.approx(plain * math.exp(0.2))
 
 
 def test_the_trap_of_the_paper_at_rest_is_the_users_choice(law: Any) -> None:

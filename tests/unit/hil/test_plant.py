@@ -344,6 +344,59 @@ def test_heating_follows_current_squared_and_lowers_friction():
     assert s[0].motor_temperature_degC == 25.0
 
 
+def curve_with(**values):
+    friction = paper_friction()[0]
+    friction.reference_degC, friction.lowest_degC, friction.highest_degC, friction.conditioned = 25.0, 0.0, 80.0, 1
+    for name, value in values.items():
+        setattr(friction, name, value)
+    return friction
+
+
+@kernel
+def push(c, s, velocity_radps, torque_Nm, substeps):
+    """As `hold_velocity`, with a torque of the motor."""
+    for _ in range(substeps):
+        s.joint_velocity_radps = velocity_radps
+        step_plant(c, s, torque_Nm)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_friction_goes_with_the_torque_through_the_reducer(sign):
+    """The reducer transmits what friction leaves over: f = f0 + k (actuator - f), where the motor drives."""
+    k, actuator_Nm = 0.2, 50.0
+    c, s = plant(friction_kind=FrictionKind.SIGN, friction=curve_with(load_coulomb=k))
+    push(c[0], s[0], sign * 0.2, sign * actuator_Nm, 100)
+    unloaded = RATIO * abs(friction_motor_torque_Nm(paper_friction()[0], sign * 0.2))
+    expected = (unloaded + k * actuator_Nm) / (1.0 + k)
+    assert s[0].friction_torque_Nm == pytest.approx(sign * expected, rel=1e-9)
+    assert s[0].reducer_torque_Nm == pytest.approx(sign * (actuator_Nm - expected), rel=1e-9)
+
+
+def test_load_raises_what_the_joint_breaks_away_at():
+    """Held against gravity, the set-valued kind stands still up to the static friction of the present load."""
+    c, s = plant(friction_kind=FrictionKind.STICK_SLIP, friction=curve_with(load_coulomb=0.3), load_torque_Nm=20.0)
+    static_Nm = RATIO * 0.14537
+    for actuator_Nm, moves in ((20.0 + static_Nm + 5.0, False), (20.0 + static_Nm + 7.0, True)):
+        run(c[0], s[0], actuator_Nm, 200)
+        assert (s[0].joint_velocity_radps > 0.0) == moves
+
+
+@pytest.mark.parametrize("degC", [15.0, 25.0, 55.0])
+def test_the_curve_has_factors_of_the_temperature_and_no_other(degC):
+    friction = curve_with(temperature_coulomb_pK=0.01, temperature_viscous_pK=0.01)
+    settings = {"friction_kind": FrictionKind.SIGN, "ambient_degC": degC, "heating_KpA2": 0.0}
+    c, s = plant(**settings, thermal=True, friction=friction)
+    hold_velocity(c[0], s[0], 0.2, 1)
+    plain = RATIO * friction_motor_torque_Nm(paper_friction()[0], 0.2)
+    assert s[0].friction_torque_Nm == pytest.approx(math.exp(-0.01 * (degC - 25.0)) * plain, rel=1e-9)
+
+
+def test_a_joint_that_locks_itself_is_refused():
+    plant(friction=curve_with(load_coulomb=0.9))
+    with pytest.raises(ValueError, match=r"friction.load.coulomb \(=0.95\) must be at most 0.9"):
+        plant(friction=curve_with(load_coulomb=0.95))
+
+
 # --- The reducer: three slopes, hysteresis, kinematic error, friction on both sides ---
 SIZE_20 = {
     "flexible": True, "motor_side_inertia_kgm2": 1.2, "reducer_stiffness_Nmprad": 1.6e4,

@@ -354,10 +354,10 @@ def test_the_verb_writes_section_pictures_page_and_report(tmp_path, config):
     assert identify(data, out, into=config, given=given, options=Options(), report=page) == 0
     result = json.loads(out.stdout.getvalue())
     assert result["kind"] == "motion"
-    assert "no law uses it yet" in out.stderr.getvalue()
     friction = load_config(config).friction
     assert friction.load.coulomb == pytest.approx(0.2, rel=0.2)
     assert friction.temperature.coulomb_pK == pytest.approx(0.01, rel=0.2)
+    assert friction.temperature.lowest_degC < friction.temperature.reference_degC < friction.temperature.highest_degC
     assert friction.model_dump(exclude_none=True)["load"] == result["friction"]["load"]
     tc_Nm = result["friction"]["positive"]["tc_Nm"] * 121.0
     assert tc_Nm == pytest.approx(6.0, rel=0.15)

@@ -18,8 +18,8 @@ from jointctl.drivers.can.socketcan import BUS_OFF, CONTROLLER, LinkState
 from jointctl.drivers.canopen.settings import TemperatureObject
 from jointctl.drivers.drive import Reading
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.firmware_py.records import LogRecord
-from jointctl.firmware_py.schema import dtype_of
+from jointctl.firmware_py.records import LawConstants, LogRecord
+from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.canopen import temperature_object
 from jointctl.tools.configuration.config import Config
@@ -179,6 +179,27 @@ def test_the_newest_reading_goes_stale(monkeypatch: pytest.MonkeyPatch) -> None:
     for now_ns, expected in ((limit_ns, 25.5), (limit_ns + 1, None)):
         monkeypatch.setattr("time.monotonic_ns", lambda now_ns=now_ns: now_ns)
         assert watch.newest_degC == expected
+
+
+def test_the_law_gets_each_reading_and_its_age_is_told_once_when_it_holds_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    law = new(LawConstants)[0]
+    with RunLogWriter(tmp_path / "a.mcap", {}) as log:
+        readings = (Reading(10 * S, 25.5), None, None, Reading(20 * S, 26.0))
+        watch = TemperatureWatch(Told(*readings), log, law)
+        for now_s, held in ((10, 25.5), (12, 25.5), (15, 25.5), (20, 26.0), (21, 26.0), (25, 26.0), (26, 26.0)):
+            monkeypatch.setattr("time.monotonic_ns", lambda now_s=now_s: now_s * S)
+            watch.poll()
+            assert law.temperature.degC[0] == held
+        monkeypatch.undo()
+        assert law.temperature.time_ns[0] == 20 * S
+        log.write_records(np.zeros(1, dtype_of(LogRecord)))
+    texts = [event.text for event in read_run_log(tmp_path / "a.mcap").events]
+    assert texts == [
+        "no temperature for 5 s: the friction feed-forward holds that of 25.5 °C",
+        "no temperature for 5 s: the friction feed-forward holds that of 26.0 °C",
+    ]
 
 
 def test_a_drive_without_a_thermometer_tells_nothing(tmp_path: Path) -> None:
