@@ -149,11 +149,13 @@ def encoder_counts(c: PlantConstants, s: PlantState) -> int:
 # vibration, as LuGre does.
 #
 # Where the curve depends on load and temperature (`friction.conditioned_torque_Nm`), the load is the torque through the
-# reducer, that of a rigid joint what the actuator has left over for inertia, gravity and load.
+# reducer, that of a rigid joint what the actuator has left over for inertia, gravity and load.  It follows in 10 ms:
+# the bristles' damping answers a change of g for some milliseconds, which would swing without a delay.
 #
 # Not modelled: dwell-time dependence of the static friction, position-dependent stiction.
 
 
+FRICTION_LOAD_s = 0.01
 _LEAST_FRICTION_Nm = 1e-9  # a curve that touches zero must not divide by it
 
 
@@ -381,8 +383,7 @@ def step_plant(c: PlantConstants, s: PlantState, target_joint_torque_Nm: float) 
     if c.end_stops != 0:
         resisting += _end_stop_torque_Nm(c, joint_middle, joint_velocity)
 
-    # the torque through the reducer in the substep before: that of this one depends on the friction
-    condition = condition_of(c.friction, s.reducer_torque_Nm * c.inverse_ratio, s.motor_temperature_degC)
+    condition = condition_of(c.friction, s.friction_load_Nm * c.inverse_ratio, s.motor_temperature_degC)
     if c.flexible == 0:
         actuator = c.torque_per_current_NmpA * current + value_at(c.torque_ripple, joint_middle)
         factor = modulation(c, s, joint_middle)
@@ -390,8 +391,7 @@ def step_plant(c: PlantConstants, s: PlantState, target_joint_torque_Nm: float) 
         velocity, travel, friction, s.bristle_deflection_rad = advance(
             c, whole, joint_velocity, s.bristle_deflection_rad, actuator - resisting, factor, condition
         )
-        if c.friction.conditioned != 0:  # half the way, or two substeps in turn would differ
-            s.reducer_torque_Nm += 0.5 * (actuator - friction - s.reducer_torque_Nm)
+        through = actuator - friction
         position = s.joint_position_rad + travel
         s.joint_position_rad = position
         s.joint_velocity_radps = velocity
@@ -421,6 +421,7 @@ def step_plant(c: PlantConstants, s: PlantState, target_joint_torque_Nm: float) 
         s.reducer_torque_Nm = through
         friction += link_friction
 
+    s.friction_load_Nm += c.friction_load_gain * (through - s.friction_load_Nm)
     s.actuator_torque_Nm = actuator
     s.friction_torque_Nm = friction
     s.load_torque_Nm = load
@@ -450,6 +451,7 @@ def _fill_friction(c: PlantConstants, settings: PlantSettings) -> None:
     of_curve = float(c.friction.temperature_coulomb_pK) != 0.0 or float(c.friction.temperature_viscous_pK) != 0.0
     c.friction_per_kelvin = 0.0 if of_curve else settings.friction_per_kelvin
     c.inverse_ratio = 1.0 / ratio
+    c.friction_load_gain = -math.expm1(-settings.step_s / FRICTION_LOAD_s)
 
 
 def _fill_actuator(c: PlantConstants, settings: PlantSettings) -> None:

@@ -276,6 +276,7 @@ class PlantConstants:
     friction_modulated: i4  # friction ripple or temperature in use
     friction: FrictionConstants
     inverse_ratio: f8
+    friction_load_gain: f8  # of one substep
     positive_factor: f8  # n times the scale of the direction: motor-side curve to joint torque
     negative_factor: f8
     friction_ripple: f8
@@ -323,7 +324,8 @@ class PlantState:
     friction_torque_Nm: f8  # positive against positive motion
     load_torque_Nm: f8  # constant, step and added load; positive against positive motion
     gravity_torque_Nm: f8
-    reducer_torque_Nm: f8  # through the flexible element; of a rigid joint only where friction goes with it
+    reducer_torque_Nm: f8  # through the flexible element; 0 for a rigid joint
+    friction_load_Nm: f8  # torque through the reducer, of a rigid one too, as friction takes it
     twist_rad: f8  # up to which the hysteresis has come
     hysteresis_rad: f8  # deflection of its bristle
     bristle_deflection_rad: f8  # on the motor's side of a flexible joint

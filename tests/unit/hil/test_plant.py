@@ -365,17 +365,19 @@ def test_friction_goes_with_the_torque_through_the_reducer(sign):
     """The reducer transmits what friction leaves over: f = f0 + k (actuator - f), where the motor drives."""
     k, actuator_Nm = 0.2, 50.0
     c, s = plant(friction_kind=FrictionKind.SIGN, friction=curve_with(load_coulomb=k))
-    push(c[0], s[0], sign * 0.2, sign * actuator_Nm, 100)
+    push(c[0], s[0], sign * 0.2, sign * actuator_Nm, 8000)
     unloaded = RATIO * abs(friction_motor_torque_Nm(paper_friction()[0], sign * 0.2))
     expected = (unloaded + k * actuator_Nm) / (1.0 + k)
     assert s[0].friction_torque_Nm == pytest.approx(sign * expected, rel=1e-9)
-    assert s[0].reducer_torque_Nm == pytest.approx(sign * (actuator_Nm - expected), rel=1e-9)
+    assert s[0].friction_load_Nm == pytest.approx(sign * (actuator_Nm - expected), rel=1e-9)
 
 
 def test_load_raises_what_the_joint_breaks_away_at():
     """Held against gravity, the set-valued kind stands still up to the static friction of the present load."""
     c, s = plant(friction_kind=FrictionKind.STICK_SLIP, friction=curve_with(load_coulomb=0.3), load_torque_Nm=20.0)
     static_Nm = RATIO * 0.14537
+    run(c[0], s[0], 20.0, 4000)
+    assert s[0].friction_load_Nm == pytest.approx(20.0)
     for actuator_Nm, moves in ((20.0 + static_Nm + 5.0, False), (20.0 + static_Nm + 7.0, True)):
         run(c[0], s[0], actuator_Nm, 200)
         assert (s[0].joint_velocity_radps > 0.0) == moves
@@ -389,6 +391,18 @@ def test_the_curve_has_factors_of_the_temperature_and_no_other(degC):
     hold_velocity(c[0], s[0], 0.2, 1)
     plain = RATIO * friction_motor_torque_Nm(paper_friction()[0], 0.2)
     assert s[0].friction_torque_Nm == pytest.approx(math.exp(-0.01 * (degC - 25.0)) * plain, rel=1e-9)
+
+
+@pytest.mark.parametrize("actuator_Nm", [50.0, -30.0])
+def test_bristles_do_not_swing_with_their_own_load(actuator_Nm):
+    """Driving and driven, at the speed and stiffness at which they answer most; settled after 0.2 s."""
+    bristles = {"bristle_stiffness_Nmprad": 3e4, "bristle_damping_Nmspr": 200.0}
+    c, s = plant(friction_kind=FrictionKind.LUGRE, friction=curve_with(load_coulomb=0.3), **bristles)
+    push(c[0], s[0], 0.9, actuator_Nm, 4000)
+    settled = s[0].friction_torque_Nm
+    for _ in range(20):
+        push(c[0], s[0], 0.9, actuator_Nm, 7)
+        assert s[0].friction_torque_Nm == pytest.approx(settled, rel=1e-6)
 
 
 def test_a_joint_that_locks_itself_is_refused():
