@@ -23,9 +23,9 @@ depends on the position."""
 
 from __future__ import annotations
 
-from jointctl.firmware_py.adaptation_records import ADAPTED_PARTS, BRISTLES, AdaptationConstants, AdaptationState
 from jointctl.firmware_py.flexible_joint import sine_of_turns
 from jointctl.firmware_py.friction import UNLOADED, Condition, step_lugre
+from jointctl.firmware_py.friction_records import ADAPTED_PARTS, BRISTLES, AdaptationConstants, AdaptationState
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.records import LawConstants
 

@@ -9,9 +9,12 @@ from typing import Annotated
 
 import numpy as np
 
-from jointctl.firmware_py.adaptation_records import AdaptationConstants as AdaptationConstants
-from jointctl.firmware_py.adaptation_records import AdaptationState as AdaptationState
-from jointctl.firmware_py.adaptation_records import LuGreConstants as LuGreConstants
+from jointctl.firmware_py.friction_records import AdaptationConstants as AdaptationConstants
+from jointctl.firmware_py.friction_records import AdaptationState as AdaptationState
+from jointctl.firmware_py.friction_records import FrictionBranch as FrictionBranch
+from jointctl.firmware_py.friction_records import FrictionConstants as FrictionConstants
+from jointctl.firmware_py.friction_records import LuGreConstants as LuGreConstants
+from jointctl.firmware_py.friction_records import TemperatureConstants as TemperatureConstants
 from jointctl.firmware_py.schema import array_of, f8, i4, i8, record, u4
 
 # --- The control law: friction model, network, observer, learning, and the law that holds them ---
@@ -22,47 +25,6 @@ TORQUE_HISTORY = 16  # cycles that an observer can look back
 LEARNING_BINS = 1 << 14
 HARMONICS = 4  # of a map of the reducer
 KNEES = 2  # of the reducer's stiffness
-
-
-@record
-class FrictionBranch:
-    """One direction of the multi-stage model (11), mirrored to positive speed and friction.
-
-    Speeds are those of the joint [rad/s], torques those at the motor [Nm].
-    """
-
-    coulomb_Nm: f8
-    static_Nm: f8
-    stribeck_speed_radps: f8
-    viscous_Nmspr: f8
-    cubic: Annotated[np.ndarray, array_of(f8, 4)]  # a0..a3 of a0 + a1 v + a2 v^2 + a3 v^3
-    knee_radps: f8  # the Stribeck stage holds up to here, the cubic one beyond
-    max_radps: f8  # beyond here the end slope is held
-
-
-@record
-class FrictionConstants:
-    """Both directions, and what they share: see `friction.conditioned_torque_Nm`."""
-
-    positive: FrictionBranch
-    negative: FrictionBranch
-    conditioned: i4  # whether friction depends on load or temperature: any of the following is not zero
-    load_coulomb: f8  # Coulomb friction for each Nm that the reducer transmits
-    load_viscous_spr: f8  # viscous friction for the same, joint rad/s
-    temperature_coulomb_pK: f8
-    temperature_viscous_pK: f8
-    reference_degC: f8  # where the curve holds as it stands
-    lowest_degC: f8  # the factors are those of these temperatures beyond them
-    highest_degC: f8
-
-
-@record
-class TemperatureConstants:
-    """The newest reading of the drive's temperature: written by the supervisor while the loop runs."""
-
-    gain: f8  # of one period: a new reading does not jump into the torque
-    degC: Annotated[np.ndarray, array_of(f8, 1)]
-    time_ns: Annotated[np.ndarray, array_of(i8, 1)]  # CLOCK_MONOTONIC of the reading; 0 = there was none
 
 
 @record

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator
 from pydantic_core import PydanticCustomError
 
-from jointctl.firmware_py.adaptation_records import RIPPLES
+from jointctl.firmware_py.friction_records import RIPPLES
 from jointctl.firmware_py.records import NEURONS
 from jointctl.tools.configuration.sections import Rule, Section, between, numbers
 

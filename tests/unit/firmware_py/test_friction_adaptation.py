@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.firmware_py.adaptation_records import BRISTLES, AdaptationState, LuGreConstants
 from jointctl.firmware_py.friction import paper_friction, step_lugre
 from jointctl.firmware_py.friction_adaptation import (
     AS_CONFIGURED,
@@ -22,6 +21,7 @@ from jointctl.firmware_py.friction_adaptation import (
     reset_adaptation,
     take_at_rest,
 )
+from jointctl.firmware_py.friction_records import BRISTLES, AdaptationState, LuGreConstants
 from jointctl.firmware_py.records import LawConstants
 from jointctl.firmware_py.schema import new
 from jointctl.tools.configuration.load import load_config

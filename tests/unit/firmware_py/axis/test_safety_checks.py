@@ -37,6 +37,14 @@ def test_a_sample_may_be_as_far_as_the_joint_can_move(
     assert tracking.fault_value == pytest.approx(moved_rad if fault else 0.0)
 
 
+def test_a_sample_exactly_as_far_as_the_joint_can_move_is_good(axis: Any, tracking: Any) -> None:
+    axis.limits.position_jump_max_rad, tracking.velocity.primed = 0.25, 1
+    sample = new(Sample)[0]
+    sample.position_rad, tracking.velocity.last_position_rad = 0.5, 0.0
+    check_jump(axis, tracking, sample, 2)
+    assert tracking.fault == Fault.NONE
+
+
 @pytest.mark.parametrize(("late_cycles", "fault"), [(0, Fault.NONE), (1, Fault.STOP_TIMEOUT)])
 def test_a_stop_has_its_time(axis: Any, tracking: Any, late_cycles: int, fault: Fault) -> None:
     tracking.phase, tracking.velocity.velocity_radps = AxisPhase.RAMPING, 0.3
@@ -63,3 +71,4 @@ def test_the_value_that_is_latched_is_the_one_beyond_its_limit(axis: Any, tracki
     }
     assert tracking.fault == fault
     assert tracking.fault_value == pytest.approx(latched[fault])
+    assert tracking.fault_drive_error == 0

@@ -314,6 +314,11 @@ def test_each_limit_at_its_edge(inside: dict[str, Any], outside: dict[str, Any],
     assert problem(**outside) is expected
 
 
+def test_a_set_point_exactly_as_far_as_allowed_is_no_jump() -> None:
+    assert problem(after=(0.2, 0.0, 0.0)) is not Problem.JUMP
+    assert problem(after=(0.2001, 0.0, 0.0)) is Problem.JUMP
+
+
 @pytest.mark.parametrize("given_radps2", [20.0, 20.1, -math.inf])
 def test_an_acceleration_that_is_given_has_the_same_limit(given_radps2: float) -> None:
     expected = NONE if given_radps2 == 20.0 else Problem.ACCELERATION
