@@ -38,7 +38,7 @@ TESTS = {  # below UNIT_TESTS
     "drivers/canopen/watchdog.py": ("drivers/canopen/test_watchdog", "drivers/canopen/test_switch_off"),
     "drivers/canopen/commissioning.py": (
         "drivers/canopen/test_commissioning", "drivers/canopen/test_odd_drives", "drivers/canopen/test_watchdog",
-        "drivers/canopen/test_eds",
+        "drivers/canopen/test_eds", "drivers/canopen/test_two_encoders",
     ),
     "drivers/canopen/drive.py": (
         "drivers/canopen/test_switch_off", "drivers/canopen/test_commissioning", "drivers/canopen/test_watchdog",

@@ -8,6 +8,7 @@ import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import can
@@ -391,19 +392,55 @@ def test_remarks_of_an_earlier_commissioning_are_not_repeated(joint: Any) -> Non
 def test_a_drive_that_is_not_ready_is_given_time_between_two_looks(joint: Any) -> None:
     joint.answers[(0x6041, 0)] = 0x0200
     pauses_s: list[float] = []
-    with joint.opened() as drive, pytest.raises(DeviceError, match="after 1 s"):
-        wait_until_ready(drive._objects, 1, 1.0, pauses_s.append)
-    assert pauses_s == [READY_POLL_S] * (round(1.0 / READY_POLL_S) - 1)
+    with joint.opened() as drive:
+        with pytest.raises(DeviceError, match="after 1 s"):
+            wait_until_ready(drive._objects, 1, 1.0, pauses_s.append)
+        assert pauses_s == [READY_POLL_S] * (round(1.0 / READY_POLL_S) - 1)
+        pauses_s.clear()
+        with pytest.raises(DeviceError, match="after 0 s"):
+            wait_until_ready(drive._objects, 1, 0.0, pauses_s.append)
+    assert pauses_s == []
 
 
 def test_what_is_exactly_at_its_bound_is_taken(joint: Any) -> None:
     assert commissioning._compare_rated("rated_current_A", 9.0, 8.0, 0.125, "A") == []
+    assert commissioning.interpolation_period(1e6 / 255) == (255, -6)
+    with pytest.raises(DeviceError, match="has no 60C2 value"):
+        commissioning.interpolation_period(1e6 / 256)
+    with joint.opened() as drive:
+        scale = drive.commission().torque_resolution_Nm
+    full = {"max_torque_permille": 900, "rated_tolerance": 0.0}
+    with joint.opened(**full, torque_max_Nm=900 * scale) as drive:
+        assert drive.commission().settings["max torque"].startswith("900 permille")
+    with joint.opened(**full, torque_max_Nm=900 * scale * 1.001) as drive, pytest.raises(DeviceError, match="is cut"):
+        drive.commission()
+
+
+def test_the_torque_slope_of_the_drive(joint: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     joint.answers[(0x6087, 0)] = 2000
     with joint.opened() as drive:
+        monkeypatch.setattr(drive._objects, "highest", {0x6087: 2000}.get)
         (remark,) = commissioning.set_torque_slope(drive._objects, 0.5, 1000.0)
         with pytest.raises(DeviceError, match="at most 1000 Nm/s"):
             commissioning.set_torque_slope(drive._objects, 0.5, 1000.5)
+    assert set(joint.downloads(0x6087)) == {2000}
     assert remark.endswith("; 6087 = 2000 permille/s")
+
+
+def test_a_drive_that_does_not_tell_its_rated_value_is_not_compared() -> None:
+    with pytest.raises(DeviceError, match="cannot be compared"):
+        commissioning._compare_rated("rated_current_A", 0.0, 5.0, 0.01, "A")
+    assert commissioning._compare_rated("rated_current_A", 1.0, 1.0, 0.01, "A") == []
+
+
+@pytest.mark.parametrize(("of_eds", "of_drive", "told"), [(1, 2, True), (0, 2, False), (1, 0, False), (2, 2, False)])
+def test_an_eds_of_another_product_is_a_remark_where_both_tell_it(
+    joint: Any, of_eds: int, of_drive: int, told: bool
+) -> None:
+    findings = commissioning.Findings()
+    eds = SimpleNamespace(name="some.eds", vendor_id=0, product_code=of_eds)
+    commissioning._compare_with_eds(joint.settings, eds, 0, of_drive, findings)
+    assert [remark.startswith("EDS some.eds is of product") for remark in findings.remarks] == [True] * told
 
 
 def test_a_drive_is_given_time_to_switch_off_and_to_change_its_mode(
