@@ -321,7 +321,7 @@ class LockstepJoint:
             fault_memory(faults, epoch_ns),
         )
         memory = _memory(constants, state, self.table if table is None else table, log)
-        scenario = Scenario(self.start_ns, round(float(axis.law.period_s) * 1e9), **how)
-        scenario = scenario._replace(thermometer=self._settings.temperature is not None)
+        period_ns, thermometer = round(float(axis.law.period_s) * 1e9), self._settings.temperature is not None
+        scenario = Scenario(self.start_ns, period_ns, thermometer=thermometer, **how)
         written, rows = run_lockstep(memory, codec_of(self._port.copy()), world, scenario, truth)
         return LockstepRun(log[:written], state[0], plant[0], world.device[0], Fault(int(state[0].fault)), truth[:rows])

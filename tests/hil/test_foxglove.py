@@ -31,17 +31,14 @@ def decoded(client: FoxgloveClient, topic: str, body: bytes) -> Any:
     return decoder(body)
 
 
-class Run:
-    """`jointctl run` with Foxglove beside it."""
+class WatchedRun:
+    """`jointctl run` with others beside it."""
 
     def __init__(self, bench: Any, *options: str, **changes: Any) -> None:
-        self.bench, self.port = bench, free_port()
+        self.bench = bench
         config = bench.config(**{**ENDLESS, **PATIENT, **changes})
         bench.joint(config)
-        self.program = bench.start("run", config, "-y", "--foxglove", f"127.0.0.1:{self.port}", *options)
-
-    def client(self) -> FoxgloveClient:
-        return FoxgloveClient(self.port)
+        self.program = bench.start("run", config, "-y", *options)
 
     def ended(self, code: int = 130) -> Any:
         """The log, after a run that ended by itself; the drive is off."""
@@ -49,6 +46,17 @@ class Run:
         assert ended.code == code, ended.err
         assert self.bench.disabled()
         return self.bench.log()
+
+
+class Run(WatchedRun):
+    """With Foxglove."""
+
+    def __init__(self, bench: Any, *options: str, **changes: Any) -> None:
+        self.port = free_port()
+        super().__init__(bench, "--foxglove", f"127.0.0.1:{self.port}", *options, **changes)
+
+    def client(self) -> FoxgloveClient:
+        return FoxgloveClient(self.port)
 
 
 def texts(log: Any) -> str:

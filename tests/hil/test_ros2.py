@@ -14,29 +14,21 @@ import zenoh
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.scoping import ros2_server
 from tests.foxglove_client import free_port
-from tests.hil.test_foxglove import ENDLESS, PATIENT, texts
+from tests.hil.test_foxglove import WatchedRun, texts
 from tests.ros2_client import DIAGNOSTICS, HASHES, JOINT_STATE, TRIGGER, Ros2Client, key
 
 DOMAIN = 7
 
 
-class Run:
-    """`jointctl run` as a node beside it."""
+class Run(WatchedRun):
+    """As a node."""
 
     def __init__(self, bench: Any, *options: str, **changes: Any) -> None:
-        self.bench, self.endpoint = bench, f"tcp/127.0.0.1:{free_port()}"
-        config = bench.config(**{**ENDLESS, **PATIENT, **changes})
-        bench.joint(config)
-        self.program = bench.start("run", config, "-y", "--ros2", str(DOMAIN), "--ros2-listen", self.endpoint, *options)
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        super().__init__(bench, "--ros2", str(DOMAIN), "--ros2-listen", self.endpoint, *options, **changes)
 
     def client(self, name: str = "teleop") -> Ros2Client:
         return Ros2Client(self.endpoint, name, DOMAIN)
-
-    def ended(self, code: int = 130) -> Any:
-        ended = self.program.finished(60.0)
-        assert ended.code == code, ended.err
-        assert self.bench.disabled()
-        return self.bench.log()
 
 
 def test_the_graph_the_states_and_the_diagnostics(bench: Any) -> None:

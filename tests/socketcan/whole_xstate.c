@@ -29,17 +29,21 @@ long ptrace(enum __ptrace_request request, ...)
     int get = (int)request == PTRACE_GETREGSET, set = (int)request == PTRACE_SETREGSET;
     if (!(get || set) || (uintptr_t)kind != NT_X86_XSTATE) return next(request, pid, kind, part);
 
+    static size_t size;  // of the processor's state
     struct iovec all = {whole, sizeof whole};
-    long result = next(PTRACE_GETREGSET, pid, kind, &all);  // also for its size
-    if (result) return result;
-    uint64_t present;
+    if (get || !size) {
+        long result = next(PTRACE_GETREGSET, pid, kind, &all);
+        if (result) return result;
+        size = all.iov_len;
+    }
+    all.iov_len = size;
+    if (part->iov_len > size) part->iov_len = size;
     if (get) {
-        if (part->iov_len > all.iov_len) part->iov_len = all.iov_len;
         memcpy(part->iov_base, whole, part->iov_len);
         return 0;
     }
-    if (part->iov_len > all.iov_len) part->iov_len = all.iov_len;
-    memset(whole, 0, all.iov_len);
+    uint64_t present;
+    memset(whole, 0, size);
     memcpy(whole, part->iov_base, part->iov_len);
     memcpy(&present, whole + PRESENT, sizeof present);
     present &= ~TILES;

@@ -49,6 +49,7 @@ NOISE_S = 0.25  # that the mean change of the torque command is taken over
 NOISE_OF_RATE = (
     0.6  # share of the rate limit that is noise too, where the limit is lower than the noise that is allowed
 )
+RIPPLE_MOST = 4.0  # of what the adaptation takes for torque ripple, times what is expected
 WARMING_S = 2.0  # in which the friction feed-forward follows a new reading of the temperature
 APPROACH_SPEED = 0.25  # share of limits.velocity_max_radps that an automatic approach may use
 
@@ -150,9 +151,6 @@ def _fill_law(law: Any, config: Config) -> None:
     network.initial_weight = control.initial_weight_Nm
     network.leakage = control.leakage_1ps
     network.weight_limit = control.weight_limit_Nm
-
-
-RIPPLE_MOST = 4.0  # times what is expected
 
 
 def _fill_adaptation(record: Any, adaptation: Adaptation, ratio: float) -> None:

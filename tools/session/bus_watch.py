@@ -207,7 +207,7 @@ class TemperatureWatch:
     def __init__(
         self, thermometer: Thermometer | None = None, log: RunLogWriter | None = None, law: Any = None
     ) -> None:
-        """`law`: the `LawConstants` of the loop, whose friction feed-forward goes with the temperature."""
+        """`law`: the `LawConstants` of the loop, whose friction feed-forward may go with the temperature."""
         self._thermometer, self._log = thermometer, log
         self._law, self._held = law, False
         self._told: set[str] = set()
@@ -233,6 +233,9 @@ class TemperatureWatch:
     def _tell_held(self) -> None:
         """Once, when the law goes on with a temperature that is not that of now, and how old it is."""
         if self._law is None or not self.readings:
+            return
+        friction = self._law.friction
+        if not (friction.temperature_coulomb_pK or friction.temperature_viscous_pK):
             return
         time_ns, degC = self.readings[-1]
         age_s = (time.monotonic_ns() - time_ns) * 1e-9

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from jointctl.drivers.drive import UNTOUCHED, CommissioningReport, is_safe
-from jointctl.drivers.errors import INTERRUPTED, DataError, DeviceError, MotionFault
+from jointctl.drivers.errors import DECLINED, INTERRUPTED, DataError, DeviceError, MotionFault
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
@@ -52,6 +52,20 @@ def words(state: str, *, interrupted: bool = False) -> str:
     if state == UNTOUCHED:
         return "the drive was left alone: another controller has it"
     return "the drive is disabled" if state else "no drive was used"
+
+
+def never_begun(state: str, output: Output, *, dry_run: bool = False) -> int:
+    """A run that was declined, or a dry run: says how the drive is, and returns the exit code."""
+    left = words(state)
+    output.note(f"dry run: nothing moved; the drive was commissioned; {left}" if dry_run else f"nothing moved; {left}")
+    return 0 if dry_run else DECLINED
+
+
+def broken_off(state: str, output: Output, by_command: str) -> int:
+    """A run that was interrupted before it was begun, `by_command` as `StopSignals` has it; returns the exit code."""
+    output.note(f"interrupted{by_command}; nothing moved")
+    require_off(state)
+    return INTERRUPTED
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from jointctl.drivers.errors import DECLINED, INTERRUPTED
+from jointctl.drivers.errors import INTERRUPTED
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import JointOrVirtual, VerbOutput, Yes
 
@@ -97,9 +97,8 @@ def doctor_motion(config: Config, output: Output, *, assume_yes: bool, torque_Nm
 def _pull(config: Config, output: Output, control: Control, *, assume_yes: bool, torque_Nm: float | None) -> int:
     from jointctl.firmware_py.states import Fault
     from jointctl.tools.inspection.motion_check import check_run, ended_finding, judged, make_plan, motion_findings
-    from jointctl.tools.session import result as drive_end
     from jointctl.tools.session.consent import TerminalConsent
-    from jointctl.tools.session.result import require_off
+    from jointctl.tools.session.result import never_begun, require_off
     from jointctl.tools.session.session import Session
 
     plan = make_plan(config, torque_Nm)
@@ -110,8 +109,7 @@ def _pull(config: Config, output: Output, control: Control, *, assume_yes: bool,
         require_off(session.drive_state)
         raise
     if result is None:
-        output.note(f"nothing moved; {drive_end.words(session.drive_state)}")
-        return DECLINED
+        return never_begun(session.drive_state, output)
     require_off(result.drive_state)
     if result.stopped_by:
         output.note(f"stopped by {result.stopped_by}; the joint is {result.drive_state}; nothing was judged")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Column, Table
 
-from jointctl.drivers.errors import DECLINED, INTERRUPTED, ConfigurationError, MotionFault, UsageError
+from jointctl.drivers.errors import INTERRUPTED, ConfigurationError, MotionFault, UsageError
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOnBus, VerbOutput, Yes
 
@@ -163,11 +163,11 @@ def map_verb(
 def _measured(config: Config, output: Output, **how: bool) -> tuple[Any, float] | int:
     """(records, time from a command to its torque) of a run, or the exit code without one."""
     from jointctl.tools.recording.run_log_reader import read_run_log
-    from jointctl.tools.session import result as drive_end
     from jointctl.tools.session.consent import TerminalConsent
     from jointctl.tools.session.control import in_control
     from jointctl.tools.session.live_panel import run_display
     from jointctl.tools.session.plan import resolve
+    from jointctl.tools.session.result import broken_off, never_begun, require_off
     from jointctl.tools.session.session import Session
 
     plan = resolve(config, allow_low_margin=how["allow_low_margin"])
@@ -181,13 +181,10 @@ def _measured(config: Config, output: Output, **how: bool) -> tuple[Any, float] 
         try:
             result = session.run()
         except KeyboardInterrupt:
-            output.note(f"interrupted{control.signals.by_command}; nothing moved")
-            drive_end.require_off(session.drive_state)
-            return INTERRUPTED
+            return broken_off(session.drive_state, output, control.signals.by_command)
     if result is None:
-        output.note(f"nothing moved; {drive_end.words(session.drive_state)}")
-        return 0 if how["dry_run"] else DECLINED
-    drive_end.require_off(session.drive_state)
+        return never_begun(session.drive_state, output, dry_run=how["dry_run"])
+    require_off(session.drive_state)
     if result.fault_text is not None:
         text = result.fault_text
         raise MotionFault(f"{result.fault.name} ({int(result.fault)}): {text.happened}; no map", text.advice)
@@ -214,6 +211,8 @@ def _late_s(config: Config) -> float:
 
 
 def _table(found: FoundMap) -> Table:
+    from jointctl.tools.analysis.reducer_map import kept_waves
+
     table = Table(
         "series",
         *(Column(name, justify="right") for name in ("a motor turn", "amplitude", "+-", "phase [rad]", "+-")),
@@ -222,8 +221,6 @@ def _table(found: FoundMap) -> Table:
         title_justify="left",
         caption_justify="left",
     )
-    from jointctl.tools.analysis.reducer_map import kept_waves
-
     for name, waves, scale, digits in (
         ("kinematic error [mrad]", found.kinematic_rad, 1e3, 4), ("torque ripple [Nm]", found.ripple_Nm, 1.0, 3),
     ):  # fmt: skip

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jointctl.drivers.errors import DECLINED, INTERRUPTED
 from jointctl.tools.output import Output
 from jointctl.tools.scoping.remote_options import NOBODY_REMOTE, RemoteOptions
 from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOnBus, VerbOutput, Yes
@@ -39,11 +38,10 @@ def run(
 ) -> int:
     """Track the configured trajectory on a real or virtual joint."""
     from jointctl.tools.scoping.remote import remote
-    from jointctl.tools.session import result as drive_end
     from jointctl.tools.session.consent import TerminalConsent, require_terminal
     from jointctl.tools.session.control import in_control
     from jointctl.tools.session.plan import resolve
-    from jointctl.tools.session.result import report_run, require_off, run_title
+    from jointctl.tools.session.result import broken_off, never_begun, report_run, run_title
     from jointctl.tools.session.session import Session
 
     if not (assume_yes or dry_run):
@@ -61,15 +59,9 @@ def run(
         try:
             result = session.run()
         except KeyboardInterrupt:
-            output.note(f"interrupted{control.signals.by_command}; nothing moved")
-            require_off(session.drive_state)
-            return INTERRUPTED
+            return broken_off(session.drive_state, output, control.signals.by_command)
     if result is None:
-        left = drive_end.words(session.drive_state)
-        output.note(
-            f"dry run: nothing moved; the drive was commissioned; {left}" if dry_run else f"nothing moved; {left}"
-        )
-        return 0 if dry_run else DECLINED
+        return never_begun(session.drive_state, output, dry_run=dry_run)
     return report_run(result, output, config)
 
 

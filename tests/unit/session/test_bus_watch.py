@@ -185,6 +185,7 @@ def test_the_law_gets_each_reading_and_its_age_is_told_once_when_it_holds_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     law = new(LawConstants)[0]
+    law.friction.temperature_viscous_pK = 0.01
     with RunLogWriter(tmp_path / "a.mcap", {}) as log:
         readings = (Reading(10 * S, 25.5), None, None, Reading(20 * S, 26.0))
         watch = TemperatureWatch(Told(*readings), log, law)
@@ -200,6 +201,17 @@ def test_the_law_gets_each_reading_and_its_age_is_told_once_when_it_holds_one(
         "no temperature for 5 s: the friction feed-forward holds that of 25.5 °C",
         "no temperature for 5 s: the friction feed-forward holds that of 26.0 °C",
     ]
+
+
+def test_a_law_whose_friction_knows_no_temperature_holds_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with RunLogWriter(tmp_path / "a.mcap", {}) as log:
+        watch = TemperatureWatch(Told(Reading(10 * S, 25.5), None), log, new(LawConstants)[0])
+        for now_s in (10, 15):
+            monkeypatch.setattr("time.monotonic_ns", lambda now_s=now_s: now_s * S)
+            watch.poll()
+        monkeypatch.undo()
+        log.write_records(np.zeros(1, dtype_of(LogRecord)))
+    assert read_run_log(tmp_path / "a.mcap").events == ()
 
 
 def test_a_drive_without_a_thermometer_tells_nothing(tmp_path: Path) -> None:
