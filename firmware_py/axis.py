@@ -148,10 +148,13 @@ def _brake(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> N
     still = abs(state.velocity.velocity_radps) <= constants.limits.standstill_radps
     if not still or state.reference.velocity_radps != 0.0:
         state.still_cycles = 0
+        state.ready = 0
     elif state.sample_age_cycles == 0:  # a lost sample proves nothing either way
         state.still_cycles += elapsed_cycles
         if state.still_cycles >= constants.sequence.settle_cycles:
-            enter(state, AxisPhase.RELEASING)
+            state.ready = 1
+            if state.held_back == 0:
+                enter(state, AxisPhase.RELEASING)
     check_stop_time(constants, state)
 
 

@@ -6,8 +6,9 @@ What differs is handed in: an `Exchange` moves frames or bytes, a `Clock` gives 
 a cycle begins (`Slot`).  Front ends: `firmware_py.realtime` on a descriptor, the same loop in plain Python over
 python-can (`tools.session.portable_loop`), and simulated time (`hil.lockstep`).
 
-Every array of records has one element an axis.  The axes share SYNC, stop word and end: a fault of one ramps the
-others down, and the loop goes on until the last one is FINISHED.
+Every array of records has one element an axis.  The axes share SYNC, stop word and end: none begins before all can, and
+the first one that brakes takes the others along in the same cycle (`hold_back`, `stop_of`); the loop goes on until the
+last one is FINISHED.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from jointctl.firmware_py.libc import load_acquire, store_release
 from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.safety import check_suspension
 from jointctl.firmware_py.schema import INT32_MAX
+from jointctl.firmware_py.sequence import request_stop, write_command
 from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest
 
 HISTOGRAM_BINS = 4097  # 1 us each; the last one holds everything later
@@ -160,13 +162,41 @@ def store_word(words: np.ndarray, index: int, value: int) -> None:
 # --- The cycle ---
 
 
+# No joint of an arm has torque while another has none, as far as the loop can see to it: they are asked to enable
+# together once all could be, get torque together once all are enabled, brake together, and release their torque
+# together once all stand.
+
+
 @kernel
 def stop_of(states: np.ndarray, axis: int, stop_request: int) -> int:
-    """The StopRequest for one axis: the stop word, or RAMP at least once another axis has tripped."""
+    """The StopRequest for one axis: the stop word, or RAMP at least once another axis has tripped, or brakes."""
     for other in range(len(states)):
-        if other != axis and states[other].fault != Fault.NONE:
+        if other != axis and (states[other].fault != Fault.NONE or states[other].phase >= AxisPhase.RAMPING):
             return max(stop_request, _RAMP)
     return stop_request
+
+
+@kernel
+def hold_back(states: np.ndarray) -> None:
+    """Which axes must stay in WAITING, ENABLING or RAMPING although they are `ready`: another one is not.
+
+    An axis that has just become ready waits for the next cycle too, so that all go on in the same one.  One that is
+    switched off by its fault is ahead, and holds no one back.
+    """
+    for axis in range(len(states)):
+        held, phase = 0, states[axis].phase
+        for other in range(len(states)):
+            if states[other].phase < phase or (states[other].phase == phase and states[other].ready == 0):
+                held = 1
+        states[axis].held_back = held
+
+
+@shared
+def stop_together(states: np.ndarray, commands: np.ndarray, stop_request: int) -> None:
+    """What an axis has come upon in this cycle stops all others in the same cycle; commands as of now."""
+    for axis in range(len(states)):
+        request_stop(states[axis], stop_of(states, axis, stop_request))
+        write_command(states[axis], commands[axis])
 
 
 @shared
@@ -209,6 +239,9 @@ def step_cycle(memory: CycleMemory, exchange: Exchange, clock: Clock, slot: Slot
     stop_request = load_word(words, Word.STOP)
     supervisor_age_cycles = (slot.wake_ns - load_word(words, Word.SUPERVISOR_NS)) // slot.period_ns
     slept_ns = clock.slept_ns(words, memory.timespec)
+    several = len(memory.state) > 1
+    if several:
+        hold_back(memory.state)
     for axis in range(len(memory.state)):
         state, sample = memory.state[axis], samples[axis]
         state.slot_ns = slot.deadline_ns
@@ -220,5 +253,7 @@ def step_cycle(memory: CycleMemory, exchange: Exchange, clock: Clock, slot: Slot
             memory.constants[axis], state, memory.tables[axis], sample, commands[axis], slot.elapsed_cycles,
             stop_of(memory.state, axis, stop_request), supervisor_age_cycles,
         )  # fmt: skip
+    if several:
+        stop_together(memory.state, commands, stop_request)
     exchange.send(exchange.link, samples, commands)
     return log_cycle(memory, slot, waited_ns, clock.now_ns(memory.timespec))

@@ -510,6 +510,8 @@ class AxisState:
     cycle: i8
     phase_cycle: i8  # cycles since the phase began
     held_up_cycles: i8  # of them those that the loop skipped in overruns beyond skipped_max_cycles
+    ready: i4  # to go on to the next phase, as far as this axis is concerned
+    held_back: i4  # by another axis that is not; set before the cycle, 0 for a single joint
     good_samples: i8
     sample_count: i8
     sample_age_cycles: i8

@@ -77,6 +77,7 @@ def enter(state: AxisState, phase: int) -> None:
     state.phase_cycle = 0
     state.held_up_cycles = 0
     state.good_samples = 0
+    state.ready = 0
 
 
 @kernel
@@ -290,8 +291,8 @@ def set_point_problem(
 
 @kernel
 def check_stop_time(constants: AxisConstants, state: AxisState) -> None:
-    """RAMPING: the joint must come to rest in time."""
-    if state.phase_cycle > constants.sequence.stop_max_cycles:
+    """RAMPING: the joint must come to rest in time; one that stands waits for the others of its arm, under control."""
+    if state.phase_cycle > constants.sequence.stop_max_cycles and state.ready == 0:
         trip(state, Fault.STOP_TIMEOUT, state.velocity.velocity_radps, 0)
 
 

@@ -37,6 +37,8 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.phase_cycle = 0
     state.held_up_cycles = 0
     state.good_samples = 0
+    state.ready = 0
+    state.held_back = 0
     state.sample_count = 0
     state.sample_age_cycles = 0
     state.saturated_cycles = 0
@@ -100,6 +102,7 @@ def step_waiting(constants: AxisConstants, state: AxisState, sample: Sample) -> 
     """WAITING: some good samples at standstill inside the limits, then ask the drive to enable."""
     limits = constants.limits
     moving = not abs(state.velocity.velocity_radps) <= limits.standstill_radps
+    state.ready = 0
     if state.good_samples >= constants.sequence.settle_cycles:
         position_rad = limit_position_rad(limits, state.measured_position_rad, state.second_position_rad)
         fault = motion_fault(limits, position_rad, 0.0, 0.0)
@@ -110,7 +113,9 @@ def step_waiting(constants: AxisConstants, state: AxisState, sample: Sample) -> 
             return
         enabled = sample.drive_state == DriveState.ENABLED  # it should be off: nobody has asked for more
         if not moving and not enabled and constants.sequence.may_enable != 0:
-            enter(state, AxisPhase.ENABLING)
+            state.ready = 1
+            if state.held_back == 0:
+                enter(state, AxisPhase.ENABLING)
             return
     if waited_too_long(state, constants.sequence.wait_max_cycles):
         if state.sample_count == 0:
@@ -129,9 +134,15 @@ def step_waiting(constants: AxisConstants, state: AxisState, sample: Sample) -> 
 
 @kernel
 def step_enabling(constants: AxisConstants, state: AxisState, sample: Sample, table: np.ndarray) -> None:
-    """ENABLING: once the drive is on, plan the way from where the joint stands to the trajectory's start."""
-    if sample.drive_state == DriveState.ENABLED and state.sample_age_cycles == 0:
+    """ENABLING: once the drive is on, plan the way from where the joint stands to the trajectory's start.
+
+    A joint of an arm has no torque until the drives of all others are on.
+    """
+    state.ready = 1 if sample.drive_state == DriveState.ENABLED and state.sample_age_cycles == 0 else 0
+    if state.ready != 0:
         if moved_before_start(constants, state):  # a brake that has opened, say
+            return
+        if state.held_back != 0:
             return
         approach_s = constants.sequence.approach_s
         state.table_row = reference_at(constants.trajectory, table, 0, 0.0, state.reference)

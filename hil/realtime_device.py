@@ -1,6 +1,6 @@
-"""The virtual drive in real time, on a file descriptor that carries 16-byte frames (AF_CAN, or AF_UNIX SEQPACKET).
+"""The virtual drives of a bus in real time, on a file descriptor that carries 16-byte frames (AF_CAN, AF_UNIX SEQPACKET).
 
-One compiled loop without the interpreter lock, in one thread.  SDO requests go through a socket pair to a second,
+One compiled loop without the interpreter lock, in one thread, for all drives of an arm: so their joints move on together.  SDO requests go through a socket pair to a second,
 Python thread, and its responses come back the same way: the core first acts on what was written, then sends the
 response, so that a master which has its answer finds the controlword carried out.  The loop is the only sender on the
 bus.
@@ -12,11 +12,12 @@ import errno as errno_codes
 import socket
 import threading
 import time
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jointctl.firmware_py.kernel import kernel
+from jointctl.firmware_py.kernel import inlined, kernel
 from jointctl.firmware_py.libc import (
     EAGAIN,
     EINTR,
@@ -31,14 +32,13 @@ from jointctl.firmware_py.libc import (
     send,
     store_release,
 )
-from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.hil.canopen.device import Cia402Device
-from jointctl.hil.canopen.device_core import accept_frame, advance
+from jointctl.hil.canopen.device_core import accept_frame, advance, advance_together
 from jointctl.hil.canopen.records import Device, NmtState, int64
-from jointctl.hil.fault_kinds import FaultMemory, fault_memory, no_faults
+from jointctl.hil.fault_kinds import FaultConstants, FaultMemory, fault_memory, no_faults
 from jointctl.hil.faults import append_frame, pass_frame, step_faults, take_due
 from jointctl.hil.frame_stamps import OLDEST_STAMP_NS, STAMPED_LAG_NS, sent_ns_of, stamp_answers
-from jointctl.hil.plant_records import PlantConstants, PlantState
 from jointctl.hil.virtual_bus import FRAME_SIZE, FrameQueue
 
 ENETDOWN = errno_codes.ENETDOWN
@@ -53,14 +53,14 @@ _FRAMES_AT_ONCE = 64  # received before timers are looked at again
 
 
 class DeviceMemory(NamedTuple):
-    """What the loop works on; arrays of one record but for `faults`."""
+    """What the loop works on; arrays of records with one element a drive."""
 
-    devices: Any  # Device[1]
-    plant_constants: Any  # PlantConstants[1]
-    plant_states: Any  # PlantState[1]
-    queues: Any  # FrameQueue[1], to the bus
-    faults: Any  # FaultConstants[N], see `hil.fault_kinds`; None = none, and nothing of them is compiled
-    fault_memories: Any  # FaultMemory[1]
+    devices: Any  # Device[N]
+    plant_constants: Any  # PlantConstants[N]
+    plant_states: Any  # PlantState[N]
+    queues: Any  # FrameQueue[N], to the bus
+    faults: Any  # FaultConstants[N, M], see `hil.fault_kinds`; None = none, and nothing of them is compiled
+    fault_memories: Any  # FaultMemory[N]
     words: np.ndarray  # int64[WORDS]
     frame: np.ndarray  # uint8[FRAME_SIZE], as the next two scratch
     polls: np.ndarray  # int32[4]
@@ -77,6 +77,11 @@ class _Joint(NamedTuple):
     service_fd: int
 
 
+@inlined
+def _joint_of(of: DeviceMemory, index: int, service_fd: int) -> _Joint:
+    return _Joint(of.devices[index], of.plant_constants[index], of.plant_states[index], of.queues[index], service_fd)
+
+
 @kernel
 def _flush(fd: int, queue: FrameQueue, words: np.ndarray) -> None:
     """Send the queue; what the bus does not take is lost and counted, as on a real bus."""
@@ -89,18 +94,19 @@ def _flush(fd: int, queue: FrameQueue, words: np.ndarray) -> None:
 
 
 @kernel
-def _flush_through_faults(
-    fd: int, faults: Any, memory: FaultMemory, node_id: int, now_ns: int, queue: FrameQueue, words: np.ndarray
-) -> None:
-    """As `_flush`, with the wire's faults; late frames go out when they are due."""
-    if faults is None:
-        _flush(fd, queue, words)
-        return
-    take_due(memory, False, now_ns, False, memory.to_controller)
-    for i in range(queue.count):
-        pass_frame(faults, memory, queue.frames[i], False, node_id, now_ns, memory.to_controller)
-    queue.count = 0
-    _flush(fd, memory.to_controller, words)
+def _flush_all(fd: int, now_ns: int, of: DeviceMemory) -> None:
+    """As `_flush` for every drive, through the faults of its wire; late frames go out when they are due."""
+    for index in range(len(of.devices)):
+        queue = of.queues[index]
+        if of.faults is None:
+            _flush(fd, queue, of.words)
+            continue
+        memory, node_id = of.fault_memories[index], int64(of.devices[index].node_id)
+        take_due(memory, False, now_ns, False, memory.to_controller)
+        for i in range(queue.count):
+            pass_frame(of.faults[index], memory, queue.frames[i], False, node_id, now_ns, memory.to_controller)
+        queue.count = 0
+        _flush(fd, memory.to_controller, of.words)
 
 
 @kernel
@@ -157,58 +163,73 @@ def _wait_for_frames(fd: int, service_fd: int, wait_ns: int, polls: np.ndarray, 
 
 
 @kernel
-def _let_faults_act(joint: _Joint, faults: Any, memory: FaultMemory, now_ns: int) -> None:
+def _let_faults_act(of: DeviceMemory, service_fd: int, now_ns: int) -> None:
     """Those of drive and plant begin and end; frames that the wire has kept come out of it."""
-    if faults is None:
+    if of.faults is None:
         return
-    step_faults(faults, memory, joint.device, joint.plant_c, joint.plant_s, now_ns)
-    take_due(memory, True, now_ns, False, memory.ready)
-    _take_frames(joint, memory.ready, now_ns)
+    for index in range(len(of.devices)):
+        joint, memory = _joint_of(of, index, service_fd), of.fault_memories[index]
+        step_faults(of.faults[index], memory, joint.device, joint.plant_c, joint.plant_s, now_ns)
+        take_due(memory, True, now_ns, False, memory.ready)
+        _take_frames(joint, memory.ready, now_ns)
 
 
 @kernel
-def _take_from_bus(joint: _Joint, faults: Any, memory: FaultMemory, frame: np.ndarray, now_ns: int) -> bool:
+def _take_from_bus(of: DeviceMemory, service_fd: int, now_ns: int) -> bool:
     """One frame of the controller, through the wire's faults, as of the time it was sent; whether it carried one."""
+    frame = of.frame
     sent_ns = sent_ns_of(frame, now_ns)
-    if faults is None:
-        _take_frame(joint, frame, sent_ns)
-    else:
-        step_faults(faults, memory, joint.device, joint.plant_c, joint.plant_s, sent_ns)
-        pass_frame(faults, memory, frame, True, int64(joint.device.node_id), sent_ns, memory.ready)
-        _take_frames(joint, memory.ready, sent_ns)
-    if sent_ns == now_ns:
-        return False
-    if _is_sync(joint.device, frame):
-        stamp_answers(joint.queue, frame)
-    return True
+    if of.faults is not None:
+        for index in range(len(of.devices)):
+            joint, memory = _joint_of(of, index, service_fd), of.fault_memories[index]
+            step_faults(of.faults[index], memory, joint.device, joint.plant_c, joint.plant_s, sent_ns)
+    if len(of.devices) > 1:  # a single joint moves on when it takes the frame
+        advance_together(of.devices, of.plant_constants, of.plant_states, sent_ns, of.queues)
+    for index in range(len(of.devices)):
+        joint = _joint_of(of, index, service_fd)
+        if of.faults is None:
+            _take_frame(joint, frame, sent_ns)
+        else:
+            memory = of.fault_memories[index]
+            pass_frame(of.faults[index], memory, frame, True, int64(joint.device.node_id), sent_ns, memory.ready)
+            _take_frames(joint, memory.ready, sent_ns)
+        if sent_ns != now_ns and _is_sync(joint.device, frame):
+            stamp_answers(joint.queue, frame)
+    return sent_ns != now_ns
 
 
 @kernel
-def _take_sdo_answer(joint: _Joint, frame: np.ndarray, now_ns: int) -> None:
+def _take_sdo_answer(of: DeviceMemory, now_ns: int) -> None:
     """An answer of the Python thread: the core first acts on what was written, then the frame goes out."""
-    joint.device.next_due_ns = 0
-    advance(joint.device, joint.plant_c, joint.plant_s, now_ns, joint.queue)
-    append_frame(joint.queue, frame)
+    frame = of.frame
+    node_id = (int64(frame[0]) | int64(frame[1]) << 8) - 0x580
+    for index in range(len(of.devices)):
+        device = of.devices[index]
+        if node_id == device.node_id or node_id == device.encoder.node_id:
+            device.next_due_ns = 0
+            advance_together(of.devices, of.plant_constants, of.plant_states, now_ns, of.queues)
+            append_frame(of.queues[index], frame)
+
+
+@kernel
+def _next_due_ns(devices: np.ndarray) -> int:
+    due_ns = int64(devices[0].next_due_ns)
+    for index in range(1, len(devices)):
+        due_ns = min(due_ns, int64(devices[index].next_due_ns))
+    return due_ns
 
 
 @kernel
 def run_device(fd: int, service_fd: int, of: DeviceMemory) -> int:
     """Serve the bus until the stop word; returns the value of ENDED_WORD."""
-    faults, words, frame, timespec = of.faults, of.words, of.frame, of.timespec
-    device: Device = of.devices[0]
-    plant_c: PlantConstants = of.plant_constants[0]
-    plant_s: PlantState = of.plant_states[0]
-    queue: FrameQueue = of.queues[0]
-    memory: FaultMemory = of.fault_memories[0]
-    joint = _Joint(device, plant_c, plant_s, queue, service_fd)
-    node_id = int64(device.node_id)
+    words, frame, timespec = of.words, of.frame, of.timespec
     stamped_ns = int64(-OLDEST_STAMP_NS)  # when the last frame with a time came
     ended = 1
     while load_acquire(words, STOP_WORD) == 0 and ended == 1:
         now_ns = monotonic_ns(timespec)
         lag_ns = STAMPED_LAG_NS if now_ns - stamped_ns < OLDEST_STAMP_NS else 0
-        _let_faults_act(joint, faults, memory, now_ns - lag_ns)
-        wait_ns = max(0, min(device.next_due_ns + lag_ns - now_ns, _LONGEST_WAIT_NS))
+        _let_faults_act(of, service_fd, now_ns - lag_ns)
+        wait_ns = max(0, min(_next_due_ns(of.devices) + lag_ns - now_ns, _LONGEST_WAIT_NS))
         _wait_for_frames(fd, service_fd, wait_ns, of.polls, timespec)
         woken_ns = monotonic_ns(timespec)
         drained = False
@@ -222,16 +243,16 @@ def run_device(fd: int, service_fd: int, of: DeviceMemory) -> int:
             if got != FRAME_SIZE:
                 continue
             now_ns = monotonic_ns(timespec)
-            if _take_from_bus(joint, faults, memory, frame, now_ns):
+            if _take_from_bus(of, service_fd, now_ns):
                 stamped_ns = now_ns
-            _flush_through_faults(fd, faults, memory, node_id, now_ns, queue, words)
+            _flush_all(fd, now_ns, of)
         while _receive(service_fd, frame) == FRAME_SIZE:
-            _take_sdo_answer(joint, frame, monotonic_ns(timespec))
-            _flush_through_faults(fd, faults, memory, node_id, monotonic_ns(timespec), queue, words)
+            _take_sdo_answer(of, monotonic_ns(timespec))
+            _flush_all(fd, monotonic_ns(timespec), of)
         # after the frames, which may be older: the plant does not go back
         if drained or lag_ns == 0:
-            advance(device, plant_c, plant_s, woken_ns - lag_ns, queue)
-            _flush_through_faults(fd, faults, memory, node_id, woken_ns, queue, words)
+            advance_together(of.devices, of.plant_constants, of.plant_states, woken_ns - lag_ns, of.queues)
+            _flush_all(fd, woken_ns, of)
     store_release(words, ENDED_WORD, ended)
     return ended
 
@@ -242,41 +263,59 @@ def store_release_word(words: np.ndarray, index: int, value: int) -> None:
     store_release(words, index, value)
 
 
-class RealtimeDevice:
-    """Runs a device on a connected socket: `start`, `stop`, or a `with` block.  The descriptor stays the caller's."""
+def _fault_rows(devices: Sequence[Cia402Device]) -> Any:
+    """FaultConstants[N, M] of the drives, those without filled up with none; None where no one has any."""
+    longest = max(len(device.faults) for device in devices)
+    if not longest:
+        return None
+    rows = np.zeros((len(devices), longest), dtype_of(FaultConstants)).view(np.recarray)
+    for row, device in zip(rows, devices, strict=True):
+        row[: len(device.faults)] = device.faults
+    return rows
 
-    def __init__(self, device: Cia402Device, fd: int) -> None:
-        self._device, self.plant_state = device, device.plant_state
+
+class RealtimeDevice:
+    """Runs the drives of a bus on a connected socket: `start`, `stop`, or a `with` block.  The descriptor stays the
+    caller's.  Several drives: those of one `Cia402Device.row`.
+    """
+
+    def __init__(self, devices: Cia402Device | Sequence[Cia402Device], fd: int) -> None:
+        self._devices = [devices] if isinstance(devices, Cia402Device) else list(devices)
+        self.plant_states = self._devices[0].whole_row.plant_states
         self._fd = fd
         self.words = np.zeros(WORDS, np.int64)
-        self._faults = device.faults if len(device.faults) else None
-        self.fault_memory = fault_memory(device.faults if len(device.faults) else no_faults())
+        self._faults = _fault_rows(self._devices)
+        self.fault_memory = new(FaultMemory, len(self._devices))
+        for index, device in enumerate(self._devices):
+            self.fault_memory[index] = fault_memory(device.faults if len(device.faults) else no_faults())[0]
         self._threads: list[threading.Thread] = []
         self._core_end: socket.socket | None = None
 
     def _run(self, service_fd: int) -> None:
-        device = self._device
+        row = self._devices[0].whole_row
         scratch = np.zeros(FRAME_SIZE, np.uint8), np.zeros(4, np.int32), np.zeros(2, np.int64)
         memory = DeviceMemory(
-            device.device, device.plant_constants, device.plant_state, new(FrameQueue), self._faults,
-            self.fault_memory, self.words, *scratch,
-        )  # fmt: skip
+            *row, new(FrameQueue, len(self._devices)), self._faults, self.fault_memory, self.words, *scratch
+        )
         run_device(self._fd, service_fd, memory)
 
     def _serve(self, service: socket.socket) -> None:
         """Answer SDO requests until the other end closes; an unfinished transfer is looked at now and then."""
-        device = self._device
         with service:
             while True:
-                service.settimeout(_SDO_LOOK_S if device.sdo.busy else None)
+                service.settimeout(_SDO_LOOK_S if any(device.sdo.busy for device in self._devices) else None)
+                responses: list[bytes] = []
                 try:
                     frame = service.recv(FRAME_SIZE)
                 except TimeoutError:
-                    responses = device.expire_sdo(time.monotonic_ns())
+                    for device in self._devices:
+                        responses += device.expire_sdo(time.monotonic_ns())
                 else:
                     if not frame:
                         return
-                    responses = device.answer_sdo(frame, time.monotonic_ns())
+                    for device in self._devices:
+                        if device.is_addressed(frame):
+                            responses += device.answer_sdo(frame, time.monotonic_ns())
                 for response in responses:
                     service.send(response)
 

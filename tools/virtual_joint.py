@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
@@ -22,8 +22,11 @@ from jointctl.drivers.can.open import CYCLIC_INTERFACES, open_cyclic_end, open_p
 from jointctl.drivers.can.virtual_bus import decode, encode
 from jointctl.drivers.errors import BusError, ConfigurationError, JointctlError
 from jointctl.firmware_py.kernel import cache_folder
-from jointctl.hil.canopen.device import Cia402Device
+from jointctl.firmware_py.schema import new
+from jointctl.hil.canopen.device import Cia402Device, DeviceRow
+from jointctl.hil.canopen.records import Device
 from jointctl.hil.plant import plant
+from jointctl.hil.plant_records import PlantConstants, PlantState
 from jointctl.hil.realtime_device import ENDED_WORD, SEND_ERRORS_WORD, STOP_WORD, WORDS, RealtimeDevice
 from jointctl.hil.virtual_bus import VirtualBusError, VirtualBusHub, default_socket_path
 from jointctl.tools.child_process import Starting
@@ -55,7 +58,7 @@ class PumpedDevice:
     """
 
     def __init__(self, device: Cia402Device, bus: can.BusABC) -> None:
-        self._device, self.plant_state = device, device.plant_state
+        self._device, self.plant_states = device, device.plant_state
         self._bus = bus
         self.words = np.zeros(WORDS, np.int64)
         self._thread: threading.Thread | None = None
@@ -128,22 +131,39 @@ class PumpedDevice:
 
 def new_device(config: Config) -> Cia402Device:
     """The drive with its plant, as the configuration says that the joint truly is, and with the objects of its EDS."""
-    constants, state = plant(**plant_settings(config))
-    try:
-        return Cia402Device(VIRTUAL_EDS, device_settings(config), constants, state, fault_constants(config))
-    except (ValueError, OverflowError) as error:  # what the EDS file must hold for a virtual drive
-        raise ConfigurationError(
-            f"drive.eds (={canopen_section(config).eds}) does not make a virtual drive: {error}"
-        ) from None
+    return new_devices([config])[0]
+
+
+def new_devices(joints: Sequence[Config]) -> list[Cia402Device]:
+    """`new_device` for each joint of an arm, their records in one row."""
+    row = DeviceRow(new(Device, len(joints)), new(PlantConstants, len(joints)), new(PlantState, len(joints)))
+    devices = []
+    for index, config in enumerate(joints):
+        made = plant(**plant_settings(config))
+        try:
+            devices.append(
+                Cia402Device(VIRTUAL_EDS, device_settings(config), *made, fault_constants(config), (row, index))
+            )
+        except (ValueError, OverflowError) as error:  # what the EDS file must hold for a virtual drive
+            raise ConfigurationError(
+                f"drive.eds (={canopen_section(config).eds}) does not make a virtual drive: {error}"
+            ) from None
+    return devices
 
 
 @contextmanager
-def serve_virtual_joint(config: Config, timing: bool = False) -> Iterator[RealtimeDevice | PumpedDevice]:
-    """Drive in threads of this process; the bus as well if it is the virtual one, all others exist already."""
-    device = new_device(config)
+def serve_virtual_joint(
+    joints: Config | Sequence[Config], timing: bool = False
+) -> Iterator[RealtimeDevice | PumpedDevice]:
+    """Drive in threads of this process; the bus as well if it is the virtual one, all others exist already.
+
+    Several joints: those of an arm, on the bus of the first one.
+    """
+    joints = [joints] if isinstance(joints, Config) else list(joints)
+    config, devices = joints[0], new_devices(joints)
     if config.bus.interface in CYCLIC_INTERFACES:
         gc.disable()  # what a compiler leaves behind is little beside what it holds
-        RealtimeDevice(device, -1).compile()  # a bus that can be found has a drive that answers
+        RealtimeDevice(devices, -1).compile()  # a bus that can be found has a drive that answers
         gc.enable()
     with ExitStack() as stack:
         if config.bus.interface == "jointctl":
@@ -153,17 +173,17 @@ def serve_virtual_joint(config: Config, timing: bool = False) -> Iterator[Realti
             except VirtualBusError as error:
                 raise BusError(str(error)) from None
         if config.bus.interface not in CYCLIC_INTERFACES:
-            if len(device.faults):
+            if len(devices[0].faults):
                 raise ConfigurationError(
                     f"bus.interface (={config.bus.interface}) must be one of {', '.join(CYCLIC_INTERFACES)} "
                     "for [[virtual.faults]]"
                 )
             bus = open_python_can(config.bus.interface, config.bus.channel, config.bus.bitrate_bitps)
             stack.callback(bus.shutdown)
-            yield stack.enter_context(PumpedDevice(device, bus))
+            yield stack.enter_context(PumpedDevice(devices[0], bus))
             return
         end = stack.enter_context(open_cyclic_end(config.bus.interface, config.bus.channel))
-        yield stack.enter_context(RealtimeDevice(device, end.fileno()))
+        yield stack.enter_context(RealtimeDevice(devices, end.fileno()))
 
 
 @contextmanager

@@ -6,6 +6,7 @@ import math
 import struct
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import canopen
 import numpy as np
@@ -76,6 +77,18 @@ class DeviceSettings:
         return self.motor_torque_constant_NmpA or self.rated_torque_mNm / self.rated_current_mA
 
 
+class DeviceRow(NamedTuple):
+    """The records of the drives of one bus, which one compiled loop serves; arrays of one element a drive."""
+
+    devices: Any  # Device[N]
+    plant_constants: Any  # PlantConstants[N]
+    plant_states: Any  # PlantState[N]
+
+    def part(self, index: int) -> DeviceRow:
+        """Of one drive: views, not copies."""
+        return DeviceRow(*(array[index : index + 1] for array in self))
+
+
 def _sdo_frames(node_id: int, responses: list[bytes]) -> list[bytes]:
     """The answers of an SDO server as frames of 16 bytes."""
     return [struct.pack("<IB3x8s", 0x580 + node_id, 8, data) for data in responses]
@@ -95,7 +108,9 @@ class Cia402Device:
         plant_constants: np.recarray,
         plant_state: np.recarray,
         faults: np.recarray | None = None,
+        row: tuple[DeviceRow, int] | None = None,
     ) -> None:
+        """`row` with the place in it: the drive is one of several, and its records, the given ones too, lie there."""
         for name, array, record in (
             ("plant_constants", plant_constants, PlantConstants),
             ("plant_state", plant_state, PlantState),
@@ -103,10 +118,13 @@ class Cia402Device:
             if getattr(array, "dtype", None) != dtype_of(record):
                 raise TypeError(f"{name} (={type(array).__name__}) must be a record array of {record.__name__}")
         self.settings = settings
-        self.plant_constants = plant_constants
-        self.plant_state = plant_state
+        whole, index = row or (DeviceRow(new(Device), plant_constants, plant_state), 0)
+        own = whole.part(index) if row is not None else whole
+        if row is not None:
+            own.plant_constants[:], own.plant_states[:] = plant_constants, plant_state
+        self.whole_row = whole
+        self.device, self.plant_constants, self.plant_state = own
         self.faults: np.ndarray = np.zeros(0) if faults is None else faults
-        self.device = new(Device)
         self.queue = new(FrameQueue)
         self._frame = np.zeros(FRAME_SIZE, np.uint8)
         self.objects = ObjectDictionary(eds_path, settings.node_id, self.device, settings.shown)
@@ -146,6 +164,11 @@ class Cia402Device:
             self.parameters.command(index, sub, value, state)
         else:
             self.objects.store(index, sub, data)
+
+    def is_addressed(self, frame: bytes) -> bool:
+        """True for an SDO request to this drive or its encoder node, in whatever state."""
+        identifier = struct.unpack_from("<I", frame)[0]
+        return bool(identifier == 0x600 + self.settings.node_id) or self._is_for_encoder(frame)
 
     def is_sdo_request(self, frame: bytes) -> bool:
         """True for a frame that `answer_sdo` is for, in a state in which SDO is alive."""

@@ -321,31 +321,76 @@ def _notice_status(device: Device) -> None:
         device.next_due_ns = 0
 
 
-@kernel
-def advance(device: Device, plant_c: PlantConstants, plant_s: PlantState, until_ns: int, queue: FrameQueue) -> None:
-    """Integrate drive and plant up to `until_ns` and append the frames that became due in the meantime to `queue`."""
-    step_ns = int64(np.rint(plant_c.step_s * 1e9))
+@inlined
+def _begin_advance(device: Device, until_ns: int, queue: FrameQueue) -> None:
     if not device.primed:
         device.primed = 1
         device.time_ns = until_ns
     apply_controlword(device, queue)  # SDO may have written 6040 or 6060
-    torque_Nm, held = 0.0, False
-    while device.time_ns + step_ns <= until_ns:
-        if not held:
-            torque_Nm, held = _torque_Nm(device, plant_c, plant_s, plant_c.step_s, queue)
-        step_plant(plant_c, plant_s, torque_Nm)
-        device.time_ns += step_ns
-        before = int64(device.event_status) >> 16
-        if int64(device.state) != before & 0xFF or device.time_ns >= device.next_due_ns:
-            sample_objects(device, plant_c, plant_s)
-            _notice_status(device)
-            run_timers(device, device.time_ns, queue)
-            held = False
+
+
+@inlined
+def _end_substep(device: Device, plant_c: PlantConstants, plant_s: PlantState, step_ns: int, queue: FrameQueue) -> bool:
+    """The drive's part of a substep whose plant has moved; whether anything was looked at that may change the torque."""
+    device.time_ns += step_ns
+    before = int64(device.event_status) >> 16
+    if int64(device.state) != before & 0xFF or device.time_ns >= device.next_due_ns:
+        sample_objects(device, plant_c, plant_s)
+        _notice_status(device)
+        run_timers(device, device.time_ns, queue)
+        return True
+    return False
+
+
+@inlined
+def _end_advance(
+    device: Device, plant_c: PlantConstants, plant_s: PlantState, until_ns: int, queue: FrameQueue
+) -> None:
     sample_objects(device, plant_c, plant_s)
     _notice_status(device)
     if until_ns >= device.next_due_ns:
         run_timers(device, until_ns, queue)
     step_encoder(device.encoder, link_reading_rad(plant_c, plant_s), until_ns, queue)
+
+
+@kernel
+def advance(device: Device, plant_c: PlantConstants, plant_s: PlantState, until_ns: int, queue: FrameQueue) -> None:
+    """Integrate drive and plant up to `until_ns` and append the frames that became due in the meantime to `queue`."""
+    step_ns = int64(np.rint(plant_c.step_s * 1e9))
+    _begin_advance(device, until_ns, queue)
+    torque_Nm, held = 0.0, False
+    while device.time_ns + step_ns <= until_ns:
+        if not held:
+            torque_Nm, held = _torque_Nm(device, plant_c, plant_s, plant_c.step_s, queue)
+        step_plant(plant_c, plant_s, torque_Nm)
+        if _end_substep(device, plant_c, plant_s, step_ns, queue):
+            held = False
+    _end_advance(device, plant_c, plant_s, until_ns, queue)
+
+
+@kernel
+def advance_together(
+    devices: np.ndarray, plant_constants: np.ndarray, plant_states: np.ndarray, until_ns: int, queues: np.ndarray
+) -> None:
+    """`advance` for the drives of an arm, one substep after the other; all arrays have one record a drive.
+
+    The one place where the plants of an arm move on: what couples them belongs beside `step_plant`.  All have the same
+    step, and the same time, as no one else advances them.
+    """
+    if len(devices) == 1:
+        advance(devices[0], plant_constants[0], plant_states[0], until_ns, queues[0])
+        return
+    step_ns = int64(np.rint(plant_constants[0].step_s * 1e9))
+    for index in range(len(devices)):
+        _begin_advance(devices[index], until_ns, queues[index])
+    while devices[0].time_ns + step_ns <= until_ns:
+        for index in range(len(devices)):
+            device, plant_c, plant_s = devices[index], plant_constants[index], plant_states[index]
+            torque_Nm, _ = _torque_Nm(device, plant_c, plant_s, plant_c.step_s, queues[index])
+            step_plant(plant_c, plant_s, torque_Nm)
+            _end_substep(device, plant_c, plant_s, step_ns, queues[index])
+    for index in range(len(devices)):
+        _end_advance(devices[index], plant_constants[index], plant_states[index], until_ns, queues[index])
 
 
 @kernel

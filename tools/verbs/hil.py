@@ -100,7 +100,7 @@ def serve_can(
         output.note(f"virtual joint: node {canopen_section(config).node} on {place}; Ctrl-C ends it")
         if bus.interface == "jointctl":
             output.note(f'attach with python-can: can.Bus(interface="jointctl", channel="{bus.channel}")')
-        with watched(config, live, output, joint.plant_state):
+        with watched(config, live, output, joint.plant_states):
             wait_for_end(signals, ready_fd, lambda: bool(joint.words[ENDED_WORD]))
     return 0
 

@@ -40,7 +40,7 @@ def test_only_what_is_compiled_and_runs_becomes_realtime(monkeypatch: pytest.Mon
         worker = threading.Thread(target=ended.wait)
         worker.start()
         yield SimpleNamespace(
-            words=[0, 0, 1, 0], path="/dev/null", baud_rate_bitps=115_200, worker=worker.native_id, plant_state=None,
+            words=[0, 0, 1, 0], path="/dev/null", baud_rate_bitps=115_200, worker=worker.native_id, plant_states=None,
             interpreter=SimpleNamespace(state=None),
         )  # fmt: skip
         assert worker.native_id in given[0]

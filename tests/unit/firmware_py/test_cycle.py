@@ -48,12 +48,18 @@ class Arm:
         self.sends = 0
         self.ended = False
         self.cycles = 0
+        self.slow_to_enable = [0, 0]  # cycles until each drive obeys
+        self.moving_rad = [0.0, 0.0]  # in each cycle
 
     def _receive(self, _: None, samples: Any, now_ns: int, until_ns: int) -> int:
-        for sample, command in zip(samples, self.memory.command, strict=True):
+        for axis, (sample, command) in enumerate(zip(samples, self.memory.command, strict=True)):
             sample.count += 1
             sample.time_ns = now_ns + 1500
-            sample.drive_state = DriveState.ENABLED if command.request == DriveRequest.ENABLE else DriveState.OFF
+            sample.position_rad += self.moving_rad[axis]
+            asked = command.request == DriveRequest.ENABLE
+            self.slow_to_enable[axis] -= asked
+            obeys = asked and self.slow_to_enable[axis] < 0
+            sample.drive_state = DriveState.ENABLED if obeys else DriveState.OFF
         return 1500
 
     def _send(self, _: None, samples: Any, commands: Any) -> int:
@@ -95,30 +101,124 @@ def test_two_axes_run_in_one_cycle_and_both_are_logged() -> None:
     assert memory.histograms[1, 1] == 600
 
 
-def test_the_loop_ends_with_the_last_axis() -> None:
+def test_the_motion_of_one_axis_is_over_the_others_brake_with_it_and_the_loop_ends_with_the_last() -> None:
     arm = Arm().run(100)
-    arm.constants[1].trajectory.duration_s = 0.5  # it is over there; the other axis goes on
+    arm.constants[1].trajectory.duration_s = 0.5
     arm.run(900)
-    assert arm.phases == [AxisPhase.TRACKING, AxisPhase.FINISHED]
-    assert not arm.ended
-    arm.memory.words[Word.STOP] = StopRequest.RAMP
-    arm.run(500)
     assert arm.ended
     assert (arm.phases, arm.faults) == ([AxisPhase.FINISHED] * 2, [Fault.NONE] * 2)
 
 
 @pytest.mark.parametrize("tripped", [0, 1])
-def test_a_fault_of_one_axis_ramps_the_other_down(tripped: int) -> None:
+def test_a_fault_of_one_axis_ramps_the_other_down_in_the_same_cycle(tripped: int) -> None:
     arm = Arm().run(300)
     arm.memory.sample[tripped].drive_error = 0x2310
     arm.memory.sample[tripped].restarts = 1
-    arm.run(2)
+    arm.run(1)
     other = 1 - tripped
     assert (arm.faults[tripped], arm.faults[other]) == (Fault.DRIVE_RESTARTED, Fault.NONE)
-    assert arm.phases[other] in (AxisPhase.RAMPING, AxisPhase.RELEASING)
+    assert arm.phases[other] == AxisPhase.RAMPING
+    assert arm.memory.command[tripped].request == DriveRequest.OFF
+    assert arm.memory.command[other].request == DriveRequest.ENABLE  # it brakes along its ramp
     arm.run(500)
     assert arm.ended
     assert arm.faults[other] == Fault.NONE
+
+
+@pytest.mark.parametrize(
+    ("request_", "phase"),
+    [(StopRequest.RAMP, AxisPhase.RAMPING), (StopRequest.QUICK_STOP, AxisPhase.QUICK_STOPPING),
+     (StopRequest.OFF, AxisPhase.DISABLING)],
+)  # fmt: skip
+def test_a_stop_reaches_every_axis_in_the_same_cycle(request_: StopRequest, phase: AxisPhase) -> None:
+    arm = Arm().run(300)
+    arm.memory.words[Word.STOP] = request_
+    assert arm.run(1).phases == [phase] * 2
+
+
+@pytest.mark.parametrize("slow", [0, 1])
+def test_no_axis_has_torque_before_all_drives_are_enabled(slow: int) -> None:
+    arm = Arm()
+    arm.slow_to_enable[slow] = 40
+    while arm.cycles < 200 and AxisPhase.ENABLING not in arm.phases:
+        arm.run(1)
+    assert arm.phases == [AxisPhase.ENABLING] * 2  # asked for in the same cycle
+    waited = 0
+    while AxisPhase.ENABLING in arm.phases:
+        assert arm.phases == [AxisPhase.ENABLING] * 2
+        assert list(arm.memory.command.torque_Nm) == [0.0, 0.0]
+        waited += 1
+        arm.run(1)
+    assert waited > 40
+    assert min(arm.phases) >= AxisPhase.APPROACH
+    assert arm.state[0].trajectory_s == arm.state[1].trajectory_s  # and both motions began in the same cycle
+
+
+@pytest.mark.parametrize("slow", [0, 1])
+def test_a_drive_that_never_enables_keeps_the_torque_from_the_other(slow: int) -> None:
+    arm = Arm()
+    arm.slow_to_enable[slow] = 1 << 30
+    phases, torques = set(), 0.0
+    while arm.cycles < 20_000 and not arm.ended:
+        phases.add(arm.run(1).phases[1 - slow])
+        torques += float(np.abs(arm.memory.command.torque_Nm).sum())
+    assert arm.ended
+    assert arm.faults[slow] == Fault.ENABLE_TIMEOUT
+    assert arm.faults[1 - slow] == Fault.NONE
+    assert torques == 0.0
+    assert not phases & {AxisPhase.APPROACH, AxisPhase.TRACKING, AxisPhase.RAMPING}
+
+
+@pytest.mark.parametrize("moving", [0, 1])
+def test_no_drive_is_enabled_while_another_joint_moves(moving: int) -> None:
+    arm = Arm()
+    arm.moving_rad[moving] = 1e-4
+    requests = set()
+    while arm.cycles < 20_000 and not arm.ended:
+        requests |= {int(request) for request in arm.run(1).memory.command.request}
+    assert arm.ended
+    assert arm.faults == [Fault.NOT_AT_STANDSTILL if axis == moving else Fault.NONE for axis in range(2)]
+    assert requests == {DriveRequest.OFF}
+
+
+@pytest.mark.parametrize("phase", [AxisPhase.WAITING, AxisPhase.ENABLING])
+def test_a_fault_before_the_torque_switches_every_axis_off_in_the_same_cycle(phase: AxisPhase) -> None:
+    arm = Arm()
+    arm.slow_to_enable = [1 << 30, 30]
+    while arm.cycles < 100 and (arm.phases != [phase] * 2 or arm.state[0].phase_cycle < 2):
+        arm.run(1)
+    arm.memory.sample[1].restarts += 1
+    arm.run(1)
+    assert arm.faults == [Fault.NONE, Fault.DRIVE_RESTARTED]
+    assert list(arm.memory.command.request) == [DriveRequest.OFF] * 2
+
+
+@pytest.mark.parametrize("late", [0, 1])
+def test_a_joint_that_stands_keeps_its_torque_until_the_other_one_stands(late: int) -> None:
+    arm = Arm().run(300)
+    arm.memory.words[Word.STOP] = StopRequest.RAMP
+    arm.moving_rad[late] = 2.0 * float(arm.constants[late].limits.standstill_radps) * PERIOD_NS * 1e-9
+    arm.run(60)
+    assert arm.phases == [AxisPhase.RAMPING] * 2
+    arm.moving_rad[late] = 0.0
+    while arm.phases == [AxisPhase.RAMPING] * 2 and arm.cycles < 2000:
+        arm.run(1)
+    assert arm.phases == [AxisPhase.RELEASING] * 2
+    assert arm.run(500).ended
+    assert arm.faults == [Fault.NONE] * 2
+
+
+@pytest.mark.parametrize("late", [0, 1])
+def test_a_joint_that_never_comes_to_rest_does_not_hold_the_other_for_good(late: int) -> None:
+    arm = Arm().run(300)
+    arm.memory.words[Word.STOP] = StopRequest.RAMP
+    for axis in range(2):
+        arm.constants[axis].sequence.stop_max_cycles = 100
+    arm.moving_rad[late] = 2.0 * float(arm.constants[late].limits.standstill_radps) * PERIOD_NS * 1e-9
+    arm.run(102)
+    assert arm.faults == [Fault.STOP_TIMEOUT if axis == late else Fault.NONE for axis in range(2)]
+    assert arm.run(1000).ended
+    assert arm.faults[1 - late] == Fault.NONE
 
 
 @pytest.mark.parametrize(("slept_ns", "faults"), [(1_000_000, Fault.NONE), (1_000_001, Fault.SUSPENDED)])
