@@ -60,7 +60,7 @@ class ArmModel(NamedTuple):
 
     def memory(self) -> Arm:
         """Of a loop; constants and links are copies."""
-        return Arm(self.constants.copy(), self.links.copy(), new(ArmMotion, len(self.links)))
+        return Arm(self.constants.copy(), self.links.copy(), new(ArmMotion, len(self.links) + 1))
 
 
 @dataclass(frozen=True)
@@ -155,9 +155,11 @@ def _bodies(
     """The links with the payload, and the motors' inertias at their joints."""
     wrong: list[str] = []
     bodies = bodies_of(urdf, names, wrong.append)
-    for body in bodies:
-        if body.joint.kind == "prismatic":
-            wrong.append(f"joint {body.joint.name} (=prismatic) must be revolute: the joints' files are in rad")
+    wrong += [
+        f"joint {body.joint.name} (=prismatic) must be revolute: the joints' files are in rad"
+        for body in bodies
+        if body.joint.kind == "prismatic"
+    ]
     inertias = arm.motor_inertia_kgm2
     if inertias is None:
         without = [c.path.name for c in joints if c.reducer is None]
