@@ -159,10 +159,10 @@ def _brake(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> N
 
 
 @kernel
-def law_torque_Nm(constants: AxisConstants, state: AxisState, where: Repetition, gap_cycles: int) -> float:
+def law_torque_Nm(constants: AxisConstants, state: AxisState, where: Repetition) -> float:
     """What the law asks for, unlimited."""
     if constants.law.kind == ControllerKind.FLEXIBLE_JOINT:
-        reading = Reading(state.measured_position_rad, state.second_position_rad, gap_cycles)
+        reading = Reading(state.measured_position_rad, state.second_position_rad, state.gap_cycles)
         return step_flexible_law(constants.law, state.law, reading, state.reference, state.command_torque_Nm, where)
     return step_law(
         constants.law,
@@ -176,9 +176,7 @@ def law_torque_Nm(constants: AxisConstants, state: AxisState, where: Repetition,
 
 
 @kernel
-def _command_torque(
-    constants: AxisConstants, state: AxisState, table: np.ndarray, elapsed_cycles: int, gap_cycles: int
-) -> None:
+def _command_torque(constants: AxisConstants, state: AxisState, table: np.ndarray, elapsed_cycles: int) -> None:
     """The torque of this cycle; a torque that is not finite is never sent."""
     if state.phase == AxisPhase.RELEASING:
         state.unlimited_torque_Nm = released_torque_Nm(constants, state, elapsed_cycles)
@@ -187,7 +185,7 @@ def _command_torque(
         if state.phase == AxisPhase.TRACKING:
             where = repetition(constants.trajectory, table, state.trajectory_s)
         follow_temperature(constants.law, state.law, False)
-        state.unlimited_torque_Nm = law_torque_Nm(constants, state, where, gap_cycles)
+        state.unlimited_torque_Nm = law_torque_Nm(constants, state, where)
         if state.stream.torque_Nm != 0.0:
             state.unlimited_torque_Nm += state.stream.torque_Nm
     else:
@@ -238,6 +236,76 @@ def _command_velocity(constants: AxisConstants, state: AxisState, elapsed_cycles
 
 
 @kernel
+def sense_axis(
+    constants: AxisConstants,
+    state: AxisState,
+    sample: Sample,
+    elapsed_cycles: int,
+    stop_request: int,
+    supervisor_age_cycles: int,
+) -> None:
+    """The first part of a cycle: the sample, a stop that is asked for, drive, bus, schedule and supervisor."""
+    state.cycle += elapsed_cycles
+    state.phase_cycle += elapsed_cycles
+    if elapsed_cycles - 1 > constants.limits.skipped_max_cycles:
+        state.held_up_cycles += elapsed_cycles - 1
+    if state.fault == Fault.NONE:
+        state.fault_encoder_error = sample.encoder_error
+    state.gap_cycles = _take_position(constants, state, sample, elapsed_cycles)
+    request_stop(state, stop_request)
+    check_supervision(constants, state, sample, elapsed_cycles - 1, supervisor_age_cycles)
+
+
+@kernel
+def move_axis(
+    constants: AxisConstants,
+    state: AxisState,
+    table: np.ndarray,
+    sample: Sample,
+    elapsed_cycles: int,
+    all_enabled: bool,
+) -> None:
+    """The second part: phase, desired motion, velocity, and whether reading and motion may be.
+
+    No joint of an arm gets torque before `all_enabled`.
+    """
+    if state.phase == AxisPhase.WAITING:
+        step_waiting(constants, state, sample)
+    elif state.phase == AxisPhase.ENABLING:
+        step_enabling(constants, state, sample, table, all_enabled)
+    step_change(constants, state, table, elapsed_cycles)
+    if not following_set_points(constants, state):
+        step_other_motion(constants, state, elapsed_cycles)
+    if state.phase >= AxisPhase.APPROACH and state.phase <= AxisPhase.RAMPING:
+        _move_reference(constants, state, table, elapsed_cycles)
+    if state.gap_cycles > 0:
+        watch_rest(constants, state, sample)
+        # The drive samples when SYNC comes, and SYNC goes out when the loop wakes up.  Until then the joint moved on
+        # with about the desired velocity: without this, 0.1 ms at 0.2 rad/s would look like 20 urad of error.
+        moved_rad = state.reference.velocity_radps * state.sample_late_s
+        state.measured_position_rad -= moved_rad
+        state.second_position_rad -= moved_rad
+        error_rad = state.measured_position_rad - state.reference.position_rad
+        step_velocity(constants.velocity, state.velocity, state.measured_position_rad, error_rad, state.gap_cycles)
+    if powered(state.phase):
+        check_reading(constants, state, elapsed_cycles)
+        check_motion(constants, state)
+
+
+@kernel
+def command_axis(
+    constants: AxisConstants, state: AxisState, table: np.ndarray, sample: Sample, command: Command, elapsed_cycles: int
+) -> None:
+    """The last part: the command."""
+    if constants.command_kind == CommandKind.VELOCITY:
+        _command_velocity(constants, state, elapsed_cycles)
+    else:
+        _command_torque(constants, state, table, elapsed_cycles)
+    step_stopping(constants, state, sample)
+    write_command(state, command)
+
+
+@kernel
 def step_axis(
     constants: AxisConstants,
     state: AxisState,
@@ -248,45 +316,12 @@ def step_axis(
     stop_request: int,
     supervisor_age_cycles: int,
 ) -> None:
-    """One cycle.
+    """One cycle of an axis that is alone; `cycle.step_cycle` does the same for all axes, part by part.
 
     `table` float64[N, 5], the rows of a table trajectory; `elapsed_cycles` >= 1 periods since the last call (more
     than 1 after an overrun); `stop_request` a `StopRequest`; `supervisor_age_cycles` periods since the supervisor's
     last sign of life.
     """
-    state.cycle += elapsed_cycles
-    state.phase_cycle += elapsed_cycles
-    if elapsed_cycles - 1 > constants.limits.skipped_max_cycles:
-        state.held_up_cycles += elapsed_cycles - 1
-    if state.fault == Fault.NONE:
-        state.fault_encoder_error = sample.encoder_error
-    gap_cycles = _take_position(constants, state, sample, elapsed_cycles)
-    request_stop(state, stop_request)
-    check_supervision(constants, state, sample, elapsed_cycles - 1, supervisor_age_cycles)
-    if state.phase == AxisPhase.WAITING:
-        step_waiting(constants, state, sample)
-    elif state.phase == AxisPhase.ENABLING:
-        step_enabling(constants, state, sample, table)
-    step_change(constants, state, table, elapsed_cycles)
-    if not following_set_points(constants, state):
-        step_other_motion(constants, state, elapsed_cycles)
-    if state.phase >= AxisPhase.APPROACH and state.phase <= AxisPhase.RAMPING:
-        _move_reference(constants, state, table, elapsed_cycles)
-    if gap_cycles > 0:
-        watch_rest(constants, state, sample)
-        # The drive samples when SYNC comes, and SYNC goes out when the loop wakes up.  Until then the joint moved on
-        # with about the desired velocity: without this, 0.1 ms at 0.2 rad/s would look like 20 urad of error.
-        moved_rad = state.reference.velocity_radps * state.sample_late_s
-        state.measured_position_rad -= moved_rad
-        state.second_position_rad -= moved_rad
-        error_rad = state.measured_position_rad - state.reference.position_rad
-        step_velocity(constants.velocity, state.velocity, state.measured_position_rad, error_rad, gap_cycles)
-    if powered(state.phase):
-        check_reading(constants, state, elapsed_cycles)
-        check_motion(constants, state)
-    if constants.command_kind == CommandKind.VELOCITY:
-        _command_velocity(constants, state, elapsed_cycles)
-    else:
-        _command_torque(constants, state, table, elapsed_cycles, gap_cycles)
-    step_stopping(constants, state, sample)
-    write_command(state, command)
+    sense_axis(constants, state, sample, elapsed_cycles, stop_request, supervisor_age_cycles)
+    move_axis(constants, state, table, sample, elapsed_cycles, True)
+    command_axis(constants, state, table, sample, command, elapsed_cycles)

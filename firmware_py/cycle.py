@@ -1,14 +1,14 @@
 """One cycle of the control loop, for all axes at once: the same function in real time, in plain Python and in lockstep.
 
-    receive -> samples -> suspension, stop word, sign of life -> step_axis for each axis -> send -> log records
+    receive -> samples -> suspension, stop word, sign of life -> desired motions -> arm -> laws -> send -> log records
 
 What differs is handed in: an `Exchange` moves frames or bytes, a `Clock` gives the time, and the front end decides when
 a cycle begins (`Slot`).  Front ends: `firmware_py.realtime` on a descriptor, the same loop in plain Python over
 python-can (`tools.session.portable_loop`), and simulated time (`hil.lockstep`).
 
-Every array of records has one element an axis.  The axes share SYNC, stop word and end: none begins before all can, and
-the first one that brakes takes the others along in the same cycle (`hold_back`, `stop_of`); the loop goes on until the
-last one is FINISHED.
+Every array of records has one element an axis.  The axes share SYNC, stop word, start and end: none is enabled before
+all can be, none gets torque before all are enabled, whatever brakes one brakes the others in the same cycle, and torque
+is released when all stand (`hold_back`, `stop_others`); the loop goes on until the last one is FINISHED.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jointctl.firmware_py.axis import step_axis
+from jointctl.firmware_py.arm_model import Arm, feed_arm, no_arm
+from jointctl.firmware_py.axis import command_axis, move_axis, sense_axis
 from jointctl.firmware_py.kernel import inlined, kernel, shared
 from jointctl.firmware_py.libc import load_acquire, store_release
 from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.safety import check_suspension
 from jointctl.firmware_py.schema import INT32_MAX
-from jointctl.firmware_py.sequence import request_stop, write_command
+from jointctl.firmware_py.sequence import is_enabled, request_stop, write_command
 from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest
 
 HISTOGRAM_BINS = 4097  # 1 us each; the last one holds everything later
@@ -48,7 +49,7 @@ class Word(IntEnum):
 
 
 WORDS = 88
-_RAMP = int(StopRequest.RAMP)
+_NO_STOP, _RAMP = int(StopRequest.NONE), int(StopRequest.RAMP)
 SUSPENDED_MIN_NS = 1_000_000  # shorter is how far apart two clocks can be read
 
 
@@ -117,6 +118,7 @@ class CycleMemory(NamedTuple):
     ring: np.ndarray  # LogRecord[R]; record k is at k % R once HEAD > k
     histograms: np.ndarray  # int64[3, HISTOGRAM_BINS]
     timespec: np.ndarray  # int64[2]: scratch of the clock
+    arm: Arm = no_arm()  # that the axes are the joints of, in their order
 
 
 class Exchange(NamedTuple):
@@ -178,7 +180,7 @@ def stop_of(states: np.ndarray, axis: int, stop_request: int) -> int:
 
 @kernel
 def hold_back(states: np.ndarray) -> None:
-    """Which axes must stay in WAITING, ENABLING or RAMPING although they are `ready`: another one is not.
+    """Which axes must stay in WAITING or RAMPING although they are `ready`: another one is not.
 
     An axis that has just become ready waits for the next cycle too, so that all go on in the same one.  One that is
     switched off by its fault is ahead, and holds no one back.
@@ -191,12 +193,14 @@ def hold_back(states: np.ndarray) -> None:
         states[axis].held_back = held
 
 
-@shared
-def stop_together(states: np.ndarray, commands: np.ndarray, stop_request: int) -> None:
-    """What an axis has come upon in this cycle stops all others in the same cycle; commands as of now."""
+@kernel
+def stop_others(states: np.ndarray, samples: np.ndarray) -> bool:
+    """Ramp down every axis of which another one has tripped, or brakes; True where the drives of all axes are enabled."""
+    all_enabled = True
     for axis in range(len(states)):
-        request_stop(states[axis], stop_of(states, axis, stop_request))
-        write_command(states[axis], commands[axis])
+        request_stop(states[axis], stop_of(states, axis, _NO_STOP))
+        all_enabled = all_enabled and is_enabled(states[axis], samples[axis])
+    return all_enabled
 
 
 @shared
@@ -249,11 +253,27 @@ def step_cycle(memory: CycleMemory, exchange: Exchange, clock: Clock, slot: Slot
         state.sample_late_s = (slot.wake_ns - slot.deadline_ns) * 1e-9 if sample.time_ns > slot.wake_ns else 0.0
         if slept_ns > SUSPENDED_MIN_NS:
             check_suspension(state, slept_ns * 1e-9)
-        step_axis(
-            memory.constants[axis], state, memory.tables[axis], sample, commands[axis], slot.elapsed_cycles,
+        sense_axis(
+            memory.constants[axis], state, sample, slot.elapsed_cycles,
             stop_of(memory.state, axis, stop_request), supervisor_age_cycles,
         )  # fmt: skip
+    all_enabled = stop_others(memory.state, samples)
+    for axis in range(len(memory.state)):
+        move_axis(
+            memory.constants[axis], memory.state[axis], memory.tables[axis], samples[axis], slot.elapsed_cycles,
+            all_enabled,
+        )  # fmt: skip
+    stop_others(memory.state, samples)
+    if len(memory.arm.links) > 0:
+        feed_arm(memory.arm, memory.constants, memory.state)
+    for axis in range(len(memory.state)):
+        command_axis(
+            memory.constants[axis], memory.state[axis], memory.tables[axis], samples[axis], commands[axis],
+            slot.elapsed_cycles,
+        )  # fmt: skip
     if several:
-        stop_together(memory.state, commands, stop_request)
+        stop_others(memory.state, samples)
+        for axis in range(len(memory.state)):
+            write_command(memory.state[axis], commands[axis])
     exchange.send(exchange.link, samples, commands)
     return log_cycle(memory, slot, waited_ns, clock.now_ns(memory.timespec))

@@ -17,7 +17,8 @@ eps is the kinematic error of the reducer and r the torque ripple, both sums of 
 needs the fourth derivative of q_d.  With one encoder alone e_l = e_m: with the motor's, the link is where the
 feed-forward expects it; with the link's, the loop must be slow against the reducer's resonance.
 
-Not modelled: hysteresis and damping of the reducer, the rates of the friction in theta_d''."""
+Not modelled: hysteresis and damping of the reducer, the rates of the friction in theta_d'', and in an arm those of what
+the other joints ask."""
 
 from __future__ import annotations
 
@@ -119,10 +120,11 @@ def desired_motor(constants: LawConstants, state: LawState, reference: Reference
     speed, acceleration = reference.velocity_radps, reference.acceleration_radps2
     link_friction = flexible.link_friction_share * state.friction_torque_Nm
     through = flexible.link_inertia_kgm2 * acceleration + link_friction + state.gravity_torque_Nm
-    through += constants.coriolis_Nmspr * speed
-    twist, compliance = twist_of(flexible, through)
     bend = flexible.link_inertia_kgm2 * reference.snap_radps4  # the second derivative of that torque
-    bend += gravity_slope_Nmprad * acceleration - state.gravity_torque_Nm * speed * speed
+    if constants.of_arm == 0:
+        through += constants.coriolis_Nmspr * speed
+        bend += gravity_slope_Nmprad * acceleration - state.gravity_torque_Nm * speed * speed
+    twist, compliance = twist_of(flexible, through)
     # theta + eps(theta) = q_d + twist: a step of Newton's method from where theta was, moved along
     own, ahead = state.flexible, reference.position_rad + twist
     target = own.target_rad + own.motor_per_link * (ahead - own.ahead_rad) if own.primed != 0 else ahead

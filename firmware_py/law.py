@@ -317,6 +317,7 @@ def reset_law(constants: LawConstants, state: LawState) -> None:
     state.temperature_degC = constants.friction.reference_degC
     reset_flexible(state.flexible)
     reset_adaptation(constants.adaptation, state.adaptation)
+    state.arm_torque_Nm = 0.0
     state.lugre_deflection_rad = 0.0
     state.integral_rads = 0.0
     state.inertia_torque_Nm = 0.0
@@ -475,9 +476,12 @@ def step_law(
     state.inertia_torque_Nm = constants.inertia_kgm2 * reference.acceleration_radps2
     proportional_Nm = -constants.inertia_kgm2 * (constants.kv * error_rate + constants.kp * error)
     state.feedback_torque_Nm = proportional_Nm
-    state.gravity_torque_Nm = constants.coriolis_Nmspr * velocity.velocity_radps + constants.gravity_Nm * math.sin(
-        position_rad - constants.gravity_zero_rad
-    )
+    if constants.of_arm != 0:
+        state.gravity_torque_Nm = state.arm_torque_Nm
+    else:
+        state.gravity_torque_Nm = constants.coriolis_Nmspr * velocity.velocity_radps + constants.gravity_Nm * math.sin(
+            position_rad - constants.gravity_zero_rad
+        )
     transmitted_Nm = state.inertia_torque_Nm + state.gravity_torque_Nm
     state.friction_torque_Nm = _friction_Nm(
         constants, state, velocity.velocity_radps, reference, reference.position_rad, transmitted_Nm
@@ -516,7 +520,9 @@ def step_flexible_law(
     flexible, own = constants.flexible, state.flexible
     gravity_slope_Nmprad = 0.0
     state.gravity_torque_Nm = 0.0
-    if constants.gravity_Nm != 0.0:
+    if constants.of_arm != 0:
+        state.gravity_torque_Nm = state.arm_torque_Nm
+    elif constants.gravity_Nm != 0.0:
         lever = reference.position_rad - constants.gravity_zero_rad
         state.gravity_torque_Nm = constants.gravity_Nm * math.sin(lever)
         gravity_slope_Nmprad = constants.gravity_Nm * math.cos(lever)

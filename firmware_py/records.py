@@ -175,6 +175,7 @@ class LawConstants:
     flexible: FlexibleConstants
     adaptation: AdaptationConstants
     feed_forward_lead_s: f8  # friction is fed forward for the motion that is desired so much later
+    of_arm: i4  # gravity and Coriolis torque are the arm's, `LawState.arm_torque_Nm`
 
 
 @record
@@ -188,6 +189,7 @@ class LawState:
     lugre_deflection_rad: f8
     integral_rads: f8
     outside_torque_Nm: f8  # ControllerKind.OUTSIDE only
+    arm_torque_Nm: f8  # what the arm asks beyond the joint's inertia, see `arm_model`; `LawConstants.of_arm` only
     # kept for the log: the parts of the torque at the joint
     inertia_torque_Nm: f8
     feedback_torque_Nm: f8
@@ -514,6 +516,7 @@ class AxisState:
     held_back: i4  # by another axis that is not; set before the cycle, 0 for a single joint
     good_samples: i8
     sample_count: i8
+    gap_cycles: i8  # periods since the sample before this cycle's, 0 where there is no new one
     sample_age_cycles: i8
     saturated_cycles: i8
     still_cycles: i8

@@ -133,16 +133,23 @@ def step_waiting(constants: AxisConstants, state: AxisState, sample: Sample) -> 
 
 
 @kernel
-def step_enabling(constants: AxisConstants, state: AxisState, sample: Sample, table: np.ndarray) -> None:
+def is_enabled(state: AxisState, sample: Sample) -> bool:
+    """Whether the drive is on, or was when the joint began to move."""
+    if state.phase == AxisPhase.ENABLING:
+        return sample.drive_state == DriveState.ENABLED and state.sample_age_cycles == 0
+    return state.phase > AxisPhase.ENABLING
+
+
+@kernel
+def step_enabling(
+    constants: AxisConstants, state: AxisState, sample: Sample, table: np.ndarray, all_enabled: bool
+) -> None:
     """ENABLING: once the drive is on, plan the way from where the joint stands to the trajectory's start.
 
-    A joint of an arm has no torque until the drives of all others are on.
+    A joint of an arm waits until `all_enabled`; one that never is ends the run of all.
     """
-    state.ready = 1 if sample.drive_state == DriveState.ENABLED and state.sample_age_cycles == 0 else 0
-    if state.ready != 0:
-        if moved_before_start(constants, state):  # a brake that has opened, say
-            return
-        if state.held_back != 0:
+    if is_enabled(state, sample):
+        if moved_before_start(constants, state) or not all_enabled:  # a brake that has opened, say
             return
         approach_s = constants.sequence.approach_s
         state.table_row = reference_at(constants.trajectory, table, 0, 0.0, state.reference)

@@ -312,9 +312,6 @@ def brake_step(reference: Reference, brake_radps2: float, period_s: float) -> No
 # Plain Python, joint side, SI units.  Errors are ValueError with one line that names the file, the row and the value.
 
 
-COLUMNS = ("time_s", "position_rad")
-
-
 def _read_text(path: Path) -> str:
     try:
         content = read_input(path, LARGEST_TABLE_BYTES)
@@ -344,16 +341,17 @@ def _number(path: Path, row: int, name: str, text: str) -> float:
     return value
 
 
-def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _read_points(path: Path, column: str) -> tuple[np.ndarray, np.ndarray]:
+    columns = ("time_s", column)
     reader = csv.reader(io.StringIO(_read_text(path)))
     header = [name.strip() for name in next(reader, [])]
-    for name in COLUMNS:
+    for name in columns:
         if header.count(name) != 1:
             shown = ",".join(header)[:80]
             raise ValueError(
-                f"{path}: row 1 (={shown!r}) must name the column {name} once; needed: {','.join(COLUMNS)}"
+                f"{path}: row 1 (={shown!r}) must name the column {name} once; needed: {','.join(columns)}"
             )
-    at_time, at_position = (header.index(name) for name in COLUMNS)
+    at_time, at_position = (header.index(name) for name in columns)
     times: list[float] = []
     positions: list[float] = []
     for fields in reader:
@@ -370,7 +368,7 @@ def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
                 f"{path}: row {row}: time_s (={time_s:g}) must be above that of the row before ({times[-1]:g})"
             )
         times.append(time_s)
-        positions.append(_number(path, row, "position_rad", fields[at_position]))
+        positions.append(_number(path, row, column, fields[at_position]))
     if len(times) < 2:
         raise ValueError(f"{path}: rows of values (={len(times)}) must be at least 2")
     return np.array(times), np.array(positions)
@@ -395,14 +393,14 @@ def spline_table(time_s: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
     raise ValueError(f"the smallest time step (={closest:g} s) must be longer, no spline can be computed")
 
 
-def table_from_csv(path: str | Path) -> np.ndarray:
-    """The table of `reference_at` from a CSV file with the columns time_s and position_rad; others are ignored.
+def table_from_csv(path: str | Path, column: str = "position_rad") -> np.ndarray:
+    """The table of `reference_at` from a CSV file with the columns time_s and `column`; others are ignored.
 
     A `spline_table` through the points.  Time is shifted so that the first row is 0.  The last line must end with a
     line end, or a file that was cut off inside its last number would pass unnoticed.  Returns float64 (points, 5).
     """
     path = Path(path)
-    time_s, position_rad = _read_points(path)
+    time_s, position_rad = _read_points(path, column)
     try:
         return spline_table(time_s - time_s[0], position_rad)
     except ValueError as error:

@@ -115,12 +115,15 @@ def raise_if(lines: list[str]) -> None:
         raise ConfigurationProblems(lines)
 
 
+_BY_KIND = ("trajectory", "motion")  # sections whose key `kind` decides which class they have
 _TRAJECTORIES = "'sine', 'min_jerk', 'trapezoid', 'table', 'hold'"  # whose key `kind` decides what else is in it
 
 
-def _model_at(location: tuple[str, ...], data: Mapping[str, Any]) -> type[BaseModel] | None:
-    """The section class that holds the last element of `location`."""
-    model: type[BaseModel] = Config
+def _model_at(
+    location: tuple[str, ...], data: Mapping[str, Any], root: type[BaseModel] | None = None
+) -> type[BaseModel] | None:
+    """The section class that holds the last element of `location`, in a file of the class `root`."""
+    model: type[BaseModel] = root or Config
     for part in location[:-1]:
         field = model.model_fields.get(part)
         if field is None:
@@ -131,7 +134,7 @@ def _model_at(location: tuple[str, ...], data: Mapping[str, Any]) -> type[BaseMo
         else:
             options = [t for t in (field.annotation, *get_args(field.annotation)) if isinstance(t, type)]
             models = [t for t in options if issubclass(t, BaseModel)]
-        if part == "trajectory":
+        if part in _BY_KIND:
             kind = data.get(part, {}).get("kind")
             models = [t for t in models if get_args(t.model_fields["kind"].annotation) == (kind,)]
         if not models:
@@ -166,30 +169,32 @@ def suggestion(unknown: str, known: list[str]) -> str:
 
 def _location(error: Any) -> list[str]:
     parts = [str(part) for part in error["loc"]]
-    if len(parts) > 1 and parts[0] == "trajectory":
+    if len(parts) > 1 and parts[0] in _BY_KIND:
         del parts[1]  # the tag of the union, which the user did not write
     return parts
 
 
-def problem_lines(errors: list[Any], data: Mapping[str, Any]) -> list[str]:
+def problem_lines(errors: list[Any], data: Mapping[str, Any], root: type[BaseModel] | None = None) -> list[str]:
     """One line for each problem; a key that is missing because it is written in another way is reported once."""
     named = set()
     for error in errors:
         if error["type"] == "extra_forbidden":
             place = tuple(_location(error))
-            model = _model_at(place, data)
+            model = _model_at(place, data, root)
             key = meant(place[-1], list(model.model_fields)) if model else None
             named.add((*place[:-1], key))
     left = [error for error in errors if error["type"] != "missing" or tuple(_location(error)) not in named]
-    return list(dict.fromkeys(problem_line(error, data, ()) for error in left))
+    return list(dict.fromkeys(problem_line(error, data, (), root) for error in left))
 
 
-def problem_line(error: Any, data: Mapping[str, Any], prefix: tuple[str, ...]) -> str:
+def problem_line(
+    error: Any, data: Mapping[str, Any], prefix: tuple[str, ...], root: type[BaseModel] | None = None
+) -> str:
     """The line of one error of pydantic; `prefix` is where in the file `data` begins."""
     location = (*prefix, *_location(error))
     name = ".".join(location)
     kind, value = error["type"], error["input"]
-    model = _model_at(location, data)
+    model = _model_at(location, data, root)
     if kind == "extra_forbidden":
         known = list(model.model_fields) if model else []
         what = f"[{name}] is not a known section" if len(location) == 1 else f"{name} is not a known key"

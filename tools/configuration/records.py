@@ -92,14 +92,14 @@ def trajectory_table(config: Config) -> np.ndarray:
 
     This reads trajectory.file: once for each run (`tools.session.plan`).
     """
-    path = config.table_path
-    if path is None:
+    path, trajectory = config.table_path, config.trajectory
+    if path is None or trajectory.kind != "table":
         return np.zeros((1, 5))
     try:
-        table = table_from_csv(path)
+        table = table_from_csv(path, trajectory.column)
     except (ValueError, OSError) as error:
         raise ConfigurationError(f"{config.path}: trajectory.file: {error}") from None
-    if config.trajectory.kind == "table" and config.trajectory.repeat and not ends_meet(table):
+    if trajectory.repeat and not ends_meet(table):
         raise ConfigurationError(f"{config.path}: trajectory.repeat (=True) needs a table that ends where it begins")
     constants = new(TrajectoryConstants)
     constants[0].kind, constants[0].table_rows = TrajectoryKind.TABLE, len(table)

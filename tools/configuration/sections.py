@@ -426,6 +426,7 @@ class Table(Section):
     kind: Literal["table"]  # a cubic spline through the rows of a file
     duration_s: Duration  # 0 = until stopped
     file: Annotated[str, Field(min_length=1)]  # CSV beside the configuration: time_s,position_rad
+    column: Annotated[str, Field(min_length=1)] = "position_rad"  # of the file, with the positions
     repeat: bool = False  # start again at the end, which must meet the beginning
 
 

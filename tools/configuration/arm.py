@@ -1,0 +1,275 @@
+"""An arm file: the URDF, the joints' own configuration files, how much of the model is fed forward, and one motion.
+
+Each joint keeps its file, which works alone as before; in the arm its [trajectory] is replaced by its part of
+[motion], and its own gravity and Coriolis torque by the arm's model.  The angle of a joint is that of the URDF: its
+encoder's zero and direction must say so.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field, ValidationError
+
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.arm_model import Arm, ArmConstants, ArmFeedForward, ArmLink, ArmMotion, JointKind
+from jointctl.firmware_py.input_file import parse_toml
+from jointctl.firmware_py.schema import new
+from jointctl.tools.configuration.arm_motion import LARGEST_ARM, ArmTrajectory, PerJoint, trajectories
+from jointctl.tools.configuration.canopen import CanopenSection
+from jointctl.tools.configuration.checks import problems_between_sections
+from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config, problem_lines, raise_if
+from jointctl.tools.configuration.load import load_config, read_text, with_units
+from jointctl.tools.configuration.records import axis_constants
+from jointctl.tools.configuration.sections import Section, between
+from jointctl.tools.configuration.urdf import Body, Urdf, bodies_of, of_body, read_urdf
+
+SHIPPED_ARM = SHIPPED_FOLDER / "arm" / "arm.toml"
+_SLACK_rad = 1e-6  # by which the digits of two files may differ
+Names = Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1, max_length=LARGEST_ARM)]
+Vector = Annotated[list[Annotated[float, between(-1000.0, 1000.0)]], Field(min_length=3, max_length=3)]
+
+
+class ArmSection(Section):
+    urdf: Annotated[str, Field(min_length=1)]  # beside the arm file
+    joints: Names  # configuration files, beside the arm file, in the order of the chain
+    joint_names: Names | None = None  # of the URDF; none = all that move, in their order
+    gravity_mps2: Vector = Field(default=[0.0, 0.0, -9.81])  # in the frame of the URDF's base
+    feed_forward: Literal["whole", "gravity", "none"] = "whole"  # how much of the arm's model the joints get
+    # of motor and reducer, at the joint; none = reducer.motor_inertia_kgm2 of each joint
+    motor_inertia_kgm2: PerJoint | None = None
+    payload_kg: Annotated[float, between(0.0, 1000.0)] = 0.0  # at the last joint's link, on top of the URDF
+    payload_at_m: Vector = Field(default=[0.0, 0.0, 0.0])  # its centre, in the frame of that link
+
+
+class _ArmFile(Section):
+    arm: ArmSection
+    motion: ArmTrajectory
+
+
+class ArmModel(NamedTuple):
+    """For the kernels."""
+
+    constants: np.ndarray  # ArmConstants[1]
+    links: np.ndarray  # ArmLink[N]
+
+    def memory(self) -> Arm:
+        """Of a loop; constants and links are copies."""
+        return Arm(self.constants.copy(), self.links.copy(), new(ArmMotion, len(self.links) + 1))
+
+
+@dataclass(frozen=True)
+class ArmConfig:
+    """An arm, checked: every joint with its part of the motion."""
+
+    path: Path
+    text: str  # of the arm file, for the log
+    arm: ArmSection
+    joints: tuple[Config, ...]
+    names: tuple[str, ...]  # of the joints in the URDF
+    urdf: Urdf
+    bodies: tuple[Body, ...]  # one a joint, the payload included
+    model: ArmModel
+    remarks: tuple[str, ...]  # what the user should know, one line each
+
+    @property
+    def rate_Hz(self) -> float:
+        return self.joints[0].loop.rate_Hz
+
+    def axis_constants(self, tables: Sequence[np.ndarray], starts_rad: Sequence[float] | None = None) -> Any:
+        """A record array of N `AxisConstants`; `tables` as of `trajectory_table` of each joint.
+
+        All joints approach in the same time, the longest of them.
+        """
+        starts = [None] * len(self.joints) if starts_rad is None else list(starts_rad)
+        parts = [
+            axis_constants(config, table, start_position_rad=start)
+            for config, table, start in zip(self.joints, tables, starts, strict=True)
+        ]
+        constants = np.concatenate(parts).view(np.recarray)
+        constants.sequence.approach_s[:] = constants.sequence.approach_s.max()
+        return constants
+
+
+def is_arm(path: str | Path) -> bool:
+    """Whether the file is that of an arm and not of one joint; `ConfigurationError` if it cannot be read."""
+    try:
+        return "arm" in parse_toml(read_text(Path(path)))
+    except tomllib.TOMLDecodeError:
+        return False
+
+
+def load_arm(path: str | Path) -> ArmConfig:
+    """Read, check and freeze an arm file with all that it names; `ConfigurationError` holds one line per problem."""
+    path = Path(path)
+    text = read_text(path)
+    try:
+        data = parse_toml(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigurationError(f"{path}: not valid TOML: {error}") from None
+    data, converted = with_units(data)
+    try:
+        file = _ArmFile.model_validate(data)
+    except ValidationError as error:
+        raise_if([f"{path}: {line}" for line in problem_lines(error.errors(include_url=False), data, _ArmFile)])
+        raise
+    arm = file.arm
+    alone = tuple(load_config(path.parent / name) for name in arm.joints)
+    urdf = read_urdf(path.parent / arm.urdf)
+    names, remarks = _names(path, arm, urdf)
+    bodies, inertias = _bodies(path, arm, urdf, names, alone)
+    joints = _moved(path, file.motion, alone, names)
+    raise_if([f"{path}: {line}" for line in (*_bus_problems(arm, joints), *_limit_problems(arm, joints, bodies))])
+    return ArmConfig(
+        path, text, arm, joints, names, urdf, tuple(bodies), _model(arm, bodies, inertias), (*converted, *remarks)
+    )
+
+
+def _names(path: Path, arm: ArmSection, urdf: Urdf) -> tuple[tuple[str, ...], list[str]]:
+    moving = tuple(joint.name for joint in urdf.moving)
+    names = moving if arm.joint_names is None else tuple(arm.joint_names)
+    known = ", ".join(moving) or "none"
+    wrong = [
+        f"arm.joint_names: {name} must be a joint of {urdf.path.name} that moves by itself: {known}"
+        for name in names
+        if name not in moving
+    ]
+    if len(set(names)) < len(names):
+        wrong.append(f"arm.joint_names (={', '.join(names)}) must not name a joint twice")
+    if not wrong and len(names) != len(arm.joints):
+        key = "arm.joint_names" if arm.joint_names is not None else f"{urdf.path.name}: joints that move"
+        wrong.append(f"{key} (={len(names)}: {', '.join(names)}) must be as many as arm.joints (={len(arm.joints)})")
+    raise_if([f"{path}: {line}" for line in wrong])
+    return names, [f"joint {name} of {urdf.path.name} is not the arm's: it stands at 0" for name in moving
+                   if name not in names]  # fmt: skip
+
+
+def _bodies(
+    path: Path, arm: ArmSection, urdf: Urdf, names: tuple[str, ...], joints: tuple[Config, ...]
+) -> tuple[list[Body], tuple[float, ...]]:
+    """The links with the payload, and the motors' inertias at their joints."""
+    wrong: list[str] = []
+    bodies = bodies_of(urdf, names, wrong.append)
+    wrong += [
+        f"joint {body.joint.name} (=prismatic) must be revolute: the joints' files are in rad"
+        for body in bodies
+        if body.joint.kind == "prismatic"
+    ]
+    inertias = arm.motor_inertia_kgm2
+    if inertias is None:
+        without = [c.path.name for c in joints if c.reducer is None]
+        if without:
+            wrong.append(f"arm.motor_inertia_kgm2 must be given: {', '.join(without)} has no [reducer] to take it from")
+        inertias = tuple(0.0 if c.reducer is None else c.reducer.motor_inertia_kgm2 for c in joints)
+    elif len(inertias) != len(joints) or min(inertias) < 0.0:
+        wrong.append(f"arm.motor_inertia_kgm2 (={list(inertias)}) must be {len(joints)} inertias, one a joint")
+    raise_if([f"{path}: {line}" for line in wrong])
+    last = bodies[-1]
+    if arm.payload_kg > 0.0:
+        payload = of_body(arm.payload_kg, np.array(arm.payload_at_m), np.zeros((3, 3))).seen_from(last.frame)
+        bodies[-1] = Body(last.parent, last.joint, last.place, last.frame, last.mass + payload)
+    return bodies, inertias
+
+
+def _moved(path: Path, motion: Any, alone: tuple[Config, ...], names: tuple[str, ...]) -> tuple[Config, ...]:
+    """The joints with their parts of the motion, which keeps their limits."""
+    try:
+        parts = list(trajectories(motion, alone, names))
+    except ValueError as error:
+        raise_if([f"{path}: {line}" for line in str(error).splitlines()])
+        raise
+    joints, wrong = [], []
+    for config, part in zip(alone, parts, strict=True):
+        if part.kind == "table":
+            part = part.model_copy(update={"file": str((path.parent / part.file).absolute())})
+            if not Path(part.file).is_file():
+                raise_if([f"{path}: motion.file (={motion.file}) must name a file beside the arm file"])
+        one = config.model_copy(update={"trajectory": part})
+        wrong += [f"{path}: with [motion], {config.path.name}: {line}" for line in problems_between_sections(one)]
+        joints.append(one)
+    raise_if(wrong)
+    return tuple(joints)
+
+
+def _nodes(config: Config) -> Iterator[tuple[str, int]]:
+    drive, encoder = config.drive, config.joint_encoder
+    assert isinstance(drive, CanopenSection)
+    yield "drive.node", drive.node
+    if encoder is not None and encoder.node is not None:
+        yield "joint_encoder.node", encoder.node
+
+
+def _bus_problems(arm: ArmSection, joints: tuple[Config, ...]) -> list[str]:
+    """Nodes, rates and buses of the joints against each other."""
+    other = [(name, c) for name, c in zip(arm.joints, joints, strict=True) if not isinstance(c.drive, CanopenSection)]
+    if other:
+        return [f"{name}: drive.kind (={c.drive.kind}) must be canopen in an arm" for name, c in other]
+    found = []
+    first, rate_Hz = arm.joints[0], joints[0].loop.rate_Hz
+    taken: dict[tuple[str, str, int], str] = {}
+    bitrates: dict[tuple[str, str], tuple[str, int]] = {}
+    for name, config in zip(arm.joints, joints, strict=True):
+        if config.loop.rate_Hz != rate_Hz:
+            found.append(
+                f"{name}: loop.rate_Hz (={config.loop.rate_Hz:g}) must be that of {first} (={rate_Hz:g}): one loop"
+            )
+        bus = config.bus.interface, config.bus.channel
+        before, bitrate = bitrates.setdefault(bus, (name, config.bus.bitrate_bitps))
+        if config.bus.bitrate_bitps != bitrate:
+            found.append(
+                f"{name}: bus.bitrate_bitps (={config.bus.bitrate_bitps}) must be that of {before} (={bitrate}), "
+                f"which is on the same bus, {bus[1]}"
+            )
+        assert isinstance(config.drive, CanopenSection)
+        for key, node in _nodes(config):
+            owner = taken.setdefault((*bus, node), f"{key} of {name}")
+            if owner != f"{key} of {name}":
+                found.append(f"{name}: {key} (={node}) must differ from {owner}, which is on the same bus, {bus[1]}")
+    return found
+
+
+def _limit_problems(arm: ArmSection, joints: tuple[Config, ...], bodies: list[Body]) -> list[str]:
+    """What the URDF allows less than a joint's file."""
+    found = []
+    for name, config, body in zip(arm.joints, joints, bodies, strict=True):
+        limits, joint = config.limits, body.joint
+        rows: tuple[tuple[str, float, str, float | None], ...] = (
+            ("position_min_rad", limits.position_min_rad, "least", joint.lower_rad),
+            ("position_max_rad", limits.position_max_rad, "most", joint.upper_rad),
+            ("velocity_max_radps", limits.velocity_max_radps, "most", joint.velocity_max_radps or None),
+            ("torque_max_Nm", limits.torque_max_Nm, "most", joint.effort_max_Nm or None),
+        )
+        for key, value, word, allowed in rows:
+            beyond = allowed is not None and (value < allowed if word == "least" else value > allowed)
+            if beyond and allowed is not None and abs(value - allowed) > _SLACK_rad:
+                found.append(
+                    f"{name}: limits.{key} (={value:g}) must be at {word} {allowed:g}, the limit of joint {joint.name} "
+                    "in the URDF"
+                )
+    return found
+
+
+def _model(arm: ArmSection, bodies: list[Body], inertias: tuple[float, ...]) -> ArmModel:
+    constants, links = new(ArmConstants), new(ArmLink, len(bodies))
+    constants[0].feed_forward = ArmFeedForward[arm.feed_forward.upper()]
+    constants[0].gravity_mps2[:] = arm.gravity_mps2
+    for link, body, inertia in zip(links, bodies, inertias, strict=True):
+        fill_link(link, body, inertia)
+    return ArmModel(constants, links)
+
+
+def fill_link(link: Any, body: Body, motor_inertia_kgm2: float) -> None:
+    """The record of a link."""
+    link.parent = body.parent
+    link.kind = JointKind.PRISMATIC if body.joint.kind == "prismatic" else JointKind.REVOLUTE
+    link.rotation[:] = body.place.rotation
+    link.offset_m[:] = body.place.offset_m
+    link.mass_kg = body.mass.mass_kg
+    link.moment_kgm[:] = body.mass.moment_kgm
+    link.inertia_kgm2[:] = body.mass.inertia_kgm2[np.triu_indices(3)]
+    link.motor_inertia_kgm2 = motor_inertia_kgm2

@@ -1,0 +1,336 @@
+"""A URDF file as the tree of its moving links: what the arm's model needs, and no more.
+
+Geometry, meshes and the rest of the file are skipped.  What makes a model wrong without an error further on is refused
+here, with the element's name: masses that are missing, inertias that no body has, loops, and magnitudes that degrees,
+millimetres or grams would give.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.input_file import number_from, read_input
+from jointctl.tools.configuration.config import raise_if
+
+# beyond these a number is taken for one in another unit
+LARGEST_LENGTH_m, LARGEST_MASS_kg, LARGEST_TURN_rad, LARGEST_SPEED_radps = 10.0, 1000.0, 2.0 * math.tau, 50.0
+LEAST_MASS_kg = 1e-6
+_ROUNDING = 1e-3  # of an inertia's largest moment, by which the digits of the file may violate what holds for bodies
+MOVING = ("revolute", "continuous", "prismatic")
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Of a frame in another one."""
+
+    rotation: np.ndarray  # (3, 3), columns: its axes
+    offset_m: np.ndarray  # (3,)
+
+    def __matmul__(self, other: Pose) -> Pose:
+        return Pose(self.rotation @ other.rotation, self.rotation @ other.offset_m + self.offset_m)
+
+
+@dataclass(frozen=True)
+class Mass:
+    """Of one body, in a frame: mass, mass times centre, inertia about the frame's origin (3, 3)."""
+
+    mass_kg: float
+    moment_kgm: np.ndarray
+    inertia_kgm2: np.ndarray
+
+    def __add__(self, other: Mass) -> Mass:
+        return Mass(
+            self.mass_kg + other.mass_kg, self.moment_kgm + other.moment_kgm, self.inertia_kgm2 + other.inertia_kgm2
+        )
+
+    def seen_from(self, pose: Pose) -> Mass:
+        """The same in the frame in which its own one has this pose."""
+        if self.mass_kg == 0.0:
+            return self
+        centre = self.moment_kgm / self.mass_kg
+        about_centre = self.inertia_kgm2 - self.mass_kg * _steiner(centre)
+        return of_body(
+            self.mass_kg, pose.rotation @ centre + pose.offset_m, pose.rotation @ about_centre @ pose.rotation.T
+        )
+
+
+def _steiner(centre_m: np.ndarray) -> np.ndarray:
+    return np.asarray(centre_m @ centre_m * np.eye(3) - np.outer(centre_m, centre_m))
+
+
+def of_body(mass_kg: float, centre_m: np.ndarray, about_centre_kgm2: np.ndarray) -> Mass:
+    return Mass(mass_kg, mass_kg * centre_m, about_centre_kgm2 + mass_kg * _steiner(centre_m))
+
+
+NO_MASS = Mass(0.0, np.zeros(3), np.zeros((3, 3)))
+
+
+@dataclass(frozen=True)
+class UrdfJoint:
+    name: str
+    kind: str
+    parent: str  # link
+    child: str  # link
+    origin: Pose  # of the child's frame in the parent's
+    axis: np.ndarray  # unit vector, in the child's frame
+    mimics: str | None = None
+    lower_rad: float | None = None
+    upper_rad: float | None = None
+    velocity_max_radps: float | None = None
+    effort_max_Nm: float | None = None
+
+    @property
+    def moves(self) -> bool:
+        return self.kind in MOVING and self.mimics is None
+
+
+@dataclass(frozen=True)
+class Urdf:
+    path: Path
+    root: str
+    links: dict[str, Mass | None]  # None: without <inertial>
+    joints: tuple[UrdfJoint, ...]  # a parent's joint before those of its children
+
+    @property
+    def moving(self) -> tuple[UrdfJoint, ...]:
+        return tuple(joint for joint in self.joints if joint.moves)
+
+
+@dataclass(frozen=True)
+class Body:
+    """A joint and all links that it moves as one; its frame has z along the joint's axis."""
+
+    parent: int  # index of a body, -1 the base
+    joint: UrdfJoint
+    place: Pose  # of its frame at angle 0 in the parent's
+    frame: Pose  # of the child link's frame in its own
+    mass: Mass
+
+
+def read_urdf(path: Path) -> Urdf:
+    """The checked file; `ConfigurationError` with one line for each problem."""
+    try:
+        content = read_input(path)
+    except OSError as error:
+        raise ConfigurationError(f"{path}: cannot be read: {error.strerror or error}") from None
+    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
+        raise ConfigurationError(f"{path}: must have no DOCTYPE and no entities")
+    try:
+        robot = ElementTree.fromstring(content)
+    except ElementTree.ParseError as error:
+        raise ConfigurationError(f"{path}: not valid XML: {error}") from None
+    if robot.tag != "robot":
+        raise ConfigurationError(f"{path}: the outermost element (={robot.tag}) must be robot; is it a URDF?")
+    return _Reader(path).read(robot)
+
+
+class _Reader:
+    def __init__(self, path: Path) -> None:
+        self._path, self._problems = path, list[str]()
+
+    def read(self, robot: ElementTree.Element) -> Urdf:
+        links = {self._name(one, "link"): one for one in robot.findall("link")}
+        joints = {self._name(one, "joint"): self._joint(one) for one in robot.findall("joint")}
+        for tag, known in (("link", links), ("joint", joints)):
+            if len(known) != len(robot.findall(tag)):
+                self._problem(f"two of the elements {tag} have the same name")
+        raise_if(self._problems)
+        found = Urdf(self._path, *self._tree(links, joints))
+        raise_if(self._problems)
+        return found
+
+    def _problem(self, text: str) -> None:
+        self._problems.append(f"{self._path}: {text}")
+
+    def _name(self, element: ElementTree.Element, tag: str) -> str:
+        name = element.get("name", "")
+        if not name:
+            self._problem(f"an element {tag} has no name")
+        return name
+
+    def _numbers(
+        self, element: ElementTree.Element | None, name: str, what: str, default: tuple[float, ...], largest: float,
+        unit: str,
+    ) -> np.ndarray:  # fmt: skip
+        """Of an attribute; beyond `largest` it is taken for one in another unit."""
+        text = element.get(name) if element is not None else None
+        if text is None:
+            return np.array(default)
+        try:
+            values = np.array([number_from(word) for word in text.split()])
+        except ValueError:
+            values = np.zeros(0)
+        if len(values) != len(default):
+            count = "a number" if len(default) == 1 else f"{len(default)} numbers"
+            self._problem(f"{what} (={text!r}) must be {count}")
+            return np.array(default)
+        if np.max(np.abs(values)) > largest:
+            self._problem(f"{what} (={text!r}) must be within {largest:.4g}; {unit}?")
+        return values
+
+    def _origin(self, element: ElementTree.Element, what: str) -> Pose:
+        origin = element.find("origin")
+        zeros = (0.0, 0.0, 0.0)
+        offset = self._numbers(origin, "xyz", f"{what}: xyz", zeros, LARGEST_LENGTH_m, "millimetres instead of m")
+        roll, pitch, yaw = self._numbers(
+            origin, "rpy", f"{what}: rpy", zeros, LARGEST_TURN_rad, "degrees instead of rad"
+        )
+        return Pose(_turn(2, yaw) @ _turn(1, pitch) @ _turn(0, roll), offset)
+
+    def _joint(self, element: ElementTree.Element) -> UrdfJoint:
+        name, kind = element.get("name", ""), element.get("type", "")
+        what = f"joint {name}"
+        if kind not in (*MOVING, "fixed"):
+            self._problem(f"{what}: type (={kind}) must be one of {', '.join(MOVING)}, fixed")
+        axis = self._numbers(element.find("axis"), "xyz", f"{what}: axis", (1.0, 0.0, 0.0), 1e6, "no direction")
+        length = float(np.linalg.norm(axis))
+        if not length > 1e-6:
+            self._problem(f"{what}: axis must not be 0 0 0")
+            axis, length = np.array([1.0, 0.0, 0.0]), 1.0
+        ends = [self._child(element, tag, what) for tag in ("parent", "child")]
+        mimic, limit = element.find("mimic"), element.find("limit")
+        largest = LARGEST_LENGTH_m if kind == "prismatic" else LARGEST_TURN_rad
+        unit = "millimetres instead of m" if kind == "prismatic" else "degrees instead of rad"
+        given = {}
+        for key, attribute, most, why in (
+            ("lower_rad", "lower", largest, unit), ("upper_rad", "upper", largest, unit),
+            ("velocity_max_radps", "velocity", LARGEST_SPEED_radps, f"{unit}, a second"),
+            ("effort_max_Nm", "effort", 1e6, "Nm"),
+        ):  # fmt: skip
+            needed = kind == "revolute" or attribute not in ("lower", "upper")
+            if limit is not None and needed and limit.get(attribute) is not None:
+                what_limit = f"{what}: limit {attribute}"
+                given[key] = float(self._numbers(limit, attribute, what_limit, (0.0,), most, why)[0])
+        return UrdfJoint(
+            name, kind, *ends, self._origin(element, what), axis / length,
+            None if mimic is None else mimic.get("joint", ""), **given,
+        )  # fmt: skip
+
+    def _child(self, element: ElementTree.Element, tag: str, what: str) -> str:
+        found = element.find(tag)
+        link = "" if found is None else found.get("link", "")
+        if not link:
+            self._problem(f"{what}: {tag} must name a link")
+        return link
+
+    def _mass(self, name: str, element: ElementTree.Element) -> Mass | None:
+        """<inertial> of a link, in the link's frame."""
+        inertial = element.find("inertial")
+        if inertial is None:
+            return None
+        what = f"link {name}"
+        mass = float(
+            self._numbers(
+                inertial.find("mass"), "value", f"{what}: mass", (0.0,), LARGEST_MASS_kg, "grams instead of kg"
+            )[0]
+        )
+        if mass < LEAST_MASS_kg:
+            self._problem(f"{what}: mass (={mass:g}) must be at least {LEAST_MASS_kg:g} kg")
+            return NO_MASS
+        tensor = inertial.find("inertia")
+        if tensor is None:
+            self._problem(f"{what}: <inertial> has no <inertia>; ixx, ixy, ixz, iyy, iyz, izz are needed")
+            return NO_MASS
+        most = mass * LARGEST_LENGTH_m**2
+        xx, xy, xz, yy, yz, zz = (
+            float(self._numbers(tensor, key, f"{what}: {key}", (0.0,), most, "kg mm2 instead of kg m2")[0])
+            for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        )
+        inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        low, middle, high = np.linalg.eigvalsh(inertia)
+        if low < -_ROUNDING * high or low + middle < high * (1.0 - _ROUNDING) or not high > 0.0:
+            moments = ", ".join(f"{value:.4g}" for value in (low, middle, high))
+            self._problem(
+                f"{what}: the principal moments of its inertia (={moments}) must be above 0, and the greatest at "
+                "most the sum of the others: no body has such an inertia"
+            )
+            return NO_MASS
+        pose = self._origin(inertial, f"{what}: inertial")
+        return of_body(mass, pose.offset_m, pose.rotation @ inertia @ pose.rotation.T)
+
+    def _tree(
+        self, links: dict[str, ElementTree.Element], joints: dict[str, UrdfJoint]
+    ) -> tuple[str, dict[str, Mass | None], tuple[UrdfJoint, ...]]:
+        above: dict[str, UrdfJoint] = {}
+        for joint in joints.values():
+            for end in (joint.parent, joint.child):
+                if end not in links:
+                    self._problem(f"joint {joint.name}: there is no link {end}")
+            if joint.child in above:
+                self._problem(
+                    f"link {joint.child} has two joints above it, {above[joint.child].name} and {joint.name}: a loop; "
+                    "links must form a tree"
+                )
+            above[joint.child] = joint
+        roots = [link for link in links if link not in above]
+        if not links or len(roots) != 1:
+            names = ", ".join(roots) or "none"
+            self._problem(f"one link must have no joint above it, here: {names}; links must form a tree without loops")
+        raise_if(self._problems)
+        order: list[UrdfJoint] = []
+        reached = [roots[0]]
+        while reached:
+            link = reached.pop(0)
+            below = [joint for joint in joints.values() if joint.parent == link]
+            order += below
+            reached += [joint.child for joint in below]
+        for joint in joints.values():
+            if joint not in order:
+                self._problem(f"joint {joint.name} is in a loop that the base {roots[0]} has no part in")
+        return roots[0], {name: self._mass(name, element) for name, element in links.items()}, tuple(order)
+
+
+def _turn(axis: int, angle_rad: float) -> np.ndarray:
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix = np.eye(3)
+    matrix[i, i] = matrix[j, j] = c
+    matrix[j, i], matrix[i, j] = s, -s
+    return matrix
+
+
+def _with_z_along(axis: np.ndarray) -> np.ndarray:
+    """A rotation whose third column is this unit vector."""
+    if np.array_equal(axis, [0.0, 0.0, 1.0]):
+        return np.eye(3)
+    x = np.cross([0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [0.0, 0.0, 1.0], axis)
+    x /= np.linalg.norm(x)
+    return np.column_stack((x, np.cross(axis, x), axis))
+
+
+def bodies_of(urdf: Urdf, names: tuple[str, ...], problem: Callable[[str], None]) -> list[Body]:
+    """The tree of these joints, in their order; all others stand at 0.  `problem` gets a line for each."""
+    index = {name: i for i, name in enumerate(names)}
+    place: dict[str, tuple[int, Pose]] = {urdf.root: (-1, Pose(np.eye(3), np.zeros(3)))}
+    bodies: dict[int, Body] = {}
+    parts: dict[int, list[Mass]] = {i: [] for i in range(-1, len(names))}
+    for joint in urdf.joints:
+        parent, pose = place[joint.parent]
+        mass = urdf.links[joint.child]
+        if joint.name in index and joint.moves:
+            i = index[joint.name]
+            if parent >= i:
+                problem(f"joint {names[parent]} is nearer to the base than {joint.name} and must stand before it")
+            upright = _with_z_along(joint.axis)
+            at = pose @ joint.origin @ Pose(upright, np.zeros(3))
+            own = Pose(upright.T, np.zeros(3))
+            bodies[i] = Body(parent, joint, at, own, NO_MASS)
+            place[joint.child] = i, own
+            if mass is None:
+                problem(f"link {joint.child}, which joint {joint.name} moves, has no <inertial>: its mass is needed")
+        else:
+            place[joint.child] = parent, pose @ joint.origin
+        body, own = place[joint.child]
+        if mass is not None:
+            parts[body].append(mass.seen_from(own))
+    return [
+        Body(bodies[i].parent, bodies[i].joint, bodies[i].place, bodies[i].frame, sum(parts[i], start=NO_MASS))
+        for i in sorted(bodies)
+    ]
