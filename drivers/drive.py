@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
 
 UNTOUCHED = "untouched"  # of `Drive.make_safe`: this program has not taken the drive over
 Approval = Callable[[str], bool]  # of a question, by the user
@@ -120,3 +123,74 @@ class Drive(Protocol):
 
     def close(self) -> None:
         """Release the bus."""
+
+
+# --- The drives that one loop commands ---
+
+
+@runtime_checkable
+class DriveOfArm(Protocol):
+    """What a drive offers besides where it is one of several: its two long steps in two parts each."""
+
+    def take_over(self, approve: Approval | None = None) -> None:
+        """The first part of `commission`: it is found, and off.  Raises as that does."""
+
+    def verify(self) -> None:
+        """The first part of `start_cyclic`: everything is read back once more, and nothing is begun."""
+
+
+class DriveGroup:
+    """All drives of a joint or an arm, in the order of its axes; of a joint there is one, and nothing else happens.
+
+    Of an arm, none is commissioned before all are found and off: the proof of one watchdog stops every drive that an
+    earlier run has left enabled.  None takes part in the cyclic exchange before all were verified.
+    """
+
+    def __init__(self, drives: Sequence[Drive]) -> None:
+        self.drives = tuple(drives)
+        self._parts = [d for d in drives if isinstance(d, DriveOfArm)] if len(drives) > 1 else []
+
+    def commission(self, approve: Approval | None = None) -> list[CommissioningReport]:
+        """`Drive.commission` of each; all are left disabled."""
+        for part in self._parts:
+            part.take_over(approve)
+        return [drive.commission(approve) for drive in self.drives]
+
+    def start_cyclic(self) -> None:
+        """`Drive.start_cyclic` of each."""
+        for part in self._parts:
+            part.verify()
+        for drive in self.drives:
+            drive.start_cyclic()
+
+    def port(self) -> Any:
+        """The record arrays of all as one."""
+        return np.concatenate([drive.port() for drive in self.drives]).view(np.recarray)
+
+    def make_safe(self, *, asked: bool = False) -> list[str]:
+        """`Drive.make_safe` of each, at the same time: none keeps its power while another one does not answer."""
+        if len(self.drives) == 1:
+            return [self.drives[0].make_safe(asked=asked)]
+        with ThreadPoolExecutor(len(self.drives)) as pool:
+            return list(pool.map(lambda drive: drive.make_safe(asked=asked), self.drives))
+
+    def close(self) -> None:
+        """Release the bus."""
+        for drive in self.drives:
+            drive.close()
+
+
+def common_state(names: Sequence[str], states: Sequence[str]) -> str:
+    """How the drives of an arm are, as one state in words: `is_safe` if all are, else what is not and whose it is."""
+    if len(set(states)) == 1:
+        return states[0]
+    off = [state for state in states if is_safe(state)]
+    differing = [
+        f"{name}: {state}" for name, state in zip(names, states, strict=True)
+        if state != (off or [""])[0] and (state == UNTOUCHED or is_safe(state))
+    ]  # fmt: skip
+    powered = [
+        f"{name}: {state}" for name, state in zip(names, states, strict=True)
+        if state != UNTOUCHED and not is_safe(state)
+    ]  # fmt: skip
+    return "; ".join(powered) if powered else ", ".join([off[0], *differing])

@@ -195,7 +195,7 @@ def hold_back(states: np.ndarray) -> None:
 
 @kernel
 def stop_others(states: np.ndarray, samples: np.ndarray) -> bool:
-    """Ramp down every axis of which another one has tripped, or brakes; True where the drives of all axes are enabled."""
+    """Ramp every axis down once another one has tripped, or brakes; True where the drives of all axes are enabled."""
     all_enabled = True
     for axis in range(len(states)):
         request_stop(states[axis], stop_of(states, axis, _NO_STOP))

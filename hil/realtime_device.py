@@ -1,9 +1,9 @@
-"""The virtual drives of a bus in real time, on a file descriptor that carries 16-byte frames (AF_CAN, AF_UNIX SEQPACKET).
+"""The virtual drives of a bus in real time, on a descriptor that carries 16-byte frames (AF_CAN, AF_UNIX SEQPACKET).
 
-One compiled loop without the interpreter lock, in one thread, for all drives of an arm: so their joints move on together.  SDO requests go through a socket pair to a second,
-Python thread, and its responses come back the same way: the core first acts on what was written, then sends the
-response, so that a master which has its answer finds the controlword carried out.  The loop is the only sender on the
-bus.
+One compiled loop without the interpreter lock, in one thread, for all drives of an arm: their joints move on together.
+SDO requests go through a socket pair to a second, Python thread, and its responses come back the same way: the core
+first acts on what was written, then sends the response, so that a master which has its answer finds the controlword
+carried out.  The loop is the only sender on the bus.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ import contextlib
 import math
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import can
@@ -52,6 +52,10 @@ REOPEN_PAUSE_S = 0.3  # an adapter that was plugged in again needs a second or t
 class CanopenDrive:
     """Implements `drivers.drive.Drive`.  `bus` is a python-can bus of its own, closed by `close`.
 
+    Of an arm, each drive but the first is given the one before it as its `bus`: all share that end of the bus, what
+    listens for other controllers there, and the heartbeat.  Their `commission`, `start_cyclic` and `close` are called
+    by `drivers.drive.DriveGroup`.
+
     It listens for other controllers from its making on.  `gate` is called between any two steps before the loop runs,
     and raises once the user has asked for a stop: no step follows then but those of `make_safe`.
     Where an adapter serves one program at a time, `reopen` is given: `start_cyclic` closes the bus for the loop, and
@@ -61,7 +65,7 @@ class CanopenDrive:
 
     def __init__(
         self,
-        bus: can.BusABC,
+        bus: can.BusABC | CanopenDrive,
         settings: CanopenSettings,
         sleep: Callable[[float], None] = time.sleep,
         reopen: Callable[[], can.BusABC] | None = None,
@@ -80,10 +84,17 @@ class CanopenDrive:
         self._guard: WatchdogGuard | None = None
         encoder = settings.joint_encoder.node if settings.joint_encoder is not None else None
         nodes = [settings.node] if encoder is None else [settings.node, encoder]
-        self._others = OtherControllers(nodes, settings.master_node, clock)
-        self._network = new_network(bus, sleep, self._others)
-        report_own_frames(self._network, self._others)
-        self._network.connect()
+        self._remarks: list[str] | None = None  # of `take_over`
+        if isinstance(bus, CanopenDrive):
+            self._others, self._network, self._arm = bus._others, bus._network, bus._arm
+            self._others.add_nodes(nodes)
+        else:
+            self._others = OtherControllers(nodes, settings.master_node, clock)
+            self._network = new_network(bus, sleep, self._others)
+            report_own_frames(self._network, self._others)
+            self._network.connect()
+            self._arm: list[CanopenDrive] = []
+        self._arm.append(self)
         sdo_timeout_s = settings.sdo_timeout_s or SDO_TIMEOUT_S
         try:
             self._eds = read_eds(settings.eds_path, settings.node)
@@ -162,18 +173,23 @@ class CanopenDrive:
         return [f"other nodes are on the bus: heartbeats of {numbers}"]
 
     def _prove_watchdog(self) -> str:
-        """See `prove_watchdog`; afterwards the node is brought back to pre-operational."""
+        """See `prove_watchdog`; afterwards the node is brought back to pre-operational.
+
+        So are the other drives of an arm that watch the same heartbeat already.
+        """
         settings = self._settings
         seen = prove_watchdog(self._network, settings.node, settings.master_node, settings.heartbeat_s, self._pause)
-        self._node.nmt.send_command(NmtCommand.ENTER_PRE_OPERATIONAL)
+        for drive in self._arm:
+            if drive._taken:
+                drive._node.nmt.send_command(NmtCommand.ENTER_PRE_OPERATIONAL)
         return seen
 
-    def commission(self, approve: Approval | None = None) -> CommissioningReport:
-        """See `Drive.commission`; the node is left in pre-operational.
+    def take_over(self, approve: Approval | None = None) -> None:
+        """The first part of `commission`: afterwards the drive is known to be off.
 
         Nothing is sent before the bus was silent for LISTEN_S, no NMT command before the drive is known to be off.
         """
-        try:
+        with self._blamed():
             self._started = False
             self._objects.remarks.clear()
             self._listen()
@@ -185,6 +201,26 @@ class CanopenDrive:
             )
             self._others.refuse()
             self._taken = True
+            self._remarks = [*([braked] if braked else []), *remarks]
+
+    @contextlib.contextmanager
+    def _blamed(self) -> Iterator[None]:
+        """What goes wrong in commissioning, with another controller as its cause where there is one."""
+        try:
+            yield
+        except can.CanError as error:
+            raise BusError(f"the bus failed during commissioning: {error}") from None
+        except (DeviceError, NoDeviceError):
+            self._others.refuse()  # explains it
+            raise
+
+    def commission(self, approve: Approval | None = None) -> CommissioningReport:
+        """See `Drive.commission`; the node is left in pre-operational."""
+        if self._remarks is None:
+            self.take_over(approve)
+        angle_rad = joint_angle_per_count_rad(self._settings)
+        with self._blamed():
+            remarks, self._remarks = self._remarks or [], None
             self._node.nmt.send_command(NmtCommand.ENTER_PRE_OPERATIONAL)
             if self._reads is None:
                 self._reads = SdoReads(self._network, self._node, lambda: round(self._clock() * 1e9))
@@ -198,12 +234,7 @@ class CanopenDrive:
                 findings.second = encoder[0]
                 findings.settings["joint encoder"] = encoder[0].words
                 findings.remarks += encoder[1]
-        except can.CanError as error:
-            raise BusError(f"the bus failed during commissioning: {error}") from None
-        except (DeviceError, NoDeviceError):
-            self._others.refuse()  # explains it
-            raise
-        findings.remarks += [*([braked] if braked else []), *remarks]
+        findings.remarks += remarks
         self._findings = findings
         second = findings.second
         start_rad = start_position_rad(
@@ -232,15 +263,35 @@ class CanopenDrive:
         made safe, has lost its watchdog or its limits: everything is read back once more.  `BusError` if another
         controller was on the bus since commissioning began.
         """
+        self.verify()
+        self._start()
+
+    def verify(self) -> None:
+        """The first part of `start_cyclic`: of an arm, all drives go through it before the first one is started."""
         if self._findings is None or self._reads is None:
             raise DeviceError("the drive has not been commissioned")
-        try:
+        with self._blamed_before_run():
             self._objects.verify_again()
             self._require_mode(self._findings.mode)
             self._encoder.verify_again()
             # another controller that came after our commissioning has the drive: its load must not be dropped by us
             self._others.refuse()
             self._gate()
+
+    @contextlib.contextmanager
+    def _blamed_before_run(self) -> Iterator[None]:
+        try:
+            yield
+        except can.CanError as error:
+            raise BusError(f"the bus failed before the run: {error}") from None
+        except (DeviceError, NoDeviceError):
+            self._others.refuse()
+            raise
+
+    def _start(self) -> None:
+        """The second part of `start_cyclic`, for a drive that was verified."""
+        assert self._findings is not None and self._reads is not None
+        with self._blamed_before_run():
             self._started = True
             self._encoder.send_command(NmtCommand.START)
             self._node.nmt.send_command(NmtCommand.START)
@@ -254,11 +305,6 @@ class CanopenDrive:
                 self._guard = WatchdogGuard(
                     self._objects, self._reads, self._settings.node, self._findings.mode, self._others.refuse
                 )
-        except can.CanError as error:
-            raise BusError(f"the bus failed before the run: {error}") from None
-        except (DeviceError, NoDeviceError):
-            self._others.refuse()
-            raise
         if self._reopen is not None:
             self._handed_over = True
             with contextlib.suppress(Exception):  # the next one to open it gets the error

@@ -64,6 +64,14 @@ class OtherControllers(can.Listener):
         self._identifiers: Counter[int] = Counter()
         self.heartbeats: set[int] = set()  # nodes that send one, ours and the drive's not among them
 
+    def add_nodes(self, nodes: Collection[int]) -> None:
+        """More nodes of the same program, before anything is sent to them."""
+        with self._lock:
+            self._nodes |= frozenset(nodes)
+            self._rpdo_ids |= {base + node: f"RPDO to node {node}" for node in nodes for base in RPDO_IDS}
+            self._commands |= {SDO_REQUEST_ID + node for node in nodes}
+            self.heartbeats -= self._nodes
+
     def on_message_received(self, msg: can.Message) -> None:
         if msg.is_error_frame or msg.is_extended_id:
             return

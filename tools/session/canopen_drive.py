@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
@@ -13,7 +13,8 @@ from jointctl.drivers.can.frames import worst_frame_bits
 from jointctl.drivers.can.open import CYCLIC_INTERFACES, SHARED_INTERFACES
 from jointctl.drivers.canopen.cia402 import State, state_of_word, state_text
 from jointctl.drivers.canopen.identifiers import EVENT_DRIVEN
-from jointctl.drivers.drive import Drive
+from jointctl.drivers.drive import Drive, DriveGroup
+from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.cycle import Histogram
 from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.canopen import canopen_section, canopen_settings, cyclic_bus_load
@@ -55,6 +56,24 @@ class CanopenSession(SessionDrive):
         reopen = None if config.bus.interface in SHARED_INTERFACES else open_bus
         return CanopenDrive(open_bus(), canopen_settings(config), reopen=reopen, gate=gate)
 
+    def open_all(self, configs: Sequence[Config], gate: Callable[[], None] = lambda: None) -> DriveGroup:
+        """See `SessionDrive`; all drives share one end of the bus."""
+        from jointctl.drivers.canopen.drive import CanopenDrive
+
+        if len(configs) == 1:
+            return DriveGroup([self.open(configs[0], gate)])
+        require_one_bus(configs)
+        first = self.open(configs[0], gate)
+        assert isinstance(first, CanopenDrive)
+        drives = [first]
+        try:
+            for config in configs[1:]:
+                drives.append(CanopenDrive(first, canopen_settings(config), gate=gate))
+        except BaseException:
+            first.close()
+            raise
+        return DriveGroup(drives)
+
     def port_record(self) -> type:
         from jointctl.drivers.canopen.cyclic import CanopenPort
 
@@ -87,6 +106,30 @@ class CanopenSession(SessionDrive):
 
     def load_row(self, share: float) -> tuple[str, str]:
         return "bus load", f"{share:.1%} at worst-case stuffing"
+
+
+def require_one_bus(configs: Sequence[Config]) -> None:
+    """`ConfigurationError` for joints of an arm that one loop on one bus cannot command."""
+    first = configs[0]
+    if first.bus.interface not in CYCLIC_INTERFACES:
+        raise ConfigurationError(
+            f"{first.path}: bus.interface (={first.bus.interface}) must be one of {', '.join(CYCLIC_INTERFACES)} "
+            "for an arm"
+        )
+    for config in configs[1:]:
+        place, wanted = (config.bus.interface, config.bus.channel), (first.bus.interface, first.bus.channel)
+        if place != wanted:
+            raise ConfigurationError(
+                f"{config.path}: bus (={':'.join(place)}) must be {':'.join(wanted)}, that of {first.path.name}: the "
+                "joints of an arm are on one bus"
+            )
+        for key in ("heartbeat_s", "master_node"):
+            value, of_first = getattr(canopen_section(config), key), getattr(canopen_section(first), key)
+            if value != of_first:
+                raise ConfigurationError(
+                    f"{config.path}: drive.{key} (={value:g}) must be {of_first:g}, that of {first.path.name}: there "
+                    "is one heartbeat for all joints of an arm"
+                )
 
 
 RPDO_BYTES = 4

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -78,6 +78,7 @@ class Snapshot:
     drive: str = DEFAULT_KIND  # drive.kind
     records: Any = ()  # all new ones, array of LogRecord (N,)
     temperature_degC: float | None = None  # None: the drive tells none, or not now
+    joint: str = ""  # which joint of an arm
 
 
 class Display(Protocol):
@@ -205,6 +206,41 @@ class PhaseLines(OnlyShows):
 
     def __exit__(self, *_: object) -> None:
         """Nothing to take away."""
+
+
+class JointDisplay:
+    """What a display gets from one joint of an arm: with its name in front, and a phase from the first one only."""
+
+    def __init__(self, display: Display, name: str, *, first: bool) -> None:
+        self._display, self._name, self._first = display, name, first
+        self.stop_request, self.stop_reason = display.stop_request, display.stop_reason
+
+    def note(self, text: str) -> None:
+        self._display.note(f"{self._name}: {text}")
+
+    def phase(self, text: str) -> None:
+        """All joints go on together."""
+        if self._first:
+            self._display.phase(text)
+
+    def show(self, snapshot: Snapshot) -> None:
+        self._display.show(replace(snapshot, joint=self._name))
+
+    def event(self, event: Event) -> None:
+        self._display.event(replace(event, text=f"{self._name}: {event.text}"))
+
+    def requests(self) -> Sequence[ViewerRequest]:
+        """An arm's gains and motion are not changed while it runs."""
+        return ()
+
+    def settings(self, values: Mapping[str, Any]) -> None:
+        """As above."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """The display is entered and left once for all joints."""
 
 
 # --- What happened in a run, in words, found by comparing each log record with the one before ---

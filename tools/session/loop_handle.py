@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import json
 import math
 import mmap
@@ -14,19 +15,23 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jointctl.drivers.errors import MotionFault
+from jointctl.firmware_py.arm_model import Arm, ArmConstants, ArmLink, ArmMotion
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Histogram, Word
 from jointctl.firmware_py.libc import NANOSECONDS
 from jointctl.firmware_py.records import AxisConstants, AxisState, Command, LogRecord, Sample
-from jointctl.firmware_py.schema import dtype_of
+from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest
 from jointctl.tools.child_process import Starting
 from jointctl.tools.configuration.config import Config
+
+if TYPE_CHECKING:
+    from jointctl.tools.configuration.arm import ArmModel
 
 # --- The memory that the supervisor and the loop process share: one anonymous file, passed on as a file descriptor ---
 # It has no name, so that nothing is left behind whatever dies; it lives as long as either process has it.
@@ -37,42 +42,55 @@ _LINE = 64  # bytes; nothing of one array shares a cache line with another
 
 
 class SharedBlock:
-    """Arrays over the shared memory; `words`, `histograms`, `table` plain, the others record arrays."""
+    """Arrays over the shared memory; `words`, `histograms`, `tables` plain, the others record arrays.
 
-    def __init__(self, fd: int, table_rows: int, port: type) -> None:
-        """Map an existing block; every process gives the same `table_rows` and record of the drive's exchange."""
+    Of an arm they have one element a joint, and its model is there too (`links`); `table` is that of the first joint.
+    """
+
+    def __init__(self, fd: int, table_rows: int, port: type, axes: int = 1, links: int = 0) -> None:
+        """Map an existing block; every process gives the same numbers and record of the drive's exchange."""
         self.fd = fd
-        self.table_rows = table_rows
+        self.table_rows, self.axes, self.axis = table_rows, axes, 0
         self._offset = 0
-        size = self._size(table_rows, port)
+        size = self._size(table_rows, port, axes)
         os.ftruncate(fd, max(os.fstat(fd).st_size, size))
         self._memory = mmap.mmap(fd, size)
         self.words = self._take(np.dtype(np.int64), WORDS)
         self.histograms = self._take(np.dtype(np.int64), len(Histogram) * HISTOGRAM_BINS).reshape(len(Histogram), -1)
-        self.table = self._take(np.dtype(np.float64), table_rows * 5).reshape(table_rows, 5)
-        self.constants = self._records(AxisConstants, 1)
-        self.state = self._records(AxisState, 1)
-        self.sample = self._records(Sample, 1)
-        self.command = self._records(Command, 1)
-        self.port = self._records(port, 1)
+        self.tables = self._take(np.dtype(np.float64), axes * table_rows * 5).reshape(axes, table_rows, 5)
+        self.table = self.tables[0]
+        self.constants = self._records(AxisConstants, axes)
+        self.state = self._records(AxisState, axes)
+        self.sample = self._records(Sample, axes)
+        self.command = self._records(Command, axes)
+        self.port = self._records(port, axes)
+        self.arm_constants, self.links = self._records(ArmConstants, 1), self._records(ArmLink, axes)[:links]
         self.ring = self._records(LogRecord, RING_RECORDS)
 
     @classmethod
-    def create(cls, table_rows: int, port: type) -> SharedBlock:
+    def create(cls, table_rows: int, port: type, axes: int = 1, links: int = 0) -> SharedBlock:
         """A new zeroed block."""
         if hasattr(os, "memfd_create"):
             fd = os.memfd_create("jointctl-loop")
         else:
             with tempfile.TemporaryFile() as file:
                 fd = os.dup(file.fileno())
-        return cls(fd, table_rows, port)
+        return cls(fd, table_rows, port, axes, links)
 
     @staticmethod
-    def _size(table_rows: int, port: type) -> int:
-        records = (AxisConstants, AxisState, Sample, Command, port)
-        words = WORDS + len(Histogram) * HISTOGRAM_BINS + table_rows * 5
-        ring = RING_RECORDS * dtype_of(LogRecord).itemsize
-        return 8 * words + sum(dtype_of(r).itemsize for r in records) + ring + 16 * _LINE
+    def _size(table_rows: int, port: type, axes: int) -> int:
+        records = (AxisConstants, AxisState, Sample, Command, port, ArmLink)
+        words = WORDS + len(Histogram) * HISTOGRAM_BINS + axes * table_rows * 5
+        rest = RING_RECORDS * dtype_of(LogRecord).itemsize + dtype_of(ArmConstants).itemsize
+        return 8 * words + axes * sum(dtype_of(r).itemsize for r in records) + rest + 20 * _LINE
+
+    def of_axis(self, axis: int) -> SharedBlock:
+        """The same memory as that of a single joint sees it."""
+        part = copy.copy(self)
+        part.axis, part.table = axis, self.tables[axis]
+        for name in ("constants", "state", "sample", "command", "port"):
+            setattr(part, name, getattr(self, name)[axis : axis + 1])
+        return part
 
     def _take(self, dtype: np.dtype[Any], count: int) -> Any:
         array = np.frombuffer(self._memory, dtype, count, self._offset)
@@ -84,20 +102,25 @@ class SharedBlock:
 
     def memory(self) -> CycleMemory:
         return CycleMemory(
-            self.constants, self.state, self.table[np.newaxis], self.sample, self.command, self.words, self.ring,
+            self.constants, self.state, self.tables, self.sample, self.command, self.words, self.ring,
             self.histograms, np.zeros(2, np.int64),
+            Arm(self.arm_constants, self.links, new(ArmMotion, len(self.links) + 1)),
         )  # fmt: skip
 
     def new_records(self, tail: int, head: int) -> tuple[Any, int]:
-        """(copy of the log records from `tail` to `head`, how many of them had been overwritten before).
+        """(copy of this axis' log records from `tail` to `head`, how many of them had been overwritten before).
+
+        Both are multiples of the number of axes: each cycle writes one record for each of them.
 
         The loop goes on: what it has written over while this was copying, and may be writing over now, counts as lost
         too.
         """
-        lost = max(0, head - RING_RECORDS - tail)
-        records = self.ring[np.arange(tail + lost, head) % RING_RECORDS]
+        axes = self.axes
+        lost = -(-max(0, head - RING_RECORDS - tail) // axes)
+        records = self.ring[np.arange(tail + lost * axes + self.axis, head, axes) % RING_RECORDS]
         now = int(self.words[Word.HEAD])
-        late = min(len(records), max(0, now + 1 - RING_RECORDS - tail - lost)) if now > head else 0
+        written_over = -(-max(0, now + axes - RING_RECORDS - tail - lost * axes) // axes)
+        late = min(len(records), written_over) if now > head else 0
         return records[late:], lost + late
 
 
@@ -136,6 +159,8 @@ class LoopOrder:
     priority: int | None
     bitrate_bitps: int | None = None  # for interfaces that set it when they are opened
     tail_path: str | None = None  # where the ring is saved if the supervisor has gone
+    axes: int = 1
+    links: int = 0  # of an arm whose model is in the block
 
     def argument(self) -> str:
         return json.dumps(asdict(self))
@@ -149,10 +174,16 @@ class LoopHandle:
     """
 
     def __init__(
-        self, config: Config, table: Any, port: type, tail_path: Path | None = None, marker_fd: int | None = None
-    ) -> None:
-        self.block = SharedBlock.create(len(table), port)
-        self.block.table[:] = table
+        self, config: Config, table: Any, port: type, tail_path: Path | None = None, marker_fd: int | None = None,
+        arm: ArmModel | None = None,
+    ) -> None:  # fmt: skip
+        """`table` (rows, 5), of an arm (axes, rows, 5), with its `arm` model."""
+        tables = np.reshape(table, (-1, *np.shape(table)[-2:]))
+        axes, rows = tables.shape[:2]
+        self.block = SharedBlock.create(rows, port, axes, 0 if arm is None else axes)
+        self.block.tables[:] = tables
+        if arm is not None:
+            self.block.arm_constants[:], self.block.links[:] = arm.constants, arm.links
         self._tail = 0
         self.lost_records = 0
         self._after_end = config.drive.when_the_loop_ends
@@ -160,7 +191,9 @@ class LoopHandle:
         order = LoopOrder(
             supervisor_pid=os.getpid(),
             block_fd=self.block.fd,
-            table_rows=len(table),
+            table_rows=rows,
+            axes=axes,
+            links=len(self.block.links),
             kind=config.drive.kind,
             interface=config.bus.interface,
             channel=config.bus.channel,
@@ -205,6 +238,12 @@ class LoopHandle:
         """The axis' phase as of the last cycle."""
         return AxisPhase(int(self.block.state[0].phase))
 
+    def of_axis(self, axis: int) -> LoopHandle:
+        """The same loop as that of a single joint is seen; whatever is asked of it is asked of all joints."""
+        part = copy.copy(self)
+        part.block = self.block.of_axis(axis)
+        return part
+
     def wait_ready(self, alive: Any = lambda: None, tell: Callable[[str], None] = lambda _: None) -> None:
         """Until the loop is compiled and warm; `alive` is called all the time and may raise; `tell` gets what it does.
 
@@ -224,7 +263,8 @@ class LoopHandle:
         """Hand over the constants and the driver's memory, and let the loop begin."""
         self.block.constants[:] = constants
         self.block.port[:] = port
-        reset_axis(self.block.constants[0], self.block.state[0])
+        for axis in range(self.block.axes):
+            reset_axis(self.block.constants[axis], self.block.state[axis])
         self.beat()
         now_ns = time.monotonic_ns()
         self.block.words[Word.ASLEEP_NS] = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - now_ns
@@ -234,7 +274,7 @@ class LoopHandle:
 
     @property
     def cycles(self) -> int:
-        return int(self.block.words[Word.HEAD])
+        return int(self.block.words[Word.HEAD]) // self.block.axes
 
     def allow_enable(self) -> None:
         """Let the axis leave WAITING (see `SequenceConstants.may_enable`)."""

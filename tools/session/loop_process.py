@@ -82,7 +82,7 @@ def become_realtime(cpu: int | None, priority: int | None, threads: Sequence[int
 def run(order: LoopOrder) -> int:
     """Warm up, wait for GO, run the loop; returns the exit code."""
     drive = session_drive(order.kind)
-    block = SharedBlock(order.block_fd, order.table_rows, drive.port_record())
+    block = SharedBlock(order.block_fd, order.table_rows, drive.port_record(), order.axes, order.links)
 
     def tell(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
@@ -109,13 +109,19 @@ def run(order: LoopOrder) -> int:
 
 
 def save_tail(block: SharedBlock, path: Path) -> None:
-    """Write what the ring holds: the joint is off by now, and nobody else is left to keep the last seconds."""
+    """Write what the ring holds: the joint is off by now, and nobody else is left to keep the last seconds.
+
+    Of an arm each joint has a file, as its log has: the second one is NAME.2.tail.mcap.
+    """
     from jointctl.tools.recording.run_log import ERROR, RunLogWriter
 
-    records, lost = block.new_records(0, int(block.words[Word.HEAD]))
-    with RunLogWriter(path, {"tail": {"why": "the supervising process had gone", "records_before": str(lost)}}) as log:
-        log.write_records(records)
-        log.write_event(ERROR, "loop", "the supervising process had gone; these are the last records of the loop")
+    for axis in range(block.axes):
+        records, lost = block.of_axis(axis).new_records(0, int(block.words[Word.HEAD]))
+        own = path if axis == 0 else path.with_name(path.name.replace(".tail.", f".{axis + 1}.tail."))
+        metadata = {"tail": {"why": "the supervising process had gone", "records_before": str(lost)}}
+        with RunLogWriter(own, metadata) as log:
+            log.write_records(records)
+            log.write_event(ERROR, "loop", "the supervising process had gone; these are the last records of the loop")
 
 
 def _place(error: BaseException) -> str:

@@ -7,10 +7,10 @@ it (`Motion.placed`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from jointctl.tools.configuration.records import (
 )
 from jointctl.tools.configuration.sections import Limits
 from jointctl.tools.recording.run_log import log_path
+
+if TYPE_CHECKING:
+    from jointctl.tools.configuration.arm import ArmConfig, ArmModel
 
 START_SHARE = 0.1  # of the following error: how far from the trajectory a run without an approach may begin
 
@@ -57,9 +60,29 @@ class Motion(Protocol):
 
 
 @dataclass(frozen=True)
+class JointPlan:
+    """What one joint does in a run, and its own log; `name` is "" where it is alone."""
+
+    config: Config
+    motion: Motion
+    log_path: Path
+    name: str = ""
+
+    def lines(self, lines: Iterable[str]) -> list[str]:
+        """Of its envelope, below its name where it is one of several."""
+        return [f"--- {self.name} ({self.config.path.name})", *lines] if self.name else list(lines)
+
+    def naming(self, text: str) -> str:
+        """A message, with its name in front where it is one of several."""
+        return f"{self.name}: {text}" if self.name else text
+
+
+@dataclass(frozen=True)
 class RunPlan:
     """One run, whichever verb it is for.  `log_every` above 1: only so many records go into the log, the last
     `log_full_rate_s` seconds all of them.
+
+    Of an arm, configuration, motion and log are those of its first joint, and `arm` has all of them.
     """
 
     config: Config
@@ -68,6 +91,48 @@ class RunPlan:
     allow_low_margin: bool = False
     log_every: int = 1
     log_full_rate_s: float = 0.0
+    arm: ArmPlan | None = None
+
+    @property
+    def joints(self) -> tuple[JointPlan, ...]:
+        """One for each axis, in their order."""
+        return self.arm.joints if self.arm is not None else (JointPlan(self.config, self.motion, self.log_path),)
+
+    @property
+    def tables(self) -> np.ndarray:
+        """float64 (axes, rows, 5): the tables of all motions, the shorter ones with rows that are not used."""
+        tables = [joint.motion.table for joint in self.joints]
+        filled = np.zeros((len(tables), max(len(table) for table in tables), 5))
+        for rows, table in zip(filled, tables, strict=True):
+            rows[: len(table)] = table
+        return filled
+
+    def placed(self, reports: Sequence[CommissioningReport]) -> Placed:
+        """The motion of all joints from where they stand: constants of all, the lines of all."""
+        parts = [j.motion.placed(report) for j, report in zip(self.joints, reports, strict=True)]
+        if self.arm is None:
+            return parts[0]
+        approach_s = max(float(part.constants[0].sequence.approach_s) for part in parts)
+        lines = []
+        for joint, report, part in zip(self.arm.joints, reports, parts, strict=True):
+            part.constants[0].sequence.approach_s = approach_s  # all begin and arrive together
+            lines += joint.lines(self.arm.envelope(joint, part, report))
+        constants = np.concatenate([part.constants for part in parts]).view(np.recarray)
+        return Placed(constants, parts[0].table, tuple(lines))
+
+
+@dataclass(frozen=True)
+class ArmPlan:
+    """The joints of an arm in a run, and the model that connects them."""
+
+    joints: tuple[JointPlan, ...]
+    model: ArmModel
+
+    @staticmethod
+    def envelope(joint: JointPlan, part: Placed, report: CommissioningReport) -> Iterable[str]:
+        """Of one joint, with the approach that all have in common."""
+        motion = joint.motion
+        return motion.envelope(part.constants[0], report) if isinstance(motion, ConfiguredMotion) else part.lines
 
 
 def joint_lines(report: CommissioningReport) -> list[str]:
@@ -102,6 +167,27 @@ def resolve(config: Config, *, allow_low_margin: bool = False, hold: bool = Fals
     table = trajectory_table(config)
     motion: Motion = FreeMotion(config, table) if hold else ConfiguredMotion(config, table)
     return RunPlan(config, motion, log_path(config), allow_low_margin)
+
+
+def resolve_any(config: Config | ArmConfig, *, allow_low_margin: bool = False, hold: bool = False) -> RunPlan:
+    """The plan of `run`, for a joint or an arm."""
+    if isinstance(config, Config):
+        return resolve(config, allow_low_margin=allow_low_margin, hold=hold)
+    return resolve_arm(config, allow_low_margin=allow_low_margin)
+
+
+def resolve_arm(arm: ArmConfig, *, allow_low_margin: bool = False) -> RunPlan:
+    """The plan of `run` for an arm: each joint has its part of the motion, and a log of its own."""
+    named = arm.joints[0].model_copy()
+    named._path = arm.path
+    path = log_path(named)
+    joints = []
+    for config, name in zip(arm.joints, arm.names, strict=True):
+        motion = ConfiguredMotion(config, trajectory_table(config))
+        joints.append(JointPlan(config, motion, path.with_name(f"{path.stem}.{name}.mcap"), name))
+    first = joints[0]
+    plan = ArmPlan(tuple(joints), arm.model)
+    return RunPlan(first.config, first.motion, first.log_path, allow_low_margin, arm=plan)
 
 
 class FreeMotion:
@@ -143,7 +229,7 @@ class ConfiguredMotion:
 
     def placed(self, report: CommissioningReport) -> Placed:
         constants = axis_constants(self.config, self.table, start_position_rad=report.start_position_rad)
-        return Placed(constants, self.table, tuple(self._envelope(constants[0], report)))
+        return Placed(constants, self.table, tuple(self.envelope(constants[0], report)))
 
     def require_start(self, start_position_rad: float) -> None:
         """`MotionFault` if there is no approach and the trajectory begins elsewhere: it would be pulled there."""
@@ -160,7 +246,7 @@ class ConfiguredMotion:
                 'give it time, sequence.approach_s = "auto"; without, it would be pulled there with all its torque',
             )
 
-    def _envelope(self, axis: Any, report: CommissioningReport) -> list[str]:
+    def envelope(self, axis: Any, report: CommissioningReport) -> list[str]:
         """Lines that say where the joint will go, how fast, with how much torque, for how long."""
         config = self.config
         low, high, speed, acceleration = peak_of(axis.trajectory, self.table)

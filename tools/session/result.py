@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from rich.console import Group
+from rich.table import Table
 
 from jointctl.drivers.drive import UNTOUCHED, CommissioningReport, is_safe
 from jointctl.drivers.errors import DECLINED, INTERRUPTED, DataError, DeviceError, MotionFault
@@ -16,6 +18,9 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_summary import RunSummary, save_run_figure, summary_table
 from jointctl.tools.session.fault_words import FaultText
+
+if TYPE_CHECKING:
+    from jointctl.tools.configuration.arm import ArmConfig
 
 # --- How a run leaves the drive: code that reports to the user that it is disabled asks here first ---
 
@@ -84,43 +89,62 @@ class RunResult:
     lost_records: int
     log_path: Path
     report: CommissioningReport
+    name: str = ""  # of the joint, where it is one of several
+    others: tuple[RunResult, ...] = ()  # the other joints of an arm
+
+    @property
+    def joints(self) -> tuple[RunResult, ...]:
+        """One result for each joint."""
+        return (self, *self.others)
 
 
 # --- What a run says at its end: a fault in words, then the picture beside the log, and the table on stdout ---
 
 
-def run_title(config: Config) -> str:
+def run_title(config: Config | ArmConfig) -> str:
     """What a run is called on its displays and its picture."""
-    return f"{config.path.stem}: {config.trajectory.kind}"
+    return f"{config.path.stem}: {_first(config).trajectory.kind}"
 
 
-def report_run(result: RunResult, output: Output, config: Config) -> int:
-    """Print and save everything, and a picture unless log.picture forbids it; returns the exit code.
+def _first(config: Config | ArmConfig) -> Config:
+    return config if isinstance(config, Config) else config.joints[0]
+
+
+def report_run(result: RunResult, output: Output, config: Config | ArmConfig) -> int:
+    """Print and save everything, and a picture of each joint unless log.picture forbids it; returns the exit code.
 
     That is 0, the one of `MotionFault`, or 130 after an interruption.  The cause of a fault comes before all else, and
     what people read before the picture, which takes a second or more.  `DeviceError` where the drive did not confirm
     that it is off; both outweigh the `DataError` of a result that cannot be written.
     """
-    if result.fault_text is not None:
-        text = result.fault_text
-        output.error(f"{result.fault.name} ({int(result.fault)}): {text.happened}", text.advice)
-    drawn = None if output.for_people else _drawn(result, output, config)
-    table = summary_table(result.summary)
-    table.add_row(*result.load_row)
-    table.add_row("drive afterwards", result.drive_state)
-    table.add_row("log", str(result.log_path))
+    joints, title = result.joints, run_title(config)
+    faulty = [joint for joint in joints if joint.fault_text is not None]
+    for joint in faulty:
+        text = joint.fault_text
+        assert text is not None
+        name = f"{joint.name}: " if joint.name else ""
+        output.error(f"{name}{joint.fault.name} ({int(joint.fault)}): {text.happened}", text.advice)
+    wanted = joints if _first(config).log.picture else ()
+    drawn = {} if output.for_people else {joint.name: _drawn(joint, output, title) for joint in wanted}
+    tables = [_table(joint) for joint in joints]
+    data = [_data(joint, drawn.get(joint.name)) for joint in joints]
     try:
-        output.result(table, _data(result, drawn), result)
-        if output.for_people and (picture := _drawn(result, output, config)):
-            output.result(f"picture    {picture}")
+        if result.others:
+            named = [{"name": joint.name, **values} for joint, values in zip(joints, data, strict=True)]
+            output.result(Group(*tables), {"joints": named}, result)
+        else:
+            output.result(tables[0], data[0], result)
+        for joint in wanted if output.for_people else ():
+            if path := _drawn(joint, output, title):
+                output.result(f"picture    {path}")
     except DataError as error:
-        if result.fault_text is None:
+        if not faulty:
             require_off(result.drive_state)
             raise
         output.warning(error.message)
-    if result.lost_records:
-        output.warning(f"{result.lost_records} log records were lost: the supervisor was too slow")
-    if result.fault_text is not None:
+    if lost := sum(joint.lost_records for joint in joints):
+        output.warning(f"{lost} log records were lost: the supervisor was too slow")
+    if faulty:
         return MotionFault.exit_code
     require_off(result.drive_state)
     if result.stopped_by:
@@ -129,12 +153,21 @@ def report_run(result: RunResult, output: Output, config: Config) -> int:
     return 0
 
 
-def _drawn(result: RunResult, output: Output, config: Config) -> Path | None:
-    """The picture beside the log, if one is wanted; why there is none then is a warning."""
-    if not config.log.picture:
-        return None
+def _table(result: RunResult) -> Table:
+    table = summary_table(result.summary)
+    if result.name:
+        table.title = f"Run of {result.name}"
+    table.add_row(*result.load_row)
+    table.add_row("drive afterwards", result.drive_state)
+    table.add_row("log", str(result.log_path))
+    return table
+
+
+def _drawn(result: RunResult, output: Output, title: str) -> Path | None:
+    """The picture beside the log; why there is none then is a warning."""
+    title = f"{title}, {result.name}" if result.name else title
     try:
-        return save_run_figure(result.records, result.log_path.with_suffix(".png"), run_title(config))
+        return save_run_figure(result.records, result.log_path.with_suffix(".png"), title)
     except DataError as error:
         output.warning(error.message)
         return None

@@ -25,7 +25,7 @@ from jointctl.tools.session.display import Display, EventFinder, Snapshot, phase
 from jointctl.tools.session.fault_words import NoticeFinder
 from jointctl.tools.session.live_changes import LiveChanges, ViewerOrders
 from jointctl.tools.session.loop_handle import LoopHandle
-from jointctl.tools.session.plan import RunPlan
+from jointctl.tools.session.plan import JointPlan, RunPlan
 from jointctl.tools.session.session_drive import Guard, session_drive
 from jointctl.tools.session.set_points import SetPointSources
 
@@ -57,11 +57,12 @@ class RunParts:
 
 
 class RunWatch:
-    """Watches one run; `poll` it."""
+    """Watches one joint of a run, the only one mostly; `poll` it."""
 
-    def __init__(self, plan: RunPlan, axis: Any, parts: RunParts) -> None:
-        """`axis`: the `AxisConstants` that the loop is about to get."""
-        config = plan.config
+    def __init__(self, plan: RunPlan, axis: Any, parts: RunParts, joint: JointPlan | None = None) -> None:
+        """`axis`: the `AxisConstants` that the loop is about to get; `joint`: of an arm, the one to watch."""
+        self.joint = joint = joint or plan.joints[0]
+        config = joint.config
         self.config, self.loop, self.around = config, parts.loop, parts.around
         self.log, self.kept, self.display = parts.log, parts.kept, parts.display
         self._set_points = parts.set_points or SetPointSources("the program")  # none from elsewhere

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 from jointctl.drivers.can.socketcan import interface_blamed
-from jointctl.drivers.drive import Approval, CommissioningReport, Declined, Drive
+from jointctl.drivers.drive import Approval, CommissioningReport, Declined, DriveGroup, common_state
 from jointctl.drivers.errors import BusError, DataError, DeviceError, JointctlError, MotionFault, NoDeviceError
 from jointctl.firmware_py.states import Fault, StopRequest
 from jointctl.tools.configuration.config import Config
@@ -20,13 +22,13 @@ from jointctl.tools.output import Output
 from jointctl.tools.recording.kept_records import KeptRecords
 from jointctl.tools.recording.run_log import ERROR, INFO, THINNING, WARNING, RunLogWriter, run_metadata
 from jointctl.tools.recording.run_summary import summarise
-from jointctl.tools.session.bus_watch import TemperatureWatch, bus_watch, recording
+from jointctl.tools.session.bus_watch import BusWatch, TemperatureWatch, bus_watch, recording
 from jointctl.tools.session.consent import Consent, prepare_log, require_ready
 from jointctl.tools.session.control import Control, StopSignals
-from jointctl.tools.session.display import Display, PhaseLines
+from jointctl.tools.session.display import Display, JointDisplay, PhaseLines
 from jointctl.tools.session.fault_words import held_up_text
 from jointctl.tools.session.loop_handle import LoopHandle
-from jointctl.tools.session.plan import Placed, RunPlan
+from jointctl.tools.session.plan import JointPlan, Placed, RunPlan
 from jointctl.tools.session.result import RunResult, warn_unless_off
 from jointctl.tools.session.run_watch import Around, RunParts, RunWatch
 from jointctl.tools.session.session_drive import Guard, session_drive
@@ -62,6 +64,7 @@ class Session:
         self._consent, self._output, self._control = consent, output, control
         self.signals = control.signals
         self._make_display = display or (lambda _: PhaseLines(output))
+        self._joints = plan.joints
         self._kind = session_drive(plan.config.drive.kind)
         self.drive_state = ""  # in words, after the run
         self.loop: LoopHandle | None = None  # once it has been started
@@ -73,31 +76,29 @@ class Session:
         tail_path = self.plan.log_path.with_suffix(".tail.mcap")
         with (
             signals.held(),
-            LoopHandle(
-                config, self.plan.motion.table, self._kind.port_record(), tail_path, self._control.marker_fd
-            ) as loop,
+            self._loop(tail_path) as loop,
             recording(config) as recorder,
             bus_watch(config) as bus_news,
             self._kind.kept_awake(self._output),
         ):
             self.loop = loop
-            drive = self._kind.open(config, signals.leave_if_asked)
+            drives = self._opened()
             guard: Guard | None = None
             try:
                 guard = self._kind.guard(config, loop)
                 try:
-                    report = self.commissioned(config, drive, self._may_brake())
+                    reports = self.commissioned(config, drives, self._may_brake())
                 except Declined:
                     return None
                 signals.leave_if_asked()
-                placed = self._ask(lambda: self._allowed(report))
+                placed = self._ask(lambda: self._allowed(reports))
                 if placed is None:
                     return None
                 loop.wait_ready(signals.leave_if_asked, self._output.note)
                 signals.leave_if_asked()
                 if guard is not None:
                     guard.wait_ready()
-                return self._supervise(drive, loop, report, placed, Around(signals, bus_news, recorder, guard))
+                return self._supervise(drives, loop, reports, placed, Around(signals, bus_news, recorder, guard))
             except (BusError, DeviceError, NoDeviceError):
                 if signals.commanded_ns:  # the frames of that stop look like another controller's
                     raise KeyboardInterrupt from None
@@ -105,11 +106,26 @@ class Session:
             except OSError as error:
                 raise DataError(f"{self.plan.log_path}: cannot be written: {error.strerror or error}") from None
             finally:
-                self.drive_state = drive.make_safe(asked=bool(signals.commanded_ns))
-                drive.close()
+                self.drive_state = self._made_safe(drives)
+                drives.close()
                 if guard is not None:
                     guard.release(self.drive_state)
                 warn_unless_off(self.drive_state, self._output)
+
+    def _loop(self, tail_path: Path) -> LoopHandle:
+        """The loop process, started; it waits for its word."""
+        plan, port, marker_fd = self.plan, self._kind.port_record(), self._control.marker_fd
+        if plan.arm is None:
+            return LoopHandle(self._config, plan.motion.table, port, tail_path, marker_fd)
+        return LoopHandle(self._config, plan.tables, port, tail_path, marker_fd, plan.arm.model)
+
+    def _opened(self) -> DriveGroup:
+        """The drives of all joints, nothing sent to them yet."""
+        return self._kind.open_all([joint.config for joint in self._joints], self.signals.leave_if_asked)
+
+    def _made_safe(self, drives: DriveGroup) -> str:
+        states = drives.make_safe(asked=bool(self.signals.commanded_ns))
+        return common_state([joint.name for joint in self._joints], states)
 
     def _ask(self, question: Callable[[], Answer]) -> Answer:
         """The answer of the user, whom a stop may interrupt."""
@@ -120,76 +136,104 @@ class Session:
             self.signals.raising = False
 
     @staticmethod
-    def commissioned(config: Config, drive: Drive, approve: Approval | None) -> CommissioningReport:
-        """`Drive.commission`; a failure also names what is wrong with the interface, if something is."""
+    def commissioned(config: Config, drives: DriveGroup, approve: Approval | None) -> list[CommissioningReport]:
+        """`DriveGroup.commission`; a failure also names what is wrong with the interface, if something is."""
         with interface_blamed(config.bus.interface, config.bus.channel, config.bus.bitrate_bitps):
-            return drive.commission(approve)
+            return drives.commission(approve)
 
     def _may_brake(self) -> Approval | None:
         brake = self._consent.brake
         return None if brake is None else lambda text: self._ask(lambda: brake(text))
 
-    def _allowed(self, report: CommissioningReport) -> Placed | None:
-        """The motion from where the joint stands, shown, possible and agreed to; None if it is not to be."""
-        plan, start_rad = self.plan, report.start_position_rad
-        placed = plan.motion.placed(report)
+    def _allowed(self, reports: Sequence[CommissioningReport]) -> Placed | None:
+        """The motion from where the joint stands, shown, possible and agreed to; None if it is not to be.
+
+        Of an arm those of all joints: one that cannot begin keeps all of them from it.
+        """
+        plan = self.plan
+        placed = plan.placed(reports)
         if self._set_points is not None:
             placed = self._set_points.announced(placed, self._config)
         self._consent.show(placed.lines)
         if self._consent.dry_run:
             return None
-        require_ready(self._config, report, plan.log_path)
-        plan.motion.require_start(start_rad)
+        for joint, report in zip(self._joints, reports, strict=True):
+            with self._blamed(joint):
+                require_ready(joint.config, report, joint.log_path)
+                joint.motion.require_start(report.start_position_rad)
         if not self._consent.agreed(placed.lines):
             return None
-        prepare_log(self._config, plan.log_path, self._output)
+        for joint in self._joints:
+            prepare_log(joint.config, joint.log_path, self._output)
         return placed
 
+    @staticmethod
+    @contextlib.contextmanager
+    def _blamed(joint: JointPlan) -> Iterator[None]:
+        """An error, with the name of the joint where there are several."""
+        try:
+            yield
+        except JointctlError as error:
+            error.message = joint.naming(error.message)
+            raise
+
     def _supervise(
-        self, drive: Drive, loop: LoopHandle, report: CommissioningReport, placed: Placed, around: Around
-    ) -> RunResult:
+        self, drives: DriveGroup, loop: LoopHandle, reports: Sequence[CommissioningReport], placed: Placed,
+        around: Around,
+    ) -> RunResult:  # fmt: skip
         plan = self.plan
-        metadata = run_metadata(self._config, report)
-        if plan.log_every > 1:
-            metadata[THINNING] = {"every": str(plan.log_every), "whole_s": f"{plan.log_full_rate_s:g}"}
-        loop.block.table[:] = placed.table
-        placed.constants[0].sequence.may_enable = 0
-        with (
-            RunLogWriter(plan.log_path, metadata) as log,
-            KeptRecords(plan.log_path.parent) as kept,
-            self._make_display(report) as display,
-            RunWatch(
-                plan, placed.constants[0], RunParts(loop, around, log, kept, display, metadata, self._set_points)
-            ) as watch,
-        ):
-            return self._carry_out(drive, loop, placed.constants, report, watch)
+        if plan.arm is None:
+            loop.block.table[:] = placed.table
+        placed.constants.sequence.may_enable[:] = 0
+        with contextlib.ExitStack() as stack:
+            display = stack.enter_context(self._make_display(reports[0]))
+            watches = []
+            for axis, (joint, report) in enumerate(zip(self._joints, reports, strict=True)):
+                metadata = run_metadata(joint.config, report)
+                if plan.log_every > 1:
+                    metadata[THINNING] = {"every": str(plan.log_every), "whole_s": f"{plan.log_full_rate_s:g}"}
+                log = stack.enter_context(RunLogWriter(joint.log_path, metadata))
+                kept = stack.enter_context(KeptRecords(joint.log_path.parent))
+                shown: Display = JointDisplay(display, joint.name, first=axis == 0) if joint.name else display
+                # frames and troubles of the bus belong to no joint: they are in the first one's log
+                own = around if axis == 0 else replace(around, bus_watch=BusWatch(joint.config, None), recorder=None)
+                parts = RunParts(loop.of_axis(axis), own, log, kept, shown, metadata, self._set_points)
+                watches.append(stack.enter_context(RunWatch(plan, placed.constants[axis], parts, joint)))
+            return self._carry_out(drives, loop, placed.constants, reports, watches)
 
     def _carry_out(
-        self, drive: Drive, loop: LoopHandle, constants: Any, report: CommissioningReport, watch: RunWatch
-    ) -> RunResult:
+        self, drives: DriveGroup, loop: LoopHandle, constants: Any, reports: Sequence[CommissioningReport],
+        watches: Sequence[RunWatch],
+    ) -> RunResult:  # fmt: skip
+        watch = watches[0]
         signals = watch.around.signals
         loop.listen()
         signals.on_command = loop.request_stop
         if signals.commanded_ns:  # just before: the loop gets it all the same, and never enables
             loop.request_stop(signals.request)
-        drive.start_cyclic()
-        watch.temperature = TemperatureWatch(drive.thermometer(), watch.log, loop.block.constants[0].law)
-        watch.settings_guard = drive.settings_guard()
+        drives.start_cyclic()
+        for drive, each in zip(drives.drives, watches, strict=True):
+            each.temperature = TemperatureWatch(drive.thermometer(), each.log, each.loop.block.constants[0].law)
+            each.settings_guard = drive.settings_guard()
         started_ns = time.monotonic_ns()
-        loop.go(constants, drive.port())
+        loop.go(constants, drives.port())
         try:
             while loop.running():
-                watch.poll()
+                for each in watches:
+                    with self._blamed(each.joint):
+                        each.poll()
                 time.sleep(POLL_S)
         except MotionFault as error:
-            state = drive.make_safe()
-            watch.take_records(last=True)
+            state = self._made_safe(drives)
+            for each in watches:
+                each.take_records(last=True)
             watch.tell_bus_news()
             watch.log.write_event(ERROR, "supervisor", str(error))
             raise MotionFault(error.message, f"{error.hint}; drive state now: {state}") from None
         except (DeviceError, BusError) as error:  # another program has the drive, or has changed what stops it
             self._brake(loop, signals, StopRequest.QUICK_STOP)
-            watch.take_records(last=True)
+            for each in watches:
+                each.take_records(last=True)
             # `jointctl stop` sends such frames as well
             if not signals.commanded_ns and not self._explained_by_restart(error, loop):
                 watch.log.write_event(ERROR, "supervisor", str(error))
@@ -198,23 +242,29 @@ class Session:
             self._brake(loop, signals)
             raise
         elapsed_s = (time.monotonic_ns() - started_ns) * 1e-9
-        watch.take_records(last=True)
-        self._raise_what_others_did(watch, loop)
-        state = drive.make_safe(asked=bool(signals.commanded_ns))
+        for each in watches:
+            each.take_records(last=True)
+        for each in watches:
+            with self._blamed(each.joint):
+                self._raise_what_others_did(each, loop)
+        state = self._made_safe(drives)
         recorder = watch.around.recorder
         if recorder is not None:
             recorder.end()
-        watch.take_records(last=True)
+        for each in watches:
+            each.take_records(last=True)
         watch.tell_bus_news()  # it often explains the fault that has ended the run
         watch.log.write_event(INFO, "drive", f"after the run: {state}")
         if recorder is not None and recorder.dropped:
             watch.log.write_event(WARNING, "log", f"{recorder.dropped} CAN frames were not recorded: too slow")
-        return self._result(watch, report, state, elapsed_s)
+        results = [self._result(*each, state, elapsed_s) for each in zip(watches, reports, strict=True)]
+        return replace(results[0], others=tuple(results[1:]))
 
     @staticmethod
     def _explained_by_restart(error: JointctlError, loop: LoopHandle) -> bool:
         """Objects of a drive that has restarted are as they were at power-on: no other program has changed them."""
-        return isinstance(error, DeviceError) and loop.verdict()[0] is Fault.DRIVE_RESTARTED
+        verdicts = [loop.of_axis(axis).verdict()[0] for axis in range(loop.block.axes)]
+        return isinstance(error, DeviceError) and Fault.DRIVE_RESTARTED in verdicts
 
     def _raise_what_others_did(self, watch: RunWatch, loop: LoopHandle) -> None:
         """Another controller's frames since the last look end the run too, and explain a fault: `MotionFault`."""
@@ -243,7 +293,7 @@ class Session:
                 time.sleep(POLL_S)
 
     def _result(self, watch: RunWatch, report: CommissioningReport, drive_state: str, elapsed_s: float) -> RunResult:
-        loop = watch.loop
+        loop, config = watch.loop, watch.config
         if not len(watch.kept):
             raise JointctlError("the loop ended without one cycle")
         records = watch.kept.records()
@@ -254,10 +304,10 @@ class Session:
         text = None
         if fault is not Fault.NONE:
             errors = int(state.fault_drive_error), int(state.fault_encoder_error)
-            text = self._kind.fault_text(self._config, fault, value, *errors)
-            text = held_up_text(fault, value, text, records, self._config.loop.rate_Hz)
+            text = self._kind.fault_text(config, fault, value, *errors)
+            text = held_up_text(fault, value, text, records, config.loop.rate_Hz)
             text = watch.around.bus_watch.explained(fault, text, int(loop.block.port[0].last_errno))
-        bus_load = float(loop.block.port[0].bits_sent) / (self._config.bus.bitrate_bitps * elapsed_s)
+        bus_load = float(loop.block.port[0].bits_sent) / (config.bus.bitrate_bitps * elapsed_s)
         return RunResult(
             summary=summarise(records, loop.block.histograms, temperatures_degC=watch.temperature.values_degC),
             records=records,
@@ -269,6 +319,7 @@ class Session:
             bus_load=bus_load,
             load_row=self._kind.load_row(bus_load),
             lost_records=loop.lost_records,
-            log_path=self.plan.log_path,
+            log_path=watch.joint.log_path,
             report=report,
+            name=watch.joint.name,
         )

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from jointctl.drivers.drive import Drive
+from jointctl.drivers.drive import Drive, DriveGroup
+from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import DriveState, Fault, in_words
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
@@ -50,6 +51,13 @@ class SessionDrive(ABC):
         `gate` is called before each step until the loop runs, and raises where none may follow.  The caller holds the
         lock.
         """
+
+    def open_all(self, configs: Sequence[Config], gate: Callable[[], None] = lambda: None) -> DriveGroup:
+        """`open` for the joints of an arm, in their order; `ConfigurationError` where they cannot share a loop."""
+        if len(configs) > 1:
+            kind = configs[1].drive.kind
+            raise ConfigurationError(f"{configs[1].path}: drive.kind (={kind}) must be canopen in an arm")
+        return DriveGroup([self.open(configs[0], gate)])
 
     @abstractmethod
     def port_record(self) -> type:

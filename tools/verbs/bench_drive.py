@@ -12,7 +12,7 @@ import os
 import re
 import tomllib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -90,6 +90,10 @@ class BenchDrive(ABC):
     @abstractmethod
     def serve(self, config: Config, output: Output, options: ServeOptions) -> int:
         """`jointctl hil`: keep the virtual joint up until a stop signal."""
+
+    def serve_all(self, joints: Sequence[Config], output: Output, options: ServeOptions) -> int:
+        """`serve` for the joints of an arm, all on the bus of the first one."""
+        raise ConfigurationError(f"{joints[0].path}: drive.kind (={joints[0].drive.kind}) must be canopen in an arm")
 
     def require_rate(self, config: Config) -> None:  # noqa: B027  (most buses need nothing)
         """`ConfigurationError` with advice where bus or line cannot carry the rate that `check` is to judge."""
@@ -187,6 +191,26 @@ def readable_keys(
             with contextlib.suppress(tomllib.TOMLDecodeError):
                 section.update(parse_toml(line))
     return ReadableKeys(path, {name: found for name, found in data.items() if isinstance(found, dict)}, given, environ)
+
+
+def stop_targets(path: Path, given: GivenPlace | None = None) -> tuple[list[StopTarget], list[ConfigurationError]]:
+    """`stop_target` of a joint's file, or of each joint that an arm's file names; beside them what cannot be read.
+
+    A joint of an arm that cannot be read must not cost the stop of the others.
+    """
+    joints = readable_keys(path).section("arm").get("joints")
+    if not isinstance(joints, list) or not joints:
+        return [stop_target(path, given)], []
+    targets: list[StopTarget] = []
+    problems: list[ConfigurationError] = []
+    for name in joints:
+        try:
+            targets.append(stop_target(path.parent / str(name), given))
+        except ConfigurationError as error:
+            problems.append(error)
+    if not targets:
+        raise problems[0]
+    return targets, problems
 
 
 def stop_target(path: Path, given: GivenPlace | None = None, environ: Mapping[str, str] | None = None) -> StopTarget:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import VerbOutput, config_path, configurations
 
 if TYPE_CHECKING:
@@ -23,10 +25,13 @@ def demo(
         Path, typer.Option("--config", help="configuration with a virtual joint", autocompletion=configurations)
     ] = Path("virtual"),
     *,
+    arm: Annotated[bool, typer.Option("--arm", help="the shipped arm of three joints instead of one joint")] = False,
     duration_s: Annotated[float | None, typer.Option("--duration", help="seconds of the trajectory", min=0.1)] = None,
     output: VerbOutput,
 ) -> int:
-    """Track a trajectory on the virtual joint: no hardware, no set-up."""
+    """Track a trajectory on the virtual joint, or with a virtual arm: no hardware, no set-up."""
+    if arm:
+        return _demo_of_arm(duration_s, output)
     from jointctl.tools.configuration.drive_section import GivenPlace, require_simulated
     from jointctl.tools.configuration.load import load_config, moved
     from jointctl.tools.verbs.run import run
@@ -45,6 +50,22 @@ def demo(
     output.note("starting the virtual joint")
     with own_virtual_joint(path, channel, output.note):
         return run(joint, output, assume_yes=True)
+
+
+def _demo_of_arm(duration_s: float | None, output: Output) -> int:
+    from jointctl.tools.configuration.arm import SHIPPED_ARM, load_arm
+    from jointctl.tools.configuration.drive_section import GivenPlace
+    from jointctl.tools.verbs.run import run
+    from jointctl.tools.verbs.verb_options import arm_on_bus
+    from jointctl.tools.virtual_joint import own_virtual_joint
+
+    channel = f"demo-{os.getpid()}"
+    arm = arm_on_bus(load_arm(SHIPPED_ARM), GivenPlace("jointctl", channel))
+    joints = arm.joints if duration_s is None else tuple(_with_duration(joint, duration_s) for joint in arm.joints)
+    arm = replace(arm, joints=tuple(with_patience(joint) for joint in joints))
+    output.note("starting the virtual arm")
+    with own_virtual_joint(SHIPPED_ARM, channel, output.note):
+        return run(arm, output, assume_yes=True)
 
 
 def with_patience(config: Config) -> Config:

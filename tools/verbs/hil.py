@@ -7,17 +7,17 @@ import os
 import select
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from jointctl.drivers.errors import ConfigurationError
+from jointctl.drivers.errors import ConfigurationError, UsageError
 from jointctl.tools.output import Output
 from jointctl.tools.scoping.remote_options import NOBODY, ObserveOptions
-from jointctl.tools.verbs.verb_options import BusOptions, ConfigPath, ProgressOutput, loaded
+from jointctl.tools.verbs.verb_options import BusOptions, ConfigPath, ProgressOutput, loaded_joint_or_arm
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.config import Config
@@ -51,13 +51,19 @@ def hil(
     live: ObserveOptions = NOBODY,
     output: ProgressOutput,
 ) -> int:
-    """Keep the virtual joint up, on a virtual bus or a pseudo-terminal, for other programs to attach to."""
+    """Keep a virtual joint or arm up, on a virtual bus or a pseudo-terminal, for other programs to attach to."""
+    from jointctl.tools.configuration.config import Config
     from jointctl.tools.verbs.bench_drive import ServeOptions, bench_of
 
-    joint = loaded(Path("elmo_serial") if serial and config == Path("virtual") else config, bus)
+    joint = loaded_joint_or_arm(Path("elmo_serial") if serial and config == Path("virtual") else config, bus)
+    options = ServeOptions(model.timing, serial, bus.port, link, ready_fd, live)
+    if not isinstance(joint, Config):
+        if model.eds is not None or live != NOBODY:
+            raise UsageError(f"--eds, --foxglove and --ros2 are for a single joint, and {joint.path} is an arm")
+        return bench_of(joint.joints[0]).serve_all(joint.joints, output, options)
     if model.eds is not None:
         joint = with_eds(joint, model.eds)
-    return bench_of(joint).serve(joint, output, ServeOptions(model.timing, serial, bus.port, link, ready_fd, live))
+    return bench_of(joint).serve(joint, output, options)
 
 
 def with_eds(config: Config, eds: Path) -> Config:
@@ -71,7 +77,7 @@ def with_eds(config: Config, eds: Path) -> Config:
 
 
 def serve_can(
-    config: Config,
+    joints: Sequence[Config],
     output: Output,
     *,
     timing: bool = False,
@@ -86,10 +92,11 @@ def serve_can(
     from jointctl.tools.session.loop_process import slow_start
     from jointctl.tools.virtual_joint import serve_virtual_joint
 
+    config = joints[0]
     with (
         slow_start(output.note, "virtual joint") as started,
         stop_signals() as signals,
-        serve_virtual_joint(config, timing) as joint,
+        serve_virtual_joint(joints, timing) as joint,
     ):
         started()
         make_realtime(config, output)
@@ -97,7 +104,9 @@ def serve_can(
         place = f"{bus.interface}:{bus.channel}"
         if bus.interface == "jointctl":
             place += f" ({default_socket_path(bus.channel)})"
-        output.note(f"virtual joint: node {canopen_section(config).node} on {place}; Ctrl-C ends it")
+        nodes = [str(canopen_section(each).node) for each in joints]
+        which = f"virtual joint: node {nodes[0]}" if len(nodes) == 1 else f"virtual arm: nodes {', '.join(nodes)}"
+        output.note(f"{which} on {place}; Ctrl-C ends it")
         if bus.interface == "jointctl":
             output.note(f'attach with python-can: can.Bus(interface="jointctl", channel="{bus.channel}")')
         with watched(config, live, output, joint.plant_states):

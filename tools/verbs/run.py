@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from jointctl.drivers.errors import UsageError
 from jointctl.tools.output import Output
 from jointctl.tools.scoping.remote_options import NOBODY_REMOTE, RemoteOptions
-from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOnBus, VerbOutput, Yes
+from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOrArmOnBus, VerbOutput, Yes
 
 if TYPE_CHECKING:
     from jointctl.drivers.drive import CommissioningReport
@@ -27,7 +28,7 @@ def _page(
 
 
 def run(
-    config: JointOnBus,
+    config: JointOrArmOnBus,
     output: VerbOutput,
     *,
     assume_yes: Yes = False,
@@ -36,22 +37,25 @@ def run(
     scope: Annotated[tuple[str, int] | None, _page] = None,
     live: RemoteOptions = NOBODY_REMOTE,
 ) -> int:
-    """Track the configured trajectory on a real or virtual joint."""
+    """Track the configured trajectory on a real or virtual joint, or with all joints of an arm."""
     from jointctl.tools.scoping.remote import remote
     from jointctl.tools.session.consent import TerminalConsent, require_terminal
     from jointctl.tools.session.control import in_control
-    from jointctl.tools.session.plan import resolve
+    from jointctl.tools.session.plan import resolve_any
     from jointctl.tools.session.result import broken_off, never_begun, report_run, run_title
     from jointctl.tools.session.session import Session
 
     if not (assume_yes or dry_run):
         require_terminal()
-    plan = resolve(config, allow_low_margin=allow_low_margin, hold=live.hold)
+    plan = resolve_any(config, allow_low_margin=allow_low_margin, hold=live.hold)
+    if plan.arm is not None and (scope is not None or live != NOBODY_REMOTE):
+        raise UsageError("--scope, --foxglove, --ros2 and --hold are for a single joint, not for an arm")
+    first = plan.config
     consent = TerminalConsent(output, assume_yes=assume_yes, dry_run=dry_run)
     with (
-        _displays(config, output, run_title(config), scope) as display,
-        remote(live, config, output) as others,
-        in_control(config, output) as control,
+        _displays(first, output, run_title(config), scope) as display,
+        remote(live, first, output) as others,
+        in_control(first, output) as control,
     ):
         session = Session(
             plan, others.consent(consent, output), output, control, others.beside(display), others.set_points

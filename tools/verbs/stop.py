@@ -2,46 +2,73 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jointctl.drivers.errors import ConfigurationError, JointctlError
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import AS_CONFIGURED, BusOptions, ConfigPath, ResultOutput, config_path, place
 
+if TYPE_CHECKING:
+    from jointctl.tools.verbs.bench_drive import StopTarget
+
 
 def stop(config: ConfigPath, output: ResultOutput, bus: BusOptions = AS_CONFIGURED) -> int:
-    """Stop and disable the drive now, also while another program controls it."""
+    """Stop and disable the drive now, or all those of an arm, also while another program controls them."""
     # Nothing but the address is taken from the configuration, which need not hold; what is wrong with it comes after.
     # The drive is stopped at once, and once more when that program has ended: it cannot enable it any more then.
+    from jointctl.drivers.drive import common_state
     from jointctl.tools.session.result import require_off
     from jointctl.tools.session.stop_call import StopCall
-    from jointctl.tools.verbs.bench_drive import stop_target
+    from jointctl.tools.verbs.bench_drive import stop_targets
 
     path = config_path(config)
-    target = stop_target(path, place(bus))
-    with StopCall(*target.place) as call:
+    targets, unread = stop_targets(path, place(bus))
+    with ExitStack() as stack:
+        calls = [stack.enter_context(StopCall(*on)) for on in dict.fromkeys(target.place for target in targets)]
         failure: JointctlError | None = None
         try:
-            state = target.switch_off(output)
+            states = _switch_off(targets, output)
         except JointctlError as error:
             failure = error
-        if call.end(output.note):
-            state = target.switch_off(output)
+        if any([call.end(output.note) for call in calls]):
+            states = _switch_off(targets, output)
         elif failure is not None:
             raise failure
+    state = common_state([f"drive {number}" for number in range(1, len(states) + 1)], states)
+    which = "the drive is" if len(states) == 1 else f"all {len(states)} drives:"
     try:
-        output.result(f"the drive is {state}", {"drive_state": state}, state)
+        output.result(f"{which} {state}", {"drive_state": state}, state)
     finally:  # a result that cannot be written must not hide that the drive is not off
-        _warn_of(path, output)
+        if not unread:
+            _warn_of(path, output)
         require_off(state)
+    if unread:
+        raise unread[0]
     return 0
 
 
+def _switch_off(targets: Sequence[StopTarget], output: Output) -> list[str]:
+    """Of all drives at once: none waits for another one that does not answer.  An error when all have been tried."""
+    if len(targets) == 1:
+        return [targets[0].switch_off(output)]
+    with ThreadPoolExecutor(len(targets)) as pool:
+        tries = [pool.submit(target.switch_off, output) for target in targets]
+    return [each.result() for each in tries]
+
+
 def _warn_of(path: Path, output: Output) -> None:
-    from jointctl.tools.configuration.load import load_config  # the stop itself does not wait for its modules
+    from jointctl.tools.configuration.arm import is_arm, load_arm  # the stop itself does not wait for its modules
+    from jointctl.tools.configuration.load import load_config
 
     try:
-        load_config(path)
+        if is_arm(path):
+            load_arm(path)
+        else:
+            load_config(path)
     except ConfigurationError as error:
         for line in error.message.splitlines():
             output.warning(f"the stop was sent, but the configuration does not hold: {line}")

@@ -28,6 +28,7 @@ from jointctl.drivers.errors import UsageError
 from jointctl.tools.output import Output
 
 if TYPE_CHECKING:
+    from jointctl.tools.configuration.arm import ArmConfig
     from jointctl.tools.configuration.config import Config
     from jointctl.tools.configuration.drive_section import GivenPlace
     from jointctl.tools.experiments.many_runs import Workers
@@ -138,6 +139,28 @@ def loaded(config: Path, bus: CanOptions = AS_CONFIGURED) -> Config:
     return moved(found, place(bus))
 
 
+def loaded_joint_or_arm(config: Path, bus: CanOptions = AS_CONFIGURED) -> Config | ArmConfig:
+    """As `loaded`; of an arm's file the arm, all joints on the bus that is named."""
+    from jointctl.tools.configuration.arm import is_arm, load_arm
+
+    path = config_path(config)
+    if not is_arm(path):
+        return loaded(config, bus)
+    found = load_arm(path)
+    for remark in found.remarks:
+        Output().warning(f"{found.path}: {remark}")
+    return arm_on_bus(found, place(bus))
+
+
+def arm_on_bus(arm: ArmConfig, given: GivenPlace) -> ArmConfig:
+    """The arm with all its joints where the command line says; `UsageError` for what is one joint's alone."""
+    from jointctl.tools.configuration.load import moved
+
+    if given.node is not None:
+        raise UsageError(f"--target (={given.node}) is one joint's, and {arm.path} is an arm", "give the joint's file")
+    return replace(arm, joints=tuple(moved(joint, given) for joint in arm.joints))
+
+
 # --- What the command line makes of an option besides ---
 
 _WITH_UNIT = re.compile(r"\s*[-+]?[\d.].*[^\W\d_].*|\s*[-+]?[\d.].*[%‰°]\s*")
@@ -194,6 +217,10 @@ def _loaded(*, config: ConfigPath, bus: BusOptions) -> Config:
     return loaded(config, bus)
 
 
+def _loaded_joint_or_arm(*, config: ConfigPath, bus: BusOptions) -> Config | ArmConfig:
+    return loaded_joint_or_arm(config, bus)
+
+
 def _loaded_file(config: ConfigPath) -> Config:
     return loaded(config)
 
@@ -233,6 +260,7 @@ def _workers(
 
 ManyRuns = Annotated["Workers | None", _workers]  # where many runs are carried out
 JointOnBus = Annotated["Config", _loaded]
+JointOrArmOnBus = Annotated["Config | ArmConfig", _loaded_joint_or_arm]
 JointOfFile = Annotated["Config", _loaded_file]
 JointOrVirtual = Annotated["Config", _loaded_or_virtual]
 ResultOutput = Annotated[Output, _json_output]  # of a verb that is done at once
