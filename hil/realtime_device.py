@@ -94,19 +94,19 @@ def _flush(fd: int, queue: FrameQueue, words: np.ndarray) -> None:
 
 
 @kernel
-def _flush_all(fd: int, now_ns: int, of: DeviceMemory) -> None:
+def _flush_all(fd: int, faults: Any, now_ns: int, of: DeviceMemory) -> None:
     """As `_flush` for every drive, through the faults of its wire; late frames go out when they are due."""
     for index in range(len(of.devices)):
         queue = of.queues[index]
-        if of.faults is None:
+        if faults is None:
             _flush(fd, queue, of.words)
-            continue
-        memory, node_id = of.fault_memories[index], int64(of.devices[index].node_id)
-        take_due(memory, False, now_ns, False, memory.to_controller)
-        for i in range(queue.count):
-            pass_frame(of.faults[index], memory, queue.frames[i], False, node_id, now_ns, memory.to_controller)
-        queue.count = 0
-        _flush(fd, memory.to_controller, of.words)
+        else:
+            memory, node_id = of.fault_memories[index], int64(of.devices[index].node_id)
+            take_due(memory, False, now_ns, False, memory.to_controller)
+            for i in range(queue.count):
+                pass_frame(faults[index], memory, queue.frames[i], False, node_id, now_ns, memory.to_controller)
+            queue.count = 0
+            _flush(fd, memory.to_controller, of.words)
 
 
 @kernel
@@ -163,35 +163,35 @@ def _wait_for_frames(fd: int, service_fd: int, wait_ns: int, polls: np.ndarray, 
 
 
 @kernel
-def _let_faults_act(of: DeviceMemory, service_fd: int, now_ns: int) -> None:
+def _let_faults_act(of: DeviceMemory, faults: Any, service_fd: int, now_ns: int) -> None:
     """Those of drive and plant begin and end; frames that the wire has kept come out of it."""
-    if of.faults is None:
+    if faults is None:
         return
     for index in range(len(of.devices)):
         joint, memory = _joint_of(of, index, service_fd), of.fault_memories[index]
-        step_faults(of.faults[index], memory, joint.device, joint.plant_c, joint.plant_s, now_ns)
+        step_faults(faults[index], memory, joint.device, joint.plant_c, joint.plant_s, now_ns)
         take_due(memory, True, now_ns, False, memory.ready)
         _take_frames(joint, memory.ready, now_ns)
 
 
 @kernel
-def _take_from_bus(of: DeviceMemory, service_fd: int, now_ns: int) -> bool:
+def _take_from_bus(of: DeviceMemory, faults: Any, service_fd: int, now_ns: int) -> bool:
     """One frame of the controller, through the wire's faults, as of the time it was sent; whether it carried one."""
     frame = of.frame
     sent_ns = sent_ns_of(frame, now_ns)
-    if of.faults is not None:
+    if faults is not None:
         for index in range(len(of.devices)):
             joint, memory = _joint_of(of, index, service_fd), of.fault_memories[index]
-            step_faults(of.faults[index], memory, joint.device, joint.plant_c, joint.plant_s, sent_ns)
+            step_faults(faults[index], memory, joint.device, joint.plant_c, joint.plant_s, sent_ns)
     if len(of.devices) > 1:  # a single joint moves on when it takes the frame
         advance_together(of.devices, of.plant_constants, of.plant_states, sent_ns, of.queues)
     for index in range(len(of.devices)):
         joint = _joint_of(of, index, service_fd)
-        if of.faults is None:
+        if faults is None:
             _take_frame(joint, frame, sent_ns)
         else:
             memory = of.fault_memories[index]
-            pass_frame(of.faults[index], memory, frame, True, int64(joint.device.node_id), sent_ns, memory.ready)
+            pass_frame(faults[index], memory, frame, True, int64(joint.device.node_id), sent_ns, memory.ready)
             _take_frames(joint, memory.ready, sent_ns)
         if sent_ns != now_ns and _is_sync(joint.device, frame):
             stamp_answers(joint.queue, frame)
@@ -222,13 +222,13 @@ def _next_due_ns(devices: np.ndarray) -> int:
 @kernel
 def run_device(fd: int, service_fd: int, of: DeviceMemory) -> int:
     """Serve the bus until the stop word; returns the value of ENDED_WORD."""
-    words, frame, timespec = of.words, of.frame, of.timespec
+    faults, words, frame, timespec = of.faults, of.words, of.frame, of.timespec
     stamped_ns = int64(-OLDEST_STAMP_NS)  # when the last frame with a time came
     ended = 1
     while load_acquire(words, STOP_WORD) == 0 and ended == 1:
         now_ns = monotonic_ns(timespec)
         lag_ns = STAMPED_LAG_NS if now_ns - stamped_ns < OLDEST_STAMP_NS else 0
-        _let_faults_act(of, service_fd, now_ns - lag_ns)
+        _let_faults_act(of, faults, service_fd, now_ns - lag_ns)
         wait_ns = max(0, min(_next_due_ns(of.devices) + lag_ns - now_ns, _LONGEST_WAIT_NS))
         _wait_for_frames(fd, service_fd, wait_ns, of.polls, timespec)
         woken_ns = monotonic_ns(timespec)
@@ -243,16 +243,16 @@ def run_device(fd: int, service_fd: int, of: DeviceMemory) -> int:
             if got != FRAME_SIZE:
                 continue
             now_ns = monotonic_ns(timespec)
-            if _take_from_bus(of, service_fd, now_ns):
+            if _take_from_bus(of, faults, service_fd, now_ns):
                 stamped_ns = now_ns
-            _flush_all(fd, now_ns, of)
+            _flush_all(fd, faults, now_ns, of)
         while _receive(service_fd, frame) == FRAME_SIZE:
             _take_sdo_answer(of, monotonic_ns(timespec))
-            _flush_all(fd, monotonic_ns(timespec), of)
+            _flush_all(fd, faults, monotonic_ns(timespec), of)
         # after the frames, which may be older: the plant does not go back
         if drained or lag_ns == 0:
             advance_together(of.devices, of.plant_constants, of.plant_states, woken_ns - lag_ns, of.queues)
-            _flush_all(fd, woken_ns, of)
+            _flush_all(fd, faults, woken_ns, of)
     store_release(words, ENDED_WORD, ended)
     return ended
 

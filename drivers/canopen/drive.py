@@ -85,16 +85,18 @@ class CanopenDrive:
         encoder = settings.joint_encoder.node if settings.joint_encoder is not None else None
         nodes = [settings.node] if encoder is None else [settings.node, encoder]
         self._remarks: list[str] | None = None  # of `take_over`
+        self._arm: list[CanopenDrive] = [self]  # all drives of this end of the bus, one list
+        self._others: OtherControllers
+        self._network: canopen.Network
         if isinstance(bus, CanopenDrive):
             self._others, self._network, self._arm = bus._others, bus._network, bus._arm
             self._others.add_nodes(nodes)
+            self._arm.append(self)
         else:
             self._others = OtherControllers(nodes, settings.master_node, clock)
             self._network = new_network(bus, sleep, self._others)
             report_own_frames(self._network, self._others)
             self._network.connect()
-            self._arm: list[CanopenDrive] = []
-        self._arm.append(self)
         sdo_timeout_s = settings.sdo_timeout_s or SDO_TIMEOUT_S
         try:
             self._eds = read_eds(settings.eds_path, settings.node)

@@ -331,7 +331,7 @@ def _begin_advance(device: Device, until_ns: int, queue: FrameQueue) -> None:
 
 @inlined
 def _end_substep(device: Device, plant_c: PlantConstants, plant_s: PlantState, step_ns: int, queue: FrameQueue) -> bool:
-    """The drive's part of a substep whose plant has moved; whether timers were looked at, which may change the torque."""
+    """The drive's part of a substep whose plant has moved; whether its timers ran, which may change the torque."""
     device.time_ns += step_ns
     before = int64(device.event_status) >> 16
     if int64(device.state) != before & 0xFF or device.time_ns >= device.next_due_ns:

@@ -34,7 +34,8 @@ def stop(config: ConfigPath, output: ResultOutput, bus: BusOptions = AS_CONFIGUR
             states = _switch_off(targets, output)
         except JointctlError as error:
             failure = error
-        if any([call.end(output.note) for call in calls]):
+        ended = [call.end(output.note) for call in calls]  # each of them, whatever the others say
+        if any(ended):
             states = _switch_off(targets, output)
         elif failure is not None:
             raise failure
