@@ -43,9 +43,10 @@ from jointctl.hil.canopen.device_errors import (
     send_waiting_emergencies,
 )
 from jointctl.hil.canopen.encoder_node import accept_encoder_frame, step_encoder
-from jointctl.hil.canopen.motion import demand_is_held, demand_torque_Nm, following_error_tripped, follows_velocity
+from jointctl.hil.canopen.motion import demand_is_held, demand_torque_Nm, following_error_tripped, follows_velocity, is_powered
 from jointctl.hil.canopen.pdo import mark_events, receive_rpdo, receive_sync, send_due_tpdos, start_pdos
 from jointctl.hil.canopen.records import CONSUMERS, PDOS, Device, HomingState, Mode, NmtState, PowerState, int64
+from jointctl.hil.arm_plant import ArmPlant, step_arm
 from jointctl.hil.plant import encoder_counts, link_reading_rad, shaft_velocity_radps, step_plant
 from jointctl.hil.plant_records import PlantConstants, PlantState
 from jointctl.hil.virtual_bus import FrameQueue
@@ -321,31 +322,82 @@ def _notice_status(device: Device) -> None:
         device.next_due_ns = 0
 
 
-@kernel
-def advance(device: Device, plant_c: PlantConstants, plant_s: PlantState, until_ns: int, queue: FrameQueue) -> None:
-    """Integrate drive and plant up to `until_ns` and append the frames that became due in the meantime to `queue`."""
-    step_ns = int64(np.rint(plant_c.step_s * 1e9))
+@inlined
+def _begin_advance(device: Device, until_ns: int, queue: FrameQueue) -> None:
     if not device.primed:
         device.primed = 1
         device.time_ns = until_ns
     apply_controlword(device, queue)  # SDO may have written 6040 or 6060
-    torque_Nm, held = 0.0, False
-    while device.time_ns + step_ns <= until_ns:
-        if not held:
-            torque_Nm, held = _torque_Nm(device, plant_c, plant_s, plant_c.step_s, queue)
-        step_plant(plant_c, plant_s, torque_Nm)
-        device.time_ns += step_ns
-        before = int64(device.event_status) >> 16
-        if int64(device.state) != before & 0xFF or device.time_ns >= device.next_due_ns:
-            sample_objects(device, plant_c, plant_s)
-            _notice_status(device)
-            run_timers(device, device.time_ns, queue)
-            held = False
+
+
+@inlined
+def _after_substep(
+    device: Device, plant_c: PlantConstants, plant_s: PlantState, step_ns: int, queue: FrameQueue
+) -> bool:
+    """Events and timers; True if something happened that may change the torque."""
+    device.time_ns += step_ns
+    before = int64(device.event_status) >> 16
+    if int64(device.state) != before & 0xFF or device.time_ns >= device.next_due_ns:
+        sample_objects(device, plant_c, plant_s)
+        _notice_status(device)
+        run_timers(device, device.time_ns, queue)
+        return True
+    return False
+
+
+@inlined
+def _end_advance(
+    device: Device, plant_c: PlantConstants, plant_s: PlantState, until_ns: int, queue: FrameQueue
+) -> None:
     sample_objects(device, plant_c, plant_s)
     _notice_status(device)
     if until_ns >= device.next_due_ns:
         run_timers(device, until_ns, queue)
     step_encoder(device.encoder, link_reading_rad(plant_c, plant_s), until_ns, queue)
+
+
+@kernel
+def advance(device: Device, plant_c: PlantConstants, plant_s: PlantState, until_ns: int, queue: FrameQueue) -> None:
+    """Integrate drive and plant up to `until_ns` and append the frames that became due in the meantime to `queue`."""
+    step_ns = int64(np.rint(plant_c.step_s * 1e9))
+    _begin_advance(device, until_ns, queue)
+    torque_Nm, held = 0.0, False
+    while device.time_ns + step_ns <= until_ns:
+        if not held:
+            torque_Nm, held = _torque_Nm(device, plant_c, plant_s, plant_c.step_s, queue)
+        step_plant(plant_c, plant_s, torque_Nm)
+        if _after_substep(device, plant_c, plant_s, step_ns, queue):
+            held = False
+    _end_advance(device, plant_c, plant_s, until_ns, queue)
+
+
+@kernel
+def advance_arm(
+    devices: np.ndarray, constants: np.ndarray, states: np.ndarray, arm: ArmPlant, until_ns: int, queues: np.ndarray
+) -> None:
+    """The same for the drives of an arm, whose joints move one another: arrays of one record a joint, equal steps.
+
+    A drive without power holds its joint with its brake.
+    """
+    count = len(devices)
+    step_ns = int64(np.rint(constants[0].step_s * 1e9))
+    for i in range(count):
+        _begin_advance(devices[i], until_ns, queues[i])
+        arm.joints[i].held = 0
+    while devices[0].time_ns + step_ns <= until_ns:
+        for i in range(count):
+            joint = arm.joints[i]
+            if joint.held == 0:
+                torque_Nm, held = _torque_Nm(devices[i], constants[i], states[i], constants[i].step_s, queues[i])
+                joint.target_Nm = torque_Nm
+                joint.held = 1 if held else 0
+                joint.braked = 0 if is_powered(devices[i]) else 1
+        step_arm(constants, states, arm)
+        for i in range(count):
+            if _after_substep(devices[i], constants[i], states[i], step_ns, queues[i]):
+                arm.joints[i].held = 0
+    for i in range(count):
+        _end_advance(devices[i], constants[i], states[i], until_ns, queues[i])
 
 
 @kernel
