@@ -302,8 +302,8 @@ def run_lockstep(
 
     `memory` is at power off; its ring holds as many records as it has room for, the newest ones, one an axis and cycle.
     `truth` float64[N, TRUTHS * axes], or None, takes what the joints truly did in the same periods (columns TRUE_* of
-    each), and in those in which the controller was held up or silent, while there is room.  Returns the numbers of log records and of
-    rows of `truth` written.
+    each), and in those in which the controller was held up or silent, while there is room.  Returns the numbers of log
+    records and of rows of `truth` written.
     """
     truth = np.zeros((0, TRUTHS)) if truth is None else truth
     written, rows = _run(memory, codec, world, scenario, truth)

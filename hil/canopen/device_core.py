@@ -13,6 +13,7 @@ import math
 import numpy as np
 
 from jointctl.firmware_py.kernel import inlined, kernel
+from jointctl.hil.arm_plant import ArmPlant, step_arm
 from jointctl.hil.canopen.cia402_core import (
     abort_connection,
     apply_controlword,
@@ -43,10 +44,15 @@ from jointctl.hil.canopen.device_errors import (
     send_waiting_emergencies,
 )
 from jointctl.hil.canopen.encoder_node import accept_encoder_frame, step_encoder
-from jointctl.hil.canopen.motion import demand_is_held, demand_torque_Nm, following_error_tripped, follows_velocity, is_powered
+from jointctl.hil.canopen.motion import (
+    demand_is_held,
+    demand_torque_Nm,
+    following_error_tripped,
+    follows_velocity,
+    is_powered,
+)
 from jointctl.hil.canopen.pdo import mark_events, receive_rpdo, receive_sync, send_due_tpdos, start_pdos
 from jointctl.hil.canopen.records import CONSUMERS, PDOS, Device, HomingState, Mode, NmtState, PowerState, int64
-from jointctl.hil.arm_plant import ArmPlant, step_arm
 from jointctl.hil.plant import encoder_counts, link_reading_rad, shaft_velocity_radps, step_plant
 from jointctl.hil.plant_records import PlantConstants, PlantState
 from jointctl.hil.virtual_bus import FrameQueue

@@ -28,6 +28,7 @@ from jointctl.drivers.errors import UsageError
 from jointctl.tools.output import Output
 
 if TYPE_CHECKING:
+    from jointctl.tools.configuration.arm import ArmConfig
     from jointctl.tools.configuration.config import Config
     from jointctl.tools.configuration.drive_section import GivenPlace
     from jointctl.tools.experiments.many_runs import Workers
@@ -198,6 +199,18 @@ def _loaded_file(config: ConfigPath) -> Config:
     return loaded(config)
 
 
+def _loaded_file_or_arm(config: ConfigPath) -> Config | ArmConfig:
+    from jointctl.tools.configuration.arm import is_arm, load_arm
+
+    path = config_path(config)
+    if not is_arm(path):
+        return loaded(config)
+    found = load_arm(path)
+    for remark in found.remarks:
+        Output().warning(f"{found.path}: {remark}")
+    return found
+
+
 def _loaded_or_virtual(*, config: ConfigPath = Path("virtual"), bus: BusOptions) -> Config:
     return loaded(config, bus)
 
@@ -234,6 +247,7 @@ def _workers(
 ManyRuns = Annotated["Workers | None", _workers]  # where many runs are carried out
 JointOnBus = Annotated["Config", _loaded]
 JointOfFile = Annotated["Config", _loaded_file]
+JointOrArm = Annotated["Config | ArmConfig", _loaded_file_or_arm]
 JointOrVirtual = Annotated["Config", _loaded_or_virtual]
 ResultOutput = Annotated[Output, _json_output]  # of a verb that is done at once
 ProgressOutput = Annotated[Output, _quiet_output]  # of a verb without a result

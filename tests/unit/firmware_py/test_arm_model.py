@@ -62,7 +62,9 @@ def test_a_law_gets_what_is_beyond_its_own_inertia() -> None:
 
 def test_gravity_alone_is_of_the_desired_pose() -> None:
     model, found, q, _, _ = fed(ArmFeedForward.GRAVITY, AxisPhase.TRACKING)
-    np.testing.assert_allclose(found, pin.computeGeneralizedGravity(model, model.createData(), at(model, q)), rtol=1e-12)
+    np.testing.assert_allclose(
+        found, pin.computeGeneralizedGravity(model, model.createData(), at(model, q)), rtol=1e-12
+    )
 
 
 def test_without_a_reference_a_joint_rests_where_it_was_measured() -> None:
