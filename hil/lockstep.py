@@ -23,7 +23,8 @@ from jointctl.firmware_py.kernel import inlined, kernel
 from jointctl.firmware_py.libc import load_acquire, store_release
 from jointctl.firmware_py.records import SET_POINTS, AxisState, Sample, StreamConstants
 from jointctl.firmware_py.states import StopRequest
-from jointctl.hil.canopen.device_core import accept_frame, advance
+from jointctl.hil.arm_plant import ArmPlant, no_arm_plant
+from jointctl.hil.canopen.device_core import accept_frame, advance, advance_arm
 from jointctl.hil.canopen.records import Device
 from jointctl.hil.fault_kinds import FaultKind, is_active, kind_active
 from jointctl.hil.faults import clock_step_cycles, collect, hand_over, step_faults, take_due, to_drive
@@ -51,14 +52,17 @@ class Codec(NamedTuple):
     """The driver's codec as C functions, and its memory; `frame_bytes` uint8[slots, 16] is that of its frames."""
 
     begin: Callable[[Any], int]  # (link) -> how many frames to send
-    accept: Callable[[Any, int, np.ndarray, int], bool]  # (link, slot, samples, now_ns)
-    end: Callable[[Any, np.ndarray, np.ndarray], None]  # (link, samples, commands)
+    accept: Callable[[Any, int, int, np.ndarray, int], bool]  # (link, axis, slot, samples, now_ns)
+    end: Callable[[Any, int, np.ndarray, np.ndarray], None]  # (link, axis, samples, commands)
     link: Any
     frame_bytes: np.ndarray
 
 
 class World(NamedTuple):
-    """The virtual drive, operational, with its joint and the wire to it; arrays of one record."""
+    """The virtual drives, operational, with their joints and the wires to them; arrays of one record an axis.
+
+    Faults are those of the first axis.
+    """
 
     device: np.ndarray
     plant_constants: np.ndarray
@@ -66,6 +70,7 @@ class World(NamedTuple):
     queue: np.ndarray  # FrameQueue
     faults: np.ndarray  # FaultConstants[N]
     fault_memory: np.ndarray
+    arm: ArmPlant = no_arm_plant()  # through which the joints move one another
 
 
 class Scenario(NamedTuple):
@@ -120,12 +125,14 @@ def _perfect_measurement(state: AxisState, sample: Sample, plant: PlantState, pe
 
 
 @inlined
-def _to_drive(link: _Link, slot: int, sample: Sample) -> None:
+def _to_drive(link: _Link, axis: int, slot: int, sample: Sample) -> None:
     """One frame of the controller; its answers are in the queue of the drive, with faults in that of the wire."""
     world, now_ns = link.world, link.memory.timespec[_NOW_NS]
-    device, joint_c, joint, outgoing = world.device[0], world.plant_constants[0], world.plant[0], world.queue[0]
+    device, joint_c, joint, outgoing = (
+        world.device[axis], world.plant_constants[axis], world.plant[axis], world.queue[axis]
+    )  # fmt: skip
     frame = link.codec.frame_bytes[slot]
-    if len(world.faults) > 0:
+    if len(world.faults) > 0 and axis == 0:
         to_drive(world.faults, world.fault_memory[0], frame, device, joint_c, joint, outgoing, now_ns)
         sample.bus_errors = sample.bus_errors + 1 if link.memory.timespec[_OFF_BUS] != 0 else 0
     elif not link.scenario.lost_to_drive:
@@ -133,39 +140,42 @@ def _to_drive(link: _Link, slot: int, sample: Sample) -> None:
 
 
 @inlined
-def _empty_mailbox(mailbox: FrameQueue, codec: Codec, samples: np.ndarray, now_ns: int) -> None:
+def _empty_mailbox(mailbox: FrameQueue, codec: Codec, axis: int, samples: np.ndarray, now_ns: int) -> None:
     """Everything that has arrived goes to the driver's codec."""
     received = int(RECEIVED_SLOT)
     for index in range(mailbox.count):
         for byte in range(FRAME_SIZE):
             codec.frame_bytes[RECEIVED_SLOT, byte] = mailbox.frames[index, byte]
-        codec.accept(codec.link, received, samples, now_ns)
+        codec.accept(codec.link, axis, received, samples, now_ns)
     mailbox.count = 0
 
 
 @inlined
 def _receive(link: _Link, samples: np.ndarray, now_ns: int, until_ns: int) -> int:
-    """SYNC to the drive, its answer into the sample; nothing is waited for."""
+    """SYNC to the drives, their answers into the samples; nothing is waited for."""
     world, codec = link.world, link.codec
-    for slot in range(codec.begin(codec.link)):
-        _to_drive(link, slot, samples[0])
-    if link.scenario.lost_from_drive:
-        world.queue[0].count = 0
-    if len(world.faults) > 0:
-        _empty_mailbox(world.fault_memory[0].to_controller, codec, samples, now_ns + _ANSWER_NS)
-    else:
-        _empty_mailbox(world.queue[0], codec, samples, now_ns + _ANSWER_NS)
-    state, axis = link.memory.state[0], link.memory.constants[0]
-    if link.scenario.ideal_velocity and state.velocity.primed != 0:
-        _perfect_measurement(state, samples[0], world.plant[0], axis.law.period_s)
+    count = codec.begin(codec.link)
+    for axis in range(len(samples)):
+        for slot in range(count):
+            _to_drive(link, axis, slot, samples[axis])
+        if link.scenario.lost_from_drive:
+            world.queue[axis].count = 0
+        if len(world.faults) > 0 and axis == 0:
+            _empty_mailbox(world.fault_memory[0].to_controller, codec, axis, samples, now_ns + _ANSWER_NS)
+        else:
+            _empty_mailbox(world.queue[axis], codec, axis, samples, now_ns + _ANSWER_NS)
+        state, period_s = link.memory.state[axis], link.memory.constants[axis].law.period_s
+        if link.scenario.ideal_velocity and state.velocity.primed != 0:
+            _perfect_measurement(state, samples[axis], world.plant[axis], period_s)
     return 0
 
 
 @inlined
 def _send(link: _Link, samples: np.ndarray, commands: np.ndarray) -> int:
     codec = link.codec
-    codec.end(codec.link, samples, commands)
-    _to_drive(link, RPDO_SLOT, samples[0])
+    for axis in range(len(samples)):
+        codec.end(codec.link, axis, samples, commands)
+        _to_drive(link, axis, RPDO_SLOT, samples[axis])
     return 0
 
 
@@ -205,17 +215,27 @@ def _put_set_points(stream: StreamConstants, world: World, scenario: Scenario, p
 
 @inlined
 def _step_world(world: World, now_ns: int) -> None:
-    """Drive and joint up to now; what has come out of the wire by now is handed over."""
+    """Drives and joints up to now; what has come out of the wire by now is handed over."""
     device, joint_c, joint, outgoing = world.device[0], world.plant_constants[0], world.plant[0], world.queue[0]
     faults, memory = world.faults, world.fault_memory[0]
     if len(faults) > 0:
         step_faults(faults, memory, device, joint_c, joint, now_ns)
-    advance(device, joint_c, joint, now_ns, outgoing)
+    if len(world.arm.links) > 0:
+        advance_arm(world.device, world.plant_constants, world.plant, world.arm, now_ns, world.queue)
+    else:
+        for axis in range(len(world.device)):
+            advance(world.device[axis], world.plant_constants[axis], world.plant[axis], now_ns, world.queue[axis])
     if len(faults) > 0:
         collect(faults, memory, device, outgoing, now_ns)
         take_due(memory, False, now_ns, False, memory.to_controller)
         take_due(memory, True, now_ns, False, memory.ready)
         hand_over(faults, memory, device, joint_c, joint, outgoing, now_ns)
+
+
+@inlined
+def _clear(world: World) -> None:
+    for axis in range(len(world.queue)):
+        world.queue[axis].count = 0
 
 
 @kernel
@@ -230,7 +250,7 @@ def _run(memory: CycleMemory, codec: Codec, world: World, scenario: Scenario, tr
         fault.epoch_ns = scenario.start_ns
     if scenario.supervisor_beats:
         store_release(words, Word.SUPERVISOR_NS, scenario.start_ns - period_ns)
-    world.queue[0].count = 0
+    _clear(world)
     first, rows, missed, elapsed, put = load_acquire(words, Word.HEAD), 0, 0, 1, 0
     finished_at = scenario.cycles
     for cycle in range(scenario.cycles + scenario.tail_cycles):
@@ -240,10 +260,12 @@ def _run(memory: CycleMemory, codec: Codec, world: World, scenario: Scenario, tr
         _step_world(world, now_ns)
         logged = scenario.log_every > 0 and cycle % scenario.log_every == 0
         if logged and rows < len(truth):
-            _write_truth(truth[rows], world.device[0], world.plant[0])
+            for axis in range(len(world.device)):
+                columns = truth[rows, TRUTHS * axis : TRUTHS * (axis + 1)]
+                _write_truth(columns, world.device[axis], world.plant[axis])
             rows += 1
         if cycle >= finished_at:
-            world.queue[0].count = 0
+            _clear(world)
             continue
         if cycle == scenario.stop_cycle:
             store_release(words, Word.STOP, scenario.stop_request)
@@ -253,9 +275,10 @@ def _run(memory: CycleMemory, codec: Codec, world: World, scenario: Scenario, tr
         if len(scenario.set_points) > 0:
             put = _put_set_points(memory.constants[0].stream, world, scenario, put, now_ns)
         if scenario.thermometer and now_ns % _READ_EVERY_NS < period_ns:
-            reading = memory.constants[0].law.temperature
-            reading.degC[0] = world.plant[0].motor_temperature_degC
-            reading.time_ns[0] = now_ns
+            for axis in range(len(world.device)):
+                reading = memory.constants[axis].law.temperature
+                reading.degC[0] = world.plant[axis].motor_temperature_degC
+                reading.time_ns[0] = now_ns
         if faulty:
             if kind_active(faults, fault, FaultKind.LOOP_HELD_UP, now_ns):
                 missed += 1
@@ -275,12 +298,12 @@ def _run(memory: CycleMemory, codec: Codec, world: World, scenario: Scenario, tr
 def run_lockstep(
     memory: CycleMemory, codec: Codec, world: World, scenario: Scenario, truth: np.ndarray | None = None
 ) -> tuple[int, int]:
-    """Run until the axis is FINISHED, `scenario.cycles` at most, then `tail_cycles` without a controller.
+    """Run until all axes are FINISHED, `scenario.cycles` at most, then `tail_cycles` without a controller.
 
-    `memory` is that of one axis, at power off; its ring holds as many records as it has room for, the newest ones.
-    `truth` float64[N, TRUTHS], or None, takes what the joint truly did in the same periods (columns TRUE_*), and in
-    those in which the controller was held up or silent, while there is room.  Returns the numbers of log records and of
-    rows of `truth` written.
+    `memory` is at power off; its ring holds as many records as it has room for, the newest ones, one an axis and cycle.
+    `truth` float64[N, TRUTHS * axes], or None, takes what the joints truly did in the same periods (columns TRUE_* of
+    each), and in those in which the controller was held up or silent, while there is room.  Returns the numbers of log
+    records and of rows of `truth` written.
     """
     truth = np.zeros((0, TRUTHS)) if truth is None else truth
     written, rows = _run(memory, codec, world, scenario, truth)

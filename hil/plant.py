@@ -350,7 +350,7 @@ R1: dict[str, Any] = {
 
 
 @kernel
-def _end_stop_torque_Nm(c: PlantConstants, position_rad: float, velocity_radps: float) -> float:
+def end_stop_torque_Nm(c: PlantConstants, position_rad: float, velocity_radps: float) -> float:
     """Torque of the stiff spring and damper behind either end stop; it pushes, it never pulls."""
     if position_rad > c.end_stop_max_rad:
         depth = position_rad - c.end_stop_max_rad
@@ -362,30 +362,81 @@ def _end_stop_torque_Nm(c: PlantConstants, position_rad: float, velocity_radps: 
 
 
 @inlined
+def load_torque_Nm(c: PlantConstants, s: PlantState) -> float:
+    """Constant, step and added load, against positive motion."""
+    load = c.load_torque_Nm + s.added_load_torque_Nm
+    if s.substep >= c.load_step_substep:
+        load += c.load_step_Nm
+    return load
+
+
+@inlined
+def rigid_actuator_Nm(c: PlantConstants, current_A: float, motor_rad: float) -> float:
+    """Of the motor at its angle / n, ripple included."""
+    return c.torque_per_current_NmpA * current_A + value_at(c.torque_ripple, motor_rad)
+
+
+@inlined
+def turn_motor(
+    c: PlantConstants, s: PlantState, current_A: float, joint_middle: float, condition: Condition
+) -> tuple[float, float, float, float]:
+    """A substep of the motor of a flexible joint: torque through the reducer, the actuator's, friction, its factor."""
+    motor_velocity = s.motor_velocity_radps
+    motor_middle = s.motor_position_rad + 0.5 * c.step_s * motor_velocity
+    actuator = rigid_actuator_Nm(c, current_A, motor_middle)
+    error, slope, _ = series_at(c.kinematic_error, motor_middle)
+    twist = motor_middle + error - joint_middle
+    twist_rate = motor_velocity * (1.0 + slope) - s.joint_velocity_radps
+    through = spring_torque_Nm(c, twist) + c.reducer_damping_Nmspr * twist_rate + hysteresis_torque_Nm(c, s, twist)
+    factor = modulation(c, s, motor_middle)
+    motor = Mass(c.inverse_driven_inertia, c.motor_friction_share)
+    velocity, travel, friction, s.bristle_deflection_rad = advance(
+        c, motor, motor_velocity, s.bristle_deflection_rad, actuator - through * (1.0 + slope), factor, condition
+    )
+    s.motor_position_rad += travel
+    s.motor_velocity_radps = velocity
+    return through, actuator, friction, factor
+
+
+@inlined
+def finish_substep(
+    c: PlantConstants, s: PlantState, current_A: float, actuator: float, friction: float, load: float, gravity: float,
+    through: float,
+) -> None:  # fmt: skip
+    """What a substep leaves: the torques [Nm], the friction's load, the temperature, the time."""
+    s.friction_load_Nm += c.friction_load_gain * (through - s.friction_load_Nm)
+    s.actuator_torque_Nm = actuator
+    s.friction_torque_Nm = friction
+    s.load_torque_Nm = load
+    s.gravity_torque_Nm = gravity
+    if c.thermal != 0:
+        steady = c.ambient_degC + c.heating_KpA2 * current_A * current_A
+        s.motor_temperature_degC += (steady - s.motor_temperature_degC) * c.thermal_gain
+    s.substep += 1
+    s.time_s = s.substep * c.step_s
+
+
+@inlined
 def step_plant(c: PlantConstants, s: PlantState, target_joint_torque_Nm: float) -> None:
     """Advance the plant by one substep of `c.step_s`.
 
     `target_joint_torque_Nm` is what the drive asks of its current loop, at the joint, positive towards positive angle.
     """
-    half_step_s = 0.5 * c.step_s
     current = step_current(c, s, target_joint_torque_Nm)
-
     joint_velocity = s.joint_velocity_radps
-    joint_middle = s.joint_position_rad + half_step_s * joint_velocity
-    load = c.load_torque_Nm + s.added_load_torque_Nm
-    if s.substep >= c.load_step_substep:
-        load += c.load_step_Nm
+    joint_middle = s.joint_position_rad + 0.5 * c.step_s * joint_velocity
+    load = load_torque_Nm(c, s)
     resisting = load
     gravity = 0.0
     if c.gravity_Nm != 0.0:
         gravity = c.gravity_Nm * math.sin(joint_middle)
         resisting += gravity
     if c.end_stops != 0:
-        resisting += _end_stop_torque_Nm(c, joint_middle, joint_velocity)
+        resisting += end_stop_torque_Nm(c, joint_middle, joint_velocity)
 
     condition = condition_of(c.friction, s.friction_load_Nm * c.inverse_ratio, s.motor_temperature_degC)
     if c.flexible == 0:
-        actuator = c.torque_per_current_NmpA * current + value_at(c.torque_ripple, joint_middle)
+        actuator = rigid_actuator_Nm(c, current, joint_middle)
         factor = modulation(c, s, joint_middle)
         whole = Mass(c.inverse_driven_inertia, 1.0)
         velocity, travel, friction, s.bristle_deflection_rad = advance(
@@ -398,20 +449,7 @@ def step_plant(c: PlantConstants, s: PlantState, target_joint_torque_Nm: float) 
         s.motor_position_rad = position
         s.motor_velocity_radps = velocity
     else:
-        motor_velocity = s.motor_velocity_radps
-        motor_middle = s.motor_position_rad + half_step_s * motor_velocity
-        actuator = c.torque_per_current_NmpA * current + value_at(c.torque_ripple, motor_middle)
-        error, slope, _ = series_at(c.kinematic_error, motor_middle)
-        twist = motor_middle + error - joint_middle
-        twist_rate = motor_velocity * (1.0 + slope) - joint_velocity
-        through = spring_torque_Nm(c, twist) + c.reducer_damping_Nmspr * twist_rate + hysteresis_torque_Nm(c, s, twist)
-        factor = modulation(c, s, motor_middle)
-        motor = Mass(c.inverse_driven_inertia, c.motor_friction_share)
-        velocity, travel, friction, s.bristle_deflection_rad = advance(
-            c, motor, motor_velocity, s.bristle_deflection_rad, actuator - through * (1.0 + slope), factor, condition
-        )
-        s.motor_position_rad += travel
-        s.motor_velocity_radps = velocity
+        through, actuator, friction, factor = turn_motor(c, s, current, joint_middle, condition)
         link = Mass(c.inverse_link_inertia, 1.0 - c.motor_friction_share)
         link_velocity, link_travel, link_friction, s.link_bristle_deflection_rad = advance(
             c, link, joint_velocity, s.link_bristle_deflection_rad, through - resisting, factor, condition
@@ -420,17 +458,7 @@ def step_plant(c: PlantConstants, s: PlantState, target_joint_torque_Nm: float) 
         s.joint_velocity_radps = link_velocity
         s.reducer_torque_Nm = through
         friction += link_friction
-
-    s.friction_load_Nm += c.friction_load_gain * (through - s.friction_load_Nm)
-    s.actuator_torque_Nm = actuator
-    s.friction_torque_Nm = friction
-    s.load_torque_Nm = load
-    s.gravity_torque_Nm = gravity
-    if c.thermal != 0:
-        steady = c.ambient_degC + c.heating_KpA2 * current * current
-        s.motor_temperature_degC += (steady - s.motor_temperature_degC) * c.thermal_gain
-    s.substep += 1
-    s.time_s = s.substep * c.step_s
+    finish_substep(c, s, current, actuator, friction, load, gravity, through)
 
 
 def _fill_friction(c: PlantConstants, settings: PlantSettings) -> None:

@@ -33,8 +33,9 @@ from jointctl.firmware_py.libc import (
     store_release,
 )
 from jointctl.firmware_py.schema import dtype_of, new
+from jointctl.hil.arm_plant import ArmPlant, no_arm_plant
 from jointctl.hil.canopen.device import Cia402Device
-from jointctl.hil.canopen.device_core import accept_frame, advance, advance_together
+from jointctl.hil.canopen.device_core import accept_frame, advance, advance_arm
 from jointctl.hil.canopen.records import Device, NmtState, int64
 from jointctl.hil.fault_kinds import FaultConstants, FaultMemory, fault_memory, no_faults
 from jointctl.hil.faults import append_frame, pass_frame, step_faults, take_due
@@ -59,6 +60,7 @@ class DeviceMemory(NamedTuple):
     plant_constants: Any  # PlantConstants[N]
     plant_states: Any  # PlantState[N]
     queues: Any  # FrameQueue[N], to the bus
+    arm: ArmPlant  # through which the joints of several drives move one another
     faults: Any  # FaultConstants[N, M], see `hil.fault_kinds`; None = none, and nothing of them is compiled
     fault_memories: Any  # FaultMemory[N]
     words: np.ndarray  # int64[WORDS]
@@ -163,6 +165,14 @@ def _wait_for_frames(fd: int, service_fd: int, wait_ns: int, polls: np.ndarray, 
 
 
 @kernel
+def _advance_all(of: DeviceMemory, until_ns: int) -> None:
+    if len(of.devices) > 1:
+        advance_arm(of.devices, of.plant_constants, of.plant_states, of.arm, until_ns, of.queues)
+    else:
+        advance(of.devices[0], of.plant_constants[0], of.plant_states[0], until_ns, of.queues[0])
+
+
+@kernel
 def _let_faults_act(of: DeviceMemory, faults: Any, service_fd: int, now_ns: int) -> None:
     """Those of drive and plant begin and end; frames that the wire has kept come out of it."""
     if faults is None:
@@ -184,7 +194,7 @@ def _take_from_bus(of: DeviceMemory, faults: Any, service_fd: int, now_ns: int) 
             joint, memory = _joint_of(of, index, service_fd), of.fault_memories[index]
             step_faults(faults[index], memory, joint.device, joint.plant_c, joint.plant_s, sent_ns)
     if len(of.devices) > 1:  # a single joint moves on when it takes the frame
-        advance_together(of.devices, of.plant_constants, of.plant_states, sent_ns, of.queues)
+        _advance_all(of, sent_ns)
     for index in range(len(of.devices)):
         joint = _joint_of(of, index, service_fd)
         if faults is None:
@@ -207,7 +217,7 @@ def _take_sdo_answer(of: DeviceMemory, now_ns: int) -> None:
         device = of.devices[index]
         if node_id == device.node_id or node_id == device.encoder.node_id:
             device.next_due_ns = 0
-            advance_together(of.devices, of.plant_constants, of.plant_states, now_ns, of.queues)
+            _advance_all(of, now_ns)
             append_frame(of.queues[index], frame)
 
 
@@ -251,7 +261,7 @@ def run_device(fd: int, service_fd: int, of: DeviceMemory) -> int:
             _flush_all(fd, faults, monotonic_ns(timespec), of)
         # after the frames, which may be older: the plant does not go back
         if drained or lag_ns == 0:
-            advance_together(of.devices, of.plant_constants, of.plant_states, woken_ns - lag_ns, of.queues)
+            _advance_all(of, woken_ns - lag_ns)
             _flush_all(fd, faults, woken_ns, of)
     store_release(words, ENDED_WORD, ended)
     return ended
@@ -276,10 +286,11 @@ def _fault_rows(devices: Sequence[Cia402Device]) -> Any:
 
 class RealtimeDevice:
     """Runs the drives of a bus on a connected socket: `start`, `stop`, or a `with` block.  The descriptor stays the
-    caller's.  Several drives: those of one `Cia402Device.row`.
+    caller's.  Several drives: those of one `Cia402Device.row`, with the arm that connects their joints.
     """
 
-    def __init__(self, devices: Cia402Device | Sequence[Cia402Device], fd: int) -> None:
+    def __init__(self, devices: Cia402Device | Sequence[Cia402Device], fd: int, arm: ArmPlant | None = None) -> None:
+        self._arm = no_arm_plant() if arm is None else arm
         self._devices = [devices] if isinstance(devices, Cia402Device) else list(devices)
         self.plant_states = self._devices[0].whole_row.plant_states
         self._fd = fd
@@ -295,7 +306,7 @@ class RealtimeDevice:
         row = self._devices[0].whole_row
         scratch = np.zeros(FRAME_SIZE, np.uint8), np.zeros(4, np.int32), np.zeros(2, np.int64)
         memory = DeviceMemory(
-            *row, new(FrameQueue, len(self._devices)), self._faults, self.fault_memory, self.words, *scratch
+            *row, new(FrameQueue, len(self._devices)), self._arm, self._faults, self.fault_memory, self.words, *scratch
         )
         run_device(self._fd, service_fd, memory)
 

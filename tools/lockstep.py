@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import queue
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,11 +20,13 @@ from jointctl.drivers.canopen.drive import CanopenDrive
 from jointctl.drivers.canopen.exchange import accept, begin, end, link_of
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.arm_model import Arm, no_arm
 from jointctl.firmware_py.cycle import HISTOGRAM_BINS, WORDS, CycleMemory, Histogram, Word
 from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.hil.arm_plant import ArmPlant
 from jointctl.hil.canopen.device import Cia402Device
 from jointctl.hil.fault_kinds import fault_memory, no_faults
 from jointctl.hil.lockstep import (
@@ -37,8 +40,10 @@ from jointctl.hil.lockstep import (
     run_lockstep,
 )
 from jointctl.hil.virtual_bus import FRAME_SIZE
+from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.plant_settings import arm_plant_of
 from jointctl.tools.configuration.records import axis_constants, trajectory_table
 from jointctl.tools.virtual_joint import new_device
 
@@ -126,10 +131,11 @@ class LockstepRun:
         return np.asarray(self.truth[:, TRUE_POSITION_rad] - self.log.desired_position_rad)
 
 
-def _memory(constants: Any, state: Any, table: np.ndarray, log: Any) -> CycleMemory:
+def _memory(constants: Any, state: Any, tables: np.ndarray, log: Any, arm: Arm | None = None) -> CycleMemory:
+    axes = len(state)
     return CycleMemory(
-        constants, state, table[np.newaxis], new(Sample), new(Command), np.zeros(WORDS, np.int64), log,
-        np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64), np.zeros(2, np.int64),
+        constants, state, tables, new(Sample, axes), new(Command, axes), np.zeros(WORDS, np.int64), log,
+        np.zeros((len(Histogram), HISTOGRAM_BINS), np.int64), np.zeros(2, np.int64), no_arm() if arm is None else arm,
     )  # fmt: skip
 
 
@@ -213,7 +219,7 @@ class LockstepJoint:
         """A run that goes on when it is asked to; `table` float64 (N, 5) as in `reference_at`."""
         state = new(AxisState)
         reset_axis(constants[0], state[0])
-        memory = _memory(constants, state, table, new(LogRecord, records))
+        memory = _memory(constants, state, table[np.newaxis], new(LogRecord, records))
         world = World(
             self._virtual.device.copy(), self.plant_constants, self.plant_state.copy(), self._virtual.queue.copy(),
             NO_FAULTS, fault_memory(NO_FAULTS, 0),
@@ -320,8 +326,83 @@ class LockstepJoint:
             faults,
             fault_memory(faults, epoch_ns),
         )
-        memory = _memory(constants, state, self.table if table is None else table, log)
+        memory = _memory(constants, state, (self.table if table is None else table)[np.newaxis], log)
         period_ns, thermometer = round(float(axis.law.period_s) * 1e9), self._settings.temperature is not None
         scenario = Scenario(self.start_ns, period_ns, thermometer=thermometer, **how)
         written, rows = run_lockstep(memory, codec_of(self._port.copy()), world, scenario, truth)
         return LockstepRun(log[:written], state[0], plant[0], world.device[0], Fault(int(state[0].fault)), truth[:rows])
+
+
+def tables_of(configs: Sequence[Config]) -> np.ndarray:
+    """The joints' tables in one array, float64 (axes, rows, 5); a shorter one has rows that no one reads."""
+    tables = [trajectory_table(config) for config in configs]
+    rows = max(len(table) for table in tables)
+    return np.stack([np.pad(table, ((0, rows - len(table)), (0, 0))) for table in tables])
+
+
+class LockstepArm:
+    """The joints of an arm, each commissioned as `LockstepJoint` is, then moved in one loop."""
+
+    def __init__(self, arm: ArmConfig) -> None:
+        self.arm = arm
+        joints = [LockstepJoint(config) for config in arm.joints]
+        self.start_ns = max(joint.start_ns for joint in joints)
+        for joint in joints:
+            joint._virtual.advance(self.start_ns - _COMMISSIONING_STEP_NS)
+        self._devices = np.concatenate([joint._virtual.device for joint in joints]).view(np.recarray)
+        self._devices.time_ns[:] = self._devices.time_ns[0]  # the drives share the grid of their substeps
+        self._queues = np.concatenate([joint._virtual.queue for joint in joints]).view(np.recarray)
+        self._ports = np.concatenate([joint._port for joint in joints]).view(np.recarray)
+        self.plant_constants = np.concatenate([joint.plant_constants for joint in joints]).view(np.recarray)
+        self.plant_state = np.concatenate([joint._virtual.plant_state for joint in joints]).view(np.recarray)
+        self._starts_rad = [joint.report.start_position_rad for joint in joints]
+        self.tables = tables_of(arm.joints)
+
+    def constants(self) -> Any:
+        """Fresh `AxisConstants`, one a joint; may be changed before `run`."""
+        constants = self.arm.axis_constants(list(self.tables), self._starts_rad)
+        constants.sequence.supervisor_max_cycles[:] = 0
+        return constants
+
+    def run(
+        self,
+        constants: Any = None,
+        *,
+        model: Arm | None = None,
+        plant: ArmPlant | None = None,
+        plant_constants: Any = None,
+        longest_s: float | None = None,
+        log_every: int = 1,
+        stop_cycle: int = NO_STOP,
+    ) -> list[LockstepRun]:
+        """One run of all joints from power off to FINISHED, a result each; what is given is not changed.
+
+        `model` is what the controller believes of the arm, `plant` what the arm is.
+        """
+        constants = (self.constants() if constants is None else constants).copy()
+        axes, first = len(constants), constants[0]
+        state = new(AxisState, axes)
+        for axis in range(axes):
+            reset_axis(constants[axis], state[axis])
+        cycles = LockstepJoint._longest_cycles(first, longest_s)
+        rows = cycles // log_every + 1
+        arm = self.arm.model.memory() if model is None else model
+        memory = _memory(constants, state, self.tables, new(LogRecord, rows * axes), arm)
+        plants = self.plant_state.copy()
+        connected = arm_plant_of(self.arm) if plant is None else ArmPlant(*(part.copy() for part in plant))
+        world = World(
+            self._devices.copy(), self.plant_constants if plant_constants is None else plant_constants, plants,
+            self._queues.copy(), NO_FAULTS, fault_memory(NO_FAULTS, 0), connected,
+        )  # fmt: skip
+        scenario = Scenario(
+            self.start_ns, round(float(first.law.period_s) * 1e9), cycles, stop_cycle, log_every=log_every
+        )
+        truth = np.zeros((rows, TRUTHS * axes))
+        written, kept = run_lockstep(memory, codec_of(self._ports.copy()), world, scenario, truth)
+        return [
+            LockstepRun(
+                memory.ring[axis:written:axes], state[axis], plants[axis], world.device[axis],
+                Fault(int(state[axis].fault)), truth[:kept, TRUTHS * axis : TRUTHS * (axis + 1)],
+            )
+            for axis in range(axes)
+        ]  # fmt: skip

@@ -30,10 +30,12 @@ from jointctl.hil.plant_records import PlantConstants, PlantState
 from jointctl.hil.realtime_device import ENDED_WORD, SEND_ERRORS_WORD, STOP_WORD, WORDS, RealtimeDevice
 from jointctl.hil.virtual_bus import VirtualBusError, VirtualBusHub, default_socket_path
 from jointctl.tools.child_process import Starting
+from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.plant_settings import (
     VIRTUAL_EDS,
+    arm_plant_of,
     device_settings,
     fault_constants,
     plant_settings,
@@ -152,18 +154,17 @@ def new_devices(joints: Sequence[Config]) -> list[Cia402Device]:
 
 
 @contextmanager
-def serve_virtual_joint(
-    joints: Config | Sequence[Config], timing: bool = False
-) -> Iterator[RealtimeDevice | PumpedDevice]:
+def serve_virtual_joint(given: Config | ArmConfig, timing: bool = False) -> Iterator[RealtimeDevice | PumpedDevice]:
     """Drive in threads of this process; the bus as well if it is the virtual one, all others exist already.
 
-    Several joints: those of an arm, on the bus of the first one.
+    Those of an arm are on the bus of the first one.
     """
-    joints = [joints] if isinstance(joints, Config) else list(joints)
+    joints = [given] if isinstance(given, Config) else list(given.joints)
+    arm = None if isinstance(given, Config) else arm_plant_of(given)
     config, devices = joints[0], new_devices(joints)
     if config.bus.interface in CYCLIC_INTERFACES:
         gc.disable()  # what a compiler leaves behind is little beside what it holds
-        RealtimeDevice(devices, -1).compile()  # a bus that can be found has a drive that answers
+        RealtimeDevice(devices, -1, arm).compile()  # a bus that can be found has a drive that answers
         gc.enable()
     with ExitStack() as stack:
         if config.bus.interface == "jointctl":
@@ -183,7 +184,7 @@ def serve_virtual_joint(
             yield stack.enter_context(PumpedDevice(devices[0], bus))
             return
         end = stack.enter_context(open_cyclic_end(config.bus.interface, config.bus.channel))
-        yield stack.enter_context(RealtimeDevice(devices, end.fileno()))
+        yield stack.enter_context(RealtimeDevice(devices, end.fileno(), arm))
 
 
 @contextmanager

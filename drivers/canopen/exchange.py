@@ -198,17 +198,20 @@ def send(link: CanopenLink, samples: np.ndarray, commands: np.ndarray) -> int:
 
 @exported(types.int64(_LINK))
 def begin(link: CanopenLink) -> int:
-    """`cyclic.begin_cycle`: so many frames are to be sent, from slot 0 on."""
-    return begin_cycle(link.port[0], link.frames)
+    """`cyclic.begin_cycle`: so many frames are to be sent to every drive, from slot 0 on."""
+    to_send = FRAME_SLOTS
+    for axis in range(len(link.port)):
+        to_send = min(to_send, begin_cycle(link.port[axis], link.frames))
+    return to_send
 
 
-@exported(types.boolean(_LINK, types.int64, _SAMPLES, types.int64))
-def accept(link: CanopenLink, slot: int, samples: np.ndarray, now_ns: int) -> bool:
-    """`cyclic.accept_frame` on one slot of the frame memory."""
-    return accept_frame(link.port[0], link.frames[slot], samples[0], now_ns)
+@exported(types.boolean(_LINK, types.int64, types.int64, _SAMPLES, types.int64))
+def accept(link: CanopenLink, axis: int, slot: int, samples: np.ndarray, now_ns: int) -> bool:
+    """`cyclic.accept_frame` of an axis on one slot of the frame memory."""
+    return accept_frame(link.port[axis], link.frames[slot], samples[axis], now_ns)
 
 
-@exported(types.void(_LINK, _SAMPLES, _COMMANDS))
-def end(link: CanopenLink, samples: np.ndarray, commands: np.ndarray) -> None:
-    """`cyclic.end_cycle`: the RPDO is in slot SLOT_RPDO."""
-    end_cycle(link.port[0], link.frames, samples[0], commands[0])
+@exported(types.void(_LINK, types.int64, _SAMPLES, _COMMANDS))
+def end(link: CanopenLink, axis: int, samples: np.ndarray, commands: np.ndarray) -> None:
+    """`cyclic.end_cycle` of an axis: its RPDO is in slot SLOT_RPDO."""
+    end_cycle(link.port[axis], link.frames, samples[axis], commands[axis])

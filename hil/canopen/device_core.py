@@ -13,6 +13,7 @@ import math
 import numpy as np
 
 from jointctl.firmware_py.kernel import inlined, kernel
+from jointctl.hil.arm_plant import ArmPlant, step_arm
 from jointctl.hil.canopen.cia402_core import (
     abort_connection,
     apply_controlword,
@@ -43,7 +44,13 @@ from jointctl.hil.canopen.device_errors import (
     send_waiting_emergencies,
 )
 from jointctl.hil.canopen.encoder_node import accept_encoder_frame, step_encoder
-from jointctl.hil.canopen.motion import demand_is_held, demand_torque_Nm, following_error_tripped, follows_velocity
+from jointctl.hil.canopen.motion import (
+    demand_is_held,
+    demand_torque_Nm,
+    following_error_tripped,
+    follows_velocity,
+    is_powered,
+)
 from jointctl.hil.canopen.pdo import mark_events, receive_rpdo, receive_sync, send_due_tpdos, start_pdos
 from jointctl.hil.canopen.records import CONSUMERS, PDOS, Device, HomingState, Mode, NmtState, PowerState, int64
 from jointctl.hil.plant import encoder_counts, link_reading_rad, shaft_velocity_radps, step_plant
@@ -330,8 +337,10 @@ def _begin_advance(device: Device, until_ns: int, queue: FrameQueue) -> None:
 
 
 @inlined
-def _end_substep(device: Device, plant_c: PlantConstants, plant_s: PlantState, step_ns: int, queue: FrameQueue) -> bool:
-    """The drive's part of a substep whose plant has moved; whether its timers ran, which may change the torque."""
+def _after_substep(
+    device: Device, plant_c: PlantConstants, plant_s: PlantState, step_ns: int, queue: FrameQueue
+) -> bool:
+    """Events and timers; True if something happened that may change the torque."""
     device.time_ns += step_ns
     before = int64(device.event_status) >> 16
     if int64(device.state) != before & 0xFF or device.time_ns >= device.next_due_ns:
@@ -363,34 +372,38 @@ def advance(device: Device, plant_c: PlantConstants, plant_s: PlantState, until_
         if not held:
             torque_Nm, held = _torque_Nm(device, plant_c, plant_s, plant_c.step_s, queue)
         step_plant(plant_c, plant_s, torque_Nm)
-        if _end_substep(device, plant_c, plant_s, step_ns, queue):
+        if _after_substep(device, plant_c, plant_s, step_ns, queue):
             held = False
     _end_advance(device, plant_c, plant_s, until_ns, queue)
 
 
 @kernel
-def advance_together(
-    devices: np.ndarray, plant_constants: np.ndarray, plant_states: np.ndarray, until_ns: int, queues: np.ndarray
+def advance_arm(
+    devices: np.ndarray, constants: np.ndarray, states: np.ndarray, arm: ArmPlant, until_ns: int, queues: np.ndarray
 ) -> None:
-    """`advance` for the drives of an arm, one substep after the other; all arrays have one record a drive.
+    """The same for the drives of an arm, whose joints move one another: arrays of one record a joint, equal steps.
 
-    The one place where the plants of an arm move on: what couples them belongs beside `step_plant`.  All have the same
-    step, and the same time, as no one else advances them.
+    A drive without power holds its joint with its brake.
     """
-    if len(devices) == 1:
-        advance(devices[0], plant_constants[0], plant_states[0], until_ns, queues[0])
-        return
-    step_ns = int64(np.rint(plant_constants[0].step_s * 1e9))
-    for index in range(len(devices)):
-        _begin_advance(devices[index], until_ns, queues[index])
+    count = len(devices)
+    step_ns = int64(np.rint(constants[0].step_s * 1e9))
+    for i in range(count):
+        _begin_advance(devices[i], until_ns, queues[i])
+        arm.joints[i].held = 0
     while devices[0].time_ns + step_ns <= until_ns:
-        for index in range(len(devices)):
-            device, plant_c, plant_s = devices[index], plant_constants[index], plant_states[index]
-            torque_Nm, _ = _torque_Nm(device, plant_c, plant_s, plant_c.step_s, queues[index])
-            step_plant(plant_c, plant_s, torque_Nm)
-            _end_substep(device, plant_c, plant_s, step_ns, queues[index])
-    for index in range(len(devices)):
-        _end_advance(devices[index], plant_constants[index], plant_states[index], until_ns, queues[index])
+        for i in range(count):
+            joint = arm.joints[i]
+            if joint.held == 0:
+                torque_Nm, held = _torque_Nm(devices[i], constants[i], states[i], constants[i].step_s, queues[i])
+                joint.target_Nm = torque_Nm
+                joint.held = 1 if held else 0
+                joint.braked = 0 if is_powered(devices[i]) else 1
+        step_arm(constants, states, arm)
+        for i in range(count):
+            if _after_substep(devices[i], constants[i], states[i], step_ns, queues[i]):
+                arm.joints[i].held = 0
+    for i in range(count):
+        _end_advance(devices[i], constants[i], states[i], until_ns, queues[i])
 
 
 @kernel

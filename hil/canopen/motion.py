@@ -225,16 +225,22 @@ def demand_is_held(device: Device) -> bool:
 
 
 @kernel
-def demand_torque_Nm(device: Device, position: int, velocity_radps: float, dt_s: float) -> float:
-    """Limited joint torque [Nm] for the next substep; `position` [counts] and velocity at the joint; 0 when off."""
+def is_powered(device: Device) -> bool:
+    """Whether the motor may have current; where not, a joint's brake is closed."""
     state = device.state
-    device.saturated = 0
-    powered = (
+    return (
         state == PowerState.OPERATION_ENABLED
         or state == PowerState.QUICK_STOP_ACTIVE
         or state == PowerState.FAULT_REACTION_ACTIVE
     )
-    if not powered:
+
+
+@kernel
+def demand_torque_Nm(device: Device, position: int, velocity_radps: float, dt_s: float) -> float:
+    """Limited joint torque [Nm] for the next substep; `position` [counts] and velocity at the joint; 0 when off."""
+    state = device.state
+    device.saturated = 0
+    if not is_powered(device):
         device.demand = 0.0
         return 0.0
     position_rad = position / device.counts_per_rad

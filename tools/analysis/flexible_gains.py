@@ -20,7 +20,7 @@ import numpy as np
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import ControllerKind, Encoders
-from jointctl.tools.analysis.linear_loop import Array, ComplexArray, LinearLoop, LoopSettings, linear_loop
+from jointctl.tools.analysis.linear_loop import Array, ComplexArray, LinearLoop, LoopSettings, TwoMasses, linear_loop
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad
 
@@ -80,7 +80,8 @@ class _Search:
         self._settings, self._count_rad = settings, count_rad
         self._omega = np.geomspace(math.tau * _LOWEST_Hz, math.pi / settings.period_s, _POINTS)
         self._z = np.exp(1j * self._omega * settings.period_s)
-        free = [joint for joint in settings.joints if joint.bristle_Nmprad == (0.0, 0.0)]
+        masses = [joint for joint in settings.joints if isinstance(joint, TwoMasses)]
+        free = [joint for joint in masses if joint.bristle_Nmprad == (0.0, 0.0)]
         wrong = (1.0 - MOTOR_ERROR, 1.0 + MOTOR_ERROR)
         free += [replace(joint, motor_kgm2=factor * joint.motor_kgm2) for joint in free for factor in wrong]
         self._joints = [linear_loop(replace(settings, joints=(joint,))).joint for joint in free]

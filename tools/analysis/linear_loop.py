@@ -98,6 +98,14 @@ class TwoMasses:
         return math.sqrt(self.stiffness_Nmprad * (1.0 / self.motor_kgm2 + 1.0 / self.link_kgm2)) / math.tau
 
 
+@dataclass(frozen=True)
+class RigidJoint:
+    """A joint whose inertia is not the one that the law believes: in an arm it goes with the pose."""
+
+    inertia_kgm2: float
+    name: str = ""  # in what it differs from the configured joint
+
+
 @lru_cache(maxsize=256)  # gains are changed far more often than joints
 def _hold_step_of_two(joint: TwoMasses, step_s: float, lag_s: float) -> tuple[Array, Array]:
     """(phi, gamma) of x = (motor, its rate, link, its rate, torque), as `_hold_step`."""
@@ -220,8 +228,8 @@ class LoopSettings:
     centres: tuple[tuple[float, float], ...] = ()  # [rad, rad/s]
     widths: tuple[float, ...] = ()  # b, one for each centre
     weight_Nm: float = 0.0  # of every neuron at the point of linearisation
-    # a joint that is not rigid: those that the loop must bear, of which the worst counts; none = it is rigid
-    joints: tuple[TwoMasses, ...] = ()
+    # the joints that the loop must bear, of which the worst counts; none = a rigid one, true to `inertia_kgm2`
+    joints: tuple[TwoMasses | RigidJoint, ...] = ()
     encoders: Encoders = Encoders.LINK
     motor_inertia_kgm2: float = 0.0  # of `inertia_kgm2`, as the law of a flexible joint believes
     twist_radps: float = 0.0
@@ -407,6 +415,8 @@ class LinearLoop:
 
 def linear_loop(settings: LoopSettings) -> LinearLoop:
     """The loop of these settings; of several joints with the first."""
-    true: float | TwoMasses = settings.joints[0] if settings.joints else settings.inertia_kgm2
+    true = settings.joints[0] if settings.joints else settings.inertia_kgm2
+    if isinstance(true, RigidJoint):
+        true = true.inertia_kgm2
     joint = sampled_joint(settings.period_s, settings.delay_s, settings.lag_s, true, settings.encoders)
     return LinearLoop(settings, joint, CONTROLLERS[settings.kind](settings))

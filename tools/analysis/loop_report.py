@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jointctl.firmware_py.velocity import low_pass_gain
-from jointctl.tools.analysis.linear_loop import LoopSettings, linear_loop
+from jointctl.tools.analysis.linear_loop import LoopSettings, RigidJoint, linear_loop
 from jointctl.tools.analysis.loop_settings import two_masses
 from jointctl.tools.analysis.margins import Margins, frequencies_radps, margins, phase_margin_deg, worst_case
 from jointctl.tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
@@ -187,6 +187,8 @@ def _draw(figure: Figure, settings: LoopSettings, found: Margins, minimum_deg: f
     frequency_Hz = omega / math.tau
     _magnitude(axes[0, 0], frequency_Hz, np.abs(response), found)
     for joint in settings.joints:
+        if isinstance(joint, RigidJoint):
+            continue
         axes[0, 0].axvline(joint.resonance_Hz, color=ORANGE, linewidth=0.8, linestyle="--")
         text = f"resonance {joint.resonance_Hz:.3g} Hz\n{joint.name}"
         axes[0, 0].text(0.03, 0.05, text, transform=axes[0, 0].transAxes, va="bottom", color=ORANGE, fontsize=9)

@@ -93,7 +93,28 @@ class ArmConfig:
         ]
         constants = np.concatenate(parts).view(np.recarray)
         constants.sequence.approach_s[:] = constants.sequence.approach_s.max()
+        for axis, load in zip(constants, self.greatest_gravity_Nm(), strict=True):
+            if self.arm.feed_forward != "none":
+                axis.law.of_arm = 1
+            if axis.limits.frozen_torque_Nm > 0.0:  # a healthy joint stands still under it
+                axis.limits.frozen_torque_Nm += load
         return constants
+
+    def greatest_gravity_Nm(self) -> list[float]:
+        """For each joint what it never has to hold more than, in whatever pose."""
+        found = []
+        for i in range(len(self.bodies)):
+            total = 0.0
+            reach = {i: 0.0}
+            for k in range(i, len(self.bodies)):
+                body = self.bodies[k]
+                if k != i:
+                    if body.parent not in reach:
+                        continue
+                    reach[k] = reach[body.parent] + float(np.linalg.norm(body.place.offset_m))
+                total += body.mass.mass_kg * reach[k] + float(np.linalg.norm(body.mass.moment_kgm))
+            found.append(total * float(np.linalg.norm(self.arm.gravity_mps2)))
+        return found
 
 
 def is_arm(path: str | Path) -> bool:

@@ -8,10 +8,12 @@ from typing import Any
 from jointctl.drivers.canopen.eds import read_eds
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.schema import new
+from jointctl.hil.arm_plant import ArmPlant, arm_plant
 from jointctl.hil.canopen.device import DeviceSettings
 from jointctl.hil.canopen.encoder_node import EncoderSettings
 from jointctl.hil.fault_kinds import FaultConstants, FaultKind, no_faults
 from jointctl.hil.plant_records import EncoderSide, FrictionKind, PlantSettings
+from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.canopen import canopen_section, eds_path, encoder_eds_path
 from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config, raise_if
 from jointctl.tools.configuration.conversions import friction_constants, torque_constant_NmpA
@@ -75,6 +77,36 @@ def plant_settings(config: Config) -> dict[str, Any]:
         raise ConfigurationError(f"{config.path}: [virtual] is missing: the virtual joint needs its true values")
     raise_if([f"{config.path}: {line}" for line in plant_problems(config)])
     return plant_keywords(config, torque_constant_NmpA(config), _true_friction(config))
+
+
+def arm_plant_problems(arm: ArmConfig) -> list[str]:
+    """What the virtual arm refuses of its joints' [virtual]."""
+    found = []
+    for config in arm.joints:
+        virtual, name = config.virtual, config.path.name
+        if virtual is None:
+            found.append(f"{name}: [virtual] is missing: the virtual joint needs its true values")
+        elif virtual.friction_kind == "stick_slip":
+            found.append(f"{name}: virtual.friction_kind (=stick_slip) must be none, sign or lugre in an arm")
+        elif arm.joints[0].virtual is not None and virtual.step_s != arm.joints[0].virtual.step_s:
+            found.append(
+                f"{name}: virtual.step_s (={virtual.step_s:g}) must be that of {arm.joints[0].path.name} "
+                f"(={arm.joints[0].virtual.step_s:g})"
+            )
+    return found
+
+
+def arm_plant_of(arm: ArmConfig) -> ArmPlant:
+    """What connects the virtual joints of an arm; masses and inertias times virtual.inertia_scale of each joint."""
+    raise_if([f"{arm.path}: {line}" for line in arm_plant_problems(arm)])
+    links = arm.model.links.copy()
+    for link, config in zip(links, arm.joints, strict=True):
+        assert config.virtual is not None
+        scale = config.virtual.inertia_scale
+        for name in ("mass_kg", "moment_kgm", "inertia_kgm2"):
+            link[name] *= scale
+        link.motor_inertia_kgm2 *= 0.0 if config.virtual.flexible else scale
+    return arm_plant(links, tuple(arm.arm.gravity_mps2))
 
 
 def device_settings(config: Config) -> DeviceSettings:

@@ -238,11 +238,13 @@ class _Reader:
         if tensor is None:
             self._problem(f"{what}: <inertial> has no <inertia>; ixx, ixy, ixz, iyy, iyz, izz are needed")
             return NO_MASS
-        most = mass * LARGEST_LENGTH_m**2
+        most, before = mass * LARGEST_LENGTH_m**2, len(self._problems)
         xx, xy, xz, yy, yz, zz = (
             float(self._numbers(tensor, key, f"{what}: {key}", (0.0,), most, "kg mm2 instead of kg m2")[0])
             for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
         )
+        if len(self._problems) > before:
+            return NO_MASS
         inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         low, middle, high = np.linalg.eigvalsh(inertia)
         if low < -_ROUNDING * high or low + middle < high * (1.0 - _ROUNDING) or not high > 0.0:
@@ -269,6 +271,7 @@ class _Reader:
                     "links must form a tree"
                 )
             above[joint.child] = joint
+        raise_if(self._problems)
         roots = [link for link in links if link not in above]
         if not links or len(roots) != 1:
             names = ", ".join(roots) or "none"

@@ -31,7 +31,7 @@ from jointctl.tools.configuration.sections import Limits
 from jointctl.tools.recording.run_log import log_path
 
 if TYPE_CHECKING:
-    from jointctl.tools.configuration.arm import ArmConfig, ArmModel
+    from jointctl.tools.configuration.arm import ArmConfig
 
 START_SHARE = 0.1  # of the following error: how far from the trajectory a run without an approach may begin
 
@@ -109,30 +109,23 @@ class RunPlan:
 
     def placed(self, reports: Sequence[CommissioningReport]) -> Placed:
         """The motion of all joints from where they stand: constants of all, the lines of all."""
-        parts = [j.motion.placed(report) for j, report in zip(self.joints, reports, strict=True)]
         if self.arm is None:
-            return parts[0]
-        approach_s = max(float(part.constants[0].sequence.approach_s) for part in parts)
-        lines = []
-        for joint, report, part in zip(self.arm.joints, reports, parts, strict=True):
-            part.constants[0].sequence.approach_s = approach_s  # all begin and arrive together
-            lines += joint.lines(self.arm.envelope(joint, part, report))
-        constants = np.concatenate([part.constants for part in parts]).view(np.recarray)
-        return Placed(constants, parts[0].table, tuple(lines))
+            return self.motion.placed(reports[0])
+        tables = [joint.motion.table for joint in self.joints]
+        constants = self.arm.config.axis_constants(tables, [report.start_position_rad for report in reports])
+        lines: list[str] = []
+        for axis, joint, report in zip(constants, self.arm.joints, reports, strict=True):
+            assert isinstance(joint.motion, ConfiguredMotion)
+            lines += joint.lines(joint.motion.envelope(axis, report))
+        return Placed(constants, tables[0], tuple(lines))
 
 
 @dataclass(frozen=True)
 class ArmPlan:
-    """The joints of an arm in a run, and the model that connects them."""
+    """The joints of an arm in a run, and what connects them."""
 
+    config: ArmConfig
     joints: tuple[JointPlan, ...]
-    model: ArmModel
-
-    @staticmethod
-    def envelope(joint: JointPlan, part: Placed, report: CommissioningReport) -> Iterable[str]:
-        """Of one joint, with the approach that all have in common."""
-        motion = joint.motion
-        return motion.envelope(part.constants[0], report) if isinstance(motion, ConfiguredMotion) else part.lines
 
 
 def joint_lines(report: CommissioningReport) -> list[str]:
@@ -186,7 +179,7 @@ def resolve_arm(arm: ArmConfig, *, allow_low_margin: bool = False) -> RunPlan:
         motion = ConfiguredMotion(config, trajectory_table(config))
         joints.append(JointPlan(config, motion, path.with_name(f"{path.stem}.{name}.mcap"), name))
     first = joints[0]
-    plan = ArmPlan(tuple(joints), arm.model)
+    plan = ArmPlan(arm, tuple(joints))
     return RunPlan(first.config, first.motion, first.log_path, allow_low_margin, arm=plan)
 
 

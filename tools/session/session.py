@@ -117,7 +117,7 @@ class Session:
         plan, port, marker_fd = self.plan, self._kind.port_record(), self._control.marker_fd
         if plan.arm is None:
             return LoopHandle(self._config, plan.motion.table, port, tail_path, marker_fd)
-        return LoopHandle(self._config, plan.tables, port, tail_path, marker_fd, plan.arm.model)
+        return LoopHandle(self._config, plan.tables, port, tail_path, marker_fd, plan.arm.config.model)
 
     def _opened(self) -> DriveGroup:
         """The drives of all joints, nothing sent to them yet."""

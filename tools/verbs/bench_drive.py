@@ -12,7 +12,7 @@ import os
 import re
 import tomllib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -25,6 +25,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.scoping.remote_options import NOBODY, ObserveOptions
 
 if TYPE_CHECKING:
+    from jointctl.tools.configuration.arm import ArmConfig
     from jointctl.tools.inspection.health import Finding
     from jointctl.tools.verbs.monitor import MonitorOptions
 
@@ -91,9 +92,9 @@ class BenchDrive(ABC):
     def serve(self, config: Config, output: Output, options: ServeOptions) -> int:
         """`jointctl hil`: keep the virtual joint up until a stop signal."""
 
-    def serve_all(self, joints: Sequence[Config], output: Output, options: ServeOptions) -> int:
-        """`serve` for the joints of an arm, all on the bus of the first one."""
-        raise ConfigurationError(f"{joints[0].path}: drive.kind (={joints[0].drive.kind}) must be canopen in an arm")
+    def serve_arm(self, arm: ArmConfig, output: Output, options: ServeOptions) -> int:
+        """`serve` for all joints of an arm."""
+        raise ConfigurationError(f"{arm.path}: its virtual joints have no drive of this kind")
 
     def require_rate(self, config: Config) -> None:  # noqa: B027  (most buses need nothing)
         """`ConfigurationError` with advice where bus or line cannot carry the rate that `check` is to judge."""

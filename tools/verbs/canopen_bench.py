@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +20,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.verbs.bench_drive import Asked, BenchDrive, ReadableKeys, ServeOptions, is_text
 
 if TYPE_CHECKING:
+    from jointctl.tools.configuration.arm import ArmConfig
     from jointctl.tools.inspection.health import Finding
     from jointctl.tools.inspection.subject import Subject
     from jointctl.tools.verbs.monitor import MonitorOptions
@@ -102,17 +103,18 @@ class CanopenBench(BenchDrive):
         yield from interface_state(config)  # last: a bus on which nobody acknowledges shows once something was sent
 
     def serve(self, config: Config, output: Output, options: ServeOptions) -> int:
-        return self.serve_all([config], output, options)
-
-    def serve_all(self, joints: Sequence[Config], output: Output, options: ServeOptions) -> int:
-        from jointctl.tools.session.canopen_drive import require_one_bus
         from jointctl.tools.verbs.hil import serve_can
 
         if options.serial or options.link is not None:
-            raise wrong_kind(joints[0].path, joints[0].drive.kind, FOR_A_PORT)
-        if len(joints) > 1:
-            require_one_bus(joints)
-        return serve_can(joints, output, timing=options.timing, ready_fd=options.ready_fd, live=options.live)
+            raise wrong_kind(config.path, config.drive.kind, FOR_A_PORT)
+        return serve_can(config, output, timing=options.timing, ready_fd=options.ready_fd, live=options.live)
+
+    def serve_arm(self, arm: ArmConfig, output: Output, options: ServeOptions) -> int:
+        from jointctl.tools.session.canopen_drive import require_one_bus
+        from jointctl.tools.verbs.hil import serve_can
+
+        require_one_bus(arm.joints)
+        return serve_can(arm, output, timing=options.timing, ready_fd=options.ready_fd, live=options.live)
 
 
 def canopen_subject(asked: Asked) -> Subject:

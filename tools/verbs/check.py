@@ -9,18 +9,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from jointctl.tools.verbs.verb_options import JointOfFile, ResultOutput
+from jointctl.drivers.errors import MarginError, UsageError
+from jointctl.tools.verbs.verb_options import JointOrArm, ResultOutput
 
 if TYPE_CHECKING:
     from jointctl.tools.analysis.linear_loop import LoopSettings
     from jointctl.tools.analysis.loop_settings import Assumption
     from jointctl.tools.analysis.margin_gate import Remedy
     from jointctl.tools.analysis.margins import Convergence, Margins, Theory
+    from jointctl.tools.configuration.arm import ArmConfig
     from jointctl.tools.configuration.config import Config
+    from jointctl.tools.output import Output
+
+_INERTIA_SLACK = 0.1  # by which joint.inertia_kgm2 may be outside of what the poses give, without a warning
 
 
 def check(
-    config: JointOfFile,
+    config: JointOrArm,
     output: ResultOutput,
     # from the sample to the torque command taking effect
     delay_s: Annotated[float | None, typer.Option("--delay", help="measured loop delay (s)", min=0.0)] = None,
@@ -29,7 +34,13 @@ def check(
     allow_low_margin: Annotated[bool, typer.Option("--allow-low-margin", help="accept a stable loop below it")] = False,
     choose_gains: Annotated[bool, typer.Option("--choose-gains", help="search gains for a flexible joint")] = False,
 ) -> int:
-    """Is the control loop stable enough?  Margins, bounds and what would help."""
+    """Is the control loop stable enough?  Margins, bounds and what would help; of an arm each joint over its poses."""
+    from jointctl.tools.configuration.arm import ArmConfig
+
+    if isinstance(config, ArmConfig):
+        if figure is not None or choose_gains:
+            raise UsageError("--figure and --choose-gains are for one joint's file, not for an arm's")
+        return check_arm(config, output, delay_s, allow_low_margin=allow_low_margin)
     from jointctl.tools.analysis.loop_report import contradictions, not_modelled, outside_payload_range
     from jointctl.tools.analysis.loop_settings import loop_settings
     from jointctl.tools.analysis.margin_gate import learning_of, meets, refusal, refuse_diverging_learning, remedies
@@ -74,6 +85,56 @@ def check(
     if not accepted:
         raise refusal(settings, found, minimum_deg, changes)
     refuse_diverging_learning(learning)
+    return 0
+
+
+def check_arm(arm: ArmConfig, output: Output, delay_s: float | None = None, *, allow_low_margin: bool = False) -> int:
+    """The bus budget of each bus, and each joint's margins over the inertias that the arm's poses give."""
+    from jointctl.tools.analysis.arm_check import HIGHEST_LOAD, joint_loops, require_budgets
+    from jointctl.tools.analysis.margin_gate import meets
+
+    budgets, loops = require_budgets(arm), joint_loops(arm, delay_s)
+    table = Table("joint or bus", "value", "note", title=f"Arm of {len(loops)} joints", title_justify="left")
+    for budget in budgets:
+        note = (
+            f"{', '.join(budget.joints)}: {budget.bits} bits a cycle at {arm.rate_Hz:g} Hz, {HIGHEST_LOAD:.0%} allowed"
+        )
+        table.add_row(budget.channel, f"{budget.load:.1%} of the bus", note)
+    refused = []
+    for loop in loops:
+        table.add_section()
+        found, minimum_deg, own = loop.margins, loop.config.margin.min_phase_margin_deg, loop.config.joint.inertia_kgm2
+        poses = loop.poses
+        table.add_row(
+            loop.name, f"{poses.least_kgm2:.3g} .. {poses.greatest_kgm2:.3g} kg m2",
+            f"over the poses; joint.inertia_kgm2 = {own:g}, gravity up to {poses.gravity_Nm:.3g} Nm",
+        )  # fmt: skip
+        margin = f"{found.phase_margin_deg:.1f} deg" if found.stable else "UNSTABLE"
+        table.add_row("  phase margin", margin, f"worst case: {found.joint}; {minimum_deg:g} deg wanted")
+        if not (1.0 - _INERTIA_SLACK) * poses.least_kgm2 <= own <= (1.0 + _INERTIA_SLACK) * poses.greatest_kgm2:
+            output.warning(
+                f"{loop.config.path}: joint.inertia_kgm2 (={own:g}) should be in "
+                f"[{poses.least_kgm2:.3g}..{poses.greatest_kgm2:.3g}], what the arm's poses give"
+            )
+        if not meets(found, minimum_deg) and not (found.stable and allow_low_margin):
+            refused.append(loop)
+    data = {
+        "buses": [asdict(budget) for budget in budgets],
+        "joints": [
+            {"name": loop.name, "poses": asdict(loop.poses), "stable": loop.margins.stable,
+             "phase_margin_deg": loop.margins.phase_margin_deg, "worst_case": loop.margins.joint}
+            for loop in loops
+        ],
+    }  # fmt: skip
+    output.result(table, data)
+    if refused:
+        from jointctl.tools.analysis.margin_gate import refusal, remedies
+
+        first = refused[0]
+        minimum_deg = first.config.margin.min_phase_margin_deg
+        changes = remedies(first.settings, minimum_deg)
+        error = refusal(first.settings, first.margins, minimum_deg, changes)
+        raise MarginError(f"joint {first.name}: {error.message}", error.hint)
     return 0
 
 

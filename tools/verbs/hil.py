@@ -7,7 +7,7 @@ import os
 import select
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,6 +20,7 @@ from jointctl.tools.scoping.remote_options import NOBODY, ObserveOptions
 from jointctl.tools.verbs.verb_options import BusOptions, ConfigPath, ProgressOutput, loaded_joint_or_arm
 
 if TYPE_CHECKING:
+    from jointctl.tools.configuration.arm import ArmConfig
     from jointctl.tools.configuration.config import Config
     from jointctl.tools.session.control import StopSignals
 
@@ -60,7 +61,7 @@ def hil(
     if not isinstance(joint, Config):
         if model.eds is not None or live != NOBODY:
             raise UsageError(f"--eds, --foxglove and --ros2 are for a single joint, and {joint.path} is an arm")
-        return bench_of(joint.joints[0]).serve_all(joint.joints, output, options)
+        return bench_of(joint.joints[0]).serve_arm(joint, output, options)
     if model.eds is not None:
         joint = with_eds(joint, model.eds)
     return bench_of(joint).serve(joint, output, options)
@@ -77,7 +78,7 @@ def with_eds(config: Config, eds: Path) -> Config:
 
 
 def serve_can(
-    joints: Sequence[Config],
+    given: Config | ArmConfig,
     output: Output,
     *,
     timing: bool = False,
@@ -88,15 +89,17 @@ def serve_can(
     from jointctl.hil.realtime_device import ENDED_WORD
     from jointctl.hil.virtual_bus import default_socket_path
     from jointctl.tools.configuration.canopen import canopen_section
+    from jointctl.tools.configuration.config import Config
     from jointctl.tools.session.control import stop_signals
     from jointctl.tools.session.loop_process import slow_start
     from jointctl.tools.virtual_joint import serve_virtual_joint
 
+    joints = [given] if isinstance(given, Config) else list(given.joints)
     config = joints[0]
     with (
         slow_start(output.note, "virtual joint") as started,
         stop_signals() as signals,
-        serve_virtual_joint(joints, timing) as joint,
+        serve_virtual_joint(given, timing) as joint,
     ):
         started()
         make_realtime(config, output)

@@ -36,7 +36,7 @@ NOBODY = DriveOptions()
 
 
 def new(
-    path: Annotated[Path, typer.Argument(metavar="FILE", help="configuration to write (TOML)")],
+    path: Annotated[Path, typer.Argument(metavar="FILE", help="configuration to write (TOML); with --arm a folder")],
     output: ProgressOutput,
     *,
     shipped: Annotated[
@@ -45,11 +45,16 @@ def new(
     ] = "elmo_gold_can",
     drive: DriveOptions = NOBODY,
     no_input: Annotated[bool, typer.Option("--no-input", help="ask nothing; what is open stays marked")] = False,
+    arm: Annotated[bool, typer.Option("--arm", help="a folder with the shipped arm: URDF, arm file, joints")] = False,
 ) -> int:
     """Write a configuration of your own, a copy of a shipped one to fill in; with -i, -c and --node from the drive.
 
     The drive says what it knows (identity, rated values, counts), the rest is asked for, one question each.
     """
+    if arm:
+        if drive != NOBODY:
+            raise UsageError("--arm asks no drive: -i, -c, -b and --node are for a joint's file")
+        return _new_arm(path, output)
     from jointctl.tools.configuration.load import read_text, shipped_config
     from jointctl.tools.inspection.first_values import filled
 
@@ -74,6 +79,25 @@ def new(
         output.note(f"next: fill in the {marked} values marked FILL IN, then jointctl doctor {path}")
     elif drive != NOBODY:
         output.note(f"next: jointctl doctor {path}, then jointctl run {path} --dry-run")
+    return 0
+
+
+def _new_arm(folder: Path, output: Output) -> int:
+    """The files of the shipped arm in a folder of their own."""
+    from jointctl.tools.configuration.arm import SHIPPED_ARM
+
+    try:
+        folder.mkdir(parents=True)
+        for source in sorted(SHIPPED_ARM.parent.iterdir()):
+            if source.suffix in (".toml", ".urdf"):
+                (folder / source.name).write_bytes(source.read_bytes())
+                output.note(f"written: {folder / source.name}")
+    except FileExistsError:
+        raise DataError(f"{folder}: exists already, a configuration is never overwritten") from None
+    except OSError as error:
+        raise DataError(f"{folder}: cannot be written: {error.strerror or error}") from None
+    arm_file = folder / SHIPPED_ARM.name
+    output.note(f"next: put your URDF in, name its joints in {arm_file}, then jointctl check {arm_file}")
     return 0
 
 

@@ -225,6 +225,18 @@ def _loaded_file(config: ConfigPath) -> Config:
     return loaded(config)
 
 
+def _loaded_file_or_arm(config: ConfigPath) -> Config | ArmConfig:
+    from jointctl.tools.configuration.arm import is_arm, load_arm
+
+    path = config_path(config)
+    if not is_arm(path):
+        return loaded(config)
+    found = load_arm(path)
+    for remark in found.remarks:
+        Output().warning(f"{found.path}: {remark}")
+    return found
+
+
 def _loaded_or_virtual(*, config: ConfigPath = Path("virtual"), bus: BusOptions) -> Config:
     return loaded(config, bus)
 
@@ -262,6 +274,7 @@ ManyRuns = Annotated["Workers | None", _workers]  # where many runs are carried 
 JointOnBus = Annotated["Config", _loaded]
 JointOrArmOnBus = Annotated["Config | ArmConfig", _loaded_joint_or_arm]
 JointOfFile = Annotated["Config", _loaded_file]
+JointOrArm = Annotated["Config | ArmConfig", _loaded_file_or_arm]
 JointOrVirtual = Annotated["Config", _loaded_or_virtual]
 ResultOutput = Annotated[Output, _json_output]  # of a verb that is done at once
 ProgressOutput = Annotated[Output, _quiet_output]  # of a verb without a result

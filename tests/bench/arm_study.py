@@ -1,0 +1,129 @@
+"""What an arm's model buys: random simulated arms of three joints under the gains of `precise`, without learning.
+
+    python -m tests.bench.arm_study [arms] [seed] [picture.png]
+
+Each arm is the shipped one with joints drawn as `jointctl study` draws them (friction +-10 % a direction, ripples, lag,
+delay, encoder), masses and inertias of every link +-10 %, and torque ripple up to 1 % of the joint's torque.  The
+controller believes the shipped figures.  The joints move in sines whose periods never repeat together, at three speeds;
+the fastest is near the joints' limits.  The same arm runs with independent joints, with gravity alone, and with the
+whole model.  Errors are the true ones (joint angle minus desired angle) after the first 5 s.  All of it is simulated.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jointctl.firmware_py.arm_model import ArmFeedForward
+from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.drawing import BLUE, GREEN, ORANGE, canvas, save_png
+from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant
+from jointctl.tools.lockstep import LockstepArm, LockstepRun
+
+DURATION_s = 40.0
+SETTLED_s = 5.0
+BASE_Hz = 0.2
+RATIOS = (1.0, (1.0 + 5.0**0.5) / 2.0, 5.0**0.5)
+SPEEDS = (0.4, 0.8, 1.3)  # factors on these frequencies
+KINDS = {
+    "independent joints": ArmFeedForward.NONE, "gravity only": ArmFeedForward.GRAVITY,
+    "whole model": ArmFeedForward.WHOLE,
+}  # fmt: skip
+
+
+def random_arm(arm: ArmConfig, seed: int, index: int) -> ArmConfig:
+    """Arm number `index` of the study with this seed."""
+    joints: list[Config] = []
+    for number, config in enumerate(arm.joints):
+        ensemble = EnsembleSettings(
+            stick_slip_share=0.0, inertia_scale=(0.9, 1.1), torque_ripple_Nm=(0.0, 0.01 * config.limits.torque_max_Nm)
+        )
+        joints.append(random_plant(config, ensemble, seed, 100 * index + number))
+    return replace(arm, joints=tuple(joints))
+
+
+def faster(constants: Any, speed: float) -> Any:
+    """The motion of the arm, its frequencies `speed` times those of the study."""
+    constants = constants.copy()
+    for axis, ratio in zip(constants, RATIOS, strict=True):
+        axis.trajectory.omega_radps = 2.0 * np.pi * BASE_Hz * ratio * speed
+        axis.trajectory.duration_s = DURATION_s
+    return constants
+
+
+def run(arm: LockstepArm, kind: ArmFeedForward, speed: float) -> list[LockstepRun]:
+    constants = faster(arm.constants(), speed)
+    constants.law.of_arm[:] = kind != ArmFeedForward.NONE
+    model = arm.arm.model.memory()
+    model.constants[0].feed_forward = kind
+    return arm.run(constants, model=model)
+
+
+def settled(one: LockstepRun) -> np.ndarray:
+    return one.tracking & (one.log.trajectory_s > SETTLED_s)
+
+
+def rmse_mrad(runs: list[LockstepRun]) -> list[float]:
+    """Of each joint; infinite if a run ended in a fault."""
+    if any(one.fault for one in runs):
+        return [float("inf")] * len(runs)
+    return [1e3 * float(np.sqrt(np.mean(one.true_error_rad[settled(one)] ** 2))) for one in runs]
+
+
+def study(arms: int, seed: int) -> np.ndarray:
+    """RMSE [mrad], array (speeds, kinds, arms, joints)."""
+    shipped = load_arm(SHIPPED_ARM)
+    found = np.zeros((len(SPEEDS), len(KINDS), arms, len(shipped.joints)))
+    for index in range(arms):
+        arm = LockstepArm(random_arm(shipped, seed, index))
+        for i, speed in enumerate(SPEEDS):
+            for k, kind in enumerate(KINDS.values()):
+                found[i, k, index] = rmse_mrad(run(arm, kind, speed))
+    return found
+
+
+def table(found: np.ndarray, names: tuple[str, ...]) -> list[str]:
+    """Lines of a table for docs/arm.md: median and 95 % of the arms, and what the whole model gains."""
+    lines = [
+        "| speed | joint | independent joints | gravity only | whole model | independent / whole |",
+        "|---|---|---|---|---|---|",
+    ]
+    for i, speed in enumerate(SPEEDS):
+        for joint, name in enumerate(names):
+            cells = [
+                f"{np.median(one):.3f} ({np.percentile(one, 95):.3f})"
+                for one in (found[i, k, :, joint] for k in range(3))
+            ]
+            gain = np.median(found[i, 0, :, joint] / found[i, 2, :, joint])
+            lines.append(f"| {speed:g} | {name} | {' | '.join(cells)} | {gain:.1f} |")
+    return lines
+
+
+def picture(path: Path) -> None:
+    """The shipped arm's joints at the highest speed, errors of the first ten seconds."""
+    arm = LockstepArm(load_arm(SHIPPED_ARM))
+    with canvas(6.0) as figure:
+        axes = figure.subplots(3, 1, sharex=True)
+        for (label, kind), colour in zip(KINDS.items(), (ORANGE, BLUE, GREEN), strict=True):
+            for axis, one, name in zip(axes, run(arm, kind, SPEEDS[-1]), arm.arm.names, strict=True):
+                shown = one.tracking & (one.log.trajectory_s < 10.0)
+                axis.plot(
+                    one.log.trajectory_s[shown], 1e3 * one.true_error_rad[shown], color=colour, linewidth=0.9,
+                    label=label,
+                )  # fmt: skip
+                axis.set_ylabel(f"{name} [mrad]")
+        axes[0].legend(loc="upper right", ncols=3)
+        axes[-1].set_xlabel("time [s]")
+        save_png(figure, path)
+
+
+if __name__ == "__main__":
+    count, chosen = (int(text) for text in (sys.argv[1:3] + ["20", "1"][len(sys.argv[1:3]) :]))
+    print("\n".join(table(study(count, chosen), load_arm(SHIPPED_ARM).names)))
+    if len(sys.argv) > 3:
+        picture(Path(sys.argv[3]))

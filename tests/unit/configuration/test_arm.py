@@ -1,0 +1,205 @@
+"""Arm files: what is read, and one clear line for each thing that cannot be."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.arm_model import newton_euler
+from jointctl.firmware_py.states import TrajectoryKind
+from jointctl.tools.configuration.arm import SHIPPED_ARM, load_arm
+from jointctl.tools.configuration.records import trajectory_table
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A copy of the shipped arm."""
+    return Path(shutil.copytree(SHIPPED_ARM.parent, tmp_path / "arm"))
+
+
+def change(path: Path, pattern: str, text: str) -> None:
+    """Replace one place of a file; it must be there."""
+    found, count = re.subn(pattern, text, path.read_text(), count=1, flags=re.S)
+    assert count == 1, f"{pattern} is not in {path.name}"
+    path.write_text(found)
+
+
+def problem(folder: Path) -> str:
+    with pytest.raises(ConfigurationError) as caught:
+        load_arm(folder / "arm.toml")
+    message = caught.value.message
+    assert "\n" not in message, message
+    return message
+
+
+def test_the_shipped_arm_is_the_one_that_pinocchio_reads() -> None:
+    """Torques of the whole model, payload and motors included, against another reader and another algorithm."""
+    arm = load_arm(SHIPPED_ARM)
+    model = pin.buildModelFromUrdf(str(SHIPPED_ARM.parent / "arm.urdf"))
+    payload = pin.Inertia(arm.arm.payload_kg, np.array(arm.arm.payload_at_m), np.zeros((3, 3)))
+    model.appendBodyToJoint(3, payload, pin.SE3.Identity())
+    model.armature = np.array(arm.arm.motor_inertia_kgm2)
+    memory = arm.model.memory()
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        q, v, a = rng.normal(size=(3, 3))
+        for own, *motion in zip(memory.motion, q, v, a, strict=False):
+            own.position_rad, own.velocity_radps, own.acceleration_radps2 = motion
+        newton_euler(memory)
+        np.testing.assert_allclose(
+            memory.motion.torque_Nm[:3], pin.rnea(model, model.createData(), q, v, a), rtol=1e-11
+        )
+
+
+URDF = """<robot name="skew">
+  <link name="world"/>
+  <joint name="mount" type="fixed"><parent link="world"/><child link="base"/>
+    <origin xyz="0.1 0.2 0.3" rpy="0.1 0.4 -1.2"/></joint>
+  <link name="base"><inertial><mass value="9"/>
+    <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+  <joint name="a" type="continuous"><parent link="base"/><child link="one"/><origin xyz="0 0.1 0.2" rpy="0.3 0 0.7"/>
+    <axis xyz="1 2 -0.5"/></joint>
+  <link name="one"><inertial><origin xyz="0.1 0 0.02" rpy="0.2 0.5 0.1"/><mass value="2"/>
+    <inertia ixx="0.02" ixy="0.003" ixz="0.001" iyy="0.03" iyz="-0.002" izz="0.025"/></inertial></link>
+  <joint name="flange" type="fixed"><parent link="one"/><child link="plate"/><origin xyz="0.2 0 0" rpy="0 1 0"/></joint>
+  <link name="plate"><inertial><origin xyz="0 0.05 0"/><mass value="0.5"/>
+    <inertia ixx="0.002" ixy="0" ixz="0" iyy="0.001" iyz="0" izz="0.0015"/></inertial></link>
+  <joint name="finger" type="prismatic"><parent link="plate"/><child link="tip"/><origin xyz="0 0 0.1"/>
+    <axis xyz="0 1 0"/><limit lower="0" upper="0.05" velocity="1" effort="10"/></joint>
+  <link name="tip"><inertial><mass value="0.1"/>
+    <inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" iyz="0" izz="1e-4"/></inertial></link>
+  <joint name="b" type="revolute"><parent link="plate"/><child link="two"/><origin xyz="0.3 0 0" rpy="0 0 1"/>
+    <axis xyz="0 -1 0"/><limit lower="-3" upper="3" velocity="9" effort="900"/></joint>
+  <link name="two"><inertial><origin xyz="0 0 0.2"/><mass value="1"/>
+    <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.004"/></inertial></link>
+</robot>"""
+
+
+def test_fixed_parts_skew_axes_and_joints_that_are_not_the_arms(folder: Path) -> None:
+    (folder / "arm.urdf").write_text(URDF)
+    change(folder / "arm.toml", r'\["shoulder.toml.*?\]', '["shoulder.toml", "elbow.toml"]')
+    change(folder / "arm.toml", r"joint_names = \[.*?\]", 'joint_names = ["a", "b"]')
+    change(folder / "arm.toml", r"motor_inertia_kgm2 = \[.*?\]", "motor_inertia_kgm2 = [0.0, 0.0]")
+    change(
+        folder / "arm.toml", r"\[motion\].*", '[motion]\nkind = "hold"\nduration_s = 1.0\nposition_rad = [0.0, 0.0]\n'
+    )
+    arm = load_arm(folder / "arm.toml")
+    assert arm.remarks == ("joint finger of arm.urdf is not the arm's: it stands at 0",)
+    whole = pin.buildModelFromXML(URDF)
+    model = pin.buildReducedModel(whole, [whole.getJointId("finger")], pin.neutral(whole))
+    frame = model.frames[model.getFrameId("two")]
+    model.appendBodyToJoint(
+        frame.parentJoint,
+        pin.Inertia(arm.arm.payload_kg, np.array(arm.arm.payload_at_m), np.zeros((3, 3))), frame.placement,
+    )  # fmt: skip
+    memory = arm.model.memory()
+    q, v, a = np.array([0.4, -0.9]), np.array([1.0, 2.0]), np.array([-3.0, 2.0])
+    for own, *motion in zip(memory.motion, q, v, a, strict=False):
+        own.position_rad, own.velocity_radps, own.acceleration_radps2 = motion
+    newton_euler(memory)
+    turned = np.array([np.cos(q[0]), np.sin(q[0]), q[1]])  # a joint without limits is a point of the circle
+    np.testing.assert_allclose(
+        memory.motion.torque_Nm[:2], pin.rnea(model, model.createData(), turned, v, a), rtol=1e-11
+    )
+
+
+def test_each_joint_gets_its_part_of_the_motion() -> None:
+    arm = load_arm(SHIPPED_ARM)
+    assert [config.trajectory.amplitude_rad for config in arm.joints] == [0.5, 0.7, 0.8]
+    constants = arm.axis_constants([trajectory_table(config) for config in arm.joints], [0.1, 0.1, 0.1])
+    assert set(constants.trajectory.kind) == {TrajectoryKind.SINE}
+    assert len(set(constants.sequence.approach_s)) == 1
+    assert constants.law.of_arm.all()
+
+
+def test_a_move_ends_for_all_joints_at_once_within_every_limit(folder: Path) -> None:
+    text = '[motion]\nkind = "min_jerk"\nduration_s = 5.0\nstart_rad = [0, 0, 0]\ntarget_rad = [0.5, -1.5, 0.1]\n'
+    change(folder / "arm.toml", r"\[motion\].*", text)
+    arm = load_arm(folder / "arm.toml")
+    times = [config.trajectory.move_s for config in arm.joints]
+    peaks = [1.875 * way / times[0] for way in (0.5, 1.5, 0.1)]
+    shares = [peak / config.limits.velocity_max_radps for peak, config in zip(peaks, arm.joints, strict=True)]
+    assert len(set(times)) == 1
+    assert max(shares) == pytest.approx(0.9, rel=1e-3)
+
+
+def test_a_table_has_a_column_for_each_joint(folder: Path) -> None:
+    rows = ["time_s,elbow_rad,wrist_rad,shoulder_rad", "0,0.0,0.1,0.2", "1,0.1,0.2,0.3", "2,0.0,0.1,0.2"]
+    (folder / "way.csv").write_text("\n".join(rows) + "\n")
+    change(folder / "arm.toml", r"\[motion\].*", '[motion]\nkind = "table"\nduration_s = 2.0\nfile = "way.csv"\n')
+    arm = load_arm(folder / "arm.toml")
+    starts = [trajectory_table(config)[0, 1] for config in arm.joints]
+    assert starts == [0.2, 0.0, 0.1]
+
+
+IN_URDF: list[tuple[str, str, str]] = [
+    (r"<inertial>\s*<origin xyz=\"0.16.*?</inertial>", "", "link forearm, which joint elbow moves, has no <inertial>"),
+    (r'<mass value="2.4"/>', '<mass value="2400"/>', "link forearm: mass (='2400') must be within 1000; grams"),
+    (r'xyz="0.35 0 0"', 'xyz="350 0 0"', "joint elbow: xyz (='350 0 0') must be within 10; millimetres"),
+    (
+        r'lower="-2.1"',
+        'lower="-120"',
+        "joint elbow: limit lower (='-120') must be within 12.57",
+    ),
+    (r'xyz="0.30 0 0"', 'xyz="0.30 0 0" rpy="0 90 0"', "joint wrist: rpy (='0 90 0') must be within 12.57; degrees"),
+    (r'ixx="0.004" ixy="0" ixz="0.001"', 'ixx="0.4" ixy="0" ixz="0"', "link forearm: the principal moments"),
+    (r'iyy="0.028"', 'iyy="28000"', "link forearm: iyy (='28000') must be within 240; kg mm2"),
+    (r'<parent link="forearm"/>', '<parent link="hand"/>', "joint wrist is in a loop"),
+    (
+        r'<child link="hand"/>',
+        '<child link="forearm"/>',
+        "link forearm has two joints above it, elbow and wrist: a loop",
+    ),
+    (r'<axis xyz="0 1 0"/>', '<axis xyz="0 0 0"/>', "joint shoulder: axis must not be 0 0 0"),
+    (r'name="wrist" type="revolute"', 'name="wrist" type="planar"', "joint wrist: type (=planar) must be one of"),
+    (r'name="wrist" type="revolute"', 'name="wrist" type="prismatic"', "joint wrist (=prismatic) must be revolute"),
+    (r'name="wrist"', 'name="hand_turn"', "arm.joint_names: wrist must be a joint of arm.urdf that moves by itself"),
+    (r"<robot", "<!DOCTYPE robot><robot", "must have no DOCTYPE"),
+    (r"</robot>", "", "not valid XML"),
+    (
+        r'velocity="3.0" effort="80"',
+        'velocity="1.5" effort="80"',
+        "elbow.toml: limits.velocity_max_radps (=2.2) must be",
+    ),
+]
+
+
+@pytest.mark.parametrize(("pattern", "text", "words"), IN_URDF, ids=[words[:40] for _, _, words in IN_URDF])
+def test_a_urdf_that_cannot_be(folder: Path, pattern: str, text: str, words: str) -> None:
+    change(folder / "arm.urdf", pattern, text)
+    assert words in problem(folder)
+
+
+IN_FILES: list[tuple[str, str, str, str]] = [
+    ("elbow.toml", r"node = 2", "node = 1", "elbow.toml: drive.node (=1) must differ from drive.node of shoulder.toml"),
+    ("wrist.toml", r"rate_Hz = 1000.0", "rate_Hz = 500.0", "wrist.toml: loop.rate_Hz (=500) must be that of shoulder"),
+    ("wrist.toml", r"bitrate_bitps = 1_000_000", "bitrate_bitps = 500_000", "wrist.toml: bus.bitrate_bitps (=500000)"),
+    ("arm.toml", r'"elbow", "wrist"\]', '"elbow"]', "arm.joint_names (=2: shoulder, elbow) must be as many as"),
+    ("arm.toml", r'"shoulder", "elbow", ', '"elbow", "shoulder", ', "joint shoulder is nearer to the base than elbow"),
+    ("arm.toml", r"amplitude_rad = \[0.5, ", "amplitude_rad = [", "motion.amplitude_rad (=2 numbers) must have 3"),
+    ("arm.toml", r"amplitude_rad = \[0.5", "amplitude_rad = [1.2", "with [motion], shoulder.toml: trajectory"),
+    ("arm.toml", r"payload_kg", "payload", "arm.payload is not a known key: did you mean payload_kg"),
+    ("arm.toml", r'feed_forward = "whole"', 'feed_forward = "all"', "arm.feed_forward (=all) must be"),
+    ("arm.toml", r"motor_inertia_kgm2 = \[.*?\]", "", "arm.motor_inertia_kgm2 must be given"),
+    ("arm.toml", r'urdf = "arm.urdf"', 'urdf = "no.urdf"', "cannot be read"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "pattern", "text", "words"), IN_FILES, ids=[one[3][:40] for one in IN_FILES])
+def test_files_that_do_not_fit_together(folder: Path, name: str, pattern: str, text: str, words: str) -> None:
+    change(folder / name, pattern, text)
+    assert words in problem(folder)
+
+
+def test_two_buses_may_have_the_same_node(folder: Path) -> None:
+    change(folder / "elbow.toml", r"node = 2", "node = 1")
+    change(folder / "elbow.toml", r'channel = "virtual0"', 'channel = "virtual1"')
+    joints: Any = load_arm(folder / "arm.toml").joints
+    assert [config.drive.node for config in joints] == [1, 1, 3]

@@ -1,0 +1,151 @@
+"""What an arm asks of its buses and of the loops of its joints: bus budgets, inertias and gravity over the poses."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from jointctl.drivers.can.frames import bus_load, highest_rate_Hz
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.arm_model import newton_euler
+from jointctl.tools.analysis.linear_loop import LoopSettings, RigidJoint
+from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.margins import Margins, margins
+from jointctl.tools.configuration.arm import ArmConfig
+from jointctl.tools.configuration.canopen import cycle_bytes
+from jointctl.tools.configuration.config import Config
+
+# of a bus by the cyclic frames at worst-case stuffing; above that of one joint, whose rate is seldom as high as the bus
+# allows: the rest carries the same few heartbeats and emergencies
+HIGHEST_LOAD = 0.85
+RATES_Hz = (4000, 2000, 1000, 500, 250, 200, 125, 100)  # that a clock divides well
+MOST_POSES = 3000
+
+
+@dataclass(frozen=True)
+class BusBudget:
+    """The cyclic frames of one bus at the rate of the loop."""
+
+    channel: str
+    joints: tuple[str, ...]
+    bits: int  # of a cycle, at worst
+    load: float
+    fitting_Hz: float  # the highest rate of `RATES_Hz` that fits; 0 if none does
+
+
+@dataclass(frozen=True)
+class PoseRange:
+    """Of one joint over a grid of poses within the limits."""
+
+    least_kgm2: float  # M_ii
+    greatest_kgm2: float
+    gravity_Nm: float  # greatest magnitude
+
+
+@dataclass(frozen=True)
+class JointOfArm:
+    """The loop of one joint, with the worst of the inertias that the poses give."""
+
+    name: str
+    config: Config
+    poses: PoseRange
+    settings: LoopSettings
+    margins: Margins
+
+
+def bus_budgets(arm: ArmConfig) -> list[BusBudget]:
+    """One for each bus; SYNC counts once."""
+    buses: dict[tuple[str, str, int], list[tuple[str, Config]]] = {}
+    for name, config in zip(arm.names, arm.joints, strict=True):
+        bus = config.bus
+        buses.setdefault((bus.interface, bus.channel, bus.bitrate_bitps), []).append((name, config))
+    budgets = []
+    for (_, channel, bitrate), joints in buses.items():
+        lengths = [0, *(n for _, config in joints for n in cycle_bytes(config)[1:])]
+        load = bus_load(lengths, arm.rate_Hz, bitrate)
+        most_Hz = highest_rate_Hz(lengths, bitrate, HIGHEST_LOAD)
+        fitting = next((rate for rate in RATES_Hz if rate <= most_Hz), 0)
+        bits = round(load * bitrate / arm.rate_Hz)
+        budgets.append(BusBudget(channel, tuple(name for name, _ in joints), bits, load, float(fitting)))
+    return budgets
+
+
+def require_budgets(arm: ArmConfig) -> list[BusBudget]:
+    """The budgets; `ConfigurationError` for a bus that cannot carry its joints at this rate."""
+    budgets = bus_budgets(arm)
+    full = [budget for budget in budgets if budget.load > HIGHEST_LOAD]
+    if full:
+        worst = max(full, key=lambda budget: budget.load)
+        fits = f"{worst.fitting_Hz:g} Hz fits" if worst.fitting_Hz else "no rate of [100..4000] fits"
+        raise ConfigurationError(
+            f"{arm.path}: bus {worst.channel}: {len(worst.joints)} joints ({', '.join(worst.joints)}) need "
+            f"{worst.bits} bits a cycle, {worst.load:.1%} of the bus at loop.rate_Hz (={arm.rate_Hz:g}), "
+            f"{HIGHEST_LOAD:.0%} allowed",
+            f"{fits} in every joint's file, or put some of the joints on a second bus",
+        )
+    return budgets
+
+
+def poses(arm: ArmConfig) -> Iterator[tuple[float, ...]]:
+    """A grid within the joints' limits, their ends included; the middle is among them."""
+    count = max(3, int(MOST_POSES ** (1.0 / len(arm.joints))) // 2 * 2 + 1)
+    yield from itertools.product(
+        *(np.linspace(c.limits.position_min_rad, c.limits.position_max_rad, count) for c in arm.joints)
+    )
+
+
+def pose_ranges(arm: ArmConfig) -> list[PoseRange]:
+    """Inertias M_ii and gravity of each joint over the grid of poses."""
+    memory = arm.model.memory()
+    gravity_mps2, motion = memory.constants.gravity_mps2[0].copy(), memory.motion
+    axes = len(arm.joints)
+    inertias, loads = [], []
+    for pose in poses(arm):
+        for axis, angle in enumerate(pose):
+            motion.position_rad[axis] = angle
+        memory.constants.gravity_mps2[0] = gravity_mps2
+        motion.acceleration_radps2[:] = 0.0
+        newton_euler(memory)
+        loads.append(np.abs(motion.torque_Nm[:axes]))
+        memory.constants.gravity_mps2[0] = 0.0
+        own = np.zeros(axes)
+        for axis in range(axes):
+            motion.acceleration_radps2[:] = 0.0
+            motion.acceleration_radps2[axis] = 1.0
+            newton_euler(memory)
+            own[axis] = motion.torque_Nm[axis]
+        inertias.append(own)
+    low, high, load = np.min(inertias, axis=0), np.max(inertias, axis=0), np.max(loads, axis=0)
+    return [PoseRange(float(low[i]), float(high[i]), float(load[i])) for i in range(axes)]
+
+
+def joint_loop(name: str, config: Config, found: PoseRange, delay_s: float | None = None) -> JointOfArm:
+    """Margins of a joint's loop with the least and the greatest inertia; of a flexible one the link's goes with it."""
+    reducer, inertia = config.reducer, config.joint.inertia_kgm2
+    ends = found.least_kgm2, found.greatest_kgm2
+    if reducer is not None:
+        motor = reducer.motor_inertia_kgm2
+        factors = tuple((end - motor) / (inertia - motor) for end in ends)
+        config = config.model_copy(update={"margin": config.margin.model_copy(update={"payload_range": factors})})
+        settings, _ = loop_settings(config, delay_s)
+    else:
+        settings, _ = loop_settings(config, delay_s)
+        rigid = tuple(RigidJoint(end, f"inertia {end:.3g} kg m2") for end in ends)
+        settings = replace(settings, joints=rigid)
+    return JointOfArm(name, config, found, settings, margins(settings))
+
+
+def joint_loops(arm: ArmConfig, delay_s: float | None = None) -> list[JointOfArm]:
+    """One for each joint, over the poses within the limits; `ConfigurationError` where gravity exceeds the torque."""
+    loops = []
+    for name, config, found in zip(arm.names, arm.joints, pose_ranges(arm), strict=True):
+        if found.gravity_Nm >= config.limits.torque_max_Nm:
+            raise ConfigurationError(
+                f"{arm.path}: joint {name}: gravity reaches {found.gravity_Nm:.3g} Nm within the joints' limits, and "
+                f"limits.torque_max_Nm (={config.limits.torque_max_Nm:g}) of {config.path.name} must be more"
+            )
+        loops.append(joint_loop(name, config, found, delay_s))
+    return loops
