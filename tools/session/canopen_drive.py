@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -65,14 +65,11 @@ class CanopenSession(SessionDrive):
         require_one_bus(configs)
         first = self.open(configs[0], gate)
         assert isinstance(first, CanopenDrive)
-        drives = [first]
         try:
-            for config in configs[1:]:
-                drives.append(CanopenDrive(first, canopen_settings(config), gate=gate))
+            return DriveGroup([first, *(CanopenDrive(first, canopen_settings(each), gate=gate) for each in configs[1:])])
         except BaseException:
             first.close()
             raise
-        return DriveGroup(drives)
 
     def port_record(self) -> type:
         from jointctl.drivers.canopen.cyclic import CanopenPort
@@ -103,6 +100,11 @@ class CanopenSession(SessionDrive):
 
     def in_fault(self, status_word: int) -> bool:
         return state_of_word(status_word) in _BAD
+
+    def bits_sent(self, ports: Any) -> float:
+        """Each drive's exchange counts what it sends itself, SYNC, and everything that it receives."""
+        others = sum(int(port.cycle) * worst_frame_bits(int(port.rpdo_length)) for port in ports[1:])
+        return float(ports[0].bits_sent) + others
 
     def load_row(self, share: float) -> tuple[str, str]:
         return "bus load", f"{share:.1%} at worst-case stuffing"

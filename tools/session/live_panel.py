@@ -7,7 +7,7 @@ import io
 import os
 import select
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Self
 
 import numpy as np
@@ -30,17 +30,25 @@ from jointctl.tools.session.session_drive import drive_state_name, session_drive
 
 
 NOTES = 3  # how many of the newest remarks stay in the panel
+_ALONE: Mapping[str, Snapshot] = {}  # a joint that is no arm's
 _NAME_WIDTH, _LEAST_WIDTH, _RIGHT_WIDTH = 11, 15, 19  # columns of the panel
 
 
-def panel(title: str, phase: str, snapshot: Snapshot | None, notes: list[str]) -> Panel:
-    """The picture of one moment; the same number of lines whatever happens, so that nothing jumps."""
+def panel(
+    title: str, phase: str, snapshot: Snapshot | None, notes: list[str], joints: Mapping[str, Snapshot] = _ALONE
+) -> Panel:
+    """The picture of one moment; the same number of lines whatever happens, so that nothing jumps.
+
+    `joints`: the newest snapshots of an arm's, by name.
+    """
     lines = [Text(f"  {line}", style="dim", no_wrap=True) for line in [*notes, *[""] * (NOTES - len(notes))]]
-    border = "red" if snapshot is not None and int(snapshot.record.fault) else "blue"
+    shown = list(joints.values()) or ([snapshot] if snapshot is not None else [])
+    border = "red" if any(int(each.record.fault) for each in shown) else "blue"
+    body = _joint_rows(joints) if joints else _Grid(_cells(phase, snapshot))
     foot = "Ctrl-C: brake and disable; again: quick stop"
     return Panel(
         # a str would be read as markup
-        Group(_Grid(_cells(phase, snapshot)), *lines), title=Text(title), subtitle=foot, title_align="left",
+        Group(body, *lines), title=Text(title), subtitle=foot, title_align="left",
         subtitle_align="left", border_style=border, width=78,
     )  # fmt: skip
 
@@ -98,6 +106,23 @@ def _cells(phase: str, snapshot: Snapshot | None) -> list[tuple[str, str | Text]
     return list(zip(names, values, strict=True))
 
 
+def _joint_rows(joints: Mapping[str, Snapshot]) -> Table:
+    """A line for each joint of an arm."""
+    table = Table(box=None, show_header=True, header_style="dim", pad_edge=False)
+    for heading in ("joint", "phase", "angle [rad]", "error [mrad]", "torque [Nm]", "fault"):
+        table.add_column(heading, no_wrap=True, justify="left" if heading in ("joint", "phase", "fault") else "right")
+    for name, snapshot in joints.items():
+        record = snapshot.record
+        active = AxisPhase.APPROACH <= int(record.phase) <= AxisPhase.RAMPING
+        fault = int(record.fault)
+        table.add_row(
+            Text(name), phase_name(int(record.phase)), f"{float(record.position_rad):+.4f}",
+            f"{float(record.error_rad) * 1e3:+.3f}" if active else "-", f"{float(record.command_torque_Nm):+.2f}",
+            Text(fault_words(fault), style="bold red") if fault else "none",
+        )  # fmt: skip
+    return table
+
+
 def time_left(trajectory_s: float, duration_s: float, phase: int) -> str:
     """In words; while the joint approaches, trajectory time is negative and counts as well."""
     if phase > AxisPhase.TRACKING:
@@ -149,6 +174,7 @@ class LivePanel(OnlyShows):
         self._title = printable(title)
         self._refresh_s = refresh_s
         self._snapshot: Snapshot | None = None
+        self._joints: dict[str, Snapshot] = {}  # of an arm
         self._phase = "starting"
         self._notes: list[str] = []
         self._ended = threading.Event()
@@ -168,6 +194,8 @@ class LivePanel(OnlyShows):
 
     def show(self, snapshot: Snapshot) -> None:
         self._snapshot = snapshot
+        if snapshot.joint:
+            self._joints = {**self._joints, snapshot.joint: snapshot}
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -190,7 +218,7 @@ class LivePanel(OnlyShows):
                     live.update(self._panel(), refresh=True)
 
     def _panel(self) -> Panel:
-        return panel(self._title, self._phase, self._snapshot, self._notes)
+        return panel(self._title, self._phase, self._snapshot, self._notes, self._joints)
 
 
 def run_display(output: Output, title: str) -> Callable[[], Display]:

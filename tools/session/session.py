@@ -257,7 +257,8 @@ class Session:
         watch.log.write_event(INFO, "drive", f"after the run: {state}")
         if recorder is not None and recorder.dropped:
             watch.log.write_event(WARNING, "log", f"{recorder.dropped} CAN frames were not recorded: too slow")
-        results = [self._result(*each, state, elapsed_s) for each in zip(watches, reports, strict=True)]
+        bus_load = self._kind.bits_sent(loop.block.port) / (self._config.bus.bitrate_bitps * elapsed_s)
+        results = [self._result(*each, state, bus_load) for each in zip(watches, reports, strict=True)]
         return replace(results[0], others=tuple(results[1:]))
 
     @staticmethod
@@ -292,7 +293,7 @@ class Session:
                 loop.beat()
                 time.sleep(POLL_S)
 
-    def _result(self, watch: RunWatch, report: CommissioningReport, drive_state: str, elapsed_s: float) -> RunResult:
+    def _result(self, watch: RunWatch, report: CommissioningReport, drive_state: str, bus_load: float) -> RunResult:
         loop, config = watch.loop, watch.config
         if not len(watch.kept):
             raise JointctlError("the loop ended without one cycle")
@@ -307,7 +308,6 @@ class Session:
             text = self._kind.fault_text(config, fault, value, *errors)
             text = held_up_text(fault, value, text, records, config.loop.rate_Hz)
             text = watch.around.bus_watch.explained(fault, text, int(loop.block.port[0].last_errno))
-        bus_load = float(loop.block.port[0].bits_sent) / (config.bus.bitrate_bitps * elapsed_s)
         return RunResult(
             summary=summarise(records, loop.block.histograms, temperatures_degC=watch.temperature.values_degC),
             records=records,

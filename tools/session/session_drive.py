@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -99,6 +99,10 @@ class SessionDrive(ABC):
     def in_fault(self, status_word: int) -> bool:
         """Whether the status word alone tells of a fault."""
         return False
+
+    def bits_sent(self, ports: Any) -> float:
+        """On bus or line in this run, `ports` the records of the exchange of all joints."""
+        return float(ports[0].bits_sent)
 
     @abstractmethod
     def load_row(self, share: float) -> tuple[str, str]:

@@ -1,0 +1,215 @@
+"""The drives of an arm on one bus: off before any is commissioned, each with its watchdog, switched off at once."""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jointctl.drivers.canopen.drive import CanopenDrive
+from jointctl.drivers.canopen.settings import CanopenSettings
+from jointctl.drivers.drive import UNTOUCHED, DriveGroup, common_state, is_safe
+from jointctl.drivers.errors import BusError, NoDeviceError
+from jointctl.hil.canopen.device import Cia402Device
+from jointctl.hil.canopen.records import NmtState, PowerState
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.verbs import bench_drive
+from jointctl.tools.virtual_joint import new_devices
+from tests.device_on_bus import DeviceOnBus
+from tests.places import CONFIGS
+
+NODES = (1, 2, 3)
+HEARTBEAT = 0x700 + 126
+
+
+class Drives:
+    """Several virtual drives as one for `DeviceOnBus`."""
+
+    def __init__(self, devices: list[Cia402Device]) -> None:
+        self.devices, self.settings = devices, devices[0].settings
+
+    def handle(self, frame: bytes, now_ns: int) -> list[bytes]:
+        return [answer for device in self.devices for answer in device.handle(frame, now_ns)]
+
+    def advance(self, now_ns: int) -> list[bytes]:
+        return [answer for device in self.devices for answer in device.advance(now_ns)]
+
+
+@dataclasses.dataclass
+class Arm:
+    bus: DeviceOnBus
+    drives: Drives
+    group: DriveGroup
+
+    def device(self, axis: int) -> Any:
+        return self.drives.devices[axis].device[0]
+
+    def objects(self, axis: int, index: int, sub: int = 0) -> int:
+        return int(self.drives.devices[axis].objects.value(index, sub))
+
+    def power_up(self, axis: int) -> None:
+        """As another program has left it: enabled, at rest."""
+        for word in (0x06, 0x07, 0x0F):
+            data = struct.pack("<BHBI", 0x2B, 0x6040, 0, word)
+            for frame in (struct.pack("<IB3x8s", 0x600 + NODES[axis], 8, data),):
+                self.drives.handle(frame, self.bus.now_ns)
+        assert self.device(axis).state == PowerState.OPERATION_ENABLED
+
+    def written(self, node: int) -> list[int]:
+        """Objects of a node that have been written over SDO."""
+        return [
+            struct.unpack_from("<H", data, 1)[0]
+            for identifier, data in self.bus.requests
+            if identifier == 0x600 + node and data[0] >> 5 == 1
+        ]
+
+
+def settings_of(settings: CanopenSettings, node: int) -> CanopenSettings:
+    return dataclasses.replace(settings, node=node)
+
+
+@pytest.fixture
+def arm(settings_of_virtual_joint: CanopenSettings) -> Iterator[Arm]:
+    config = load_config(CONFIGS / "virtual.toml")
+    settings_of_virtual_joint = dataclasses.replace(settings_of_virtual_joint, sdo_timeout_s=1.0)
+    configs = [
+        config.model_copy(update={"drive": config.drive.model_copy(update={"node": node})}) for node in NODES
+    ]  # fmt: skip
+    drives = Drives(new_devices(configs))
+    with DeviceOnBus(drives, settings_of_virtual_joint) as bus:  # type: ignore[arg-type]
+        first = bus.drive(settings_of_virtual_joint)
+        others = [CanopenDrive(first, settings_of(settings_of_virtual_joint, n), sleep=first._sleep) for n in NODES[1:]]
+        group = DriveGroup([first, *others])
+        yield Arm(bus, drives, group)
+        group.close()
+
+
+def test_each_drive_is_commissioned_and_its_watchdog_proven(arm: Arm) -> None:
+    reports = arm.group.commission()
+    assert len(reports) == len(NODES)
+    for axis in range(len(NODES)):
+        assert reports[axis].settings["watchdog detects"] == "EMCY 8130h"
+        assert arm.objects(axis, 0x1016, 1) == 126 << 16 | 200
+        assert arm.objects(axis, 0x6007) == 3
+        assert arm.objects(axis, 0x1400, 5) == 100
+        assert arm.device(axis).nmt == NmtState.PRE_OPERATIONAL  # the proofs of the others have put none to sleep
+        assert arm.device(axis).state == PowerState.SWITCH_ON_DISABLED
+    arm.group.start_cyclic()
+    assert [int(arm.device(axis).nmt) for axis in range(3)] == [NmtState.OPERATIONAL] * 3
+    ports = arm.group.port()
+    assert list(ports.rpdo_id) == [0x201, 0x202, 0x203]
+    assert list(ports.tpdo_id) == [0x181, 0x182, 0x183]
+    assert len(np.unique(ports.own_heartbeat_id)) == 1
+
+
+@pytest.mark.parametrize("lost", [0, 1, 2])
+def test_nothing_is_written_to_any_drive_before_all_have_been_found(arm: Arm, lost: int) -> None:
+    del arm.drives.devices[lost]
+    with pytest.raises(NoDeviceError, match=f"node {NODES[lost]} does not answer"):
+        arm.group.commission()
+    assert [arm.written(node) for node in NODES] == [[], [], []]
+
+
+@pytest.mark.parametrize("enabled", [0, 1, 2])
+def test_a_drive_that_is_found_enabled_is_left_as_it_is_without_the_users_word(arm: Arm, enabled: int) -> None:
+    """No proof of another one's watchdog stops it either: its load would not have been asked about."""
+    arm.power_up(enabled)
+    with pytest.raises(BusError, match=f"node {NODES[enabled]} is operation enabled"):
+        arm.group.commission()
+    assert arm.device(enabled).state == PowerState.OPERATION_ENABLED
+    assert not [identifier for identifier, _ in arm.bus.requests if identifier == HEARTBEAT]
+
+
+@pytest.mark.parametrize("enabled", [0, 1, 2])
+def test_its_twin_is_braked_first_with_the_users_word(arm: Arm, enabled: int) -> None:
+    arm.power_up(enabled)
+    asked: list[str] = []
+
+    def yes(question: str) -> bool:
+        assert not [identifier for identifier, _ in arm.bus.requests if identifier == HEARTBEAT]
+        asked.append(question)
+        return True
+
+    reports = arm.group.commission(yes)
+    assert len(asked) == 1
+    assert ["braked" in " ".join(report.remarks) for report in reports] == [axis == enabled for axis in range(3)]
+
+
+@pytest.mark.parametrize(
+    ("identifier", "data", "words"),
+    [
+        (0x202, bytes(4), "RPDO to node 2"), (0x603, bytes.fromhex("4000100000000000"), "SDO request"),
+        (0, bytes([1, 2]), "NMT 'start' to node 2"), (0x80, b"", "SYNC"),
+    ],
+)  # fmt: skip
+def test_another_controller_of_any_joint_refuses_the_arm(arm: Arm, identifier: int, data: bytes, words: str) -> None:
+    arm.bus.send(identifier, data)
+    with pytest.raises(BusError, match=words):
+        arm.group.commission()
+    assert [arm.written(node) for node in NODES] == [[], [], []]
+
+
+def test_and_a_stranger_on_the_bus_is_a_remark_but_no_drive_of_the_arm_is_one(arm: Arm) -> None:
+    arm.bus.send(0x709, b"\x05")
+    assert all("heartbeats of 9" in " ".join(report.remarks) for report in arm.group.commission())
+
+
+@pytest.mark.parametrize("changed", [0, 1, 2])
+def test_no_drive_is_started_if_one_has_lost_what_stops_it(arm: Arm, changed: int) -> None:
+    arm.group.commission()
+    arm.drives.devices[changed].objects.store(0x6007, 0, struct.pack("<h", 0))
+    with pytest.raises(Exception, match="6007"):
+        arm.group.start_cyclic()
+    assert [int(arm.device(axis).nmt) for axis in range(3)] == [NmtState.PRE_OPERATIONAL] * 3
+
+
+@pytest.mark.parametrize("deaf", [0, 1, 2])
+def test_a_drive_that_does_not_answer_keeps_no_other_one_from_being_switched_off(
+    arm: Arm, deaf: int, short_timeout: None
+) -> None:
+    arm.group.commission()
+    for axis in range(3):
+        arm.power_up(axis)
+    devices = list(arm.drives.devices)
+    lost = arm.drives.devices.pop(deaf)
+    states = arm.group.make_safe()
+    assert [is_safe(state) for state in states] == [axis != deaf for axis in range(3)]
+    assert [int(each.device[0].state) == PowerState.OPERATION_ENABLED for each in devices] == [
+        each is lost for each in devices
+    ]  # fmt: skip
+    said = common_state(("a", "b", "c"), states)
+    assert said.startswith(f"{'abc'[deaf]}: unknown")
+    assert not is_safe(said)
+
+
+@pytest.mark.parametrize(
+    ("states", "common", "safe"),
+    [
+        (("off", "off"), "off", True), (("off", "fault"), "off, b: fault", True),
+        (("off", UNTOUCHED), f"off, b: {UNTOUCHED}", True), ((UNTOUCHED, UNTOUCHED), UNTOUCHED, False),
+        (("off", "operation enabled"), "b: operation enabled", False),
+        (("unknown: x", UNTOUCHED), "a: unknown: x", False), (("unknown: x",), "unknown: x", False),
+    ],
+)  # fmt: skip
+def test_an_arm_is_off_only_if_every_drive_is(states: tuple[str, ...], common: str, safe: bool) -> None:
+    assert common_state(("a", "b")[: len(states)], states) == common
+    assert is_safe(common) is safe
+
+
+def test_stop_finds_every_joint_of_an_arm_whatever_else_its_files_say(tmp_path: Path) -> None:
+    text = (CONFIGS / "virtual.toml").read_text()
+    for node in NODES:
+        (tmp_path / f"{node}.toml").write_text(text.replace("node = 1", f"node = {node}", 1))
+    path = tmp_path / "arm.toml"
+    path.write_text('[arm]\njoints = ["1.toml", "2.toml", "3.toml"]\nthis is no TOML\n')
+    targets, unread = bench_drive.stop_targets(path)
+    assert ([target.node for target in targets], unread) == ([1, 2, 3], [])  # type: ignore[attr-defined]
+    (tmp_path / "2.toml").unlink()
+    targets, unread = bench_drive.stop_targets(path)
+    assert [target.node for target in targets] == [1, 3]  # type: ignore[attr-defined]
+    assert len(unread) == 1
