@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jointctl.firmware_py.kernel import inlined, kernel
+from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.libc import (
     EAGAIN,
     EINTR,
@@ -77,11 +77,6 @@ class _Joint(NamedTuple):
     plant_s: Any  # PlantState
     queue: Any  # FrameQueue
     service_fd: int
-
-
-@inlined
-def _joint_of(of: DeviceMemory, index: int, service_fd: int) -> _Joint:
-    return _Joint(of.devices[index], of.plant_constants[index], of.plant_states[index], of.queues[index], service_fd)
 
 
 @kernel
@@ -178,7 +173,10 @@ def _let_faults_act(of: DeviceMemory, faults: Any, service_fd: int, now_ns: int)
     if faults is None:
         return
     for index in range(len(of.devices)):
-        joint, memory = _joint_of(of, index, service_fd), of.fault_memories[index]
+        memory = of.fault_memories[index]
+        joint = _Joint(
+            of.devices[index], of.plant_constants[index], of.plant_states[index], of.queues[index], service_fd
+        )
         step_faults(faults[index], memory, joint.device, joint.plant_c, joint.plant_s, now_ns)
         take_due(memory, True, now_ns, False, memory.ready)
         _take_frames(joint, memory.ready, now_ns)
@@ -191,12 +189,17 @@ def _take_from_bus(of: DeviceMemory, faults: Any, service_fd: int, now_ns: int) 
     sent_ns = sent_ns_of(frame, now_ns)
     if faults is not None:
         for index in range(len(of.devices)):
-            joint, memory = _joint_of(of, index, service_fd), of.fault_memories[index]
+            memory = of.fault_memories[index]
+            joint = _Joint(
+                of.devices[index], of.plant_constants[index], of.plant_states[index], of.queues[index], service_fd
+            )
             step_faults(faults[index], memory, joint.device, joint.plant_c, joint.plant_s, sent_ns)
     if len(of.devices) > 1:  # a single joint moves on when it takes the frame
         _advance_all(of, sent_ns)
     for index in range(len(of.devices)):
-        joint = _joint_of(of, index, service_fd)
+        joint = _Joint(
+            of.devices[index], of.plant_constants[index], of.plant_states[index], of.queues[index], service_fd
+        )
         if faults is None:
             _take_frame(joint, frame, sent_ns)
         else:

@@ -1,0 +1,164 @@
+"""The shipped arm of three joints in real time, from the command line: run, stop, and what dies on the way."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import struct
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+from jointctl.drivers.canopen.cia402 import State, state_of_word
+from jointctl.firmware_py.states import AxisPhase, DriveState, Fault
+from jointctl.tools.configuration.arm import SHIPPED_ARM
+from jointctl.tools.recording.run_log_reader import read_run_log
+
+NODES = (1, 2, 3)
+NAMES = ("shoulder", "elbow", "wrist")
+OFF = (State.SWITCH_ON_DISABLED, State.FAULT)
+
+
+class ArmBench:
+    """The shipped arm's files on a bus of the test's own, and its virtual drives."""
+
+    def __init__(self, bench: Any) -> None:
+        self.bench, self.folder = bench, bench.folder / "arm"
+        shutil.copytree(SHIPPED_ARM.parent, self.folder)
+        for path in self.folder.glob("*.toml"):
+            text = path.read_text()
+            text = re.sub(r'(?m)^channel = "\w+"', f'channel = "{bench.channel}"', text)
+            text = re.sub(r"(?m)^sample_age_max_s = \S+", "sample_age_max_s = 0.15", text)
+            text = re.sub(r"(?m)^skipped_max_s = \S+", "skipped_max_s = 0.15", text)
+            path.write_text(text)
+        self.path = str(self.folder / "arm.toml")
+        self.drives = bench.start("hil", self.path).saw("virtual arm: nodes 1, 2, 3")
+
+    def tracking(self) -> Any:
+        """A run that tracks by now."""
+        return self.bench.start("run", self.path, "-y").saw("  tracking")
+
+    def states(self) -> list[State]:
+        """Of each drive, over SDO."""
+        with can.Bus(interface="jointctl", channel=self.bench.channel) as bus:
+            return [self._state(bus, node) for node in NODES]
+
+    @staticmethod
+    def _state(bus: can.BusABC, node: int) -> State:
+        request = struct.pack("<BHB4x", 0x40, 0x6041, 0)
+        bus.send(can.Message(arbitration_id=0x600 + node, data=request, is_extended_id=False))
+        while (answer := bus.recv(2.0)) is not None:
+            if answer.arbitration_id == 0x580 + node:
+                return state_of_word(int.from_bytes(answer.data[4:6], "little"))
+        pytest.fail(f"node {node} does not answer")
+
+    def all_off(self, within_s: float = 2.0) -> bool:
+        give_up_s = time.monotonic() + within_s
+        states = self.states()
+        while not all(state in OFF for state in states):
+            if time.monotonic() > give_up_s:
+                pytest.fail(f"not off: {states}")
+            states = self.states()
+        return True
+
+    def logs(self) -> list[Any]:
+        """Of the newest run, in the order of the joints."""
+        return [read_run_log(max(self.bench.folder.glob(f"runs/*.{name}.mcap"))) for name in NAMES]
+
+
+@pytest.fixture
+def arm(bench: Any) -> Iterator[ArmBench]:
+    made = ArmBench(bench)
+    yield made
+    made.drives.signal(signal.SIGTERM)
+    made.drives.finished(30.0)
+
+
+def test_demo_moves_three_joints_and_leaves_a_log_of_each(bench: Any) -> None:
+    done = bench.run("demo", "--arm", "--duration", "2.0", "--json")
+    assert done.code == 0, done.err
+    joints = json.loads(done.out)["joints"]
+    assert [joint["name"] for joint in joints] == list(NAMES)
+    assert [joint["fault"] for joint in joints] == [None] * 3
+    assert {joint["drive_state"] for joint in joints} == {"switch on disabled"}
+    assert 0.3 < joints[0]["bus_load"] < 0.8  # 74.5 % at 1 kHz with the longest frames, without skipped slots
+    logs = [read_run_log(bench.folder / joint["log"]) for joint in joints]
+    assert len({len(log.records) for log in logs}) == 1
+    for log in logs:
+        assert np.ptp(log.records.position_rad[log.records.phase == AxisPhase.TRACKING]) > 0.1
+        assert log.records.drive_state[-1] == DriveState.OFF
+    together = np.stack([log.records.phase for log in logs])
+    powered = (together >= AxisPhase.APPROACH) & (together <= AxisPhase.RAMPING)
+    assert np.all(powered.all(axis=0) == powered.any(axis=0))  # torque begins and ends in the same cycle
+
+
+@pytest.mark.parametrize("joint", ["arm", "elbow"])
+def test_stop_on_the_arms_file_and_on_a_joints_file_stops_all(arm: ArmBench, joint: str) -> None:
+    run = arm.tracking()
+    stopped = arm.bench.run("stop", str(arm.folder / f"{joint}.toml"))
+    assert stopped.code == 0, stopped.err
+    assert run.finished(30.0).code == 130
+    assert arm.all_off()
+
+
+def test_ctrl_c_brakes_all_joints_along_their_ramps(arm: ArmBench) -> None:
+    run = arm.tracking()
+    run.signal(signal.SIGINT)
+    assert run.finished(30.0).code == 130
+    assert arm.all_off()
+    for log in arm.logs():
+        phases = [AxisPhase(int(p)) for p in np.unique(log.records.phase)]
+        assert AxisPhase.RAMPING in phases
+        assert AxisPhase.QUICK_STOPPING not in phases
+
+
+@pytest.mark.parametrize("node", NODES)
+def test_a_drive_that_restarts_stops_the_others_along_their_ramps(arm: ArmBench, node: int) -> None:
+    run = arm.tracking()
+    with can.Bus(interface="jointctl", channel=arm.bench.channel) as bus:
+        bus.send(can.Message(arbitration_id=0, data=[0x81, node], is_extended_id=False))
+    done = run.finished(30.0)
+    assert done.code in (4, 7), done.err
+    assert arm.all_off()
+
+
+@pytest.mark.parametrize("dies", ["loop", "both"])
+def test_loop_or_all_killed_every_drive_stops_by_its_own_watchdog(arm: ArmBench, dies: str) -> None:
+    run = arm.tracking()
+    loop = next(
+        pid for pid in run.children() if b"loop_process" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    )  # fmt: skip
+    if dies == "both":
+        run.signal(signal.SIGKILL)
+    os.kill(loop, signal.SIGKILL)
+    if dies == "loop":
+        assert run.finished(30.0).code == 7
+    assert arm.all_off()
+
+
+def test_one_drive_of_three_missing_moves_nothing(arm: ArmBench) -> None:
+    path = arm.folder / "wrist.toml"
+    path.write_text(path.read_text().replace("node = 3", "node = 9"))
+    done = arm.bench.run("run", arm.path, "-y")
+    done.refused(5, "node 9 does not answer")
+    assert arm.all_off()
+
+
+def test_the_fault_of_one_joint_is_named_with_it(arm: ArmBench) -> None:
+    path = arm.folder / "elbow.toml"
+    text = re.sub(r"(?m)^following_error_max_rad = \S+", "following_error_max_rad = 0.00002", path.read_text())
+    path.write_text(text)
+    done = arm.bench.run("run", arm.path, "-y")
+    assert done.code == 7, done.err
+    assert "elbow: FOLLOWING_ERROR" in done.err
+    assert arm.all_off()
+    faults = [int(log.records.fault[-1]) for log in arm.logs()]
+    assert faults == [Fault.NONE, Fault.FOLLOWING_ERROR, Fault.NONE]
