@@ -74,7 +74,7 @@ class JointOfArm:
 
 
 class ArmPlant(NamedTuple):
-    """The memory of the arm; without links the joints are on their own."""
+    """The memory of the arm; without links the joints are on their own, and only what their drives ask is kept."""
 
     constants: np.ndarray  # ArmPlantConstants[1]
     links: np.ndarray  # ArmLink[N]
@@ -83,7 +83,8 @@ class ArmPlant(NamedTuple):
 
 
 def no_arm_plant() -> ArmPlant:
-    return arm_plant(new(ArmLink, 0), (0.0, 0.0, 0.0))
+    """Of joints that nothing connects."""
+    return ArmPlant(new(ArmPlantConstants), new(ArmLink, 0), new(JointOfArm, MOST_JOINTS + 1), np.zeros(1, np.int64))
 
 
 def arm_plant(links: Any, gravity_mps2: tuple[float, ...]) -> ArmPlant:

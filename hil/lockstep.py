@@ -24,7 +24,7 @@ from jointctl.firmware_py.libc import load_acquire, store_release
 from jointctl.firmware_py.records import SET_POINTS, AxisState, Sample, StreamConstants
 from jointctl.firmware_py.states import StopRequest
 from jointctl.hil.arm_plant import ArmPlant, no_arm_plant
-from jointctl.hil.canopen.device_core import accept_frame, advance, advance_arm
+from jointctl.hil.canopen.device_core import accept_frame, advance, advance_together
 from jointctl.hil.canopen.records import Device
 from jointctl.hil.fault_kinds import FaultKind, is_active, kind_active
 from jointctl.hil.faults import clock_step_cycles, collect, hand_over, step_faults, take_due, to_drive
@@ -220,11 +220,10 @@ def _step_world(world: World, now_ns: int) -> None:
     faults, memory = world.faults, world.fault_memory[0]
     if len(faults) > 0:
         step_faults(faults, memory, device, joint_c, joint, now_ns)
-    if len(world.arm.links) > 0:
-        advance_arm(world.device, world.plant_constants, world.plant, world.arm, now_ns, world.queue)
+    if len(world.device) > 1 or len(world.arm.links) > 0:
+        advance_together(world.device, world.plant_constants, world.plant, now_ns, world.queue, world.arm)
     else:
-        for axis in range(len(world.device)):
-            advance(world.device[axis], world.plant_constants[axis], world.plant[axis], now_ns, world.queue[axis])
+        advance(device, joint_c, joint, now_ns, outgoing)
     if len(faults) > 0:
         collect(faults, memory, device, outgoing, now_ns)
         take_due(memory, False, now_ns, False, memory.to_controller)

@@ -337,10 +337,8 @@ def _begin_advance(device: Device, until_ns: int, queue: FrameQueue) -> None:
 
 
 @inlined
-def _after_substep(
-    device: Device, plant_c: PlantConstants, plant_s: PlantState, step_ns: int, queue: FrameQueue
-) -> bool:
-    """Events and timers; True if something happened that may change the torque."""
+def _end_substep(device: Device, plant_c: PlantConstants, plant_s: PlantState, step_ns: int, queue: FrameQueue) -> bool:
+    """The drive's part of a substep whose plant has moved; whether its timers ran, which may change the torque."""
     device.time_ns += step_ns
     before = int64(device.event_status) >> 16
     if int64(device.state) != before & 0xFF or device.time_ns >= device.next_due_ns:
@@ -372,38 +370,46 @@ def advance(device: Device, plant_c: PlantConstants, plant_s: PlantState, until_
         if not held:
             torque_Nm, held = _torque_Nm(device, plant_c, plant_s, plant_c.step_s, queue)
         step_plant(plant_c, plant_s, torque_Nm)
-        if _after_substep(device, plant_c, plant_s, step_ns, queue):
+        if _end_substep(device, plant_c, plant_s, step_ns, queue):
             held = False
     _end_advance(device, plant_c, plant_s, until_ns, queue)
 
 
 @kernel
-def advance_arm(
-    devices: np.ndarray, constants: np.ndarray, states: np.ndarray, arm: ArmPlant, until_ns: int, queues: np.ndarray
-) -> None:
-    """The same for the drives of an arm, whose joints move one another: arrays of one record a joint, equal steps.
+def advance_together(
+    devices: np.ndarray, plant_constants: np.ndarray, plant_states: np.ndarray, until_ns: int, queues: np.ndarray,
+    arm: ArmPlant,
+) -> None:  # fmt: skip
+    """`advance` for the drives of an arm, one substep after the other; all arrays have one record a drive.
 
-    A drive without power holds its joint with its brake.
+    The one place where the plants of an arm move on; `arm` couples them, or is `no_arm_plant`.  All have the same step,
+    and the same time, as no one else advances them.  In an arm a drive without power holds its joint with its brake.
     """
-    count = len(devices)
-    step_ns = int64(np.rint(constants[0].step_s * 1e9))
-    for i in range(count):
-        _begin_advance(devices[i], until_ns, queues[i])
-        arm.joints[i].held = 0
+    if len(devices) == 1 and len(arm.links) == 0:
+        advance(devices[0], plant_constants[0], plant_states[0], until_ns, queues[0])
+        return
+    step_ns = int64(np.rint(plant_constants[0].step_s * 1e9))
+    for index in range(len(devices)):
+        _begin_advance(devices[index], until_ns, queues[index])
+        arm.joints[index].held = 0
     while devices[0].time_ns + step_ns <= until_ns:
-        for i in range(count):
-            joint = arm.joints[i]
+        for index in range(len(devices)):
+            joint, device = arm.joints[index], devices[index]
+            plant_c, plant_s = plant_constants[index], plant_states[index]
             if joint.held == 0:
-                torque_Nm, held = _torque_Nm(devices[i], constants[i], states[i], constants[i].step_s, queues[i])
+                torque_Nm, held = _torque_Nm(device, plant_c, plant_s, plant_c.step_s, queues[index])
                 joint.target_Nm = torque_Nm
                 joint.held = 1 if held else 0
-                joint.braked = 0 if is_powered(devices[i]) else 1
-        step_arm(constants, states, arm)
-        for i in range(count):
-            if _after_substep(devices[i], constants[i], states[i], step_ns, queues[i]):
-                arm.joints[i].held = 0
-    for i in range(count):
-        _end_advance(devices[i], constants[i], states[i], until_ns, queues[i])
+                joint.braked = 0 if is_powered(device) else 1
+            if len(arm.links) == 0:
+                step_plant(plant_c, plant_s, joint.target_Nm)
+        if len(arm.links) > 0:
+            step_arm(plant_constants, plant_states, arm)
+        for index in range(len(devices)):
+            if _end_substep(devices[index], plant_constants[index], plant_states[index], step_ns, queues[index]):
+                arm.joints[index].held = 0
+    for index in range(len(devices)):
+        _end_advance(devices[index], plant_constants[index], plant_states[index], until_ns, queues[index])
 
 
 @kernel
