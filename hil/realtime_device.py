@@ -35,7 +35,7 @@ from jointctl.firmware_py.libc import (
 from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.hil.arm_plant import ArmPlant, no_arm_plant
 from jointctl.hil.canopen.device import Cia402Device
-from jointctl.hil.canopen.device_core import accept_frame, advance, advance_arm
+from jointctl.hil.canopen.device_core import accept_frame, advance, advance_together
 from jointctl.hil.canopen.records import Device, NmtState, int64
 from jointctl.hil.fault_kinds import FaultConstants, FaultMemory, fault_memory, no_faults
 from jointctl.hil.faults import append_frame, pass_frame, step_faults, take_due
@@ -161,10 +161,7 @@ def _wait_for_frames(fd: int, service_fd: int, wait_ns: int, polls: np.ndarray, 
 
 @kernel
 def _advance_all(of: DeviceMemory, until_ns: int) -> None:
-    if len(of.devices) > 1:
-        advance_arm(of.devices, of.plant_constants, of.plant_states, of.arm, until_ns, of.queues)
-    else:
-        advance(of.devices[0], of.plant_constants[0], of.plant_states[0], until_ns, of.queues[0])
+    advance_together(of.devices, of.plant_constants, of.plant_states, until_ns, of.queues, of.arm)
 
 
 @kernel
