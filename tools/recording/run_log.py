@@ -503,12 +503,15 @@ def require_room(config: Config, path: Path) -> None:
 def remove_oldest(config: Config, path: Path) -> list[Path]:
     """Keep the newest `log.keep` runs of this configuration, `path` counted as one; returns what was removed.
 
-    A run is its log with the pictures and pages beside it, by name; nothing else in the folder is touched.
+    A run is its log with the pictures and pages beside it, by name; nothing else in the folder is touched.  Of an arm
+    the logs of each joint count by themselves.
     """
     if not config.log.keep or not path.parent.is_dir():
         return []
+    of_arm = re.fullmatch(r"(.*)-\d{8}-\d{6}(?:-\d+)?(\..+)", path.stem)
+    first, joint = (of_arm[1], of_arm[2]) if of_arm is not None else (config.path.stem, "")
     name = re.compile(
-        rf"({re.escape(config.path.stem)}-\d{{8}}-\d{{6}}(?:-\d+)?)(?:\.tail|\.recording-\d+)?\.(?:mcap|png|html)"
+        rf"({re.escape(first)}-\d{{8}}-\d{{6}}(?:-\d+)?{re.escape(joint)})(?:\.tail|\.recording-\d+)?\.(?:mcap|png|html)"
     )
     runs: dict[str, list[Path]] = {}
     for file in path.parent.iterdir():

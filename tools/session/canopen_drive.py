@@ -66,10 +66,11 @@ class CanopenSession(SessionDrive):
         first = self.open(configs[0], gate)
         assert isinstance(first, CanopenDrive)
         try:
-            return DriveGroup([first, *(CanopenDrive(first, canopen_settings(each), gate=gate) for each in configs[1:])])
+            others = [CanopenDrive(first, canopen_settings(config), gate=gate) for config in configs[1:]]
         except BaseException:
             first.close()
             raise
+        return DriveGroup([first, *others])
 
     def port_record(self) -> type:
         from jointctl.drivers.canopen.cyclic import CanopenPort

@@ -170,7 +170,13 @@ def resolve_any(config: Config | ArmConfig, *, allow_low_margin: bool = False, h
 
 
 def resolve_arm(arm: ArmConfig, *, allow_low_margin: bool = False) -> RunPlan:
-    """The plan of `run` for an arm: each joint has its part of the motion, and a log of its own."""
+    """The plan of `run` for an arm: each joint has its part of the motion, and a log of its own.
+
+    `ConfigurationError` also where a bus cannot carry the joints on it.
+    """
+    from jointctl.tools.analysis.arm_check import require_budgets  # a single joint does not wait for it
+
+    require_budgets(arm)
     named = arm.joints[0].model_copy()
     named._path = arm.path
     path = log_path(named)

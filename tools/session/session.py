@@ -190,6 +190,9 @@ class Session:
             watches = []
             for axis, (joint, report) in enumerate(zip(self._joints, reports, strict=True)):
                 metadata = run_metadata(joint.config, report)
+                if plan.arm is not None:  # its [motion] is what the joint does, and not the joint's own [trajectory]
+                    arm = plan.arm.config
+                    metadata["arm"] = {"configuration": arm.text, "path": str(arm.path), "joint": joint.name}
                 if plan.log_every > 1:
                     metadata[THINNING] = {"every": str(plan.log_every), "whole_s": f"{plan.log_full_rate_s:g}"}
                 log = stack.enter_context(RunLogWriter(joint.log_path, metadata))
