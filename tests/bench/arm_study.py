@@ -6,7 +6,7 @@ Each arm is the shipped one with joints drawn as `jointctl study` draws them (fr
 delay, encoder), masses and inertias of every link +-10 %, and torque ripple up to 1 % of the joint's torque.  The
 controller believes the shipped figures.  The joints move in sines whose periods never repeat together, at three speeds;
 the fastest is near the joints' limits.  The same arm runs with independent joints, with gravity alone, and with the
-whole model.  Errors are the true ones (joint angle minus desired angle) after the first 5 s.  All of it is simulated.
+whole model.  Errors are the true ones (joint angle minus desired angle) after the first 10 s.  All of it is simulated.
 """
 
 from __future__ import annotations
@@ -14,22 +14,25 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from jointctl.firmware_py.arm_model import ArmFeedForward
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.sections import Sine
 from jointctl.tools.drawing import BLUE, GREEN, ORANGE, canvas, save_png
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant
 from jointctl.tools.lockstep import LockstepArm, LockstepRun
 
 DURATION_s = 40.0
-SETTLED_s = 5.0
+SETTLED_s = 10.0
 BASE_Hz = 0.2
 RATIOS = (1.0, (1.0 + 5.0**0.5) / 2.0, 5.0**0.5)
-SPEEDS = (0.4, 0.8, 1.3)  # factors on these frequencies
+AMPLITUDES_rad = (1.0, 0.7, 0.6)
+OFFSETS_rad = (-0.2, 0.8, 0.0)
+SPEEDS = (0.5, 1.2, 2.2)  # factors on these frequencies
+PAPER_BRISTLE_Nmprad, PAPER_DAMPING_Nmspr = 8e4, 200.0  # of the joint that `jointctl study` draws from
 KINDS = {
     "independent joints": ArmFeedForward.NONE, "gravity only": ArmFeedForward.GRAVITY,
     "whole model": ArmFeedForward.WHOLE,
@@ -40,24 +43,34 @@ def random_arm(arm: ArmConfig, seed: int, index: int) -> ArmConfig:
     """Arm number `index` of the study with this seed."""
     joints: list[Config] = []
     for number, config in enumerate(arm.joints):
+        assert config.friction is not None
+        assert config.friction.lugre is not None
+        size = config.friction.lugre.stiffness_Nmprad / PAPER_BRISTLE_Nmprad  # of its friction beside the paper's joint
+        low, high = EnsembleSettings().bristle_stiffness_Nmprad
         ensemble = EnsembleSettings(
-            stick_slip_share=0.0, inertia_scale=(0.9, 1.1), torque_ripple_Nm=(0.0, 0.01 * config.limits.torque_max_Nm)
-        )
+            stick_slip_share=0.0, inertia_scale=(0.9, 1.1), torque_ripple_Nm=(0.0, 0.01 * config.limits.torque_max_Nm),
+            bristle_stiffness_Nmprad=(size * low, size * high), bristle_damping_Nmspr=size * PAPER_DAMPING_Nmspr,
+        )  # fmt: skip
         joints.append(random_plant(config, ensemble, seed, 100 * index + number))
     return replace(arm, joints=tuple(joints))
 
 
-def faster(constants: Any, speed: float) -> Any:
-    """The motion of the arm, its frequencies `speed` times those of the study."""
-    constants = constants.copy()
-    for axis, ratio in zip(constants, RATIOS, strict=True):
-        axis.trajectory.omega_radps = 2.0 * np.pi * BASE_Hz * ratio * speed
-        axis.trajectory.duration_s = DURATION_s
-    return constants
+def moving(arm: ArmConfig, speed: float) -> ArmConfig:
+    """The arm with the motion of the study at this speed; each sine begins at a crest, without speed."""
+    joints = []
+    for config, ratio, amplitude, offset in zip(arm.joints, RATIOS, AMPLITUDES_rad, OFFSETS_rad, strict=True):
+        frequency_Hz = BASE_Hz * ratio * speed
+        sine = Sine(
+            kind="sine", duration_s=DURATION_s, amplitude_rad=amplitude, frequency_Hz=frequency_Hz,
+            shift_s=0.25 / frequency_Hz, offset_rad=offset,
+        )  # fmt: skip
+        joints.append(config.model_copy(update={"trajectory": sine}))
+    return replace(arm, joints=tuple(joints))
 
 
 def run(arm: LockstepArm, kind: ArmFeedForward, speed: float) -> list[LockstepRun]:
-    constants = faster(arm.constants(), speed)
+    arm.arm = moving(arm.arm, speed)
+    constants = arm.constants()
     constants.law.of_arm[:] = kind != ArmFeedForward.NONE
     model = arm.arm.model.memory()
     model.constants[0].feed_forward = kind
@@ -71,6 +84,7 @@ def settled(one: LockstepRun) -> np.ndarray:
 def rmse_mrad(runs: list[LockstepRun]) -> list[float]:
     """Of each joint; infinite if a run ended in a fault."""
     if any(one.fault for one in runs):
+        print([(one.fault.name, float(one.state.fault_value)) for one in runs], file=sys.stderr)
         return [float("inf")] * len(runs)
     return [1e3 * float(np.sqrt(np.mean(one.true_error_rad[settled(one)] ** 2))) for one in runs]
 
