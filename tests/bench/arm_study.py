@@ -6,7 +6,8 @@ Each arm is the shipped one with joints drawn as `jointctl study` draws them (fr
 delay, encoder), masses and inertias of every link +-10 %, and torque ripple up to 1 % of the joint's torque.  The
 controller believes the shipped figures.  The joints move in sines whose periods never repeat together, at three speeds;
 the fastest is near the joints' limits.  The same arm runs with independent joints, with gravity alone, and with the
-whole model.  Errors are the true ones (joint angle minus desired angle) after the first 10 s.  All of it is simulated.
+whole model; then all of it again with friction that the controller knows, which leaves what the arm itself does.  Errors
+are the true ones (joint angle minus desired angle) after the first 10 s.  All of it is simulated.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from jointctl.tools.drawing import BLUE, GREEN, ORANGE, canvas, save_png
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant
 from jointctl.tools.lockstep import LockstepArm, LockstepRun
 
-DURATION_s = 40.0
+DURATION_s = 25.0
 SETTLED_s = 10.0
 BASE_Hz = 0.2
 RATIOS = (1.0, (1.0 + 5.0**0.5) / 2.0, 5.0**0.5)
@@ -39,8 +40,8 @@ KINDS = {
 }  # fmt: skip
 
 
-def random_arm(arm: ArmConfig, seed: int, index: int) -> ArmConfig:
-    """Arm number `index` of the study with this seed."""
+def random_arm(arm: ArmConfig, seed: int, index: int, known: bool) -> ArmConfig:
+    """Arm number `index` of the study with this seed; `known`: its friction is the believed one, without ripples."""
     joints: list[Config] = []
     for number, config in enumerate(arm.joints):
         assert config.friction is not None
@@ -51,7 +52,13 @@ def random_arm(arm: ArmConfig, seed: int, index: int) -> ArmConfig:
             stick_slip_share=0.0, inertia_scale=(0.9, 1.1), torque_ripple_Nm=(0.0, 0.01 * config.limits.torque_max_Nm),
             bristle_stiffness_Nmprad=(size * low, size * high), bristle_damping_Nmspr=size * PAPER_DAMPING_Nmspr,
         )  # fmt: skip
-        joints.append(random_plant(config, ensemble, seed, 100 * index + number))
+        if known:
+            exact = {"friction_scale": (1.0, 1.0), "friction_ripple": (0.0, 0.0), "torque_ripple_Nm": (0.0, 0.0)}
+            ensemble = ensemble.model_copy(update=exact)
+        drawn = random_plant(config, ensemble, seed, 100 * index + number)
+        assert drawn.virtual is not None
+        crest = {"initial_position_rad": AMPLITUDES_rad[number] + OFFSETS_rad[number]}  # where the motion begins
+        joints.append(drawn.model_copy(update={"virtual": drawn.virtual.model_copy(update=crest)}))
     return replace(arm, joints=tuple(joints))
 
 
@@ -64,7 +71,8 @@ def moving(arm: ArmConfig, speed: float) -> ArmConfig:
             kind="sine", duration_s=DURATION_s, amplitude_rad=amplitude, frequency_Hz=frequency_Hz,
             shift_s=0.25 / frequency_Hz, offset_rad=offset,
         )  # fmt: skip
-        joints.append(config.model_copy(update={"trajectory": sine}))
+        sequence = config.sequence.model_copy(update={"approach_s": 0.5})  # it stands there, and must gain acceleration
+        joints.append(config.model_copy(update={"trajectory": sine, "sequence": sequence}))
     return replace(arm, joints=tuple(joints))
 
 
@@ -89,12 +97,12 @@ def rmse_mrad(runs: list[LockstepRun]) -> list[float]:
     return [1e3 * float(np.sqrt(np.mean(one.true_error_rad[settled(one)] ** 2))) for one in runs]
 
 
-def study(arms: int, seed: int) -> np.ndarray:
+def study(arms: int, seed: int, known: bool) -> np.ndarray:
     """RMSE [mrad], array (speeds, kinds, arms, joints)."""
     shipped = load_arm(SHIPPED_ARM)
     found = np.zeros((len(SPEEDS), len(KINDS), arms, len(shipped.joints)))
     for index in range(arms):
-        arm = LockstepArm(random_arm(shipped, seed, index))
+        arm = LockstepArm(random_arm(shipped, seed, index, known))
         for i, speed in enumerate(SPEEDS):
             for k, kind in enumerate(KINDS.values()):
                 found[i, k, index] = rmse_mrad(run(arm, kind, speed))
@@ -138,6 +146,8 @@ def picture(path: Path) -> None:
 
 if __name__ == "__main__":
     count, chosen = (int(text) for text in (sys.argv[1:3] + ["20", "1"][len(sys.argv[1:3]) :]))
-    print("\n".join(table(study(count, chosen), load_arm(SHIPPED_ARM).names)))
+    for known in (False, True):
+        print(f"\nfriction {'as believed' if known else 'as in study'}, {count} arms, seed {chosen}\n")
+        print("\n".join(table(study(count, chosen, known), load_arm(SHIPPED_ARM).names)), flush=True)
     if len(sys.argv) > 3:
         picture(Path(sys.argv[3]))
