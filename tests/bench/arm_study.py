@@ -6,7 +6,8 @@ Each arm is the shipped one with joints drawn as `jointctl study` draws them (fr
 delay, encoder), masses and inertias of every link +-10 %, and torque ripple up to 1 % of the joint's torque.  The
 controller believes the shipped figures.  The joints move in sines whose periods never repeat together, at three speeds;
 the fastest is near the joints' limits.  The same arm runs with independent joints, with gravity alone, and with the
-whole model.  Errors are the true ones (joint angle minus desired angle) after the first 5 s.  All of it is simulated.
+whole model; then all of it again with friction that the controller knows, which leaves what the arm itself does.  Errors
+are the true ones (joint angle minus desired angle) after the first 10 s.  All of it is simulated.
 """
 
 from __future__ import annotations
@@ -14,50 +15,70 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from jointctl.firmware_py.arm_model import ArmFeedForward
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.sections import Sine
 from jointctl.tools.drawing import BLUE, GREEN, ORANGE, canvas, save_png
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant
 from jointctl.tools.lockstep import LockstepArm, LockstepRun
 
-DURATION_s = 40.0
-SETTLED_s = 5.0
+DURATION_s = 25.0
+SETTLED_s = 10.0
 BASE_Hz = 0.2
 RATIOS = (1.0, (1.0 + 5.0**0.5) / 2.0, 5.0**0.5)
-SPEEDS = (0.4, 0.8, 1.3)  # factors on these frequencies
+AMPLITUDES_rad = (1.0, 0.7, 0.6)
+OFFSETS_rad = (-0.2, 0.8, 0.0)
+SPEEDS = (0.5, 1.2, 2.2)  # factors on these frequencies
+PAPER_BRISTLE_Nmprad, PAPER_DAMPING_Nmspr = 8e4, 200.0  # of the joint that `jointctl study` draws from
 KINDS = {
     "independent joints": ArmFeedForward.NONE, "gravity only": ArmFeedForward.GRAVITY,
     "whole model": ArmFeedForward.WHOLE,
 }  # fmt: skip
 
 
-def random_arm(arm: ArmConfig, seed: int, index: int) -> ArmConfig:
-    """Arm number `index` of the study with this seed."""
+def random_arm(arm: ArmConfig, seed: int, index: int, known: bool) -> ArmConfig:
+    """Arm number `index` of the study with this seed; `known`: its friction is the believed one, without ripples."""
     joints: list[Config] = []
     for number, config in enumerate(arm.joints):
+        assert config.friction is not None
+        assert config.friction.lugre is not None
+        size = config.friction.lugre.stiffness_Nmprad / PAPER_BRISTLE_Nmprad  # of its friction beside the paper's joint
+        low, high = EnsembleSettings().bristle_stiffness_Nmprad
         ensemble = EnsembleSettings(
-            stick_slip_share=0.0, inertia_scale=(0.9, 1.1), torque_ripple_Nm=(0.0, 0.01 * config.limits.torque_max_Nm)
-        )
-        joints.append(random_plant(config, ensemble, seed, 100 * index + number))
+            stick_slip_share=0.0, inertia_scale=(0.9, 1.1), torque_ripple_Nm=(0.0, 0.01 * config.limits.torque_max_Nm),
+            bristle_stiffness_Nmprad=(size * low, size * high), bristle_damping_Nmspr=size * PAPER_DAMPING_Nmspr,
+        )  # fmt: skip
+        if known:
+            exact = {"friction_scale": (1.0, 1.0), "friction_ripple": (0.0, 0.0), "torque_ripple_Nm": (0.0, 0.0)}
+            ensemble = ensemble.model_copy(update=exact)
+        drawn = random_plant(config, ensemble, seed, 100 * index + number)
+        assert drawn.virtual is not None
+        crest = {"initial_position_rad": AMPLITUDES_rad[number] + OFFSETS_rad[number]}  # where the motion begins
+        joints.append(drawn.model_copy(update={"virtual": drawn.virtual.model_copy(update=crest)}))
     return replace(arm, joints=tuple(joints))
 
 
-def faster(constants: Any, speed: float) -> Any:
-    """The motion of the arm, its frequencies `speed` times those of the study."""
-    constants = constants.copy()
-    for axis, ratio in zip(constants, RATIOS, strict=True):
-        axis.trajectory.omega_radps = 2.0 * np.pi * BASE_Hz * ratio * speed
-        axis.trajectory.duration_s = DURATION_s
-    return constants
+def moving(arm: ArmConfig, speed: float) -> ArmConfig:
+    """The arm with the motion of the study at this speed; each sine begins at a crest, without speed."""
+    joints = []
+    for config, ratio, amplitude, offset in zip(arm.joints, RATIOS, AMPLITUDES_rad, OFFSETS_rad, strict=True):
+        frequency_Hz = BASE_Hz * ratio * speed
+        sine = Sine(
+            kind="sine", duration_s=DURATION_s, amplitude_rad=amplitude, frequency_Hz=frequency_Hz,
+            shift_s=0.25 / frequency_Hz, offset_rad=offset,
+        )  # fmt: skip
+        sequence = config.sequence.model_copy(update={"approach_s": 0.5})  # it stands there, and must gain acceleration
+        joints.append(config.model_copy(update={"trajectory": sine, "sequence": sequence}))
+    return replace(arm, joints=tuple(joints))
 
 
 def run(arm: LockstepArm, kind: ArmFeedForward, speed: float) -> list[LockstepRun]:
-    constants = faster(arm.constants(), speed)
+    arm.arm = moving(arm.arm, speed)
+    constants = arm.constants()
     constants.law.of_arm[:] = kind != ArmFeedForward.NONE
     model = arm.arm.model.memory()
     model.constants[0].feed_forward = kind
@@ -71,16 +92,17 @@ def settled(one: LockstepRun) -> np.ndarray:
 def rmse_mrad(runs: list[LockstepRun]) -> list[float]:
     """Of each joint; infinite if a run ended in a fault."""
     if any(one.fault for one in runs):
+        print([(one.fault.name, float(one.state.fault_value)) for one in runs], file=sys.stderr)
         return [float("inf")] * len(runs)
     return [1e3 * float(np.sqrt(np.mean(one.true_error_rad[settled(one)] ** 2))) for one in runs]
 
 
-def study(arms: int, seed: int) -> np.ndarray:
+def study(arms: int, seed: int, known: bool) -> np.ndarray:
     """RMSE [mrad], array (speeds, kinds, arms, joints)."""
     shipped = load_arm(SHIPPED_ARM)
     found = np.zeros((len(SPEEDS), len(KINDS), arms, len(shipped.joints)))
     for index in range(arms):
-        arm = LockstepArm(random_arm(shipped, seed, index))
+        arm = LockstepArm(random_arm(shipped, seed, index, known))
         for i, speed in enumerate(SPEEDS):
             for k, kind in enumerate(KINDS.values()):
                 found[i, k, index] = rmse_mrad(run(arm, kind, speed))
@@ -124,6 +146,8 @@ def picture(path: Path) -> None:
 
 if __name__ == "__main__":
     count, chosen = (int(text) for text in (sys.argv[1:3] + ["20", "1"][len(sys.argv[1:3]) :]))
-    print("\n".join(table(study(count, chosen), load_arm(SHIPPED_ARM).names)))
+    for known in (False, True):
+        print(f"\nfriction {'as believed' if known else 'as in study'}, {count} arms, seed {chosen}\n")
+        print("\n".join(table(study(count, chosen, known), load_arm(SHIPPED_ARM).names)), flush=True)
     if len(sys.argv) > 3:
         picture(Path(sys.argv[3]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -100,17 +101,19 @@ def poses(arm: ArmConfig) -> Iterator[tuple[float, ...]]:
 def pose_ranges(arm: ArmConfig) -> list[PoseRange]:
     """Inertias M_ii and gravity of each joint over the grid of poses."""
     memory = arm.model.memory()
-    gravity_mps2, motion = memory.constants.gravity_mps2[0].copy(), memory.motion
+    constants: Any = memory.constants[0]
+    motion: Any = memory.motion
+    gravity_mps2 = constants.gravity_mps2.copy()
     axes = len(arm.joints)
     inertias, loads = [], []
     for pose in poses(arm):
         for axis, angle in enumerate(pose):
             motion.position_rad[axis] = angle
-        memory.constants.gravity_mps2[0] = gravity_mps2
+        constants.gravity_mps2[:] = gravity_mps2
         motion.acceleration_radps2[:] = 0.0
         newton_euler(memory)
         loads.append(np.abs(motion.torque_Nm[:axes]))
-        memory.constants.gravity_mps2[0] = 0.0
+        constants.gravity_mps2[:] = 0.0
         own = np.zeros(axes)
         for axis in range(axes):
             motion.acceleration_radps2[:] = 0.0

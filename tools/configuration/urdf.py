@@ -194,23 +194,24 @@ class _Reader:
         if not length > 1e-6:
             self._problem(f"{what}: axis must not be 0 0 0")
             axis, length = np.array([1.0, 0.0, 0.0]), 1.0
-        ends = [self._child(element, tag, what) for tag in ("parent", "child")]
         mimic, limit = element.find("mimic"), element.find("limit")
         largest = LARGEST_LENGTH_m if kind == "prismatic" else LARGEST_TURN_rad
         unit = "millimetres instead of m" if kind == "prismatic" else "degrees instead of rad"
-        given = {}
-        for key, attribute, most, why in (
-            ("lower_rad", "lower", largest, unit), ("upper_rad", "upper", largest, unit),
-            ("velocity_max_radps", "velocity", LARGEST_SPEED_radps, f"{unit}, a second"),
-            ("effort_max_Nm", "effort", 1e6, "Nm"),
-        ):  # fmt: skip
-            needed = kind == "revolute" or attribute not in ("lower", "upper")
-            if limit is not None and needed and limit.get(attribute) is not None:
-                what_limit = f"{what}: limit {attribute}"
-                given[key] = float(self._numbers(limit, attribute, what_limit, (0.0,), most, why)[0])
+
+        def given(attribute: str, most: float, why: str) -> float | None:
+            if limit is None or limit.get(attribute) is None:
+                return None
+            return float(self._numbers(limit, attribute, f"{what}: limit {attribute}", (0.0,), most, why)[0])
+
+        ranged = kind == "revolute"  # a continuous joint has none
         return UrdfJoint(
-            name, kind, *ends, self._origin(element, what), axis / length,
-            None if mimic is None else mimic.get("joint", ""), **given,
+            name=name, kind=kind, parent=self._child(element, "parent", what),
+            child=self._child(element, "child", what), origin=self._origin(element, what), axis=axis / length,
+            mimics=None if mimic is None else mimic.get("joint", ""),
+            lower_rad=given("lower", largest, unit) if ranged else None,
+            upper_rad=given("upper", largest, unit) if ranged else None,
+            velocity_max_radps=given("velocity", LARGEST_SPEED_radps, f"{unit}, a second"),
+            effort_max_Nm=given("effort", 1e6, "Nm"),
         )  # fmt: skip
 
     def _child(self, element: ElementTree.Element, tag: str, what: str) -> str:
