@@ -14,7 +14,7 @@ import pytest
 from jointctl.drivers.canopen.drive import CanopenDrive
 from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.drivers.drive import UNTOUCHED, DriveGroup, common_state, is_safe
-from jointctl.drivers.errors import BusError, NoDeviceError
+from jointctl.drivers.errors import BusError, DeviceError, NoDeviceError
 from jointctl.hil.canopen.device import Cia402Device
 from jointctl.hil.canopen.records import NmtState, PowerState
 from jointctl.tools.configuration.load import load_config
@@ -100,6 +100,7 @@ def test_each_drive_is_commissioned_and_its_watchdog_proven(arm: Arm) -> None:
         assert arm.device(axis).nmt == NmtState.PRE_OPERATIONAL  # the proofs of the others have put none to sleep
         assert arm.device(axis).state == PowerState.SWITCH_ON_DISABLED
     arm.group.start_cyclic()
+    arm.bus.settle()
     assert [int(arm.device(axis).nmt) for axis in range(3)] == [NmtState.OPERATIONAL] * 3
     ports = arm.group.port()
     assert list(ports.rpdo_id) == [0x201, 0x202, 0x203]
@@ -119,7 +120,7 @@ def test_nothing_is_written_to_any_drive_before_all_have_been_found(arm: Arm, lo
 def test_a_drive_that_is_found_enabled_is_left_as_it_is_without_the_users_word(arm: Arm, enabled: int) -> None:
     """No proof of another one's watchdog stops it either: its load would not have been asked about."""
     arm.power_up(enabled)
-    with pytest.raises(BusError, match=f"node {NODES[enabled]} is operation enabled"):
+    with pytest.raises(DeviceError, match=f"node {NODES[enabled]} is operation enabled"):
         arm.group.commission()
     assert arm.device(enabled).state == PowerState.OPERATION_ENABLED
     assert not [identifier for identifier, _ in arm.bus.requests if identifier == HEARTBEAT]
@@ -163,8 +164,9 @@ def test_and_a_stranger_on_the_bus_is_a_remark_but_no_drive_of_the_arm_is_one(ar
 def test_no_drive_is_started_if_one_has_lost_what_stops_it(arm: Arm, changed: int) -> None:
     arm.group.commission()
     arm.drives.devices[changed].objects.store(0x6007, 0, struct.pack("<h", 0))
-    with pytest.raises(Exception, match="6007"):
+    with pytest.raises(DeviceError, match="6007"):
         arm.group.start_cyclic()
+    arm.bus.settle()
     assert [int(arm.device(axis).nmt) for axis in range(3)] == [NmtState.PRE_OPERATIONAL] * 3
 
 
