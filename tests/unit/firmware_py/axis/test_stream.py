@@ -319,6 +319,12 @@ def test_a_set_point_exactly_as_far_as_allowed_is_no_jump() -> None:
     assert problem(after=(0.2001, 0.0, 0.0)) is Problem.JUMP
 
 
+def test_a_set_point_exactly_as_steep_as_allowed_is_none_too_steep() -> None:
+    """In 1/32 s with 20 rad/s2: 0.625 rad/s, and 0.625/64 rad from rest to rest."""
+    assert problem(after=(0.01, 0.625, 0.0), ms=31.25) is NONE
+    assert problem(after=(0.009765625, 0.0, 0.0), ms=31.25) is NONE
+
+
 @pytest.mark.parametrize("given_radps2", [20.0, 20.1, -math.inf])
 def test_an_acceleration_that_is_given_has_the_same_limit(given_radps2: float) -> None:
     expected = NONE if given_radps2 == 20.0 else Problem.ACCELERATION
