@@ -321,6 +321,11 @@ def test_a_set_point_exactly_as_far_as_allowed_is_no_jump() -> None:
     assert problem(after=(0.2001, 0.0, 0.0)) is Problem.JUMP
 
 
+def test_a_torque_that_stays_is_not_too_fast() -> None:
+    assert problem(before=(0.0, 0.0, 0.4), after=(0.0, 0.0, 0.4), ms=0.5) is NONE
+    assert problem(before=(0.0, 0.0, -0.4), after=(0.0, 0.0, 0.4), ms=0.5) is Problem.TORQUE_RATE
+
+
 def test_a_set_point_exactly_as_steep_as_allowed_is_none_too_steep() -> None:
     """In 1/32 s with 20 rad/s2: 0.625 rad/s, and 0.625/64 rad from rest to rest."""
     assert problem(after=(0.01, 0.625, 0.0), ms=31.25) is NONE
