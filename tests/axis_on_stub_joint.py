@@ -193,6 +193,7 @@ def finish(run: Any) -> Any:
 
 def assert_fault(run: Any, fault: Fault, reaction: Reaction) -> None:
     assert (Fault(int(run.state.fault)), Reaction(int(run.state.reaction))) == (fault, reaction)
+    assert run.state.fault_drive_error in (0, run.sample.drive_error)
     run.joint.load_Nm = 0.0
     finish(run)
     assert run.state.fault == fault

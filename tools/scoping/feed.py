@@ -44,6 +44,7 @@ class ScopeOrder:
     port: int
     token: str  # without it nothing is shown or taken
     drive: str = DEFAULT_KIND  # drive.kind
+    loop_cpu: int | None = None  # loop.cpu
     feed_fd: int = -1  # -1: show `log` instead
     log: str = ""
 

@@ -71,6 +71,7 @@ class RemoteOrder:
     domain: int = 0
     allow_remote: bool = False
     only_states: bool = False  # there is no loop: joint states are all there is
+    loop_cpu: int | None = None  # loop.cpu
     feed_fd: int = -1
     set_points_fd: int = -1
 
@@ -201,8 +202,9 @@ def remote(
     allow = isinstance(options, RemoteOptions) and options.allow_remote
     sources = SetPointSources(owner) if allow else None
     order = RemoteOrder(
-        run_title(config), joint_name(config.path), config.drive.kind, "", allow_remote=allow, only_states=only_states
-    )
+        run_title(config), joint_name(config.path), config.drive.kind, "", allow_remote=allow, only_states=only_states,
+        loop_cpu=config.loop.cpu,
+    )  # fmt: skip
     with ExitStack() as stack:
         feeds: list[ScopeFeed] = []
         enabling: ScopeFeed | None = None

@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import json
-import os
 import secrets
 import socket
 import sys
@@ -23,7 +22,7 @@ from urllib.parse import parse_qs, urlsplit
 from jointctl.tools.recording.run_log_reader import read_run_log
 from jointctl.tools.scoping.feed import COUNT_AGAIN_S, ScopeOrder
 from jointctl.tools.scoping.history import EVENTS, RING_RECORDS, History
-from jointctl.tools.scoping.supervisor_link import NICE, Feed
+from jointctl.tools.scoping.supervisor_link import Feed, stand_aside
 from jointctl.tools.session.display import ViewerRequest, viewer
 
 if TYPE_CHECKING:
@@ -187,8 +186,9 @@ def serve(order: ScopeOrder) -> None:
 
 
 def main() -> int:
-    os.nice(NICE)
-    serve(ScopeOrder(**json.loads(sys.stdin.buffer.read())))
+    order = ScopeOrder(**json.loads(sys.stdin.buffer.read()))
+    stand_aside(order.loop_cpu)
+    serve(order)
     return 0
 
 

@@ -228,10 +228,21 @@ class WayBack:
         return self._feed.ask(ViewerRequest(kind, who, values or {}))
 
 
+def stand_aside(loop_cpu: int | None) -> None:
+    """Niced, and all on one processor, not the loop's where that is fixed: then the others stay the loop's.
+
+    On two processors a server on both made the p99 of the loop's wake-up 17 to 20 % longer, on one not measurably.
+    """
+    os.nice(NICE)
+    with contextlib.suppress(OSError):
+        if others := os.sched_getaffinity(0) - {loop_cpu}:
+            os.sched_setaffinity(0, {min(others)})
+
+
 def serve_order(serve: Callable[[RemoteOrder], None]) -> int:
     """Entry point of a server's process."""
-    os.nice(NICE)
     order = RemoteOrder(**json.loads(sys.stdin.buffer.read()))
+    stand_aside(order.loop_cpu)
     try:
         serve(order)
     except Exception as error:  # of the libraries: anything

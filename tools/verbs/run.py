@@ -83,7 +83,7 @@ def _displays(
         return
     from jointctl.tools.scoping.feed import scope_order, scope_server
 
-    order = scope_order(title, *scope, drive=config.drive.kind)
+    order = scope_order(title, *scope, drive=config.drive.kind, loop_cpu=config.loop.cpu)
     output.address(f"scope: {order.url}")
     with scope_server(order) as feed:
         feed.settings({"stage": "terminal"})

@@ -87,7 +87,7 @@ def live_scope(
     from jointctl.tools.session.result import run_title, words
 
     title = run_title(config)
-    order = scope_order(title, host, port, drive=config.drive.kind)
+    order = scope_order(title, host, port, drive=config.drive.kind, loop_cpu=config.loop.cpu)
     output.address(f"scope: {order.url}  (Ctrl-C ends it; nothing moves before Start on the page)")
     with scope_server(order, in_charge=True, unwatched_s=unwatched_s) as feed:
         runs = _Runs(config, output, feed, title, allow_low_margin=allow_low_margin)

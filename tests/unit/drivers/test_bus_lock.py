@@ -387,6 +387,29 @@ def test_one_that_dies_before_it_has_read_has_left(channel: str, name: str) -> N
         assert holder.left
 
 
+def test_nothing_more_comes_from_one_that_dies_before_it_has_read(channel: str, name: str) -> None:
+    with squatter(name) as listener, first_holder(channel) as holder:
+        holder.send("who")
+        listener.accept()[0].close()
+        assert holder.poll()
+        assert not holder.is_controller
+
+
+@pytest.mark.parametrize(("own", "other", "may"), [(1000, 1000, True), (1000, 0, True), (1000, 1, False)])
+def test_the_same_user_and_root_may_ask(
+    own: int, other: int, may: bool, channel: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: own)
+    monkeypatch.setattr(bus_lock, "process_behind", lambda _: (1, other))
+    with socket.socket(socket.AF_UNIX) as caller:
+        assert bus_lock.may_ask(caller) is may
+
+
+def test_a_program_that_forgets_its_lock_can_end_all_the_same(channel: str) -> None:
+    with controller(channel, HOLD.replace("while not stopped:", "while False:")) as forgetful:
+        assert forgetful.wait(20.0) == 0
+
+
 def test_an_answer_that_does_not_come_is_waited_for_as_long_as_said(
     channel: str, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

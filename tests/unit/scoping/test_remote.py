@@ -27,7 +27,7 @@ from jointctl.tools.scoping.feed import ScopeFeed
 from jointctl.tools.scoping.foxglove_server import set_point_of
 from jointctl.tools.scoping.remote import EnabledFromElsewhere, joint_name
 from jointctl.tools.scoping.remote_options import RemoteOptions, check_remote, foxglove_place, with_values
-from jointctl.tools.scoping.supervisor_link import BURST, SetPointLink
+from jointctl.tools.scoping.supervisor_link import BURST, NICE, SetPointLink, stand_aside
 from jointctl.tools.session.display import ViewerRequest
 from jointctl.tools.session.loop_handle import SharedBlock
 from jointctl.tools.session.plan import Placed
@@ -312,3 +312,22 @@ def test_garbage_of_a_foxglove_client(data: bytes, words: str) -> None:
 def test_a_set_point_of_a_foxglove_client() -> None:
     data = b'{"position_rad": 0.1, "velocity_radps": null, "torque_Nm": 2, "time_s": 3.5}'
     assert set_point_of("x", data) == RemoteSetPoint("x", 0.1, None, None, 2.0, 3.5)
+
+
+# --- where a server runs ---
+
+
+@pytest.mark.parametrize(
+    ("allowed", "loop_cpu", "kept"),
+    [({0, 1, 5}, None, [{0}]), ({0, 1, 5}, 0, [{1}]), ({2, 3}, 0, [{2}]), ({1}, 1, [])],
+)
+def test_a_server_keeps_to_one_processor_and_not_the_loops(
+    allowed: set[int], loop_cpu: int | None, kept: list[set[int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nice: list[int] = []
+    chosen: list[set[int]] = []
+    monkeypatch.setattr("os.nice", nice.append)
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: allowed)
+    monkeypatch.setattr("os.sched_setaffinity", lambda pid, processors: chosen.append(processors))
+    stand_aside(loop_cpu)
+    assert (nice, chosen) == ([NICE], kept)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -13,9 +14,11 @@ from jointctl.firmware_py.states import AxisPhase, Fault, LimitSource
 
 
 @pytest.fixture
-def tracking(state: Any) -> Any:
+def tracking(state: Any) -> Iterator[Any]:
+    """None of these checks gives an error code of the drive."""
     state.phase = AxisPhase.TRACKING
-    return state
+    yield state
+    assert state.fault_drive_error == 0
 
 
 @pytest.mark.trips(Fault.POSITION_JUMP, "(1.001, Fault.POSITION_JUMP)")
@@ -71,4 +74,3 @@ def test_the_value_that_is_latched_is_the_one_beyond_its_limit(axis: Any, tracki
     }
     assert tracking.fault == fault
     assert tracking.fault_value == pytest.approx(latched[fault])
-    assert tracking.fault_drive_error == 0

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 import os
+from collections import Counter
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import CubicHermiteSpline
 
 from jointctl.firmware_py.records import SET_POINTS, ChangeKind, Reference, SetPoint
-from jointctl.firmware_py.safety import set_point_problem
+from jointctl.firmware_py.safety import reference_fault, set_point_problem
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest, TrajectoryKind
 from jointctl.firmware_py.states import SetPointProblem as Problem
@@ -317,6 +319,47 @@ def test_each_limit_at_its_edge(inside: dict[str, Any], outside: dict[str, Any],
 def test_a_set_point_exactly_as_far_as_allowed_is_no_jump() -> None:
     assert problem(after=(0.2, 0.0, 0.0)) is not Problem.JUMP
     assert problem(after=(0.2001, 0.0, 0.0)) is Problem.JUMP
+
+
+def test_a_torque_that_stays_is_not_too_fast() -> None:
+    assert problem(before=(0.0, 0.0, 0.4), after=(0.0, 0.0, 0.4), ms=0.5) is NONE
+    assert problem(before=(0.0, 0.0, -0.4), after=(0.0, 0.0, 0.4), ms=0.5) is Problem.TORQUE_RATE
+
+
+def test_a_set_point_exactly_as_steep_as_allowed_is_none_too_steep() -> None:
+    """In 1/32 s with 20 rad/s2: 0.625 rad/s, and 0.625/64 rad from rest to rest."""
+    assert problem(after=(0.01, 0.625, 0.0), ms=31.25) is NONE
+    assert problem(after=(0.009765625, 0.0, 0.0), ms=31.25) is NONE
+
+
+def test_the_way_between_two_set_points_is_that_of_hermites_cubic() -> None:
+    """Speed and stopping way at each quarter, against another implementation of the cubic, close to the limits."""
+    random, rig = np.random.default_rng(20), Rig()
+    limits = rig.axis.limits
+    limits.position_min_rad, limits.position_max_rad, limits.velocity_max_radps = -0.5, 0.5, 1.0
+    found = Counter[Problem]()
+    for _ in range(2000):
+        duration_s = random.uniform(0.02, 0.12)
+        speeds_radps = random.uniform(0.2, 1.0) + np.array([-0.5, 0.5]) * random.uniform(-0.4, 0.4)
+        speeds_radps = np.clip(speeds_radps, -0.999, 0.999)  # not at the limit itself
+        way_rad = duration_s * speeds_radps.mean() + random.uniform(-9.0, 9.0) * duration_s**2
+        start_rad = random.uniform(0.2, 0.5)
+        cubic = CubicHermiteSpline([0.0, duration_s], [start_rad, start_rad + way_rad], speeds_radps)
+        expected = Problem.NONE
+        for at_s in duration_s * np.array([0.25, 0.5, 0.75, 1.0]):
+            speed_radps = float(cubic(at_s, 1))
+            if abs(speed_radps) > 1.0:
+                expected = Problem.VELOCITY
+                break
+            if reference_fault(limits, float(cubic(at_s)), speed_radps, 20.0, DELAY_ms * 1e-3) != Fault.NONE:
+                expected = Problem.STOPPING_WAY
+                break
+        points = ((start_rad, speeds_radps[0], 0.0), (start_rad + way_rad, speeds_radps[1], 0.0))
+        told = problem(*points, ms=1e3 * duration_s)
+        if told not in (Problem.POSITION, Problem.JUMP, Problem.ACCELERATION):
+            assert told is expected, points
+            found[told] += 1
+    assert min(found[told] for told in (Problem.NONE, Problem.VELOCITY, Problem.STOPPING_WAY)) > 100
 
 
 @pytest.mark.parametrize("given_radps2", [20.0, 20.1, -math.inf])
