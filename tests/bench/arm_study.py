@@ -6,8 +6,8 @@ Each arm is the shipped one with joints drawn as `jointctl study` draws them (fr
 delay, encoder), masses and inertias of every link +-10 %, and torque ripple up to 1 % of the joint's torque.  The
 controller believes the shipped figures.  The joints move in sines whose periods never repeat together, at three speeds;
 the fastest is near the joints' limits.  The same arm runs with independent joints, with gravity alone, and with the
-whole model; then all of it again with friction that the controller knows, which leaves what the arm itself does.  Errors
-are the true ones (joint angle minus desired angle) after the first 10 s.  All of it is simulated.
+whole model; then all of it again with friction that the controller knows, which leaves what the arm itself does.
+Errors are the true ones (joint angle minus desired angle) after the first 10 s.  All of it is simulated.
 """
 
 from __future__ import annotations
