@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jointctl.firmware_py.kalman import kalman_gains
 from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.tools.analysis.linear_loop import LoopSettings, linear_loop
 from jointctl.tools.analysis.loop_settings import two_masses
 from jointctl.tools.analysis.margins import Margins, frequencies_radps, margins, phase_margin_deg, worst_case
-from jointctl.tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
+from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad, torque_constant_NmpA
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, SOFT, canvas, save_png
 
 if TYPE_CHECKING:
@@ -73,16 +74,20 @@ def not_modelled(config: Config) -> list[str]:
         found.append(
             f"encoder.counts_per_turn (={config.encoder.counts_per_turn}): one count moves the torque by "
             f"{step_Nm:.1f} Nm, more than {STEP_SHARE:.0%} of limits.torque_max_Nm: "
-            "it will chatter; lower kv or velocity_cutoff_Hz"
+            'it will chatter; lower kv or velocity_cutoff_Hz, or take control.velocity_filter = "kalman"'
         )
     return found
 
 
 def encoder_step_Nm(config: Config) -> float:
-    """By how much kp and kv move the torque when the reading changes by one count."""
+    """By how much the law moves the torque, in that cycle, when the reading changes by one count."""
     control, rate_Hz = config.control, config.loop.rate_Hz
+    count_rad = abs(joint_rad_per_count(config)) if control.kind == "flexible_joint" else law_resolution_rad(config)
+    if control.velocity_filter == "kalman":
+        g1, g2, g3 = kalman_gains(control.velocity_cutoff_Hz, control.observer_radps, 1.0 / rate_Hz)
+        return config.joint.inertia_kgm2 * (control.kp * g1 + control.kv * g2 + g3) * count_rad
     slope_1ps = low_pass_gain(control.velocity_cutoff_Hz, 1.0 / rate_Hz) * rate_Hz
-    return config.joint.inertia_kgm2 * (control.kp + control.kv * slope_1ps) * abs(joint_rad_per_count(config))
+    return config.joint.inertia_kgm2 * (control.kp + control.kv * slope_1ps) * count_rad
 
 
 # --- Constants that are each in range and do not fit together: the user is warned, nothing is refused ---

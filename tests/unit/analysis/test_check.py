@@ -25,7 +25,7 @@ from jointctl.tools.experiments.controllers import from_file
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.check import check
 from jointctl.tools.verbs.fault_campaign import fault_campaign
-from tests.configurations import shipped
+from tests.configurations import changed, shipped
 
 
 # --- `check`: table, JSON, verdict, remedies and picture; where each assumption comes from ---
@@ -230,6 +230,17 @@ def test_what_the_model_leaves_out_is_said() -> None:
 def test_an_encoder_too_coarse_for_the_gains_is_told(bits: int, side: str, warned: bool) -> None:
     config = shipped("precise", encoder__counts_per_turn=2**bits, encoder__side=side)
     assert any("chatter" in text for text in not_modelled(config)) is warned
+
+
+@pytest.mark.parametrize(("bits", "cutoff_Hz"), [(14, 40.0), (15, 50.0), (16, 80.0)])
+def test_with_the_kalman_filter_the_same_encoder_is_fine_enough(bits: int, cutoff_Hz: float) -> None:
+    config = shipped(
+        "precise", encoder__counts_per_turn=2**bits, control__velocity_filter="kalman",
+        control__velocity_cutoff_Hz=cutoff_Hz, control__kp=2500.0, control__kv=100.0, control__observer_radps=50.0,
+    )  # fmt: skip
+    assert not any("chatter" in text for text in not_modelled(config))
+    config = changed(config, control__velocity_cutoff_Hz=400.0, encoder__counts_per_turn=2**12)
+    assert any("chatter" in text for text in not_modelled(config))
 
 
 def test_a_soft_reducer_is_told_with_its_resonance_and_of_a_real_joint_nobody_knows_it() -> None:
