@@ -225,6 +225,7 @@ class LoopSettings:
     weight_Nm: float = 0.0  # of every neuron at the point of linearisation
     # a joint that is not rigid: those that the loop must bear, of which the worst counts; none = it is rigid
     joints: tuple[TwoMasses, ...] = ()
+    largest_s: float = math.inf  # peak of |S| that is accepted, of each joint
     encoders: Encoders = Encoders.LINK
     motor_inertia_kgm2: float = 0.0  # of `inertia_kgm2`, as the law of a flexible joint believes
     twist_radps: float = 0.0
@@ -233,7 +234,7 @@ class LoopSettings:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, (int, float)) and not math.isfinite(value):
+            if field.name != "largest_s" and isinstance(value, (int, float)) and not math.isfinite(value):
                 raise ValueError(f"{field.name} (={value}) must be finite")
         for name in _POSITIVE:
             if not getattr(self, name) > 0.0:

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointctl.firmware_py.kalman import kalman_gains
-from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.tools.analysis.linear_loop import LoopSettings, linear_loop
-from jointctl.tools.analysis.loop_settings import two_masses
+from jointctl.tools.analysis.loop_settings import loop_settings, two_masses
+from jointctl.tools.analysis.margin_gate import encoder_step_Nm
 from jointctl.tools.analysis.margins import Margins, frequencies_radps, margins, phase_margin_deg, worst_case
-from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad, torque_constant_NmpA
+from jointctl.tools.configuration.conversions import torque_constant_NmpA
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, SOFT, canvas, save_png
 
 if TYPE_CHECKING:
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 # --- What the linear loop does not know ---
 
 
-STEP_SHARE = 0.2  # of the torque limit; `precise` with 17 bit is below, with 16 bit, where it chatters, above
+STEP_SHARE = 0.25  # of the torque limit; `precise` with 17 bit is below, with 16 bit, where it is noisy, above
 OUTSIDE = (0.5, 2.0)  # factors on the link's inertia that are looked at beyond what must hold
 
 
@@ -69,7 +68,7 @@ def not_modelled(config: Config) -> list[str]:
             f"virtual.flexible (=true): the reducer resonates at {resonance_Hz:.1f} Hz, "
             "which takes margin that is not counted here"
         )
-    step_Nm = encoder_step_Nm(config)
+    step_Nm = encoder_step_Nm(config, loop_settings(config)[0])
     if step_Nm > STEP_SHARE * config.limits.torque_max_Nm:
         found.append(
             f"encoder.counts_per_turn (={config.encoder.counts_per_turn}): one count moves the torque by "
@@ -77,17 +76,6 @@ def not_modelled(config: Config) -> list[str]:
             'it will chatter; lower kv or velocity_cutoff_Hz, or take control.velocity_filter = "kalman"'
         )
     return found
-
-
-def encoder_step_Nm(config: Config) -> float:
-    """By how much the law moves the torque, in that cycle, when the reading changes by one count."""
-    control, rate_Hz = config.control, config.loop.rate_Hz
-    count_rad = abs(joint_rad_per_count(config)) if control.kind == "flexible_joint" else law_resolution_rad(config)
-    if control.velocity_filter == "kalman":
-        g1, g2, g3 = kalman_gains(control.velocity_cutoff_Hz, control.observer_radps, 1.0 / rate_Hz)
-        return config.joint.inertia_kgm2 * (control.kp * g1 + control.kv * g2 + g3) * count_rad
-    slope_1ps = low_pass_gain(control.velocity_cutoff_Hz, 1.0 / rate_Hz) * rate_Hz
-    return config.joint.inertia_kgm2 * (control.kp + control.kv * slope_1ps) * count_rad
 
 
 # --- Constants that are each in range and do not fit together: the user is warned, nothing is refused ---

@@ -99,6 +99,7 @@ def _two_masses(config: Config) -> dict[str, Any]:
     ]
     return {
         "joints": tuple(joints),
+        "largest_s": margin.max_sensitivity,
         "encoders": encoders,
         "motor_inertia_kgm2": reducer.motor_inertia_kgm2,
         "twist_radps": control.twist_radps,
