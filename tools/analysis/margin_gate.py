@@ -235,7 +235,7 @@ def refuse_chatter(config: Config, settings: LoopSettings) -> None:
     if step_Nm + holding_Nm >= limit_Nm:
         raise MarginError(
             f"the torque would chatter at its limit: one count of the encoder moves it by {step_Nm:.1f} Nm, friction "
-            f"and gravity need {holding_Nm:.1f} Nm; together they must be less than limits.torque_max_Nm (={limit_Nm:g})",
+            f"and gravity need {holding_Nm:.1f} Nm; together they must be below limits.torque_max_Nm (={limit_Nm:g})",
             'an encoder with more counts, control.velocity_filter = "kalman", or lower control.velocity_cutoff_Hz, kv '
             "and observer_radps",
         )

@@ -34,7 +34,7 @@ from jointctl.tools.analysis.margins import (
     worst_case,
 )
 from jointctl.tools.configuration.config import Config
-from tests.configurations import shipped
+from tests.configurations import changed, shipped
 
 JIT_DISABLED = bool(numba.config.DISABLE_JIT)
 PERIOD_s = 1e-3
@@ -221,6 +221,19 @@ def believed(**changes: Any) -> Config:
     return shipped("realistic", **changes)
 
 
+def with_encoders(config: Config, encoders: Encoders) -> Config:
+    """The encoder on the motor alone, or that on the link alone."""
+    if encoders == Encoders.BOTH:
+        return config
+    assert config.joint_encoder is not None
+    counts = config.joint_encoder.counts_per_turn
+    alone = changed(config, joint_encoder=None)
+    return alone if encoders == Encoders.MOTOR else changed(
+        alone, encoder__side="joint", encoder__counts_per_turn=counts
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("encoders", list(Encoders))
 @pytest.mark.parametrize(
     "changes",
     [
@@ -230,13 +243,16 @@ def believed(**changes: Any) -> Config:
         {"margin__loop_delay_s": 2.5e-3},
     ],
 )
-def test_chosen_gains_keep_their_promise_on_every_joint(changes: dict[str, Any]) -> None:
-    config = believed(**changes)
+def test_chosen_gains_keep_their_promise_on_every_joint(changes: dict[str, Any], encoders: Encoders) -> None:
+    config = with_encoders(believed(**changes), encoders)
     settings, _ = loop_settings(config)
     gains = chosen_gains(config, settings)
     assert gains.largest_s <= LARGEST_S_ANYWHERE * 1.01
     assert gains.noise_Nm <= LARGEST_NOISE_Nm * 1.01
-    chosen = replace(settings, **gains.changes())
+    chosen = replace(settings, kp=gains.kp, kv=gains.kv, observer_radps=gains.observer_radps)
+    chosen = replace(chosen, cutoff_Hz=gains.cutoff_Hz or settings.cutoff_Hz)
+    assert settings.encoders == encoders
+    assert ("velocity_cutoff_Hz" in gains.changes()) is (encoders == Encoders.LINK)
     for case in cases(chosen):
         if case.joints[0].bristle_Nmprad == (0.0, 0.0):
             found = margins(case)
