@@ -9,6 +9,7 @@ import math
 from jointctl.firmware_py.flexible_joint import Reading, desired_motor, motor_and_link_errors, reset_flexible
 from jointctl.firmware_py.friction import Condition, compensation_motor_torque_Nm, condition_of, step_lugre
 from jointctl.firmware_py.friction_adaptation import adapt, adapted_feed_forward_Nm, reset_adaptation, take_at_rest
+from jointctl.firmware_py.kalman import step_kalman
 from jointctl.firmware_py.kernel import kernel, plain
 from jointctl.firmware_py.records import (
     LEARNING_BINS,
@@ -152,8 +153,19 @@ def reset_observer(state: ObserverState, momentum_Nms: float) -> None:
     state.integral_Nms = momentum_Nms
     state.disturbance_Nm = 0.0
     state.newest = 0
+    state.primed = 0
+    state.known_torque_Nm = 0.0
     for i in range(TORQUE_HISTORY):
         state.sent_torque_Nm[i] = 0.0
+
+
+@kernel
+def applied_torque_Nm(constants: ObserverConstants, state: ObserverState, sent_torque_Nm: float) -> float:
+    """The torque at work: that of `delay_cycles` before the command of the cycle before, which it takes note of."""
+    state.newest = (state.newest + 1) % TORQUE_HISTORY
+    state.sent_torque_Nm[state.newest] = sent_torque_Nm
+    delay = min(max(constants.delay_cycles, 0), TORQUE_HISTORY - 1)
+    return state.sent_torque_Nm[(state.newest - delay + TORQUE_HISTORY) % TORQUE_HISTORY]
 
 
 @kernel
@@ -170,10 +182,7 @@ def step_observer(
     `sent_torque_Nm` is the command of the cycle before; `known_torque_Nm` what the model says opposes the motion
     (friction, gravity), `momentum_Nms` is J q'.
     """
-    state.newest = (state.newest + 1) % TORQUE_HISTORY
-    state.sent_torque_Nm[state.newest] = sent_torque_Nm
-    delay = min(max(constants.delay_cycles, 0), TORQUE_HISTORY - 1)
-    applied = state.sent_torque_Nm[(state.newest - delay + TORQUE_HISTORY) % TORQUE_HISTORY]
+    applied = applied_torque_Nm(constants, state, sent_torque_Nm)
     state.integral_Nms += period_s * (applied - known_torque_Nm - state.disturbance_Nm)
     state.disturbance_Nm = constants.bandwidth_radps * (state.integral_Nms - momentum_Nms)
     return state.disturbance_Nm
@@ -435,6 +444,9 @@ def _rest_torque_Nm(
         state.network_torque_Nm = network_torque_Nm(constants.network, state.network, error, error_rate)
         adapt_network(constants.network, state.network, error, error_rate, constants.period_s)
         return -state.network_torque_Nm
+    if constants.observer.kalman != 0:
+        state.observer_torque_Nm = state.observer.disturbance_Nm
+        return state.observer_torque_Nm
     if constants.kind == ControllerKind.COMPUTED_TORQUE_OBSERVER:
         known = state.friction_torque_Nm + state.gravity_torque_Nm + state.learned_torque_Nm
         momentum = constants.inertia_kgm2 * velocity_radps
@@ -469,7 +481,14 @@ def step_law(
     if constants.kind == ControllerKind.OUTSIDE:
         return state.outside_torque_Nm
     error = position_rad - reference.position_rad
-    if constants.filtered_error_rate != 0:
+    velocity_radps = velocity.velocity_radps
+    if constants.observer.kalman != 0:
+        observer = state.observer
+        applied_Nm = applied_torque_Nm(constants.observer, observer, sent_torque_Nm - observer.known_torque_Nm)
+        step_kalman(constants.observer, observer, applied_Nm, error, constants.inertia_kgm2, constants.period_s)
+        error, error_rate = observer.error_rad, observer.error_rate_radps
+        velocity_radps = reference.velocity_radps + error_rate
+    elif constants.filtered_error_rate != 0:
         error_rate = velocity.error_rate_radps
     else:
         error_rate = velocity.velocity_radps - reference.velocity_radps
@@ -479,14 +498,14 @@ def step_law(
     if constants.of_arm != 0:
         state.gravity_torque_Nm = state.arm_torque_Nm
     else:
-        state.gravity_torque_Nm = constants.coriolis_Nmspr * velocity.velocity_radps + constants.gravity_Nm * math.sin(
+        state.gravity_torque_Nm = constants.coriolis_Nmspr * velocity_radps + constants.gravity_Nm * math.sin(
             position_rad - constants.gravity_zero_rad
         )
     transmitted_Nm = state.inertia_torque_Nm + state.gravity_torque_Nm
     state.friction_torque_Nm = _friction_Nm(
-        constants, state, velocity.velocity_radps, reference, reference.position_rad, transmitted_Nm
+        constants, state, velocity_radps, reference, reference.position_rad, transmitted_Nm
     )
-    rest_Nm = _rest_torque_Nm(constants, state, error, error_rate, velocity.velocity_radps, sent_torque_Nm)
+    rest_Nm = _rest_torque_Nm(constants, state, error, error_rate, velocity_radps, sent_torque_Nm)
     if constants.adaptation.enabled != 0:
         _adapt(constants, state, reference.velocity_radps, position_rad, error_rate, transmitted_Nm)
         rest_Nm = state.observer_torque_Nm
@@ -494,6 +513,9 @@ def step_law(
     state.learned_torque_Nm = _learn(constants, state, where, correction_Nm, error)
     if constants.kind == ControllerKind.COMPUTED_TORQUE_OBSERVER:
         rest_Nm = state.observer_torque_Nm
+    state.observer.known_torque_Nm = (
+        state.inertia_torque_Nm + state.gravity_torque_Nm + state.friction_torque_Nm + state.learned_torque_Nm
+    )
     return (
         state.inertia_torque_Nm
         + proportional_Nm

@@ -17,6 +17,7 @@ import math
 
 import numpy as np
 
+from jointctl.firmware_py.kalman import set_kalman_gains
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import reset_learning, right_column_of_p
 from jointctl.firmware_py.libc import load_acquire
@@ -140,6 +141,8 @@ def set_gains(constants: ChangeConstants, law: LawConstants, state: LawState, ga
         state.observer.integral_Nms += state.observer.disturbance_Nm * (1.0 / now - 1.0 / before)
     law.kp, law.kv, law.ki = gains.kp, gains.kv, gains.ki
     law.observer.bandwidth_radps = now
+    if law.observer.kalman != 0:
+        set_kalman_gains(law.observer, law.period_s)
     law.network.learning_rate = gains.learning_rate
     p12, p22 = right_column_of_p(gains.kp, gains.kv, constants.q1, constants.q2)
     law.network.p_b[0] = p12 / law.inertia_kgm2

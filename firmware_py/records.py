@@ -49,10 +49,15 @@ class NetworkState:
 
 @record
 class ObserverConstants:
-    """See `law.step_observer`."""
+    """See `law.step_observer`; what follows the delay is that of `kalman.step_kalman`."""
 
     bandwidth_radps: f8  # 0 = off
     delay_cycles: i8  # from the command to the torque that it becomes
+    kalman: i4  # the Kalman filter takes the place of observer and filtered error rate
+    cutoff_Hz: f8  # of its velocity
+    error_gain: f8
+    rate_gain_1ps: f8
+    disturbance_gain_1ps2: f8
 
 
 @record
@@ -61,6 +66,11 @@ class ObserverState:
     disturbance_Nm: f8
     newest: i8
     sent_torque_Nm: Annotated[np.ndarray, array_of(f8, TORQUE_HISTORY)]
+    # the Kalman filter alone
+    primed: i4  # 0 until the first reading
+    error_rad: f8
+    error_rate_radps: f8
+    known_torque_Nm: f8  # of the command of the cycle before: what was fed forward
 
 
 @record

@@ -3,26 +3,35 @@
 from __future__ import annotations
 
 import itertools
+import math
 from typing import Any
 
 import numpy as np
 import pytest
 
 from jointctl.firmware_py.states import AxisPhase, Fault, Notice, Reaction
+from jointctl.hil.lockstep import TRUE_POSITION_rad
+from jointctl.tools.configuration.sections import Hold
 from jointctl.tools.experiments.controllers import controller_constants, named
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
 from tests.bench.swing_alarms import outcomes, tasks
-from tests.configurations import shipped
+from tests.configurations import changed, shipped
 
 LIMIT_Nm = 60.0
 NEAR_LIMIT_Nm = 57.0  # a torque that reaches it on both sides swings between its limits
 SWING_CYCLES = 300  # between the two sides
 WITHIN_CYCLES = 1000
+KALMAN: dict[int, dict[str, Any]] = {  # of docs/law.md, for these encoders
+    bits: {"velocity_filter": "kalman", "velocity_cutoff_Hz": cutoff_Hz, "observer_radps": observer, "kp": kp, "kv": kv}
+    for bits, cutoff_Hz, observer, kp, kv in (
+        (14, 40.0, 40.0, 2500.0, 100.0), (15, 50.0, 50.0, 3000.0, 110.0), (16, 80.0, 60.0, 3600.0, 120.0),
+    )
+}  # fmt: skip
 
 
 def carry_out(
     controller: str, duration_s: float, *, bits: int = 19, side: str = "joint", control: dict[str, Any] | None = None,
-    watched: bool = True, **virtual: Any,
+    watched: bool = True, at_rest: bool = False, **virtual: Any,
 ) -> LockstepRun:  # fmt: skip
     """`configs/precise.toml` with another law, encoder or joint."""
     law = named((controller,))[0].control.model_copy(update=control or {})
@@ -30,6 +39,8 @@ def carry_out(
     config = shipped(
         "precise", trajectory__duration_s=duration_s, encoder__counts_per_turn=2**bits, encoder__side=side, **there
     )
+    if at_rest:
+        config = changed(config, trajectory=Hold(kind="hold", duration_s=duration_s, position_rad=0.2))
     joint = LockstepJoint(config)
     chosen = named((controller,))[0]
     constants = controller_constants(
@@ -109,8 +120,9 @@ def test_a_loop_that_swings_ends_within_a_second_of_its_first_swing(
             10.0,
             {"command_delay_s": 0.0, "control": {"kp": 6400.0, "kv": 160.0, "velocity_cutoff_Hz": 300.0}},
         ),
+        ("precise", 10.0, {"bits": 15, "control": KALMAN[15]}),
     ],
-    ids=["3 ms", "light link", "fine encoder", "pid, 5 ms", "paper, 2.5 ms", "gains"],
+    ids=["3 ms", "light link", "fine encoder", "pid, 5 ms", "paper, 2.5 ms", "gains", "coarse encoder, Kalman filter"],
 )
 def test_its_twin_that_settles_goes_on(controller: str, duration_s: float, joint: dict[str, Any]) -> None:
     run = carry_out(controller, duration_s, **joint)
@@ -149,6 +161,32 @@ def test_a_coarse_encoder_is_reported_as_torque_noise(bits: int, noisy: bool) ->
     if noisy:
         assert run.state.swing.noise_told_Nm > 0.2 * LIMIT_Nm
         assert np.abs(run.log.command_torque_Nm).max() < LIMIT_Nm
+
+
+@pytest.mark.parametrize("friction", ["lugre", "stick_slip"])
+@pytest.mark.parametrize(("bits", "rmse_rad"), [(14, 0.2e-3), (15, 0.1e-3), (16, 0.06e-3)])
+def test_with_the_kalman_filter_a_coarse_encoder_is_quiet_and_precise(
+    bits: int, rmse_rad: float, friction: str
+) -> None:
+    """Without learning, which needs its repetitions."""
+    control = {**KALMAN[bits], "learning": None}
+    run = carry_out("precise", 30.0, bits=bits, control=control, friction_kind=friction)
+    assert run.fault is Fault.NONE
+    assert run.state.notices == 0
+    tracked = np.asarray(run.log.error_rad[run.tracking])[10_000:]
+    assert np.sqrt(np.mean(tracked**2)) <= rmse_rad
+    torque = np.asarray(run.log.command_torque_Nm[run.tracking])[10_000:]
+    assert np.mean(np.abs(np.diff(torque))) <= 3.0
+
+
+@pytest.mark.parametrize("friction", ["lugre", "stick_slip"])
+@pytest.mark.parametrize("bits", [14, 15, 16])
+def test_with_the_kalman_filter_a_coarse_encoder_does_not_hunt_at_rest(bits: int, friction: str) -> None:
+    run = carry_out("precise", 30.0, bits=bits, control=KALMAN[bits], friction_kind=friction, at_rest=True)
+    assert run.fault is Fault.NONE
+    assert run.state.notices == 0
+    resting = run.truth[run.tracking, TRUE_POSITION_rad][10_000:]
+    assert np.ptp(resting) <= math.tau / 2**bits
 
 
 @pytest.mark.parametrize("controller", ["paper", "precise", "pid"])

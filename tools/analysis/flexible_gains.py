@@ -5,7 +5,8 @@ The least error of the link after a step of friction at the motor, subject to
     |S| <= LARGEST_S with the joint as it is believed, <= LARGEST_S_ANYWHERE with every one of `LoopSettings.joints`
     torque noise of the encoders' counts <= LARGEST_NOISE_Nm
 
-Searched by Nelder and Mead over kv and the observer's bandwidth.  kp is KP_OF_KV kv^2: with less damping the search
+Searched by Nelder and Mead over kv and the observer's bandwidth; with the link's encoder alone, where the resonance
+lies between torque and encoder, over the velocity's cut-off too.  kp is KP_OF_KV kv^2: with less damping the search
 finds loops that a joint a little different from what is believed makes unstable, and so does an observer above
 LARGEST_OBSERVER_radps.  A constraint that is not met costs in proportion.  The motor's inertia may be wrong by
 MOTOR_ERROR besides.  The joints held by friction are left to the margin gate: what holds takes the resonance away.
@@ -30,12 +31,17 @@ LARGEST_NOISE_Nm = 0.6
 LARGEST_OBSERVER_radps = 110.0
 KP_OF_KV = 1.5
 MOTOR_ERROR = 0.15
+HIGHEST_CUTOFF = 0.45  # of the rate
 PENALTY = 20.0  # on the logarithm of the error, for each unit by which a constraint is missed
 UNSTABLE = 1e3
-_START = np.log([20.0, 80.0])  # kv [1/s], observer [rad/s]
+# kv [1/s], observer [rad/s], and where it is searched the cut-off [Hz]
+_START = {
+    Encoders.BOTH: np.log([20.0, 80.0]), Encoders.MOTOR: np.log([20.0, 80.0]), Encoders.LINK: np.log([6.0, 6.0, 40.0]),
+}  # fmt: skip
+_COLUMNS = {Encoders.BOTH: [0, 1], Encoders.MOTOR: [1], Encoders.LINK: [0]}  # of link and motor, what the law reads
 _LOWEST_Hz = 0.3
 _POINTS = 250
-_EVALUATIONS = 80
+_EVALUATIONS = {2: 80, 3: 160}  # by how many are searched
 
 
 @dataclass(frozen=True)
@@ -47,10 +53,12 @@ class FlexibleGains:
     observer_radps: float
     largest_s: float
     noise_Nm: float
+    cutoff_Hz: float | None = None  # where it was searched
 
     def changes(self) -> dict[str, float]:
         """Keys of [control]."""
-        return {"kp": self.kp, "kv": self.kv, "observer_radps": self.observer_radps}
+        gains = {"kp": self.kp, "kv": self.kv, "observer_radps": self.observer_radps}
+        return gains if self.cutoff_Hz is None else {**gains, "velocity_cutoff_Hz": self.cutoff_Hz}
 
 
 @dataclass(frozen=True)
@@ -68,9 +76,12 @@ class _Judged:
 
 
 def _with_gains(settings: LoopSettings, logarithms: Array) -> LoopSettings:
-    """The loop with these logarithms of kv and of the observer's bandwidth, to three digits."""
-    kv, observer = (float(f"{math.exp(x):.3g}") for x in logarithms)
-    return replace(settings, kp=float(f"{KP_OF_KV * kv * kv:.3g}"), kv=kv, observer_radps=observer)
+    """The loop with these logarithms of kv, of the observer's bandwidth and perhaps of the cut-off, to three digits."""
+    kv, observer, *cutoff = (float(f"{math.exp(x):.3g}") for x in logarithms)
+    highest = HIGHEST_CUTOFF / settings.period_s
+    cutoff_Hz = min(cutoff[0], highest) if cutoff else settings.cutoff_Hz
+    kp = float(f"{KP_OF_KV * kv * kv:.3g}")
+    return replace(settings, kp=kp, kv=kv, observer_radps=observer, cutoff_Hz=cutoff_Hz)
 
 
 class _Search:
@@ -85,7 +96,10 @@ class _Search:
         wrong = (1.0 - MOTOR_ERROR, 1.0 + MOTOR_ERROR)
         free += [replace(joint, motor_kgm2=factor * joint.motor_kgm2) for joint in free for factor in wrong]
         self._joints = [linear_loop(replace(settings, joints=(joint,))).joint for joint in free]
-        self._responses = [joint.response(self._z) for joint in self._joints]
+        # link and motor of each, of which the law reads one or both
+        seen = [linear_loop(replace(settings, joints=(joint,), encoders=Encoders.BOTH)).joint for joint in free]
+        self._positions = [joint.response(self._z) for joint in seen]
+        self._responses = [positions[:, _COLUMNS[settings.encoders]] for positions in self._positions]
         size = [joint.stiffness_Nmprad * joint.link_kgm2 * joint.motor_kgm2 for joint in free]
         self._believed = int(np.argsort(size)[len(size) // 2])
 
@@ -100,7 +114,8 @@ class _Search:
             largest.append(float(np.max(np.abs(self._sensitivity(law, response)))))
         response = self._responses[self._believed]
         sensitivity = self._sensitivity(law, response)
-        error = response[:, 0, 0] * sensitivity / self._omega  # of a step of torque
+        link = self._positions[self._believed][:, 0, 0]
+        error = link * sensitivity / self._omega  # of a step of torque
         noise = np.abs(law[:, 0, :] * sensitivity[:, None]) ** 2 @ (self._count_rad**2 / 12.0)
         return _Judged(
             error=math.sqrt(np.trapezoid(np.abs(error) ** 2, self._omega)),
@@ -117,20 +132,22 @@ class _Search:
 
 
 def chosen_gains(config: Config, settings: LoopSettings) -> FlexibleGains:
-    """For the loop of `loop_settings(config)` with both encoders; about half a second."""
+    """For the loop of `loop_settings(config)`; about half a second, twice that with the link's encoder alone."""
     from scipy.optimize import minimize  # here: only this search waits for it
 
-    if settings.kind != ControllerKind.FLEXIBLE_JOINT or settings.encoders != Encoders.BOTH:
+    if settings.kind != ControllerKind.FLEXIBLE_JOINT:
         raise ConfigurationError(
-            f'{config.path}: gains are chosen for control.kind = "flexible_joint" (={config.control.kind}) with both '
-            "encoders only"
+            f'{config.path}: gains are chosen for control.kind = "flexible_joint" (={config.control.kind}) only'
         )
-    counts_rad = [law_resolution_rad(config), abs(joint_rad_per_count(config))]  # link, motor
-    search = _Search(settings, np.array(counts_rad))
+    start = _START[settings.encoders]
+    counts_rad = np.array([law_resolution_rad(config), abs(joint_rad_per_count(config))])  # link, motor
+    search = _Search(settings, counts_rad[_COLUMNS[settings.encoders]])
+    steps = 0.4 * np.vstack((np.zeros(len(start)), -np.eye(len(start))))
     found = minimize(
-        lambda x: search.judged(_with_gains(settings, x)).cost, _START, method="Nelder-Mead",
-        options={"maxfev": _EVALUATIONS, "initial_simplex": _START + 0.4 * np.vstack((np.zeros(2), -np.eye(2)))},
+        lambda x: search.judged(_with_gains(settings, x)).cost, start, method="Nelder-Mead",
+        options={"maxfev": _EVALUATIONS[len(start)], "initial_simplex": start + steps},
     )  # fmt: skip
     chosen = _with_gains(settings, found.x)
     judged = search.judged(chosen)
-    return FlexibleGains(chosen.kp, chosen.kv, chosen.observer_radps, judged.s_anywhere, judged.noise_Nm)
+    cutoff_Hz = chosen.cutoff_Hz if len(start) > 2 else None
+    return FlexibleGains(chosen.kp, chosen.kv, chosen.observer_radps, judged.s_anywhere, judged.noise_Nm, cutoff_Hz)

@@ -34,6 +34,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from jointctl.firmware_py.kalman import kalman_gains
+from jointctl.firmware_py.kernel import plain
 from jointctl.firmware_py.law import solve_lyapunov_p
 from jointctl.firmware_py.states import ControllerKind, Encoders
 from jointctl.firmware_py.velocity import low_pass_gain
@@ -221,6 +223,7 @@ class LoopSettings:
     ki: float = 0.0  # [1/s^3], PID only
     observer_radps: float = 0.0  # disturbance observer only
     observer_delay_cycles: int = 0
+    kalman: bool = False  # velocity and disturbance by the Kalman filter
     # the network; without effect for other kinds
     q: tuple[float, float] = (1.0, 1.0)  # Q = diag(q1, q2)
     learning_rate: float = 0.0  # beta
@@ -230,6 +233,7 @@ class LoopSettings:
     weight_Nm: float = 0.0  # of every neuron at the point of linearisation
     # the joints that the loop must bear, of which the worst counts; none = a rigid one, true to `inertia_kgm2`
     joints: tuple[TwoMasses | RigidJoint, ...] = ()
+    largest_s: float = math.inf  # peak of |S| that is accepted, of each joint
     encoders: Encoders = Encoders.LINK
     motor_inertia_kgm2: float = 0.0  # of `inertia_kgm2`, as the law of a flexible joint believes
     twist_radps: float = 0.0
@@ -238,7 +242,7 @@ class LoopSettings:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, (int, float)) and not math.isfinite(value):
+            if field.name != "largest_s" and isinstance(value, (int, float)) and not math.isfinite(value):
                 raise ValueError(f"{field.name} (={value}) must be finite")
         for name in _POSITIVE:
             if not getattr(self, name) > 0.0:
@@ -333,6 +337,8 @@ def computed_torque_rbf(settings: LoopSettings) -> StateSpace:
 
 def computed_torque_observer(settings: LoopSettings) -> StateSpace:
     """The law with the disturbance observer: states z [Nms], r [Nm] and the commands that are not yet applied [Nm]."""
+    if settings.kalman:
+        return kalman_observer(settings)
     waiting = settings.observer_delay_cycles + 1  # the newest command known is that of the cycle before
     rows = _Rows(4 + waiting)
     momentum = settings.inertia_kgm2 * rows.rate(settings)
@@ -341,6 +347,21 @@ def computed_torque_observer(settings: LoopSettings) -> StateSpace:
     output = rows.feedback(settings) + disturbance
     sent = [output, *(rows.state(4 + i) for i in range(waiting - 1))]
     return rows.state_space(settings, [integral, disturbance, *sent], output)
+
+
+def kalman_observer(settings: LoopSettings) -> StateSpace:
+    """The same law by the Kalman filter: states e, e', d [Nm] as corrected, and the commands not yet applied [Nm]."""
+    waiting, period_s, inertia = settings.observer_delay_cycles + 1, settings.period_s, settings.inertia_kgm2
+    rows = _Rows(3 + waiting)
+    g1, g2, g3 = plain(kalman_gains)(settings.cutoff_Hz, settings.observer_radps, period_s)
+    acceleration = (rows.state(2 + waiting) - rows.state(2)) / inertia
+    expected = rows.state(0) + period_s * (rows.state(1) + 0.5 * period_s * acceleration)
+    apart = rows.error - expected
+    error, rate = expected + g1 * apart, rows.state(1) + period_s * acceleration + g2 * apart
+    disturbance = rows.state(2) - inertia * g3 * apart
+    output = disturbance - inertia * (settings.kp * error + settings.kv * rate)
+    sent = [output, *(rows.state(3 + i) for i in range(waiting - 1))]
+    return rows.of_rows([error, rate, disturbance, *sent], output)
 
 
 def pid(settings: LoopSettings) -> StateSpace:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.tools.analysis.linear_loop import LoopSettings, RigidJoint, linear_loop
-from jointctl.tools.analysis.loop_settings import two_masses
+from jointctl.tools.analysis.loop_settings import loop_settings, two_masses
+from jointctl.tools.analysis.margin_gate import encoder_step_Nm
 from jointctl.tools.analysis.margins import Margins, frequencies_radps, margins, phase_margin_deg, worst_case
-from jointctl.tools.configuration.conversions import joint_rad_per_count, torque_constant_NmpA
+from jointctl.tools.configuration.conversions import torque_constant_NmpA
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, SOFT, canvas, save_png
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 # --- What the linear loop does not know ---
 
 
-STEP_SHARE = 0.2  # of the torque limit; `precise` with 17 bit is below, with 16 bit, where it chatters, above
+STEP_SHARE = 0.25  # of the torque limit; `precise` with 17 bit is below, with 16 bit, where it is noisy, above
 OUTSIDE = (0.5, 2.0)  # factors on the link's inertia that are looked at beyond what must hold
 
 
@@ -68,21 +68,14 @@ def not_modelled(config: Config) -> list[str]:
             f"virtual.flexible (=true): the reducer resonates at {resonance_Hz:.1f} Hz, "
             "which takes margin that is not counted here"
         )
-    step_Nm = encoder_step_Nm(config)
+    step_Nm = encoder_step_Nm(config, loop_settings(config)[0])
     if step_Nm > STEP_SHARE * config.limits.torque_max_Nm:
         found.append(
             f"encoder.counts_per_turn (={config.encoder.counts_per_turn}): one count moves the torque by "
             f"{step_Nm:.1f} Nm, more than {STEP_SHARE:.0%} of limits.torque_max_Nm: "
-            "it will chatter; lower kv or velocity_cutoff_Hz"
+            'it will chatter; lower kv or velocity_cutoff_Hz, or take control.velocity_filter = "kalman"'
         )
     return found
-
-
-def encoder_step_Nm(config: Config) -> float:
-    """By how much kp and kv move the torque when the reading changes by one count."""
-    control, rate_Hz = config.control, config.loop.rate_Hz
-    slope_1ps = low_pass_gain(control.velocity_cutoff_Hz, 1.0 / rate_Hz) * rate_Hz
-    return config.joint.inertia_kgm2 * (control.kp + control.kv * slope_1ps) * abs(joint_rad_per_count(config))
 
 
 # --- Constants that are each in range and do not fit together: the user is warned, nothing is refused ---

@@ -54,6 +54,7 @@ def loop_settings(config: Config, delay_s: float | None = None) -> tuple[LoopSet
             lag_s=current_lag_s,
             inertia_kgm2=config.joint.inertia_kgm2,
             cutoff_Hz=control.velocity_cutoff_Hz,
+            kalman=control.velocity_filter == "kalman",
             q=(control.lyapunov_q[0], control.lyapunov_q[-1]),
             **control.model_dump(include=_SAME_IN_CONTROL),
             centres=centres,
@@ -63,11 +64,12 @@ def loop_settings(config: Config, delay_s: float | None = None) -> tuple[LoopSet
         )
     except ValueError as error:
         raise ConfigurationError(f"{config.path}: {error}") from None
+    filtered = "Kalman filter" if settings.kalman else "0 = none"
     assumptions: tuple[Assumption, ...] = (
         Assumption("loop rate", config.loop.rate_Hz, "Hz", "loop.rate_Hz"),
         Assumption("loop delay", delay_s, "s", delay_origin),
         Assumption("current lag", current_lag_s, "s", "margin.current_lag_s"),
-        Assumption("velocity filter", control.velocity_cutoff_Hz, "Hz", "control.velocity_cutoff_Hz (0 = none)"),
+        Assumption("velocity filter", control.velocity_cutoff_Hz, "Hz", f"control.velocity_cutoff_Hz ({filtered})"),
         Assumption("joint inertia", config.joint.inertia_kgm2, "kg m^2", "joint.inertia_kgm2"),
     )
     if config.reducer is not None:
@@ -97,6 +99,7 @@ def _two_masses(config: Config) -> dict[str, Any]:
     ]
     return {
         "joints": tuple(joints),
+        "largest_s": margin.max_sensitivity,
         "encoders": encoders,
         "motor_inertia_kgm2": reducer.motor_inertia_kgm2,
         "twist_radps": control.twist_radps,

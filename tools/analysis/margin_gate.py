@@ -11,20 +11,24 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from jointctl.drivers.errors import MarginError
-from jointctl.firmware_py.states import ControllerKind
-from jointctl.tools.analysis.linear_loop import LoopSettings
+from jointctl.firmware_py.states import ControllerKind, Encoders
+from jointctl.tools.analysis.linear_loop import CONTROLLERS, LoopSettings
 from jointctl.tools.analysis.loop_settings import loop_settings
 from jointctl.tools.analysis.margins import (
     OBSERVING,
     Convergence,
     Margins,
+    largest_sensitivity,
     learning_convergence,
     margins,
     phase_margin_deg,
     worst_case,
 )
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad, static_friction_Nm
 
 # --- remedies ---
 
@@ -62,13 +66,20 @@ def _boundary(bad: float, good: float, meets: Callable[[float], bool]) -> float:
     return good
 
 
+def _enough(settings: LoopSettings, minimum_deg: float) -> bool:
+    """Phase margin and, of joints that are not rigid, the peak of |S|."""
+    if phase_margin_deg(settings) < minimum_deg:
+        return False
+    return not settings.joints or largest_sensitivity(settings)[0] <= settings.largest_s
+
+
 def _search(
     settings: LoopSettings, minimum_deg: float, start: float, end: float, change: Callable[[float], LoopSettings]
 ) -> tuple[float, LoopSettings, float] | None:
     """(value, settings, phase margin) nearest to `start` on the way to `end` (both > 0, a scan by ratio)."""
 
     def meets(value: float) -> bool:
-        return phase_margin_deg(change(value)) >= minimum_deg
+        return _enough(change(value), minimum_deg)
 
     steps = min(_STEPS, max(1, math.ceil(abs(math.log(end / start)) / math.log(_SCAN_RATIO))))
     bad = start
@@ -76,8 +87,8 @@ def _search(
         value = start * (end / start) ** (i / steps)
         if meets(value):
             value = _rounded(_boundary(bad, value, meets), end > start)
-            reached = phase_margin_deg(change(value))
-            return (value, change(value), reached) if reached >= minimum_deg else None
+            reached = change(value)
+            return (value, reached, phase_margin_deg(reached)) if _enough(reached, minimum_deg) else None
         bad = value
     return None
 
@@ -88,14 +99,16 @@ def remedies(settings: LoopSettings, minimum_deg: float) -> list[Remedy]:
     Of several joints each is searched with the worst one, and then must do for all.
     """
     s = worst_case(settings)
+    if _enough(s, minimum_deg):
+        s = largest_sensitivity(settings)[2]
     network = s.kind == ControllerKind.COMPUTED_TORQUE_RBF and s.learning_rate > 0.0
     found = []
 
     def add(text: str, result: tuple[float, LoopSettings, float] | None) -> None:
         if result is not None and s.joints:
             everywhere = replace(result[1], joints=settings.joints)
-            reached = phase_margin_deg(everywhere)
-            result = (result[0], everywhere, reached) if reached >= minimum_deg else None
+            enough = _enough(everywhere, minimum_deg)
+            result = (result[0], everywhere, phase_margin_deg(everywhere)) if enough else None
         if result is not None:
             found.append(Remedy(text.format(value=result[0], changed=result[1]), result[1], result[2]))
 
@@ -162,7 +175,7 @@ def longest_delay_s(settings: LoopSettings, minimum_deg: float) -> float | None:
     """The longest loop delay up to the present one that still leaves the margin; None if even no delay does not."""
 
     def meets(delay_s: float) -> bool:
-        return phase_margin_deg(replace(settings, delay_s=delay_s)) >= minimum_deg
+        return _enough(replace(settings, delay_s=delay_s), minimum_deg)
 
     if not meets(0.0):
         return None
@@ -182,6 +195,8 @@ def require_margin(config: Config, delay_s: float | None = None, *, allow_low_ma
     minimum_deg = config.margin.min_phase_margin_deg
     settings, _ = loop_settings(config, delay_s)
     found = margins(settings)
+    if not allow_low_margin:
+        refuse_chatter(config, settings)
     refuse_diverging_learning(learning_of(config, settings))
     if not meets(found, minimum_deg) and not (found.stable and allow_low_margin):
         raise refusal(settings, found, minimum_deg, remedies(settings, minimum_deg))
@@ -203,8 +218,31 @@ def refuse_diverging_learning(found: Convergence | None) -> None:
         )
 
 
+def encoder_step_Nm(config: Config, settings: LoopSettings) -> float:
+    """By how much the law moves the torque, in that cycle, when an encoder counts one on; of two the greater one."""
+    counts_rad = [law_resolution_rad(config)]
+    if settings.kind == ControllerKind.FLEXIBLE_JOINT and settings.encoders != Encoders.LINK:
+        both = settings.encoders == Encoders.BOTH
+        counts_rad = [*counts_rad, abs(joint_rad_per_count(config))] if both else [abs(joint_rad_per_count(config))]
+    steps_Nm = np.abs(CONTROLLERS[settings.kind](settings).d[0]) * counts_rad
+    return float(np.max(steps_Nm))
+
+
+def refuse_chatter(config: Config, settings: LoopSettings) -> None:
+    """`MarginError` where the torque that moves the joint and one count on top of it reach the limit."""
+    step_Nm, limit_Nm = encoder_step_Nm(config, settings), config.limits.torque_max_Nm
+    holding_Nm = (static_friction_Nm(config) or 0.0) + abs(config.joint.gravity_Nm)
+    if step_Nm + holding_Nm >= limit_Nm:
+        raise MarginError(
+            f"the torque would chatter at its limit: one count of the encoder moves it by {step_Nm:.1f} Nm, friction "
+            f"and gravity need {holding_Nm:.1f} Nm; together they must be below limits.torque_max_Nm (={limit_Nm:g})",
+            'an encoder with more counts, control.velocity_filter = "kalman", or lower control.velocity_cutoff_Hz, kv '
+            "and observer_radps",
+        )
+
+
 def meets(found: Margins, minimum_deg: float) -> bool:
-    return found.stable and found.phase_margin_deg >= minimum_deg
+    return found.stable and found.phase_margin_deg >= minimum_deg and found.sensitivity_accepted
 
 
 def refusal(settings: LoopSettings, found: Margins, minimum_deg: float, changes: list[Remedy]) -> MarginError:
@@ -213,14 +251,23 @@ def refusal(settings: LoopSettings, found: Margins, minimum_deg: float, changes:
         f"at {1.0 / settings.period_s:g} Hz with {settings.delay_s * 1e3:g} ms loop delay, "
         f"{settings.lag_s * 1e3:g} ms current lag, {filtered}"
     )
-    if found.joint:
+    too_sensitive = found.stable and found.phase_margin_deg >= minimum_deg
+    if too_sensitive:
+        where += f"; worst case: {found.sensitivity_joint}"
+    elif found.joint:
         where += f"; worst case: {found.joint}"
-    if found.stable:
+    if too_sensitive:
+        what = (
+            f"peak of the sensitivity |S| (={found.sensitivity_peak:.2f} at {found.sensitivity_peak_Hz:.1f} Hz) must "
+            f"be at most {settings.largest_s:g} (margin.max_sensitivity)"
+        )
+    elif found.stable:
         what = f"phase margin (={found.phase_margin_deg:.1f} deg) must be at least {minimum_deg:g} deg"
     else:
         what = f"the control loop is unstable; a phase margin of at least {minimum_deg:g} deg is required"
     texts = [f"{r.text} gives {r.phase_margin_deg:.1f} deg" for r in changes]
-    longest_s = longest_delay_s(worst_case(settings), minimum_deg)
+    worst = largest_sensitivity(settings)[2] if too_sensitive else worst_case(settings)
+    longest_s = longest_delay_s(worst, minimum_deg)
     if longest_s is not None and longest_s > 0.0:
         texts.append(f"a loop delay of {longest_s * 1e3:g} ms or less")
     hint = "any one of: " + "; ".join(texts) if texts else "no single setting reaches it: lower kp, kv and q together"

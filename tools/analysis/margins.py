@@ -84,11 +84,13 @@ class Margins:
     delay_margin_s: float  # in addition to the assumed delay
     sensitivity_peak: float  # Ms = max |1 / (1 + L)|
     sensitivity_peak_Hz: float
+    sensitivity_accepted: bool  # not more than `LoopSettings.largest_s`
     slowest_time_constant_s: float  # of the closed loop's slowest mode; inf if unstable
     oscillation_Hz: float  # of the complex pair that decays slowest; nan without one
     oscillation_damping: float  # its damping ratio, negative if it grows
     poles: tuple[complex, ...]  # eigenvalues z, largest first
     joint: str = ""  # the one that these are of, where the loop must bear several
+    sensitivity_joint: str = ""  # the one with the highest peak, which is given
 
 
 @dataclass(frozen=True)
@@ -213,31 +215,53 @@ def cases(settings: LoopSettings) -> list[LoopSettings]:
 
 def worst_case(settings: LoopSettings) -> LoopSettings:
     """The joint with the least phase margin; where the loop is unstable with several, the fastest to grow."""
+    return _worst_cases(settings)[0]
+
+
+def _worst_cases(settings: LoopSettings) -> tuple[LoopSettings, LoopSettings]:
+    """That one, and the joint with the highest peak of |S|, which means something where all are stable."""
     found = cases(settings)
     if len(found) == 1:
-        return found[0]
+        return found[0], found[0]
     omega = frequencies_radps(settings.period_s, _COARSE_POINTS)
     z = np.exp(1j * omega * settings.period_s)
     law = linear_loop(settings).controller.response(z)  # the same for all of them
 
-    def rank(case: LoopSettings) -> tuple[float, float]:
+    def rank(case: LoopSettings) -> tuple[float, float, float]:
         loop = linear_loop(case)
         radius = float(np.max(np.abs(loop.closed_loop_poles())))
         if radius >= 1.0:
-            return 0.0, -radius
+            return 0.0, -radius, 0.0
         response = -(law @ loop.joint.response(z))[:, 0, 0]
         logarithm = np.log(np.abs(response))
         i = np.flatnonzero((logarithm[:-1] > 0.0) != (logarithm[1:] > 0.0))
         share = logarithm[i] / (logarithm[i] - logarithm[i + 1])
         crossing = (1.0 - share) * response[i] + share * response[i + 1]
-        return float(np.min(np.abs(np.angle(-crossing)), initial=math.pi)), 0.0
+        closest = float(np.min(np.abs(1.0 + response)))
+        return float(np.min(np.abs(np.angle(-crossing)), initial=math.pi)), 0.0, closest
 
-    return min(found, key=rank)
+    ranks = [rank(case) for case in found]
+    return found[ranks.index(min(ranks))], found[int(np.argmin([closest for _, _, closest in ranks]))]
+
+
+def largest_sensitivity(settings: LoopSettings) -> tuple[float, float, LoopSettings]:
+    """(peak of |S|, at [Hz], the joint that has it); infinite where the loop is unstable with one."""
+    worst, case = _worst_cases(settings)
+    if not linear_loop(worst).is_stable():
+        return math.inf, math.nan, worst
+    return *_highest_peak(case), case
+
+
+def _highest_peak(case: LoopSettings) -> tuple[float, float]:
+    """(peak of |S|, at [Hz]) with one joint."""
+    omega, loop = frequencies_radps(case.period_s), linear_loop(case)
+    peak, peak_radps = _sensitivity_peak(loop, omega, loop.open_loop(omega))
+    return peak, peak_radps / math.tau
 
 
 def margins(settings: LoopSettings) -> Margins:
     """All margins of the loop with these settings; of several joints those of the worst one."""
-    settings = worst_case(settings)
+    settings, most_sensitive = _worst_cases(settings)
     joint = settings.joints[0].name if settings.joints else ""
     loop = linear_loop(settings)
     poles = sorted((complex(z) for z in loop.closed_loop_poles()), key=abs, reverse=True)
@@ -246,8 +270,8 @@ def margins(settings: LoopSettings) -> Margins:
     oscillation_Hz = frequency / math.tau
     if radius >= 1.0:
         return Margins(
-            False, 0.0, math.nan, 1.0, 1.0, 0.0, math.inf, math.nan, math.inf, oscillation_Hz, damping, tuple(poles),
-            joint,
+            False, 0.0, math.nan, 1.0, 1.0, 0.0, math.inf, math.nan, False, math.inf, oscillation_Hz, damping,
+            tuple(poles), joint, joint,
         )  # fmt: skip
     omega = frequencies_radps(settings.period_s)
     response = loop.open_loop(omega)
@@ -255,7 +279,7 @@ def margins(settings: LoopSettings) -> Margins:
     phases = [(abs(math.atan2(-value.imag, -value.real)), at) for at, value in crossings]  # distance from -180 deg
     phase, crossover = min(phases, default=(math.pi, math.nan))
     factors = _gain_factors(loop, omega, response)
-    peak, peak_radps = _sensitivity_peak(loop, omega, response)
+    peak, peak_Hz = _highest_peak(most_sensitive)
     return Margins(
         stable=True,
         phase_margin_deg=math.degrees(phase),
@@ -264,12 +288,14 @@ def margins(settings: LoopSettings) -> Margins:
         gain_margin_down=max((f for f in factors if f < 1.0), default=0.0),
         delay_margin_s=delay_margin_s(settings, crossings),
         sensitivity_peak=peak,
-        sensitivity_peak_Hz=peak_radps / math.tau,
+        sensitivity_peak_Hz=peak_Hz,
+        sensitivity_accepted=peak <= settings.largest_s,
         slowest_time_constant_s=-settings.period_s / math.log(radius) if radius > 0.0 else 0.0,
         oscillation_Hz=oscillation_Hz,
         oscillation_damping=damping,
         poles=tuple(poles),
         joint=joint,
+        sensitivity_joint=most_sensitive.joints[0].name if most_sensitive.joints else "",
     )
 
 

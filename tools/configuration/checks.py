@@ -155,6 +155,13 @@ def _control_problems(config: Config) -> list[str]:
             f"control.observer_radps (={control.observer_radps:g}) must be more than 0 with control.kind "
             f'"computed_torque_observer" or "flexible_joint" and 0 with any other (={control.kind})'
         )
+    if control.velocity_filter == "kalman" and (
+        control.kind != "computed_torque_observer" or not control.velocity_cutoff_Hz
+    ):
+        found.append(
+            'control.velocity_filter (=kalman) needs control.kind "computed_torque_observer" '
+            f"(={control.kind}) and control.velocity_cutoff_Hz above 0 (={control.velocity_cutoff_Hz:g})"
+        )
     if control.kind != "pid" and control.ki:
         found.append(f'control.ki (={control.ki:g}) must be 0 unless control.kind is "pid" (={control.kind})')
     if control.learning is not None and control.kind not in OBSERVING:

@@ -79,6 +79,8 @@ class Control(Section):
     zero_rule: Literal["zero", "paper", "linear"]  # friction compensation at exactly zero velocity
     zero_band_radps: Annotated[float, between(0.0, 10.0)] = 0.0  # half width of the linear zero rule
     velocity_cutoff_Hz: Annotated[float, between(0.0, 2000.0)]  # 0 = no filter
+    # kalman: position, velocity and disturbance from a model, for coarse encoders; computed_torque_observer only
+    velocity_filter: Literal["low_pass", "kalman"] = "low_pass"
     filtered_error_rate: bool  # filter the velocity error as a whole: no bias from the filter's lag
     # with which the link's encoder corrects the expected twist, flexible_joint with both encoders only
     twist_radps: Annotated[float, between(0.0, 1000.0, open_low=True)] = 60.0

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.kalman import set_kalman_gains
+from jointctl.firmware_py.kernel import plain
 from jointctl.firmware_py.law import solve_lyapunov_p
 from jointctl.firmware_py.live_change import gains_of
 from jointctl.firmware_py.records import NEURONS, AxisConstants, Gains, TrajectoryConstants
@@ -125,6 +127,10 @@ def _fill_law(law: Any, config: Config) -> None:
     law.period_s = period_s(config)
     law.observer.bandwidth_radps = control.observer_radps
     law.observer.delay_cycles = control.observer_delay_cycles
+    if control.velocity_filter == "kalman":
+        law.observer.kalman = 1
+        law.observer.cutoff_Hz = control.velocity_cutoff_Hz
+        plain(set_kalman_gains)(law.observer, period_s(config))
     if control.learning is not None:
         _copy(law.learning, control.learning, "gain", "error_gain_ps2", "lead_cycles", "blend_s")
         law.learning.half_width = control.learning.half_width_cycles

@@ -257,6 +257,7 @@ class Margin(Section):
     payload_range: Annotated[tuple[float, ...], numbers("factors", 2, low=0.0, high=100.0)] = (0.7, 1.4)
     # with [reducer]: by this share the stiffness may be less or more
     stiffness_error: Annotated[float, between(0.0, 0.9)] = 0.3
+    max_sensitivity: Annotated[float, between(1.0, 100.0)] = 3.0  # with [reducer]: run refuses above this peak of |S|
 
 
 class Live(Section):

@@ -120,7 +120,8 @@ class EnsembleSettings(Section):
     inertia_scale: Annotated[Interval, _FromList, _interval(0.1, 10.0)] = (0.95, 1.05)
     # the rest, where the reducer is flexible: the encoder on the joint is then a second one, beside that on the motor
     flexible: bool = False
-    law: Literal["encoder", "joint_encoder"] = "joint_encoder"  # which of them feeds the law
+    # which of them feeds the law; joint_encoder_alone: there is none on the motor
+    law: Literal["encoder", "joint_encoder", "joint_encoder_alone"] = "joint_encoder"
     reducer_sizes: Annotated[tuple[int, ...], _FromList, AfterValidator(_sizes)] = tuple(REDUCERS)
     flexible_inertia_scale: Annotated[Interval, _FromList, _interval(0.1, 10.0)] = (0.85, 1.15)  # in its place
     inertia_ratio: Annotated[Interval, _FromList, _interval(0.01, 100.0)] = (0.3, 5.0)  # link to motor, log-uniform
@@ -133,7 +134,7 @@ class EnsembleSettings(Section):
     # what the controller believes of the reducer: each inertia and the stiffness are wrong by up to this share
     model_error: Annotated[float, between(0.0, 0.5)] = 0.15
     maps: bool = True  # whether it has maps of kinematic error and torque ripple
-    choose_gains: bool = True  # of the law with both encoders, for what it believes of each; else they are as given
+    choose_gains: bool = True  # of the law of a flexible joint, for what it believes of each; else they are as given
     map_error: Annotated[float, between(0.0, 1.0)] = 0.05  # share by which their amplitudes are wrong at most
 
 
@@ -190,7 +191,8 @@ def _belief(
         stiffness_beyond_Nmprad=tuple(scale * x for x in true.reducer_stiffness_beyond_Nmprad),
         loop_stiffness_Nmprad=SMALL_MOTION * stiffness,
         damping_Nmspr=float(np.mean(settings.reducer_damping)) * critical * math.sqrt(stiffness),
-        link_friction_share=float(np.mean(settings.link_friction_share)), map=made if settings.maps else None,
+        link_friction_share=float(np.mean(settings.link_friction_share)),
+        map=made if settings.maps and settings.law != "joint_encoder_alone" else None,
     )  # fmt: skip
     return believed, link
 
@@ -230,11 +232,12 @@ def random_plant(base: Config, settings: EnsembleSettings, seed: int, index: int
         virtual |= _flexible(base, settings, random)
         low_bits, high_bits = settings.motor_encoder_bits
         motor = {"counts_per_turn": 2 ** int(random.integers(low_bits, high_bits + 1)), "side": "motor"}
-        update["encoder"] = base.encoder.model_copy(update=motor)
-        update["joint_encoder"] = JointEncoder(
-            source="drive", counts_per_turn=2**bits, direction=1, zero_counts=0, law=settings.law,
-            disagreement_max_rad=ENCODERS_APART_rad,
-        )  # fmt: skip
+        if settings.law != "joint_encoder_alone":
+            update["encoder"] = base.encoder.model_copy(update=motor)
+            update["joint_encoder"] = JointEncoder(
+                source="drive", counts_per_turn=2**bits, direction=1, zero_counts=0, law=settings.law,
+                disagreement_max_rad=ENCODERS_APART_rad,
+            )  # fmt: skip
         true = base.virtual.model_copy(update=virtual)
         update["reducer"], link_kgm2 = _belief(base, true, settings, random)
         believed_kgm2 = update["reducer"].motor_inertia_kgm2 + link_kgm2
@@ -364,8 +367,7 @@ def run_plant(task: PlantTask) -> PlantResult:
     count_rad = law_resolution_rad(config)
     figures = []
     for controller in task.controllers:
-        both = task.plant.flexible and task.plant.law == "joint_encoder"
-        if controller.control.kind == "flexible_joint" and both and task.plant.choose_gains:
+        if controller.control.kind == "flexible_joint" and task.plant.flexible and task.plant.choose_gains:
             controller = with_chosen_gains(config, controller)
         constants = controller_constants(config, controller, joint.report.start_position_rad)
         run = run_scenario(joint, constants, task.scenario, motion=motion)

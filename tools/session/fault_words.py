@@ -360,8 +360,8 @@ def notice_text(notice: Notice, state: Any) -> str:
     if notice is Notice.TORQUE_NOISE:
         return (
             f"torque noise: the command changes by {float(state.swing.noise_told_Nm):.1f} Nm from cycle to cycle; "
-            "an encoder with more counts, a lower control.velocity_cutoff_Hz or lower gains (kv, observer_radps) "
-            "make it quieter"
+            'an encoder with more counts, control.velocity_filter = "kalman", a lower control.velocity_cutoff_Hz or '
+            "lower gains (kv, observer_radps) make it quieter"
         )
     return (
         "iterative learning is off for the rest of the run: its error grew in three repetitions, to "

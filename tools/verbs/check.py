@@ -43,7 +43,14 @@ def check(
         return check_arm(config, output, delay_s, allow_low_margin=allow_low_margin)
     from jointctl.tools.analysis.loop_report import contradictions, not_modelled, outside_payload_range
     from jointctl.tools.analysis.loop_settings import loop_settings
-    from jointctl.tools.analysis.margin_gate import learning_of, meets, refusal, refuse_diverging_learning, remedies
+    from jointctl.tools.analysis.margin_gate import (
+        learning_of,
+        meets,
+        refusal,
+        refuse_chatter,
+        refuse_diverging_learning,
+        remedies,
+    )
     from jointctl.tools.analysis.margins import margins, theory
     from jointctl.tools.drawing import require_png
     from jointctl.tools.verbs.bench_drive import bench_of
@@ -84,6 +91,8 @@ def check(
         output.warning(text)
     if not accepted:
         raise refusal(settings, found, minimum_deg, changes)
+    if not allow_low_margin:
+        refuse_chatter(config, settings)
     refuse_diverging_learning(learning)
     return 0
 
@@ -208,7 +217,9 @@ def _add_margins(table: Table, found: Margins) -> None:
     )
     table.add_row("gain margin down", f"x {found.gain_margin_down:.3g}", "the other way")
     table.add_row("delay margin", f"{found.delay_margin_s * 1e3:.2f} ms", "in addition to the loop delay above")
-    table.add_row("sensitivity peak Ms", f"{found.sensitivity_peak:.2f}", f"at {found.sensitivity_peak_Hz:.2f} Hz")
+    other = f"; {found.sensitivity_joint}" if found.sensitivity_joint != found.joint else ""
+    note = f"at {found.sensitivity_peak_Hz:.2f} Hz{other}"
+    table.add_row("sensitivity peak Ms", f"{found.sensitivity_peak:.2f}", note)
     table.add_row("slowest mode", f"{found.slowest_time_constant_s:.3g} s", "time constant")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import re
 from contextlib import nullcontext
 from pathlib import Path
@@ -13,19 +14,21 @@ import pytest
 
 from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MarginError, UsageError
 from jointctl.firmware_py.states import ControllerKind
+from jointctl.firmware_py.velocity import low_pass_gain
 from jointctl.tools.analysis.linear_loop import CONTROLLERS
 from jointctl.tools.analysis.loop_report import not_modelled
 from jointctl.tools.analysis.loop_settings import loop_settings
-from jointctl.tools.analysis.margin_gate import require_margin
+from jointctl.tools.analysis.margin_gate import encoder_step_Nm, require_margin
 from jointctl.tools.analysis.margins import phase_margin_deg
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.conversions import joint_rad_per_count
 from jointctl.tools.configuration.drive_section import require_simulated
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.experiments.controllers import from_file
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.check import check
 from jointctl.tools.verbs.fault_campaign import fault_campaign
-from tests.configurations import shipped
+from tests.configurations import changed, shipped
 
 
 # --- `check`: table, JSON, verdict, remedies and picture; where each assumption comes from ---
@@ -232,6 +235,17 @@ def test_an_encoder_too_coarse_for_the_gains_is_told(bits: int, side: str, warne
     assert any("chatter" in text for text in not_modelled(config)) is warned
 
 
+@pytest.mark.parametrize(("bits", "cutoff_Hz"), [(14, 40.0), (15, 50.0), (16, 80.0)])
+def test_with_the_kalman_filter_the_same_encoder_is_fine_enough(bits: int, cutoff_Hz: float) -> None:
+    config = shipped(
+        "precise", encoder__counts_per_turn=2**bits, control__velocity_filter="kalman",
+        control__velocity_cutoff_Hz=cutoff_Hz, control__kp=2500.0, control__kv=100.0, control__observer_radps=50.0,
+    )  # fmt: skip
+    assert not any("chatter" in text for text in not_modelled(config))
+    config = changed(config, control__velocity_cutoff_Hz=400.0, encoder__counts_per_turn=2**12)
+    assert any("chatter" in text for text in not_modelled(config))
+
+
 def test_a_soft_reducer_is_told_with_its_resonance_and_of_a_real_joint_nobody_knows_it() -> None:
     soft = {"flexible": True, "motor_side_inertia_kgm2": 1.05, "reducer_stiffness_Nmprad": 1.05 / 2 * 6283.2**2 / 1e4}
     for changes, words in (
@@ -373,6 +387,46 @@ def test_gains_are_chosen_on_request_for_the_law_of_a_flexible_joint_only() -> N
     shown, _, code = run_check(shipped("realistic"), choose_gains=True)
     assert code == 0
     assert re.search(r"chosen gains +│ kp = [\d.]+, kv = [\d.]+, observer_radps = [\d.]+ ", shown)
-    for other in (shipped("virtual"), rigid_law_behind_a_reducer("encoder"), shipped("realistic", joint_encoder=None)):
-        with pytest.raises(ConfigurationError, match=r"gains are chosen for control.kind = .* with both encoders only"):
+    shown, _, code = run_check(shipped("realistic", joint_encoder=None, encoder__side="joint"), choose_gains=True)
+    assert re.search(r"chosen gains .* velocity_cutoff_Hz = [\d.]+ ", shown)  # the resonance lies between
+    for other in (shipped("virtual"), rigid_law_behind_a_reducer("encoder")):
+        with pytest.raises(ConfigurationError, match=r'gains are chosen for control.kind = "flexible_joint" .* only'):
             run_check(other, choose_gains=True)
+
+
+KALMAN = {"control__velocity_filter": "kalman", "control__velocity_cutoff_Hz": 60.0}
+
+
+# --- a torque that an encoder moves to its limit is refused; on the simulated joint it is a limit cycle ---
+@pytest.mark.parametrize(
+    ("changes", "refused"),
+    [
+        ({"encoder__counts_per_turn": 2**15}, True),  # `faults/test_limit_cycle.py`: "coarse encoder"
+        ({"encoder__counts_per_turn": 2**16}, False),  # and its twin that is only noisy
+        ({"encoder__counts_per_turn": 2**15, **KALMAN}, False),
+        ({"limits__torque_max_Nm": 32.0}, False),
+        ({"encoder__counts_per_turn": 2**17, "limits__torque_max_Nm": 32.0}, True),  # 13.3 Nm on top of 19
+    ],
+)  # fmt: skip
+def test_what_would_chatter_at_the_torque_limit_is_refused(changes: dict[str, Any], refused: bool) -> None:
+    config = shipped("precise", control__learning=None, **changes)
+    messages, code = run_check(config)[1:]
+    assert ("the torque would chatter at its limit: one count" in messages) is refused
+    assert code == (9 if refused else 0)
+    with pytest.raises(MarginError, match="chatter") if refused else nullcontext():
+        require_margin(config)
+    assert require_margin(config, allow_low_margin=True).stable
+
+
+def test_the_step_of_a_count_is_that_of_position_rate_and_observer() -> None:
+    precise = shipped("precise", encoder__counts_per_turn=2**17)
+    slope_1ps = low_pass_gain(200.0, 1e-3) * 1000.0
+    expected = 2.1 * (3600.0 + (120.0 + 60.0) * slope_1ps) * math.tau / 2**17
+    assert encoder_step_Nm(precise, loop_settings(precise)[0]) == pytest.approx(expected)
+    two = shipped("realistic", joint_encoder__counts_per_turn=2**24)  # the motor's encoder is the coarser one
+    loop, _ = loop_settings(two)
+    slope_1ps = low_pass_gain(loop.cutoff_Hz, 1e-3) * 1000.0
+    kept = math.exp(-loop.twist_radps * 1e-3)
+    of_motor = loop.inertia_kgm2 * (loop.kp * kept + loop.kv * slope_1ps)
+    of_motor += loop.observer_radps * loop.motor_inertia_kgm2 * slope_1ps
+    assert encoder_step_Nm(two, loop) == pytest.approx(of_motor * abs(joint_rad_per_count(two)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +11,7 @@ import numba
 import numpy as np
 import pytest
 
+from jointctl.drivers.errors import MarginError
 from jointctl.firmware_py.flexible_joint import Reading
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import reset_law, step_flexible_law
@@ -22,9 +24,17 @@ from jointctl.hil.plant import plant, step_plant
 from jointctl.tools.analysis.flexible_gains import LARGEST_S_ANYWHERE, LARGEST_NOISE_Nm, chosen_gains
 from jointctl.tools.analysis.linear_loop import LoopSettings, TwoMasses, linear_loop
 from jointctl.tools.analysis.loop_settings import loop_settings
-from jointctl.tools.analysis.margins import cases, delay_margin_s, margins, phase_margin_deg, worst_case
+from jointctl.tools.analysis.margin_gate import require_margin
+from jointctl.tools.analysis.margins import (
+    cases,
+    delay_margin_s,
+    largest_sensitivity,
+    margins,
+    phase_margin_deg,
+    worst_case,
+)
 from jointctl.tools.configuration.config import Config
-from tests.configurations import shipped
+from tests.configurations import changed, shipped
 
 JIT_DISABLED = bool(numba.config.DISABLE_JIT)
 PERIOD_s = 1e-3
@@ -211,6 +221,19 @@ def believed(**changes: Any) -> Config:
     return shipped("realistic", **changes)
 
 
+def with_encoders(config: Config, encoders: Encoders) -> Config:
+    """The encoder on the motor alone, or that on the link alone."""
+    if encoders == Encoders.BOTH:
+        return config
+    assert config.joint_encoder is not None
+    counts = config.joint_encoder.counts_per_turn
+    alone = changed(config, joint_encoder=None)
+    return alone if encoders == Encoders.MOTOR else changed(
+        alone, encoder__side="joint", encoder__counts_per_turn=counts
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("encoders", list(Encoders))
 @pytest.mark.parametrize(
     "changes",
     [
@@ -220,13 +243,16 @@ def believed(**changes: Any) -> Config:
         {"margin__loop_delay_s": 2.5e-3},
     ],
 )
-def test_chosen_gains_keep_their_promise_on_every_joint(changes: dict[str, Any]) -> None:
-    config = believed(**changes)
+def test_chosen_gains_keep_their_promise_on_every_joint(changes: dict[str, Any], encoders: Encoders) -> None:
+    config = with_encoders(believed(**changes), encoders)
     settings, _ = loop_settings(config)
     gains = chosen_gains(config, settings)
     assert gains.largest_s <= LARGEST_S_ANYWHERE * 1.01
     assert gains.noise_Nm <= LARGEST_NOISE_Nm * 1.01
-    chosen = replace(settings, **gains.changes())
+    chosen = replace(settings, kp=gains.kp, kv=gains.kv, observer_radps=gains.observer_radps)
+    chosen = replace(chosen, cutoff_Hz=gains.cutoff_Hz or settings.cutoff_Hz)
+    assert settings.encoders == encoders
+    assert ("velocity_cutoff_Hz" in gains.changes()) is (encoders == Encoders.LINK)
     for case in cases(chosen):
         if case.joints[0].bristle_Nmprad == (0.0, 0.0):
             found = margins(case)
@@ -242,3 +268,44 @@ def test_more_delay_leaves_smaller_gains() -> None:
         found.append(chosen_gains(config, loop_settings(config)[0]).kv)
     assert found == sorted(found, reverse=True)
     assert found[-1] < 0.7 * found[0]
+
+
+# --- the peak of |S| is judged of the joint that has it, besides the phase margin ---
+def test_the_sensitivity_is_that_of_the_joint_with_the_highest_peak() -> None:
+    found = {case.joints[0].name: margins(case).sensitivity_peak for case in cases(loop_settings(believed())[0])}
+    whole = margins(loop_settings(believed())[0])
+    assert whole.sensitivity_peak == pytest.approx(max(found.values()))
+    assert found[whole.sensitivity_joint] == pytest.approx(whole.sensitivity_peak)
+    peak, peak_Hz, case = largest_sensitivity(loop_settings(believed())[0])
+    assert (peak, peak_Hz, case.joints[0].name) == (
+        whole.sensitivity_peak, whole.sensitivity_peak_Hz, whole.sensitivity_joint
+    )  # fmt: skip
+
+
+def test_a_peak_above_the_limit_is_refused_with_remedies_that_do() -> None:
+    """Enough phase margin and a resonance that is too sharp."""
+    sharp = {"control__kv": 90.0, "control__kp": 1000.0, "margin__min_phase_margin_deg": 5.0}
+    found = margins(loop_settings(believed(**sharp))[0])
+    assert found.phase_margin_deg > 5.0
+    just = {**sharp, "margin__max_sensitivity": found.sensitivity_peak * 1.001}
+    assert require_margin(believed(**just)).stable
+    limit = round(found.sensitivity_peak * 0.8, 2)
+    config = believed(**sharp, margin__max_sensitivity=limit)
+    with pytest.raises(
+        MarginError, match=rf"peak of the sensitivity \|S\| \(=[\d.]+ at [\d.]+ Hz\) must be at most {limit:g}"
+    ) as caught:
+        require_margin(config)
+    assert found.sensitivity_joint in str(caught.value)
+    assert require_margin(config, allow_low_margin=True).stable
+    remedy = re.search(
+        r"a slower loop: control\.kp = ([\d.e+]+), kv = ([\d.]+), observer_radps = ([\d.]+)", caught.value.hint
+    )
+    assert remedy is not None
+    kp, kv, observer = (float(number) for number in remedy.groups())
+    slower = believed(**{**sharp, "control__kp": kp, "control__kv": kv, "control__observer_radps": observer})
+    assert margins(loop_settings(slower)[0]).sensitivity_peak <= 1.005 * limit  # the numbers of the message are rounded
+
+
+def test_of_a_rigid_joint_no_peak_is_judged() -> None:
+    found = require_margin(shipped("paper", margin__max_sensitivity=1.0, margin__min_phase_margin_deg=10.0))
+    assert found.sensitivity_peak > 1.0

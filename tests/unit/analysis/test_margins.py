@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
+from jointctl.firmware_py.kalman import set_kalman_gains
 from jointctl.firmware_py.kernel import JIT_DISABLED, kernel
 from jointctl.firmware_py.law import reset_law, solve_lyapunov_p, step_law
 from jointctl.firmware_py.records import LawConstants, LawState, Reference, VelocityConstants, VelocityState
@@ -80,6 +81,7 @@ ANY_KIND = (
     replace(Q1800, kind=ControllerKind.PID, kp=3 * 45.0**2, kv=3 * 45.0, ki=45.0**3),
     replace(Q1800, kind=ControllerKind.COMPUTED_TORQUE_OBSERVER, observer_radps=60.0, observer_delay_cycles=1),
 )
+KALMAN = replace(ANY_KIND[3], kalman=True, kp=2500.0, kv=100.0, cutoff_Hz=40.0, observer_radps=40.0)
 
 
 # --- The model of the sampled loop in itself: two ways to the same number, and limits where they must be ---
@@ -104,7 +106,7 @@ def test_the_sampled_joint_is_the_matrix_exponential(delay_periods, lag_s, perio
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.3e-3, 1e-3, 2.6e-3, 3e-3])
-@pytest.mark.parametrize("loop", ANY_KIND)
+@pytest.mark.parametrize("loop", [*ANY_KIND, KALMAN])
 def test_frequency_response_and_state_space_agree(loop, delay_s):
     whole = linear_loop(replace(loop, delay_s=delay_s))
     omega = np.array([1.0, 80.0, 900.0, 3000.0])
@@ -300,6 +302,9 @@ def test_longest_delay():
 SUBSTEP_s = 100e-6 if JIT_DISABLED else 25e-6
 
 
+PERIOD_s = 1e-3
+
+
 DURATION_s = 2.0 if JIT_DISABLED else 20.0
 
 
@@ -330,23 +335,32 @@ def energies(law_c, law_s, velocity_c, velocity_s, reference, plant_c, plant_s, 
     return early, late
 
 
-def decays(loop: LoopSettings, delay_substeps: int, matched: bool) -> bool:
-    """Whether the simulated joint comes to rest with this delay."""
+def law_records(loop: LoopSettings, matched: bool):
+    """The law's constants and state, at rest."""
     law_c, law_s = new(LawConstants), new(LawState)
-    velocity_c, velocity_s, reference = new(VelocityConstants), new(VelocityState), new(Reference)
     law = law_c[0]
     law.kind, law.period_s, law.filtered_error_rate = loop.kind, loop.period_s, matched
     law.inertia_kgm2, law.kp, law.kv, law.ki = loop.inertia_kgm2, loop.kp, loop.kv, loop.ki
     law.observer.bandwidth_radps, law.observer.delay_cycles = loop.observer_radps, loop.observer_delay_cycles
+    if loop.kalman:
+        law.observer.kalman, law.observer.cutoff_Hz = 1, loop.cutoff_Hz
+        set_kalman_gains(law.observer, loop.period_s)
     _, p12, p22 = solve_lyapunov_p(loop.kp, loop.kv, *loop.q)
     network = law.network
     network.p_b[0], network.p_b[1] = p12 / loop.inertia_kgm2, p22 / loop.inertia_kgm2
     network.centres[:] = loop.centres
     network.inverse_width[:] = [0.5 / b**2 for b in loop.widths]
     network.learning_rate, network.leakage = loop.learning_rate, loop.leakage_1ps
+    reset_law(law, law_s[0])
+    return law_c, law_s
+
+
+def decays(loop: LoopSettings, delay_substeps: int, matched: bool) -> bool:
+    """Whether the simulated joint comes to rest with this delay."""
+    law_c, law_s = law_records(loop, matched)
+    velocity_c, velocity_s, reference = new(VelocityConstants), new(VelocityState), new(Reference)
     velocity_c[0].period_s, velocity_c[0].cutoff_Hz = loop.period_s, loop.cutoff_Hz
     velocity_c[0].period_gain = low_pass_gain(loop.cutoff_Hz, loop.period_s)
-    reset_law(law, law_s[0])
     plant_c, plant_s = plant(
         step_s=SUBSTEP_s,
         inertia_kgm2=loop.inertia_kgm2,
@@ -356,7 +370,7 @@ def decays(loop: LoopSettings, delay_substeps: int, matched: bool) -> bool:
         initial_position_rad=START_rad,
     )
     early, late = energies(
-        law, law_s[0], velocity_c[0], velocity_s[0], reference[0], plant_c[0], plant_s[0],
+        law_c[0], law_s[0], velocity_c[0], velocity_s[0], reference[0], plant_c[0], plant_s[0],
         round(loop.period_s / SUBSTEP_s), round(DURATION_s / loop.period_s),
     )  # fmt: skip
     return late < early
@@ -401,8 +415,27 @@ def gain_sets() -> list[LoopSettings]:
     return chosen
 
 
+def kalman_sets() -> list[LoopSettings]:
+    """Seeded, around what docs/law.md recommends for coarse encoders, at three rates."""
+    rng = np.random.default_rng(31)
+    return [
+        replace(
+            KALMAN,
+            period_s=(5e-4, 1e-3, 2e-3)[i % 3],
+            lag_s=rng.uniform(0.0, 1e-3),
+            cutoff_Hz=rng.uniform(25.0, 90.0),
+            kp=2500.0 * rng.uniform(0.5, 1.5),
+            kv=100.0 * rng.uniform(0.7, 1.3),
+            observer_radps=rng.uniform(20.0, 80.0),
+            observer_delay_cycles=int(rng.integers(0, 3)),
+            inertia_kgm2=rng.uniform(0.5, 5.0),
+        )
+        for i in range(6)
+    ]
+
+
 FRICTIONLESS = replace(Q2500, lag_s=0.3e-3, weight_Nm=0.0)
-SIMULATED = [FRICTIONLESS, replace(Q2500, cutoff_Hz=30.0, weight_Nm=0.0), *gain_sets()]
+SIMULATED = [FRICTIONLESS, replace(Q2500, cutoff_Hz=30.0, weight_Nm=0.0), *gain_sets(), *kalman_sets()]
 
 
 @pytest.mark.parametrize("case", range(1 if JIT_DISABLED else len(SIMULATED)))
@@ -422,3 +455,45 @@ def test_predicted_and_simulated_delay_limits_agree(case):
 def test_frictionless_check_with_the_kernels(matched):
     assert decays(FRICTIONLESS, round(4.4e-3 / SUBSTEP_s), matched)
     assert not decays(FRICTIONLESS, round(5.0e-3 / SUBSTEP_s), matched)
+
+
+@kernel
+def injected_loop(law_c, law_s, velocity_s, reference, plant_c, plant_s, substeps, injected_Nm, commands, torques):
+    """The closed loop, `injected_Nm` added behind the law: what the law asks for, and what the joint is given."""
+    torque = 0.0
+    for k in range(len(injected_Nm)):
+        torque = step_law(law_c, law_s, plant_s.joint_position_rad, velocity_s, reference, torque, NO_REPETITION)
+        commands[k] = torque
+        torques[k] = torque + injected_Nm[k]
+        for _ in range(substeps):
+            step_plant(plant_c, plant_s, torques[k])
+
+
+@pytest.mark.parametrize("case", range(1 if JIT_DISABLED else 6))
+def test_injected_sines_find_the_gain_and_phase_of_the_kalman_filter(case):
+    loop = replace(kalman_sets()[case], period_s=PERIOD_s, delay_s=1e-3)
+    law_c, law_s = law_records(loop, True)
+    plant_c, plant_s = plant(
+        step_s=SUBSTEP_s, inertia_kgm2=loop.inertia_kgm2, current_limit_A=1e4, current_lag_s=loop.lag_s,
+        command_delay_s=loop.delay_s,
+    )  # fmt: skip
+    found = margins(loop)
+    assert found.stable
+    period = 1000
+    for line in sorted(
+        {round(found.crossover_Hz), 2 * round(found.crossover_Hz), round(found.sensitivity_peak_Hz), 40}
+    ):
+        reset_law(law_c[0], law_s[0])
+        injected = 1e-4 * np.sin(math.tau * line * np.arange(6 * period) / period)
+        commands, torques = np.zeros(len(injected)), np.zeros(len(injected))
+        injected_loop(
+            law_c[0], law_s[0], new(VelocityState)[0], new(Reference)[0], plant_c[0], plant_s[0],
+            round(PERIOD_s / SUBSTEP_s), injected, commands, torques,
+        )  # fmt: skip
+        wave = np.exp(-1j * math.tau * line * np.arange(period) / period)
+        measured = -(commands[-period:] @ wave) / (torques[-period:] @ wave)
+        # the virtual joint takes the torque at the end of a substep for all of it: half a substep less lag
+        modelled = linear_loop(replace(loop, delay_s=loop.delay_s - 0.5 * SUBSTEP_s))
+        expected = modelled.open_loop(np.array([math.tau * line]))[0]
+        assert abs(measured) == pytest.approx(abs(expected), rel=0.03)
+        assert abs(math.degrees(np.angle(measured / expected))) < 1.0
