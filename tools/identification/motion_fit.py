@@ -21,12 +21,14 @@ from jointctl.tools.identification.models import FORMS, MIN_PER_STAGE, Branch, b
 from jointctl.tools.identification.motion_data import Motion, MotionSettings
 from jointctl.tools.identification.motion_model import (
     BOUNDS,
+    EXPERIMENTS,
     FORM_STEPS,
     SIGNS,
     TERMS,
     Model,
     Samples,
     WS_MAX_radps,
+    jacobian,
     unit_of,
 )
 
@@ -40,7 +42,6 @@ RESAMPLES = 400
 _HUBER = 1.345
 _SLACK = 1e-6  # of the least squares, relative
 _LEAST_SHARE = 0.2  # of each direction's samples that each half of the blocks must have
-_LOAD_RANGE = 0.5  # of the mean friction: less variation of |tau| tells nothing of load friction
 _LEAST_WARMING_K = 3.0
 _ONE_DIRECTION = 0.02  # share of samples
 _CONSTANT_SPEED = 0.2  # of the median speed, between the thousandths at the ends
@@ -319,12 +320,6 @@ def _resampled(model: Model, vector: np.ndarray, problem: _Problem, seed: int) -
     least sixteen.  The spread is widened for the parameters that the fit has taken from the blocks.
     """
     residual = problem.torque_Nm - model.torque_Nm(vector, problem.samples)
-    step = 1e-6 * np.maximum(np.abs(vector), 1e-2)
-    columns = [
-        (model.torque_Nm(vector + d, problem.samples) - model.torque_Nm(vector - d, problem.samples)) / (2.0 * d[k])
-        for k, d in enumerate(np.diag(step))
-    ]
-    jacobian = np.column_stack(columns)
     spread = max(1.4826 * float(np.median(np.abs(residual))), 1e-12)
     weight = np.minimum(1.0, _HUBER * spread / np.maximum(np.abs(residual), 1e-12))
     count = len(residual)
@@ -333,10 +328,11 @@ def _resampled(model: Model, vector: np.ndarray, problem: _Problem, seed: int) -
     which = np.arange(count) // length
     size, freedom = len(vector), max(blocks - len(vector), 2)
     normal, right = np.zeros((blocks, size, size)), np.zeros((blocks, size))
-    weighted = weight[:, None] * jacobian
+    slopes = jacobian(model, vector, problem.samples)
+    weighted = weight[:, None] * slopes
     for at in range(blocks):
         mine = which == at
-        normal[at], right[at] = weighted[mine].T @ jacobian[mine], weighted[mine].T @ residual[mine]
+        normal[at], right[at] = weighted[mine].T @ slopes[mine], weighted[mine].T @ residual[mine]
     scale = np.sqrt(np.maximum(np.trace(normal.sum(0)) / size, 1e-300))
     ridge = 1e-10 * scale**2 * np.eye(size)
 
@@ -363,22 +359,6 @@ def _correlation_samples(residual: np.ndarray) -> float:
     return float(max(1.0, 2.0 * np.sum(correlation[: ends[0] if len(ends) else None]) - 1.0))
 
 
-_EXPERIMENT = {
-    "inertia": "accelerate more",
-    "gravity_sin": "move over a larger angle",
-    "gravity_cos": "move over a larger angle",
-    "load_scale": "move under two known loads, both ways",
-    "load_coulomb": "move both ways under two loads or more",
-    "load_viscous": "move at several speeds under two loads or more",
-    "temperature_coulomb": "measure slow motion cold and warm",
-    "temperature_viscous": "measure fast motion cold and warm",
-    "tc": "measure longer, and more speeds",
-    "rise": "move more slowly (near standstill, above --speed-min)",
-    "ws": "move more slowly (near standstill, above --speed-min)",
-    "tv": "move at more speeds, farther apart",
-}
-
-
 def _parameters(model: Model, vector: np.ndarray, resampled: np.ndarray) -> dict[str, Parameter]:
     """Intervals in physical terms: ws instead of its logarithm, and a hint where a number is hardly known."""
     low, high = np.percentile(resampled, (50.0 - 50.0 * LEVEL, 50.0 + 50.0 * LEVEL), axis=0)
@@ -394,7 +374,7 @@ def _parameters(model: Model, vector: np.ndarray, resampled: np.ndarray) -> dict
         if max(most - value, value - least) > _WEAK * abs(value):
             zero = least <= 0.0 <= most
             weak = (
-                ("not distinguishable from 0" if zero else "hardly known") + ": " + _EXPERIMENT.get(kind, "more data")
+                ("not distinguishable from 0" if zero else "hardly known") + ": " + EXPERIMENTS.get(kind, "more data")
             )
         found[f"{kind} {word}".strip()] = Parameter(value, least, most, weak)
     return found

@@ -170,6 +170,7 @@ class SweepMeter:
         self._model = model
         self.tolerance = Tolerance(0.01, 0.0)  # set once the drive's resolution is known
         self.temperature_degC: float | None = None  # the drive's newest, set before `feed`
+        self.warmth: tuple[np.ndarray, np.ndarray] | None = None  # in its place: trajectory time, temperature
         self._on_point = on_point
         self._next = 0
         self._chunks: list[np.ndarray] = []
@@ -220,4 +221,5 @@ class SweepMeter:
             return
         result = plateau(taken, window.point.velocity_radps, model.orders_prad, self.tolerance, model.resolution_rad)
         if math.isfinite(result.velocity_radps) and math.isfinite(result.motor_torque_Nm):
-            self._on_point(MeasuredPoint(window.point, result, window.end_s, self.temperature_degC))
+            warmth = self.temperature_degC if self.warmth is None else float(np.interp(window.end_s, *self.warmth))
+            self._on_point(MeasuredPoint(window.point, result, window.end_s, warmth))

@@ -168,7 +168,7 @@ def stroke_of(speed_radps: float, s: PlanSettings) -> Stroke:
     return Stroke(speed_radps, window, 1, min(strokes, MOST_STROKES), window, length)
 
 
-class _Builder:
+class MotionBuilder:
     """Collects table rows; keeps time, position and velocity of the end of what has been planned."""
 
     def __init__(self, s: PlanSettings) -> None:
@@ -227,7 +227,7 @@ class _Builder:
         return np.array([*self._rows, (self.t_s, self.q_rad, 0.0, 0.0, 0.0)])
 
 
-def _measure(builder: _Builder, stroke: Stroke, direction: int, s: PlanSettings) -> list[tuple[float, float]]:
+def _measure(builder: MotionBuilder, stroke: Stroke, direction: int, s: PlanSettings) -> list[tuple[float, float]]:
     """One stroke from rest to rest; returns its windows."""
     velocity = direction * stroke.speed_radps
     builder.ramp(velocity)
@@ -254,7 +254,7 @@ def plan_motion(points: list[SweepPoint], s: PlanSettings, warm_up_turns: float 
         else:
             groups.append([point])
     strokes = {abs(p.velocity_radps): stroke_of(abs(p.velocity_radps), s) for p in points}
-    builder = _Builder(s)
+    builder = MotionBuilder(s)
     builder.rest(REVERSAL_s)
     half = 0.5 * max((stroke.length_rad for stroke in strokes.values()), default=0.0)
     left_rad = warm_up_turns * math.tau

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from jointctl.drivers.errors import ConfigurationError, DataError
+from jointctl.drivers.errors import ConfigurationError, DataError, UsageError
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import Report, VerbOutput, config_path, configuration_files, configurations
 
@@ -104,6 +104,10 @@ class FitOptions:
     mean_samples: Annotated[
         int | None, typer.Option("--mean-samples", help="running mean of a motion, in place of the band's low-pass")
     ] = None
+    also: Annotated[
+        list[Path] | None,
+        typer.Option("--also", help="a further motion of the joint, warmer or with another load; may be repeated"),
+    ] = None
 
 
 def _fit(given: FitOptions) -> Options:
@@ -111,7 +115,8 @@ def _fit(given: FitOptions) -> Options:
     from jointctl.tools.identification.motion_data import MotionSettings
     from jointctl.tools.identification.swarm import SwarmSettings
 
-    motion = MotionSettings(given.band, given.speed_min, given.acceleration_max, given.mean_samples)
+    also = tuple(given.also or ())
+    motion = MotionSettings(given.band, given.speed_min, given.acceleration_max, given.mean_samples, also)
     swarm = SwarmSettings(**{field.name: getattr(given, field.name) for field in fields(SwarmSettings)})
     same = ("model", "continuous", "search_knee", "static_max_Nm", "outlier_threshold", "folds")
     return Options(
@@ -234,6 +239,8 @@ def identify(
     config = None if config is None else config_path(config)
     limits = _limits(into, config, output)
     from_data = _from_motion if is_series(data_path, given) else _from_plateaus
+    if from_data is _from_plateaus and options.motion.also:
+        raise UsageError(f"--also (={options.motion.also[0]}) is for motions, and {data_path} holds plateaus")
     found = from_data(data_path, given, options, limits, output)
     for note in found.notes:  # also with -q: a fit of other points than were measured is another result
         output.address(f"{data_path}: {note}")
@@ -250,7 +257,8 @@ def identify(
     files[stem.with_name(stem.name + ".report.json")] = report_json.encode("utf-8")
     if out is not None:
         files[out] = text.encode("utf-8")
-    protected = [p for p in (data_path, data_path.with_suffix(".json"), into, config) if p is not None]
+    read = (data_path, data_path.with_suffix(".json"), into, config, *options.motion.also)
+    protected = [p for p in read if p is not None]
     for path in files:
         require_target(path, protected)
     if into is not None:  # first, because it is the one that may be refused
@@ -310,13 +318,18 @@ def _from_plateaus(
 
 
 def motion_from(path: Path, given: ForeignFormat, settings: MotionSettings) -> Motion:
-    """The motion of a run log or of a table."""
-    from jointctl.tools.identification.motion_data import motion_of_log, read_motion
+    """The motion of a run log or of a table, with those of `settings.also` after it."""
+    from jointctl.tools.identification.motion_data import is_series, joined, motion_of_log, read_motion
     from jointctl.tools.recording.run_log_reader import read_run_log
 
-    if path.suffix.lower() == ".mcap":
-        return motion_of_log(path, read_run_log(path), given, settings)
-    return read_motion(path, given, settings)
+    def one(path: Path) -> Motion:
+        if path.suffix.lower() == ".mcap":
+            return motion_of_log(path, read_run_log(path), given, settings)
+        if not is_series(path, given):
+            raise DataError(f"{path}: is no motion in time", "--also is for run logs, and tables with --time-column")
+        return read_motion(path, given, settings)
+
+    return joined([one(each) for each in (path, *settings.also)])
 
 
 def _from_motion(

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Column, Table
 
-from jointctl.drivers.errors import INTERRUPTED, ConfigurationError, MotionFault, UsageError
+from jointctl.drivers.errors import ConfigurationError, MotionFault, UsageError
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOnBus, VerbOutput, Yes
 
 if TYPE_CHECKING:
-    from jointctl.drivers.drive import CommissioningReport
     from jointctl.tools.analysis.reducer_map import FoundMap, MapRun
     from jointctl.tools.configuration.config import Config
 
@@ -163,35 +162,12 @@ def map_verb(
 def _measured(config: Config, output: Output, **how: bool) -> tuple[Any, float] | int:
     """(records, time from a command to its torque) of a run, or the exit code without one."""
     from jointctl.tools.recording.run_log_reader import read_run_log
-    from jointctl.tools.session.consent import TerminalConsent
-    from jointctl.tools.session.control import in_control
-    from jointctl.tools.session.live_panel import run_display
     from jointctl.tools.session.plan import resolve
-    from jointctl.tools.session.result import broken_off, never_begun, require_off
-    from jointctl.tools.session.session import Session
+    from jointctl.tools.sweeping.carry_out import carried_out
 
-    plan = resolve(config, allow_low_margin=how["allow_low_margin"])
-    consent = TerminalConsent(output, assume_yes=how["assume_yes"], dry_run=how["dry_run"])
-
-    def display(_: CommissioningReport) -> Any:
-        return run_display(output, f"{config.path.stem}: map")()
-
-    with in_control(config, output) as control:
-        session = Session(plan, consent, output, control, display)
-        try:
-            result = session.run()
-        except KeyboardInterrupt:
-            return broken_off(session.drive_state, output, control.signals.by_command)
-    if result is None:
-        return never_begun(session.drive_state, output, dry_run=how["dry_run"])
-    require_off(session.drive_state)
-    if result.fault_text is not None:
-        text = result.fault_text
-        raise MotionFault(f"{result.fault.name} ({int(result.fault)}): {text.happened}; no map", text.advice)
-    if result.stopped_by:
-        output.note(f"stopped by {result.stopped_by}; no map")
-        return INTERRUPTED
-    return read_run_log(result.log_path).records, _late_s(config)
+    plan = resolve(config, allow_low_margin=how.pop("allow_low_margin"))
+    result = carried_out(plan, output, "map", **how)
+    return result if isinstance(result, int) else (read_run_log(result.log_path).records, _late_s(config))
 
 
 def _lockstep(config: Config) -> tuple[Any, float]:
