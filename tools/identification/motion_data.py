@@ -26,11 +26,13 @@ from jointctl.firmware_py.input_file import LARGEST_LOG_BYTES, open_input
 from jointctl.firmware_py.states import AxisPhase
 from jointctl.tools.configuration.conversions import RADPS_PER_UNIT
 from jointctl.tools.identification.friction_data import (
+    MIN_PER_DIRECTION,
     RAD_PER_UNIT,
     ForeignFormat,
     TableFile,
     check_given,
     numbers,
+    read_sidecar,
     read_table,
     require_told,
 )
@@ -89,6 +91,7 @@ class Motion:
     torque_name: str  # of the column
     speed_name: str  # of the velocity's column, or of the position's where there is none
     notes: tuple[str, ...] = ()
+    plateaus: bool = False  # a sample is the mean over a plateau of constant speed
 
     def used(self, settings: MotionSettings) -> np.ndarray:
         """Samples (N,) that the model is to describe."""
@@ -140,6 +143,34 @@ def read_motion(path: Path, given: ForeignFormat, settings: MotionSettings) -> M
     settings.check()
     check_given(given)
     return _prepared(_table(path, given), settings)
+
+
+def motion_of_plateaus(path: Path, given: ForeignFormat) -> Motion | None:
+    """A sweep under known loads or while the joint warmed up, a sample a plateau; None for any other file."""
+    if path.suffix.lower() != ".csv" or given.mapped or given.delimiter != "auto":
+        return None
+    table = read_table(path)
+    if not {"load_Nm", "velocity_radps", "motor_torque_Nm", "temperature_degC"} <= set(table.columns):
+        return None
+    ratio = float(read_sidecar(path)["reduction_ratio"])
+    settled = numbers(table, "settled") == 1.0
+    notes = [f"{np.count_nonzero(~settled)} points never settled: not used"] if not settled.all() else []
+    warm_index = table.column("temperature_degC")
+    degC = np.array([table.number(row, warm_index, empty=math.nan) for row in table.rows])[settled]
+
+    def column(name: str) -> np.ndarray:
+        return numbers(table, name)[settled]
+
+    velocity, load = column("velocity_radps"), column("load_Nm")
+    if len(velocity) < 2 * MIN_PER_DIRECTION:
+        raise DataError(f"{path}: {len(velocity)} settled points: at least {2 * MIN_PER_DIRECTION} are needed")
+    nothing = np.zeros(len(velocity))
+    return Motion(
+        path, table.sha256, 1.0, 1.0, column("time_s"),
+        0.5 * (column("position_min_rad") + column("position_max_rad")), velocity, nothing,
+        column("motor_torque_Nm") * ratio + load, load, degC if np.isfinite(degC).all() else None,
+        nothing == 0.0, nothing != 0.0, ratio, "motor_torque_Nm", "velocity_radps", tuple(notes), plateaus=True,
+    )  # fmt: skip
 
 
 class LoggedRun(Protocol):

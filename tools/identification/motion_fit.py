@@ -200,6 +200,8 @@ class _Problem:
 def _blocks(motion: Motion, used: np.ndarray, words: tuple[str, ...]) -> tuple[np.ndarray, int]:
     """(block of each sample, number): as few as give both halves samples of each direction."""
     count = len(motion.time_s)
+    if motion.plateaus:  # in order of speed: neighbours are not alike, and a block is a speed, both ways
+        return np.arange(count) // 2, -(-count // 2)
     blocks = BLOCKS
     while True:
         block = np.minimum(np.arange(count) * blocks // count, blocks - 1)
@@ -233,7 +235,7 @@ def _ground(motion: Motion, used: np.ndarray) -> _Ground:
             f"{name}: no reversal: friction of the other direction is taken to be the same, and an offset of the "
             "torque or a load looks like Coulomb friction: move both ways"
         )
-    forms, terms = set(FORM_STEPS), {"inertia"}
+    forms, terms = set(FORM_STEPS), set[str]() if motion.plateaus else {"inertia"}
     low, middle, high = np.percentile(np.abs(v), (0.1, 50, 99.9))
     if high - low < _CONSTANT_SPEED * middle:
         forms = {"coulomb"}
@@ -402,6 +404,8 @@ def _untold(model: Model, motion: Motion, parameters: dict[str, Parameter]) -> l
 def _repeating(motion: Motion, used: np.ndarray, error_Nm: np.ndarray, block: np.ndarray) -> list[str]:
     """A line where the error on odd blocks is that at the same place, the same way, in even ones."""
     q = motion.position_rad[used]
+    if motion.plateaus:
+        return []
     place = np.minimum(((q - q.min()) / max(float(np.ptp(q)), 1e-12) * _PLACES).astype(int), _PLACES - 1)
     place = place + _PLACES * (motion.velocity_radps[used] > 0.0)
     error, odd = error_Nm[used], block[used] % 2 == 1

@@ -48,6 +48,8 @@ def motion_lines(found: MotionFit) -> list[str]:
     used = int(found.motion.used(found.settings).sum())
     mean = found.settings.mean_samples
     smoothed = f"mean of {mean} samples" if mean else f"band of {found.motion.band_Hz:.4g} Hz"
+    if found.motion.plateaus:
+        smoothed = "each the mean of a plateau"
     slow = f"{used} of {len(found.motion.time_s)} samples: above {found.settings.speed_min_radps:g} rad/s"
     if np.isfinite(found.settings.acceleration_max_radps2):
         slow += f", below {found.settings.acceleration_max_radps2:g} rad/s2"

@@ -122,22 +122,30 @@ class SweepPass:
     def placed(self, report: CommissioningReport) -> Placed:
         """See `Motion`; about the place where the joint stands, as far as the limits allow."""
         require_torque(report)
-        motion = shifted(self.motion, middle_rad(self.config, self.motion, report.start_position_rad))
-        return Placed(sweep_constants(self.config, report, motion), motion.table, tuple(self._envelope(report)))
+        motion = shifted(self.motion, self._middle_rad(report))
+        constants = sweep_constants(self.config, report, motion)
+        if constants[0].limits.frozen_torque_Nm > 0.0:  # a healthy joint may stand still under so much more
+            constants[0].limits.frozen_torque_Nm += abs(self.points[0].condition.load_Nm)
+        return Placed(constants, motion.table, tuple(self._envelope(report)))
 
     def require_start(self, start_position_rad: float) -> None:
         """From everywhere within the limits."""
 
+    def _middle_rad(self, report: CommissioningReport) -> float:
+        place_rad = self.points[0].condition.place_rad
+        return middle_rad(self.config, self.motion, report.start_position_rad) if place_rad is None else place_rad
+
     def _envelope(self, report: CommissioningReport) -> list[str]:
         config, motion = self.config, self.motion
         limits = config.limits
-        start = report.start_position_rad
-        middle = middle_rad(config, motion, start)
-        approach_s = approach_time_s(config, start, middle)
+        middle = self._middle_rad(report)
+        approach_s = approach_time_s(config, report.start_position_rad, middle)
         speeds = sorted(abs(p.velocity_radps) for p in self.points)
         total_s = motion.duration_s + approach_s + OVERHEAD_S
         gravity_Nm = config.joint.gravity_Nm
         own = [f"joint.gravity_Nm (={gravity_Nm:g}) is subtracted from what is measured"] if gravity_Nm else []
+        load_Nm = self.points[0].condition.load_Nm
+        own += [f"a load of {load_Nm:g} Nm at the joint is subtracted; the drive must hold it"] if load_Nm else []
         return [
             *joint_lines(report),
             f"approach   to {middle:+.4f} rad in {approach_s:.1f} s",

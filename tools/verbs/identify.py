@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -222,9 +222,10 @@ def identify(
     # DATA.friction.toml, and they beside it.
     from jointctl.tools.configuration.load import shipped_config
     from jointctl.tools.drawing import png
+    from jointctl.tools.identification.friction_data import ForeignFormat
     from jointctl.tools.identification.identification import Options
     from jointctl.tools.identification.identification_report import snippet, write_into
-    from jointctl.tools.identification.motion_data import is_series
+    from jointctl.tools.identification.motion_data import is_series, motion_of_plateaus
     from jointctl.tools.recording.report_page import check_target
     from jointctl.tools.written_file import replace_file, require_target
 
@@ -238,9 +239,11 @@ def identify(
         raise DataError(f"--into {into}: a shipped configuration is not written into", hint)
     config = None if config is None else config_path(config)
     limits = _limits(into, config, output)
-    from_data = _from_motion if is_series(data_path, given) else _from_plateaus
-    if from_data is _from_plateaus and options.motion.also:
+    in_time = is_series(data_path, given)
+    if options.motion.also and not in_time:
         raise UsageError(f"--also (={options.motion.also[0]}) is for motions, and {data_path} holds plateaus")
+    regressed = in_time or motion_of_plateaus(data_path, given or ForeignFormat()) is not None
+    from_data = _from_motion if regressed else _from_plateaus
     found = from_data(data_path, given, options, limits, output)
     for note in found.notes:  # also with -q: a fit of other points than were measured is another result
         output.address(f"{data_path}: {note}")
@@ -319,7 +322,13 @@ def _from_plateaus(
 
 def motion_from(path: Path, given: ForeignFormat, settings: MotionSettings) -> Motion:
     """The motion of a run log or of a table, with those of `settings.also` after it."""
-    from jointctl.tools.identification.motion_data import is_series, joined, motion_of_log, read_motion
+    from jointctl.tools.identification.motion_data import (
+        is_series,
+        joined,
+        motion_of_log,
+        motion_of_plateaus,
+        read_motion,
+    )
     from jointctl.tools.recording.run_log_reader import read_run_log
 
     def one(path: Path) -> Motion:
@@ -329,7 +338,8 @@ def motion_from(path: Path, given: ForeignFormat, settings: MotionSettings) -> M
             raise DataError(f"{path}: is no motion in time", "--also is for run logs, and tables with --time-column")
         return read_motion(path, given, settings)
 
-    return joined([one(each) for each in (path, *settings.also)])
+    plateaus = motion_of_plateaus(path, given)
+    return plateaus or joined([one(each) for each in (path, *settings.also)])
 
 
 def _from_motion(
@@ -346,7 +356,10 @@ def _from_motion(
     verdict = check_motion(motion, limits) if limits is not None else Verdict()
     if verdict.problems:
         raise DataError(f"{path}: {'; '.join(verdict.problems)}")
-    found = identify_motion(motion, options.motion, knee_radps=options.knee_radps, seed=options.swarm.seed)
+    settings = options.motion
+    if motion.plateaus:
+        settings = replace(settings, speed_min_radps=0.5 * float(abs(motion.velocity_radps).min()))
+    found = identify_motion(motion, settings, knee_radps=options.knee_radps, seed=options.swarm.seed)
     section = reports.motion_section(found)
     warnings = list(verdict.warnings)
     if len(found.model.directions) == 1:
