@@ -200,8 +200,9 @@ class _Problem:
 def _blocks(motion: Motion, used: np.ndarray, words: tuple[str, ...]) -> tuple[np.ndarray, int]:
     """(block of each sample, number): as few as give both halves samples of each direction."""
     count = len(motion.time_s)
-    if motion.plateaus:  # in order of speed: neighbours are not alike, and a block is a speed, both ways
-        return np.arange(count) // 2, -(-count // 2)
+    if motion.plateaus:  # a block is a speed, both ways; at random, so that each half has every speed somewhere
+        blocks = -(-count // 2)
+        return np.random.default_rng(0).permutation(blocks)[np.arange(count) // 2], blocks
     blocks = BLOCKS
     while True:
         block = np.minimum(np.arange(count) * blocks // count, blocks - 1)

@@ -112,7 +112,9 @@ def map_verb(
     output: VerbOutput,
     *,
     options: MapOptions = MapOptions(),
-    write: Annotated[bool, typer.Option("--write", help="section reducer.map into CONFIG; comments stay")] = False,
+    write: Annotated[
+        bool, typer.Option("--write", help="section reducer.map, or ripple, into CONFIG; comments stay")
+    ] = False,
     figure: Annotated[Path | None, typer.Option("--figure", help="PNG with both series (CONFIG.map.png)")] = None,
     assume_yes: Yes = False,
     dry_run: DryRun = False,
@@ -122,7 +124,7 @@ def map_verb(
     from jointctl.tools.analysis.reducer_map import found_map, map_figure
     from jointctl.tools.configuration.config import SHIPPED_FOLDER
     from jointctl.tools.drawing import require_png, save_png
-    from jointctl.tools.identification.identification_report import write_map
+    from jointctl.tools.identification.identification_report import write_map, write_ripple
     from jointctl.tools.session.consent import require_terminal
 
     if write and config.path.resolve().is_relative_to(SHIPPED_FOLDER):
@@ -130,8 +132,6 @@ def map_verb(
             f"{config.path.name} is a shipped configuration and is not changed",
             f"`jointctl new mine.toml --from {config.path.stem}` makes it yours",
         )
-    if write and config.reducer is None:
-        raise ConfigurationError(f"{config.path}: [reducer] is missing, which [reducer.map] belongs to")
     picture = figure or Path(f"{config.path.stem}.map.png")
     require_png(picture, [config.path])
     if not (assume_yes or dry_run or options.lockstep):
@@ -143,7 +143,8 @@ def map_verb(
     if isinstance(measured, int):
         return measured
     found = found_map(map_run(moving, *measured))
-    values = found.values(config.encoder.direction, config.encoder.zero_counts)
+    mounting = config.encoder.direction, config.encoder.zero_counts
+    values = found.values(*mounting) if config.reducer is not None else found.ripple_values(*mounting)
     output.result(_table(found), {**asdict(found), "map": values}, found)
     save_png(map_figure(found, f"{config.path.stem}: map of the reducer"), picture)
     output.note(f"written: {picture}")
@@ -154,7 +155,8 @@ def map_verb(
                 values[key] = list(getattr(config.reducer.map, key))
     if write:
         turns = f"{found.turns[0]} motor turns forwards, {found.turns[1]} backwards"
-        write_map(config.path, values, [f"map of {turns} at {found.speed_radps:g} rad/s"])
+        write_section = write_map if config.reducer is not None else write_ripple
+        write_section(config.path, values, [f"map of {turns} at {found.speed_radps:g} rad/s"])
         output.note(f"written: {config.path}")
     return 0
 
