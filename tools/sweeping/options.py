@@ -225,8 +225,8 @@ def check_options(options: SweepOptions) -> None:
     if options.warm_between_turns and options.passes * len(options.conditions) == 1:
         raise UsageError(f"--warm-between (={options.warm_between_turns:g}) needs --passes of 2 or more, or loads")
     for name, values in (("--load-Nm", options.loads_Nm), ("--at", options.places_rad)):
-        for value in values or ():
-            check_range(name, value, -1e5, 1e5)
+        for number in values or ():
+            check_range(name, number, -1e5, 1e5)
         if values and len(set(values)) < len(values):
             raise UsageError(f"{name} (={', '.join(f'{value:g}' for value in values)}) must differ")
     if options.loads_Nm and len(options.loads_Nm) > 1 and options.assume_yes and not options.lockstep:
