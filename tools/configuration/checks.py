@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from jointctl.firmware_py.records import HARMONICS, KNEES
+from jointctl.firmware_py.records import KNEES
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import RADPS_PER_UNIT, velocity_of_a_count_radps
 from jointctl.tools.configuration.sections import Friction, FrictionDirection, Reducer, ReducerMap
@@ -290,11 +290,9 @@ def _ripple_problems(config: Config) -> list[str]:
         if getattr(made, key) != getattr(encoder, key)
     ]
     counts = [len(values) for values in (made.torque_Nm, made.per_motor_turn, made.phase_rad)]
-    if len(set(counts)) > 1 or counts[0] > HARMONICS:
-        found.append(
-            f"ripple.torque_Nm, per_motor_turn and phase_rad (={', '.join(map(str, counts))} numbers) must be equally "
-            f"many, {HARMONICS} at most"
-        )
+    if len(set(counts)) > 1:
+        given = ", ".join(map(str, counts))
+        found.append(f"ripple.torque_Nm, per_motor_turn and phase_rad (={given}) must be equally many numbers")
     if _is_flexible(config):
         found.append('[ripple] is not for control.kind "flexible_joint": there it is torque_ripple of [reducer.map]')
     adaptation = config.control.adaptation

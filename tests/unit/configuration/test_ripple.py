@@ -38,8 +38,11 @@ def test_the_sines_reach_the_law_in_its_units(tmp_path: Path) -> None:
     [
         ({"zero_counts": 5}, r"ripple.zero_counts \(=5\) differs from encoder.zero_counts \(=0\)"),
         ({"direction": -1}, r"ripple.direction \(=-1\) differs from encoder.direction \(=1\)"),
-        ({"phase_rad": [0.0]}, r"torque_Nm, per_motor_turn and phase_rad \(=2, 2, 1 numbers\) must be equally many"),
-        ({key: [1.0] * 5 for key in ("torque_Nm", "per_motor_turn", "phase_rad")}, r"equally many, 4 at most"),
+        ({"phase_rad": [0.0]}, r"torque_Nm, per_motor_turn and phase_rad \(=2, 2, 1\) must be equally many numbers"),
+        (
+            {key: [1.0] * 5 for key in ("torque_Nm", "per_motor_turn", "phase_rad")},
+            r"must be a list of up to 4 numbers",
+        ),
         ({"base": "realistic"}, r'\[ripple\] is not for control.kind "flexible_joint"'),
     ],
 )
