@@ -131,7 +131,7 @@ class Sweep:
         if self.options.loads_Nm and not (self.options.lockstep or self.options.dry_run or self.options.assume_yes):
             load = f"A load of {condition.load_Nm:g} Nm at the joint: is it attached?"
             if condition.load_Nm != self._attached_Nm and not agreed(self.output, load):
-                return "the user"
+                return "the user" if self.file is not None else None
             self._attached_Nm = condition.load_Nm
         stopped: str | None = ""
         if points:

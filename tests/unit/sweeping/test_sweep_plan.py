@@ -368,7 +368,7 @@ def test_an_unbounded_joint_is_swept_about_where_it_stands(config: Config) -> No
         ({"loads_Nm": [5.0, 5.0]}, r"--load-Nm \(=5, 5\) must differ"),
         ({"loads_Nm": [math.inf]}, r"--load-Nm \(=inf\) must be in"),
         ({"loads_Nm": [0.0, 5.0], "assume_yes": True}, r"-y does not go with --load-Nm of several loads"),
-        ({"places_rad": [3.2]}, r"--at \(=3.2\) must be in \(-3.09..3.09\) rad, inside the limits"),
+        ({"places_rad": [3.2]}, r"--at \(=3.2\) must be in \(-3.1..3.1\) rad, inside the limits"),
     ],
 )
 def test_a_bad_option_is_one_line_with_exit_code_2(config: Config, options: dict[str, Any], text: str) -> None:
