@@ -6,7 +6,13 @@ from __future__ import annotations
 
 import math
 
-from jointctl.firmware_py.flexible_joint import Reading, desired_motor, motor_and_link_errors, reset_flexible
+from jointctl.firmware_py.flexible_joint import (
+    Reading,
+    desired_motor,
+    motor_and_link_errors,
+    reset_flexible,
+    value_at,
+)
 from jointctl.firmware_py.friction import Condition, compensation_motor_torque_Nm, condition_of, step_lugre
 from jointctl.firmware_py.friction_adaptation import adapt, adapted_feed_forward_Nm, reset_adaptation, take_at_rest
 from jointctl.firmware_py.kalman import step_kalman
@@ -317,6 +323,18 @@ def record_correction(constants: LearningConstants, state: LearningState, correc
 
 
 @kernel
+def follow_temperature(constants: LawConstants, state: LawState, at_once: bool) -> None:
+    """The temperature for the feed-forward: that of the newest reading, however old it is; none: that of the curve."""
+    if constants.friction.conditioned == 0:
+        return
+    newest_degC = constants.friction.reference_degC
+    if constants.temperature.time_ns[0] != 0:
+        newest_degC = constants.temperature.degC[0]
+    gain = 1.0 if at_once else constants.temperature.gain
+    state.temperature_degC += gain * (newest_degC - state.temperature_degC)
+
+
+@kernel
 def reset_law(constants: LawConstants, state: LawState) -> None:
     """Forget everything learned; the joint is at rest."""
     reset_network(constants.network, state.network)
@@ -324,6 +342,7 @@ def reset_law(constants: LawConstants, state: LawState) -> None:
     reset_learning(state.learning)
     state.learning.stopped = 0
     state.temperature_degC = constants.friction.reference_degC
+    follow_temperature(constants, state, True)
     reset_flexible(state.flexible)
     reset_adaptation(constants.adaptation, state.adaptation)
     state.arm_torque_Nm = 0.0
@@ -336,18 +355,6 @@ def reset_law(constants: LawConstants, state: LawState) -> None:
     state.network_torque_Nm = 0.0
     state.observer_torque_Nm = 0.0
     state.learned_torque_Nm = 0.0
-
-
-@kernel
-def follow_temperature(constants: LawConstants, state: LawState, at_once: bool) -> None:
-    """The temperature for the feed-forward: that of the newest reading, however old it is; none: that of the curve."""
-    if constants.friction.conditioned == 0:
-        return
-    newest_degC = constants.friction.reference_degC
-    if constants.temperature.time_ns[0] != 0:
-        newest_degC = constants.temperature.degC[0]
-    gain = 1.0 if at_once else constants.temperature.gain
-    state.temperature_degC += gain * (newest_degC - state.temperature_degC)
 
 
 @kernel
@@ -505,6 +512,8 @@ def step_law(
     state.friction_torque_Nm = _friction_Nm(
         constants, state, velocity_radps, reference, reference.position_rad, transmitted_Nm
     )
+    ahead_rad = reference.position_rad + constants.feed_forward_lead_s * reference.velocity_radps
+    state.friction_torque_Nm -= value_at(constants.flexible.torque_ripple, ahead_rad)
     rest_Nm = _rest_torque_Nm(constants, state, error, error_rate, velocity_radps, sent_torque_Nm)
     if constants.adaptation.enabled != 0:
         _adapt(constants, state, reference.velocity_radps, position_rad, error_rate, transmitted_Nm)

@@ -141,7 +141,7 @@ class FlexibleConstants:
     stiffening_radpNm: Annotated[np.ndarray, array_of(f8, KNEES)]  # by which the compliance falls at each knee
     knee_Nm: Annotated[np.ndarray, array_of(f8, KNEES)]
     kinematic_error: HarmonicSeries  # [rad]
-    torque_ripple: HarmonicSeries  # [Nm]
+    torque_ripple: HarmonicSeries  # [Nm]; the laws of a rigid joint feed it forward as well
     twist_gain: f8  # of the slow correction of the twist, of one period
     motor_velocity: VelocityConstants
     link_velocity: VelocityConstants

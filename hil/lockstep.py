@@ -32,8 +32,10 @@ from jointctl.hil.plant_records import PlantState
 from jointctl.hil.virtual_bus import FRAME_SIZE, FrameQueue
 
 # columns of the array of true values that a run may leave
-TRUE_POSITION_rad, TRUE_VELOCITY_radps, TRUE_FRICTION_Nm, TRUE_ACTUATOR_Nm, TRUE_POWER_STATE = range(5)
-TRUTHS = 5
+TRUE_POSITION_rad, TRUE_VELOCITY_radps, TRUE_FRICTION_Nm, TRUE_ACTUATOR_Nm, TRUE_POWER_STATE, TRUE_WARMTH_degC = range(
+    6
+)
+TRUTHS = 6
 # columns of the set-points that a program sends in a run: when, as it goes on, and what
 POINT_TIME_s, POINT_VALUES = 0, 1  # position, velocity, acceleration, torque: four columns
 NO_POINTS = np.zeros((0, 5))
@@ -107,6 +109,7 @@ def _write_truth(row: np.ndarray, device: Device, plant: PlantState) -> None:
     row[TRUE_FRICTION_Nm] = plant.friction_torque_Nm
     row[TRUE_ACTUATOR_Nm] = plant.actuator_torque_Nm
     row[TRUE_POWER_STATE] = device.state
+    row[TRUE_WARMTH_degC] = plant.motor_temperature_degC
 
 
 @kernel

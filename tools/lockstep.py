@@ -119,6 +119,7 @@ class LockstepRun:
     device: Any  # Device record
     fault: Fault
     truth: np.ndarray  # float64 (N, TRUTHS): what the joint truly did, columns `hil.lockstep.TRUE_*`
+    thermometer: bool = False  # whether the drive reports the motor's temperature, which is one of those
 
     @property
     def tracking(self) -> np.ndarray:
@@ -330,7 +331,9 @@ class LockstepJoint:
         period_ns, thermometer = round(float(axis.law.period_s) * 1e9), self._settings.temperature is not None
         scenario = Scenario(self.start_ns, period_ns, thermometer=thermometer, **how)
         written, rows = run_lockstep(memory, codec_of(self._port.copy()), world, scenario, truth)
-        return LockstepRun(log[:written], state[0], plant[0], world.device[0], Fault(int(state[0].fault)), truth[:rows])
+        return LockstepRun(
+            log[:written], state[0], plant[0], world.device[0], Fault(int(state[0].fault)), truth[:rows], thermometer
+        )
 
 
 def tables_of(configs: Sequence[Config]) -> np.ndarray:

@@ -1,17 +1,21 @@
-"""What friction by load and temperature buys: random simulated joints under `precise`, without learning.
+"""What friction by load and temperature buys, as it is identified: random simulated joints without learning.
 
-    python -m tests.bench.load_and_temperature [joints] [seed]
+    python -m tests.bench.load_and_temperature [joints] [seed] [quiet joints]
 
-Each joint carries a pendulum of 20 Nm and has a temperature of its own, 15 to 55 degC; how its friction goes with both
-is drawn at random.  The controller believes the curve of 25 degC without load (today's model), or the true load and
-temperature terms beside it, each wrong by up to 10 % (the extended one).  Errors: RMSE of the friction feed-forward
-against the true friction, and of the joint itself, in the first period of the motion.  Then one joint warms up from 20
-to 50 degC while it moves.  All of it is simulated.
+Each joint carries a pendulum of 20 Nm; how its friction goes with load and temperature is drawn at random.  It is moved
+as `excite` does, cold (15 to 20 degC) and warm (45 to 50 degC), and both logs go through `identify`.  At a temperature
+of its own, 15 to 55 degC, `precise` then believes the curve of 25 degC without load (today's model), the section that
+was identified, or the truth.  Errors: RMSE of the friction feed-forward against the true friction, and of the joint
+itself, in the first period of a motion that is not one of those.  `quiet` joints have neither ripple nor coarse
+encoders: what is left there is the friction model's.  Then one joint warms up from 20 to 50 degC while it moves.  All
+of it is simulated.
 """
 
 from __future__ import annotations
 
 import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -19,14 +23,28 @@ import numpy as np
 from jointctl.hil.lockstep import TRUE_FRICTION_Nm
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.configuration.sections import FrictionLoad, FrictionTemperature
+from jointctl.tools.configuration.sections import Friction, FrictionLoad, FrictionTemperature
 from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant
+from jointctl.tools.identification.friction_data import ForeignFormat
+from jointctl.tools.identification.motion_data import MotionSettings
+from jointctl.tools.identification.motion_fit import identify_motion
+from jointctl.tools.identification.motion_report import motion_section
 from jointctl.tools.lockstep import LockstepJoint, LockstepRun
+from jointctl.tools.output import Output
+from jointctl.tools.session.consent import TerminalConsent
+from jointctl.tools.sweeping.carry_out import config_of_sweep, lockstep_log
+from jointctl.tools.sweeping.excitation import Design, ExcitePass, designed
+from jointctl.tools.verbs.identify import motion_from
 
 PENDULUM_Nm = 20.0
 AMPLITUDE_rad = 1.4  # the load is then up to 19.7 Nm either way
 PERIOD_s = 10.0
-BELIEF_ERROR = 0.1
+COLD_degC, WARM_degC = (15.0, 20.0), (45.0, 50.0)
+MOTION_s = 60.0
+MODELS = ("today's model", "identified", "true")
+QUIET = EnsembleSettings(
+    friction_scale=(0.98, 1.02), torque_ripple_Nm=(0.0, 0.0), friction_ripple=(0.0, 0.0), encoder_bits=(24, 24)
+)
 WARM_UP_s = 300.0
 
 
@@ -50,29 +68,47 @@ def base_config() -> Config:
     )
 
 
-def with_terms(config: Config, random: np.random.Generator, *, extended: bool, virtual: dict[str, Any]) -> Config:
-    """The joint with its true terms, and what the controller believes of them."""
+def true_terms(config: Config, random: np.random.Generator, **virtual: Any) -> tuple[Config, Friction]:
+    """The joint with friction that goes with load and temperature, which the controller knows nothing of; the truth."""
     assert config.friction is not None
     assert config.virtual is not None
-    load = {"coulomb": random.uniform(0.03, 0.2), "viscous_spr": random.uniform(0.0, 0.1)}
-    warm = {"coulomb_pK": random.uniform(0.002, 0.008), "viscous_pK": random.uniform(0.01, 0.03)}
-
-    def friction(wrong: float) -> Any:
-        def about(values: dict[str, float]) -> dict[str, float]:
-            return {key: value * (1.0 + random.uniform(-wrong, wrong)) for key, value in values.items()}
-
-        assert config.friction is not None
-        terms = {"load": FrictionLoad(**about(load)),
-                 "temperature": FrictionTemperature(reference_degC=25.0, **about(warm))}  # fmt: skip
-        return config.friction.model_copy(update=terms)
-
-    truth, belief = friction(0.0), friction(BELIEF_ERROR)
+    truth = config.friction.model_copy(update={
+        "load": FrictionLoad(coulomb=random.uniform(0.03, 0.2), viscous_spr=random.uniform(0.0, 0.1)),
+        "temperature": FrictionTemperature(
+            reference_degC=25.0, coulomb_pK=random.uniform(0.002, 0.008), viscous_pK=random.uniform(0.01, 0.03)
+        ),
+    })  # fmt: skip
     return config.model_copy(
-        update={
-            "friction": belief if extended else config.friction,
-            "virtual": config.virtual.model_copy(update={"friction": truth, **virtual}),
-        }
-    )
+        update={"virtual": config.virtual.model_copy(update={"friction": truth, **virtual})}
+    ), truth
+
+
+def believing(config: Config, friction: Friction) -> Config:
+    """With another curve and terms; its bristles stay."""
+    assert config.friction is not None
+    names = ("velocity_unit", "velocity_side", "torque_side", "positive", "negative", "load", "temperature")
+    changed = config.friction.model_copy(update={name: getattr(friction, name) for name in names})
+    return config.model_copy(update={"friction": changed})
+
+
+def excited(config: Config, design: Design, degC: float, folder: Path) -> Path:
+    """The log of the designed motion at a temperature."""
+    assert config.virtual is not None
+    virtual = config.virtual.model_copy(update={"ambient_degC": degC})
+    log = config.log.model_copy(update={"folder": str(folder)})
+    moving = config_of_sweep(config.model_copy(update={"virtual": virtual, "log": log}), "torque")
+    path = lockstep_log(moving, ExcitePass(moving, design), TerminalConsent(Output(quiet=True), assume_yes=True))
+    assert path is not None
+    return path
+
+
+def identified(config: Config, design: Design, random: np.random.Generator) -> Friction:
+    """What `identify` makes of a cold and a warm log."""
+    with TemporaryDirectory() as name:
+        cold, warm = (excited(config, design, random.uniform(*ends), Path(name)) for ends in (COLD_degC, WARM_degC))
+        settings = MotionSettings(speed_min_radps=0.8 * design.slowest_radps, also=(warm,))
+        found = identify_motion(motion_from(cold, ForeignFormat(), settings), settings)
+    return Friction.model_validate(motion_section(found))
 
 
 def errors(run: LockstepRun, after_s: float, before_s: float) -> tuple[float, float]:
@@ -85,47 +121,62 @@ def errors(run: LockstepRun, after_s: float, before_s: float) -> tuple[float, fl
     return float(np.sqrt(np.mean(friction_Nm**2))), float(np.sqrt(np.mean(error_mrad**2)))
 
 
-def random_joints(joints: int, seed: int) -> np.ndarray:
-    """(joints, 2 models, 2 errors) of the first period."""
-    found = np.zeros((joints, 2, 2))
-    settings = EnsembleSettings(friction_scale=(0.98, 1.02))
-    for index in range(joints):
-        drawn = random_plant(base_config(), settings, seed, index)
-        for model in (0, 1):
-            random = np.random.default_rng([seed, index, 1])
-            virtual = {"ambient_degC": float(random.uniform(15.0, 55.0))}
-            config = with_terms(drawn, random, extended=bool(model), virtual=virtual)
-            run = LockstepJoint(config).run()
-            found[index, model] = errors(run, 0.0, PERIOD_s) if not run.fault else np.inf
-    return found
+def random_joint(seed: int, index: int, design: Design, *, quiet: bool) -> np.ndarray:
+    """(3 models, 2 errors) of the first period of one joint."""
+    settings = QUIET if quiet else EnsembleSettings(friction_scale=(0.98, 1.02))
+    random = np.random.default_rng([seed, index, 1])
+    config, truth = true_terms(random_plant(base_config(), settings, seed, index), random)
+    found = identified(config, design, random)
+    assert config.virtual is not None
+    virtual = config.virtual.model_copy(update={"ambient_degC": float(random.uniform(15.0, 55.0))})
+    config = config.model_copy(update={"virtual": virtual})
+    rows = []
+    for believed in (config, believing(config, found), believing(config, truth)):
+        run = LockstepJoint(believed).run()
+        rows.append(errors(run, 0.0, PERIOD_s) if not run.fault else (np.inf, np.inf))
+    return np.array(rows)
 
 
-def warm_up(*, extended: bool) -> tuple[float, float, float, float]:
-    """(temperature at the start, at the end [degC], RMSE [mrad], the worst RMSE of a period [mrad])."""
-    config = base_config()
-    virtual = {"ambient_degC": 20.0, "thermal": True, "thermal_time_s": 100.0, "heating_KpA2": 6.0}
-    config = with_terms(config, np.random.default_rng(7), extended=extended, virtual=virtual)
+def warm_up(design: Design) -> list[tuple[str, float, float, float]]:
+    """(model, temperature at the end [degC], RMSE [mrad], the worst RMSE of a period [mrad]), from 20 degC on."""
+    random = np.random.default_rng(7)
+    heating = {"ambient_degC": 20.0, "thermal": True, "thermal_time_s": 100.0, "heating_KpA2": 6.0}
+    config, _ = true_terms(base_config(), random)
+    assert config.virtual is not None
+    believed = believing(config, identified(config, design, random))
     trajectory = config.trajectory.model_copy(update={"duration_s": WARM_UP_s})
-    joint = LockstepJoint(config.model_copy(update={"trajectory": trajectory}))
-    run = joint.run()
-    periods = [errors(run, at_s, at_s + PERIOD_s)[1] for at_s in np.arange(PERIOD_s, WARM_UP_s, PERIOD_s)]
-    whole = errors(run, PERIOD_s, WARM_UP_s)[1] if not run.fault else np.inf
-    return 20.0, float(run.plant.motor_temperature_degC), whole, max(periods)
+    rows = []
+    for name, each in (("today's model", config), ("identified", believed)):
+        virtual = each.virtual.model_copy(update=heating)  # type: ignore[union-attr]
+        run = LockstepJoint(each.model_copy(update={"trajectory": trajectory, "virtual": virtual})).run()
+        periods = [errors(run, at_s, at_s + PERIOD_s)[1] for at_s in np.arange(PERIOD_s, WARM_UP_s, PERIOD_s)]
+        whole = errors(run, PERIOD_s, WARM_UP_s)[1] if not run.fault else np.inf
+        rows.append((name, float(run.plant.motor_temperature_degC), whole, max(periods)))
+    return rows
 
 
-def main(joints: int = 40, seed: int = 90311) -> None:
-    found = random_joints(joints, seed)
-    print(f"{joints} joints, seed {seed}, simulated; medians (5..95 %) of the first period")
-    for model, name in enumerate(("today's model", "load and temperature")):
-        for figure, unit in enumerate(("Nm of friction", "mrad of the joint")):
-            low, middle, high = np.quantile(found[:, model, figure], (0.05, 0.5, 0.95), method="higher")
-            print(f"  {name:22} {middle:8.4f} ({low:.4f} .. {high:.4f}) {unit}")
-    halved = np.mean(found[:, 1] <= 0.5 * found[:, 0], axis=0)
-    print(f"  at least halved on {halved[0]:.0%} (friction), {halved[1]:.0%} (tracking) of the joints")
-    for extended in (False, True):
-        start, end, whole, worst = warm_up(extended=extended)
-        name = "load and temperature" if extended else "today's model"
-        print(f"warm-up {start:.0f} -> {end:.1f} degC, {name}: {whole:.4f} mrad RMSE, worst period {worst:.4f}")
+def main(joints: int = 40, seed: int = 90311, quiet_joints: int = 10) -> None:
+    design = designed(config_of_sweep(base_config(), "torque"), MOTION_s, 1)
+    for quiet, count in ((False, joints), (True, quiet_joints)):
+        rows = []
+        for index in range(count):
+            rows.append(random_joint(seed, index, design, quiet=quiet))
+            print(f"{index}: {np.round(rows[-1], 4).tolist()}", file=sys.stderr, flush=True)
+        found = np.array(rows)
+        kind = "quiet" if quiet else "realistic"
+        print(f"{count} {kind} joints, seed {seed}, simulated; medians (5..95 %) of the first period")
+        for model, name in enumerate(MODELS):
+            for figure, unit in enumerate(("Nm of friction", "mrad of the joint")):
+                low, middle, high = np.quantile(found[:, model, figure], (0.05, 0.5, 0.95), method="higher")
+                print(f"  {name:14} {middle:8.4f} ({low:.4f} .. {high:.4f}) {unit}")
+        for model in (1, 2):
+            halved = np.mean(found[:, model] <= 0.5 * found[:, 0], axis=0)
+            print(
+                f"  {MODELS[model]}: at least halved on {halved[0]:.0%} (friction), {halved[1]:.0%} (tracking)",
+                flush=True,
+            )
+    for name, end, whole, worst in warm_up(design):
+        print(f"warm-up 20 -> {end:.1f} degC, {name}: {whole:.4f} mrad RMSE, worst period {worst:.4f}")
 
 
 if __name__ == "__main__":

@@ -7,10 +7,12 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from jointctl.drivers.errors import ConfigurationError, UsageError
 from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.map import MapOptions, config_of_map, map_verb
 from tests.configurations import shipped, written
@@ -46,9 +48,27 @@ def test_what_cannot_be_measured_or_written_is_refused_before_anything_moves(tmp
     output = Output(stdout=io.StringIO(), stderr=io.StringIO())
     with pytest.raises(ConfigurationError, match="is a shipped configuration and is not changed"):
         map_verb(load_config(shipped_config("realistic")), output, options=IN_LOCKSTEP, write=True)
-    rigid = load_config(written(tmp_path / "rigid.toml", "precise"))
-    with pytest.raises(ConfigurationError, match=r"\[reducer\] is missing"):
-        map_verb(rigid, output, options=IN_LOCKSTEP, write=True)
+
+
+def test_the_ripple_of_a_rigid_joint_is_found_written_and_lowers_the_error_before_anything_was_learned(
+    tmp_path: Path,
+) -> None:
+    path = written(tmp_path / "rigid.toml", "precise", control__learning=None, trajectory__duration_s=20.0)
+    before = load_config(path)
+    output = Output(stdout=io.StringIO(), stderr=io.StringIO())
+    assert map_verb(before, output, options=IN_LOCKSTEP, write=True, figure=tmp_path / "map.png") == 0
+    after = load_config(path)
+    assert after.ripple is not None
+    assert after.virtual is not None
+    found = dict(zip(after.ripple.per_motor_turn, after.ripple.torque_Nm, strict=True))
+    assert [found[order] for order in (2.0, 10.0)] == pytest.approx(after.virtual.torque_ripple_Nm, rel=0.15)
+    rms = []
+    for config in (before, after):
+        run = LockstepJoint(config).run()
+        assert not run.fault
+        error = run.true_error_rad[run.tracking & (run.log.trajectory_s < 10.0)]
+        rms.append(float(np.sqrt(np.mean(error**2))))
+    assert rms[1] < 0.8 * rms[0]
 
 
 @pytest.mark.parametrize(

@@ -79,6 +79,28 @@ def test_plants_fill_their_ranges_and_stay_inside(base: Config) -> None:
     assert {round(math.log2(plant.encoder.counts_per_turn)) for plant in plants} == {17, 18, 19, 20}
 
 
+def test_loaded_plants_are_the_same_but_for_pendulum_temperature_and_what_friction_owes_to_them() -> None:
+    base, plain = shipped("precise"), EnsembleSettings(flexible=True)
+    loaded = plain.model_copy(update={"loaded": True})
+    for index in range(20):
+        without, with_load = random_plant(base, plain, 4, index), random_plant(base, loaded, 4, index)
+        true = with_load.virtual
+        assert true is not None
+        assert true.friction is not None
+        assert true.friction.load is not None
+        assert true.friction.temperature is not None
+        assert 0.03 <= true.friction.load.coulomb <= 0.2
+        assert 15.0 <= true.ambient_degC <= 55.0
+        assert with_load.joint.gravity_Nm == true.gravity_Nm <= 20.0
+        assert with_load.friction == without.friction
+        same = {"friction": None, "gravity_Nm": 0.0, "ambient_degC": 25.0}
+        assert true.model_copy(update=same) == without.virtual
+    assert with_plants(StudySettings(), ["loaded"]).plant.loaded
+    assert not with_plants(StudySettings(), ["loaded", "realistic"]).plant.loaded
+    with pytest.raises(ConfigurationError, match=r"plant.loaded \(=true\) needs \[friction\]"):
+        random_plant(base.model_copy(update={"friction": None}), loaded, 4, 0)
+
+
 # --- running ---
 def test_same_seed_same_result_with_one_process_and_with_two(base: Config) -> None:
     alone = short_study(base, 1, 1)

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointctl.drivers.errors import DeviceError, MotionFault
+from jointctl.drivers.errors import DECLINED, DataError, DeviceError, MotionFault
 from jointctl.tools.configuration.canopen import eds_path
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config, shipped_config
-from jointctl.tools.sweeping.options import SweepOptions
-from jointctl.tools.verbs.sweep import sweep
+from jointctl.tools.sweeping.options import SweepOptions, SweepPoint
+from jointctl.tools.verbs.sweep import Sweep, sweep
 from tests.configurations import changed
 from tests.hil.sweep_rows import rows, truth_Nm
 from tests.sessions import output
@@ -179,3 +179,42 @@ def test_resume_revisits_what_did_not_settle_and_only_once(config: Config, tmp_p
     assert sweep(config, told, out, SweepOptions(lockstep=True, points=4, resume=True)) == 0
     assert "nothing is left" in err.getvalue()
     assert len(rows(out)) == 5
+
+
+def test_a_sweep_under_loads_has_them_in_its_rows_and_goes_on_where_it_was(config: Config, tmp_path: Path) -> None:
+    out = tmp_path / "data.csv"
+    options: dict[str, Any] = {"points": 4, "loads_Nm": [0.0, 8.0], "mode": "torque"}
+    found = swept(config, out, **options)
+    assert found["load_Nm"].tolist() == [0.0] * 4 + [8.0] * 4
+    assert found["pass"].tolist() == [0] * 4 + [1] * 4
+    error_Nm = found["motor_torque_Nm"] - truth_Nm(config, found["velocity_radps"])  # the load is taken off
+    assert np.max(np.abs(error_Nm)) < 0.004
+    text, sidecar = out.read_text(), json.loads(out.with_suffix(".json").read_text())
+    sidecar["measured"] = sidecar["measured"][:5]
+    out.with_suffix(".json").write_text(json.dumps(sidecar))
+    again = swept(config, out, **options, resume=True)
+    assert out.read_text().splitlines()[:6] == text.splitlines()[:6]
+    assert again["load_Nm"].tolist() == found["load_Nm"].tolist()
+    with pytest.raises(DataError, match="was measured with another plan"):
+        swept(config, out, points=4, loads_Nm=[0.0, 7.0], mode="torque", resume=True)
+
+
+def test_each_load_is_asked_for_and_without_it_nothing_moves(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, measured = list[str](), list[float]()
+
+    def answer(_: Any, question: str) -> bool:
+        asked.append(question)
+        return len(asked) == 1
+
+    def measure(points: list[SweepPoint], *_: float) -> str:
+        measured.append(points[0].condition.load_Nm)
+        return ""
+
+    monkeypatch.setattr("jointctl.tools.session.consent.agreed", answer)
+    command = Sweep(config, output()[0], tmp_path / "data.csv", SweepOptions(points=4, loads_Nm=[0.0, 8.0]))
+    monkeypatch.setattr(command, "_measure", measure)
+    assert command.run() == DECLINED
+    assert measured == [0.0]
+    assert asked[1] == "A load of 8 Nm at the joint: is it attached?"

@@ -63,7 +63,7 @@ class Wave:
     amplitude_half: float
     phase_rad: float
     phase_half_rad: float
-    found: bool  # more than noise
+    found: bool  # more than noise, and each half of the turns is better predicted from the other with it
 
 
 @dataclass(frozen=True)
@@ -87,6 +87,14 @@ class FoundMap:
             found[f"{name}_per_motor_turn"] = [float(wave.per_motor_turn) for wave in kept]
             found[f"{name}_phase_rad"] = [float(f"{wave.phase_rad:.4g}") for wave in kept]
         return found
+
+    def ripple_values(self, direction: int, zero_counts: int) -> dict[str, Any]:
+        """Keys of [ripple], of a joint that is taken as rigid."""
+        values = self.values(direction, zero_counts)
+        names = {"torque_Nm": "torque_ripple_Nm", "per_motor_turn": "torque_ripple_per_motor_turn",
+                 "phase_rad": "torque_ripple_phase_rad"}  # fmt: skip
+        head = {key: values[key] for key in ("direction", "zero_counts")}
+        return head | {name: values[key] for name, key in names.items()}
 
 
 def kept_waves(waves: Sequence[Wave]) -> list[Wave]:
@@ -141,10 +149,17 @@ def _waves(estimates: np.ndarray) -> tuple[Wave, ...]:
         waves.append(
             Wave(
                 k + 1, float(amplitude), width * float(along), float(np.angle(mean)), min(half, math.pi),
-                bool(amplitude > _LARGEST_SPREAD * error),
+                bool(amplitude > _LARGEST_SPREAD * error and _predicts(estimates[:, k])),
             )
         )  # fmt: skip
     return tuple(waves)
+
+
+def _predicts(estimates: np.ndarray) -> bool:
+    """Whether the mean of each half of the turns lowers the error on the other half."""
+    halves = estimates[::2], estimates[1::2]
+    left = sum(float(np.sum(np.abs(mine - other.mean()) ** 2)) for mine, other in (halves, halves[::-1]))
+    return left < float(np.sum(np.abs(estimates) ** 2))
 
 
 def found_map(run: MapRun) -> FoundMap:

@@ -85,6 +85,7 @@ def problems_between_sections(config: Config) -> list[str]:
         *_control_problems(config),
         *_friction_problems(config),
         *_reducer_problems(config),
+        *_ripple_problems(config),
         *_drive_problems(config),
     ]
 
@@ -281,6 +282,29 @@ def _map_problems(config: Config, made: ReducerMap) -> list[str]:
                 f"reducer.map.{name}_{unit} must be as long a list as its per_motor_turn and phase_rad, "
                 f"{' and '.join(map(str, counts))} are given"
             )
+    return found
+
+
+def _ripple_problems(config: Config) -> list[str]:
+    """[ripple] belongs to one mounting of the encoder, to a law that takes the joint as rigid, and is fed once."""
+    made, encoder = config.ripple, config.encoder
+    if made is None:
+        return []
+    found = [
+        f"ripple.{key} (={getattr(made, key)}) differs from encoder.{key} (={getattr(encoder, key)}): "
+        "it was measured with another mounting; `jointctl map` measures anew"
+        for key in ("direction", "zero_counts")
+        if getattr(made, key) != getattr(encoder, key)
+    ]
+    counts = [len(values) for values in (made.torque_Nm, made.per_motor_turn, made.phase_rad)]
+    if len(set(counts)) > 1:
+        given = ", ".join(map(str, counts))
+        found.append(f"ripple.torque_Nm, per_motor_turn and phase_rad (={given}) must be equally many numbers")
+    if _is_flexible(config):
+        found.append('[ripple] is not for control.kind "flexible_joint": there it is torque_ripple of [reducer.map]')
+    adaptation = config.control.adaptation
+    if adaptation is not None and adaptation.ripple_per_motor_turn:
+        found.append("[ripple] does not go with control.adaptation.ripple_per_motor_turn: it would be fed twice")
     return found
 
 

@@ -28,6 +28,7 @@ from jointctl.tools.configuration.sections import (
     Loop,
     Margin,
     Reducer,
+    Ripple,
     Section,
     Sequence,
     Stream,
@@ -48,6 +49,7 @@ class Config(Section):
     joint: Joint
     joint_encoder: JointEncoder | None = None
     reducer: Reducer | None = None
+    ripple: Ripple | None = None
     limits: Limits
     sequence: Sequence
     loop: Loop

@@ -145,6 +145,10 @@ def _fill_law(law: Any, config: Config) -> None:
             _copy(law.lugre, config.friction.lugre, "stiffness_Nmprad", "damping_Nmspr")
     if config.reducer is not None:
         _fill_flexible(law.flexible, config, config.reducer)
+    ripple = config.ripple
+    if ripple is not None:
+        series = law.flexible.torque_ripple
+        _fill_series(series, joint.reduction_ratio, (ripple.torque_Nm, ripple.per_motor_turn, ripple.phase_rad))
     network = law.network
     _, p12, p22 = solve_lyapunov_p(control.kp, control.kv, control.lyapunov_q[0], control.lyapunov_q[-1])
     network.p_b[0] = p12 / joint.inertia_kgm2
@@ -186,13 +190,17 @@ def _fill_flexible(record: Any, config: Config, reducer: Reducer) -> None:
     _fill_velocity(record.link_velocity, config, control.link_cutoff_Hz if both else control.velocity_cutoff_Hz)
     if reducer.map is not None:
         for name, unit in (("kinematic_error", "rad"), ("torque_ripple", "Nm")):
-            amplitudes = getattr(reducer.map, f"{name}_{unit}")
-            series = getattr(record, name)
-            series.count = len(amplitudes)
-            for i, amplitude in enumerate(amplitudes):
-                series.amplitude[i] = amplitude
-                series.turns_prad[i] = ratio * getattr(reducer.map, f"{name}_per_motor_turn")[i] / math.tau
-                series.phase_turns[i] = getattr(reducer.map, f"{name}_phase_rad")[i] / math.tau
+            made = tuple(getattr(reducer.map, f"{name}_{rest}") for rest in (unit, "per_motor_turn", "phase_rad"))
+            _fill_series(getattr(record, name), ratio, made)
+
+
+def _fill_series(series: Any, ratio: float, waves: tuple[tuple[float, ...], ...]) -> None:
+    """`waves`: amplitudes, periods a motor turn, phases [rad]."""
+    series.count = len(waves[0])
+    for i, (amplitude, per_motor_turn, phase_rad) in enumerate(zip(*waves, strict=True)):
+        series.amplitude[i] = amplitude
+        series.turns_prad[i] = ratio * per_motor_turn / math.tau
+        series.phase_turns[i] = phase_rad / math.tau
 
 
 def _fill_velocity(record: Any, config: Config, cutoff_Hz: float) -> None:

@@ -359,6 +359,16 @@ class ReducerMap(Section):
     torque_ripple_phase_rad: Numbers = ()  # of each
 
 
+class Ripple(Section):
+    """Torque of motor and reducer that goes with the angle alone, for a law without [reducer]; see `map`."""
+
+    direction: Direction  # encoder.direction when it was measured
+    zero_counts: Annotated[int, between(-(2**31), 2**31 - 1)]  # encoder.zero_counts when it was measured
+    torque_Nm: Numbers  # amplitudes, at the joint, positive towards positive angle, four at most
+    per_motor_turn: Numbers  # periods of each; those of a joint turn divided by the ratio
+    phase_rad: Numbers  # of each
+
+
 class Reducer(Section):
     """What twists between motor and link; every value at the joint."""
 

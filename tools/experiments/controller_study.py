@@ -40,7 +40,16 @@ from jointctl.tools.analysis.margins import phase_margin_deg
 from jointctl.tools.child_process import processors
 from jointctl.tools.configuration.config import Config, suggestion
 from jointctl.tools.configuration.conversions import law_resolution_rad
-from jointctl.tools.configuration.sections import JointEncoder, Reducer, ReducerMap, Section, Virtual, between
+from jointctl.tools.configuration.sections import (
+    FrictionLoad,
+    FrictionTemperature,
+    JointEncoder,
+    Reducer,
+    ReducerMap,
+    Section,
+    Virtual,
+    between,
+)
 from jointctl.tools.drawing import BLUE, GREY, INK, canvas
 from jointctl.tools.experiments.controllers import (
     DEFAULT,
@@ -95,6 +104,7 @@ REDUCERS: dict[int, tuple[float, tuple[float, float], tuple[float, float]]] = {
 }
 ENCODERS_APART_rad = 0.02  # by which two encoders of a flexible joint may differ
 DELAY_ERROR_s = 0.2e-3  # by which the loop delay is measured wrong
+CURVE_degC = 25.0  # at which [friction] holds as it stands
 SMALL_MOTION = 1.6  # times the stiffness of the catalogue: what an identification with small motions finds
 
 
@@ -136,6 +146,14 @@ class EnsembleSettings(Section):
     maps: bool = True  # whether it has maps of kinematic error and torque ripple
     choose_gains: bool = True  # of the law of a flexible joint, for what it believes of each; else they are as given
     map_error: Annotated[float, between(0.0, 1.0)] = 0.05  # share by which their amplitudes are wrong at most
+    # friction that goes with load and temperature, of which the controller knows nothing but what its file says
+    loaded: bool = False
+    pendulum_Nm: Annotated[Interval, _FromList, _interval(0.0, 1e4)] = (0.0, 20.0)  # which the controller knows
+    load_coulomb: Annotated[Interval, _FromList, _interval(0.0, 2.0)] = (0.03, 0.2)
+    load_viscous_spr: Annotated[Interval, _FromList, _interval(0.0, 2.0)] = (0.0, 0.1)
+    temperature_degC: Annotated[Interval, _FromList, _interval(-50.0, 100.0)] = (15.0, 55.0)
+    temperature_coulomb_pK: Annotated[Interval, _FromList, _interval(-0.2, 0.2)] = (0.002, 0.008)
+    temperature_viscous_pK: Annotated[Interval, _FromList, _interval(-0.2, 0.2)] = (0.01, 0.03)
 
 
 def _flexible(base: Config, settings: EnsembleSettings, random: np.random.Generator) -> dict[str, Any]:
@@ -197,6 +215,27 @@ def _belief(
     return believed, link
 
 
+def _loaded(base: Config, settings: EnsembleSettings, random: np.random.Generator) -> dict[str, Any]:
+    """Keys of [virtual] for a pendulum, a temperature, and the friction that goes with both."""
+    if base.friction is None:
+        raise ConfigurationError(f"{base.path}: plant.loaded (=true) needs [friction], which it adds to")
+
+    def uniform(interval: tuple[float, float]) -> float:
+        return float(random.uniform(*interval))
+
+    truth = {
+        "load": FrictionLoad(coulomb=uniform(settings.load_coulomb), viscous_spr=uniform(settings.load_viscous_spr)),
+        "temperature": FrictionTemperature(
+            reference_degC=CURVE_degC, coulomb_pK=uniform(settings.temperature_coulomb_pK),
+            viscous_pK=uniform(settings.temperature_viscous_pK),
+        ),
+    }  # fmt: skip
+    return {
+        "friction": base.friction.model_copy(update=truth), "gravity_Nm": uniform(settings.pendulum_Nm),
+        "ambient_degC": uniform(settings.temperature_degC),
+    }  # fmt: skip
+
+
 def random_plant(base: Config, settings: EnsembleSettings, seed: int, index: int) -> Config:
     """The configuration with the virtual joint number `index` of the study with this seed."""
     random = np.random.default_rng([seed, index])
@@ -246,6 +285,10 @@ def random_plant(base: Config, settings: EnsembleSettings, seed: int, index: int
     delay_s = virtual["command_delay_s"] + float(random.uniform(-DELAY_ERROR_s, DELAY_ERROR_s))
     measured = {"loop_delay_s": max(delay_s, 0.0), "current_lag_s": virtual["current_lag_s"]}
     update["margin"] = base.margin.model_copy(update=measured)
+    if settings.loaded:  # drawn by themselves: the rest of the plant is the same with and without
+        virtual |= _loaded(base, settings, np.random.default_rng([seed, index, 1]))
+        joint = update.get("joint", base.joint)
+        update["joint"] = joint.model_copy(update={"gravity_Nm": virtual["gravity_Nm"]})
     update["virtual"] = base.virtual.model_copy(update=virtual)
     return base.model_copy(update=update)
 

@@ -382,7 +382,7 @@ def sidecar_contents(reduction_ratio: float, torque_constant_NmpA: float, **more
     }
 
 
-def _sidecar(path: Path) -> dict[str, Any]:
+def read_sidecar(path: Path) -> dict[str, Any]:
     beside = path.with_suffix(".json")
     if not beside.exists():
         raise DataError(f"{beside}: missing: the sidecar of the sweep holds the ratio", "or give --ratio")
@@ -424,7 +424,7 @@ def read_sweep(table: TableFile, given: ForeignFormat) -> FrictionData:
         raise DataError(f"{table.path}: the last line has no end: the file is cut off", "remove the last line")
     ratio, constant, limits = given.ratio or math.nan, math.nan, None
     if given.ratio is None or table.path.with_suffix(".json").exists():
-        sidecar = _sidecar(table.path)
+        sidecar = read_sidecar(table.path)
         ratio, constant = float(sidecar["reduction_ratio"]), float(sidecar["torque_constant_NmpA"])
         limits = _recorded_limits(table.path.with_suffix(".json"), sidecar)
         if given.ratio is not None and abs(given.ratio / ratio - 1.0) > 1e-6:

@@ -369,19 +369,38 @@ def with_map(text: str, values: dict[str, Any], remarks: list[str]) -> str:
     reducer = document.get("reducer")
     if reducer is None:
         raise ConfigurationError("[reducer] is missing, which [reducer.map] belongs to")
-    if "map" not in reducer:
-        reducer["map"] = tomlkit.table()
-    found = reducer["map"]
-    for line in remarks:
-        found.comment(MARK.removeprefix("# ") + line)
-    for key, value in values.items():
-        found[key] = value
+    _fill(reducer, "map", values, remarks)
     return tomlkit.dumps(document)
+
+
+def with_ripple(text: str, values: dict[str, Any], remarks: list[str]) -> str:
+    """As `with_map`, with [ripple]."""
+    try:
+        document = tomlkit.parse(text)
+    except TOMLKitError as error:
+        raise ConfigurationError(f"not valid TOML: {error}") from None
+    _fill(document, "ripple", values, remarks)
+    return tomlkit.dumps(document)
+
+
+def _fill(parent: Any, name: str, values: dict[str, Any], remarks: list[str]) -> None:
+    """A table of a document of tomlkit, made if it is not there."""
+    if name not in parent:
+        parent[name] = tomlkit.table()
+    for line in remarks:
+        parent[name].comment(MARK.removeprefix("# ") + line)
+    for key, value in values.items():
+        parent[name][key] = value
 
 
 def write_map(config_path: Path, values: dict[str, Any], remarks: list[str]) -> None:
     """As `write_into`, with [reducer.map]."""
     _write_changed(config_path, lambda text: with_map(text, values, remarks))
+
+
+def write_ripple(config_path: Path, values: dict[str, Any], remarks: list[str]) -> None:
+    """As `write_into`, with [ripple]."""
+    _write_changed(config_path, lambda text: with_ripple(text, values, remarks))
 
 
 def write_into(config_path: Path, values: dict[str, Any], remarks: list[str]) -> None:

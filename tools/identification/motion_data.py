@@ -12,7 +12,8 @@ from __future__ import annotations
 import hashlib
 import math
 import tomllib
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -25,11 +26,13 @@ from jointctl.firmware_py.input_file import LARGEST_LOG_BYTES, open_input
 from jointctl.firmware_py.states import AxisPhase
 from jointctl.tools.configuration.conversions import RADPS_PER_UNIT
 from jointctl.tools.identification.friction_data import (
+    MIN_PER_DIRECTION,
     RAD_PER_UNIT,
     ForeignFormat,
     TableFile,
     check_given,
     numbers,
+    read_sidecar,
     read_table,
     require_told,
 )
@@ -41,6 +44,7 @@ _FACTOR_TOLERANCE = 0.05  # of velocity over slope of position: gears and filter
 _SATURATED_SHARE = 0.005  # of the samples at the greatest torque: more is a limit, not a peak
 _TWICE_SHARE = 0.2  # of the samples: more at the time of the one before are a clock that is too coarse
 _SAME = 1e-9
+_SAME_RATE = 0.01
 _TOP_SPEED_radps = 100.0  # of a joint behind a reducer
 _SIDE_TOLERANCE = 0.5  # of the logarithm of a factor that is near the ratio
 
@@ -53,6 +57,7 @@ class MotionSettings:
     speed_min_radps: float = 0.05  # slower, friction is set-valued
     acceleration_max_radps2: float = math.inf
     mean_samples: int | None = None  # of a running mean that takes the low-pass's place where nothing is differentiated
+    also: tuple[Path, ...] = ()  # further files of the same joint, that are fitted together with the first
 
     def check(self) -> None:
         for flag, value, low, high in (
@@ -86,6 +91,7 @@ class Motion:
     torque_name: str  # of the column
     speed_name: str  # of the velocity's column, or of the position's where there is none
     notes: tuple[str, ...] = ()
+    plateaus: bool = False  # a sample is the mean over a plateau of constant speed
 
     def used(self, settings: MotionSettings) -> np.ndarray:
         """Samples (N,) that the model is to describe."""
@@ -137,6 +143,34 @@ def read_motion(path: Path, given: ForeignFormat, settings: MotionSettings) -> M
     settings.check()
     check_given(given)
     return _prepared(_table(path, given), settings)
+
+
+def motion_of_plateaus(path: Path, given: ForeignFormat) -> Motion | None:
+    """A sweep under known loads or while the joint warmed up, a sample a plateau; None for any other file."""
+    if path.suffix.lower() != ".csv" or given.mapped or given.delimiter != "auto":
+        return None
+    table = read_table(path)
+    if not {"load_Nm", "velocity_radps", "motor_torque_Nm", "temperature_degC"} <= set(table.columns):
+        return None
+    ratio = float(read_sidecar(path)["reduction_ratio"])
+    settled = numbers(table, "settled") == 1.0
+    notes = [f"{np.count_nonzero(~settled)} points never settled: not used"] if not settled.all() else []
+    warm_index = table.column("temperature_degC")
+    degC = np.array([table.number(row, warm_index, empty=math.nan) for row in table.rows])[settled]
+
+    def column(name: str) -> np.ndarray:
+        return numbers(table, name)[settled]
+
+    velocity, load = column("velocity_radps"), column("load_Nm")
+    if len(velocity) < 2 * MIN_PER_DIRECTION:
+        raise DataError(f"{path}: {len(velocity)} settled points: at least {2 * MIN_PER_DIRECTION} are needed")
+    nothing = np.zeros(len(velocity))
+    return Motion(
+        path, table.sha256, 1.0, 1.0, column("time_s"),
+        0.5 * (column("position_min_rad") + column("position_max_rad")), velocity, nothing,
+        column("motor_torque_Nm") * ratio + load, load, degC if np.isfinite(degC).all() else None,
+        nothing == 0.0, nothing != 0.0, ratio, "motor_torque_Nm", "velocity_radps", tuple(notes), plateaus=True,
+    )  # fmt: skip
 
 
 class LoggedRun(Protocol):
@@ -236,6 +270,38 @@ def _check_mapped(table: TableFile, given: ForeignFormat) -> None:
     needed += [("--torque-side", given.torque_side)] if given.torque_column else []
     needed += [("--torque-constant", given.torque_constant_NmpA)] if given.current_column else []
     require_told(table, given, needed)
+
+
+def joined(motions: Sequence[Motion]) -> Motion:
+    """Several motions of one joint, one after the other; `DataError` where they do not go together."""
+    first = motions[0]
+    if len(motions) == 1:
+        return first
+    for other in motions[1:]:
+        for name, one, two in (
+            ("reduction ratio", first.reduction_ratio, other.reduction_ratio), ("rate", first.rate_Hz, other.rate_Hz),
+        ):  # fmt: skip
+            if abs(two / one - 1.0) > _SAME_RATE:
+                raise DataError(f"{other.path}: {name} (={two:.6g}) must be that of {first.path} (={one:.6g})")
+        if (other.load_Nm is None) != (first.load_Nm is None):
+            raise DataError(f"{other.path}: a known load in one file and none in another do not go together")
+    starts = np.cumsum([0.0, *(each.time_s[-1] - each.time_s[0] + 1.0 / first.rate_Hz for each in motions[:-1])])
+
+    def together(name: str) -> Any:
+        parts = [getattr(each, name) for each in motions]
+        return None if any(part is None for part in parts) else np.concatenate(parts)
+
+    notes = [f"{each.path.name}: {note}" for each in motions for note in each.notes]
+    warm = together("temperature_degC")
+    if warm is None and any(each.temperature_degC is not None for each in motions):
+        notes.append("temperature: not in every file, so in none is it used")
+    names = ("position_rad", "velocity_radps", "acceleration_radps2", "torque_Nm", "load_Nm", "whole", "reversing")
+    times = [start + each.time_s - each.time_s[0] for start, each in zip(starts, motions, strict=True)]
+    return replace(
+        first, time_s=np.concatenate(times), temperature_degC=warm, notes=tuple(notes),
+        sha256=" ".join(each.sha256 for each in motions),
+        **{name: together(name) for name in names},
+    )  # fmt: skip
 
 
 # --- what is wrong with the data, before anything is fitted ---

@@ -21,12 +21,14 @@ from jointctl.tools.identification.models import FORMS, MIN_PER_STAGE, Branch, b
 from jointctl.tools.identification.motion_data import Motion, MotionSettings
 from jointctl.tools.identification.motion_model import (
     BOUNDS,
+    EXPERIMENTS,
     FORM_STEPS,
     SIGNS,
     TERMS,
     Model,
     Samples,
     WS_MAX_radps,
+    jacobian,
     unit_of,
 )
 
@@ -40,7 +42,6 @@ RESAMPLES = 400
 _HUBER = 1.345
 _SLACK = 1e-6  # of the least squares, relative
 _LEAST_SHARE = 0.2  # of each direction's samples that each half of the blocks must have
-_LOAD_RANGE = 0.5  # of the mean friction: less variation of |tau| tells nothing of load friction
 _LEAST_WARMING_K = 3.0
 _ONE_DIRECTION = 0.02  # share of samples
 _CONSTANT_SPEED = 0.2  # of the median speed, between the thousandths at the ends
@@ -199,6 +200,9 @@ class _Problem:
 def _blocks(motion: Motion, used: np.ndarray, words: tuple[str, ...]) -> tuple[np.ndarray, int]:
     """(block of each sample, number): as few as give both halves samples of each direction."""
     count = len(motion.time_s)
+    if motion.plateaus:  # a block is a speed, both ways; at random, so that each half has every speed somewhere
+        blocks = -(-count // 2)
+        return np.random.default_rng(0).permutation(blocks)[np.arange(count) // 2], blocks
     blocks = BLOCKS
     while True:
         block = np.minimum(np.arange(count) * blocks // count, blocks - 1)
@@ -232,7 +236,7 @@ def _ground(motion: Motion, used: np.ndarray) -> _Ground:
             f"{name}: no reversal: friction of the other direction is taken to be the same, and an offset of the "
             "torque or a load looks like Coulomb friction: move both ways"
         )
-    forms, terms = set(FORM_STEPS), {"inertia"}
+    forms, terms = set(FORM_STEPS), set[str]() if motion.plateaus else {"inertia"}
     low, middle, high = np.percentile(np.abs(v), (0.1, 50, 99.9))
     if high - low < _CONSTANT_SPEED * middle:
         forms = {"coulomb"}
@@ -319,12 +323,6 @@ def _resampled(model: Model, vector: np.ndarray, problem: _Problem, seed: int) -
     least sixteen.  The spread is widened for the parameters that the fit has taken from the blocks.
     """
     residual = problem.torque_Nm - model.torque_Nm(vector, problem.samples)
-    step = 1e-6 * np.maximum(np.abs(vector), 1e-2)
-    columns = [
-        (model.torque_Nm(vector + d, problem.samples) - model.torque_Nm(vector - d, problem.samples)) / (2.0 * d[k])
-        for k, d in enumerate(np.diag(step))
-    ]
-    jacobian = np.column_stack(columns)
     spread = max(1.4826 * float(np.median(np.abs(residual))), 1e-12)
     weight = np.minimum(1.0, _HUBER * spread / np.maximum(np.abs(residual), 1e-12))
     count = len(residual)
@@ -333,10 +331,11 @@ def _resampled(model: Model, vector: np.ndarray, problem: _Problem, seed: int) -
     which = np.arange(count) // length
     size, freedom = len(vector), max(blocks - len(vector), 2)
     normal, right = np.zeros((blocks, size, size)), np.zeros((blocks, size))
-    weighted = weight[:, None] * jacobian
+    slopes = jacobian(model, vector, problem.samples)
+    weighted = weight[:, None] * slopes
     for at in range(blocks):
         mine = which == at
-        normal[at], right[at] = weighted[mine].T @ jacobian[mine], weighted[mine].T @ residual[mine]
+        normal[at], right[at] = weighted[mine].T @ slopes[mine], weighted[mine].T @ residual[mine]
     scale = np.sqrt(np.maximum(np.trace(normal.sum(0)) / size, 1e-300))
     ridge = 1e-10 * scale**2 * np.eye(size)
 
@@ -363,22 +362,6 @@ def _correlation_samples(residual: np.ndarray) -> float:
     return float(max(1.0, 2.0 * np.sum(correlation[: ends[0] if len(ends) else None]) - 1.0))
 
 
-_EXPERIMENT = {
-    "inertia": "accelerate more",
-    "gravity_sin": "move over a larger angle",
-    "gravity_cos": "move over a larger angle",
-    "load_scale": "move under two known loads, both ways",
-    "load_coulomb": "move both ways under two loads or more",
-    "load_viscous": "move at several speeds under two loads or more",
-    "temperature_coulomb": "measure slow motion cold and warm",
-    "temperature_viscous": "measure fast motion cold and warm",
-    "tc": "measure longer, and more speeds",
-    "rise": "move more slowly (near standstill, above --speed-min)",
-    "ws": "move more slowly (near standstill, above --speed-min)",
-    "tv": "move at more speeds, farther apart",
-}
-
-
 def _parameters(model: Model, vector: np.ndarray, resampled: np.ndarray) -> dict[str, Parameter]:
     """Intervals in physical terms: ws instead of its logarithm, and a hint where a number is hardly known."""
     low, high = np.percentile(resampled, (50.0 - 50.0 * LEVEL, 50.0 + 50.0 * LEVEL), axis=0)
@@ -394,7 +377,7 @@ def _parameters(model: Model, vector: np.ndarray, resampled: np.ndarray) -> dict
         if max(most - value, value - least) > _WEAK * abs(value):
             zero = least <= 0.0 <= most
             weak = (
-                ("not distinguishable from 0" if zero else "hardly known") + ": " + _EXPERIMENT.get(kind, "more data")
+                ("not distinguishable from 0" if zero else "hardly known") + ": " + EXPERIMENTS.get(kind, "more data")
             )
         found[f"{kind} {word}".strip()] = Parameter(value, least, most, weak)
     return found
@@ -422,6 +405,8 @@ def _untold(model: Model, motion: Motion, parameters: dict[str, Parameter]) -> l
 def _repeating(motion: Motion, used: np.ndarray, error_Nm: np.ndarray, block: np.ndarray) -> list[str]:
     """A line where the error on odd blocks is that at the same place, the same way, in even ones."""
     q = motion.position_rad[used]
+    if motion.plateaus:
+        return []
     place = np.minimum(((q - q.min()) / max(float(np.ptp(q)), 1e-12) * _PLACES).astype(int), _PLACES - 1)
     place = place + _PLACES * (motion.velocity_radps[used] > 0.0)
     error, odd = error_Nm[used], block[used] % 2 == 1

@@ -51,6 +51,21 @@ BOUNDS = {
     "temperature_coulomb": (-0.2, 0.2), "temperature_viscous": (-0.2, 0.2),
 }  # fmt: skip
 
+EXPERIMENTS = {  # which would tell a parameter that the data leave open
+    "inertia": "accelerate more",
+    "gravity_sin": "move over a larger angle",
+    "gravity_cos": "move over a larger angle",
+    "load_scale": "move under two known loads, both ways",
+    "load_coulomb": "move both ways under two loads or more",
+    "load_viscous": "move at several speeds under two loads or more",
+    "temperature_coulomb": "measure slow motion cold and warm",
+    "temperature_viscous": "measure fast motion cold and warm",
+    "tc": "measure longer, and more speeds",
+    "rise": "move more slowly (near standstill, above --speed-min)",
+    "ws": "move more slowly (near standstill, above --speed-min)",
+    "tv": "move at more speeds, farther apart",
+}
+
 
 @dataclass(frozen=True)
 class Samples:
@@ -133,6 +148,15 @@ class Model:
         value = dict(zip(self.names, vector, strict=True))
         tau = self.transmitted_Nm(value, s)
         return tau + self.friction_Nm(value, s, tau)
+
+
+def jacobian(model: Model, vector: np.ndarray, samples: Samples) -> np.ndarray:
+    """Slopes (N, p) of the torque against each parameter."""
+    step = 1e-6 * np.maximum(np.abs(vector), 1e-2)
+    return np.column_stack([
+        (model.torque_Nm(vector + d, samples) - model.torque_Nm(vector - d, samples)) / (2.0 * d[k])
+        for k, d in enumerate(np.diag(step))
+    ])  # fmt: skip
 
 
 def unit_of(name: str) -> str:

@@ -48,6 +48,8 @@ def motion_lines(found: MotionFit) -> list[str]:
     used = int(found.motion.used(found.settings).sum())
     mean = found.settings.mean_samples
     smoothed = f"mean of {mean} samples" if mean else f"band of {found.motion.band_Hz:.4g} Hz"
+    if found.motion.plateaus:
+        smoothed = "each the mean of a plateau"
     slow = f"{used} of {len(found.motion.time_s)} samples: above {found.settings.speed_min_radps:g} rad/s"
     if np.isfinite(found.settings.acceleration_max_radps2):
         slow += f", below {found.settings.acceleration_max_radps2:g} rad/s2"
@@ -115,24 +117,34 @@ def prediction_figure(found: MotionFit) -> Any:
     every = max(1, len(motion.time_s) // _SHOWN)
     shown = slice(None, None, every)
     time = motion.time_s[shown] - motion.time_s[0]
+    style: dict[str, Any] = {}
+    if motion.plateaus:
+        time, style = np.arange(len(motion.time_s))[shown], {"linestyle": "", "marker": "o", "markersize": 3.0}
     outside = ~motion.used(found.settings)[shown]
     with canvas(6.4, f"{motion.path.name}: predicted on held-out blocks") as figure:
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-        upper.plot(time, motion.torque_Nm[shown], color=BLUE, label="measured")
+        upper.plot(time, motion.torque_Nm[shown], color=BLUE, label="measured", **style)
         predicted = (motion.torque_Nm - found.errors_Nm)[shown]
-        upper.plot(time, predicted, color=ORANGE, label="predicted by the fit to the shaded blocks")
+        upper.plot(
+            time,
+            predicted,
+            color=ORANGE,
+            label="predicted by the fit to the shaded blocks",
+            **{**style, "markersize": 1.5} if style else {},
+        )
         error = np.where(outside, np.nan, found.errors_Nm[shown])
         lower.plot(time, found.errors_Nm[shown], color=GREY, linewidth=0.6, label="standstill, reversal, not used")
-        lower.plot(time, error, color=BLUE, label="used")
+        lower.plot(time, error, color=BLUE, label="used", **style)
+        margin = 0.5 if motion.plateaus else 0.0
         for number in range(0, found.blocks, 2):
             inside = time[found.block[shown] == number]
             for axis in (upper, lower):
-                axis.axvspan(inside[0], inside[-1], color=GREY, alpha=0.15, linewidth=0.0)
+                axis.axvspan(inside[0] - margin, inside[-1] + margin, color=GREY, alpha=0.15, linewidth=0.0)
         worst = np.nanpercentile(np.abs(error), 99.5) if np.isfinite(error).any() else 1.0
         lower.set_ylim(-2.0 * worst, 2.0 * worst)
         upper.set_ylabel("torque at the joint [Nm]")
         lower.set_ylabel("measured - predicted [Nm]")
-        lower.set_xlabel("time [s]")
+        lower.set_xlabel("plateau" if motion.plateaus else "time [s]")
         _legend_above(upper)
         _legend_above(lower)
         return figure
@@ -164,7 +176,14 @@ def residual_figure(found: MotionFit) -> Any:
         every = max(1, len(error) // _SHOWN)
         for axis, (name, values) in zip(axes, regressors.items(), strict=False):
             x = values[chosen]
-            axis.plot(x[::every], error[::every], ".", color=BLUE, markersize=1.5, alpha=0.3, rasterized=True)
+            axis.plot(
+                x[::every],
+                error[::every],
+                ".",
+                color=BLUE,
+                rasterized=True,
+                **{"markersize": 5.0} if motion.plateaus else {"markersize": 1.5, "alpha": 0.3},
+            )
             edges = np.unique(np.percentile(x, np.linspace(0.0, 100.0, 11)))
             place = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, max(len(edges) - 2, 0))
             means = [(x[place == k].mean(), error[place == k].mean()) for k in np.unique(place)]

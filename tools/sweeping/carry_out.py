@@ -10,24 +10,30 @@ import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
 from jointctl.drivers.drive import CommissioningReport
-from jointctl.drivers.errors import ConfigurationError, UsageError
+from jointctl.drivers.errors import INTERRUPTED, ConfigurationError, MotionFault, UsageError
 from jointctl.firmware_py.records import Reference
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import CommandKind, Fault, TrajectoryKind
 from jointctl.firmware_py.trajectory import approach_duration_s
+from jointctl.hil.lockstep import TRUE_WARMTH_degC
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import APPROACH_MIN_S, APPROACH_SPEED, axis_constants
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.output import Advance, Output
-from jointctl.tools.recording.run_log import log_path
-from jointctl.tools.session.consent import Consent
-from jointctl.tools.session.display import OnlyShows, Snapshot
-from jointctl.tools.session.plan import Placed, RunPlan, joint_lines, remark_lines
+from jointctl.tools.recording.run_log import RunLogWriter, log_path, run_metadata
+from jointctl.tools.session.consent import Consent, TerminalConsent
+from jointctl.tools.session.control import in_control
+from jointctl.tools.session.display import Display, OnlyShows, Snapshot
+from jointctl.tools.session.live_panel import run_display
+from jointctl.tools.session.plan import Motion, Placed, RunPlan, joint_lines, remark_lines
+from jointctl.tools.session.result import RunResult, broken_off, never_begun, require_off
+from jointctl.tools.session.session import Session
 from jointctl.tools.sweeping.meter import SweepMeter
 from jointctl.tools.sweeping.options import SweepPoint
 from jointctl.tools.sweeping.plan import SweepMotion, constant_remarks, position_margin_rad, require_torque, shifted
@@ -116,22 +122,30 @@ class SweepPass:
     def placed(self, report: CommissioningReport) -> Placed:
         """See `Motion`; about the place where the joint stands, as far as the limits allow."""
         require_torque(report)
-        motion = shifted(self.motion, middle_rad(self.config, self.motion, report.start_position_rad))
-        return Placed(sweep_constants(self.config, report, motion), motion.table, tuple(self._envelope(report)))
+        motion = shifted(self.motion, self._middle_rad(report))
+        constants = sweep_constants(self.config, report, motion)
+        if constants[0].limits.frozen_torque_Nm > 0.0:  # a healthy joint may stand still under so much more
+            constants[0].limits.frozen_torque_Nm += abs(self.points[0].condition.load_Nm)
+        return Placed(constants, motion.table, tuple(self._envelope(report)))
 
     def require_start(self, start_position_rad: float) -> None:
         """From everywhere within the limits."""
 
+    def _middle_rad(self, report: CommissioningReport) -> float:
+        place_rad = self.points[0].condition.place_rad
+        return middle_rad(self.config, self.motion, report.start_position_rad) if place_rad is None else place_rad
+
     def _envelope(self, report: CommissioningReport) -> list[str]:
         config, motion = self.config, self.motion
         limits = config.limits
-        start = report.start_position_rad
-        middle = middle_rad(config, motion, start)
-        approach_s = approach_time_s(config, start, middle)
+        middle = self._middle_rad(report)
+        approach_s = approach_time_s(config, report.start_position_rad, middle)
         speeds = sorted(abs(p.velocity_radps) for p in self.points)
         total_s = motion.duration_s + approach_s + OVERHEAD_S
         gravity_Nm = config.joint.gravity_Nm
         own = [f"joint.gravity_Nm (={gravity_Nm:g}) is subtracted from what is measured"] if gravity_Nm else []
+        load_Nm = self.points[0].condition.load_Nm
+        own += [f"a load of {load_Nm:g} Nm at the joint is subtracted; the drive must hold it"] if load_Nm else []
         return [
             *joint_lines(report),
             f"approach   to {middle:+.4f} rad in {approach_s:.1f} s",
@@ -183,14 +197,67 @@ class MeterDisplay(OnlyShows):
         self._stack.__exit__(*exception)
 
 
+def carried_out(plan: RunPlan, output: Output, what: str, *, assume_yes: bool, dry_run: bool) -> RunResult | int:
+    """One run of `plan`, its motion shown and agreed to before: its result, or the exit code without one.
+
+    `what` it is for ("map"); `MotionFault` where a fault has ended it.
+    """
+    consent = TerminalConsent(output, assume_yes=assume_yes, dry_run=dry_run)
+
+    def display(_: CommissioningReport) -> Display:
+        return run_display(output, f"{plan.config.path.stem}: {what}")()
+
+    with in_control(plan.config, output) as control:
+        session = Session(plan, consent, output, control, display)
+        try:
+            result = session.run()
+        except KeyboardInterrupt:
+            return broken_off(session.drive_state, output, control.signals.by_command)
+    if result is None:
+        return never_begun(session.drive_state, output, dry_run=dry_run)
+    require_off(session.drive_state)
+    if result.fault_text is not None:
+        text = result.fault_text
+        raise MotionFault(f"{result.fault.name} ({int(result.fault)}): {text.happened}; no {what}", text.advice)
+    if result.stopped_by:
+        output.note(f"stopped by {result.stopped_by}; no {what}")
+        return INTERRUPTED
+    return result
+
+
+def lockstep_log(config: Config, motion: Motion, consent: Consent) -> Path | None:
+    """A run log of the motion on the virtual joint in simulated time; None after a dry run."""
+    joint = _virtual_joint(config)
+    placed = motion.placed(joint.report)
+    consent.show(placed.lines)
+    if consent.dry_run:
+        return None
+    joint.table, axis = placed.table, placed.constants[0]
+    axis.sequence.supervisor_max_cycles = 0
+    run = joint.run(placed.constants)
+    if run.fault:
+        raise MotionFault(f"{run.fault.name} ({int(run.fault)}); no log")
+    path = log_path(config)
+    with RunLogWriter(path, run_metadata(config, joint.report)) as log:
+        log.write_records(run.log)
+        if run.thermometer:
+            for at in range(0, len(run.log), round(config.loop.rate_Hz)):
+                log.write_temperature(int(run.log.time_ns[at]), float(run.truth[at, TRUE_WARMTH_degC]))
+    return path
+
+
+def _virtual_joint(config: Config) -> LockstepJoint:
+    if not config.drive.simulated:
+        raise UsageError('--lockstep is for drive.kind = "canopen": the serial joint runs in real time only')
+    return LockstepJoint(config)
+
+
 def sweep_in_lockstep(
     swept: SweepPass, meter: SweepMeter, consent: Consent, begin: Begin
 ) -> tuple[Fault, float] | None:
     """The whole motion on the virtual joint in simulated time; the fault and its value, None after a dry run."""
     config = swept.config
-    if not config.drive.simulated:
-        raise UsageError('--lockstep is for drive.kind = "canopen": the serial joint runs in real time only')
-    joint = LockstepJoint(config)
+    joint = _virtual_joint(config)
     placed = swept.placed(joint.report)
     consent.show(placed.lines)
     if consent.dry_run:
@@ -200,5 +267,7 @@ def sweep_in_lockstep(
     axis.sequence.supervisor_max_cycles = 0
     cycles = (swept.motion.duration_s + float(axis.sequence.approach_s)) * config.loop.rate_Hz
     run = joint.run(placed.constants, log_every=max(1, math.ceil(cycles / LOCKSTEP_RECORDS)))
+    if run.thermometer:
+        meter.warmth = run.log.trajectory_s[run.tracking], run.truth[run.tracking, TRUE_WARMTH_degC]
     meter.feed(run.log)
     return run.fault, float(run.state.fault_value)

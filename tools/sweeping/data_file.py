@@ -39,6 +39,11 @@ from jointctl.tools.sweeping.meter import MeasuredPoint
 from jointctl.tools.written_file import writing
 
 HEADING = ",".join(SWEEP_COLUMNS) + "\n"
+LOAD_COLUMN = "load_Nm"  # of a sweep under known loads
+
+
+def _heading(sidecar: dict[str, Any]) -> str:
+    return HEADING.replace("\n", f",{LOAD_COLUMN}\n") if sidecar.get("loaded") else HEADING
 
 
 def _replace(path: Path, text: str) -> None:
@@ -90,7 +95,7 @@ class SweepFile:
         )
         with writing(path):
             _replace(path.with_suffix(".json"), json.dumps(sidecar, indent=1))
-            path.write_text(HEADING, encoding="ascii")
+            path.write_text(_heading(sidecar), encoding="ascii")
         return cls(path, sidecar, torque_constant_NmpA)
 
     @classmethod
@@ -116,7 +121,7 @@ class SweepFile:
                 "give the options and the configuration of the first time, or another -o",
             )
         rows = len(sidecar["measured"])
-        if len(lines) < rows + 1 or lines[0] != HEADING or not "".join(lines[: rows + 1]).endswith("\n"):
+        if len(lines) < rows + 1 or lines[0] != _heading(sidecar) or not "".join(lines[: rows + 1]).endswith("\n"):
             raise DataError(f"{path}: holds {max(0, len(lines) - 1)} rows, its sidecar counts {rows}")
         if len(lines) > rows + 1:
             _replace(path, "".join(lines[: rows + 1]))
@@ -136,7 +141,7 @@ class SweepFile:
             f"{result.velocity_std_radps:.6g}", f"{result.motor_torque_std_Nm * current:.6g}", result.samples,
             int(result.settled), f"{result.position_min_rad:.7g}", f"{result.position_max_rad:.7g}",
             f"{measured.time_s:.3f}", "" if temperature_degC is None else f"{temperature_degC:.1f}", point.direction,
-            point.pass_number,
+            point.pass_number, *([f"{measured.load_Nm:.9g}"] if self._sidecar.get("loaded") else []),
         )  # fmt: skip
         line = io.StringIO()
         csv.writer(line, lineterminator="\n").writerow(values)

@@ -155,6 +155,7 @@ class MeasuredPoint:
     result: PlateauResult
     time_s: float  # trajectory time at the end of its last window
     temperature_degC: float | None = None  # of the drive, if it tells one
+    load_Nm: float = 0.0  # mean of gravity and known load, at the joint
 
 
 class SweepMeter:
@@ -170,10 +171,12 @@ class SweepMeter:
         self._model = model
         self.tolerance = Tolerance(0.01, 0.0)  # set once the drive's resolution is known
         self.temperature_degC: float | None = None  # the drive's newest, set before `feed`
+        self.warmth: tuple[np.ndarray, np.ndarray] | None = None  # in its place: trajectory time, temperature
         self._on_point = on_point
         self._next = 0
         self._chunks: list[np.ndarray] = []
         self._open: dict[int, list[Samples]] = {}
+        self._loads: dict[int, list[np.ndarray]] = {}
         self.lost_points: list[SweepPoint] = []
 
     @property
@@ -207,17 +210,23 @@ class SweepMeter:
         model = self._model
         if samples.shape[1] >= FEWEST_IN_WINDOW:
             time_s, position_rad, velocity_radps, torque_Nm = samples
-            gravity_Nm = model.gravity_Nm * np.sin(position_rad - model.gravity_zero_rad)
-            motor_Nm = (torque_Nm - gravity_Nm) / model.reduction_ratio
+            load_Nm = model.gravity_Nm * np.sin(position_rad - model.gravity_zero_rad) + window.point.condition.load_Nm
+            motor_Nm = (torque_Nm - load_Nm) / model.reduction_ratio
+            self._loads.setdefault(window.point.index, []).append(load_Nm)
             self._open.setdefault(window.point.index, []).append(
                 Samples(time_s, position_rad, velocity_radps, motor_Nm)
             )
         if not window.last:
             return
-        taken = self._open.pop(window.point.index, [])
+        taken, loads = self._open.pop(window.point.index, []), self._loads.pop(window.point.index, [])
         if sum(len(w.time_s) for w in taken) < LEAST_SAMPLES:
             self.lost_points.append(window.point)
             return
         result = plateau(taken, window.point.velocity_radps, model.orders_prad, self.tolerance, model.resolution_rad)
         if math.isfinite(result.velocity_radps) and math.isfinite(result.motor_torque_Nm):
-            self._on_point(MeasuredPoint(window.point, result, window.end_s, self.temperature_degC))
+            warmth = self.temperature_degC
+            if self.warmth is not None:
+                warmth = float(np.mean(np.interp(np.concatenate([w.time_s for w in taken]), *self.warmth)))
+            self._on_point(
+                MeasuredPoint(window.point, result, window.end_s, warmth, float(np.mean(np.concatenate(loads))))
+            )

@@ -9,6 +9,7 @@ import hashlib
 import json
 import math
 import random
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -32,12 +33,24 @@ _GRID_POWER = 2.0  # near-zero: speeds go with this power of their number
 
 
 @dataclass(frozen=True)
+class Condition:
+    """Under which a whole pass is measured."""
+
+    load_Nm: float = 0.0  # known constant load at the joint, positive where it needs a positive motor torque
+    place_rad: float | None = None  # middle of the motion; None: about where the joint stands
+
+
+UNLOADED = Condition()
+
+
+@dataclass(frozen=True)
 class SweepPoint:
     """One plateau of the grid; `index` is its place in the plan and never changes."""
 
     index: int
     velocity_radps: float
     pass_number: int
+    condition: Condition = UNLOADED
 
     @property
     def direction(self) -> int:
@@ -100,26 +113,31 @@ def both_directions(speeds: list[float], points: int) -> list[float]:
     return velocities
 
 
-def ordered_points(velocities: list[float], passes: int, shuffle_seed: int | None) -> list[SweepPoint]:
+def ordered_points(
+    velocities: list[float], passes: int, shuffle_seed: int | None, conditions: Sequence[Condition] = (UNLOADED,)
+) -> list[SweepPoint]:
     """All points in the order of measuring: pass by pass, both directions of a speed one after the other.
 
     A shuffled order is another one in each pass, so that drift does not look like a property of the speed.
     """
     random_order = None if shuffle_seed is None else random.Random(shuffle_seed)
     points: list[SweepPoint] = []
-    for number in range(passes):
+    for number, condition in enumerate(each for each in conditions for _ in range(passes)):
         speeds = list(dict.fromkeys(abs(v) for v in velocities))
         if random_order is not None:
             random_order.shuffle(speeds)
         for speed in speeds:
             pair = sorted((v for v in velocities if abs(v) == speed), reverse=True)
-            points += [SweepPoint(len(points) + k, velocity, number) for k, velocity in enumerate(pair)]
+            points += [SweepPoint(len(points) + k, velocity, number, condition) for k, velocity in enumerate(pair)]
     return points
 
 
 def plan_hash(points: list[SweepPoint], more: dict[str, float]) -> str:
     """Identifies a plan: its points in their order, and what else decides about the measurement."""
-    content = [[f"{p.velocity_radps:.9g}", p.pass_number] for p in points]
+    content = [
+        [f"{p.velocity_radps:.9g}", p.pass_number, *([] if p.condition == UNLOADED else [repr(p.condition)])]
+        for p in points
+    ]
     text = json.dumps([content, {key: f"{value:.9g}" for key, value in sorted(more.items())}])
     return hashlib.sha256(text.encode("ascii")).hexdigest()[:16]
 
@@ -151,6 +169,17 @@ class SweepOptions:
         int | None, typer.Option("--shuffle", metavar="SEED", help="speeds in random order, against drift")
     ] = None
     passes: Annotated[int, typer.Option("--passes", help="times that the whole grid is measured")] = 1
+    loads_Nm: Annotated[
+        list[float] | None,
+        typer.Option("--load-Nm", metavar="NM", help="known constant load at the joint; one each for further passes"),
+    ] = None
+    places_rad: Annotated[
+        list[float] | None,
+        typer.Option("--at", metavar="RAD", help="middle of the motion, of a pendulum; one each for further passes"),
+    ] = None
+    warm_between_turns: Annotated[
+        float, typer.Option("--warm-between", metavar="TURNS", help="of the joint before each further pass: warms it")
+    ] = 0.0
     dwell_s: Annotated[
         float | None, typer.Option("--dwell", metavar="S", help="wanted measuring time per point (1, quick 0.5)")
     ] = None
@@ -171,6 +200,17 @@ class SweepOptions:
         Path | None, typer.Option("--report", metavar="FILE.html", help="the result as one self-contained page as well")
     ] = None
 
+    @property
+    def conditions(self) -> tuple[Condition, ...]:
+        """Of the passes: each load at each place."""
+        places: list[float] | list[None] = self.places_rad or [None]
+        return tuple(Condition(load, place) for load in self.loads_Nm or [0.0] for place in places)
+
+    @property
+    def conditioned(self) -> bool:
+        """Whether friction is measured under more than one load or temperature: the data then tell the load."""
+        return bool(self.loads_Nm or self.places_rad or self.warm_between_turns)
+
 
 AS_IT_FITS = SweepOptions()
 
@@ -181,6 +221,16 @@ def check_options(options: SweepOptions) -> None:
         check_range("--points", options.points, 2, MOST_POINTS)
     check_range("--passes", options.passes, 1, 100)
     check_range("--warm-up", options.warm_up_turns, 0.0, 1000.0)
+    check_range("--warm-between", options.warm_between_turns, 0.0, 1000.0)
+    if options.warm_between_turns and options.passes * len(options.conditions) == 1:
+        raise UsageError(f"--warm-between (={options.warm_between_turns:g}) needs --passes of 2 or more, or loads")
+    for name, values in (("--load-Nm", options.loads_Nm), ("--at", options.places_rad)):
+        for number in values or ():
+            check_range(name, number, -1e5, 1e5)
+        if values and len(set(values)) < len(values):
+            raise UsageError(f"{name} (={', '.join(f'{value:g}' for value in values)}) must differ")
+    if options.loads_Nm and len(options.loads_Nm) > 1 and options.assume_yes and not options.lockstep:
+        raise UsageError("-y does not go with --load-Nm of several loads: each must be attached, and confirmed")
     for name, value in (("--max-speed", options.max_speed_radps), ("--min-speed", options.min_speed_radps)):
         if value is not None:
             check_range(name, value, 1e-5, 1000.0)

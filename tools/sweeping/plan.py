@@ -16,6 +16,7 @@ acceleration and constant speed are cubics, so nothing is approximated.  The acc
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import asdict, dataclass
 
@@ -168,7 +169,7 @@ def stroke_of(speed_radps: float, s: PlanSettings) -> Stroke:
     return Stroke(speed_radps, window, 1, min(strokes, MOST_STROKES), window, length)
 
 
-class _Builder:
+class MotionBuilder:
     """Collects table rows; keeps time, position and velocity of the end of what has been planned."""
 
     def __init__(self, s: PlanSettings) -> None:
@@ -227,7 +228,7 @@ class _Builder:
         return np.array([*self._rows, (self.t_s, self.q_rad, 0.0, 0.0, 0.0)])
 
 
-def _measure(builder: _Builder, stroke: Stroke, direction: int, s: PlanSettings) -> list[tuple[float, float]]:
+def _measure(builder: MotionBuilder, stroke: Stroke, direction: int, s: PlanSettings) -> list[tuple[float, float]]:
     """One stroke from rest to rest; returns its windows."""
     velocity = direction * stroke.speed_radps
     builder.ramp(velocity)
@@ -241,8 +242,13 @@ def _measure(builder: _Builder, stroke: Stroke, direction: int, s: PlanSettings)
     return spans
 
 
-def plan_motion(points: list[SweepPoint], s: PlanSettings, warm_up_turns: float = 0.0) -> SweepMotion:
-    """The motion that visits `points` in their order; the two directions of a speed share their strokes."""
+def plan_motion(
+    points: list[SweepPoint], s: PlanSettings, warm_up_turns: float = 0.0, warm_between_turns: float = 0.0
+) -> SweepMotion:
+    """The motion that visits `points` in their order; the two directions of a speed share their strokes.
+
+    Turns before the first and before each further pass warm the joint up.
+    """
     groups: list[list[SweepPoint]] = []
     for point in points:
         last = groups[-1] if groups else []
@@ -254,18 +260,14 @@ def plan_motion(points: list[SweepPoint], s: PlanSettings, warm_up_turns: float 
         else:
             groups.append([point])
     strokes = {abs(p.velocity_radps): stroke_of(abs(p.velocity_radps), s) for p in points}
-    builder = _Builder(s)
+    builder = MotionBuilder(s)
     builder.rest(REVERSAL_s)
     half = 0.5 * max((stroke.length_rad for stroke in strokes.values()), default=0.0)
-    left_rad = warm_up_turns * math.tau
-    side = 1.0
-    while left_rad > 0.0 and half > 0.0:
-        left_rad -= abs(side * half - builder.q_rad)
-        builder.move_to(side * half)
-        builder.rest(REVERSAL_s)
-        side = -side
+    _warm_up(builder, half, warm_up_turns)
     windows: list[Window] = []
-    for group in groups:
+    for before, group in itertools.pairwise([groups[0] if groups else [], *groups]):
+        if group[0].pass_number != before[0].pass_number:
+            _warm_up(builder, half, warm_between_turns)
         stroke = strokes[abs(group[0].velocity_radps)]
         for number in range(stroke.strokes):
             for point in group:
@@ -278,6 +280,16 @@ def plan_motion(points: list[SweepPoint], s: PlanSettings, warm_up_turns: float 
     builder.move_to(0.0)
     builder.rest(REVERSAL_s)
     return SweepMotion(builder.table(), tuple(windows), builder.low_rad, builder.high_rad)
+
+
+def _warm_up(builder: MotionBuilder, half_rad: float, turns: float) -> None:
+    """Back and forth over +-half, so many turns of the joint in all."""
+    left_rad, side = turns * math.tau, 1.0
+    while left_rad > 0.0 and half_rad > 0.0:
+        left_rad -= abs(side * half_rad - builder.q_rad)
+        builder.move_to(side * half_rad)
+        builder.rest(REVERSAL_s)
+        side = -side
 
 
 def shifted(motion: SweepMotion, middle_rad: float) -> SweepMotion:
@@ -307,10 +319,11 @@ class SweepPlan:
     points: list[SweepPoint]
     settings: PlanSettings
     hash: str
+    warm_between_turns: float = 0.0
 
     def motion(self, points: list[SweepPoint], warm_up_turns: float, dwell_factor: float = 1.0) -> SweepMotion:
         values = {**asdict(self.settings), "dwell_s": self.settings.dwell_s * dwell_factor}
-        return plan_motion(points, PlanSettings(**values), warm_up_turns)
+        return plan_motion(points, PlanSettings(**values), warm_up_turns, self.warm_between_turns)
 
 
 def position_margin_rad(config: Config) -> float:
@@ -322,7 +335,7 @@ def make_plan(config: Config, options: SweepOptions) -> SweepPlan:
     """Check the options against the joint and plan; `UsageError` in one line."""
     check_options(options)
     limits = config.limits
-    width = limits.position_max_rad - limits.position_min_rad - 2.0 * position_margin_rad(config)
+    width = _width_rad(config, options)
     wanted_s = options.dwell_s or (QUICK_DWELL_S if options.quick else 1.0)
     dwell_s = max(wanted_s, SAMPLES_SPARE * LEAST_SAMPLES / config.loop.rate_Hz)
     allowed = SPEED_SHARE * limits.velocity_max_radps
@@ -351,13 +364,29 @@ def make_plan(config: Config, options: SweepOptions) -> SweepPlan:
 
         velocities = grid(options.points or (QUICK_MOST if options.quick else DEFAULT_POINTS))
     chosen = settings(TRANSIT_SHARE * fastest)
-    points = ordered_points(velocities, options.passes, options.shuffle_seed)
+
+    def ordered(velocities: list[float]) -> list[SweepPoint]:
+        return ordered_points(velocities, options.passes, options.shuffle_seed, options.conditions)
+
+    points = ordered(velocities)
     if options.quick:
         count = QUICK_MOST
         while plan_motion(points, chosen, options.warm_up_turns).duration_s > QUICK_S and count > QUICK_LEAST:
             count -= 4
-            points = ordered_points(grid(count), options.passes, options.shuffle_seed)
-    return SweepPlan(points, chosen, plan_hash(points, asdict(chosen) | measuring_constants(config)))
+            points = ordered(grid(count))
+    warming = {"warm_between_turns": options.warm_between_turns} if options.warm_between_turns else {}
+    identity = plan_hash(points, asdict(chosen) | measuring_constants(config) | warming)
+    return SweepPlan(points, chosen, identity, options.warm_between_turns)
+
+
+def _width_rad(config: Config, options: SweepOptions) -> float:
+    """Of the travel, the same about each place."""
+    low = config.limits.position_min_rad + position_margin_rad(config)
+    high = config.limits.position_max_rad - position_margin_rad(config)
+    for place in options.places_rad or ():
+        if not low < place < high:
+            raise UsageError(f"--at (={place:g}) must be in ({low:g}..{high:g}) rad, inside the limits")
+    return min((2.0 * min(place - low, high - place) for place in options.places_rad or ()), default=high - low)
 
 
 def _check_fastest(name: str, fastest: float, reachable: float, allowed: float) -> None:

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from jointctl.drivers.errors import ConfigurationError, DataError
+from jointctl.drivers.errors import ConfigurationError, DataError, UsageError
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import Report, VerbOutput, config_path, configuration_files, configurations
 
@@ -104,6 +104,10 @@ class FitOptions:
     mean_samples: Annotated[
         int | None, typer.Option("--mean-samples", help="running mean of a motion, in place of the band's low-pass")
     ] = None
+    also: Annotated[
+        list[Path] | None,
+        typer.Option("--also", help="a further motion of the joint, warmer or with another load; may be repeated"),
+    ] = None
 
 
 def _fit(given: FitOptions) -> Options:
@@ -111,7 +115,8 @@ def _fit(given: FitOptions) -> Options:
     from jointctl.tools.identification.motion_data import MotionSettings
     from jointctl.tools.identification.swarm import SwarmSettings
 
-    motion = MotionSettings(given.band, given.speed_min, given.acceleration_max, given.mean_samples)
+    also = tuple(given.also or ())
+    motion = MotionSettings(given.band, given.speed_min, given.acceleration_max, given.mean_samples, also)
     swarm = SwarmSettings(**{field.name: getattr(given, field.name) for field in fields(SwarmSettings)})
     same = ("model", "continuous", "search_knee", "static_max_Nm", "outlier_threshold", "folds")
     return Options(
@@ -217,9 +222,10 @@ def identify(
     # DATA.friction.toml, and they beside it.
     from jointctl.tools.configuration.load import shipped_config
     from jointctl.tools.drawing import png
+    from jointctl.tools.identification.friction_data import ForeignFormat
     from jointctl.tools.identification.identification import Options
     from jointctl.tools.identification.identification_report import snippet, write_into
-    from jointctl.tools.identification.motion_data import is_series
+    from jointctl.tools.identification.motion_data import is_series, motion_of_plateaus
     from jointctl.tools.recording.report_page import check_target
     from jointctl.tools.written_file import replace_file, require_target
 
@@ -233,7 +239,11 @@ def identify(
         raise DataError(f"--into {into}: a shipped configuration is not written into", hint)
     config = None if config is None else config_path(config)
     limits = _limits(into, config, output)
-    from_data = _from_motion if is_series(data_path, given) else _from_plateaus
+    in_time = is_series(data_path, given)
+    if options.motion.also and not in_time:
+        raise UsageError(f"--also (={options.motion.also[0]}) is for motions, and {data_path} holds plateaus")
+    regressed = in_time or motion_of_plateaus(data_path, given or ForeignFormat()) is not None
+    from_data = _from_motion if regressed else _from_plateaus
     found = from_data(data_path, given, options, limits, output)
     for note in found.notes:  # also with -q: a fit of other points than were measured is another result
         output.address(f"{data_path}: {note}")
@@ -250,7 +260,8 @@ def identify(
     files[stem.with_name(stem.name + ".report.json")] = report_json.encode("utf-8")
     if out is not None:
         files[out] = text.encode("utf-8")
-    protected = [p for p in (data_path, data_path.with_suffix(".json"), into, config) if p is not None]
+    read = (data_path, data_path.with_suffix(".json"), into, config, *options.motion.also)
+    protected = [p for p in read if p is not None]
     for path in files:
         require_target(path, protected)
     if into is not None:  # first, because it is the one that may be refused
@@ -310,13 +321,25 @@ def _from_plateaus(
 
 
 def motion_from(path: Path, given: ForeignFormat, settings: MotionSettings) -> Motion:
-    """The motion of a run log or of a table."""
-    from jointctl.tools.identification.motion_data import motion_of_log, read_motion
+    """The motion of a run log or of a table, with those of `settings.also` after it."""
+    from jointctl.tools.identification.motion_data import (
+        is_series,
+        joined,
+        motion_of_log,
+        motion_of_plateaus,
+        read_motion,
+    )
     from jointctl.tools.recording.run_log_reader import read_run_log
 
-    if path.suffix.lower() == ".mcap":
-        return motion_of_log(path, read_run_log(path), given, settings)
-    return read_motion(path, given, settings)
+    def one(path: Path) -> Motion:
+        if path.suffix.lower() == ".mcap":
+            return motion_of_log(path, read_run_log(path), given, settings)
+        if not is_series(path, given):
+            raise DataError(f"{path}: is no motion in time", "--also is for run logs, and tables with --time-column")
+        return read_motion(path, given, settings)
+
+    plateaus = motion_of_plateaus(path, given)
+    return plateaus or joined([one(each) for each in (path, *settings.also)])
 
 
 def _from_motion(
@@ -333,7 +356,10 @@ def _from_motion(
     verdict = check_motion(motion, limits) if limits is not None else Verdict()
     if verdict.problems:
         raise DataError(f"{path}: {'; '.join(verdict.problems)}")
-    found = identify_motion(motion, options.motion, knee_radps=options.knee_radps, seed=options.swarm.seed)
+    settings = options.motion
+    if motion.plateaus:
+        settings = replace(settings, speed_min_radps=0.5 * float(abs(motion.velocity_radps).min()))
+    found = identify_motion(motion, settings, knee_radps=options.knee_radps, seed=options.swarm.seed)
     section = reports.motion_section(found)
     warnings = list(verdict.warnings)
     if len(found.model.directions) == 1:

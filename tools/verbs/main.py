@@ -18,6 +18,7 @@ from jointctl.tools.verbs.check import check
 from jointctl.tools.verbs.clear_fault import clear_fault
 from jointctl.tools.verbs.demo import demo
 from jointctl.tools.verbs.doctor import doctor
+from jointctl.tools.verbs.excite import excite
 from jointctl.tools.verbs.fault_campaign import fault_campaign
 from jointctl.tools.verbs.hil import hil
 from jointctl.tools.verbs.identify import identify
@@ -77,7 +78,7 @@ for _panel, _verbs in (
     (BEGIN, (demo, new, zero, hil, doctor)),
     (MOVE, (run, stop, clear_fault, check)),
     (INSPECT, (scan, info, monitor)),
-    (FRICTION, (sweep, identify, validate, map_verb)),
+    (FRICTION, (sweep, excite, identify, validate, map_verb)),
     (LOOK, (report, scope)),
     (COMPARE, (paper, study_verb, fault_campaign)),
 ):

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Column, Table
 
-from jointctl.drivers.errors import INTERRUPTED, ConfigurationError, MotionFault, UsageError
+from jointctl.drivers.errors import ConfigurationError, MotionFault, UsageError
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOnBus, VerbOutput, Yes
 
 if TYPE_CHECKING:
-    from jointctl.drivers.drive import CommissioningReport
     from jointctl.tools.analysis.reducer_map import FoundMap, MapRun
     from jointctl.tools.configuration.config import Config
 
@@ -113,7 +112,9 @@ def map_verb(
     output: VerbOutput,
     *,
     options: MapOptions = MapOptions(),
-    write: Annotated[bool, typer.Option("--write", help="section reducer.map into CONFIG; comments stay")] = False,
+    write: Annotated[
+        bool, typer.Option("--write", help="section reducer.map, or ripple, into CONFIG; comments stay")
+    ] = False,
     figure: Annotated[Path | None, typer.Option("--figure", help="PNG with both series (CONFIG.map.png)")] = None,
     assume_yes: Yes = False,
     dry_run: DryRun = False,
@@ -123,7 +124,7 @@ def map_verb(
     from jointctl.tools.analysis.reducer_map import found_map, map_figure
     from jointctl.tools.configuration.config import SHIPPED_FOLDER
     from jointctl.tools.drawing import require_png, save_png
-    from jointctl.tools.identification.identification_report import write_map
+    from jointctl.tools.identification.identification_report import write_map, write_ripple
     from jointctl.tools.session.consent import require_terminal
 
     if write and config.path.resolve().is_relative_to(SHIPPED_FOLDER):
@@ -131,8 +132,6 @@ def map_verb(
             f"{config.path.name} is a shipped configuration and is not changed",
             f"`jointctl new mine.toml --from {config.path.stem}` makes it yours",
         )
-    if write and config.reducer is None:
-        raise ConfigurationError(f"{config.path}: [reducer] is missing, which [reducer.map] belongs to")
     picture = figure or Path(f"{config.path.stem}.map.png")
     require_png(picture, [config.path])
     if not (assume_yes or dry_run or options.lockstep):
@@ -144,7 +143,8 @@ def map_verb(
     if isinstance(measured, int):
         return measured
     found = found_map(map_run(moving, *measured))
-    values = found.values(config.encoder.direction, config.encoder.zero_counts)
+    mounting = config.encoder.direction, config.encoder.zero_counts
+    values = found.values(*mounting) if config.reducer is not None else found.ripple_values(*mounting)
     output.result(_table(found), {**asdict(found), "map": values}, found)
     save_png(map_figure(found, f"{config.path.stem}: map of the reducer"), picture)
     output.note(f"written: {picture}")
@@ -155,7 +155,8 @@ def map_verb(
                 values[key] = list(getattr(config.reducer.map, key))
     if write:
         turns = f"{found.turns[0]} motor turns forwards, {found.turns[1]} backwards"
-        write_map(config.path, values, [f"map of {turns} at {found.speed_radps:g} rad/s"])
+        write_section = write_map if config.reducer is not None else write_ripple
+        write_section(config.path, values, [f"map of {turns} at {found.speed_radps:g} rad/s"])
         output.note(f"written: {config.path}")
     return 0
 
@@ -163,35 +164,12 @@ def map_verb(
 def _measured(config: Config, output: Output, **how: bool) -> tuple[Any, float] | int:
     """(records, time from a command to its torque) of a run, or the exit code without one."""
     from jointctl.tools.recording.run_log_reader import read_run_log
-    from jointctl.tools.session.consent import TerminalConsent
-    from jointctl.tools.session.control import in_control
-    from jointctl.tools.session.live_panel import run_display
     from jointctl.tools.session.plan import resolve
-    from jointctl.tools.session.result import broken_off, never_begun, require_off
-    from jointctl.tools.session.session import Session
+    from jointctl.tools.sweeping.carry_out import carried_out
 
-    plan = resolve(config, allow_low_margin=how["allow_low_margin"])
-    consent = TerminalConsent(output, assume_yes=how["assume_yes"], dry_run=how["dry_run"])
-
-    def display(_: CommissioningReport) -> Any:
-        return run_display(output, f"{config.path.stem}: map")()
-
-    with in_control(config, output) as control:
-        session = Session(plan, consent, output, control, display)
-        try:
-            result = session.run()
-        except KeyboardInterrupt:
-            return broken_off(session.drive_state, output, control.signals.by_command)
-    if result is None:
-        return never_begun(session.drive_state, output, dry_run=how["dry_run"])
-    require_off(session.drive_state)
-    if result.fault_text is not None:
-        text = result.fault_text
-        raise MotionFault(f"{result.fault.name} ({int(result.fault)}): {text.happened}; no map", text.advice)
-    if result.stopped_by:
-        output.note(f"stopped by {result.stopped_by}; no map")
-        return INTERRUPTED
-    return read_run_log(result.log_path).records, _late_s(config)
+    plan = resolve(config, allow_low_margin=how.pop("allow_low_margin"))
+    result = carried_out(plan, output, "map", **how)
+    return result if isinstance(result, int) else (read_run_log(result.log_path).records, _late_s(config))
 
 
 def _lockstep(config: Config) -> tuple[Any, float]:

@@ -181,7 +181,7 @@ class StudyFlags:
     plants: Annotated[
         list[str] | None,
         typer.Option(
-            "--plants", help="how many random plants; rigid or realistic (a soft reducer): which; both in turn"
+            "--plants", help="how many random plants; rigid, realistic (a soft reducer), loaded (friction by load too)"
         ),
     ] = None
     seed: Annotated[int | None, typer.Option("--seed")] = None
@@ -209,12 +209,12 @@ def with_plants(settings: StudySettings, given: list[str]) -> StudySettings:
 
     changed = settings.model_dump()
     for text in given:
-        if text in ("rigid", "realistic"):
-            changed["plant"]["flexible"] = text == "realistic"
+        if text in ("rigid", "realistic", "loaded"):
+            changed["plant"] |= {"flexible": text != "rigid", "loaded": text == "loaded"}
         elif text.isascii() and text.isdigit():
             changed["plants"] = int(text)
         else:
-            raise ConfigurationError(f"--plants (={text}) must be a number, rigid or realistic")
+            raise ConfigurationError(f"--plants (={text}) must be a number, rigid, realistic or loaded")
     return checked(changed, "command line")
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from jointctl.tools.session.fault_words import FaultText
     from jointctl.tools.sweeping.data_file import SweepFile
     from jointctl.tools.sweeping.meter import JointModel, MeasuredPoint
-    from jointctl.tools.sweeping.options import SweepPoint
+    from jointctl.tools.sweeping.options import Condition, SweepPoint
     from jointctl.tools.sweeping.plan import PlanSettings
 
 RELATIVE_TOLERANCE = 0.01
@@ -82,6 +82,7 @@ class Sweep:
         self.plan = make_plan(config, options)
         self.file: SweepFile | None = None
         self.drive_state = ""
+        self._attached_Nm = math.nan  # the load that the user has confirmed
         self._time_offset_s = 0.0
         self._unsettled: dict[int, SweepPoint] = {}
         self._consent = TerminalConsent(
@@ -111,18 +112,36 @@ class Sweep:
                     self._write_page()
                     return 0
             stopped: str | None = ""
-            if todo:
-                stopped = self._measure(todo, self.options.warm_up_turns, 1.0)
-            if stopped == "":
-                again = self._to_revisit()
-                if again:
-                    points = "1 point" if len(again) == 1 else f"{len(again)} points"
-                    self.output.note(f"{points} did not settle: once more, with more time")
-                    stopped = self._measure(again, 0.0, REVISIT_DWELL)
+            for condition in options.conditions:
+                stopped = self._under(condition, [p for p in todo if p.condition == condition])
+                if stopped != "":
+                    break
             return self._report(stopped)
         finally:
             if self.file is not None:
                 self.file.close()
+
+    def _under(self, condition: Condition, points: list[SweepPoint]) -> str | None:
+        """Measure under one load, at one place, and once more what did not settle; as `_measure`."""
+        from jointctl.tools.session.consent import agreed
+
+        again = [p for p in self._to_revisit() if p.condition == condition]
+        if not (points or again):
+            return ""
+        if self.options.loads_Nm and not (self.options.lockstep or self.options.dry_run or self.options.assume_yes):
+            load = f"A load of {condition.load_Nm:g} Nm at the joint: is it attached?"
+            if condition.load_Nm != self._attached_Nm and not agreed(self.output, load):
+                return "the user" if self.file is not None else None
+            self._attached_Nm = condition.load_Nm
+        stopped: str | None = ""
+        if points:
+            stopped = self._measure(points, self.options.warm_up_turns, 1.0)
+        again = [p for p in self._to_revisit() if p.condition == condition]
+        if stopped == "" and again:
+            text = "1 point" if len(again) == 1 else f"{len(again)} points"
+            self.output.note(f"{text} did not settle: once more, with more time")
+            stopped = self._measure(again, 0.0, REVISIT_DWELL)
+        return stopped
 
     def _to_revisit(self) -> list[SweepPoint]:
         """Points that did not settle and were not visited more than REVISITS times yet."""
@@ -146,6 +165,10 @@ class Sweep:
         motion = self.plan.motion(points, warm_up_turns, dwell_factor)
         self._time_offset_s = self.file.elapsed_s if self.file is not None else 0.0
         meter = SweepMeter(motion.windows, joint_model(config, self.plan.settings), self._on_point)
+        load_Nm = points[0].condition.load_Nm
+        if options.lockstep and load_Nm and config.virtual is not None:
+            carried = {"load_torque_Nm": config.virtual.load_torque_Nm + load_Nm}
+            config = config.model_copy(update={"virtual": config.virtual.model_copy(update=carried)})
         swept = SweepPass(config, motion, points)
 
         def begin(report: CommissioningReport) -> None:
@@ -200,6 +223,7 @@ class Sweep:
             "limits": recorded_limits(self.config),
             "torque_source": self.config.drive.torque_source,
             "gravity_subtracted_Nm": self.config.joint.gravity_Nm,
+            "loaded": self.options.conditioned,
             "points": len(self.plan.points),
             "options": options,
             "configuration": self.config.text,

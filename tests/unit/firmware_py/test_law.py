@@ -356,6 +356,24 @@ def test_the_temperature_of_the_feed_forward_is_the_last_that_was_read(law: Any)
     law.temperature.degC[0] = 5.0
     follow_temperature(law, state, True)
     assert friction_feed_forward_Nm(law, state, 0.0, 0.2) == pytest.approx(plain * math.exp(0.2))
+    reset_law(law, state)  # the joint is about to be enabled: it does not begin with the temperature of the curve
+    assert state.temperature_degC == 5.0
+
+
+def test_a_known_ripple_is_taken_off_the_feed_forward_where_it_will_be(law: Any) -> None:
+    law.kind, law.feed_forward = ControllerKind.COMPUTED_TORQUE, FeedForward.DESIRED
+    state, velocity, reference = blocks(law)
+    reference.velocity_radps = 0.2
+    step(law, state, 0.5, velocity, reference)
+    plain = state.friction_torque_Nm
+    ripple = law.flexible.torque_ripple
+    ripple.count, ripple.amplitude[0], ripple.turns_prad[0], ripple.phase_turns[0] = 1, 0.8, 242.0 / math.tau, 0.1
+    for lead_s in (0.0, 0.01):
+        law.feed_forward_lead_s = lead_s
+        step(law, state, 0.5, velocity, reference)
+        ahead_rad = reference.position_rad + lead_s * 0.2
+        expected = plain - 0.8 * math.sin(242.0 * ahead_rad + 0.1 * math.tau)
+        assert state.friction_torque_Nm == pytest.approx(expected, abs=1e-9)
 
 
 def test_the_trap_of_the_paper_at_rest_is_the_users_choice(law: Any) -> None:

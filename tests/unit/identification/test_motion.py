@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,15 +21,18 @@ from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.identification.friction_data import ForeignFormat
 from jointctl.tools.identification.identification import Options
 from jointctl.tools.identification.models import FORMS
-from jointctl.tools.identification.motion_data import Motion, MotionSettings, read_motion
+from jointctl.tools.identification.motion_data import Motion, MotionSettings, joined, motion_of_plateaus, read_motion
 from jointctl.tools.identification.motion_fit import MotionFit, identify_motion
 from jointctl.tools.identification.plausibility import JointLimits, check_motion
 from jointctl.tools.recording.run_log import RunLogWriter
+from jointctl.tools.sweeping.data_file import SweepFile
+from jointctl.tools.sweeping.meter import MeasuredPoint, PlateauResult
+from jointctl.tools.sweeping.options import SweepPoint
 from jointctl.tools.verbs.identify import identify, motion_from
 from tests.page_figures import foreign_colours, svgs
 from tests.places import PUBLIC_DATA
 from tests.unit.identification.synthetic_friction import output
-from tests.unit.identification.synthetic_motion import FORMAT, TrueJoint, motion_columns, read, write_table
+from tests.unit.identification.synthetic_motion import FORMAT, RATIO, TrueJoint, motion_columns, read, write_table
 
 SETTINGS = MotionSettings()
 
@@ -100,6 +104,92 @@ def test_a_known_load_gives_the_scale_of_the_torque_too(folder):
     assert found.parameters["load_scale"].value == pytest.approx(-0.1, abs=0.02)
     assert found.parameters["load_coulomb"].value == pytest.approx(0.2, abs=0.04)
     assert not any("torque constant" in line for line in found.untold)
+
+
+def plateaus(path: Path, joint: TrueJoint, noise_Nm: float = 0.05) -> Path:
+    """A sweep of `joint` under three loads, each cold and warm, as `sweep` writes it."""
+    random = np.random.default_rng(4)
+    file = SweepFile.create(path, RATIO, 0.1, "abc", {"loaded": True})
+    speeds = np.geomspace(0.01, 1.0, 20)
+    moves = [(load, warm, side * v) for load in (-15.0, 0.0, 15.0) for warm in (0.0, 20.0) for v in speeds
+             for side in (1.0, -1.0)]  # fmt: skip
+    for index, (load, warm, v) in enumerate(moves):
+        torque = float(joint.torque_Nm(0.0, v, 0.0, load, warm)) - load + noise_Nm * random.standard_normal()
+        result = PlateauResult(v, torque / RATIO, 0.001, 0.001, 900, -0.1, 0.1, 1e-4, "")
+        file.add(MeasuredPoint(SweepPoint(index, v, 0), result, 3.0 * index, 25.0 + warm, load))
+    file.close()
+    return path
+
+
+def test_a_sweep_under_loads_cold_and_warm_gives_their_terms(tmp_path):
+    joint = TrueJoint(gravity_Nm=0.0, load_coulomb=0.1, load_viscous_spr=0.05, coulomb_perK=0.006, viscous_perK=0.02)
+    data = plateaus(tmp_path / "loads.csv", joint)
+    out = output(json=True)
+    assert identify(data, out, out=tmp_path / "found.toml", options=Options()) == 0
+    found = json.loads(out.stdout.getvalue())
+    assert set(found["terms"]) >= {"load-coulomb", "load-viscous", "temperature-coulomb", "temperature-viscous"}
+    true = {"load_coulomb": 0.1, "load_viscous": 0.05, "temperature_coulomb": 0.006, "temperature_viscous": 0.02}
+    # friction at T0, the middle: the sizes are those of 25 degC times a factor
+    cool = np.exp(-0.006 * (found["reference_degC"] - 25.0)), np.exp(-0.02 * (found["reference_degC"] - 25.0))
+    factor = {"load_coulomb": cool[0], "load_viscous": cool[1]}
+    for name, value in true.items():
+        parameter = found["parameters"][name]
+        assert parameter["low"] <= value * factor.get(name, 1.0) <= parameter["high"], name
+    assert found["held_out_rmse_Nm"] < 2.0 * 0.05
+
+
+def test_a_sweep_without_loads_is_fitted_as_always(tmp_path):
+    data = plateaus(tmp_path / "loads.csv", TrueJoint(gravity_Nm=0.0))
+    heading, *rows = data.read_text().splitlines()
+    data.write_text("\n".join(line.rsplit(",", 1)[0] for line in (heading, *rows)) + "\n")
+    assert motion_of_plateaus(data, ForeignFormat()) is None
+
+
+def test_a_cold_and_a_warm_motion_together_tell_the_temperature(tmp_path):
+    joint = TrueJoint(coulomb_perK=0.01, viscous_perK=0.03)
+    cold = motion_columns(joint, seconds=30.0, seed=1)
+    warm = motion_columns(joint, seconds=30.0, seed=2)
+    warm["warmth"] = warm["warmth"] + 20.0
+    warm["tau"] = _at(joint, warm, 20.0)
+    settings = replace(SETTINGS, also=(write_table(tmp_path / "warm.csv", warm),))
+    given = replace(FORMAT, temperature_column="warmth")
+    motion = motion_from(write_table(tmp_path / "cold.csv", cold), given, settings)
+    assert np.all(np.diff(motion.time_s) > 0.0)
+    assert np.count_nonzero(~motion.whole) > 2  # nothing is used across the joint of both files
+    found = identify_motion(motion, settings)
+    assert found.parameters["temperature_viscous"].value == pytest.approx(0.03, rel=0.2)
+    assert found.parameters["temperature_coulomb"].value == pytest.approx(0.01, rel=0.25)
+
+
+def _at(joint, columns, warming_K):
+    """The torque of the same motion at another temperature, with its noise."""
+    t, q = columns["t"], columns["q"]
+    v, a = np.gradient(q, t), np.gradient(np.gradient(q, t), t)
+    return columns["tau"] - joint.torque_Nm(q, v, a) + joint.torque_Nm(q, v, a, None, warming_K)
+
+
+@pytest.mark.parametrize(
+    ("change", "also", "message"),
+    [
+        ({"ratio": 50.0}, "b.csv", r"a.csv: reduction ratio \(=100\) must be that of .*b.csv \(=50\)"),
+        ({"load_column": "load"}, "b.csv", r"a known load in one file and none in another"),
+    ],
+)
+def test_motions_that_do_not_go_together_are_refused(tmp_path, change, also, message):
+    one = read(tmp_path / also, motion_columns(seconds=10.0, load_Nm=5.0), **change)
+    two = read(tmp_path / "a.csv", motion_columns(seconds=10.0))
+    with pytest.raises(DataError, match=message):
+        joined([one, two])
+
+
+def test_a_further_file_must_be_a_motion(tmp_path):
+    data = write_table(tmp_path / "move.csv", motion_columns(seconds=10.0))
+    log = run_log(tmp_path / "run.mcap", motion_columns(seconds=10.0))
+    with pytest.raises(DataError, match=r"x\.csv: is no motion in time"):
+        motion_from(log, ForeignFormat(), replace(SETTINGS, also=(tmp_path / "x.csv",)))
+    sweep = plateaus(tmp_path / "s.csv", TrueJoint())
+    with pytest.raises(UsageError, match=r"--also \(=.*move.csv\) is for motions"):
+        identify(sweep, output(), options=Options(motion=replace(SETTINGS, also=(data,))))
 
 
 def test_single_wild_samples_do_not_move_the_result(folder):

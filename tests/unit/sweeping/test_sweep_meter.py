@@ -9,6 +9,7 @@ import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,7 @@ from jointctl.tools.sweeping.meter import (
     sticking_share,
     without_ripple,
 )
-from jointctl.tools.sweeping.options import SweepOptions, SweepPoint
+from jointctl.tools.sweeping.options import Condition, SweepOptions, SweepPoint
 from jointctl.tools.sweeping.plan import Window
 from jointctl.tools.verbs import sweep as verb
 
@@ -237,6 +238,28 @@ def test_gravity_is_subtracted() -> None:
     assert found.result.motor_torque_std_Nm == pytest.approx(0.0, abs=1e-12)
 
 
+def test_a_known_load_is_subtracted_and_kept() -> None:
+    log = records()
+    log.measured_torque_Nm = 20.0 + 5.0 * np.sin(log.position_rad - 0.3) - 7.0
+    model = JointModel(100.0, 5.0, 0.3, 1.2e-5, MODEL.orders_prad)
+    windows = tuple(replace(w, point=replace(w.point, condition=Condition(-7.0))) for w in BOTH_WINDOWS)
+    (found,) = measure(log, windows, model)
+    assert found.result.motor_torque_Nm == pytest.approx(0.2)
+    position = np.concatenate([log.position_rad[(log.trajectory_s >= w.start_s) & (log.trajectory_s < w.end_s)]
+                               for w in BOTH_WINDOWS])  # fmt: skip
+    assert found.load_Nm == pytest.approx(np.mean(5.0 * np.sin(position - 0.3)) - 7.0, rel=1e-6)
+
+
+def test_the_temperature_is_the_mean_over_the_windows_in_simulated_time() -> None:
+    found: list[MeasuredPoint] = []
+    meter = SweepMeter(BOTH_WINDOWS, MODEL, found.append)
+    meter.warmth = np.array([0.0, 4.0]), np.array([20.0, 40.0])
+    meter.feed(records())
+    lengths = [w.end_s - w.start_s for w in BOTH_WINDOWS]
+    middle_s = np.average([0.5 * (w.start_s + w.end_s) for w in BOTH_WINDOWS], weights=lengths)
+    assert found[0].temperature_degC == pytest.approx(20.0 + 5.0 * middle_s, abs=0.01)
+
+
 # --- files ---
 def measured(point: SweepPoint, torque_Nm: float = 0.2, problem: str = "") -> MeasuredPoint:
     velocity = point.velocity_radps
@@ -280,6 +303,19 @@ def test_columns_of_a_row(path: Path) -> None:
     sidecar = json.loads(path.with_suffix(".json").read_text())
     assert sidecar["unsettled"] == {"3": "the joint stuck and slipped"}
     assert sidecar["drive"] == {"serial": "7"}
+
+
+def test_a_sweep_under_loads_has_a_column_of_them_and_goes_on_with_it(path: Path) -> None:
+    file = SweepFile.create(path, 121.0, 0.1, "abc", {"loaded": True})
+    file.add(replace(measured(SweepPoint(0, 0.1, 0)), load_Nm=7.25))
+    file.close()
+    file = SweepFile.resume(path, 0.1, "abc")
+    file.add(replace(measured(SweepPoint(1, -0.1, 0)), load_Nm=-1.0))
+    file.close()
+    heading, *rows = path.read_text().splitlines()
+    assert heading == f"{HEADING.strip()},load_Nm"
+    assert [float(row.split(",")[-1]) for row in rows] == [7.25, -1.0]
+    assert len(read_friction_data(path, both=False).velocity_radps) == 2
 
 
 def test_each_row_is_in_the_file_at_once(path: Path) -> None:

@@ -258,6 +258,27 @@ def test_warm_up_travels_the_turns_asked_for() -> None:
     )
 
 
+def test_further_passes_begin_with_the_turns_that_warm_the_joint() -> None:
+    s = plan_settings()
+    points = points_of([3.0], passes=2)
+    plain, between = plan_motion(points, s), plan_motion(points, s, 0.0, 2.0)
+    assert between.duration_s - plain.duration_s >= math.tau * 2.0 / s.transit_radps
+    first = [w for w in between.windows if w.point.pass_number == 0]
+    assert [w.end_s for w in first] == [w.end_s for w in plain.windows if w.point.pass_number == 0]
+    assert plan_motion(points_of([3.0]), s, 0.0, 2.0).duration_s == plan_motion(points_of([3.0]), s).duration_s
+
+
+def test_every_load_at_every_place_has_its_passes_and_the_hash_tells_them_apart() -> None:
+    options = SweepOptions(loads_Nm=[0.0, 5.0], places_rad=[-0.3, 0.4])
+    points = ordered_points([0.1, -0.1], 2, None, options.conditions)
+    assert [(p.condition.load_Nm, p.condition.place_rad) for p in points[::4]] == [
+        (0.0, -0.3), (0.0, 0.4), (5.0, -0.3), (5.0, 0.4),
+    ]  # fmt: skip
+    assert [p.pass_number for p in points[::2]] == list(range(8))
+    plain = ordered_points([0.1, -0.1], 8, None)
+    assert plan_hash(points, {}) != plan_hash(plain, {})
+
+
 # --- Options of a sweep against the joint: every bad one is a single line, and the defaults fit ---
 SWEEP = shipped_config("sweep_virtual")
 
@@ -342,6 +363,12 @@ def test_an_unbounded_joint_is_swept_about_where_it_stands(config: Config) -> No
         ({"speeds": Path("x.txt")}, r"--speeds FILE goes with --grid list"),
         ({"grid": "list", "speeds": Path("x.txt"), "points": 5}, r"do not go with --grid list"),
         ({"quick": True, "points": 50}, r"--quick chooses the number of points"),
+        ({"warm_between_turns": 5.0}, r"--warm-between \(=5\) needs --passes of 2 or more, or loads"),
+        ({"warm_between_turns": -1.0, "passes": 2}, r"--warm-between \(=-1\) must be in \[0..1000\]"),
+        ({"loads_Nm": [5.0, 5.0]}, r"--load-Nm \(=5, 5\) must differ"),
+        ({"loads_Nm": [math.inf]}, r"--load-Nm \(=inf\) must be in"),
+        ({"loads_Nm": [0.0, 5.0], "assume_yes": True}, r"-y does not go with --load-Nm of several loads"),
+        ({"places_rad": [3.2]}, r"--at \(=3.2\) must be in \(-3.1..3.1\) rad, inside the limits"),
     ],
 )
 def test_a_bad_option_is_one_line_with_exit_code_2(config: Config, options: dict[str, Any], text: str) -> None:
@@ -349,6 +376,16 @@ def test_a_bad_option_is_one_line_with_exit_code_2(config: Config, options: dict
         make_plan(config, SweepOptions(**options))
     assert error.value.exit_code == 2
     assert "\n" not in error.value.message
+
+
+def test_the_travel_is_the_same_about_each_place_and_inside_the_limits(config: Config) -> None:
+    plan = make_plan(config, SweepOptions(places_rad=[-1.0, 2.0], points=24))
+    low, high = config.limits.position_min_rad, config.limits.position_max_rad
+    half = 0.5 * plan.settings.width_rad
+    assert half == pytest.approx(high - config.limits.following_error_max_rad - 2.0)
+    assert low < -1.0 - half
+    motion = plan.motion(plan.points[:24], 0.0)
+    assert max(-motion.low_rad, motion.high_rad) <= half + 1e-9
 
 
 def test_a_list_of_speeds_is_used_as_it_is(config: Config, tmp_path: Path) -> None:
