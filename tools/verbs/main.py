@@ -30,6 +30,7 @@ from jointctl.tools.verbs.new import new
 from jointctl.tools.verbs.paper import paper
 from jointctl.tools.verbs.params import params_app
 from jointctl.tools.verbs.report import report
+from jointctl.tools.verbs.response import response
 from jointctl.tools.verbs.run import run
 from jointctl.tools.verbs.scan import scan
 from jointctl.tools.verbs.scope import scope
@@ -37,6 +38,7 @@ from jointctl.tools.verbs.start import never_refuse_a_character, occupy_standard
 from jointctl.tools.verbs.stop import stop
 from jointctl.tools.verbs.study import study_verb
 from jointctl.tools.verbs.sweep import sweep
+from jointctl.tools.verbs.tune import tune
 from jointctl.tools.verbs.validate import validate
 from jointctl.tools.verbs.verb_options import BEGIN, COMPARE, FRICTION, INSPECT, LOOK, MOVE, Verb, Verbs, grouped
 from jointctl.tools.verbs.zero import zero
@@ -76,9 +78,9 @@ def callback(
 
 for _panel, _verbs in (
     (BEGIN, (demo, new, zero, hil, doctor)),
-    (MOVE, (run, stop, clear_fault, check)),
+    (MOVE, (run, stop, clear_fault, check, tune)),
     (INSPECT, (scan, info, monitor)),
-    (FRICTION, (sweep, excite, identify, validate, map_verb)),
+    (FRICTION, (sweep, excite, identify, validate, map_verb, response)),
     (LOOK, (report, scope)),
     (COMPARE, (paper, study_verb, fault_campaign)),
 ):
