@@ -29,17 +29,21 @@ LARGEST_S = 1.8
 LARGEST_S_ANYWHERE = 2.5
 LARGEST_NOISE_Nm = 0.6
 LARGEST_OBSERVER_radps = 110.0
+LEAST_KV_1ps = 3.0  # softer loops bear anything and are of no use
 KP_OF_KV = 1.5
 MOTOR_ERROR = 0.15
+ROUNDED = 1.02  # by which a constraint may be missed, as the search ends near it
 HIGHEST_CUTOFF = 0.45  # of the rate
 PENALTY = 20.0  # on the logarithm of the error, for each unit by which a constraint is missed
 UNSTABLE = 1e3
 # kv [1/s], observer [rad/s], and where it is searched the cut-off [Hz]
 _START = {
-    Encoders.BOTH: np.log([20.0, 80.0]), Encoders.MOTOR: np.log([20.0, 80.0]), Encoders.LINK: np.log([6.0, 6.0, 40.0]),
-}  # fmt: skip
+    Encoders.BOTH: np.log([20.0, 80.0]),
+    Encoders.MOTOR: np.log([20.0, 80.0]),
+    Encoders.LINK: np.log([10.0, 30.0, 15.0]),
+}
 _COLUMNS = {Encoders.BOTH: [0, 1], Encoders.MOTOR: [1], Encoders.LINK: [0]}  # of link and motor, what the law reads
-_LOWEST_Hz = 0.3
+_LOWEST_Hz = {Encoders.BOTH: 0.3, Encoders.MOTOR: 0.3, Encoders.LINK: 0.1}  # of the error that counts
 _POINTS = 250
 _EVALUATIONS = {2: 80, 3: 160}  # by how many are searched
 
@@ -55,6 +59,12 @@ class FlexibleGains:
     noise_Nm: float
     cutoff_Hz: float | None = None  # where it was searched
 
+    @property
+    def met(self) -> bool:
+        """Whether there are gains that keep what was asked for."""
+        stiff = self.kv * ROUNDED >= LEAST_KV_1ps
+        return stiff and max(self.largest_s / LARGEST_S_ANYWHERE, self.noise_Nm / LARGEST_NOISE_Nm) <= ROUNDED
+
     def changes(self) -> dict[str, float]:
         """Keys of [control]."""
         gains = {"kp": self.kp, "kv": self.kv, "observer_radps": self.observer_radps}
@@ -67,7 +77,7 @@ class _Judged:
     s: float  # max |S| of the believed joint
     s_anywhere: float
     noise_Nm: float
-    beyond: float  # logarithm of the observer's bandwidth over the largest one
+    beyond: float  # logarithm of the observer's bandwidth over the largest one, or of the least kv over kv
 
     @property
     def cost(self) -> float:
@@ -89,7 +99,7 @@ class _Search:
 
     def __init__(self, settings: LoopSettings, count_rad: Array) -> None:
         self._settings, self._count_rad = settings, count_rad
-        self._omega = np.geomspace(math.tau * _LOWEST_Hz, math.pi / settings.period_s, _POINTS)
+        self._omega = np.geomspace(math.tau * _LOWEST_Hz[settings.encoders], math.pi / settings.period_s, _POINTS)
         self._z = np.exp(1j * self._omega * settings.period_s)
         masses = [joint for joint in settings.joints if isinstance(joint, TwoMasses)]
         free = [joint for joint in masses if joint.bristle_Nmprad == (0.0, 0.0)]
@@ -122,7 +132,9 @@ class _Search:
             s=largest[self._believed],
             s_anywhere=max(largest),
             noise_Nm=math.sqrt(np.trapezoid(noise, self._omega) * settings.period_s / math.pi),
-            beyond=max(math.log(settings.observer_radps / LARGEST_OBSERVER_radps), 0.0),
+            beyond=max(
+                math.log(settings.observer_radps / LARGEST_OBSERVER_radps), math.log(LEAST_KV_1ps / settings.kv), 0.0
+            ),
         )
 
     @staticmethod

@@ -271,7 +271,9 @@ def random_plant(base: Config, settings: EnsembleSettings, seed: int, index: int
         virtual |= _flexible(base, settings, random)
         low_bits, high_bits = settings.motor_encoder_bits
         motor = {"counts_per_turn": 2 ** int(random.integers(low_bits, high_bits + 1)), "side": "motor"}
-        if settings.law != "joint_encoder_alone":
+        if settings.law == "joint_encoder_alone":
+            update["joint_encoder"] = None
+        else:
             update["encoder"] = base.encoder.model_copy(update=motor)
             update["joint_encoder"] = JointEncoder(
                 source="drive", counts_per_turn=2**bits, direction=1, zero_counts=0, law=settings.law,

@@ -154,6 +154,9 @@ def _add_gains(table: Table, config: Config, settings: LoopSettings) -> None:
     gains = chosen_gains(config, settings)
     value = ", ".join(f"{name} = {number:g}" for name, number in gains.changes().items())
     note = f"largest |S| {gains.largest_s:.2f} over all joints, torque noise {gains.noise_Nm:.2f} Nm"
+    note += (
+        "" if gains.met else ": NOT what is asked for, there are no such gains; less delay, or the other encoder too"
+    )
     table.add_row("chosen gains", value, note)
 
 

@@ -261,6 +261,17 @@ def test_chosen_gains_keep_their_promise_on_every_joint(changes: dict[str, Any],
     assert phase_margin_deg(chosen) > 20.0
 
 
+def test_where_there_are_no_gains_that_is_said_and_none_is_uselessly_soft() -> None:
+    """A light motor on the motor's encoder, a heavy link, and more delay than that bears."""
+    changes = {"reducer__motor_inertia_kgm2": 0.2, "margin__loop_delay_s": 6e-3, "reducer__loop_stiffness_Nmprad": 5e4}
+    config = with_encoders(believed(**changes), Encoders.MOTOR)
+    gains = chosen_gains(config, loop_settings(config)[0])
+    assert not gains.met
+    assert gains.kv >= 1.0
+    config = with_encoders(believed(), Encoders.MOTOR)
+    assert chosen_gains(config, loop_settings(config)[0]).met
+
+
 def test_more_delay_leaves_smaller_gains() -> None:
     found = []
     for delay_s in (0.5e-3, 1.5e-3, 3e-3):
