@@ -131,8 +131,10 @@ def test_standby_stops_every_axis(slept_ns: int, faults: Fault) -> None:
 # --- the front ends --------------------------------------------------------------------------------------------
 
 
-CALLERS = {
-    "step_axis": {"firmware_py/cycle.py"}, "write_log": {"firmware_py/cycle.py"},
+CALLERS = {  # `axis.step_axis` puts the parts together for the tests of one axis
+    "sense_axis": {"firmware_py/axis.py", "firmware_py/cycle.py"},
+    "move_axis": {"firmware_py/axis.py", "firmware_py/cycle.py"},
+    "command_axis": {"firmware_py/axis.py", "firmware_py/cycle.py"}, "write_log": {"firmware_py/cycle.py"},
     "check_suspension": {"firmware_py/cycle.py"}, "step_cycle": {"firmware_py/realtime.py", "hil/lockstep.py"},
     "run_cycles": {"firmware_py/realtime.py", "tools/session/portable_loop.py"},
 }  # fmt: skip
