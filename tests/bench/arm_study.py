@@ -6,8 +6,8 @@ Each arm is the shipped one with joints drawn as `jointctl study` draws them (fr
 delay, encoder), masses and inertias of every link +-10 %, and torque ripple up to 1 % of the joint's torque.  The
 controller believes the shipped figures.  The joints move in sines whose periods never repeat together, at three speeds;
 the fastest is near the joints' limits.  The same arm runs with independent joints, with gravity alone, and with the
-whole model; then all of it again with friction that the controller knows, which leaves what the arm itself does, and without
-observer and adaptation, computed torque alone.
+whole model; then all of it again with friction that the controller knows, which leaves what the arm itself does, and
+without observer and adaptation, computed torque alone.
 Errors are the true ones (joint angle minus desired angle) after the first 10 s.  All of it is simulated.
 """
 
@@ -137,13 +137,13 @@ def table(found: np.ndarray, names: tuple[str, ...]) -> list[str]:
 
 
 def picture(path: Path) -> None:
-    """The shipped arm's joints at the highest speed, errors of the first ten seconds."""
-    arm = LockstepArm(load_arm(SHIPPED_ARM))
+    """Errors of one of the study's arms at the highest speed, five seconds of them."""
+    arm = LockstepArm(random_arm(load_arm(SHIPPED_ARM), 1, 0))
     with canvas(6.0) as figure:
         axes = figure.subplots(3, 1, sharex=True)
         for (label, kind), colour in zip(KINDS.items(), (ORANGE, BLUE, GREEN), strict=True):
             for axis, one, name in zip(axes, run(arm, kind, SPEEDS[-1]), arm.arm.names, strict=True):
-                shown = one.tracking & (one.log.trajectory_s < 10.0)
+                shown = settled(one) & (one.log.trajectory_s < SETTLED_s + 5.0)
                 axis.plot(
                     one.log.trajectory_s[shown], 1e3 * one.true_error_rad[shown], color=colour, linewidth=0.9,
                     label=label,
