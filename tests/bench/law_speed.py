@@ -177,7 +177,8 @@ def run_any_law(
         now.measured_position_rad = now.second_position_rad = inputs[i, 0]
         step_velocity(axis.velocity, now.velocity, inputs[i, 0], inputs[i, 0] - inputs[i, 1], 1)
         where = repetition(axis.trajectory, table, i * axis.law.period_s)
-        unlimited = law_torque_Nm(axis, now, where, 1)
+        now.gap_cycles = 1
+        unlimited = law_torque_Nm(axis, now, where)
         limited, _ = limited_torque_Nm(axis.limits, unlimited, now.command_torque_Nm, axis.law.period_s)
         now.command_torque_Nm = limited
         torque_Nm[i] = limited

@@ -24,13 +24,14 @@ from jointctl.tools.configuration.records import axis_constants, trajectory_tabl
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.main import app
 from jointctl.tools.written_file import prepare_folder
+from tests.bench.arm_speed import arm_rows
 from tests.bench.exchange_speed import Rounds, exchange_rows
 from tests.bench.law_speed import flexible_rows, law_rows
 from tests.bench.paired import Row, conditions, outcome_data, outcome_table, skipped, write_outcome
 from tests.bench.simulation_speed import lockstep_rows, program_rows, swarm_rows
 from tests.bench.start_speed import start_rows
 
-PARTS = ("law", "loop", "lockstep", "program", "swarm", "start")
+PARTS = ("law", "arm", "loop", "lockstep", "program", "swarm", "start")
 
 
 def _law(config: Config, folder: Path, pairs: int) -> Iterator[Row]:
@@ -45,6 +46,7 @@ def _law(config: Config, folder: Path, pairs: int) -> Iterator[Row]:
 def _part(name: str, config: Config, folder: Path, quick: bool, verbs: Sequence[str]) -> Iterator[Row]:
     parts: dict[str, Callable[[], Iterator[Row]]] = {
         "law": lambda: _law(config, folder, 15 if quick else 61),
+        "arm": lambda: arm_rows(pairs=15 if quick else 61, runs=3 if quick else 15),
         "loop": lambda: exchange_rows(
             config,
             folder,
@@ -107,7 +109,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--quick", action="store_true", help="shorter, with more noise")
     parser.add_argument("--out", type=Path, help="folder for bench.json and bench.png")
-    parser.add_argument("--only", action="append", default=[], help="law, loop, lockstep, swarm or start")
+    parser.add_argument("--only", action="append", default=[], help=", ".join(PARTS))
     parser.add_argument("--json", action="store_true", help="JSON on stdout instead of the table")
     parser.add_argument("--quiet", action="store_true", help="only the result")
     chosen = parser.parse_args(words)
