@@ -292,7 +292,8 @@ class CanopenDrive:
 
     def _start(self) -> None:
         """The second part of `start_cyclic`, for a drive that was verified."""
-        assert self._findings is not None and self._reads is not None
+        assert self._findings is not None
+        assert self._reads is not None
         with self._blamed_before_run():
             self._started = True
             self._encoder.send_command(NmtCommand.START)
