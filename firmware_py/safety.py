@@ -33,8 +33,7 @@ from jointctl.firmware_py.states import (
 )
 from jointctl.firmware_py.trajectory import cubic
 
-# Half swings in a row that are a limit cycle.  On 480 runs of healthy joints there were 2 at most of either kind,
-# and 6 that grew.
+# Half swings in a row that are a limit cycle; on 480 runs of healthy joints 2 at most of either kind, and 6 that grew.
 TORQUE_SWINGS = 4
 ERROR_SWINGS = 6
 GROWING_SWINGS = 8

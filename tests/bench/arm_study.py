@@ -6,7 +6,8 @@ Each arm is the shipped one with joints drawn as `jointctl study` draws them (fr
 delay, encoder), masses and inertias of every link +-10 %, and torque ripple up to 1 % of the joint's torque.  The
 controller believes the shipped figures.  The joints move in sines whose periods never repeat together, at three speeds;
 the fastest is near the joints' limits.  The same arm runs with independent joints, with gravity alone, and with the
-whole model; then all of it again with friction that the controller knows, which leaves what the arm itself does.
+whole model; then all of it again with friction that the controller knows, which leaves what the arm itself does, and
+without observer and adaptation, computed torque alone.
 Errors are the true ones (joint angle minus desired angle) after the first 10 s.  All of it is simulated.
 """
 
@@ -38,10 +39,16 @@ KINDS = {
     "independent joints": ArmFeedForward.NONE, "gravity only": ArmFeedForward.GRAVITY,
     "whole model": ArmFeedForward.WHOLE,
 }  # fmt: skip
+PARTS: dict[str, dict[str, bool]] = {
+    "friction as in study": {}, "friction as believed": {"known": True}, "without observer": {"observer": False},
+}  # fmt: skip
 
 
-def random_arm(arm: ArmConfig, seed: int, index: int, known: bool) -> ArmConfig:
-    """Arm number `index` of the study with this seed; `known`: its friction is the believed one, without ripples."""
+def random_arm(arm: ArmConfig, seed: int, index: int, *, known: bool = False, observer: bool = True) -> ArmConfig:
+    """Arm number `index` of the study with this seed.
+
+    `known`: its friction is the believed one, without ripples.  Without `observer` the law is computed torque alone.
+    """
     joints: list[Config] = []
     for number, config in enumerate(arm.joints):
         assert config.friction is not None
@@ -55,6 +62,9 @@ def random_arm(arm: ArmConfig, seed: int, index: int, known: bool) -> ArmConfig:
         if known:
             exact = {"friction_scale": (1.0, 1.0), "friction_ripple": (0.0, 0.0), "torque_ripple_Nm": (0.0, 0.0)}
             ensemble = ensemble.model_copy(update=exact)
+        if not observer:
+            alone = {"kind": "computed_torque", "observer_radps": 0.0, "adaptation": None}
+            config = config.model_copy(update={"control": config.control.model_copy(update=alone)})
         drawn = random_plant(config, ensemble, seed, 100 * index + number)
         assert drawn.virtual is not None
         crest = {"initial_position_rad": AMPLITUDES_rad[number] + OFFSETS_rad[number]}  # where the motion begins
@@ -97,12 +107,12 @@ def rmse_mrad(runs: list[LockstepRun]) -> list[float]:
     return [1e3 * float(np.sqrt(np.mean(one.true_error_rad[settled(one)] ** 2))) for one in runs]
 
 
-def study(arms: int, seed: int, known: bool) -> np.ndarray:
+def study(arms: int, seed: int, how: dict[str, bool]) -> np.ndarray:
     """RMSE [mrad], array (speeds, kinds, arms, joints)."""
     shipped = load_arm(SHIPPED_ARM)
     found = np.zeros((len(SPEEDS), len(KINDS), arms, len(shipped.joints)))
     for index in range(arms):
-        arm = LockstepArm(random_arm(shipped, seed, index, known))
+        arm = LockstepArm(random_arm(shipped, seed, index, **how))
         for i, speed in enumerate(SPEEDS):
             for k, kind in enumerate(KINDS.values()):
                 found[i, k, index] = rmse_mrad(run(arm, kind, speed))
@@ -127,13 +137,13 @@ def table(found: np.ndarray, names: tuple[str, ...]) -> list[str]:
 
 
 def picture(path: Path) -> None:
-    """The shipped arm's joints at the highest speed, errors of the first ten seconds."""
-    arm = LockstepArm(load_arm(SHIPPED_ARM))
+    """Errors of one of the study's arms at the highest speed, five seconds of them."""
+    arm = LockstepArm(random_arm(load_arm(SHIPPED_ARM), 1, 0))
     with canvas(6.0) as figure:
         axes = figure.subplots(3, 1, sharex=True)
         for (label, kind), colour in zip(KINDS.items(), (ORANGE, BLUE, GREEN), strict=True):
             for axis, one, name in zip(axes, run(arm, kind, SPEEDS[-1]), arm.arm.names, strict=True):
-                shown = one.tracking & (one.log.trajectory_s < 10.0)
+                shown = settled(one) & (one.log.trajectory_s < SETTLED_s + 5.0)
                 axis.plot(
                     one.log.trajectory_s[shown], 1e3 * one.true_error_rad[shown], color=colour, linewidth=0.9,
                     label=label,
@@ -146,8 +156,8 @@ def picture(path: Path) -> None:
 
 if __name__ == "__main__":
     count, chosen = (int(text) for text in (sys.argv[1:3] + ["20", "1"][len(sys.argv[1:3]) :]))
-    for known in (False, True):
-        print(f"\nfriction {'as believed' if known else 'as in study'}, {count} arms, seed {chosen}\n")
-        print("\n".join(table(study(count, chosen, known), load_arm(SHIPPED_ARM).names)), flush=True)
+    for heading, how in PARTS.items():
+        print(f"\n{heading}, {count} arms, seed {chosen}\n")
+        print("\n".join(table(study(count, chosen, how), load_arm(SHIPPED_ARM).names)), flush=True)
     if len(sys.argv) > 3:
         picture(Path(sys.argv[3]))

@@ -109,7 +109,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--quick", action="store_true", help="shorter, with more noise")
     parser.add_argument("--out", type=Path, help="folder for bench.json and bench.png")
-    parser.add_argument("--only", action="append", default=[], help="law, loop, lockstep, swarm or start")
+    parser.add_argument("--only", action="append", default=[], help=", ".join(PARTS))
     parser.add_argument("--json", action="store_true", help="JSON on stdout instead of the table")
     parser.add_argument("--quiet", action="store_true", help="only the result")
     chosen = parser.parse_args(words)

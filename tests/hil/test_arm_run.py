@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.canopen.cia402 import State, state_of_word
+from jointctl.drivers.canopen.identifiers import NmtState
 from jointctl.firmware_py.states import AxisPhase, DriveState, Fault
 from jointctl.tools.configuration.arm import SHIPPED_ARM
 from jointctl.tools.recording.run_log_reader import read_run_log
@@ -47,16 +48,19 @@ class ArmBench:
         return self.bench.start("run", self.path, "-y").saw("  tracking")
 
     def states(self) -> list[State]:
-        """Of each drive, over SDO."""
+        """Of each drive, over SDO; one whose watchdog has stopped its node answers in pre-operational."""
         with can.Bus(interface="jointctl", channel=self.bench.channel) as bus:
+            bus.send(can.Message(arbitration_id=0, data=[0x80, 0], is_extended_id=False))
             return [self._state(bus, node) for node in NODES]
 
     @staticmethod
     def _state(bus: can.BusABC, node: int) -> State:
         request = struct.pack("<BHB4x", 0x40, 0x6041, 0)
         bus.send(can.Message(arbitration_id=0x600 + node, data=request, is_extended_id=False))
-        while (answer := bus.recv(2.0)) is not None:
-            if answer.arbitration_id == 0x580 + node:
+        give_up_s = time.monotonic() + 3.0
+        while time.monotonic() < give_up_s:
+            answer = bus.recv(0.1)
+            if answer is not None and answer.arbitration_id == 0x580 + node:
                 return state_of_word(int.from_bytes(answer.data[4:6], "little"))
         pytest.fail(f"node {node} does not answer")
 
@@ -68,6 +72,17 @@ class ArmBench:
                 pytest.fail(f"not off: {states}")
             states = self.states()
         return True
+
+    def stopped_by_watchdog(self, within_s: float = 3.0) -> bool:
+        """Whether each node says by its heartbeat that it has stopped (1029:1); nothing is sent to it."""
+        stopped: set[int] = set()
+        give_up_s = time.monotonic() + within_s
+        with can.Bus(interface="jointctl", channel=self.bench.channel) as bus:
+            while len(stopped) < len(NODES) and time.monotonic() < give_up_s:
+                heard = bus.recv(0.1)
+                if heard is not None and heard.arbitration_id - 0x700 in NODES and heard.data[0] == NmtState.STOPPED:
+                    stopped.add(heard.arbitration_id - 0x700)
+        return stopped == set(NODES)
 
     def logs(self) -> list[Any]:
         """Of the newest run, in the order of the joints."""
@@ -141,6 +156,8 @@ def test_loop_or_all_killed_every_drive_stops_by_its_own_watchdog(arm: ArmBench,
     os.kill(loop, signal.SIGKILL)
     if dies == "loop":
         assert run.finished(30.0).code == 7
+    else:
+        assert arm.stopped_by_watchdog()
     assert arm.all_off()
 
 

@@ -321,7 +321,7 @@ class LoopHandle:
             return False
         if code is None:
             silent_s = (time.monotonic_ns() - int(self.block.words[Word.LOOP_NS])) * 1e-9
-            if silent_s <= (SILENT_S if self.cycles else OPENING_S):
+            if silent_s <= (SILENT_S if self.block.words[Word.HEAD] else OPENING_S):
                 return True
             self._process.kill()  # whatever it would do next, it must not wake up beside a new run
             with contextlib.suppress(subprocess.TimeoutExpired):  # stuck in the system: the drive must not wait for it

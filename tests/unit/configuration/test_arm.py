@@ -112,7 +112,7 @@ def test_fixed_parts_skew_axes_and_joints_that_are_not_the_arms(folder: Path) ->
 
 def test_each_joint_gets_its_part_of_the_motion() -> None:
     arm = load_arm(SHIPPED_ARM)
-    assert [config.trajectory.amplitude_rad for config in arm.joints] == [0.5, 0.7, 0.8]
+    assert [config.trajectory.amplitude_rad for config in arm.joints] == [0.6, 0.7, 0.6]
     constants = arm.axis_constants([trajectory_table(config) for config in arm.joints], [0.1, 0.1, 0.1])
     assert set(constants.trajectory.kind) == {TrajectoryKind.SINE}
     assert len(set(constants.sequence.approach_s)) == 1
@@ -164,9 +164,9 @@ IN_URDF: list[tuple[str, str, str]] = [
     (r"<robot", "<!DOCTYPE robot><robot", "must have no DOCTYPE"),
     (r"</robot>", "", "not valid XML"),
     (
-        r'velocity="3.0" effort="80"',
+        r'velocity="3.5" effort="80"',
         'velocity="1.5" effort="80"',
-        "elbow.toml: limits.velocity_max_radps (=2.2) must be",
+        "elbow.toml: limits.velocity_max_radps (=3.4) must be",
     ),
 ]
 
@@ -183,8 +183,8 @@ IN_FILES: list[tuple[str, str, str, str]] = [
     ("wrist.toml", r"bitrate_bitps = 1_000_000", "bitrate_bitps = 500_000", "wrist.toml: bus.bitrate_bitps (=500000)"),
     ("arm.toml", r'"elbow", "wrist"\]', '"elbow"]', "arm.joint_names (=2: shoulder, elbow) must be as many as"),
     ("arm.toml", r'"shoulder", "elbow", ', '"elbow", "shoulder", ', "joint shoulder is nearer to the base than elbow"),
-    ("arm.toml", r"amplitude_rad = \[0.5, ", "amplitude_rad = [", "motion.amplitude_rad (=2 numbers) must have 3"),
-    ("arm.toml", r"amplitude_rad = \[0.5", "amplitude_rad = [1.2", "with [motion], shoulder.toml: trajectory"),
+    ("arm.toml", r"amplitude_rad = \[0.6, ", "amplitude_rad = [", "motion.amplitude_rad (=2 numbers) must have 3"),
+    ("arm.toml", r"amplitude_rad = \[0.6", "amplitude_rad = [1.2", "with [motion], shoulder.toml: trajectory"),
     ("arm.toml", r"payload_kg", "payload", "arm.payload is not a known key: did you mean payload_kg"),
     ("arm.toml", r'feed_forward = "whole"', 'feed_forward = "all"', "arm.feed_forward (=all) must be"),
     ("arm.toml", r"motor_inertia_kgm2 = \[.*?\]", "", "arm.motor_inertia_kgm2 must be given"),

@@ -99,6 +99,27 @@ def test_one_joint_is_the_joint_that_stands_alone() -> None:
     assert states[0].joint_position_rad == pytest.approx(alone[0].joint_position_rad, abs=1e-6)
 
 
+def test_one_flexible_joint_is_the_joint_that_stands_alone() -> None:
+    """The motor of a flexible joint is no part of the link, which the reducer moves."""
+    links = new_pendulum()
+    links[0].inertia_kgm2[5], links[0].motor_inertia_kgm2 = 0.8, 0.0
+    settings: dict[str, Any] = {
+        "friction_kind": FrictionKind.LUGRE, "inertia_kgm2": 2.0, "flexible": True, "motor_side_inertia_kgm2": 1.2,
+        "reducer_stiffness_Nmprad": 1.3e4, "hysteresis_width_rad": 2e-4, "link_friction_share": 0.1,
+    }  # fmt: skip
+    constants, states, arm = free_arm(links, **settings)
+    arm.constants[0].gravity_mps2[:] = [0.0, 0.0, -9.81]
+    alone_c, alone = plant(step_s=STEP_s, gravity_Nm=0.5 * 9.81, **settings)
+    for k in range(20_000):
+        torque = 40.0 * np.sin(2e-3 * k)
+        arm.joints.target_Nm[0] = torque
+        step_arm(constants, states, arm)
+        step_plant(alone_c[0], alone[0], torque)
+    assert abs(alone[0].joint_position_rad) > 0.005
+    assert states[0].joint_position_rad == pytest.approx(alone[0].joint_position_rad, abs=2e-6)
+    assert states[0].motor_position_rad == pytest.approx(alone[0].motor_position_rad, abs=2e-6)
+
+
 def new_pendulum() -> Any:
     """m g l = 0.5 g, 2 kg m2 in all; hanging down at angle 0."""
     links = chain(1, 1)

@@ -1,0 +1,124 @@
+"""An arm in a session: what is shown of all joints, the memory of the loop joint by joint, logs that are kept."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jointctl.drivers.canopen.cyclic import CanopenPort
+from jointctl.drivers.drive import CommissioningReport, DriveIdentity
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.cycle import Word
+from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
+from jointctl.tools.recording.run_log import INFO, Event, remove_oldest
+from jointctl.tools.session.canopen_drive import require_one_bus
+from jointctl.tools.session.display import JointDisplay, OnlyShows
+from jointctl.tools.session.loop_handle import RING_RECORDS, SharedBlock
+from jointctl.tools.session.plan import resolve_arm
+
+NAMES = ["shoulder", "elbow", "wrist"]
+
+
+@pytest.fixture(scope="module")
+def arm() -> ArmConfig:
+    return load_arm(SHIPPED_ARM)
+
+
+def report(start_rad: float) -> CommissioningReport:
+    return CommissioningReport(DriveIdentity("", "", "", ""), "cst", start_rad, 0.1, 1e-5)
+
+
+def test_the_envelope_names_every_joint_and_their_common_approach(arm: ArmConfig) -> None:
+    plan = resolve_arm(arm)
+    placed = plan.placed([report(start) for start in (0.1, 0.2, -0.3)])
+    text = "\n".join(placed.lines)
+    assert re.findall(r"--- (\w+) \(", text) == NAMES
+    assert re.findall(r"now at +(\S+) rad", text) == ["+0.1000", "+0.2000", "-0.3000"]
+    shown = {float(seconds) for seconds in re.findall(r"approach .* in (\S+) s", text)}
+    assert len(shown) == 1
+    approaches = placed.constants.sequence.approach_s
+    assert np.all(approaches == approaches[0])  # what is shown is what the loop gets
+    assert round(float(approaches[0]), 1) in shown
+    assert [float(start) for start in placed.constants.sequence.start_rad] == [0.1, 0.2, -0.3]
+
+
+def test_each_joint_has_a_log_of_its_own(arm: ArmConfig) -> None:
+    plan = resolve_arm(arm)
+    assert [joint.name for joint in plan.joints] == NAMES
+    assert [joint.log_path.name.split(".")[1:] for joint in plan.joints] == [[name, "mcap"] for name in NAMES]
+    assert plan.tables.shape[::2] == (3, 5)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("bus", "channel", "other"), "must be jointctl:virtual0"), (("drive", "heartbeat_s", 0.3), "must be 0.2"),
+        (("drive", "master_node", 99), "one heartbeat for all joints"),
+    ],
+)  # fmt: skip
+def test_joints_that_one_loop_cannot_command_are_refused(arm: ArmConfig, change: Any, words: str) -> None:
+    section, key, value = change
+    joints = list(arm.joints)
+    require_one_bus(joints)
+    joints[2] = joints[2].model_copy(
+        update={section: getattr(joints[2], section).model_copy(update={key: value})}
+    )  # fmt: skip
+    with pytest.raises(ConfigurationError, match=words) as caught:
+        require_one_bus(joints)
+    assert "wrist.toml" in str(caught.value)
+
+
+@pytest.mark.parametrize("cycles", [0, 1, 7, RING_RECORDS // 3 - 1, RING_RECORDS // 3 + 5, RING_RECORDS])
+def test_each_joint_sees_its_own_records_and_how_many_it_lost(cycles: int) -> None:
+    block = SharedBlock.create(1, CanopenPort, 3)
+    try:
+        for record in range(max(0, 3 * cycles - RING_RECORDS), 3 * cycles):
+            block.ring[record % RING_RECORDS].cycle = record // 3
+            block.ring[record % RING_RECORDS].phase = record % 3
+        block.words[Word.HEAD] = 3 * cycles
+        for axis in range(3):
+            records, lost = block.of_axis(axis).new_records(0, 3 * cycles)
+            assert lost + len(records) == cycles
+            assert list(records.cycle) == list(range(lost, cycles))
+            assert set(records.phase) <= {axis}
+            assert lost <= max(0, cycles - RING_RECORDS // 3) + 1
+    finally:
+        os.close(block.fd)
+
+
+def test_of_an_arms_display_each_joint_has_its_name_and_the_first_one_the_phase() -> None:
+    said: list[str] = []
+
+    class Lines(OnlyShows):
+        note = phase = said.append
+
+        def event(self, event: Event) -> None:
+            said.append(event.text)
+
+    for number, name in enumerate(NAMES[:2]):
+        shown = JointDisplay(Lines(), name, first=number == 0)  # type: ignore[arg-type]
+        shown.phase("tracking")
+        shown.note("a remark")
+        shown.event(Event(0, INFO, "loop", "an event"))
+    assert said == ["tracking", "shoulder: a remark", "shoulder: an event", "elbow: a remark", "elbow: an event"]
+
+
+def test_of_an_arm_the_newest_logs_of_each_joint_are_kept(arm: ArmConfig, tmp_path: Path) -> None:
+    config = arm.joints[0]
+    config = config.model_copy(update={"log": config.log.model_copy(update={"keep": 2})})
+    for minute in range(3):
+        for name in NAMES:
+            for ending in ("mcap", "png"):
+                path = tmp_path / f"arm-20260101-00{minute:02}00.{name}.{ending}"
+                path.touch()
+                os.utime(path, (minute, minute))
+    (tmp_path / "shoulder-20260101-000000.mcap").touch()  # of the joint alone
+    removed = remove_oldest(config, tmp_path / "arm-20260101-000300.shoulder.mcap")
+    assert sorted(path.name for path in removed) == [
+        f"arm-20260101-00{minute:02}00.shoulder.{ending}" for minute in range(2) for ending in ("mcap", "png")
+    ]  # fmt: skip
