@@ -169,7 +169,7 @@ def test_an_exception_sends_controlword_0_and_a_sync_once(
 ) -> None:
     """On a dead bus it is still the exception."""
     bus = DriveBus()
-    step_axis = cycle.step_axis
+    command_axis = cycle.command_axis
     frames_before = []
 
     def failing(*arguments: Any) -> None:
@@ -177,13 +177,13 @@ def test_an_exception_sends_controlword_0_and_a_sync_once(
             frames_before.append(len(bus.sent))
             bus.on_send = on_send
             raise MemoryError("no more")
-        step_axis(*arguments)
+        command_axis(*arguments)
 
     def on_send(bus: DriveBus, identifier: int) -> None:
         if dead:
             raise can.CanOperationError("bus off")
 
-    monkeypatch.setattr(cycle, "step_axis", failing)
+    monkeypatch.setattr(cycle, "command_axis", failing)
     with pytest.raises(MemoryError, match="no more"):
         run(bus, block)
     assert bus.sent[frames_before[0] :] == ([] if dead else [(RPDO, bytes(4)), (SYNC, b"")])
