@@ -41,6 +41,7 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.held_back = 0
     state.sample_count = 0
     state.sample_age_cycles = 0
+    state.gap_cycles = 0
     state.saturated_cycles = 0
     state.still_cycles = 0
     state.frozen_samples = 0
