@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from jointctl.verbs import (
         check,
         doctor,
+        excite,
         fault_campaign,
         identify,
         identify_motion,
@@ -65,6 +66,7 @@ __all__ = [
     "__version__",
     "check",
     "doctor",
+    "excite",
     "fault_campaign",
     "identify",
     "identify_motion",

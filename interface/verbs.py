@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from jointctl.tools.recording.run_log_reader import RunLog
     from jointctl.tools.session.result import RunResult
     from jointctl.tools.verbs.check import LoopCheck
+    from jointctl.tools.verbs.excite import ExciteResult
     from jointctl.tools.verbs.paper import PaperResult
     from jointctl.tools.verbs.sweep import SweepResult
     from jointctl.tools.verbs.validate import Validation
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 run: Callable[..., RunResult | None]
 check: Callable[..., LoopCheck]
 sweep: Callable[..., SweepResult | None]
+excite: Callable[..., ExciteResult | None]
 validate: Callable[..., Validation]
 report: Callable[..., Path]
 study: Callable[..., StudyResult]

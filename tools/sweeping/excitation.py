@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -39,6 +39,9 @@ from jointctl.tools.sweeping.plan import (
     require_torque,
     shifted,
 )
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 CANDIDATES = 60
 STROKES_SHARE = (0.4, 0.7)  # of the duration; the rest are sines
@@ -284,7 +287,7 @@ class ExcitePass:
         ]
 
 
-def excitation_figure(design: Design, title: str) -> Any:
+def excitation_figure(design: Design, title: str) -> Figure:
     """The motion over time, and which speeds it visits under which torque."""
     found = design.samples
     time_s = np.arange(len(found.position_rad)) * _SAMPLE_s

@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from jointctl.drivers.errors import ConfigurationError
@@ -26,7 +27,7 @@ def with_ripple(folder: Path, *, base: str = "precise", **values: Any) -> Path:
 
 def test_the_sines_reach_the_law_in_its_units(tmp_path: Path) -> None:
     config = load_config(with_ripple(tmp_path))
-    series = axis_constants(config, [[0.0] * 5])[0].law.flexible.torque_ripple
+    series = axis_constants(config, np.zeros((1, 5)))[0].law.flexible.torque_ripple
     assert series.count == 2
     assert list(series.amplitude[:2]) == [0.5, 0.3]
     assert list(series.turns_prad[:2]) == pytest.approx([121.0 * order / math.tau for order in (2.0, 10.0)])
