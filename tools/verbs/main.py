@@ -29,6 +29,7 @@ from jointctl.tools.verbs.new import new
 from jointctl.tools.verbs.paper import paper
 from jointctl.tools.verbs.params import params_app
 from jointctl.tools.verbs.report import report
+from jointctl.tools.verbs.response import response
 from jointctl.tools.verbs.run import run
 from jointctl.tools.verbs.scan import scan
 from jointctl.tools.verbs.scope import scope
@@ -77,7 +78,7 @@ for _panel, _verbs in (
     (BEGIN, (demo, new, zero, hil, doctor)),
     (MOVE, (run, stop, clear_fault, check)),
     (INSPECT, (scan, info, monitor)),
-    (FRICTION, (sweep, identify, validate, map_verb)),
+    (FRICTION, (sweep, identify, validate, map_verb, response)),
     (LOOK, (report, scope)),
     (COMPARE, (paper, study_verb, fault_campaign)),
 ):

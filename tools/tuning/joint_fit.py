@@ -1,0 +1,228 @@
+"""Rigid or two-mass model of a joint, fitted to its frequency response with delay and lag of the current loop.
+
+Both are `linear_loop`'s sampled joint, exact for every delay; a rigid one is the motor's mass alone.  Least squares of
+the relative error of every line, weighted by its interval, with a soft loss, from several starts.  The model with two
+masses is taken where the data tell it from the rigid one (Bayes' information criterion).  Intervals are those of the
+linearised fit, as wide as its residuals say.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import OptimizeResult, least_squares
+from scipy.stats import t as student
+
+from jointctl.drivers.errors import DataError
+from jointctl.firmware_py.states import Encoders
+from jointctl.tools.analysis.linear_loop import TwoMasses, sampled_joint
+from jointctl.tools.tuning.frequency_response import GOOD_COHERENCE, LEVEL, Channel, ComplexArray, FrequencyResponse
+
+LEAST_RELATIVE = 0.02  # of a line: what no model describes
+WORST_RELATIVE = 0.7  # of its interval: such a line says nothing
+LEAST_LINES = 12
+SOFT = 1.5  # residuals beyond so many deviations count less
+DAMPING_SHARE = 0.04  # of the critical damping, where a fit begins
+START_RATIOS = (0.4, 1.2, 3.5)  # link over motor
+START_RESONANCES_Hz = (10.0, 15.0, 20.0, 27.0, 36.0, 50.0, 70.0)
+STARTS = 3  # of them, the best ones, are followed
+SLACK = 1e-5  # relative, of the search
+BETTER = 10.0  # by which the criterion must be less
+LATEST_s = 0.012  # of delay and of lag, at most
+_NO_LINK = 1.0  # kg m^2 of a link that no spring holds
+_VALUES = ("inertia_kgm2", "link_kgm2", "resonance_Hz", "stiffness_Nmprad", "damping_Nmspr", "friction_Nmspr",
+           "delay_s", "lag_s", "late_s")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value with the half width of its interval of 95 %."""
+
+    value: float
+    half: float
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """What was found; `link_kgm2`, `resonance_Hz`, `stiffness_Nmprad`, `damping_Nmspr` are 0 of a rigid joint."""
+
+    flexible: bool
+    values: dict[str, Estimate]
+    period_s: float
+    rms: float  # of the relative error over the lines that were used
+    lines: int
+    criterion: float  # by which the chosen model is better than the other one
+
+    def __getattr__(self, name: str) -> Estimate:
+        try:
+            return self.__dict__["values"][name]  # type: ignore[no-any-return]
+        except KeyError:
+            raise AttributeError(name) from None
+
+    def joint(self) -> TwoMasses:
+        """As the loop's analysis takes it."""
+        link = self.link_kgm2.value
+        viscous = self.friction_Nmspr.value
+        if not self.flexible:
+            return TwoMasses(self.inertia_kgm2.value, _NO_LINK, 0.0, 0.0, (0.0, 0.0), (viscous, 0.0))
+        return TwoMasses(
+            self.inertia_kgm2.value - link, link, self.stiffness_Nmprad.value, self.damping_Nmspr.value, (0.0, 0.0),
+            (viscous, 0.0),
+        )  # fmt: skip
+
+    def response(self, frequency_Hz: np.ndarray, side: str) -> ComplexArray:
+        """Of the model, at the motor or the link."""
+        return _response(self.joint(), self.delay_s.value, self.lag_s.value, self.period_s, frequency_Hz)[
+            side if self.flexible else "motor"
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "model": "two masses" if self.flexible else "rigid",
+            "values": {name: {"value": one.value, "half": one.half} for name, one in self.values.items()},
+            "period_s": self.period_s, "rms": self.rms, "lines": self.lines, "criterion": self.criterion,
+        }  # fmt: skip
+
+
+def fit_from_dict(found: dict[str, Any]) -> JointFit:
+    """What `to_dict` made."""
+    values = {name: Estimate(one["value"], one["half"]) for name, one in found["values"].items()}
+    return JointFit(
+        found["model"] == "two masses", values, found["period_s"], found["rms"], found["lines"], found["criterion"]
+    )
+
+
+def _response(
+    joint: TwoMasses, delay_s: float, lag_s: float, period_s: float, frequency_Hz: np.ndarray
+) -> dict[str, ComplexArray]:
+    z = np.exp(1j * math.tau * frequency_Hz * period_s)
+    both = sampled_joint(period_s, delay_s, lag_s, joint, Encoders.BOTH).response(z)
+    return {"link": both[:, 0, 0], "motor": both[:, 1, 0]}
+
+
+@dataclass(frozen=True)
+class _Data:
+    frequency_Hz: np.ndarray
+    measured: ComplexArray
+    sigma: np.ndarray
+    side: str
+
+
+def _used(found: FrequencyResponse) -> list[_Data]:
+    """Lines of either encoder that say something."""
+    parts = []
+    for side in ("motor", "link"):
+        channel: Channel | None = getattr(found, side)
+        if channel is None:
+            continue
+        good = (channel.half < WORST_RELATIVE) & (channel.coherence > 0.5 * GOOD_COHERENCE)
+        sigma = np.hypot(0.5 * channel.half[good], LEAST_RELATIVE)
+        parts.append(_Data(found.frequency_Hz[good], channel.response[good], sigma, side))
+    if sum(len(part.sigma) for part in parts) < LEAST_LINES:
+        lines = sum(len(part.sigma) for part in parts)
+        raise DataError(
+            f"lines with coherence (={lines}) must be at least {LEAST_LINES} for a model of the joint",
+            "more torque (--torque), or a longer response (--legs)",
+        )
+    return parts
+
+
+class _Model:
+    """Parameters are logarithms but for the friction: (J, delay, lag, B) and (link / motor, resonance, damping)."""
+
+    def __init__(self, parts: list[_Data], period_s: float, flexible: bool) -> None:
+        self.parts, self.period_s, self.flexible = parts, period_s, flexible
+        self.count = 2 * sum(len(part.sigma) for part in parts)
+
+    def joint(self, x: np.ndarray) -> TwoMasses:
+        inertia, viscous = math.exp(x[0]), x[3]
+        if not self.flexible:
+            return TwoMasses(inertia, _NO_LINK, 0.0, 0.0, (0.0, 0.0), (viscous, 0.0))
+        ratio = math.exp(x[4])
+        motor, link = inertia / (1.0 + ratio), inertia * ratio / (1.0 + ratio)
+        reduced = motor * link / inertia
+        omega = math.tau * math.exp(x[5])
+        damping = 2.0 * math.exp(x[6]) * omega * reduced
+        return TwoMasses(motor, link, omega * omega * reduced, damping, (0.0, 0.0), (viscous, 0.0))
+
+    def residuals(self, x: np.ndarray) -> NDArray[np.float64]:
+        joint, late = self.joint(x), (math.exp(x[1]), math.exp(x[2]))
+        rows = []
+        for part in self.parts:
+            side = part.side if self.flexible else "motor"
+            model = _response(joint, *late, self.period_s, part.frequency_Hz)[side]
+            off = np.log(model / part.measured) / part.sigma
+            rows += [off.real, off.imag]
+        return np.concatenate(rows)
+
+    def fitted(self, start: list[float]) -> OptimizeResult:
+        low = [-12.0, math.log(1e-5), math.log(1e-5), -1e3]
+        high = [12.0, math.log(LATEST_s), math.log(LATEST_s), 1e4]
+        if self.flexible:
+            low, high = [*low, math.log(0.02), math.log(2.0), math.log(1e-3)], [*high, math.log(50.0), 8.0, 0.0]
+        return least_squares(
+            self.residuals, start, bounds=(low, high), loss="soft_l1", f_scale=SOFT,
+            x_scale=[1.0, 1.0, 1.0, 10.0] + [1.0] * (3 if self.flexible else 0), max_nfev=60, ftol=SLACK, xtol=SLACK,
+        )  # fmt: skip
+
+    def criterion(self, found: OptimizeResult) -> float:
+        """Bayes' information criterion of a soft loss, in units of its own noise."""
+        return self.count * math.log(2.0 * found.cost / self.count) + len(found.x) * math.log(self.count)
+
+    def named(self, x: np.ndarray) -> np.ndarray:
+        """The values of `_VALUES`."""
+        joint, delay, lag = self.joint(x), math.exp(x[1]), math.exp(x[2])
+        if self.flexible:
+            whole = joint.motor_kgm2 + joint.link_kgm2
+            parts = [whole, joint.link_kgm2, joint.resonance_Hz, joint.stiffness_Nmprad, joint.damping_Nmspr]
+        else:
+            parts = [joint.motor_kgm2, 0.0, 0.0, 0.0, 0.0]
+        return np.array([*parts, x[3], delay, lag, delay + lag])
+
+
+def fit_joint(found: FrequencyResponse, inertia_kgm2: float) -> JointFit:
+    """The model that the data choose; `inertia_kgm2` is where the search begins.  `DataError` with too few lines."""
+    parts = _used(found)
+    begin = [math.log(inertia_kgm2), math.log(0.0015), math.log(0.0005), 5.0]
+    rigid = _Model(parts, found.period_s, False)
+    one = min((rigid.fitted([begin[0] + step, *begin[1:]]) for step in (-0.5, 0.5)), key=lambda fit: fit.cost)
+    soft = _Model(parts, found.period_s, True)
+    inertia = float(np.clip(one.x[0], -3.0 + begin[0], 3.0 + begin[0]))
+    starts = [
+        [inertia, *begin[1:], math.log(ratio), math.log(resonance), math.log(DAMPING_SHARE)]
+        for ratio in START_RATIOS
+        for resonance in START_RESONANCES_Hz
+    ]
+    starts.sort(key=lambda start: float(np.sum(np.abs(soft.residuals(np.array(start))))))
+    two = min((soft.fitted(start) for start in starts[:STARTS]), key=lambda fit: fit.cost)
+    better = rigid.criterion(one) - soft.criterion(two)
+    highest = max(float(part.frequency_Hz[-1]) for part in parts)
+    flexible = better > BETTER and soft.joint(two.x).resonance_Hz < highest
+    model, best = (soft, two) if flexible else (rigid, one)
+    relative = [part.sigma for part in parts]
+    weighted = model.residuals(best.x) * np.concatenate([np.concatenate((s, s)) for s in relative])
+    return JointFit(
+        flexible, _intervals(model, best), found.period_s, float(np.sqrt(np.mean(weighted**2))), model.count // 2,
+        abs(better),
+    )  # fmt: skip
+
+
+def _intervals(model: _Model, best: OptimizeResult) -> dict[str, Estimate]:
+    free = max(model.count - len(best.x), 1)
+    residuals = model.residuals(best.x)
+    # of the bulk: what the soft loss leaves aside is no noise of the fit
+    scale = max(1.4826 * float(np.median(np.abs(residuals))), 0.5) ** 2
+    cov = np.linalg.pinv(best.jac.T @ best.jac) * scale
+    width = float(student.ppf(0.5 + 0.5 * LEVEL, free))
+    centre = model.named(best.x)
+    slopes = np.empty((len(centre), len(best.x)))
+    for k in range(len(best.x)):
+        step = np.zeros(len(best.x))
+        step[k] = 1e-4
+        slopes[:, k] = (model.named(best.x + step) - model.named(best.x - step)) / 2e-4
+    half = width * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", slopes, cov, slopes), 0.0))
+    return {name: Estimate(float(v), float(h)) for name, v, h in zip(_VALUES, centre, half, strict=True)}

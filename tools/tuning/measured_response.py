@@ -1,0 +1,90 @@
+"""The frequency response as a command measures it: short stages that begin small and grow, then the whole one.
+
+A stage with more torque follows while the coherence is low and the torque is not yet the largest allowed one.  It ends
+where the joint answers a greater torque with more than its share, which is what a loop on its way to a limit cycle
+does; limit cycles themselves, and encoders that disagree, end a run as they end every other one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jointctl.drivers.errors import MotionFault, UsageError
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.tuning.carry_out import Carrier
+from jointctl.tools.tuning.excitation import (
+    LEAST_SHARE,
+    Multisine,
+    ResponseMotion,
+    ResponsePlan,
+    config_of_response,
+    largest_peak_Nm,
+    legs_of,
+    multisine,
+    speed_and_period,
+)
+from jointctl.tools.tuning.frequency_response import FrequencyResponse, grown, response_of
+from jointctl.tools.tuning.tune_options import ResponseOptions
+
+LEAST_LEGS, MOST_LEGS = 8, 100
+STAGE_PAIRS = 2  # of legs in a stage that only looks for the torque
+GROWTH = 2.0  # of the torque from stage to stage
+ENOUGH_COHERENCE = 0.98  # median over the lines
+RESONANCE_GROWTH = 2.5  # of a line from stage to stage
+
+
+@dataclass(frozen=True)
+class ResponseTask:
+    """What is to be measured, resolved before anything moves; `config` is that of `config_of_response`."""
+
+    config: Config
+    sine: Multisine
+    pairs: int
+    largest_Nm: float
+
+    def motion(self, peak_Nm: float, pairs: int) -> ResponseMotion:
+        plan = ResponsePlan(legs_of(self.config, pairs), self.sine, peak_Nm)
+        return ResponseMotion(self.config, plan, self.largest_Nm)
+
+
+def response_task(config: Config, options: ResponseOptions) -> ResponseTask:
+    """`UsageError` where the options or the limits do not fit."""
+    if not LEAST_LEGS <= options.legs <= MOST_LEGS:
+        raise UsageError(f"--legs (={options.legs}) must be in [{LEAST_LEGS}..{MOST_LEGS}]")
+    moving = config_of_response(config, options.torque_Nm)
+    _, length_s = speed_and_period(moving)
+    return ResponseTask(moving, multisine(moving.loop.rate_Hz, length_s), options.legs // 2, largest_peak_Nm(moving))
+
+
+def measured_response(task: ResponseTask, carrier: Carrier) -> FrequencyResponse:
+    """All stages; faults as `Carrier.run` has them."""
+    peak_Nm, before = LEAST_SHARE * task.largest_Nm, None
+    while peak_Nm < task.largest_Nm:
+        found = _stage(task, carrier, peak_Nm, STAGE_PAIRS)
+        carrier.output.note(f"  {peak_Nm:.2f} Nm: coherence {found.coherence:.3f}")
+        if before is not None:
+            _refuse_growth(before, found)
+        if found.coherence >= ENOUGH_COHERENCE and peak_Nm >= 0.5 * task.largest_Nm:
+            break
+        peak_Nm, before = GROWTH * peak_Nm, found
+    found = _stage(task, carrier, min(peak_Nm, task.largest_Nm), task.pairs)
+    carrier.output.note(f"  {found.peak_Nm:.2f} Nm: coherence {found.coherence:.3f}, {found.legs} legs")
+    if before is not None:
+        _refuse_growth(before, found)
+    return found
+
+
+def _refuse_growth(before: FrequencyResponse, after: FrequencyResponse) -> None:
+    factor = grown(before, after)
+    if factor > RESONANCE_GROWTH:
+        raise MotionFault(
+            f"the joint answers {after.peak_Nm:.2g} Nm with {factor:.1f} times its share of what it does at "
+            f"{before.peak_Nm:.2g} Nm: a resonance grows",
+            "less torque: --torque",
+        )
+
+
+def _stage(task: ResponseTask, carrier: Carrier, peak_Nm: float, pairs: int) -> FrequencyResponse:
+    motion = task.motion(peak_Nm, pairs)
+    carried = carrier.run(task.config, motion, f"{task.config.path.stem}: response, {peak_Nm:.2f} Nm")
+    return response_of(task.config, motion.plan, carried.records)

@@ -1,0 +1,114 @@
+"""`jointctl response CONFIG`: frequency response of a joint, and the model with one or two masses that fits it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.table import Column, Table
+
+from jointctl.drivers.errors import INTERRUPTED, DataError
+from jointctl.tools.output import Output
+from jointctl.tools.tuning.tune_options import ResponseOptions
+from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOnBus, VerbOutput, Yes
+
+if TYPE_CHECKING:
+    from jointctl.tools.configuration.config import Config
+    from jointctl.tools.tuning.frequency_response import FrequencyResponse
+    from jointctl.tools.tuning.joint_fit import JointFit
+
+ROWS = (
+    ("inertia_kgm2", "total inertia [kg m^2]", 1.0, ""),
+    ("link_kgm2", "link inertia [kg m^2]", 1.0, ""),
+    ("resonance_Hz", "resonance [Hz]", 1.0, "of a small motion"),
+    ("stiffness_Nmprad", "stiffness [Nm/rad]", 1.0, "of a small motion"),
+    ("damping_Nmspr", "damping of the reducer [Nm s/rad]", 1.0, ""),
+    ("friction_Nmspr", "slope of the friction [Nm s/rad]", 1.0, "at the speed of the triangle"),
+    ("late_s", "delay and lag together [ms]", 1e3, "from a position sample to its torque"),
+    ("delay_s", "of it delay [ms]", 1e3, ""),
+    ("lag_s", "of it lag of the current [ms]", 1e3, ""),
+)  # fmt: skip
+
+
+def response(
+    config: JointOnBus,
+    output: VerbOutput,
+    *,
+    options: ResponseOptions = ResponseOptions(),
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="JSON file with the response and the fit (CONFIG.response.json)")
+    ] = None,
+    figure: Annotated[Path | None, typer.Option("--figure", help="PNG with the Bode plot (CONFIG.response.png)")] = None,
+    assume_yes: Yes = False,
+    dry_run: DryRun = False,
+    allow_low_margin: AllowLowMargin = False,
+) -> int:
+    """Frequency response by a multisine on a slow triangle in torque; inertias, resonance, stiffness, delay and lag."""
+    import contextlib
+
+    from jointctl.tools.drawing import require_png, save_png
+    from jointctl.tools.session.consent import TerminalConsent, require_terminal
+    from jointctl.tools.session.control import in_control
+    from jointctl.tools.session.result import never_begun
+    from jointctl.tools.tuning.carry_out import Carrier, NotCarriedOut
+    from jointctl.tools.tuning.frequency_response import bode_figure
+    from jointctl.tools.tuning.joint_fit import fit_joint
+    from jointctl.tools.tuning.measured_response import measured_response, response_task
+    from jointctl.tools.written_file import replace_file, require_target
+
+    picture, file = figure or Path(f"{config.path.stem}.response.png"), out or Path(f"{config.path.stem}.response.json")
+    if file.suffix != ".json":
+        raise DataError(f"-o (={file}) must end in .json")
+    require_png(picture, [config.path])
+    require_target(file, [config.path])
+    task = response_task(config, options)
+    if not (assume_yes or dry_run or options.lockstep):
+        require_terminal()
+    consent = TerminalConsent(output, assume_yes=assume_yes or options.lockstep, dry_run=dry_run)
+    with contextlib.ExitStack() as stack:
+        control = None if options.lockstep else stack.enter_context(in_control(task.config, output))
+        try:
+            found = measured_response(task, Carrier(output, consent, control, allow_low_margin))
+        except NotCarriedOut as ended:
+            if ended.stopped_by:
+                output.note(f"stopped by {ended.stopped_by}; no response")
+                return INTERRUPTED
+            return never_begun(ended.drive_state, output, dry_run=dry_run)
+    replace_file(file, json.dumps(found.to_dict(), indent=1).encode())
+    output.note(f"written: {file}")
+    save_png(bode_figure(found, f"{config.path.stem}: frequency response"), picture)
+    fit = fit_joint(found, config.joint.inertia_kgm2)
+    save_png(bode_figure(found, f"{config.path.stem}: frequency response", fit), picture)
+    replace_file(file, json.dumps({**found.to_dict(), "fit": fit.to_dict()}, indent=1).encode())
+    output.result(fit_table(config, found, fit), {**found.to_dict(), "fit": fit.to_dict()}, (found, fit))
+    output.note(f"written: {picture}")
+    return 0
+
+
+def fit_table(config: Config, found: FrequencyResponse, fit: JointFit) -> Table:
+    """What was found beside what the configuration says."""
+    table = Table(
+        "quantity", *(Column(name, justify="right") for name in ("found", "+-", "configured")), "",
+        title=f"{'Two masses' if fit.flexible else 'Rigid joint'}, {found.legs} legs, {found.peak_Nm:.2f} Nm, "
+        f"coherence {found.coherence:.3f}",
+        caption="+-: intervals of 95 %, of the fit alone", title_justify="left", caption_justify="left",
+    )  # fmt: skip
+    reducer, margin = config.reducer, config.margin
+    link = None if reducer is None else config.joint.inertia_kgm2 - reducer.motor_inertia_kgm2
+    known = {
+        "inertia_kgm2": config.joint.inertia_kgm2, "link_kgm2": link, "lag_s": margin.current_lag_s,
+        "delay_s": margin.loop_delay_s,
+        "stiffness_Nmprad": None if reducer is None else reducer.loop_stiffness_Nmprad or reducer.stiffness_Nmprad,
+    }  # fmt: skip
+    for name, label, scale, remark in ROWS:
+        one = fit.values[name]
+        if not fit.flexible and name in ("link_kgm2", "resonance_Hz", "stiffness_Nmprad", "damping_Nmspr"):
+            continue
+        configured = known.get(name)
+        table.add_row(
+            label, f"{scale * one.value:.4g}", f"{scale * one.half:.2g}",
+            "" if configured is None else f"{scale * configured:.4g}", remark,
+        )  # fmt: skip
+    return table
