@@ -6,7 +6,8 @@ simulated time as well.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from jointctl.drivers.drive import CommissioningReport
@@ -55,6 +56,10 @@ class Carrier:
     control: Control | None
     allow_low_margin: bool = False
     drive_state: str = ""
+
+    def quietly(self) -> Output:
+        """For a part whose result is not that of the command."""
+        return replace(self.output, quiet=True, json=False, taken=lambda _: None)
 
     def run(self, config: Config, motion: Motion, title: str, *, also_faults: bool = False) -> Carried:
         """The records; `MotionFault` after a fault unless `also_faults`, `NotCarriedOut` where it was not begun."""
@@ -107,3 +112,11 @@ class Carrier:
 def one_line_of(error: JointctlError) -> str:
     """The message with its advice, for a report."""
     return f"{error.message}; {error.hint}" if error.hint else error.message
+
+
+class ShownConsent(TerminalConsent):
+    """One yes for all motions of a command; the envelope of each is shown all the same."""
+
+    def show(self, lines: Sequence[str]) -> None:
+        for line in lines:
+            self._output.note(f"  {line}") if self._given else self._output.fact(line)

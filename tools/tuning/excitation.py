@@ -204,9 +204,15 @@ def config_of_response(config: Config, torque_Nm: float | None) -> Config:
     if torque_Nm is not None and torque_Nm < limits.torque_max_Nm:
         update["limits"] = limits.model_copy(update={"torque_max_Nm": torque_Nm})
         update["drive"] = config.drive.free_of_torque_limit()
-    if config.joint_encoder is not None and config.encoder.side == "motor":
-        update["joint_encoder"] = config.joint_encoder.model_copy(update={"law": "encoder"})
-    return config.model_copy(update=update)
+    return motor_fed(config.model_copy(update=update))
+
+
+def motor_fed(config: Config) -> Config:
+    """The configuration with a law that reads the motor's encoder, where there is one beside the link's."""
+    second = config.joint_encoder
+    if second is None or config.encoder.side != "motor":
+        return config
+    return config.model_copy(update={"joint_encoder": second.model_copy(update={"law": "encoder"})})
 
 
 @dataclass(frozen=True)
@@ -258,4 +264,3 @@ class ResponseMotion:
             limits_line(config.limits),
             *remark_lines(report.remarks),
         ]
-

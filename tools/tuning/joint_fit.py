@@ -32,6 +32,7 @@ START_RESONANCES_Hz = (10.0, 15.0, 20.0, 27.0, 36.0, 50.0, 70.0)
 STARTS = 3  # of them, the best ones, are followed
 SLACK = 1e-5  # relative, of the search
 BETTER = 10.0  # by which the criterion must be less
+USUAL_LAG_s, LAG_SPREAD = 0.0005, 0.7  # a lag's logarithm: the data tell its sum with the delay, hardly the two apart
 LATEST_s = 0.012  # of delay and of lag, at most
 _NO_LINK = 1.0  # kg m^2 of a link that no spring holds
 _VALUES = ("inertia_kgm2", "link_kgm2", "resonance_Hz", "stiffness_Nmprad", "damping_Nmspr", "friction_Nmspr",
@@ -151,7 +152,7 @@ class _Model:
 
     def residuals(self, x: np.ndarray) -> NDArray[np.float64]:
         joint, late = self.joint(x), (math.exp(x[1]), math.exp(x[2]))
-        rows = []
+        rows = [np.array([(x[2] - math.log(USUAL_LAG_s)) / LAG_SPREAD])]
         for part in self.parts:
             side = part.side if self.flexible else "motor"
             model = _response(joint, *late, self.period_s, part.frequency_Hz)[side]
@@ -204,7 +205,7 @@ def fit_joint(found: FrequencyResponse, inertia_kgm2: float) -> JointFit:
     flexible = better > BETTER and soft.joint(two.x).resonance_Hz < highest
     model, best = (soft, two) if flexible else (rigid, one)
     relative = [part.sigma for part in parts]
-    weighted = model.residuals(best.x) * np.concatenate([np.concatenate((s, s)) for s in relative])
+    weighted = model.residuals(best.x)[1:] * np.concatenate([np.concatenate((s, s)) for s in relative])
     return JointFit(
         flexible, _intervals(model, best), found.period_s, float(np.sqrt(np.mean(weighted**2))), model.count // 2,
         abs(better),

@@ -8,6 +8,7 @@ does; limit cycles themselves, and encoders that disagree, end a run as they end
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from jointctl.drivers.errors import MotionFault, UsageError
 from jointctl.tools.configuration.config import Config
@@ -56,22 +57,22 @@ def response_task(config: Config, options: ResponseOptions) -> ResponseTask:
     return ResponseTask(moving, multisine(moving.loop.rate_Hz, length_s), options.legs // 2, largest_peak_Nm(moving))
 
 
-def measured_response(task: ResponseTask, carrier: Carrier) -> FrequencyResponse:
-    """All stages; faults as `Carrier.run` has them."""
+def measured_response(task: ResponseTask, carrier: Carrier) -> tuple[FrequencyResponse, Any, ResponsePlan]:
+    """All stages; (response, records, plan) of the last one.  Faults as `Carrier.run` has them."""
     peak_Nm, before = LEAST_SHARE * task.largest_Nm, None
     while peak_Nm < task.largest_Nm:
-        found = _stage(task, carrier, peak_Nm, STAGE_PAIRS)
+        found, *_ = _stage(task, carrier, peak_Nm, STAGE_PAIRS)
         carrier.output.note(f"  {peak_Nm:.2f} Nm: coherence {found.coherence:.3f}")
         if before is not None:
             _refuse_growth(before, found)
         if found.coherence >= ENOUGH_COHERENCE and peak_Nm >= 0.5 * task.largest_Nm:
             break
         peak_Nm, before = GROWTH * peak_Nm, found
-    found = _stage(task, carrier, min(peak_Nm, task.largest_Nm), task.pairs)
+    found, records, plan = _stage(task, carrier, min(peak_Nm, task.largest_Nm), task.pairs)
     carrier.output.note(f"  {found.peak_Nm:.2f} Nm: coherence {found.coherence:.3f}, {found.legs} legs")
     if before is not None:
         _refuse_growth(before, found)
-    return found
+    return found, records, plan
 
 
 def _refuse_growth(before: FrequencyResponse, after: FrequencyResponse) -> None:
@@ -84,7 +85,9 @@ def _refuse_growth(before: FrequencyResponse, after: FrequencyResponse) -> None:
         )
 
 
-def _stage(task: ResponseTask, carrier: Carrier, peak_Nm: float, pairs: int) -> FrequencyResponse:
+def _stage(
+    task: ResponseTask, carrier: Carrier, peak_Nm: float, pairs: int
+) -> tuple[FrequencyResponse, Any, ResponsePlan]:
     motion = task.motion(peak_Nm, pairs)
     carried = carrier.run(task.config, motion, f"{task.config.path.stem}: response, {peak_Nm:.2f} Nm")
-    return response_of(task.config, motion.plan, carried.records)
+    return response_of(task.config, motion.plan, carried.records), carried.records, motion.plan

@@ -37,6 +37,7 @@ from jointctl.tools.verbs.start import never_refuse_a_character, occupy_standard
 from jointctl.tools.verbs.stop import stop
 from jointctl.tools.verbs.study import study_verb
 from jointctl.tools.verbs.sweep import sweep
+from jointctl.tools.verbs.tune import tune
 from jointctl.tools.verbs.validate import validate
 from jointctl.tools.verbs.verb_options import BEGIN, COMPARE, FRICTION, INSPECT, LOOK, MOVE, Verb, Verbs, grouped
 from jointctl.tools.verbs.zero import zero
@@ -76,7 +77,7 @@ def callback(
 
 for _panel, _verbs in (
     (BEGIN, (demo, new, zero, hil, doctor)),
-    (MOVE, (run, stop, clear_fault, check)),
+    (MOVE, (run, stop, clear_fault, check, tune)),
     (INSPECT, (scan, info, monitor)),
     (FRICTION, (sweep, identify, validate, map_verb, response)),
     (LOOK, (report, scope)),

@@ -10,7 +10,6 @@ import typer
 from rich.table import Column, Table
 
 from jointctl.drivers.errors import INTERRUPTED, DataError
-from jointctl.tools.output import Output
 from jointctl.tools.tuning.tune_options import ResponseOptions
 from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOnBus, VerbOutput, Yes
 
@@ -40,7 +39,9 @@ def response(
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="JSON file with the response and the fit (CONFIG.response.json)")
     ] = None,
-    figure: Annotated[Path | None, typer.Option("--figure", help="PNG with the Bode plot (CONFIG.response.png)")] = None,
+    figure: Annotated[
+        Path | None, typer.Option("--figure", help="PNG with the Bode plot (CONFIG.response.png)")
+    ] = None,
     assume_yes: Yes = False,
     dry_run: DryRun = False,
     allow_low_margin: AllowLowMargin = False,
@@ -70,7 +71,7 @@ def response(
     with contextlib.ExitStack() as stack:
         control = None if options.lockstep else stack.enter_context(in_control(task.config, output))
         try:
-            found = measured_response(task, Carrier(output, consent, control, allow_low_margin))
+            found, *_ = measured_response(task, Carrier(output, consent, control, allow_low_margin))
         except NotCarriedOut as ended:
             if ended.stopped_by:
                 output.note(f"stopped by {ended.stopped_by}; no response")

@@ -1,0 +1,129 @@
+"""What a tune has found, put into a configuration: the one in use, and the file, whose comments stay.
+
+The virtual joint is described relative to what its configuration believes.  A better belief must not move the joint
+itself, so that [virtual] then says what it is: `inertia_scale` follows, and the friction is kept as [virtual.friction].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.sections import Reducer
+from jointctl.tools.tuning.joint_fit import Estimate, JointFit
+
+MARK = "# tuned by jointctl: "
+SMALL_MOTION = 1.6  # stiffness of a small motion over that under a steady torque: hysteresis, 1.4 to 1.84
+CRITICAL_SHARE = 0.04  # of the critical damping: what is more is hysteresis, which a small motion does not have
+DIGITS = 5
+
+
+@dataclass(frozen=True)
+class Found:
+    """One value of the configuration with where it comes from."""
+
+    section: tuple[str, ...]
+    key: str
+    value: Any
+    source: str  # with the interval
+
+
+def rounded(value: float) -> float:
+    return float(f"{value:.{DIGITS}g}")
+
+
+def values_of_fit(config: Config, fit: JointFit, source: str) -> list[Found]:
+    """Inertia, delay, lag, and of a soft reducer its inertias, stiffness and damping."""
+
+    def found(section: str, key: str, one: Estimate, value: float | None = None) -> Found:
+        number = rounded(one.value if value is None else value)
+        return Found((section,), key, number, f"{number:g} +- {one.half:.2g}, {source}")
+
+    values = [
+        found("joint", "inertia_kgm2", fit.inertia_kgm2),
+        found("margin", "loop_delay_s", fit.delay_s, max(fit.delay_s.value, 0.0)),
+        found("margin", "current_lag_s", fit.lag_s, max(fit.lag_s.value, 0.0)),
+    ]
+    if not fit.flexible:
+        return values
+    joint = fit.joint()
+    values.append(found("reducer", "motor_inertia_kgm2", fit.link_kgm2, joint.motor_kgm2))
+    values.append(found("reducer", "loop_stiffness_Nmprad", fit.stiffness_Nmprad))
+    if config.reducer is None:
+        steady = rounded(fit.stiffness_Nmprad.value / SMALL_MOTION)
+        remark = f"{steady:g}, loop_stiffness_Nmprad / {SMALL_MOTION:g}: not measured"
+        values.append(Found(("reducer",), "stiffness_Nmprad", steady, remark))
+    reduced = joint.motor_kgm2 * joint.link_kgm2 / (joint.motor_kgm2 + joint.link_kgm2)
+    damping = min(joint.damping_Nmspr, CRITICAL_SHARE * 2.0 * (joint.stiffness_Nmprad * reduced) ** 0.5)
+    values.append(found("reducer", "damping_Nmspr", fit.damping_Nmspr, damping))
+    return values
+
+
+def with_values(config: Config, values: list[Found]) -> Config:
+    """The configuration in use with these values; the virtual joint stays what it was."""
+    sections: dict[str, dict[str, Any]] = {}
+    for one in values:
+        sections.setdefault(one.section[0], {})[one.key] = one.value
+    update: dict[str, Any] = {}
+    for name, keys in sections.items():
+        own = getattr(config, name)
+        if own is None and name == "reducer":
+            update[name] = Reducer(**keys)
+        else:
+            update[name] = own.model_copy(update=keys)
+    return _same_plant(config, config.model_copy(update=update))
+
+
+def _same_plant(before: Config, after: Config) -> Config:
+    virtual = before.virtual
+    if virtual is None:
+        return after
+    scale = virtual.inertia_scale * before.joint.inertia_kgm2 / after.joint.inertia_kgm2
+    kept = {"inertia_scale": scale, "friction": virtual.friction or before.friction}
+    return after.model_copy(update={"virtual": virtual.model_copy(update=kept)})
+
+
+def with_friction(config: Config, section: Mapping[str, Any]) -> Config:
+    """The configuration in use with the friction that was identified; what it knew of bristles stays."""
+    from jointctl.tools.configuration.sections import Friction
+
+    lugre = config.friction.lugre if config.friction is not None else None
+    return _same_plant(
+        config, config.model_copy(update={"friction": Friction.model_validate({**section, "lugre": lugre})})
+    )
+
+
+def with_tuned(text: str, values: list[Found], sources: Mapping[str, list[str]]) -> str:
+    """`text` with these values; a comment under the heading of each section says where they come from.
+
+    Sections that are not there are added at the end.  Comments stay, but those of an earlier tune.
+    """
+    kept = "".join(line for line in text.splitlines(keepends=True) if not line.startswith(MARK))
+    newline = "\r\n" if "\r\n" in kept else "\n"
+    try:
+        document = tomlkit.parse(kept)
+    except TOMLKitError as error:
+        raise ConfigurationError(f"not valid TOML: {error}") from None
+    for one in values:
+        table: Any = document
+        for name in one.section:
+            if name not in table:
+                table[name] = tomlkit.table()
+            table = table[name]
+        if one.value is None:
+            table.pop(one.key, None)
+        elif not (one.key in table and table[one.key] == one.value):
+            table[one.key] = list(one.value) if isinstance(one.value, tuple) else one.value
+    lines: list[str] = []
+    for line in tomlkit.dumps(document).splitlines(keepends=True):
+        lines.append(line if line.endswith("\n") else line + newline)
+        heading = line.split("#")[0].strip()
+        if heading.startswith("[") and heading.endswith("]"):
+            lines += [MARK + source + newline for source in sources.get(heading[1:-1].strip(), ())]
+    return "".join(lines)

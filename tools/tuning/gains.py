@@ -1,0 +1,382 @@
+"""Gains for an identified joint: the least modelled error of tracking that keeps the margins wherever the joint may be.
+
+    phase margin >= 35 deg, gain margin >= 2, |S| <= 2      inertias, stiffness at the ends of their intervals, delay
+                                                            and lag at the late end, link at both ends of the payload
+    phase margin >= margin.min_phase_margin_deg             every joint of the gate of `run`
+    torque noise of the encoders' counts <= a share of limits.torque_max_Nm
+
+The error is that after a step of friction, |G S / w| over all frequencies.  Nelder and Mead from several starts over
+kv, the observer's bandwidth (or the network's q) and the velocity filter; kp follows from kv.  A goal that is missed
+costs in proportion, so that the result of a joint that does not allow all of them is the nearest one, and says so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.states import Encoders
+from jointctl.tools.analysis.flexible_gains import KP_OF_KV, LARGEST_OBSERVER_radps
+from jointctl.tools.analysis.linear_loop import (
+    Array,
+    ComplexArray,
+    LinearLoop,
+    LoopSettings,
+    TwoMasses,
+    linear_loop,
+    sampled_joint,
+)
+from jointctl.tools.analysis.loop_settings import loop_settings, two_masses
+from jointctl.tools.analysis.margins import OBSERVING, cases, learning_convergence
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.control_section import Control, Learning
+from jointctl.tools.configuration.conversions import joint_rad_per_count, law_resolution_rad
+from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, canvas
+from jointctl.tools.experiments.controllers import from_file, paper_control
+from jointctl.tools.tuning.joint_fit import JointFit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PHASE_MARGIN_deg, GAIN_MARGIN, SENSITIVITY = 35.0, 2.0, 2.0
+NOISE_SHARES = {"tracking": 0.03, "settling": 0.03, "quiet": 0.03}  # of limits.torque_max_Nm
+QUIET_ERROR = 2.0  # times the least error: what a quiet loop may have
+PENALTY = 30.0  # for each share by which a goal is missed
+UNSTABLE = 1e3
+LEAST_INERTIA_SHARE = 0.03  # by which an inertia may be wrong however narrow its interval: friction is no viscous one
+LEAST_STIFFNESS_SHARE = 0.1
+LEAST_LATE_s = 0.1e-3
+HIGHEST_CUTOFF = 0.45  # of the velocity filter, of loop.rate_Hz
+LEARNING_FACTOR = 0.9  # of a repetition, at most
+_LOWEST_Hz, _POINTS, _EVALUATIONS = 0.3, 240, 90
+
+
+@dataclass(frozen=True)
+class Law:
+    """A law to choose: the [control] that it starts from, and what the search turns."""
+
+    name: str
+    control: Callable[[], Control]
+    keys: tuple[str, ...]  # of LoopSettings, positive
+    starts: tuple[tuple[float, ...], ...]
+    kp_of_kv: float
+
+    most_observer_radps: float = math.inf
+
+    def beyond(self, settings: LoopSettings) -> float:
+        """Share by which the observer is quicker than this law bears on a joint a little different from the model."""
+        return max(settings.observer_radps / self.most_observer_radps - 1.0, 0.0)
+
+    def settings(self, settings: LoopSettings, logarithms: Array) -> LoopSettings:
+        """With these values, to three digits."""
+        values: dict[str, Any] = {
+            key: float(f"{math.exp(x):.3g}") for key, x in zip(self.keys, logarithms, strict=True)
+        }
+        if "cutoff_Hz" in values:
+            values["cutoff_Hz"] = min(values["cutoff_Hz"], float(f"{HIGHEST_CUTOFF / settings.period_s:.3g}"))
+        values["kp"] = float(f"{self.kp_of_kv * values['kv'] ** 2:.3g}")
+        if "q" in values:
+            values["q"] = (values["q"], values["q"])
+        return replace(settings, **values)
+
+
+LAWS = {
+    "precise": Law(
+        "precise", lambda: from_file("precise").control, ("kv", "observer_radps", "cutoff_Hz"),
+        ((120.0, 60.0, 200.0), (60.0, 40.0, 150.0), (25.0, 20.0, 100.0)), 0.25,
+    ),
+    "paper": Law(
+        "paper", paper_control, ("kv", "q"), ((56.0, 1800.0), (40.0, 600.0), (20.0, 200.0)), 0.25,
+    ),
+    "two_encoders": Law(
+        "two_encoders", lambda: from_file("realistic").control, ("kv", "observer_radps"),
+        ((20.0, 80.0), (12.0, 50.0), (6.0, 25.0)), KP_OF_KV, LARGEST_OBSERVER_radps,
+    ),
+}  # fmt: skip
+
+
+def chosen_law(config: Config, fit: JointFit, wanted: str) -> Law:
+    """`wanted` "auto": both encoders where the reducer is soft and there are two, else the precise one."""
+    both = config.joint_encoder is not None and config.encoder.side == "motor"
+    if wanted == "auto":
+        wanted = "two_encoders" if fit.flexible and both else "precise"
+    if wanted == "two_encoders" and not (fit.flexible and both):
+        raise ConfigurationError(
+            f"{config.path}: --law (=two_encoders) needs [joint_encoder] beside an encoder on the motor, and a joint "
+            "whose reducer is seen to be soft"
+        )
+    return LAWS[wanted]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One choice of gains; margins are those of the worst joint in the intervals."""
+
+    settings: LoopSettings
+    error: float  # of tracking, in any unit
+    phase_margin_deg: float
+    gain_margin: float
+    sensitivity: float
+    noise_Nm: float
+    gate_deg: float  # least phase margin of the joints of the gate
+    settling_s: float  # slowest mode of the joint as it is believed
+
+    @property
+    def stable(self) -> bool:
+        return self.error < UNSTABLE
+
+
+@dataclass(frozen=True)
+class Goals:
+    noise_Nm: float
+    gate_deg: float
+
+    def missed(self, one: Judged) -> dict[str, float]:
+        """By what share each goal is missed; empty if none is."""
+        shares = {
+            f"phase margin {one.phase_margin_deg:.1f} of {PHASE_MARGIN_deg:g} deg":
+                1.0 - one.phase_margin_deg / PHASE_MARGIN_deg,
+            f"gain margin {one.gain_margin:.2f} of {GAIN_MARGIN:g}": 1.0 - one.gain_margin / GAIN_MARGIN,
+            f"|S| {one.sensitivity:.2f}, {SENSITIVITY:g} at most": one.sensitivity / SENSITIVITY - 1.0,
+            f"torque noise {one.noise_Nm:.2f} Nm, {self.noise_Nm:.2g} at most": one.noise_Nm / self.noise_Nm - 1.0,
+            f"phase margin of the gate {one.gate_deg:.1f} of {self.gate_deg:g} deg":
+                1.0 - one.gate_deg / self.gate_deg if self.gate_deg > 0.0 else 0.0,
+        }  # fmt: skip
+        return {name: share for name, share in shares.items() if share > 1e-3}
+
+
+@dataclass(frozen=True)
+class ChosenGains:
+    """What the search found, and everything it tried."""
+
+    law: str
+    objective: str
+    best: Judged
+    missed: dict[str, float]
+    tried: tuple[Judged, ...]
+    goals: Goals
+    control: Control
+
+    def missed_by(self, one: Judged) -> dict[str, float]:
+        return self.goals.missed(one)
+
+    def with_gains(self, one: Judged) -> Control:
+        """[control] with the gains of another choice."""
+        update = _changes(one.settings, LAWS[self.law])
+        learning = _converging(one.settings, self.control.learning)
+        return self.control.model_copy(update={**update, "learning": learning})
+
+
+def identified_joints(config: Config, fit: JointFit) -> list[float | TwoMasses]:
+    """The joint as it is believed, first, then at the ends of its intervals and of the payload."""
+    inertia = max(fit.inertia_kgm2.half / fit.inertia_kgm2.value, LEAST_INERTIA_SHARE)
+    payload = sorted({1.0, *config.margin.payload_range})
+    ends = (1.0, 1.0 - inertia, 1.0 + inertia)
+    if config.reducer is None:
+        factors = [p * end for p in payload for end in ends] if _payload_given(config) else list(ends)
+        return [config.joint.inertia_kgm2 * factor for factor in (1.0, *factors)]
+    stiffness = max(fit.stiffness_Nmprad.half / fit.stiffness_Nmprad.value, LEAST_STIFFNESS_SHARE)
+    link = max(fit.link_kgm2.half / fit.link_kgm2.value, LEAST_INERTIA_SHARE)
+    believed = two_masses(config, config.reducer, 1.0, 1.0, False)
+    found = [believed, *(replace(believed, motor_kgm2=end * believed.motor_kgm2) for end in ends[1:])]
+    for p in payload:
+        for factor in (1.0 - link, 1.0 + link):
+            for k in (1.0 - stiffness, 1.0 + stiffness):
+                found.append(two_masses(config, config.reducer, p * factor, k, False))
+    return list(found)
+
+
+def _payload_given(config: Config) -> bool:
+    """Whether the file names a payload: the automatic range is that of a link behind a soft reducer."""
+    return "payload_range" in config.margin.model_fields_set
+
+
+class _Search:
+    def __init__(self, config: Config, law: Law, fit: JointFit, settings: LoopSettings) -> None:
+        self.law, self.nominal = law, settings
+        self.tried: list[Judged] = []
+        period_s = self.nominal.period_s
+        self._omega = np.geomspace(math.tau * _LOWEST_Hz, math.pi / period_s, _POINTS)
+        self._z = np.exp(1j * self._omega * period_s)
+        # the late end of delay and lag for all of them
+        late_s = settings.delay_s + max(fit.late_s.half, LEAST_LATE_s)
+        self._joints = [
+            sampled_joint(period_s, late_s, settings.lag_s, joint, settings.encoders)
+            for joint in identified_joints(config, fit)
+        ]
+        self._of_goals = len(self._joints)
+        self._joints += [linear_loop(case).joint for case in cases(settings)]
+        self._responses = [joint.response(self._z) for joint in self._joints]
+        counts = [law_resolution_rad(config), abs(joint_rad_per_count(config))]
+        two = self.nominal.encoders == Encoders.BOTH
+        self._count_rad = np.array(counts if two else counts[:1])
+
+    def judged(self, logarithms: Array) -> Judged:
+        settings = self.law.settings(self.nominal, logarithms)
+        found = self._judge(settings)
+        self.tried.append(found)
+        return found
+
+    def _judge(self, settings: LoopSettings) -> Judged:
+        controller = linear_loop(settings).controller
+        law = controller.response(self._z)
+        margins: list[tuple[float, float, float]] = []
+        settling = 0.0
+        for number, (joint, response) in enumerate(zip(self._joints, self._responses, strict=True)):
+            radius = float(np.max(np.abs(LinearLoop(settings, joint, controller).closed_loop_poles())))
+            if radius >= 1.0:
+                return Judged(settings, UNSTABLE * radius, 0.0, 1.0, UNSTABLE, 0.0, 0.0, math.inf)
+            settling = -settings.period_s / math.log(radius) if number == 0 else settling
+            margins.append(_margins(-(law @ response)[:, 0, 0]))
+        response = self._responses[0]
+        sensitivity = 1.0 / (1.0 - (law @ response)[:, 0, 0])
+        error = response[:, 0, 0] * sensitivity / self._omega
+        noise = np.abs(law[:, 0, :] * sensitivity[:, None]) ** 2 @ (self._count_rad**2 / 12.0)
+        phases, gains, peaks = zip(*margins[: self._of_goals], strict=True)
+        return Judged(
+            settings, math.sqrt(np.trapezoid(np.abs(error) ** 2, self._omega)), min(phases), min(gains), max(peaks),
+            math.sqrt(np.trapezoid(noise, self._omega) * settings.period_s / math.pi),
+            min((phase for phase, _, _ in margins[self._of_goals :]), default=90.0), settling,
+        )  # fmt: skip
+
+
+def _margins(open_loop: ComplexArray) -> tuple[float, float, float]:
+    """(phase margin [deg], gain margin in either direction, largest |S|) on the grid of frequencies."""
+    logarithm = np.log(np.abs(open_loop))
+    i = np.flatnonzero((logarithm[:-1] > 0.0) != (logarithm[1:] > 0.0))
+    share = logarithm[i] / (logarithm[i] - logarithm[i + 1])
+    crossing = (1.0 - share) * open_loop[i] + share * open_loop[i + 1]
+    phase = float(np.degrees(np.min(np.abs(np.angle(-crossing)), initial=math.pi)))
+    imaginary, real = open_loop.imag, open_loop.real
+    i = np.flatnonzero((imaginary[:-1] > 0.0) != (imaginary[1:] > 0.0))
+    share = imaginary[i] / (imaginary[i] - imaginary[i + 1])
+    where = (1.0 - share) * real[i] + share * real[i + 1]
+    size = np.abs(where[where < 0.0])
+    gain = float(np.min(np.maximum(size, 1.0 / size), initial=math.inf))
+    return phase, gain, float(np.max(1.0 / np.abs(1.0 + open_loop)))
+
+
+def choose_gains(config: Config, fit: JointFit, wanted: str = "auto", objective: str = "tracking") -> ChosenGains:
+    """For a configuration that holds what was identified; some seconds."""
+    law = chosen_law(config, fit, wanted)
+    control = _control(config, law.control())
+    ready = config.model_copy(update={"control": control})
+    settings, _ = loop_settings(ready)
+    goals = Goals(NOISE_SHARES[objective] * config.limits.torque_max_Nm, config.margin.min_phase_margin_deg)
+    search = _Search(ready, law, fit, settings)
+
+    def cost(one: Judged, least_error: float | None) -> float:
+        if not one.stable:
+            return 100.0 + math.log(one.error)
+        missed = PENALTY * (sum(goals.missed(one).values()) + law.beyond(one.settings))
+        if objective == "settling":
+            return math.log(one.settling_s) + 0.2 * math.log(one.error) + missed
+        if least_error is not None:
+            return (
+                math.log(one.noise_Nm) + PENALTY * max(math.log(one.error / (QUIET_ERROR * least_error)), 0.0) + missed
+            )
+        return math.log(one.error) + missed
+
+    def best_of(least_error: float | None) -> Judged:
+        for start in law.starts:
+            x = np.log(start)
+            minimize(
+                lambda x: cost(search.judged(x), least_error), x, method="Nelder-Mead",
+                options={
+                    "maxfev": _EVALUATIONS, "xatol": 0.01, "fatol": 0.01,
+                    "initial_simplex": x + 0.3 * np.vstack((np.zeros(len(x)), -np.eye(len(x)))),
+                },
+            )  # fmt: skip
+        return min(search.tried, key=lambda one: cost(one, least_error))
+
+    best = best_of(None)
+    if objective == "quiet" and best.stable:
+        best = best_of(best.error)
+    chosen = control.model_copy(update=_changes(best.settings, law))
+    return ChosenGains(
+        law.name, objective, best, goals.missed(best), tuple(search.tried), goals,
+        chosen.model_copy(update={"learning": _converging(best.settings, chosen.learning)}),
+    )  # fmt: skip
+
+
+def _control(config: Config, control: Control) -> Control:
+    """The law's own [control] for this joint: what is late, and the friction that is known."""
+    late_s = (config.margin.loop_delay_s or 0.0) + config.margin.current_lag_s
+    feed_forward = control.feed_forward
+    if config.friction is None:
+        feed_forward = "none"
+    elif config.friction.lugre is None and feed_forward == "lugre_desired":
+        feed_forward = "desired"
+    update: dict[str, Any] = {
+        "feed_forward": feed_forward, "feed_forward_lead_s": 0.0 if feed_forward == "none" else round(late_s, 6),
+        "adaptation": None,
+    }  # fmt: skip
+    if control.kind in ("computed_torque_observer", "flexible_joint"):
+        update["observer_delay_cycles"] = min(max(round(late_s * config.loop.rate_Hz), 1), 15)
+        update["learning"] = control.learning or config.control.learning
+    return control.model_copy(update=update)
+
+
+def _changes(settings: LoopSettings, law: Law) -> dict[str, Any]:
+    """Keys of [control]."""
+    named: dict[str, Any] = {"kp": settings.kp, "kv": settings.kv}
+    if "observer_radps" in law.keys:
+        named["observer_radps"] = settings.observer_radps
+    if "cutoff_Hz" in law.keys:
+        named["velocity_cutoff_Hz"] = settings.cutoff_Hz
+    if "q" in law.keys:
+        named["lyapunov_q"] = settings.q
+    return named
+
+
+def _converging(settings: LoopSettings, learning: Learning | None) -> Learning | None:
+    """Learning that converges on every joint of the intervals: its gain from the error is lowered, then its gain."""
+    if learning is None or settings.kind not in OBSERVING:
+        return None
+    for _ in range(8):
+        if learning_convergence(settings, learning).worst_factor <= LEARNING_FACTOR:
+            return learning
+        learning = learning.model_copy(
+            update={"error_gain_ps2": 0.5 * learning.error_gain_ps2, "gain": 0.8 * learning.gain}
+        )
+    return None
+
+
+# --- the picture ---
+
+
+def trade_off_figure(found: ChosenGains, title: str) -> Figure:
+    """Error against phase margin of everything that was tried; what meets all goals is blue, the chosen point orange."""
+    stable = [one for one in found.tried if one.stable]
+    with canvas(4.2, title) as figure:
+        axis = figure.subplots()
+        for colour, label, chosen in (
+            (GREY, "misses a goal", [one for one in stable if not _meets(one)]),
+            (BLUE, "margins met", [one for one in stable if _meets(one)]),
+            (ORANGE, "chosen", [found.best]),
+        ):
+            size = 60 if label == "chosen" else 10
+            axis.scatter(
+                [one.phase_margin_deg for one in chosen], [one.error / found.best.error for one in chosen], s=size,
+                color=colour, label=label, zorder=3 if label == "chosen" else 2,
+            )  # fmt: skip
+        axis.axvline(PHASE_MARGIN_deg, color=RED, linewidth=0.8)
+        axis.set_yscale("log")
+        axis.set_ylim(0.3, 30.0)
+        axis.set_xmargin(0.03)
+        axis.set_xlabel("phase margin of the worst joint in the intervals [deg]")
+        axis.set_ylabel("modelled error / that of the chosen point")
+        axis.legend()
+        return figure
+
+
+def _meets(one: Judged) -> bool:
+    return (
+        one.phase_margin_deg >= PHASE_MARGIN_deg and one.gain_margin >= GAIN_MARGIN and one.sensitivity <= SENSITIVITY
+    )

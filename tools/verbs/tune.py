@@ -1,0 +1,69 @@
+"""`jointctl tune CONFIG`: the joint commissions itself, from its direction to gains that keep their margins."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jointctl.drivers.errors import INTERRUPTED, ConfigurationError, UsageError
+from jointctl.tools.tuning.tune_options import TuneOptions
+from jointctl.tools.verbs.verb_options import DryRun, JointOnBus, VerbOutput, Yes
+
+LAWS, OBJECTIVES = ("auto", "paper", "precise", "two_encoders"), ("tracking", "settling", "quiet")
+
+
+def tune(
+    config: JointOnBus,
+    output: VerbOutput,
+    *,
+    options: TuneOptions = TuneOptions(),
+    folder: Annotated[
+        Path | None, typer.Option("--folder", help="for what each step leaves, and the report (CONFIG.tune)")
+    ] = None,
+    assume_yes: Yes = False,
+    dry_run: DryRun = False,
+) -> int:
+    """Identify the joint and choose its gains: about 7 minutes of motion; writes CONFIG and a report, asks once.
+
+    Direction, frequency response, gravity, friction, map of the reducer, gains, a run to verify them.  An aborted tune
+    leaves the file as it was.
+    """
+    from jointctl.tools.configuration.config import SHIPPED_FOLDER
+    from jointctl.tools.session.consent import require_terminal
+    from jointctl.tools.session.control import in_control
+    from jointctl.tools.session.result import never_begun
+    from jointctl.tools.tuning.carry_out import Carrier, NotCarriedOut, ShownConsent
+    from jointctl.tools.verbs.tune_steps import Tune
+
+    for name, value, known in (("--law", options.law, LAWS), ("--objective", options.objective, OBJECTIVES)):
+        if value not in known:
+            raise UsageError(f"{name} (={value}) must be one of {', '.join(known)}")
+    if config.path.resolve().is_relative_to(SHIPPED_FOLDER):
+        raise ConfigurationError(
+            f"{config.path.name} is a shipped configuration and is not changed",
+            f"`jointctl new mine.toml --from {config.path.stem}` makes it yours",
+        )
+    if not (assume_yes or dry_run or options.lockstep):
+        require_terminal()
+    consent = ShownConsent(output, assume_yes=assume_yes or options.lockstep, dry_run=dry_run)
+    with contextlib.ExitStack() as stack:
+        carrier = Carrier(output, consent, None)
+        job = Tune(config, options, carrier, folder or config.path.with_suffix(".tune"))
+        consent.show(job.envelope())
+        if not (dry_run or consent.agreed(())):
+            return never_begun("", output)
+        if not options.lockstep:
+            carrier.control = stack.enter_context(in_control(job.config, output))
+        try:
+            return job.run()
+        except NotCarriedOut as ended:
+            if ended.stopped_by:
+                output.note(f"stopped by {ended.stopped_by}; {config.path} is as it was; --resume goes on")
+                return INTERRUPTED
+            return never_begun(ended.drive_state, output, dry_run=dry_run)
+        except KeyboardInterrupt:
+            output.note(f"interrupted; nothing moves any more; {config.path} is as it was; --resume goes on")
+            return INTERRUPTED

@@ -1,0 +1,518 @@
+"""The steps of `tune`, one after the other: each leaves its data in the folder of the tune and can be resumed from.
+
+The order differs from that of a commissioning by hand in one place: the frequency response comes before the friction,
+because its weak law needs neither the inertia nor the friction, and every law after it does.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Column, Table
+
+from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MarginError, MotionFault, UsageError
+from jointctl.firmware_py.input_file import read_input
+from jointctl.firmware_py.states import AxisPhase
+from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.margin_gate import require_margin
+from jointctl.tools.analysis.margins import Margins, margins
+from jointctl.tools.analysis.reducer_map import FoundMap, found_map, map_figure
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.control_section import Control
+from jointctl.tools.configuration.conversions import period_s, static_friction_Nm
+from jointctl.tools.configuration.load import load_config
+from jointctl.tools.configuration.records import trajectory_table
+from jointctl.tools.configuration.sections import ReducerMap
+from jointctl.tools.identification.friction_data import read_friction_data
+from jointctl.tools.identification.identification import Options, identify_friction
+from jointctl.tools.identification.identification_report import section_values
+from jointctl.tools.identification.swarm import SwarmSettings
+from jointctl.tools.inspection.health import PROBLEM
+from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check, make_plan, motion_findings
+from jointctl.tools.recording.report_page import Paragraph, Section, from_terminal, svg_figure, write_verb_page
+from jointctl.tools.session.plan import ConfiguredMotion
+from jointctl.tools.sweeping.options import SweepOptions
+from jointctl.tools.tuning.carry_out import Carrier
+from jointctl.tools.tuning.excitation import motor_fed
+from jointctl.tools.tuning.found_values import Found, rounded, values_of_fit, with_friction, with_tuned, with_values
+from jointctl.tools.tuning.frequency_response import FrequencyResponse, bode_figure, from_dict
+from jointctl.tools.tuning.gains import ChosenGains, choose_gains, trade_off_figure
+from jointctl.tools.tuning.gravity import gravity_of
+from jointctl.tools.tuning.joint_fit import JointFit, fit_from_dict, fit_joint
+from jointctl.tools.tuning.measured_response import measured_response, response_task
+from jointctl.tools.tuning.tune_options import ResponseOptions, TuneOptions
+from jointctl.tools.verbs.map import MapOptions, config_of_map, map_run
+from jointctl.tools.verbs.response import fit_table
+from jointctl.tools.verbs.sweep import Sweep
+from jointctl.tools.written_file import replace_file
+
+STEPS = ("direction", "response", "gravity", "friction", "map", "gains", "verification")
+STATE = "steps.json"
+STRONGER = 2.0  # of the check of the direction, as long as the joint stands still
+SWEEP_POINTS, SWEEP_RATIO, SWEEP_DWELL_s, WARM_UP_TURNS = 36, 100.0, 0.5, 0.1
+SWARM = SwarmSettings(particles=300, iterations=1500)
+VERIFY_s, VERIFY_FROM_s = 30.0, 5.0
+REFINE_RUNS = 4
+REFINE_BETTER = 0.97  # of the error: less is noise of the measurement
+REFINE_APART = 0.15  # share by which gains that are tried must differ
+
+
+@dataclass
+class Tune:
+    """One tune of one joint; `config` is the one in use, which each step improves."""
+
+    original: Config
+    options: TuneOptions
+    carrier: Carrier
+    folder: Path
+    config: Config = field(init=False)
+    state: dict[str, Any] = field(init=False, default_factory=dict)  # results by step, as JSON holds them
+    fit: JointFit | None = field(init=False, default=None)
+    response: FrequencyResponse | None = field(init=False, default=None)
+    found_map: FoundMap | None = field(init=False, default=None)
+    gains: ChosenGains | None = field(init=False, default=None)
+
+    def __post_init__(self) -> None:
+        limits, torque_Nm = self.original.limits, self.options.torque_Nm
+        self.config = self.original
+        if torque_Nm is not None:
+            if not 0.0 < torque_Nm <= limits.torque_max_Nm:
+                raise UsageError(
+                    f"--torque (={torque_Nm:g}) must be in (0..{limits.torque_max_Nm:g}], limits.torque_max_Nm"
+                )
+            self.config = self.config.model_copy(
+                update={
+                    "limits": limits.model_copy(update={"torque_max_Nm": torque_Nm}),
+                    "drive": self.config.drive.free_of_torque_limit(),
+                }
+            )
+        response_task(self.config, self._response_options())  # what does not fit is refused before anything moves
+
+    # --- what it will do ---
+
+    def envelope(self) -> list[str]:
+        """Every motion, in its order."""
+        limits, output = self.config.limits, self.config.path
+        low, high = limits.position_min_rad, limits.position_max_rad
+        task = response_task(self.config, self._response_options())
+        inside = f"{low:+.3f} .. {high:+.3f} rad"
+        trajectory = self.config.trajectory.kind
+        return [
+            f"tune       {output}, law {self.options.law}, objective {self.options.objective}",
+            "direction  a soft spring pulls the joint a little to both sides, with more torque while it stands",
+            f"response   triangle at 0.2 rad/s within {inside}, multisine of up to {task.largest_Nm:.1f} Nm, 2 minutes",
+            f"friction   plateaus of constant speed within {inside}, up to {0.9 * limits.velocity_max_radps:.2f} rad/s, "
+            "about 4 minutes",
+            "map        once back and forth at 0.03 rad/s, where the reducer is soft",
+            f"verify     {trajectory} of the configuration, {VERIFY_s:.0f} s, before and after",
+            f"limits     {inside}, {limits.velocity_max_radps:.2f} rad/s, {limits.torque_max_Nm:.1f} Nm in every step; "
+            "keep the joint free and unloaded, a hand on the emergency stop",
+        ]
+
+    def _response_options(self) -> ResponseOptions:
+        return ResponseOptions(lockstep=self.options.lockstep)
+
+    # --- the chain ---
+
+    def run(self) -> int:
+        """All steps that are not done yet; then the file and the report."""
+        text = read_input(self.original.path).decode("utf-8-sig")
+        self._open(hashlib.sha256(text.encode()).hexdigest())
+        for name in STEPS:
+            step: Callable[[], Any] = getattr(self, f"_step_{name}")
+            done = name in self.state
+            self.carrier.output.note(f"{name}: {'done before' if done else ''}")
+            try:
+                if not done:
+                    self.state[name] = step()
+                    self._save()
+                getattr(self, f"_take_{name}", lambda _: None)(self.state[name])
+            except JointctlError as error:
+                kept = f"{self.original.path} is as it was, {self.folder} has the steps before"
+                raise type(error)(f"{name}: {error.message}; {kept}", error.hint) from None
+        if self.options.refine:
+            self._refine()
+        self._write(text)
+        return 0
+
+    def _open(self, digest: str) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        path = self.folder / STATE
+        about = {"configuration": digest, "torque_Nm": self.config.limits.torque_max_Nm}
+        if self.options.resume:
+            try:
+                kept = json.loads(path.read_text())
+            except (OSError, ValueError) as error:
+                raise DataError(f"{path}: cannot be read: {error}", "without --resume it begins anew") from None
+            if kept.get("about") != about:
+                raise DataError(
+                    f"{path}: is of another configuration or torque than {self.original.path}",
+                    "without --resume it begins anew",
+                )
+            self.state = {name: kept[name] for name in STEPS if name in kept}
+        self._about = about
+
+    def _save(self) -> None:
+        replace_file(self.folder / STATE, json.dumps({"about": self._about, **self.state}, indent=1).encode())
+
+    # --- 1. direction and counts ---
+
+    def _step_direction(self) -> list[dict[str, Any]]:
+        """As `doctor --motion`, with twice the torque while the joint stands still."""
+        config = motor_fed(self.config)  # a loop over the link is the one that a soft reducer makes unstable
+        torque_Nm = make_plan(config, None).torque_Nm
+        while True:
+            plan = make_plan(config, min(torque_Nm, config.limits.torque_max_Nm))
+            inner = config_of_check(config, plan)
+            carried = self.carrier.run(inner, CheckMotion(inner, plan), "direction", also_faults=True)
+            findings = list(motion_findings(config, plan, carried.records, carried.fault, carried.text))
+            bad = [finding for finding in findings if finding.status == PROBLEM]
+            stands = any(finding.topic == "motion" for finding in bad)
+            if not (stands and plan.torque_Nm < self.config.limits.torque_max_Nm):
+                break
+            torque_Nm = STRONGER * plan.torque_Nm
+        if bad:
+            raise MotionFault(bad[0].text, bad[0].remedy)
+        for finding in findings:
+            self.carrier.output.note(f"  {finding.topic}: {finding.text}")
+        return [asdict(finding) for finding in findings]
+
+    # --- 2. frequency response and the model that fits it ---
+
+    def _step_response(self) -> dict[str, Any]:
+        # a friction that may be wrong by any factor is no help to the weak law
+        control = self.config.control.model_copy(update={"feed_forward": "none"})
+        config = self.config.model_copy(update={"control": control})
+        task = response_task(config, self._response_options())
+        found, records, plan = measured_response(task, self.carrier)
+        gravity = gravity_of(plan, records[records.phase == AxisPhase.TRACKING], period_s(config))
+        fit = fit_joint(found, config.joint.inertia_kgm2)
+        return {**found.to_dict(), "fit": fit.to_dict(), "gravity": asdict(gravity), "sure": gravity.found}
+
+    def _take_response(self, kept: dict[str, Any]) -> None:
+        self.response, self.fit = from_dict(kept), fit_from_dict(kept["fit"])
+        self.config = with_values(self.config, self._fitted())
+        self.carrier.output.note(
+            f"  {'two masses' if self.fit.flexible else 'rigid'}, {self.fit.inertia_kgm2.value:.4g} kg m^2, "
+            f"{1e3 * self.fit.late_s.value:.2f} ms of delay and lag"
+        )
+        # a quiet law for the motions that measure
+        self.config = self._with_control(self._chosen(self.options.law, "quiet").control)
+
+    def _fitted(self) -> list[Found]:
+        assert self.fit is not None and self.response is not None
+        source = f"95 %, response of {self.response.legs} legs at {self.response.peak_Nm:.2g} Nm"
+        return values_of_fit(self.original, self.fit, source)
+
+    def _with_control(self, control: Control) -> Config:
+        update: dict[str, Any] = {"control": control}
+        second = self.config.joint_encoder
+        if second is not None and self.config.encoder.side == "motor":
+            law = "joint_encoder" if control.kind == "flexible_joint" else "encoder"
+            update["joint_encoder"] = second.model_copy(update={"law": law})
+        return self.config.model_copy(update=update)
+
+    def _chosen(self, law: str, objective: str) -> ChosenGains:
+        assert self.fit is not None
+        return choose_gains(self.config, self.fit, law, objective)
+
+    # --- 3. gravity, of the same motion ---
+
+    def _step_gravity(self) -> dict[str, Any]:
+        kept = self.state["response"]
+        return {**kept["gravity"], "found": kept["sure"]}
+
+    def _take_gravity(self, kept: dict[str, Any]) -> None:
+        if kept["found"]:
+            self.config = with_values(self.config, self._gravity_values())
+
+    def _gravity_values(self) -> list[Found]:
+        kept = self.state["gravity"]
+        if not kept["found"]:
+            return []
+        torque, zero = rounded(kept["torque_Nm"]), rounded(kept["zero_rad"])
+        return [
+            Found(("joint",), "gravity_Nm", torque, f"{torque:g} +- {kept['half_Nm']:.2g}, 95 %, legs of the response"),
+            Found(("joint",), "gravity_zero_rad", zero, f"{zero:g}, legs of the response"),
+        ]
+
+    # --- 4. friction ---
+
+    def _step_friction(self) -> dict[str, Any]:
+        path = self.folder / "friction.csv"
+        for old in (path, path.with_suffix(".json")):
+            old.unlink(missing_ok=True)
+        fastest = 0.9 * self.config.limits.velocity_max_radps
+        options = SweepOptions(
+            points=SWEEP_POINTS, min_speed_radps=None, dwell_s=SWEEP_DWELL_s, warm_up_turns=WARM_UP_TURNS,
+            mode="torque", assume_yes=True, lockstep=self.options.lockstep, grid="log",
+        )  # fmt: skip
+        from dataclasses import replace
+
+        from jointctl.tools.sweeping.plan import make_plan as sweep_plan
+
+        top = max(abs(p.velocity_radps) for p in sweep_plan(self.config, options).points)
+        options = replace(options, min_speed_radps=min(top, fastest) / SWEEP_RATIO)
+        command = Sweep(self.config, self.carrier.quietly(), path, options)
+        command.control = self.carrier.control
+        if command.run() != 0:
+            from jointctl.tools.tuning.carry_out import NotCarriedOut
+
+            raise NotCarriedOut(command.drive_state, "interruption")
+        found = identify_friction(read_friction_data(path, None), Options(swarm=SWARM))
+        static = static_friction_Nm(self.config)
+        return {
+            "section": section_values(found.branches["positive"], found.branches["negative"]),
+            "rmse_Nm": found.rmse_Nm, "points": len(found.measured_Nm), "model": found.model, "static_before": static,
+        }  # fmt: skip
+
+    def _take_friction(self, kept: dict[str, Any]) -> None:
+        self.config = with_friction(self.config, kept["section"])
+
+    # --- 5. map of the reducer ---
+
+    def _step_map(self) -> dict[str, Any]:
+        """Of a joint with two encoders and a soft reducer; nothing else has a use for it."""
+        if self.config.reducer is None or self.config.joint_encoder is None:
+            return {}
+        without = self.config.reducer.model_copy(update={"map": None})
+        moving = config_of_map(self.config.model_copy(update={"reducer": without}), MapOptions())
+        carried = self.carrier.run(moving, ConfiguredMotion(moving, trajectory_table(moving)), "map")
+        settings, _ = loop_settings(moving)
+        self.found_map = found_map(map_run(moving, carried.records, settings.delay_s + settings.lag_s))
+        encoder = self.config.encoder
+        return self.found_map.values(encoder.direction, encoder.zero_counts)
+
+    def _take_map(self, kept: dict[str, Any]) -> None:
+        if kept and self.config.reducer is not None:
+            values = {key: tuple(value) if isinstance(value, list) else value for key, value in kept.items()}
+            reducer = self.config.reducer.model_copy(update={"map": ReducerMap(**values)})
+            self.config = self.config.model_copy(update={"reducer": reducer})
+
+    # --- 6. gains ---
+
+    def _step_gains(self) -> dict[str, Any]:
+        self.gains = self._chosen(self.options.law, self.options.objective)
+        self._require(self.gains)
+        best = self.gains.best
+        return {
+            "law": self.gains.law, "control": self.gains.control.model_dump(mode="json", exclude_none=True),
+            "missed": self.gains.missed, "phase_margin_deg": best.phase_margin_deg, "gain_margin": best.gain_margin,
+            "sensitivity": best.sensitivity, "noise_Nm": best.noise_Nm,
+        }  # fmt: skip
+
+    @staticmethod
+    def _require(gains: ChosenGains) -> None:
+        if not gains.best.stable:
+            raise MarginError(
+                f"no gains of the law {gains.law} are stable over the intervals of this joint",
+                "--law; a shorter loop delay; the encoder on the motor",
+            )
+
+    def _take_gains(self, kept: dict[str, Any]) -> None:
+        self.config = self._with_control(Control.model_validate_json(json.dumps(kept["control"])))
+        for name in kept["missed"]:
+            self.carrier.output.warning(f"this joint does not allow all: {name}")
+
+    # --- 7. the run that shows it ---
+
+    def _step_verification(self) -> dict[str, Any]:
+        found = {"after": self._verified(self.config, "verification")}
+        before = self._before()
+        try:
+            require_margin(before)
+        except JointctlError as error:
+            return {**found, "before_refused": error.message}
+        return {**found, "before": self._verified(before, "the same before")}
+
+    def _before(self) -> Config:
+        """The configuration as it was, on the joint that was found."""
+        joint = self.original.joint
+        control = self.original.control
+        update = {"control": control, "joint": joint, "friction": self.original.friction}
+        found = self.config.model_copy(update=update)
+        virtual = self.config.virtual
+        if virtual is not None:
+            scale = virtual.inertia_scale * self.config.joint.inertia_kgm2 / joint.inertia_kgm2
+            found = found.model_copy(update={"virtual": virtual.model_copy(update={"inertia_scale": scale})})
+        return found.model_copy(update={"reducer": self.original.reducer, "joint_encoder": self.original.joint_encoder})
+
+    def _verified(self, config: Config, title: str) -> dict[str, Any]:
+        trajectory = config.trajectory
+        seconds = min(trajectory.duration_s or VERIFY_s, VERIFY_s)
+        moving = config.model_copy(update={"trajectory": trajectory.model_copy(update={"duration_s": seconds})})
+        motion = ConfiguredMotion(moving, trajectory_table(moving))
+        also = title != "verification"
+        carried = self.carrier.run(moving, motion, title, also_faults=also)
+        rows = carried.records[carried.records.phase == AxisPhase.TRACKING]
+        rows = rows[rows.trajectory_s >= min(VERIFY_FROM_s, 0.5 * seconds)]
+        if carried.text is not None or not len(rows):
+            return {"fault": carried.fault.name}
+        error = 1e3 * np.asarray(rows.error_rad)
+        return {
+            "rmse_mrad": float(np.sqrt(np.mean(error**2))), "peak_mrad": float(np.max(np.abs(error))),
+            "chatter_Nm": float(np.mean(np.abs(np.diff(rows.command_torque_Nm)))), "seconds": seconds, "log": carried.log,
+        }  # fmt: skip
+
+    # --- 8. refinement ---
+
+    def _refine(self) -> None:
+        """Runs with other gains that meet every goal, the most promising first; what measures better stays."""
+        gains = self.gains or self._chosen(self.options.law, self.options.objective)
+        best, error = gains.best, self.state["verification"]["after"]["rmse_mrad"]
+        allowed = [one for one in gains.tried if one.stable and not gains.missed_by(one)]
+        tried, runs = [best], []
+        for one in sorted(allowed, key=lambda one: one.error):
+            if len(runs) == REFINE_RUNS:
+                break
+            if all(_apart(one.settings, other.settings) > REFINE_APART for other in tried):
+                tried.append(one)
+                control = gains.with_gains(one)
+                found = self._verified(self._with_control(control), "refinement")
+                runs.append({"kp": one.settings.kp, "kv": one.settings.kv, **found})
+                self.carrier.output.note(f"  kv {one.settings.kv:g}: {found.get('rmse_mrad', math.inf):.4f} mrad")
+                if found.get("rmse_mrad", math.inf) < REFINE_BETTER * error:
+                    error, self.config = found["rmse_mrad"], self._with_control(control)
+                    self.state["gains"]["control"] = control.model_dump(mode="json", exclude_none=True)
+                    self.state["verification"]["after"] = found
+        self.state["refinement"] = {"runs": runs}
+        self._save()
+
+    # --- 9. what is written ---
+
+    def _values(self) -> list[Found]:
+        """Everything that the file gets."""
+        assert self.fit is not None
+        gains = self.state["gains"]
+        objective = (
+            f"{self.options.objective}, law {gains['law']}, worst phase margin {gains['phase_margin_deg']:.0f} deg"
+        )
+        values = [*self._fitted(), *self._gravity_values()]
+        before, after = self.original.control.model_dump(), self.config.control.model_dump()
+        for key, value in after.items():
+            if key not in ("learning", "adaptation") and value != before[key]:
+                source = f"{value}, {objective}"
+                values.append(Found(("control",), key, value[0] if key == "lyapunov_q" else value, source))
+        if before["learning"] != after["learning"]:
+            if after["learning"] is None:
+                values.append(Found(("control",), "learning", None, "none: it would not converge, or the law has none"))
+            for key, value in (after["learning"] or {}).items():
+                values.append(Found(("control", "learning"), key, value, ""))
+        if before["adaptation"] is not None and after["adaptation"] is None:
+            values.append(Found(("control",), "adaptation", None, "none"))
+        friction = self.state["friction"]
+        for key, value in friction["section"].items():
+            if isinstance(value, dict):
+                values += [Found(("friction", key), name, number, "") for name, number in value.items()]
+            else:
+                values.append(Found(("friction",), key, value, ""))
+        values += [Found(("reducer", "map"), key, value, "") for key, value in self.state["map"].items()]
+        second, chosen = self.original.joint_encoder, self.config.joint_encoder
+        if second is not None and chosen is not None and second.law != chosen.law:
+            values.append(Found(("joint_encoder",), "law", chosen.law, f"{chosen.law}, of the law {gains['law']}"))
+        virtual = self.config.virtual
+        if virtual is not None and virtual != self.original.virtual:
+            kept = "the virtual joint stays what it was"
+            values.append(Found(("virtual",), "inertia_scale", rounded(virtual.inertia_scale), kept))
+            if self.original.virtual is not None and self.original.virtual.friction is None and virtual.friction:
+                values += _nested(("virtual", "friction"), virtual.friction.model_dump(exclude_none=True))
+        return values
+
+    def _write(self, text: str) -> None:
+        values = self._values()
+        friction = self.state["friction"]
+        sources: dict[str, list[str]] = {}
+        for one in values:
+            if one.source:
+                sources.setdefault(".".join(one.section), []).append(f"{one.key} = {one.source}")
+        sources["friction"] = [f"{friction['points']} points, RMSE {friction['rmse_Nm']:.2g} Nm at the motor"]
+        if self.state["map"]:
+            sources["reducer.map"] = ["one motion both ways"]
+        content = with_tuned(text, values, sources).encode()
+        replace_file(self.original.path, content, load_config)
+        replace_file(self.folder / "before.toml", text.encode())
+        self._report()
+        self.carrier.output.note(f"written: {self.original.path}; as it was: {self.folder / 'before.toml'}")
+
+    def _tables(self) -> tuple[Table, Table]:
+        assert self.fit is not None and self.response is not None
+        gains, verified = self.state["gains"], self.state["verification"]
+        table = Table(
+            "", *(Column(name, justify="right") for name in ("before", "after")), title="Loop and tracking",
+            title_justify="left", caption_justify="left",
+            caption="margins of the joint that was found, worst case; error from 5 s on, as the encoder shows it",
+        )  # fmt: skip
+        old, new = (_margins_or_none(config) for config in (self._before_on_found(), self.config))
+        for name, pick in (
+            ("phase margin [deg]", lambda m: f"{m.phase_margin_deg:.1f}"),
+            ("gain margin up", lambda m: f"{m.gain_margin_up:.2f}"),
+            ("largest |S|", lambda m: f"{m.sensitivity_peak:.2f}"),
+        ):  # fmt: skip
+            table.add_row(name, *("-" if m is None else pick(m) for m in (old, new)))
+        before, after = verified.get("before", {}), verified["after"]
+        for name, key in (("RMSE [mrad]", "rmse_mrad"), ("peak [mrad]", "peak_mrad"), ("chatter [Nm]", "chatter_Nm")):
+            shown = [f"{one[key]:.4g}" if key in one else one.get("fault", "refused") for one in (before, after)]
+            table.add_row(name, *shown)
+        for name in gains["missed"]:
+            table.add_row("missed", "", name)
+        return fit_table(self.original, self.response, self.fit), table
+
+    def _before_on_found(self) -> Config:
+        return self.config.model_copy(
+            update={"control": self.original.control, "joint_encoder": self.original.joint_encoder}
+        )
+
+    def _report(self) -> None:
+        fitted, loop = self._tables()
+        output = self.carrier.output
+        data = {**self.state, "values": [[".".join(one.section), one.key, one.value] for one in self._values()]}
+        output.result(fitted)
+        output.result(loop, data, self.state)
+        assert self.response is not None
+        gains = self.gains or self._chosen(self.options.law, self.options.objective)
+        pictures: list[Any] = [
+            svg_figure(bode_figure(self.response, "Frequency response", self.fit), "Bode plot with coherence"),
+            svg_figure(trade_off_figure(gains, "Error against margin"), "Every choice of gains that was tried"),
+        ]
+        if self.found_map is not None:
+            pictures.append(svg_figure(map_figure(self.found_map, "Map of the reducer"), "Kinematic error and ripple"))
+        friction = self.state["friction"]
+        moved = [Paragraph(line) for line in self.envelope()]
+        sections = [
+            Section("Moved", moved), Section("Found", [from_terminal(fitted)]),
+            Section("Friction", [Paragraph(
+                f"{friction['points']} plateaus, RMSE {friction['rmse_Nm']:.3g} Nm at the motor: {self.folder}/friction.csv"
+            )]),
+            Section("Loop and tracking", [from_terminal(loop)]), Section("Figures", pictures),
+        ]  # fmt: skip
+        write_verb_page(self.folder / "report.html", f"Tune of {self.original.path.stem}", sections, output)
+
+
+def _nested(section: tuple[str, ...], values: dict[str, Any]) -> list[Found]:
+    found: list[Found] = []
+    for key, value in values.items():
+        if isinstance(value, dict):
+            found += _nested((*section, key), value)
+        else:
+            found.append(Found(section, key, value, ""))
+    return found
+
+
+def _margins_or_none(config: Config) -> Margins | None:
+    try:
+        return margins(loop_settings(config)[0])
+    except ConfigurationError:
+        return None
+
+
+def _apart(one: Any, other: Any) -> float:
+    """Greatest relative difference of the gains."""
+    pairs = [(getattr(one, key), getattr(other, key)) for key in ("kv", "observer_radps", "cutoff_Hz")]
+    return max((abs(math.log(a / b)) for a, b in pairs if a > 0.0 and b > 0.0), default=0.0)
