@@ -185,10 +185,12 @@ def identified_joints(config: Config, fit: JointFit) -> list[float | TwoMasses]:
     link = max(fit.link_kgm2.half / fit.link_kgm2.value, LEAST_INERTIA_SHARE)
     believed = two_masses(config, config.reducer, 1.0, 1.0, False)
     found = [believed, *(replace(believed, motor_kgm2=end * believed.motor_kgm2) for end in ends[1:])]
-    for p in payload:
-        for factor in (1.0 - link, 1.0 + link):
-            for k in (1.0 - stiffness, 1.0 + stiffness):
-                found.append(two_masses(config, config.reducer, p * factor, k, False))
+    found += [
+        two_masses(config, config.reducer, p * factor, k, False)
+        for p in payload
+        for factor in (1.0 - link, 1.0 + link)
+        for k in (1.0 - stiffness, 1.0 + stiffness)
+    ]
     return list(found)
 
 
@@ -352,7 +354,7 @@ def _converging(settings: LoopSettings, learning: Learning | None) -> Learning |
 
 
 def trade_off_figure(found: ChosenGains, title: str) -> Figure:
-    """Error against phase margin of everything that was tried; what meets all goals is blue, the chosen point orange."""
+    """Error against phase margin of everything that was tried; what keeps the margins is blue."""
     stable = [one for one in found.tried if one.stable]
     with canvas(4.2, title) as figure:
         axis = figure.subplots()

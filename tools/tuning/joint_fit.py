@@ -60,7 +60,7 @@ class JointFit:
 
     def __getattr__(self, name: str) -> Estimate:
         try:
-            return self.__dict__["values"][name]  # type: ignore[no-any-return]
+            return self.__dict__["values"][name]
         except KeyError:
             raise AttributeError(name) from None
 

@@ -22,6 +22,9 @@ class ResponseOptions:
     lockstep: Annotated[bool, typer.Option("--lockstep", help="virtual joint in simulated time: seconds")] = False
 
 
+AS_IT_FITS = ResponseOptions()
+
+
 @dataclass(frozen=True)
 class TuneOptions:
     """What `tune` may do, and what it is after."""
@@ -39,3 +42,6 @@ class TuneOptions:
     ] = False
     resume: Annotated[bool, typer.Option("--resume", help="go on after the last step that was done")] = False
     lockstep: Annotated[bool, typer.Option("--lockstep", help="virtual joint in simulated time: seconds")] = False
+
+
+TUNE_ALL = TuneOptions()

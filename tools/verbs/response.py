@@ -10,7 +10,7 @@ import typer
 from rich.table import Column, Table
 
 from jointctl.drivers.errors import INTERRUPTED, DataError
-from jointctl.tools.tuning.tune_options import ResponseOptions
+from jointctl.tools.tuning.tune_options import AS_IT_FITS, ResponseOptions
 from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOnBus, VerbOutput, Yes
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def response(
     config: JointOnBus,
     output: VerbOutput,
     *,
-    options: ResponseOptions = ResponseOptions(),
+    options: ResponseOptions = AS_IT_FITS,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="JSON file with the response and the fit (CONFIG.response.json)")
     ] = None,

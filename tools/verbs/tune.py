@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from jointctl.drivers.errors import INTERRUPTED, ConfigurationError, UsageError
-from jointctl.tools.tuning.tune_options import TuneOptions
+from jointctl.tools.tuning.tune_options import TUNE_ALL, TuneOptions
 from jointctl.tools.verbs.verb_options import DryRun, JointOnBus, VerbOutput, Yes
 
 LAWS, OBJECTIVES = ("auto", "paper", "precise", "two_encoders"), ("tracking", "settling", "quiet")
@@ -19,7 +19,7 @@ def tune(
     config: JointOnBus,
     output: VerbOutput,
     *,
-    options: TuneOptions = TuneOptions(),
+    options: TuneOptions = TUNE_ALL,
     folder: Annotated[
         Path | None, typer.Option("--folder", help="for what each step leaves, and the report (CONFIG.tune)")
     ] = None,

@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,9 @@ from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check,
 from jointctl.tools.recording.report_page import Paragraph, Section, from_terminal, svg_figure, write_verb_page
 from jointctl.tools.session.plan import ConfiguredMotion
 from jointctl.tools.sweeping.options import SweepOptions
-from jointctl.tools.tuning.carry_out import Carrier
+from jointctl.tools.sweeping.plan import SPEED_SHARE as SWEEP_SHARE
+from jointctl.tools.sweeping.plan import make_plan as sweep_plan
+from jointctl.tools.tuning.carry_out import Carrier, NotCarriedOut
 from jointctl.tools.tuning.excitation import motor_fed
 from jointctl.tools.tuning.found_values import Found, rounded, values_of_fit, with_friction, with_tuned, with_values
 from jointctl.tools.tuning.frequency_response import FrequencyResponse, bode_figure, from_dict
@@ -102,14 +104,14 @@ class Tune:
         limits, output = self.config.limits, self.config.path
         low, high = limits.position_min_rad, limits.position_max_rad
         task = response_task(self.config, self._response_options())
+        top_radps = SWEEP_SHARE * limits.velocity_max_radps
         inside = f"{low:+.3f} .. {high:+.3f} rad"
         trajectory = self.config.trajectory.kind
         return [
             f"tune       {output}, law {self.options.law}, objective {self.options.objective}",
             "direction  a soft spring pulls the joint a little to both sides, with more torque while it stands",
-            f"response   triangle at 0.2 rad/s within {inside}, multisine of up to {task.largest_Nm:.1f} Nm, 2 minutes",
-            f"friction   plateaus of constant speed within {inside}, up to {0.9 * limits.velocity_max_radps:.2f} rad/s, "
-            "about 4 minutes",
+            f"response   triangle at 0.2 rad/s within {inside}, multisine up to {task.largest_Nm:.1f} Nm, 2 minutes",
+            f"friction   plateaus of constant speed within {inside}, up to {top_radps:.2f} rad/s, about 4 minutes",
             "map        once back and forth at 0.03 rad/s, where the reducer is soft",
             f"verify     {trajectory} of the configuration, {VERIFY_s:.0f} s, before and after",
             f"limits     {inside}, {limits.velocity_max_radps:.2f} rad/s, {limits.torque_max_Nm:.1f} Nm in every step; "
@@ -207,7 +209,8 @@ class Tune:
         self.config = self._with_control(self._chosen(self.options.law, "quiet").control)
 
     def _fitted(self) -> list[Found]:
-        assert self.fit is not None and self.response is not None
+        assert self.fit is not None
+        assert self.response is not None
         source = f"95 %, response of {self.response.legs} legs at {self.response.peak_Nm:.2g} Nm"
         return values_of_fit(self.original, self.fit, source)
 
@@ -249,22 +252,15 @@ class Tune:
         path = self.folder / "friction.csv"
         for old in (path, path.with_suffix(".json")):
             old.unlink(missing_ok=True)
-        fastest = 0.9 * self.config.limits.velocity_max_radps
         options = SweepOptions(
-            points=SWEEP_POINTS, min_speed_radps=None, dwell_s=SWEEP_DWELL_s, warm_up_turns=WARM_UP_TURNS,
+            points=SWEEP_POINTS, dwell_s=SWEEP_DWELL_s, warm_up_turns=WARM_UP_TURNS,
             mode="torque", assume_yes=True, lockstep=self.options.lockstep, grid="log",
         )  # fmt: skip
-        from dataclasses import replace
-
-        from jointctl.tools.sweeping.plan import make_plan as sweep_plan
-
-        top = max(abs(p.velocity_radps) for p in sweep_plan(self.config, options).points)
-        options = replace(options, min_speed_radps=min(top, fastest) / SWEEP_RATIO)
+        top_radps = max(abs(point.velocity_radps) for point in sweep_plan(self.config, options).points)
+        options = replace(options, min_speed_radps=top_radps / SWEEP_RATIO)
         command = Sweep(self.config, self.carrier.quietly(), path, options)
         command.control = self.carrier.control
         if command.run() != 0:
-            from jointctl.tools.tuning.carry_out import NotCarriedOut
-
             raise NotCarriedOut(command.drive_state, "interruption")
         found = identify_friction(read_friction_data(path, None), Options(swarm=SWARM))
         static = static_friction_Nm(self.config)
@@ -292,7 +288,9 @@ class Tune:
 
     def _take_map(self, kept: dict[str, Any]) -> None:
         if kept and self.config.reducer is not None:
-            values = {key: tuple(value) if isinstance(value, list) else value for key, value in kept.items()}
+            values: dict[str, Any] = {
+                key: tuple(value) if isinstance(value, list) else value for key, value in kept.items()
+            }
             reducer = self.config.reducer.model_copy(update={"map": ReducerMap(**values)})
             self.config = self.config.model_copy(update={"reducer": reducer})
 
@@ -358,7 +356,8 @@ class Tune:
         error = 1e3 * np.asarray(rows.error_rad)
         return {
             "rmse_mrad": float(np.sqrt(np.mean(error**2))), "peak_mrad": float(np.max(np.abs(error))),
-            "chatter_Nm": float(np.mean(np.abs(np.diff(rows.command_torque_Nm)))), "seconds": seconds, "log": carried.log,
+            "chatter_Nm": float(np.mean(np.abs(np.diff(rows.command_torque_Nm)))), "seconds": seconds,
+            "log": carried.log,
         }  # fmt: skip
 
     # --- 8. refinement ---
@@ -368,7 +367,7 @@ class Tune:
         gains = self.gains or self._chosen(self.options.law, self.options.objective)
         best, error = gains.best, self.state["verification"]["after"]["rmse_mrad"]
         allowed = [one for one in gains.tried if one.stable and not gains.missed_by(one)]
-        tried, runs = [best], []
+        tried, runs = [best], list[dict[str, Any]]()
         for one in sorted(allowed, key=lambda one: one.error):
             if len(runs) == REFINE_RUNS:
                 break
@@ -436,26 +435,26 @@ class Tune:
         if self.state["map"]:
             sources["reducer.map"] = ["one motion both ways"]
         content = with_tuned(text, values, sources).encode()
-        replace_file(self.original.path, content, load_config)
+        replace_file(self.original.path, content, _require_valid)
         replace_file(self.folder / "before.toml", text.encode())
         self._report()
         self.carrier.output.note(f"written: {self.original.path}; as it was: {self.folder / 'before.toml'}")
 
     def _tables(self) -> tuple[Table, Table]:
-        assert self.fit is not None and self.response is not None
+        assert self.fit is not None
+        assert self.response is not None
         gains, verified = self.state["gains"], self.state["verification"]
         table = Table(
             "", *(Column(name, justify="right") for name in ("before", "after")), title="Loop and tracking",
             title_justify="left", caption_justify="left",
             caption="margins of the joint that was found, worst case; error from 5 s on, as the encoder shows it",
         )  # fmt: skip
-        old, new = (_margins_or_none(config) for config in (self._before_on_found(), self.config))
-        for name, pick in (
-            ("phase margin [deg]", lambda m: f"{m.phase_margin_deg:.1f}"),
-            ("gain margin up", lambda m: f"{m.gain_margin_up:.2f}"),
-            ("largest |S|", lambda m: f"{m.sensitivity_peak:.2f}"),
+        both = [_margins_or_none(config) for config in (self._before_on_found(), self.config)]
+        for name, key, form in (
+            ("phase margin [deg]", "phase_margin_deg", ".1f"), ("gain margin up", "gain_margin_up", ".2f"),
+            ("largest |S|", "sensitivity_peak", ".2f"),
         ):  # fmt: skip
-            table.add_row(name, *("-" if m is None else pick(m) for m in (old, new)))
+            table.add_row(name, *("-" if one is None else format(getattr(one, key), form) for one in both))
         before, after = verified.get("before", {}), verified["after"]
         for name, key in (("RMSE [mrad]", "rmse_mrad"), ("peak [mrad]", "peak_mrad"), ("chatter [Nm]", "chatter_Nm")):
             shown = [f"{one[key]:.4g}" if key in one else one.get("fault", "refused") for one in (before, after)]
@@ -488,7 +487,7 @@ class Tune:
         sections = [
             Section("Moved", moved), Section("Found", [from_terminal(fitted)]),
             Section("Friction", [Paragraph(
-                f"{friction['points']} plateaus, RMSE {friction['rmse_Nm']:.3g} Nm at the motor: {self.folder}/friction.csv"
+                f"{friction['points']} plateaus, RMSE {friction['rmse_Nm']:.3g} Nm at the motor, in friction.csv"
             )]),
             Section("Loop and tracking", [from_terminal(loop)]), Section("Figures", pictures),
         ]  # fmt: skip
@@ -503,6 +502,10 @@ def _nested(section: tuple[str, ...], values: dict[str, Any]) -> list[Found]:
         else:
             found.append(Found(section, key, value, ""))
     return found
+
+
+def _require_valid(path: Path) -> None:
+    load_config(path)
 
 
 def _margins_or_none(config: Config) -> Margins | None:
