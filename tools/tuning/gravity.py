@@ -31,11 +31,15 @@ class Gravity:
 
     @property
     def found(self) -> bool:
-        return self.torque_Nm > max(LEAST_Nm, 0.5 * SURE * self.half_Nm)
+        return abs(self.torque_Nm) > max(LEAST_Nm, 0.5 * SURE * self.half_Nm)
 
 
-def gravity_of(plan: ResponsePlan, records: Any, period_s: float) -> Gravity:
-    """Of the legs of a frequency response, whose multisine has no mean over its period."""
+def gravity_of(plan: ResponsePlan, records: Any, period_s: float, zero_rad: float) -> Gravity:
+    """Of the legs of a frequency response, whose multisine has no mean over its period.
+
+    Over the way of a joint the cosine is hardly told from the friction's asymmetry: where it is not sure, the angle
+    without lever is the configured `zero_rad`.
+    """
     cycle = np.round(np.asarray(records.trajectory_s) / period_s).astype(int)
     position, torque, sides = [], [], []
     for start in plan.legs.starts:
@@ -49,11 +53,19 @@ def gravity_of(plan: ResponsePlan, records: Any, period_s: float) -> Gravity:
             position.append(float(np.mean(rows.position_rad[part])))
             torque.append(float(np.mean(rows.command_torque_Nm[part] - excitation[part])))
             sides.append(math.copysign(1.0, rows.desired_velocity_radps[part[0]]))
-    q, side = np.array(position), np.array(sides)
-    columns = np.column_stack((side > 0.0, side < 0.0, np.sin(q), np.cos(q))).astype(float)
-    found, *_ = np.linalg.lstsq(columns, np.array(torque), rcond=None)
-    left = np.array(torque) - columns @ found
-    spread = np.linalg.pinv(columns.T @ columns) * float(left @ left) / max(len(q) - 4, 1)
-    # a sin q + b cos q; with offsets of its own for each direction b is the curvature, and a the slope
-    half = 2.0 * math.sqrt(float(max(spread[2, 2], spread[3, 3])))
-    return Gravity(math.hypot(found[2], found[3]), half, math.atan2(-found[3], found[2]))
+    angle, side = np.array(position) - zero_rad, np.array(sides)
+    constant = np.column_stack((side > 0.0, side < 0.0)).astype(float)
+    both, spread = _fitted(np.column_stack((constant, np.sin(angle), np.cos(angle))), np.array(torque))
+    if abs(both[3]) > SURE * spread[3]:
+        size = math.hypot(both[2], both[3])
+        return Gravity(size, 2.0 * float(np.max(spread[2:])), zero_rad + math.atan2(-both[3], both[2]))
+    one, spread = _fitted(np.column_stack((constant, np.sin(angle))), np.array(torque))
+    return Gravity(float(one[2]), 2.0 * float(spread[2]), zero_rad)
+
+
+def _fitted(columns: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(least squares, standard errors)."""
+    found, *_ = np.linalg.lstsq(columns, values, rcond=None)
+    left = values - columns @ found
+    variance = float(left @ left) / max(len(values) - columns.shape[1], 1)
+    return found, np.sqrt(variance * np.diag(np.linalg.pinv(columns.T @ columns)))

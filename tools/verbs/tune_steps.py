@@ -194,7 +194,8 @@ class Tune:
         config = self.config.model_copy(update={"control": control})
         task = response_task(config, self._response_options())
         found, records, plan = measured_response(task, self.carrier)
-        gravity = gravity_of(plan, records[records.phase == AxisPhase.TRACKING], period_s(config))
+        tracked = records[records.phase == AxisPhase.TRACKING]
+        gravity = gravity_of(plan, tracked, period_s(config), config.joint.gravity_zero_rad)
         fit = fit_joint(found, config.joint.inertia_kgm2)
         return {**found.to_dict(), "fit": fit.to_dict(), "gravity": asdict(gravity), "sure": gravity.found}
 

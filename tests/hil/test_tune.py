@@ -1,0 +1,133 @@
+"""`response` and `tune` on the virtual joint in simulated time: they find what is there; a failure leaves the file."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import pytest
+
+from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MotionFault, UsageError
+from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.margins import margins
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.plant_settings import plant_settings
+from jointctl.tools.output import Output
+from jointctl.tools.tuning.tune_options import ResponseOptions, TuneOptions
+from jointctl.tools.verbs.response import response
+from jointctl.tools.verbs.tune import tune
+from tests.configurations import changed, written
+
+IN_LOCKSTEP = ResponseOptions(lockstep=True)
+
+
+def outputs(*, json_too: bool = True) -> tuple[Output, io.StringIO, io.StringIO]:
+    out, err = io.StringIO(), io.StringIO()
+    return Output(json=json_too, stdout=out, stderr=err), out, err
+
+
+def test_the_response_of_a_soft_joint_names_both_masses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    output, out, _ = outputs()
+    assert response(load_config(shipped_config("realistic")), output, options=IN_LOCKSTEP) == 0
+    found = json.loads(out.getvalue())
+    values = {name: one["value"] for name, one in found["fit"]["values"].items()}
+    assert found["fit"]["model"] == "two masses"
+    assert values["inertia_kgm2"] == pytest.approx(2.1, rel=0.03)
+    assert values["link_kgm2"] == pytest.approx(1.1, rel=0.06)
+    assert values["late_s"] == pytest.approx(1.5e-3, abs=0.1e-3)
+    assert 1.4 < values["stiffness_Nmprad"] / 1.6e4 < 2.0  # hysteresis makes a small motion stiffer
+    assert (tmp_path / "realistic.response.png").read_bytes().startswith(b"\x89PNG")
+    assert json.loads((tmp_path / "realistic.response.json").read_text()) == found
+
+
+@pytest.fixture
+def wrong(tmp_path: Path) -> Path:
+    """A joint whose inertia is 1.6 times what its configuration says, with lower gains than it could have."""
+    return written(
+        tmp_path / "joint.toml", "precise", joint__inertia_kgm2=1.3125, virtual__inertia_scale=1.6, control__kp=900.0,
+        control__kv=60.0, control__observer_radps=20.0, virtual__gravity_Nm=4.0,
+    )  # fmt: skip
+
+
+def test_a_tune_finds_the_joint_and_writes_what_is_better(wrong: Path) -> None:
+    text, before = wrong.read_text(), load_config(wrong)
+    output, out, _ = outputs()
+    assert tune(before, output, options=TuneOptions(lockstep=True)) == 0
+    after = load_config(wrong)
+    assert after.joint.inertia_kgm2 == pytest.approx(2.1, rel=0.03)
+    assert after.joint.gravity_Nm == pytest.approx(4.0, rel=0.3)
+    assert after.margin.loop_delay_s is not None
+    assert after.margin.loop_delay_s + after.margin.current_lag_s == pytest.approx(1.5e-3, abs=0.1e-3)
+    assert after.friction is not None
+    assert after.friction.positive.tc_Nm == pytest.approx(1.1 * 0.11985, rel=0.03)
+    assert plant_settings(after)["inertia_kgm2"] == pytest.approx(plant_settings(before)["inertia_kgm2"], rel=1e-4)
+    true = changed(after, joint__inertia_kgm2=2.1, margin__loop_delay_s=1e-3, margin__current_lag_s=5e-4)
+    assert margins(loop_settings(true)[0]).phase_margin_deg > 30.0
+    found = json.loads(out.getvalue())["verification"]
+    assert found["after"]["rmse_mrad"] < 0.5 * found["before"]["rmse_mrad"]
+    comments = [line.split("#", 1)[1].rstrip() for line in text.splitlines() if "#" in line]
+    assert all(comment in wrong.read_text() for comment in comments)
+    folder = wrong.with_suffix(".tune")
+    assert "Bode plot" in (folder / "report.html").read_text()
+    assert (folder / "before.toml").read_text() == text
+
+
+def test_a_tune_goes_on_where_it_ended(wrong: Path) -> None:
+    output, *_ = outputs()
+    assert tune(load_config(wrong), output, options=TuneOptions(lockstep=True, objective="quiet")) == 0
+    first, folder = wrong.read_text(), wrong.with_suffix(".tune")
+    wrong.write_text((folder / "before.toml").read_text())
+    state = json.loads((folder / "steps.json").read_text())
+    for name in ("gains", "verification"):  # as if it had ended before them
+        del state[name]
+    state["response"]["legs"] = 77
+    (folder / "steps.json").write_text(json.dumps(state))
+    output, _, err = outputs()
+    assert tune(load_config(wrong), output, options=TuneOptions(lockstep=True, objective="quiet", resume=True)) == 0
+    assert "friction: done before" in err.getvalue()
+    assert wrong.read_text() == first.replace("of 12 legs", "of 77 legs")
+    with pytest.raises(DataError, match="is of another configuration or torque than"):
+        tune(load_config(wrong), output, options=TuneOptions(lockstep=True, resume=True))
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "words"),
+    [
+        # as stuck as a joint with its brake closed
+        ({"virtual__friction_positive_scale": 9.0, "virtual__friction_negative_scale": 9.0}, MotionFault,
+         r"direction: the reading of \[encoder\] stood still .* at up to 60.0 Nm"),
+        ({"virtual__end_stops": True, "virtual__end_stop_min_rad": -0.3, "virtual__end_stop_max_rad": 0.3}, MotionFault,
+         r"response: .*(FOLLOWING_ERROR|TORQUE_SATURATED|POSITION_FROZEN|LIMIT_CYCLE)"),
+    ],
+)  # fmt: skip
+def test_a_joint_that_does_not_move_as_it_should_ends_it_in_one_line(
+    tmp_path: Path, changes: dict[str, object], error: type[JointctlError], words: str
+) -> None:
+    path = written(tmp_path / "joint.toml", "precise", **changes)
+    text = path.read_text()
+    output, *_ = outputs()
+    with pytest.raises(error, match=words) as raised:
+        tune(load_config(path), output, options=TuneOptions(lockstep=True))
+    assert "is as it was" in str(raised.value)
+    assert path.read_text() == text
+
+
+def test_what_cannot_be_is_refused_before_anything_moves(tmp_path: Path) -> None:
+    output, *_ = outputs()
+    path = written(tmp_path / "joint.toml", "precise")
+    for options, words in (
+        (TuneOptions(lockstep=True, law="best"), r"--law \(=best\) must be one of auto, paper"),
+        (TuneOptions(lockstep=True, objective="fast"), r"--objective \(=fast\) must be one of"),
+        (TuneOptions(lockstep=True, torque_Nm=99.0), r"--torque \(=99\) must be in \(0..60\]"),
+        (TuneOptions(lockstep=True, torque_Nm=10.0), r"the torque \(=10 Nm\) must be more than"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            tune(load_config(path), output, options=options)
+    with pytest.raises(ConfigurationError, match="is a shipped configuration and is not changed"):
+        tune(load_config(shipped_config("precise")), output, options=TuneOptions(lockstep=True))
+    with pytest.raises(DataError, match=r"steps.json: cannot be read"):
+        tune(load_config(path), output, options=TuneOptions(lockstep=True, resume=True))
+    with pytest.raises(UsageError, match=r"--legs \(=2\) must be in \[8..100\]"):
+        response(load_config(path), output, options=ResponseOptions(legs=2, lockstep=True))

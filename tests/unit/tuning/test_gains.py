@@ -1,0 +1,117 @@
+"""Chosen gains keep what was asked for, judged by the margins of `check`; what is written keeps its comments."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import tomlkit
+
+from jointctl.drivers.errors import ConfigurationError
+from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.analysis.margins import learning_convergence, margins
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.plant_settings import plant_settings
+from jointctl.tools.tuning.found_values import MARK, Found, values_of_fit, with_tuned, with_values
+from jointctl.tools.tuning.gains import SENSITIVITY, PHASE_MARGIN_deg, choose_gains
+from jointctl.tools.tuning.joint_fit import Estimate, JointFit
+from tests.configurations import changed, shipped
+
+NAMES = ("inertia_kgm2", "link_kgm2", "resonance_Hz", "stiffness_Nmprad", "damping_Nmspr", "friction_Nmspr",
+         "delay_s", "lag_s", "late_s")  # fmt: skip
+
+
+def fit_of(inertia: float, late_s: float, link: float = 0.0, stiffness: float = 0.0) -> JointFit:
+    motor = inertia - link
+    resonance = math.sqrt(stiffness * inertia / (motor * link)) / math.tau if link else 0.0
+    values = (inertia, link, resonance, stiffness, 0.02 * math.sqrt(stiffness), 15.0, late_s - 5e-4, 5e-4, late_s)
+    estimates = {name: Estimate(v, 0.02 * v) for name, v in zip(NAMES, values, strict=True)}
+    return JointFit(link > 0.0, estimates, 1e-3, 0.03, 80, 50.0)
+
+
+def known(config: Config, fit: JointFit) -> Config:
+    return with_values(config, values_of_fit(config, fit, "test"))
+
+
+@pytest.mark.parametrize(("law", "late_s"), [("precise", 1.5e-3), ("precise", 2.8e-3), ("paper", 2.0e-3)])
+def test_a_rigid_joint_gets_gains_with_the_margins(law: str, late_s: float) -> None:
+    fit = fit_of(2.0, late_s)
+    config = known(shipped("precise"), fit)
+    found = choose_gains(config, fit, law)
+    assert found.missed == {}
+    settings, _ = loop_settings(changed(config, control=found.control))
+    for factor in (0.97, 1.0, 1.03):  # a heavier joint is a smaller gain
+        judged = margins(replace(settings, inertia_kgm2=settings.inertia_kgm2, kp=settings.kp / factor))
+        assert judged.phase_margin_deg > PHASE_MARGIN_deg - 0.5
+        assert judged.sensitivity_peak < SENSITIVITY + 0.02
+    if found.control.learning is not None:
+        assert learning_convergence(settings, found.control.learning).worst_factor < 1.0
+
+
+def test_more_delay_leaves_less_and_a_quiet_loop_is_quieter() -> None:
+    errors, noises = [], []
+    for late_s, objective in ((1.5e-3, "tracking"), (3e-3, "tracking"), (1.5e-3, "quiet")):
+        fit = fit_of(2.0, late_s)
+        best = choose_gains(known(shipped("precise"), fit), fit, "precise", objective).best
+        errors.append(best.error)
+        noises.append(best.noise_Nm)
+    assert errors[1] > 1.5 * errors[0]
+    assert noises[2] < 0.7 * noises[0]
+    assert errors[2] < 2.1 * errors[0]
+
+
+def test_a_soft_joint_with_two_encoders_gets_their_law_and_passes_the_gate() -> None:
+    fit = fit_of(2.1, 1.8e-3, 1.1, 2.6e4)
+    config = known(shipped("realistic"), fit)
+    found = choose_gains(config, fit)
+    assert found.law == "two_encoders"
+    assert found.control.kind == "flexible_joint"
+    judged = margins(loop_settings(changed(config, control=found.control))[0])
+    assert judged.phase_margin_deg >= config.margin.min_phase_margin_deg
+    assert found.best.settings.observer_radps < 120.0
+
+
+def test_a_goal_that_the_joint_does_not_allow_is_named_with_how_much_is_missing() -> None:
+    fit = fit_of(2.1, 1.8e-3, 1.1, 2.0e4)
+    found = choose_gains(known(shipped("realistic", margin__min_phase_margin_deg=89.0), fit), fit)
+    (name, share), *others = found.missed.items()
+    assert name.startswith("phase margin of the gate")
+    assert name.endswith("of 89 deg")
+    assert 0.0 < share < 1.0
+    assert not others
+
+
+def test_two_encoders_are_refused_where_there_is_one() -> None:
+    fit = fit_of(2.0, 1.5e-3)
+    with pytest.raises(ConfigurationError, match=r"--law \(=two_encoders\) needs \[joint_encoder\]"):
+        choose_gains(known(shipped("precise"), fit), fit, "two_encoders")
+
+
+def test_a_better_belief_does_not_move_the_virtual_joint() -> None:
+    config = shipped("realistic")
+    better = known(config, fit_of(1.7, 1.5e-3, 0.8, 2e4))
+    assert better.joint.inertia_kgm2 == 1.7
+    before, after = plant_settings(config), plant_settings(better)
+    assert after["inertia_kgm2"] == pytest.approx(before["inertia_kgm2"])
+    assert {**after, "inertia_kgm2": 0.0, "friction": 0.0} == {**before, "inertia_kgm2": 0.0, "friction": 0.0}
+
+
+def test_the_file_keeps_its_comments_and_a_second_tune_replaces_the_first() -> None:
+    text = "# mine\n[joint]  # the joint\ninertia_kgm2 = 1.0  # a guess\n\n"
+    text += "[control]\nkp = 3.0\n\n[control.learning]\ngain = 0.1\n"
+    for number in (2.0, 2.5):
+        values = [
+            Found(("joint",), "inertia_kgm2", number, f"{number} +- 0.1"),
+            Found(("margin",), "current_lag_s", 5e-4, "x"),
+            Found(("control",), "learning", None, ""),
+        ]  # fmt: skip
+        text = with_tuned(text, values, {"joint": [f"inertia_kgm2 = {number} +- 0.1"], "margin": ["x"]})
+    assert tomlkit.parse(text).unwrap() == {
+        "joint": {"inertia_kgm2": 2.5}, "control": {"kp": 3.0}, "margin": {"current_lag_s": 5e-4}
+    }  # fmt: skip
+    assert "# mine" in text
+    assert "# a guess" in text
+    assert "[joint]  # the joint" in text
+    assert text.count(MARK) == 2
+    assert "2.0 +-" not in text

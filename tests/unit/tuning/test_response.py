@@ -1,0 +1,208 @@
+"""Frequency response and fit: what a joint truly is comes out of what its positions say."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from jointctl.drivers.errors import DataError, UsageError
+from jointctl.firmware_py.records import LogRecord, Reference, TrajectoryConstants
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, Encoders, TrajectoryKind
+from jointctl.firmware_py.trajectory import reference_at
+from jointctl.tools.analysis.linear_loop import TwoMasses, sampled_joint
+from jointctl.tools.tuning.excitation import (
+    ResponsePlan,
+    config_of_response,
+    excitation_table,
+    largest_peak_Nm,
+    legs_of,
+    multisine,
+    room_rad,
+    speed_and_period,
+)
+from jointctl.tools.tuning.frequency_response import Channel, FrequencyResponse, from_dict, grown, response_of
+from jointctl.tools.tuning.gravity import gravity_of
+from jointctl.tools.tuning.joint_fit import fit_from_dict, fit_joint
+from tests.configurations import shipped
+
+T = 1e-3
+SOFT = TwoMasses(0.9, 1.3, 2.4e4, 15.0, (0.0, 0.0), (12.0, 0.0))
+RIGID = TwoMasses(2.1, 1.0, 0.0, 0.0, (0.0, 0.0), (15.0, 0.0))
+
+
+def plan(peak_Nm: float = 6.0, pairs: int = 3) -> ResponsePlan:
+    config = config_of_response(shipped("precise"), None)
+    return ResponsePlan(legs_of(config, pairs), multisine(1000.0, speed_and_period(config)[1]), peak_Nm)
+
+
+def made_response(joint: TwoMasses, late: tuple[float, float], seed: int = 1, motor: bool = True) -> FrequencyResponse:
+    """The model itself with 3 % of noise."""
+    random = np.random.default_rng(seed)
+    frequency = multisine(1000.0, 4.0).frequency_Hz
+    true = sampled_joint(T, *late, joint, Encoders.BOTH).response(np.exp(2j * math.pi * frequency * T))
+    channels = []
+    for column in (1, 0):
+        size = len(frequency)
+        noise = 0.03 * (random.normal(size=size) + 1j * random.normal(size=size))
+        channels.append(Channel(true[:, column, 0] * (1.0 + noise), np.full(size, 0.06), np.full(size, 0.99)))
+    return FrequencyResponse(frequency, channels[0], channels[1] if motor else None, 12, 5.0, T)
+
+
+def test_the_multisine_has_its_lines_a_peak_of_one_and_nothing_between() -> None:
+    sine = multisine(1000.0, 4.0)
+    assert np.max(np.abs(sine.wave)) == pytest.approx(1.0)
+    spectrum = np.abs(np.fft.rfft(sine.wave))
+    others = np.setdiff1d(np.arange(len(spectrum)), sine.bins)
+    assert np.max(spectrum[others]) < 1e-9 * np.max(spectrum)
+    assert np.min(spectrum[sine.bins]) > 0.1 * np.max(spectrum)
+    assert np.min(np.diff(sine.bins)) >= 2
+    assert sine.frequency_Hz[0] == 1.0
+    assert sine.frequency_Hz[-1] <= 250.0
+    assert 1.0 / np.std(sine.wave) < 3.5  # the crest of random phases is 4 and more
+
+
+def test_the_reference_is_the_triangle_and_its_acceleration_the_torque() -> None:
+    """However the time is rounded; and the acceleration is that times the inertia, in every cycle."""
+    made = plan()
+    table = excitation_table(made, 2.0, T)
+    constants = new(TrajectoryConstants)[0]
+    constants.kind, constants.table_rows = TrajectoryKind.TABLE, len(table)
+    position_rad = 0.0
+    for cycle in range(len(made.legs.velocity_radps) - 1):
+        velocity = made.legs.velocity_radps[cycle]
+        if cycle:
+            position_rad += 0.5 * (velocity + made.legs.velocity_radps[cycle - 1]) * T
+        if cycle % 97:
+            continue
+        for rounding in (-1e-10, 1e-10):
+            reference = new(Reference)[0]
+            reference_at(constants, table, cycle, cycle * T + rounding, reference)
+            if cycle == 0:
+                continue
+            assert reference.position_rad == pytest.approx(position_rad, abs=1e-9)
+            assert reference.velocity_radps == pytest.approx(velocity, abs=1e-8)
+    start = made.legs.starts[0]
+    wave = 2.0 * 2.0 * table[start : start + made.samples - 1, 3]  # behind the last one the leg is braked
+    expected = np.roll(made.peak_Nm * made.sine.wave, -start)[:-1]
+    assert wave == pytest.approx(expected, abs=1e-9)
+
+
+def test_every_leg_holds_one_period_at_constant_speed_within_the_travel() -> None:
+    made, config = plan(pairs=6), config_of_response(shipped("precise"), None)
+    velocity = made.legs.velocity_radps
+    assert np.max(np.cumsum(velocity) * T) <= room_rad(config)
+    assert np.min(np.cumsum(velocity) * T) >= -1e-9
+    assert abs(np.sum(velocity) * T) < 1e-9
+    speeds = set()
+    for start in made.legs.starts:
+        leg = velocity[start : start + made.samples]
+        assert np.ptp(leg) == 0.0
+        speeds.add(round(abs(float(leg[0])), 6))
+    assert len(speeds) == 6
+    assert np.max(np.abs(np.diff(velocity))) <= 0.51 * config.sequence.brake_radps2 * T + 1e-9
+
+
+def test_a_joint_that_cannot_slide_or_has_no_torque_is_refused() -> None:
+    narrow = shipped("precise", limits__position_min_rad=-0.2, limits__position_max_rad=0.2)
+    with pytest.raises(UsageError, match=r"the travel \(=0.2 rad\) must be at least"):
+        speed_and_period(narrow)
+    with pytest.raises(UsageError, match=r"--torque \(=61\) must be in \(0..60\]"):
+        config_of_response(shipped("precise"), 61.0)
+    weak = config_of_response(shipped("precise"), 15.0)
+    assert weak.limits.torque_max_Nm == 15.0
+    with pytest.raises(UsageError, match=r"the torque \(=15 Nm\) must be more than"):
+        largest_peak_Nm(weak)
+
+
+def records_of(made: ResponsePlan, joint: TwoMasses, gravity_Nm: float = 0.0) -> np.ndarray:
+    """A log of a joint that the excitation moves about its triangle; friction and gravity are in the command."""
+    rows = len(made.legs.velocity_radps)
+    log = new(LogRecord, rows)
+    triangle = np.cumsum(made.legs.velocity_radps) * T
+    excitation = made.peak_Nm * np.resize(made.sine.wave, rows)
+    frequency = np.fft.rfftfreq(made.samples, T)[1:-1]
+    both = sampled_joint(T, 1.2e-3, 0.5e-3, joint, Encoders.BOTH).response(np.exp(2j * math.pi * frequency * T))
+    spectrum = np.fft.rfft(made.peak_Nm * made.sine.wave)
+    log.phase, log.trajectory_s = AxisPhase.TRACKING, np.arange(rows) * T
+    log.desired_position_rad, log.desired_velocity_radps = triangle, made.legs.velocity_radps
+    for name, column in (("position_rad", 1), ("second_position_rad", 0)):
+        answer = np.zeros(len(spectrum), dtype=np.complex128)
+        answer[1:-1] = spectrum[1:-1] * both[:, column, 0]
+        setattr(log, name, triangle + np.resize(np.fft.irfft(answer, made.samples), rows))
+    log.command_torque_Nm = excitation + 20.0 * np.sign(made.legs.velocity_radps) + gravity_Nm * np.sin(triangle - 0.1)
+    return log
+
+
+def test_the_response_is_that_of_the_joint_in_spite_of_a_leg_that_is_disturbed() -> None:
+    made = plan(pairs=4)
+    log = records_of(made, SOFT)
+    start = made.legs.starts[3]
+    log.position_rad[start : start + made.samples] += 1e-3 * np.sin(40.0 * np.arange(made.samples) * T)
+    config = config_of_response(shipped("realistic"), None)
+    found = response_of(config, made, log)
+    frequency = found.frequency_Hz
+    true = sampled_joint(T, 1.2e-3, 0.5e-3, SOFT, Encoders.BOTH).response(np.exp(2j * math.pi * frequency * T))
+    assert found.motor is not None
+    assert found.link is not None
+    assert found.motor.response == pytest.approx(true[:, 1, 0], rel=0.01)
+    assert found.link.response == pytest.approx(true[:, 0, 0], rel=0.01)
+    assert found.coherence > 0.99
+    again = from_dict(found.to_dict())
+    assert again.motor is not None
+    assert again.motor.response == pytest.approx(found.motor.response)
+    assert grown(found, again) == pytest.approx(1.0)
+
+
+def test_legs_that_were_lost_do_not_count_and_too_few_are_refused() -> None:
+    made = plan(pairs=3)
+    log = records_of(made, RIGID)
+    config = config_of_response(shipped("precise"), None)
+    kept = log[np.arange(len(log)) < made.legs.starts[4] + made.samples]
+    assert response_of(config, made, kept).legs == 5
+    with pytest.raises(DataError, match=r"legs that were measured \(=2\) must be at least 4"):
+        response_of(config, made, log[np.arange(len(log)) < made.legs.starts[1] + made.samples])
+
+
+@pytest.mark.parametrize("gravity_Nm", [0.0, 6.0, -4.0])
+def test_gravity_is_what_both_directions_have_in_common(gravity_Nm: float) -> None:
+    made = plan(pairs=4)
+    found = gravity_of(made, records_of(made, RIGID, gravity_Nm), T, 0.1)
+    assert found.torque_Nm == pytest.approx(gravity_Nm, abs=0.1)
+    assert found.found == (gravity_Nm != 0.0)
+    assert found.zero_rad == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_two_masses_are_found_with_intervals_from_a_wrong_guess(seed: int) -> None:
+    fit = fit_joint(made_response(SOFT, (1.3e-3, 0.6e-3), seed), 5.0)
+    assert fit.flexible
+    for name, true in (
+        ("inertia_kgm2", 2.2), ("link_kgm2", 1.3), ("stiffness_Nmprad", 2.4e4), ("resonance_Hz", SOFT.resonance_Hz),
+    ):  # fmt: skip
+        one = fit.values[name]
+        assert one.value == pytest.approx(true, rel=0.03)
+        assert abs(one.value - true) < 2.0 * one.half
+    assert fit.late_s.value == pytest.approx(1.9e-3, abs=0.05e-3)
+    again = fit_from_dict(fit.to_dict())
+    frequency = np.array([5.0, 30.0, 100.0])
+    assert again.response(frequency, "link") == pytest.approx(fit.response(frequency, "link"))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_rigid_joint_is_not_taken_for_two_masses(seed: int) -> None:
+    found = made_response(RIGID, (1.0e-3, 0.4e-3), seed, motor=False)
+    fit = fit_joint(found, 1.0)
+    assert not fit.flexible
+    assert fit.inertia_kgm2.value == pytest.approx(2.1, rel=0.02)
+    assert fit.late_s.value == pytest.approx(1.4e-3, abs=0.05e-3)
+
+
+def test_a_response_without_coherence_gives_no_model() -> None:
+    found = made_response(RIGID, (1e-3, 0.0))
+    assert found.motor is not None
+    blind = Channel(found.motor.response, found.motor.half, np.full(len(found.frequency_Hz), 0.1))
+    with pytest.raises(DataError, match=r"lines with coherence \(=0\) must be at least 12"):
+        fit_joint(FrequencyResponse(found.frequency_Hz, blind, None, 12, 5.0, T), 2.0)
