@@ -47,7 +47,7 @@ def wrong(tmp_path: Path) -> Path:
     """A joint whose inertia is 1.6 times what its configuration says, with lower gains than it could have."""
     return written(
         tmp_path / "joint.toml", "precise", joint__inertia_kgm2=1.3125, virtual__inertia_scale=1.6, control__kp=900.0,
-        control__kv=60.0, control__observer_radps=20.0, virtual__gravity_Nm=4.0,
+        control__kv=60.0, control__observer_radps=20.0, control__learning=None, virtual__gravity_Nm=4.0,
     )  # fmt: skip
 
 

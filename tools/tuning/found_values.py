@@ -99,6 +99,12 @@ def with_friction(config: Config, section: Mapping[str, Any]) -> Config:
     )
 
 
+def without_friction(config: Config) -> Config:
+    """The configuration in use before the friction is known."""
+    control = config.control.model_copy(update={"feed_forward": "none", "adaptation": None})
+    return _same_plant(config, config.model_copy(update={"friction": None, "control": control}))
+
+
 def with_tuned(text: str, values: list[Found], sources: Mapping[str, list[str]]) -> str:
     """`text` with these values; a comment under the heading of each section says where they come from.
 

@@ -43,7 +43,15 @@ from jointctl.tools.sweeping.plan import SPEED_SHARE as SWEEP_SHARE
 from jointctl.tools.sweeping.plan import make_plan as sweep_plan
 from jointctl.tools.tuning.carry_out import Carrier, NotCarriedOut
 from jointctl.tools.tuning.excitation import motor_fed
-from jointctl.tools.tuning.found_values import Found, rounded, values_of_fit, with_friction, with_tuned, with_values
+from jointctl.tools.tuning.found_values import (
+    Found,
+    rounded,
+    values_of_fit,
+    with_friction,
+    with_tuned,
+    with_values,
+    without_friction,
+)
 from jointctl.tools.tuning.frequency_response import FrequencyResponse, bode_figure, from_dict
 from jointctl.tools.tuning.gains import ChosenGains, choose_gains, trade_off_figure
 from jointctl.tools.tuning.gravity import gravity_of
@@ -57,6 +65,7 @@ from jointctl.tools.written_file import replace_file
 
 STEPS = ("direction", "response", "gravity", "friction", "map", "gains", "verification")
 STATE = "steps.json"
+FRICTION_SHARE = 0.75  # of the torque that is allowed: more friction leaves nothing to move with
 STRONGER = 2.0  # of the check of the direction, as long as the joint stands still
 SWEEP_POINTS, SWEEP_RATIO, SWEEP_DWELL_s, WARM_UP_TURNS = 36, 100.0, 0.5, 0.1
 SWARM = SwarmSettings(particles=300, iterations=1500)
@@ -126,7 +135,13 @@ class Tune:
     def run(self) -> int:
         """All steps that are not done yet; then the file and the report."""
         text = read_input(self.original.path).decode("utf-8-sig")
-        self._open(hashlib.sha256(text.encode()).hexdigest())
+        self.carry_out(hashlib.sha256(text.encode()).hexdigest())
+        self._write(text)
+        return 0
+
+    def carry_out(self, digest: str) -> None:
+        """The steps alone; `digest` of the configuration that they are for."""
+        self._open(digest)
         for name in STEPS:
             step: Callable[[], Any] = getattr(self, f"_step_{name}")
             done = name in self.state
@@ -141,8 +156,6 @@ class Tune:
                 raise type(error)(f"{name}: {error.message}; {kept}", error.hint) from None
         if self.options.refine:
             self._refine()
-        self._write(text)
-        return 0
 
     def _open(self, digest: str) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -184,14 +197,21 @@ class Tune:
             raise MotionFault(bad[0].text, bad[0].remedy)
         for finding in findings:
             self.carrier.output.note(f"  {finding.topic}: {finding.text}")
+        needed_Nm = max((finding.numbers.get("break_away_Nm", 0.0) for finding in findings), default=0.0)
+        allowed_Nm = self.config.limits.torque_max_Nm
+        if needed_Nm > FRICTION_SHARE * allowed_Nm:
+            raise MotionFault(
+                f"the joint began to move at {needed_Nm:.1f} Nm, and the torque (={allowed_Nm:g} Nm) must be more than "
+                f"{needed_Nm / FRICTION_SHARE:.1f} Nm for the rest",
+                "--torque, limits.torque_max_Nm; or the brake is closed",
+            )
         return [asdict(finding) for finding in findings]
 
     # --- 2. frequency response and the model that fits it ---
 
     def _step_response(self) -> dict[str, Any]:
-        # a friction that may be wrong by any factor is no help to the weak law
-        control = self.config.control.model_copy(update={"feed_forward": "none"})
-        config = self.config.model_copy(update={"control": control})
+        # a friction that may be wrong by any factor is no help, neither to the weak law nor to what watches the reading
+        config = without_friction(self.config)
         task = response_task(config, self._response_options())
         found, records, plan = measured_response(task, self.carrier)
         tracked = records[records.phase == AxisPhase.TRACKING]
@@ -259,7 +279,7 @@ class Tune:
         )  # fmt: skip
         top_radps = max(abs(point.velocity_radps) for point in sweep_plan(self.config, options).points)
         options = replace(options, min_speed_radps=top_radps / SWEEP_RATIO)
-        command = Sweep(self.config, self.carrier.quietly(), path, options)
+        command = Sweep(without_friction(self.config), self.carrier.quietly(), path, options)
         command.control = self.carrier.control
         if command.run() != 0:
             raise NotCarriedOut(command.drive_state, "interruption")
@@ -268,6 +288,7 @@ class Tune:
         return {
             "section": section_values(found.branches["positive"], found.branches["negative"]),
             "rmse_Nm": found.rmse_Nm, "points": len(found.measured_Nm), "model": found.model, "static_before": static,
+            "seconds": command.file.elapsed_s if command.file is not None else 0.0,
         }  # fmt: skip
 
     def _take_friction(self, kept: dict[str, Any]) -> None:

@@ -1,0 +1,224 @@
+"""`tune` on random joints, started from wrong guesses: identified errors, margins with the true values, tracking.
+
+    python tests/bench/tune_ensemble.py [--seed 90701] [--plants 40] [--soft] [--workers 2] [--csv FILE]
+
+Each joint of the ensemble of `study` (`tools/experiments/controller_study.py`; `--soft`: the realistic one with a soft
+reducer and two encoders) begins with an inertia that is wrong by a factor of 0.5 to 2, a friction wrong by the same, no
+reducer, and the delay of the shipped configuration.  Simulated time.  The same law is chosen a second time from the
+true values, and both run 0.35 sin(0.2 pi t); the error is that of the link itself from 20 s to 40 s.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import math
+import multiprocessing
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+from jointctl.drivers.errors import JointctlError  # noqa: E402
+from jointctl.firmware_py.states import Encoders  # noqa: E402
+from jointctl.tools.analysis.linear_loop import TwoMasses  # noqa: E402
+from jointctl.tools.analysis.loop_settings import loop_settings  # noqa: E402
+from jointctl.tools.analysis.margins import margins  # noqa: E402
+from jointctl.tools.configuration.config import Config  # noqa: E402
+from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
+from jointctl.tools.configuration.sections import Friction  # noqa: E402
+from jointctl.tools.experiments.controller_study import EnsembleSettings, random_plant  # noqa: E402
+from jointctl.tools.lockstep import LockstepJoint  # noqa: E402
+from jointctl.tools.output import Output  # noqa: E402
+from jointctl.tools.session.consent import TerminalConsent  # noqa: E402
+from jointctl.tools.tuning.carry_out import Carried, Carrier  # noqa: E402
+from jointctl.tools.tuning.found_values import SMALL_MOTION, values_of_fit, with_values  # noqa: E402
+from jointctl.tools.tuning.gains import choose_gains  # noqa: E402
+from jointctl.tools.tuning.joint_fit import Estimate, JointFit  # noqa: E402
+from jointctl.tools.tuning.tune_options import TuneOptions  # noqa: E402
+from jointctl.tools.verbs.tune_steps import Tune  # noqa: E402
+
+RUN_s, FROM_s = 40.0, 20.0
+SCALED = ("tc_Nm", "ts_Nm", "tv", "a0", "a1", "a2", "a3")
+HELD_LINK = ((0.0, 1e4), (0.0, 200.0))  # of a rigid joint: a link that nothing moves
+
+
+class Timed(Carrier):
+    """Counts the time that the joint moves."""
+
+    seconds = 0.0
+
+    def run(self, *args: Any, **how: Any) -> Carried:
+        carried = super().run(*args, **how)
+        self.seconds += len(carried.records) / args[0].loop.rate_Hz
+        return carried
+
+
+def scaled(friction: Friction, positive: float, negative: float) -> Friction:
+    """The same with the torque of each direction times a factor."""
+
+    def side(one: Any, factor: float) -> Any:
+        return one.model_copy(update={key: factor * getattr(one, key) for key in SCALED})
+
+    return friction.model_copy(
+        update={"positive": side(friction.positive, positive), "negative": side(friction.negative, negative)}
+    )
+
+
+def wrong_guess(config: Config, seed: int, index: int) -> Config:
+    """What a user begins with; the virtual joint stays what it is."""
+    random = np.random.default_rng([seed, index, 1])
+    inertia, friction = (float(math.exp(random.uniform(-math.log(2.0), math.log(2.0)))) for _ in range(2))
+    assert config.virtual is not None
+    assert config.friction is not None
+    virtual = {"inertia_scale": config.virtual.inertia_scale / inertia, "friction": config.friction}
+    update: dict[str, Any] = {
+        "joint": config.joint.model_copy(update={"inertia_kgm2": inertia * config.joint.inertia_kgm2}),
+        "friction": scaled(config.friction, friction, friction),
+        "virtual": config.virtual.model_copy(update=virtual),
+        "margin": config.margin.model_copy(update={"loop_delay_s": None, "current_lag_s": 0.0005}),
+        "reducer": None,
+    }
+    return config.model_copy(update=update)
+
+
+def true_fit(config: Config, found: JointFit, true_kgm2: float) -> JointFit:
+    """As if the response had told the truth, with the intervals of the one that was measured."""
+    virtual = config.virtual
+    assert virtual is not None
+    late_s = virtual.command_delay_s + virtual.current_lag_s
+    values = {"inertia_kgm2": true_kgm2, "delay_s": virtual.command_delay_s, "lag_s": virtual.current_lag_s,
+              "late_s": late_s, "friction_Nmspr": found.friction_Nmspr.value}  # fmt: skip
+    if virtual.flexible:
+        motor, link = virtual.motor_side_inertia_kgm2, true_kgm2 - virtual.motor_side_inertia_kgm2
+        stiffness = SMALL_MOTION * virtual.reducer_stiffness_Nmprad
+        resonance = math.sqrt(stiffness * (1.0 / motor + 1.0 / link)) / math.tau
+        values |= {"link_kgm2": link, "stiffness_Nmprad": stiffness, "resonance_Hz": resonance,
+                   "damping_Nmspr": virtual.reducer_damping_Nmspr}  # fmt: skip
+    estimates = {name: Estimate(values.get(name, 0.0), one.half) for name, one in found.values.items()}
+    return JointFit(virtual.flexible, estimates, found.period_s, found.rms, found.lines, found.criterion)
+
+
+def true_margin_deg(config: Config, true_kgm2: float) -> float:
+    """Least phase margin of the loop on the joint as it is; a soft one with and without what hysteresis adds."""
+    virtual = config.virtual
+    assert virtual is not None
+    if virtual.flexible:
+        motor, link = virtual.motor_side_inertia_kgm2, true_kgm2 - virtual.motor_side_inertia_kgm2
+        joints = tuple(
+            TwoMasses(motor, link, factor * virtual.reducer_stiffness_Nmprad, virtual.reducer_damping_Nmspr)
+            for factor in (1.0, SMALL_MOTION, 2.0)
+        )
+        how: dict[str, Any] = {"joints": joints}
+    else:
+        how = {"joints": (TwoMasses(true_kgm2, 1.0, 0.0, 0.0, *HELD_LINK),), "encoders": Encoders.MOTOR}
+    settings, _ = loop_settings(config)
+    late = {"delay_s": virtual.command_delay_s, "lag_s": virtual.current_lag_s}
+    from dataclasses import replace
+
+    return margins(replace(settings, **late, **how)).phase_margin_deg
+
+
+def rmse_mrad(config: Config) -> float:
+    """Of the link itself; nan where a fault ended the run."""
+    trajectory = config.trajectory.model_copy(update={"duration_s": RUN_s})
+    run = LockstepJoint(config.model_copy(update={"trajectory": trajectory})).run()
+    rows = run.tracking & (run.log.trajectory_s >= FROM_s)
+    return math.nan if run.fault else 1e3 * float(np.sqrt(np.mean(run.true_error_rad[rows] ** 2)))
+
+
+def tuned(task: tuple[int, int, bool]) -> dict[str, Any]:
+    """One joint; with `failed` where it was not tuned."""
+    seed, index, soft = task
+    base = load_config(shipped_config("realistic" if soft else "precise"))
+    plant = random_plant(base, EnsembleSettings(flexible=soft), seed, index)
+    assert plant.virtual is not None
+    true_kgm2 = plant.joint.inertia_kgm2 * plant.virtual.inertia_scale
+    guess = wrong_guess(plant, seed, index)
+    silent = Output(quiet=True, stdout=io.StringIO(), stderr=io.StringIO())
+    row: dict[str, Any] = {"plant": index, "friction": plant.virtual.friction_kind}
+    carrier = Timed(silent, TerminalConsent(silent, assume_yes=True), None)
+    started = time.process_time()
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            job = Tune(guess, TuneOptions(lockstep=True), carrier, Path(folder))
+            job.carry_out("")
+    except JointctlError as error:
+        return {**row, "failed": error.message}
+    row |= {"cpu_s": time.process_time() - started, "joint_s": carrier.seconds + job.state["friction"]["seconds"]}
+    fit, virtual = job.fit, plant.virtual
+    assert fit is not None
+    row["flexible"] = fit.flexible
+    row["inertia"] = fit.inertia_kgm2.value / true_kgm2 - 1.0
+    row["inertia_half"] = fit.inertia_kgm2.half / true_kgm2
+    row["late_ms"] = 1e3 * (fit.late_s.value - virtual.command_delay_s - virtual.current_lag_s)
+    if soft:
+        link = true_kgm2 - virtual.motor_side_inertia_kgm2
+        row["link"] = fit.link_kgm2.value / link - 1.0
+        row["stiffness_over_first"] = fit.stiffness_Nmprad.value / virtual.reducer_stiffness_Nmprad
+    row["law"] = job.state["gains"]["law"]
+    row["missed"] = "; ".join(job.state["gains"]["missed"])
+    row["believed_margin_deg"] = job.state["gains"]["phase_margin_deg"]
+    row["true_margin_deg"] = true_margin_deg(job.config, true_kgm2)
+    row["rmse_mrad"] = rmse_mrad(job.config)
+    row["rmse_before_mrad"] = job.state["verification"].get("before", {}).get("rmse_mrad", math.nan)
+    truth = true_fit(plant, fit, true_kgm2)
+    known = with_values(job.config, values_of_fit(job.config, truth, ""))
+    assert plant.friction is not None
+    friction = scaled(plant.friction, virtual.friction_positive_scale, virtual.friction_negative_scale)
+    known = known.model_copy(update={"friction": friction})
+    best = choose_gains(known, truth, row["law"])
+    row["rmse_true_mrad"] = rmse_mrad(known.model_copy(update={"control": best.control}))
+    return row
+
+
+def _figures(rows: list[dict[str, Any]], name: str) -> str:
+    values = np.abs([row[name] for row in rows if name in row and math.isfinite(row[name])])
+    if not len(values):
+        return "none"
+    return f"median {np.median(values):.4g}, worst {np.max(values):.4g} of {len(values)}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=90701)
+    parser.add_argument("--plants", type=int, default=40)
+    parser.add_argument("--soft", action="store_true")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--csv", type=Path)
+    given = parser.parse_args()
+    tasks = [(given.seed, index, given.soft) for index in range(given.plants)]
+    rows: list[dict[str, Any]] = []
+    with multiprocessing.get_context("spawn").Pool(given.workers) as pool:
+        for row in pool.imap(tuned, tasks):
+            rows.append(row)
+            print(row, flush=True)
+    good = [row for row in rows if "failed" not in row]
+    for row in good:
+        row["ratio"] = row["rmse_mrad"] / row["rmse_true_mrad"]
+    if given.csv is not None:
+        with given.csv.open("w", newline="") as file:
+            writer = csv.DictWriter(file, sorted({key for row in rows for key in row}))
+            writer.writeheader()
+            writer.writerows(rows)
+    print(f"{len(good)} of {len(rows)} tuned, seed {given.seed}, {'soft' if given.soft else 'rigid'}; simulated")
+    for name in ("inertia", "link", "stiffness_over_first", "late_ms", "rmse_mrad", "rmse_true_mrad", "ratio",
+                 "joint_s", "cpu_s"):  # fmt: skip
+        print(f"  {name}: {_figures(good, name)}")
+    margins_deg = sorted(row["true_margin_deg"] for row in good)
+    inside = sum(1 for row in good if abs(row["inertia"]) <= row["inertia_half"])
+    print(f"  true phase margin: worst {margins_deg[0]:.1f}, 30 deg and more {sum(m >= 30.0 for m in margins_deg)}")
+    print(f"  ratio at most 1.2: {sum(row['ratio'] <= 1.2 for row in good)}; interval of the inertia holds: {inside}")
+
+
+if __name__ == "__main__":
+    main()
