@@ -89,7 +89,12 @@ def test_a_tune_goes_on_where_it_ended(wrong: Path) -> None:
     assert "friction: done before" in err.getvalue()
     assert wrong.read_text() == first.replace("of 12 legs", "of 77 legs")
     with pytest.raises(DataError, match="is of another configuration or torque than"):
-        tune(load_config(wrong), output, options=TuneOptions(lockstep=True, resume=True))
+        tune(load_config(wrong), output, options=TuneOptions(lockstep=True, torque_Nm=50.0, resume=True))
+    output, _, err = outputs()  # another objective for what was identified
+    assert tune(load_config(wrong), output, options=TuneOptions(lockstep=True, resume=True)) == 0
+    assert "friction: done before" in err.getvalue()
+    assert "gains: done before" not in err.getvalue()
+    assert load_config(wrong).control.kv != load_config(folder / "before.toml").control.kv
 
 
 @pytest.mark.parametrize(

@@ -145,7 +145,7 @@ class Tune:
         for name in STEPS:
             step: Callable[[], Any] = getattr(self, f"_step_{name}")
             done = name in self.state
-            self.carrier.output.note(f"{name}: {'done before' if done else ''}")
+            self.carrier.output.note(f"{name}: done before" if done else name)
             try:
                 if not done:
                     self.state[name] = step()
@@ -161,21 +161,24 @@ class Tune:
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / STATE
         about = {"configuration": digest, "torque_Nm": self.config.limits.torque_max_Nm}
+        asked = [self.options.law, self.options.objective]
         if self.options.resume:
             try:
                 kept = json.loads(path.read_text())
             except (OSError, ValueError) as error:
                 raise DataError(f"{path}: cannot be read: {error}", "without --resume it begins anew") from None
-            if kept.get("about") != about:
+            own = kept.get("about", {})
+            if about not in (own, {**own, "configuration": kept.get("written")}):
                 raise DataError(
                     f"{path}: is of another configuration or torque than {self.original.path}",
                     "without --resume it begins anew",
                 )
-            self.state = {name: kept[name] for name in STEPS if name in kept}
-        self._about = about
+            steps = STEPS if kept.get("asked") == asked else STEPS[: STEPS.index("gains")]  # another law or objective
+            self.state = {name: kept[name] for name in steps if name in kept}
+        self._about: dict[str, Any] = {"about": about, "asked": asked}
 
     def _save(self) -> None:
-        replace_file(self.folder / STATE, json.dumps({"about": self._about, **self.state}, indent=1).encode())
+        replace_file(self.folder / STATE, json.dumps({**self._about, **self.state}, indent=1).encode())
 
     # --- 1. direction and counts ---
 
@@ -459,6 +462,8 @@ class Tune:
         content = with_tuned(text, values, sources).encode()
         replace_file(self.original.path, content, _require_valid)
         replace_file(self.folder / "before.toml", text.encode())
+        self._about["written"] = hashlib.sha256(content).hexdigest()
+        self._save()
         self._report()
         self.carrier.output.note(f"written: {self.original.path}; as it was: {self.folder / 'before.toml'}")
 

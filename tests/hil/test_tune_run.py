@@ -1,0 +1,76 @@
+"""`tune` as a process on the virtual bus in real time."""
+
+from __future__ import annotations
+
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from jointctl.tools.configuration.load import load_config
+
+
+@pytest.fixture
+def joint(bench: Any) -> Any:
+    """The bench with the joint of `precise` running; limits for a busy computer."""
+    bench.config(base="precise", limits__sample_age_max_s=0.5, limits__skipped_max_s=0.5, drive__heartbeat_s=1.0,
+                 sequence__supervisor_timeout_s=5.0)  # fmt: skip
+    bench.joint("joint.toml")
+    return bench
+
+
+def believed(joint: Any, old: str, new: str) -> Path:
+    """What the user believes of that joint."""
+    text = (joint.folder / "joint.toml").read_text()
+    assert text.count(old) == 1, old
+    path: Path = joint.folder / "mine.toml"
+    path.write_text(text.replace(old, new))
+    return path
+
+
+def test_an_encoder_that_counts_the_other_way_ends_it_with_the_drive_off(joint: Any) -> None:
+    path = believed(joint, "direction = 1 ", "direction = -1 ")
+    text = path.read_text()
+    done = joint.run("tune", "mine.toml", "-y")
+    assert done.code == 7, done.err
+    assert "direction: by [encoder] the joint moved against the torque" in done.err
+    assert "mine.toml is as it was" in done.err
+    assert "Traceback" not in done.err
+    assert joint.disabled()
+    assert path.read_text() == text
+
+
+def test_ctrl_c_in_the_response_ramps_down_and_keeps_the_steps_before(joint: Any) -> None:
+    path = believed(joint, "inertia_kgm2 = 2.1 ", "inertia_kgm2 = 1.5 ")
+    text = path.read_text()
+    started = joint.start("tune", "mine.toml", "-y")
+    started.saw("excitation multisine")
+    give_up_s = time.monotonic() + 180.0
+    while started.err.count("\n  tracking") < 2:
+        assert started.process.poll() is None, started.err
+        assert time.monotonic() < give_up_s, started.err
+        time.sleep(0.05)
+    started.signal(signal.SIGINT)
+    done = started.finished()
+    assert done.code == 130, done.err
+    assert "stopped by SIGINT" in done.err
+    assert done.err.count("ramping") == 2
+    assert joint.disabled()
+    assert path.read_text() == text
+    assert '"direction"' in (joint.folder / "mine.tune" / "steps.json").read_text()
+
+
+@pytest.mark.slow("eight minutes of motion")
+def test_a_whole_tune_in_real_time(joint: Any) -> None:
+    path = believed(joint, "inertia_kgm2 = 2.1 ", "inertia_kgm2 = 1.5 ")
+    done = joint.start("tune", "mine.toml", "-y").finished(1500.0)
+    assert done.code == 0, done.err
+    assert joint.disabled()
+    found = load_config(path)
+    assert found.joint.inertia_kgm2 == pytest.approx(2.1, rel=0.05)
+    assert found.margin.loop_delay_s is not None
+    assert found.margin.loop_delay_s + found.margin.current_lag_s == pytest.approx(1.5e-3, abs=0.5e-3)
+    assert (joint.folder / "mine.tune" / "report.html").exists()
+    assert joint.run("check", "mine.toml").code == 0
