@@ -283,7 +283,8 @@ class Tune:
             mode="torque", assume_yes=True, lockstep=self.options.lockstep, grid="log",
         )  # fmt: skip
         top_radps = max(abs(point.velocity_radps) for point in sweep_plan(self.config, options).points)
-        options = replace(options, min_speed_radps=top_radps / SWEEP_RATIO)
+        top_radps = min(top_radps, SWEEP_SHARE * self.config.limits.velocity_max_radps)
+        options = replace(options, max_speed_radps=top_radps, min_speed_radps=top_radps / SWEEP_RATIO)
         command = Sweep(without_friction(self.config), self.carrier.quietly(), path, options)
         command.control = self.carrier.control
         if command.run() != 0:
