@@ -31,7 +31,7 @@ LEAST_LEGS, MOST_LEGS = 8, 100
 STAGE_PAIRS = 2  # of legs in a stage that only looks for the torque
 GROWTH = 2.0  # of the torque from stage to stage
 ENOUGH_COHERENCE = 0.98  # median over the lines
-RESONANCE_GROWTH = 2.5  # of a line from stage to stage
+RESONANCE_GROWTH = 2.5  # of the highest peak from stage to stage
 
 
 @dataclass(frozen=True)
