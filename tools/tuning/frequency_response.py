@@ -174,10 +174,15 @@ def response_of(config: Config, plan: ResponsePlan, records: Any) -> FrequencyRe
 
 
 def grown(before: FrequencyResponse, after: FrequencyResponse) -> float:
-    """The greatest factor by which a line with good coherence answers more than with a smaller torque."""
+    """The factor by which the highest peak of the acceleration is higher than with a smaller torque.
+
+    Of the peaks and not line by line: with more torque hysteresis lets a resonance come down a little.
+    """
     good = (before.fed.coherence > GOOD_COHERENCE) & (after.fed.coherence > GOOD_COHERENCE)
-    factors = np.abs(after.fed.response[good]) / np.abs(before.fed.response[good])
-    return float(np.max(factors, initial=1.0))
+    peaks = [
+        np.max(np.abs(one.fed.response[good]) * one.frequency_Hz[good] ** 2, initial=0.0) for one in (before, after)
+    ]
+    return float(peaks[1] / peaks[0]) if peaks[0] > 0.0 else 1.0
 
 
 # --- the picture ---

@@ -7,10 +7,10 @@ does; limit cycles themselves, and encoders that disagree, end a run as they end
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from jointctl.drivers.errors import MotionFault, UsageError
+from jointctl.drivers.errors import DataError, MotionFault, UsageError
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.tuning.carry_out import Carrier
 from jointctl.tools.tuning.excitation import (
@@ -24,14 +24,16 @@ from jointctl.tools.tuning.excitation import (
     multisine,
     speed_and_period,
 )
-from jointctl.tools.tuning.frequency_response import FrequencyResponse, grown, response_of
+from jointctl.tools.tuning.found_values import Found, rounded, with_values
+from jointctl.tools.tuning.frequency_response import GOOD_COHERENCE, FrequencyResponse, grown, response_of
+from jointctl.tools.tuning.joint_fit import fit_joint
 from jointctl.tools.tuning.tune_options import ResponseOptions
 
 LEAST_LEGS, MOST_LEGS = 8, 100
 STAGE_PAIRS = 2  # of legs in a stage that only looks for the torque
 GROWTH = 2.0  # of the torque from stage to stage
 ENOUGH_COHERENCE = 0.98  # median over the lines
-RESONANCE_GROWTH = 2.5  # of a line from stage to stage
+RESONANCE_GROWTH = 2.5  # of the highest peak from stage to stage
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,8 @@ def measured_response(task: ResponseTask, carrier: Carrier) -> tuple[FrequencyRe
         carrier.output.note(f"  {peak_Nm:.2f} Nm: coherence {found.coherence:.3f}")
         if before is not None:
             _refuse_growth(before, found)
+        elif found.coherence >= GOOD_COHERENCE:
+            task = _better(task, found)
         if found.coherence >= ENOUGH_COHERENCE and peak_Nm >= 0.5 * task.largest_Nm:
             break
         peak_Nm, before = GROWTH * peak_Nm, found
@@ -73,6 +77,16 @@ def measured_response(task: ResponseTask, carrier: Carrier) -> tuple[FrequencyRe
     if before is not None:
         _refuse_growth(before, found)
     return found, records, plan
+
+
+def _better(task: ResponseTask, found: FrequencyResponse) -> ResponseTask:
+    """With the inertia that the first stage tells: the weak law of one that is too light is too weak for friction."""
+    try:
+        inertia = fit_joint(found, task.config.joint.inertia_kgm2).inertia_kgm2.value
+    except DataError:
+        return task
+    config = with_values(task.config, [Found(("joint",), "inertia_kgm2", rounded(inertia), "")])
+    return replace(task, config=config)
 
 
 def _refuse_growth(before: FrequencyResponse, after: FrequencyResponse) -> None:

@@ -94,7 +94,8 @@ def fit_table(config: Config, found: FrequencyResponse, fit: JointFit) -> Table:
         "quantity", *(Column(name, justify="right") for name in ("found", "+-", "configured")), "",
         title=f"{'Two masses' if fit.flexible else 'Rigid joint'}, {found.legs} legs, {found.peak_Nm:.2f} Nm, "
         f"coherence {found.coherence:.3f}",
-        caption="+-: intervals of 95 %, of the fit alone", title_justify="left", caption_justify="left",
+        caption="+-: intervals of 95 %; docs/tune.md says what is in them", title_justify="left",
+        caption_justify="left",
     )  # fmt: skip
     reducer, margin = config.reducer, config.margin
     link = None if reducer is None else config.joint.inertia_kgm2 - reducer.motor_inertia_kgm2

@@ -19,7 +19,7 @@ from rich.table import Column, Table
 
 from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MarginError, MotionFault, UsageError
 from jointctl.firmware_py.input_file import read_input
-from jointctl.firmware_py.states import AxisPhase
+from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.analysis.loop_settings import loop_settings
 from jointctl.tools.analysis.margin_gate import require_margin
 from jointctl.tools.analysis.margins import Margins, margins
@@ -39,7 +39,6 @@ from jointctl.tools.inspection.motion_check import CheckMotion, config_of_check,
 from jointctl.tools.recording.report_page import Paragraph, Section, from_terminal, svg_figure, write_verb_page
 from jointctl.tools.session.plan import ConfiguredMotion
 from jointctl.tools.sweeping.options import SweepOptions
-from jointctl.tools.sweeping.plan import SPEED_SHARE as SWEEP_SHARE
 from jointctl.tools.sweeping.plan import make_plan as sweep_plan
 from jointctl.tools.tuning.carry_out import Carrier, NotCarriedOut
 from jointctl.tools.tuning.excitation import motor_fed
@@ -67,6 +66,7 @@ STEPS = ("direction", "response", "gravity", "friction", "map", "gains", "verifi
 STATE = "steps.json"
 FRICTION_SHARE = 0.75  # of the torque that is allowed: more friction leaves nothing to move with
 STRONGER = 2.0  # of the check of the direction, as long as the joint stands still
+SWEEP_SHARE = 0.7  # of limits.velocity_max_radps: a soft reducer swings about the speed
 SWEEP_POINTS, SWEEP_RATIO, SWEEP_DWELL_s, WARM_UP_TURNS = 36, 100.0, 0.5, 0.1
 SWARM = SwarmSettings(particles=300, iterations=1500)
 VERIFY_s, VERIFY_FROM_s = 30.0, 5.0
@@ -192,7 +192,9 @@ class Tune:
             carried = self.carrier.run(inner, CheckMotion(inner, plan), "direction", also_faults=True)
             findings = list(motion_findings(config, plan, carried.records, carried.fault, carried.text))
             bad = [finding for finding in findings if finding.status == PROBLEM]
-            stands = any(finding.topic == "motion" for finding in bad)
+            # it stands, or comes to stand again, under a torque that is too small for it
+            stands = bool(bad) and all(finding.topic in ("motion", "check") for finding in bad)
+            stands = stands and carried.fault in (Fault.NONE, Fault.POSITION_FROZEN, Fault.TORQUE_SATURATED)
             if not (stands and plan.torque_Nm < self.config.limits.torque_max_Nm):
                 break
             torque_Nm = STRONGER * plan.torque_Nm
@@ -229,8 +231,8 @@ class Tune:
             f"  {'two masses' if self.fit.flexible else 'rigid'}, {self.fit.inertia_kgm2.value:.4g} kg m^2, "
             f"{1e3 * self.fit.late_s.value:.2f} ms of delay and lag"
         )
-        # a quiet law for the motions that measure
-        self.config = self._with_control(self._chosen(self.options.law, "quiet").control)
+        # for the motions that measure: at low speed a softer law sticks, and no plateau settles
+        self.config = self._with_control(self._chosen(self.options.law, "tracking").control)
 
     def _fitted(self) -> list[Found]:
         assert self.fit is not None
@@ -281,7 +283,8 @@ class Tune:
             mode="torque", assume_yes=True, lockstep=self.options.lockstep, grid="log",
         )  # fmt: skip
         top_radps = max(abs(point.velocity_radps) for point in sweep_plan(self.config, options).points)
-        options = replace(options, min_speed_radps=top_radps / SWEEP_RATIO)
+        top_radps = min(top_radps, SWEEP_SHARE * self.config.limits.velocity_max_radps)
+        options = replace(options, max_speed_radps=top_radps, min_speed_radps=top_radps / SWEEP_RATIO)
         command = Sweep(without_friction(self.config), self.carrier.quietly(), path, options)
         command.control = self.carrier.control
         if command.run() != 0:

@@ -156,6 +156,14 @@ def test_the_response_is_that_of_the_joint_in_spite_of_a_leg_that_is_disturbed()
     assert grown(found, again) == pytest.approx(1.0)
 
 
+def test_a_resonance_that_comes_down_does_not_grow_and_one_that_grows_does() -> None:
+    before = made_response(SOFT, (1e-3, 5e-4))
+    lower = made_response(TwoMasses(0.9, 1.3, 2.0e4, 15.0, (0.0, 0.0), (12.0, 0.0)), (1e-3, 5e-4))
+    assert grown(before, lower) < 1.3
+    undamped = made_response(TwoMasses(0.9, 1.3, 2.4e4, 2.0, (0.0, 0.0), (0.0, 0.0)), (1e-3, 5e-4))
+    assert grown(before, undamped) > 2.5
+
+
 def test_legs_that_were_lost_do_not_count_and_too_few_are_refused() -> None:
     made = plan(pairs=3)
     log = records_of(made, RIGID)
