@@ -298,7 +298,7 @@ class Exchange:
         now_ns = time.monotonic_ns() - held_up_ns
         receive(self._link, self.sample, now_ns, now_ns + wait_ns)
         bus.join()
-        end(self._link, self.sample, new(Command))
+        end(self._link, 0, self.sample, new(Command))
         return int(self.sample[0].count) - before
 
     def _answer(self, answer: Callable[[bytes], bytes] | None) -> None:

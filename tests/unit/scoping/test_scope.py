@@ -607,7 +607,7 @@ def test_what_run_checks_is_checked_before_start(
 
         def run(self) -> None:
             self.drive_state = "switch on disabled"
-            self._allowed(CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.0, 0.1, 1e-5))
+            self._allowed([CommissioningReport(DriveIdentity("", "", "", ""), "cst", 0.0, 0.1, 1e-5)])
 
     monkeypatch.setattr("jointctl.tools.session.session.Session", Asking)
     monkeypatch.setattr(session_module, "require_ready", require_ready)

@@ -11,7 +11,7 @@ import pytest
 from jointctl.firmware_py.records import Sample
 from jointctl.firmware_py.safety import check_encoders, enter
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.sequence import step_enabling, step_waiting
+from jointctl.firmware_py.sequence import is_enabled, step_enabling, step_waiting
 from jointctl.firmware_py.states import AxisPhase, DriveState, Fault, Reaction
 from jointctl.firmware_py.trajectory import approach_at
 from tests.unit.firmware_py.axis.sequence_records import sample_of
@@ -48,6 +48,31 @@ def test_enabling_is_only_asked_at_standstill_inside_the_limits(
     step_waiting(axis, state, sample_of(DriveState.OFF))
     assert (state.phase, state.fault, state.fault_drive_error) == (phase, fault, 0)
     assert state.fault_value == pytest.approx(position_rad if fault else 0.0, nan_ok=True)
+
+
+def test_a_joint_of_an_arm_that_could_be_enabled_waits_for_the_others(axis: Any, state: Any) -> None:
+    settled(state)
+    state.held_back = 1
+    step_waiting(axis, state, sample_of(DriveState.OFF))
+    assert (state.phase, state.ready) == (AxisPhase.WAITING, 1)
+    state.held_back = 0
+    step_waiting(axis, state, sample_of(DriveState.OFF))
+    assert (state.phase, state.ready) == (AxisPhase.ENABLING, 0)
+
+
+@pytest.mark.parametrize(
+    ("phase", "drive_state", "age_cycles", "enabled"),
+    [
+        (AxisPhase.WAITING, DriveState.ENABLED, 0, False), (AxisPhase.ENABLING, DriveState.OFF, 0, False),
+        (AxisPhase.ENABLING, DriveState.ENABLED, 1, False), (AxisPhase.ENABLING, DriveState.ENABLED, 0, True),
+        (AxisPhase.APPROACH, DriveState.ENABLED, 1, True),
+    ],
+)  # fmt: skip
+def test_a_drive_counts_as_enabled_from_its_own_fresh_word_on(
+    state: Any, phase: int, drive_state: DriveState, age_cycles: int, enabled: bool
+) -> None:
+    state.phase, state.sample_age_cycles = phase, age_cycles
+    assert is_enabled(state, sample_of(drive_state)) == enabled
 
 
 @pytest.mark.trips(Fault.MOVED_BEFORE_START, "0.375 + 1e-12, True")
