@@ -237,9 +237,7 @@ def test_the_report_is_a_table_json_and_a_picture(tmp_path: Path):
 
 
 def test_a_part_that_does_not_exist_is_named():
-    with pytest.raises(
-        UsageError, match=r"only \(=lop\) must be one of law, arm, loop, lockstep,"
-    ):
+    with pytest.raises(UsageError, match=r"only \(=lop\) must be one of law, arm, loop, lockstep,"):
         speed.bench(Output(quiet=True), only=["lop"])
 
 

@@ -177,7 +177,7 @@ def time_allowed_s(config: Config, names: tuple[str, ...]) -> float:
 def death(bench: Any) -> Iterator[Death]:
     config = load_config(bench.folder / bench.config(**CHANGES))
     with real_time_joint(config) as joint, can.Bus(interface="jointctl", channel=bench.channel) as bus:
-        yield Death(bench, config, joint._device, bus)
+        yield Death(bench, config, joint._devices[0], bus)
         bench.end()
 
 

@@ -229,10 +229,7 @@ class WayBack:
 
 
 def stand_aside(loop_cpu: int | None) -> None:
-    """Niced, and all on one processor, not the loop's where that is fixed: then the others stay the loop's.
-
-    On two processors a server on both made the p99 of the loop's wake-up 17 to 20 % longer, on one not measurably.
-    """
+    """Niced, and all on one processor, not the loop's where that is fixed: then the others stay the loop's."""
     os.nice(NICE)
     with contextlib.suppress(OSError):
         if others := os.sched_getaffinity(0) - {loop_cpu}:
