@@ -4,7 +4,8 @@
 
 One run of the virtual joint; windows with them and windows in which the program only waits alternate, and which of the
 two comes first.  `set-points`: the program sends them.  `foxglove`, `ros2`: the server serves a client that gets every
-topic, on the same cores; in the other windows both processes are held.
+topic, on the same cores, or on one (`--client-cpu 0`, where the server is: a client elsewhere takes nothing of the
+others); in the other windows both processes are held.
 
 From the run's log: p99 of the wake-up and of the work in each window, the ratio of each pair, and the median of the
 ratios with its quartiles.
@@ -59,10 +60,12 @@ def _windows(joint: jointctl.Joint, pairs: int, seconds: float, load: Load) -> l
 
 
 @contextmanager
-def _onlooker(kind: str, port: int) -> Iterator[Load]:
+def _onlooker(kind: str, port: int, client_cpu: int | None) -> Iterator[Load]:
     """A client of its own process, which runs, as the server does, only for the windows with it."""
     command = [sys.executable, "-m", "tests.bench.onlooker", kind, str(port)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE) as process:
+        if client_cpu is not None:
+            os.sched_setaffinity(process.pid, {client_cpu})
         pids = [process.pid, _child(f"{kind}_server")]
 
         def look_on(joint: jointctl.Joint, seconds: float) -> None:
@@ -104,7 +107,9 @@ def _stream(joint: jointctl.Joint, seconds: float, rate_Hz: float) -> None:
         time.sleep(max(0.0, begun_s + sent / rate_Hz - time.monotonic()))
 
 
-def client_rows(pairs: int, seconds: float, rate_Hz: float, beside: str = SET_POINTS) -> list[Row]:
+def client_rows(
+    pairs: int, seconds: float, rate_Hz: float, beside: str = SET_POINTS, client_cpu: int | None = None
+) -> list[Row]:
     """A row each for wake-up and work."""
     from jointctl.tools.configuration.load import load_config, shipped_config
 
@@ -126,7 +131,7 @@ def client_rows(pairs: int, seconds: float, rate_Hz: float, beside: str = SET_PO
         if beside == SET_POINTS:
             windows = _windows(joint, pairs, seconds, lambda joint, seconds: _stream(joint, seconds, rate_Hz))
         else:
-            load = stack.enter_context(_onlooker(beside, port))
+            load = stack.enter_context(_onlooker(beside, port, client_cpu))
             windows = _windows(joint, pairs, seconds, load)
     assert joint.log_path is not None
     records = jointctl.read_log(joint.log_path).records
@@ -152,10 +157,11 @@ def main(
     seconds: Annotated[float, typer.Option(min=2.5)] = 5.0,
     rate: Annotated[float, typer.Option(help="set-points a second", min=1.0)] = 500.0,
     beside: Annotated[str, typer.Option("--with", help=f"{SET_POINTS}, {FOXGLOVE} or {ROS2}")] = SET_POINTS,
+    client_cpu: Annotated[int | None, typer.Option(help="the only processor of the client", min=0)] = None,
     json: bool = False,
 ) -> None:
     """Measure and print."""
-    rows = client_rows(pairs, seconds, rate, beside)
+    rows = client_rows(pairs, seconds, rate, beside, client_cpu)
     Output(json=json).result(outcome_table(rows), outcome_data(rows, conditions()))
 
 
