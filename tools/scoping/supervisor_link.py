@@ -229,11 +229,12 @@ class WayBack:
 
 
 def stand_aside(loop_cpu: int | None) -> None:
-    """Niced, and all on one processor, not the loop's where that is fixed: then the others stay the loop's."""
+    """Niced, and off the loop's processor where that is fixed and there is another."""
     os.nice(NICE)
-    with contextlib.suppress(OSError):
-        if others := os.sched_getaffinity(0) - {loop_cpu}:
-            os.sched_setaffinity(0, {min(others)})
+    if loop_cpu is not None:
+        with contextlib.suppress(OSError):
+            if others := os.sched_getaffinity(0) - {loop_cpu}:
+                os.sched_setaffinity(0, others)
 
 
 def serve_order(serve: Callable[[RemoteOrder], None]) -> int:
