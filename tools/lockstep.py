@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,7 +43,7 @@ from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.plant_settings import arm_plant_of
-from jointctl.tools.configuration.records import axis_constants, trajectory_table
+from jointctl.tools.configuration.records import axis_constants, stacked_tables, trajectory_table
 from jointctl.tools.virtual_joint import new_device
 
 _COMMISSIONING_STEP_NS = 1000  # the device's clock goes on a little with every frame
@@ -336,13 +335,6 @@ class LockstepJoint:
         )
 
 
-def tables_of(configs: Sequence[Config]) -> np.ndarray:
-    """The joints' tables in one array, float64 (axes, rows, 5); a shorter one has rows that no one reads."""
-    tables = [trajectory_table(config) for config in configs]
-    rows = max(len(table) for table in tables)
-    return np.stack([np.pad(table, ((0, rows - len(table)), (0, 0))) for table in tables])
-
-
 class LockstepArm:
     """The joints of an arm, each commissioned as `LockstepJoint` is, then moved in one loop."""
 
@@ -359,7 +351,7 @@ class LockstepArm:
         self.plant_constants = np.concatenate([joint.plant_constants for joint in joints]).view(np.recarray)
         self.plant_state = np.concatenate([joint._virtual.plant_state for joint in joints]).view(np.recarray)
         self._starts_rad = [joint.report.start_position_rad for joint in joints]
-        self.tables = tables_of(arm.joints)
+        self.tables = stacked_tables([trajectory_table(config) for config in arm.joints])
 
     def constants(self) -> Any:
         """Fresh `AxisConstants`, one a joint; may be changed before `run`."""

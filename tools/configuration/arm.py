@@ -7,7 +7,6 @@ encoder's zero and direction must say so.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,15 +15,13 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import Field, ValidationError
 
-from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.arm_model import Arm, ArmConstants, ArmFeedForward, ArmLink, ArmMotion, JointKind
-from jointctl.firmware_py.input_file import parse_toml
 from jointctl.firmware_py.schema import new
 from jointctl.tools.configuration.arm_motion import LARGEST_ARM, ArmTrajectory, PerJoint, trajectories
 from jointctl.tools.configuration.canopen import CanopenSection
 from jointctl.tools.configuration.checks import problems_between_sections
 from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config, problem_lines, raise_if
-from jointctl.tools.configuration.load import load_config, read_text, with_units
+from jointctl.tools.configuration.load import config_of, load_config, read_document, with_units
 from jointctl.tools.configuration.records import axis_constants
 from jointctl.tools.configuration.sections import Section, between
 from jointctl.tools.configuration.urdf import Body, Urdf, bodies_of, of_body, read_urdf
@@ -117,22 +114,19 @@ class ArmConfig:
         return found
 
 
-def is_arm(path: str | Path) -> bool:
-    """Whether the file is that of an arm and not of one joint; `ConfigurationError` if it cannot be read."""
-    try:
-        return "arm" in parse_toml(read_text(Path(path)))
-    except tomllib.TOMLDecodeError:
-        return False
+def load_joint_or_arm(path: str | Path) -> Config | ArmConfig:
+    """As `load_config`, or as `load_arm` of a file with an [arm]."""
+    path = Path(path)
+    text, data = read_document(path)
+    return (_arm_of if "arm" in data else config_of)(path, text, data)
 
 
 def load_arm(path: str | Path) -> ArmConfig:
     """Read, check and freeze an arm file with all that it names; `ConfigurationError` holds one line per problem."""
-    path = Path(path)
-    text = read_text(path)
-    try:
-        data = parse_toml(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigurationError(f"{path}: not valid TOML: {error}") from None
+    return _arm_of(Path(path), *read_document(Path(path)))
+
+
+def _arm_of(path: Path, text: str, data: dict[str, Any]) -> ArmConfig:
     data, converted = with_units(data)
     try:
         file = _ArmFile.model_validate(data)
@@ -197,7 +191,7 @@ def _bodies(
     return bodies, inertias
 
 
-def _moved(path: Path, motion: Any, alone: tuple[Config, ...], names: tuple[str, ...]) -> tuple[Config, ...]:
+def _moved(path: Path, motion: ArmTrajectory, alone: tuple[Config, ...], names: tuple[str, ...]) -> tuple[Config, ...]:
     """The joints with their parts of the motion, which keeps their limits."""
     try:
         parts = list(trajectories(motion, alone, names))
@@ -207,9 +201,10 @@ def _moved(path: Path, motion: Any, alone: tuple[Config, ...], names: tuple[str,
     joints, wrong = [], []
     for config, part in zip(alone, parts, strict=True):
         if part.kind == "table":
-            part = part.model_copy(update={"file": str((path.parent / part.file).absolute())})
-            if not Path(part.file).is_file():
-                raise_if([f"{path}: motion.file (={motion.file}) must name a file beside the arm file"])
+            file = (path.parent / part.file).absolute()
+            if not file.is_file():
+                raise_if([f"{path}: motion.file (={part.file}) must name a file beside the arm file"])
+            part = part.model_copy(update={"file": str(file)})
         one = config.model_copy(update={"trajectory": part})
         wrong += [f"{path}: with [motion], {config.path.name}: {line}" for line in problems_between_sections(one)]
         joints.append(one)

@@ -70,7 +70,7 @@ class ArmHold(Section):
 
 
 ArmTrajectory = Annotated[ArmSine | ArmMove | ArmTable | ArmHold, Field(discriminator="kind")]
-_OF_A_JOINT: TypeAdapter[Any] = TypeAdapter(Trajectory)
+_OF_A_JOINT: TypeAdapter[Trajectory] = TypeAdapter(Trajectory)
 
 
 def shortest_move_s(configs: tuple[Config, ...], way_rad: tuple[float, ...]) -> float:
@@ -86,7 +86,7 @@ def shortest_move_s(configs: tuple[Config, ...], way_rad: tuple[float, ...]) -> 
     return math.ceil(longest * 1e3) * 1e-3
 
 
-def trajectories(motion: Any, configs: tuple[Config, ...], names: tuple[str, ...]) -> Iterator[Any]:
+def trajectories(motion: ArmTrajectory, configs: tuple[Config, ...], names: tuple[str, ...]) -> Iterator[Trajectory]:
     """The section [trajectory] of each joint; `ValueError` with a line each for what it must not be."""
     given = {key: value for key, value in motion.model_dump().items() if value is not None}
     wrong = [

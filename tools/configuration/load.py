@@ -84,12 +84,20 @@ def load_config(path: str | Path) -> Config:
 
     What only the virtual joint can judge of [virtual] is judged where it is made (`plant_settings`).
     """
-    path = Path(path)
+    return config_of(Path(path), *read_document(Path(path)))
+
+
+def read_document(path: Path) -> tuple[str, dict[str, Any]]:
+    """A TOML file and what it says; `ConfigurationError`."""
     text = read_text(path)
     try:
-        data = parse_toml(text)
+        return text, parse_toml(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigurationError(f"{path}: not valid TOML: {error}") from None
+
+
+def config_of(path: Path, text: str, data: dict[str, Any]) -> Config:
+    """As `load_config`, of a file that was read."""
     data, remarks = renamed(data)
     data, converted = with_units(data)
     config = _validated(data, str(path))

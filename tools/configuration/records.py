@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -109,6 +110,12 @@ def trajectory_table(config: Config) -> np.ndarray:
     problems = extremes_problems(config, peak.position_min_rad, peak.position_max_rad, peak.velocity_radps)
     raise_if([f"{config.path}: {line}" for line in problems])
     return table
+
+
+def stacked_tables(tables: Sequence[np.ndarray]) -> np.ndarray:
+    """float64 (axes, rows, 5): the tables of several axes; a shorter one ends with rows that no one reads."""
+    rows = max(len(table) for table in tables)
+    return np.stack([np.pad(table, ((0, rows - len(table)), (0, 0))) for table in tables])
 
 
 def _copy(record: Any, section: Section, *names: str) -> None:

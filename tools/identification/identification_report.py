@@ -1,34 +1,23 @@
-"""What comes out of an identification: tables, figures, and the [friction] section of a configuration.
+"""What comes out of an identification: tables, figures, and the values of [friction] in a configuration.
 
-The numbers are written as (11) prints them: joint deg/s and motor Nm, with the signs of Table 3.  Writing the section
-keeps the comments and everything else of the file; the new text is checked as a complete configuration before it
-replaces the file in one step; on any error the file stays as it is.
+The numbers are written as (11) prints them: joint deg/s and motor Nm, with the signs of Table 3.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import tomlkit
 from rich.console import Group, RenderableType
 from rich.table import Column, Table
 from rich.text import Text
-from tomlkit.exceptions import TOMLKitError
 
-from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.friction import DEGREE
-from jointctl.firmware_py.input_file import read_input
-from jointctl.tools.configuration.config import ConfigurationProblems
-from jointctl.tools.configuration.load import load_config
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, canvas
 from jointctl.tools.identification.friction_data import FrictionData, relative_errors, relative_figures
 from jointctl.tools.identification.identification import DIRECTIONS, Identification
 from jointctl.tools.identification.models import FORMS, Branch
 from jointctl.tools.identification.uncertainty import NAMES
-from jointctl.tools.written_file import replace_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -294,9 +283,6 @@ def convergence_figure(identified: Identification) -> Any | None:
 
 # --- the [friction] section ---
 
-MARK = "# identified by jointctl: "
-OPTIONAL = ("load", "temperature")  # sections of [friction] that only a motion identifies
-
 
 def direction_values(found: Branch, *, negative: bool) -> dict[str, float]:
     """One direction under the keys of the configuration: deg/s at the joint, Nm at the motor, signs of (11)."""
@@ -323,111 +309,3 @@ def section_values(positive: Branch, negative: Branch) -> dict[str, Any]:
         "positive": direction_values(positive, negative=False),
         "negative": direction_values(negative, negative=True),
     }
-
-
-def snippet(values: dict[str, Any], remarks: list[str]) -> str:
-    """The section as a text of its own."""
-    lines = [MARK + line for line in remarks] + ["[friction]"]
-    lines += [f'{key} = "{values[key]}"' for key in ("velocity_unit", "velocity_side", "torque_side")]
-    for name in [key for key in ("positive", "negative", *OPTIONAL) if key in values]:
-        lines += ["", f"[friction.{name}]", *(f"{key} = {value!r}" for key, value in values[name].items())]
-    return "\n".join(lines) + "\n"
-
-
-def with_section(text: str, values: dict[str, Any], remarks: list[str]) -> str:
-    """`text` with its [friction] replaced or appended; other keys of it ([friction.lugre]) and all comments stay."""
-    kept = "".join(line for line in text.splitlines(keepends=True) if not line.startswith(MARK))
-    newline = "\r\n" if "\r\n" in kept else "\n"
-    try:
-        document = tomlkit.parse(kept)
-    except TOMLKitError as error:
-        raise ConfigurationError(f"not valid TOML: {error}") from None
-    friction = document.get("friction")
-    if friction is None:
-        gap = "" if not kept or kept.endswith(newline) else newline
-        return kept + gap + newline + snippet(values, remarks).replace("\n", newline)
-    for key in ("velocity_unit", "velocity_side", "torque_side"):
-        friction[key] = values[key]
-    for name in OPTIONAL:  # they belong to the curve that they were found with
-        friction.pop(name, None)
-    for name in [key for key in ("positive", "negative", *OPTIONAL) if key in values]:
-        if name not in friction:
-            friction[name] = tomlkit.table()
-        for key, value in values[name].items():
-            friction[name][key] = value
-    lines = tomlkit.dumps(document).splitlines(keepends=True)
-    at = next((k for k, line in enumerate(lines) if line.replace(" ", "").startswith("[friction")), len(lines))
-    return "".join(lines[:at] + [MARK + line + newline for line in remarks] + lines[at:])
-
-
-def with_map(text: str, values: dict[str, Any], remarks: list[str]) -> str:
-    """`text` with its [reducer.map] replaced or added; everything else and all comments but the map's stay."""
-    try:
-        document = tomlkit.parse(text)
-    except TOMLKitError as error:
-        raise ConfigurationError(f"not valid TOML: {error}") from None
-    reducer = document.get("reducer")
-    if reducer is None:
-        raise ConfigurationError("[reducer] is missing, which [reducer.map] belongs to")
-    _fill(reducer, "map", values, remarks)
-    return tomlkit.dumps(document)
-
-
-def with_ripple(text: str, values: dict[str, Any], remarks: list[str]) -> str:
-    """As `with_map`, with [ripple]."""
-    try:
-        document = tomlkit.parse(text)
-    except TOMLKitError as error:
-        raise ConfigurationError(f"not valid TOML: {error}") from None
-    _fill(document, "ripple", values, remarks)
-    return tomlkit.dumps(document)
-
-
-def _fill(parent: Any, name: str, values: dict[str, Any], remarks: list[str]) -> None:
-    """A table of a document of tomlkit, made if it is not there."""
-    if name not in parent:
-        parent[name] = tomlkit.table()
-    for line in remarks:
-        parent[name].comment(MARK.removeprefix("# ") + line)
-    for key, value in values.items():
-        parent[name][key] = value
-
-
-def write_map(config_path: Path, values: dict[str, Any], remarks: list[str]) -> None:
-    """As `write_into`, with [reducer.map]."""
-    _write_changed(config_path, lambda text: with_map(text, values, remarks))
-
-
-def write_ripple(config_path: Path, values: dict[str, Any], remarks: list[str]) -> None:
-    """As `write_into`, with [ripple]."""
-    _write_changed(config_path, lambda text: with_ripple(text, values, remarks))
-
-
-def write_into(config_path: Path, values: dict[str, Any], remarks: list[str]) -> None:
-    """Put the section into a configuration; if the result is not valid, `ConfigurationError`, and the file stays."""
-    _write_changed(config_path, lambda text: with_section(text, values, remarks))
-
-
-def _write_changed(config_path: Path, change: Callable[[str], str]) -> None:
-    try:
-        text = read_input(config_path).decode("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(
-            f"{config_path}: cannot be read: {getattr(error, 'strerror', None) or error}"
-        ) from None
-    try:
-        changed = change(text)
-    except ConfigurationError as error:
-        raise ConfigurationError(f"{config_path}: {error.message}") from None
-
-    def check(temporary: Path) -> None:
-        try:
-            load_config(temporary)
-        except ConfigurationProblems as error:
-            raise ConfigurationProblems(
-                [line.replace(str(temporary), str(config_path)) for line in error.problems]
-            ) from None
-        except ConfigurationError as error:
-            raise ConfigurationError(error.message.replace(str(temporary), str(config_path)), error.hint) from None
-
-    replace_file(config_path, changed.encode("utf-8"), check)

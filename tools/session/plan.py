@@ -25,6 +25,7 @@ from jointctl.tools.configuration.records import (
     expect_client,
     fill_trajectory,
     free_constants,
+    stacked_tables,
     trajectory_table,
 )
 from jointctl.tools.configuration.sections import Limits
@@ -100,12 +101,8 @@ class RunPlan:
 
     @property
     def tables(self) -> np.ndarray:
-        """float64 (axes, rows, 5): the tables of all motions, the shorter ones with rows that are not used."""
-        tables = [joint.motion.table for joint in self.joints]
-        filled = np.zeros((len(tables), max(len(table) for table in tables), 5))
-        for rows, table in zip(filled, tables, strict=True):
-            rows[: len(table)] = table
-        return filled
+        """The tables of all motions, see `stacked_tables`."""
+        return stacked_tables([joint.motion.table for joint in self.joints])
 
     def placed(self, reports: Sequence[CommissioningReport]) -> Placed:
         """The motion of all joints from where they stand: constants of all, the lines of all."""

@@ -115,9 +115,8 @@ class Session:
     def _loop(self, tail_path: Path) -> LoopHandle:
         """The loop process, started; it waits for its word."""
         plan, port, marker_fd = self.plan, self._kind.port_record(), self._control.marker_fd
-        if plan.arm is None:
-            return LoopHandle(self._config, plan.motion.table, port, tail_path, marker_fd)
-        return LoopHandle(self._config, plan.tables, port, tail_path, marker_fd, plan.arm.config.model)
+        model = None if plan.arm is None else plan.arm.config.model
+        return LoopHandle(self._config, plan.tables, port, tail_path, marker_fd, model)
 
     def _opened(self) -> DriveGroup:
         """The drives of all joints, nothing sent to them yet."""

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import tomlkit
-from tomlkit.exceptions import TOMLKitError
 
-from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.sections import Reducer
+from jointctl.tools.configuration.written_sections import document_of
 from jointctl.tools.tuning.joint_fit import Estimate, JointFit
 
 MARK = "# tuned by jointctl: "
@@ -110,12 +109,7 @@ def with_tuned(text: str, values: list[Found], sources: Mapping[str, list[str]])
 
     Sections that are not there are added at the end.  Comments stay, but those of an earlier tune.
     """
-    kept = "".join(line for line in text.splitlines(keepends=True) if not line.startswith(MARK))
-    newline = "\r\n" if "\r\n" in kept else "\n"
-    try:
-        document = tomlkit.parse(kept)
-    except TOMLKitError as error:
-        raise ConfigurationError(f"not valid TOML: {error}") from None
+    document, newline = document_of(text, MARK)
     for one in values:
         table: Any = document
         for name in one.section:

@@ -221,10 +221,10 @@ def identify(
     # into: the section goes into it, figures and the JSON report beside the data.  Otherwise into `out`, default
     # DATA.friction.toml, and they beside it.
     from jointctl.tools.configuration.load import shipped_config
+    from jointctl.tools.configuration.written_sections import friction_snippet, with_friction_section, write_changed
     from jointctl.tools.drawing import png
     from jointctl.tools.identification.friction_data import ForeignFormat
     from jointctl.tools.identification.identification import Options
-    from jointctl.tools.identification.identification_report import snippet, write_into
     from jointctl.tools.identification.motion_data import is_series, motion_of_plateaus
     from jointctl.tools.recording.report_page import check_target
     from jointctl.tools.written_file import replace_file, require_target
@@ -254,7 +254,7 @@ def identify(
         out = data_path.with_suffix(".friction.toml")
     stem = out.with_suffix("") if out is not None else data_path.with_suffix(".friction")
     result = {**found.result, "friction": found.section}
-    text = snippet(found.section, found.remarks)
+    text = friction_snippet(found.section, found.remarks)
     files = {stem.with_name(f"{stem.name}{end}.png"): png(figure) for end, (figure, _) in found.pictures.items()}
     report_json = json.dumps(result, indent=1, allow_nan=False)
     files[stem.with_name(stem.name + ".report.json")] = report_json.encode("utf-8")
@@ -265,7 +265,7 @@ def identify(
     for path in files:
         require_target(path, protected)
     if into is not None:  # first, because it is the one that may be refused
-        write_into(into, found.section, found.remarks)
+        write_changed(into, lambda before: with_friction_section(before, found.section, found.remarks))
     for path, content in files.items():
         replace_file(path, content)
     output.result(found.shown, {**result, "files": [str(p) for p in files]})

@@ -123,8 +123,8 @@ def map_verb(
     """Measure kinematic error and torque ripple of the reducer: one slow motion both ways, Fourier series, picture."""
     from jointctl.tools.analysis.reducer_map import found_map, map_figure
     from jointctl.tools.configuration.config import SHIPPED_FOLDER
+    from jointctl.tools.configuration.written_sections import with_map, write_changed
     from jointctl.tools.drawing import require_png, save_png
-    from jointctl.tools.identification.identification_report import write_map, write_ripple
     from jointctl.tools.session.consent import require_terminal
 
     if write and config.path.resolve().is_relative_to(SHIPPED_FOLDER):
@@ -155,8 +155,9 @@ def map_verb(
                 values[key] = list(getattr(config.reducer.map, key))
     if write:
         turns = f"{found.turns[0]} motor turns forwards, {found.turns[1]} backwards"
-        write_section = write_map if config.reducer is not None else write_ripple
-        write_section(config.path, values, [f"map of {turns} at {found.speed_radps:g} rad/s"])
+        write_changed(
+            config.path, lambda text: with_map(text, values, f"map of {turns} at {found.speed_radps:g} rad/s")
+        )
         output.note(f"written: {config.path}")
     return 0
 

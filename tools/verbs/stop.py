@@ -62,14 +62,10 @@ def _switch_off(targets: Sequence[StopTarget], output: Output) -> list[str]:
 
 
 def _warn_of(path: Path, output: Output) -> None:
-    from jointctl.tools.configuration.arm import is_arm, load_arm  # the stop itself does not wait for its modules
-    from jointctl.tools.configuration.load import load_config
+    from jointctl.tools.configuration.arm import load_joint_or_arm  # the stop itself does not wait for its modules
 
     try:
-        if is_arm(path):
-            load_arm(path)
-        else:
-            load_config(path)
+        load_joint_or_arm(path)
     except ConfigurationError as error:
         for line in error.message.splitlines():
             output.warning(f"the stop was sent, but the configuration does not hold: {line}")

@@ -141,15 +141,13 @@ def loaded(config: Path, bus: CanOptions = AS_CONFIGURED) -> Config:
 
 def loaded_joint_or_arm(config: Path, bus: CanOptions = AS_CONFIGURED) -> Config | ArmConfig:
     """As `loaded`; of an arm's file the arm, all joints on the bus that is named."""
-    from jointctl.tools.configuration.arm import is_arm, load_arm
+    from jointctl.tools.configuration.arm import ArmConfig, load_joint_or_arm
+    from jointctl.tools.configuration.load import moved
 
-    path = config_path(config)
-    if not is_arm(path):
-        return loaded(config, bus)
-    found = load_arm(path)
+    found = load_joint_or_arm(config_path(config))
     for remark in found.remarks:
         Output().warning(f"{found.path}: {remark}")
-    return arm_on_bus(found, place(bus))
+    return arm_on_bus(found, place(bus)) if isinstance(found, ArmConfig) else moved(found, place(bus))
 
 
 def arm_on_bus(arm: ArmConfig, given: GivenPlace) -> ArmConfig:
@@ -226,15 +224,7 @@ def _loaded_file(config: ConfigPath) -> Config:
 
 
 def _loaded_file_or_arm(config: ConfigPath) -> Config | ArmConfig:
-    from jointctl.tools.configuration.arm import is_arm, load_arm
-
-    path = config_path(config)
-    if not is_arm(path):
-        return loaded(config)
-    found = load_arm(path)
-    for remark in found.remarks:
-        Output().warning(f"{found.path}: {remark}")
-    return found
+    return loaded_joint_or_arm(config)
 
 
 def _loaded_or_virtual(*, config: ConfigPath = Path("virtual"), bus: BusOptions) -> Config:

@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 import pytest
+import tomlkit
 
-from jointctl.drivers.errors import ConfigurationError, DataError
+from jointctl.drivers.errors import DataError
 from jointctl.tools.analysis.reducer_map import (
     FoundMap,
     MapRun,
@@ -16,7 +17,7 @@ from jointctl.tools.analysis.reducer_map import (
     late_torque_Nm,
     map_figure,
 )
-from jointctl.tools.identification.identification_report import with_map
+from jointctl.tools.configuration.written_sections import with_map
 
 RATIO, SPEED, MOTOR, LINK = 121.0, 0.03, 0.9, 1.2
 ERROR = {1: (1.5e-5, 0.3), 2: (2e-4, 0.6), 4: (5e-5, -1.1)}  # per motor turn: (rad, rad)
@@ -115,18 +116,17 @@ OLD = "\n[reducer.map]  # older\nkinematic_error_rad = [0.1]  # too much\n"
 
 @pytest.mark.parametrize("old", ["", OLD])
 def test_the_section_is_written_and_every_comment_stays(old: str) -> None:
-    import tomlkit
-
     values = found_map(made_run()).values(1, 17)
-    text = with_map(CONFIGURATION.replace("{map}", old), values, ["map of 4 turns"])
+    text = with_map(CONFIGURATION.replace("{map}", old), values, "map of 4 turns")
     again = tomlkit.parse(text).unwrap()
     assert again["reducer"]["map"] == values
     assert again["limits"] == {"position_min_rad": -0.7}
     for comment in ("# believed", "# of the motor", "# of the joint", "map of 4 turns"):
         assert comment in text
-    assert with_map(text, values, ["map of 5 turns"]).count("map of") == 1
+    assert with_map(text, values, "map of 5 turns").count("map of") == 1
 
 
-def test_a_configuration_without_a_reducer_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match=r"\[reducer\] is missing"):
-        with_map("[limits]\n", {}, [])
+def test_without_a_reducer_the_ripple_has_a_section_of_its_own() -> None:
+    assert tomlkit.parse(with_map("[limits]\n", {"torque_ripple_Nm": 0.1}, "")).unwrap()["ripple"] == {
+        "torque_ripple_Nm": 0.1
+    }

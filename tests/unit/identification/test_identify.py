@@ -16,10 +16,10 @@ from jointctl.drivers.errors import ConfigurationError, DataError, UsageError
 from jointctl.firmware_py.friction import DEGREE, friction_curve_Nm, paper_friction
 from jointctl.tools.configuration.conversions import friction_constants
 from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.configuration.written_sections import MARK, friction_snippet, with_friction_section
 from jointctl.tools.identification import identification
 from jointctl.tools.identification.friction_data import ForeignFormat
 from jointctl.tools.identification.identification import Options
-from jointctl.tools.identification.identification_report import MARK, snippet, with_section
 from jointctl.tools.identification.swarm import SwarmSettings
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.identify import identify
@@ -132,31 +132,31 @@ def test_comments_and_other_sections_of_the_configuration_stay(sweep, config):
 
 def test_a_section_is_appended_where_there_is_none_and_lugre_is_kept():
     text = "# mine\n[joint]\nreduction_ratio = 121.0 # checked"
-    added = with_section(text, VALUES, ["from a test"])
+    added = with_friction_section(text, VALUES, ["from a test"])
     assert added.startswith(text + "\n")
     assert tomlkit.parse(added).unwrap()["friction"] == VALUES
-    kept = with_section(added + "\n[friction.lugre]\nstiffness_Nmprad = 8e4 # bench\n", VALUES, ["again"])
+    kept = with_friction_section(added + "\n[friction.lugre]\nstiffness_Nmprad = 8e4 # bench\n", VALUES, ["again"])
     assert tomlkit.parse(kept).unwrap()["friction"]["lugre"] == {"stiffness_Nmprad": 8e4}
     assert "# bench" in kept
     assert kept.count(MARK) == 1
 
 
 def test_a_section_with_lugre_alone_is_completed():
-    changed = with_section("[friction.lugre]\nstiffness_Nmprad = 8e4 # bench\n", VALUES, ["x"])
+    changed = with_friction_section("[friction.lugre]\nstiffness_Nmprad = 8e4 # bench\n", VALUES, ["x"])
     expected = {**VALUES, "lugre": {"stiffness_Nmprad": 8e4}}
     assert tomlkit.parse(changed).unwrap()["friction"] == expected
     assert "# bench" in changed
 
 
 def test_windows_line_ends_stay():
-    text = snippet(VALUES, ["x"]).replace("\n", "\r\n")
-    changed = with_section(text, {**VALUES, "velocity_unit": "rad/s"}, ["y"])
+    text = friction_snippet(VALUES, ["x"]).replace("\n", "\r\n")
+    changed = with_friction_section(text, {**VALUES, "velocity_unit": "rad/s"}, ["y"])
     assert changed.count("\n") == changed.count("\r\n")
     assert tomlkit.parse(changed).unwrap()["friction"]["velocity_unit"] == "rad/s"
 
 
 def test_the_snippet_is_what_the_configuration_reads():
-    assert tomlkit.parse(snippet(VALUES, [])).unwrap() == {"friction": VALUES}
+    assert tomlkit.parse(friction_snippet(VALUES, [])).unwrap() == {"friction": VALUES}
 
 
 def test_a_configuration_without_friction_gets_it(sweep, config):
