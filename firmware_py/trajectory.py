@@ -393,6 +393,12 @@ def spline_table(time_s: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
     raise ValueError(f"the smallest time step (={closest:g} s) must be longer, no spline can be computed")
 
 
+def eased(share: np.ndarray) -> np.ndarray:
+    """0 to 1 with continuous acceleration, and rest outside: the quintic of a move."""
+    u = np.clip(share, 0.0, 1.0)
+    return np.asarray(u**3 * (10.0 + u * (-15.0 + 6.0 * u)))
+
+
 def table_from_csv(path: str | Path, column: str = "position_rad") -> np.ndarray:
     """The table of `reference_at` from a CSV file with the columns time_s and `column`; others are ignored.
 

@@ -19,7 +19,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from jointctl.firmware_py.trajectory import QUINTIC_PEAK_ACCELERATION, QUINTIC_PEAK_SPEED, spline_table
+from jointctl.firmware_py.trajectory import QUINTIC_PEAK_ACCELERATION, QUINTIC_PEAK_SPEED, eased, spline_table
 
 RandomMotion = Literal["multi_sine", "point_to_point", "reversals", "creep"]
 RANDOM_MOTIONS: tuple[RandomMotion, ...] = get_args(RandomMotion)
@@ -41,12 +41,6 @@ class Motion:
     rests_s: np.ndarray
 
 
-def _eased(share: np.ndarray) -> np.ndarray:
-    """0 to 1 with continuous acceleration."""
-    u = np.clip(share, 0.0, 1.0)
-    return np.asarray(u**3 * (10.0 + u * (-15.0 + 6.0 * u)))
-
-
 def _within_limits(table: np.ndarray) -> np.ndarray:
     """The same motion, smaller by as much as the limits ask for."""
     inside = np.linspace(0.0, 1.0, 9)[:, None] * np.diff(table[:, 0])
@@ -66,7 +60,7 @@ def _multi_sine(random: np.random.Generator, duration_s: float) -> tuple[np.ndar
         frequency_Hz = math.exp(random.uniform(math.log(0.05), math.log(0.7)))
         amplitude = random.uniform(0.3, 1.0) / frequency_Hz
         position += amplitude * np.sin(math.tau * (frequency_Hz * time_s + random.uniform()))
-    position *= _eased(time_s / _EASE_S) * _eased((duration_s - time_s) / _EASE_S)
+    position *= eased(time_s / _EASE_S) * eased((duration_s - time_s) / _EASE_S)
     return _within_limits(spline_table(time_s, position)), _NO_RESTS
 
 
@@ -85,7 +79,7 @@ def _sampled(moves: list[tuple[float, float, float]], duration_s: float) -> np.n
     time_s = np.linspace(0.0, duration_s, round(duration_s / _ROW_S) + 1)
     position = np.zeros_like(time_s)
     for begin_s, end_s, distance_rad in moves:
-        position += distance_rad * _eased((time_s - begin_s) / (end_s - begin_s))
+        position += distance_rad * eased((time_s - begin_s) / (end_s - begin_s))
     return spline_table(time_s, position)
 
 
@@ -116,9 +110,9 @@ def _creep(random: np.random.Generator, duration_s: float) -> tuple[np.ndarray, 
     speed = np.zeros_like(time_s)
     turn_s, side = 0.5, 1.0
     while turn_s < duration_s:
-        speed += side * _eased((time_s - turn_s) / 0.2) * (2.0 if turn_s > 0.5 else 1.0)
+        speed += side * eased((time_s - turn_s) / 0.2) * (2.0 if turn_s > 0.5 else 1.0)
         turn_s, side = turn_s + random.uniform(5.0, 15.0), -side
-    speed *= CREEP_radps * _eased((duration_s - 0.5 - time_s) / 0.2)
+    speed *= CREEP_radps * eased((duration_s - 0.5 - time_s) / 0.2)
     position = np.concatenate(([0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(time_s))))
     return spline_table(time_s, position), _NO_RESTS
 

@@ -20,7 +20,7 @@ import numpy as np
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.states import AxisPhase, Fault, TrajectoryKind
-from jointctl.firmware_py.trajectory import spline_table
+from jointctl.firmware_py.trajectory import eased, spline_table
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import (
     joint_rad_per_count,
@@ -126,9 +126,9 @@ def motion_table(plan: CheckPlan, start_rad: float) -> np.ndarray:
     """Rows of `trajectory.reference_at`, float64 (N, 5): smooth ramps from stop to stop, and a rest at each."""
     times_s, places, end_s, place = [0.0], [0.0], 0.0, 0.0
     for stop in STOPS:
-        for share in np.linspace(0.0, 1.0, _ROWS_PER_RAMP + 1)[1:]:
-            times_s.append(end_s + share * plan.ramp_s)
-            places.append(place + (stop - place) * share**3 * (10.0 - 15.0 * share + 6.0 * share**2))
+        shares = np.linspace(0.0, 1.0, _ROWS_PER_RAMP + 1)[1:]
+        times_s += (end_s + shares * plan.ramp_s).tolist()
+        places += (place + (stop - place) * eased(shares)).tolist()
         for share in (0.5, 1.0):
             times_s.append(end_s + plan.ramp_s + share * REST_s)
             places.append(stop)

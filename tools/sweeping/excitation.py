@@ -20,7 +20,7 @@ import numpy as np
 
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import UsageError
-from jointctl.firmware_py.trajectory import spline_table
+from jointctl.firmware_py.trajectory import eased, spline_table
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import friction_constants
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, canvas
@@ -186,11 +186,6 @@ def _there_and_back(builder: MotionBuilder, speed: float, place_rad: float, ways
         builder.ramp(0.0)
 
 
-def _eased(share: np.ndarray) -> np.ndarray:
-    u = np.clip(share, 0.0, 1.0)
-    return np.asarray(u**3 * (10.0 + u * (-15.0 + 6.0 * u)))
-
-
 def _sines(s: PlanSettings, duration_s: float, random: np.random.Generator) -> np.ndarray:
     """A table of sines from rest to rest, as large as travel, speed and acceleration allow."""
     time_s = np.linspace(0.0, duration_s, round(duration_s / ROW_S) + 1)
@@ -200,7 +195,7 @@ def _sines(s: PlanSettings, duration_s: float, random: np.random.Generator) -> n
         frequency_Hz = turn_Hz * math.exp(random.uniform(math.log(0.2), math.log(4.0)))
         amplitude = random.uniform(0.3, 1.0) / frequency_Hz ** random.uniform(1.0, 2.0)
         position += amplitude * np.sin(math.tau * (frequency_Hz * time_s + random.uniform()))
-    position *= _eased(time_s / EASE_S) * _eased((duration_s - time_s) / EASE_S)
+    position *= eased(time_s / EASE_S) * eased((duration_s - time_s) / EASE_S)
     table = spline_table(time_s, position)
     reach = np.max(np.abs(table[:, 1])) / (0.5 * s.width_rad)
     speed = np.max(np.abs(table[:, 2])) / s.transit_radps

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PHASE_MARGIN_deg, GAIN_MARGIN, SENSITIVITY = 35.0, 2.0, 2.0
-NOISE_SHARES = {"tracking": 0.03, "settling": 0.03, "quiet": 0.03}  # of limits.torque_max_Nm
+NOISE_SHARE = 0.03  # of limits.torque_max_Nm
 QUIET_ERROR = 2.0  # times the least error: what a quiet loop may have
 PENALTY = 30.0  # for each share by which a goal is missed
 UNSTABLE = 1e3
@@ -270,7 +270,7 @@ def choose_gains(config: Config, fit: JointFit, wanted: str = "auto", objective:
     control = _control(config, law.control())
     ready = config.model_copy(update={"control": control})
     settings, _ = loop_settings(ready)
-    goals = Goals(NOISE_SHARES[objective] * config.limits.torque_max_Nm, config.margin.min_phase_margin_deg)
+    goals = Goals(NOISE_SHARE * config.limits.torque_max_Nm, config.margin.min_phase_margin_deg)
     search = _Search(ready, law, fit, settings)
 
     def cost(one: Judged, least_error: float | None) -> float:

@@ -77,14 +77,15 @@ def response(
                 output.note(f"stopped by {ended.stopped_by}; no response")
                 return INTERRUPTED
             return never_begun(ended.drive_state, output, dry_run=dry_run)
-    replace_file(file, json.dumps(found.to_dict(), indent=1).encode())
-    output.note(f"written: {file}")
-    save_png(bode_figure(found, f"{config.path.stem}: frequency response"), picture)
-    fit = fit_joint(found, config.joint.inertia_kgm2)
-    save_png(bode_figure(found, f"{config.path.stem}: frequency response", fit), picture)
-    replace_file(file, json.dumps({**found.to_dict(), "fit": fit.to_dict()}, indent=1).encode())
-    output.result(fit_table(config, found, fit), {**found.to_dict(), "fit": fit.to_dict()}, (found, fit))
-    output.note(f"written: {picture}")
+    result, fit = found.to_dict(), None
+    try:
+        fit = fit_joint(found, config.joint.inertia_kgm2)
+        result["fit"] = fit.to_dict()
+    finally:  # what was measured is kept where no model fits
+        replace_file(file, json.dumps(result, indent=1).encode())
+        save_png(bode_figure(found, f"{config.path.stem}: frequency response", fit), picture)
+        output.note(f"written: {file}, {picture}")
+    output.result(fit_table(config, found, fit), result, (found, fit))
     return 0
 
 
