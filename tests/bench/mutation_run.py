@@ -43,6 +43,7 @@ TESTS = {  # below UNIT_TESTS
     "drivers/canopen/drive.py": (
         "drivers/canopen/test_switch_off", "drivers/canopen/test_commissioning", "drivers/canopen/test_watchdog",
         "drivers/canopen/test_two_encoders", "drivers/canopen/test_other_controllers",
+        "drivers/canopen/test_thermometer", "drivers/canopen/test_arm_drives", "drivers/canopen/test_odd_drives",
     ),
     "drivers/bus_lock.py": ("drivers/test_bus_lock",),
     "tools/session/stop_call.py": ("session/test_control", "drivers/test_bus_lock"),

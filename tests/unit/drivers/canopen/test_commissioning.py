@@ -122,6 +122,7 @@ def test_torque_mode_where_the_drive_has_no_cyclic_one(joint: Any) -> None:
     assert joint.value(0x6060) == 4
     assert joint.value(0x6087) == 1_000_000
     assert any("TQ" in remark for remark in report.remarks)
+    assert (joint.downloads(0x60C2, 1), joint.downloads(0x60C2, 2)) == ([1], [-3 & 0xFF])  # it has the object
 
 
 @pytest.mark.parametrize(("mode", "shown"), [("csv", Mode.CYCLIC_SYNC_VELOCITY), ("pv", Mode.PROFILE_VELOCITY)])
@@ -190,6 +191,20 @@ def test_only_a_node_that_does_not_answer_is_sent_pre_operational_at_first(joint
     assert (0x6041 in read) is (attempts == 0)
 
 
+def test_a_node_that_is_anothers_while_it_does_not_answer_is_sent_nothing(joint: Any) -> None:
+    joint.mute += [(0x1000, 0)] * SDO_ATTEMPTS
+
+    def gate() -> None:
+        if joint.requests:
+            joint.send(0x080, b"")
+
+    with joint.opened(boot_timeout_s=1.0) as drive:
+        drive._objects.gate = gate
+        with pytest.raises(BusError, match="SYNC"):
+            drive.commission()
+    assert not [data for cob, data in joint.requests if cob == 0]
+
+
 UNRATED = {"rated_torque_Nm": None, "rated_current_A": None}
 
 
@@ -215,7 +230,7 @@ UNRATED = {"rated_torque_Nm": None, "rated_current_A": None}
         ({}, {(0x1016, 1): 0}, r"object 1016:1 \(consumer heartbeat time\) reads back 0, 8257736 was written"),
         ({}, {(0x1A00, 2): 0x606C0020}, r"1A00:2 \(PDO 1800 mapping of position actual value\) reads back"),
         ({}, {(0x6041, 0): 0x0218}, r"node 1 is in fault \(error code 0000h\) .*never resets one by itself"),
-        ({}, {(0x6041, 0): 0x021F}, r"node 1 is in fault"),
+        ({}, {(0x6041, 0): 0x021F, (0x603F, 0): 0x8611}, r"node 1 is in fault \(error code 8611h\)"),
         ({}, {(0x6071, 0): 5}, r"object 6071 \(target torque\) reads back 5, 0 was written"),
     ],
 )  # fmt: skip
@@ -405,6 +420,7 @@ def test_a_drive_that_is_not_ready_is_given_time_between_two_looks(joint: Any) -
 def test_what_is_exactly_at_its_bound_is_taken(joint: Any) -> None:
     assert commissioning._compare_rated("rated_current_A", 9.0, 8.0, 0.125, "A") == []
     assert commissioning.interpolation_period(1e6 / 255) == (255, -6)
+    assert commissioning.interpolation_period(0.1) == (10, 0)
     with pytest.raises(DeviceError, match="has no 60C2 value"):
         commissioning.interpolation_period(1e6 / 256)
     with joint.opened() as drive:

@@ -324,6 +324,7 @@ def test_a_fixed_feedback_map_is_used_by_its_offsets(commission: Any, joint: Any
     port = commission.port[0]
     assert (port.tpdo_id, port.tpdo_length) == (0x3A5, 8)
     assert (port.torque_at, port.position_at, port.status_at) == (0, 2, 6)
+    assert report.measures_torque
     assert any("PDO 1802 is used as it is, on 3A5h" in remark for remark in report.remarks)
     assert joint.value(0x1800, 1) & 0x80000000
     assert not joint.value(0x1802, 1) & 0x80000000

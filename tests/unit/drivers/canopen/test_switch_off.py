@@ -17,6 +17,7 @@ import pytest
 from jointctl.drivers.at_rest import refuse_unless_at_rest
 from jointctl.drivers.canopen import switch_off as switch_off_module
 from jointctl.drivers.canopen.cia402 import State
+from jointctl.drivers.canopen.identifiers import NmtCommand
 from jointctl.drivers.canopen.switch_off import POLL_S, SDO_TIMEOUT_S, SwitchOff, brake, brake_if_enabled
 from jointctl.drivers.drive import UNTOUCHED, CommissioningReport, Declined, DriveIdentity, is_safe
 from jointctl.drivers.errors import BusError, DataError, DeviceError, NoDeviceError
@@ -355,6 +356,18 @@ def test_clear_fault_takes_every_rpdo_timer_away(joint: Any) -> None:
         written = {data[1] | data[2] << 8 for cob, data in commands(joint) if cob == 0x601}
         assert {0x1400, 0x1402} <= written
         assert 0x1401 not in written  # it had none
+
+
+def test_clear_fault_ends_what_would_keep_the_fault_alive(joint: Any) -> None:
+    with joint.opened() as drive:
+        drive._objects.write(0x1016, 1, 126 << 16 | 200, what="consumer heartbeat time")
+        drive._node.nmt.send_command(NmtCommand.START)
+        joint.settle()
+        joint.requests.clear()
+        drive.clear_fault()
+        assert joint.downloads(0x1016, 1) == [0]
+        assert next(data for cob, data in joint.requests if cob == 0) == bytes([NmtCommand.ENTER_PRE_OPERATIONAL, 1])
+        assert joint.device.device[0].nmt == 127
 
 
 # --- what a run says at its end ---

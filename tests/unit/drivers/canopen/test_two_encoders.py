@@ -132,6 +132,7 @@ DRIVE = {**{k: v for k, v in NODE.items() if k != "node"}, "source": "drive"}
 def test_a_run_with_two_encoders(tmp_path: Path, encoder: dict[str, Any]) -> None:
     joint = LockstepJoint(short_run(tmp_path, encoder, virtual__initial_position_rad=0.1))
     assert joint.report.start_position_rad == pytest.approx(0.1, abs=1e-4)
+    assert ("524288" if "node" in encoder else "60E4:1") in joint.report.settings["joint encoder"]
     run = joint.run()
     assert run.fault is Fault.NONE
     tracked = run.log[run.tracking]
