@@ -15,7 +15,7 @@ import can
 import pytest
 
 from jointctl.drivers.canopen import commissioning
-from jointctl.drivers.canopen.cia402 import Mode, State
+from jointctl.drivers.canopen.cia402 import ControlWord, Mode, State
 from jointctl.drivers.canopen.commissioning import LARGEST_PERMILLE, READY_POLL_S, STEEP_RADPS2, wait_until_ready
 from jointctl.drivers.canopen.drive import GATE_S, REOPEN_ATTEMPTS, REOPEN_PAUSE_S, CanopenDrive
 from jointctl.drivers.canopen.identifiers import NmtCommand
@@ -411,6 +411,7 @@ def test_a_drive_that_is_not_ready_is_given_time_between_two_looks(joint: Any) -
         with pytest.raises(DeviceError, match="after 1 s"):
             wait_until_ready(drive._objects, 1, 1.0, pauses_s.append)
         assert pauses_s == [READY_POLL_S] * (round(1.0 / READY_POLL_S) - 1)
+        assert joint.downloads(0x6040)[:4] == [ControlWord.SHUTDOWN, ControlWord.DISABLE_VOLTAGE] * 2
         pauses_s.clear()
         with pytest.raises(DeviceError, match="after 0 s"):
             wait_until_ready(drive._objects, 1, 0.0, pauses_s.append)
