@@ -7,6 +7,7 @@ each of them by a variable of the page.  matplotlib is slow to import, and only 
 from __future__ import annotations
 
 import io
+import re
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -83,11 +84,32 @@ def canvas(height_in: float, title: str = "") -> Iterator[Figure]:
         yield figure
 
 
+_POWER = re.compile(r"\$\\mathdefault\{(.*?)\^\{(\S+?)\}\}\$")
+_RAISED = str.maketrans("0123456789-\N{MINUS SIGN}", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻⁻")
+
+
+def _powers_in_letters(figure: Figure) -> None:
+    """Ticks of logarithmic axes as "10³": formulas are not set (`text.parse_math`), since a name may look like one."""
+    from matplotlib.ticker import LogFormatterMathtext, LogFormatterSciNotation
+
+    class Powers(LogFormatterSciNotation):
+        def __call__(self, x: float, pos: int | None = None) -> str:
+            text = _POWER.sub(lambda found: found[1] + found[2].translate(_RAISED), super().__call__(x, pos))
+            return text.replace(r"\times", "\N{MULTIPLICATION SIGN}").removeprefix("$\\mathdefault{").removesuffix("}$")
+
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            if isinstance(axis.get_major_formatter(), LogFormatterMathtext):
+                axis.set_major_formatter(Powers(labelOnlyBase=True))
+                axis.set_minor_formatter(Powers(labelOnlyBase=False))
+
+
 def save_figure(figure: Figure, target: BinaryIO | TextIO, **how: Any) -> None:
     """matplotlib's `savefig` in the common style; names in titles and legends are shown as they may be."""
     import matplotlib
     from matplotlib.text import Text
 
+    _powers_in_letters(figure)
     for text in figure.findobj(Text):
         text.set_text(printable(text.get_text(), keep="\n"))
     with matplotlib.rc_context({**STYLE, "svg.hashsalt": how.pop("hashsalt", None)}), warnings.catch_warnings():

@@ -260,7 +260,7 @@ def _poles(axis: Axes, found: Margins, period_s: float) -> None:
             text += f"\noscillation {found.oscillation_Hz:.3g} Hz, damping {found.oscillation_damping:.2f}"
         axis.text(0.03, 0.04, text, transform=axis.transAxes, fontsize=9, color=RED)
     hidden = len(found.poles) - len(shown)
-    axis.set_title(f"closed-loop poles, {hidden} fast ones not shown; dotted: damping", fontsize=9, color=GREY)
+    axis.set_title(f"closed-loop poles but {hidden} fast ones, lines of damping", fontsize=9, color=GREY)
     axis.set_xlim(-widest, max(0.15 * widest, *(1.2 * pole.real for pole in shown)))
     axis.set_xlabel("real part [1/s]")
     axis.set_ylabel("imaginary part [rad/s]")

@@ -18,7 +18,7 @@ from jointctl.drivers.errors import DataError
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, DriveState, Fault
-from jointctl.tools.drawing import BLUE, COLOURS, canvas, png, save_png
+from jointctl.tools.drawing import BLUE, COLOURS, canvas, png, save_figure, save_png
 from jointctl.tools.experiments.campaign import MANY, campaign_figure, rows_by_kind, table
 from jointctl.tools.experiments.controller_study import PlantResult, StudyResult, study_figure
 from jointctl.tools.experiments.judge import Verdict
@@ -75,6 +75,26 @@ def test_one_figure_is_a_png_on_white_and_an_svg_in_the_colours_of_the_page(tmp_
     assert "stroke: var(--blue)" in svg
     assert "torque [Nm]</text>" in svg
     assert save_png(figure, tmp_path / "new" / "a.png").read_bytes() == png(figure)
+
+
+def test_powers_of_ten_are_letters_and_a_name_with_dollars_is_no_formula() -> None:
+    with canvas(3.0, "joint $a_1$") as figure:
+        wide, narrow = figure.subplots(1, 2)
+        wide.loglog([0.1, 500.0], [1e-4, 3e6])
+        narrow.loglog([3.0, 6.0], [2e-5, 4e-5])
+        wide.legend([], title="$x$ and \\times")
+    text = io.StringIO()
+    save_figure(figure, text, format="svg")
+    found = re.findall(r"<text[^>]*>([^<]*)</text>", text.getvalue())
+    assert {
+        "joint $a_1$",
+        "$x$ and \\times",
+        "10⁻¹",
+        "10⁶",
+        "3\N{MULTIPLICATION SIGN}10⁰",
+        "2\N{MULTIPLICATION SIGN}10⁻⁵",
+    } <= set(found)
+    assert not [words for words in found if "mathdefault" in words]
 
 
 def test_a_colour_of_its_own_or_black_text_would_be_found() -> None:
