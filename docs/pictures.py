@@ -1,6 +1,6 @@
-"""What the pages show of runs, made anew: pictures of notebook, demo and page, and the table of `paper`.
+"""What the pages show of runs, made anew: pictures of notebook, demo, first hour and page, and the table of `paper`.
 
-python docs/pictures.py [notebook] [demo] [page] [paper]     all of them, without a word
+python docs/pictures.py [notebook] [demo] [first_hour] [page] [paper]     all of them, without a word
 
 The page needs the extra `scope`, websockets and a Chromium.
 """
@@ -54,6 +54,19 @@ def demo(folder: Path) -> None:
     (picture,) = folder.glob("runs/*.png")
     (DOCS / "demo.png").write_bytes(picture.read_bytes())
     smaller(DOCS / "demo.png")
+
+
+def first_hour(folder: Path) -> None:
+    """Friction and margins, by the commands of docs/first-hour.md."""
+    made = {"sweep.friction.png": "friction.png", "loop.png": "margins.png"}
+    wanted = ("jointctl new", "jointctl sweep", "jointctl identify sweep.csv", "sed -i", "jointctl check")
+    for line in (DOCS / "first-hour.md").read_text(encoding="utf-8").splitlines():
+        if line.startswith(wanted) and " other.csv" not in line:
+            line = line.replace("jointctl", " ".join(JOINTCTL), 1)
+            subprocess.run(line, shell=True, cwd=folder, check=True)
+    for name, picture in made.items():
+        (DOCS / picture).write_bytes((folder / name).read_bytes())
+        smaller(DOCS / picture)
 
 
 def smaller(picture: Path) -> None:
@@ -117,7 +130,9 @@ def paper(folder: Path) -> None:
     LAW.write_text(f"{before}{table}\n\n{rest}", encoding="utf-8")
 
 
-PARTS: dict[str, Callable[[Path], None]] = {"notebook": notebook, "demo": demo, "page": page, "paper": paper}
+PARTS: dict[str, Callable[[Path], None]] = {
+    "notebook": notebook, "demo": demo, "first_hour": first_hour, "page": page, "paper": paper,
+}  # fmt: skip
 
 if __name__ == "__main__":
     for part in sys.argv[1:] or PARTS:
