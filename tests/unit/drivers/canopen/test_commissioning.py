@@ -51,7 +51,7 @@ def test_the_report(commissioned: Any) -> None:
     assert (report.mode, report.commands_velocity) == ("cyclic_sync_torque", False)
     assert report.start_position_rad == pytest.approx(0.1, abs=count_rad)
     assert (report.torque_resolution_Nm, report.position_resolution_rad) == pytest.approx((0.0605, count_rad))
-    assert report.identity.name == "jointctl virtual joint"
+    assert (report.identity.name, report.identity.serial) == ("jointctl virtual joint", "1")
     assert report.settings["max torque"] == "1000 permille = 60.5 Nm"
     assert report.settings["60C2"] == "1e-3 s"
     assert report.settings["watchdog"].startswith("200 ms")
@@ -78,6 +78,12 @@ def test_what_is_in_the_drive_afterwards(commissioned: Any) -> None:
     assert (port.max_permille, port.node, port.heartbeat_cycles) == (1000, 1, 66)
 
 
+def test_the_drive_watches_the_heartbeat_for_the_time_that_is_configured(joint: Any) -> None:
+    with joint.opened(heartbeat_s=0.9) as drive:
+        drive.commission()
+    assert joint.value(0x1016, 1) == 126 << 16 | 900
+
+
 def test_targets_are_zeroed_before_anything_else_is_written(commissioned: Any) -> None:
     bus, _, _ = commissioned
     written = [
@@ -87,6 +93,7 @@ def test_targets_are_zeroed_before_anything_else_is_written(commissioned: Any) -
     first = {index: written.index(index) for index in written}
     assert written[0] == 0x6040
     assert first[0x6071] < first[0x60FF] < first[0x6060] < first[0x6072] < first[0x60C2] < first[0x1016] < first[0x1800]
+    assert set(bus.downloads(0x60FF)) == {0}
     assert set(bus.downloads(0x6040)) == {0}  # nothing but "disable voltage" is ever written while commissioning
 
 

@@ -90,6 +90,11 @@ def test_a_torque_slope_that_is_not_there_is_a_remark(lacking: Any) -> None:
 
 
 @pytest.mark.parametrize("sub", [1, 2])
+def test_half_an_encoder_resolution_is_none(lacking: Any, sub: int) -> None:
+    assert lacking((0x608F, sub)).counts_per_motor_turn == 0.0
+
+
+@pytest.mark.parametrize("sub", [1, 2])
 def test_a_profile_mode_does_without_half_a_period(lacking: Any, joint: Any, sub: int) -> None:
     assert "60C2" not in lacking((0x60C2, sub), mode="tq").settings
     assert not joint.downloads(0x60C2, 3 - sub)
