@@ -111,7 +111,7 @@ _cache_file.save = _save_where_there_is_room
 _load_index = _cache_file._load_index
 
 
-def _index_that_can_be_read(file: Any) -> Any:
+def _index_that_can_be_read(file: Path) -> Any:
     """An index that is damaged, or names what this program cannot import, costs compiling, not the run."""
     try:
         return _load_index(file)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from jointctl.tools.analysis.loop_settings import loop_settings, two_masses
 from jointctl.tools.analysis.margin_gate import encoder_step_Nm
 from jointctl.tools.analysis.margins import Margins, frequencies_radps, margins, phase_margin_deg, worst_case
 from jointctl.tools.configuration.conversions import torque_constant_NmpA
+from jointctl.tools.configuration.sections import Trajectory
 from jointctl.tools.drawing import BLUE, GREY, ORANGE, RED, SOFT, canvas, save_png
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ def _current_contradiction(config: Config) -> list[str]:
     ]
 
 
-def trajectory_acceleration(trajectory: Any) -> float | None:
+def trajectory_acceleration(trajectory: Trajectory) -> float | None:
     """The largest acceleration [rad/s2] of a trajectory; None where a file must be read first."""
     if trajectory.kind == "sine":
         parts = [trajectory] + ([trajectory.switch] if trajectory.switch else [])

@@ -11,7 +11,7 @@ from pydantic_core import PydanticCustomError
 
 from jointctl.firmware_py.trajectory import QUINTIC_PEAK_ACCELERATION, QUINTIC_PEAK_SPEED
 from jointctl.tools.configuration.config import Config, problem_line
-from jointctl.tools.configuration.sections import Duration, Rule, Section, Trajectory, between
+from jointctl.tools.configuration.sections import Duration, Rule, Section, Trajectory, between, is_number
 
 LARGEST_ARM = 16  # joints
 PER_JOINT_TEXT = "a list of numbers, one a joint"
@@ -20,18 +20,18 @@ SPEED_SHARE = 0.9  # of limits.velocity_max_radps that an automatic move may use
 TORQUE_SHARE = 0.5  # of limits.torque_max_Nm that it may give the joint's inertia
 
 
-def _per_joint(value: Any) -> Any:
-    good = isinstance(value, (list, tuple)) and 0 < len(value) <= LARGEST_ARM
-    if not good or not all(isinstance(x, (int, float)) and not isinstance(x, bool) and math.isfinite(x) for x in value):
-        raise PydanticCustomError("numbers", f"must be {PER_JOINT_TEXT}")
-    return tuple(float(x) for x in value)
+def _per_joint(value: object) -> tuple[float, ...]:
+    if isinstance(value, (list, tuple)) and 0 < len(value) <= LARGEST_ARM:
+        if all(is_number(x) and math.isfinite(x) for x in value):
+            return tuple(float(x) for x in value)
+    raise PydanticCustomError("numbers", f"must be {PER_JOINT_TEXT}")
 
 
 PerJoint = Annotated[tuple[float, ...], BeforeValidator(Rule(PER_JOINT_TEXT, _per_joint))]
 
 
-def _auto_or_time(value: Any) -> Any:
-    if value == "auto" or (isinstance(value, (int, float)) and not isinstance(value, bool) and 1e-3 <= value <= 1e5):
+def _auto_or_time(value: object) -> Any:
+    if value == "auto" or (is_number(value) and 1e-3 <= value <= 1e5):
         return value
     raise PydanticCustomError("range", 'must be "auto" or in [0.001..1e5]')
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from jointctl.firmware_py.records import KNEES
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.conversions import RADPS_PER_UNIT, velocity_of_a_count_radps
-from jointctl.tools.configuration.sections import Friction, FrictionDirection, Reducer, ReducerMap
+from jointctl.tools.configuration.sections import Friction, FrictionDirection, Reducer, ReducerMap, Trajectory
 
 OBSERVING = ("computed_torque_observer", "flexible_joint")  # laws with a disturbance observer
 SWING_PERIODS = 4.0  # that half a swing takes at least: a faster one no sampled loop can follow
@@ -16,7 +15,7 @@ CURVE_POINTS = 200  # at which a friction curve is looked at
 SWITCH_rad, SWITCH_radps = 1e-3, 1e-2  # what rounding of the numbers in a file may leave at a switch
 
 
-def trajectory_extremes(trajectory: Any) -> tuple[float, float, float] | None:
+def trajectory_extremes(trajectory: Trajectory) -> tuple[float, float, float] | None:
     """(lowest position [rad], highest position [rad], highest speed [rad/s]); None where a file must be read first.
 
     A sine is taken with its full amplitude even if `duration_s` ends before the peak.
@@ -55,10 +54,11 @@ def extremes_problems(config: Config, low_rad: float, high_rad: float, speed_rad
     return found
 
 
-def switch_problems(trajectory: Any) -> list[str]:
+def switch_problems(trajectory: Trajectory) -> list[str]:
     """The second sine must go on where the first one is, and as fast: a step of the reference asks for all torque."""
-    switch = trajectory.switch if trajectory.kind == "sine" else None
-    if switch is None or 0.0 < trajectory.duration_s <= switch.at_s:
+    if trajectory.kind != "sine" or (switch := trajectory.switch) is None:
+        return []
+    if 0.0 < trajectory.duration_s <= switch.at_s:
         return []
     places, speeds = [], []
     for part in (trajectory, switch):

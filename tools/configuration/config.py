@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, PrivateAttr, SerializeAsAny
+from pydantic_core import ErrorDetails
 
 from jointctl.drivers.errors import ConfigurationError, one_line
 from jointctl.tools.configuration.control_section import Control
@@ -169,7 +170,7 @@ def suggestion(unknown: str, known: list[str]) -> str:
     return f": did you mean {key}?"
 
 
-def _location(error: Any) -> list[str]:
+def _location(error: ErrorDetails) -> list[str]:
     parts = [str(part) for part in error["loc"]]
     if len(parts) > 1 and parts[0] in _BY_KIND:
         del parts[1]  # the tag of the union, which the user did not write
@@ -190,7 +191,7 @@ def problem_lines(errors: list[Any], data: Mapping[str, Any], root: type[BaseMod
 
 
 def problem_line(
-    error: Any, data: Mapping[str, Any], prefix: tuple[str, ...], root: type[BaseModel] | None = None
+    error: ErrorDetails, data: Mapping[str, Any], prefix: tuple[str, ...], root: type[BaseModel] | None = None
 ) -> str:
     """The line of one error of pydantic; `prefix` is where in the file `data` begins."""
     location = (*prefix, *_location(error))
@@ -225,14 +226,14 @@ _RULES = {
 }
 
 
-def _rule(error: Any) -> str:
+def _rule(error: ErrorDetails) -> str:
     if error["type"] == "literal_error":
         return f"must be one of {error['ctx']['expected']}"
     message = str(error["msg"])
     return message[0].lower() + message[1:]
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     text = value if isinstance(value, str) else f"{value:g}" if isinstance(value, float) else str(value)
     text = " ".join(text.split()) or '""'
     return text if len(text) <= 60 else text[:57] + "..."

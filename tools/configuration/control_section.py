@@ -9,16 +9,16 @@ from pydantic_core import PydanticCustomError
 
 from jointctl.firmware_py.friction_records import RIPPLES
 from jointctl.firmware_py.records import NEURONS
-from jointctl.tools.configuration.sections import Rule, Section, between, numbers
+from jointctl.tools.configuration.sections import Rule, Section, between, is_number, numbers
 
 CENTRES = "15 numbers or 15 pairs [rad, rad/s], each in [-100..100]"
 
 
-def _centres(value: Any) -> Any:
+def _centres(value: object) -> Any:
     """15 numbers, taken for both inputs as the paper does, or 15 pairs [rad, rad/s]."""
 
-    def number(x: Any) -> bool:
-        return isinstance(x, (int, float)) and not isinstance(x, bool) and abs(x) <= 100.0
+    def number(x: object) -> bool:
+        return is_number(x) and abs(x) <= 100.0
 
     if isinstance(value, (list, tuple)) and len(value) == NEURONS:
         if all(number(x) for x in value):

@@ -114,13 +114,13 @@ KINDS = tuple(_SECTIONS)
 KINDS_TEXT = ", ".join(f"'{kind}'" for kind in KINDS)
 
 
-def section_class(kind: Any) -> type[DriveSection] | None:
+def section_class(kind: object) -> type[DriveSection] | None:
     """The class of [drive] for drive.kind; None for what is no kind.  Only that drive's modules are loaded."""
     load = _SECTIONS.get(kind) if isinstance(kind, str) else None
     return load() if load is not None else None
 
 
-def checked_drive(value: Any) -> Any:
+def checked_drive(value: object) -> Any:
     """For pydantic: the section of its kind."""
     if not isinstance(value, dict):
         return value

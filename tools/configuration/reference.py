@@ -106,7 +106,7 @@ def type_and_range(annotation: Any, metadata: tuple[Any, ...] = ()) -> tuple[str
     return TYPES[annotation], allowed
 
 
-def shown_default(value: Any) -> str:
+def shown_default(value: object) -> str:
     """As it would stand in the file."""
     if value is None or value == ():
         return "none"

@@ -11,13 +11,18 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeGuard
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
 from jointctl.drivers.can.channel import NAME, RESERVED, split_channel, with_options
 from jointctl.drivers.can.open import CYCLIC_INTERFACES
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Of TOML: true and false are none."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def interval_text(low: float, high: float, open_low: bool = False) -> str:
@@ -31,7 +36,7 @@ class Rule:
     allowed: str
     check: Callable[[Any], Any]
 
-    def __call__(self, value: Any) -> Any:
+    def __call__(self, value: object) -> Any:
         return self.check(value)
 
 
@@ -50,9 +55,8 @@ def between(low: float, high: float, *, open_low: bool = False) -> Any:
 def _auto_or_number(low: float, high: float) -> Any:
     allowed = f'"auto" or in {interval_text(low, high)}'
 
-    def check(value: Any) -> Any:
-        number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if value == "auto" or (number and low <= value <= high):
+    def check(value: object) -> Any:
+        if value == "auto" or (is_number(value) and low <= value <= high):
             return value
         raise PydanticCustomError("range", "must be {allowed}", {"allowed": allowed})
 
@@ -63,10 +67,9 @@ def numbers(name: str, *counts: int, low: float, high: float) -> Any:
     """One number or a list of as many as `counts` allows, each in (low..high]; a tuple afterwards."""
     allowed = f"{' or '.join(map(str, counts))} {name}, each in {interval_text(low, high, True)}"
 
-    def check(value: Any) -> tuple[float, ...]:
-        items = value if isinstance(value, (list, tuple)) else [value]
-        good = all(isinstance(x, (int, float)) and not isinstance(x, bool) and low < x <= high for x in items)
-        if not good or len(items) not in counts:
+    def check(value: object) -> tuple[float, ...]:
+        items: list[Any] | tuple[Any, ...] = value if isinstance(value, (list, tuple)) else [value]
+        if not all(is_number(x) and low < x <= high for x in items) or len(items) not in counts:
             raise PydanticCustomError("numbers", "must be {allowed}", {"allowed": allowed})
         return tuple(float(x) for x in items)
 
@@ -95,7 +98,7 @@ class Section(BaseModel):
 ALLOWED = "names of python-can with texts, numbers, true or false; none for socketcan and jointctl"
 
 
-def checked_options(value: Any) -> Any:
+def checked_options(value: object) -> Any:
     """For pydantic: a table of names and plain values."""
     if value is None:
         return None
@@ -332,12 +335,11 @@ class JointEncoder(Section):
 NUMBERS_TEXT = "a list of up to 4 numbers"
 
 
-def _list(value: Any) -> Any:
+def _list(value: object) -> tuple[float, ...]:
     """Lists of TOML as tuples, which a frozen model needs."""
-    good = isinstance(value, (list, tuple)) and len(value) <= 4
-    if not good or any(isinstance(x, bool) or not isinstance(x, (int, float)) for x in value):
-        raise PydanticCustomError("numbers", f"must be {NUMBERS_TEXT}")
-    return tuple(float(x) for x in value)
+    if isinstance(value, (list, tuple)) and len(value) <= 4 and all(is_number(x) for x in value):
+        return tuple(float(x) for x in value)
+    raise PydanticCustomError("numbers", f"must be {NUMBERS_TEXT}")
 
 
 Numbers = Annotated[tuple[float, ...], BeforeValidator(Rule(NUMBERS_TEXT, _list))]
@@ -470,7 +472,7 @@ FAULT_KINDS = (
 FAULT_KINDS_TEXT = "one of " + ", ".join(FAULT_KINDS)
 
 
-def _kind(value: Any) -> Any:
+def _kind(value: object) -> Any:
     if value not in FAULT_KINDS:
         raise PydanticCustomError("fault_kind", "must be {kinds}", {"kinds": FAULT_KINDS_TEXT})
     return value
@@ -489,7 +491,7 @@ class VirtualFault(Section):
 FAULTS_TEXT = f"a list of at most {MAX_FAULTS} faults"
 
 
-def _faults(value: Any) -> Any:
+def _faults(value: object) -> Any:
     """A list of tables as a tuple, which a frozen model needs."""
     if not isinstance(value, (list, tuple)) or len(value) > MAX_FAULTS:
         raise PydanticCustomError("faults", f"must be {FAULTS_TEXT}")

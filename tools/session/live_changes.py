@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
 from pydantic import ValidationError
 
 from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MarginError
@@ -93,7 +94,7 @@ class _Chosen(Section):
     trajectory: Trajectory
 
 
-def new_motion(config: Config, table: Any, values: Mapping[str, Any]) -> tuple[Any, str]:
+def new_motion(config: Config, table: np.ndarray, values: Mapping[str, Any]) -> tuple[Any, str]:
     """(a record array of one `TrajectoryConstants`, the motion in words) of {"kind": ..., ...}.
 
     The keys are those of [trajectory]; kind "configured" is that section itself.  A sine begins at its crest, where it
@@ -108,7 +109,7 @@ def new_motion(config: Config, table: Any, values: Mapping[str, Any]) -> tuple[A
     return constants, checked_motion(config, record, table)
 
 
-def checked_motion(config: Config, record: Any, table: Any) -> str:
+def checked_motion(config: Config, record: Any, table: np.ndarray) -> str:
     """A `TrajectoryConstants` in words; `ConfigurationError` where position, speed or torque leave the limits."""
     peak = peak_of(record, table)
     problems = extremes_problems(config, peak.position_min_rad, peak.position_max_rad, peak.velocity_radps)

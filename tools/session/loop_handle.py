@@ -174,8 +174,8 @@ class LoopHandle:
     """
 
     def __init__(
-        self, config: Config, table: Any, port: type, tail_path: Path | None = None, marker_fd: int | None = None,
-        arm: ArmModel | None = None,
+        self, config: Config, table: np.ndarray, port: type, tail_path: Path | None = None,
+        marker_fd: int | None = None, arm: ArmModel | None = None,
     ) -> None:  # fmt: skip
         """`table` (rows, 5), of an arm (axes, rows, 5), with its `arm` model."""
         tables = np.reshape(table, (-1, *np.shape(table)[-2:]))

@@ -15,7 +15,7 @@ import os
 from collections import Counter
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.table import Table as TerminalTable
@@ -37,6 +37,9 @@ from jointctl.tools.recording.report_page import (
 )
 from jointctl.tools.sweeping.meter import MeasuredPoint
 from jointctl.tools.written_file import writing
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as MatplotlibFigure
 
 HEADING = ",".join(SWEEP_COLUMNS) + "\n"
 LOAD_COLUMN = "load_Nm"  # of a sweep under known loads
@@ -212,7 +215,7 @@ def _figure(rows: list[dict[str, Any]]) -> Figure:
     velocity, torque = (np.array([float(row[key]) for row in rows]) for key in ("velocity_radps", "motor_torque_Nm"))
     settled = np.array([row["settled"] == "1" for row in rows])
 
-    def paint(figure: Any) -> None:
+    def paint(figure: MatplotlibFigure) -> None:
         whole, near = figure.subplots(1, 2, width_ratios=(3, 2))
         for axis in (whole, near):
             for mask, colour, label in ((settled & (velocity > 0), BLUE, "positive"),

@@ -165,7 +165,7 @@ class ReadableKeys:
         return float(value) if good and value is not None else None
 
 
-def is_text(value: Any) -> bool:
+def is_text(value: object) -> bool:
     """Whether it names something."""
     return isinstance(value, str) and bool(value)
 

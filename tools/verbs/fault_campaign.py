@@ -12,6 +12,8 @@ from jointctl.tools.output import Output
 from jointctl.tools.verbs.verb_options import ConfigPath, ManyRuns, Report, VerbOutput, loaded
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from jointctl.tools.configuration.config import Config
     from jointctl.tools.experiments.fault_scenarios import During
     from jointctl.tools.experiments.judge import Verdict
@@ -100,7 +102,7 @@ def fault_campaign(
 
 
 def _write_page(
-    path: Path, config: Config, verdicts: list[Verdict], found: list[dict[str, Any]], figure: Any, seed: int,
+    path: Path, config: Config, verdicts: list[Verdict], found: list[dict[str, Any]], figure: Figure, seed: int,
     output: Output,
 ) -> None:  # fmt: skip
     from jointctl.tools.experiments.campaign import rows_by_kind, table

@@ -78,7 +78,7 @@ def _list_rows(content: list[dict[str, Any]]) -> Iterator[tuple[str, str, str]]:
             yield f"  {row['object']} {row['name']}", str(row["value"]), row["unit"]
 
 
-def _plain_text(value: Any) -> str:
+def _plain_text(value: object) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{item} ms" if key == "ms" else f"{key} {item}" for key, item in value.items())
     return f"{value:g}" if isinstance(value, float) else str(value)
