@@ -21,6 +21,7 @@ from jointctl.drivers.canopen.drive import GATE_S, REOPEN_ATTEMPTS, REOPEN_PAUSE
 from jointctl.drivers.canopen.identifiers import NmtCommand
 from jointctl.drivers.canopen.network import LISTEN_S
 from jointctl.drivers.canopen.sdo import ATTEMPTS as SDO_ATTEMPTS
+from jointctl.drivers.canopen.switch_off import state_of
 from jointctl.drivers.drive import UNTOUCHED
 from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError, NoDeviceError
 
@@ -514,6 +515,25 @@ def test_a_drive_whose_fault_was_cleared_is_made_safe(joint: Any) -> None:
     with joint.opened() as drive:
         drive.clear_fault()
         assert drive.make_safe() == "switch on disabled"
+
+
+def test_its_twin_that_another_controller_has_since_is_left_alone(joint: Any) -> None:
+    with joint.opened() as drive:
+        drive.clear_fault()
+        joint.send(0x080, b"")
+        assert drive.make_safe() == UNTOUCHED
+
+
+def test_who_comes_while_a_fault_is_looked_at_keeps_the_drive(joint: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def looked(objects: Any) -> State:
+        found = state_of(objects)
+        joint.send(0x080, b"")
+        return found
+
+    monkeypatch.setattr("jointctl.drivers.canopen.drive.state_of", looked)
+    with joint.opened() as drive, pytest.raises(BusError, match="1 x SYNC"):
+        drive.clear_fault()
+    assert not [data for cob, data in joint.requests if cob == 0]
 
 
 def test_our_own_frames_that_come_back_are_no_ones_elses(joint: Any) -> None:
