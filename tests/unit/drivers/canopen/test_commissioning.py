@@ -9,7 +9,7 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import can
 import pytest
@@ -52,7 +52,8 @@ def test_the_report(commissioned: Any) -> None:
     assert (report.mode, report.commands_velocity) == ("cyclic_sync_torque", False)
     assert report.start_position_rad == pytest.approx(0.1, abs=count_rad)
     assert (report.torque_resolution_Nm, report.position_resolution_rad) == pytest.approx((0.0605, count_rad))
-    assert (report.identity.name, report.identity.serial) == ("jointctl virtual joint", "1")
+    identity = report.identity
+    assert (identity.name, identity.serial, identity.revision) == ("jointctl virtual joint", "1", "0x00010000")
     assert report.settings["max torque"] == "1000 permille = 60.5 Nm"
     assert report.settings["60C2"] == "1e-3 s"
     assert report.settings["watchdog"].startswith("200 ms")
@@ -412,8 +413,9 @@ def test_remarks_of_an_earlier_commissioning_are_not_repeated(joint: Any) -> Non
         assert "of an earlier one" not in drive.commission().remarks
 
 
-def test_a_drive_that_is_not_ready_is_given_time_between_two_looks(joint: Any) -> None:
-    joint.answers[(0x6041, 0)] = 0x0200
+@pytest.mark.parametrize("status_word", [0x0200, 0x0205])  # not ready; none that the standard knows
+def test_a_drive_that_is_not_ready_is_given_time_between_two_looks(joint: Any, status_word: int) -> None:
+    joint.answers[(0x6041, 0)] = status_word
     pauses_s: list[float] = []
     with joint.opened() as drive:
         with pytest.raises(DeviceError, match="after 1 s"):
@@ -424,6 +426,21 @@ def test_a_drive_that_is_not_ready_is_given_time_between_two_looks(joint: Any) -
         with pytest.raises(DeviceError, match="after 0 s"):
             wait_until_ready(drive._objects, 1, 0.0, pauses_s.append)
     assert pauses_s == []
+
+
+def test_a_drive_that_is_ready_gets_no_voltage(joint: Any) -> None:
+    joint.answers[(0x6041, 0)] = 0x0221
+    with joint.opened() as drive:
+        wait_until_ready(drive._objects, 1, 1.0, lambda _: None)
+        joint.settle()
+    assert joint.downloads(0x6040) == [ControlWord.DISABLE_VOLTAGE]
+
+
+def test_an_encoder_resolution_that_cannot_be_read_is_none() -> None:
+    def refuse(*_: Any, **__: Any) -> int:
+        raise DeviceError("refused")
+
+    assert commissioning.counts_per_motor_turn(cast(Any, SimpleNamespace(has=lambda *_: True, read=refuse))) == 0.0
 
 
 def test_what_is_exactly_at_its_bound_is_taken(joint: Any) -> None:
@@ -471,7 +488,8 @@ def test_an_eds_of_another_product_is_a_remark_where_both_tell_it(
 def test_a_drive_is_given_time_to_switch_off_and_to_change_its_mode(
     joint: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    states = iter([State.SWITCH_ON_DISABLED, *[State.QUICK_STOP_ACTIVE] * 3, State.SWITCH_ON_DISABLED])
+    slow = [State.QUICK_STOP_ACTIVE, State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE]
+    states = iter([State.SWITCH_ON_DISABLED, *slow, State.SWITCH_ON_DISABLED])
     monkeypatch.setattr(commissioning, "state_of", lambda _: next(states))
     joint.answers[(0x6061, 0)] = 3
     pauses_s: list[float] = []
