@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 from pydantic_core import PydanticCustomError
 
 from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.states import CommandKind
 from jointctl.tools.configuration.sections import Ampere, Direction, Section
 
 if TYPE_CHECKING:
@@ -74,6 +75,10 @@ class DriveSection(Section, ABC):
     def motor_current(self) -> tuple[str, float] | None:
         """The current that the drive is set up for [A], with its key; None where the configuration does not have it."""
         return None
+
+    def own_loop(self) -> CommandKind:
+        """What the loop commands: torque, or what the drive closes the loop for."""
+        return CommandKind.TORQUE
 
     @abstractmethod
     def assumed_delay(self, config: Config) -> tuple[float, str]:
@@ -154,4 +159,13 @@ def require_simulated(config: Config, what: str) -> None:
             config.drive.kind,
             f'"canopen" for {what}',
             "the serial joint runs in real time only: `jointctl hil --serial`, then `jointctl run CONFIG -p PORT`",
+        )
+
+
+def require_torque(config: Config, what: str) -> None:
+    """`ConfigurationError` where the drive closes its own loop: `what` moves the joint by torque."""
+    if config.drive.own_loop() is not CommandKind.TORQUE:
+        raise ConfigurationError(
+            f"{config.path}: drive.mode must be cst, tq or auto for {what}: it moves the joint by torque",
+            "take a copy of the file with that mode and without [drive.cascade]",
         )
