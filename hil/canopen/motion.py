@@ -9,7 +9,7 @@ from jointctl.hil.canopen.records import Device, DriveObjects, HomingState, Mode
 
 # --- Torque demand of the virtual drive in every mode of operation, at the plant's substep rate ---
 # CST and TQ set the torque; CSV and PV run a PI velocity loop; CSP and PP a P position loop around it.  60B1 is added
-# to the velocity that the loop of CSP or CSV gets, 60B2 to its torque.  With `loop_period_s` those two modes are computed
+# to the velocity that the loop of CSP or CSV gets, 60B2 to its torque.  With `loop_period_s` those modes are computed
 # at that rate, as in a drive, and held in between.  A stop ramp (quick stop, fault reaction, disable) uses the velocity
 # loop in every mode.  Result in per mille of the rated motor torque, limited by 6072 and by 6073 through the torque
 # constant.  Positive = positive joint motion. Not modelled: velocity estimation inside the drive (the loop sees the
