@@ -1,7 +1,8 @@
 """Margins of the loops that a drive closes itself (CSP, CSV), where the configuration gives its gains.
 
     velocity loop   Lv = (Kv + Ki/s) / (J s) e^(-s Tv) / (1 + s Tl)   PI, Tv = 1.5 periods of the drive, Tl current lag
-    position loop   Lp = Kp/s  Lv / (1 + Lv)  e^(-s Tp)               P; in CSV it is closed on the PC, Tp is ours
+    position loop   Lp = Kp/s  Lv / (1 + Lv)  e^(-s Tp)               P; CSP: Tp = 0, the drive computes both at once
+                                                                      CSV: it is closed on the PC, Tp is our delay
 
 At the joint, rigid, without friction (which only adds damping) and without the offsets (which are outside the loops).
 Not modelled: the drive's filters and its estimation of the velocity, a reducer that is not rigid.
@@ -63,7 +64,7 @@ def cascade_margins(config: Config, delay_s: float) -> list[LoopMargin]:
     omega = np.geomspace(_LOWEST_radps, math.pi * cascade.loop_rate_Hz, _POINTS)
     s = 1j * omega
     drive_s = SAMPLES_LATE / cascade.loop_rate_Hz
-    late_s = drive_s if kind is CommandKind.POSITION else delay_s + 0.5 / config.loop.rate_Hz
+    late_s = 0.0 if kind is CommandKind.POSITION else delay_s + 0.5 / config.loop.rate_Hz
     found, closed = [], np.ones_like(s)
     if cascade.velocity_gain_Nmspr is not None and cascade.velocity_integral_Nmprad is not None:
         gain = cascade.velocity_gain_Nmspr + cascade.velocity_integral_Nmprad / s
