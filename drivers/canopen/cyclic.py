@@ -112,7 +112,8 @@ class CanopenPort:
     target_is_velocity: i4  # the target is 60FF (32 bit) instead of 6071 (16 bit)
     velocity_radpspunit: f8  # of 60FF and 60B1
     target_is_position: i4  # the target is 607A (32 bit)
-    torque_offset_at: i4  # byte position of 60B2 in the RPDO; -1 = not mapped
+    has_torque_offset: i4  # 1: the RPDO holds 60B2 as well
+    torque_offset_at: i4
     offset_rpdo_id: u4  # of the RPDO that holds 60B1 alone; 0 = there is none
     offset_share: f8  # of the target's velocity that goes into 60B1
     second: SecondPosition
@@ -398,7 +399,7 @@ def _put_target(port: CanopenPort, data: np.ndarray, command: Command, enabled: 
         put_u32(data, port.target_at, velocity_units(port, command.velocity_radps) if enabled else 0)
     else:
         put_u16(data, port.target_at, torque_permille(port, command.torque_Nm) if enabled else 0)
-    if port.torque_offset_at >= 0:
+    if port.has_torque_offset != 0:
         put_u16(data, port.torque_offset_at, torque_permille(port, command.torque_Nm) if enabled else 0)
 
 

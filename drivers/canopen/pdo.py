@@ -428,6 +428,7 @@ def new_port(
     for i, value in enumerate(layout.fill):
         port.rpdo_filler[i] = value
     port.target_is_velocity, port.target_is_position = int(velocity), int(position)
+    port.has_torque_offset = int(layout.torque_offset_at >= 0)
     port.offset_share = settings.velocity_share
     # the drive counts speed in the direction of its encoder
     port.velocity_radpspunit = joint_velocity_per_unit_radps(settings) * settings.encoder_direction

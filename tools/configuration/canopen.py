@@ -17,7 +17,14 @@ from jointctl.drivers.errors import ConfigurationError, DeviceError
 from jointctl.firmware_py.states import CommandKind
 from jointctl.tools.configuration.config import Config, ConfigurationProblems, beside, problem_line
 from jointctl.tools.configuration.conversions import joint_settings, torque_constant_NmpA
-from jointctl.tools.configuration.drive_section import FOR_A_NODE, FOR_A_PORT, DriveSection, GivenPlace, wrong_kind
+from jointctl.tools.configuration.drive_section import (
+    FOR_A_NODE,
+    FOR_A_PORT,
+    DriveSection,
+    GivenPlace,
+    SentWithTarget,
+    wrong_kind,
+)
 from jointctl.tools.configuration.sections import (
     Bus,
     Identity,
@@ -136,6 +143,16 @@ class CanopenSection(DriveSection):
         if self.cascade is None:
             return CommandKind.TORQUE
         return CommandKind.POSITION if self.mode == "csp" else CommandKind.VELOCITY
+
+    def sent_with_target(self, rate_Hz: float) -> SentWithTarget | None:
+        """The lead: the periods of a synchronous RPDO, and one in which the drive moves on to the target."""
+        cascade, kind = self.cascade, self.rpdo_transmission_type
+        if cascade is None:
+            return None
+        lead_s = cascade.lead_s
+        if isinstance(lead_s, str):
+            lead_s = (1.0 + (max(kind, 1) if kind <= LAST_SYNCHRONOUS else 0.0)) / rate_Hz
+        return SentWithTarget(lead_s, cascade.position_gain_ps or 0.0, cascade.torque_offset)
 
     def free_of_torque_limit(self) -> CanopenSection:
         return self.model_copy(update={"max_torque_permille": None})

@@ -39,6 +39,15 @@ class GivenPlace:
         return next((value for value in (self.interface, self.channel, self.bitrate) if value is not None), None)
 
 
+@dataclass(frozen=True)
+class SentWithTarget:
+    """What a drive that closes its own loop gets beside the desired motion."""
+
+    lead_s: float  # by which the motion is sent ahead of its time
+    position_gain_ps: float  # of the position loop here, where the drive closes the velocity loop alone
+    torque_offset: bool
+
+
 class DriveSection(Section, ABC):
     """The section of any drive."""
 
@@ -79,6 +88,10 @@ class DriveSection(Section, ABC):
     def own_loop(self) -> CommandKind:
         """What the loop commands: torque, or what the drive closes the loop for."""
         return CommandKind.TORQUE
+
+    def sent_with_target(self, rate_Hz: float) -> SentWithTarget | None:
+        """For a drive that closes its own loop in a run; None: torque is commanded."""
+        return None
 
     @abstractmethod
     def assumed_delay(self, config: Config) -> tuple[float, str]:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.drivers.canopen.identifiers import LAST_SYNCHRONOUS
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.kalman import set_kalman_gains
 from jointctl.firmware_py.kernel import plain
@@ -17,7 +16,6 @@ from jointctl.firmware_py.live_change import gains_of
 from jointctl.firmware_py.records import NEURONS, AxisConstants, Gains, TrajectoryConstants
 from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.states import (
-    CommandKind,
     ControllerKind,
     Encoders,
     FeedForward,
@@ -27,7 +25,6 @@ from jointctl.firmware_py.states import (
 )
 from jointctl.firmware_py.trajectory import approach_duration_s, approach_start, ends_meet, peak_of, table_from_csv
 from jointctl.firmware_py.velocity import low_pass_gain
-from jointctl.tools.configuration.canopen import CanopenSection, canopen_section
 from jointctl.tools.configuration.checks import extremes_problems
 from jointctl.tools.configuration.config import Config, raise_if
 from jointctl.tools.configuration.control_section import Adaptation, Control
@@ -81,27 +78,15 @@ def axis_constants(config: Config, table: np.ndarray, *, start_position_rad: flo
 
 def _fill_own_loop(axis: Any, config: Config) -> None:
     """What a drive gets that closes its position or velocity loop itself."""
-    axis.command_kind = config.drive.own_loop()
-    if axis.command_kind == CommandKind.TORQUE:
+    sent, record = config.drive.sent_with_target(config.loop.rate_Hz), axis.velocity_command
+    if sent is None:
         return
-    drive, record = canopen_section(config), axis.velocity_command
-    cascade = drive.cascade
-    assert cascade is not None
-    record.position_gain_ps = cascade.position_gain_ps or 0.0
+    axis.command_kind = config.drive.own_loop()
+    record.position_gain_ps, record.lead_s = sent.position_gain_ps, sent.lead_s
+    record.feeds_torque = int(sent.torque_offset)
     record.acceleration_max_radps2 = config.limits.torque_max_Nm / config.joint.inertia_kgm2
-    record.feeds_torque = int(cascade.torque_offset)
     second = config.joint_encoder
     record.from_second = int(second is not None and second.law == "joint_encoder")
-    record.lead_s = lead_s(drive, config.loop.rate_Hz)
-
-
-def lead_s(drive: CanopenSection, rate_Hz: float) -> float:
-    """Until a target takes effect: the periods of a synchronous RPDO, and one in which the drive moves on to it."""
-    assert drive.cascade is not None
-    if not isinstance(drive.cascade.lead_s, str):
-        return drive.cascade.lead_s
-    kind = drive.rpdo_transmission_type
-    return (1.0 + (max(kind, 1) if kind <= LAST_SYNCHRONOUS else 0.0)) / rate_Hz
 
 
 def free_constants(config: Config, start_rad: float) -> Any:

@@ -109,7 +109,6 @@ def check_cascade(
     from jointctl.tools.analysis.cascade import cascade_margins, cascade_of, cascade_unknowns, require_cascade
     from jointctl.tools.analysis.loop_settings import loop_settings
     from jointctl.tools.configuration.canopen import canopen_section
-    from jointctl.tools.configuration.records import lead_s
     from jointctl.tools.verbs.bench_drive import bench_of
 
     section, cascade = canopen_section(config), cascade_of(config)
@@ -118,7 +117,8 @@ def check_cascade(
     table = Table("quantity", "value", "note", title=title, title_justify="left")
     for assumed in (delay,):
         table.add_row(assumed.name, f"{assumed.value:g} {assumed.unit}", assumed.origin)
-    lead = lead_s(section, config.loop.rate_Hz)
+    with_target = section.sent_with_target(config.loop.rate_Hz)
+    lead = with_target.lead_s if with_target is not None else 0.0
     table.add_row("lead", f"{lead * 1e3:g} ms", "by which the motion is sent ahead (drive.cascade.lead_s)")
     sent = {
         "torque offset": cascade.torque_offset,

@@ -15,7 +15,6 @@ from jointctl.drivers.errors import MarginError, UsageError
 from jointctl.tools.analysis.cascade import cascade_margins, cascade_text, require_cascade
 from jointctl.tools.configuration.canopen import CanopenSection, cyclic_bus_load, rpdo_bytes
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.records import lead_s
 from jointctl.tools.output import Output
 from jointctl.tools.verbs.check import check
 from tests.configurations import changed, load, problems, shipped
@@ -127,8 +126,11 @@ def test_check_reports_both_loops_and_the_lead() -> None:
 @pytest.mark.parametrize(("kind", "periods"), [(0, 2.0), (1, 2.0), (3, 4.0), (240, 241.0), (254, 1.0), (255, 1.0)])
 def test_the_lead_is_until_the_target_takes_effect(kind: int, periods: float) -> None:
     drive = drive_of(own_loop()).model_copy(update={"rpdo_transmission_type": kind})
-    assert lead_s(drive, 500.0) == pytest.approx(periods / 500.0)
-    assert lead_s(drive_of(own_loop(lead_s=0.004)), 500.0) == 0.004
+    sent, chosen = drive.sent_with_target(500.0), drive_of(own_loop(lead_s=0.004)).sent_with_target(500.0)
+    assert sent is not None
+    assert chosen is not None
+    assert (sent.lead_s, chosen.lead_s) == (pytest.approx(periods / 500.0), 0.004)
+    assert drive_of(shipped("virtual")).sent_with_target(500.0) is None
 
 
 @pytest.mark.parametrize(
