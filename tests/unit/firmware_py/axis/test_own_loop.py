@@ -21,9 +21,12 @@ from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import (
     AxisPhase,
     CommandKind,
+    ControllerKind,
     DriveRequest,
     DriveState,
+    Encoders,
     Fault,
+    FeedForward,
     StopRequest,
     TrajectoryKind,
 )
@@ -292,3 +295,26 @@ def test_without_offsets_there_is_one_frame(settings_of_virtual_joint: Any) -> N
     command.request, command.velocity_radps = DriveRequest.ENABLE, 1.0
     end_cycle(port, frames, new(Sample)[0], command)
     assert (frames[SLOT_RPDO].length, frames[SLOT_OFFSET].can_id) == (6, 0)
+
+
+# --- a joint that is not rigid ---
+@pytest.mark.parametrize(("encoders", "twisted"), [(Encoders.MOTOR, True), (Encoders.LINK, False)])
+def test_of_a_flexible_joint_the_target_of_the_motors_encoder_is_ahead_by_the_twist(
+    csp: OwnLoopRig, encoders: Encoders, twisted: bool
+) -> None:
+    law = csp.rig.axis.law
+    law.kind, law.feed_forward = ControllerKind.FLEXIBLE_JOINT, FeedForward.NONE
+    law.flexible.encoders = encoders
+    law.flexible.motor_inertia_kgm2, law.flexible.link_inertia_kgm2 = 1.0, law.inertia_kgm2 - 1.0
+    law.flexible.compliance_radpNm = 1e-4
+    law.flexible.motor_velocity = law.flexible.link_velocity = csp.rig.axis.velocity
+    csp.until(AxisPhase.TRACKING)
+    csp.tick(200)
+    state = csp.rig.state
+    twist_rad = 1e-4 * (law.inertia_kgm2 - 1.0) * state.reference.acceleration_radps2
+    assert abs(twist_rad) > 1e-6
+    ahead_rad = state.reference.position_rad + 2e-3 * (
+        state.reference.velocity_radps + 1e-3 * state.reference.acceleration_radps2
+    )
+    expected_rad = ahead_rad + (twist_rad if twisted else 0.0)
+    assert csp.targets[-1] == pytest.approx(expected_rad, abs=2e-7)
