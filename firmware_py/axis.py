@@ -29,6 +29,7 @@ from jointctl.firmware_py.safety import (
     check_supervision,
     check_swing,
     enter,
+    limited_target_radps,
     limited_torque_Nm,
     limited_velocity_radps,
     powered,
@@ -44,7 +45,16 @@ from jointctl.firmware_py.sequence import (
     step_waiting,
     write_command,
 )
-from jointctl.firmware_py.states import AxisPhase, CommandKind, ControllerKind, Fault, Reaction, TrajectoryKind
+from jointctl.firmware_py.states import (
+    AxisPhase,
+    CommandKind,
+    ControllerKind,
+    DriveState,
+    Encoders,
+    Fault,
+    Reaction,
+    TrajectoryKind,
+)
 from jointctl.firmware_py.stream import following_set_points, step_other_motion, step_stream
 from jointctl.firmware_py.trajectory import (
     NO_REPETITION,
@@ -63,18 +73,32 @@ from jointctl.firmware_py.velocity import step_velocity
 # The correction keeps the joint on the planned motion (a drive's velocity loop alone drifts); it is small on purpose,
 # so that at constant speed the torque is what friction asks for.  Sent only if it is finite, then limited by the
 # velocity limit and by the acceleration limit, in that order.  Not modelled: the drive's own ramps and limits.
+#
+# A run in CSP or CSV (docs/law.md) sends the motion that is desired `lead_s` later, when it takes effect, and the law's
+# feed-forward for it as torque offset.  In CSP the target position is limited like a joint that moves.
 
 
 @kernel
 def velocity_command_radps(constants: VelocityCommandConstants, reference: Reference, position_rad: float) -> float:
-    """The unlimited velocity command [rad/s]."""
+    """The unlimited velocity command [rad/s] for the motion that is desired now."""
     return reference.velocity_radps - constants.position_gain_ps * (position_rad - reference.position_rad)
+
+
+@kernel
+def look_ahead(reference: Reference, lead_s: float, ahead: Reference) -> None:
+    """The desired motion `lead_s` later, as far as its derivatives of now say."""
+    ahead.position_rad = reference.position_rad + lead_s * (
+        reference.velocity_radps + 0.5 * lead_s * reference.acceleration_radps2
+    )
+    ahead.velocity_radps = reference.velocity_radps + lead_s * reference.acceleration_radps2
+    ahead.acceleration_radps2 = reference.acceleration_radps2
+    ahead.snap_radps4 = reference.snap_radps4
 
 
 # --- One tick of one joint: sample in, command out ---
 # position -> phase and reference -> velocity -> safety -> law -> finite check, torque limit, rate limit
 #
-# With CommandKind.VELOCITY the last part is the velocity command -> finite check, velocity limit, acceleration limit.
+# With CommandKind.VELOCITY and POSITION the last part is velocity or target -> finite, limits, acceleration limit.
 #
 # The phases themselves are in `sequence`, the limits in `safety`.
 
@@ -159,17 +183,17 @@ def _brake(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> N
 
 
 @kernel
-def law_torque_Nm(constants: AxisConstants, state: AxisState, where: Repetition) -> float:
+def law_torque_Nm(constants: AxisConstants, state: AxisState, reference: Reference, where: Repetition) -> float:
     """What the law asks for, unlimited."""
     if constants.law.kind == ControllerKind.FLEXIBLE_JOINT:
         reading = Reading(state.measured_position_rad, state.second_position_rad, state.gap_cycles)
-        return step_flexible_law(constants.law, state.law, reading, state.reference, state.command_torque_Nm, where)
+        return step_flexible_law(constants.law, state.law, reading, reference, state.command_torque_Nm, where)
     return step_law(
         constants.law,
         state.law,
         state.measured_position_rad,
         state.velocity,
-        state.reference,
+        reference,
         state.command_torque_Nm,
         where,
     )
@@ -185,7 +209,7 @@ def _command_torque(constants: AxisConstants, state: AxisState, table: np.ndarra
         if state.phase == AxisPhase.TRACKING:
             where = repetition(constants.trajectory, table, state.trajectory_s)
         follow_temperature(constants.law, state.law, False)
-        state.unlimited_torque_Nm = law_torque_Nm(constants, state, where)
+        state.unlimited_torque_Nm = law_torque_Nm(constants, state, state.reference, where)
         if state.stream.torque_Nm != 0.0:
             state.unlimited_torque_Nm += state.stream.torque_Nm
     else:
@@ -203,36 +227,98 @@ def _command_torque(constants: AxisConstants, state: AxisState, table: np.ndarra
 
 
 @kernel
-def _command_velocity(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> None:
-    """The velocity of this cycle for a drive that closes the velocity loop; zero while the torque is released.
+def _feed_forward_Nm(constants: AxisConstants, state: AxisState) -> float:
+    """The law without its feedback, for `state.ahead`; the drive's own loop is the feedback."""
+    law = state.law
+    if constants.velocity_command.feeds_torque == 0 and constants.law.kind != ControllerKind.FLEXIBLE_JOINT:
+        return 0.0
+    follow_temperature(constants.law, law, False)
+    law_torque_Nm(constants, state, state.ahead, NO_REPETITION)
+    law.feedback_torque_Nm = 0.0
+    law.observer_torque_Nm = 0.0
+    if constants.velocity_command.feeds_torque == 0:
+        return 0.0
+    return law.inertia_torque_Nm + law.gravity_torque_Nm + law.friction_torque_Nm + state.stream.torque_Nm
 
-    The torque limit is the drive's; at the limit for too long is a fault here as well, by the measured torque.
+
+@kernel
+def _target_rad(constants: AxisConstants, state: AxisState) -> float:
+    """Where the encoder that the drive closes its loop on is to be: the motor's is ahead of the link by the twist."""
+    if constants.law.kind == ControllerKind.FLEXIBLE_JOINT and constants.law.flexible.encoders != Encoders.LINK:
+        return state.law.flexible.target_rad - state.law.flexible.twist_error_rad
+    return state.ahead.position_rad
+
+
+@kernel
+def _unpowered_target(constants: AxisConstants, state: AxisState, sample: Sample) -> None:
+    """No command; the target position is where the joint is, and stays there from enabling on."""
+    follow_temperature(constants.law, state.law, True)
+    state.command_velocity_radps = 0.0
+    state.command_torque_Nm = 0.0
+    state.unlimited_torque_Nm = 0.0
+    state.saturated_cycles = 0
+    state.has_target = 0
+    if state.phase != AxisPhase.ENABLING or sample.drive_state != DriveState.ENABLED:
+        second = constants.velocity_command.from_second != 0
+        state.command_position_rad = state.second_position_rad if second else state.measured_position_rad
+
+
+@kernel
+def _command_motion(constants: AxisConstants, state: AxisState, sample: Sample, elapsed_cycles: int) -> None:
+    """Target position or velocity, and torque offset, of this cycle for a drive that closes that loop itself.
+
+    While the torque is released the joint stands under the drive's loop, and the offset ends.  The limit of the whole
+    torque is the drive's; at the limit for too long is a fault here as well, by the measured torque.
     """
-    limits = constants.limits
-    period_s = constants.law.period_s
-    if state.phase == AxisPhase.RELEASING:
-        if state.phase_cycle * period_s >= constants.sequence.release_s:
-            enter(state, AxisPhase.DISABLING)
-        unlimited_radps = 0.0
-    elif powered(state.phase):
-        unlimited_radps = velocity_command_radps(
-            constants.velocity_command, state.reference, state.measured_position_rad
-        )
-    else:
-        state.command_velocity_radps = 0.0
-        state.saturated_cycles = 0
+    limits, own, period_s = constants.limits, constants.velocity_command, constants.law.period_s
+    if not powered(state.phase):
+        _unpowered_target(constants, state, sample)
         return
-    velocity_radps, finite = limited_velocity_radps(
-        limits,
-        constants.velocity_command.acceleration_max_radps2,
-        unlimited_radps,
-        state.command_velocity_radps,
-        elapsed_cycles * period_s,
-    )
-    check_finite(state, finite, unlimited_radps)
+    if state.phase == AxisPhase.RELEASING:
+        state.unlimited_torque_Nm = released_torque_Nm(constants, state, elapsed_cycles)
+        state.ahead.position_rad = state.command_position_rad
+        state.ahead.velocity_radps = 0.0
+    elif own.lead_s > 0.0 or own.feeds_torque != 0 or constants.command_kind == CommandKind.POSITION:
+        look_ahead(state.reference, own.lead_s, state.ahead)
+        state.unlimited_torque_Nm = _feed_forward_Nm(constants, state)
+        state.ahead.position_rad = _target_rad(constants, state)
+    if constants.command_kind == CommandKind.POSITION:
+        # through an overrun the drive's set-point stood still; 60C2 makes up for one period, not for all of them
+        before_radps = state.command_velocity_radps if elapsed_cycles == 1 else 0.0
+        velocity_radps, finite = limited_target_radps(
+            limits, own.acceleration_max_radps2, period_s, state.ahead, state.command_position_rad, before_radps
+        )
+        state.command_position_rad += velocity_radps * period_s
+        unlimited = state.ahead.position_rad
+    else:
+        unlimited = _velocity_radps(constants, state, elapsed_cycles)
+        velocity_radps, finite = limited_velocity_radps(
+            limits, own.acceleration_max_radps2, unlimited, state.command_velocity_radps, elapsed_cycles * period_s
+        )
+    check_finite(state, finite, unlimited)
+    torque_Nm, finite = limited_torque_Nm(limits, state.unlimited_torque_Nm, state.command_torque_Nm, period_s)
+    check_finite(state, finite, state.unlimited_torque_Nm)
     check_swing(constants, state, state.measured_torque_Nm)
     check_saturation(limits, state, state.measured_torque_Nm, elapsed_cycles)
     state.command_velocity_radps = velocity_radps if powered(state.phase) else 0.0
+    state.command_torque_Nm = torque_Nm if powered(state.phase) else 0.0
+
+
+@kernel
+def _velocity_radps(constants: AxisConstants, state: AxisState, elapsed_cycles: int) -> float:
+    """CommandKind.VELOCITY: the velocity of this cycle, unlimited; zero while the torque is released."""
+    own = constants.velocity_command
+    if state.phase == AxisPhase.RELEASING:
+        return 0.0
+    position_rad = state.measured_position_rad
+    if own.lead_s <= 0.0:
+        return velocity_command_radps(own, state.reference, position_rad)
+    target_rad, feed_radps = state.ahead.position_rad, state.ahead.velocity_radps
+    if state.has_target != 0 and elapsed_cycles == 1:  # with the speed of the twist, where there is one
+        feed_radps = (target_rad - state.command_position_rad) / constants.law.period_s
+    state.has_target = 1
+    state.command_position_rad = target_rad
+    return feed_radps - own.position_gain_ps * (position_rad - state.reference.position_rad)
 
 
 @kernel
@@ -297,8 +383,8 @@ def command_axis(
     constants: AxisConstants, state: AxisState, table: np.ndarray, sample: Sample, command: Command, elapsed_cycles: int
 ) -> None:
     """The last part: the command."""
-    if constants.command_kind == CommandKind.VELOCITY:
-        _command_velocity(constants, state, elapsed_cycles)
+    if constants.command_kind != CommandKind.TORQUE:
+        _command_motion(constants, state, sample, elapsed_cycles)
     else:
         _command_torque(constants, state, table, elapsed_cycles)
     step_stopping(constants, state, sample)

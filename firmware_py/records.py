@@ -463,10 +463,13 @@ class SequenceConstants:
 
 @record
 class VelocityCommandConstants:
-    """See `axis.velocity_command_radps`."""
+    """For a drive that closes the velocity loop, or the position loop as well; see `axis.velocity_command_radps`."""
 
-    position_gain_ps: f8
+    position_gain_ps: f8  # CommandKind.VELOCITY only
     acceleration_max_radps2: f8
+    lead_s: f8  # the motion that is desired so much later is sent; 0 = that of now, without torque offset
+    feeds_torque: i4  # the law's feed-forward is sent as torque offset
+    from_second: i4  # the drive closes its loop on the encoder that does not feed the law
 
 
 @record
@@ -506,8 +509,9 @@ class Sample:
 
 @record
 class Command:
-    torque_Nm: f8
-    velocity_radps: f8  # CommandKind.VELOCITY only
+    torque_Nm: f8  # CommandKind.TORQUE; of a drive that closes its own loop the torque offset
+    velocity_radps: f8  # CommandKind.VELOCITY; with POSITION that of the target position, for the velocity offset
+    position_rad: f8  # CommandKind.POSITION only
     request: i4  # DriveRequest
 
 
@@ -545,7 +549,10 @@ class AxisState:
     measured_torque_Nm: f8
     command_torque_Nm: f8
     unlimited_torque_Nm: f8  # the law's output before limits, kept for the log
-    command_velocity_radps: f8  # CommandKind.VELOCITY only
+    command_velocity_radps: f8  # CommandKind.VELOCITY; with POSITION that of the target position
+    command_position_rad: f8  # the target of the last cycle, of the encoder that the drive closes its loop on
+    has_target: i4  # 1 from the first target that was made of the desired motion
+    ahead: Reference  # the desired motion `VelocityCommandConstants.lead_s` later
     approach: Annotated[np.ndarray, array_of(f8, 6)]  # quintic coefficients
     reference: Reference
     velocity: VelocityState

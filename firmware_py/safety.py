@@ -14,6 +14,7 @@ from jointctl.firmware_py.records import (
     AxisConstants,
     AxisState,
     LimitConstants,
+    Reference,
     Sample,
     SetPoint,
     StreamConstants,
@@ -303,12 +304,12 @@ def check_reading(constants: AxisConstants, state: AxisState, elapsed_cycles: in
     """A reading that stands still although the reference moves on, or although the joint is pushed hard.
 
     It must be early: behind a stuck encoder the law pushes ever harder, and the joint moves unseen, long before the
-    following error is too large.  Where the drive closes the velocity loop, the torque is the one that it measures.
+    following error is too large.  Where the drive closes a loop itself, the torque is the one that it measures.
     Of an overrun's `elapsed_cycles`, the reference's way counts for one: the drive received no other.
     """
     limits = constants.limits
     torque_Nm = state.command_torque_Nm
-    if constants.command_kind == CommandKind.VELOCITY:
+    if constants.command_kind != CommandKind.TORQUE:
         torque_Nm = state.measured_torque_Nm
     state.frozen_way_rad += (state.reference.position_rad - state.frozen_reference_rad) / elapsed_cycles
     state.frozen_reference_rad = state.reference.position_rad
@@ -399,8 +400,32 @@ def limited_velocity_radps(
 
 
 @kernel
+def limited_target_radps(
+    limits: LimitConstants, acceleration_max_radps2: float, period_s: float, target: Reference, position_rad: float,
+    velocity_radps: float,
+) -> tuple[float, bool]:  # fmt: skip
+    """(velocity of the target position [rad/s], finite): finite, position, velocity, acceleration limit, in that order.
+
+    `position_rad` and `velocity_radps` are those of the last target.  A target that is out of reach is caught up with
+    as a joint would, without a jump and without going beyond it; half of the acceleration is left for braking.
+    Not finite: the last target stays, and the caller must stop the joint.
+    """
+    if not (math.isfinite(target.position_rad) and math.isfinite(target.velocity_radps)):
+        return 0.0, False
+    aim_rad = min(max(target.position_rad, limits.position_min_rad), limits.position_max_rad)
+    step = acceleration_max_radps2 * period_s
+    wanted = (aim_rad - position_rad) / period_s
+    if abs(wanted - velocity_radps) > step:
+        left_rad = aim_rad - position_rad - target.velocity_radps * period_s
+        speed = min(math.sqrt(acceleration_max_radps2 * abs(left_rad)), abs(left_rad) / period_s)
+        wanted = target.velocity_radps + math.copysign(speed, left_rad)
+    wanted = min(max(wanted, -limits.velocity_max_radps), limits.velocity_max_radps)
+    return min(max(wanted, velocity_radps - step), velocity_radps + step), True
+
+
+@kernel
 def check_finite(state: AxisState, finite: bool, unlimited: float) -> None:
-    """A command that is no number: it was not sent (`limited_torque_Nm`, `limited_velocity_radps`)."""
+    """A command that is no number: it was not sent (the three `limited_*`)."""
     if not finite:
         trip(state, Fault.NOT_FINITE, unlimited, 0)
 

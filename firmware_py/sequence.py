@@ -52,6 +52,8 @@ def reset_axis(constants: AxisConstants, state: AxisState) -> None:
     state.command_torque_Nm = 0.0
     state.unlimited_torque_Nm = 0.0
     state.command_velocity_radps = 0.0
+    state.command_position_rad = 0.0
+    state.has_target = 0
     state.velocity.primed = 0
     reset_law(constants.law, state.law)
     reset_change(state.change)
@@ -210,6 +212,7 @@ def write_command(state: AxisState, command: Command) -> None:
     """What the drive is asked for in this phase."""
     command.torque_Nm = state.command_torque_Nm
     command.velocity_radps = state.command_velocity_radps
+    command.position_rad = state.command_position_rad
     if state.phase == AxisPhase.QUICK_STOPPING:
         command.request = DriveRequest.QUICK_STOP
     elif state.phase >= AxisPhase.ENABLING and state.phase <= AxisPhase.RELEASING:

@@ -186,6 +186,7 @@ class CommandKind(IntEnum):
 
     TORQUE = 0
     VELOCITY = 1  # the drive closes the velocity loop itself
+    POSITION = 2  # the drive closes the position loop as well
 
 
 class StopRequest(IntEnum):

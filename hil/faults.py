@@ -97,7 +97,7 @@ def frame_class(frame: np.ndarray, to_drive: bool, node_id: int) -> FrameClass:
     if to_drive:
         if identifier == 0x80:
             return FrameClass.SYNC
-        if identifier == 0x200 + node_id:
+        if identifier == 0x200 + node_id or identifier == 0x300 + node_id:
             return FrameClass.RPDO
         if identifier > 0x700 and identifier <= 0x77F:
             return FrameClass.CONTROLLER_HEARTBEAT

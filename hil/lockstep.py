@@ -40,9 +40,11 @@ TRUTHS = 6
 POINT_TIME_s, POINT_VALUES = 0, 1  # position, velocity, acceleration, torque: four columns
 NO_POINTS = np.zeros((0, 5))
 
-# slots of the frame memory, agreed with the caller that passes the codec: sent in begin (up to two), RPDO, received
+# slots of the frame memory, agreed with the caller that passes the codec: sent in begin (up to two), RPDO, received,
+# and the RPDO with an offset, if its identifier is not 0
 RPDO_SLOT = 2
 RECEIVED_SLOT = 3
+OFFSET_SLOT = 4
 # No delay is modelled, but with the time of the request an answer would be that of an earlier one.
 _ANSWER_NS = 1
 _READ_EVERY_NS = 1_000_000_000  # the temperature
@@ -178,6 +180,8 @@ def _send(link: _Link, samples: np.ndarray, commands: np.ndarray) -> int:
     codec = link.codec
     for axis in range(len(samples)):
         codec.end(codec.link, axis, samples, commands)
+        if codec.frame_bytes[OFFSET_SLOT, 0] != 0 or codec.frame_bytes[OFFSET_SLOT, 1] != 0:
+            _to_drive(link, axis, OFFSET_SLOT, samples[axis])
         _to_drive(link, axis, RPDO_SLOT, samples[axis])
     return 0
 

@@ -16,6 +16,7 @@ from jointctl.firmware_py.states import AxisPhase, ControllerKind, Fault, StopRe
 from jointctl.joint import TABLE_ROWS, State
 from jointctl.live_joint import state_of
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.drive_section import require_torque
 from jointctl.tools.configuration.records import free_constants
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.session.live_changes import post_change
@@ -95,6 +96,7 @@ class LockstepMotor:
     def step_torque(self, torque_Nm: float) -> None:
         if not self._outside:
             self.require()
+            require_torque(self.config, "step_torque")
             self._outside, axis = True, self.constants[0]
             axis.law.kind = ControllerKind.OUTSIDE
             limits = axis.limits

@@ -11,7 +11,7 @@ LOCKSTEP = tuple(
     for folder, names in {
         "hil": "friction_chain law_options map paper_figures random_motions study sweep tune",
         "faults": "campaign_configurations every_frame fault_campaign fault_engine fault_regressions late_samples"
-        " limit_cycle unwatched_loop",
+        " limit_cycle own_loop_faults unwatched_loop",
         "docs": "configuration_reference notebook reference_pages troubleshooting",
     }.items()
     for name in names.split()

@@ -8,19 +8,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from jointctl.drivers.canopen.cia402 import SUPPORTED_MODE_BIT, ControlWord, Mode, State, state_of_word
 from jointctl.drivers.canopen.eds import EdsFile
 from jointctl.drivers.canopen.encoder import EncoderFindings, commission_drive_object
 from jointctl.drivers.canopen.pdo import (
+    OFFSET_RPDO,
+    TARGET_POSITION,
     TARGET_TORQUE,
     TARGET_VELOCITY,
     PdoLayout,
     configure_loop_pdos,
+    joint_angle_per_count_rad,
     joint_torque_per_permille_Nm,
     joint_velocity_per_unit_radps,
     listen_to_our_sync,
+    map_velocity_offset,
 )
 from jointctl.drivers.canopen.sdo import ObjectAccess
 from jointctl.drivers.canopen.settings import CanopenSettings
@@ -35,14 +39,20 @@ MODES = {
     "cst": (Mode.CYCLIC_SYNC_TORQUE,),
     "tq": (Mode.TORQUE,),
     "auto": (Mode.CYCLIC_SYNC_TORQUE, Mode.TORQUE),
+    "csp": (Mode.CYCLIC_SYNC_POSITION,),
     "csv": (Mode.CYCLIC_SYNC_VELOCITY,),
     "pv": (Mode.PROFILE_VELOCITY,),
     "velocity or torque": (
         Mode.CYCLIC_SYNC_VELOCITY, Mode.PROFILE_VELOCITY, Mode.CYCLIC_SYNC_TORQUE, Mode.TORQUE,
     ),
 }  # fmt: skip
-CYCLIC_MODES = (Mode.CYCLIC_SYNC_TORQUE, Mode.CYCLIC_SYNC_VELOCITY)
+CYCLIC_MODES = (Mode.CYCLIC_SYNC_TORQUE, Mode.CYCLIC_SYNC_VELOCITY, Mode.CYCLIC_SYNC_POSITION)
 VELOCITY_MODES = (Mode.CYCLIC_SYNC_VELOCITY, Mode.PROFILE_VELOCITY)
+TARGETS = {
+    Mode.CYCLIC_SYNC_POSITION: TARGET_POSITION, Mode.CYCLIC_SYNC_VELOCITY: TARGET_VELOCITY,
+    Mode.PROFILE_VELOCITY: TARGET_VELOCITY,
+}  # fmt: skip
+FOLLOWING_TIMEOUT_MS = 20  # of 6066
 LARGEST_UNSIGNED = 0xFFFFFFFF
 STEEP_RADPS2 = 1000.0  # profile acceleration at the joint, above any that the loop asks for
 STEEP_PERMILLE_PS = 1_000_000
@@ -144,7 +154,10 @@ def disable(objects: ObjectAccess, settings: CanopenSettings, pause: Pause) -> N
             hint="find that program; `jointctl stop` brakes the drive and switches it off",
         )
     objects.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE, what="controlword")
-    objects.write_verified(0x6071, 0, 0, what="target torque")
+    if settings.holds_alone:  # such a drive need not have a torque mode
+        objects.write_if_present(0x6071, 0, 0, what="target torque")
+    else:
+        objects.write_verified(0x6071, 0, 0, what="target torque")
     for index, what in ((0x60FF, "target velocity"), (0x60B1, "velocity offset"), (0x60B2, "torque offset")):
         objects.write_if_present(index, 0, 0, what=what)
     for _ in range(ATTEMPTS):
@@ -189,9 +202,61 @@ def choose_mode(objects: ObjectAccess, settings: CanopenSettings, findings: Find
     findings.settings["mode"] = findings.mode.name.lower()
 
 
+def take_place(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
+    """In CSP: the target is where the joint stands, before anything could enable; the drive's own following window."""
+    here = objects.read(0x6064, what="position actual value")
+    objects.write_verified(0x607A, 0, here, what="target position")
+    window = math.ceil(settings.following_error_max_rad / joint_angle_per_count_rad(settings))
+    window = min(window, LARGEST_UNSIGNED - 1)  # the greatest number switches it off
+    if objects.write_if_present(0x6065, 0, window, what="following error window"):
+        objects.write_if_present(0x6066, 0, FOLLOWING_TIMEOUT_MS, what="following error time out")
+        findings.settings["following window"] = f"{window} counts = {settings.following_error_max_rad:g} rad"
+    else:
+        findings.remarks.append("no object 6065: the loop alone watches the following error")
+
+
+def _scaled_units(objects: ObjectAccess) -> list[str]:
+    """Whether 6064 and 607A are counts of the encoder: a gear ratio (6091) or feed (6092) scales both alike."""
+    found = []
+    for index, what in ((0x6091, "gear ratio"), (0x6092, "feed constant")):
+        if not (objects.has(index, 1) and objects.has(index, 2)):
+            continue
+        above, below = (objects.read(index, sub, what=what) for sub in (1, 2))
+        if index == 0x6091 and above != below:
+            found.append(
+                f"6091 is {above}:{below}: the drive scales 6064 and 607A by it; encoder.counts_per_turn and "
+                "joint.reduction_ratio must be those of the scaled position"
+            )
+        elif index == 0x6092 and objects.has(0x608F, 1) and above != objects.read(0x608F, 1, what="resolution"):
+            found.append(
+                f"6092 is {above}:{below}: 6064 and 607A are not counts of the encoder (608F) but units of that feed, "
+                "and encoder.counts_per_turn must be in them"
+            )
+    return found
+
+
+def require_own_loop(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
+    """What a run needs of a drive that closes its own loop; it must not go on holding with no one watching."""
+    if not objects.has(0x6007):
+        raise DeviceError(
+            f"node {settings.node} has no object 6007 (abort connection option): in mode {settings.mode} it may go on "
+            "holding the joint when this computer dies",
+            'drive.mode = "cst" if it has that mode; such a drive is not enabled in this one',
+        )
+    if settings.torque_offset and not objects.has(0x60B2):
+        raise DeviceError(
+            f"node {settings.node} has no object 60B2 (torque offset), which drive.cascade.torque_offset (=true) needs",
+            "torque_offset = false leaves the feed-forward away: the drive's loop alone then follows",
+        )
+    if not objects.has(0x6077):
+        findings.remarks.append("no object 6077: a torque at its limit, or one that swings, is not noticed")
+    findings.remarks += _scaled_units(objects)
+
+
 def limit_velocity(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> None:
-    """In the velocity modes: no stale target, the drive's own limit 607F, ramps that leave the loop's own in charge."""
-    objects.write_verified(0x60FF, 0, 0, what="target velocity")
+    """With a loop of its own: no stale target, the drive's own limit 607F, ramps that leave the loop's in charge."""
+    if findings.mode in VELOCITY_MODES:
+        objects.write_verified(0x60FF, 0, 0, what="target velocity")
     unit_radps = joint_velocity_per_unit_radps(settings)
     if settings.velocity_max_radps is not None and objects.has(0x607F):
         highest = min(math.ceil(settings.velocity_max_radps / unit_radps), LARGEST_UNSIGNED)
@@ -329,6 +394,22 @@ def arm_watchdog(objects: ObjectAccess, settings: CanopenSettings, findings: Fin
     findings.settings["watchdog"] = f"{milliseconds} ms on the heartbeat of node {settings.master_node}"
 
 
+def _map_pdos(objects: ObjectAccess, settings: CanopenSettings, findings: Findings) -> PdoLayout:
+    """Those of the loop in the mode that was chosen; a drive without 60B1 goes without velocity offset."""
+    wanted = settings.velocity_offset and findings.mode is Mode.CYCLIC_SYNC_POSITION
+    if wanted and not objects.has(0x60B1):
+        wanted = False
+        findings.remarks.append("no object 60B1: without velocity offset the joint lags by its speed / position gain")
+    layout = configure_loop_pdos(
+        objects, settings.node, settings.rpdo_transmission_type, TARGETS.get(findings.mode, TARGET_TORQUE),
+        mode=findings.mode, max_permille=findings.max_permille, torque_offset=settings.torque_offset,
+        spare=frozenset({OFFSET_RPDO} if wanted else ()),
+    )  # fmt: skip
+    if not wanted:
+        return layout
+    return replace(layout, offset_rpdo_id=map_velocity_offset(objects, settings.node, settings.rpdo_transmission_type))
+
+
 def commission(
     objects: ObjectAccess, settings: CanopenSettings, eds: EdsFile, pause: Pause, prove: Callable[[], str] | None = None
 ) -> Findings:
@@ -341,21 +422,22 @@ def commission(
     disable(objects, settings, pause)
     choose_mode(objects, settings, findings, pause)
     limit_torque(objects, settings, findings)
-    if findings.mode in VELOCITY_MODES:
+    if settings.holds_alone:
+        require_own_loop(objects, settings, findings)
+    if findings.mode in TARGETS:
         limit_velocity(objects, settings, findings)
+    if findings.mode is Mode.CYCLIC_SYNC_POSITION:
+        take_place(objects, settings, findings)
     findings.settings.update(set_sync(objects, settings.rate_Hz, cyclic=findings.mode in CYCLIC_MODES))
     arm_watchdog(objects, settings, findings)
     if prove is not None:
         findings.settings["watchdog detects"] = prove()
-    target = TARGET_VELOCITY if findings.mode in VELOCITY_MODES else TARGET_TORQUE
-    findings.layout = configure_loop_pdos(
-        objects, settings.node, settings.rpdo_transmission_type, target,
-        mode=findings.mode, max_permille=findings.max_permille,
-    )  # fmt: skip
-    deadline, remarks = arm_rpdo_deadline(objects, settings, findings.layout.rpdo_id)
-    if deadline:
-        findings.settings["RPDO deadline"] = deadline
-    findings.remarks += remarks
+    findings.layout = _map_pdos(objects, settings, findings)
+    for rpdo_id in filter(None, (findings.layout.rpdo_id, findings.layout.offset_rpdo_id)):
+        deadline, remarks = arm_rpdo_deadline(objects, settings, rpdo_id)
+        if deadline:
+            findings.settings["RPDO deadline"] = deadline
+        findings.remarks += remarks
     second = settings.joint_encoder
     if second is not None and second.node is None:
         findings.second = commission_drive_object(objects, second, settings.node)

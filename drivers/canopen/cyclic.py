@@ -4,7 +4,9 @@ The real loop, the portable loop and the lockstep simulation all use these three
 
     begin_cycle  ->  SYNC, and the heartbeat when it is due
     accept_frame <-  TPDO (statusword, position, torque), EMCY, heartbeat and boot-up of the drive
-    end_cycle    ->  RPDO (controlword, target torque or target velocity)
+    end_cycle    ->  RPDO (controlword, target torque, velocity or position; torque offset), RPDO with velocity offset
+
+A target position follows the joint while it is not enabled, so that it does not jump when it is.
 
 Two encoders on one joint: a sample counts once both have answered the same SYNC.  So the loss of either ends the run as
 a stale sample.  An encoder node that reports an error (EMCY) or that has restarted is not believed: no sample counts
@@ -33,7 +35,8 @@ SLOT_SYNC = 0
 SLOT_HEARTBEAT = 1
 SLOT_RPDO = 2
 SLOT_RECEIVED = 3
-FRAME_SLOTS = 4
+SLOT_OFFSET = 4  # the RPDO with the velocity offset; its identifier is 0 where there is none
+FRAME_SLOTS = 5
 SCRATCH_WORDS = 8
 SEEN_FIRST, SEEN_SECOND = 1, 2
 _BOTH = SEEN_FIRST | SEEN_SECOND
@@ -42,6 +45,7 @@ _BOTH = SEEN_FIRST | SEEN_SECOND
 IGNORED_MAX_CYCLES = 20
 # an error code stays for so long although the drive has reset it: it may be why the joint stops
 ERROR_SHOWN_CYCLES = 20
+_MOST_COUNTS = 2.0**62
 _WORST_BITS = np.array([worst_frame_bits(length) for length in range(9)])
 
 
@@ -106,7 +110,12 @@ class CanopenPort:
     torque_Nmppermille: f8
     max_permille: i4
     target_is_velocity: i4  # the target is 60FF (32 bit) instead of 6071 (16 bit)
-    velocity_radpspunit: f8  # of 60FF
+    velocity_radpspunit: f8  # of 60FF and 60B1
+    target_is_position: i4  # the target is 607A (32 bit)
+    has_torque_offset: i4  # 1: the RPDO holds 60B2 as well
+    torque_offset_at: i4
+    offset_rpdo_id: u4  # of the RPDO that holds 60B1 alone; 0 = there is none
+    offset_share: f8  # of the target's velocity that goes into 60B1
     second: SecondPosition
     # state
     first_rad: f8  # position by 6064
@@ -366,8 +375,49 @@ def velocity_units(port: CanopenPort, velocity_radps: float) -> int:
 
 
 @kernel
+def position_counts(port: CanopenPort, position_rad: float) -> int:
+    """Joint position [rad] in counts of 607A, to be cut to 32 bits; where the joint is if it is not finite."""
+    value = (position_rad - port.first_offset_rad) / port.position_radpcount + port.zero_counts
+    if not abs(value) < _MOST_COUNTS:
+        return np.int64(port.last_counts)  # type: ignore[return-value]
+    return round(value)
+
+
+@kernel
+def put_u32(data: np.ndarray, at: int, value: int) -> None:
+    put_u16(data, at, value)
+    put_u16(data, at + 2, value >> 16)
+
+
+@kernel
+def _put_target(port: CanopenPort, data: np.ndarray, command: Command, enabled: bool) -> None:
+    """Target and torque offset; with power off, zero and where the joint is."""
+    if port.target_is_position != 0:
+        here = np.int64(port.last_counts)
+        put_u32(data, port.target_at, position_counts(port, command.position_rad) if enabled else here)  # type: ignore[arg-type]
+    elif port.target_is_velocity != 0:
+        put_u32(data, port.target_at, velocity_units(port, command.velocity_radps) if enabled else 0)
+    else:
+        put_u16(data, port.target_at, torque_permille(port, command.torque_Nm) if enabled else 0)
+    if port.has_torque_offset != 0:
+        put_u16(data, port.torque_offset_at, torque_permille(port, command.torque_Nm) if enabled else 0)
+
+
+@kernel
+def _put_velocity_offset(port: CanopenPort, frame: Frame, command: Command, enabled: bool) -> None:
+    frame.can_id = port.offset_rpdo_id
+    if port.offset_rpdo_id == 0:
+        return
+    frame.length = 4
+    put_u32(frame.payload, 0, velocity_units(port, port.offset_share * command.velocity_radps) if enabled else 0)
+    port.bits_sent += _WORST_BITS[4]
+
+
+@kernel
 def end_cycle(port: CanopenPort, frames: np.ndarray, sample: Sample, command: Command) -> None:
-    """Write the RPDO (slot 2).  The target is zero unless the drive is asked to be, and is, enabled.
+    """Write the RPDO (slot 2) and the one with the velocity offset.
+
+    The target is zero, or where the joint is, unless the drive is asked to be, and is, enabled.
 
     Once the heartbeat is withheld the drive's watchdog is dead: from then on enabling is refused.
     """
@@ -388,10 +438,6 @@ def end_cycle(port: CanopenPort, frames: np.ndarray, sample: Sample, command: Co
         port.ignored_cycles += 1
     elif port.ignored_cycles <= IGNORED_MAX_CYCLES:
         port.ignored_cycles = 0
-    if port.target_is_velocity != 0:
-        units = velocity_units(port, command.velocity_radps) if enabled else 0
-        put_u16(frame.payload, port.target_at, units)
-        put_u16(frame.payload, port.target_at + 2, units >> 16)
-    else:
-        put_u16(frame.payload, port.target_at, torque_permille(port, command.torque_Nm) if enabled else 0)
+    _put_target(port, frame.payload, command, enabled)
+    _put_velocity_offset(port, frames[SLOT_OFFSET], command, enabled)
     port.bits_sent += _WORST_BITS[min(frame.length, 8)]

@@ -14,6 +14,7 @@ import canopen
 from canopen.objectdictionary import ObjectDictionaryError
 from canopen.objectdictionary.datatypes import NUMBER_TYPES
 
+from jointctl.drivers.canopen.cia402 import Mode
 from jointctl.drivers.canopen.commissioning import VELOCITY_MODES, Findings, commission
 from jointctl.drivers.canopen.eds import read_eds
 from jointctl.drivers.canopen.encoder import EncoderEnd
@@ -347,6 +348,7 @@ class CanopenDrive:
             found.torque_per_permille_Nm,
             found.max_permille,
             velocity=velocity,
+            position=found.mode is Mode.CYCLIC_SYNC_POSITION,
             layout=found.layout,
             heartbeat_watched=found.heartbeat_watched,
             second_range_counts=found.second.range_counts if found.second is not None else DRIVE_RANGE_COUNTS,

@@ -15,6 +15,7 @@ from jointctl.drivers.can.frames import FRAME_BYTES, Frame
 from jointctl.drivers.canopen.cyclic import (
     FRAME_SLOTS,
     SCRATCH_WORDS,
+    SLOT_OFFSET,
     SLOT_RECEIVED,
     SLOT_RPDO,
     CanopenPort,
@@ -186,6 +187,8 @@ def send(link: CanopenLink, samples: np.ndarray, commands: np.ndarray) -> int:
     ports, failed = link.port, 0
     for axis in range(len(ports)):
         end_cycle(ports[axis], link.frames, samples[axis], commands[axis])
+        if ports[axis].offset_rpdo_id != 0:
+            _note_sent(ports[axis], samples[axis], send_frame(ports[0].fd, link.frames, SLOT_OFFSET), False)
         error = send_frame(ports[0].fd, link.frames, SLOT_RPDO)
         _note_sent(ports[axis], samples[axis], error, True)
         if error != 0:
@@ -213,5 +216,5 @@ def accept(link: CanopenLink, axis: int, slot: int, samples: np.ndarray, now_ns:
 
 @exported(types.void(_LINK, types.int64, _SAMPLES, _COMMANDS))
 def end(link: CanopenLink, axis: int, samples: np.ndarray, commands: np.ndarray) -> None:
-    """`cyclic.end_cycle` of an axis: its RPDO is in slot SLOT_RPDO."""
+    """`cyclic.end_cycle` of an axis: its RPDOs are in the slots SLOT_OFFSET (identifier 0: none) and SLOT_RPDO."""
     end_cycle(link.port[axis], link.frames, samples[axis], commands[axis])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from jointctl.drivers.canopen.cia402 import State
@@ -19,6 +19,7 @@ from jointctl.drivers.canopen.identifiers import (
     HEARTBEAT_ID,
     LAST_SYNCHRONOUS,
     RPDO1_ID,
+    RPDO2_ID,
     SYNC_ID,
     TPDO1_ID,
     TPDO2_ID,
@@ -65,7 +66,17 @@ TORQUE = MappedObject(0x6077, 0, 16, "torque actual value")
 CONTROL = MappedObject(0x6040, 0, 16, "controlword")
 TARGET_TORQUE = MappedObject(0x6071, 0, 16, "target torque")
 TARGET_VELOCITY = MappedObject(0x60FF, 0, 32, "target velocity")
-_NAMES = {item.entry(): item.name for item in (STATUS, POSITION, TORQUE, CONTROL, TARGET_TORQUE, TARGET_VELOCITY)}
+TARGET_POSITION = MappedObject(0x607A, 0, 32, "target position")
+TORQUE_OFFSET = MappedObject(0x60B2, 0, 16, "torque offset")
+VELOCITY_OFFSET = MappedObject(0x60B1, 0, 32, "velocity offset")
+_NAMES = {
+    item.entry(): item.name
+    for item in (
+        STATUS, POSITION, TORQUE, CONTROL, TARGET_TORQUE, TARGET_VELOCITY, TARGET_POSITION, TORQUE_OFFSET,
+        VELOCITY_OFFSET,
+    )
+}  # fmt: skip
+OFFSET_RPDO = 0x1401  # the second one: 607A and 60B2 leave no room for 60B1 in the first
 
 # Further objects that a fixed RPDO may carry: zero is what they must hold while a torque or a velocity is commanded
 # (60FF and 60B2 would add to it, 607A is not looked at).  6060 gets the mode, 6072 the limit; nothing else is known
@@ -87,6 +98,8 @@ class PdoLayout:
     torque_at: int
     control_at: int
     target_at: int
+    torque_offset_at: int = -1
+    offset_rpdo_id: int = 0  # of the RPDO with 60B1 alone; 0 = there is none
     fill: bytes = bytes(LONGEST_BYTES)  # of the RPDO where the loop writes nothing
 
 
@@ -125,7 +138,7 @@ def layout_of(tpdo: PdoMap, rpdo: PdoMap, target: MappedObject, fill: bytes = by
     return PdoLayout(
         tpdo_id=tpdo.identifier, rpdo_id=rpdo.identifier, tpdo_length=tpdo.bytes, rpdo_length=rpdo.bytes,
         status_at=tpdo.at(STATUS), position_at=tpdo.at(POSITION), torque_at=tpdo.at(TORQUE),
-        control_at=rpdo.at(CONTROL), target_at=rpdo.at(target), fill=fill,
+        control_at=rpdo.at(CONTROL), target_at=rpdo.at(target), torque_offset_at=rpdo.at(TORQUE_OFFSET), fill=fill,
     )  # fmt: skip
 
 
@@ -253,24 +266,34 @@ def configure_loop_pdos(
     *,
     mode: int = 0,
     max_permille: int = 0,
+    torque_offset: bool = False,
     spare: frozenset[int] = frozenset(),
 ) -> PdoLayout:
-    """TPDO1 = statusword, position, torque at every SYNC; RPDO1 = controlword, `target`; the others off.
+    """TPDO1 = statusword, position, torque at every SYNC; RPDO1 = controlword, `target`, torque offset; the others off.
 
     Where the drive refuses that, the first of its PDOs that holds what is needed is used as it is; `mode` and
     `max_permille` then fill 6060 and 6072 in it.  PDOs in `spare` stay as they are.
     Raises `DeviceError` with what is missing.
     """
-    for item in (STATUS, POSITION, CONTROL, target):
+    sent = (CONTROL, target, TORQUE_OFFSET) if torque_offset else (CONTROL, target)
+    for item in (STATUS, POSITION, *sent):
         objects.require(item.index, item.sub, what=item.name)
     mapped = (STATUS, POSITION, TORQUE) if objects.has(TORQUE.index) else (STATUS, POSITION)
     tpdo = _map_or_find(objects, COMMUNICATION_TPDO, TPDO1_ID + node, EVERY_SYNC, mapped)
-    rpdo = _map_or_find(objects, COMMUNICATION_RPDO, RPDO1_ID + node, rpdo_transmission_type, (CONTROL, target))
+    rpdo = _map_or_find(objects, COMMUNICATION_RPDO, RPDO1_ID + node, rpdo_transmission_type, sent)
     for first, kept in ((COMMUNICATION_TPDO, tpdo), (COMMUNICATION_RPDO, rpdo)):
         for base in pdos_of(objects, first):
             if base != kept.base and base not in spare:
                 disable_pdo(objects, base)
-    return layout_of(tpdo, rpdo, target, fill_of(rpdo, target, mode, max_permille))
+    layout = layout_of(tpdo, rpdo, target, fill_of(rpdo, target, mode, max_permille))
+    return layout if torque_offset else replace(layout, torque_offset_at=-1)
+
+
+def map_velocity_offset(objects: ObjectAccess, node: int, rpdo_transmission_type: int) -> int:
+    """RPDO2 = velocity offset; its identifier."""
+    objects.require(OFFSET_RPDO, 1, what="PDO communication parameter")
+    configure_pdo(objects, OFFSET_RPDO, RPDO2_ID + node, rpdo_transmission_type, (VELOCITY_OFFSET,))
+    return RPDO2_ID + node
 
 
 def _map_or_find(
@@ -373,14 +396,15 @@ def new_port(
     max_permille: int,
     *,
     velocity: bool = False,
+    position: bool = False,
     layout: PdoLayout | None = None,
     heartbeat_watched: bool = True,
     second_range_counts: int = DRIVE_RANGE_COUNTS,
 ) -> Any:
     """A `CanopenPort` record array of one record; the file descriptor is still missing.
 
-    `velocity`: the drive is in a velocity mode and the RPDO carries 60FF.  `layout`: of the PDOs (None: our own).
-    `heartbeat_watched`: the drive sends its own heartbeat.
+    `velocity`: the drive is in a velocity mode and the RPDO carries 60FF; `position`: CSP and 607A.
+    `layout`: of the PDOs (None: our own).  `heartbeat_watched`: the drive sends its own heartbeat.
     """
     layout = layout or own_layout(settings.node, velocity=velocity)
     ports = new(CanopenPort)
@@ -398,11 +422,14 @@ def new_port(
     for key in (
         "tpdo_id", "rpdo_id", "tpdo_length", "rpdo_length",
         "status_at", "position_at", "torque_at", "control_at", "target_at",
+        "torque_offset_at", "offset_rpdo_id",
     ):  # fmt: skip
         setattr(port, key, getattr(layout, key))
     for i, value in enumerate(layout.fill):
         port.rpdo_filler[i] = value
-    port.target_is_velocity = int(velocity)
+    port.target_is_velocity, port.target_is_position = int(velocity), int(position)
+    port.has_torque_offset = int(layout.torque_offset_at >= 0)
+    port.offset_share = settings.velocity_share
     # the drive counts speed in the direction of its encoder
     port.velocity_radpspunit = joint_velocity_per_unit_radps(settings) * settings.encoder_direction
     port.position_radpcount = joint_angle_per_count_rad(settings) * settings.encoder_direction

@@ -73,4 +73,9 @@ class CanopenSettings:
     encoder_incremental: bool = False
     sdo_timeout_s: float | None = None  # of one SDO request; None: `switch_off.SDO_TIMEOUT_S`
     velocity_max_radps: float | None = None  # at the joint, for the drive's own limit in the velocity modes
+    torque_offset: bool = False  # 60B2 beside the target of a drive that closes its own loop
+    velocity_offset: bool = False  # 60B1 beside 607A
+    velocity_share: float = 1.0  # of the target's velocity that goes into 60B1
+    following_error_max_rad: float = 0.0  # at the joint, for the drive's own window in CSP
+    holds_alone: bool = False  # a run in which the drive would hold the joint by itself if no one stopped it
     temperature: TemperatureObject | None = None  # the object that holds it, if any

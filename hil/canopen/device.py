@@ -41,6 +41,8 @@ class DeviceSettings:
     velocity_gain_Nmspr: float = 200.0
     velocity_integral_Nmprad: float = 10_000.0
     position_gain_ps: float = 30.0
+    velocity_feed: float = 1.0  # share of the set-point's velocity that CSP feeds forward by itself
+    loop_rate_Hz: float = 0.0  # of the loops in CSP and CSV; 0 = each substep of the plant
     parameter_file: Path | None = None  # keeps what 1010 saves; None = as long as the device exists
     torque_direction: int = 1  # -1: positive motor torque drives the joint to negative angles
     second_counts_prad: float = 0.0  # of 60E4:1, on the joint, with the sign of its direction
@@ -61,6 +63,8 @@ class DeviceSettings:
             ("velocity_gain_Nmspr", 0.0, 1e6),
             ("velocity_integral_Nmprad", 0.0, 1e8),
             ("position_gain_ps", 0.0, 1e4),
+            ("velocity_feed", 0.0, 1.0),
+            ("loop_rate_Hz", 0.0, 1e5),
         ):
             value = getattr(self, name)
             if not low <= value <= high:
@@ -144,6 +148,8 @@ class Cia402Device:
         device.velocity_gain_Nmspr = settings.velocity_gain_Nmspr
         device.velocity_integral_Nmprad = settings.velocity_integral_Nmprad
         device.position_gain_ps = settings.position_gain_ps
+        device.velocity_feed = settings.velocity_feed
+        device.loop_period_s = 1.0 / settings.loop_rate_Hz if settings.loop_rate_Hz else 0.0
         device.torque_sign = float(settings.torque_direction)
         device.second_counts_prad = settings.second_counts_prad
         device.second_offset_counts = settings.second_offset_counts

@@ -422,13 +422,13 @@ def check_write(objects: ObjectDictionary, index: int, sub: int, value: int, pow
 # --- Objects 1010 and 1011 of the virtual drive: what a reset brings back (CiA 301, 7.5.2.13 and 14) ---
 # "save" written to 1010 makes the present values the ones that a reset restores; "load" written to 1011 makes it
 # those of the EDS and the drive's settings again.  Sub 1 means all, 2 the communication objects (1000..1FFF), 3 the
-# others. Commands and targets are never saved (6040, 6060, 6071, 607A, 60B2, 60FF), nor the error history.  With a
-# file the saved values outlive the process.
+# others. Commands and targets are never saved (6040, 6060, 6071, 607A, 60B1, 60B2, 60FF), nor the error history.  With
+# a file the saved values outlive the process.
 
 
 SAVE = 0x65766173
 LOAD = 0x64616F6C
-_NEVER_SAVED = (0x1003, 0x1010, 0x1011, 0x6040, 0x6060, 0x6071, 0x607A, 0x60B2, 0x60FF)
+_NEVER_SAVED = (0x1003, 0x1010, 0x1011, 0x6040, 0x6060, 0x6071, 0x607A, 0x60B1, 0x60B2, 0x60FF)
 
 
 class ParameterStore:

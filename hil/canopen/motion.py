@@ -8,10 +8,12 @@ from jointctl.firmware_py.kernel import kernel
 from jointctl.hil.canopen.records import Device, DriveObjects, HomingState, Mode, PowerState, int64
 
 # --- Torque demand of the virtual drive in every mode of operation, at the plant's substep rate ---
-# CST and TQ set the torque; CSV and PV run a PI velocity loop; CSP and PP a P position loop around it.  A stop ramp
-# (quick stop, fault reaction, disable) uses the velocity loop in every mode.  Result in per mille of the rated motor
-# torque, limited by 6072 and by 6073 through the torque constant.  Positive = positive joint motion. Not modelled:
-# velocity estimation inside the drive (the loop sees the plant's velocity), jerk limits, 60B0, 60B1.
+# CST and TQ set the torque; CSV and PV run a PI velocity loop; CSP and PP a P position loop around it.  60B1 is added
+# to the velocity that the loop of CSP or CSV gets, 60B2 to its torque.  With `loop_period_s` those modes are computed
+# at that rate, as in a drive, and held in between.  A stop ramp (quick stop, fault reaction, disable) uses the velocity
+# loop in every mode.  Result in per mille of the rated motor torque, limited by 6072 and by 6073 through the torque
+# constant.  Positive = positive joint motion. Not modelled: velocity estimation inside the drive (the loop sees the
+# plant's velocity), jerk limits, 60B0.
 
 
 _HALT = 0x0100
@@ -99,10 +101,10 @@ def _cyclic_position(device: Device, position_rad: float, velocity_radps: float,
         device.segment_target = target
         device.segment_left_s = period_s
         device.segment_velocity_radps = (target / device.counts_per_rad - device.reference_position_rad) / period_s
-    feed_radps = 0.0
+    feed_radps = int64(device.drive.velocity_offset) / device.counts_per_rad
     if device.segment_left_s > 0.5 * dt_s:
-        feed_radps = device.segment_velocity_radps
-        device.reference_position_rad += feed_radps * dt_s
+        feed_radps += device.velocity_feed * device.segment_velocity_radps
+        device.reference_position_rad += device.segment_velocity_radps * dt_s
         device.segment_left_s -= dt_s
     return _position_loop(device, position_rad, velocity_radps, feed_radps, dt_s)
 
@@ -146,7 +148,7 @@ def _mode_demand(device: Device, position: int, velocity_radps: float, dt_s: flo
         target = 0.0 if drive.controlword & _HALT else device.torque_sign * float(drive.target_torque)
         return device.demand + _limit(target - device.demand, int64(drive.torque_slope) * dt_s)
     if mode == Mode.CYCLIC_VELOCITY:
-        target_radps = int64(drive.target_velocity) / device.counts_per_rad
+        target_radps = (int64(drive.target_velocity) + int64(drive.velocity_offset)) / device.counts_per_rad
         device.reference_velocity_radps = _limit(target_radps, _max_speed_radps(device))
         return _velocity_loop(device, velocity_radps, dt_s) + device.torque_sign * float(drive.torque_offset)
     if mode == Mode.PROFILE_VELOCITY:
@@ -165,6 +167,19 @@ def _mode_demand(device: Device, position: int, velocity_radps: float, dt_s: flo
         device.reference_velocity_radps += _limit(target_radps - device.reference_velocity_radps, step_radps)
         return _velocity_loop(device, velocity_radps, dt_s)
     return 0.0
+
+
+@kernel
+def _sampled_demand(device: Device, position: int, velocity_radps: float, dt_s: float) -> float:
+    """The demand of the mode; in CSP and CSV computed once in `loop_period_s`, and held in between."""
+    mode, period_s = device.drive.mode_display, device.loop_period_s
+    if period_s <= 0.0 or (mode != Mode.CYCLIC_POSITION and mode != Mode.CYCLIC_VELOCITY):
+        return _mode_demand(device, position, velocity_radps, dt_s)
+    device.loop_due_s -= dt_s
+    if device.loop_due_s > 0.0:
+        return device.demand
+    device.loop_due_s += period_s
+    return _mode_demand(device, position, velocity_radps, period_s)
 
 
 @kernel
@@ -254,11 +269,12 @@ def demand_torque_Nm(device: Device, position: int, velocity_radps: float, dt_s:
         if not device.setpoint_active:
             device.setpoint_position_rad = position_rad
         device.integral_Nm = 0.0
+        device.loop_due_s = 0.0
         device.demand = 0.0
     if device.braking != 0:
         demand = _brake(device, velocity_radps, dt_s)
     elif state == PowerState.OPERATION_ENABLED:
-        demand = _mode_demand(device, position, velocity_radps, dt_s)
+        demand = _sampled_demand(device, position, velocity_radps, dt_s)
     else:
         device.reference_velocity_radps = 0.0
         demand = _velocity_loop(device, velocity_radps, dt_s)

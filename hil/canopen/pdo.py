@@ -80,6 +80,8 @@ def read_object(drive: DriveObjects, entry: int) -> int:
         value = int64(drive.target_velocity)
     elif key == 0x60B200:
         value = int64(drive.torque_offset)
+    elif key == 0x60B100:
+        value = int64(drive.velocity_offset)
     return value
 
 
@@ -95,6 +97,8 @@ def write_object(drive: DriveObjects, entry: int, raw: int) -> None:
         drive.target_torque = signed
     elif key == 0x60B200:
         drive.torque_offset = signed
+    elif key == 0x60B100:
+        drive.velocity_offset = signed
     elif key == 0x60FF00:
         drive.target_velocity = signed
     elif key == 0x607A00:

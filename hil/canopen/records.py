@@ -223,6 +223,7 @@ class DriveObjects:
     homing_method: Annotated[i1, At(0x6098)]
     homing_speed: Annotated[np.ndarray, array_of(u4, 2), At(0x6099, 1)]
     homing_acceleration: Annotated[u4, At(0x609A)]
+    velocity_offset: Annotated[i4, At(0x60B1)]
     torque_offset: Annotated[i2, At(0x60B2)]
     interpolation_time: Annotated[u1, At(0x60C2, 1)]
     interpolation_exponent: Annotated[i1, At(0x60C2, 2)]
@@ -250,6 +251,8 @@ class Device:
     velocity_gain_Nmspr: f8
     velocity_integral_Nmprad: f8
     position_gain_ps: f8  # 1/s
+    velocity_feed: f8  # share of the set-point's velocity that CSP feeds forward by itself
+    loop_period_s: f8  # of its loops in CSP and CSV; 0 = each substep of the plant
     # test access: while not zero the cause of this fault (an EMCY code) is present
     inject_fault_code: u2
     torque_sign: f8  # -1.0: positive torque of the motor drives the joint to negative angles
@@ -304,6 +307,7 @@ class Device:
     homing_time_left_s: f8
     home_shift_counts: i8  # encoder minus reported position
     integral_Nm: f8
+    loop_due_s: f8  # until the loops of CSP and CSV are computed again
     demand: f8  # torque demand before limits [per mille of rated]
     saturated: i4
     following_time_s: f8

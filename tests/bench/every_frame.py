@@ -1,6 +1,7 @@
 """A stop, a death, another controller or a loss after EVERY frame of a run: is the joint off in time, and off for good?
 
-    python tests/bench/every_frame.py [--kind run|sweep|program] [--deadline yes|no] [--every 1] [--rest 20]
+    python tests/bench/every_frame.py [--kind run|sweep|program] [--mode cst|csp|csv] [--deadline yes|no]
+                                      [--every 1] [--rest 20]
                                       [--workers 2] [--phase NAME] [--injection NAME]
                                       [--cluster tcp://127.0.0.1:8786] [--parts 8]
 
@@ -268,9 +269,10 @@ def judge(
     return verdict
 
 
-def prepared(kind: str, deadline: bool, folder: Path) -> tuple[Config, Config]:
+def prepared(kind: str, deadline: bool, folder: Path, mode: str = "cst") -> tuple[Config, Config]:
     """The configuration of a short run, and that of its virtual drive, which has all objects."""
-    text = shipped_config("virtual").read_text()
+    text = shipped_config("virtual" if mode == "cst" else "csp").read_text()
+    text = re.sub(r'(?m)^mode = "\w+"', f'mode = "{mode}"', text)
     for key, value in SHORT.items():
         text = re.sub(rf"(?m)^{key} = \S+", f"{key} = {value}", text)
     eds = (ROOT / "configs" / "virtual_joint.eds").read_text()
@@ -329,9 +331,11 @@ def new_session(kind: str, config: Config, control: Control, folder: Path) -> Se
 class Exhaustion:
     """Runs once and forks after its frames."""
 
-    def __init__(self, kind: str, deadline: bool, every: int, rest: int, part: tuple[int, int], out: Any) -> None:
+    def __init__(
+        self, kind: str, deadline: bool, every: int, rest: int, part: tuple[int, int], out: Any, mode: str = "cst"
+    ) -> None:  # fmt: skip
         self.kind, self.deadline, self.every, self.rest, self.part, self.out = kind, deadline, every, rest, part, out
-        self.child = False
+        self.child, self.mode = False, mode
         self.parent = os.getppid()  # ends with it: no one would read what this finds
         self.chosen = self.in_rest = 0
         self.phases: list[str] = []  # the only ones, or all
@@ -341,7 +345,7 @@ class Exhaustion:
     def run(self) -> int:
         """The number of frames of the undisturbed run."""
         with tempfile.TemporaryDirectory() as name:
-            config, joint = prepared(self.kind, self.deadline, Path(name))
+            config, joint = prepared(self.kind, self.deadline, Path(name), self.mode)
             for injection in WARM_UP:
                 self._warm_up(config, joint, Path(name), injection)
             with simulated(joint) as world:
@@ -491,6 +495,7 @@ def rows_of_parts(words: list[str], parts: int, workers: Workers) -> Iterator[di
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kind", choices=("run", "sweep", "program"), action="append")
+    parser.add_argument("--mode", choices=("cst", "csp", "csv"), default="cst", help="drive.mode of the joint")
     parser.add_argument("--deadline", choices=("yes", "no"), action="append", help="whether the drive has 1400:5")
     parser.add_argument("--every", type=int, default=1, help="every Nth of the frames that would be tried")
     parser.add_argument("--rest", type=int, default=20, help="every Nth frame where nothing changes")
@@ -504,7 +509,9 @@ def main() -> int:
     kinds, deadlines = given.kind or ["run", "sweep", "program"], given.deadline or ["yes", "no"]
     if given.part:
         number, count = map(int, given.part.split("/"))
-        one = Exhaustion(kinds[0], deadlines[0] == "yes", given.every, given.rest, (number, count), sys.stdout)
+        one = Exhaustion(
+            kinds[0], deadlines[0] == "yes", given.every, given.rest, (number, count), sys.stdout, given.mode
+        )
         one.phases, one.injections = given.phase or [], given.injection or one.injections
         sys.stdout.write(json.dumps({"frames": one.run()}) + "\n")
         return 0
@@ -516,7 +523,13 @@ def main() -> int:
     for kind in kinds:
         for deadline in deadlines:
             words = [str(Path(__file__).resolve()), "--kind", kind, "--deadline", deadline, "--every", str(given.every)]
-            words += ["--rest", str(given.rest), *(f"--phase={name}" for name in given.phase or [])]
+            words += [
+                "--mode",
+                given.mode,
+                "--rest",
+                str(given.rest),
+                *(f"--phase={name}" for name in given.phase or []),
+            ]
             words += [f"--injection={name}" for name in given.injection or []]
             for row in rows_of_parts(words, parts, workers):
                 if "frames" in row:

@@ -178,7 +178,7 @@ def run_any_law(
         step_velocity(axis.velocity, now.velocity, inputs[i, 0], inputs[i, 0] - inputs[i, 1], 1)
         where = repetition(axis.trajectory, table, i * axis.law.period_s)
         now.gap_cycles = 1
-        unlimited = law_torque_Nm(axis, now, where)
+        unlimited = law_torque_Nm(axis, now, now.reference, where)
         limited, _ = limited_torque_Nm(axis.limits, unlimited, now.command_torque_Nm, axis.law.period_s)
         now.command_torque_Nm = limited
         torque_Nm[i] = limited

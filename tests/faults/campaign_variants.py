@@ -11,6 +11,11 @@ from pathlib import Path
 
 from tests.places import CONFIGS
 
+OWN_LOOP = (  # the drive closes its own loops
+    (r'^mode = "cst"', 'mode = "csp"'),
+    (r'^kind = "computed_torque_rbf"', 'kind = "computed_torque"'),
+    (r"^\[encoder\]", "[drive.cascade]\nposition_gain_ps = 30.0\n\n[encoder]"),
+)
 VARIANTS: dict[str, tuple[tuple[str, str], ...]] = {
     "gravity": (  # known to the law; about half of what friction holds
         (r"^torque_constant_NmpA", "gravity_Nm = 6.0\ntorque_constant_NmpA"),
@@ -20,6 +25,8 @@ VARIANTS: dict[str, tuple[tuple[str, str], ...]] = {
         (r"^counts_per_turn = \d+", "counts_per_turn = 4096"),
         (r'^side = "joint"', 'side = "motor"'),
     ),
+    "csp": OWN_LOOP,
+    "csv": (*OWN_LOOP[1:], (r'^mode = "cst"', 'mode = "csv"')),
     "rate_500_Hz": ((r"^rate_Hz = [\d.]+", "rate_Hz = 500.0"),),
     "rate_2_kHz": ((r"^rate_Hz = [\d.]+", "rate_Hz = 2000.0"),),
 }

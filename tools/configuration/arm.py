@@ -18,7 +18,7 @@ from pydantic import Field, ValidationError
 from jointctl.firmware_py.arm_model import Arm, ArmConstants, ArmFeedForward, ArmLink, ArmMotion, JointKind
 from jointctl.firmware_py.schema import new
 from jointctl.tools.configuration.arm_motion import LARGEST_ARM, ArmTrajectory, PerJoint, trajectories
-from jointctl.tools.configuration.canopen import CanopenSection
+from jointctl.tools.configuration.canopen import TORQUE_WANTED, CanopenSection
 from jointctl.tools.configuration.checks import problems_between_sections
 from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config, problem_lines, raise_if
 from jointctl.tools.configuration.load import config_of, load_config, read_document, with_units
@@ -225,7 +225,8 @@ def _bus_problems(arm: ArmSection, joints: tuple[Config, ...]) -> list[str]:
     other = [(name, c) for name, c in zip(arm.joints, joints, strict=True) if not isinstance(c.drive, CanopenSection)]
     if other:
         return [f"{name}: drive.kind (={c.drive.kind}) must be canopen in an arm" for name, c in other]
-    found = []
+    own = [(name, c.drive) for name, c in zip(arm.joints, joints, strict=True) if isinstance(c.drive, CanopenSection)]
+    found = [f"{name}: {TORQUE_WANTED.format(d.mode, 'an arm')}" for name, d in own if d.cascade is not None]
     first, rate_Hz = arm.joints[0], joints[0].loop.rate_Hz
     taken: dict[tuple[str, str, int], str] = {}
     bitrates: dict[tuple[str, str], tuple[str, int]] = {}

@@ -14,34 +14,65 @@ from jointctl.drivers.can.frames import bus_load, highest_rate_Hz
 from jointctl.drivers.canopen.identifiers import EVENT_DRIVEN, LAST_SYNCHRONOUS
 from jointctl.drivers.canopen.settings import CanopenSettings, JointEncoderSettings, TemperatureObject
 from jointctl.drivers.errors import ConfigurationError, DeviceError
+from jointctl.firmware_py.states import CommandKind
 from jointctl.tools.configuration.config import Config, ConfigurationProblems, beside, problem_line
 from jointctl.tools.configuration.conversions import joint_settings, torque_constant_NmpA
-from jointctl.tools.configuration.drive_section import FOR_A_NODE, FOR_A_PORT, DriveSection, GivenPlace, wrong_kind
+from jointctl.tools.configuration.drive_section import (
+    FOR_A_NODE,
+    FOR_A_PORT,
+    DriveSection,
+    GivenPlace,
+    SentWithTarget,
+    wrong_kind,
+)
 from jointctl.tools.configuration.sections import (
     Bus,
     Identity,
     Node,
     ObjectPlace,
+    Section,
+    auto_or_number,
     between,
     index_and_sub,
     whole_channel,
 )
 
 TPDO_BYTES, RPDO_BYTES = 8, 4
-VELOCITY_RPDO_BYTES = 6  # 60FF is longer than 6071
+VELOCITY_RPDO_BYTES = 6  # 60FF and 607A are longer than 6071
+OFFSET_BYTES, VELOCITY_OFFSET_BYTES = 2, 4  # 60B2 in the same frame, 60B1 in one of its own
+HOLDING_OPTIONS = 5  # of 605A: from here on the drive stays in Quick Stop Active, with its power on
+CASCADE_LAWS = ("computed_torque", "flexible_joint")
 SECOND_POSITION_BYTES = 4
-_FRAMES = ("TPDO", "RPDO", "second encoder")
 TORQUE_MODES = ("cst", "tq", "auto")  # of `CanopenSettings.mode`; the others may end in a velocity mode
 HIGHEST_LOAD = 0.8  # of the bus by the cyclic frames; the rest is for heartbeats, SDO and EMCY
 CAN_RATE_HZ = (100.0, 4000.0)
+TORQUE_WANTED = "drive.mode (={}) must be cst, tq or auto for {}: see [drive.cascade]"
 DRIVE_MODES = {"auto": "velocity or torque", "csv": "csv", "pv": "pv"}  # `sweep --mode`: `CanopenSettings.mode`
+
+
+class Cascade(Section):
+    """For `mode` csp or csv: the drive closes its own loops, and these are sent to it or known of it; docs/law.md."""
+
+    torque_offset: bool = True  # 60B2: the law's torques for inertia, gravity and friction
+    velocity_offset: bool = True  # 60B1: csp only, where the speed is part of csv's target
+    # of the target's speed in 60B1; less where the drive's own velocity feed-forward does the rest
+    velocity_share: Annotated[float, between(0.0, 1.0)] = 1.0
+    # by which the motion is sent ahead of its time; auto = until it takes effect, by rpdo_transmission_type and rate
+    lead_s: Annotated[float | Literal["auto"], auto_or_number(0.0, 0.1)] = "auto"
+    # of the position loop: csv closes it here, and needs it; of csp it is the drive's, and for `check` and [virtual]
+    position_gain_ps: Annotated[float, between(0.0, 1000.0, open_low=True)] | None = None
+    # of the drive's velocity loop, at the joint; for `check` and [virtual]
+    velocity_gain_Nmspr: Annotated[float, between(0.0, 1e6, open_low=True)] | None = None
+    velocity_integral_Nmprad: Annotated[float, between(0.0, 1e8)] | None = None  # gain of its integral
+    loop_rate_Hz: Annotated[float, between(500.0, 1e5)] = 8000.0  # of the drive's loops
 
 
 class CanopenSection(DriveSection):
     kind: Literal["canopen"]  # a CiA 402 drive on CANopen
     node: Node  # CANopen node of the drive
     eds: Annotated[str, Field(min_length=1)]  # beside the configuration file, or the name of a shipped one
-    mode: Literal["cst", "tq", "auto"]  # torque mode: cyclic synchronous, profile, or what 6502 offers
+    # torque mode: cyclic synchronous, profile, or what 6502 offers; csp, csv: the drive closes its own loops
+    mode: Literal["cst", "tq", "auto", "csp", "csv"]
     vendor_id: Identity | None = None  # expected in 1018:1; none = any
     product_code: Identity | None = None  # expected in 1018:2; none = any
     rated_current_A: Annotated[float, between(0.0, 1000.0, open_low=True)] | None = None  # compared with 6075
@@ -60,6 +91,7 @@ class CanopenSection(DriveSection):
     temperature_object: ObjectPlace | None = None  # the drive's own, "2103"; read once a second, to be shown and logged
     temperature_unit_degC: Annotated[float, between(0.0, 1000.0, open_low=True)] = 1.0  # of one count of it
     temperature_offset_degC: Annotated[float, between(-1000.0, 1000.0)] = 0.0  # at 0 counts; -273.15 for kelvin
+    cascade: Cascade | None = None
 
     simulated: ClassVar[bool] = True
     sends_frames: ClassVar[bool] = True
@@ -71,7 +103,7 @@ class CanopenSection(DriveSection):
     )
 
     def problems(self, config: Config) -> list[str]:
-        return joint_encoder_problems(config) + canopen_problems(config)
+        return joint_encoder_problems(config) + canopen_problems(config) + cascade_problems(config)
 
     def files(self, config: Config) -> tuple[tuple[str, Path], ...]:
         found = (("drive.eds", eds_path(config)), ("joint_encoder.eds", encoder_eds_path(config)))
@@ -101,7 +133,26 @@ class CanopenSection(DriveSection):
     def in_sweep_mode(self, mode: str) -> CanopenSection:
         if mode == "speed":
             raise DeviceError("--mode (=speed) must be auto, csv, pv or torque: it is a CANopen drive")
-        return self if mode == "torque" else self.model_copy(update={"mode": DRIVE_MODES[mode]})
+        if mode == "torque" and self.cascade is None:
+            return self
+        if mode == "torque":
+            raise ConfigurationError(TORQUE_WANTED.format(self.mode, "a motion by torque"))
+        return self.model_copy(update={"mode": DRIVE_MODES[mode], "cascade": None})
+
+    def own_loop(self) -> CommandKind:
+        if self.cascade is None:
+            return CommandKind.TORQUE
+        return CommandKind.POSITION if self.mode == "csp" else CommandKind.VELOCITY
+
+    def sent_with_target(self, rate_Hz: float) -> SentWithTarget | None:
+        """The lead: the periods of a synchronous RPDO, and one in which the drive moves on to the target."""
+        cascade, kind = self.cascade, self.rpdo_transmission_type
+        if cascade is None:
+            return None
+        lead_s = cascade.lead_s
+        if isinstance(lead_s, str):
+            lead_s = (1.0 + (max(kind, 1) if kind <= LAST_SYNCHRONOUS else 0.0)) / rate_Hz
+        return SentWithTarget(lead_s, cascade.position_gain_ps or 0.0, cascade.torque_offset)
 
     def free_of_torque_limit(self) -> CanopenSection:
         return self.model_copy(update={"max_torque_permille": None})
@@ -150,7 +201,28 @@ def canopen_settings(config: Config) -> CanopenSettings:
         joint_encoder=joint_encoder_settings(config),
         encoder_incremental=config.encoder.kind == "incremental",
         temperature=temperature_object(config),
+        **_offsets(canopen_section(config)),
     )
+
+
+def _offsets(drive: CanopenSection) -> dict[str, Any]:
+    cascade = drive.cascade
+    if cascade is None:
+        return {}
+    velocity = drive.mode == "csp" and cascade.velocity_offset
+    share = cascade.velocity_share
+    return {
+        "torque_offset": cascade.torque_offset, "velocity_offset": velocity, "velocity_share": share,
+        "holds_alone": True,
+    }  # fmt: skip
+
+
+def rpdo_bytes(drive: CanopenSection) -> tuple[int, ...]:
+    """Data bytes of the RPDOs of a cycle."""
+    first = RPDO_BYTES if drive.mode in TORQUE_MODES else VELOCITY_RPDO_BYTES
+    offsets = _offsets(drive)
+    first += OFFSET_BYTES if offsets.get("torque_offset") else 0
+    return (first, VELOCITY_OFFSET_BYTES) if offsets.get("velocity_offset") else (first,)
 
 
 def temperature_object(config: Config) -> TemperatureObject | None:
@@ -182,10 +254,9 @@ def joint_encoder_settings(config: Config) -> JointEncoderSettings | None:
 
 
 def cycle_bytes(config: Config) -> tuple[int, ...]:
-    """Data bytes of the frames of one cycle: SYNC, TPDO, RPDO, and the TPDO of a second encoder."""
-    rpdo = RPDO_BYTES if canopen_section(config).mode in TORQUE_MODES else VELOCITY_RPDO_BYTES
+    """Data bytes of the frames of one cycle: SYNC, TPDO, RPDOs, and the TPDO of a second encoder."""
     second = () if config.joint_encoder is None else (SECOND_POSITION_BYTES,)
-    return (0, TPDO_BYTES, rpdo, *second)
+    return (0, TPDO_BYTES, *rpdo_bytes(canopen_section(config)), *second)
 
 
 def cyclic_bus_load(config: Config) -> float:
@@ -195,7 +266,9 @@ def cyclic_bus_load(config: Config) -> float:
     load = bus_load(lengths, rate_Hz, bitrate)
     if load > HIGHEST_LOAD:
         highest = highest_rate_Hz(lengths, bitrate, HIGHEST_LOAD)
-        frames = " + ".join(("SYNC", *(f"{name}({n})" for name, n in zip(_FRAMES, lengths[1:], strict=False))))
+        sent = len(rpdo_bytes(canopen_section(config)))
+        names = ("TPDO", *["RPDO"] * sent, "second encoder")
+        frames = " + ".join(("SYNC", *(f"{name}({n})" for name, n in zip(names, lengths[1:], strict=False))))
         raise ConfigurationError(
             f"loop.rate_Hz (={rate_Hz:g}) must be at most {highest:.0f} at bus.bitrate_bitps (={bitrate}): "
             f"{frames} = {load * bitrate / rate_Hz:.0f} bits a cycle, "
@@ -271,4 +344,49 @@ def canopen_problems(config: Config) -> list[str]:
     reference = f"{drive.torque_reference}_{'A' if drive.torque_reference == 'rated_current' else 'Nm'}"
     if config.virtual is not None and getattr(drive, reference) is None:
         found.append(f"drive.{reference} is missing: the virtual drive needs it, torque is in thousandths of it")
+    return found
+
+
+def cascade_problems(config: Config) -> list[str]:
+    """drive.mode csp and csv against the rest."""
+    drive, control = canopen_section(config), config.control
+    mode, cascade = drive.mode, drive.cascade
+    if (mode in ("csp", "csv")) != (cascade is not None):
+        if cascade is not None:
+            return [f'[drive.cascade] must be left out unless drive.mode (={mode}) is "csp" or "csv"']
+        return [] if mode in TORQUE_MODES else [f"[drive.cascade] is missing: drive.mode (={mode}) needs it"]
+    if cascade is None:
+        return []
+    found = []
+    if control.kind not in CASCADE_LAWS:
+        found.append(
+            f"control.kind (={control.kind}) must be {' or '.join(CASCADE_LAWS)} with drive.mode (={mode}): the "
+            "drive's own loop is the feedback, and the law's feed-forward is sent with it"
+        )
+    found += [
+        f"[control.{name}] must be left out with drive.mode (={mode}): the feedback is the drive's"
+        for name in ("learning", "adaptation")
+        if getattr(control, name) is not None
+    ]
+    if control.feed_forward == "measured":
+        found.append(
+            f"control.feed_forward (=measured) must be none, desired or lugre_desired with drive.mode (={mode})"
+        )
+    if mode == "csv" and cascade.position_gain_ps is None:
+        found.append(
+            "drive.cascade.position_gain_ps is missing: with drive.mode (=csv) the position loop is closed here"
+        )
+    if (cascade.velocity_gain_Nmspr is None) != (cascade.velocity_integral_Nmprad is None):
+        found.append("drive.cascade.velocity_gain_Nmspr and velocity_integral_Nmprad must be given together")
+    if drive.quick_stop_option >= HOLDING_OPTIONS:
+        found.append(
+            f"drive.quick_stop_option (={drive.quick_stop_option}) must be in [0..{HOLDING_OPTIONS - 1}] with "
+            f"drive.mode (={mode}): the drive would stay in Quick Stop Active and hold the joint with no one watching"
+        )
+    second = config.joint_encoder
+    if second is not None and second.law == "joint_encoder" and control.kind != "flexible_joint":
+        found.append(
+            f'joint_encoder.law (=joint_encoder) needs control.kind "flexible_joint" (={control.kind}) with drive.mode '
+            f"(={mode}): the drive closes its loop on encoder 6064"
+        )
     return found

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 from pydantic_core import PydanticCustomError
 
 from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.states import CommandKind
 from jointctl.tools.configuration.sections import Ampere, Direction, Section
 
 if TYPE_CHECKING:
@@ -36,6 +37,15 @@ class GivenPlace:
     def bus(self) -> str | int | None:
         """What names a CAN bus; None if nothing does."""
         return next((value for value in (self.interface, self.channel, self.bitrate) if value is not None), None)
+
+
+@dataclass(frozen=True)
+class SentWithTarget:
+    """What a drive that closes its own loop gets beside the desired motion."""
+
+    lead_s: float  # by which the motion is sent ahead of its time
+    position_gain_ps: float  # of the position loop here, where the drive closes the velocity loop alone
+    torque_offset: bool
 
 
 class DriveSection(Section, ABC):
@@ -73,6 +83,14 @@ class DriveSection(Section, ABC):
 
     def motor_current(self) -> tuple[str, float] | None:
         """The current that the drive is set up for [A], with its key; None where the configuration does not have it."""
+        return None
+
+    def own_loop(self) -> CommandKind:
+        """What the loop commands: torque, or what the drive closes the loop for."""
+        return CommandKind.TORQUE
+
+    def sent_with_target(self, rate_Hz: float) -> SentWithTarget | None:
+        """For a drive that closes its own loop in a run; None: torque is commanded."""
         return None
 
     @abstractmethod
@@ -154,4 +172,13 @@ def require_simulated(config: Config, what: str) -> None:
             config.drive.kind,
             f'"canopen" for {what}',
             "the serial joint runs in real time only: `jointctl hil --serial`, then `jointctl run CONFIG -p PORT`",
+        )
+
+
+def require_torque(config: Config, what: str) -> None:
+    """`ConfigurationError` where the drive closes its own loop: `what` moves the joint by torque."""
+    if config.drive.own_loop() is not CommandKind.TORQUE:
+        raise ConfigurationError(
+            f"{config.path}: drive.mode must be cst, tq or auto for {what}: it moves the joint by torque",
+            "take a copy of the file with that mode and without [drive.cascade]",
         )

@@ -14,7 +14,7 @@ from jointctl.hil.canopen.encoder_node import EncoderSettings
 from jointctl.hil.fault_kinds import FaultConstants, FaultKind, no_faults
 from jointctl.hil.plant_records import EncoderSide, FrictionKind, PlantSettings
 from jointctl.tools.configuration.arm import ArmConfig
-from jointctl.tools.configuration.canopen import canopen_section, eds_path, encoder_eds_path
+from jointctl.tools.configuration.canopen import CanopenSection, canopen_section, eds_path, encoder_eds_path
 from jointctl.tools.configuration.config import SHIPPED_FOLDER, Config, raise_if
 from jointctl.tools.configuration.conversions import friction_constants, torque_constant_NmpA
 from jointctl.tools.configuration.sections import OWN_KEYS, Virtual
@@ -131,7 +131,22 @@ def device_settings(config: Config) -> DeviceSettings:
         product_code=drive.product_code or product_code or 1,
         shown=eds.dictionary if eds is not None else None,
         **_second_encoder(config),
+        **_drive_loops(drive),
     )
+
+
+def _drive_loops(drive: CanopenSection) -> dict[str, Any]:
+    """Its own loops in CSP and CSV, with the gains that the configuration knows; else those of `DeviceSettings`."""
+    cascade = drive.cascade
+    if cascade is None:
+        return {}
+    gains = {
+        "velocity_gain_Nmspr": cascade.velocity_gain_Nmspr,
+        "velocity_integral_Nmprad": cascade.velocity_integral_Nmprad,
+        "position_gain_ps": cascade.position_gain_ps if drive.mode == "csp" else None,
+    }
+    known = {name: gain for name, gain in gains.items() if gain is not None}
+    return {**known, "velocity_feed": 1.0 - cascade.velocity_share, "loop_rate_Hz": cascade.loop_rate_Hz}
 
 
 def _second_encoder(config: Config) -> dict[str, Any]:

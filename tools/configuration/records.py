@@ -72,7 +72,21 @@ def axis_constants(config: Config, table: np.ndarray, *, start_position_rad: flo
     _fill_sequence(axis.sequence, config, table, start_position_rad)
     fill_change(axis.change, axis.law, config)
     _fill_stream(axis.stream, config)
+    _fill_own_loop(axis, config)
     return constants
+
+
+def _fill_own_loop(axis: Any, config: Config) -> None:
+    """What a drive gets that closes its position or velocity loop itself."""
+    sent, record = config.drive.sent_with_target(config.loop.rate_Hz), axis.velocity_command
+    if sent is None:
+        return
+    axis.command_kind = config.drive.own_loop()
+    record.position_gain_ps, record.lead_s = sent.position_gain_ps, sent.lead_s
+    record.feeds_torque = int(sent.torque_offset)
+    record.acceleration_max_radps2 = config.limits.torque_max_Nm / config.joint.inertia_kgm2
+    second = config.joint_encoder
+    record.from_second = int(second is not None and second.law == "joint_encoder")
 
 
 def free_constants(config: Config, start_rad: float) -> Any:

@@ -52,7 +52,7 @@ def between(low: float, high: float, *, open_low: bool = False) -> Any:
     return AfterValidator(Rule(interval, check))
 
 
-def _auto_or_number(low: float, high: float) -> Any:
+def auto_or_number(low: float, high: float) -> Any:
     allowed = f'"auto" or in {interval_text(low, high)}'
 
     def check(value: object) -> Any:
@@ -179,7 +179,7 @@ class Limits(Section):
 
 class Sequence(Section):
     # time to the start of the trajectory; 0 = none, the joint must stand there
-    approach_s: Annotated[float | Literal["auto"], _auto_or_number(0.0, 600.0)]
+    approach_s: Annotated[float | Literal["auto"], auto_or_number(0.0, 600.0)]
     brake_radps2: Annotated[float, between(0.0, 10_000.0, open_low=True)]  # of a controlled stop
     release_s: Annotated[float, between(0.0, 60.0)]  # torque to zero at standstill
     settle_s: Annotated[float, between(0.0, 10.0, open_low=True)]  # good samples in a row before enabling
@@ -277,13 +277,13 @@ class Stream(Section):
     timeout_s: Annotated[float, between(0.002, 10.0)] = 0.1  # between two of them, after which the next is a new start
     client_timeout_s: Annotated[float, between(0.05, 3600.0)] = 1.0  # silence of the program that ends the run
     # "auto": half of what limits.torque_max_Nm gives the inertia
-    acceleration_max_radps2: Annotated[float | Literal["auto"], _auto_or_number(1e-6, 1e9)] = "auto"
+    acceleration_max_radps2: Annotated[float | Literal["auto"], auto_or_number(1e-6, 1e9)] = "auto"
     # from one to the next; "auto": limits.following_error_max_rad
-    jump_max_rad: Annotated[float | Literal["auto"], _auto_or_number(1e-9, 100.0)] = "auto"
+    jump_max_rad: Annotated[float | Literal["auto"], auto_or_number(1e-9, 100.0)] = "auto"
     # on top of the law's; "auto": a fifth of limits.torque_max_Nm
-    torque_max_Nm: Annotated[float | Literal["auto"], _auto_or_number(0.0, 1e6)] = "auto"
+    torque_max_Nm: Annotated[float | Literal["auto"], auto_or_number(0.0, 1e6)] = "auto"
     # of that torque; "auto": a tenth of limits.torque_rate_max_Nmps
-    torque_rate_max_Nmps: Annotated[float | Literal["auto"], _auto_or_number(1e-6, 1e9)] = "auto"
+    torque_rate_max_Nmps: Annotated[float | Literal["auto"], auto_or_number(1e-6, 1e9)] = "auto"
 
 
 class Log(Section):

@@ -35,6 +35,8 @@ from pydantic_core import PydanticCustomError
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.input_file import parse_toml, read_input
+from jointctl.firmware_py.states import CommandKind
+from jointctl.tools.analysis.cascade import cascade_margins
 from jointctl.tools.analysis.loop_settings import loop_settings
 from jointctl.tools.analysis.margins import phase_margin_deg
 from jointctl.tools.child_process import processors
@@ -402,6 +404,15 @@ def quantile(values: np.ndarray, share: float) -> float:
     return float(np.quantile(values, share, method=method))  # type: ignore[call-overload]
 
 
+def _margin_deg(config: Config) -> float:
+    """The least phase margin; nan where the drive closes its loops and their gains are not given."""
+    settings, assumptions = loop_settings(config)
+    if config.drive.own_loop() is CommandKind.TORQUE:
+        return phase_margin_deg(settings)
+    delay_s = next(assumed.value for assumed in assumptions if assumed.name == "loop delay")
+    return min((loop.phase_margin_deg for loop in cascade_margins(config, delay_s)), default=math.nan)
+
+
 def run_plant(task: PlantTask) -> PlantResult:
     """Commission the plant and run every controller on it."""
     config = random_plant(task.base, task.plant, task.seed, task.index)
@@ -415,8 +426,9 @@ def run_plant(task: PlantTask) -> PlantResult:
         if controller.control.kind == "flexible_joint" and task.plant.flexible and task.plant.choose_gains:
             controller = with_chosen_gains(config, controller)
         constants = controller_constants(config, controller, joint.report.start_position_rad)
-        run = run_scenario(joint, constants, task.scenario, motion=motion)
-        margin_deg = phase_margin_deg(loop_settings(controller_config(config, controller))[0])
+        own = LockstepJoint(controller_config(config, controller)) if controller.cascade else joint
+        run = run_scenario(own, constants, task.scenario, motion=motion)
+        margin_deg = _margin_deg(controller_config(config, controller))
         figures.append(replace(error_figures(run, task.after_s, motion, count_rad), phase_margin_deg=margin_deg))
     assert config.virtual is not None
     on_joint = config.encoder if config.joint_encoder is None else config.joint_encoder

@@ -7,15 +7,17 @@ believes about the friction is the base configuration's [friction], or that of t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
 from jointctl.drivers.errors import ConfigurationError
+from jointctl.firmware_py.states import CommandKind
 from jointctl.tools.analysis.flexible_gains import chosen_gains
 from jointctl.tools.analysis.loop_settings import loop_settings
+from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.checks import problems_between_sections
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.control_section import Control
@@ -40,6 +42,11 @@ TABLE: dict[str, dict[str, Any]] = {
     "observer": {**_OBSERVER, "observer_radps": 60.0},
     "observer_stiff": {**_OBSERVER, "observer_radps": 60.0, "kp": 2500.0, "kv": 100.0},
 }
+# of a base whose drive closes its own loops: keys of [drive.cascade] that differ from it; the law is computed torque
+OF_DRIVES: dict[str, dict[str, Any]] = {
+    "drive_alone": {"torque_offset": False, "velocity_offset": False, "lead_s": 0.0},
+    "drive_without_torque": {"torque_offset": False},
+}
 PRECISE = "precise"  # configs/precise.toml
 DEFAULT = (*TABLE, PRECISE)
 
@@ -51,6 +58,7 @@ class Controller:
     name: str
     control: Control
     friction: Friction | None = None
+    cascade: Mapping[str, Any] = field(default_factory=dict)  # keys of [drive.cascade] that differ from the base's
 
 
 def paper_control() -> Control:
@@ -83,6 +91,8 @@ def named(names: tuple[str, ...] = DEFAULT) -> list[Controller]:
     for name in names:
         if name in TABLE:
             found.append(Controller(name, changed(paper, TABLE[name], name)))
+        elif name in OF_DRIVES:
+            found.append(Controller(name, changed(paper, TABLE["computed_torque"], name), cascade=OF_DRIVES[name]))
         else:
             found.append(from_file(name))
     doubled = sorted({c.name for c in found if sum(c.name == other.name for other in found) > 1})
@@ -97,7 +107,7 @@ def from_file(name: str) -> Controller:
     if not path.exists() and shipped_config(name).exists():
         path = shipped_config(name)
     if not path.exists():
-        known = ", ".join(TABLE)
+        known = ", ".join((*TABLE, *OF_DRIVES))
         raise ConfigurationError(f"controller (={name}) must be a configuration file or one of {known}")
     config = load_config(path)
     require_simulated(config, "study")
@@ -109,6 +119,13 @@ def controller_config(base: Config, controller: Controller) -> Config:
     update: dict[str, Any] = {"control": controller.control}
     if controller.friction is not None:
         update["friction"] = controller.friction
+    drive = base.drive
+    if controller.cascade:
+        if drive.own_loop() is CommandKind.TORQUE:
+            raise ConfigurationError(f"controller {controller.name} needs a --base with drive.mode csp or csv")
+        cascade = canopen_section(base).cascade
+        assert cascade is not None
+        update["drive"] = drive.model_copy(update={"cascade": cascade.model_copy(update=dict(controller.cascade))})
     config = base.model_copy(update=update)
     problems = problems_between_sections(config)
     if problems:

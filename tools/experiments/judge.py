@@ -39,7 +39,7 @@ from jointctl.drivers.canopen.cyclic import IGNORED_MAX_CYCLES
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.records import AxisConstants, Reference
 from jointctl.firmware_py.schema import new
-from jointctl.firmware_py.states import AxisPhase, DriveRequest, Fault, Reaction
+from jointctl.firmware_py.states import AxisPhase, CommandKind, DriveRequest, Fault, Reaction
 from jointctl.firmware_py.trajectory import reference_at
 from jointctl.hil.canopen.records import PowerState
 from jointctl.hil.fault_kinds import FaultKind
@@ -313,7 +313,7 @@ def _carry_out(
     return run, constants
 
 
-def _commands(run: LockstepRun, allowed: Envelope) -> list[str]:
+def _commands(run: LockstepRun, allowed: Envelope, *, by_position: bool = False) -> list[str]:
     log, found = run.log, []
     torque = np.asarray(log.command_torque_Nm)
     powered = (log.phase >= AxisPhase.APPROACH) & (log.phase <= AxisPhase.RELEASING)
@@ -327,7 +327,10 @@ def _commands(run: LockstepRun, allowed: Envelope) -> list[str]:
     speed = np.asarray(log.command_velocity_radps)
     if not np.isfinite(speed).all() or np.abs(speed).max() > allowed.command_max_radps:
         found.append(f"velocity command {np.abs(speed).max():.3f} rad/s exceeds {allowed.command_max_radps:g}")
-    steps = (np.abs(np.diff(speed)) / (1.0 + np.asarray(log.skipped)[1:]))[powered[1:]]
+    skipped = np.asarray(log.skipped)[1:]
+    steps = (np.abs(np.diff(speed)) / (1.0 + skipped))[powered[1:]]
+    if by_position:  # while the loop is held up, the drive's set-point stands still: the target starts from there
+        steps = steps[skipped[powered[1:]] == 0]
     if len(steps) and steps.max() > allowed.command_step_radps * (1.0 + 1e-9):
         found.append(f"velocity command steps by {steps.max():.4f} rad/s, allowed {allowed.command_step_radps:g}")
     if speed[~powered].any():
@@ -442,7 +445,7 @@ def judge(config: Config, joint: LockstepJoint, scenario: Scenario) -> Verdict:
         fault=run.fault.name,
         reaction=Reaction(int(run.state.reaction)).name,
         violations=tuple(
-            _commands(run, allowed)
+            _commands(run, allowed, by_position=int(axis.command_kind) == CommandKind.POSITION)
             + _motion(run, allowed)
             + ending
             + _enabled_again(run, scenario, start_ns, period_ns)

@@ -30,7 +30,20 @@ from jointctl.drivers.canopen.identifiers import (
     SYNC_ID,
     TPDO1_ID,
 )
-from jointctl.drivers.canopen.pdo import CONTROL, DISABLED, POSITION, STATUS, TARGET_TORQUE, TARGET_VELOCITY, TORQUE
+from jointctl.drivers.canopen.pdo import (
+    CONTROL,
+    DISABLED,
+    POSITION,
+    STATUS,
+    TARGET_POSITION,
+    TARGET_TORQUE,
+    TARGET_VELOCITY,
+    TORQUE,
+    TORQUE_OFFSET,
+    VELOCITY_OFFSET,
+    MappedObject,
+)
+from jointctl.drivers.canopen.settings import CanopenSettings
 from jointctl.tools.inspection.objects import NMT_COMMANDS, SIGNED, Objects, Place, error_register_text, nmt_state
 from jointctl.tools.inspection.subject import abort_text
 from jointctl.tools.session.fault_words import emergency_text
@@ -41,6 +54,7 @@ PREDEFINED = 4  # PDOs of each direction in the predefined connection set
 _SPAN = 0x200
 _RPDO, _RPDO_MAP, _TPDO, _TPDO_MAP = 0x1400, 0x1600, 0x1800, 0x1A00
 _BASES = {True: (_TPDO, _TPDO_MAP, TPDO1_ID), False: (_RPDO, _RPDO_MAP, RPDO1_ID)}
+_PDO_STEP = 0x100  # between the identifiers of a node's PDOs
 _FIRST_REAL_OBJECT = 0x20  # below are the data types, mapped to leave a gap
 COB_MASK = 0x1FFFFFFF
 
@@ -95,7 +109,7 @@ class PdoMaps:
         """The PDO, made if it is new, with the identifier of the predefined connection set."""
         key = node, transmit, number
         if key not in self._maps:
-            cob_id = _BASES[transmit][2] + 0x100 * (number - 1) + node if number <= PREDEFINED else None
+            cob_id = _BASES[transmit][2] + _PDO_STEP * (number - 1) + node if number <= PREDEFINED else None
             self._maps[key] = PdoMap(node, transmit, number, cob_id)
             self._index()
         return self._maps[key]
@@ -148,18 +162,27 @@ class PdoMaps:
                 if isinstance(value, int):
                     self.learn(node, index, sub, value)
 
-    def learn_loop(self, node: int, velocity: bool = False) -> None:
-        """What `jointctl run` and `sweep` set up: statusword, position, torque; controlword, target."""
-        for transmit, mapped in (
-            (True, (STATUS, POSITION, TORQUE)),
-            (False, (CONTROL, TARGET_VELOCITY if velocity else TARGET_TORQUE)),
-        ):
-            pdo = self.of(node, transmit, 1)
-            pdo.cob_id, pdo.enabled, pdo.count = _BASES[transmit][2] + node, True, len(mapped)
-            pdo.slots = {number: item.entry() for number, item in enumerate(mapped, start=1)}
-            for number in range(2, PREDEFINED + 1):
-                self.of(node, transmit, number).enabled = False
+    def learn_loop(self, node: int, sent: tuple[tuple[MappedObject, ...], ...] = ((CONTROL, TARGET_TORQUE),)) -> None:
+        """What `jointctl run` and `sweep` set up: statusword, position, torque; the RPDOs that are `sent`."""
+        for transmit, pdos in ((True, ((STATUS, POSITION, TORQUE),)), (False, sent)):
+            for number in range(1, PREDEFINED + 1):
+                pdo = self.of(node, transmit, number)
+                pdo.enabled = number <= len(pdos)
+                if not pdo.enabled:
+                    continue
+                mapped = pdos[number - 1]
+                pdo.cob_id, pdo.count = _BASES[transmit][2] + _PDO_STEP * (number - 1) + node, len(mapped)
+                pdo.slots = {slot: item.entry() for slot, item in enumerate(mapped, start=1)}
         self._index()
+
+
+def sent_by_loop(settings: CanopenSettings) -> tuple[tuple[MappedObject, ...], ...]:
+    """The objects in each RPDO of a run."""
+    targets = {"csp": TARGET_POSITION, "csv": TARGET_VELOCITY, "pv": TARGET_VELOCITY}
+    first: tuple[MappedObject, ...] = (CONTROL, targets.get(settings.mode, TARGET_TORQUE))
+    if settings.torque_offset:
+        first = (*first, TORQUE_OFFSET)
+    return (first, (VELOCITY_OFFSET,)) if settings.velocity_offset else (first,)
 
 
 # --- SDO ---

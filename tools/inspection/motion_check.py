@@ -28,6 +28,7 @@ from jointctl.tools.configuration.conversions import (
     static_friction_Nm,
     velocity_of_a_count_radps,
 )
+from jointctl.tools.configuration.drive_section import require_torque
 from jointctl.tools.configuration.records import APPROACH_MIN_S, axis_constants
 from jointctl.tools.inspection.health import NOTE, OK, PROBLEM, Finding
 from jointctl.tools.recording.run_log import log_path
@@ -105,6 +106,7 @@ def make_plan(config: Config, torque_Nm: float | None) -> CheckPlan:
 
 def config_of_check(config: Config, plan: CheckPlan) -> Config:
     """The configuration with the limits and the law of the check; the drive's own torque limit follows from it."""
+    require_torque(config, "the motion check")
     limits = config.limits.model_copy(
         update={
             "torque_max_Nm": plan.torque_Nm,

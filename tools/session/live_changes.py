@@ -235,7 +235,7 @@ class LiveChanges:
     def limits(self) -> dict[str, tuple[float, float]]:
         """Of the gains that can be changed in this run."""
         low, high = self._axis.change.low, self._axis.change.high
-        if self._axis.command_kind == CommandKind.VELOCITY:
+        if self._axis.command_kind != CommandKind.TORQUE:
             return {}  # the drive closes the loop with gains of its own
         return {name: (float(low[name]), float(high[name])) for name in NAMES if low[name] < high[name]}
 

@@ -32,6 +32,7 @@ from jointctl.drivers.can.frames import ERROR_FLAG, Frame
 from jointctl.drivers.can.virtual_bus import decode, encode
 from jointctl.drivers.canopen.cyclic import (
     FRAME_SLOTS,
+    SLOT_OFFSET,
     SLOT_RECEIVED,
     SLOT_RPDO,
     SLOT_SYNC,
@@ -116,7 +117,7 @@ class PortableExchange:
         self._least_wait_ns = receive_ns // 2
         self._failed = False
         # some interfaces echo a program's own frames; counted again, they would double the bus load
-        names = ("sync_id", "rpdo_id", "own_heartbeat_id")
+        names = ("sync_id", "rpdo_id", "offset_rpdo_id", "own_heartbeat_id")
         self._own = frozenset(int(identifier) for name in names for identifier in self._ports[name])
 
     def _fail(self, error: Exception) -> None:
@@ -202,6 +203,8 @@ class PortableExchange:
         """Send the RPDO of each drive; a failure counts in the next cycle."""
         for port, sample, command in self._axes:
             end_cycle(port, self._frames, sample, command)
+            if port.offset_rpdo_id:
+                self._send(SLOT_OFFSET)
             self._send(SLOT_RPDO)
         return 0
 

@@ -204,8 +204,12 @@ class RunWatch:
     def margin_text(self, delay_s: float) -> str:
         """What is left of the stability with that delay, in words; raises if it is too little to enable.
 
-        Where the drive closes its velocity loop by itself, ours is the slow position correction.
+        Where the drive closes its velocity loop by itself, in a sweep, ours is the slow position correction.
         """
+        if self.config.drive.own_loop() is not CommandKind.TORQUE:
+            from jointctl.tools.analysis.cascade import cascade_text  # not loaded for another drive
+
+            return cascade_text(self.config, delay_s, allow_low_margin=self._allow_low_margin)
         if self._drives_loop_ps is not None:
             margin_deg = math.degrees(0.5 * math.pi - self._drives_loop_ps * delay_s)
             return f"position correction with {margin_deg:.0f} deg phase margin"

@@ -83,7 +83,7 @@ class SetPointStream:
         axis, state = loop.constants[0], loop.axis[0]
         self._loop, self._limits, self._constants = loop, axis.limits, axis.stream
         self._brake_radps2 = float(axis.sequence.brake_radps2)
-        self._by_velocity = int(axis.command_kind) != 0
+        self._takes_torque = int(axis.command_kind) == 0 or int(axis.velocity_command.feeds_torque) != 0
         stream = loop.constants["stream"]
         self._times, self._values = stream["time_ns"][0], stream["values"][0]
         self._written, self._alive_ns = stream["written"][0], stream["alive_ns"][0]
@@ -116,8 +116,8 @@ class SetPointStream:
             raise SetPointError("a set-point must be made of numbers") from None
         if acceleration_radps2 is not None and not math.isfinite(acceleration):
             raise SetPointError(f"acceleration_radps2 (={acceleration:g}) must be finite")
-        if torque_Nm and self._by_velocity:
-            raise SetPointError(f"torque_Nm (={torque_Nm:g}) must be 0: the drive closes the velocity loop by itself")
+        if torque_Nm and not self._takes_torque:
+            raise SetPointError(f"torque_Nm (={torque_Nm:g}) must be 0: the drive closes its own loop, without 60B2")
         now_ns, accepted = self._loop.now_ns(), self._accepted
         if accepted and accepted[-1][0] <= now_ns - self._delay_ns:  # the loop has come to the end of them
             accepted.clear()

@@ -10,6 +10,7 @@ import typer
 from rich.table import Table
 
 from jointctl.drivers.errors import MarginError, UsageError
+from jointctl.firmware_py.states import CommandKind
 from jointctl.tools.verbs.verb_options import JointOrArm, ResultOutput
 
 if TYPE_CHECKING:
@@ -59,6 +60,10 @@ def check(
         require_png(figure, (config.path,))
     drive = bench_of(config)
     drive.require_rate(config)
+    if config.drive.own_loop() is not CommandKind.TORQUE:
+        if figure is not None or choose_gains:
+            raise UsageError("--figure and --choose-gains are for drive.mode cst, tq and auto")
+        return check_cascade(config, output, delay_s, allow_low_margin=allow_low_margin)
     minimum_deg = config.margin.min_phase_margin_deg
     settings, assumptions = loop_settings(config, delay_s)
     found = margins(settings)
@@ -94,6 +99,47 @@ def check(
     if not allow_low_margin:
         refuse_chatter(config, settings)
     refuse_diverging_learning(learning)
+    return 0
+
+
+def check_cascade(
+    config: Config, output: Output, delay_s: float | None = None, *, allow_low_margin: bool = False
+) -> int:
+    """Of a drive that closes its own loops: what is known of them, and when what is sent takes effect."""
+    from jointctl.tools.analysis.cascade import cascade_margins, cascade_of, cascade_unknowns, require_cascade
+    from jointctl.tools.analysis.loop_settings import loop_settings
+    from jointctl.tools.configuration.canopen import canopen_section
+    from jointctl.tools.verbs.bench_drive import bench_of
+
+    section, cascade = canopen_section(config), cascade_of(config)
+    delay = next(a for a in loop_settings(config, delay_s)[1] if a.name == "loop delay")
+    title = f"The drive closes the loop ({section.mode})"
+    table = Table("quantity", "value", "note", title=title, title_justify="left")
+    for assumed in (delay,):
+        table.add_row(assumed.name, f"{assumed.value:g} {assumed.unit}", assumed.origin)
+    with_target = section.sent_with_target(config.loop.rate_Hz)
+    lead = with_target.lead_s if with_target is not None else 0.0
+    table.add_row("lead", f"{lead * 1e3:g} ms", "by which the motion is sent ahead (drive.cascade.lead_s)")
+    sent = {
+        "torque offset": cascade.torque_offset,
+        "velocity offset": cascade.velocity_offset and section.mode == "csp",
+    }
+    table.add_row("sent besides the target", ", ".join(k for k, on in sent.items() if on) or "nothing", "60B2, 60B1")
+    table.add_section()
+    found = cascade_margins(config, delay.value)
+    for loop in found:
+        note = f"at {loop.crossover_Hz:.1f} Hz; gain margin x {loop.gain_margin_up:.3g}"
+        table.add_row(loop.name, f"{loop.phase_margin_deg:.1f} deg phase margin", note)
+    for row in bench_of(config).check_rows(config):
+        table.add_row(*row)
+    data = {
+        "mode": section.mode, "lead_s": lead, "loops": [asdict(loop) for loop in found],
+        "min_phase_margin_deg": config.margin.min_phase_margin_deg,
+    }  # fmt: skip
+    output.result(table, data)
+    for text in cascade_unknowns(config):
+        output.note(f"not in this analysis: {text}")
+    require_cascade(config, delay.value, allow_low_margin=allow_low_margin)
     return 0
 
 

@@ -47,7 +47,7 @@ TRACEBACK = "JOINTCTL_TRACEBACK"  # in the environment: show where an unexpected
 EPILOG = (
     "First steps: `jointctl demo` shows all of it on a virtual joint; `jointctl doctor` tells what this computer can "
     "do; `jointctl new my_joint.toml` begins a configuration of your own. CONFIG is a TOML file or the name of a "
-    "shipped one: virtual, precise, paper, realistic, sweep_virtual, elmo_gold_can, elmo_serial."
+    "shipped one: virtual, precise, paper, realistic, csp, sweep_virtual, elmo_gold_can, elmo_serial."
 )
 
 app = typer.Typer(

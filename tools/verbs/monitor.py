@@ -78,9 +78,9 @@ def selection_of(options: MonitorOptions) -> Selection:
 
 def new_decoder(subject: Subject, *, ask: bool) -> FrameDecoder:
     """With what the subject tells about objects and PDOs; `ask` reads the mapping from the drive over SDO."""
-    from jointctl.tools.configuration.canopen import TORQUE_MODES, canopen_section
+    from jointctl.tools.configuration.canopen import canopen_settings
     from jointctl.tools.inspection.drive_info import pdo_maps
-    from jointctl.tools.inspection.frame_decoder import FrameDecoder, PdoMaps
+    from jointctl.tools.inspection.frame_decoder import FrameDecoder, PdoMaps, sent_by_loop
     from jointctl.tools.inspection.objects import Objects
     from jointctl.tools.inspection.subject import SdoReader, canopen_network
 
@@ -91,7 +91,7 @@ def new_decoder(subject: Subject, *, ask: bool) -> FrameDecoder:
         if known.dictionary is not None:
             maps.learn_from_eds(known.dictionary, subject.node)
     if subject.config is not None and subject.node is not None:
-        maps.learn_loop(subject.node, velocity=canopen_section(subject.config).mode not in TORQUE_MODES)
+        maps.learn_loop(subject.node, sent_by_loop(canopen_settings(subject.config)))
     if ask:
         node = subject.required_node()
         with canopen_network(subject) as network:

@@ -66,7 +66,7 @@ def test_the_elmo_configuration_refuses_to_load_until_it_is_filled_in(tmp_path: 
         ("node = .*", "node = 1.0", "drive.node (=1) must be a whole number"),
         ("node = .*", "", "drive.node is missing"),
         ("direction = .*", "direction = 0", "encoder.direction (=0) must be 1 or -1"),
-        ("mode = .*", 'mode = "csp"', "drive.mode (=csp) must be one of 'cst', 'tq' or 'auto'"),
+        ("mode = .*", 'mode = "pp"', "drive.mode (=pp) must be one of 'cst', 'tq', 'auto', 'csp' or 'csv'"),
         ("approach_s = .*", 'approach_s = "slow"', 'sequence.approach_s (=slow) must be "auto" or in [0..600]'),
         ("lyapunov_q = .*", "lyapunov_q = [1.0, 2.0, 3.0]",
          "control.lyapunov_q (=[1.0, 2.0, 3.0]) must be 1 or 2 numbers, each in (0..1e+12]"),

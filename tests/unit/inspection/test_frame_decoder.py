@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,9 @@ import can
 import pytest
 
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.tools.configuration.load import shipped_config
-from jointctl.tools.inspection.frame_decoder import Decoded, FrameDecoder, PdoMaps
+from jointctl.tools.configuration.canopen import canopen_settings
+from jointctl.tools.configuration.load import load_config, shipped_config
+from jointctl.tools.inspection.frame_decoder import Decoded, FrameDecoder, PdoMaps, sent_by_loop
 from jointctl.tools.inspection.objects import Objects, control_text, read_dictionary
 
 EDS = shipped_config("virtual").with_name("virtual_joint.eds")
@@ -85,8 +87,14 @@ def test_the_mapping_of_the_configuration() -> None:
     assert decoder.decode(frame(0x205, struct.pack("<Hh", 0x0F, -7))).text == (
         "RPDO1 Controlword 000Fh enable operation, Target torque -7"
     )
-    maps.learn_loop(5, velocity=True)
-    assert "Target velocity -7" in decoder.decode(frame(0x205, struct.pack("<Hi", 0x0F, -7))).text
+    settings = canopen_settings(load_config(shipped_config("csp")))
+    maps.learn_loop(5, sent_by_loop(settings))
+    assert decoder.decode(frame(0x205, struct.pack("<Hih", 0x0F, -7, 9))).text.endswith(
+        "Target position -7, Torque offset 9"
+    )
+    assert decoder.decode(frame(0x305, struct.pack("<i", -8))).text == "RPDO2 Velocity offset -8"
+    maps.learn_loop(5, sent_by_loop(dataclasses.replace(settings, mode="csv", velocity_offset=False)))
+    assert "Target velocity -7" in decoder.decode(frame(0x205, struct.pack("<Hih", 0x0F, -7, 9))).text
 
 
 @pytest.mark.parametrize(("length", "malformed"), [(8, False), (7, True), (2, True)])

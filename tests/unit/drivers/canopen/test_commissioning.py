@@ -151,6 +151,39 @@ def test_a_velocity_mode_begins_with_no_target_and_the_drives_own_limit(joint: A
     assert any("profile velocity mode (PV)" in remark for remark in report.remarks) == bool(steep)
 
 
+# --- a drive that closes its own loops ---
+OWN_LOOP: dict[str, Any] = {"holds_alone": True, "torque_offset": True, "velocity_offset": True}
+
+
+def test_csp_begins_with_the_target_where_the_joint_stands(joint: Any) -> None:
+    joint.answers[(0x6064, 0)] = 4321
+    with joint.opened(mode="csp", following_error_max_rad=0.05, **OWN_LOOP) as drive:
+        report = drive.commission()
+        port = drive.port()[0]
+    assert (report.mode, joint.value(0x6060), joint.value(0x6061)) == ("cyclic_sync_position", 8, 8)
+    assert joint.downloads(0x607A)[-1] == 4321
+    written = [data[1:3] for cob, data in joint.requests if cob == 0x601 and data[0] & 0xE0 == 0x20]
+    assert b"\x7a\x60" in written[written.index(b"\x60\x60") :]  # the choice of the mode may have brought one
+    assert (joint.value(0x6065), joint.value(0x6066)) == (math.ceil(0.05 / (math.tau / 2**19)), 20)
+    assert (joint.downloads(0x60C2, 1), joint.downloads(0x60C2, 2)) == ([1], [-3 & 0xFF])
+    assert [joint.value(0x1600, sub) for sub in range(4)] == [3, 0x60400010, 0x607A0020, 0x60B20010]
+    assert [joint.value(0x1601, sub) for sub in range(2)] == [1, 0x60B10020]
+    assert (joint.value(0x1400, 5), joint.value(0x1401, 5)) == (100, 100)  # the deadlines of both
+    assert (port.target_is_position, port.torque_offset_at, port.offset_rpdo_id) == (1, 6, 0x301)
+
+
+def test_csv_of_a_run_maps_the_torque_offset_and_its_twin_of_a_sweep_does_not(joint: Any) -> None:
+    with joint.opened(mode="csv", holds_alone=True, torque_offset=True) as drive:
+        drive.commission()
+        port = drive.port()[0]
+    assert [joint.value(0x1600, sub) for sub in range(4)] == [3, 0x60400010, 0x60FF0020, 0x60B20010]
+    assert (port.target_is_velocity, port.torque_offset_at, port.offset_rpdo_id) == (1, 6, 0)
+    with joint.opened(mode="csv") as drive:
+        drive.commission()
+        assert drive.port()[0].torque_offset_at == -1
+    assert joint.value(0x1600) == 2
+
+
 @pytest.mark.parametrize(("torque_max_Nm", "cut"), [(60.0, False), (3000.0, True)])
 def test_a_torque_beyond_what_6072_holds_is_reported(joint: Any, torque_max_Nm: float, cut: bool) -> None:
     with joint.opened(torque_max_Nm=torque_max_Nm, max_torque_permille=None) as drive:

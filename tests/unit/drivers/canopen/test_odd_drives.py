@@ -83,6 +83,29 @@ def test_a_torque_that_is_not_measured_is_not_mapped(lacking: Any, commission: A
     assert [joint.value(0x1A00, k) for k in range(3)] == [2, STATUS, POSITION]
 
 
+OWN_LOOP: dict[str, Any] = {"mode": "csp", "holds_alone": True, "torque_offset": True, "velocity_offset": True}
+
+
+@pytest.mark.parametrize(
+    ("index", "words"),
+    [(0x6007, "object 6007 .* may go on holding the joint when this computer dies"), (0x60B2, "object 60B2 .*offset")],
+)
+def test_a_drive_that_lacks_what_a_loop_of_its_own_needs_is_refused(lacking: Any, index: int, words: str) -> None:
+    with pytest.raises(DeviceError, match=words):
+        lacking((index, None), **OWN_LOOP)
+
+
+def test_its_twin_in_torque_mode_the_same_drive_is_accepted(lacking: Any) -> None:
+    assert lacking((0x6007, None), (0x60B2, None)).mode == "cyclic_sync_torque"
+
+
+def test_without_60b1_6065_and_a_torque_mode_csp_goes_on_with_remarks(lacking: Any, commission: Any) -> None:
+    remarks = lacking((0x60B1, None), (0x6065, None), (0x6071, None), (0x6077, None), **OWN_LOOP).remarks
+    assert (commission.port[0].offset_rpdo_id, commission.port[0].torque_offset_at) == (0, 6)
+    for index in ("60B1", "6065", "6077"):
+        assert any(f"no object {index}" in remark for remark in remarks)
+
+
 def test_a_torque_slope_that_is_not_there_is_a_remark(lacking: Any) -> None:
     report = lacking((0x6087, None), (0x60C2, None), mode="tq")
     assert any("no object 6087" in line for line in report.remarks)

@@ -1,0 +1,91 @@
+"""CSP and CSV at simulated time: what the feed-forward is worth, no jump, and a drive that no one watches any more."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.hil.canopen.records import PowerState
+from jointctl.hil.fault_kinds import FaultConstants, FaultKind
+from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_POSITION_rad, TRUE_VELOCITY_radps
+from jointctl.tools.configuration.canopen import CanopenSection
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.lockstep import LockstepJoint, LockstepRun
+from tests.configurations import changed, shipped
+
+POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
+DEAD_AT_s = 3.0
+
+
+def own_loop(mode: str, **cascade: Any) -> Config:
+    config = changed(shipped("csp"), trajectory__duration_s=6.0)
+    drive = config.drive
+    assert isinstance(drive, CanopenSection)
+    assert drive.cascade is not None
+    kept = drive.cascade.model_copy(update=cascade)
+    return config.model_copy(update={"drive": drive.model_copy(update={"mode": mode, "cascade": kept})})
+
+
+@pytest.fixture(scope="module", params=["csp", "csv"])
+def joint(request: pytest.FixtureRequest) -> LockstepJoint:
+    return LockstepJoint(own_loop(request.param))
+
+
+def rmse_mrad(run: LockstepRun) -> float:
+    assert run.fault is Fault.NONE
+    return float(1e3 * np.sqrt(np.mean(run.true_error_rad[run.tracking][1000:] ** 2)))
+
+
+def test_the_feed_forward_divides_the_following_error_of_the_drive_by_more_than_ten() -> None:
+    alone = LockstepJoint(own_loop("csp", torque_offset=False, velocity_offset=False, lead_s=0.0)).run()
+    everything = LockstepJoint(own_loop("csp")).run()
+    assert rmse_mrad(alone) > 3.0  # the lag of a P position loop: speed / gain
+    assert rmse_mrad(everything) < 0.1 * rmse_mrad(alone)
+
+
+def test_each_part_makes_it_better(joint: LockstepJoint) -> None:
+    mode = joint.config.drive.mode  # type: ignore[attr-defined]
+    without_torque = LockstepJoint(own_loop(mode, torque_offset=False)).run()
+    assert rmse_mrad(joint.run()) < 0.5 * rmse_mrad(without_torque)
+
+
+def test_the_joint_does_not_jump_when_it_is_enabled_and_nothing_moves_it_after_release(joint: LockstepJoint) -> None:
+    run = joint.run()
+    first = int(np.argmax(run.truth[:, TRUE_POWER_STATE] == PowerState.OPERATION_ENABLED))
+    positions = run.truth[:, TRUE_POSITION_rad]
+    assert np.abs(positions[first : first + 20] - positions[first]).max() < 5e-5
+    releasing = positions[run.log.phase == AxisPhase.RELEASING]
+    assert np.ptp(releasing) < 2e-4
+    assert run.state.phase == AxisPhase.FINISHED
+    assert not np.isin(run.truth[-1, TRUE_POWER_STATE], POWERED)
+
+
+def dead_from(kind: FaultKind, duration_s: float) -> Any:
+    faults = new(FaultConstants)
+    faults[0].kind, faults[0].start_s, faults[0].duration_s = kind, DEAD_AT_s, duration_s
+    faults[0].magnitude, faults[0].seed = 1.0, 1
+    return faults
+
+
+@pytest.mark.parametrize("kind", [FaultKind.LOOP_HELD_UP, FaultKind.BUS_OFF])
+def test_a_joint_whose_computer_dies_is_braked_by_the_drive_and_switched_off(
+    joint: LockstepJoint, kind: FaultKind
+) -> None:
+    run = joint.run_with_faults(dead_from(kind, 30.0), epoch_at_start=True, longest_s=5.0, tail_s=1.0)
+    on = np.flatnonzero(np.isin(run.truth[:, TRUE_POWER_STATE], POWERED))
+    off_after_s = (on[-1] + 1) * 1e-3 - DEAD_AT_s
+    braking_s = 1.0 / 2.0  # from the velocity limit at brake_radps2, more than the quick stop of the drive needs
+    assert 0.0 < off_after_s < 0.28 + braking_s
+    assert np.abs(run.truth[on[-1] + 100 :, TRUE_VELOCITY_radps]).max() < 0.02
+    assert run.truth[int(DEAD_AT_s * 1e3), TRUE_POWER_STATE] == PowerState.OPERATION_ENABLED
+
+
+@pytest.mark.parametrize("kind", [FaultKind.LOOP_HELD_UP, FaultKind.BUS_OFF])
+def test_its_twin_a_computer_that_was_away_for_a_moment_goes_on(joint: LockstepJoint, kind: FaultKind) -> None:
+    run = joint.run_with_faults(dead_from(kind, 0.015), epoch_at_start=True)
+    assert run.fault is Fault.NONE
+    assert np.abs(run.log.error_rad[run.tracking]).max() < 0.02

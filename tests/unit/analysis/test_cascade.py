@@ -1,0 +1,183 @@
+"""Margins of the loops that a drive closes itself, and what `check` says of them."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from jointctl.drivers.errors import MarginError, UsageError
+from jointctl.tools.analysis.cascade import cascade_margins, cascade_text, require_cascade
+from jointctl.tools.configuration.canopen import CanopenSection, cyclic_bus_load, rpdo_bytes
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.output import Output
+from jointctl.tools.verbs.check import check
+from tests.configurations import changed, load, problems, shipped
+from tests.places import CONFIGS
+
+CSP = (CONFIGS / "csp.toml").read_text()
+
+
+def own_loop(mode: str = "csp", **cascade: Any) -> Config:
+    config = shipped("csp")
+    drive = config.drive
+    assert isinstance(drive, CanopenSection)
+    assert drive.cascade is not None
+    cascade_changed = drive.cascade.model_copy(update=cascade)
+    return config.model_copy(update={"drive": drive.model_copy(update={"mode": mode, "cascade": cascade_changed})})
+
+
+def drive_of(config: Config) -> CanopenSection:
+    assert isinstance(config.drive, CanopenSection)
+    return config.drive
+
+
+# --- margins ---
+def test_without_delay_and_lag_the_velocity_loop_is_the_textbook_one() -> None:
+    config = changed(own_loop(loop_rate_Hz=1e5), margin__current_lag_s=0.0)
+    velocity = cascade_margins(config, 1e-3)[0]
+    inertia, gain, integral = config.joint.inertia_kgm2, 200.0, 10000.0
+    omega = math.tau * velocity.crossover_Hz
+    assert abs((gain + integral / (1j * omega)) / (1j * omega * inertia)) == pytest.approx(1.0, abs=2e-3)
+    late_deg = math.degrees(omega * 1.5e-5)
+    assert velocity.phase_margin_deg == pytest.approx(
+        math.degrees(math.atan(omega * gain / integral)) - late_deg, abs=0.1
+    )
+
+
+@pytest.mark.parametrize("share", [0.97, 1.03])
+@pytest.mark.parametrize("loop", [0, 1])
+def test_the_gain_margin_is_where_the_sampled_loop_becomes_unstable(loop: int, share: float) -> None:
+    """Simulated with the drive's period: zero-order hold, one period to compute."""
+    config = own_loop(loop_rate_Hz=2000.0, velocity_gain_Nmspr=600.0)
+    if loop:
+        config = own_loop(loop_rate_Hz=2000.0, velocity_gain_Nmspr=600.0, position_gain_ps=60.0)
+    config = changed(config, margin__current_lag_s=0.5e-3)
+    factor = share * cascade_margins(config, 1e-3)[loop].gain_margin_up
+    gains = [600.0, 10000.0, drive_of(config).cascade.position_gain_ps]  # type: ignore[union-attr]
+    if loop == 0:
+        gains = [factor * gains[0], factor * gains[1], 0.0]
+    else:
+        gains[2] = (gains[2] or 0.0) * factor
+    grows = _simulated(config, gains, 4000) > 1.0
+    assert grows == (share > 1.0)
+
+
+def _simulated(config: Config, gains: list[Any], steps: int) -> float:
+    """Growth of the error over the second half of a run from a small displacement."""
+    period = 1.0 / drive_of(config).cascade.loop_rate_Hz  # type: ignore[union-attr]
+    lag, inertia = config.margin.current_lag_s, config.joint.inertia_kgm2
+    a = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0 / inertia], [0.0, 0.0, -1.0 / lag]])
+    b = np.array([[0.0], [0.0], [1.0 / lag]])
+    ad, bd, *_ = signal.cont2discrete((a, b, np.eye(3), np.zeros((3, 1))), period)
+    x, integral, late = np.array([1e-3, 1e-3, 0.0]), 0.0, 0.0
+    sizes = []
+    for _ in range(steps):
+        error = gains[2] * -x[0] - x[1]
+        torque, integral = gains[0] * error + integral, integral + gains[1] * error * period
+        x, late = ad @ x + bd[:, 0] * late, torque
+        sizes.append(abs(x[1]))
+        if sizes[-1] > 1e12:
+            return math.inf
+    return max(sizes[3 * steps // 4 :]) / max(sizes[steps // 4 : steps // 2])
+
+
+def test_csv_closes_the_position_loop_here_and_feels_our_delay() -> None:
+    quick, slow = (cascade_margins(own_loop("csv"), delay)[1].phase_margin_deg for delay in (1e-3, 5e-3))
+    assert slow < quick
+    alone = [cascade_margins(own_loop("csp"), delay)[1] for delay in (1e-3, 5e-3)]
+    assert alone[0] == alone[1]
+
+
+# --- what is said and refused ---
+def test_nothing_is_said_of_gains_that_are_not_given() -> None:
+    config = own_loop(velocity_gain_Nmspr=None, velocity_integral_Nmprad=None)
+    assert cascade_margins(config, 1e-3) == []
+    assert "gains are not given" in cascade_text(config, 1e-3)
+    both = own_loop("csv", velocity_gain_Nmspr=None, velocity_integral_Nmprad=None)
+    assert [loop.name for loop in cascade_margins(both, 1e-3)] == ["position loop"]
+
+
+def test_a_cascade_without_its_margin_is_refused_and_an_unstable_one_always() -> None:
+    config = own_loop(velocity_integral_Nmprad=200_000.0, position_gain_ps=None)
+    with pytest.raises(MarginError, match=r"velocity loop \(=.* deg\) must be at least 15 deg"):
+        require_cascade(config, 1e-3)
+    assert require_cascade(config, 1e-3, allow_low_margin=True)
+    with pytest.raises(MarginError, match="unstable"):
+        require_cascade(own_loop(position_gain_ps=900.0), 1e-3, allow_low_margin=True)
+
+
+def test_check_reports_both_loops_and_the_lead() -> None:
+    out, err = io.StringIO(), io.StringIO()
+    assert check(own_loop(), Output(json=True, stdout=out, stderr=err)) == 0
+    data = json.loads(out.getvalue())
+    assert [loop["name"] for loop in data["loops"]] == ["velocity loop", "position loop"]
+    assert (data["mode"], data["lead_s"]) == ("csp", 0.002)
+    assert "filters" in err.getvalue()
+    with pytest.raises(UsageError, match="--choose-gains"):
+        check(own_loop(), Output(json=True, stdout=out, stderr=err), choose_gains=True)
+
+
+@pytest.mark.parametrize(("kind", "periods"), [(0, 2.0), (1, 2.0), (3, 4.0), (240, 241.0), (254, 1.0), (255, 1.0)])
+def test_the_lead_is_until_the_target_takes_effect(kind: int, periods: float) -> None:
+    drive = drive_of(own_loop()).model_copy(update={"rpdo_transmission_type": kind})
+    sent, chosen = drive.sent_with_target(500.0), drive_of(own_loop(lead_s=0.004)).sent_with_target(500.0)
+    assert sent is not None
+    assert chosen is not None
+    assert (sent.lead_s, chosen.lead_s) == (pytest.approx(periods / 500.0), 0.004)
+    assert drive_of(shipped("virtual")).sent_with_target(500.0) is None
+
+
+@pytest.mark.parametrize(
+    ("mode", "cascade", "lengths"),
+    [("csp", {}, (8, 4)), ("csp", {"velocity_offset": False}, (8,)), ("csv", {}, (8,)),
+     ("csv", {"torque_offset": False}, (6,))],
+)  # fmt: skip
+def test_the_frames_of_a_cycle(mode: str, cascade: dict[str, Any], lengths: tuple[int, ...]) -> None:
+    config = own_loop(mode, **cascade)
+    assert rpdo_bytes(drive_of(config)) == lengths
+    assert cyclic_bus_load(config) > cyclic_bus_load(shipped("virtual"))
+
+
+# --- combinations that cannot be ---
+@pytest.mark.parametrize(
+    ("pattern", "line", "words"),
+    [
+        (r'kind = "computed_torque"', 'kind = "computed_torque_rbf"', "control.kind (=computed_torque_rbf) must be"),
+        (r'feed_forward = "lugre_desired"', 'feed_forward = "measured"', "control.feed_forward (=measured) must be"),
+        (r"quick_stop_option = 2", "quick_stop_option = 6", "drive.quick_stop_option (=6) must be in [0..4]"),
+        (
+            r'mode = "csp"',
+            'mode = "cst"',
+            '[drive.cascade] must be left out unless drive.mode (=cst) is "csp" or "csv"',
+        ),
+        (r"velocity_gain_Nmspr = 200.0", "", "velocity_gain_Nmspr and velocity_integral_Nmprad must be given together"),
+        (r"position_gain_ps = 30.0", "position_gain_ps = 0", "position_gain_ps (=0) must be in (0..1000]"),
+        (r"torque_offset = true", "lead_s = 0.2", 'lead_s (=0.2) must be "auto" or in [0..0.1]'),
+    ],
+)
+def test_what_does_not_fit_is_one_line(tmp_path: Any, pattern: str, line: str, words: str) -> None:
+    found = problems(tmp_path, pattern, line, CSP)
+    assert any(words in text for text in found), found
+
+
+def test_csv_needs_the_gain_of_the_position_loop_and_a_section(tmp_path: Any) -> None:
+    csv = CSP.replace('mode = "csp"', 'mode = "csv"')
+    assert load(tmp_path, text=csv)
+    found = problems(tmp_path, r"position_gain_ps = 30.0", "", csv)
+    assert any("drive.cascade.position_gain_ps is missing" in text for text in found)
+    virtual = (CONFIGS / "virtual.toml").read_text()
+    assert any(
+        "[drive.cascade] is missing" in text for text in problems(tmp_path, 'mode = "cst"', 'mode = "csv"', virtual)
+    )
+
+
+def test_a_serial_drive_has_no_such_mode(tmp_path: Any) -> None:
+    text = (CONFIGS / "elmo_serial.toml").read_text()
+    found = problems(tmp_path, r'kind = "elmo_serial"', 'kind = "elmo_serial"\nmode = "csp"', text)
+    assert any("drive.mode" in line for line in found)
