@@ -105,7 +105,8 @@ class OtherControllers(can.Listener):
         if self._beside_own_loop and identifier != NMT_ID:
             index = self._written(identifier, data)
             critical = index is not None and (index in _CRITICAL or index in _RPDO_RECORDS)
-            return f"SDO request that writes object {index:04X}" if critical else ""
+            node = identifier - SDO_REQUEST_ID
+            return f"SDO request to node {node} that writes object {index:04X}" if critical else ""
         if identifier == SYNC_ID:
             return f"SYNC ({SYNC_ID:03X}h)"
         if identifier == NMT_ID and len(data) >= 2 and (data[1] == _ALL_NODES or data[1] in self._nodes):

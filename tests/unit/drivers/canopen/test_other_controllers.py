@@ -76,10 +76,10 @@ def test_heartbeats_of_other_nodes_are_kept_as_such() -> None:
     ("identifier", "data", "words"),
     [
         (0x000, bytes([2, NODE]), "1 x NMT 'stop' to node 5"),
-        (0x600 + NODE, b"\x23\x16\x10\x01\0\0\0\0", "1 x SDO request that writes object 1016"),
-        (0x600 + NODE, b"\x2b\x40\x60\x00\x0f\0\0\0", "1 x SDO request that writes object 6040"),
-        (0x600 + NODE, b"\xc2\x00\x14\x05\0\0\0\0", "1 x SDO request that writes object 1400"),
-        (0x600 + NODE, b"\x23\x16\x10\x01", "1 x SDO request that writes object 1016"),
+        (0x600 + NODE, b"\x23\x16\x10\x01\0\0\0\0", "1 x SDO request to node 5 that writes object 1016"),
+        (0x600 + NODE, b"\x2b\x40\x60\x00\x0f\0\0\0", "1 x SDO request to node 5 that writes object 6040"),
+        (0x600 + NODE, b"\xc2\x00\x14\x05\0\0\0\0", "1 x SDO request to node 5 that writes object 1400"),
+        (0x600 + NODE, b"\x23\x16\x10\x01", "1 x SDO request to node 5 that writes object 1016"),
         (0x600 + NODE, b"\x23\x16\x10", ""),  # too short to write anything
         (0x600 + 7, b"\x23\x16\x10\x01\0\0\0\0", ""),  # to another drive
         (0x600 + NODE, b"\x2b\x72\x60\x00\x0f\0\0\0", ""),  # 6072: it does not decide whether there is power
