@@ -4,8 +4,8 @@ Ours, C and cyclictest all keep to the last core, and the load to the first: lef
 core of one measured loop and not that of the next.  Our loop and the one in C run as a process of their own with the
 same priority and locked memory, on a bus that both find commissioned by the same driver; the load begins after that.
 The C loop has no phases, no limits of motion, no supervision and no model of an arm: it is what the exchange costs.
-The Python loops run in this process, as they would in a user's script, with the drive disabled and zero torque.  FOR THE
-VIRTUAL JOINT ONLY.
+The Python loops run in this process, as they would in a user's script, with the drive disabled and zero torque.
+FOR THE VIRTUAL JOINT ONLY.
 """
 
 from __future__ import annotations
