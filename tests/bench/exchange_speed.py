@@ -195,14 +195,15 @@ def run_ours(given: Config | ArmConfig, seconds: float, load_name: str) -> LoopT
                 loop.beat()
                 chunks.append(loop.new_records())
                 time.sleep(POLL_S)
-        ended_early, (fault, value) = not loop.running(), loop.verdict()
+        ended_early, verdicts = not loop.running(), [loop.of_axis(axis).verdict() for axis in range(loop.block.axes)]
         loop.request_stop(StopRequest.OFF)
         end_s = time.monotonic() + END_S
         while time.monotonic() < end_s and loop.running():
             loop.beat()
             time.sleep(POLL_S)
     if ended_early:
-        raise JointctlError(f"the control loop stopped by itself while it was measured: {fault.name} ({value:g})")
+        faults = ", ".join(f"{fault.name} ({value:g})" for fault, value in verdicts)
+        raise JointctlError(f"the control loop stopped by itself while it was measured: {faults}")
     records = np.concatenate(chunks)[round(SETTLE_S * config.loop.rate_Hz) :]
     _require_enabled("our", records["drive_state"] == DriveState.ENABLED)
     rows = np.column_stack([records["wake_late_ns"], records["round_trip_ns"], records["work_ns"]])
@@ -436,20 +437,20 @@ def _against_python(case: Case, rounds: int) -> Iterator[Row]:
     yield from _rows(case.name, intervals, canopen, "canopen SYNC", _INTERVALS)
 
 
-def arm_for_comparison(law: Config, channel: str) -> ArmConfig:
-    """The shipped arm, each joint with the law of `law`, which is the one that the C source knows, and its gravity."""
+def arm_for_comparison(channel: str) -> ArmConfig:
+    """The shipped arm with the law that the C source knows; ours has the arm's model besides."""
     arm = arm_on_bus(load_arm(SHIPPED_ARM), GivenPlace("jointctl", channel))
     joints = tuple(
         changed(
-            joint, control=law.control, loop__cpu=cores()[-1], limits__sample_age_max_s=PATIENCE_S,
-            limits__skipped_max_s=PATIENCE_S, limits__following_error_max_rad=1.0,
+            joint, control__kind="computed_torque_rbf", control__observer_radps=0.0, control__adaptation=None,
+            loop__cpu=cores()[-1], limits__sample_age_max_s=PATIENCE_S, limits__skipped_max_s=PATIENCE_S,
         )
         for joint in arm.joints
     )  # fmt: skip
     return replace(arm, joints=joints)
 
 
-def arm_exchange_rows(law: Config, folder: Path, *, rounds: int, seconds: float) -> Iterator[Row]:
+def arm_exchange_rows(folder: Path, *, rounds: int, seconds: float) -> Iterator[Row]:
     """Three drives against the same exchange in C: a virtual arm of its own, on a virtual bus that models bit times."""
     try:
         program = exchange_program(folder)
@@ -458,7 +459,7 @@ def arm_exchange_rows(law: Config, folder: Path, *, rounds: int, seconds: float)
         return
     channel = f"bench-arm{os.getpid()}"
     with separate_virtual_joint(SHIPPED_ARM, channel, timing=True):
-        yield from _against_c(Case(arm_for_comparison(law, channel), "idle", seconds), program, rounds)
+        yield from _against_c(Case(arm_for_comparison(channel), "idle", seconds), program, rounds)
 
 
 def exchange_rows(config: Config, folder: Path, *, rounds: Rounds, seconds: float, quick: bool) -> Iterator[Row]:

@@ -49,7 +49,7 @@ def _part(name: str, config: Config, folder: Path, quick: bool, verbs: Sequence[
         "law": lambda: _law(config, folder, 15 if quick else 61),
         "arm": lambda: chain(
             arm_rows(pairs=15 if quick else 61, runs=3 if quick else 15),
-            arm_exchange_rows(config, folder, rounds=2 if quick else 16, seconds=1.0 if quick else 4.0),
+            arm_exchange_rows(folder, rounds=2 if quick else 16, seconds=1.0 if quick else 4.0),
         ),
         "loop": lambda: exchange_rows(
             config,
