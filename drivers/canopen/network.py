@@ -113,7 +113,7 @@ class OtherControllers(can.Listener):
             command = NmtCommand(data[0]).name.lower().replace("_", " ") if data[0] in set(NmtCommand) else "unknown"
             return f"NMT {command!r} to {f'node {data[1]}' if data[1] else 'all nodes'}"
         if identifier - SDO_REQUEST_ID in self._nodes:
-            return f"SDO request ({identifier:03X}h)"
+            return f"SDO request to node {identifier - SDO_REQUEST_ID} ({identifier:03X}h)"
         if identifier == HEARTBEAT_ID + self._master_node:
             return f"heartbeat of node {self._master_node}, which is our own (drive.master_node)"
         if identifier in self._rpdo_ids:

@@ -28,7 +28,7 @@ CONTROLLER = [
     (0x000, bytes([128, NODE]), "1 x NMT 'enter pre operational' to node 5"),
     (0x000, bytes([1, 0]), "1 x NMT 'start' to all nodes"),
     (0x000, bytes([77, 9]), "1 x NMT 'unknown' to node 9"),
-    (0x600 + NODE, bytes(8), "1 x SDO request (605h)"),
+    (0x600 + NODE, bytes(8), "1 x SDO request to node 5 (605h)"),
     (0x200 + NODE, bytes(4), "1 x RPDO to node 5 (205h)"),
     (0x500 + 9, bytes(4), "1 x RPDO to node 9 (509h)"),
     (0x700 + MASTER, b"\x05", "1 x heartbeat of node 126, which is our own (drive.master_node)"),
@@ -136,4 +136,4 @@ def test_our_own_frames_are_not_anothers_where_the_interface_hands_them_back(ech
         if echoes:
             assert heard(others, *request) == ""
         heard(others, 0x580 + NODE, bytes(8))
-    assert heard(others, *request) == "1 x SDO request (605h)"  # the twin: the same frame once more is another's
+    assert heard(others, *request) == "1 x SDO request to node 5 (605h)"  # the twin: the same frame once more is another's
