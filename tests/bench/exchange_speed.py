@@ -39,8 +39,7 @@ from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_section import GivenPlace
-from jointctl.tools.configuration.records import axis_constants, trajectory_table
-from jointctl.tools.lockstep import tables_of
+from jointctl.tools.configuration.records import axis_constants, stacked_tables, trajectory_table
 from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.loop_handle import RECEIVE_SHARE, LoopHandle
 from jointctl.tools.verbs.verb_options import arm_on_bus
@@ -160,6 +159,10 @@ def joints_of(given: Config | ArmConfig) -> tuple[Config, ...]:
     return (given,) if isinstance(given, Config) else given.joints
 
 
+def _tables(given: Config | ArmConfig) -> np.ndarray:
+    return stacked_tables([trajectory_table(config) for config in joints_of(given)])
+
+
 @contextmanager
 def commissioned(given: Config | ArmConfig) -> Iterator[tuple[DriveGroup, Any]]:
     """(drives, AxisConstants) of the joints as they stand; afterwards the drives are off."""
@@ -169,7 +172,7 @@ def commissioned(given: Config | ArmConfig) -> Iterator[tuple[DriveGroup, Any]]:
         if isinstance(given, Config):
             yield drives, axis_constants(given, trajectory_table(given), start_position_rad=starts[0])
         else:
-            yield drives, given.axis_constants(list(tables_of(given.joints)), starts)
+            yield drives, given.axis_constants(list(_tables(given)), starts)
     finally:
         drives.make_safe()
         drives.close()
@@ -178,7 +181,7 @@ def commissioned(given: Config | ArmConfig) -> Iterator[tuple[DriveGroup, Any]]:
 def _loop(given: Config | ArmConfig) -> LoopHandle:
     config = joints_of(given)[0]
     arm = None if isinstance(given, Config) else given.model
-    return LoopHandle(config, tables_of(joints_of(given)), CanopenPort, arm=arm)
+    return LoopHandle(config, _tables(given), CanopenPort, arm=arm)
 
 
 def run_ours(given: Config | ArmConfig, seconds: float, load_name: str) -> LoopTimes:

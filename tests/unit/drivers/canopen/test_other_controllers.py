@@ -136,4 +136,6 @@ def test_our_own_frames_are_not_anothers_where_the_interface_hands_them_back(ech
         if echoes:
             assert heard(others, *request) == ""
         heard(others, 0x580 + NODE, bytes(8))
-    assert heard(others, *request) == "1 x SDO request to node 5 (605h)"  # the twin: the same frame once more is another's
+    assert (
+        heard(others, *request) == "1 x SDO request to node 5 (605h)"
+    )  # the twin: the same frame once more is another's
