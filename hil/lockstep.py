@@ -65,7 +65,8 @@ class Codec(NamedTuple):
 class World(NamedTuple):
     """The virtual drives, operational, with their joints and the wires to them; arrays of one record an axis.
 
-    Faults are those of the first axis.
+    Faults are those of one axis: its wire, drive and plant.  What is the computer's (clock, processor, supervisor, the
+    adapter that is off the bus) is all axes' at once.
     """
 
     device: np.ndarray
@@ -75,6 +76,7 @@ class World(NamedTuple):
     faults: np.ndarray  # FaultConstants[N]
     fault_memory: np.ndarray
     arm: ArmPlant = no_arm_plant()  # through which the joints move one another
+    faulty: int = 0  # the axis that has the faults
 
 
 class Scenario(NamedTuple):
@@ -137,10 +139,13 @@ def _to_drive(link: _Link, axis: int, slot: int, sample: Sample) -> None:
         world.device[axis], world.plant_constants[axis], world.plant[axis], world.queue[axis]
     )  # fmt: skip
     frame = link.codec.frame_bytes[slot]
-    if len(world.faults) > 0 and axis == 0:
+    faulty = len(world.faults) > 0
+    off_bus = faulty and link.memory.timespec[_OFF_BUS] != 0
+    if faulty:
+        sample.bus_errors = sample.bus_errors + 1 if off_bus else 0
+    if faulty and axis == world.faulty:
         to_drive(world.faults, world.fault_memory[0], frame, device, joint_c, joint, outgoing, now_ns)
-        sample.bus_errors = sample.bus_errors + 1 if link.memory.timespec[_OFF_BUS] != 0 else 0
-    elif not link.scenario.lost_to_drive:
+    elif not (link.scenario.lost_to_drive or off_bus):
         accept_frame(device, joint_c, joint, frame, now_ns, outgoing)
 
 
@@ -163,9 +168,10 @@ def _receive(link: _Link, samples: np.ndarray, now_ns: int, until_ns: int) -> in
     for axis in range(len(samples)):
         for slot in range(count):
             _to_drive(link, axis, slot, samples[axis])
-        if link.scenario.lost_from_drive:
+        faulty = len(world.faults) > 0
+        if link.scenario.lost_from_drive or (faulty and link.memory.timespec[_OFF_BUS] != 0):
             world.queue[axis].count = 0
-        if len(world.faults) > 0 and axis == 0:
+        if faulty and axis == world.faulty:
             _empty_mailbox(world.fault_memory[0].to_controller, codec, axis, samples, now_ns + _ANSWER_NS)
         else:
             _empty_mailbox(world.queue[axis], codec, axis, samples, now_ns + _ANSWER_NS)
@@ -223,7 +229,10 @@ def _put_set_points(stream: StreamConstants, world: World, scenario: Scenario, p
 @inlined
 def _step_world(world: World, now_ns: int) -> None:
     """Drives and joints up to now; what has come out of the wire by now is handed over."""
-    device, joint_c, joint, outgoing = world.device[0], world.plant_constants[0], world.plant[0], world.queue[0]
+    axis = world.faulty
+    device, joint_c, joint, outgoing = (
+        world.device[axis], world.plant_constants[axis], world.plant[axis], world.queue[axis]
+    )  # fmt: skip
     faults, memory = world.faults, world.fault_memory[0]
     if len(faults) > 0:
         step_faults(faults, memory, device, joint_c, joint, now_ns)

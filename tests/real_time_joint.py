@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from jointctl.hil.elmo.device import ElmoDevice
+from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.virtual_elmo import serve_virtual_elmo
 from jointctl.tools.virtual_joint import serve_virtual_joint
@@ -29,8 +30,8 @@ def schedule(thread: int, policy: int, priority: int) -> None:
 
 
 @contextmanager
-def real_time_joint(config: Config) -> Iterator[Any]:
-    """Bus and CANopen drive of `config`; only their compiled threads come first."""
+def real_time_joint(config: Config | ArmConfig) -> Iterator[Any]:
+    """Bus and CANopen drives of `config`; only their compiled threads come first."""
     before = set(threading.enumerate())
     with serve_virtual_joint(config) as joint:
         for thread in set(threading.enumerate()) - before:

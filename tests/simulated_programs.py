@@ -1,4 +1,4 @@
-"""Supervisor, loop, `jointctl stop` and the virtual drive at simulated time, in one process that can be forked.
+"""Supervisor, loop, `jointctl stop` and the virtual drives at simulated time, in one process that can be forked.
 
 Each program is a greenlet that runs the code that ships: the real `Session`, the real driver, the portable loop on
 the kernels of the compiled one, the real `stop_node`.  Only what waits is replaced: sleeping lets the drive and the
@@ -16,7 +16,7 @@ import mmap
 import struct
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from io import StringIO
 from pathlib import Path
@@ -35,15 +35,22 @@ from jointctl.drivers.canopen import drive as drive_module
 from jointctl.drivers.canopen import switch_off as switch_off_module
 from jointctl.drivers.canopen.drive import CanopenDrive
 from jointctl.drivers.canopen.switch_off import stop_node
+from jointctl.drivers.drive import DriveGroup
 from jointctl.firmware_py.cycle import Word
 from jointctl.firmware_py.libc import NANOSECONDS
+from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase
+from jointctl.hil.arm_plant import no_arm_plant
+from jointctl.hil.canopen.device_core import advance_together
 from jointctl.hil.canopen.records import PowerState
-from jointctl.hil.fault_kinds import fault_memory, no_faults
+from jointctl.hil.fault_kinds import FaultConstants, FaultKind, fault_memory, no_faults
 from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUTHS, Scenario, run_lockstep
 from jointctl.hil.lockstep import World as Joint
+from jointctl.hil.virtual_bus import FrameQueue
+from jointctl.tools.configuration.arm import ArmConfig, ArmModel
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.plant_settings import arm_plant_of
 from jointctl.tools.lockstep import codec_of
 from jointctl.tools.output import Output
 from jointctl.tools.session import loop_handle as loop_module
@@ -52,7 +59,7 @@ from jointctl.tools.session import session as session_module
 from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.control import StopSignals
 from jointctl.tools.session.loop_handle import LoopHandle
-from jointctl.tools.virtual_joint import new_device
+from jointctl.tools.virtual_joint import new_devices
 
 STEP_NS = 1_000_000
 FAST_STEPS = 5
@@ -62,19 +69,30 @@ LONGEST_CHUNK = 250  # cycles of the loop in one compiled call
 FRAME_NS = 1_000
 LOOK_s = 0.005
 SUPERVISOR, SESSION = "supervisor", "session"  # the second: a thread of the first, where that is a user's program
+SWITCHING_OFF = "switching off "  # threads of the first, one a drive of an arm
 _FRAME = struct.Struct("<IB3x8s")
+CUT_OFF = new(FaultConstants)  # nothing gets to the drive, nothing comes from it
+CUT_OFF[0].kind, CUT_OFF[0].duration_s, CUT_OFF[0].magnitude = FaultKind.FRAMES_LOST, 1e9, 1.0
 POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
 
 
 class World:
-    """One virtual drive, the bus, and the programs on it.  `on_frame` runs after each frame."""
+    """The virtual drives, the bus, and the programs on it.  `on_frame` runs after each frame."""
 
-    def __init__(self, config: Config) -> None:
-        self.device = new_device(config)
+    def __init__(self, given: Config | ArmConfig) -> None:
+        joints = [given] if isinstance(given, Config) else list(given.joints)
+        self.devices = new_devices(joints)
+        row = self.devices[0].whole_row
+        self.queues = new(FrameQueue, len(joints))
+        for index, device in enumerate(self.devices):
+            device.queue = self.queues[index : index + 1]
+        arm = no_arm_plant() if isinstance(given, Config) else arm_plant_of(given)
+        self.joints = Joint(*row, self.queues, no_faults(), fault_memory(no_faults()), arm)
         self.now_ns = 1_000_000_000
         self.frames = 0
         self.on_frame: Callable[[int, int], None] = lambda number, identifier: None
         self.lost_to_drive = self.lost_from_drive = False
+        self.cut_off: int | None = None  # the axis whose drive is on the bus no more
         self.fast = False  # frame by frame no more: whole cycles of the loop in one compiled call
         self.long_naps = False  # once the loop runs
         self.ears: list[Any] = []
@@ -86,8 +104,9 @@ class World:
         self.power_changes: list[tuple[int, bool]] = []
         self.enabled_unproven = False
         self.watchdog_proven = lambda: True
-        for frame in self.device.advance(self.now_ns):
-            del frame  # the boot-up message: no one is there yet
+        self._let_joints_move()
+        for device in self.devices:
+            device.advance(self.now_ns)  # the boot-up message: no one is there yet
 
     # --- time ---
 
@@ -134,18 +153,25 @@ class World:
             return STEP_NS
         return (FAST_STEPS if self.powered else OFF_STEPS) * STEP_NS
 
+    def _let_joints_move(self) -> None:
+        """All of them, up to now: each drive alone would move its joint as if it were no arm's."""
+        *row, queues, _, _, arm, _ = self.joints
+        advance_together(*row, self.now_ns, queues, arm)
+
     def _advance(self, to_ns: int) -> None:
         self.now_ns = to_ns
-        for frame in self.device.advance(to_ns):
-            self._from_drive(frame)
+        self._let_joints_move()
+        for axis, device in enumerate(self.devices):
+            for frame in device.advance(to_ns):
+                self._from_drive(axis, frame)
         self.look()
 
     def look(self) -> None:
-        self.note_power(int(self.device.device[0].state), self.now_ns)
+        self.note_power([int(device.device[0].state) for device in self.devices], self.now_ns)
 
-    def note_power(self, state: int, time_ns: int) -> None:
-        """The drive's state at that time."""
-        powered = state in POWERED
+    def note_power(self, states: Sequence[int], time_ns: int) -> None:
+        """The drives' states at that time: `powered` is whether any of them has power."""
+        powered = any(state in POWERED for state in states)
         if powered != self.powered:
             self.powered = powered
             self.power_changes.append((time_ns, powered))
@@ -160,7 +186,7 @@ class World:
     def kill(self, *names: str) -> None:
         """They execute nothing more, nor do their threads; one that is executing now ends here."""
         if SUPERVISOR in names:
-            names = (*names, SESSION)
+            names = (*names, SESSION, *(name for name in self.programs if name.startswith(SWITCHING_OFF)))
         for name in names:
             if (program := self.programs.pop(name, None)) is not None:
                 self.dead.append(program)  # what is forgotten would be unwound, and so act once more
@@ -176,21 +202,27 @@ class World:
     # --- frames ---
 
     def send(self, sender: Any, identifier: int, data: bytes) -> None:
-        """A frame of a program: to every other one, and to the drive, which answers at once."""
+        """A frame of a program: to every other one, and to the drives, which answer at once."""
         self.now_ns += FRAME_NS
         frame = _FRAME.pack(identifier, len(data), data)
-        answers = [] if self.lost_to_drive else self.device.handle(frame, self.now_ns)
+        self._let_joints_move()
+        answers = [
+            (axis, answer)
+            for axis, device in enumerate(self.devices)
+            if not self.lost_to_drive and axis != self.cut_off
+            for answer in device.handle(frame, self.now_ns)
+        ]
         for ear in list(self.ears):
             if ear is not sender:
                 ear.deliver(identifier, data)
         self.look()
         self._count(identifier)
-        for answer in answers:
-            self._from_drive(answer)
+        for axis, answer in answers:
+            self._from_drive(axis, answer)
 
-    def _from_drive(self, frame: bytes) -> None:
+    def _from_drive(self, axis: int, frame: bytes) -> None:
         identifier, size, data = _FRAME.unpack(frame)
-        if not self.lost_from_drive:
+        if not self.lost_from_drive and axis != self.cut_off:
             for ear in list(self.ears):
                 ear.deliver(identifier, data[:size])
         self._count(identifier)
@@ -276,25 +308,16 @@ class SimulatedLoop(LoopHandle):
     world: World
 
     def __init__(
-        self, config: Config, table: Any, port: type, tail_path: Path | None = None, marker_fd: int | None = None
-    ) -> None:
-        self.block = loop_module.SharedBlock.create(len(table), port)
-        self.block.table[:] = table
+        self, config: Config, table: Any, port: type, tail_path: Path | None = None, marker_fd: int | None = None,
+        arm: ArmModel | None = None,
+    ) -> None:  # fmt: skip
+        self.block = loop_module.new_block(table, port, arm)
         self._tail = self.lost_records = 0
         self._after_end = config.drive.when_the_loop_ends
         self._period_ns = round(NANOSECONDS / config.loop.rate_Hz)
         self._process: Any = SimulatedProcess()
         self._bus = SimulatedBus(self.world)
-        device = self.world.device
         self._memory, self._codec = self.block.memory(), codec_of(self.block.port)
-        self._joint = Joint(
-            device.device,
-            device.plant_constants,
-            device.plant_state,
-            device.queue,
-            no_faults(),
-            fault_memory(no_faults()),
-        )
         self._cycles(0, 0)  # loads what is compiled, before anything is forked
         self.block.words[Word.READY] = 1
 
@@ -316,7 +339,7 @@ class SimulatedLoop(LoopHandle):
         world.sleep_until_ns(deadline_ns)
         if not world.fast:
             return
-        while self.block.state[0].phase != AxisPhase.FINISHED:
+        while (self.block.state.phase != AxisPhase.FINISHED).any():
             cycles = max(1, min(LONGEST_CHUNK, (world.next_wake_ns() - deadline_ns) // self._period_ns))
             deadline_ns += self._cycles(deadline_ns, cycles) * self._period_ns
             world.sleep_until_ns(deadline_ns)
@@ -326,20 +349,24 @@ class SimulatedLoop(LoopHandle):
     def _cycles(self, first_ns: int, cycles: int) -> int:
         """So many whole cycles in one call; how many there were until FINISHED."""
         block, world, period_ns = self.block, self.world, self._period_ns
-        truth = np.zeros((cycles, TRUTHS))
+        axes = block.axes
+        truth, joints = np.zeros((cycles, TRUTHS * axes)), world.joints
+        if world.cut_off is not None:
+            joints = joints._replace(faults=CUT_OFF, fault_memory=fault_memory(CUT_OFF, -1), faulty=world.cut_off)
         scenario = Scenario(
             first_ns, period_ns, cycles, supervisor_beats=False,
             lost_to_drive=world.lost_to_drive, lost_from_drive=world.lost_from_drive,
         )  # fmt: skip
-        written, rows = run_lockstep(self._memory, self._codec, self._joint, scenario, truth)
-        self._joint.queue[0].count = 0
+        written, rows = run_lockstep(self._memory, self._codec, joints, scenario, truth)
+        world.queues.count[:] = 0
+        done = written // axes
         for row in range(rows):
-            world.note_power(int(truth[row, TRUE_POWER_STATE]), first_ns + row * period_ns)
-        if written:
-            world.now_ns = max(world.now_ns, first_ns + (written - 1) * period_ns)
+            world.note_power(truth[row, TRUE_POWER_STATE::TRUTHS].astype(int).tolist(), first_ns + row * period_ns)
+        if done:
+            world.now_ns = max(world.now_ns, first_ns + (done - 1) * period_ns)
             block.words[Word.LOOP_NS] = world.now_ns
             world.look()
-        return int(written)
+        return done
 
     def _ended(self) -> None:
         self.block.words[Word.ENDED] = 1
@@ -406,20 +433,43 @@ class SilentLog:
     def write_temperature(self, time_ns: int, degC: float | None) -> None: ...
 
 
-def stop_of_this_computer(world: World, signals: StopSignals, node: int) -> None:
+def stop_of_this_computer(world: World, signals: StopSignals, nodes: Sequence[int]) -> None:
     """`jointctl stop`: the request through the lock of the bus, and the frames."""
-    stop_of_another_computer(world, node)
+    stop_of_another_computer(world, nodes)
     signals.on_stop_command()
 
 
-def stop_of_another_computer(world: World, node: int) -> None:
+def stop_of_another_computer(world: World, nodes: Sequence[int]) -> None:
     """The frames alone."""
-    world.start("stop", lambda: stop_node(None, node, sleep=world.sleep))  # type: ignore[arg-type]
+    for node in nodes:
+        world.start(f"stop {node}", partial(stop_node, None, node, sleep=world.sleep))  # type: ignore[arg-type]
+
+
+class SimulatedGroup(DriveGroup):
+    """Switches its drives off at the same time, each in a program of the world in the place of a thread."""
+
+    def __init__(self, world: World, drives: Sequence[CanopenDrive]) -> None:
+        super().__init__(drives)
+        self._world = world
+
+    def make_safe(self, *, asked: bool = False) -> list[str]:
+        if len(self.drives) == 1:
+            return super().make_safe(asked=asked)
+        states: dict[int, str] = {}
+
+        def switch_off(axis: int) -> None:
+            states[axis] = self.drives[axis].make_safe(asked=asked)
+
+        for axis in range(len(self.drives)):
+            self._world.start(f"{SWITCHING_OFF}{axis}", partial(switch_off, axis))
+        while len(states) < len(self.drives):
+            self._world.sleep(LOOK_s)
+        return [states[axis] for axis in range(len(self.drives))]
 
 
 @contextlib.contextmanager
-def simulated(joint: Config) -> Iterator[World]:
-    """The world of one run, with the drive of `joint`; supervisors that are made inside run in it."""
+def simulated(joint: Config | ArmConfig) -> Iterator[World]:
+    """The world of one run, with the drives of `joint`; supervisors that are made inside run in it."""
     logging.getLogger("canopen").setLevel(logging.CRITICAL)
     world = World(joint)
 
@@ -436,11 +486,14 @@ def simulated(joint: Config) -> Iterator[World]:
     def new_network(_: Any, __: Any, *listeners: can.Listener) -> SimulatedNetwork:
         return SimulatedNetwork(world, listeners)
 
-    def open_simulated(wanted: Config, gate: Callable[[], None] = lambda: None) -> CanopenDrive:
+    def open_simulated(_: Any, configs: Sequence[Config], gate: Callable[[], None] = lambda: None) -> DriveGroup:
         bus: Any = None
-        return CanopenDrive(
-            bus, canopen_settings(wanted), sleep=world.sleep, gate=gate, clock=lambda: world.now_ns * 1e-9
-        )
+        drives: list[CanopenDrive] = []
+        for config in configs:
+            settings = canopen_settings(config)
+            drives.append(CanopenDrive(bus, settings, world.sleep, gate=gate, clock=lambda: world.now_ns * 1e-9))
+            bus = drives[0]
+        return SimulatedGroup(world, drives)
 
     loops: list[SimulatedLoop] = []
 
@@ -463,7 +516,7 @@ def simulated(joint: Config) -> Iterator[World]:
             (portable_loop, "slept_ns", lambda *_: 0),
             (loop_module, "mmap", private),
             (session_module, "LoopHandle", new_loop),
-            (CanopenSession, "open", lambda _, *arguments: open_simulated(*arguments)),
+            (CanopenSession, "open_all", open_simulated),
             (session_module, "recording", lambda _: contextlib.nullcontext()),
             (session_module, "RunLogWriter", SilentLog),
             (live_joint_module, "threading", threads),

@@ -351,6 +351,8 @@ class LockstepArm:
         self.plant_constants = np.concatenate([joint.plant_constants for joint in joints]).view(np.recarray)
         self.plant_state = np.concatenate([joint._virtual.plant_state for joint in joints]).view(np.recarray)
         self._starts_rad = [joint.report.start_position_rad for joint in joints]
+        counts = np.abs(self._devices.counts_per_rad)
+        self.quick_stop_radps2 = self._devices.drive.quick_stop_deceleration / counts  # of each drive, float64 (N,)
         self.tables = stacked_tables([trajectory_table(config) for config in arm.joints])
 
     def constants(self) -> Any:
@@ -374,29 +376,58 @@ class LockstepArm:
 
         `model` is what the controller believes of the arm, `plant` what the arm is.
         """
-        constants = (self.constants() if constants is None else constants).copy()
+        constants = self.constants() if constants is None else constants
+        plants = self.plant_constants if plant_constants is None else plant_constants, self.plant_state
+        world = self._world(plants, arm_plant_of(self.arm) if plant is None else plant)
+        cycles = LockstepJoint._longest_cycles(constants[0], longest_s)
+        return self._carry_out(
+            constants, self.arm.model.memory() if model is None else model, world,
+            cycles=cycles, stop_cycle=stop_cycle, log_every=log_every,
+        )  # fmt: skip
+
+    def run_with_faults(
+        self,
+        faults: Any,
+        faulty: int,
+        constants: Any,
+        plants: tuple[Any, Any],
+        plant: ArmPlant,
+        *,
+        longest_s: float,
+        tail_s: float,
+    ) -> list[LockstepRun]:
+        """As `run`, with these `FaultConstants` on joint `faulty`; times count from the start of the run.
+
+        `plants`: constants and states, one a joint.  The joints are watched for `tail_s` after the controller has
+        ended.
+        """
+        world = self._world(plants, plant)._replace(faults=faults, fault_memory=fault_memory(faults, -1), faulty=faulty)
+        tail_cycles = int(tail_s / float(constants[0].law.period_s))
+        cycles = LockstepJoint._longest_cycles(constants[0], longest_s)
+        return self._carry_out(constants, self.arm.model.memory(), world, cycles=cycles, tail_cycles=tail_cycles)
+
+    def _world(self, plants: tuple[Any, Any], plant: ArmPlant) -> World:
+        """The drives, and what they move, as they are when a run begins; constants and states of the joints."""
+        return World(
+            self._devices.copy(), plants[0], plants[1].copy(), self._queues.copy(), NO_FAULTS,
+            fault_memory(NO_FAULTS, 0), ArmPlant(*(part.copy() for part in plant)),
+        )  # fmt: skip
+
+    def _carry_out(self, constants: Any, model: Arm, world: World, **how: Any) -> list[LockstepRun]:
+        """`how`: fields of `Scenario`."""
+        constants = constants.copy()
         axes, first = len(constants), constants[0]
         state = new(AxisState, axes)
         for axis in range(axes):
             reset_axis(constants[axis], state[axis])
-        cycles = LockstepJoint._longest_cycles(first, longest_s)
-        rows = cycles // log_every + 1
-        arm = self.arm.model.memory() if model is None else model
-        memory = _memory(constants, state, self.tables, new(LogRecord, rows * axes), arm)
-        plants = self.plant_state.copy()
-        connected = arm_plant_of(self.arm) if plant is None else ArmPlant(*(part.copy() for part in plant))
-        world = World(
-            self._devices.copy(), self.plant_constants if plant_constants is None else plant_constants, plants,
-            self._queues.copy(), NO_FAULTS, fault_memory(NO_FAULTS, 0), connected,
-        )  # fmt: skip
-        scenario = Scenario(
-            self.start_ns, round(float(first.law.period_s) * 1e9), cycles, stop_cycle, log_every=log_every
-        )
-        truth = np.zeros((rows, TRUTHS * axes))
+        scenario = Scenario(self.start_ns, round(float(first.law.period_s) * 1e9), **how)
+        rows = scenario.cycles // scenario.log_every + 1
+        memory = _memory(constants, state, self.tables, new(LogRecord, rows * axes), model)
+        truth = np.zeros((rows + scenario.tail_cycles, TRUTHS * axes))
         written, kept = run_lockstep(memory, codec_of(self._ports.copy()), world, scenario, truth)
         return [
             LockstepRun(
-                memory.ring[axis:written:axes], state[axis], plants[axis], world.device[axis],
+                memory.ring[axis:written:axes], state[axis], world.plant[axis], world.device[axis],
                 Fault(int(state[axis].fault)), truth[:kept, TRUTHS * axis : TRUTHS * (axis + 1)],
             )
             for axis in range(axes)

@@ -189,15 +189,15 @@ def serve_virtual_joint(given: Config | ArmConfig, timing: bool = False) -> Iter
 
 @contextmanager
 def separate_virtual_joint(
-    config_path: Path, channel: str, tell: Callable[[str], None] = lambda _: None
+    config_path: Path, channel: str, tell: Callable[[str], None] = lambda _: None, *, timing: bool = False
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """`jointctl hil` as a process of its own on a bus of the given name; ended when the block is left.
+    """`jointctl hil` as a process of its own on a bus of the given name, with `--timing` or not; ended with the block.
 
     `tell` gets a line now and then while it compiles.  Raises `BusError` if it ends, or hangs, before it is ready.
     """
     read_end, write_end = os.pipe()
     command = [sys.executable, "-P", "-m", "jointctl.tools.verbs", "hil", str(config_path), "--interface", "jointctl"]
-    command += ["--channel", channel, "--ready-fd", str(write_end), "--quiet"]
+    command += ["--channel", channel, "--ready-fd", str(write_end), "--quiet", *(["--timing"] if timing else [])]
     process = subprocess.Popen(command, pass_fds=(write_end,), stdin=subprocess.DEVNULL, start_new_session=True)
     os.close(write_end)
     try:

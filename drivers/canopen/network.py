@@ -105,14 +105,15 @@ class OtherControllers(can.Listener):
         if self._beside_own_loop and identifier != NMT_ID:
             index = self._written(identifier, data)
             critical = index is not None and (index in _CRITICAL or index in _RPDO_RECORDS)
-            return f"SDO request that writes object {index:04X}" if critical else ""
+            node = identifier - SDO_REQUEST_ID
+            return f"SDO request to node {node} that writes object {index:04X}" if critical else ""
         if identifier == SYNC_ID:
             return f"SYNC ({SYNC_ID:03X}h)"
         if identifier == NMT_ID and len(data) >= 2 and (data[1] == _ALL_NODES or data[1] in self._nodes):
             command = NmtCommand(data[0]).name.lower().replace("_", " ") if data[0] in set(NmtCommand) else "unknown"
             return f"NMT {command!r} to {f'node {data[1]}' if data[1] else 'all nodes'}"
         if identifier - SDO_REQUEST_ID in self._nodes:
-            return f"SDO request ({identifier:03X}h)"
+            return f"SDO request to node {identifier - SDO_REQUEST_ID} ({identifier:03X}h)"
         if identifier == HEARTBEAT_ID + self._master_node:
             return f"heartbeat of node {self._master_node}, which is our own (drive.master_node)"
         if identifier in self._rpdo_ids:

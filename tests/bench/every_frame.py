@@ -1,12 +1,13 @@
 """A stop, a death, another controller or a loss after EVERY frame of a run: is the joint off in time, and off for good?
 
-    python tests/bench/every_frame.py [--kind run|sweep|program] [--mode cst|csp|csv] [--deadline yes|no]
+    python tests/bench/every_frame.py [--kind run|sweep|program|arm] [--mode cst|csp|csv] [--deadline yes|no]
                                       [--every 1] [--rest 20]
                                       [--workers 2] [--phase NAME] [--injection NAME]
                                       [--cluster tcp://127.0.0.1:8786] [--parts 8]
 
 The run is simulated (`tests/simulated_programs.py`): supervisor, loop, `jointctl stop` and virtual drive at simulated
-time, frame by frame; `program` is a user's program that sends set-points through `jointctl.Joint`.  Right after frame k
+time, frame by frame; `program` is a user's program that sends set-points through `jointctl.Joint`, `arm` a run of the
+shipped arm, where what is done to one drive is done to that of the middle joint.  Right after frame k
 the process is forked for each injection; the child carries the run on to its end and judges it, the parent goes on as
 if nothing had been.  `--rest N`: every Nth frame where nothing changes: while the loop waits with the drive off, and
 from 100 ms after enabling until the stop.  Exit code 1 on a violation.
@@ -41,6 +42,7 @@ from jointctl.firmware_py.cycle import Word  # noqa: E402
 from jointctl.firmware_py.states import Fault  # noqa: E402
 from jointctl.joint import Joint  # noqa: E402
 from jointctl.tools.child_process import processors  # noqa: E402
+from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm  # noqa: E402
 from jointctl.tools.configuration.canopen import canopen_section  # noqa: E402
 from jointctl.tools.configuration.config import Config  # noqa: E402
 from jointctl.tools.configuration.load import load_config, shipped_config  # noqa: E402
@@ -52,7 +54,7 @@ from jointctl.tools.session.control import (  # noqa: E402
     StopSignals,
 )
 from jointctl.tools.session.display import PhaseLines  # noqa: E402
-from jointctl.tools.session.plan import resolve  # noqa: E402
+from jointctl.tools.session.plan import resolve, resolve_arm  # noqa: E402
 from jointctl.tools.session.result import RunResult  # noqa: E402
 from jointctl.tools.session.session import Session  # noqa: E402
 from tests.simulated_programs import (  # noqa: E402
@@ -82,15 +84,28 @@ class Scene:
     """One run, and what became of it."""
 
     world: World
-    config: Config
+    joints: tuple[Config, ...]
     signals: StopSignals
     carried_out: Callable[[], RunResult | None]  # the whole of the supervisor's program
     outcome: str = ""  # how the supervisor ended: "" while it runs
     text: str = ""
 
     @property
+    def config(self) -> Config:
+        return self.joints[0]
+
+    @property
+    def nodes(self) -> list[int]:
+        return [canopen_section(config).node for config in self.joints]
+
+    @property
+    def axis(self) -> int:
+        """Of the joint that an injection is for, if it is for one."""
+        return len(self.joints) // 2
+
+    @property
     def node(self) -> int:
-        return canopen_section(self.config).node
+        return self.nodes[self.axis]
 
     @property
     def loop(self) -> Any:
@@ -104,6 +119,12 @@ class Scene:
             return "commissioning"
         return "switching off" if loop.block.words[Word.ENDED] else loop.phase.name.lower().replace("_", " ")
 
+    def names_joint(self, injection: str) -> bool:
+        """Whether the message says whose drive it was, if it was one's."""
+        if not (INJECTIONS[injection].of_one_drive or injection.startswith(OF_ONE_DRIVE)):
+            return True
+        return f"node {self.node}" in self.text or self.joints[self.axis].path.stem in self.text
+
     def carry_out(self) -> None:
         """The supervisor's program."""
         try:
@@ -116,9 +137,10 @@ class Scene:
             self.outcome = "done" if result is not None else "declined"
             if result is not None and result.stopped_by not in ("", live_joint.WHO):
                 self.outcome, self.text = "interrupted", result.stopped_by
-            elif result is not None and result.fault is not Fault.NONE:
+            elif result is not None and any(one.fault is not Fault.NONE for one in result.joints):
                 self.outcome = "fault"
-                self.text = f"{result.fault.name}: {result.fault_text}"
+                faulty = [one for one in result.joints if one.fault is not Fault.NONE]
+                self.text = "; ".join(f"{one.name} {one.fault.name}: {one.fault_text}" for one in faulty)
 
 
 SEEN: list[Any] = []  # loops of this process
@@ -157,7 +179,8 @@ class Injection:
     """`reaction_s`: until the joint is being stopped, at most (docs/safety.md); `causes`: one must be in the message.
 
     `may_enable`: the program that would enable cannot know of it yet.  `other_controller`: it writes to the drive while
-    the loop enables it, which goes on until the supervisor's next look.
+    the loop enables it, which goes on until the supervisor's next look.  `of_one_drive`: of an arm, the message must
+    name that joint or its node.
     """
 
     act: Callable[[Scene], None]
@@ -165,6 +188,7 @@ class Injection:
     causes: tuple[str, ...] = ()
     may_enable: bool = False
     other_controller: bool = False
+    of_one_drive: bool = False
 
 
 def at_once(_: Config) -> float:
@@ -189,10 +213,11 @@ SILENCE = ("no answer", "does not answer", "STALE", "NO_SAMPLES", "SAMPLES_MISSI
            "ENABLE_TIMEOUT", "OFF_TIMEOUT", "did not confirm", "watchdog tripped", "cannot be read",
            "timed out")  # fmt: skip
 HANGS = "the program hangs"  # but the session's thread goes on
+CUT_OFF = "one drive is cut off"
 INJECTIONS = {
-    "stop": Injection(lambda s: stop_of_this_computer(s.world, s.signals, s.node), at_once, (STOP_COMMAND,)),
+    "stop": Injection(lambda s: stop_of_this_computer(s.world, s.signals, s.nodes), at_once, (STOP_COMMAND,)),
     "stop of another computer": Injection(
-        lambda s: stop_of_another_computer(s.world, s.node), at_once, OTHERS, other_controller=True
+        lambda s: stop_of_another_computer(s.world, s.nodes), at_once, OTHERS, other_controller=True
     ),
     "loop dies": Injection(die("loop"), by_heartbeat, ("loop process",), may_enable=True),
     "supervisor dies": Injection(die("supervisor"), by_ramp, may_enable=True),
@@ -212,7 +237,11 @@ INJECTIONS = {
     ),
     "frames to the drive lost": Injection(lose("lost_to_drive"), by_heartbeat, SILENCE),
     "frames of the drive lost": Injection(lose("lost_from_drive"), by_heartbeat, SILENCE, may_enable=True),
+    CUT_OFF: Injection(
+        lambda s: setattr(s.world, "cut_off", s.axis), by_heartbeat, SILENCE, may_enable=True, of_one_drive=True
+    ),
 }
+OF_ONE_DRIVE = ("NMT ", "SDO ")  # begin the names of these
 
 
 @dataclass
@@ -266,23 +295,34 @@ def judge(
             problems.append("the run went on as if nothing had been")
         elif session.outcome != "done" and not any(cause in session.text for cause in injection.causes):
             problems.append(f"the message does not name the cause: {session.outcome}: {session.text[:200]}")
+        elif session.outcome != "done" and len(session.joints) > 1 and not session.names_joint(name):
+            problems.append(f"the message does not name the joint: {session.outcome}: {session.text[:200]}")
     return verdict
 
 
-def prepared(kind: str, deadline: bool, folder: Path, mode: str = "cst") -> tuple[Config, Config]:
-    """The configuration of a short run, and that of its virtual drive, which has all objects."""
-    text = shipped_config("virtual" if mode == "cst" else "csp").read_text()
-    text = re.sub(r'(?m)^mode = "\w+"', f'mode = "{mode}"', text)
-    for key, value in SHORT.items():
-        text = re.sub(rf"(?m)^{key} = \S+", f"{key} = {value}", text)
+def prepared(
+    kind: str, deadline: bool, folder: Path, mode: str = "cst"
+) -> tuple[Config | ArmConfig, Config | ArmConfig]:
+    """The configuration of a short run, and that of its virtual drives, which have all objects."""
     eds = (ROOT / "configs" / "virtual_joint.eds").read_text()
     if not deadline:
         eds, count = re.subn(r"(?ims)^\[1400sub5\].*?(?=^\[|\Z)", "", eds)
         assert count == 1
-    (folder / "joint.eds").write_text(eds)
-    (folder / "drive.toml").write_text(text)
-    (folder / f"{kind}.toml").write_text(text.replace('"virtual_joint.eds"', '"joint.eds"'))
-    return load_config(folder / f"{kind}.toml"), load_config(folder / "drive.toml")
+    found: list[Config | ArmConfig] = []
+    shipped = SHIPPED_ARM if kind == "arm" else shipped_config("virtual" if mode == "cst" else "csp")
+    for name, its_eds in (("run", "joint.eds"), ("drive", "virtual_joint.eds")):
+        own = folder / name
+        own.mkdir()
+        (own / "joint.eds").write_text(eds)
+        for path in shipped.parent.iterdir() if kind == "arm" else [shipped]:
+            text = path.read_text()
+            for key, value in SHORT.items():
+                text = re.sub(rf"(?m)^{key} = \S+", f"{key} = {value}", text)
+            if kind != "arm":
+                text = re.sub(r'(?m)^mode = "\w+"', f'mode = "{mode}"', text)
+            (own / path.name).write_text(text.replace('"virtual_joint.eds"', f'"{its_eds}"'))
+        found.append((load_arm if kind == "arm" else load_config)(own / shipped.name))
+    return found[0], found[1]
 
 
 def of_a_program(config: Config, control: Control, world: World) -> Callable[[], RunResult | None]:
@@ -306,9 +346,11 @@ def of_a_program(config: Config, control: Control, world: World) -> Callable[[],
     return send
 
 
-def new_session(kind: str, config: Config, control: Control, folder: Path) -> Session:
+def new_session(kind: str, config: Config | ArmConfig, control: Control, folder: Path) -> Session:
     output, log = quiet_output(), folder / "log.mcap"
     consent = TerminalConsent(output, assume_yes=True)
+    if isinstance(config, ArmConfig):
+        return Session(resolve_arm(config), consent, output, control, lambda _: PhaseLines(output))
     if kind == "run":
         plan = replace(resolve(config), log_path=log)
         return Session(plan, consent, output, control, lambda _: PhaseLines(output))
@@ -339,7 +381,8 @@ class Exhaustion:
         self.parent = os.getppid()  # ends with it: no one would read what this finds
         self.chosen = self.in_rest = 0
         self.phases: list[str] = []  # the only ones, or all
-        self.injections = [name for name in INJECTIONS if kind == "program" or name != HANGS]
+        only = {HANGS: "program", CUT_OFF: "arm"}  # to a single drive that is frames lost both ways
+        self.injections = [name for name in INJECTIONS if only.get(name, kind) == kind]
         self.why: tuple[str, int, str, int, bool, int] | None = None
 
     def run(self) -> int:
@@ -362,7 +405,7 @@ class Exhaustion:
                 assert not world.powered
                 return world.frames
 
-    def _warm_up(self, config: Config, joint: Config, folder: Path, name: str) -> None:
+    def _warm_up(self, config: Config | ArmConfig, joint: Config | ArmConfig, folder: Path, name: str) -> None:
         """One run with an injection: what is loaded or remembered at its first use would be so in every child."""
         with simulated(joint) as world:
             session = self._start(config, world, folder)
@@ -372,7 +415,7 @@ class Exhaustion:
             world.run(lambda: world.now_ns > LONGEST_s * 1e9)
         SEEN.clear()
 
-    def _start(self, config: Config, world: World, folder: Path) -> Scene:
+    def _start(self, config: Config | ArmConfig, world: World, folder: Path) -> Scene:
         from jointctl.tools.session import session as session_module
 
         made = session_module.LoopHandle
@@ -383,12 +426,14 @@ class Exhaustion:
 
         session_module.LoopHandle = make  # type: ignore[misc, assignment]
         if self.kind == "program":  # its session has a thread of its own
+            assert isinstance(config, Config)
             signals = StopSignals(wake=lambda: None)
-            session = Scene(world, config, signals, of_a_program(config, Control(signals), world))
+            session = Scene(world, (config,), signals, of_a_program(config, Control(signals), world))
         else:
             signals = StopSignals(wake=lambda: signals.on_signal(15, None))
             supervisor = new_session(self.kind, config, Control(signals), folder)
-            session = Scene(world, supervisor.plan.config, signals, supervisor.run)
+            joints = tuple(joint.config for joint in supervisor.plan.joints)
+            session = Scene(world, joints, signals, supervisor.run)
         world.start(SUPERVISOR, session.carry_out)
         return session
 
@@ -494,8 +539,8 @@ def rows_of_parts(words: list[str], parts: int, workers: Workers) -> Iterator[di
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kind", choices=("run", "sweep", "program"), action="append")
-    parser.add_argument("--mode", choices=("cst", "csp", "csv"), default="cst", help="drive.mode of the joint")
+    parser.add_argument("--kind", choices=("run", "sweep", "program", "arm"), action="append")
+    parser.add_argument("--mode", choices=("cst", "csp", "csv"), default="cst", help="drive.mode of a joint")
     parser.add_argument("--deadline", choices=("yes", "no"), action="append", help="whether the drive has 1400:5")
     parser.add_argument("--every", type=int, default=1, help="every Nth of the frames that would be tried")
     parser.add_argument("--rest", type=int, default=20, help="every Nth frame where nothing changes")
@@ -506,7 +551,7 @@ def main() -> int:
     parser.add_argument("--injection", choices=list(INJECTIONS), action="append", help="only this one")
     parser.add_argument("--part", help=argparse.SUPPRESS)
     given = parser.parse_args()
-    kinds, deadlines = given.kind or ["run", "sweep", "program"], given.deadline or ["yes", "no"]
+    kinds, deadlines = given.kind or ["run", "sweep", "program", "arm"], given.deadline or ["yes", "no"]
     if given.part:
         number, count = map(int, given.part.split("/"))
         one = Exhaustion(

@@ -1,11 +1,11 @@
-"""The loop on the virtual joint against the same exchange in C, cyclictest and Python loops; idle and under load.
+"""The loop on the virtual joint or arm against the same exchange in C, cyclictest and Python loops; idle, under load.
 
 Ours, C and cyclictest all keep to the last core, and the load to the first: left to the system, the load shares the
 core of one measured loop and not that of the next.  Our loop and the one in C run as a process of their own with the
 same priority and locked memory, on a bus that both find commissioned by the same driver; the load begins after that.
-The C loop has no phases, no limits of motion and no supervision: it is what the exchange itself costs.  The Python
-loops run in this process, as they would in a user's script, with the drive disabled and zero torque.  FOR THE VIRTUAL
-JOINT ONLY.
+The C loop has no phases, no limits of motion, no supervision and no model of an arm: it is what the exchange costs.
+The Python loops run in this process, as they would in a user's script, with the drive disabled and zero torque.
+FOR THE VIRTUAL JOINT ONLY.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,18 +32,21 @@ from jointctl.drivers.can.open import open_cyclic_end
 from jointctl.drivers.can.virtual_bus import VirtualBus
 from jointctl.drivers.canopen.cyclic import CanopenPort
 from jointctl.drivers.canopen.identifiers import RPDO1_ID, SYNC_ID, TPDO1_ID
-from jointctl.drivers.drive import Drive
+from jointctl.drivers.drive import DriveGroup
 from jointctl.drivers.errors import JointctlError
 from jointctl.firmware_py.states import DriveState, StopRequest
+from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.configuration.records import axis_constants, trajectory_table
+from jointctl.tools.configuration.drive_section import GivenPlace
+from jointctl.tools.configuration.records import axis_constants, stacked_tables, trajectory_table
 from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.loop_handle import RECEIVE_SHARE, LoopHandle
+from jointctl.tools.verbs.verb_options import arm_on_bus
 from jointctl.tools.virtual_joint import separate_virtual_joint
 from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
 from tests.bench.c_programs import NoCompilerError, exchange_program, setting_doubles
-from tests.bench.paired import Row, compared, interleaved, skipped
+from tests.bench.paired import Row, compared, interleaved, measured, skipped
 from tests.configurations import changed
 
 # --- load: a busy thread of this very process, or a busy process ---
@@ -125,6 +128,7 @@ class LoopTimes:
     wake_us: np.ndarray
     round_trip_us: np.ndarray
     work_us: np.ndarray
+    skipped: int = 0  # slots
 
     def quantile(self, name: str, share: float) -> float:
         """Of `wake`, `round_trip` or `work` [us]; nan where nothing was measured."""
@@ -150,21 +154,40 @@ PATIENCE_S = 0.25  # so long a computer may stand still without ending the run
 ENABLED_SHARE = 0.9
 
 
+def joints_of(given: Config | ArmConfig) -> tuple[Config, ...]:
+    """One, or those of an arm."""
+    return (given,) if isinstance(given, Config) else given.joints
+
+
+def _tables(given: Config | ArmConfig) -> np.ndarray:
+    return stacked_tables([trajectory_table(config) for config in joints_of(given)])
+
+
 @contextmanager
-def commissioned(config: Config) -> Iterator[tuple[Drive, Any]]:
-    """(drive, AxisConstants) of the joint as it stands; afterwards the drive is off."""
-    drive = CanopenSession().open(config)
+def commissioned(given: Config | ArmConfig) -> Iterator[tuple[DriveGroup, Any]]:
+    """(drives, AxisConstants) of the joints as they stand; afterwards the drives are off."""
+    drives = CanopenSession().open_all(joints_of(given))
     try:
-        report = drive.commission()
-        yield drive, axis_constants(config, trajectory_table(config), start_position_rad=report.start_position_rad)
+        starts = [report.start_position_rad for report in drives.commission()]
+        if isinstance(given, Config):
+            yield drives, axis_constants(given, trajectory_table(given), start_position_rad=starts[0])
+        else:
+            yield drives, given.axis_constants(list(_tables(given)), starts)
     finally:
-        drive.make_safe()
-        drive.close()
+        drives.make_safe()
+        drives.close()
 
 
-def run_ours(config: Config, seconds: float, load_name: str) -> LoopTimes:
+def _loop(given: Config | ArmConfig) -> LoopHandle:
+    config = joints_of(given)[0]
+    arm = None if isinstance(given, Config) else given.model
+    return LoopHandle(config, _tables(given), CanopenPort, arm=arm)
+
+
+def run_ours(given: Config | ArmConfig, seconds: float, load_name: str) -> LoopTimes:
     """The control loop for so long after it has settled; this process only gives its sign of life meanwhile."""
-    with LoopHandle(config, trajectory_table(config), CanopenPort) as loop, commissioned(config) as (drive, constants):
+    config = joints_of(given)[0]
+    with _loop(given) as loop, commissioned(given) as (drive, constants):
         loop.wait_ready()
         drive.start_cyclic()
         loop.go(constants, drive.port())
@@ -175,18 +198,19 @@ def run_ours(config: Config, seconds: float, load_name: str) -> LoopTimes:
                 loop.beat()
                 chunks.append(loop.new_records())
                 time.sleep(POLL_S)
-        ended_early, (fault, value) = not loop.running(), loop.verdict()
+        ended_early, verdicts = not loop.running(), [loop.of_axis(axis).verdict() for axis in range(loop.block.axes)]
         loop.request_stop(StopRequest.OFF)
         end_s = time.monotonic() + END_S
         while time.monotonic() < end_s and loop.running():
             loop.beat()
             time.sleep(POLL_S)
     if ended_early:
-        raise JointctlError(f"the control loop stopped by itself while it was measured: {fault.name} ({value:g})")
+        faults = ", ".join(f"{fault.name} ({value:g})" for fault, value in verdicts)
+        raise JointctlError(f"the control loop stopped by itself while it was measured: {faults}")
     records = np.concatenate(chunks)[round(SETTLE_S * config.loop.rate_Hz) :]
     _require_enabled("our", records["drive_state"] == DriveState.ENABLED)
     rows = np.column_stack([records["wake_late_ns"], records["round_trip_ns"], records["work_ns"]])
-    return times_from_ns(rows.astype(np.int64))
+    return replace(times_from_ns(rows.astype(np.int64)), skipped=int(records["skipped"].sum()))
 
 
 def _require_enabled(whose: str, enabled: np.ndarray) -> None:
@@ -196,35 +220,37 @@ def _require_enabled(whose: str, enabled: np.ndarray) -> None:
         raise JointctlError(f"{whose} loop had the drive enabled in {share:.0%} of its cycles only")
 
 
-def run_c(program: Path, config: Config, seconds: float, load_name: str) -> LoopTimes:
+def run_c(program: Path, given: Config | ArmConfig, seconds: float, load_name: str) -> LoopTimes:
     """The same exchange in C for so long after it has settled."""
+    config = joints_of(given)[0]
     rate_Hz = config.loop.rate_Hz
     cycles = round((SETTLE_S + seconds) * rate_Hz)
     period_ns = round(1e9 / rate_Hz)
     with (
         open_cyclic_end(config.bus.interface, config.bus.channel) as end,
-        commissioned(config) as (drive, constants),
+        commissioned(given) as (drive, constants),
     ):
-        setting = setting_doubles(constants[0], drive.port()[0])
+        settings = [setting_doubles(*one) for one in zip(constants, drive.port(), strict=True)]
         drive.start_cyclic()
         fd = end.fileno()
-        numbers = (fd, config.loop.priority or 0, period_ns, int(RECEIVE_SHARE * period_ns), cycles)
+        receive_ns = int(RECEIVE_SHARE * period_ns)
+        numbers = (fd, config.loop.priority or 0, period_ns, receive_ns, cycles, len(settings))
         with load(load_name), cores_awake(), on_core(config.loop.cpu):  # as ours, and awake as cyclictest as well
             result = subprocess.run(
                 [str(program), *map(str, numbers)],
-                input=setting.tobytes(),
+                input=np.concatenate(settings).tobytes(),
                 stdout=subprocess.PIPE,
                 pass_fds=(fd,),
                 check=False,
                 timeout=10.0 * (SETTLE_S + seconds) + 10.0,
             )
     rows = np.frombuffer(result.stdout, np.int64)
-    if result.returncode != 0 or len(rows) != 4 * cycles:
-        raise JointctlError(f"the C loop ended with code {result.returncode} after {len(rows) // 4} of {cycles} cycles")
-    rows = rows.reshape(cycles, 4)[round(SETTLE_S * rate_Hz) : -round(0.1 * rate_Hz)]
+    if result.returncode != 0 or len(rows) != 5 * cycles:
+        raise JointctlError(f"the C loop ended with code {result.returncode} after {len(rows) // 5} of {cycles} cycles")
+    rows = rows.reshape(cycles, 5)[round(SETTLE_S * rate_Hz) : -round(0.1 * rate_Hz)]
     enabled = rows[:, 3] == 1
     _require_enabled("the C", enabled)
-    return times_from_ns(rows[enabled])
+    return replace(times_from_ns(rows[enabled]), skipped=int(rows[:, 4].sum()))
 
 
 def cyclictest_path() -> str | None:
@@ -330,7 +356,7 @@ def run_canopen_sync(config: Config, seconds: float, load_name: str) -> LoopTime
 
 # --- the comparison ---
 
-Loop = Callable[[Config, float, str], LoopTimes]  # one segment: joint, seconds, name of the load
+Loop = Callable[[Any, float, str], LoopTimes]  # one segment: joint, seconds, name of the load
 GROUP = "loop"
 RATES_Hz = (1000.0, 2000.0)
 GOAL = 1.2
@@ -362,14 +388,16 @@ class Rounds:
 class Case:
     """One rate and one load; a segment lasts `seconds`."""
 
-    config: Config
+    config: Config | ArmConfig
     load_name: str
     seconds: float
 
     @property
     def name(self) -> str:
         """As the table has it."""
-        return f"{self.config.loop.rate_Hz / 1000.0:g} kHz, {self.load_name}"
+        joints = joints_of(self.config)
+        several = f"{len(joints)} joints, " if len(joints) > 1 else ""
+        return f"{several}{joints[0].loop.rate_Hz / 1000.0:g} kHz, {self.load_name}"
 
 
 def _rows(
@@ -393,6 +421,10 @@ def _in_turn(case: Case, rounds: int, *loops: Loop) -> list[list[LoopTimes]]:
 def _against_c(case: Case, program: Path, rounds: int) -> Iterator[Row]:
     ours, theirs = _in_turn(case, rounds, run_ours, partial(run_c, program))
     yield from _rows(case.name, ours, theirs, "C loop", _AGAINST_C)
+    if isinstance(case.config, ArmConfig):
+        skipped_slots = [float(sum(times.skipped for times in one)) for one in (ours, theirs)]
+        note = f"in C {skipped_slots[1]:g}, in {rounds * case.seconds:g} s each"
+        yield measured(GROUP, f"{case.name}: slots skipped", [skipped_slots[0]], "", note=note)
 
 
 def _against_cyclictest(case: Case, path: str, rounds: int) -> Iterator[Row]:
@@ -406,6 +438,31 @@ def _against_python(case: Case, rounds: int) -> Iterator[Row]:
     yield from _rows(case.name, ours, python_can, "python-can loop", _AGAINST_PYTHON)
     intervals = [LoopTimes(np.abs(np.diff(times.wake_us)), times.work_us, times.work_us) for times in ours]
     yield from _rows(case.name, intervals, canopen, "canopen SYNC", _INTERVALS)
+
+
+def arm_for_comparison(channel: str) -> ArmConfig:
+    """The shipped arm with the law that the C source knows; ours has the arm's model besides."""
+    arm = arm_on_bus(load_arm(SHIPPED_ARM), GivenPlace("jointctl", channel))
+    joints = tuple(
+        changed(
+            joint, control__kind="computed_torque_rbf", control__observer_radps=0.0, control__adaptation=None,
+            loop__cpu=cores()[-1], limits__sample_age_max_s=PATIENCE_S, limits__skipped_max_s=PATIENCE_S,
+        )
+        for joint in arm.joints
+    )  # fmt: skip
+    return replace(arm, joints=joints)
+
+
+def arm_exchange_rows(folder: Path, *, rounds: int, seconds: float) -> Iterator[Row]:
+    """Three drives against the same exchange in C: a virtual arm of its own, on a virtual bus that models bit times."""
+    try:
+        program = exchange_program(folder)
+    except NoCompilerError as error:
+        yield skipped(GROUP, "3 joints, against a C loop", error.message)
+        return
+    channel = f"bench-arm{os.getpid()}"
+    with separate_virtual_joint(SHIPPED_ARM, channel, timing=True):
+        yield from _against_c(Case(arm_for_comparison(channel), "idle", seconds), program, rounds)
 
 
 def exchange_rows(config: Config, folder: Path, *, rounds: Rounds, seconds: float, quick: bool) -> Iterator[Row]:

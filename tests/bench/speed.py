@@ -12,6 +12,7 @@ import logging
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.verbs.main import app
 from jointctl.tools.written_file import prepare_folder
 from tests.bench.arm_speed import arm_rows
-from tests.bench.exchange_speed import Rounds, exchange_rows
+from tests.bench.exchange_speed import Rounds, arm_exchange_rows, exchange_rows
 from tests.bench.law_speed import flexible_rows, law_rows
 from tests.bench.paired import Row, conditions, outcome_data, outcome_table, skipped, write_outcome
 from tests.bench.simulation_speed import lockstep_rows, program_rows, swarm_rows
@@ -46,7 +47,10 @@ def _law(config: Config, folder: Path, pairs: int) -> Iterator[Row]:
 def _part(name: str, config: Config, folder: Path, quick: bool, verbs: Sequence[str]) -> Iterator[Row]:
     parts: dict[str, Callable[[], Iterator[Row]]] = {
         "law": lambda: _law(config, folder, 15 if quick else 61),
-        "arm": lambda: arm_rows(pairs=15 if quick else 61, runs=3 if quick else 15),
+        "arm": lambda: chain(
+            arm_rows(pairs=15 if quick else 61, runs=3 if quick else 15),
+            arm_exchange_rows(folder, rounds=2 if quick else 16, seconds=1.0 if quick else 4.0),
+        ),
         "loop": lambda: exchange_rows(
             config,
             folder,

@@ -1,4 +1,4 @@
-"""Real processes that are killed right after a chosen frame of a run: the drive is off in time, and off for good.
+"""Real processes that are killed right after a chosen frame of a run: every drive is off in time, and off for good.
 
 The same after every frame, at simulated time: tests/bench/every_frame.py.
 """
@@ -19,18 +19,19 @@ import pytest
 from jointctl.drivers.bus_lock import lock_name, marked_processes
 from jointctl.drivers.canopen.identifiers import NMT_ID, RPDO1_ID, SDO_REQUEST_ID, SYNC_ID, NmtCommand
 from jointctl.hil.canopen.records import PowerState
+from jointctl.tools.configuration.arm import load_arm
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
 from tests.hil.moving_run import ENABLED, QUICK_STOP_ACTIVE, alive
 from tests.real_time_joint import real_time_joint
 
-NODE = 1
+NODE = 1  # of the joint, and of an arm's first one
 FAULT_REACTION_ACTIVE = 0x0F  # of the statusword
 POWERED = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
 ENABLE = 0x0F  # controlword, from which on the loop counts
 SHUTDOWN, SWITCH_ON, DISABLE = 0x06, 0x07, 0x00
-FASTEST_RADPS = 0.25  # of the motion
+FASTEST_RADPS, FASTEST_OF_ARM_RADPS = 0.25, 2.0  # of the motion
 LONGEST_S = 180.0  # until the frame; the first start may have to compile
 NOISE_S = 0.3  # by which a busy computer may see or do something later
 IN_FLIGHT_S = 0.05  # a command that the dead have sent before
@@ -53,7 +54,7 @@ class Counts:
     def take(self, message: can.Message) -> None:
         self.frames += 1
         identifier, data = message.arbitration_id, bytes(message.data)
-        if identifier == SDO_REQUEST_ID + NODE:
+        if SDO_REQUEST_ID < identifier <= SDO_REQUEST_ID + 127:
             self.requests += 1
         elif identifier == SYNC_ID:
             self.syncs += 1
@@ -92,11 +93,13 @@ def disabling(seen: Counts) -> bool:
 
 @dataclass
 class Death:
-    """A run, and what an onlooker saw of it: frames, and the truth about the power stage."""
+    """A run, and what an onlooker saw of it: frames, and the truth about the power stages."""
 
     bench: Any
     config: Config
-    device: Any
+    path: str  # of its file
+    fastest_radps: float
+    devices: Any
     bus: can.BusABC
     counts: Counts = field(default_factory=Counts)
     changes: list[tuple[float, bool]] = field(default_factory=list)  # (time [s], whether there is power)
@@ -105,7 +108,8 @@ class Death:
 
     @property
     def powered(self) -> bool:
-        return self.device.device[0].state in POWERED
+        """Whether any drive is."""
+        return any(device.device[0].state in POWERED for device in self.devices)
 
     def look(self, until_s: float, moment: Moment = lambda _: False) -> bool:
         """Take all that is sent until then; True right after the frame that makes it the moment."""
@@ -121,7 +125,7 @@ class Death:
 
     def start(self, moment: Moment, names: tuple[str, ...]) -> None:
         """A run until the moment; then these die, the supervisor first, so that it cannot act on the loop's death."""
-        self.run = self.bench.start("run", "joint.toml", "-y")
+        self.run = self.bench.start("run", self.path, "-y")
         give_up_s = time.monotonic() + LONGEST_S
         while not (children := self.run.children()):
             assert self.run.process.poll() is None, self.run.err
@@ -147,7 +151,7 @@ class Death:
 
     def judge(self, names: tuple[str, ...]) -> None:
         """Off in time, for a second and until the last process of the run has ended; and that none is left."""
-        allowed_s = time_allowed_s(self.config, names) + NOISE_S
+        allowed_s = time_allowed_s(self.config, names, self.fastest_radps) + NOISE_S
         while time.monotonic() < self.killed_s + allowed_s and (self.powered or not self.has_ended()):
             self.look(time.monotonic() + 0.05)
         assert not self.powered, f"with power {allowed_s:.2f} s after the death"
@@ -164,10 +168,10 @@ class Death:
             assert all(after_s <= IN_FLIGHT_S for after_s in enabled), enabled
 
 
-def time_allowed_s(config: Config, names: tuple[str, ...]) -> float:
+def time_allowed_s(config: Config, names: tuple[str, ...], fastest_radps: float) -> float:
     """docs/safety.md: until the reaction begins, and what it takes."""
     sequence = config.sequence
-    braking_s = FASTEST_RADPS / sequence.brake_radps2
+    braking_s = fastest_radps / sequence.brake_radps2
     if "loop" in names:
         return 20.0 / config.loop.rate_Hz + canopen_section(config).heartbeat_s + braking_s
     return sequence.supervisor_timeout_s + braking_s + sequence.release_s
@@ -177,7 +181,17 @@ def time_allowed_s(config: Config, names: tuple[str, ...]) -> float:
 def death(bench: Any) -> Iterator[Death]:
     config = load_config(bench.folder / bench.config(**CHANGES))
     with real_time_joint(config) as joint, can.Bus(interface="jointctl", channel=bench.channel) as bus:
-        yield Death(bench, config, joint._devices[0], bus)
+        yield Death(bench, config, "joint.toml", FASTEST_RADPS, joint._devices, bus)
+        bench.end()
+
+
+@pytest.fixture
+def death_of_arm(bench: Any) -> Iterator[Death]:
+    short = {name.partition("__")[2]: value for name, value in CHANGES.items()}
+    path = bench.arm(**{**short, "approach_s": 1.0})
+    arm = load_arm(path)
+    with real_time_joint(arm) as joints, can.Bus(interface="jointctl", channel=bench.channel) as bus:
+        yield Death(bench, arm.joints[0], str(path), FASTEST_OF_ARM_RADPS, joints._devices, bus)
         bench.end()
 
 
@@ -205,6 +219,25 @@ def test_after_the_death_the_drive_is_off_in_time_and_stays_off(
         assert death.run.process.returncode > 0
     state = death.bench.status_word() & 0x6F  # as the drive tells an independent client
     assert state not in (ENABLED, QUICK_STOP_ACTIVE, FAULT_REACTION_ACTIVE)
+
+
+DEATHS_OF_ARM: dict[str, tuple[Moment, tuple[str, ...]]] = {
+    "commissioning, 90th SDO request, both": (sdo_request(90), BOTH),
+    "commissioning, 250th SDO request, supervisor": (sdo_request(250), SUPERVISOR),
+    "NMT start, loop": (lambda seen: seen.started, LOOP), "enabling, both": (controlword(ENABLE), BOTH),
+    "approach, 5 ms, loop": (sync_after_enabling(5), LOOP),
+    "approach, 300 ms, both": (sync_after_enabling(300), BOTH),
+    "tracking, supervisor": (sync_after_enabling(1200), SUPERVISOR),
+    "tracking, both": (sync_after_enabling(1300), BOTH), "stopping, loop": (sync_after_enabling(1550), LOOP),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("moment", "names"), DEATHS_OF_ARM.values(), ids=DEATHS_OF_ARM)
+def test_after_the_death_every_drive_of_an_arm_is_off_in_time_and_stays_off(
+    death_of_arm: Death, moment: Moment, names: tuple[str, ...]
+) -> None:
+    death_of_arm.start(moment, names)
+    death_of_arm.judge(names)
 
 
 def test_a_drive_without_its_watchdog_is_seen_to_keep_its_power(death: Death) -> None:

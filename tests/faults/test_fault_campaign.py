@@ -160,22 +160,23 @@ def test_a_wrong_cause_and_a_fault_that_is_not_noticed_are_violations(config: Co
     number = list(FAULT_CLASSES).index(FaultKind.DRIVE_REBOOT)
     scenario = dataclasses.replace(draw_scenario(1, number), at_s=1.5, trajectory=draw_scenario(1, 1).trajectory)
     run, _ = run_scenario(config, lockstep, scenario)
-    assert judge_module._cause(run, scenario, 1e-3, lockstep.start_ns) == []
+    assert judge_module.wrong_cause(run, scenario, 1e-3, lockstep.start_ns) == []
     wrong = dataclasses.replace(run, fault=Fault.VELOCITY_LIMIT)
-    assert "the cause is reported as VELOCITY_LIMIT" in judge_module._cause(wrong, scenario, 1e-3, lockstep.start_ns)[0]
+    (line,) = judge_module.wrong_cause(wrong, scenario, 1e-3, lockstep.start_ns)
+    assert "the cause is reported as VELOCITY_LIMIT" in line
     left = dataclasses.replace(run, fault=Fault.DRIVE_NOT_ENABLED)
     for code, told in ((0x8250, False), (0x8130, True)):
         left.state.fault_drive_error = code
-        lines = judge_module._cause(
+        lines = judge_module.wrong_cause(
             left, dataclasses.replace(scenario, kind=FaultKind.RPDO_LOST), 1e-3, lockstep.start_ns
         )
         assert any("reported as 8130h, not 8250h" in line for line in lines) is told
     harmless = dataclasses.replace(scenario, harmless=True)
-    assert "a harmless fault tripped" in judge_module._cause(run, harmless, 1e-3, lockstep.start_ns)[0]
+    assert "a harmless fault tripped" in judge_module.wrong_cause(run, harmless, 1e-3, lockstep.start_ns)[0]
     early = dataclasses.replace(scenario, at_s=1e6)
     quiet, _ = run_scenario(config, lockstep, early)
     late = dataclasses.replace(scenario, at_s=1.2)
-    assert judge_module._cause(quiet, late, 1e-3, lockstep.start_ns) == ["the fault was not noticed"]
+    assert judge_module.wrong_cause(quiet, late, 1e-3, lockstep.start_ns) == ["the fault was not noticed"]
 
 
 def test_the_envelope_follows_its_derivation(config: Config, lockstep: LockstepJoint) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
+import shutil
 import subprocess
 import sys
 import time
@@ -14,6 +16,7 @@ from typing import Any
 import can
 import canopen
 
+from jointctl.tools.configuration.arm import SHIPPED_ARM
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.recording.run_log_reader import read_run_log
 from tests.configurations import written
@@ -89,6 +92,18 @@ class Bench:
             "limits__sample_age_max_s": 0.15, "limits__skipped_max_s": 0.15,
         }  # fmt: skip
         return written(self.folder / name, base, **{**short, **changes}).name
+
+    def arm(self, **changes: Any) -> Path:
+        """The shipped arm's files on this bus; `changes`: keys of any of them."""
+        folder = self.folder / "arm"
+        shutil.copytree(SHIPPED_ARM.parent, folder)
+        values = {"channel": f'"{self.channel}"', "sample_age_max_s": 0.15, "skipped_max_s": 0.15, **changes}
+        for path in folder.glob("*.toml"):
+            text = path.read_text()
+            for key, value in values.items():
+                text = re.sub(rf"(?m)^{key} = \S+", f"{key} = {value}", text)
+            path.write_text(text)
+        return folder / "arm.toml"
 
     def start(self, *arguments: str, **options: Any) -> Started:
         self._started.append(Started(self.folder, arguments, **options))

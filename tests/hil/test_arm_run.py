@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 import signal
 import struct
 import time
@@ -20,7 +19,6 @@ import pytest
 from jointctl.drivers.canopen.cia402 import State, state_of_word
 from jointctl.drivers.canopen.identifiers import NmtState
 from jointctl.firmware_py.states import AxisPhase, DriveState, Fault
-from jointctl.tools.configuration.arm import SHIPPED_ARM
 from jointctl.tools.recording.run_log_reader import read_run_log
 
 NODES = (1, 2, 3)
@@ -32,15 +30,8 @@ class ArmBench:
     """The shipped arm's files on a bus of the test's own, and its virtual drives."""
 
     def __init__(self, bench: Any) -> None:
-        self.bench, self.folder = bench, bench.folder / "arm"
-        shutil.copytree(SHIPPED_ARM.parent, self.folder)
-        for path in self.folder.glob("*.toml"):
-            text = path.read_text()
-            text = re.sub(r'(?m)^channel = "\w+"', f'channel = "{bench.channel}"', text)
-            text = re.sub(r"(?m)^sample_age_max_s = \S+", "sample_age_max_s = 0.15", text)
-            text = re.sub(r"(?m)^skipped_max_s = \S+", "skipped_max_s = 0.15", text)
-            path.write_text(text)
-        self.path = str(self.folder / "arm.toml")
+        self.bench, path = bench, bench.arm()
+        self.path, self.folder = str(path), path.parent
         self.drives = bench.start("hil", self.path).saw("virtual arm: nodes 1, 2, 3")
 
     def tracking(self) -> Any:

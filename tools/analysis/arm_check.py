@@ -98,8 +98,8 @@ def poses(arm: ArmConfig) -> Iterator[tuple[float, ...]]:
     )
 
 
-def pose_ranges(arm: ArmConfig) -> list[PoseRange]:
-    """Inertias M_ii and gravity of each joint over the grid of poses."""
+def pose_models(arm: ArmConfig) -> tuple[np.ndarray, np.ndarray]:
+    """M, float64 (poses, N, N), and gravity's torques, (poses, N), over the grid of poses."""
     memory = arm.model.memory()
     constants: Any = memory.constants[0]
     motion: Any = memory.motion
@@ -112,17 +112,24 @@ def pose_ranges(arm: ArmConfig) -> list[PoseRange]:
         constants.gravity_mps2[:] = gravity_mps2
         motion.acceleration_radps2[:] = 0.0
         newton_euler(memory)
-        loads.append(np.abs(motion.torque_Nm[:axes]))
+        loads.append(motion.torque_Nm[:axes].copy())
         constants.gravity_mps2[:] = 0.0
-        own = np.zeros(axes)
+        inertia = np.zeros((axes, axes))
         for axis in range(axes):
             motion.acceleration_radps2[:] = 0.0
             motion.acceleration_radps2[axis] = 1.0
             newton_euler(memory)
-            own[axis] = motion.torque_Nm[axis]
-        inertias.append(own)
-    low, high, load = np.min(inertias, axis=0), np.max(inertias, axis=0), np.max(loads, axis=0)
-    return [PoseRange(float(low[i]), float(high[i]), float(load[i])) for i in range(axes)]
+            inertia[axis] = motion.torque_Nm[:axes]
+        inertias.append(inertia)
+    return np.array(inertias), np.array(loads)
+
+
+def pose_ranges(arm: ArmConfig) -> list[PoseRange]:
+    """Inertias M_ii and gravity of each joint over the grid of poses."""
+    inertias, loads = pose_models(arm)
+    own = np.diagonal(inertias, axis1=1, axis2=2)
+    low, high, load = own.min(axis=0), own.max(axis=0), np.abs(loads).max(axis=0)
+    return [PoseRange(float(low[i]), float(high[i]), float(load[i])) for i in range(len(load))]
 
 
 def joint_loop(name: str, config: Config, found: PoseRange, delay_s: float | None = None) -> JointOfArm:

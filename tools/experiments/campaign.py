@@ -13,18 +13,21 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.table import Column, Table
 
 from jointctl.firmware_py.states import Fault
+from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.drawing import INK, MID_BLUE, MID_GREEN, MID_RED, canvas
-from jointctl.tools.experiments.fault_scenarios import During, draw_scenario
+from jointctl.tools.experiments.arm_campaign import ArmScenario, draw_arm_scenario, judge_arm, masses_of
+from jointctl.tools.experiments.fault_scenarios import During, Scenario, draw_scenario
 from jointctl.tools.experiments.judge import Verdict, judge
 from jointctl.tools.experiments.many_runs import HERE, Workers
-from jointctl.tools.lockstep import LockstepJoint
+from jointctl.tools.lockstep import LockstepArm, LockstepJoint
 from jointctl.tools.sweeping.carry_out import with_mode
 
 # --- the runs ---
@@ -37,10 +40,17 @@ _kept = threading.local()  # of a worker: the joint of the campaign that it work
 class Scenarios:
     """Some of a campaign: `numbers` of its seed; it is sent to a worker."""
 
-    config: Config
+    config: Config | ArmConfig
     seed: int
     during: During
     numbers: tuple[int, ...]
+
+
+def scenario_of(config: Config | ArmConfig, seed: int, number: int, during: During) -> Scenario | ArmScenario:
+    """Scenario `number` of the campaign with this seed."""
+    if isinstance(config, ArmConfig):
+        return draw_arm_scenario(config, seed, number)
+    return draw_scenario(seed, number, during)
 
 
 def campaign_joint(config: Config, during: During) -> tuple[Config, LockstepJoint]:
@@ -49,18 +59,25 @@ def campaign_joint(config: Config, during: During) -> tuple[Config, LockstepJoin
     return config, LockstepJoint(config)
 
 
+def judge_of(config: Config | ArmConfig, during: During) -> Callable[[Any], Verdict]:
+    """What judges its scenarios."""
+    if isinstance(config, ArmConfig):
+        return partial(judge_arm, LockstepArm(config), masses_of(config))
+    return partial(judge, *campaign_joint(config, during))
+
+
 def judge_all(some: Scenarios) -> list[Verdict]:
     """In their order; a worker commissions its joint once."""
-    key = some.config, some.during
+    config, during = some.config, some.during
+    key = (config.arm, config.joints) if isinstance(config, ArmConfig) else (config, during)
     if getattr(_kept, "key", None) != key:
-        _kept.joint = campaign_joint(*key)
+        _kept.judge = judge_of(config, during)
         _kept.key = key
-    config, joint = _kept.joint
-    return [judge(config, joint, draw_scenario(some.seed, number, some.during)) for number in some.numbers]
+    return [_kept.judge(scenario_of(config, some.seed, number, during)) for number in some.numbers]
 
 
 def run_campaign(
-    config: Config,
+    config: Config | ArmConfig,
     seed: int,
     count: int,
     advance: Callable[[float], None],
@@ -144,23 +161,28 @@ def table(rows: Sequence[KindRow]) -> Table:
     return shown
 
 
-def violations(verdicts: Sequence[Verdict], seed: int, during: During = "run") -> list[dict[str, Any]]:
+def violations(
+    config: Config | ArmConfig, verdicts: Sequence[Verdict], seed: int, during: During = "run"
+) -> list[dict[str, Any]]:
     """Everything that is needed to look at each violation again."""
     return [
-        {**asdict(verdict), "scenario": draw_scenario(seed, verdict.number, during).describe()}
+        {**asdict(verdict), "scenario": scenario_of(config, seed, verdict.number, during).describe()}
         for verdict in verdicts
         if verdict.violations
     ]
 
 
-def write_json(path: Path, seed: int, verdicts: Sequence[Verdict], elapsed_s: float, during: During = "run") -> None:
+def write_json(
+    path: Path, seed: int, verdicts: Sequence[Verdict], elapsed_s: float, during: During, found: list[dict[str, Any]]
+) -> None:
+    """`found`: as of `violations`."""
     content = {
         "seed": seed,
         "during": during,
         "scenarios": len(verdicts),
         "elapsed_s": round(elapsed_s, 1),
         "kinds": [asdict(row) for row in rows_by_kind(verdicts)],
-        "violations": violations(verdicts, seed, during),
+        "violations": found,
     }
     text = json.dumps(content, indent=1, allow_nan=False)
     path.write_text(text + "\n")

@@ -333,33 +333,37 @@ class Scenario:
         }
 
 
-def _trajectory(random: np.random.Generator, duration_s: float) -> Any:
+def draw_trajectory(
+    random: np.random.Generator, duration_s: float, reach_rad: float = REACH_RAD, top_radps: float = TOP_SPEED_RADPS
+) -> Any:
+    """A hold, a sine, or moves there and back; within `reach_rad` of zero, not faster than `top_radps`."""
     kind = random.integers(4)
     if kind == 0:
-        return Hold(kind="hold", duration_s=duration_s, position_rad=float(random.uniform(-REACH_RAD, REACH_RAD)))
+        return Hold(kind="hold", duration_s=duration_s, position_rad=float(random.uniform(-reach_rad, reach_rad)))
     if kind == 1:
-        amplitude = random.uniform(0.02, REACH_RAD)
-        highest = min(0.5, TOP_SPEED_RADPS / (amplitude * math.tau))
+        amplitude = random.uniform(0.02, reach_rad)
+        highest = min(0.5, top_radps / (amplitude * math.tau))
         return Sine(
             kind="sine", duration_s=duration_s, amplitude_rad=float(amplitude),
             frequency_Hz=float(random.uniform(0.05, highest)), shift_s=float(random.uniform(0.0, 3.0)),
         )  # fmt: skip
-    start, target = (float(x) for x in random.uniform(-REACH_RAD, REACH_RAD, 2))
+    start, target = (float(x) for x in random.uniform(-reach_rad, reach_rad, 2))
     way = max(abs(target - start), 1e-3)
     if kind == 2:
-        move_s = max(1.875 * way / random.uniform(0.1, TOP_SPEED_RADPS), 0.4)
+        move_s = max(1.875 * way / random.uniform(0.1, top_radps), 0.4)
         return MinJerk(
             kind="min_jerk", duration_s=duration_s, start_rad=start, target_rad=target, move_s=float(move_s),
             dwell_s=float(random.uniform(0.0, 0.3)), repeat=True,
         )  # fmt: skip
     return Trapezoid(
         kind="trapezoid", duration_s=duration_s, start_rad=start, target_rad=target,
-        speed_radps=float(random.uniform(0.1, TOP_SPEED_RADPS)), acceleration_radps2=float(random.uniform(0.5, 3.0)),
+        speed_radps=float(random.uniform(0.1, top_radps)), acceleration_radps2=float(random.uniform(0.5, 3.0)),
         dwell_s=float(random.uniform(0.0, 0.3)), repeat=True,
     )  # fmt: skip
 
 
-def _plant(random: np.random.Generator) -> dict[str, Any]:
+def draw_plant(random: np.random.Generator) -> dict[str, Any]:
+    """Settings of `plant_of`."""
     sticks = random.random() < 0.25
     return {
         "friction_kind": FrictionKind.STICK_SLIP if sticks else FrictionKind.LUGRE,
@@ -404,7 +408,7 @@ def draw_scenario(seed: int, number: int, during: During = "run") -> Scenario:
     tracking_s = float(random.uniform(0.5, 2.5))
     latest_s = BEFORE_s + (LONGEST_s if during == "sweep" else tracking_s)
     at_s = float(random.uniform(0.0, latest_s))
-    trajectory = draw_strokes(random) if during == "sweep" else _trajectory(random, tracking_s)
+    trajectory = draw_strokes(random) if during == "sweep" else draw_trajectory(random, tracking_s)
     if during == "program":
         trajectory = Program(trajectory, float(random.uniform(0.002, 0.02)))
     return Scenario(
@@ -414,7 +418,7 @@ def draw_scenario(seed: int, number: int, during: During = "run") -> Scenario:
         magnitude=magnitude,
         trajectory=trajectory,
         start_offset_rad=float(random.uniform(-0.1, 0.1)),
-        plant=_plant(random),
+        plant=draw_plant(random),
     )  # fmt: skip
 
 

@@ -192,14 +192,17 @@ LEAST_SCALE = 0.9  # of the friction, RIPPLE_Nm the most of the motor: what a sc
 RIPPLE_Nm = 1.4
 
 
-def _demands(config: Config) -> list[tuple[str, float, float]]:
+SIZED_FOR_Nm = 60.0  # limits.torque_max_Nm that the torques of scenarios are drawn for
+
+
+def _demands(config: Config, torque_Nm: float) -> list[tuple[str, float, float]]:
     """(key, value, least value): harmless sizes are just inside these limits, trajectories use that much room."""
     limits, sequence = config.limits, config.sequence
     return [
         ("limits.position_max_rad", limits.position_max_rad, 0.7),
         ("-limits.position_min_rad", -limits.position_min_rad, 0.7),
         ("limits.velocity_max_radps", limits.velocity_max_radps, 1.0),
-        ("limits.torque_max_Nm", limits.torque_max_Nm, 60.0),
+        ("limits.torque_max_Nm", limits.torque_max_Nm, torque_Nm),
         ("limits.following_error_max_rad", limits.following_error_max_rad, 0.05),
         ("limits.position_jump_max_rad", limits.position_jump_max_rad, 0.02),
         ("limits.sample_age_max_s", limits.sample_age_max_s, 0.05),
@@ -209,22 +212,30 @@ def _demands(config: Config) -> list[tuple[str, float, float]]:
     ]
 
 
-def require_fit(config: Config) -> None:
-    """`ConfigurationError` for a configuration whose campaign would prove nothing, or find what is no violation."""
+def require_joint_fits(config: Config, torque_Nm: float = 0.0) -> None:
+    """`ConfigurationError` for a joint, alone or of an arm, for which the scenarios are not made."""
     virtual = config.virtual
     if virtual is None:
         raise ConfigurationError(f"{config.path}: [virtual] is missing: the campaign needs a virtual joint")
-    friction = virtual.friction or config.friction
-    if friction is None:
+    if virtual.friction is None and config.friction is None:
         raise ConfigurationError(f"{config.path}: [friction] is missing, and so is [virtual.friction]")
     if virtual.faults:
         raise ConfigurationError(f"{config.path}: [[virtual.faults]] must be empty: the campaign brings its own")
-    for key, value, least in _demands(config):
+    for key, value, least in _demands(config, torque_Nm):
         if value < least:
             raise ConfigurationError(
                 f"{config.path}: {key} (={value:g}) must be at least {least:g}: the campaign's harmless faults and its "
                 "trajectories are made for the limits of configs/virtual.toml"
             )
+
+
+def require_fit(config: Config) -> None:
+    """`ConfigurationError` for a configuration whose campaign would prove nothing, or find what is no violation."""
+    require_joint_fits(config, SIZED_FOR_Nm)
+    virtual = config.virtual
+    assert virtual is not None
+    friction = virtual.friction or config.friction
+    assert friction is not None
     weakest_Nm = config.joint.reduction_ratio * min(abs(friction.positive.tc_Nm), abs(friction.negative.tc_Nm))
     held_Nm = LEAST_SCALE * weakest_Nm * (1.0 - virtual.friction_ripple) - RIPPLE_Nm
     if load_Nm(config) >= held_Nm:
@@ -402,7 +413,7 @@ def _enabled_again(run: LockstepRun, scenario: Scenario, start_ns: int, period_n
     return []
 
 
-def _cause(run: LockstepRun, scenario: Scenario, period_s: float, start_ns: int) -> list[str]:
+def wrong_cause(run: LockstepRun, scenario: Scenario, period_s: float, start_ns: int) -> list[str]:
     fault, expected = run.fault, FAULT_CLASSES[scenario.kind]
     if scenario.harmless:
         return [] if fault is Fault.NONE else [f"a harmless fault tripped {fault.name} (={run.state.fault_value:.4f})"]
@@ -424,6 +435,28 @@ def _cause(run: LockstepRun, scenario: Scenario, period_s: float, start_ns: int)
     return []
 
 
+def fault_row_of(run: LockstepRun, start_ns: int, period_ns: int) -> int:
+    """The row of the true values in which the loop latched its fault; -1 without one."""
+    tripped = np.flatnonzero(run.log.fault != Fault.NONE)
+    return (int(run.log.time_ns[tripped[0]]) - start_ns) // period_ns if len(tripped) else -1
+
+
+def wrong_of_joint(
+    run: LockstepRun, allowed: Envelope, scenario: Scenario, fault_row: int, start_ns: int, period_ns: int,
+    *, by_position: bool = False,
+) -> tuple[list[str], float | None]:  # fmt: skip
+    """What holds for any joint, whatever the fault: (violations, time from `fault_row` until off and at rest)."""
+    ending, off_s = _ending(run, allowed, fault_row, period_ns * 1e-9)
+    again = _enabled_again(run, scenario, start_ns, period_ns)
+    return [*_commands(run, allowed, by_position=by_position), *_motion(run, allowed), *ending, *again], off_s
+
+
+def beyond_rad(run: LockstepRun, limits: Any) -> float:
+    """How far the joint truly got beyond its position limits."""
+    position = run.truth[:, TRUE_POSITION_rad]
+    return float(max(position.max() - limits.position_max_rad, limits.position_min_rad - position.min(), 0.0))
+
+
 def judge(config: Config, joint: LockstepJoint, scenario: Scenario) -> Verdict:
     """Run a scenario and check every invariant."""
     scenario = in_time(config, joint, fitted(config, scenario))
@@ -433,26 +466,18 @@ def judge(config: Config, joint: LockstepJoint, scenario: Scenario) -> Verdict:
     period_ns = round(period_s * 1e9)
     start_ns = int(joint.start_ns)
     allowed = envelope(config, scenario, axis)
-    tripped = np.flatnonzero(run.log.fault != Fault.NONE)
-    fault_row = (int(run.log.time_ns[tripped[0]]) - start_ns) // period_ns if len(tripped) else -1
-    ending, off_s = _ending(run, allowed, fault_row, period_s)
-    position = run.truth[:, TRUE_POSITION_rad]
-    limits = axis.limits
+    fault_row = fault_row_of(run, start_ns, period_ns)
+    by_position = int(axis.command_kind) == CommandKind.POSITION
+    wrong, off_s = wrong_of_joint(run, allowed, scenario, fault_row, start_ns, period_ns, by_position=by_position)
     return Verdict(
         number=scenario.number,
         kind=scenario.kind.name.lower(),
         harmless=scenario.harmless,
         fault=run.fault.name,
         reaction=Reaction(int(run.state.reaction)).name,
-        violations=tuple(
-            _commands(run, allowed, by_position=int(axis.command_kind) == CommandKind.POSITION)
-            + _motion(run, allowed)
-            + ending
-            + _enabled_again(run, scenario, start_ns, period_ns)
-            + _cause(run, scenario, period_s, start_ns)
-        ),
+        violations=tuple(wrong + wrong_cause(run, scenario, period_s, start_ns)),
         peak_radps=float(np.abs(run.truth[:, TRUE_VELOCITY_radps]).max()),
-        beyond_rad=float(max(position.max() - limits.position_max_rad, limits.position_min_rad - position.min(), 0.0)),
-        allowed_rad=allowed.position_max_rad - float(limits.position_max_rad),
+        beyond_rad=beyond_rad(run, axis.limits),
+        allowed_rad=allowed.position_max_rad - float(axis.limits.position_max_rad),
         off_s=off_s,
     )

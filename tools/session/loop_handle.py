@@ -124,6 +124,17 @@ class SharedBlock:
         return records[late:], lost + late
 
 
+def new_block(table: Any, port: type, arm: ArmModel | None) -> SharedBlock:
+    """With the motion's table (rows, 5), of an arm (axes, rows, 5) with its model."""
+    tables = np.reshape(table, (-1, *np.shape(table)[-2:]))
+    axes, rows = tables.shape[:2]
+    block = SharedBlock.create(rows, port, axes, 0 if arm is None else axes)
+    block.tables[:] = tables
+    if arm is not None:
+        block.arm_constants[:], block.links[:] = arm.constants, arm.links
+    return block
+
+
 QUANTILE = 0.99  # of the times that a loop delay is made of
 
 
@@ -178,12 +189,7 @@ class LoopHandle:
         marker_fd: int | None = None, arm: ArmModel | None = None,
     ) -> None:  # fmt: skip
         """`table` (rows, 5), of an arm (axes, rows, 5), with its `arm` model."""
-        tables = np.reshape(table, (-1, *np.shape(table)[-2:]))
-        axes, rows = tables.shape[:2]
-        self.block = SharedBlock.create(rows, port, axes, 0 if arm is None else axes)
-        self.block.tables[:] = tables
-        if arm is not None:
-            self.block.arm_constants[:], self.block.links[:] = arm.constants, arm.links
+        self.block = new_block(table, port, arm)
         self._tail = 0
         self.lost_records = 0
         self._after_end = config.drive.when_the_loop_ends
@@ -191,8 +197,8 @@ class LoopHandle:
         order = LoopOrder(
             supervisor_pid=os.getpid(),
             block_fd=self.block.fd,
-            table_rows=rows,
-            axes=axes,
+            table_rows=self.block.tables.shape[1],
+            axes=self.block.axes,
             links=len(self.block.links),
             kind=config.drive.kind,
             interface=config.bus.interface,

@@ -169,9 +169,11 @@ class Session:
     @staticmethod
     @contextlib.contextmanager
     def _blamed(joint: JointPlan) -> Iterator[None]:
-        """An error, with the name of the joint where there are several."""
+        """An error, with the name of the joint where there are several; one of the bus is all joints'."""
         try:
             yield
+        except BusError:  # it names the node, which need not be the joint's that has come across it
+            raise
         except JointctlError as error:
             error.message = joint.naming(error.message)
             raise

@@ -9,11 +9,12 @@ import typer
 
 from jointctl.drivers.errors import INTERRUPTED, UsageError
 from jointctl.tools.output import Output
-from jointctl.tools.verbs.verb_options import ConfigPath, ManyRuns, Report, VerbOutput, loaded
+from jointctl.tools.verbs.verb_options import ConfigPath, ManyRuns, Report, VerbOutput, loaded_joint_or_arm
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from jointctl.tools.configuration.arm import ArmConfig
     from jointctl.tools.configuration.config import Config
     from jointctl.tools.experiments.fault_scenarios import During
     from jointctl.tools.experiments.judge import Verdict
@@ -23,15 +24,15 @@ LARGEST = 2**31 - 1  # of a seed or of a scenario's number
 SHOWN = 20
 
 
-def _joint(config: ConfigPath = Path("virtual")) -> Config:
-    return loaded(config)
+def _joint_or_arm(config: ConfigPath = Path("virtual")) -> Config | ArmConfig:
+    return loaded_joint_or_arm(config)
 
 
-JointToBreak = Annotated["Config", _joint]
+JointOrArmToBreak = Annotated["Config | ArmConfig", _joint_or_arm]
 
 
 def fault_campaign(
-    config: JointToBreak,
+    config: JointOrArmToBreak,
     output: VerbOutput,
     *,
     count: Annotated[int, typer.Option("--count", help="how many random scenarios", min=1, max=LARGEST)] = 10_000,
@@ -47,9 +48,14 @@ def fault_campaign(
     workers: ManyRuns = None,
     report: Report = None,
 ) -> int:
-    """Random faults on random joints in lockstep; every safety invariant is checked in every scenario."""
+    """Random faults on random joints in lockstep; every safety invariant is checked in every scenario.
+
+    Of an arm one joint after the other has the fault, and all of them are checked.
+    """
+    from jointctl.tools.configuration.arm import ArmConfig
     from jointctl.tools.configuration.drive_section import require_simulated
     from jointctl.tools.drawing import save_png
+    from jointctl.tools.experiments.arm_campaign import require_arm_fits
     from jointctl.tools.experiments.campaign import (
         campaign_figure,
         rows_by_kind,
@@ -66,8 +72,13 @@ def fault_campaign(
     if sweep and program:
         raise UsageError("--sweep and --program exclude each other")
     during: During = "sweep" if sweep else "program" if program else "run"
-    require_simulated(config, "fault-campaign")
-    require_fit(config)
+    if isinstance(config, ArmConfig):
+        if during != "run":
+            raise UsageError(f"--{during} is one joint's, and {config.path} is an arm", "give the joint's file")
+        require_arm_fits(config)
+    else:
+        require_simulated(config, "fault-campaign")
+        require_fit(config)
     if scenario is not None:
         return _replay(config, output, seed, scenario, during)
     if report is not None:
@@ -76,10 +87,11 @@ def fault_campaign(
     with output.progress("fault campaign", float(count)) as advance:
         verdicts, elapsed_s, interrupted = run_campaign(config, seed, count, advance, workers or HERE, during)
     rows = rows_by_kind(verdicts)
-    found = violations(verdicts, seed, during)
-    figure = campaign_figure(verdicts, config.limits.velocity_max_radps)
+    found = violations(config, verdicts, seed, during)
+    joints = config.joints if isinstance(config, ArmConfig) else (config,)
+    figure = campaign_figure(verdicts, max(joint.limits.velocity_max_radps for joint in joints))
     if verdicts:
-        write_json(folder / "campaign.json", seed, verdicts, elapsed_s, during)
+        write_json(folder / "campaign.json", seed, verdicts, elapsed_s, during, found)
         save_png(figure, folder / "campaign.png")
     data = {
         "scenarios": len(verdicts), "violations": len(found), "seed": seed, "elapsed_s": round(elapsed_s, 1),
@@ -102,8 +114,8 @@ def fault_campaign(
 
 
 def _write_page(
-    path: Path, config: Config, verdicts: list[Verdict], found: list[dict[str, Any]], figure: Figure, seed: int,
-    output: Output,
+    path: Path, config: Config | ArmConfig, verdicts: list[Verdict], found: list[dict[str, Any]], figure: Figure,
+    seed: int, output: Output,
 ) -> None:  # fmt: skip
     from jointctl.tools.experiments.campaign import rows_by_kind, table
     from jointctl.tools.recording.report_page import (
@@ -133,14 +145,12 @@ def _write_page(
     write_verb_page(path, "Fault campaign", sections, output, subtitle=str(config.path))
 
 
-def _replay(config: Config, output: Output, seed: int, number: int, during: During) -> int:
+def _replay(config: Config | ArmConfig, output: Output, seed: int, number: int, during: During) -> int:
     """One scenario, with all that it consists of."""
-    from jointctl.tools.experiments.campaign import campaign_joint
-    from jointctl.tools.experiments.fault_scenarios import draw_scenario
-    from jointctl.tools.experiments.judge import judge
+    from jointctl.tools.experiments.campaign import judge_of, scenario_of
 
-    chosen = draw_scenario(seed, number, during)
-    verdict = judge(*campaign_joint(config, during), chosen)
+    chosen = scenario_of(config, seed, number, during)
+    verdict = judge_of(config, during)(chosen)
     described = chosen.describe()
     lines = [f"{key}: {value}" for key, value in described.items()]
     lines += [

@@ -1,12 +1,13 @@
 /* The exchange of the control loop in plain C, for comparison: same deadlines, same frames, same waits, same law.
  *
- *     sleep until the absolute deadline -> SYNC -> wait for TPDO -> law -> RPDO -> one log record
+ *     sleep until the absolute deadline -> SYNC -> wait for each TPDO -> laws -> RPDOs -> a log record of each drive
  *
- * FOR THE VIRTUAL JOINT ONLY: it has no phases, no limits of motion, no faults and no supervisor.  It enables the
- * drive and holds the position that it finds, then switches the drive off.
+ * FOR THE VIRTUAL JOINT AND ARM ONLY: it has no phases, no limits of motion, no faults and no supervisor.  It enables
+ * the drives and holds the positions that it finds, then switches the drives off.
  *
- * exchange_loop FD PRIORITY PERIOD_ns RECEIVE_ns CYCLES; struct setting on stdin; on stdout CYCLES rows of int64
- * [wake-up after the deadline, wait for the sample, work, enabled], times in ns, -1 for a wait without a sample.
+ * exchange_loop FD PRIORITY PERIOD_ns RECEIVE_ns CYCLES DRIVES; on stdin a struct setting of each drive, all on one
+ * bus; on stdout CYCLES rows of int64 [wake-up after the deadline, wait for the samples, work, all enabled, slots
+ * skipped], times in ns, -1 for a wait in which one did not come.
  */
 #define _GNU_SOURCE
 #include <errno.h>
@@ -37,6 +38,7 @@ struct setting { /* doubles for the same reason as struct law */
 
 #define LOG_BYTES 408 /* about what the control loop records each cycle */
 #define LOG_RECORDS 16384
+#define MOST_DRIVES 16
 
 static char log_ring[LOG_RECORDS][LOG_BYTES];
 
@@ -62,13 +64,43 @@ static int take_frame(int fd, struct frame *frame)
     return got == sizeof *frame;
 }
 
-/* Everything that waits, up to the wanted frame; 1 if it came. */
-static int drain(int fd, struct frame *frame, uint32_t wanted)
+struct drive {
+    struct setting k;
+    struct law_state law;
+    struct frame rpdo;
+    int status, came;
+    double position, start;
+};
+
+static struct drive drives[MOST_DRIVES];
+
+/* Takes everything that waits. */
+static void drain(int fd, int count)
 {
-    while (take_frame(fd, frame))
-        if (frame->can_id == wanted)
-            return 1;
-    return 0;
+    struct frame got;
+    while (take_frame(fd, &got))
+        for (int i = 0; i < count; i++) {
+            struct drive *drive = &drives[i];
+            if (got.can_id != (uint32_t)drive->k.tpdo_id)
+                continue;
+            int32_t counts;
+            uint16_t word;
+            memcpy(&word, got.payload + (int)drive->k.status_at, 2);
+            memcpy(&counts, got.payload + (int)drive->k.position_at, 4);
+            drive->status = word;
+            drive->position = counts * drive->k.position_radpcount;
+            if (isnan(drive->start))
+                drive->start = drive->position;
+            drive->came = 1;
+        }
+}
+
+static int all_came(int count)
+{
+    for (int i = 0; i < count; i++)
+        if (!drives[i].came)
+            return 0;
+    return 1;
 }
 
 static int control_word(int status)
@@ -84,13 +116,21 @@ static int control_word(int status)
 
 int main(int argc, char **argv)
 {
-    static struct setting k;
-    static struct law_state state;
-    if (argc != 6 || fread(&k, sizeof k, 1, stdin) != 1)
+    if (argc != 7)
         return 2;
-    int fd = atoi(argv[1]), priority = atoi(argv[2]);
+    int fd = atoi(argv[1]), priority = atoi(argv[2]), count = atoi(argv[6]);
     int64_t period_ns = atoll(argv[3]), receive_ns = atoll(argv[4]), cycles = atoll(argv[5]);
-    int64_t(*times)[4] = calloc(cycles, sizeof *times);
+    if (count < 1 || count > MOST_DRIVES)
+        return 2;
+    for (int i = 0; i < count; i++) {
+        struct drive *drive = &drives[i];
+        if (fread(&drive->k, sizeof drive->k, 1, stdin) != 1)
+            return 2;
+        drive->rpdo.can_id = (uint32_t)drive->k.rpdo_id;
+        drive->rpdo.length = (uint8_t)drive->k.rpdo_length;
+        drive->start = NAN;
+    }
+    int64_t(*times)[5] = calloc(cycles, sizeof *times);
     if (times == NULL)
         return 3;
     memset(log_ring, 1, sizeof log_ring);
@@ -101,29 +141,26 @@ int main(int argc, char **argv)
     }
     mlockall(MCL_CURRENT | MCL_FUTURE);
 
-    struct frame sync = {.can_id = (uint32_t)k.sync_id}, heartbeat = {.can_id = (uint32_t)k.heartbeat_id, .length = 1};
-    struct frame rpdo = {.can_id = (uint32_t)k.rpdo_id, .length = (uint8_t)k.rpdo_length}, got;
+    const struct setting *first = &drives[0].k;
+    struct frame sync = {.can_id = (uint32_t)first->sync_id};
+    struct frame heartbeat = {.can_id = (uint32_t)first->heartbeat_id, .length = 1};
     heartbeat.payload[0] = 5;
-    uint32_t tpdo_id = (uint32_t)k.tpdo_id;
-    int status_at = (int)k.status_at, position_at = (int)k.position_at;
-    int control_at = (int)k.control_at, target_at = (int)k.target_at, heartbeat_cycles = (int)k.heartbeat_cycles;
-    int status = 0;
-    double position = 0.0, start = NAN;
+    int heartbeat_cycles = (int)first->heartbeat_cycles;
     int64_t deadline_ns = now_ns() + period_ns;
     for (int64_t cycle = 0; cycle < cycles; cycle++) {
         struct timespec until = {deadline_ns / 1000000000LL, deadline_ns % 1000000000LL};
         while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &until, NULL) == EINTR)
             ;
-        int64_t wake_ns = now_ns(), late_ns = wake_ns - deadline_ns;
-        if (late_ns >= period_ns)
-            deadline_ns += late_ns / period_ns * period_ns;
-        drain(fd, &got, 0xFFFFFFFF);
+        int64_t wake_ns = now_ns(), late_ns = wake_ns - deadline_ns, skipped = late_ns / period_ns;
+        deadline_ns += skipped * period_ns;
+        drain(fd, count);
+        for (int i = 0; i < count; i++)
+            drives[i].came = 0;
         send_frame(fd, &sync);
         if (heartbeat_cycles > 0 && cycle % heartbeat_cycles == 0)
             send_frame(fd, &heartbeat);
         int64_t started_ns = now_ns(), arrived_ns = started_ns, give_up_ns = deadline_ns + receive_ns;
-        int came;
-        while (!(came = drain(fd, &got, tpdo_id)) && arrived_ns < give_up_ns) {
+        while (drain(fd, count), !all_came(count) && arrived_ns < give_up_ns) {
             int64_t left_ns = give_up_ns - arrived_ns;
             struct pollfd readable = {.fd = fd, .events = POLLIN};
             struct timespec wait = {left_ns / 1000000000LL, left_ns % 1000000000LL};
@@ -131,30 +168,30 @@ int main(int argc, char **argv)
             arrived_ns = now_ns();
         }
         int64_t waited_ns = now_ns() - started_ns;
-        if (came) {
-            int32_t counts;
-            uint16_t word;
-            memcpy(&word, got.payload + status_at, 2);
-            memcpy(&counts, got.payload + position_at, 4);
-            status = word;
-            position = counts * k.position_radpcount;
-            if (isnan(start))
-                start = position;
+        int enabled = 1;
+        for (int i = 0; i < count; i++) {
+            struct drive *drive = &drives[i];
+            const struct setting *k = &drive->k;
+            int own = (drive->status & 0x6F) == 0x27;
+            double torque =
+                isnan(drive->start) ? 0.0 : law_tick(&k->law, &drive->law, drive->position, drive->start, 0.0, 0.0);
+            double permille = fmin(fmax(torque / k->torque_Nmppermille, -k->max_permille), k->max_permille);
+            int16_t target = own ? (int16_t)lround(permille) : 0;
+            uint16_t command = cycle + 50 < cycles ? (uint16_t)control_word(drive->status) : 0;
+            memcpy(drive->rpdo.payload + (int)k->control_at, &command, 2);
+            memcpy(drive->rpdo.payload + (int)k->target_at, &target, 2);
+            enabled &= own;
         }
-        int enabled = (status & 0x6F) == 0x27;
-        double torque = isnan(start) ? 0.0 : law_tick(&k.law, &state, position, start, 0.0, 0.0);
-        double permille = fmin(fmax(torque / k.torque_Nmppermille, -k.max_permille), k.max_permille);
-        int16_t target = enabled ? (int16_t)lround(permille) : 0;
-        uint16_t command = cycle + 50 < cycles ? (uint16_t)control_word(status) : 0;
-        memcpy(rpdo.payload + control_at, &command, 2);
-        memcpy(rpdo.payload + target_at, &target, 2);
-        send_frame(fd, &rpdo);
+        for (int i = 0; i < count; i++)
+            send_frame(fd, &drives[i].rpdo);
         int64_t end_ns = now_ns();
-        memcpy(log_ring[cycle % LOG_RECORDS], &state, sizeof state);
+        for (int i = 0; i < count; i++)
+            memcpy(log_ring[(cycle * count + i) % LOG_RECORDS], &drives[i].law, sizeof drives[i].law);
         times[cycle][0] = late_ns;
-        times[cycle][1] = came ? waited_ns : -1;
+        times[cycle][1] = all_came(count) ? waited_ns : -1;
         times[cycle][2] = end_ns - wake_ns - waited_ns;
         times[cycle][3] = enabled;
+        times[cycle][4] = skipped;
         deadline_ns += period_ns;
     }
     fwrite(times, sizeof *times, cycles, stdout);

@@ -12,7 +12,7 @@ import pytest
 
 from jointctl.drivers.canopen.cyclic import CanopenPort
 from jointctl.drivers.drive import CommissioningReport, DriveIdentity
-from jointctl.drivers.errors import ConfigurationError
+from jointctl.drivers.errors import BusError, ConfigurationError, DeviceError, JointctlError
 from jointctl.firmware_py.cycle import Word
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.recording.run_log import INFO, Event, remove_oldest
@@ -20,6 +20,7 @@ from jointctl.tools.session.canopen_drive import require_one_bus
 from jointctl.tools.session.display import JointDisplay, OnlyShows
 from jointctl.tools.session.loop_handle import RING_RECORDS, SharedBlock
 from jointctl.tools.session.plan import resolve_arm
+from jointctl.tools.session.session import Session
 
 NAMES = ["shoulder", "elbow", "wrist"]
 
@@ -122,3 +123,16 @@ def test_of_an_arm_the_newest_logs_of_each_joint_are_kept(arm: ArmConfig, tmp_pa
     assert sorted(path.name for path in removed) == [
         f"arm-20260101-00{minute:02}00.shoulder.{ending}" for minute in range(2) for ending in ("mcap", "png")
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (DeviceError("6040 was changed"), "elbow: 6040 was changed"),
+        (BusError("1 x SDO request to node 3"), "1 x SDO request to node 3"),  # the joint whose watch saw it is any
+    ],
+)
+def test_an_error_names_its_joint_and_one_of_the_bus_none(arm: ArmConfig, error: JointctlError, message: str) -> None:
+    with pytest.raises(JointctlError) as raised, Session._blamed(resolve_arm(arm).joints[1]):
+        raise error
+    assert raised.value.message == message

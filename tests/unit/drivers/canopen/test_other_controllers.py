@@ -28,7 +28,7 @@ CONTROLLER = [
     (0x000, bytes([128, NODE]), "1 x NMT 'enter pre operational' to node 5"),
     (0x000, bytes([1, 0]), "1 x NMT 'start' to all nodes"),
     (0x000, bytes([77, 9]), "1 x NMT 'unknown' to node 9"),
-    (0x600 + NODE, bytes(8), "1 x SDO request (605h)"),
+    (0x600 + NODE, bytes(8), "1 x SDO request to node 5 (605h)"),
     (0x200 + NODE, bytes(4), "1 x RPDO to node 5 (205h)"),
     (0x500 + 9, bytes(4), "1 x RPDO to node 9 (509h)"),
     (0x700 + MASTER, b"\x05", "1 x heartbeat of node 126, which is our own (drive.master_node)"),
@@ -76,10 +76,10 @@ def test_heartbeats_of_other_nodes_are_kept_as_such() -> None:
     ("identifier", "data", "words"),
     [
         (0x000, bytes([2, NODE]), "1 x NMT 'stop' to node 5"),
-        (0x600 + NODE, b"\x23\x16\x10\x01\0\0\0\0", "1 x SDO request that writes object 1016"),
-        (0x600 + NODE, b"\x2b\x40\x60\x00\x0f\0\0\0", "1 x SDO request that writes object 6040"),
-        (0x600 + NODE, b"\xc2\x00\x14\x05\0\0\0\0", "1 x SDO request that writes object 1400"),
-        (0x600 + NODE, b"\x23\x16\x10\x01", "1 x SDO request that writes object 1016"),
+        (0x600 + NODE, b"\x23\x16\x10\x01\0\0\0\0", "1 x SDO request to node 5 that writes object 1016"),
+        (0x600 + NODE, b"\x2b\x40\x60\x00\x0f\0\0\0", "1 x SDO request to node 5 that writes object 6040"),
+        (0x600 + NODE, b"\xc2\x00\x14\x05\0\0\0\0", "1 x SDO request to node 5 that writes object 1400"),
+        (0x600 + NODE, b"\x23\x16\x10\x01", "1 x SDO request to node 5 that writes object 1016"),
         (0x600 + NODE, b"\x23\x16\x10", ""),  # too short to write anything
         (0x600 + 7, b"\x23\x16\x10\x01\0\0\0\0", ""),  # to another drive
         (0x600 + NODE, b"\x2b\x72\x60\x00\x0f\0\0\0", ""),  # 6072: it does not decide whether there is power
@@ -136,4 +136,6 @@ def test_our_own_frames_are_not_anothers_where_the_interface_hands_them_back(ech
         if echoes:
             assert heard(others, *request) == ""
         heard(others, 0x580 + NODE, bytes(8))
-    assert heard(others, *request) == "1 x SDO request (605h)"  # the twin: the same frame once more is another's
+    assert (
+        heard(others, *request) == "1 x SDO request to node 5 (605h)"
+    )  # the twin: the same frame once more is another's

@@ -1,0 +1,243 @@
+"""The campaign on the shipped arm: no violation in a sample, and each invariant of several joints does notice."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jointctl.drivers.errors import ConfigurationError, UsageError
+from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.hil.canopen.records import PowerState
+from jointctl.hil.fault_kinds import FaultKind
+from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_POSITION_rad, TRUE_VELOCITY_radps
+from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
+from jointctl.tools.experiments import arm_campaign
+from jointctl.tools.experiments.arm_campaign import (
+    COMMON,
+    ArmScenario,
+    Masses,
+    draw_arm_scenario,
+    envelopes,
+    judge_arm,
+    masses_of,
+    require_arm_fits,
+    run_arm_scenario,
+)
+from jointctl.tools.experiments.fault_scenarios import FAULT_CLASSES, kinds_during
+from jointctl.tools.experiments.many_runs import Workers
+from jointctl.tools.lockstep import LockstepArm, LockstepRun
+from jointctl.tools.verbs.fault_campaign import fault_campaign
+from tests.sessions import output
+
+KINDS = kinds_during("run")
+PERIOD_NS = 1_000_000
+
+
+@pytest.fixture(scope="module")
+def arm() -> ArmConfig:
+    return load_arm(SHIPPED_ARM)
+
+
+@pytest.fixture(scope="module")
+def joints(arm: ArmConfig) -> LockstepArm:
+    return LockstepArm(arm)
+
+
+@pytest.fixture(scope="module")
+def masses(arm: ArmConfig) -> Masses:
+    return masses_of(arm)
+
+
+def of_kind(arm: ArmConfig, kind: FaultKind, axis: int, *, harmless: bool) -> ArmScenario:
+    """The first scenario of seed 1 with this fault on this joint, while it tracks."""
+    number = KINDS.index(kind) + len(KINDS) * axis
+    while True:
+        found = draw_arm_scenario(arm, 1, number)
+        fault = found.fault
+        if fault.harmless is harmless and 1.4 < fault.at_s < 1.0 + fault.trajectory.duration_s:
+            return found
+        number += len(KINDS) * len(arm.joints)
+
+
+def test_no_scenario_violates_an_invariant(arm: ArmConfig, joints: LockstepArm, masses: Masses) -> None:
+    """Each kind once, one joint after the other; the whole: docs/safety.md."""
+    found = []
+    for index in range(len(KINDS)):
+        number = index + len(KINDS) * (index % len(arm.joints))
+        found.append(judge_arm(joints, masses, draw_arm_scenario(arm, 21, number)))
+    assert [(v.number, v.kind, v.violations) for v in found if v.violations] == []
+    assert [v.kind for v in found] == [kind.name.lower() for kind in KINDS]
+    assert sum(v.fault != "NONE" for v in found) > len(found) // 4
+    assert all(v.fault == "NONE" for v in found if v.harmless)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        FaultKind.ENCODER_JUMP, FaultKind.DRIVE_HEARTBEAT_LOST, FaultKind.TPDO_LOST, FaultKind.SYNC_LOST,
+        FaultKind.CONTROLLER_HEARTBEAT_LOST,
+    ],
+)  # fmt: skip
+def test_a_fault_is_that_of_its_joint_and_its_twin_is_none(
+    arm: ArmConfig, joints: LockstepArm, kind: FaultKind, axis: int
+) -> None:
+    harmful = of_kind(arm, kind, axis, harmless=False)
+    assert harmful.faulty == axis
+    runs, _ = run_arm_scenario(joints, harmful)
+    assert runs[axis].fault in FAULT_CLASSES[kind].causes
+    assert [run.fault for other, run in enumerate(runs) if other != axis] == [Fault.NONE] * 2
+    begun = [int(np.flatnonzero(run.log.phase >= AxisPhase.RAMPING)[0]) for run in runs]
+    assert max(begun) - min(begun) <= 1
+    twin, _ = run_arm_scenario(joints, of_kind(arm, kind, axis, harmless=True))
+    assert [run.fault for run in twin] == [Fault.NONE] * 3
+
+
+def test_what_is_the_computers_reaches_every_drive(arm: ArmConfig, joints: LockstepArm) -> None:
+    """Off the bus: no drive gets a frame, so each stops by its own watchdog."""
+    scenario = of_kind(arm, FaultKind.BUS_OFF, 0, harmless=False)
+    scenario = dataclasses.replace(
+        scenario, joints=tuple(dataclasses.replace(joint, duration_s=30.0) for joint in scenario.joints)
+    )
+    runs, _ = run_arm_scenario(joints, scenario)
+    assert FaultKind.BUS_OFF in COMMON
+    at_row = round(scenario.fault.at_s / 1e-3)
+    for run in runs:
+        assert run.truth[at_row, TRUE_POWER_STATE] == PowerState.OPERATION_ENABLED
+        assert run.truth[at_row + 1500, TRUE_POWER_STATE] != PowerState.OPERATION_ENABLED
+        assert run.fault in FAULT_CLASSES[FaultKind.BUS_OFF].causes
+
+
+# --- each invariant notices ---
+
+
+@pytest.fixture
+def stopped(arm: ArmConfig, joints: LockstepArm) -> tuple[list[LockstepRun], ArmScenario]:
+    """The elbow's encoder jumped; arrays that a test may change."""
+    scenario = of_kind(arm, FaultKind.ENCODER_JUMP, 1, harmless=False)
+    runs, _ = run_arm_scenario(joints, scenario)
+    return [dataclasses.replace(run, log=run.log.copy(), truth=run.truth.copy()) for run in runs], scenario
+
+
+def lines(arm: ArmConfig, joints: LockstepArm, runs: list[LockstepRun], scenario: ArmScenario) -> list[str]:
+    start_ns = joints.start_ns
+    rows = [arm_campaign.fault_row_of(run, start_ns, PERIOD_NS) for run in runs]
+    return [
+        *arm_campaign._torque_before_all(runs, start_ns, PERIOD_NS),
+        *arm_campaign._not_together(runs),
+        *arm_campaign._wrong_report(runs, scenario, arm.names, rows, start_ns, PERIOD_NS),
+    ]
+
+
+def first_torque(run: LockstepRun) -> int:
+    return int(np.flatnonzero(run.log.command_torque_Nm)[0])
+
+
+def spoil_enabling(runs: list[LockstepRun], cycles: int) -> None:
+    """The wrist's drive is enabled so many cycles after the first torque."""
+    row = min(first_torque(run) for run in runs)
+    runs[2].truth[: row + cycles, TRUE_POWER_STATE] = PowerState.SWITCHED_ON
+    runs[2].truth[row + cycles, TRUE_POWER_STATE] = PowerState.OPERATION_ENABLED
+
+
+def spoil_stop(runs: list[LockstepRun], cycles: int) -> None:
+    """The wrist goes on for so many cycles."""
+    first = min(int(np.flatnonzero(run.log.phase >= AxisPhase.RAMPING)[0]) for run in runs)
+    runs[2].log.phase[: first + cycles] = AxisPhase.TRACKING
+
+
+def spoil_report(runs: list[LockstepRun], cycles: int) -> None:
+    """The shoulder says that it was so many cycles before the elbow; negative: after it."""
+    row = int(np.flatnonzero(runs[1].log.fault != Fault.NONE)[0])
+    runs[0].log.fault[row - cycles :] = Fault.FOLLOWING_ERROR
+    runs[0] = dataclasses.replace(runs[0], fault=Fault.FOLLOWING_ERROR)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "just_wrong", "just_right", "words"),
+    [
+        (spoil_enabling, 1, 0, "before the drive of joint 2 was enabled"),
+        (spoil_stop, 2, 1, "went on for 2 cycles"),
+        (spoil_report, 1, 0, "reported as that of shoulder, FOLLOWING_ERROR"),
+    ],
+)
+def test_each_invariant_of_all_joints_notices(
+    arm: ArmConfig, joints: LockstepArm, stopped: Any, spoil: Any, just_wrong: int, just_right: int, words: str
+) -> None:
+    runs, scenario = stopped
+    assert lines(arm, joints, runs, scenario) == []
+    for amount, noticed in ((just_right, False), (just_wrong, True)):
+        spoilt = [dataclasses.replace(run, log=run.log.copy(), truth=run.truth.copy()) for run in runs]
+        spoil(spoilt, amount)
+        assert any(words in line for line in lines(arm, joints, spoilt, scenario)) is noticed
+
+
+def test_a_cause_that_has_nothing_to_do_with_it_is_noticed(arm: ArmConfig, joints: LockstepArm, stopped: Any) -> None:
+    runs, scenario = stopped
+    for axis, fault, words in ((1, Fault.OVERRUN, "elbow: the cause"), (0, Fault.DRIVE_FAULT, "shoulder: reported")):
+        spoilt = list(runs)
+        spoilt[axis] = dataclasses.replace(runs[axis], fault=fault)
+        assert any(words in line for line in lines(arm, joints, spoilt, scenario)), fault
+
+
+def test_a_joint_that_leaves_its_envelope_is_named(
+    arm: ArmConfig, joints: LockstepArm, masses: Masses, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenario = of_kind(arm, FaultKind.ENCODER_JUMP, 1, harmless=False)
+    runs, constants = run_arm_scenario(joints, scenario)
+    allowed = envelopes(joints, masses, scenario, constants)
+    assert judge_arm(joints, masses, scenario).violations == ()
+    for column, value, words in (
+        (TRUE_POSITION_rad, allowed[2].position_max_rad + 1e-6, "wrist: position"),
+        (TRUE_VELOCITY_radps, -allowed[2].velocity_max_radps - 1e-6, "wrist: speed"),
+    ):
+        runs[2].truth[1000, column], before = value, runs[2].truth[1000, column]
+        monkeypatch.setattr(arm_campaign, "run_arm_scenario", lambda *_: (runs, constants))
+        (line,) = judge_arm(joints, masses, scenario).violations
+        assert line.startswith(words)
+        runs[2].truth[1000, column] = before
+
+
+def test_the_envelope_follows_its_derivation(arm: ArmConfig, joints: LockstepArm) -> None:
+    """By hand, for masses that do not depend on the pose: the elbow's drive fails, nothing else is thrown."""
+    scenario = of_kind(arm, FaultKind.DRIVE_FAULT, 1, harmless=False)
+    _, constants = run_arm_scenario(joints, scenario)
+    plain = Masses(np.diag([0.5, 1.25, 8.0]), np.zeros((3, 3)), np.array([30.0, 10.0, 1.0]))
+    allowed = envelopes(joints, plain, scenario, constants)[1]
+    push = 1.25 * (0.6 * 121.0 + 10.0 + sum(scenario.fault.plant["torque_ripple_Nm"]))
+    speed, brake = 3.4 + push * 0.01, joints.quick_stop_radps2[1]
+    assert brake == pytest.approx(1e6 / (524288 / (2 * np.pi)))
+    assert allowed.velocity_max_radps == pytest.approx(speed)
+    assert allowed.position_max_rad == pytest.approx(2.0 + 0.034 + 0.5 * push * 1e-4 + speed**2 / (2 * brake))
+
+
+# --- the verb ---
+
+
+def test_the_verb_takes_an_arm_and_replays_one_scenario(arm: ArmConfig, tmp_path: Path) -> None:
+    shown, out, _ = output(json=True)
+    assert fault_campaign(arm, shown, count=3, seed=5, folder=tmp_path / "new", workers=Workers(1)) == 0
+    assert json.loads(out.getvalue())["scenarios"] == 3
+    assert json.loads((tmp_path / "new" / "campaign.json").read_text())["violations"] == []
+    shown, out, _ = output(json=True)
+    assert fault_campaign(arm, shown, seed=5, scenario=40) == 0
+    told = json.loads(out.getvalue())
+    assert told["scenario"]["joint"] == 1
+    assert len(told["scenario"]["joints"]) == 3
+    assert told["verdict"]["number"] == 40
+
+
+def test_what_is_one_joints_is_refused_and_so_is_an_arm_that_proves_nothing(arm: ArmConfig) -> None:
+    shown, _, _ = output()
+    with pytest.raises(UsageError, match=r"--sweep is one joint's, and .*arm.toml is an arm"):
+        fault_campaign(arm, shown, sweep=True)
+    slow = arm.joints[1].model_copy(
+        update={"limits": arm.joints[1].limits.model_copy(update={"velocity_max_radps": 0.9})}
+    )
+    with pytest.raises(ConfigurationError, match=r"elbow.toml: limits.velocity_max_radps \(=0.9\) must be at least 1"):
+        require_arm_fits(dataclasses.replace(arm, joints=(arm.joints[0], slow, arm.joints[2])))

@@ -1,0 +1,375 @@
+"""The campaign on an arm: one joint has the fault, all joints move, and what must then hold for each and for all.
+
+Scenario `number` of a seed has the fault that a single joint's scenario of that number has (`fault_scenarios`), on one
+joint after the other; torques are scaled to that joint's limit.  Every joint has a motion and a plant of its own.
+
+What holds for a single joint (`judge`) must hold for each of them.  Besides:
+
+- no joint has torque before the drives of all are enabled;
+- whatever stops one joint stops all, in the same cycle, or where its command is the cause in the next one;
+- the first fault is that of the joint that has it, with its cause; after it another joint may report only what the
+  first one's stop does to it.
+
+How far and how fast a joint may get follows from `judge` with the arm's mass matrix M: until the reaction has begun,
+every drive may push with all that it has, each gravity torque, ripple and added load in the worst direction,
+
+    a = max over the poses of sum_j |M^-1_ij| (drive_j + ripple_j + gravity_j + load_j)
+
+for the reaction time of the fault on its joint, for that of a measured limit on the others.  A joint whose brake closes
+throws the others: |M_ij| / M_ii of its speed.  The virtual arm's brakes hold, so there is no friction to be braked by:
+quick stop and ramp brake with 6085 or sequence.brake_radps2, the smaller one.  A motor that yields too little lets its
+joint fall until the drive has given up its stop ramp.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from jointctl.firmware_py.records import Reference
+from jointctl.firmware_py.safety import PUSHED_CYCLES
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.states import AxisPhase, Fault, Reaction
+from jointctl.firmware_py.trajectory import reference_at
+from jointctl.hil.canopen.records import PowerState
+from jointctl.hil.fault_kinds import FaultKind
+from jointctl.hil.lockstep import TRUE_POWER_STATE, TRUE_VELOCITY_radps
+from jointctl.hil.plant_records import FrictionKind
+from jointctl.tools.analysis.arm_check import pose_models
+from jointctl.tools.configuration.arm import ArmConfig
+from jointctl.tools.configuration.canopen import canopen_section
+from jointctl.tools.configuration.config import Config
+from jointctl.tools.configuration.plant_settings import arm_plant_of
+from jointctl.tools.experiments.fault_scenarios import (
+    FAULT_CLASSES,
+    LATE_CAUSES,
+    MOTION,
+    REACH_RAD,
+    Scenario,
+    draw_plant,
+    draw_scenario,
+    draw_trajectory,
+    fitted,
+    kinds_during,
+    plant_of,
+)
+from jointctl.tools.experiments.judge import (
+    BLIND_RAD,
+    BLIND_RADPS,
+    APPROACH_s,
+    BRAKE_SPARE_s,
+    Envelope,
+    SIZED_FOR_Nm,
+    SPARE_s,
+    TAIL_s,
+    Verdict,
+    beyond_rad,
+    fault_row_of,
+    reaction_s,
+    require_joint_fits,
+    wrong_cause,
+    wrong_of_joint,
+)
+from jointctl.tools.lockstep import LockstepArm, LockstepRun
+
+# --- the scenario ---
+
+SIZED_FOR_rad = 0.7  # the position limit for which `fault_scenarios` draws
+SPEED_SHARE = 0.35  # of limits.velocity_max_radps: with a filter of 200 Hz twice that must still be harmless
+RIPPLE_SHARE = 0.4  # of what is drawn for that joint, at the same torque
+PAPER_BRISTLE_Nmprad = 8e4
+INERTIA_SCALES = (0.95, 1.05)
+OF_TORQUE = frozenset({FaultKind.TORQUE_SATURATED, FaultKind.LOAD_JUMP})  # magnitudes in Nm
+# of the computer, so of all joints at once
+COMMON = frozenset(
+    {FaultKind.BUS_OFF, FaultKind.LOOP_HELD_UP, FaultKind.CLOCK_STEP, FaultKind.SUPERVISOR_SILENT}
+)  # fmt: skip
+WEAK = frozenset({FaultKind.TORQUE_SATURATED, FaultKind.CURRENT_LOOP_DEAD})  # the motor yields too little
+
+
+@dataclass(frozen=True)
+class ArmScenario:
+    """What happens to each joint; the fault is in the scenario of joint `faulty`, those of the others have none."""
+
+    faulty: int
+    joints: tuple[Scenario, ...]
+    inertia_scales: tuple[float, ...]
+
+    @property
+    def fault(self) -> Scenario:
+        return self.joints[self.faulty]
+
+    def describe(self) -> dict[str, Any]:
+        """For JSON and people."""
+        joints = [
+            {"inertia_scale": scale, **{k: v for k, v in joint.describe().items() if k in ("trajectory", "plant")}}
+            for scale, joint in zip(self.inertia_scales, self.joints, strict=True)
+        ]
+        fault = {k: v for k, v in self.fault.describe().items() if k not in ("trajectory", "plant")}
+        return {**fault, "joint": self.faulty, "joints": joints}
+
+
+def draw_arm_scenario(arm: ArmConfig, seed: int, number: int) -> ArmScenario:
+    """Scenario `number` of the campaign with this seed."""
+    base = draw_scenario(seed, number)
+    faulty = number // len(kinds_during("run")) % len(arm.joints)
+    random = np.random.default_rng([seed, number, 1])
+    joints, scales = [], []
+    for axis, config in enumerate(arm.joints):
+        limits, size = config.limits, config.limits.torque_max_Nm / SIZED_FOR_Nm
+        reach_rad = REACH_RAD / SIZED_FOR_rad * min(limits.position_max_rad, -limits.position_min_rad)
+        trajectory = draw_trajectory(
+            random, base.trajectory.duration_s, reach_rad, SPEED_SHARE * limits.velocity_max_radps
+        )
+        joint = replace(base, trajectory=trajectory, plant=_plant(random, config, size),
+                        start_offset_rad=float(random.uniform(-0.1, 0.1)))  # fmt: skip
+        scales.append(float(random.uniform(*INERTIA_SCALES)))
+        if axis != faulty:
+            joint = replace(joint, kind=FaultKind.NONE)
+        elif joint.kind in OF_TORQUE:
+            joint = replace(joint, magnitude=size * joint.magnitude)
+        joints.append(fitted(config, joint))
+    return ArmScenario(faulty, tuple(joints), tuple(scales))
+
+
+def _plant(random: np.random.Generator, config: Config, size: float) -> dict[str, Any]:
+    """Settings of `plant_of`: a joint of an arm has no stick-slip friction, and the arm has the inertias."""
+    drawn = draw_plant(random)
+    del drawn["inertia_kgm2"]
+    assert config.friction is not None
+    bristles = config.friction.lugre.stiffness_Nmprad if config.friction.lugre is not None else PAPER_BRISTLE_Nmprad
+    return {
+        **drawn,
+        "friction_kind": FrictionKind.LUGRE,
+        "bristle_stiffness_Nmprad": drawn["bristle_stiffness_Nmprad"] * bristles / PAPER_BRISTLE_Nmprad,
+        "torque_ripple_Nm": tuple(RIPPLE_SHARE * size * ripple for ripple in drawn["torque_ripple_Nm"]),
+    }
+
+
+# --- the run ---
+
+
+def moving(arm: ArmConfig, scenario: ArmScenario) -> ArmConfig:
+    """The arm with the scenario's motions and inertias."""
+    joints = []
+    for config, joint, scale in zip(arm.joints, scenario.joints, scenario.inertia_scales, strict=True):
+        assert config.virtual is not None
+        sequence = config.sequence.model_copy(update={"approach_s": APPROACH_s})
+        virtual = config.virtual.model_copy(update={"inertia_scale": scale})
+        changed = {"trajectory": joint.trajectory, "sequence": sequence, "virtual": virtual}
+        joints.append(config.model_copy(update=changed))
+    return replace(arm, joints=tuple(joints))
+
+
+def run_arm_scenario(joints: LockstepArm, scenario: ArmScenario) -> tuple[list[LockstepRun], Any]:
+    """The runs of the joints, and the `AxisConstants` that they used."""
+    arm = moving(joints.arm, scenario)
+    at_zero = [0.0] * len(arm.joints)
+    first, starts = new(Reference)[0], []
+    for axis, constants in enumerate(arm.axis_constants(list(joints.tables), at_zero)):
+        reference_at(constants.trajectory, joints.tables[axis], 0, 0.0, first)
+        limits = arm.joints[axis].limits
+        start = float(first.position_rad) + scenario.joints[axis].start_offset_rad
+        starts.append(min(max(start, limits.position_min_rad + 0.05), limits.position_max_rad - 0.05))
+    constants = arm.axis_constants(list(joints.tables), starts)
+    parts = [plant_of(*one) for one in zip(arm.joints, scenario.joints, starts, strict=True)]
+    plants = tuple(np.concatenate([part[i] for part in parts]).view(np.recarray) for i in (0, 1))
+    runs = joints.run_with_faults(
+        scenario.fault.fault(), scenario.faulty, constants, (plants[0], plants[1]), arm_plant_of(arm),
+        longest_s=APPROACH_s + scenario.fault.trajectory.duration_s + SPARE_s, tail_s=TAIL_s,
+    )  # fmt: skip
+    return runs, constants
+
+
+# --- the envelope ---
+
+
+@dataclass(frozen=True)
+class Masses:
+    """Over the poses: the greatest |M^-1|, the greatest |M_ij| / M_ii, the greatest gravity [Nm]."""
+
+    inverse: np.ndarray
+    throw: np.ndarray
+    gravity_Nm: np.ndarray
+
+
+def masses_of(arm: ArmConfig) -> Masses:
+    """With what a scenario's inertias may add."""
+    inertias, gravity = pose_models(arm)
+    low, high = INERTIA_SCALES
+    own = np.diagonal(inertias, axis1=1, axis2=2)
+    throw = (np.abs(inertias) / own[:, :, np.newaxis]).max(axis=0) * high / low
+    np.fill_diagonal(throw, 0.0)
+    return Masses(np.abs(np.linalg.inv(inertias)).max(axis=0) / low, throw, np.abs(gravity).max(axis=0) * high)
+
+
+def envelopes(joints: LockstepArm, masses: Masses, scenario: ArmScenario, constants: Any) -> list[Envelope]:
+    """Of each joint, see the module."""
+    arm, fault = joints.arm, scenario.fault
+    pushes = masses.gravity_Nm + [sum(joint.plant["torque_ripple_Nm"]) for joint in scenario.joints]
+    pushes += [_drive_Nm(config) for config in arm.joints]
+    if fault.kind is FaultKind.LOAD_JUMP:
+        pushes[scenario.faulty] += abs(fault.magnitude)
+    push = masses.inverse @ pushes
+    speed_limits = np.array([config.limits.velocity_max_radps for config in arm.joints])
+    waits = np.array([
+        reaction_s(config, fault.kind if fault.kind in COMMON or axis == scenario.faulty else FaultKind.NONE)
+        for axis, config in enumerate(arm.joints)
+    ])  # fmt: skip
+    brakes = np.minimum([config.sequence.brake_radps2 for config in arm.joints], joints.quick_stop_radps2)
+    alone = speed_limits + push * waits
+    fall_s = np.zeros(len(alone))
+    if fault.kind in WEAK:
+        fall_s[scenario.faulty] = (alone / brakes)[scenario.faulty] + BRAKE_SPARE_s
+    elif fault.kind is FaultKind.LOAD_JUMP:
+        fall_s[scenario.faulty] = fault.duration_s
+    loads = masses.gravity_Nm.copy()
+    if fault.kind is FaultKind.LOAD_JUMP:
+        loads[scenario.faulty] += abs(fault.magnitude)
+    alone = alone + masses.inverse @ loads * fall_s
+    speeds = alone + masses.throw @ alone
+    ways = speed_limits * waits + 0.5 * push * waits**2 + speeds * fall_s + speeds**2 / (2.0 * brakes)
+    stops = waits + fall_s + speeds / brakes + BRAKE_SPARE_s
+    found = []
+    for axis, config in enumerate(arm.joints):
+        shift, speed = _misread(config, scenario, constants[axis], axis, float(ways[axis]))
+        found.append(
+            _envelope(config, constants[axis], float(ways[axis]) + shift, float(speeds[axis]) + speed, stops.max())
+        )
+    return found
+
+
+def _drive_Nm(config: Config) -> float:
+    section = canopen_section(config)
+    share = 1e-3 * (section.max_torque_permille or 1000)
+    return share * (section.rated_torque_Nm or 0.0) * config.joint.reduction_ratio
+
+
+def _misread(config: Config, scenario: ArmScenario, constants: Any, axis: int, way: float) -> tuple[float, float]:
+    """What a wrong reading adds to the joint that has it: (rad, rad/s)."""
+    fault = scenario.fault
+    if axis != scenario.faulty:
+        return 0.0, 0.0
+    if fault.kind is FaultKind.ENCODER_JUMP:
+        return abs(fault.magnitude), 0.0
+    if fault.kind is FaultKind.ENCODER_DRIFT:
+        run_s = APPROACH_s + fault.trajectory.duration_s + config.sequence.stop_timeout_s
+        return abs(fault.magnitude) * min(fault.duration_s, run_s + 1.0), abs(fault.magnitude)
+    if fault.kind is FaultKind.ENCODER_REVERSED:
+        return 2.0 * config.limits.following_error_max_rad + way, 0.0
+    if fault.kind is FaultKind.ENCODER_STUCK:  # blind, pushed by what a healthy joint does not stand still under
+        friction = constants.law.friction
+        viscous = min(friction.positive.viscous_Nmspr, friction.negative.viscous_Nmspr)
+        blind = float(constants.limits.frozen_torque_Nm / (viscous * config.joint.reduction_ratio))
+        pushed = _drive_Nm(config) / config.joint.inertia_kgm2 * PUSHED_CYCLES / config.loop.rate_Hz
+        return BLIND_RAD * (blind + pushed) / BLIND_RADPS, blind + pushed
+    return 0.0, 0.0
+
+
+def _envelope(config: Config, constants: Any, way: float, speed: float, stop_s: float) -> Envelope:
+    limits, sequence = constants.limits, config.sequence
+    return Envelope(
+        position_min_rad=limits.position_min_rad - way,
+        position_max_rad=limits.position_max_rad + way,
+        velocity_max_radps=speed,
+        command_max_Nm=limits.torque_max_Nm,
+        command_step_Nm=limits.torque_rate_max_Nmps * constants.law.period_s,
+        stop_s=float(stop_s),
+        ramp_s=sequence.stop_timeout_s + sequence.release_s + float(stop_s),
+    )
+
+
+def require_arm_fits(arm: ArmConfig) -> None:
+    """`ConfigurationError` for an arm whose campaign would prove nothing."""
+    for config in arm.joints:
+        require_joint_fits(config)
+
+
+# --- the invariants ---
+
+
+def judge_arm(joints: LockstepArm, masses: Masses, scenario: ArmScenario) -> Verdict:
+    """Run a scenario and check every invariant; `masses` as of `masses_of`.
+
+    Speed, way and time in the verdict are the greatest of all joints; fault and reaction those of the first that
+    reported one.
+    """
+    runs, constants = run_arm_scenario(joints, scenario)
+    period_ns, start_ns = round(float(constants[0].law.period_s) * 1e9), int(joints.start_ns)
+    allowed = envelopes(joints, masses, scenario, constants)
+    fault_rows = [fault_row_of(run, start_ns, period_ns) for run in runs]
+    first = min((row for row in fault_rows if row >= 0), default=-1)
+    found, off_s = [], []
+    names = joints.arm.names
+    for axis, name in enumerate(names):
+        wrong, off = wrong_of_joint(runs[axis], allowed[axis], scenario.joints[axis], first, start_ns, period_ns)
+        found += [f"{name}: {line}" for line in wrong]
+        off_s.append(off)
+    found += _torque_before_all(runs, start_ns, period_ns) + _not_together(runs)
+    found += _wrong_report(runs, scenario, names, fault_rows, start_ns, period_ns)
+    fault, named = scenario.fault, runs[fault_rows.index(first)]
+    beyond = [beyond_rad(run, one.limits) for run, one in zip(runs, constants, strict=True)]
+    worst = int(np.argmax(beyond))
+    return Verdict(
+        number=fault.number,
+        kind=fault.kind.name.lower(),
+        harmless=fault.harmless,
+        fault=named.fault.name,
+        reaction=Reaction(int(named.state.reaction)).name,
+        violations=tuple(found),
+        peak_radps=max(float(np.abs(run.truth[:, TRUE_VELOCITY_radps]).max()) for run in runs),
+        beyond_rad=beyond[worst],
+        allowed_rad=allowed[worst].position_max_rad - float(constants[worst].limits.position_max_rad),
+        off_s=None if first < 0 else max(value for value in off_s if value is not None),
+    )
+
+
+def _torque_before_all(runs: list[LockstepRun], start_ns: int, period_ns: int) -> list[str]:
+    """Torque that a joint got before the drives of all were enabled."""
+    commanded = np.array([run.log.command_torque_Nm != 0.0 for run in runs]).any(axis=0)
+    rows = np.flatnonzero(commanded)
+    if not len(rows):
+        return []
+    row = (int(runs[0].log.time_ns[rows[0]]) - start_ns) // period_ns
+    off = [
+        axis
+        for axis, run in enumerate(runs)
+        if not (run.truth[: row + 1, TRUE_POWER_STATE] == PowerState.OPERATION_ENABLED).any()
+    ]
+    return [f"torque commanded before the drive of joint {axis} was enabled" for axis in off]
+
+
+def _not_together(runs: list[LockstepRun]) -> list[str]:
+    """Joints that went on when another one had begun to stop."""
+    stopping = [np.flatnonzero(run.log.phase >= AxisPhase.RAMPING) for run in runs]
+    begun = [int(rows[0]) if len(rows) else len(runs[0].log) for rows in stopping]
+    late = max(begun) - min(begun)
+    return [f"a joint went on for {late} cycles after another had begun to stop"] if late > 1 else []
+
+
+def _wrong_report(
+    runs: list[LockstepRun], scenario: ArmScenario, names: tuple[str, ...], fault_rows: list[int], start_ns: int,
+    period_ns: int,
+) -> list[str]:  # fmt: skip
+    """The joint and the cause that are reported first, and what others report after it."""
+    fault, faulty = scenario.fault, scenario.faulty
+    first = min((row for row in fault_rows if row >= 0), default=-1)
+    earliest = [axis for axis, row in enumerate(fault_rows) if row == first]
+    if fault.kind in COMMON:
+        reported = earliest[0]
+    elif first < 0 or faulty in earliest:
+        reported = faulty
+    else:
+        return [f"the fault is reported as that of {names[earliest[0]]}, {runs[earliest[0]].fault.name}"]
+    found = [f"{names[reported]}: {line}" for line in wrong_cause(runs[reported], fault, period_ns * 1e-9, start_ns)]
+    if fault.harmless:
+        return found or [f"{names[axis]}: a harmless fault of {names[faulty]} tripped {run.fault.name}"
+                         for axis, run in enumerate(runs) if run.fault is not Fault.NONE]  # fmt: skip
+    after = MOTION | LATE_CAUSES | (FAULT_CLASSES[fault.kind].causes if fault.kind in COMMON else frozenset())
+    return found + [
+        f"{names[axis]}: reported {run.fault.name} after it"
+        for axis, run in enumerate(runs)
+        if axis != reported and run.fault is not Fault.NONE and run.fault not in after
+    ]
