@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,6 +12,10 @@ import numpy as np
 from jointctl.drivers.can.frames import bus_load, highest_rate_Hz
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.arm_model import newton_euler
+from jointctl.firmware_py.kernel import plain
+from jointctl.firmware_py.records import Reference
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.trajectory import reference_at
 from jointctl.tools.analysis.linear_loop import LoopSettings, RigidJoint
 from jointctl.tools.analysis.loop_settings import loop_settings
 from jointctl.tools.analysis.margins import Margins, margins
@@ -24,6 +28,7 @@ from jointctl.tools.configuration.config import Config
 HIGHEST_LOAD = 0.85
 RATES_Hz = (4000, 2000, 1000, 500, 250, 200, 125, 100)  # that a clock divides well
 MOST_POSES = 3000
+MOTION_SAMPLES = 400  # of a motion whose torques are looked at
 
 
 @dataclass(frozen=True)
@@ -123,6 +128,34 @@ def pose_ranges(arm: ArmConfig) -> list[PoseRange]:
         inertias.append(own)
     low, high, load = np.min(inertias, axis=0), np.max(inertias, axis=0), np.max(loads, axis=0)
     return [PoseRange(float(low[i]), float(high[i]), float(load[i])) for i in range(axes)]
+
+
+def require_torques(
+    arm: ArmConfig, trajectories: Sequence[Any], tables: np.ndarray, duration_s: float, alive: Callable[[], None]
+) -> None:
+    """`ConfigurationError` where the model asks more of a joint than its limit, at one of `MOTION_SAMPLES` moments.
+
+    `trajectories`: TrajectoryConstants of each joint, `tables` their rows; `alive` is called in between.
+    """
+    memory = arm.model.memory()
+    motion: Any = memory.motion
+    reference: Any = new(Reference)[0]
+    rows, at = [0] * len(trajectories), plain(reference_at)
+    for time_s in np.linspace(0.0, duration_s, MOTION_SAMPLES):
+        alive()
+        for axis, trajectory in enumerate(trajectories):
+            rows[axis] = at(trajectory, tables[axis], rows[axis], float(time_s), reference)
+            own = motion[axis]
+            own.position_rad, own.velocity_radps = reference.position_rad, reference.velocity_radps
+            own.acceleration_radps2 = reference.acceleration_radps2
+        newton_euler(memory)
+        for axis, (name, config) in enumerate(zip(arm.names, arm.joints, strict=True)):
+            torque_Nm = float(motion[axis].torque_Nm)
+            if not abs(torque_Nm) <= config.limits.torque_max_Nm:
+                raise ConfigurationError(
+                    f"{name}: the motion takes {torque_Nm:.3g} Nm at {time_s:.3g} s by the arm's model, must be in "
+                    f"[{-config.limits.torque_max_Nm:g}..{config.limits.torque_max_Nm:g}], limits.torque_max_Nm"
+                )
 
 
 def joint_loop(name: str, config: Config, found: PoseRange, delay_s: float | None = None) -> JointOfArm:

@@ -45,6 +45,8 @@ class PreparedMotion(ViewerRequest):
     trajectory: Any = None  # record array of one TrajectoryConstants
     words: str = ""
     answered: Callable[[str], None] = lambda _: None
+    joint: str = ""  # whose it is, in an arm
+    move_s: float = 0.0  # that the way to its beginning takes at least
 
 
 def viewer(address: str | None) -> str:
@@ -209,10 +211,13 @@ class PhaseLines(OnlyShows):
 
 
 class JointDisplay:
-    """What a display gets from one joint of an arm: with its name in front, and a phase from the first one only."""
+    """What a display gets from one joint of an arm: with its name in front, and a phase from the first one only.
 
-    def __init__(self, display: Display, name: str, *, first: bool) -> None:
-        self._display, self._name, self._first = display, name, first
+    The joints share `orders`, motions that the program has given and that no joint has taken yet.
+    """
+
+    def __init__(self, display: Display, name: str, orders: list[PreparedMotion], *, first: bool) -> None:
+        self._display, self._name, self._orders, self._first = display, name, orders, first
         self.stop_request, self.stop_reason = display.stop_request, display.stop_reason
 
     def note(self, text: str) -> None:
@@ -230,8 +235,11 @@ class JointDisplay:
         self._display.event(replace(event, text=f"{self._name}: {event.text}"))
 
     def requests(self) -> Sequence[ViewerRequest]:
-        """An arm's gains and motion are not changed while it runs."""
-        return ()
+        """Motions of the program for this joint; viewers change neither gains nor motion of an arm."""
+        self._orders += [request for request in self._display.requests() if isinstance(request, PreparedMotion)]
+        own = [order for order in self._orders if order.joint == self._name]
+        self._orders[:] = [order for order in self._orders if order.joint != self._name]
+        return own
 
     def settings(self, values: Mapping[str, Any]) -> None:
         """As above."""

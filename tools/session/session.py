@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,10 +25,10 @@ from jointctl.tools.recording.run_summary import summarise
 from jointctl.tools.session.bus_watch import BusWatch, TemperatureWatch, bus_watch, recording
 from jointctl.tools.session.consent import Consent, prepare_log, require_ready
 from jointctl.tools.session.control import Control, StopSignals
-from jointctl.tools.session.display import Display, JointDisplay, PhaseLines
+from jointctl.tools.session.display import Display, JointDisplay, PhaseLines, PreparedMotion
 from jointctl.tools.session.fault_words import held_up_text
 from jointctl.tools.session.loop_handle import LoopHandle
-from jointctl.tools.session.plan import JointPlan, Placed, RunPlan
+from jointctl.tools.session.plan import Placed, RunPlan, blamed
 from jointctl.tools.session.result import RunResult, warn_unless_off
 from jointctl.tools.session.run_watch import Around, RunParts, RunWatch
 from jointctl.tools.session.session_drive import Guard, session_drive
@@ -157,7 +157,7 @@ class Session:
         if self._consent.dry_run:
             return None
         for joint, report in zip(self._joints, reports, strict=True):
-            with self._blamed(joint):
+            with blamed(joint.name):
                 require_ready(joint.config, report, joint.log_path)
                 joint.motion.require_start(report.start_position_rad)
         if not self._consent.agreed(placed.lines):
@@ -165,16 +165,6 @@ class Session:
         for joint in self._joints:
             prepare_log(joint.config, joint.log_path, self._output)
         return placed
-
-    @staticmethod
-    @contextlib.contextmanager
-    def _blamed(joint: JointPlan) -> Iterator[None]:
-        """An error, with the name of the joint where there are several."""
-        try:
-            yield
-        except JointctlError as error:
-            error.message = joint.naming(error.message)
-            raise
 
     def _supervise(
         self, drives: DriveGroup, loop: LoopHandle, reports: Sequence[CommissioningReport], placed: Placed,
@@ -186,7 +176,8 @@ class Session:
         placed.constants.sequence.may_enable[:] = 0
         with contextlib.ExitStack() as stack:
             display = stack.enter_context(self._make_display(reports[0]))
-            watches = []
+            watches: list[RunWatch] = []
+            orders: list[PreparedMotion] = []
             for axis, (joint, report) in enumerate(zip(self._joints, reports, strict=True)):
                 metadata = run_metadata(joint.config, report)
                 if plan.arm is not None:  # its [motion] is what the joint does, and not the joint's own [trajectory]
@@ -196,7 +187,7 @@ class Session:
                     metadata[THINNING] = {"every": str(plan.log_every), "whole_s": f"{plan.log_full_rate_s:g}"}
                 log = stack.enter_context(RunLogWriter(joint.log_path, metadata))
                 kept = stack.enter_context(KeptRecords(joint.log_path.parent))
-                shown: Display = JointDisplay(display, joint.name, first=axis == 0) if joint.name else display
+                shown: Display = JointDisplay(display, joint.name, orders, first=axis == 0) if joint.name else display
                 # frames and troubles of the bus belong to no joint: they are in the first one's log
                 own = around if axis == 0 else replace(around, bus_watch=BusWatch(joint.config, None), recorder=None)
                 parts = RunParts(loop.of_axis(axis), own, log, kept, shown, metadata, self._set_points)
@@ -222,7 +213,7 @@ class Session:
         try:
             while loop.running():
                 for each in watches:
-                    with self._blamed(each.joint):
+                    with blamed(each.joint.name):
                         each.poll()
                 time.sleep(POLL_S)
         except MotionFault as error:
@@ -247,7 +238,7 @@ class Session:
         for each in watches:
             each.take_records(last=True)
         for each in watches:
-            with self._blamed(each.joint):
+            with blamed(each.joint.name):
                 self._raise_what_others_did(each, loop)
         state = self._made_safe(drives)
         recorder = watch.around.recorder

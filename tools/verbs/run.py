@@ -41,13 +41,13 @@ def run(
     from jointctl.tools.scoping.remote import remote
     from jointctl.tools.session.consent import TerminalConsent, require_terminal
     from jointctl.tools.session.control import in_control
-    from jointctl.tools.session.plan import resolve_any
+    from jointctl.tools.session.plan import configured, free, resolve_any
     from jointctl.tools.session.result import broken_off, never_begun, report_run, run_title
     from jointctl.tools.session.session import Session
 
     if not (assume_yes or dry_run):
         require_terminal()
-    plan = resolve_any(config, allow_low_margin=allow_low_margin, hold=live.hold)
+    plan = resolve_any(config, free if live.hold else configured, allow_low_margin=allow_low_margin)
     if plan.arm is not None and (scope is not None or live != NOBODY_REMOTE):
         raise UsageError("--scope, --foxglove, --ros2 and --hold are for a single joint, not for an arm")
     first = plan.config
