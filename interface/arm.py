@@ -121,7 +121,7 @@ class Arm(Program):
         What is wrong with one joint's part refuses the whole: `SetPointError` names the joint, its value and the limit,
         and all joints go on to the last valid set-point and rest there.
         """
-        self._command(position_rad, velocity_radps, acceleration_radps2, torque_Nm, time_s=time_s)
+        self._command((position_rad, velocity_radps, acceleration_radps2, torque_Nm), time_s)
 
     def step_torque(self, torque_Nm: npt.ArrayLike) -> ArmState:
         """At simulated time only: one cycle with these torques [Nm] instead of the laws'; the state after it.

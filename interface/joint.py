@@ -131,7 +131,7 @@ class Joint(Program):
         `SetPointError` names what is wrong, with value and limit: the joint goes on to the last valid set-point and
         rests there.  A set-point that is refused is no sign of life.
         """
-        self._command(position_rad, velocity_radps, acceleration_radps2, torque_Nm, time_s=time_s)
+        self._command((position_rad, velocity_radps, acceleration_radps2, torque_Nm), time_s)
 
     def step_torque(self, torque_Nm: float) -> State:
         """At simulated time only: one cycle with this torque [Nm] instead of the law's; the state after it.

@@ -18,7 +18,7 @@ from jointctl.drivers.errors import ConfigurationError, JointctlError, UsageErro
 from jointctl.firmware_py.records import MotionChange, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, TrajectoryKind, in_words
-from jointctl.tools.session.set_points import SetPointError, SetPointStream, finite
+from jointctl.tools.session.set_points import Numbers, SetPointError, SetPointStream, finite
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.arm import ArmConfig
@@ -30,6 +30,7 @@ TABLE_ROWS = 1 << 16  # of `follow`, at most
 PHASES = tuple(in_words(phase) for phase in AxisPhase)
 COMMISSIONED = "commissioned"  # the phase before the first cycle
 OFF = "switch on disabled"
+SetPointValues = tuple[Numbers, Numbers | None, Numbers | None, Numbers | None]  # position to torque
 
 
 class Axes(NamedTuple):
@@ -261,11 +262,11 @@ class Program:
             trajectories = [motion.trajectory[0] for motion in motions]
             require_torques(self._axes.arm, trajectories, tables, duration_s, self._alive)
 
-    def _command(self, *values: Any, time_s: float | None) -> None:
+    def _command(self, values: SetPointValues, time_s: float | None) -> None:
         stream = self._following()
         if self._under_way:
             raise SetPointError("a motion is under way: set-points are followed from rest", "wait for its end")
-        stream.take(*values, time_s=time_s)
+        stream.take(*values, time_s)
 
     def _at_rest(self) -> list[float]:
         """Where the references rest; a motion that is under way comes to its end first."""

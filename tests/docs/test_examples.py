@@ -27,6 +27,13 @@ def test_own_law(tmp_path: Path) -> None:
     assert configured < 0.5 * own < 5.0
 
 
+def test_an_arm(tmp_path: Path) -> None:
+    *joints, phase = ran(tmp_path, str(ROOT / "examples" / "arm.py")).splitlines()
+    assert [line.split()[0] for line in joints] == ["shoulder", "elbow", "wrist"]
+    assert all(float(line.split()[1]) < 0.5 for line in joints)
+    assert phase == "finished"
+
+
 @pytest.mark.realtime
 def test_set_points_in_real_time(tmp_path: Path) -> None:
     out = ran(tmp_path, str(ROOT / "examples" / "stream.py"))
