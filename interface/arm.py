@@ -59,11 +59,13 @@ class Arm(Program):
         channel: str | None = None,
         bitrate: int | None = None,
         allow_low_margin: bool = False,
+        foxglove: bool | str = False,
+        ros2: bool | int = False,
     ) -> None:
         super().__init__(
             motor_of(
                 config, "Arm", lockstep=lockstep, place=(interface, channel, bitrate, None, None), virtual=virtual,
-                allow_low_margin=allow_low_margin,
+                allow_low_margin=allow_low_margin, foxglove=foxglove, ros2=ros2,
             )
         )  # fmt: skip
 

@@ -131,7 +131,7 @@ class LiveMotor:
             if self.axes.arm is not None:
                 newton_euler(self.axes.arm.model.memory())
             output, first = Output(quiet=True), self.axes.joints[0]
-            others = self._stack.enter_context(remote(self._options, first, output, owner=WHO))
+            others = self._stack.enter_context(remote(self._options, self._source.config, output, owner=WHO))
             control = self._control = self._stack.enter_context(in_program(first, output))
             self._approval = _Approval(control.signals.leave_if_asked)
             plan = resolve_any(self._source.config, self._motion, allow_low_margin=self._allow_low_margin)

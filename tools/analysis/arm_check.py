@@ -141,7 +141,9 @@ def require_torques(
     motion: Any = memory.motion
     reference: Any = new(Reference)[0]
     rows, at = [0] * len(trajectories), plain(reference_at)
-    for time_s in np.linspace(0.0, duration_s, MOTION_SAMPLES):
+    times_s = np.linspace(0.0, duration_s, MOTION_SAMPLES)
+    torques_Nm = np.zeros((len(times_s), len(trajectories)))
+    for time_s, torques in zip(times_s, torques_Nm, strict=True):
         alive()
         for axis, trajectory in enumerate(trajectories):
             rows[axis] = at(trajectory, tables[axis], rows[axis], float(time_s), reference)
@@ -149,13 +151,14 @@ def require_torques(
             own.position_rad, own.velocity_radps = reference.position_rad, reference.velocity_radps
             own.acceleration_radps2 = reference.acceleration_radps2
         newton_euler(memory)
-        for axis, (name, config) in enumerate(zip(arm.names, arm.joints, strict=True)):
-            torque_Nm = float(motion[axis].torque_Nm)
-            if not abs(torque_Nm) <= config.limits.torque_max_Nm:
-                raise ConfigurationError(
-                    f"{name}: the motion takes {torque_Nm:.3g} Nm at {time_s:.3g} s by the arm's model, must be in "
-                    f"[{-config.limits.torque_max_Nm:g}..{config.limits.torque_max_Nm:g}], limits.torque_max_Nm"
-                )
+        torques[:] = motion.torque_Nm[: len(torques)]
+    for name, config, torques in zip(arm.names, arm.joints, torques_Nm.T, strict=True):
+        worst, limit_Nm = int(np.argmax(np.abs(torques))), config.limits.torque_max_Nm
+        if not abs(torques[worst]) <= limit_Nm:
+            raise ConfigurationError(
+                f"{name}: the motion takes {torques[worst]:.3g} Nm at {times_s[worst]:.3g} s by the arm's model, "
+                f"must be in [{-limit_Nm:g}..{limit_Nm:g}], limits.torque_max_Nm"
+            )
 
 
 def joint_loop(name: str, config: Config, found: PoseRange, delay_s: float | None = None) -> JointOfArm:

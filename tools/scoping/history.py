@@ -93,9 +93,10 @@ class History:
             self.skipped = 0
         self.events.clear()
 
-    def take_bytes(self, body: bytes) -> None:
-        """As `take`, of records as they came through the socket."""
-        self.take(np.frombuffer(body, dtype_of(LogRecord)))
+    def take_bytes(self, body: bytes, axis: int = 0) -> None:
+        """As `take`, of records as they came through the socket; of an arm those of the first joint."""
+        if axis == 0:
+            self.take(np.frombuffer(body, dtype_of(LogRecord)))
 
     def newest(self, span_s: float, before_s: float | None = None) -> Any:
         """A copy of the records of the last `span_s`, up to `before_s` since the start if that is given."""

@@ -81,6 +81,7 @@ class Snapshot:
     records: Any = ()  # all new ones, array of LogRecord (N,)
     temperature_degC: float | None = None  # None: the drive tells none, or not now
     joint: str = ""  # which joint of an arm
+    axis: int = 0  # its number
 
 
 class Display(Protocol):
@@ -216,8 +217,8 @@ class JointDisplay:
     The joints share `orders`, motions that the program has given and that no joint has taken yet.
     """
 
-    def __init__(self, display: Display, name: str, orders: list[PreparedMotion], *, first: bool) -> None:
-        self._display, self._name, self._orders, self._first = display, name, orders, first
+    def __init__(self, display: Display, name: str, orders: list[PreparedMotion], axis: int) -> None:
+        self._display, self._name, self._orders, self._axis = display, name, orders, axis
         self.stop_request, self.stop_reason = display.stop_request, display.stop_reason
 
     def note(self, text: str) -> None:
@@ -225,11 +226,11 @@ class JointDisplay:
 
     def phase(self, text: str) -> None:
         """All joints go on together."""
-        if self._first:
+        if self._axis == 0:
             self._display.phase(text)
 
     def show(self, snapshot: Snapshot) -> None:
-        self._display.show(replace(snapshot, joint=self._name))
+        self._display.show(replace(snapshot, joint=self._name, axis=self._axis))
 
     def event(self, event: Event) -> None:
         self._display.event(replace(event, text=f"{self._name}: {event.text}"))

@@ -97,6 +97,11 @@ class RunPlan:
         return self.arm.joints if self.arm is not None else (JointPlan(self.config, self.motion, self.log_path),)
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Of the joints of an arm; ("",) of one that is alone."""
+        return tuple(joint.name for joint in self.joints)
+
+    @property
     def tables(self) -> np.ndarray:
         """The tables of all motions, see `stacked_tables`."""
         return stacked_tables([joint.motion.table for joint in self.joints])

@@ -20,6 +20,7 @@ from jointctl.firmware_py.states import Fault, StopRequest
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
 from jointctl.tools.recording.kept_records import KeptRecords
+from jointctl.tools.recording.ros_messages import JOINT_NAMES
 from jointctl.tools.recording.run_log import ERROR, INFO, THINNING, WARNING, RunLogWriter, run_metadata
 from jointctl.tools.recording.run_summary import summarise
 from jointctl.tools.session.bus_watch import BusWatch, TemperatureWatch, bus_watch, recording
@@ -185,12 +186,14 @@ class Session:
                     metadata["arm"] = {"configuration": arm.text, "path": str(arm.path), "joint": joint.name}
                 if plan.log_every > 1:
                     metadata[THINNING] = {"every": str(plan.log_every), "whole_s": f"{plan.log_full_rate_s:g}"}
-                log = stack.enter_context(RunLogWriter(joint.log_path, metadata))
+                names = (plan.names if axis == 0 else (joint.name,)) if joint.name else JOINT_NAMES
+                log = stack.enter_context(RunLogWriter(joint.log_path, metadata, names))
                 kept = stack.enter_context(KeptRecords(joint.log_path.parent))
-                shown: Display = JointDisplay(display, joint.name, orders, first=axis == 0) if joint.name else display
+                shown: Display = JointDisplay(display, joint.name, orders, axis) if joint.name else display
                 # frames and troubles of the bus belong to no joint: they are in the first one's log
                 own = around if axis == 0 else replace(around, bus_watch=BusWatch(joint.config, None), recorder=None)
-                parts = RunParts(loop.of_axis(axis), own, log, kept, shown, metadata, self._set_points)
+                points, together = (self._set_points, None) if axis == 0 else (None, watches[0].log)
+                parts = RunParts(loop.of_axis(axis), own, log, kept, shown, metadata, points, together)
                 watches.append(stack.enter_context(RunWatch(plan, placed.constants[axis], parts, joint)))
             return self._carry_out(drives, loop, placed.constants, reports, watches)
 

@@ -309,13 +309,13 @@ class SetPointStream:
 
 @dataclass(frozen=True)
 class RemoteSetPoint:
-    """As the arguments of `Joint.command`, and who sends it."""
+    """As the arguments of `Joint.command`, of an arm those of `Arm.command`, and who sends it."""
 
     who: str
-    position_rad: float
-    velocity_radps: float | None = None
-    acceleration_radps2: float | None = None
-    torque_Nm: float = 0.0
+    position_rad: Numbers
+    velocity_radps: Numbers | None = None
+    acceleration_radps2: Numbers | None = None
+    torque_Nm: Numbers | None = None
     time_s: float | None = None
 
 
@@ -330,6 +330,7 @@ class SetPointSources:
         self.owner = owner
         self._program = owner
         self._block: SharedBlock | None = None
+        self._names: Sequence[str] = ("",)
         self._stream: SetPointStream | None = None
         self._lock = threading.Lock()
         self._news: list[tuple[int, str]] = []
@@ -368,21 +369,22 @@ class SetPointSources:
 
     def require(self) -> None:
         """See `StreamedLoop`: it tracks, and nothing but set-points or standing still."""
-        phase, change = AxisPhase(int(self.axis[0].phase)), int(self.axis[0].change.motion)
-        if phase is not AxisPhase.TRACKING:
-            raise SetPointError(f"the joint follows no set-points now ({in_words(phase)})")
-        kind = TrajectoryKind(int(self.constants[0].trajectory.kind))
-        if kind not in (TrajectoryKind.STREAM, TrajectoryKind.HOLD) or change != MotionChange.NONE:
-            raise SetPointError(
-                f"a motion is under way ({in_words(kind)}): set-points are followed where the joint holds its place"
-            )
+        for constants, axis in zip(self.constants, self.axis, strict=True):
+            phase, change = AxisPhase(int(axis.phase)), int(axis.change.motion)
+            if phase is not AxisPhase.TRACKING:
+                raise SetPointError(f"the joint follows no set-points now ({in_words(phase)})")
+            kind = TrajectoryKind(int(constants.trajectory.kind))
+            if kind not in (TrajectoryKind.STREAM, TrajectoryKind.HOLD) or change != MotionChange.NONE:
+                raise SetPointError(
+                    f"a motion is under way ({in_words(kind)}): set-points are followed where the joint holds its place"
+                )
 
     # the supervisor's side
 
-    def begin(self, block: SharedBlock) -> None:
-        """The loop is let go, with this memory."""
+    def begin(self, block: SharedBlock, names: Sequence[str] = ("",)) -> None:
+        """The loop is let go, with this memory of all joints."""
         with self._lock:
-            self._block, self._stream = block, None
+            self._block, self._stream, self._names = block, None, names
             self.owner = self._program
 
     def end(self) -> None:
@@ -393,7 +395,7 @@ class SetPointSources:
         """The sign of life while no source has the joint; events (level, text) since the last call."""
         with self._lock:
             if self._block is not None and not self.owner:
-                self._block.constants["stream"]["alive_ns"][0][0] = time.monotonic_ns()
+                self._block.constants["stream"]["alive_ns"][:] = time.monotonic_ns()
             now_s = time.monotonic()
             if self._refused and now_s - self._told_s >= TELL_S:
                 for who, (count, words) in self._refused.items():
@@ -418,7 +420,7 @@ class SetPointSources:
         if self.owner and self.owner != point.who:
             raise SetPointError(f"the set-points of this run come from {self.owner}, not from {point.who}")
         self._running()
-        self._stream = self._stream or SetPointStream(self)
+        self._stream = self._stream or SetPointStream(self, self._names)
         self._stream.take(
             point.position_rad, point.velocity_radps, point.acceleration_radps2, point.torque_Nm, point.time_s
         )

@@ -137,7 +137,7 @@ def watched(config: Config, live: ObserveOptions, output: Output, plant_state: A
                 record[0].position_rad, record[0].velocity_radps = plant.joint_position_rad, plant.joint_velocity_radps
                 record[0].measured_torque_Nm = plant.actuator_torque_Nm
                 for feed in others.feeds:
-                    feed.send(RECORDS, record.tobytes())
+                    feed.send(RECORDS, b"\0" + record.tobytes())
 
         thread = threading.Thread(target=watch, name="joint states", daemon=True)
         thread.start()

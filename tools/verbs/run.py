@@ -48,13 +48,13 @@ def run(
     if not (assume_yes or dry_run):
         require_terminal()
     plan = resolve_any(config, free if live.hold else configured, allow_low_margin=allow_low_margin)
-    if plan.arm is not None and (scope is not None or live != NOBODY_REMOTE):
-        raise UsageError("--scope, --foxglove, --ros2 and --hold are for a single joint, not for an arm")
+    if plan.arm is not None and scope is not None:
+        raise UsageError("--scope is for a single joint, not for an arm", "--foxglove shows all of its joints")
     first = plan.config
     consent = TerminalConsent(output, assume_yes=assume_yes, dry_run=dry_run)
     with (
         _displays(first, output, run_title(config), scope) as display,
-        remote(live, first, output) as others,
+        remote(live, config, output) as others,
         in_control(first, output) as control,
     ):
         session = Session(

@@ -15,7 +15,7 @@ import jointctl
 from jointctl.firmware_py.arm_model import newton_euler
 from jointctl.firmware_py.records import ChangeKind
 from jointctl.firmware_py.states import AxisPhase, TrajectoryKind
-from jointctl.tools.configuration.arm import SHIPPED_ARM, load_arm
+from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 
 NAMES = ("shoulder", "elbow", "wrist")
 RATE_Hz = 100.0
@@ -181,29 +181,29 @@ def test_a_move_beyond_a_limit_names_the_joint_and_moves_none(
     assert (arm.state.desired_position_rad == before).all()
 
 
-def with_torque_limit(name: str, torque_max_Nm: float) -> Any:
-    """The shipped arm, one joint's torque limited."""
+def upright(torque_max_Nm: float) -> ArmConfig:
+    """The shipped arm, its upper arm nearly upright, with another torque limit of the shoulder."""
     arm = load_arm(SHIPPED_ARM)
-    joints = [
-        joint.model_copy(update={"limits": joint.limits.model_copy(update={"torque_max_Nm": torque_max_Nm})})
-        if own == name
-        else joint
-        for own, joint in zip(arm.names, arm.joints, strict=True)
-    ]
-    return replace(arm, joints=tuple(joints))
+    first, virtual = arm.joints[0], arm.joints[0].virtual
+    assert virtual is not None
+    limits = first.limits.model_copy(update={"torque_max_Nm": torque_max_Nm})
+    virtual = virtual.model_copy(update={"initial_position_rad": 1.3})
+    return replace(arm, joints=(first.model_copy(update={"limits": limits, "virtual": virtual}), *arm.joints[1:]))
 
 
-@pytest.mark.parametrize(("limit_Nm", "allowed"), [(13.0, False), (16.0, True)])
+@pytest.mark.parametrize(("limit_Nm", "allowed"), [(28.0, False), (70.0, True)])
 def test_what_the_arms_model_asks_on_the_way_is_within_the_torque_limits(limit_Nm: float, allowed: bool) -> None:
-    """A slow way of the shoulder, whose gravity is -13.5 Nm at its end and far less by its own inertia."""
-    with jointctl.Arm(with_torque_limit("shoulder", limit_Nm), lockstep=True) as arm:
+    """Slowly down to where gravity is 32 Nm: the shoulder's own inertia asks for next to nothing."""
+    with jointctl.Arm(upright(limit_Nm), lockstep=True) as arm:
         arm.enable()
-        call = lambda: arm.move_to([0.3, -0.4, 0.2], duration_s=3.0)  # noqa: E731
+        before = arm.state.desired_position_rad
         if allowed:
-            call()
-        else:
-            with pytest.raises(jointctl.ConfigurationError, match=r"shoulder: the motion takes .* by the arm's model"):
-                call()
+            arm.move_to([0.1, 0.1, 0.1], duration_s=3.0)
+            return
+        with pytest.raises(jointctl.ConfigurationError, match=r"shoulder: the motion takes -3\d.* by the arm's model"):
+            arm.move_to([0.1, 0.1, 0.1], duration_s=3.0)
+        arm.step(0.1)
+        assert (arm.state.desired_position_rad == before).all()
 
 
 @pytest.mark.parametrize(

@@ -101,7 +101,7 @@ def test_of_an_arms_display_each_joint_has_its_name_and_the_first_one_the_phase(
             said.append(event.text)
 
     for number, name in enumerate(NAMES[:2]):
-        shown = JointDisplay(Lines(), name, [], first=number == 0)  # type: ignore[arg-type]
+        shown = JointDisplay(Lines(), name, [], number)  # type: ignore[arg-type]
         shown.phase("tracking")
         shown.note("a remark")
         shown.event(Event(0, INFO, "loop", "an event"))
