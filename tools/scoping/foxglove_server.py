@@ -99,7 +99,7 @@ class FoxgloveView(ServerListener):
         self._told_s, self._lock = 0.0, threading.Lock()
         self._states, self._events = _channel(JOINT_STATE_TOPIC), _channel(EVENT_TOPIC)
         alone = len(order.names) == 1
-        topics = [replace(RECORD_TOPIC, name=RECORD_TOPIC.name if alone else f"/{name}") for name in order.names]
+        topics = [replace(RECORD_TOPIC, name=RECORD_TOPIC.name + ("" if alone else f"/{name}")) for name in order.names]
         self._records = [] if order.only_states else [_channel(topic) for topic in topics]
 
     def start(self) -> None:

@@ -73,7 +73,7 @@ def vector(name: str, given: object, names: Sequence[str]) -> tuple[float, ...]:
     try:
         values: Any = given if isinstance(given, (Sequence, np.ndarray)) and np.ndim(given) else (given,)
         numbers = tuple(float(value) for value in values)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise SetPointError("a set-point must be made of numbers") from None
     if len(numbers) != len(names):
         raise SetPointError(f"{name} (={len(numbers)} numbers) must have {len(names)}, one a joint")
