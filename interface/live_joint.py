@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from jointctl.drivers.errors import JointctlError, MotionFault
-from jointctl.firmware_py.arm_model import newton_euler
 from jointctl.firmware_py.cycle import Word
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.joint_source import Source
@@ -36,10 +35,7 @@ from jointctl.tools.session.set_points import load_check
 WHO = "the program"
 ENDED = "the run has ended"
 # what takes its time to load, and is needed while the joint waits for its program
-_NEEDED = (
-    "scipy.interpolate", "jointctl.tools.session.live_changes", "jointctl.tools.configuration.checks",
-    "jointctl.tools.analysis.arm_check",
-)  # fmt: skip
+_NEEDED = ("scipy.interpolate", "jointctl.tools.session.live_changes", "jointctl.tools.configuration.checks")
 ANSWER_S = 2.0  # of the loop to a new motion
 
 
@@ -129,7 +125,9 @@ class LiveMotor:
             self._stack.enter_context(self._source.served())
             load_check()  # not beside commissioning: compiling would hold up the heartbeat
             if self.axes.arm is not None:
-                newton_euler(self.axes.arm.model.memory())
+                from jointctl.tools.analysis.arm_check import load_torques
+
+                load_torques(self.axes.arm)
             output, first = Output(quiet=True), self.axes.joints[0]
             others = self._stack.enter_context(remote(self._options, self._source.config, output, owner=WHO))
             control = self._control = self._stack.enter_context(in_program(first, output))

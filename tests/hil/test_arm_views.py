@@ -6,17 +6,21 @@ import math
 import signal
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from mcap_ros2.reader import read_ros2_messages
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 from jointctl.firmware_py.states import AxisPhase, Fault
+from tests.browser import PROGRAM, Browser
 from tests.foxglove_client import FoxgloveClient, free_port
 from tests.hil.test_arm_run import NAMES, ArmBench
 from tests.hil.test_foxglove import decoded
 from tests.hil.test_python_arm import PATIENT
+from tests.hil.test_scope_browser import environment, moves, printed_address, state_is
 from tests.ros2_client import DIAGNOSTICS, JOINT_STATE, Ros2Client
 
 DOMAIN = 7
@@ -73,12 +77,38 @@ def test_foxglove_has_all_joints_takes_vectors_and_stops_all(arm: ArmBench) -> N
     assert arm.all_off()
     assert_followed(arm)
     first = max(arm.bench.folder.glob("runs/*.shoulder.mcap"))
-    logged = [message.ros_msg for message in read_ros2_messages(str(first), topics=["/joint_states"])]
+    with first.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        logged = [message for *_, message in reader.iter_decoded_messages(["/joint_states"])]
     assert len(logged) > 200
     assert {tuple(state.name) for state in logged} == {NAMES}
     positions = np.array([state.position for state in logged])
     for column, log in zip(positions.T, arm.logs(), strict=True):
         assert np.isin(column, log.records.position_rad).all()
+
+
+@pytest.mark.skipif(PROGRAM is None, reason="no Chromium on this computer")
+def test_the_page_shows_the_joint_that_is_chosen_and_stops_all(arm: ArmBench, tmp_path: Path) -> None:
+    pytest.importorskip("nicegui")
+    run = arm.bench.start(
+        "run", arm.path, "-y", "--scope", "--scope-port", str(free_port()), env=environment()
+    )  # fmt: skip
+    run.saw("  tracking")
+    url = printed_address(run)
+    with Browser(tmp_path) as browser:
+        tab = browser.open(url)
+        state_is(tab, "tracking")
+        moves(tab)
+        assert tab.js("document.querySelector('[data-testid=\"go\"]')") is None  # nothing changes an arm's motion
+        tab.click("joint")
+        tab.until("[...document.querySelectorAll('.q-item')].some(e => e.innerText == 'wrist')")
+        tab.js("[...document.querySelectorAll('.q-item')].find(e => e.innerText == 'wrist').click()")
+        tab.until("document.querySelector('[data-testid=\"joint\"]').closest('.q-field').innerText.includes('wrist')")
+        moves(tab)
+        tab.click("stop")
+        done = run.finished(60.0)
+    assert done.code == 130, done.err
+    assert arm.all_off()
 
 
 def test_a_ros_2_node_enables_leads_and_leaves_all_joints(arm: ArmBench) -> None:

@@ -12,8 +12,7 @@ import numpy as np
 from jointctl.drivers.can.frames import bus_load, highest_rate_Hz
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.arm_model import newton_euler
-from jointctl.firmware_py.kernel import plain
-from jointctl.firmware_py.records import Reference
+from jointctl.firmware_py.records import Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.trajectory import reference_at
 from jointctl.tools.analysis.linear_loop import LoopSettings, RigidJoint
@@ -130,6 +129,12 @@ def pose_ranges(arm: ArmConfig) -> list[PoseRange]:
     return [PoseRange(float(low[i]), float(high[i]), float(load[i])) for i in range(axes)]
 
 
+def load_torques(arm: ArmConfig) -> None:
+    """Compile or load what `require_torques` calls: that may take seconds."""
+    newton_euler(arm.model.memory())
+    reference_at(new(TrajectoryConstants)[0], np.zeros((1, 5)), 0, 0.0, new(Reference)[0])
+
+
 def require_torques(
     arm: ArmConfig, trajectories: Sequence[Any], tables: np.ndarray, duration_s: float, alive: Callable[[], None]
 ) -> None:
@@ -140,13 +145,13 @@ def require_torques(
     memory = arm.model.memory()
     motion: Any = memory.motion
     reference: Any = new(Reference)[0]
-    rows, at = [0] * len(trajectories), plain(reference_at)
+    rows = [0] * len(trajectories)
     times_s = np.linspace(0.0, duration_s, MOTION_SAMPLES)
     torques_Nm = np.zeros((len(times_s), len(trajectories)))
     for time_s, torques in zip(times_s, torques_Nm, strict=True):
         alive()
         for axis, trajectory in enumerate(trajectories):
-            rows[axis] = at(trajectory, tables[axis], rows[axis], float(time_s), reference)
+            rows[axis] = reference_at(trajectory, tables[axis], rows[axis], float(time_s), reference)
             own = motion[axis]
             own.position_rad, own.velocity_radps = reference.position_rad, reference.velocity_radps
             own.acceleration_radps2 = reference.acceleration_radps2

@@ -19,6 +19,7 @@ from typing import Any, Self
 from jointctl.drivers.errors import DataError, UsageError, printable
 from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.configuration.drive_section import DEFAULT_KIND
+from jointctl.tools.recording.ros_messages import JOINT_NAMES
 from jointctl.tools.recording.run_log import Event
 from jointctl.tools.session.display import LONGEST_BYTES, Snapshot, ViewerRequest, decoded
 
@@ -45,6 +46,7 @@ class ScopeOrder:
     token: str  # without it nothing is shown or taken
     drive: str = DEFAULT_KIND  # drive.kind
     loop_cpu: int | None = None  # loop.cpu
+    joints: tuple[str, ...] = JOINT_NAMES
     feed_fd: int = -1  # -1: show `log` instead
     log: str = ""
 

@@ -214,10 +214,10 @@ class PhaseLines(OnlyShows):
 class JointDisplay:
     """What a display gets from one joint of an arm: with its name in front, and a phase from the first one only.
 
-    The joints share `orders`, motions that the program has given and that no joint has taken yet.
+    The joints share `orders`, what was asked for and no joint has taken yet.
     """
 
-    def __init__(self, display: Display, name: str, orders: list[PreparedMotion], axis: int) -> None:
+    def __init__(self, display: Display, name: str, orders: list[ViewerRequest], axis: int) -> None:
         self._display, self._name, self._orders, self._axis = display, name, orders, axis
         self.stop_request, self.stop_reason = display.stop_request, display.stop_reason
 
@@ -236,11 +236,18 @@ class JointDisplay:
         self._display.event(replace(event, text=f"{self._name}: {event.text}"))
 
     def requests(self) -> Sequence[ViewerRequest]:
-        """Motions of the program for this joint; viewers change neither gains nor motion of an arm."""
-        self._orders += [request for request in self._display.requests() if isinstance(request, PreparedMotion)]
-        own = [order for order in self._orders if order.joint == self._name]
-        self._orders[:] = [order for order in self._orders if order.joint != self._name]
+        """Motions of the program for this joint, the first one's the number of viewers.
+
+        Viewers change neither gains nor motion of an arm.
+        """
+        new = self._display.requests()
+        self._orders += [each for each in new if isinstance(each, PreparedMotion) or each.kind == "viewers"]
+        own = [order for order in self._orders if self._is_own(order)]
+        self._orders[:] = [order for order in self._orders if not self._is_own(order)]
         return own
+
+    def _is_own(self, order: ViewerRequest) -> bool:
+        return order.joint == self._name if isinstance(order, PreparedMotion) else self._axis == 0
 
     def settings(self, values: Mapping[str, Any]) -> None:
         """As above."""

@@ -26,7 +26,7 @@ from jointctl.tools.recording.run_summary import summarise
 from jointctl.tools.session.bus_watch import BusWatch, TemperatureWatch, bus_watch, recording
 from jointctl.tools.session.consent import Consent, prepare_log, require_ready
 from jointctl.tools.session.control import Control, StopSignals
-from jointctl.tools.session.display import Display, JointDisplay, PhaseLines, PreparedMotion
+from jointctl.tools.session.display import Display, JointDisplay, PhaseLines, ViewerRequest
 from jointctl.tools.session.fault_words import held_up_text
 from jointctl.tools.session.loop_handle import LoopHandle
 from jointctl.tools.session.plan import Placed, RunPlan, blamed
@@ -178,7 +178,7 @@ class Session:
         with contextlib.ExitStack() as stack:
             display = stack.enter_context(self._make_display(reports[0]))
             watches: list[RunWatch] = []
-            orders: list[PreparedMotion] = []
+            orders: list[ViewerRequest] = []
             for axis, (joint, report) in enumerate(zip(self._joints, reports, strict=True)):
                 metadata = run_metadata(joint.config, report)
                 if plan.arm is not None:  # its [motion] is what the joint does, and not the joint's own [trajectory]
