@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.joint import state_of
+from jointctl.joint_source import Wanted
 from jointctl.program import Newest, Program, motor_of
 from jointctl.tools.session.set_points import finite
 
@@ -62,12 +63,9 @@ class Arm(Program):
         foxglove: bool | str = False,
         ros2: bool | int = False,
     ) -> None:
-        super().__init__(
-            motor_of(
-                config, "Arm", lockstep=lockstep, place=(interface, channel, bitrate, None, None), virtual=virtual,
-                allow_low_margin=allow_low_margin, foxglove=foxglove, ros2=ros2,
-            )
-        )  # fmt: skip
+        place = interface, channel, bitrate, None, None
+        wanted = Wanted(place, virtual, allow_low_margin, foxglove, ros2)
+        super().__init__(motor_of(config, "Arm", wanted, lockstep=lockstep))
 
     @property
     def config(self) -> ArmConfig:

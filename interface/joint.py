@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy.typing as npt
 
 from jointctl.firmware_py.states import fault_name
+from jointctl.joint_source import Wanted
 from jointctl.program import OFF, PHASES, Motor, Newest, Program, motor_of
 from jointctl.tools.session.session_drive import drive_state_name
 from jointctl.tools.session.set_points import SetPointError, finite
@@ -74,12 +75,9 @@ class Joint(Program):
         ros2: bool | int = False,
         allow_remote: bool = False,
     ) -> None:
-        super().__init__(
-            motor_of(
-                config, "Joint", lockstep=lockstep, place=(interface, channel, bitrate, port, target), virtual=virtual,
-                allow_low_margin=allow_low_margin, foxglove=foxglove, ros2=ros2, allow_remote=allow_remote,
-            )
-        )  # fmt: skip
+        place = interface, channel, bitrate, port, target
+        wanted = Wanted(place, virtual, allow_low_margin, foxglove, ros2, allow_remote)
+        super().__init__(motor_of(config, "Joint", wanted, lockstep=lockstep))
 
     @property
     def config(self) -> Config:

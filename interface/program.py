@@ -18,6 +18,7 @@ from jointctl.drivers.errors import ConfigurationError, JointctlError, UsageErro
 from jointctl.firmware_py.records import MotionChange, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, TrajectoryKind, in_words
+from jointctl.joint_source import Wanted, wanted_source
 from jointctl.tools.session.set_points import Numbers, SetPointError, SetPointStream, finite
 
 if TYPE_CHECKING:
@@ -120,11 +121,8 @@ class NewMotion(NamedTuple):
     words: str
 
 
-def motor_of(config: Config | ArmConfig | str | Path, kind: str, *, lockstep: bool, **how: Any) -> Motor:
-    """The motor for what `Joint` or `Arm` (`kind`) was given; `how`: see `joint_source.Wanted`."""
-    from jointctl.joint_source import Wanted, wanted_source
-
-    wanted = Wanted(**how)
+def motor_of(config: Config | ArmConfig | str | Path, kind: str, wanted: Wanted, *, lockstep: bool) -> Motor:
+    """The motor for what `Joint` or `Arm` (`kind`) was given."""
     source, options = wanted_source(config, kind, wanted)
     if lockstep:
         if options.foxglove is not None or options.ros2 is not None:

@@ -64,9 +64,10 @@ def test_motions_and_set_points_then_all_off(arm: ArmBench) -> None:
         + """
     arm.move_to([0.3, -0.2, 0.1], duration_s=1.0)
     arm.follow([0.0, 0.5, 1.0], [[0.2, -0.1, 0.1], [0.25, -0.1, 0.2], [0.2, -0.1, 0.1]])
+    begun = time.monotonic()
     for k in range(1, 200):
         arm.command(np.array([0.2, -0.1, 0.1]) + 1e-6 * k * k * np.array([1, 2, -1]), time_s=0.005 * k)
-        time.sleep(0.005)
+        time.sleep(max(0.0, begun + 0.005 * k - time.monotonic()))
     arm.wait(0.8)
     say("at " + " ".join(f"{at:.6f}" for at in arm.state.desired_position_rad))
     say(f"kernels compiled or loaded meanwhile: {sorted(kernels() - at_first)}")
