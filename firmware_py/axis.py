@@ -7,6 +7,7 @@ import numpy as np
 from jointctl.firmware_py.flexible_joint import Reading
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import follow_temperature, step_flexible_law, step_law
+from jointctl.firmware_py.libc import load_acquire
 from jointctl.firmware_py.live_change import step_change, step_new_motion
 from jointctl.firmware_py.records import (
     AxisConstants,
@@ -330,7 +331,9 @@ def sense_axis(
     stop_request: int,
     supervisor_age_cycles: int,
 ) -> None:
-    """The first part of a cycle: the sample, a stop that is asked for, drive, bus, schedule and supervisor."""
+    """The first part of a cycle: set-points and requests that have come, the sample, a stop, all that is supervised."""
+    state.stream.written = load_acquire(constants.stream.written, 0)
+    state.change.order = load_acquire(constants.change.order, 0)
     state.cycle += elapsed_cycles
     state.phase_cycle += elapsed_cycles
     if elapsed_cycles - 1 > constants.limits.skipped_max_cycles:

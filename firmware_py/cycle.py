@@ -203,6 +203,17 @@ def stop_others(states: np.ndarray, samples: np.ndarray) -> bool:
     return all_enabled
 
 
+@kernel
+def wait_for_all(states: np.ndarray) -> None:
+    """A set-point or a change counts once there is one for every axis: all begin in the same cycle, or none does."""
+    written, order = states[0].stream.written, states[0].change.order
+    for axis in range(len(states)):
+        written = min(written, states[axis].stream.written)
+        order = min(order, states[axis].change.order)
+    for axis in range(len(states)):
+        states[axis].stream.written, states[axis].change.order = written, order
+
+
 @shared
 def log_cycle(memory: CycleMemory, slot: Slot, waited_ns: int, end_ns: int) -> bool:
     """A record of each axis, the histograms and the words; True once every axis is FINISHED."""
@@ -257,6 +268,8 @@ def step_cycle(memory: CycleMemory, exchange: Exchange, clock: Clock, slot: Slot
             memory.constants[axis], state, sample, slot.elapsed_cycles,
             stop_of(memory.state, axis, stop_request), supervisor_age_cycles,
         )  # fmt: skip
+    if several:
+        wait_for_all(memory.state)
     all_enabled = stop_others(memory.state, samples)
     for axis in range(len(memory.state)):
         move_axis(

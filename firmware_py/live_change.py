@@ -1,10 +1,10 @@
 """Changes while the joint moves: gains along a straight line, a new motion by way of rest.
 
-The supervisor writes one `ChangeRequest` and then counts `order` up; the loop takes it at the beginning of a cycle and
-answers with the same number.  Until then the supervisor writes nothing, so that a request is never half old and half
-new.  The loop trusts nobody: what is not finite, outside of the limits, not from rest, or comes while the joint is
-being stopped, is refused and changes nothing.  That the control loop is stable with new gains, and on the way to
-them, is for the supervisor to know (`tools.analysis.margin_gate`).
+The supervisor writes one `ChangeRequest` and then counts `order` up; the loop takes it at the beginning of a cycle, in
+an arm once there is one for every joint, and answers with the same number.  Until then the supervisor writes nothing,
+so that a request is never half old and half new.  The loop trusts nobody: what is not finite, outside of the limits,
+not from rest, or comes while the joint is being stopped, is refused and changes nothing.  That the control loop is
+stable with new gains, and on the way to them, is for the supervisor to know (`tools.analysis.margin_gate`).
 
 A new motion brakes the reference as a controlled stop does, moves it along the quintic of least jerk to the start of
 the new motion, where it is at rest, and begins it; `trajectory_s` is negative until then.  In each cycle the reference
@@ -20,7 +20,6 @@ import numpy as np
 from jointctl.firmware_py.kalman import set_kalman_gains
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import reset_learning, right_column_of_p
-from jointctl.firmware_py.libc import load_acquire
 from jointctl.firmware_py.records import (
     AxisConstants,
     AxisState,
@@ -55,6 +54,7 @@ _LONGEST_s = 1e9
 @kernel
 def reset_change(state: ChangeState) -> None:
     """Begin a run: nothing has been asked for."""
+    state.order = 0
     state.answered = 0
     state.answer = ChangeAnswer.NONE
     state.ramping = 0
@@ -167,18 +167,21 @@ def _take_gains(constants: AxisConstants, state: AxisState, request: ChangeReque
 def _take_motion(constants: AxisConstants, state: AxisState, table: np.ndarray, request: ChangeRequest) -> int:
     if state.phase != AxisPhase.TRACKING:
         return ChangeAnswer.WRONG_PHASE
-    if not trajectory_allowed(constants.limits, request.trajectory, table.shape[0]):
+    allowed = trajectory_allowed(constants.limits, request.trajectory, table.shape[0])
+    if not (allowed and within(request.move_s, 0.0, _LONGEST_s)):
         return ChangeAnswer.MOTION_LIMIT
     change = state.change
     reference_at(request.trajectory, table, 0, 0.0, change.goal)
     if not abs(change.goal.velocity_radps) <= REST_radps:
         return ChangeAnswer.NOT_FROM_REST
     change.next_trajectory = request.trajectory
+    change.move_s = request.move_s
     change.motion = MotionChange.BRAKING
     speed = state.reference.velocity_radps
     brake_s = abs(speed) / constants.sequence.brake_radps2
     rest_rad = state.reference.position_rad + 0.5 * speed * brake_s
-    state.trajectory_s = -brake_s - move_duration_s(constants.change, change.goal.position_rad - rest_rad)
+    move_s = move_duration_s(constants.change, change.goal.position_rad - rest_rad)
+    state.trajectory_s = -brake_s - max(change.move_s, move_s)
     return ChangeAnswer.TAKEN
 
 
@@ -204,7 +207,7 @@ def _ramp_gains(constants: AxisConstants, state: AxisState, elapsed_cycles: int)
 def step_change(constants: AxisConstants, state: AxisState, table: np.ndarray, elapsed_cycles: int) -> None:
     """Take a request, if there is a whole one, and go on with a change of gains; a stop freezes them as they are."""
     request = constants.change.request
-    order = load_acquire(constants.change.order, 0)
+    order = state.change.order
     if order != state.change.answered and request.first == order and request.last == order:
         answer: int = ChangeAnswer.WRONG_KIND
         if request.kind == ChangeKind.GAINS:
@@ -228,7 +231,8 @@ def step_new_motion(constants: AxisConstants, state: AxisState, table: np.ndarra
             at_rad = state.reference.position_rad
             change.goal.velocity_radps = 0.0
             change.goal.acceleration_radps2 = 0.0  # the move ends at rest; the new motion's acceleration sets in then
-            change.move_s = move_duration_s(constants.change, change.goal.position_rad - at_rad)
+            move_s = move_duration_s(constants.change, change.goal.position_rad - at_rad)
+            change.move_s = max(change.move_s, move_s)
             plan_approach(at_rad, change.goal, change.move_s, state.approach)
             state.trajectory_s = -change.move_s
             change.motion = MotionChange.MOVING

@@ -297,6 +297,7 @@ class ChangeRequest:
     kind: i4  # ChangeKind
     gains: Gains
     trajectory: TrajectoryConstants
+    move_s: f8  # the way to the motion's beginning takes so long at least: that of the other joints of an arm
     last: i8
 
 
@@ -318,6 +319,7 @@ class ChangeConstants:
 
 @record
 class ChangeState:
+    order: i8  # number of the newest request that has come for all joints
     answered: i8  # number of the newest request that was answered
     answer: i4  # ChangeAnswer
     ramping: i4  # 1 while gains change
@@ -327,7 +329,7 @@ class ChangeState:
     target: Gains
     now: Gains  # between the two
     goal: Reference  # of the new motion at its start, at rest
-    move_s: f8
+    move_s: f8  # that the way there takes, at least until it begins
     next_trajectory: TrajectoryConstants
 
 
@@ -368,6 +370,7 @@ class StreamConstants:
 
 @record
 class StreamState:
+    written: i8  # set-points that have come for all joints since the start
     taken: i8  # set-points taken out of the ring
     refused: i8  # of them those that the loop did not follow
     following: i4  # 1 between two set-points, 0 at rest or braking

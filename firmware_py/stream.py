@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 
 from jointctl.firmware_py.kernel import kernel
-from jointctl.firmware_py.libc import load_acquire
 from jointctl.firmware_py.records import (
     SET_POINTS,
     AxisConstants,
@@ -37,6 +36,7 @@ CLOSE_SHARE = 3  # of the delay: set-points nearer than that are one
 @kernel
 def reset_stream(state: StreamState) -> None:
     """Begin a run: nothing has come."""
+    state.written = 0
     state.taken = 0
     state.refused = 0
     state.following = 0
@@ -84,7 +84,7 @@ def _next(constants: AxisConstants, state: AxisState, time_ns: int, elapsed_ns: 
     `elapsed_ns`: since the reference was as `state` has it.
     """
     stream, own = constants.stream, state.stream
-    written = load_acquire(stream.written, 0)
+    written = own.written
     while own.taken < written:
         _fetch(stream, own.taken, own.coming)
         own.taken += 1
@@ -151,7 +151,7 @@ def step_other_motion(constants: AxisConstants, state: AxisState, elapsed_cycles
     if own.torque_Nm != 0.0:
         _turn_torque(constants, state, 0.0, elapsed_cycles)
     own.following = 0
-    written = load_acquire(constants.stream.written, 0)
+    written = own.written
     if own.taken == written:
         return
     still = reference.velocity_radps == 0.0 and reference.acceleration_radps2 == 0.0

@@ -17,6 +17,7 @@ from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from jointctl.arm import Arm, ArmState
     from jointctl.drivers.errors import (
         BusError,
         ConfigurationError,
@@ -51,6 +52,8 @@ if TYPE_CHECKING:
     __version__: str
 
 __all__ = [
+    "Arm",
+    "ArmState",
     "BusError",
     "ConfigurationError",
     "DataError",
@@ -82,7 +85,7 @@ __all__ = [
     "validate",
 ]
 
-_OF_JOINT = ("Joint", "SetPointError", "State")
+_HOMES = {"Joint": "joint", "SetPointError": "joint", "State": "joint", "Arm": "arm", "ArmState": "arm"}
 
 
 def __getattr__(name: str) -> object:
@@ -93,5 +96,5 @@ def __getattr__(name: str) -> object:
         return version("jointctl")
     if name not in __all__:
         raise AttributeError(f"module 'jointctl' has no attribute {name!r}")
-    home = "joint" if name in _OF_JOINT else "verbs" if name.islower() else "drivers.errors"
+    home = _HOMES.get(name) or ("verbs" if name.islower() else "drivers.errors")
     return getattr(_import_module(f"jointctl.{home}"), name)

@@ -1,38 +1,57 @@
-"""Which joint is meant: a file, a shipped configuration, a virtual joint of its own."""
+"""Which joint or arm is meant: a file, a shipped configuration, virtual drives of its own."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.scoping.remote_options import FOXGLOVE_AT, RemoteOptions, usual_domain
 
+if TYPE_CHECKING:
+    from jointctl.tools.configuration.arm import ArmConfig
+
 _NUMBERS = count(1)
+SHIPPED_NAME = "virtual"  # what `Arm` calls the shipped arm
+_WORDS = {"Joint": "a joint", "Arm": "an arm"}
 Place = tuple[str | None, str | None, int | None, str | None, int | None]  # interface, channel, bitrate, port, node
 
 
 @dataclass(frozen=True)
-class JointSource:
-    """A configuration, and whether its virtual joint is to be started."""
+class Wanted:
+    """What a program asks for, as the arguments of `Joint`; `place`: instead of the configuration's."""
 
-    config: Config
+    place: Place = (None,) * 5
+    virtual: bool = False
+    allow_low_margin: bool = False
+    foxglove: bool | str = False
+    ros2: bool | int = False
+    allow_remote: bool = False
+
+
+@dataclass(frozen=True)
+class Source:
+    """A configuration, and whether its virtual drives are to be started."""
+
+    config: Config | ArmConfig
     own_virtual: bool
 
     @contextmanager
     def served(self) -> Iterator[None]:
-        """With the virtual joint running, in a process of its own, where it is one's own."""
+        """With the virtual drives running, in a process of their own, where they are one's own."""
         from jointctl.tools.virtual_joint import own_virtual_joint
 
         if not self.own_virtual:
             yield
             return
-        with own_virtual_joint(self.config.path, self.config.bus.channel):
+        first = self.config if isinstance(self.config, Config) else self.config.joints[0]
+        with own_virtual_joint(self.config.path, first.bus.channel):
             yield
 
 
@@ -43,23 +62,43 @@ def observers(foxglove: bool | str, ros2: bool | int, *, allow_remote: bool) -> 
     return RemoteOptions(at, domain, allow_remote=allow_remote)
 
 
-def joint_source(given: str | Path | Config, place: Place, *, virtual: bool) -> JointSource:
-    """`ConfigurationError` for what cannot be read, or has no virtual joint although one is asked for."""
+def wanted_source(given: str | Path | Config | ArmConfig, kind: str, wanted: Wanted) -> tuple[Source, RemoteOptions]:
+    """For a "Joint" or an "Arm" (`kind`); `ConfigurationError` for what cannot be read, or is of the other one.
+
+    Also where virtual drives are asked for and the configuration has none.
+    """
     from jointctl.tools.configuration.drive_section import GivenPlace, require_simulated
-    from jointctl.tools.configuration.load import load_config, moved
+    from jointctl.tools.configuration.load import moved
     from jointctl.tools.verbs.demo import with_patience
+    from jointctl.tools.verbs.verb_options import arm_on_bus
+
+    options = observers(wanted.foxglove, wanted.ros2, allow_remote=wanted.allow_remote)
+    config, shipped = _loaded(given, kind)
+    found = "Joint" if isinstance(config, Config) else "Arm"
+    if found != kind:
+        raise ConfigurationError(f"{config.path}: is no file of {_WORDS[kind]}", f"jointctl.{found} moves it")
+    joints = (config,) if isinstance(config, Config) else config.joints
+    without = [joint.path for joint in joints if joint.virtual is None]
+    own = wanted.virtual or (shipped and not without and not any(wanted.place))
+    for joint in joints if own else ():
+        require_simulated(joint, "a virtual joint")
+    if own and without:
+        raise ConfigurationError(f"{without[0]}: has no [virtual] section, so there is no virtual joint to start")
+    place = GivenPlace("jointctl", f"python-{os.getpid()}-{next(_NUMBERS)}") if own else GivenPlace(*wanted.place)
+    if isinstance(config, Config):
+        config = moved(config, place, {}) if own else moved(config, place)
+        return Source(with_patience(config) if own else config, own), options
+    arm = arm_on_bus(config, place)
+    return Source(replace(arm, joints=tuple(map(with_patience, arm.joints))) if own else arm, own), options
+
+
+def _loaded(given: str | Path | Config | ArmConfig, kind: str) -> tuple[Config | ArmConfig, bool]:
+    """The configuration, and whether it is a shipped one that was named."""
+    from jointctl.tools.configuration.arm import SHIPPED_ARM, load_joint_or_arm
     from jointctl.tools.verbs.verb_options import config_path
 
-    if isinstance(given, Config):
-        config, shipped = given, False
-    else:
-        path = config_path(Path(given))
-        config, shipped = load_config(path), not os.path.exists(given)
-    own = virtual or (shipped and config.virtual is not None and not any(place))
-    if not own:
-        return JointSource(moved(config, GivenPlace(*place)), False)
-    require_simulated(config, "a virtual joint")
-    if config.virtual is None:
-        raise ConfigurationError(f"{config.path}: has no [virtual] section, so there is no virtual joint to start")
-    channel = f"python-{os.getpid()}-{next(_NUMBERS)}"
-    return JointSource(with_patience(moved(config, GivenPlace("jointctl", channel), {})), True)
+    if not isinstance(given, (str, Path)):
+        return given, False
+    shipped = not os.path.exists(given)
+    its_own = shipped and kind == "Arm" and str(given) == SHIPPED_NAME
+    return load_joint_or_arm(SHIPPED_ARM if its_own else config_path(Path(given))), shipped

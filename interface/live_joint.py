@@ -1,4 +1,4 @@
-"""A joint in real time for a program: the Session in a thread of its own, and the loop's memory between both."""
+"""Joints in real time for a program: the Session in a thread of its own, and the loop's memory between both."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ import numpy as np
 
 from jointctl.drivers.errors import JointctlError, MotionFault
 from jointctl.firmware_py.cycle import Word
-from jointctl.firmware_py.states import AxisPhase, Fault, fault_name, in_words
-from jointctl.joint import POLL_S, TABLE_ROWS, State
-from jointctl.joint_source import JointSource
+from jointctl.firmware_py.states import AxisPhase, Fault
+from jointctl.joint_source import Source
+from jointctl.program import POLL_S, TABLE_ROWS, Newest, NewMotion, axes_of
+from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
-from jointctl.tools.recording.run_log import ERROR, Event, log_path
+from jointctl.tools.recording.run_log import ERROR, Event
 from jointctl.tools.scoping.remote import remote
 from jointctl.tools.scoping.remote_options import NOBODY_REMOTE, RemoteOptions
 from jointctl.tools.session import result as drive_end
 from jointctl.tools.session.control import Control, in_program
 from jointctl.tools.session.display import OnlyShows, PreparedMotion, Snapshot, ViewerRequest
 from jointctl.tools.session.loop_handle import RING_RECORDS, LoopHandle
-from jointctl.tools.session.plan import FreeMotion, RunPlan
+from jointctl.tools.session.plan import FreeMotion, resolve_any
 from jointctl.tools.session.result import RunResult
 from jointctl.tools.session.session import Session
-from jointctl.tools.session.session_drive import drive_state_name, session_drive
+from jointctl.tools.session.session_drive import session_drive
 from jointctl.tools.session.set_points import load_check
 
 WHO = "the program"
 ENDED = "the run has ended"
 # what takes its time to load, and is needed while the joint waits for its program
 _NEEDED = ("scipy.interpolate", "jointctl.tools.session.live_changes", "jointctl.tools.configuration.checks")
-_PHASES = tuple(in_words(phase) for phase in AxisPhase)
 ANSWER_S = 2.0  # of the loop to a new motion
 
 
@@ -97,11 +97,12 @@ class LiveMotor:
     """See `Motor`.  The session supervises in a thread; the loop has its own process, as in `jointctl run`."""
 
     def __init__(
-        self, source: JointSource, options: RemoteOptions = NOBODY_REMOTE, *, allow_low_margin: bool = False
+        self, source: Source, options: RemoteOptions = NOBODY_REMOTE, *, allow_low_margin: bool = False
     ) -> None:
         self._source, self._options, self._allow_low_margin = source, options, allow_low_margin
-        self.config, self._drive = source.config, session_drive(source.config.drive.kind)
-        self._motion = FreeMotion(self.config, np.zeros((TABLE_ROWS, 5)), by_program=True)
+        self.axes = axes_of(source.config)
+        self.drive = session_drive(self.axes.joints[0].drive.kind)
+        self._motions: list[FreeMotion] = []
         self._display = _ProgramDisplay()
         self._stack = ExitStack()
         self._thread: threading.Thread | None = None
@@ -113,22 +114,26 @@ class LiveMotor:
         self._error: BaseException | None = None
         self._told = False  # whether the program has got `_error`
         self._began_ns = 0
-        self.log_path: Path | None = None
+        self.log_paths: tuple[Path, ...] = ()
         self.constants: Any = None
         self.axis: Any = None
-        self.table = np.zeros((0, 5))
+        self.tables = np.zeros((0, 0, 5))
 
     def begin(self) -> None:
         """Commission: returns with the drive ready and disabled, or raises why not."""
         try:
             self._stack.enter_context(self._source.served())
             load_check()  # not beside commissioning: compiling would hold up the heartbeat
-            output = Output(quiet=True)
-            others = self._stack.enter_context(remote(self._options, self.config, output, owner=WHO))
-            control = self._control = self._stack.enter_context(in_program(self.config, output))
+            if self.axes.arm is not None:
+                from jointctl.tools.analysis.arm_check import load_torques
+
+                load_torques(self.axes.arm)
+            output, first = Output(quiet=True), self.axes.joints[0]
+            others = self._stack.enter_context(remote(self._options, self._source.config, output, owner=WHO))
+            control = self._control = self._stack.enter_context(in_program(first, output))
             self._approval = _Approval(control.signals.leave_if_asked)
-            plan = RunPlan(self.config, self._motion, log_path(self.config), self._allow_low_margin)
-            self.log_path = plan.log_path
+            plan = resolve_any(self._source.config, self._motion, allow_low_margin=self._allow_low_margin)
+            self.log_paths = tuple(joint.log_path for joint in plan.joints)
             display = others.beside(lambda _: self._display)
             self._session = Session(plan, self._approval, output, control, display, others.set_points)
             self._thread = threading.Thread(target=self._run, name="jointctl session")
@@ -142,6 +147,10 @@ class LiveMotor:
             self._stack.close()
             raise
         self._began_ns = time.monotonic_ns()
+
+    def _motion(self, config: Config) -> FreeMotion:
+        self._motions.append(FreeMotion(config, np.zeros((TABLE_ROWS, 5)), by_program=True))
+        return self._motions[-1]
 
     def _run(self) -> None:
         assert self._session is not None
@@ -160,15 +169,16 @@ class LiveMotor:
             raise error.with_traceback(None)
         if error is not None and not isinstance(error, KeyboardInterrupt):
             raise error
-        if result is not None and result.fault_text is not None:
-            text = result.fault_text
-            raise MotionFault(f"{result.fault.name} ({int(result.fault)}): {text.happened}", text.advice)
+        for joint in () if result is None else result.joints:
+            if joint.fault_text is not None:
+                named, text = f"{joint.name}: " if joint.name else "", joint.fault_text
+                raise MotionFault(f"{named}{joint.fault.name} ({int(joint.fault)}): {text.happened}", text.advice)
         control = self._control
         by = result.stopped_by if result is not None else control.signals.name if control is not None else ""
         raise MotionFault(f"{ENDED}{f', by {by}' if by else ''}; the joint is off", "begin a new Joint")
 
     def require(self) -> None:
-        if self.axis is not None and self.axis[0].phase > AxisPhase.TRACKING:
+        if self.axis is not None and self.axis["phase"].max() > AxisPhase.TRACKING:
             self._join()  # it is being stopped: the cause is known at the end
         self._raise()
 
@@ -186,25 +196,26 @@ class LiveMotor:
             self._raise()
             time.sleep(POLL_S)
         loop = self._loop = session.loop
-        self.table = loop.block.table
+        self.tables = loop.block.tables
         self.axis = loop.block.state
         constants = self.constants = loop.block.constants
-        alive_ns = constants["stream"]["alive_ns"][0]
-        while self.axis[0].phase != AxisPhase.TRACKING:
-            alive_ns[0] = time.monotonic_ns()
+        alive_ns = constants["stream"]["alive_ns"]
+        while (self.axis["phase"] != AxisPhase.TRACKING).any():
+            alive_ns[:] = time.monotonic_ns()
             self.require()
             time.sleep(POLL_S)
 
-    def state(self) -> State:
+    def newest(self) -> Newest:
         now_ns = time.monotonic_ns()
+        starts_rad = tuple(motion.start_rad for motion in self._motions)
         loop = self._loop
         head = 0 if loop is None else int(loop.block.words[Word.HEAD])
         if loop is None or head == 0:
             self._raise()
-            at_rad, age_s = self._motion.start_rad, (now_ns - self._began_ns) * 1e-9
-            return State(at_rad, 0.0, 0.0, at_rad, "commissioned", "", "switch on disabled", age_s, now_ns * 1e-9)
-        record = loop.block.ring.view(np.ndarray)[(head - 1) % RING_RECORDS].copy()
-        return state_of(record, self._drive, now_ns)
+            return Newest((), starts_rad, now_ns, self._began_ns)
+        ring, axes = loop.block.ring.view(np.ndarray), loop.block.axes
+        records = tuple(ring[(head - axes + axis) % RING_RECORDS].copy() for axis in range(axes))
+        return Newest(records, starts_rad, now_ns, int(records[0]["time_ns"]))
 
     def now_ns(self) -> int:
         return time.monotonic_ns()
@@ -213,18 +224,21 @@ class LiveMotor:
         time.sleep(min(seconds, 0.05))
         self.require()
 
-    def post(self, trajectory: Any, words: str) -> None:
+    def post(self, motions: Sequence[NewMotion], move_s: float) -> None:
         self.require()
         answers: list[str] = []
-        self._display.motions.append(PreparedMotion("motion", WHO, {}, trajectory, words, answers.append))
+        for motion, name in zip(motions, self.axes.names, strict=True):
+            self._display.motions.append(
+                PreparedMotion("motion", WHO, {}, *motion, answered=answers.append, joint=name, move_s=move_s)
+            )
         end_s = time.monotonic() + ANSWER_S
-        while not answers:
+        while len(answers) < len(motions):
             self.require()
             if time.monotonic() > end_s:
                 raise MotionFault(f"the loop did not answer within {ANSWER_S:g} s")
             time.sleep(POLL_S)
-        if answers[0]:
-            raise MotionFault(f"the loop did not take the motion: {answers[0]}")
+        if refused := [answer for answer in answers if answer]:
+            raise MotionFault(f"the loop did not take the motion: {refused[0]}")
 
     def stop(self) -> None:
         self._end()
@@ -258,25 +272,11 @@ class LiveMotor:
         error, result = self._error, self.result
         if self._told:
             return
-        if isinstance(error, JointctlError) or (result is not None and result.fault is not Fault.NONE):
+        if isinstance(error, JointctlError) or any(
+            joint.fault is not Fault.NONE for joint in (() if result is None else result.joints)
+        ):
             self._raise()
         if error is not None and not isinstance(error, (JointctlError, KeyboardInterrupt)):
             raise error
         if self._session is not None:
             drive_end.require_off(self._session.drive_state)
-
-
-def state_of(record: Any, drive: Any, now_ns: int) -> State:
-    """A log record in words and numbers; `now_ns` on the clock of the record."""
-    fault = int(record["fault"])
-    return State(
-        position_rad=float(record["position_rad"]),
-        velocity_radps=float(record["velocity_radps"]),
-        torque_Nm=float(record["measured_torque_Nm"]),
-        desired_position_rad=float(record["desired_position_rad"]),
-        phase=_PHASES[record["phase"]],
-        fault=fault_name(fault) if fault else "",
-        drive_state=drive_state_name(drive, int(record["status_word"]), int(record["drive_state"])),
-        age_s=max(0.0, (now_ns - int(record["time_ns"])) * 1e-9),
-        time_s=now_ns * 1e-9,
-    )

@@ -66,6 +66,7 @@ class Ros2Client:
             config.insert_json5(path, json.dumps(value))
         self.session, self.domain, self.name = zenoh.open(config), domain, name
         self._gid, self._sent = bytes(range(16)), 0
+        self.commands = "/joint/command"
         give_up_s = time.monotonic() + timeout_s
         while not list(self.session.info.peers_zid()):
             assert time.monotonic() < give_up_s
@@ -108,14 +109,14 @@ class Ros2Client:
         self._gid = digest[8:][::-1] + digest[:8][::-1]  # low half first, each little-endian
 
     def command(self, body: bytes | None = None, **fields: Any) -> None:
-        """A set-point, or whatever `body` is, to /joint/command."""
+        """A set-point, or whatever `body` is, to `self.commands`."""
         if body is None:
             time_s = fields.pop("time_s", 0.0)
             sec, nanosec = int(time_s), round(time_s % 1.0 * 1e9) % 1_000_000_000
             values = {"positions": [], "velocities": [], "accelerations": [], "effort": [], **fields}
             values["time_from_start"] = {"sec": sec, "nanosec": nanosec}
             body = bytes(serialize_dynamic(SET_POINT, DEFINITIONS[SET_POINT])[SET_POINT](values))
-        self.session.put(key(self.domain, "/joint/command", SET_POINT), body, attachment=self._attachment())
+        self.session.put(key(self.domain, self.commands, SET_POINT), body, attachment=self._attachment())
 
     def call(self, name: str) -> tuple[bool, str]:
         """A service without arguments; its reply belongs to this very request."""

@@ -146,7 +146,7 @@ class SteppedRun:
         self.memory, self._codec, self.world = memory, codec, world
         self.now_ns = start_ns
         self._period_ns = round(float(memory.constants[0].law.period_s) * 1e9)
-        self._phase = memory.state["phase"]
+        self._phases, self._axes = memory.state["phase"], len(memory.state)
         self._words, self._ring = memory.words.data, memory.ring.view(dtype_of(LogRecord), np.ndarray)
         self._kept: list[np.ndarray] = []
         self._taken = 0
@@ -156,20 +156,24 @@ class SteppedRun:
         self._parts = parts_of_a_run(memory, codec, world, self._scenario, self._part, self._truth)
 
     def step(self, cycles: int) -> None:
-        """So many cycles, fewer if the axis has FINISHED; the simulated time goes on all the same."""
+        """So many cycles, fewer if all axes have FINISHED; the simulated time goes on all the same."""
+        axes, most = self._axes, len(self._ring) // self._axes
         while cycles > 0:
-            count = min(cycles, len(self._ring))
-            if self._words[_HEAD] + count - self._taken > len(self._ring):
+            count = min(cycles, most)
+            if self._words[_HEAD] + count * axes - self._taken > len(self._ring):
                 self._keep()
-            if self._phase[0] != _FINISHED:
+            if self._moving():
                 self._part[:] = self.now_ns, count
                 next(self._parts)
             self.now_ns += count * self._period_ns
             cycles -= count
 
-    def newest(self) -> Any:
-        """The newest log record, a structured scalar that the next step may change."""
-        return self._ring[(self._words[_HEAD] - 1) % len(self._ring)]
+    def _moving(self) -> bool:
+        return self._phases[0] != _FINISHED or bool((self._phases != _FINISHED).any())
+
+    def newest(self, axis: int = 0) -> Any:
+        """The newest log record of an axis, a structured scalar that the next step may change."""
+        return self._ring[(self._words[_HEAD] - self._axes + axis) % len(self._ring)]
 
     def _keep(self) -> None:
         head, size = self._words[_HEAD], len(self._ring)
@@ -178,7 +182,7 @@ class SteppedRun:
         self._taken = head
 
     def records(self) -> Any:
-        """Every log record so far, a record array (N,)."""
+        """Every log record so far, a record array (N,): of each cycle one for each axis."""
         self._keep()
         self._kept = [np.concatenate(self._kept)]
         return self._kept[0].view(np.recarray)
@@ -350,14 +354,29 @@ class LockstepArm:
         self._ports = np.concatenate([joint._port for joint in joints]).view(np.recarray)
         self.plant_constants = np.concatenate([joint.plant_constants for joint in joints]).view(np.recarray)
         self.plant_state = np.concatenate([joint._virtual.plant_state for joint in joints]).view(np.recarray)
-        self._starts_rad = [joint.report.start_position_rad for joint in joints]
         counts = np.abs(self._devices.counts_per_rad)
         self.quick_stop_radps2 = self._devices.drive.quick_stop_deceleration / counts  # of each drive, float64 (N,)
         self.tables = stacked_tables([trajectory_table(config) for config in arm.joints])
+        self.reports = [joint.report for joint in joints]
+        self._thermometer = all(joint._settings.temperature is not None for joint in joints)
+
+    def stepped(self, constants: Any, tables: np.ndarray) -> SteppedRun:
+        """A run that goes on when it is asked to; `tables` float64 (axes, rows, 5)."""
+        memory = self._memory(constants, tables, STEP_RECORDS, self.arm.model.memory())
+        world = self._world((self.plant_constants, self.plant_state), arm_plant_of(self.arm))
+        return SteppedRun(memory, codec_of(self._ports.copy()), world, self.start_ns, thermometer=self._thermometer)
+
+    @staticmethod
+    def _memory(constants: Any, tables: np.ndarray, records: int, model: Arm) -> CycleMemory:
+        """The loop's, as a run begins; `records`: for each axis."""
+        state = new(AxisState, len(constants))
+        for axis, its_constants in zip(state, constants, strict=True):
+            reset_axis(its_constants, axis)
+        return _memory(constants, state, tables, new(LogRecord, records * len(constants)), model)
 
     def constants(self) -> Any:
         """Fresh `AxisConstants`, one a joint; may be changed before `run`."""
-        constants = self.arm.axis_constants(list(self.tables), self._starts_rad)
+        constants = self.arm.axis_constants(list(self.tables), [report.start_position_rad for report in self.reports])
         constants.sequence.supervisor_max_cycles[:] = 0
         return constants
 
@@ -416,13 +435,11 @@ class LockstepArm:
     def _carry_out(self, constants: Any, model: Arm, world: World, **how: Any) -> list[LockstepRun]:
         """`how`: fields of `Scenario`."""
         constants = constants.copy()
-        axes, first = len(constants), constants[0]
-        state = new(AxisState, axes)
-        for axis in range(axes):
-            reset_axis(constants[axis], state[axis])
-        scenario = Scenario(self.start_ns, round(float(first.law.period_s) * 1e9), **how)
+        axes = len(constants)
+        scenario = Scenario(self.start_ns, round(float(constants[0].law.period_s) * 1e9), **how)
         rows = scenario.cycles // scenario.log_every + 1
-        memory = _memory(constants, state, self.tables, new(LogRecord, rows * axes), model)
+        memory = self._memory(constants, self.tables, rows, model)
+        state = memory.state
         truth = np.zeros((rows + scenario.tail_cycles, TRUTHS * axes))
         written, kept = run_lockstep(memory, codec_of(self._ports.copy()), world, scenario, truth)
         return [

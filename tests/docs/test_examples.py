@@ -27,6 +27,19 @@ def test_own_law(tmp_path: Path) -> None:
     assert configured < 0.5 * own < 5.0
 
 
+def test_an_arm(tmp_path: Path) -> None:
+    *joints, phase = ran(tmp_path, str(ROOT / "examples" / "arm.py")).splitlines()
+    assert [line.split()[0] for line in joints] == ["shoulder", "elbow", "wrist"]
+    assert all(float(line.split()[1]) < 0.5 for line in joints)
+    assert phase == "finished"
+
+
+def test_an_arm_as_the_page_shows_it(tmp_path: Path) -> None:
+    (block,) = (block for block in BLOCKS if "jointctl.Arm(" in block)
+    out = ran(tmp_path, "-c", f"import jointctl\n{block}\nprint(moved.shape[1], arm.state.phase)")
+    assert out.splitlines()[-1] == "3 finished"
+
+
 @pytest.mark.realtime
 def test_set_points_in_real_time(tmp_path: Path) -> None:
     out = ran(tmp_path, str(ROOT / "examples" / "stream.py"))

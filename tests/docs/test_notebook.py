@@ -32,7 +32,7 @@ def test_the_notebook_holds_no_outputs(notebook: Any) -> None:
 def test_the_tutorial_is_made_of_cells_of_the_notebook(notebook: Any) -> None:
     """Those with a joint at simulated time; what the page shows is what runs there."""
     cells = [cell.source for cell in notebook.cells]
-    shown = [block for block in BLOCKS if "lockstep=True) as" in block]
+    shown = [block for block in BLOCKS if "lockstep=True) as joint" in block]
     assert len(shown) == 4
     assert [block for block in shown if block not in cells] == []
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,6 +12,9 @@ import numpy as np
 from jointctl.drivers.can.frames import bus_load, highest_rate_Hz
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.arm_model import newton_euler
+from jointctl.firmware_py.records import Reference, TrajectoryConstants
+from jointctl.firmware_py.schema import new
+from jointctl.firmware_py.trajectory import reference_at
 from jointctl.tools.analysis.linear_loop import LoopSettings, RigidJoint
 from jointctl.tools.analysis.loop_settings import loop_settings
 from jointctl.tools.analysis.margins import Margins, margins
@@ -24,6 +27,7 @@ from jointctl.tools.configuration.config import Config
 HIGHEST_LOAD = 0.85
 RATES_Hz = (4000, 2000, 1000, 500, 250, 200, 125, 100)  # that a clock divides well
 MOST_POSES = 3000
+MOTION_SAMPLES = 400  # of a motion whose torques are looked at
 
 
 @dataclass(frozen=True)
@@ -130,6 +134,43 @@ def pose_ranges(arm: ArmConfig) -> list[PoseRange]:
     own = np.diagonal(inertias, axis1=1, axis2=2)
     low, high, load = own.min(axis=0), own.max(axis=0), np.abs(loads).max(axis=0)
     return [PoseRange(float(low[i]), float(high[i]), float(load[i])) for i in range(len(load))]
+
+
+def load_torques(arm: ArmConfig) -> None:
+    """Compile or load what `require_torques` calls: that may take seconds."""
+    newton_euler(arm.model.memory())
+    reference_at(new(TrajectoryConstants)[0], np.zeros((1, 5)), 0, 0.0, new(Reference)[0])
+
+
+def require_torques(
+    arm: ArmConfig, trajectories: Sequence[Any], tables: np.ndarray, duration_s: float, alive: Callable[[], None]
+) -> None:
+    """`ConfigurationError` where the model asks more of a joint than its limit, at one of `MOTION_SAMPLES` moments.
+
+    `trajectories`: TrajectoryConstants of each joint, `tables` their rows; `alive` is called in between.
+    """
+    memory = arm.model.memory()
+    motion: Any = memory.motion
+    reference: Any = new(Reference)[0]
+    rows = [0] * len(trajectories)
+    times_s = np.linspace(0.0, duration_s, MOTION_SAMPLES)
+    torques_Nm = np.zeros((len(times_s), len(trajectories)))
+    for time_s, torques in zip(times_s, torques_Nm, strict=True):
+        alive()
+        for axis, trajectory in enumerate(trajectories):
+            rows[axis] = reference_at(trajectory, tables[axis], rows[axis], float(time_s), reference)
+            own = motion[axis]
+            own.position_rad, own.velocity_radps = reference.position_rad, reference.velocity_radps
+            own.acceleration_radps2 = reference.acceleration_radps2
+        newton_euler(memory)
+        torques[:] = motion.torque_Nm[: len(torques)]
+    for name, config, torques in zip(arm.names, arm.joints, torques_Nm.T, strict=True):
+        worst, limit_Nm = int(np.argmax(np.abs(torques))), config.limits.torque_max_Nm
+        if not abs(torques[worst]) <= limit_Nm:
+            raise ConfigurationError(
+                f"{name}: the motion takes {torques[worst]:.3g} Nm at {times_s[worst]:.3g} s by the arm's model, "
+                f"must be in [{-limit_Nm:g}..{limit_Nm:g}], limits.torque_max_Nm"
+            )
 
 
 def joint_loop(name: str, config: Config, found: PoseRange, delay_s: float | None = None) -> JointOfArm:

@@ -79,17 +79,23 @@ class ArmConfig:
         return self.joints[0].loop.rate_Hz
 
     def axis_constants(self, tables: Sequence[np.ndarray], starts_rad: Sequence[float] | None = None) -> Any:
-        """A record array of N `AxisConstants`; `tables` as of `trajectory_table` of each joint.
-
-        All joints approach in the same time, the longest of them.
-        """
+        """A record array of N `AxisConstants`; `tables` as of `trajectory_table` of each joint."""
         starts = [None] * len(self.joints) if starts_rad is None else list(starts_rad)
         parts = [
             axis_constants(config, table, start_position_rad=start)
             for config, table, start in zip(self.joints, tables, starts, strict=True)
         ]
-        constants = np.concatenate(parts).view(np.recarray)
+        return self.connected(parts)
+
+    def connected(self, parts: Sequence[Any]) -> Any:
+        """A record array of N `AxisConstants` of those of each joint alone.
+
+        All joints approach in the same time, the longest of them, and follow set-points equally late.
+        """
+        constants: Any = np.concatenate(parts).view(np.recarray)
         constants.sequence.approach_s[:] = constants.sequence.approach_s.max()
+        constants.stream.delay_ns[:] = constants.stream.delay_ns.max()
+        constants.stream.timeout_ns[:] = constants.stream.timeout_ns.min()
         for axis, load in zip(constants, self.greatest_gravity_Nm(), strict=True):
             if self.arm.feed_forward != "none":
                 axis.law.of_arm = 1

@@ -101,7 +101,7 @@ def free_constants(config: Config, start_rad: float) -> Any:
 
 def expect_client(constants: Any, config: Config) -> None:
     """The loop ends the run when the program that commands the joint has been silent for `stream.client_timeout_s`."""
-    constants[0].stream.client_timeout_ns = round(config.stream.client_timeout_s * 1e9)
+    constants["stream"]["client_timeout_ns"] = round(config.stream.client_timeout_s * 1e9)
 
 
 def trajectory_table(config: Config) -> np.ndarray:

@@ -62,10 +62,12 @@ from jointctl.tools.recording.ros_messages import (
     CAN_TOPIC,
     CDR_HEADER,
     EVENT_TOPIC,
+    JOINT_NAMES,
     JOINT_STATE_TOPIC,
     RECORD_TOPIC,
     TEMPERATURE,
     TEMPERATURE_TOPIC,
+    StateCycles,
     Topic,
     event_body,
     joint_states,
@@ -272,7 +274,6 @@ class McapFile:
 
 
 INFO, WARNING, ERROR = 20, 30, 40  # levels, those of Python's logging and of rcl_interfaces/msg/Log
-JOINT_STATE_NS = 10_000_000  # between two of them; a tenth of the records costs 3 % of the file, all 33 %
 # metadata of a log from which records are left out on purpose: "every" so many one is kept, the last "whole_s" all
 THINNING = "thinning"
 _PACKAGES = ("jointctl", "numpy", "numba", "python-can", "canopen", "mcap")
@@ -351,13 +352,15 @@ class RunLogWriter:
     """Writes one log; use it as a context manager, so that an exception still finishes the file.
 
     What was written is in the hands of the operating system at the latest `flush_s` later (checked at each write, so
-    write at least that often) and at once after an event.  `clock` [s] is for tests.
+    write at least that often) and at once after an event.  `clock` [s] is for tests.  `joints`: the names in its joint
+    states, those of an arm in the log of its first joint.
     """
 
     def __init__(
         self,
         path: str | Path,
         metadata: Mapping[str, Mapping[str, str]],
+        joints: tuple[str, ...] = JOINT_NAMES,
         *,
         flush_s: float = 0.5,
         clock: Callable[[], float] = time.monotonic,
@@ -380,8 +383,8 @@ class RunLogWriter:
         self._channels: dict[str, int] = {}
         for topic in (RECORD_TOPIC, JOINT_STATE_TOPIC, EVENT_TOPIC):  # the others only in logs that have them
             self._channel(topic)
-        self._unflushed = bytearray()  # records whose joint states are still to be written
-        self._slot = -1  # of the last joint state
+        self._joints, self._states = joints, StateCycles(len(joints))
+        self._unflushed: list[np.ndarray] = []  # states that are still to be written
         self._file.flush()
 
     def _channel(self, topic: Topic) -> int:
@@ -405,9 +408,14 @@ class RunLogWriter:
         numbers = (self._written + np.arange(len(records))) & 0xFFFFFFFF
         self._add(RECORD_TOPIC, records["time_ns"], records, numbers)
         self._written += len(records)
-        self._unflushed += records.tobytes()
+        self.take_states(records)
         if self._clock() - self._flushed_at_s >= self._flush_s:
             self.flush()
+
+    def take_states(self, records: np.ndarray, joint: int = 0) -> None:
+        """New records of any joint, for the joint states."""
+        if len(found := self._states.take(records, joint)):
+            self._unflushed.append(found)
 
     def write_frames(self, frames: np.ndarray) -> None:
         """Append raw CAN frames, an array of shape (N,) of CAN_FRAME in order of time."""
@@ -432,12 +440,9 @@ class RunLogWriter:
 
     def _write_joint_states(self) -> None:
         if self._unflushed:
-            records = np.frombuffer(self._unflushed, dtype_of(LogRecord))
-            self._unflushed = bytearray()
-            slots = records["time_ns"] // JOINT_STATE_NS
-            chosen = records[np.diff(slots, prepend=self._slot) != 0]
-            self._slot = int(slots[-1])
-            self._add(JOINT_STATE_TOPIC, chosen["time_ns"], joint_states(chosen, self._offset_ns))
+            cycles, self._unflushed = np.concatenate(self._unflushed), []
+            states = joint_states(cycles, self._offset_ns, self._joints)
+            self._add(JOINT_STATE_TOPIC, cycles["time_ns"][:, 0], states)
 
     def flush(self) -> None:
         self._write_joint_states()

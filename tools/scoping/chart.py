@@ -59,7 +59,7 @@ class Chart:
     """Refreshed ten times a second; what is not live or is paused is drawn only when something about it changes."""
 
     def __init__(self, history: History, *, live: bool) -> None:
-        self._history = history
+        self._all, self._history = history, history
         self._held_s: float | None = None  # right end of the picture while it stands
         self._drawn: Any = None
         self._names: tuple[str, list[str]] | None = None  # view and signals of the picture
@@ -67,6 +67,10 @@ class Chart:
         self._seen = Seen("", np.zeros(0), {})
         self._next_cursor = 0
         with ui.row().classes("w-full items-center gap-3"):
+            if len(history.joints) > 1:
+                names = dict(enumerate(history.joints))
+                self._joint = ui.select(names, value=0, label="joint", on_change=self._on_joint).classes("w-32")
+                self._joint.props('dense options-dense data-testid="joint"')
             self._signals = ui.select(list(SIGNALS), value=list(FIRST_SIGNALS), multiple=True, label="signals")
             self._signals.classes("grow min-w-40").props('dense options-dense data-testid="signals"')
             self._span = ui.select(list(SPANS_s), value=10 if live else 60, label="span [s]").classes("w-20")
@@ -104,6 +108,10 @@ class Chart:
             for name, save in (("CSV", self._save_csv), ("PNG", self._save_png)):
                 button = ui.button(name, on_click=save, color=None).props("flat dense no-caps")
                 button.props(f'data-testid="{name.lower()}" title="what is seen, as {name}"')
+
+    def _on_joint(self) -> None:
+        self._history = self._all.of(int(self._joint.value or 0))
+        self._names = self._drawn = None
 
     def _on_view(self) -> None:
         self._names = None  # the zoom and the axes begin anew

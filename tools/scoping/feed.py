@@ -19,10 +19,11 @@ from typing import Any, Self
 from jointctl.drivers.errors import DataError, UsageError, printable
 from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.configuration.drive_section import DEFAULT_KIND
+from jointctl.tools.recording.ros_messages import JOINT_NAMES
 from jointctl.tools.recording.run_log import Event
 from jointctl.tools.session.display import LONGEST_BYTES, Snapshot, ViewerRequest, decoded
 
-RECORDS, EVENT, SETTINGS = b"R", b"E", b"S"  # first byte of a message
+RECORDS, EVENT, SETTINGS = b"R", b"E", b"S"  # first byte of a message; of records the second is the joint's number
 REQUESTS = 16  # of viewers, at most between two looks
 AT_ONCE = 64  # messages of a server that are read in one look: it must not hold the supervisor up
 PIECE = 64  # records a message; less than the buffer of the socket
@@ -45,6 +46,7 @@ class ScopeOrder:
     token: str  # without it nothing is shown or taken
     drive: str = DEFAULT_KIND  # drive.kind
     loop_cpu: int | None = None  # loop.cpu
+    joints: tuple[str, ...] = JOINT_NAMES
     feed_fd: int = -1  # -1: show `log` instead
     log: str = ""
 
@@ -121,11 +123,11 @@ class ScopeFeed:
         """So are phases."""
 
     def show(self, snapshot: Snapshot) -> None:
-        if snapshot.temperature_degC != self._temperature_degC:
+        if snapshot.axis == 0 and snapshot.temperature_degC != self._temperature_degC:
             self._temperature_degC = snapshot.temperature_degC
             self.settings({"temperature_degC": self._temperature_degC})
         for at in range(0, len(snapshot.records), PIECE):
-            self.send(RECORDS, snapshot.records[at : at + PIECE].tobytes())
+            self.send(RECORDS, bytes([snapshot.axis]) + snapshot.records[at : at + PIECE].tobytes())
 
     def event(self, event: Event) -> None:
         self.send(EVENT, json.dumps(asdict(event)).encode())

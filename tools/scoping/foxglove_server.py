@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 
 import foxglove
 import numpy as np
@@ -57,16 +58,17 @@ def client_name(number: int) -> str:
 
 
 def set_point_of(who: str, data: bytes) -> RemoteSetPoint:
-    """Of a JSON object with the arguments of `Joint.command`; `ValueError` tells what is wrong with it."""
+    """Of a JSON object with the arguments of `Joint.command`, or `Arm.command`; `ValueError` tells what is wrong."""
     found = json.loads(data)
     if not isinstance(found, dict) or "position_rad" not in found:
         raise ValueError("it must be an object with position_rad")
     for key, value in found.items():
         if key not in _KEYS:
             raise ValueError(f"{str(key)[:40]!r} is none of {', '.join(_KEYS)}")
-        if value is not None and (isinstance(value, bool) or not isinstance(value, (int, float))):
+        listed = value if isinstance(value, list) and key != "time_s" else [value]
+        if value is not None and not all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in listed):
             raise ValueError(f"{key} (={str(value)[:40]}) must be a number")
-    values = {key: float(value) for key, value in found.items() if value is not None}
+    values = {key: value for key, value in found.items() if value is not None}
     if "position_rad" not in values:
         raise ValueError("position_rad must be a number")
     return RemoteSetPoint(who, **values)
@@ -88,7 +90,7 @@ class FoxgloveView(ServerListener):
 
     def __init__(self, order: RemoteOrder) -> None:
         self._order = order
-        self.view = LiveView(self)
+        self.view = LiveView(self, order.names)
         self.way = WayBack(order, self.view, self._refused)
         self._server: WebSocketServer | None = None
         self._topics: dict[tuple[int, int], ClientChannel] = {}
@@ -96,7 +98,9 @@ class FoxgloveView(ServerListener):
         self._refusals: dict[str, str] = {}  # the newest of each client, not yet reported
         self._told_s, self._lock = 0.0, threading.Lock()
         self._states, self._events = _channel(JOINT_STATE_TOPIC), _channel(EVENT_TOPIC)
-        self._records = None if order.only_states else _channel(RECORD_TOPIC)
+        alone = len(order.names) == 1
+        topics = [replace(RECORD_TOPIC, name=RECORD_TOPIC.name + ("" if alone else f"/{name}")) for name in order.names]
+        self._records = [] if order.only_states else [_channel(topic) for topic in topics]
 
     def start(self) -> None:
         order = self._order
@@ -119,11 +123,11 @@ class FoxgloveView(ServerListener):
 
     # --- Publisher ---
 
-    def states(self, record: np.void, body: bytes, wall_ns: int) -> None:
+    def states(self, records: np.ndarray, body: bytes, wall_ns: int) -> None:
         self._tell_refusals()
         self._states.log(body, log_time=wall_ns)
-        if self._records is not None:
-            self._records.log(CDR_HEADER + record.tobytes(), log_time=wall_ns)
+        for channel, record in zip(self._records, records, strict=False):  # none of them with joint states alone
+            channel.log(CDR_HEADER + record.tobytes(), log_time=wall_ns)
 
     def event(self, event: Event, body: bytes, wall_ns: int) -> None:
         self._events.log(body, log_time=wall_ns)

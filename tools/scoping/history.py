@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 from jointctl.drivers.errors import printable
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of, new
+from jointctl.tools.recording.ros_messages import JOINT_NAMES
 from jointctl.tools.recording.run_log import Event
 from jointctl.tools.recording.run_summary import drawn_indices, powered
 
@@ -52,9 +53,14 @@ def printable_values(value: object) -> Any:
 
 
 class History:
-    """Filled by one thread, read by others; its memory never grows."""
+    """Filled by one thread, read by others; its memory never grows.
 
-    def __init__(self, ring_records: int = RING_RECORDS) -> None:
+    Of an arm it is that of the first joint, with events and settings of all; `of` has the records of the others.
+    """
+
+    def __init__(self, ring_records: int = RING_RECORDS, joints: Sequence[str] = JOINT_NAMES) -> None:
+        self.joints = tuple(joints)
+        self._others = [History(ring_records) for _ in joints[1:]]
         self._ring = new(LogRecord, ring_records)
         self._head = 0
         self._start_ns = 0
@@ -85,17 +91,24 @@ class History:
             self._head += len(records)
             self.skipped += int(records["skipped"].sum())
 
+    def of(self, joint: int) -> History:
+        """The records of a joint."""
+        return self if joint == 0 else self._others[joint - 1]
+
     def begin(self) -> None:
         """A new run: what was seen of the one before goes."""
+        for other in self._others:
+            other.begin()
         with self._lock:
             self._head = 0
             self._start_ns = 0
             self.skipped = 0
         self.events.clear()
 
-    def take_bytes(self, body: bytes) -> None:
+    def take_bytes(self, body: bytes, axis: int = 0) -> None:
         """As `take`, of records as they came through the socket."""
-        self.take(np.frombuffer(body, dtype_of(LogRecord)))
+        if axis < len(self.joints):
+            self.of(axis).take(np.frombuffer(body, dtype_of(LogRecord)))
 
     def newest(self, span_s: float, before_s: float | None = None) -> Any:
         """A copy of the records of the last `span_s`, up to `before_s` since the start if that is given."""

@@ -19,12 +19,14 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jointctl.drivers.drive import Approval, CommissioningReport
 from jointctl.drivers.errors import DataError, JointctlError
 from jointctl.firmware_py.states import StopRequest
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
+from jointctl.tools.recording.ros_messages import JOINT_NAMES
 from jointctl.tools.scoping.feed import ScopeFeed, require_free, server_process
 from jointctl.tools.scoping.remote_options import (
     LISTEN_AT,
@@ -37,6 +39,9 @@ from jointctl.tools.session.consent import Consent
 from jointctl.tools.session.display import LONGEST_BYTES, Display, Displays, decoded
 from jointctl.tools.session.result import run_title
 from jointctl.tools.session.set_points import RemoteSetPoint, SetPointSources
+
+if TYPE_CHECKING:
+    from jointctl.tools.configuration.arm import ArmConfig
 
 APPROVED_S = 300.0  # how long an approval at the terminal waits for the enable that it is for
 POLL_S = 0.05
@@ -66,6 +71,7 @@ class RemoteOrder:
 
     title: str
     joint: str  # the name of the node, and of its topics and services
+    names: tuple[str, ...]  # of the joints in the joint states
     drive: str  # drive.kind
     place: str  # HOST:PORT, or a zenoh endpoint
     domain: int = 0
@@ -192,7 +198,7 @@ def require_package(kind: _Kind) -> None:
 
 @contextmanager
 def remote(
-    options: ObserveOptions, config: Config, output: Output, *, owner: str = "", only_states: bool = False
+    options: ObserveOptions, config: Config | ArmConfig, output: Output, *, owner: str = "", only_states: bool = False
 ) -> Iterator[Remote]:
     """Serve what the options ask for.  `owner`: the program that the set-points of this run come from.
 
@@ -201,9 +207,10 @@ def remote(
     check_remote(options)
     allow = isinstance(options, RemoteOptions) and options.allow_remote
     sources = SetPointSources(owner) if allow else None
+    first, names = (config, JOINT_NAMES) if isinstance(config, Config) else (config.joints[0], config.names)
     order = RemoteOrder(
-        run_title(config), joint_name(config.path), config.drive.kind, "", allow_remote=allow, only_states=only_states,
-        loop_cpu=config.loop.cpu,
+        run_title(config), joint_name(config.path), names, first.drive.kind, "", allow_remote=allow,
+        only_states=only_states, loop_cpu=first.loop.cpu,
     )  # fmt: skip
     with ExitStack() as stack:
         feeds: list[ScopeFeed] = []

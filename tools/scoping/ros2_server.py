@@ -185,7 +185,7 @@ class Ros2View:
     def __init__(self, order: RemoteOrder) -> None:
         self._order = order
         self._types = type_store()
-        self.view = LiveView(self)
+        self.view = LiveView(self, order.names)
         self.way = WayBack(order, self.view, self._refused)
         self._session = zenoh.open(session_config(order.place))
         self._node = Node(order.domain, str(self._session.info.zid()), order.joint)
@@ -275,7 +275,7 @@ class Ros2View:
         who = self._name_of(found)
         try:
             point: Any = self._types.deserialize_cdr(sample.payload.to_bytes(), SET_POINT)
-            self.way.set_point(set_point_of(who, point))
+            self.way.set_point(set_point_of(who, point, len(self._order.names)))
         except Exception as error:  # whatever comes, the node goes on
             self._refused(who, f"not understood: {printable(str(error))[:200] or type(error).__name__}")
 
@@ -294,12 +294,12 @@ class Ros2View:
 
     # --- Publisher ---
 
-    def states(self, record: np.void, body: bytes, wall_ns: int) -> None:
+    def states(self, records: np.ndarray, body: bytes, wall_ns: int) -> None:
         self._put_states(body)
         now_s = time.monotonic()
         if now_s - self._told_s >= DIAGNOSTICS_S:
             self._told_s = now_s
-            self._put_diagnostics(self._diagnostics(record, wall_ns))
+            self._put_diagnostics(self._diagnostics(records, wall_ns))
 
     def event(self, event: Event, body: bytes, wall_ns: int) -> None:
         """See `Publisher`: the newest warning or error is in the diagnostics."""
@@ -309,7 +309,19 @@ class Ros2View:
     def settings(self) -> None:
         """See `Publisher`: they are in the diagnostics."""
 
-    def _diagnostics(self, record: np.void, wall_ns: int) -> bytes:
+    def _diagnostics(self, records: np.ndarray, wall_ns: int) -> bytes:
+        types = self._types.types
+        sec, nanosec = divmod(wall_ns, SECOND_NS)
+        found = types[DIAGNOSTICS](
+            header=types["std_msgs/msg/Header"](
+                stamp=types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec), frame_id=""
+            ),
+            status=[self._status(name, record) for name, record in zip(self._order.names, records, strict=True)],
+        )
+        return bytes(self._types.serialize_cdr(found, DIAGNOSTICS))
+
+    def _status(self, name: str, record: np.void) -> Any:
+        """Of one joint."""
         types, order, settings = self._types.types, self._order, self.view.settings
         pair, status = types["diagnostic_msgs/msg/KeyValue"], types["diagnostic_msgs/msg/DiagnosticStatus"]
         fault, (level, problem) = int(record["fault"]), self._problem
@@ -327,28 +339,23 @@ class Ros2View:
             level = _ERROR if fault else level
             message = f"{phase}: {fault_words(fault)}" if fault else phase
         shown = [pair(key=key, value=str(value)) for key, value in values.items() if value not in (None, "")]
-        sec, nanosec = divmod(wall_ns, SECOND_NS)
-        found = types[DIAGNOSTICS](
-            header=types["std_msgs/msg/Header"](
-                stamp=types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec), frame_id=""
-            ),
-            status=[status(level=level, name=f"{order.joint}: joint", message=message, hardware_id="", values=shown)],
-        )
-        return bytes(self._types.serialize_cdr(found, DIAGNOSTICS))
+        return status(level=level, name=f"{order.joint}: {name}", message=message, hardware_id="", values=shown)
 
 
-def set_point_of(who: str, point: Any) -> RemoteSetPoint:
-    """Of a JointTrajectoryPoint of one joint; a time of zero is none.  `ValueError` tells what is wrong."""
-    given: dict[str, float | None] = {}
-    for name, least in (("positions", 1), ("velocities", 0), ("accelerations", 0), ("effort", 0)):
+def set_point_of(who: str, point: Any, joints: int = 1) -> RemoteSetPoint:
+    """Of a JointTrajectoryPoint of all joints; a time of zero is none.  `ValueError` tells what is wrong."""
+    given: dict[str, list[float] | None] = {}
+    whose = "one joint" if joints == 1 else f"{joints} joints"
+    for name, least in (("positions", joints), ("velocities", 0), ("accelerations", 0), ("effort", 0)):
         values = np.asarray(getattr(point, name), float)
-        if not least <= len(values) <= 1:
-            raise ValueError(f"{name} has {len(values)} values, must have {'1' if least else '0 or 1'}: one joint")
-        given[name] = float(values[0]) if len(values) else None
+        if len(values) not in (least, joints):
+            wanted = str(joints) if least else f"0 or {joints}"
+            raise ValueError(f"{name} has {len(values)} values, must have {wanted}: {whose}")
+        given[name] = values.tolist() or None
     time_s = point.time_from_start.sec + point.time_from_start.nanosec * 1e-9
     assert given["positions"] is not None
     return RemoteSetPoint(
-        who, given["positions"], given["velocities"], given["accelerations"], given["effort"] or 0.0, time_s or None
+        who, given["positions"], given["velocities"], given["accelerations"], given["effort"], time_s or None
     )
 
 

@@ -409,7 +409,7 @@ class ScopePage:
                 with ui.row().classes("w-full no-wrap gap-10 items-start scope-body"):
                     self._deadlines = _text_block(f"Deadlines, last {STATISTICS_s:g} s", "deadlines")
                     self._events = _text_block("Events", "events")
-            if self._link is not None:
+            if self._link is not None and len(self._history.joints) == 1:  # an arm's gains and motion are not changed
                 self._changes: ChangePanels | None = ChangePanels(self._ask, self._who)
             else:
                 self._changes = None

@@ -164,7 +164,7 @@ def serve(order: ScopeOrder) -> None:
 
     feed: Feed | None = None
     if order.feed_fd >= 0:
-        history = History(RING_RECORDS)
+        history = History(RING_RECORDS, order.joints)
         feed = Feed(socket.socket(fileno=order.feed_fd), history)
         feed.start()
     else:

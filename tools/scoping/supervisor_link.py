@@ -13,7 +13,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any, Protocol
 
@@ -23,7 +23,7 @@ from jointctl.drivers.errors import DataError, one_line, printable
 from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import dtype_of
 from jointctl.tools.output import Output
-from jointctl.tools.recording.ros_messages import CDR_HEADER, event_body, joint_states
+from jointctl.tools.recording.ros_messages import CDR_HEADER, JOINT_NAMES, StateCycles, event_body, joint_states
 from jointctl.tools.recording.run_log import Event
 from jointctl.tools.scoping.feed import EVENT, RECORDS, SETTINGS
 from jointctl.tools.scoping.history import printable_values
@@ -45,8 +45,8 @@ class Watcher(Protocol):
     ended: bool
     heard_s: float  # when the last message came, time.monotonic
 
-    def take_bytes(self, body: bytes) -> None:
-        """Log records, as they stand in the log."""
+    def take_bytes(self, body: bytes, axis: int = 0) -> None:
+        """Log records of a joint, as they stand in the log."""
 
     def take_event(self, event: Event) -> None:
         """One more event."""
@@ -76,7 +76,7 @@ class Feed(threading.Thread):
             if not message:
                 break
             if message[:1] == RECORDS:
-                self._watcher.take_bytes(message[1:])
+                self._watcher.take_bytes(message[2:], message[1])
             elif message[:1] == EVENT:
                 self._watcher.take_event(Event(**json.loads(message[1:])))
             elif message[:1] == SETTINGS:
@@ -150,16 +150,17 @@ class SetPointLink:
 # A `LiveView` is the `Watcher` of its feed; its `Publisher` puts what it is given onto the wire.
 
 
-RATE_HZ = 100
-_PERIOD_NS = 1_000_000_000 // RATE_HZ
 NOT_TAKEN = "not taken: jointctl does not listen"
 
 
 class Publisher(Protocol):
     """One kind of server; called in the thread of the feed.  Bodies are CDR, as they stand in the log."""
 
-    def states(self, record: np.void, body: bytes, wall_ns: int) -> None:
-        """A log record and the sensor_msgs/msg/JointState of it, a hundred times a second; its time since 1970."""
+    def states(self, records: np.ndarray, body: bytes, wall_ns: int) -> None:
+        """Log records of all joints, shape (joints,), and the sensor_msgs/msg/JointState of them, 100 times a second.
+
+        `wall_ns`: their time since 1970.
+        """
 
     def event(self, event: Event, body: bytes, wall_ns: int) -> None:
         """What has happened, and the rcl_interfaces/msg/Log of it."""
@@ -171,22 +172,21 @@ class Publisher(Protocol):
 class LiveView:
     """Passes on what comes from the supervisor."""
 
-    def __init__(self, publisher: Publisher) -> None:
-        self._publisher = publisher
+    def __init__(self, publisher: Publisher, names: Sequence[str] = JOINT_NAMES) -> None:
+        self._publisher, self._names = publisher, tuple(names)
+        self._cycles = StateCycles(len(names))
         self.settings: dict[str, Any] = {}
         self.ended, self.heard_s = False, time.monotonic()
         self._wall_ns = time.time_ns() - time.monotonic_ns()
-        self._slot = 0
 
-    def take_bytes(self, body: bytes) -> None:
-        """Of each hundredth of a second the first record."""
-        records = np.frombuffer(body, dtype_of(LogRecord))
-        slots = records["time_ns"] // _PERIOD_NS
-        records = records[np.diff(slots, prepend=self._slot) != 0]
-        self._slot = int(slots[-1])
-        for record, state in zip(records, joint_states(records, self._wall_ns), strict=True):
+    def take_bytes(self, body: bytes, axis: int = 0) -> None:
+        """Of each hundredth of a second the first cycle."""
+        if axis >= len(self._names):
+            return
+        cycles = self._cycles.take(np.frombuffer(body, dtype_of(LogRecord)), axis)
+        for records, state in zip(cycles, joint_states(cycles, self._wall_ns, self._names), strict=True):
             body = CDR_HEADER + state.tobytes()
-            self._publisher.states(record, body, int(record["time_ns"]) + self._wall_ns)
+            self._publisher.states(records, body, int(records[0]["time_ns"]) + self._wall_ns)
 
     def take_event(self, event: Event) -> None:
         shown = replace(event, source=printable(event.source), text=printable(event.text))

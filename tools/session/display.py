@@ -45,6 +45,8 @@ class PreparedMotion(ViewerRequest):
     trajectory: Any = None  # record array of one TrajectoryConstants
     words: str = ""
     answered: Callable[[str], None] = lambda _: None
+    joint: str = ""  # whose it is, in an arm
+    move_s: float = 0.0  # that the way to its beginning takes at least
 
 
 def viewer(address: str | None) -> str:
@@ -79,6 +81,7 @@ class Snapshot:
     records: Any = ()  # all new ones, array of LogRecord (N,)
     temperature_degC: float | None = None  # None: the drive tells none, or not now
     joint: str = ""  # which joint of an arm
+    axis: int = 0  # its number
 
 
 class Display(Protocol):
@@ -209,10 +212,13 @@ class PhaseLines(OnlyShows):
 
 
 class JointDisplay:
-    """What a display gets from one joint of an arm: with its name in front, and a phase from the first one only."""
+    """What a display gets from one joint of an arm: with its name in front, and a phase from the first one only.
 
-    def __init__(self, display: Display, name: str, *, first: bool) -> None:
-        self._display, self._name, self._first = display, name, first
+    The joints share `orders`, what was asked for and no joint has taken yet.
+    """
+
+    def __init__(self, display: Display, name: str, orders: list[ViewerRequest], axis: int) -> None:
+        self._display, self._name, self._orders, self._axis = display, name, orders, axis
         self.stop_request, self.stop_reason = display.stop_request, display.stop_reason
 
     def note(self, text: str) -> None:
@@ -220,18 +226,28 @@ class JointDisplay:
 
     def phase(self, text: str) -> None:
         """All joints go on together."""
-        if self._first:
+        if self._axis == 0:
             self._display.phase(text)
 
     def show(self, snapshot: Snapshot) -> None:
-        self._display.show(replace(snapshot, joint=self._name))
+        self._display.show(replace(snapshot, joint=self._name, axis=self._axis))
 
     def event(self, event: Event) -> None:
         self._display.event(replace(event, text=f"{self._name}: {event.text}"))
 
     def requests(self) -> Sequence[ViewerRequest]:
-        """An arm's gains and motion are not changed while it runs."""
-        return ()
+        """Motions of the program for this joint, the first one's the number of viewers.
+
+        Viewers change neither gains nor motion of an arm.
+        """
+        new = self._display.requests()
+        self._orders += [each for each in new if isinstance(each, PreparedMotion) or each.kind == "viewers"]
+        own = [order for order in self._orders if self._is_own(order)]
+        self._orders[:] = [order for order in self._orders if not self._is_own(order)]
+        return own
+
+    def _is_own(self, order: ViewerRequest) -> bool:
+        return order.joint == self._name if isinstance(order, PreparedMotion) else self._axis == 0
 
     def settings(self, values: Mapping[str, Any]) -> None:
         """As above."""

@@ -175,10 +175,11 @@ _WHY = {
 }
 
 
-def post_change(box: Any, kind: ChangeKind, payload: Any) -> int:
+def post_change(box: Any, kind: ChangeKind, payload: Any, move_s: float = 0.0) -> int:
     """Into the letter box of `ChangeConstants`, the request first, its number last; the loop has answered the others.
 
-    `payload`: gains as a mapping, or a record array of one `TrajectoryConstants`.
+    `payload`: gains as a mapping, or a record array of one `TrajectoryConstants`; `move_s`: that the way to its
+    beginning takes at least.  In an arm the loop waits for a request to every joint.
     """
     number, request = int(box.order[0]) + 1, box.request
     request.kind = kind
@@ -186,7 +187,7 @@ def post_change(box: Any, kind: ChangeKind, payload: Any) -> int:
         for name in NAMES:
             request.gains[name] = payload[name]
     else:
-        request.trajectory = payload[0]
+        request.trajectory, request.move_s = payload[0], move_s
     request.first = request.last = number
     box.order[0] = number
     return number
@@ -201,6 +202,7 @@ class _Change:
     gate: Future[float] | None = None
     request: str = ""  # kind of the request
     number: int = 0  # 0: not yet with the loop
+    move_s: float = 0.0
     answered: Callable[[str], None] = lambda _: None
 
 
@@ -303,12 +305,12 @@ class LiveChanges:
         text = f"motion {self.motion()} -> {words}"
         change = _Change(text, request.who, ChangeKind.MOTION, trajectory, request=request.kind)
         if isinstance(request, PreparedMotion):
-            change.answered = request.answered
+            change.answered, change.move_s = request.answered, request.move_s
         self._post(change)
         return change
 
     def _post(self, change: _Change) -> None:
-        change.number = post_change(self._axis.change, change.kind, change.payload)
+        change.number = post_change(self._axis.change, change.kind, change.payload, change.move_s)
 
     def poll(self) -> None:
         """Go on with the open change: the gate's word, then the loop's."""

@@ -51,6 +51,7 @@ class SharedBlock:
         """Map an existing block; every process gives the same numbers and record of the drive's exchange."""
         self.fd = fd
         self.table_rows, self.axes, self.axis = table_rows, axes, 0
+        self.whole = self  # also seen from one axis
         self._offset = 0
         size = self._size(table_rows, port, axes)
         os.ftruncate(fd, max(os.fstat(fd).st_size, size))

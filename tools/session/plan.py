@@ -7,7 +7,8 @@ it (`Motion.placed`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from jointctl.drivers.drive import CommissioningReport
-from jointctl.drivers.errors import MotionFault
+from jointctl.drivers.errors import BusError, JointctlError, MotionFault
 from jointctl.firmware_py.records import Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.trajectory import approach_start, peak_of, reference_at
@@ -73,10 +74,6 @@ class JointPlan:
         """Of its envelope, below its name where it is one of several."""
         return [f"--- {self.name} ({self.config.path.name})", *lines] if self.name else list(lines)
 
-    def naming(self, text: str) -> str:
-        """A message, with its name in front where it is one of several."""
-        return f"{self.name}: {text}" if self.name else text
-
 
 @dataclass(frozen=True)
 class RunPlan:
@@ -100,6 +97,11 @@ class RunPlan:
         return self.arm.joints if self.arm is not None else (JointPlan(self.config, self.motion, self.log_path),)
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Of the joints of an arm; ("",) of one that is alone."""
+        return tuple(joint.name for joint in self.joints)
+
+    @property
     def tables(self) -> np.ndarray:
         """The tables of all motions, see `stacked_tables`."""
         return stacked_tables([joint.motion.table for joint in self.joints])
@@ -108,13 +110,27 @@ class RunPlan:
         """The motion of all joints from where they stand: constants of all, the lines of all."""
         if self.arm is None:
             return self.motion.placed(reports[0])
-        tables = [joint.motion.table for joint in self.joints]
-        constants = self.arm.config.axis_constants(tables, [report.start_position_rad for report in reports])
+        joints = self.arm.joints
+        placed = [joint.motion.placed(report) for joint, report in zip(joints, reports, strict=True)]
+        constants = self.arm.config.connected([each.constants for each in placed])
         lines: list[str] = []
-        for axis, joint, report in zip(constants, self.arm.joints, reports, strict=True):
-            assert isinstance(joint.motion, ConfiguredMotion)
+        for axis, joint, report in zip(constants, joints, reports, strict=True):
             lines += joint.lines(joint.motion.envelope(axis, report))
-        return Placed(constants, tables[0], tuple(lines))
+        return Placed(constants, placed[0].table, tuple(lines))
+
+
+class JointMotion(Motion, Protocol):
+    """That of one joint of an arm."""
+
+    def envelope(self, axis: Any, report: CommissioningReport) -> list[str]:
+        """Lines that say where the joint will go; `axis`: its `AxisConstants` in the arm."""
+
+
+@dataclass(frozen=True)
+class JointOfArmPlan(JointPlan):
+    """See `JointPlan`."""
+
+    motion: JointMotion
 
 
 @dataclass(frozen=True)
@@ -122,7 +138,19 @@ class ArmPlan:
     """The joints of an arm in a run, and what connects them."""
 
     config: ArmConfig
-    joints: tuple[JointPlan, ...]
+    joints: tuple[JointOfArmPlan, ...]
+
+
+@contextmanager
+def blamed(name: str) -> Iterator[None]:
+    """An error, with the name of the joint in front where it is one of several."""
+    try:
+        yield
+    except BusError:  # it names the node, which need not be the joint's that has come across it
+        raise
+    except JointctlError as error:
+        error.message = f"{name}: {error.message}" if name else error.message
+        raise
 
 
 def joint_lines(report: CommissioningReport) -> list[str]:
@@ -149,25 +177,34 @@ def remark_lines(remarks: Iterable[str]) -> list[str]:
     return [f"remark     {remark}" for remark in remarks]
 
 
-def resolve(config: Config, *, allow_low_margin: bool = False, hold: bool = False) -> RunPlan:
-    """The plan of `run`; `ConfigurationError` for a table that leaves the limits or cannot be read.
-
-    `hold`: the joint stays where it stands, ready for set-points, instead of the configured trajectory.
-    """
-    table = trajectory_table(config)
-    motion: Motion = FreeMotion(config, table) if hold else ConfiguredMotion(config, table)
-    return RunPlan(config, motion, log_path(config), allow_low_margin)
+def configured(config: Config) -> ConfiguredMotion:
+    """Its section [trajectory]."""
+    return ConfiguredMotion(config, trajectory_table(config))
 
 
-def resolve_any(config: Config | ArmConfig, *, allow_low_margin: bool = False, hold: bool = False) -> RunPlan:
-    """The plan of `run`, for a joint or an arm."""
+def free(config: Config) -> FreeMotion:
+    """It stays where it stands, ready for set-points; its section [trajectory] must be good all the same."""
+    return FreeMotion(config, trajectory_table(config))
+
+
+def resolve(config: Config, *, allow_low_margin: bool = False) -> RunPlan:
+    """The plan of `run`; `ConfigurationError` for a table that leaves the limits or cannot be read."""
+    return resolve_any(config, allow_low_margin=allow_low_margin)
+
+
+def resolve_any(
+    config: Config | ArmConfig, motion: Callable[[Config], JointMotion] = configured, *, allow_low_margin: bool = False
+) -> RunPlan:
+    """The plan of a run of a joint or an arm; `motion` is made for each joint."""
     if isinstance(config, Config):
-        return resolve(config, allow_low_margin=allow_low_margin, hold=hold)
-    return resolve_arm(config, allow_low_margin=allow_low_margin)
+        return RunPlan(config, motion(config), log_path(config), allow_low_margin)
+    return resolve_arm(config, motion, allow_low_margin=allow_low_margin)
 
 
-def resolve_arm(arm: ArmConfig, *, allow_low_margin: bool = False) -> RunPlan:
-    """The plan of `run` for an arm: each joint has its part of the motion, and a log of its own.
+def resolve_arm(
+    arm: ArmConfig, motion: Callable[[Config], JointMotion] = configured, *, allow_low_margin: bool = False
+) -> RunPlan:
+    """The plan of a run of an arm: each joint has its part of the motion, and a log of its own.
 
     `ConfigurationError` also where a bus cannot carry the joints on it.
     """
@@ -179,8 +216,7 @@ def resolve_arm(arm: ArmConfig, *, allow_low_margin: bool = False) -> RunPlan:
     path = log_path(named)
     joints = []
     for config, name in zip(arm.joints, arm.names, strict=True):
-        motion = ConfiguredMotion(config, trajectory_table(config))
-        joints.append(JointPlan(config, motion, path.with_name(f"{path.stem}.{name}.mcap"), name))
+        joints.append(JointOfArmPlan(config, motion(config), path.with_name(f"{path.stem}.{name}.mcap"), name))
     first = joints[0]
     plan = ArmPlan(arm, tuple(joints))
     return RunPlan(first.config, first.motion, first.log_path, allow_low_margin, arm=plan)
@@ -200,17 +236,21 @@ class FreeMotion:
         config, start_rad = self._config, report.start_position_rad
         self.start_rad = start_rad
         constants = free_constants(config, start_rad)
-        what = "none: the joint holds its place"
         if self._by_program:
             expect_client(constants, config)
-            what = f"as the program says; it may be silent for {config.stream.client_timeout_s:g} s"
-        lines = (
+        return Placed(constants, self.table, tuple(self.envelope(constants[0], report)))
+
+    def envelope(self, axis: Any, report: CommissioningReport) -> list[str]:
+        """Lines that say where the joint stands, and who may move it."""
+        what = "none: the joint holds its place"
+        if axis.stream.client_timeout_ns:
+            what = f"as the program says; it may be silent for {axis.stream.client_timeout_ns * 1e-9:g} s"
+        return [
             *joint_lines(report),
-            f"motion     from {start_rad:+.4f} rad, {what}",
-            limits_line(config.limits),
+            f"motion     from {self.start_rad:+.4f} rad, {what}",
+            limits_line(self._config.limits),
             *remark_lines(report.remarks),
-        )
-        return Placed(constants, self.table, lines)
+        ]
 
     def require_start(self, start_position_rad: float) -> None:
         """It begins where the joint stands."""

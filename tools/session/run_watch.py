@@ -54,6 +54,7 @@ class RunParts:
     display: Display
     metadata: Mapping[str, Mapping[str, str]]
     set_points: SetPointSources | None = None
+    arm_log: RunLogWriter | None = None  # of the first joint of an arm, with the states of all; None there
 
 
 class RunWatch:
@@ -65,6 +66,7 @@ class RunWatch:
         config = joint.config
         self.config, self.loop, self.around = config, parts.loop, parts.around
         self.log, self.kept, self.display = parts.log, parts.kept, parts.display
+        self._arm_log, self._names = parts.arm_log, plan.names
         self._set_points = parts.set_points or SetPointSources("the program")  # none from elsewhere
         self.temperature = TemperatureWatch()  # until the drive's own thermometer is known
         self.settings_guard: SettingsGuard | None = None
@@ -85,7 +87,7 @@ class RunWatch:
         self._orders = ViewerOrders(changes, self.log.path, parts.metadata)
 
     def __enter__(self) -> Self:
-        self._set_points.begin(self.loop.block)
+        self._set_points.begin(self.loop.block.whole, self._names)
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -180,6 +182,8 @@ class RunWatch:
         if len(records):
             self.kept.append(records)
             self.log.write_records(records)
+            if self._arm_log is not None:
+                self._arm_log.take_states(records, self.loop.block.axis)
 
     def check_delay(self) -> None:
         """Once enough cycles have run with the drive off: refuse the gains, or let the loop enable."""

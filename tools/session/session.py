@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,15 +20,16 @@ from jointctl.firmware_py.states import Fault, StopRequest
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.output import Output
 from jointctl.tools.recording.kept_records import KeptRecords
+from jointctl.tools.recording.ros_messages import JOINT_NAMES
 from jointctl.tools.recording.run_log import ERROR, INFO, THINNING, WARNING, RunLogWriter, run_metadata
 from jointctl.tools.recording.run_summary import summarise
 from jointctl.tools.session.bus_watch import BusWatch, TemperatureWatch, bus_watch, recording
 from jointctl.tools.session.consent import Consent, prepare_log, require_ready
 from jointctl.tools.session.control import Control, StopSignals
-from jointctl.tools.session.display import Display, JointDisplay, PhaseLines
+from jointctl.tools.session.display import Display, JointDisplay, PhaseLines, ViewerRequest
 from jointctl.tools.session.fault_words import held_up_text
 from jointctl.tools.session.loop_handle import LoopHandle
-from jointctl.tools.session.plan import JointPlan, Placed, RunPlan
+from jointctl.tools.session.plan import Placed, RunPlan, blamed
 from jointctl.tools.session.result import RunResult, warn_unless_off
 from jointctl.tools.session.run_watch import Around, RunParts, RunWatch
 from jointctl.tools.session.session_drive import Guard, session_drive
@@ -157,7 +158,7 @@ class Session:
         if self._consent.dry_run:
             return None
         for joint, report in zip(self._joints, reports, strict=True):
-            with self._blamed(joint):
+            with blamed(joint.name):
                 require_ready(joint.config, report, joint.log_path)
                 joint.motion.require_start(report.start_position_rad)
         if not self._consent.agreed(placed.lines):
@@ -165,18 +166,6 @@ class Session:
         for joint in self._joints:
             prepare_log(joint.config, joint.log_path, self._output)
         return placed
-
-    @staticmethod
-    @contextlib.contextmanager
-    def _blamed(joint: JointPlan) -> Iterator[None]:
-        """An error, with the name of the joint where there are several; one of the bus is all joints'."""
-        try:
-            yield
-        except BusError:  # it names the node, which need not be the joint's that has come across it
-            raise
-        except JointctlError as error:
-            error.message = joint.naming(error.message)
-            raise
 
     def _supervise(
         self, drives: DriveGroup, loop: LoopHandle, reports: Sequence[CommissioningReport], placed: Placed,
@@ -188,7 +177,8 @@ class Session:
         placed.constants.sequence.may_enable[:] = 0
         with contextlib.ExitStack() as stack:
             display = stack.enter_context(self._make_display(reports[0]))
-            watches = []
+            watches: list[RunWatch] = []
+            orders: list[ViewerRequest] = []
             for axis, (joint, report) in enumerate(zip(self._joints, reports, strict=True)):
                 metadata = run_metadata(joint.config, report)
                 if plan.arm is not None:  # its [motion] is what the joint does, and not the joint's own [trajectory]
@@ -196,12 +186,14 @@ class Session:
                     metadata["arm"] = {"configuration": arm.text, "path": str(arm.path), "joint": joint.name}
                 if plan.log_every > 1:
                     metadata[THINNING] = {"every": str(plan.log_every), "whole_s": f"{plan.log_full_rate_s:g}"}
-                log = stack.enter_context(RunLogWriter(joint.log_path, metadata))
+                names = (plan.names if axis == 0 else (joint.name,)) if joint.name else JOINT_NAMES
+                log = stack.enter_context(RunLogWriter(joint.log_path, metadata, names))
                 kept = stack.enter_context(KeptRecords(joint.log_path.parent))
-                shown: Display = JointDisplay(display, joint.name, first=axis == 0) if joint.name else display
+                shown: Display = JointDisplay(display, joint.name, orders, axis) if joint.name else display
                 # frames and troubles of the bus belong to no joint: they are in the first one's log
                 own = around if axis == 0 else replace(around, bus_watch=BusWatch(joint.config, None), recorder=None)
-                parts = RunParts(loop.of_axis(axis), own, log, kept, shown, metadata, self._set_points)
+                points, together = (self._set_points, None) if axis == 0 else (None, watches[0].log)
+                parts = RunParts(loop.of_axis(axis), own, log, kept, shown, metadata, points, together)
                 watches.append(stack.enter_context(RunWatch(plan, placed.constants[axis], parts, joint)))
             return self._carry_out(drives, loop, placed.constants, reports, watches)
 
@@ -224,7 +216,7 @@ class Session:
         try:
             while loop.running():
                 for each in watches:
-                    with self._blamed(each.joint):
+                    with blamed(each.joint.name):
                         each.poll()
                 time.sleep(POLL_S)
         except MotionFault as error:
@@ -249,7 +241,7 @@ class Session:
         for each in watches:
             each.take_records(last=True)
         for each in watches:
-            with self._blamed(each.joint):
+            with blamed(each.joint.name):
                 self._raise_what_others_did(each, loop)
         state = self._made_safe(drives)
         recorder = watch.around.recorder

@@ -10,8 +10,11 @@ import math
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
+
+import numpy as np
 
 from jointctl.drivers.errors import ConfigurationError, JointctlError
 from jointctl.firmware_py.cycle import Word
@@ -41,11 +44,11 @@ class StreamedLoop(Protocol):
 
     @property
     def constants(self) -> Any:
-        """Record array of one AxisConstants, that of the loop."""
+        """Record array of AxisConstants, those of the loop."""
 
     @property
     def axis(self) -> Any:
-        """Record array of one AxisState, that of the loop."""
+        """Record array of AxisState, those of the loop."""
 
     def now_ns(self) -> int:
         """The loop's clock."""
@@ -65,6 +68,18 @@ def finite(name: str, value: float) -> float:
     return number
 
 
+def vector(name: str, given: object, names: Sequence[str]) -> tuple[float, ...]:
+    """One number for each joint, finite or not; `SetPointError` for what is none."""
+    try:
+        values: Any = given if isinstance(given, (Sequence, np.ndarray)) and np.ndim(given) else (given,)
+        numbers = tuple(float(value) for value in values)
+    except (TypeError, ValueError, OverflowError):
+        raise SetPointError("a set-point must be made of numbers") from None
+    if len(numbers) != len(names):
+        raise SetPointError(f"{name} (={len(numbers)} numbers) must have {len(names)}, one a joint")
+    return numbers
+
+
 def load_check() -> None:
     """Compile or load the loop's check before the loop watches its client: that may take seconds."""
     axis, point = new(AxisConstants)[0], new(SetPoint)[0]
@@ -72,65 +87,42 @@ def load_check() -> None:
 
 
 _Point = tuple[int, float, float, float]  # time [ns], position, velocity, torque
+_Given = tuple[float, float | None, float, float]  # position, velocity, acceleration, torque
+Numbers = float | Sequence[float] | np.ndarray  # one a joint
 
 
-class SetPointStream:
-    """Writes set-points into the loop's ring, after the checks that the loop makes as well."""
+class _AxisPoints:
+    """Set-points of one axis: those that the loop follows, what is wrong with the next one, and the loop's ring."""
 
-    _TIME_GAIN, _CALLS = 0.05, 65  # of the clock recovered from calls without a time
-
-    def __init__(self, loop: StreamedLoop) -> None:
-        axis, state = loop.constants[0], loop.axis[0]
-        self._loop, self._limits, self._constants = loop, axis.limits, axis.stream
+    def __init__(self, loop: StreamedLoop, number: int, name: str) -> None:
+        axis, state, stream = loop.constants[number], loop.axis[number], loop.constants["stream"]
+        self.name, self._limits, self._constants = name, axis.limits, axis.stream
         self._brake_radps2 = float(axis.sequence.brake_radps2)
         self._takes_torque = int(axis.command_kind) == 0 or int(axis.velocity_command.feeds_torque) != 0
-        stream = loop.constants["stream"]
-        self._times, self._values = stream["time_ns"][0], stream["values"][0]
-        self._written, self._alive_ns = stream["written"][0], stream["alive_ns"][0]
-        self._delay_ns, self._timeout_ns = int(axis.stream.delay_ns), int(axis.stream.timeout_ns)
-        self._close_ns = self._delay_ns // CLOSE_SHARE
-        self._state, self._reference = state.stream, state.reference
+        self._times, self._values = stream["time_ns"][number], stream["values"][number]
+        self.written, self.alive_ns = stream["written"][number], stream["alive_ns"][number]
+        self.delay_ns, self._timeout_ns = int(axis.stream.delay_ns), int(axis.stream.timeout_ns)
+        self._close_ns = self.delay_ns // CLOSE_SHARE
+        self.state, self._reference = state.stream, state.reference
         self._before, self._point = new(SetPoint), new(SetPoint)
-        self._accepted: deque[_Point] = deque()
-        self._calls_ns: deque[int] = deque(maxlen=self._CALLS)
-        self._offset_ns: int | None = None  # of the program's own clock
-        self._refused = int(self._state.refused)
-        self.alive()
+        self.accepted: deque[_Point] = deque()
 
-    def alive(self) -> None:
-        """The program's sign of life."""
-        self._alive_ns[0] = self._loop.now_ns()
+    def begin(self, now_ns: int) -> None:
+        """The way to the first set-point is from where the reference is."""
+        reference = self._reference
+        start = float(reference.position_rad), float(reference.velocity_radps), float(self.state.torque_Nm)
+        self.accepted.append((now_ns - self.delay_ns, *start))
 
-    def take(
-        self, position_rad: float, velocity_radps: float | None, acceleration_radps2: float | None, torque_Nm: float,
-        time_s: float | None,
-    ) -> None:  # fmt: skip
-        """One set-point; `SetPointError` if it is refused."""
-        self._loop.require()
-        self._check_loop()
-        try:
-            position_rad, torque_Nm = float(position_rad), float(torque_Nm)
-            velocity = None if velocity_radps is None else float(velocity_radps)
-            acceleration = math.nan if acceleration_radps2 is None else float(acceleration_radps2)
-        except (TypeError, ValueError):
-            raise SetPointError("a set-point must be made of numbers") from None
-        if acceleration_radps2 is not None and not math.isfinite(acceleration):
-            raise SetPointError(f"acceleration_radps2 (={acceleration:g}) must be finite")
+    def checked(self, time_ns: int, given: _Given) -> _Point:
+        """The set-point, without a velocity with that on the way to it; `SetPointError` if it must not be followed."""
+        accepted, (position_rad, velocity, acceleration, torque_Nm) = self.accepted, given
+        last = accepted[-1]
+        if time_ns <= last[0]:
+            raise self._refusal(SetPointProblem.TIME, (time_ns, position_rad, velocity or 0.0, torque_Nm), last)
         if torque_Nm and not self._takes_torque:
-            raise SetPointError(f"torque_Nm (={torque_Nm:g}) must be 0: the drive closes its own loop, without 60B2")
-        now_ns, accepted = self._loop.now_ns(), self._accepted
-        if accepted and accepted[-1][0] <= now_ns - self._delay_ns:  # the loop has come to the end of them
-            accepted.clear()
-        time_ns = self._time_of(time_s, now_ns, accepted[-1][0] if accepted else None)
-        if accepted and time_ns <= accepted[-1][0]:
-            self._refuse(SetPointProblem.TIME, (time_ns, position_rad, velocity or 0.0, torque_Nm), accepted[-1])
+            raise self.error(f"torque_Nm (={torque_Nm:g}) must be 0: the drive closes its own loop, without 60B2")
         if velocity is None:
-            velocity = (position_rad - accepted[-1][1]) / ((time_ns - accepted[-1][0]) * 1e-9) if accepted else 0.0
-        if not accepted:
-            reference = self._reference
-            rest_ns = now_ns - self._delay_ns
-            start = float(reference.position_rad), float(reference.velocity_radps), float(self._state.torque_Nm)
-            accepted.append((rest_ns, *start))
+            velocity = (position_rad - last[1]) / ((time_ns - last[0]) * 1e-9)
         before = accepted[0]
         for point in accepted:
             if time_ns - point[0] < self._close_ns:
@@ -142,53 +134,29 @@ class SetPointStream:
             set_point_problem(self._limits, self._constants, self._brake_radps2, self._before[0], self._point[0])
         )
         if problem:
-            self._refuse(problem, found, before)
-        self._put(time_ns, (position_rad, velocity, acceleration, torque_Nm))
-        while len(accepted) > 1 and time_ns - accepted[1][0] >= self._close_ns:
+            raise self._refusal(SetPointProblem(problem), found, before)
+        return found
+
+    def put(self, point: _Point, acceleration: float) -> None:
+        """Into the ring; the loop takes it once it is counted."""
+        slot = int(self.written[0]) % len(self._times)
+        self._times[slot], self._values[slot] = point[0], (*point[1:3], acceleration, point[3])
+        accepted = self.accepted
+        while len(accepted) > 1 and point[0] - accepted[1][0] >= self._close_ns:
             accepted.popleft()
-        accepted.append(found)
-        self._alive_ns[0] = now_ns
+        accepted.append(point)
 
-    def _refuse(self, problem: int, point: _Point, before: _Point) -> None:
-        if len(self._accepted) == 1:
-            self._accepted.clear()  # that was only where the reference rests
-        raise SetPointError(*self._words(SetPointProblem(problem), point, before))
-
-    def _put(self, time_ns: int, values: tuple[float, ...]) -> None:
-        number, slots = int(self._written[0]), len(self._times)
-        if number - int(self._state.taken) >= slots:
+    def require_room(self) -> None:
+        slots = len(self._times)
+        if int(self.written[0]) - int(self.state.taken) >= slots:
             raise SetPointError(f"{slots} set-points wait for the loop already", "send them as the joint moves on")
-        slot = number % slots
-        self._times[slot], self._values[slot] = time_ns, values
-        self._written[0] = number + 1  # last
 
-    def _check_loop(self) -> None:
-        refused = int(self._state.refused)
-        if refused != self._refused:
-            count, self._refused = refused - self._refused, refused
-            self._accepted.clear()
-            raise SetPointError(
-                f"{count} set-points were not followed: they came after their time, or during another motion",
-                "begin again from where the joint is to rest",
-            )
+    def error(self, text: str, hint: str = "") -> SetPointError:
+        """With the joint's name in front where it is one of several."""
+        return SetPointError(f"{self.name}: {text}" if self.name else text, hint)
 
-    def _time_of(self, time_s: float | None, now_ns: int, last_ns: int | None) -> int:
-        """Time of the set-point [ns]; calls without a time are taken as even, at the rate of the last ones."""
-        if time_s is not None:
-            given_ns = round(finite("time_s", time_s) * 1e9)
-            if self._offset_ns is None or last_ns is None:
-                self._offset_ns = now_ns - given_ns
-            return given_ns + self._offset_ns
-        self._offset_ns = None
-        calls = self._calls_ns
-        if last_ns is None or now_ns - calls[-1] > self._delay_ns:  # a beginning, or after a pause
-            calls.clear()
-        calls.append(now_ns)
-        if last_ns is None or len(calls) == 1:
-            return max(now_ns, (last_ns or 0) + 1)
-        interval_ns = (now_ns - calls[0]) / (len(calls) - 1)
-        off_ns = now_ns - (last_ns + interval_ns)
-        return last_ns + max(round(interval_ns + self._TIME_GAIN * off_ns), round(0.5 * interval_ns), 1)
+    def _refusal(self, problem: SetPointProblem, point: _Point, before: _Point) -> SetPointError:
+        return self.error(*self._words(problem, point, before))
 
     def _words(self, problem: SetPointProblem, point: _Point, before: _Point) -> tuple[str, str]:
         """Message and hint: the value and what is allowed, and the key that it comes from."""
@@ -200,7 +168,7 @@ class SetPointStream:
             f"torque_Nm (={point[3]:g})",
         )
         way, more = f"{point[1] - before[1]:+g} rad", f"{point[3] - before[3]:+g} Nm"
-        later_s, longest_s = (point[0] - before[0]) * 1e-9, (self._timeout_ns + self._delay_ns) * 1e-9
+        later_s, longest_s = (point[0] - before[0]) * 1e-9, (self._timeout_ns + self.delay_ns) * 1e-9
         jump, steepest = float(stream.jump_max_rad), float(stream.acceleration_max_radps2)
         most, rate = float(stream.torque_max_Nm), float(stream.torque_rate_max_Nmps)
         start = f"{before[1]:g} rad at {before[2]:g} rad/s"
@@ -233,18 +201,121 @@ class SetPointStream:
         return texts[problem]
 
 
+class SetPointStream:
+    """Writes set-points of all joints into the loop's rings, after the checks that the loop makes as well.
+
+    One that is refused for one joint is refused for all: nothing of it is written.
+    """
+
+    _TIME_GAIN, _CALLS = 0.05, 65  # of the clock recovered from calls without a time
+
+    def __init__(self, loop: StreamedLoop, names: Sequence[str] = ("",)) -> None:
+        """`names` of the joints, for messages; "" where there is only one."""
+        self._loop, self._names = loop, names
+        self._axes = [_AxisPoints(loop, number, name) for number, name in enumerate(names)]
+        self._zeros, self._none_given = (0.0,) * len(names), (math.nan,) * len(names)
+        self._delay_ns = self._axes[0].delay_ns
+        self._calls_ns: deque[int] = deque(maxlen=self._CALLS)
+        self._offset_ns: int | None = None  # of the program's own clock
+        self._refused = self._refused_by_loop()
+        self.alive()
+
+    def alive(self) -> None:
+        """The program's sign of life."""
+        now_ns = self._loop.now_ns()
+        for axis in self._axes:
+            axis.alive_ns[0] = now_ns
+
+    def take(
+        self, position_rad: Numbers, velocity_radps: Numbers | None, acceleration_radps2: Numbers | None,
+        torque_Nm: Numbers | None, time_s: float | None,
+    ) -> None:  # fmt: skip
+        """One set-point, of each joint; `SetPointError` if it is refused."""
+        self._loop.require()
+        self._check_loop()
+        axes, names = self._axes, self._names
+        positions = vector("position_rad", position_rad, names)
+        torques = self._zeros if torque_Nm is None else vector("torque_Nm", torque_Nm, names)
+        velocities: Sequence[float | None] | None = None
+        if velocity_radps is not None:
+            velocities = vector("velocity_radps", velocity_radps, names)
+        accelerations = self._none_given
+        if acceleration_radps2 is not None:
+            accelerations = vector("acceleration_radps2", acceleration_radps2, names)
+            for axis, value in zip(axes, accelerations, strict=True):
+                if not math.isfinite(value):
+                    raise axis.error(f"acceleration_radps2 (={value:g}) must be finite")
+        now_ns, accepted = self._loop.now_ns(), axes[0].accepted
+        if accepted and accepted[-1][0] <= now_ns - self._delay_ns:  # the loop has come to the end of them
+            self._forget()
+        time_ns = self._time_of(time_s, now_ns, accepted[-1][0] if accepted else None)
+        if not accepted:
+            velocities = velocities or self._zeros
+            for axis in axes:
+                axis.begin(now_ns)
+        given = zip(positions, velocities or (None,) * len(axes), accelerations, torques, strict=True)
+        try:
+            found = [axis.checked(time_ns, values) for axis, values in zip(axes, given, strict=True)]
+        except SetPointError:
+            if len(accepted) == 1:
+                self._forget()  # that was only where the reference rests
+            raise
+        for axis in axes:
+            axis.require_room()
+        for axis, point, acceleration in zip(axes, found, accelerations, strict=True):
+            axis.put(point, acceleration)
+        for axis in axes:  # last
+            axis.written[0] += 1
+            axis.alive_ns[0] = now_ns
+
+    def _forget(self) -> None:
+        for axis in self._axes:
+            axis.accepted.clear()
+
+    def _refused_by_loop(self) -> int:
+        return max(int(axis.state.refused) for axis in self._axes)
+
+    def _check_loop(self) -> None:
+        refused = self._refused_by_loop()
+        if refused != self._refused:
+            count, self._refused = refused - self._refused, refused
+            self._forget()
+            raise SetPointError(
+                f"{count} set-points were not followed: they came after their time, or during another motion",
+                "begin again from where the joint is to rest",
+            )
+
+    def _time_of(self, time_s: float | None, now_ns: int, last_ns: int | None) -> int:
+        """Time of the set-point [ns]; calls without a time are taken as even, at the rate of the last ones."""
+        if time_s is not None:
+            given_ns = round(finite("time_s", time_s) * 1e9)
+            if self._offset_ns is None or last_ns is None:
+                self._offset_ns = now_ns - given_ns
+            return given_ns + self._offset_ns
+        self._offset_ns = None
+        calls = self._calls_ns
+        if last_ns is None or not calls or now_ns - calls[-1] > self._delay_ns:  # a beginning, or after a pause
+            calls.clear()
+        calls.append(now_ns)
+        if last_ns is None or len(calls) == 1:
+            return max(now_ns, (last_ns or 0) + 1)
+        interval_ns = (now_ns - calls[0]) / (len(calls) - 1)
+        off_ns = now_ns - (last_ns + interval_ns)
+        return last_ns + max(round(interval_ns + self._TIME_GAIN * off_ns), round(0.5 * interval_ns), 1)
+
+
 # --- Sources in processes of their own ---
 
 
 @dataclass(frozen=True)
 class RemoteSetPoint:
-    """As the arguments of `Joint.command`, and who sends it."""
+    """As the arguments of `Joint.command`, of an arm those of `Arm.command`, and who sends it."""
 
     who: str
-    position_rad: float
-    velocity_radps: float | None = None
-    acceleration_radps2: float | None = None
-    torque_Nm: float = 0.0
+    position_rad: Numbers
+    velocity_radps: Numbers | None = None
+    acceleration_radps2: Numbers | None = None
+    torque_Nm: Numbers | None = None
     time_s: float | None = None
 
 
@@ -259,6 +330,7 @@ class SetPointSources:
         self.owner = owner
         self._program = owner
         self._block: SharedBlock | None = None
+        self._names: Sequence[str] = ("",)
         self._stream: SetPointStream | None = None
         self._lock = threading.Lock()
         self._news: list[tuple[int, str]] = []
@@ -297,21 +369,22 @@ class SetPointSources:
 
     def require(self) -> None:
         """See `StreamedLoop`: it tracks, and nothing but set-points or standing still."""
-        phase, change = AxisPhase(int(self.axis[0].phase)), int(self.axis[0].change.motion)
-        if phase is not AxisPhase.TRACKING:
-            raise SetPointError(f"the joint follows no set-points now ({in_words(phase)})")
-        kind = TrajectoryKind(int(self.constants[0].trajectory.kind))
-        if kind not in (TrajectoryKind.STREAM, TrajectoryKind.HOLD) or change != MotionChange.NONE:
-            raise SetPointError(
-                f"a motion is under way ({in_words(kind)}): set-points are followed where the joint holds its place"
-            )
+        for constants, axis in zip(self.constants, self.axis, strict=True):
+            phase, change = AxisPhase(int(axis.phase)), int(axis.change.motion)
+            if phase is not AxisPhase.TRACKING:
+                raise SetPointError(f"the joint follows no set-points now ({in_words(phase)})")
+            kind = TrajectoryKind(int(constants.trajectory.kind))
+            if kind not in (TrajectoryKind.STREAM, TrajectoryKind.HOLD) or change != MotionChange.NONE:
+                raise SetPointError(
+                    f"a motion is under way ({in_words(kind)}): set-points are followed where the joint holds its place"
+                )
 
     # the supervisor's side
 
-    def begin(self, block: SharedBlock) -> None:
-        """The loop is let go, with this memory."""
+    def begin(self, block: SharedBlock, names: Sequence[str] = ("",)) -> None:
+        """The loop is let go, with this memory of all joints."""
         with self._lock:
-            self._block, self._stream = block, None
+            self._block, self._stream, self._names = block, None, names
             self.owner = self._program
 
     def end(self) -> None:
@@ -322,7 +395,7 @@ class SetPointSources:
         """The sign of life while no source has the joint; events (level, text) since the last call."""
         with self._lock:
             if self._block is not None and not self.owner:
-                self._block.constants["stream"]["alive_ns"][0][0] = time.monotonic_ns()
+                self._block.constants["stream"]["alive_ns"][:] = time.monotonic_ns()
             now_s = time.monotonic()
             if self._refused and now_s - self._told_s >= TELL_S:
                 for who, (count, words) in self._refused.items():
@@ -347,7 +420,7 @@ class SetPointSources:
         if self.owner and self.owner != point.who:
             raise SetPointError(f"the set-points of this run come from {self.owner}, not from {point.who}")
         self._running()
-        self._stream = self._stream or SetPointStream(self)
+        self._stream = self._stream or SetPointStream(self, self._names)
         self._stream.take(
             point.position_rad, point.velocity_radps, point.acceleration_radps2, point.torque_Nm, point.time_s
         )

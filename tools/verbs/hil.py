@@ -59,8 +59,8 @@ def hil(
     joint = loaded_joint_or_arm(Path("elmo_serial") if serial and config == Path("virtual") else config, bus)
     options = ServeOptions(model.timing, serial, bus.port, link, ready_fd, live)
     if not isinstance(joint, Config):
-        if model.eds is not None or live != NOBODY:
-            raise UsageError(f"--eds, --foxglove and --ros2 are for a single joint, and {joint.path} is an arm")
+        if model.eds is not None:
+            raise UsageError(f"--eds (={model.eds}) is for a single joint, and {joint.path} is an arm")
         return bench_of(joint.joints[0]).serve_arm(joint, output, options)
     if model.eds is not None:
         joint = with_eds(joint, model.eds)
@@ -112,14 +112,14 @@ def serve_can(
         output.note(f"{which} on {place}; Ctrl-C ends it")
         if bus.interface == "jointctl":
             output.note(f'attach with python-can: can.Bus(interface="jointctl", channel="{bus.channel}")')
-        with watched(config, live, output, joint.plant_states):
+        with watched(given, live, output, joint.plant_states):
             wait_for_end(signals, ready_fd, lambda: bool(joint.words[ENDED_WORD]))
     return 0
 
 
 @contextlib.contextmanager
-def watched(config: Config, live: ObserveOptions, output: Output, plant_state: Any) -> Iterator[None]:
-    """With Foxglove and ROS 2 looking on: the joint states of the plant, a record array of one `PlantState`."""
+def watched(config: Config | ArmConfig, live: ObserveOptions, output: Output, plants: Any) -> Iterator[None]:
+    """With Foxglove and ROS 2 looking on: the joint states of the plants, a record array of `PlantState`."""
     from jointctl.firmware_py.records import LogRecord
     from jointctl.firmware_py.schema import new
     from jointctl.tools.scoping.feed import RECORDS
@@ -129,15 +129,16 @@ def watched(config: Config, live: ObserveOptions, output: Output, plant_state: A
         if not others.feeds:
             yield
             return
-        ended, plant, record = threading.Event(), plant_state[0], new(LogRecord)
+        ended, records = threading.Event(), new(LogRecord, len(plants))
 
         def watch() -> None:
             while not ended.wait(_STATES_S):
-                record[0].time_ns = time.monotonic_ns()
-                record[0].position_rad, record[0].velocity_radps = plant.joint_position_rad, plant.joint_velocity_radps
-                record[0].measured_torque_Nm = plant.actuator_torque_Nm
-                for feed in others.feeds:
-                    feed.send(RECORDS, record.tobytes())
+                records.time_ns = time.monotonic_ns()
+                records.position_rad, records.velocity_radps = plants.joint_position_rad, plants.joint_velocity_radps
+                records.measured_torque_Nm = plants.actuator_torque_Nm
+                for axis, record in enumerate(records):
+                    for feed in others.feeds:
+                        feed.send(RECORDS, bytes([axis]) + record.tobytes())
 
         thread = threading.Thread(target=watch, name="joint states", daemon=True)
         thread.start()

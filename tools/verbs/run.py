@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jointctl.drivers.errors import UsageError
 from jointctl.tools.output import Output
 from jointctl.tools.scoping.remote_options import NOBODY_REMOTE, RemoteOptions
 from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOrArmOnBus, VerbOutput, Yes
 
 if TYPE_CHECKING:
     from jointctl.drivers.drive import CommissioningReport
-    from jointctl.tools.configuration.config import Config
     from jointctl.tools.session.display import Display
+    from jointctl.tools.session.plan import RunPlan
 
 
 def _page(
@@ -41,20 +40,18 @@ def run(
     from jointctl.tools.scoping.remote import remote
     from jointctl.tools.session.consent import TerminalConsent, require_terminal
     from jointctl.tools.session.control import in_control
-    from jointctl.tools.session.plan import resolve_any
+    from jointctl.tools.session.plan import configured, free, resolve_any
     from jointctl.tools.session.result import broken_off, never_begun, report_run, run_title
     from jointctl.tools.session.session import Session
 
     if not (assume_yes or dry_run):
         require_terminal()
-    plan = resolve_any(config, allow_low_margin=allow_low_margin, hold=live.hold)
-    if plan.arm is not None and (scope is not None or live != NOBODY_REMOTE):
-        raise UsageError("--scope, --foxglove, --ros2 and --hold are for a single joint, not for an arm")
+    plan = resolve_any(config, free if live.hold else configured, allow_low_margin=allow_low_margin)
     first = plan.config
     consent = TerminalConsent(output, assume_yes=assume_yes, dry_run=dry_run)
     with (
-        _displays(first, output, run_title(config), scope) as display,
-        remote(live, first, output) as others,
+        _displays(plan, output, run_title(config), scope) as display,
+        remote(live, config, output) as others,
         in_control(first, output) as control,
     ):
         session = Session(
@@ -71,9 +68,10 @@ def run(
 
 @contextmanager
 def _displays(
-    config: Config, output: Output, title: str, scope: tuple[str, int] | None
+    plan: RunPlan, output: Output, title: str, scope: tuple[str, int] | None
 ) -> Iterator[Callable[[CommissioningReport], Display]]:
     """What shows the run: the terminal, and the page if one is wanted."""
+    from jointctl.tools.recording.ros_messages import JOINT_NAMES
     from jointctl.tools.session.display import Displays
     from jointctl.tools.session.live_panel import run_display
 
@@ -83,7 +81,8 @@ def _displays(
         return
     from jointctl.tools.scoping.feed import scope_order, scope_server
 
-    order = scope_order(title, *scope, drive=config.drive.kind, loop_cpu=config.loop.cpu)
+    config, joints = plan.config, JOINT_NAMES if plan.arm is None else plan.names
+    order = scope_order(title, *scope, drive=config.drive.kind, loop_cpu=config.loop.cpu, joints=joints)
     output.address(f"scope: {order.url}")
     with scope_server(order) as feed:
         feed.settings({"stage": "terminal"})

@@ -228,6 +228,16 @@ def test_standby_stops_every_axis(slept_ns: int, faults: Fault) -> None:
     assert arm.run(1).faults == [faults] * 2
 
 
+@pytest.mark.parametrize("first", [0, 1])
+def test_set_points_and_changes_count_once_they_have_come_for_every_axis(first: int) -> None:
+    arm = Arm().run(5)
+    for axis, expected in ((first, 0), (1 - first, 1)):
+        arm.constants[axis].stream.written[0] = arm.constants[axis].change.order[0] = 1
+        arm.run(1)
+        for state in arm.state:
+            assert (int(state.stream.written), int(state.change.order)) == (expected, expected)
+
+
 # --- the front ends --------------------------------------------------------------------------------------------
 
 

@@ -119,6 +119,15 @@ def test_times_must_ascend_without_a_gap(joint: Joint) -> None:
     joint.command(at_rad, 0.0, time_s=7.01)
 
 
+def test_a_set_point_without_a_time_may_follow_one_with_a_time(joint: Joint) -> None:
+    at_rad = joint.state.desired_position_rad
+    joint.command(at_rad + 0.001, time_s=7.0)
+    joint.step(0.01)
+    joint.command(at_rad + 0.002)
+    joint.step(0.2)
+    assert joint.state.desired_position_rad >= at_rad + 0.002
+
+
 def test_a_torque_comes_on_top_and_goes_at_its_rate(joint: Joint) -> None:
     at_rad = joint.state.desired_position_rad
     for k in range(1, 201):

@@ -15,16 +15,20 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from jointctl.firmware_py.records import LogRecord
+from jointctl.firmware_py.schema import new
 from jointctl.tools.recording.kept_records import ThinnedRecords
 from jointctl.tools.recording.log_export import candump_bytes
 from jointctl.tools.recording.ros_messages import (
     CAN_TOPIC,
+    CDR_HEADER,
     EVENT_TOPIC,
-    JOINT_STATE,
     JOINT_STATE_TOPIC,
     RECORD_TOPIC,
     TEMPERATURE_TOPIC,
+    StateCycles,
     frame_array,
+    joint_states,
 )
 from jointctl.tools.recording.run_log import ERROR, INFO, THINNING, WARNING, Event, RunLogWriter
 from jointctl.tools.recording.run_log_reader import RunLog, began_at, read_run_log
@@ -162,9 +166,37 @@ def test_every_topic_has_a_definition_of_its_own() -> None:
     assert len({topic.name for topic in topics}) == len({topic.schema for topic in topics}) == len(topics)
 
 
-def test_a_joint_state_has_no_padding_at_its_end() -> None:
-    offset = JOINT_STATE.fields["effort_Nm"][1]  # type: ignore[index]
-    assert offset + 8 == JOINT_STATE.itemsize
+@pytest.mark.parametrize("names", [("joint",), ("shoulder", "el", "wrist_1"), ("ä", "b")])
+def test_joint_states_are_read_by_ros_whatever_the_names(names: tuple[str, ...]) -> None:
+    records = new(LogRecord, 2 * len(names)).reshape(2, -1)
+    records["time_ns"] = [[10**9 + 5], [2 * 10**9]]
+    for number, field in enumerate(("position_rad", "velocity_radps", "measured_torque_Nm")):
+        records[field] = number + np.arange(records.size).reshape(records.shape)
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for row, message in zip(records, joint_states(np.asarray(records), 7, names), strict=True):
+        found: Any = store.deserialize_cdr(CDR_HEADER + message.tobytes(), JOINT_STATE_TOPIC.schema)
+        assert tuple(found.name) == names
+        assert stamp_ns(found.header.stamp) == row["time_ns"][0] + 7
+        for values, field in zip(
+            (found.position, found.velocity, found.effort),
+            ("position_rad", "velocity_radps", "measured_torque_Nm"),
+            strict=True,
+        ):
+            assert values.tolist() == row[field].tolist()
+
+
+def test_of_several_joints_a_state_waits_for_the_records_of_all() -> None:
+    records = new(LogRecord, 40)
+    records.time_ns = 10**9 + np.arange(40) * MS
+    cycles = StateCycles(2)
+    assert cycles.take(records[:25], 0).shape == (0, 2)
+    found = cycles.take(records[:15], 1)
+    assert (found["time_ns"] - 10**9).tolist() == [[0, 0], [10 * MS, 10 * MS]]
+    assert (cycles.take(records[15:], 1)["time_ns"][:, 1] - 10**9).tolist() == [20 * MS]
+    for second in range(1000):  # one whose records never come: what waits does not grow
+        records.time_ns += 40 * MS
+        assert not len(cycles.take(records, 0)), second
+    assert len(cycles._waiting) <= 101
 
 
 # --- Times ---

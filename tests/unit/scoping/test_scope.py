@@ -68,6 +68,16 @@ def test_the_memory_is_a_ring() -> None:
     assert history.events[-1].time_ns == 3 * EVENTS - 1
 
 
+def test_of_an_arm_each_joint_has_its_own_records_and_the_events_are_of_all() -> None:
+    history, rows = History(1000, ("shoulder", "elbow")), records(30)
+    history.take_bytes(rows[:20].tobytes(), 0)
+    history.take_bytes(rows[20:].tobytes(), 1)
+    history.take_bytes(rows.tobytes(), 2)  # there is no such joint
+    assert [len(history.of(joint).newest(1000.0)) for joint in (0, 1)] == [20, 10]
+    history.begin()
+    assert not any(len(history.of(joint).newest(1000.0)) for joint in (0, 1))
+
+
 @pytest.mark.parametrize(("span_s", "before_s", "first", "last"), [(0.1, None, 900, 999), (0.1, 0.5, 401, 500)])
 def test_the_picture_is_the_last_stretch_or_the_held_one(
     span_s: float, before_s: float | None, first: int, last: int
@@ -161,7 +171,7 @@ def test_records_and_events_arrive_as_they_were(ends: tuple[socket.socket, socke
         message = ends[1].recv(1 << 20)
         kinds.append(message[:1])
         if message[:1] == RECORDS:
-            history.take_bytes(message[1:])
+            history.take_bytes(message[2:], message[1])
     assert kinds == [RECORDS] * -(-count // PIECE) + [EVENT]
     np.testing.assert_array_equal(history.newest(1e9), records(count))
     assert feed.dropped == 0

@@ -17,7 +17,7 @@ from jointctl.firmware_py.cycle import Word
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.recording.run_log import INFO, Event, remove_oldest
 from jointctl.tools.session.canopen_drive import require_one_bus
-from jointctl.tools.session.display import JointDisplay, OnlyShows
+from jointctl.tools.session.display import JointDisplay, OnlyShows, PreparedMotion, ViewerRequest
 from jointctl.tools.session.loop_handle import RING_RECORDS, SharedBlock
 from jointctl.tools.session.plan import resolve_arm
 from jointctl.tools.session.session import Session
@@ -102,11 +102,30 @@ def test_of_an_arms_display_each_joint_has_its_name_and_the_first_one_the_phase(
             said.append(event.text)
 
     for number, name in enumerate(NAMES[:2]):
-        shown = JointDisplay(Lines(), name, first=number == 0)  # type: ignore[arg-type]
+        shown = JointDisplay(Lines(), name, [], number)  # type: ignore[arg-type]
         shown.phase("tracking")
         shown.note("a remark")
         shown.event(Event(0, INFO, "loop", "an event"))
     assert said == ["tracking", "shoulder: a remark", "shoulder: an event", "elbow: a remark", "elbow: an event"]
+
+
+def test_a_program_moves_each_joint_viewers_none() -> None:
+    waiting = [
+        ViewerRequest("gains", "a viewer", {"kp": 1.0}), ViewerRequest("viewers", "", {"count": 0}),
+        *(PreparedMotion("motion", "the program", joint=name) for name in reversed(NAMES)),
+    ]  # fmt: skip
+
+    class Asking(OnlyShows):
+        def requests(self) -> list[ViewerRequest]:
+            taken = list(waiting)
+            waiting.clear()
+            return taken
+
+    orders: list[ViewerRequest] = []
+    shown = [JointDisplay(Asking(), name, orders, axis) for axis, name in enumerate(NAMES)]  # type: ignore[arg-type]
+    taken = [[(each.kind, getattr(each, "joint", "")) for each in one.requests()] for one in shown]
+    assert taken == [[("viewers", ""), ("motion", "shoulder")], [("motion", "elbow")], [("motion", "wrist")]]
+    assert not orders
 
 
 def test_of_an_arm_the_newest_logs_of_each_joint_are_kept(arm: ArmConfig, tmp_path: Path) -> None:
