@@ -25,7 +25,8 @@ from jointctl.tools.scoping.remote_options import NOBODY_REMOTE, RemoteOptions
 from jointctl.tools.session import result as drive_end
 from jointctl.tools.session.control import Control, in_program
 from jointctl.tools.session.display import OnlyShows, PreparedMotion, Snapshot, ViewerRequest
-from jointctl.tools.session.loop_handle import RING_RECORDS, LoopHandle
+from jointctl.tools.session.loop_handle import LoopHandle
+from jointctl.tools.session.loop_memory import RING_RECORDS
 from jointctl.tools.session.plan import FreeMotion, resolve_any
 from jointctl.tools.session.result import RunResult
 from jointctl.tools.session.session import Session

@@ -17,7 +17,8 @@ from jointctl.tools.configuration.load import load_config
 from jointctl.tools.configuration.records import trajectory_table
 from jointctl.tools.recording.run_log_reader import read_run_log
 from jointctl.tools.session.canopen_drive import CanopenSession
-from jointctl.tools.session.loop_handle import RING_RECORDS, LoopHandle, SharedBlock
+from jointctl.tools.session.loop_handle import LoopHandle
+from jointctl.tools.session.loop_memory import RING_RECORDS, SharedBlock
 from tests.hil.moving_run import Moving, gone
 from tests.sessions import constants_of
 

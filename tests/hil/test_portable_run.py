@@ -30,7 +30,7 @@ from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.configuration.canopen import canopen_settings
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.load import load_config
-from jointctl.tools.session.loop_handle import SharedBlock
+from jointctl.tools.session.loop_memory import SharedBlock
 from jointctl.tools.session.portable_loop import run_portable_loop, warm_up
 from jointctl.tools.virtual_joint import PumpedDevice, new_device, serve_virtual_joint
 from tests.configurations import SLOW_LOOP, written

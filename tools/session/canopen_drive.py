@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,14 +19,12 @@ from jointctl.firmware_py.states import Fault
 from jointctl.tools.configuration.canopen import canopen_section, canopen_settings, cyclic_bus_load
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.session.fault_words import FaultText, emergency_text, fault_text
-from jointctl.tools.session.loop_handle import QUANTILE, quantile_s
+from jointctl.tools.session.loop_memory import QUANTILE, quantile_s
 from jointctl.tools.session.session_drive import SessionDrive
 
 if TYPE_CHECKING:
     import can
 
-    from jointctl.tools.session.loop_handle import LoopOrder, SharedBlock
-    from jointctl.tools.session.loops import ReadyLoop
 
 _BAD = (State.FAULT, State.FAULT_REACTION_ACTIVE, State.UNDEFINED)
 
@@ -71,17 +68,6 @@ class CanopenSession(SessionDrive):
             first.close()
             raise
         return DriveGroup([first, *others])
-
-    def port_record(self) -> type:
-        from jointctl.drivers.canopen.cyclic import CanopenPort
-
-        return CanopenPort
-
-    def loop(self, order: LoopOrder, block: SharedBlock) -> AbstractContextManager[ReadyLoop]:
-        """Compiled on a bus that is a descriptor, in plain Python over any other."""
-        from jointctl.tools.session.loops import compiled_loop, portable_loop
-
-        return (compiled_loop if order.interface in CYCLIC_INTERFACES else portable_loop)(order, block)
 
     def loop_delay_s(self, config: Config, histograms: np.ndarray) -> float:
         kind, rate_Hz = canopen_section(config).rpdo_transmission_type, config.loop.rate_Hz

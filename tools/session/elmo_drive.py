@@ -28,8 +28,8 @@ from jointctl.tools.configuration.elmo import ElmoSection, elmo_section, elmo_se
 from jointctl.tools.output import Output
 from jointctl.tools.session.elmo_guard import GuardOrder, running_supervisor
 from jointctl.tools.session.fault_words import FaultText, fault_text
-from jointctl.tools.session.loop_handle import QUANTILE, SILENT_S, LoopHandle, LoopOrder, SharedBlock, quantile_s
-from jointctl.tools.session.loops import FOREVER, ReadyLoop, loop_call
+from jointctl.tools.session.loop_handle import SILENT_S, LoopHandle
+from jointctl.tools.session.loop_memory import QUANTILE, quantile_s
 from jointctl.tools.session.session_drive import SessionDrive
 
 
@@ -41,14 +41,6 @@ class ElmoSession(SessionDrive):
 
     def open(self, config: Config, gate: Callable[[], None] = lambda: None) -> Drive:
         return ElmoDrive(elmo_settings(config), gate=gate)
-
-    def port_record(self) -> type:
-        from jointctl.drivers.elmo.cyclic import ElmoPort
-
-        return ElmoPort
-
-    def loop(self, order: LoopOrder, block: SharedBlock) -> AbstractContextManager[ReadyLoop]:
-        return serial_loop(order, block)
 
     def loop_delay_s(self, config: Config, histograms: np.ndarray) -> float:
         """Round trip of PX and work at their 99th percentile, and TC on the line; the drive takes it at its end."""
@@ -228,39 +220,6 @@ def serial_fault_text(fault: Fault, value: float) -> FaultText | None:
     if fault is Fault.DRIVE_NOT_ENABLED and math.isfinite(value) and round(value) & SERVO_ON:
         return STATUS_LOST_TEXT
     return SERIAL_TEXTS.get(fault)
-
-
-# --- The loop on a serial line ---
-# It is compiled, and not plain Python as for CAN adapters without a descriptor: a serial port is a descriptor that the
-# C library reads and writes.  Wake-up late p50 / p99 / max at 150 Hz on a noisy 2-core virtual machine, SCHED_FIFO:
-# this loop 27 / 56 / 178 us, a bare Python sleep 43 / 84 / 221 us, and 123 / 155 / 3168 us without SCHED_FIFO.
-
-
-@contextmanager
-def serial_loop(order: LoopOrder, block: SharedBlock) -> Iterator[ReadyLoop]:
-    """The compiled loop on a serial line, warm.
-
-    The port is opened when the loop is let go: by then the supervisor has locked and configured it.  However the
-    loop ends, the drive is commanded to switch off: it would keep its last torque command for ever.
-    """
-    from jointctl.drivers.elmo import exchange
-    from jointctl.drivers.elmo.dialogue import SWITCH_OFF
-    from jointctl.drivers.elmo.serial_port import open_descriptor
-
-    call = loop_call(exchange, block, order.period_ns, order.receive_ns)
-    call(0)  # compiles, or loads from the cache
-
-    def go() -> None:
-        fd = open_descriptor(order.channel)
-        try:
-            block.port[0].fd = fd
-            call(FOREVER)
-        finally:
-            with contextlib.suppress(OSError):
-                os.write(fd, SWITCH_OFF)
-            os.close(fd)
-
-    yield ReadyLoop(go)
 
 
 # --- A computer that is kept awake while a drive moves that would hold its last command ---

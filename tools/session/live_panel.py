@@ -23,7 +23,7 @@ from jointctl.firmware_py.states import AxisPhase
 from jointctl.tools.output import Output
 from jointctl.tools.recording.run_log import ERROR, Event
 from jointctl.tools.session.display import Display, OnlyShows, PhaseLines, Snapshot, fault_words, phase_name
-from jointctl.tools.session.loop_handle import QUANTILE, quantile_s
+from jointctl.tools.session.loop_memory import QUANTILE, quantile_s
 from jointctl.tools.session.session_drive import drive_state_name, session_drive
 
 # --- The panel of `run`: the picture of one moment, from the newest `Snapshot`; nothing here is drawn or waits ---

@@ -25,8 +25,8 @@ from pathlib import Path
 from jointctl.drivers.errors import JointctlError
 from jointctl.firmware_py.cycle import Word
 from jointctl.firmware_py.kernel import on_compiling
-from jointctl.tools.session.loop_handle import LoopOrder, SharedBlock
-from jointctl.tools.session.session_drive import session_drive
+from jointctl.tools.session.loop_memory import LoopOrder, SharedBlock
+from jointctl.tools.session.loops import loop_of
 from jointctl.tools.wake_up import cores_awake
 
 SLOW_START_S = 2.0
@@ -81,14 +81,14 @@ def become_realtime(cpu: int | None, priority: int | None, threads: Sequence[int
 
 def run(order: LoopOrder) -> int:
     """Warm up, wait for GO, run the loop; returns the exit code."""
-    drive = session_drive(order.kind)
-    block = SharedBlock(order.block_fd, order.table_rows, drive.port_record(), order.axes, order.links)
+    port, loop = loop_of(order.kind)
+    block = SharedBlock(order.block_fd, order.table_rows, port, order.axes, order.links)
 
     def tell(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
     gc.disable()
-    with slow_start(tell, "loop") as started, drive.loop(order, block) as ready:
+    with slow_start(tell, "loop") as started, loop(order, block) as ready:
         started()
         gc.freeze()
         for line in become_realtime(order.cpu, order.priority):

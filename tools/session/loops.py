@@ -11,14 +11,14 @@ import os
 import socket
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING
 
 from jointctl.firmware_py.cycle import Exchange
 from jointctl.firmware_py.libc import NANOSECONDS
-from jointctl.tools.session.loop_handle import LoopOrder, SharedBlock
+from jointctl.tools.session.loop_memory import LoopOrder, SharedBlock
 
 if TYPE_CHECKING:
     import can
@@ -32,6 +32,33 @@ class ReadyLoop:
 
     go: Callable[[], object]
     flush: Callable[[], None] = lambda: None  # of a loop that does not listen before it goes
+
+
+Loop = Callable[[LoopOrder, SharedBlock], AbstractContextManager[ReadyLoop]]
+
+
+def _of_canopen() -> tuple[type, Loop]:
+    from jointctl.drivers.can.open import CYCLIC_INTERFACES
+    from jointctl.drivers.canopen.cyclic import CanopenPort
+
+    return CanopenPort, lambda order, block: (compiled_loop if order.interface in CYCLIC_INTERFACES else portable_loop)(
+        order, block
+    )
+
+
+def _of_elmo_serial() -> tuple[type, Loop]:
+    from jointctl.drivers.elmo.cyclic import ElmoPort
+    from jointctl.tools.session.elmo_loop import serial_loop
+
+    return ElmoPort, serial_loop
+
+
+_KINDS = {"canopen": _of_canopen, "elmo_serial": _of_elmo_serial}
+
+
+def loop_of(kind: str) -> tuple[type, Loop]:
+    """For drive.kind, of which alone modules are loaded: the record of its exchange, and its loop when it is warm."""
+    return _KINDS[kind]()
 
 
 def loop_call(driver: ModuleType, block: SharedBlock, period_ns: int, receive_ns: int) -> Callable[[int], int]:

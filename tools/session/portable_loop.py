@@ -49,7 +49,7 @@ from jointctl.firmware_py.libc import NANOSECONDS, sleep_until_ns
 from jointctl.firmware_py.realtime import run_cycles, slept_ns
 from jointctl.firmware_py.schema import INT32_MAX, new
 from jointctl.firmware_py.states import DriveRequest
-from jointctl.tools.session.loop_handle import QUANTILE, SharedBlock, quantile_s
+from jointctl.tools.session.loop_memory import QUANTILE, SharedBlock, quantile_s
 
 HIGHEST_RATE_HZ = 500.0
 FOREVER = 1 << 62

@@ -29,6 +29,7 @@ from jointctl.tools.session.control import Control, StopSignals
 from jointctl.tools.session.display import Display, JointDisplay, PhaseLines, ViewerRequest
 from jointctl.tools.session.fault_words import held_up_text
 from jointctl.tools.session.loop_handle import LoopHandle
+from jointctl.tools.session.loops import loop_of
 from jointctl.tools.session.plan import Placed, RunPlan, blamed
 from jointctl.tools.session.result import RunResult, warn_unless_off
 from jointctl.tools.session.run_watch import Around, RunParts, RunWatch
@@ -115,7 +116,7 @@ class Session:
 
     def _loop(self, tail_path: Path) -> LoopHandle:
         """The loop process, started; it waits for its word."""
-        plan, port, marker_fd = self.plan, self._kind.port_record(), self._control.marker_fd
+        plan, port, marker_fd = self.plan, loop_of(self._config.drive.kind)[0], self._control.marker_fd
         model = None if plan.arm is None else plan.arm.config.model
         return LoopHandle(self._config, plan.tables, port, tail_path, marker_fd, model)
 

@@ -17,8 +17,7 @@ from jointctl.tools.output import Output
 from jointctl.tools.session.fault_words import FaultText
 
 if TYPE_CHECKING:
-    from jointctl.tools.session.loop_handle import LoopHandle, LoopOrder, SharedBlock
-    from jointctl.tools.session.loops import ReadyLoop
+    from jointctl.tools.session.loop_handle import LoopHandle
 
 
 class Guard(Protocol):
@@ -58,14 +57,6 @@ class SessionDrive(ABC):
             kind = configs[1].drive.kind
             raise ConfigurationError(f"{configs[1].path}: drive.kind (={kind}) must be canopen in an arm")
         return DriveGroup([self.open(configs[0], gate)])
-
-    @abstractmethod
-    def port_record(self) -> type:
-        """The record of the cyclic exchange, which the loop and `Drive.port` share."""
-
-    @abstractmethod
-    def loop(self, order: LoopOrder, block: SharedBlock) -> AbstractContextManager[ReadyLoop]:
-        """In the loop's own process: the loop, warm."""
 
     @abstractmethod
     def loop_delay_s(self, config: Config, histograms: np.ndarray) -> float:

@@ -26,7 +26,7 @@ from jointctl.firmware_py.stream import CLOSE_SHARE
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.records import expect_client
 from jointctl.tools.recording.run_log import INFO, WARNING
-from jointctl.tools.session.loop_handle import SharedBlock
+from jointctl.tools.session.loop_memory import SharedBlock
 from jointctl.tools.session.plan import Placed
 
 TELL_S = 1.0  # how often refusals are reported, at most

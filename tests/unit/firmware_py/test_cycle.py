@@ -21,7 +21,7 @@ from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fau
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.lockstep import LockstepJoint
 from jointctl.tools.session import portable_loop
-from jointctl.tools.session.loop_handle import SharedBlock
+from jointctl.tools.session.loop_memory import SharedBlock
 from tests.axis_on_stub_joint import small_axis_constants
 from tests.places import ROOT
 

@@ -22,13 +22,14 @@ from jointctl.drivers.errors import BusError
 from jointctl.tools.verbs import main, start
 from jointctl.tools.configuration.load import load_config
 from jointctl.tools.session.session_drive import session_drive
+from jointctl.tools.session.loops import loop_of
 from jointctl.tools.session.plan import resolve
 from jointctl.tools.verbs.run import run
 config = load_config(Path(sys.argv[1]))
 resolve(config)
 drive = session_drive(config.drive.kind)
 drive.check_rate(config)
-drive.port_record()
+loop_of(config.drive.kind)
 with suppress(BusError):  # there is no such interface
     drive.open(config)
 print(json.dumps(sorted(sys.modules)))
@@ -36,7 +37,7 @@ print(json.dumps(sorted(sys.modules)))
 LOOP = """
 import json, sys
 from jointctl.tools.session import loop_process, loops
-from jointctl.tools.session.loop_handle import SharedBlock
+from jointctl.tools.session.loop_memory import SharedBlock
 from jointctl.drivers.canopen import exchange
 from jointctl.drivers.canopen.cyclic import CanopenPort
 loops.compiled_call(SharedBlock.create(1, CanopenPort), 1_000_000, 0)

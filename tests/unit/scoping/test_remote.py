@@ -29,9 +29,9 @@ from jointctl.tools.scoping.remote import EnabledFromElsewhere, joint_name
 from jointctl.tools.scoping.remote_options import RemoteOptions, check_remote, foxglove_place, with_values
 from jointctl.tools.scoping.supervisor_link import BURST, NICE, SetPointLink, stand_aside
 from jointctl.tools.session.display import ViewerRequest
-from jointctl.tools.session.loop_handle import SharedBlock
+from jointctl.tools.session.loop_memory import SharedBlock
+from jointctl.tools.session.loops import loop_of
 from jointctl.tools.session.plan import Placed
-from jointctl.tools.session.session_drive import session_drive
 from jointctl.tools.session.set_points import RemoteSetPoint, SetPointSources
 from tests.sessions import output
 
@@ -184,7 +184,7 @@ def test_without_allow_remote_nothing_but_stop_comes_through(ends: Any, kind: st
 
 def tracking(owner: str = "") -> tuple[SetPointSources, Any]:
     """Sources, and the memory of a loop that holds its place at 0 rad."""
-    block: Any = SharedBlock.create(1, session_drive(CONFIG.drive.kind).port_record())
+    block: Any = SharedBlock.create(1, loop_of(CONFIG.drive.kind)[0])
     block.constants[:] = free_constants(CONFIG, 0.0)
     block.state[0].phase, block.words[Word.GO] = AxisPhase.TRACKING, 1
     sources = SetPointSources(owner)

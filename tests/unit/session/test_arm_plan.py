@@ -18,9 +18,8 @@ from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 from jointctl.tools.recording.run_log import INFO, Event, remove_oldest
 from jointctl.tools.session.canopen_drive import require_one_bus
 from jointctl.tools.session.display import JointDisplay, OnlyShows, PreparedMotion, ViewerRequest
-from jointctl.tools.session.loop_handle import RING_RECORDS, SharedBlock
-from jointctl.tools.session.plan import resolve_arm
-from jointctl.tools.session.session import Session
+from jointctl.tools.session.loop_memory import RING_RECORDS, SharedBlock
+from jointctl.tools.session.plan import blamed, resolve_arm
 
 NAMES = ["shoulder", "elbow", "wrist"]
 
@@ -152,6 +151,6 @@ def test_of_an_arm_the_newest_logs_of_each_joint_are_kept(arm: ArmConfig, tmp_pa
     ],
 )
 def test_an_error_names_its_joint_and_one_of_the_bus_none(arm: ArmConfig, error: JointctlError, message: str) -> None:
-    with pytest.raises(JointctlError) as raised, Session._blamed(resolve_arm(arm).joints[1]):
+    with pytest.raises(JointctlError) as raised, blamed(resolve_arm(arm).joints[1].name):
         raise error
     assert raised.value.message == message

@@ -22,7 +22,7 @@ from jointctl.firmware_py.sequence import reset_axis
 from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest, TrajectoryKind
 from jointctl.tools.configuration.load import load_config, shipped_config
 from jointctl.tools.session import loop_process, loops, portable_loop
-from jointctl.tools.session.loop_handle import SharedBlock
+from jointctl.tools.session.loop_memory import LoopOrder, SharedBlock
 from jointctl.tools.session.portable_loop import (
     HIGHEST_RATE_HZ,
     check_portable_rate,
@@ -342,7 +342,7 @@ def order(interface: str, period_ns: int, block: SharedBlock) -> str:
     channel = "no-such-bus"
     fd = os.dup(block.fd)
     timing = period_ns, 600_000, None, None
-    return loop_process.LoopOrder(os.getpid(), fd, 1, "canopen", interface, channel, *timing).argument()
+    return LoopOrder(os.getpid(), fd, 1, "canopen", interface, channel, *timing).argument()
 
 
 @pytest.mark.parametrize(

@@ -132,6 +132,7 @@ class SilentLoop:
         histograms[Histogram.WORK, 20] = histograms[Histogram.WAKE, 5] = 300
         histograms[Histogram.ROUND_TRIP, 100] = samples
         self.block = SimpleNamespace(histograms=histograms)
+        self.block.whole = self.block
         self.cycles = 300
         self.may_enable = False
 
