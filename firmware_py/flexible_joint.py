@@ -54,7 +54,6 @@ def reset_flexible(state: FlexibleState) -> None:
     """Nothing known of the twist; the next cycle begins with the errors that it finds."""
     state.primed = 0
     state.twist_error_rad = 0.0
-    state.known_torque_Nm = 0.0
     state.motor_velocity.primed = 0
     state.link_velocity.primed = 0
 

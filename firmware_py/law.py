@@ -150,7 +150,8 @@ def adapt_network(
 #
 # `r` [Nm at the joint] follows minus the unknown torque with bandwidth L [rad/s]; the law adds it with the sign that
 # cancels.  No acceleration is differentiated.  The applied torque is the one that was sent, limited, as many cycles
-# ago as a command needs to become torque, so that saturation does not wind the observer up.
+# ago as a command needs to become torque, so that saturation does not wind the observer up.  `known` is that of this
+# cycle, or, `paired`, that of the same command: then friction fed forward ahead of the motion is no disturbance.
 
 
 @kernel
@@ -200,6 +201,9 @@ def add_to_disturbance(constants: ObserverConstants, state: ObserverState, torqu
     if constants.bandwidth_radps > 0.0:
         state.integral_Nms += torque_Nm / constants.bandwidth_radps
         state.disturbance_Nm += torque_Nm
+        if constants.paired != 0:  # as if it had been the observer's in the commands that are no torque yet, too
+            for i in range(TORQUE_HISTORY):
+                state.sent_torque_Nm[i] += torque_Nm
 
 
 # --- Iterative learning for trajectories that repeat: the torque that feedback had to add is fed forward next time ---
@@ -456,6 +460,9 @@ def _rest_torque_Nm(
         return state.observer_torque_Nm
     if constants.kind == ControllerKind.COMPUTED_TORQUE_OBSERVER:
         known = state.friction_torque_Nm + state.gravity_torque_Nm + state.learned_torque_Nm
+        if constants.observer.paired != 0:
+            sent_Nm -= state.observer.known_torque_Nm
+            known = 0.0
         momentum = constants.inertia_kgm2 * velocity_radps
         state.observer_torque_Nm = step_observer(
             constants.observer, state.observer, sent_Nm, known, momentum, constants.period_s
@@ -522,9 +529,10 @@ def step_law(
     state.learned_torque_Nm = _learn(constants, state, where, correction_Nm, error)
     if constants.kind == ControllerKind.COMPUTED_TORQUE_OBSERVER:
         rest_Nm = state.observer_torque_Nm
-    state.observer.known_torque_Nm = (
-        state.inertia_torque_Nm + state.gravity_torque_Nm + state.friction_torque_Nm + state.learned_torque_Nm
-    )
+    known_Nm = state.inertia_torque_Nm + state.gravity_torque_Nm + state.friction_torque_Nm + state.learned_torque_Nm
+    if constants.observer.paired != 0:
+        known_Nm -= state.inertia_torque_Nm  # its momentum is that of the whole motion
+    state.observer.known_torque_Nm = known_Nm
     return (
         state.inertia_torque_Nm
         + proportional_Nm
@@ -566,8 +574,9 @@ def step_flexible_law(
     rate_radps = own.motor_velocity.error_rate_radps
     momentum = flexible.motor_inertia_kgm2 * rate_radps
     momentum += flexible.link_inertia_kgm2 * own.link_velocity.error_rate_radps
+    sent_torque_Nm -= state.observer.known_torque_Nm
     state.observer_torque_Nm = step_observer(
-        constants.observer, state.observer, sent_torque_Nm - own.known_torque_Nm, 0.0, momentum, constants.period_s
+        constants.observer, state.observer, sent_torque_Nm, 0.0, momentum, constants.period_s
     )
     if constants.adaptation.enabled != 0:
         known_Nm -= state.friction_torque_Nm
@@ -579,5 +588,5 @@ def step_flexible_law(
     correction_Nm = state.feedback_torque_Nm + state.observer_torque_Nm
     correction_Nm -= constants.inertia_kgm2 * constants.learning.error_gain_ps2 * link_rad
     state.learned_torque_Nm = _learn(constants, state, where, correction_Nm, link_rad)
-    own.known_torque_Nm = known_Nm + state.learned_torque_Nm
-    return own.known_torque_Nm + state.feedback_torque_Nm + state.observer_torque_Nm
+    state.observer.known_torque_Nm = known_Nm + state.learned_torque_Nm
+    return state.observer.known_torque_Nm + state.feedback_torque_Nm + state.observer_torque_Nm

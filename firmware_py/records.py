@@ -53,6 +53,7 @@ class ObserverConstants:
 
     bandwidth_radps: f8  # 0 = off
     delay_cycles: i8  # from the command to the torque that it becomes
+    paired: i4  # what was fed forward is compared with the torque of its own command
     kalman: i4  # the Kalman filter takes the place of observer and filtered error rate
     cutoff_Hz: f8  # of its velocity
     error_gain: f8
@@ -66,11 +67,11 @@ class ObserverState:
     disturbance_Nm: f8
     newest: i8
     sent_torque_Nm: Annotated[np.ndarray, array_of(f8, TORQUE_HISTORY)]
+    known_torque_Nm: f8  # of the command of the cycle before: what was fed forward
     # the Kalman filter alone
     primed: i4  # 0 until the first reading
     error_rad: f8
     error_rate_radps: f8
-    known_torque_Nm: f8  # of the command of the cycle before: what was fed forward
 
 
 @record
@@ -154,7 +155,6 @@ class FlexibleState:
     ahead_rad: f8  # theta_d and the kinematic error there
     motor_per_link: f8  # slope of theta_d against that
     twist_error_rad: f8  # b
-    known_torque_Nm: f8  # of the last cycle: feed-forward and what was learned
     motor_velocity: VelocityState
     link_velocity: VelocityState
 

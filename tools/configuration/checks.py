@@ -163,6 +163,16 @@ def _control_problems(config: Config) -> list[str]:
             'control.velocity_filter (=kalman) needs control.kind "computed_torque_observer" '
             f"(={control.kind}) and control.velocity_cutoff_Hz above 0 (={control.velocity_cutoff_Hz:g})"
         )
+    if control.observer_paired and (
+        control.kind != "computed_torque_observer"
+        or control.velocity_filter == "kalman"
+        or control.adaptation is not None
+    ):
+        found.append(
+            'control.observer_paired (=true) needs control.kind "computed_torque_observer" '
+            f'(={control.kind}) with control.velocity_filter "low_pass" (={control.velocity_filter}), '
+            "without [control.adaptation]"
+        )
     if control.kind != "pid" and control.ki:
         found.append(f'control.ki (={control.ki:g}) must be 0 unless control.kind is "pid" (={control.kind})')
     if control.learning is not None and control.kind not in OBSERVING:

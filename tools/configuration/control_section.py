@@ -63,6 +63,8 @@ class Control(Section):
     # bandwidth, computed_torque_observer and flexible_joint only
     observer_radps: Annotated[float, between(0.0, 2000.0)] = 0.0
     observer_delay_cycles: Annotated[int, between(0, 15)] = 1  # from a command to its torque
+    # compare what was fed forward with the torque of its own command: for motions without rests, docs/law.md
+    observer_paired: bool = False
     # of the Lyapunov equation: Q = q I, or diag(q1, q2)
     lyapunov_q: Annotated[tuple[float, ...], numbers("numbers", 1, 2, low=0.0, high=1e12)]
     learning_rate: Annotated[float, between(0.0, 1e9)]  # of the network's weights

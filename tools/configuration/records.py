@@ -148,6 +148,7 @@ def _fill_law(law: Any, config: Config) -> None:
     law.period_s = period_s(config)
     law.observer.bandwidth_radps = control.observer_radps
     law.observer.delay_cycles = control.observer_delay_cycles
+    law.observer.paired = control.observer_paired
     if control.velocity_filter == "kalman":
         law.observer.kalman = 1
         law.observer.cutoff_Hz = control.velocity_cutoff_Hz

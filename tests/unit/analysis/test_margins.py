@@ -458,21 +458,30 @@ def test_frictionless_check_with_the_kernels(matched):
 
 
 @kernel
-def injected_loop(law_c, law_s, velocity_s, reference, plant_c, plant_s, substeps, injected_Nm, commands, torques):
+def injected_loop(
+    law_c, law_s, velocity_c, velocity_s, reference, plant_c, plant_s, substeps, injected_Nm, commands, torques
+):
     """The closed loop, `injected_Nm` added behind the law: what the law asks for, and what the joint is given."""
     torque = 0.0
     for k in range(len(injected_Nm)):
-        torque = step_law(law_c, law_s, plant_s.joint_position_rad, velocity_s, reference, torque, NO_REPETITION)
+        q = plant_s.joint_position_rad
+        step_velocity(velocity_c, velocity_s, q, q, 1)  # the Kalman filter does without
+        torque = step_law(law_c, law_s, q, velocity_s, reference, torque, NO_REPETITION)
         commands[k] = torque
         torques[k] = torque + injected_Nm[k]
         for _ in range(substeps):
             step_plant(plant_c, plant_s, torques[k])
 
 
-@pytest.mark.parametrize("case", range(1 if JIT_DISABLED else 6))
-def test_injected_sines_find_the_gain_and_phase_of_the_kalman_filter(case):
-    loop = replace(kalman_sets()[case], period_s=PERIOD_s, delay_s=1e-3)
+@pytest.mark.parametrize("case", range(1 if JIT_DISABLED else 9))
+def test_injected_sines_find_the_gain_and_phase_of_kalman_filter_and_paired_observer(case):
+    observer = replace(ANY_KIND[3], lag_s=(0.3e-3, 0.5e-3, 1e-3)[case % 3], observer_delay_cycles=case % 3)
+    loop = replace([*kalman_sets(), observer, observer, observer][case], period_s=PERIOD_s, delay_s=1e-3)
     law_c, law_s = law_records(loop, True)
+    law_c[0].observer.paired = not loop.kalman
+    velocity_c = new(VelocityConstants)
+    velocity_c[0].period_s, velocity_c[0].cutoff_Hz = loop.period_s, loop.cutoff_Hz
+    velocity_c[0].period_gain = low_pass_gain(loop.cutoff_Hz, loop.period_s)
     plant_c, plant_s = plant(
         step_s=SUBSTEP_s, inertia_kgm2=loop.inertia_kgm2, current_limit_A=1e4, current_lag_s=loop.lag_s,
         command_delay_s=loop.delay_s,
@@ -487,7 +496,7 @@ def test_injected_sines_find_the_gain_and_phase_of_the_kalman_filter(case):
         injected = 1e-4 * np.sin(math.tau * line * np.arange(6 * period) / period)
         commands, torques = np.zeros(len(injected)), np.zeros(len(injected))
         injected_loop(
-            law_c[0], law_s[0], new(VelocityState)[0], new(Reference)[0], plant_c[0], plant_s[0],
+            law_c[0], law_s[0], velocity_c[0], new(VelocityState)[0], new(Reference)[0], plant_c[0], plant_s[0],
             round(PERIOD_s / SUBSTEP_s), injected, commands, torques,
         )  # fmt: skip
         wave = np.exp(-1j * math.tau * line * np.arange(period) / period)

@@ -148,6 +148,7 @@ def test_several_problems_are_told_at_once(tmp_path: Path) -> None:
         ("velocity_cutoff_Hz = .*", "velocity_cutoff_Hz = 500.0", "control.velocity_cutoff_Hz (=500)"),
         ("zero_rule = .*", 'zero_rule = "linear"', "control.zero_band_radps (=0)"),
         ("zero_rule = .*", 'zero_rule = "zero"\nvelocity_filter = "kalman"', "control.velocity_filter (=kalman) needs"),
+        ("zero_rule = .*", 'zero_rule = "zero"\nobserver_paired = true', "control.observer_paired (=true) needs"),
         ("knee = 40.0", "knee = 201.0", "friction.positive.knee (=201) and max (=200)"),
         ("torque_max_Nm = .*", "torque_max_Nm = 60.51", "limits.torque_max_Nm (=60.51) must be in (0..60.5]"),
         ("stop_timeout_s = .*", "stop_timeout_s = 0.5", "sequence.stop_timeout_s (=0.5)"),

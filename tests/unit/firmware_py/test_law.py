@@ -13,6 +13,7 @@ from jointctl.firmware_py.friction import friction_motor_torque_Nm, step_lugre
 from jointctl.firmware_py.law import (
     GROWN,
     adapt_network,
+    add_to_disturbance,
     eigenvalues,
     follow_temperature,
     friction_feed_forward_Nm,
@@ -22,8 +23,10 @@ from jointctl.firmware_py.law import (
     reset_law,
     reset_learning,
     reset_network,
+    reset_observer,
     solve_lyapunov_p,
     step_law,
+    step_observer,
     ultimate_bounds,
     watch_learning,
 )
@@ -34,6 +37,8 @@ from jointctl.firmware_py.records import (
     LearningState,
     NetworkConstants,
     NetworkState,
+    ObserverConstants,
+    ObserverState,
     Reference,
     VelocityConstants,
     VelocityState,
@@ -403,6 +408,42 @@ def test_closed_loop_on_the_exact_model(law: Any, kind: int) -> None:
         # the slow mode of 16.5 s starts at a small fraction of what computed torque alone leaves
         assert 0.0 < position < 0.2 * alone_rad
         assert state.network_torque_Nm == pytest.approx(load_Nm, rel=0.15)
+
+
+# --- The observer that compares what was fed forward with the torque of its own command ---
+@pytest.mark.parametrize("paired", [1, 0])
+@pytest.mark.parametrize("delay_cycles", [0, 1, 4])
+def test_friction_fed_forward_ahead_is_a_disturbance_only_to_the_observer_that_is_not_paired(
+    law: Any, delay_cycles: int, paired: int
+) -> None:
+    """The model is true and the friction comes when the command is torque: nothing moves that should not."""
+    law.kind, law.feed_forward, law.filtered_error_rate = (
+        ControllerKind.COMPUTED_TORQUE_OBSERVER, FeedForward.DESIRED, 1,
+    )  # fmt: skip
+    law.observer.bandwidth_radps, law.observer.delay_cycles, law.observer.paired = 60.0, delay_cycles, paired
+    state, velocity, reference = blocks(law)
+    sent_Nm, found_Nm = 0.0, []
+    for k in range(400):
+        reference.velocity_radps = 0.2 if k // 100 % 2 else -0.2
+        sent_Nm = step_law(law, state, 0.0, velocity, reference, sent_Nm, NO_REPETITION)
+        found_Nm.append(abs(state.observer_torque_Nm))
+    if paired:
+        assert max(found_Nm) < 1e-12
+    else:  # some 17 Nm that turn round, for as many cycles as a command takes, at 60 rad/s
+        assert max(found_Nm) > 0.06 * 17.0 * (delay_cycles + 1)
+
+
+@pytest.mark.parametrize("paired", [1, 0])
+def test_a_torque_that_is_handed_over_is_not_taken_back_by_commands_on_their_way(paired: int) -> None:
+    constants, state = new(ObserverConstants)[0], new(ObserverState)[0]
+    constants.bandwidth_radps, constants.delay_cycles, constants.paired = 60.0, 5, paired
+    reset_observer(state, 0.0)
+    fed_Nm = 8.0
+    for _ in range(1000):  # all of it is fed forward, nothing is unknown
+        step_observer(constants, state, 0.0 if paired else fed_Nm, 0.0 if paired else fed_Nm, 0.0, 1e-3)
+    add_to_disturbance(constants, state, fed_Nm)
+    for _ in range(20):
+        assert step_observer(constants, state, fed_Nm, 0.0, 0.0, 1e-3) == pytest.approx(fed_Nm)
 
 
 # --- Iterative learning that makes the error grow is switched off; its twin goes on learning ---
