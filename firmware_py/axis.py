@@ -9,15 +9,8 @@ from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import follow_temperature, step_flexible_law, step_law
 from jointctl.firmware_py.libc import load_acquire
 from jointctl.firmware_py.live_change import step_change, step_new_motion
-from jointctl.firmware_py.records import (
-    AxisConstants,
-    AxisState,
-    Command,
-    MotionChange,
-    Reference,
-    Sample,
-    VelocityCommandConstants,
-)
+from jointctl.firmware_py.motion_records import MotionChange, Reference
+from jointctl.firmware_py.records import AxisConstants, AxisState, Command, Sample, VelocityCommandConstants
 from jointctl.firmware_py.safety import (
     check_encoders,
     check_finite,

@@ -17,6 +17,7 @@ from jointctl.firmware_py.friction import Condition, compensation_motor_torque_N
 from jointctl.firmware_py.friction_adaptation import adapt, adapted_feed_forward_Nm, reset_adaptation, take_at_rest
 from jointctl.firmware_py.kalman import step_kalman
 from jointctl.firmware_py.kernel import kernel, plain
+from jointctl.firmware_py.motion_records import Reference
 from jointctl.firmware_py.records import (
     LEARNING_BINS,
     NEURONS,
@@ -29,7 +30,6 @@ from jointctl.firmware_py.records import (
     NetworkState,
     ObserverConstants,
     ObserverState,
-    Reference,
     VelocityState,
 )
 from jointctl.firmware_py.states import ControllerKind, FeedForward

@@ -20,21 +20,17 @@ import numpy as np
 from jointctl.firmware_py.kalman import set_kalman_gains
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import reset_learning, right_column_of_p
-from jointctl.firmware_py.records import (
-    AxisConstants,
-    AxisState,
+from jointctl.firmware_py.motion_records import (
     ChangeAnswer,
     ChangeConstants,
     ChangeKind,
     ChangeRequest,
     ChangeState,
     Gains,
-    LawConstants,
-    LawState,
-    LimitConstants,
     MotionChange,
     TrajectoryConstants,
 )
+from jointctl.firmware_py.records import AxisConstants, AxisState, LawConstants, LawState, LimitConstants
 from jointctl.firmware_py.safety import within
 from jointctl.firmware_py.states import AxisPhase, ControllerKind, TrajectoryKind
 from jointctl.firmware_py.trajectory import (

@@ -4,7 +4,6 @@ SI units throughout.  `joint_` is the low-velocity side of the reducer, `motor_`
 
 from __future__ import annotations
 
-from enum import IntEnum
 from typing import Annotated
 
 import numpy as np
@@ -15,6 +14,7 @@ from jointctl.firmware_py.friction_records import FrictionBranch as FrictionBran
 from jointctl.firmware_py.friction_records import FrictionConstants as FrictionConstants
 from jointctl.firmware_py.friction_records import LuGreConstants as LuGreConstants
 from jointctl.firmware_py.friction_records import TemperatureConstants as TemperatureConstants
+from jointctl.firmware_py.motion_records import ChangeConstants, ChangeState, Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import array_of, f8, i4, i8, record, u4
 
 # --- The control law: friction model, network, observer, learning, and the law that holds them ---
@@ -208,129 +208,6 @@ class LawState:
     network_torque_Nm: f8  # fhat, which is subtracted
     observer_torque_Nm: f8
     learned_torque_Nm: f8
-
-
-# --- The desired motion ---
-
-
-@record
-class Reference:
-    position_rad: f8
-    velocity_radps: f8
-    acceleration_radps2: f8
-    snap_radps4: f8  # fourth derivative; 0 where the motion has jumps in it, or where it is not known
-
-
-@record
-class TrajectoryConstants:
-    """One trajectory; which fields matter depends on `kind`."""
-
-    kind: i4  # TrajectoryKind
-    repeats: i4  # point-to-point kinds and tables: start again at the end
-    table_rows: i4
-    duration_s: f8  # of the run; 0 = until stopped
-    # SINE: offset + amplitude sin(omega (t + shift)), with a second set from switch_s on (0 = no switch)
-    amplitude_rad: f8
-    omega_radps: f8
-    shift_s: f8
-    offset_rad: f8
-    switch_s: f8
-    amplitude2_rad: f8
-    omega2_radps: f8
-    shift2_s: f8
-    offset2_rad: f8
-    # MIN_JERK, TRAPEZOID: from start to target and, when repeated, back, resting dwell_s at each end
-    start_rad: f8
-    target_rad: f8
-    move_s: f8  # MIN_JERK: duration of one move
-    speed_radps: f8  # TRAPEZOID
-    acceleration_radps2: f8  # TRAPEZOID
-    dwell_s: f8
-
-
-# --- What may change while the joint moves: gains and the motion; see `live_change` ---
-
-
-class ChangeKind(IntEnum):
-    """What a request asks for."""
-
-    GAINS = 1
-    MOTION = 2
-
-
-class ChangeAnswer(IntEnum):
-    """What the loop did with the newest request."""
-
-    NONE = 0
-    TAKEN = 1
-    WRONG_KIND = 2
-    WRONG_PHASE = 3  # not while the joint is under way, or it is being stopped
-    GAIN_LIMIT = 4  # not finite, or outside of the limits of the configuration
-    MOTION_LIMIT = 5  # position or speed outside of the limits, or not finite
-    NOT_FROM_REST = 6  # the new motion does not begin at rest
-
-
-class MotionChange(IntEnum):
-    """Where a change of the motion is; the phase stays TRACKING."""
-
-    NONE = 0
-    BRAKING = 1  # the reference comes to rest
-    MOVING = 2  # from there to the start of the new motion
-
-
-@record
-class Gains:
-    """Those of `LawConstants` that may change; what the kind of law does not use has no room to change."""
-
-    kp: f8  # [1/s^2]
-    kv: f8  # [1/s]
-    ki: f8  # [1/s^3], PID
-    observer_radps: f8
-    learning_rate: f8  # of the network
-
-
-@record
-class ChangeRequest:
-    """Written by the supervisor before it counts `ChangeConstants.order` up, and never while a request is open."""
-
-    first: i8  # the order's number; with `last` it shows that the whole request has arrived
-    kind: i4  # ChangeKind
-    gains: Gains
-    trajectory: TrajectoryConstants
-    move_s: f8  # the way to the motion's beginning takes so long at least: that of the other joints of an arm
-    last: i8
-
-
-@record
-class ChangeConstants:
-    """The limits of a change, and the letter box: the only part of the constants that changes after the start."""
-
-    low: Gains
-    high: Gains
-    ramp_s: f8  # duration of a change of gains
-    q1: f8  # Q = diag(q1, q2) of the Lyapunov equation
-    q2: f8
-    move_speed_radps: f8  # peak of a move to the start of a new motion
-    move_acceleration_radps2: f8
-    move_min_s: f8
-    request: ChangeRequest
-    order: Annotated[np.ndarray, array_of(i8, 1)]  # number of the newest request, 0 = none
-
-
-@record
-class ChangeState:
-    order: i8  # number of the newest request that has come for all joints
-    answered: i8  # number of the newest request that was answered
-    answer: i4  # ChangeAnswer
-    ramping: i4  # 1 while gains change
-    ramp_s: f8  # since the change of gains began
-    motion: i4  # MotionChange
-    start: Gains
-    target: Gains
-    now: Gains  # between the two
-    goal: Reference  # of the new motion at its start, at rest
-    move_s: f8  # that the way there takes, at least until it begins
-    next_trajectory: TrajectoryConstants
 
 
 # --- Set-points that come while the joint moves: see `stream` ---

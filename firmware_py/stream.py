@@ -16,16 +16,8 @@ from __future__ import annotations
 import math
 
 from jointctl.firmware_py.kernel import kernel
-from jointctl.firmware_py.records import (
-    SET_POINTS,
-    AxisConstants,
-    AxisState,
-    MotionChange,
-    Reference,
-    SetPoint,
-    StreamConstants,
-    StreamState,
-)
+from jointctl.firmware_py.motion_records import MotionChange, Reference
+from jointctl.firmware_py.records import SET_POINTS, AxisConstants, AxisState, SetPoint, StreamConstants, StreamState
 from jointctl.firmware_py.safety import set_point_problem
 from jointctl.firmware_py.states import AxisPhase, SetPointProblem, TrajectoryKind
 from jointctl.firmware_py.trajectory import brake_step, cubic

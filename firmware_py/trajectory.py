@@ -13,7 +13,8 @@ import numpy as np
 
 from jointctl.firmware_py.input_file import LARGEST_TABLE_BYTES, number_from, read_input
 from jointctl.firmware_py.kernel import kernel
-from jointctl.firmware_py.records import Reference, SetPoint, TrajectoryConstants
+from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
+from jointctl.firmware_py.records import SetPoint
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import TrajectoryKind
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from jointctl.drivers.errors import MotionFault, UsageError
 from jointctl.firmware_py.cycle import Word
-from jointctl.firmware_py.records import ChangeAnswer, ChangeKind
+from jointctl.firmware_py.motion_records import ChangeAnswer, ChangeKind
 from jointctl.firmware_py.states import AxisPhase, ControllerKind, Fault, StopRequest, in_words
 from jointctl.program import TABLE_ROWS, Axes, Newest, NewMotion
 from jointctl.tools.configuration.drive_section import require_torque

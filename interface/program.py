@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from jointctl.drivers.errors import ConfigurationError, JointctlError, UsageError
-from jointctl.firmware_py.records import MotionChange, TrajectoryConstants
+from jointctl.firmware_py.motion_records import MotionChange, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, TrajectoryKind, in_words
 from jointctl.joint_source import Wanted, wanted_source

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from jointctl.firmware_py.records import Reference, TrajectoryConstants
+from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import TrajectoryKind
 from jointctl.firmware_py.trajectory import reference_at, repetition

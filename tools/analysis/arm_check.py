@@ -12,7 +12,7 @@ import numpy as np
 from jointctl.drivers.can.frames import bus_load, highest_rate_Hz
 from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.arm_model import newton_euler
-from jointctl.firmware_py.records import Reference, TrajectoryConstants
+from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.trajectory import reference_at
 from jointctl.tools.analysis.linear_loop import LoopSettings, RigidJoint

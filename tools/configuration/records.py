@@ -13,7 +13,8 @@ from jointctl.firmware_py.kalman import set_kalman_gains
 from jointctl.firmware_py.kernel import plain
 from jointctl.firmware_py.law import solve_lyapunov_p
 from jointctl.firmware_py.live_change import gains_of
-from jointctl.firmware_py.records import NEURONS, AxisConstants, Gains, TrajectoryConstants
+from jointctl.firmware_py.motion_records import Gains, TrajectoryConstants
+from jointctl.firmware_py.records import NEURONS, AxisConstants
 from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.states import (
     ControllerKind,

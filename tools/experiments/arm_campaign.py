@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from jointctl.firmware_py.records import Reference
+from jointctl.firmware_py.motion_records import Reference
 from jointctl.firmware_py.safety import PUSHED_CYCLES
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault, Reaction

@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from jointctl.firmware_py.records import Reference, TrajectoryConstants
+from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import Fault
 from jointctl.firmware_py.trajectory import reference_at

@@ -37,7 +37,8 @@ import numpy as np
 
 from jointctl.drivers.canopen.cyclic import IGNORED_MAX_CYCLES
 from jointctl.drivers.errors import ConfigurationError
-from jointctl.firmware_py.records import AxisConstants, Reference
+from jointctl.firmware_py.motion_records import Reference
+from jointctl.firmware_py.records import AxisConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, CommandKind, DriveRequest, Fault, Reaction
 from jointctl.firmware_py.trajectory import reference_at

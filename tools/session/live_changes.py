@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from jointctl.drivers.errors import ConfigurationError, DataError, JointctlError, MarginError
 from jointctl.firmware_py.kernel import plain
 from jointctl.firmware_py.live_change import gains_of
-from jointctl.firmware_py.records import ChangeAnswer, ChangeKind, Gains, MotionChange, TrajectoryConstants
+from jointctl.firmware_py.motion_records import ChangeAnswer, ChangeKind, Gains, MotionChange, TrajectoryConstants
 from jointctl.firmware_py.schema import dtype_of, new
 from jointctl.firmware_py.states import AxisPhase, CommandKind, TrajectoryKind, in_words
 from jointctl.firmware_py.trajectory import peak_of

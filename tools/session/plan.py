@@ -17,7 +17,7 @@ import numpy as np
 
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import BusError, JointctlError, MotionFault
-from jointctl.firmware_py.records import Reference, TrajectoryConstants
+from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.trajectory import approach_start, peak_of, reference_at
 from jointctl.tools.configuration.config import Config

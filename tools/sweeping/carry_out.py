@@ -17,7 +17,7 @@ import numpy as np
 
 from jointctl.drivers.drive import CommissioningReport
 from jointctl.drivers.errors import INTERRUPTED, ConfigurationError, MotionFault, UsageError
-from jointctl.firmware_py.records import Reference
+from jointctl.firmware_py.motion_records import Reference
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import CommandKind, Fault, TrajectoryKind
 from jointctl.firmware_py.trajectory import approach_duration_s

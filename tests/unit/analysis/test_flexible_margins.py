@@ -15,7 +15,8 @@ from jointctl.drivers.errors import MarginError
 from jointctl.firmware_py.flexible_joint import Reading
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import reset_law, step_flexible_law
-from jointctl.firmware_py.records import LawConstants, LawState, Reference
+from jointctl.firmware_py.motion_records import Reference
+from jointctl.firmware_py.records import LawConstants, LawState
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ControllerKind, Encoders, FeedForward
 from jointctl.firmware_py.trajectory import NO_REPETITION

@@ -14,7 +14,8 @@ from scipy.linalg import expm
 from jointctl.firmware_py.kalman import set_kalman_gains
 from jointctl.firmware_py.kernel import JIT_DISABLED, kernel
 from jointctl.firmware_py.law import reset_law, solve_lyapunov_p, step_law
-from jointctl.firmware_py.records import LawConstants, LawState, Reference, VelocityConstants, VelocityState
+from jointctl.firmware_py.motion_records import Reference
+from jointctl.firmware_py.records import LawConstants, LawState, VelocityConstants, VelocityState
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ControllerKind
 from jointctl.firmware_py.trajectory import NO_REPETITION

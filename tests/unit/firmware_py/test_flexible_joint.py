@@ -12,7 +12,8 @@ from jointctl.drivers.errors import ConfigurationError
 from jointctl.firmware_py.flexible_joint import Reading, motor_and_link_errors, reset_flexible, series_at, twist_of
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.law import reset_law, step_flexible_law
-from jointctl.firmware_py.records import FlexibleConstants, FlexibleState, LawConstants, LawState, Reference
+from jointctl.firmware_py.motion_records import Reference
+from jointctl.firmware_py.records import FlexibleConstants, FlexibleState, LawConstants, LawState
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import ControllerKind, DriveState, Encoders, Fault, FeedForward
 from jointctl.firmware_py.trajectory import NO_REPETITION

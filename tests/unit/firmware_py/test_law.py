@@ -30,6 +30,7 @@ from jointctl.firmware_py.law import (
     ultimate_bounds,
     watch_learning,
 )
+from jointctl.firmware_py.motion_records import Reference
 from jointctl.firmware_py.records import (
     NEURONS,
     LawState,
@@ -39,7 +40,6 @@ from jointctl.firmware_py.records import (
     NetworkState,
     ObserverConstants,
     ObserverState,
-    Reference,
     VelocityConstants,
     VelocityState,
 )

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jointctl.firmware_py.kernel import kernel
-from jointctl.firmware_py.records import Reference, TrajectoryConstants
+from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import TrajectoryKind
 from jointctl.firmware_py.trajectory import (
@@ -472,7 +472,7 @@ def test_an_approach_to_a_start_above_the_limits_is_refused():
 _BOTH_WAYS = """
 import json
 import numpy as np
-from jointctl.firmware_py.records import Reference, TrajectoryConstants
+from jointctl.firmware_py.motion_records import (Reference, TrajectoryConstants)
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.trajectory import approach_at, brake_step, plan_approach, reference_at
 from jointctl.hil.plant import R1, encoder_counts, plant, step_plant

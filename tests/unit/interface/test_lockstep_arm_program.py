@@ -13,7 +13,7 @@ import pytest
 
 import jointctl
 from jointctl.firmware_py.arm_model import newton_euler
-from jointctl.firmware_py.records import ChangeKind
+from jointctl.firmware_py.motion_records import ChangeKind
 from jointctl.firmware_py.states import AxisPhase, TrajectoryKind
 from jointctl.tools.configuration.arm import SHIPPED_ARM, ArmConfig, load_arm
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.errors import UsageError
-from jointctl.firmware_py.records import TrajectoryConstants
+from jointctl.firmware_py.motion_records import TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import TrajectoryKind
 from jointctl.firmware_py.trajectory import peak_of

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jointctl.drivers.errors import ConfigurationError, DataError, DeviceError, JointctlError, UsageError
-from jointctl.firmware_py.records import Reference, TrajectoryConstants
+from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import TrajectoryKind
 from jointctl.firmware_py.trajectory import peak_of, reference_at

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from jointctl.drivers.errors import DataError, UsageError
-from jointctl.firmware_py.records import LogRecord, Reference, TrajectoryConstants
+from jointctl.firmware_py.motion_records import Reference, TrajectoryConstants
+from jointctl.firmware_py.records import LogRecord
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Encoders, TrajectoryKind
 from jointctl.firmware_py.trajectory import reference_at

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from jointctl.firmware_py.live_change import gains_of
-from jointctl.firmware_py.records import ChangeAnswer, ChangeKind, TrajectoryConstants
+from jointctl.firmware_py.motion_records import ChangeAnswer, ChangeKind, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import TrajectoryKind
 

@@ -9,7 +9,7 @@ import pytest
 
 from jointctl.firmware_py.law import solve_lyapunov_p
 from jointctl.firmware_py.live_change import gains_allowed, gains_of, set_gains
-from jointctl.firmware_py.records import ChangeAnswer, ChangeKind, Gains
+from jointctl.firmware_py.motion_records import ChangeAnswer, ChangeKind, Gains
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, ControllerKind, Fault, StopRequest
 from tests.axis_on_stub_joint import NewRig

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jointctl.firmware_py.live_change import move_duration_s, trajectory_allowed
-from jointctl.firmware_py.records import ChangeAnswer, ChangeKind, MotionChange, TrajectoryConstants
+from jointctl.firmware_py.motion_records import ChangeAnswer, ChangeKind, MotionChange, TrajectoryConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest, TrajectoryKind
 from tests.axis_on_stub_joint import NewRig
