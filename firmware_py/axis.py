@@ -1,4 +1,4 @@
-"""One tick of one joint: sample in, command out; with the velocity command that it uses."""
+"""One tick of one joint: sample in, command out."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from jointctl.firmware_py.law import follow_temperature, step_flexible_law, step
 from jointctl.firmware_py.libc import load_acquire
 from jointctl.firmware_py.live_change import step_change, step_new_motion
 from jointctl.firmware_py.motion_records import MotionChange, Reference
-from jointctl.firmware_py.records import AxisConstants, AxisState, Command, Sample, VelocityCommandConstants
+from jointctl.firmware_py.own_loop import limited_target_radps, look_ahead, velocity_command_radps
+from jointctl.firmware_py.records import AxisConstants, AxisState, Command, Sample
 from jointctl.firmware_py.safety import (
     check_encoders,
     check_finite,
@@ -23,7 +24,6 @@ from jointctl.firmware_py.safety import (
     check_supervision,
     check_swing,
     enter,
-    limited_target_radps,
     limited_torque_Nm,
     limited_velocity_radps,
     powered,
@@ -59,35 +59,6 @@ from jointctl.firmware_py.trajectory import (
     repetition,
 )
 from jointctl.firmware_py.velocity import step_velocity
-
-# --- The velocity command: the reference's velocity plus a small position correction ---
-# For a drive that closes the velocity loop itself:
-# v = v_d - k (q - q_d)          at the joint, rad/s, k = position_gain_ps [1/s]
-#
-# The correction keeps the joint on the planned motion (a drive's velocity loop alone drifts); it is small on purpose,
-# so that at constant speed the torque is what friction asks for.  Sent only if it is finite, then limited by the
-# velocity limit and by the acceleration limit, in that order.  Not modelled: the drive's own ramps and limits.
-#
-# A run in CSP or CSV (docs/law.md) sends the motion that is desired `lead_s` later, when it takes effect, and the law's
-# feed-forward for it as torque offset.  In CSP the target position is limited like a joint that moves.
-
-
-@kernel
-def velocity_command_radps(constants: VelocityCommandConstants, reference: Reference, position_rad: float) -> float:
-    """The unlimited velocity command [rad/s] for the motion that is desired now."""
-    return reference.velocity_radps - constants.position_gain_ps * (position_rad - reference.position_rad)
-
-
-@kernel
-def look_ahead(reference: Reference, lead_s: float, ahead: Reference) -> None:
-    """The desired motion `lead_s` later, as far as its derivatives of now say."""
-    ahead.position_rad = reference.position_rad + lead_s * (
-        reference.velocity_radps + 0.5 * lead_s * reference.acceleration_radps2
-    )
-    ahead.velocity_radps = reference.velocity_radps + lead_s * reference.acceleration_radps2
-    ahead.acceleration_radps2 = reference.acceleration_radps2
-    ahead.snap_radps4 = reference.snap_radps4
-
 
 # --- One tick of one joint: sample in, command out ---
 # position -> phase and reference -> velocity -> safety -> law -> finite check, torque limit, rate limit

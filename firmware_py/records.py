@@ -324,9 +324,7 @@ class LimitConstants:
 
 
 @record
-class SequenceConstants:
-    """Times of the run's phases."""
-
+class SequenceConstants:  # times of the run's phases
     approach_s: f8  # 0 = start the trajectory at once, where the joint stands
     start_rad: f8  # where the joint stood when the motion was shown, which `approach_s` was made for
     moved_max_rad: f8  # by which it may be elsewhere when it is enabled; 0 = not checked, `start_rad` is not known
@@ -342,9 +340,7 @@ class SequenceConstants:
 
 
 @record
-class VelocityCommandConstants:
-    """For a drive that closes the velocity loop, or the position loop as well; see `axis.velocity_command_radps`."""
-
+class VelocityCommandConstants:  # for a drive that closes the velocity loop, or the position loop as well: `own_loop`
     position_gain_ps: f8  # CommandKind.VELOCITY only
     acceleration_max_radps2: f8
     lead_s: f8  # the motion that is desired so much later is sent; 0 = that of now, without torque offset

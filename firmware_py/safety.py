@@ -10,7 +10,6 @@ import math
 
 from jointctl.firmware_py.kernel import kernel
 from jointctl.firmware_py.libc import load_acquire
-from jointctl.firmware_py.motion_records import Reference
 from jointctl.firmware_py.records import (
     AxisConstants,
     AxisState,
@@ -398,32 +397,8 @@ def limited_velocity_radps(
 
 
 @kernel
-def limited_target_radps(
-    limits: LimitConstants, acceleration_max_radps2: float, period_s: float, target: Reference, position_rad: float,
-    velocity_radps: float,
-) -> tuple[float, bool]:  # fmt: skip
-    """(velocity of the target position [rad/s], finite): finite, position, velocity, acceleration limit, in that order.
-
-    `position_rad` and `velocity_radps` are those of the last target.  A target that is out of reach is caught up with
-    as a joint would, without a jump and without going beyond it; half of the acceleration is left for braking.
-    Not finite: the last target stays, and the caller must stop the joint.
-    """
-    if not (math.isfinite(target.position_rad) and math.isfinite(target.velocity_radps)):
-        return 0.0, False
-    aim_rad = min(max(target.position_rad, limits.position_min_rad), limits.position_max_rad)
-    step = acceleration_max_radps2 * period_s
-    wanted = (aim_rad - position_rad) / period_s
-    if abs(wanted - velocity_radps) > step:
-        left_rad = aim_rad - position_rad - target.velocity_radps * period_s
-        speed = min(math.sqrt(acceleration_max_radps2 * abs(left_rad)), abs(left_rad) / period_s)
-        wanted = target.velocity_radps + math.copysign(speed, left_rad)
-    wanted = min(max(wanted, -limits.velocity_max_radps), limits.velocity_max_radps)
-    return min(max(wanted, velocity_radps - step), velocity_radps + step), True
-
-
-@kernel
 def check_finite(state: AxisState, finite: bool, unlimited: float) -> None:
-    """A command that is no number: it was not sent (the three `limited_*`)."""
+    """A command that is no number: it was not sent (`limited_*`, also of `own_loop`)."""
     if not finite:
         trip(state, Fault.NOT_FINITE, unlimited, 0)
 
