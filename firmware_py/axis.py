@@ -316,6 +316,7 @@ def move_axis(
     table: np.ndarray,
     sample: Sample,
     elapsed_cycles: int,
+    all_prepared: bool,
     all_enabled: bool,
 ) -> None:
     """The second part: phase, desired motion, velocity, and whether reading and motion may be.
@@ -325,7 +326,7 @@ def move_axis(
     if state.phase == AxisPhase.WAITING:
         step_waiting(constants, state, sample)
     elif state.phase == AxisPhase.ENABLING:
-        step_enabling(constants, state, sample, table, all_enabled)
+        step_enabling(constants, state, sample, table, all_prepared, all_enabled)
     step_change(constants, state, table, elapsed_cycles)
     if not following_set_points(constants, state):
         step_other_motion(constants, state, elapsed_cycles)
@@ -376,5 +377,5 @@ def step_axis(
     last sign of life.
     """
     sense_axis(constants, state, sample, elapsed_cycles, stop_request, supervisor_age_cycles)
-    move_axis(constants, state, table, sample, elapsed_cycles, True)
+    move_axis(constants, state, table, sample, elapsed_cycles, True, True)
     command_axis(constants, state, table, sample, command, elapsed_cycles)

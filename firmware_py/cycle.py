@@ -27,7 +27,7 @@ from jointctl.firmware_py.records import AxisState, Command, LogRecord, Sample
 from jointctl.firmware_py.safety import check_suspension
 from jointctl.firmware_py.schema import INT32_MAX
 from jointctl.firmware_py.sequence import is_enabled, request_stop, write_command
-from jointctl.firmware_py.states import AxisPhase, Fault, StopRequest
+from jointctl.firmware_py.states import AxisPhase, DriveRequest, DriveState, Fault, StopRequest
 
 HISTOGRAM_BINS = 4097  # 1 us each; the last one holds everything later
 
@@ -164,9 +164,9 @@ def store_word(words: np.ndarray, index: int, value: int) -> None:
 # --- The cycle ---
 
 
-# No joint of an arm has torque while another has none, as far as the loop can see to it: they are asked to enable
-# together once all could be, get torque together once all are enabled, brake together, and release their torque
-# together once all stand.
+# No joint of an arm has torque while another has none, as far as the loop can see to it: their drives are prepared
+# together once all joints could be enabled, enabled together once all are prepared, get torque together once all are
+# enabled, brake together, and release their torque together once all stand.
 
 
 @kernel
@@ -201,6 +201,16 @@ def stop_others(states: np.ndarray, samples: np.ndarray) -> bool:
         request_stop(states[axis], stop_of(states, axis, _NO_STOP))
         all_enabled = all_enabled and is_enabled(states[axis], samples[axis])
     return all_enabled
+
+
+@kernel
+def all_prepared(samples: np.ndarray) -> bool:
+    """Whether no drive is farther than one step from enabled: an enabled joint without torque falls, its brake open."""
+    for axis in range(len(samples)):
+        state = samples[axis].drive_state
+        if state != DriveState.PREPARED and state != DriveState.ENABLED:
+            return False
+    return True
 
 
 @kernel
@@ -270,11 +280,11 @@ def step_cycle(memory: CycleMemory, exchange: Exchange, clock: Clock, slot: Slot
         )  # fmt: skip
     if several:
         wait_for_all(memory.state)
-    all_enabled = stop_others(memory.state, samples)
+    together, all_enabled = all_prepared(samples), stop_others(memory.state, samples)
     for axis in range(len(memory.state)):
         move_axis(
             memory.constants[axis], memory.state[axis], memory.tables[axis], samples[axis], slot.elapsed_cycles,
-            all_enabled,
+            together, all_enabled,
         )  # fmt: skip
     stop_others(memory.state, samples)
     if len(memory.arm.links) > 0:
@@ -288,5 +298,11 @@ def step_cycle(memory: CycleMemory, exchange: Exchange, clock: Clock, slot: Slot
         stop_others(memory.state, samples)
         for axis in range(len(memory.state)):
             write_command(memory.state[axis], commands[axis])
+            if (
+                commands[axis].request == DriveRequest.ENABLE
+                and memory.state[axis].phase == AxisPhase.ENABLING
+                and not together
+            ):
+                commands[axis].request = DriveRequest.PREPARE
     exchange.send(exchange.link, samples, commands)
     return log_cycle(memory, slot, waited_ns, clock.now_ns(memory.timespec))

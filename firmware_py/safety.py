@@ -301,13 +301,16 @@ def check_reading(constants: AxisConstants, state: AxisState, elapsed_cycles: in
     """A reading that stands still although the reference moves on, or although the joint is pushed hard.
 
     It must be early: behind a stuck encoder the law pushes ever harder, and the joint moves unseen, long before the
-    following error is too large.  Where the drive closes a loop itself, the torque is the one that it measures.
+    following error is too large.  Where the drive closes a loop itself, the torque is the one that it measures; in an
+    arm it is what the command has beyond the arm's own.
     Of an overrun's `elapsed_cycles`, the reference's way counts for one: the drive received no other.
     """
     limits = constants.limits
     torque_Nm = state.command_torque_Nm
     if constants.command_kind != CommandKind.TORQUE:
         torque_Nm = state.measured_torque_Nm
+    elif constants.law.of_arm != 0:
+        torque_Nm -= state.law.arm_torque_Nm  # what the other joints' motion asks for pushes no joint
     state.frozen_way_rad += (state.reference.position_rad - state.frozen_reference_rad) / elapsed_cycles
     state.frozen_reference_rad = state.reference.position_rad
     way_rad = state.frozen_way_rad

@@ -146,11 +146,11 @@ def is_enabled(state: AxisState, sample: Sample) -> bool:
 
 @kernel
 def step_enabling(
-    constants: AxisConstants, state: AxisState, sample: Sample, table: np.ndarray, all_enabled: bool
+    constants: AxisConstants, state: AxisState, sample: Sample, table: np.ndarray, all_prepared: bool, all_enabled: bool
 ) -> None:
     """ENABLING: once the drive is on, plan the way from where the joint stands to the trajectory's start.
 
-    A joint of an arm waits until `all_enabled`; one that never is ends the run of all.
+    A joint of an arm waits until `all_prepared`, then until `all_enabled`; one that never is ends the run of all.
     """
     if is_enabled(state, sample):
         if moved_before_start(constants, state) or not all_enabled:  # a brake that has opened, say
@@ -170,6 +170,8 @@ def step_enabling(
         reset_law(constants.law, state.law)
         state.frozen_way_rad = 0.0
         state.frozen_reference_rad = state.reference.position_rad
+    elif sample.drive_state == DriveState.PREPARED and not all_prepared:
+        return  # it waits for another one
     elif waited_too_long(state, constants.sequence.enable_max_cycles):
         trip(state, Fault.ENABLE_TIMEOUT, float(sample.status_word), sample.drive_error)
 

@@ -25,6 +25,7 @@ class DriveState(IntEnum):
     STOPPING = 4  # the drive itself brakes (quick stop)
     FAULT = 5  # power off because of a fault
     FAULT_BRAKING = 6  # still carrying out the reaction to a fault
+    PREPARED = 7  # one step before ENABLED: the power stage is on, a brake still closed
 
 
 class DriveRequest(IntEnum):
@@ -33,6 +34,7 @@ class DriveRequest(IntEnum):
     OFF = 0
     ENABLE = 1
     QUICK_STOP = 2
+    PREPARE = 3  # up to PREPARED, and back to it from ENABLED
 
 
 class AxisPhase(IntEnum):

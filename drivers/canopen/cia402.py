@@ -101,8 +101,10 @@ def drive_state(state: int) -> DriveState:
         return DriveState.ENABLED
     if state == State.SWITCH_ON_DISABLED:
         return DriveState.OFF
-    if state == State.READY_TO_SWITCH_ON or state == State.SWITCHED_ON:
+    if state == State.READY_TO_SWITCH_ON:
         return DriveState.STARTING
+    if state == State.SWITCHED_ON:
+        return DriveState.PREPARED
     if state == State.QUICK_STOP_ACTIVE:
         return DriveState.STOPPING
     if state == State.FAULT:
@@ -115,13 +117,13 @@ def drive_state(state: int) -> DriveState:
 @kernel
 def control_word(state: int, request: int) -> ControlWord:
     """The command that leads from `state` towards what the loop wants."""
-    if request == DriveRequest.ENABLE:
+    if request == DriveRequest.ENABLE or request == DriveRequest.PREPARE:
         if state == State.SWITCH_ON_DISABLED:
             return ControlWord.SHUTDOWN
         if state == State.READY_TO_SWITCH_ON:
             return ControlWord.SWITCH_ON
         if state == State.SWITCHED_ON or state == State.OPERATION_ENABLED:
-            return ControlWord.ENABLE_OPERATION
+            return ControlWord.ENABLE_OPERATION if request == DriveRequest.ENABLE else ControlWord.SWITCH_ON
         return ControlWord.DISABLE_VOLTAGE
     if request == DriveRequest.QUICK_STOP and (state == State.OPERATION_ENABLED or state == State.QUICK_STOP_ACTIVE):
         return ControlWord.QUICK_STOP

@@ -425,7 +425,7 @@ def end_cycle(port: CanopenPort, frames: np.ndarray, sample: Sample, command: Co
     if port.heartbeat_watched != 0:
         sample.heartbeat_age_cycles = min(port.cycle - port.heartbeat_heard_cycle, INT32_MAX)
     request = np.int64(command.request)
-    if request == DriveRequest.ENABLE and port.ignored_cycles > IGNORED_MAX_CYCLES:
+    if request != DriveRequest.QUICK_STOP and port.ignored_cycles > IGNORED_MAX_CYCLES:
         request = np.int64(DriveRequest.OFF)
     frame = frames[SLOT_RPDO]
     frame.can_id = port.rpdo_id

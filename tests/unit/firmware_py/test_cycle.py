@@ -48,7 +48,8 @@ class Arm:
         self.sends = 0
         self.ended = False
         self.cycles = 0
-        self.slow_to_enable = [0, 0]  # cycles until each drive obeys
+        self.slow_to_prepare = [0, 0]  # cycles until each drive obeys
+        self.slow_to_enable = [0, 0]
         self.moving_rad = [0.0, 0.0]  # in each cycle
 
     def _receive(self, _: None, samples: Any, now_ns: int, until_ns: int) -> int:
@@ -56,10 +57,14 @@ class Arm:
             sample.count += 1
             sample.time_ns = now_ns + 1500
             sample.position_rad += self.moving_rad[axis]
-            asked = command.request == DriveRequest.ENABLE
-            self.slow_to_enable[axis] -= asked
-            obeys = asked and self.slow_to_enable[axis] < 0
-            sample.drive_state = DriveState.ENABLED if obeys else DriveState.OFF
+            prepare, enable = (command.request == request for request in (DriveRequest.PREPARE, DriveRequest.ENABLE))
+            self.slow_to_prepare[axis] -= prepare
+            self.slow_to_enable[axis] -= enable
+            sample.drive_state = DriveState.OFF
+            if (prepare or enable) and self.slow_to_prepare[axis] < 0:
+                sample.drive_state = DriveState.PREPARED
+                if enable and self.slow_to_enable[axis] < 0:
+                    sample.drive_state = DriveState.ENABLED
         return 1500
 
     def _send(self, _: None, samples: Any, commands: Any) -> int:
@@ -154,19 +159,33 @@ def test_no_axis_has_torque_before_all_drives_are_enabled(slow: int) -> None:
     assert arm.state[0].trajectory_s == arm.state[1].trajectory_s  # and both motions began in the same cycle
 
 
+@pytest.mark.parametrize("step", ["slow_to_prepare", "slow_to_enable"])
 @pytest.mark.parametrize("slow", [0, 1])
-def test_a_drive_that_never_enables_keeps_the_torque_from_the_other(slow: int) -> None:
+def test_a_drive_that_never_enables_keeps_the_torque_from_the_other(slow: int, step: str) -> None:
     arm = Arm()
-    arm.slow_to_enable[slow] = 1 << 30
-    phases, torques = set(), 0.0
+    getattr(arm, step)[slow] = 1 << 30
+    phases, torques, enabled = set(), 0.0, False
     while arm.cycles < 20_000 and not arm.ended:
         phases.add(arm.run(1).phases[1 - slow])
         torques += float(np.abs(arm.memory.command.torque_Nm).sum())
+        enabled |= arm.memory.sample.drive_state[1 - slow] == DriveState.ENABLED
     assert arm.ended
+    assert enabled == (step == "slow_to_enable")  # one that is not prepared keeps the brake of the other closed
     assert arm.faults[slow] == Fault.ENABLE_TIMEOUT
     assert arm.faults[1 - slow] == Fault.NONE
     assert torques == 0.0
     assert not phases & {AxisPhase.APPROACH, AxisPhase.TRACKING, AxisPhase.RAMPING}
+
+
+@pytest.mark.parametrize("fell", [0, 1])
+def test_a_drive_that_falls_back_before_all_are_enabled_takes_the_other_with_it(fell: int) -> None:
+    arm = Arm()
+    arm.slow_to_enable[fell] = 1 << 30
+    while arm.memory.sample.drive_state[1 - fell] != DriveState.ENABLED:
+        arm.run(1)
+    arm.slow_to_prepare[fell] = 1 << 30
+    assert [int(request) for request in arm.run(1).memory.command.request] == [DriveRequest.PREPARE] * 2
+    assert arm.run(1).memory.sample.drive_state[1 - fell] == DriveState.PREPARED
 
 
 @pytest.mark.parametrize("moving", [0, 1])

@@ -46,7 +46,7 @@ def test_every_state_is_reached() -> None:
     ("state", "expected"),
     [
         (State.NOT_READY_TO_SWITCH_ON, DriveState.UNKNOWN), (State.SWITCH_ON_DISABLED, DriveState.OFF),
-        (State.READY_TO_SWITCH_ON, DriveState.STARTING), (State.SWITCHED_ON, DriveState.STARTING),
+        (State.READY_TO_SWITCH_ON, DriveState.STARTING), (State.SWITCHED_ON, DriveState.PREPARED),
         (State.OPERATION_ENABLED, DriveState.ENABLED), (State.QUICK_STOP_ACTIVE, DriveState.STOPPING),
         (State.FAULT_REACTION_ACTIVE, DriveState.FAULT_BRAKING), (State.FAULT, DriveState.FAULT),
         (State.UNDEFINED, DriveState.UNKNOWN),
@@ -68,6 +68,8 @@ ENABLE_WORDS = {
 def test_control_words(state: State) -> None:
     assert control_word(int(state), DriveRequest.OFF) == 0x00
     assert control_word(int(state), DriveRequest.ENABLE) == ENABLE_WORDS.get(state, 0x00)
+    prepare = {**ENABLE_WORDS, State.SWITCHED_ON: 0x07, State.OPERATION_ENABLED: 0x07}  # 3 and, from enabled, 5
+    assert control_word(int(state), DriveRequest.PREPARE) == prepare.get(state, 0x00)
     braking = state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE)
     assert control_word(int(state), DriveRequest.QUICK_STOP) == (0x02 if braking else 0x00)
 

@@ -95,7 +95,7 @@ def test_targets_are_zeroed_before_anything_else_is_written(commissioned: Any) -
     first = {index: written.index(index) for index in written}
     assert written[0] == 0x6040
     assert first[0x6071] < first[0x60FF] < first[0x6060] < first[0x6072] < first[0x60C2] < first[0x1016] < first[0x1800]
-    assert set(bus.downloads(0x60FF)) == {0}
+    assert set(bus.downloads(0x60FF)) == set(bus.downloads(0x60B1)) == set(bus.downloads(0x60B2)) == {0}
     assert set(bus.downloads(0x6040)) == {0}  # nothing but "disable voltage" is ever written while commissioning
 
 
@@ -231,6 +231,15 @@ def test_only_a_node_that_does_not_answer_is_sent_pre_operational_at_first(joint
     assert joint.requests[first] == (0, bytes([NmtCommand.ENTER_PRE_OPERATIONAL, 1]))
     read = [struct.unpack_from("<H", data, 1)[0] for cob, data in joint.requests[:first] if cob == 0x601]
     assert (0x6041 in read) is (attempts == 0)
+
+
+def test_a_node_is_given_the_time_that_it_takes_to_boot(empty_bus: Any) -> None:
+    with empty_bus.opened(boot_timeout_s=1.0) as drive:
+        tries = round(1.0 / (drive._node.sdo.RESPONSE_TIMEOUT * SDO_ATTEMPTS))
+        with pytest.raises(NoDeviceError):
+            drive.commission()
+    sent = [data for cob, data in empty_bus.requests if cob == 0]
+    assert sent == [bytes([NmtCommand.ENTER_PRE_OPERATIONAL, 1])] * tries
 
 
 def test_a_node_that_is_anothers_while_it_does_not_answer_is_sent_nothing(joint: Any) -> None:

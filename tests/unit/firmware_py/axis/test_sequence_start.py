@@ -95,7 +95,7 @@ def test_a_joint_that_was_moved_since_the_motion_was_shown_is_not_driven(
     if phase is AxisPhase.WAITING:
         step_waiting(axis, state, idle_sample())
     else:
-        step_enabling(axis, state, idle_sample(DriveState.ENABLED), axis_table(), True)
+        step_enabling(axis, state, idle_sample(DriveState.ENABLED), axis_table(), True, True)
     if moved:
         assert (state.phase, state.fault) == (AxisPhase.DISABLING, Fault.MOVED_BEFORE_START)
         assert state.fault_value == pytest.approx(position_rad - start_rad, nan_ok=True)
@@ -186,7 +186,7 @@ def test_a_wait_that_is_over_only_because_the_loop_was_held_up_says_so(
         if phase is AxisPhase.WAITING:
             step_waiting(axis, state, sample_of(DriveState.OFF))
         else:
-            step_enabling(axis, state, sample_of(DriveState.OFF), axis_table(), True)
+            step_enabling(axis, state, sample_of(DriveState.OFF), axis_table(), True, True)
         assert state.phase == AxisPhase.DISABLING
         assert bool(state.fault == Fault.OVERRUN) is (fault is Fault.OVERRUN)
         assert fault is None or state.fault_value == held_up_cycles
@@ -198,7 +198,7 @@ def test_what_held_up_the_phase_before_is_not_the_cause_of_this_ones_end(axis: A
     state.held_up_cycles = 5
     enter(state, AxisPhase.ENABLING)
     state.phase_cycle = 31
-    step_enabling(axis, state, sample_of(DriveState.OFF), axis_table(), True)
+    step_enabling(axis, state, sample_of(DriveState.OFF), axis_table(), True, True)
     assert (state.phase, state.fault) == (AxisPhase.DISABLING, Fault.ENABLE_TIMEOUT)
 
 
@@ -209,7 +209,7 @@ def test_torque_begins_only_with_a_fresh_sample_of_an_enabled_drive(
 ) -> None:
     state.phase, state.sample_age_cycles, state.measured_position_rad = AxisPhase.ENABLING, age_cycles, 0.3
     state.law.network.weights[:] = 5.0
-    step_enabling(axis, state, sample_of(drive_state), axis_table(), True)
+    step_enabling(axis, state, sample_of(drive_state), axis_table(), True, True)
     if drive_state is DriveState.ENABLED and age_cycles == 0:
         assert state.phase == AxisPhase.APPROACH
         assert state.reference.position_rad == 0.3
@@ -227,7 +227,7 @@ def test_the_approach_leads_from_where_the_joint_stands_into_the_trajectory(axis
     state.phase, state.measured_position_rad, state.velocity.last_position_rad = AxisPhase.ENABLING, 0.3, 0.30001
     state.velocity.last_error_rad, state.velocity.error_rate_radps = 5.0, 5.0
     state.table_row, state.frozen_way_rad, state.frozen_reference_rad = 3, 9.0, 9.0
-    step_enabling(axis, state, sample_of(DriveState.ENABLED), axis_table(), True)
+    step_enabling(axis, state, sample_of(DriveState.ENABLED), axis_table(), True, True)
     assert (state.trajectory_s, state.table_row) == (-0.2, 0)
     assert (state.frozen_way_rad, state.frozen_reference_rad) == (0.0, 0.3)
     # the error has no history yet
@@ -242,7 +242,7 @@ def test_the_approach_leads_from_where_the_joint_stands_into_the_trajectory(axis
 def test_without_an_approach_the_trajectory_begins_at_once(axis: Any, state: Any) -> None:
     axis.sequence.approach_s = 0.0
     state.phase = AxisPhase.ENABLING
-    step_enabling(axis, state, sample_of(DriveState.ENABLED), axis_table(), True)
+    step_enabling(axis, state, sample_of(DriveState.ENABLED), axis_table(), True, True)
     assert state.phase == AxisPhase.TRACKING
     assert state.reference.velocity_radps == pytest.approx(0.35 * 0.2 * 3.14159265, rel=1e-6)
 
@@ -252,7 +252,7 @@ def test_without_an_approach_the_trajectory_begins_at_once(axis: Any, state: Any
 @pytest.mark.parametrize(("phase_cycle", "fault"), [(30, Fault.NONE), (31, Fault.ENABLE_TIMEOUT)])
 def test_enable_timeout(axis: Any, state: Any, phase_cycle: int, fault: Fault) -> None:
     state.phase, state.phase_cycle = AxisPhase.ENABLING, phase_cycle
-    step_enabling(axis, state, sample_of(DriveState.STARTING), axis_table(), True)
+    step_enabling(axis, state, sample_of(DriveState.STARTING), axis_table(), True, True)
     assert state.fault == fault
     assert state.phase == (AxisPhase.DISABLING if fault else AxisPhase.ENABLING)
     assert (state.fault_value, state.fault_drive_error) == ((0x1237, 0x3310) if fault else (0.0, 0))
@@ -290,10 +290,19 @@ def test_a_flexible_reducer_between_two_encoders_may_twist(axis: Any, state: Any
 
 def test_a_joint_of_an_arm_waits_until_all_are_enabled(axis: Any, state: Any) -> None:
     state.phase = AxisPhase.ENABLING
-    step_enabling(axis, state, sample_of(DriveState.ENABLED), axis_table(), False)
+    step_enabling(axis, state, sample_of(DriveState.ENABLED), axis_table(), True, False)
     assert state.phase == AxisPhase.ENABLING
     state.phase_cycle = axis.sequence.enable_max_cycles + 1  # the one that is not enabled is the cause
-    step_enabling(axis, state, sample_of(DriveState.ENABLED), axis_table(), False)
+    step_enabling(axis, state, sample_of(DriveState.ENABLED), axis_table(), True, False)
     assert (state.phase, state.fault) == (AxisPhase.ENABLING, Fault.NONE)
-    step_enabling(axis, state, sample_of(DriveState.ENABLED), axis_table(), True)
+    step_enabling(axis, state, sample_of(DriveState.ENABLED), axis_table(), True, True)
     assert state.phase == AxisPhase.APPROACH
+
+
+@pytest.mark.parametrize(("all_prepared", "fault"), [(False, Fault.NONE), (True, Fault.ENABLE_TIMEOUT)])
+def test_a_drive_that_is_prepared_is_not_late_while_it_waits_for_another_one(
+    axis: Any, state: Any, all_prepared: bool, fault: Fault
+) -> None:
+    state.phase, state.phase_cycle = AxisPhase.ENABLING, axis.sequence.enable_max_cycles + 1
+    step_enabling(axis, state, sample_of(DriveState.PREPARED), axis_table(), all_prepared, False)
+    assert state.fault == fault

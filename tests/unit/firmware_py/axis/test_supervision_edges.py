@@ -203,6 +203,17 @@ def test_a_joint_that_gives_way_to_little_is_watched_as_well(stuck: tuple[Any, A
     assert state.pushed_cycles == int(pushed)
 
 
+@pytest.mark.parametrize(("asked_Nm", "pushed"), [(0.0, True), (3.5, False), (8.0, True)])
+def test_of_an_arm_what_the_other_joints_ask_for_pushes_none(
+    stuck: tuple[Any, Any], asked_Nm: float, pushed: bool
+) -> None:
+    axis, state = stuck
+    axis.limits.frozen_torque_Nm, axis.law.of_arm = 3.0, 1
+    state.command_torque_Nm, state.law.arm_torque_Nm = 4.0, asked_Nm
+    check_reading(axis, state, 1)
+    assert state.pushed_cycles == int(pushed)
+
+
 @pytest.mark.parametrize("by", ["less torque", "a reading that moves"])
 def test_pushing_counts_from_the_beginning_again(stuck: tuple[Any, Any], by: str) -> None:
     axis, state = stuck
