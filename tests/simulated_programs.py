@@ -53,12 +53,11 @@ from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.plant_settings import arm_plant_of
 from jointctl.tools.lockstep import codec_of
 from jointctl.tools.output import Output
-from jointctl.tools.session import loop_handle as loop_module
-from jointctl.tools.session import portable_loop
+from jointctl.tools.session import loop_memory, portable_loop
 from jointctl.tools.session import session as session_module
 from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.control import StopSignals
-from jointctl.tools.session.loop_handle import LoopHandle
+from jointctl.tools.session.loop_handle import RECEIVE_SHARE, LoopHandle
 from jointctl.tools.virtual_joint import new_devices
 
 STEP_NS = 1_000_000
@@ -311,7 +310,7 @@ class SimulatedLoop(LoopHandle):
         self, config: Config, table: Any, port: type, tail_path: Path | None = None, marker_fd: int | None = None,
         arm: ArmModel | None = None,
     ) -> None:  # fmt: skip
-        self.block = loop_module.new_block(table, port, arm)
+        self.block = loop_memory.new_block(table, port, arm)
         self._tail = self.lost_records = 0
         self._after_end = config.drive.when_the_loop_ends
         self._period_ns = round(NANOSECONDS / config.loop.rate_Hz)
@@ -373,9 +372,7 @@ class SimulatedLoop(LoopHandle):
         self._process.code = 0
 
     def _cycle(self) -> None:
-        portable_loop.run_portable_loop(
-            self._bus, self.block, self._period_ns, int(loop_module.RECEIVE_SHARE * self._period_ns)
-        )
+        portable_loop.run_portable_loop(self._bus, self.block, self._period_ns, int(RECEIVE_SHARE * self._period_ns))
         self._ended()
 
     def die(self) -> None:
@@ -515,7 +512,7 @@ def simulated(joint: Config | ArmConfig) -> Iterator[World]:
             (switch_off_module, "new_network", new_network),
             (portable_loop, "sleep_until_ns", lambda *when: loops[-1].wait_for_cycle(*when)),
             (portable_loop, "slept_ns", lambda *_: 0),
-            (loop_module, "mmap", private),
+            (loop_memory, "mmap", private),
             (session_module, "LoopHandle", new_loop),
             (CanopenSession, "open_all", open_simulated),
             (session_module, "recording", lambda _: contextlib.nullcontext()),

@@ -46,7 +46,12 @@ OF_THE_ENCODER = {"encoder_on_motor", "encoder_direction"}
 @pytest.mark.parametrize(
     ("settings", "section", "by_hand"),
     [
-        (CanopenSettings, CanopenSection, {"eds_path", "encoder_incremental", "joint_encoder", "temperature"}),
+        (
+            CanopenSettings,
+            CanopenSection,
+            {"eds_path", "encoder_incremental", "joint_encoder", "temperature"}
+            | {"torque_offset", "velocity_offset", "velocity_share", "holds_alone"},  # of [drive.cascade]
+        ),
         (ElmoSettings, ElmoSection, {"mode", "ramp_radps2"}),
     ],
 )

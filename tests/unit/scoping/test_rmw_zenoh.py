@@ -100,9 +100,9 @@ def point_of(time_s: float = 0.0, **fields: list[float]) -> RemoteSetPoint:
 
 
 def test_set_points_of_ros_2() -> None:
-    assert point_of(positions=[0.1]) == RemoteSetPoint("a node", 0.1)
+    assert point_of(positions=[0.1]) == RemoteSetPoint("a node", [0.1])
     full = point_of(1.5, positions=[0.1], velocities=[0.2], accelerations=[0.3], effort=[4.0])
-    assert full == RemoteSetPoint("a node", 0.1, 0.2, 0.3, 4.0, 1.5)
+    assert full == RemoteSetPoint("a node", [0.1], [0.2], [0.3], [4.0], 1.5)
 
 
 @pytest.mark.parametrize("fields", [{}, {"positions": [0.1, 0.2]}, {"positions": [0.1], "velocities": [0.1, 0.2]}])

@@ -464,7 +464,8 @@ def test_the_joints_own_friction_is_not_the_controllers(config: Config, tmp_path
         ("knee = 40.0", "knee = 400.0", "virtual.friction.positive.knee (=400) and max (=205) must be"),
         ("a0 = -0.175", "a0 = 3.0", "virtual.friction.negative: a0..a3 must give friction that opposes"),
         ('mode = "cst"', 'velocity_unit = "rpm"\nmode = "cst"', "drive.velocity_unit (=rpm) must be one of 'counts/s'"),
-        ('mode = "cst"', 'mode = "csv"', "drive.mode (=csv) must be one of 'cst', 'tq' or 'auto'"),
+        ('mode = "cst"', 'mode = "pv"', "drive.mode (=pv) must be one of 'cst', 'tq', 'auto', 'csp' or 'csv'"),
+        ('mode = "cst"', 'mode = "csv"', "[drive.cascade] is missing: drive.mode (=csv) needs it"),
     ],
 )
 def test_a_bad_key_of_the_sweeps_configuration_is_one_line(tmp_path: Path, old: str, new: str, text: str) -> None:

@@ -141,6 +141,7 @@ def test_another_motion_gives_way_at_rest_only(velocity: float, acceleration: fl
     reference = run.state.reference
     reference.velocity_radps, reference.acceleration_radps2 = velocity, acceleration
     run.put(0.0)
+    run.state.stream.written = 1  # the cycle has seen it
     step_other_motion(run.axis, run.state, 1)
     assert bool(run.axis.trajectory.kind == TrajectoryKind.STREAM) is begins
     assert run.state.stream.refused == (0 if begins else 1)
