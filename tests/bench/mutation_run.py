@@ -34,7 +34,10 @@ TESTS = {  # below UNIT_TESTS
     "firmware_py/stream.py": ("firmware_py/axis/test_stream", "firmware_py/axis/test_sequence_rules"),
     "firmware_py/sequence.py": ("firmware_py/axis/test_sequence_*", "firmware_py/axis/test_axis_*"),
     "drivers/canopen/cia402.py": ("drivers/canopen/test_cia402",),
-    "drivers/canopen/network.py": ("drivers/canopen/test_other_controllers", "drivers/canopen/test_switch_off"),
+    "drivers/canopen/network.py": (
+        "drivers/canopen/test_other_controllers", "drivers/canopen/test_switch_off", "drivers/canopen/test_arm_drives",
+        "drivers/canopen/test_commissioning",
+    ),
     "drivers/at_rest.py": ("drivers/canopen/test_switch_off", "drivers/elmo/test_elmo_drive"),
     "drivers/canopen/switch_off.py": ("drivers/canopen/test_switch_off",),
     "drivers/canopen/watchdog.py": ("drivers/canopen/test_watchdog", "drivers/canopen/test_switch_off"),

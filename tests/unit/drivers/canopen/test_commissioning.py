@@ -93,6 +93,8 @@ def test_targets_are_zeroed_before_anything_else_is_written(commissioned: Any) -
     ]
     assert not {0x607F, 0x6083} & set(written)  # of the velocity modes
     first = {index: written.index(index) for index in written}
+    frames = [cob == 0 for cob, data in bus.requests if cob == 0 or (cob == 0x601 and data[0] & 0xE0 == 0x20)]
+    assert frames[0]  # in pre-operational, where PDOs can be mapped
     assert written[0] == 0x6040
     assert first[0x6071] < first[0x60FF] < first[0x6060] < first[0x6072] < first[0x60C2] < first[0x1016] < first[0x1800]
     assert set(bus.downloads(0x60FF)) == set(bus.downloads(0x60B1)) == set(bus.downloads(0x60B2)) == {0}
@@ -575,6 +577,22 @@ def test_a_drive_whose_fault_was_cleared_is_made_safe(joint: Any) -> None:
     with joint.opened() as drive:
         drive.clear_fault()
         assert drive.make_safe() == "switch on disabled"
+
+
+def test_who_comes_after_another_commissioning_keeps_the_drive_until_it_is_started_again(joint: Any) -> None:
+    with joint.opened() as drive:
+        drive.commission()
+        drive.start_cyclic()
+        assert drive.make_safe() == "switch on disabled"
+        drive.commission()
+        joint.send(0x601, b"\x2b\x40\x60\x00\x06\0\0\0")
+        assert drive.make_safe() == UNTOUCHED
+
+
+def test_without_an_object_for_it_there_is_no_thermometer(joint: Any) -> None:
+    with joint.opened(temperature=None) as drive:
+        drive.commission()
+        assert drive.thermometer() is None
 
 
 def test_its_twin_that_another_controller_has_since_is_left_alone(joint: Any) -> None:
