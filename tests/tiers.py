@@ -10,8 +10,8 @@ LOCKSTEP = tuple(
     f"{folder}/test_{name}.py"
     for folder, names in {
         "hil": "friction_chain law_options map paper_figures random_motions study sweep tune",
-        "faults": "campaign_configurations every_frame fault_campaign fault_engine fault_regressions late_samples"
-        " limit_cycle own_loop_faults unwatched_loop",
+        "faults": "arm_campaign campaign_configurations every_frame fault_campaign fault_engine fault_regressions"
+        " late_samples limit_cycle own_loop_faults unwatched_loop",
         "docs": "configuration_reference notebook reference_pages troubleshooting",
     }.items()
     for name in names.split()

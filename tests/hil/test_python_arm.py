@@ -79,7 +79,7 @@ def test_motions_and_set_points_then_all_off(arm: ArmBench) -> None:
     (line,) = (line for line in ended.err.splitlines() if line.startswith("at "))
     at_rad = np.array([float(word) for word in line.split()[1:]])
     ways = np.array([1.0, 2.0, -1.0])
-    brake_rad = (397e-6 / 0.005) ** 2 * ways**2 * np.sign(ways) / (2.0 * 2.0)  # at 2 rad/s2
+    brake_rad = (397e-6 / 0.005) ** 2 * ways**2 * np.sign(ways) / (2.0 * np.array([15.0, 20.0, 30.0]))
     assert at_rad == pytest.approx([0.2, -0.1, 0.1] + 1e-6 * 199**2 * ways + brake_rad, abs=1e-3)
     logs = arm.logs()
     assert len({len(log.records) for log in logs}) == 1
