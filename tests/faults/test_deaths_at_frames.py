@@ -111,12 +111,15 @@ class Death:
         """Whether any drive is."""
         return any(device.device[0].state in POWERED for device in self.devices)
 
+    def note_power(self) -> None:
+        if self.powered != (self.changes[-1][1] if self.changes else False):
+            self.changes.append((time.monotonic(), self.powered))
+
     def look(self, until_s: float, moment: Moment = lambda _: False) -> bool:
         """Take all that is sent until then; True right after the frame that makes it the moment."""
         while time.monotonic() < until_s:
             message = self.bus.recv(0.001)
-            if self.powered != (self.changes[-1][1] if self.changes else False):
-                self.changes.append((time.monotonic(), self.powered))
+            self.note_power()
             if message is not None:
                 self.counts.take(message)
                 if moment(self.counts):
@@ -137,7 +140,8 @@ class Death:
         for name, pid in (("supervisor", self.run.process.pid), ("loop", self.loop)):
             if name in names:
                 os.kill(pid, signal.SIGKILL)
-        self.killed_s, self.powered_then = time.monotonic(), self.powered
+        self.note_power()  # before the time of death: what it sees had come by then
+        self.killed_s, self.powered_then = time.monotonic(), bool(self.changes) and self.changes[-1][1]
 
     def has_ended(self) -> bool:
         return not (alive(self.run.process.pid) or alive(self.loop))
