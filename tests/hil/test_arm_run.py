@@ -9,6 +9,7 @@ import signal
 import struct
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -80,12 +81,22 @@ class ArmBench:
         return [read_run_log(max(self.bench.folder.glob(f"runs/*.{name}.mcap"))) for name in NAMES]
 
 
-@pytest.fixture
-def arm(bench: Any) -> Iterator[ArmBench]:
+@contextmanager
+def arm_bench(bench: Any, more: str = "") -> Iterator[ArmBench]:
+    """With the drives running; `more` goes to the end of each joint's file."""
     made = ArmBench(bench)
+    for name in NAMES:
+        with (made.folder / f"{name}.toml").open("a") as file:
+            file.write(more)
     yield made
     made.drives.signal(signal.SIGTERM)
     made.drives.finished(30.0)
+
+
+@pytest.fixture
+def arm(bench: Any) -> Iterator[ArmBench]:
+    with arm_bench(bench) as made:
+        yield made
 
 
 def test_demo_moves_three_joints_and_leaves_a_log_of_each(bench: Any) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +16,7 @@ from mcap_ros2.decoder import DecoderFactory
 from jointctl.firmware_py.states import AxisPhase, Fault
 from tests.browser import PROGRAM, Browser
 from tests.foxglove_client import FoxgloveClient, free_port
-from tests.hil.test_arm_run import NAMES, ArmBench
+from tests.hil.test_arm_run import NAMES, ArmBench, arm_bench
 from tests.hil.test_foxglove import decoded
 from tests.hil.test_python_arm import PATIENT
 from tests.hil.test_scope_browser import environment, moves, printed_address, state_is
@@ -29,13 +28,8 @@ START_rad = 0.1  # virtual.initial_position_rad of all
 
 @pytest.fixture
 def arm(bench: Any) -> Iterator[ArmBench]:
-    made = ArmBench(bench)
-    for name in NAMES:
-        with (made.folder / f"{name}.toml").open("a") as file:
-            file.write(PATIENT)
-    yield made
-    made.drives.signal(signal.SIGTERM)
-    made.drives.finished(30.0)
+    with arm_bench(bench, PATIENT) as made:
+        yield made
 
 
 def targets(now_s: float) -> list[float]:

@@ -12,7 +12,7 @@ import pytest
 
 from jointctl.firmware_py.states import AxisPhase, Fault
 from jointctl.tools.recording.run_log_reader import read_run_log
-from tests.hil.test_arm_run import NAMES, ArmBench
+from tests.hil.test_arm_run import NAMES, ArmBench, arm_bench
 from tests.hil.test_python_joint import KERNELS, RAMPED
 
 PROGRAM = """
@@ -45,13 +45,8 @@ PATIENT = "\n[stream]\ndelay_s = 0.3\ntimeout_s = 1.0\nclient_timeout_s = 3.0\n"
 
 @pytest.fixture
 def arm(bench: Any) -> Iterator[ArmBench]:
-    made = ArmBench(bench)
-    for name in NAMES:
-        with (made.folder / f"{name}.toml").open("a") as file:
-            file.write(PATIENT)
-    yield made
-    made.drives.signal(signal.SIGTERM)
-    made.drives.finished(30.0)
+    with arm_bench(bench, PATIENT) as made:
+        yield made
 
 
 def started(arm: ArmBench, body: str) -> Any:
