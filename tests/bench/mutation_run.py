@@ -53,6 +53,7 @@ TESTS = {  # below UNIT_TESTS
     "drivers/bus_lock.py": ("drivers/test_bus_lock",),
     "tools/session/stop_call.py": ("session/test_control", "drivers/test_bus_lock"),
     "tools/session/control.py": ("session/test_control",),
+    "tools/session/elmo_guard.py": ("session/test_elmo_guard",),
     "tools/session/set_points.py": ("interface/test_lockstep_joint", "scoping/test_remote"),
 }  # fmt: skip
 KERNELS = (*(module for module in TESTS if module.startswith("firmware_py")), "drivers/canopen/cia402.py")

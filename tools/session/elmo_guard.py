@@ -145,9 +145,9 @@ class LineGuard:
 
     def __init__(self, order: GuardOrder) -> None:
         self._order = order
+        self._tty = open_descriptor(order.port)
         self._words = memoryview(mmap.mmap(order.block_fd, 8 * order.words)).cast("q")
         self._control = socket.socket(fileno=order.control_fd)
-        self._tty = open_descriptor(order.port)
         self._server = self._bound(guard_address(order.port))
         self._callers: list[socket.socket] = []
         self._asked_s: float | None = None  # when `jointctl stop` came
