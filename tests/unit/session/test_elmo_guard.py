@@ -145,6 +145,10 @@ class Guarded:
             return os.read(self._leader, 1000)
         return b""
 
+    def says(self, text: bytes) -> None:
+        """The drive does, on the line."""
+        os.write(self._leader, text)
+
     def unplug(self) -> None:
         os.close(self._follower)
         os.close(self._leader)
@@ -327,13 +331,33 @@ def test_only_another_adapter_is_left_alone(world: Guarded, monkeypatch: pytest.
             guard._require_same_device()
 
 
+def test_nothing_is_reached_behind_another_adapter(
+    world: Guarded, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(elmo_guard, "usb_serial_number", lambda port: "B2")
+    world.say({"state": "unknown: gone"})
+    assert world.run(usb_serial_number="A1") == 0
+    assert world.opened == []
+    assert "could not be switched off: another adapter has this name now" in capsys.readouterr().err
+
+
 def test_a_port_that_was_unplugged_keeps_no_name(world: Guarded) -> None:
+    tty = world.started()._tty
     world.after(0.5, world.unplug)
     world.after(1.0, lambda: world.say({"state": "off"}))
     assert world.run() == 0
     assert world.guard._tty == -1
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(tty)
     world.guard._tell()  # nobody is there to hear it, and nothing is raised
     world.guard._close_tty()
+
+
+def test_what_a_drive_says_is_for_others_to_read(world: Guarded) -> None:
+    world.after(0.5, lambda: world.says(b"MO=0;"))
+    world.after(1.0, lambda: world.say({"state": "off"}))
+    assert world.run() == 0
+    assert world.guard._tty >= 0
 
 
 def test_a_port_that_cannot_be_opened_is_told_by_the_program(
@@ -415,6 +439,15 @@ def test_after_a_stop_was_asked_for_it_waits_less_for_the_loop(
     guard._asked_s = world.now_ns / 1e9 if asked else None
     assert guard._outcome() is None
     assert world.told() == (SWITCH_OFF if late and asked else b"")
+
+
+def test_a_loop_that_has_ended_is_not_late(world: Guarded) -> None:
+    """The line is the supervisor's, who switches off."""
+    world.words[Word.GO], world.words[Word.LOOP_NS], world.words[Word.ENDED] = 1, world.now_ns - SECOND_ns, 1
+    guard = world.started()
+    guard._asked_s = world.now_ns / 1e9
+    assert guard._outcome() is None
+    assert world.told() == b""
 
 
 @pytest.mark.trips("serial user: everything", "(OBEY_S + 0.01, True, True)")

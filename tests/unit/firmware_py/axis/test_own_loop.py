@@ -16,8 +16,8 @@ from jointctl.drivers.canopen.cyclic import FRAME_SLOTS, SLOT_OFFSET, SLOT_RPDO,
 from jointctl.drivers.canopen.pdo import PdoLayout, new_port, own_layout
 from jointctl.firmware_py.axis import command_axis
 from jointctl.firmware_py.motion_records import Reference
-from jointctl.firmware_py.own_loop import limited_target_radps, look_ahead
-from jointctl.firmware_py.records import Command, LimitConstants, Sample
+from jointctl.firmware_py.own_loop import limited_target_radps, look_ahead, velocity_command_radps
+from jointctl.firmware_py.records import Command, LimitConstants, Sample, VelocityCommandConstants
 from jointctl.firmware_py.schema import new
 from jointctl.firmware_py.states import (
     AxisPhase,
@@ -66,6 +66,14 @@ def test_a_target_within_the_acceleration_limit_is_reached_at_once(
     assert (found == pytest.approx(sign * velocity, abs=1e-9)) is reached
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_what_counts_is_the_change_of_velocity_not_the_velocity(limits: Any, sign: float) -> None:
+    """A target that is reached without any change is, though it will stand still; so is one at exactly the limit."""
+    assert stepped(limits, target(sign * 0.5 * PERIOD_s), 0.0, sign * 0.5) == (pytest.approx(sign * 0.5), True)
+    backwards = target(sign * 0.5, sign * -0.5)  # in binary fractions: the limit is met to the bit
+    assert limited_target_radps(limits, 2.0, 0.5, backwards, 0.0, 0.0) == (sign, True)
+
+
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_a_target_that_is_not_finite_stays_where_it_was(limits: Any, bad: float) -> None:
     assert stepped(limits, target(bad), 0.3, 1.0) == (0.0, False)
@@ -94,19 +102,28 @@ def test_a_target_out_of_reach_is_caught_up_with_like_a_joint_would(
 
 
 def test_a_target_beyond_the_position_limits_is_not_gone_to(limits: Any) -> None:
-    position = velocity = 0.0
+    position = velocity = fastest = 0.0
     for _ in range(3000):
         velocity, _ = stepped(limits, target(5.0), position, velocity)
         position += velocity * PERIOD_s
+        fastest = max(fastest, velocity)
     assert position == pytest.approx(1.0, abs=1e-6)
+    assert fastest == 2.0  # its limit: the acceleration would allow more
 
 
 def test_the_motion_ahead_is_that_of_its_derivatives() -> None:
     ahead, now = new(Reference)[0], target(0.3, 0.2)
-    now.acceleration_radps2 = -4.0
+    now.acceleration_radps2, now.snap_radps4 = -4.0, 7.0
     look_ahead(now, 0.01, ahead)
     assert (ahead.position_rad, ahead.velocity_radps) == pytest.approx((0.3 + 0.002 - 0.0002, 0.16))
-    assert ahead.acceleration_radps2 == -4.0
+    assert (ahead.acceleration_radps2, ahead.snap_radps4) == (-4.0, 7.0)
+
+
+@pytest.mark.parametrize(("position_rad", "expected_radps"), [(0.3, 0.2), (0.31, 0.2 - 0.05), (0.28, 0.2 + 0.1)])
+def test_the_velocity_command_leads_back_to_the_planned_motion(position_rad: float, expected_radps: float) -> None:
+    constants = new(VelocityCommandConstants)[0]
+    constants.position_gain_ps = 5.0
+    assert velocity_command_radps(constants, target(0.3, 0.2), position_rad) == pytest.approx(expected_radps)
 
 
 # --- a whole run of the axis ---
