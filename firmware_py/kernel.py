@@ -85,8 +85,9 @@ def prepare_cache() -> Path | None:
 
 cache_folder = prepare_cache()
 
+import llvmlite.binding as llvm  # noqa: E402
 import numba  # noqa: E402  (NUMBA_CACHE_DIR is read while numba is imported)
-from numba.core import caching, event, types  # noqa: E402
+from numba.core import caching, codegen, event, types  # noqa: E402
 from numba.core.registry import CPUDispatcher  # noqa: E402
 from numba.extending import register_jitable  # noqa: E402
 
@@ -131,6 +132,75 @@ with contextlib.suppress(ImportError):
     import numba.np.linalg as _numba_linalg
 
     _numba_linalg.ensure_blas = _no_blas
+
+
+# Numba optimises every function together with all that it calls, and makes machine code of it: of a function ten calls
+# deep ten times.  The machine code is only needed where Python or C calls: what has no wrapper for them is kept as it
+# was lowered, and optimised with each function that has one.  Compiling takes half the time.
+_plain_library: Any = codegen.JITCodeLibrary
+_WRAPPERS = ("_ZN7cpython", "_ZN5cfunc")  # how numba's names of what Python and C call begin
+
+
+class _Library(_plain_library):  # type: ignore[misc]
+    """What numba makes of one function; `_late` while it has no machine code, which comes when an address is asked."""
+
+    _late = False
+
+    def finalize(self) -> None:
+        self._late = not any(function.name.startswith(_WRAPPERS) for function in self._final_module.functions)
+        super().finalize()
+
+    def _optimize_final_module(self) -> None:
+        if not self._late:
+            super()._optimize_final_module()
+
+    def _finalize_final_module(self) -> None:
+        if not self._late:
+            super()._finalize_final_module()
+            return
+        self._finalize_dynamic_globals()
+        self._verify_declare_only_symbols()
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        self._ensure_finalized()
+        if self._late and any(function.name == name for function in self.get_defined_functions()):
+            self._late = False
+            self._optimize_final_module()
+            self._finalize_final_module()
+        return int(super().get_pointer_to_function(name))
+
+    def serialize_using_object_code(self) -> tuple[str, str, object]:
+        if self._late:
+            return (self.name, "late", self._final_module.as_bitcode())
+        serialized: tuple[str, str, object] = super().serialize_using_object_code()
+        return serialized
+
+    @classmethod
+    def _unserialize(cls, owner: Any, state: tuple[str, str, Any]) -> Any:
+        name, kind, data = state
+        if kind != "late":
+            return super()._unserialize(owner, state)
+        library = owner.create_library(name)
+        library._final_module = llvm.parse_bitcode(data)
+        library._late = True
+        library._finalize_final_module()
+        return library
+
+
+_jit: Any = codegen.JITCPUCodegen
+_jit._library_class = _Library
+_set_env = _jit.set_env
+
+
+def _set_env_of_machine_code(owner: Any, name: str, env: object) -> None:
+    """Only machine code has a place for numba's environment of a function, which no kernel uses."""
+    if owner._engine.is_symbol_defined(name):
+        _set_env(owner, name, env)
+
+
+_jit.set_env = _set_env_of_machine_code
+
 _NO_COUNTS: dict[str, Any] = {"_nrt": False, "cache": cache_folder is not None}
 _MACHINE: dict[str, Any] = {"_nrt": False, "nogil": True, "error_model": "numpy"}
 _OPTIONS: dict[str, Any] = {**_NO_COUNTS, **_MACHINE}

@@ -86,6 +86,50 @@ def test_what_allocates_does_not_compile() -> None:
         allocating(3)
 
 
+# --- machine code is made where it is needed ---
+ONE_KERNEL = """
+from jointctl.firmware_py.kernel import kernel
+
+@kernel
+def doubled(a: float) -> float:
+    return 2.0 * a
+
+@kernel
+def called(a: float) -> float:
+    return doubled(a) + 1.0
+"""
+CALLS_IT = """
+import numba
+from one_kernel import called, doubled
+
+again = numba.njit(lambda a: doubled(a) + 2.0)  # kept nowhere, so that it needs what it calls
+
+def made(which: object) -> list[object]:
+    return [*which.overloads.values()]
+
+def hits(which: object) -> int:
+    return sum(which.stats.cache_hits.values())
+
+print(called(3.0), again(3.0), doubled(3.0))
+print(made(called)[0].library._late, hits(called), hits(doubled.inner), hits(doubled))
+for compiled in made(doubled.inner):
+    library = compiled.library
+    print(library._late, library.get_pointer_to_function(compiled.fndesc.mangled_name) > 0, library._late)
+    print(library.get_pointer_to_function("not_there"))
+"""
+
+
+@pytest.mark.skipif(kernel_module.JIT_DISABLED, reason="nothing is compiled")
+def test_what_only_kernels_call_has_no_machine_code_and_comes_from_the_cache(tmp_path: Path) -> None:
+    (tmp_path / "one_kernel.py").write_text(ONE_KERNEL)
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n" + CALLS_IT
+    cache = str(tmp_path / "cache")
+    first, second = (run_python(code, JOINTCTL_CACHE_DIR=cache).split() for _ in range(2))
+    assert first[:7] == ["7.0", "8.0", "6.0", "False", "0", "0", "0"]
+    assert second[:7] == ["7.0", "8.0", "6.0", "False", "1", "1", "1"]
+    assert first[7:] == second[7:] == ["True", "True", "False", "0"]
+
+
 # --- the cache must never run stale ---
 @pytest.fixture
 def copy_of_sources(tmp_path: Path) -> Path:
