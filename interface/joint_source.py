@@ -16,6 +16,7 @@ from jointctl.tools.scoping.remote_options import FOXGLOVE_AT, RemoteOptions, us
 
 if TYPE_CHECKING:
     from jointctl.tools.configuration.arm import ArmConfig
+    from jointctl.tools.own_virtual_joint import OwnVirtualJoint
 
 _NUMBERS = count(1)
 SHIPPED_NAME = "virtual"  # what `Arm` calls the shipped arm
@@ -43,16 +44,16 @@ class Source:
     own_virtual: bool
 
     @contextmanager
-    def served(self) -> Iterator[None]:
-        """With the virtual drives running, in a process of their own, where they are one's own."""
-        from jointctl.tools.virtual_joint import own_virtual_joint
+    def served(self) -> Iterator[OwnVirtualJoint | None]:
+        """With the virtual drives starting, in a process of their own, where they are one's own."""
+        from jointctl.tools.own_virtual_joint import own_virtual_joint
 
         if not self.own_virtual:
-            yield
+            yield None
             return
         first = self.config if isinstance(self.config, Config) else self.config.joints[0]
-        with own_virtual_joint(self.config.path, first.bus.channel):
-            yield
+        with own_virtual_joint(self.config.path, first.bus.channel) as own:
+            yield own
 
 
 def observers(foxglove: bool | str, ros2: bool | int, *, allow_remote: bool) -> RemoteOptions:

@@ -123,7 +123,7 @@ class LiveMotor:
     def begin(self) -> None:
         """Commission: returns with the drive ready and disabled, or raises why not."""
         try:
-            self._stack.enter_context(self._source.served())
+            own = self._stack.enter_context(self._source.served())
             load_check()  # not beside commissioning: compiling would hold up the heartbeat
             if self.axes.arm is not None:
                 from jointctl.tools.analysis.arm_check import load_torques
@@ -137,6 +137,9 @@ class LiveMotor:
             self.log_paths = tuple(joint.log_path for joint in plan.joints)
             display = others.beside(lambda _: self._display)
             self._session = Session(plan, self._approval, output, control, display, others.set_points)
+            if own is not None:
+                own.until_bus()
+                self._session.until_ready = own.until_ready
             self._thread = threading.Thread(target=self._run, name="jointctl session")
             self._thread.start()
             for name in _NEEDED:  # commissioning waits for the drive most of the time

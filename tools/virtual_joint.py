@@ -1,27 +1,20 @@
-"""The virtual joint of a configuration: bus, drive and plant, in this process (`jointctl hil`) or in one of its own."""
+"""The virtual joint of a configuration in this process: bus, drive and plant."""
 
 from __future__ import annotations
 
 import gc
-import os
-import select
-import signal
 import struct
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from pathlib import Path
+from contextlib import ExitStack, contextmanager
 
 import can
 import numpy as np
 
 from jointctl.drivers.can.open import CYCLIC_INTERFACES, open_cyclic_end, open_python_can
 from jointctl.drivers.can.virtual_bus import decode, encode
-from jointctl.drivers.errors import BusError, ConfigurationError, JointctlError
-from jointctl.firmware_py.kernel import cache_folder
+from jointctl.drivers.errors import BusError, ConfigurationError
 from jointctl.firmware_py.schema import new
 from jointctl.hil.canopen.device import Cia402Device, DeviceRow
 from jointctl.hil.canopen.records import Device
@@ -29,7 +22,6 @@ from jointctl.hil.plant import plant
 from jointctl.hil.plant_records import PlantConstants, PlantState
 from jointctl.hil.realtime_device import ENDED_WORD, SEND_ERRORS_WORD, STOP_WORD, WORDS, RealtimeDevice
 from jointctl.hil.virtual_bus import VirtualBusError, VirtualBusHub, default_socket_path
-from jointctl.tools.child_process import Starting
 from jointctl.tools.configuration.arm import ArmConfig
 from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
@@ -41,8 +33,6 @@ from jointctl.tools.configuration.plant_settings import (
     plant_settings,
 )
 
-_POLL_S = 0.1
-_START_POLL_S = 0.02
 _LONGEST_WAIT_NS = 2_000_000  # timers and the plant move on at least this often
 _FRAMES_AT_ONCE = 64  # received before timers are looked at again
 _SEND_TIMEOUT_S = 0.01
@@ -153,26 +143,37 @@ def new_devices(joints: Sequence[Config]) -> list[Cia402Device]:
     return devices
 
 
+def _start_bus(stack: ExitStack, config: Config, timing: bool) -> None:
+    path = default_socket_path(config.bus.channel)
+    try:
+        stack.enter_context(VirtualBusHub(path, config.bus.bitrate_bitps, timing))
+    except VirtualBusError as error:
+        raise BusError(str(error)) from None
+
+
 @contextmanager
-def serve_virtual_joint(given: Config | ArmConfig, timing: bool = False) -> Iterator[RealtimeDevice | PumpedDevice]:
+def serve_virtual_joint(
+    given: Config | ArmConfig, timing: bool = False, bus_is_up: Callable[[], None] | None = None
+) -> Iterator[RealtimeDevice | PumpedDevice]:
     """Drive in threads of this process; the bus as well if it is the virtual one, all others exist already.
 
-    Those of an arm are on the bus of the first one.
+    Those of an arm are on the bus of the first one.  A bus that can be found has a drive that answers, unless somebody
+    is told with `bus_is_up` that there is a bus already, and waits for the drive.
     """
     joints = [given] if isinstance(given, Config) else list(given.joints)
-    arm = None if isinstance(given, Config) else arm_plant_of(given)
-    config, devices = joints[0], new_devices(joints)
-    if config.bus.interface in CYCLIC_INTERFACES:
-        gc.disable()  # what a compiler leaves behind is little beside what it holds
-        RealtimeDevice(devices, -1, arm).compile()  # a bus that can be found has a drive that answers
-        gc.enable()
+    config = joints[0]
     with ExitStack() as stack:
-        if config.bus.interface == "jointctl":
-            path = default_socket_path(config.bus.channel)
-            try:
-                stack.enter_context(VirtualBusHub(path, config.bus.bitrate_bitps, timing))
-            except VirtualBusError as error:
-                raise BusError(str(error)) from None
+        own_bus = config.bus.interface == "jointctl"
+        if own_bus and bus_is_up is not None:
+            _start_bus(stack, config, timing)
+            bus_is_up()
+        arm, devices = None if isinstance(given, Config) else arm_plant_of(given), new_devices(joints)
+        if config.bus.interface in CYCLIC_INTERFACES:
+            gc.disable()  # what a compiler leaves behind is little beside what it holds
+            RealtimeDevice(devices, -1, arm).compile()
+            gc.enable()
+        if own_bus and bus_is_up is None:
+            _start_bus(stack, config, timing)
         if config.bus.interface not in CYCLIC_INTERFACES:
             if len(devices[0].faults):
                 raise ConfigurationError(
@@ -185,70 +186,3 @@ def serve_virtual_joint(given: Config | ArmConfig, timing: bool = False) -> Iter
             return
         end = stack.enter_context(open_cyclic_end(config.bus.interface, config.bus.channel))
         yield stack.enter_context(RealtimeDevice(devices, end.fileno(), arm))
-
-
-@contextmanager
-def separate_virtual_joint(
-    config_path: Path, channel: str, tell: Callable[[str], None] = lambda _: None, *, timing: bool = False
-) -> Iterator[subprocess.Popen[bytes]]:
-    """`jointctl hil` as a process of its own on a bus of the given name, with `--timing` or not; ended with the block.
-
-    `tell` gets a line now and then while it compiles.  Raises `BusError` if it ends, or hangs, before it is ready.
-    """
-    read_end, write_end = os.pipe()
-    command = [sys.executable, "-P", "-m", "jointctl.tools.verbs", "hil", str(config_path), "--interface", "jointctl"]
-    command += ["--channel", channel, "--ready-fd", str(write_end), "--quiet", *(["--timing"] if timing else [])]
-    process = subprocess.Popen(command, pass_fds=(write_end,), stdin=subprocess.DEVNULL, start_new_session=True)
-    os.close(write_end)
-    try:
-        starting = Starting("the virtual joint", process, tell, BusError)
-        while not select.select([read_end], [], [], _POLL_S)[0]:
-            starting.check()
-        if os.read(read_end, 1) != b"+":  # its end of the pipe has gone, and so will it
-            process.wait()
-            starting.check()
-        yield process
-    finally:
-        os.close(read_end)
-        process.send_signal(signal.SIGTERM)
-        try:
-            process.wait(5.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-
-
-@contextmanager
-def own_virtual_joint(config_path: Path, channel: str, tell: Callable[[str], None] = lambda _: None) -> Iterator[None]:
-    """`separate_virtual_joint`, with a loop that is compiled when the block begins."""
-    with _compiling_beside(tell) as loop_compiled, separate_virtual_joint(config_path, channel, tell):
-        loop_compiled()
-        yield
-
-
-@contextmanager
-def _compiling_beside(tell: Callable[[str], None]) -> Iterator[Callable[[], None]]:
-    """Where the loop is not compiled yet, a process does that beside what the block does; what this gives waits for it.
-
-    Whatever becomes of it: the loop compiles by itself what it does not find.
-    """
-    if cache_folder is None or any(cache_folder.rglob("realtime.run_loop-*.nbi")):
-        yield lambda: None
-        return
-    tell("compiling, which only the first start does")
-    command = [sys.executable, "-P", "-m", "jointctl.tools.session.loops"]
-    silent = subprocess.DEVNULL
-    process = subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent, start_new_session=True)
-
-    def wait() -> None:
-        starting = Starting("the loop", process, tell)
-        with suppress(JointctlError):
-            while process.poll() is None:
-                starting.check()
-                time.sleep(_START_POLL_S)
-
-    try:
-        yield wait
-    finally:
-        process.kill()
-        process.wait()

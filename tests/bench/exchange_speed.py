@@ -40,10 +40,10 @@ from jointctl.tools.configuration.canopen import canopen_section
 from jointctl.tools.configuration.config import Config
 from jointctl.tools.configuration.drive_section import GivenPlace
 from jointctl.tools.configuration.records import axis_constants, stacked_tables, trajectory_table
+from jointctl.tools.own_virtual_joint import separate_virtual_joint
 from jointctl.tools.session.canopen_drive import CanopenSession
 from jointctl.tools.session.loop_handle import RECEIVE_SHARE, LoopHandle
 from jointctl.tools.verbs.verb_options import arm_on_bus
-from jointctl.tools.virtual_joint import separate_virtual_joint
 from jointctl.tools.wake_up import cores_awake, fifo, wake_up_lateness_ns
 from tests.bench.c_programs import NoCompilerError, exchange_program, setting_doubles
 from tests.bench.paired import Row, compared, interleaved, measured, skipped

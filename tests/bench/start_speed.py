@@ -20,7 +20,7 @@ from pathlib import Path
 
 from jointctl.drivers.errors import JointctlError
 from jointctl.tools.configuration.config import Config
-from jointctl.tools.virtual_joint import separate_virtual_joint
+from jointctl.tools.own_virtual_joint import separate_virtual_joint
 from tests.bench.paired import Row, compared, interleaved, measured
 
 GROUP = "start"

@@ -70,6 +70,8 @@ class Session:
         self._kind = session_drive(plan.config.drive.kind)
         self.drive_state = ""  # in words, after the run
         self.loop: LoopHandle | None = None  # once it has been started
+        # Waits for drives that are still starting, beside the loop and the listening; the argument may end it.
+        self.until_ready: Callable[[Callable[[], None]], None] = lambda alive: None
 
     def run(self) -> RunResult | None:
         """The whole run; None if it was declined.  Afterwards the drive is off, or `drive_state` says otherwise."""
@@ -88,6 +90,7 @@ class Session:
             guard: Guard | None = None
             try:
                 guard = self._kind.guard(config, loop)
+                self.until_ready(signals.leave_if_asked)
                 try:
                     reports = self.commissioned(config, drives, self._may_brake())
                 except Declined:

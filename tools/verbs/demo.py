@@ -34,8 +34,8 @@ def demo(
         return _demo_of_arm(duration_s, output)
     from jointctl.tools.configuration.drive_section import GivenPlace, require_simulated
     from jointctl.tools.configuration.load import load_config, moved
-    from jointctl.tools.verbs.run import run
-    from jointctl.tools.virtual_joint import own_virtual_joint
+    from jointctl.tools.own_virtual_joint import own_virtual_joint
+    from jointctl.tools.verbs.run import tracked
 
     path = config_path(config)
     joint = load_config(path)
@@ -48,24 +48,24 @@ def demo(
         joint = _with_duration(joint, duration_s)
     joint = with_patience(joint)
     output.note("starting the virtual joint")
-    with own_virtual_joint(path, channel, output.note):
-        return run(joint, output, assume_yes=True)
+    with own_virtual_joint(path, channel, output.note) as own:
+        return tracked(joint, output, assume_yes=True, own=own)
 
 
 def _demo_of_arm(duration_s: float | None, output: Output) -> int:
     from jointctl.tools.configuration.arm import SHIPPED_ARM, load_arm
     from jointctl.tools.configuration.drive_section import GivenPlace
-    from jointctl.tools.verbs.run import run
+    from jointctl.tools.own_virtual_joint import own_virtual_joint
+    from jointctl.tools.verbs.run import tracked
     from jointctl.tools.verbs.verb_options import arm_on_bus
-    from jointctl.tools.virtual_joint import own_virtual_joint
 
     channel = f"demo-{os.getpid()}"
     arm = arm_on_bus(load_arm(SHIPPED_ARM), GivenPlace("jointctl", channel))
     joints = arm.joints if duration_s is None else tuple(_with_duration(joint, duration_s) for joint in arm.joints)
     arm = replace(arm, joints=tuple(with_patience(joint) for joint in joints))
     output.note("starting the virtual arm")
-    with own_virtual_joint(SHIPPED_ARM, channel, output.note):
-        return run(arm, output, assume_yes=True)
+    with own_virtual_joint(SHIPPED_ARM, channel, output.note) as own:
+        return tracked(arm, output, assume_yes=True, own=own)
 
 
 def with_patience(config: Config) -> Config:

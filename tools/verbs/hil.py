@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +17,7 @@ import typer
 
 from jointctl.drivers.errors import ConfigurationError, UsageError
 from jointctl.tools.output import Output
+from jointctl.tools.own_virtual_joint import BUS, DRIVE
 from jointctl.tools.scoping.remote_options import NOBODY, ObserveOptions
 from jointctl.tools.verbs.verb_options import BusOptions, ConfigPath, ProgressOutput, loaded_joint_or_arm
 
@@ -85,7 +87,7 @@ def serve_can(
     ready_fd: int | None = None,
     live: ObserveOptions = NOBODY,
 ) -> int:
-    """Serve until a stop signal; `ready_fd` gets one byte once the bus can be used, and its reader's end ends us."""
+    """Serve until a stop signal; `ready_fd` gets `BUS` and `DRIVE` in time, and its reader's end ends us."""
     from jointctl.hil.realtime_device import ENDED_WORD
     from jointctl.hil.virtual_bus import default_socket_path
     from jointctl.tools.configuration.canopen import canopen_section
@@ -99,7 +101,7 @@ def serve_can(
     with (
         slow_start(output.note, "virtual joint") as started,
         stop_signals() as signals,
-        serve_virtual_joint(given, timing) as joint,
+        serve_virtual_joint(given, timing, None if ready_fd is None else partial(say, ready_fd, BUS)) as joint,
     ):
         started()
         make_realtime(config, output)
@@ -161,13 +163,18 @@ def make_realtime(config: Config, output: Output) -> None:
 
 
 def wait_for_end(signals: StopSignals, ready_fd: int | None, ended: Callable[[], bool] = lambda: False) -> None:
-    """Tell `ready_fd` with one byte that we are up; until a stop signal, its reader's end, or `ended`."""
+    """Tell `ready_fd` that the drive answers; until a stop signal, its reader's end, or `ended`."""
     if ready_fd is not None:
-        os.set_blocking(ready_fd, False)
-        with contextlib.suppress(BrokenPipeError):
-            os.write(ready_fd, b"+")
+        say(ready_fd, DRIVE)
     while not signals.count and not ended() and not _reader_gone(ready_fd):
         time.sleep(_POLL_S)
+
+
+def say(ready_fd: int, word: bytes) -> None:
+    """To the program that has started us."""
+    os.set_blocking(ready_fd, False)
+    with contextlib.suppress(BrokenPipeError):
+        os.write(ready_fd, word)
 
 
 def _reader_gone(ready_fd: int | None) -> bool:

@@ -14,6 +14,9 @@ from jointctl.tools.verbs.verb_options import AllowLowMargin, DryRun, JointOrArm
 
 if TYPE_CHECKING:
     from jointctl.drivers.drive import CommissioningReport
+    from jointctl.tools.configuration.arm import ArmConfig
+    from jointctl.tools.configuration.config import Config
+    from jointctl.tools.own_virtual_joint import OwnVirtualJoint
     from jointctl.tools.session.display import Display
     from jointctl.tools.session.plan import RunPlan
 
@@ -37,12 +40,36 @@ def run(
     live: RemoteOptions = NOBODY_REMOTE,
 ) -> int:
     """Track the configured trajectory on a real or virtual joint, or with all joints of an arm."""
+    return tracked(
+        config,
+        output,
+        assume_yes=assume_yes,
+        dry_run=dry_run,
+        allow_low_margin=allow_low_margin,
+        scope=scope,
+        live=live,
+    )
+
+
+def tracked(
+    config: Config | ArmConfig,
+    output: Output,
+    *,
+    assume_yes: bool,
+    dry_run: bool = False,
+    allow_low_margin: bool = False,
+    scope: tuple[str, int] | None = None,
+    live: RemoteOptions = NOBODY_REMOTE,
+    own: OwnVirtualJoint | None = None,
+) -> int:
+    """`run` from Python; `own`: the virtual joint that was started for it, and may still be starting."""
     from jointctl.tools.scoping.remote import remote
     from jointctl.tools.session.consent import TerminalConsent, require_terminal
     from jointctl.tools.session.control import in_control
     from jointctl.tools.session.plan import configured, free, resolve_any
     from jointctl.tools.session.result import broken_off, never_begun, report_run, run_title
     from jointctl.tools.session.session import Session
+    from jointctl.tools.session.set_points import load_check
 
     if not (assume_yes or dry_run):
         require_terminal()
@@ -57,6 +84,10 @@ def run(
         session = Session(
             plan, others.consent(consent, output), output, control, others.beside(display), others.set_points
         )
+        if own is not None:
+            load_check()  # the first kernel loads much of numba: while the bus is not there yet
+            own.until_bus()
+            session.until_ready = own.until_ready
         try:
             result = session.run()
         except KeyboardInterrupt:
