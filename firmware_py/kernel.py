@@ -139,6 +139,7 @@ with contextlib.suppress(ImportError):
 # was lowered, and optimised with each function that has one.  Compiling takes half the time.
 _plain_library: Any = codegen.JITCodeLibrary
 _WRAPPERS = ("_ZN7cpython", "_ZN5cfunc")  # how numba's names of what Python and C call begin
+_ADDRESSES = "numba.dynamic.globals"
 
 
 class _Library(_plain_library):  # type: ignore[misc]
@@ -151,6 +152,9 @@ class _Library(_plain_library):  # type: ignore[misc]
         super().finalize()
 
     def _optimize_final_module(self) -> None:
+        # an address of this process keeps a function out of the cache: optimising tells whether it is used
+        if any(variable.name.startswith(_ADDRESSES) for variable in self._final_module.global_variables):
+            self._late = False
         if not self._late:
             super()._optimize_final_module()
 
