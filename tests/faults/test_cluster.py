@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,18 +36,17 @@ PROGRAM = "from dask.__main__ import main; main()"
 class Cluster:
     """Scheduler and workers, each a process of its own."""
 
-    def __init__(self, folder: Path) -> None:
-        self.address, self._folder = f"tcp://127.0.0.1:{free_port()}", folder
+    def __init__(self, folder: Path, certificates: Sequence[str] = ()) -> None:
+        scheme = "tls" if certificates else "tcp"
+        self.address, self._folder, self._certificates = f"{scheme}://127.0.0.1:{free_port()}", folder, certificates
         self.processes: list[subprocess.Popen[bytes]] = []
         port = self.address.rpartition(":")[2]
-        self._start("scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
+        self._start("scheduler", "--protocol", scheme, "--host", "127.0.0.1", "--port", port, "--no-dashboard")
 
     def _start(self, *words: str) -> subprocess.Popen[bytes]:
         with (self._folder / f"{words[0]}-{len(self.processes)}").open("wb") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-P", "-c", PROGRAM, *words], stdout=log, stderr=log, cwd=self._folder,
-                start_new_session=True,
-            )  # fmt: skip
+            command = [sys.executable, "-P", "-c", PROGRAM, *words, *self._certificates]
+            process = subprocess.Popen(command, stdout=log, stderr=log, cwd=self._folder, start_new_session=True)
         self.processes.append(process)
         return process
 
@@ -190,3 +190,44 @@ def test_without_the_extra_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(DataError, match="the extra `cluster`"):
         verdicts_of(Workers(cluster="tcp://127.0.0.1:8786"), 1)
+
+
+def certificates(folder: Path) -> dict[str, str]:
+    """An authority, and one certificate of it for all ends, as dask names them."""
+
+    def openssl(*words: str) -> None:
+        subprocess.run(["openssl", *words], cwd=folder, check=True, capture_output=True)
+
+    new_key = ("-newkey", "rsa:2048", "-nodes")
+    openssl("req", "-x509", *new_key, "-keyout", "ca.key", "-out", "ca.pem", "-days", "1", "-subj", "/CN=ca")
+    openssl("req", *new_key, "-keyout", "node.key", "-out", "node.csr", "-subj", "/CN=node")
+    openssl(
+        "x509", "-req", "-in", "node.csr", "-CA", "ca.pem", "-CAkey", "ca.key", "-CAcreateserial", "-out", "node.pem"
+    )
+    names = {"ca-file": "ca.pem", "client.cert": "node.pem", "client.key": "node.key"}
+    return {f"distributed.comm.tls.{key}": str(folder / name) for key, name in names.items()}
+
+
+@needs_distributed
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="not installed: openssl")
+def test_over_tls_the_results_are_the_same_and_nobody_comes_in_without_a_certificate(tmp_path: Path) -> None:
+    import dask
+
+    ours = certificates(tmp_path)
+    authority, certificate, key = ours.values()
+    cluster = Cluster(tmp_path, ("--tls-ca-file", authority, "--tls-cert", certificate, "--tls-key", key))
+    try:
+        cluster.worker("a")
+        with dask.config.set(ours):
+            cluster.wait_for(1)
+            assert verdicts_of(Workers(cluster=cluster.address), 16) == verdicts_of(Workers(1), 16)
+        with pytest.raises(UsageError, match="DASK_DISTRIBUTED__COMM__TLS__CA_FILE is not set"):
+            verdicts_of(Workers(cluster=cluster.address), 1)
+        for given in ({"distributed.comm.tls.client.cert": authority}, {"distributed.comm.tls.ca-file": "/nowhere"}):
+            with (
+                dask.config.set(ours | given),
+                pytest.raises(UsageError, match=r"cannot be used: .*(mismatch|No such)"),
+            ):
+                verdicts_of(Workers(cluster=cluster.address), 1)
+    finally:
+        cluster.close()

@@ -127,9 +127,11 @@ def _of_cluster(workers: Workers) -> Iterator[tuple[Executor, int]]:
     except ImportError:
         hint = "in a clone: pip install -e '.[cluster]'"
         raise DataError("--cluster needs the extra `cluster` (distributed), which is not installed", hint) from None
+    if urlsplit(address).scheme == "tls":
+        _require_certificates(address, distributed.Security())
     try:
         client: Any = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
-    except (OSError, TypeError, ValueError) as error:  # TypeError: no certificates for TLS
+    except (OSError, TypeError, ValueError) as error:
         raise JointctlError(f"--cluster (={address}): no scheduler answers: {error}", "docs/cluster.md") from None
     try:
         threads = _fit_workers(client, address, workers.warn)
@@ -140,6 +142,19 @@ def _of_cluster(workers: Workers) -> Iterator[tuple[Executor, int]]:
             executor.shutdown(wait=False)
     finally:
         client.close()
+
+
+def _require_certificates(address: str, security: Any) -> None:
+    """A client without them cannot even be closed again."""
+    for name, given in (("CA_FILE", security.tls_ca_file), ("CLIENT__CERT", security.tls_client_cert)):
+        if given is None:
+            variable = f"DASK_DISTRIBUTED__COMM__TLS__{name}"
+            raise UsageError(f"--cluster (={address}) needs certificates, and {variable} is not set", "docs/cluster.md")
+    try:
+        security.get_connection_args("client")
+    except (OSError, ValueError) as error:
+        files = f"{security.tls_ca_file}, {security.tls_client_cert}, {security.tls_client_key}"
+        raise UsageError(f"--cluster (={address}): the certificates in {files} cannot be used: {error}") from None
 
 
 def _about() -> tuple[str, str]:
